@@ -1,0 +1,43 @@
+# Needs only make and Python 3.11 or newer: the first target that runs builds .venv, the others reuse it.
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+STAMP := $(VENV)/.stamp
+
+# jaxlib 0.10.2 can deadlock in batched MJX steps where XLA's thread pool has only two threads.
+NPROC ?= 4
+export NPROC
+
+.PHONY: help demo test test-full lint clean
+.DEFAULT_GOAL := help
+
+help:
+	@echo "make demo       shape a cable into a U, an S and a Z; writes runs/demo/report.html"
+	@echo "make test       lint, types and the quick tests"
+	@echo "make test-full  lint, types and every test"
+	@echo "make lint       ruff and pyright"
+	@echo "make clean      remove .venv and caches (runs/ stays)"
+
+$(STAMP): pyproject.toml constraints.txt
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
+		{ echo "cablejax needs Python 3.11 or newer; name one: make PYTHON=/path/to/python3.11"; exit 2; }
+	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --disable-pip-version-check --quiet -c constraints.txt -e '.[dev]'
+	@touch $@
+
+demo: $(STAMP)
+	$(BIN)/python -m cablejax demo --overwrite
+
+lint: $(STAMP)
+	$(BIN)/ruff format --check .
+	$(BIN)/ruff check .
+	$(BIN)/pyright
+
+test: lint
+	$(BIN)/python -m pytest -m "not slow"
+
+test-full: lint
+	$(BIN)/python -m pytest
+
+clean:
+	rm -rf $(VENV) build dist .pytest_cache .ruff_cache .hypothesis

@@ -1,0 +1,61 @@
+"""The command line: `cablejax demo | simulate | train | shape | bench`."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from typing import Annotated, Any
+
+import tyro
+from tyro.conf import subcommand
+
+from cablejax.commands.bench import Bench
+from cablejax.commands.demo import Demo
+from cablejax.commands.options import Command
+from cablejax.commands.shape import Shape
+from cablejax.commands.simulate import Simulate
+from cablejax.commands.train import Train
+
+USER_ERROR = 2
+"""Exit code for input that cannot be used."""
+
+INTERRUPTED = 130
+"""Exit code after Ctrl-C, as shells have it."""
+
+_COMMANDS: Any = (
+    Annotated[Demo, subcommand("demo")]
+    | Annotated[Simulate, subcommand("simulate")]
+    | Annotated[Train, subcommand("train")]
+    | Annotated[Shape, subcommand("shape")]
+    | Annotated[Bench, subcommand("bench")]
+)
+_DESCRIPTION = """Two robot grippers bring a cable to a shape.
+
+Start with `cablejax demo`: it needs nothing else and writes a page to look at. To make your own model: `simulate` a data
+set, `train` on it, `shape` a cable with the result. `cablejax COMMAND --help` explains each one."""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Runs one command and returns the exit code: 0, 2 for input that cannot be used, 130 after Ctrl-C.
+
+    Args:
+        arguments: what follows `cablejax` on the command line; by default that of this process.
+    """
+    command: Command | Bench = tyro.cli(
+        _COMMANDS,
+        prog="cablejax",
+        description=_DESCRIPTION,
+        args=arguments,
+        config=(tyro.conf.OmitArgPrefixes, tyro.conf.OmitSubcommandPrefixes, tyro.conf.FlagCreatePairsOff),
+    )
+    command = command.what if isinstance(command, Bench) else command
+    try:
+        command.run()
+    except ValueError as error:
+        print(f"cablejax: {error}", file=sys.stderr)
+        return USER_ERROR
+    except KeyboardInterrupt as interrupt:
+        said = str(interrupt)
+        print(f"\ncablejax: {said or 'Interrupted. ' + command.resume_hint}", file=sys.stderr)
+        return INTERRUPTED
+    return 0

@@ -1,0 +1,140 @@
+"""`cablejax bench simulate | mpc`: how fast this machine runs the simulators and the controller."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Callable
+from typing import Annotated, Any
+
+from tyro.conf import subcommand
+
+from cablejax.commands.options import Command, UsageError, say, text_table
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class BenchSimulate(Command):
+    """Time the simulators: MJX in a batch, C MuJoCo on one core and on several.
+
+    An environment-step is one time step of one cable. The engines take turns, and the median of the rounds counts."""
+
+    batch: int = 256
+    """Cables that MJX simulates at once; C simulates as many, one after the other."""
+
+    seconds: int = 1
+    """Simulated seconds per round."""
+
+    rounds: int = 5
+    """How often each engine takes its turn."""
+
+    threads: int = 2
+    """Threads of C MuJoCo to compare with one."""
+
+    links: int | None = None
+    """Links of the cable; by default the package's."""
+
+    def execute(self):
+        import functools
+
+        import jax
+        import jax.numpy as jnp
+        import numpy as np
+
+        from cablejax.simulate import CableConfig, MjxEngine, ThreadedEngine, compiler_options
+
+        for name in ("batch", "seconds", "rounds", "threads"):
+            if getattr(self, name) < 1:
+                raise UsageError(f"--{name} is {getattr(self, name)}, expected at least 1.")
+        config = CableConfig() if self.links is None else CableConfig(n_links=self.links)
+        mjx, one, many = MjxEngine(config), ThreadedEngine(config, 1), ThreadedEngine(config, self.threads)
+
+        # An arch, moved slowly: contact with the table, bending and grasps are all at work.
+        state = one.initial_state(np.array([[0.0, 0.0, 0.6], [0.8, 0.0, -0.6]]))
+        rng = np.random.default_rng(self.seed)
+        twist = jnp.asarray(rng.uniform(-0.01, 0.01, (self.batch, self.seconds, 2, 3)))
+        params, states = jax.tree.map(
+            lambda leaf: jnp.broadcast_to(jnp.asarray(leaf), (self.batch, *jnp.shape(leaf))), (config.params(), state)
+        )
+
+        say(f"compiling the MJX engine for {self.batch} cables of {config.n_links} links ...")
+        begin = time.perf_counter()
+        unroll = jax.vmap(functools.partial(mjx.unroll, interval=1.0))
+        compiled = jax.jit(unroll, compiler_options=compiler_options()).lower(params, states, twist).compile()
+        compile_s = time.perf_counter() - begin
+        memory = compiled.memory_analysis()
+        memory_bytes = memory.temp_size_in_bytes + memory.argument_size_in_bytes + memory.output_size_in_bytes
+
+        contestants = {
+            "mjx": lambda: jax.block_until_ready(compiled(params, states, twist)),
+            "c_one": lambda: one.rollout(params, states, twist, 1.0),
+            "c_many": lambda: many.rollout(params, states, twist, 1.0),
+        }
+        steps = self.batch * self.seconds * mjx.substeps(1.0)
+        micros = {k: 1e6 * v / steps for k, v in _median_seconds(contestants, self.rounds).items()}
+        result = {
+            "links": config.n_links,
+            "timestep_s": config.timestep,
+            "batch": self.batch,
+            "threads": self.threads,
+            "mjx_us_per_env_step": micros["mjx"],
+            "c_us_per_env_step": micros["c_one"],
+            "c_threads_us_per_env_step": micros["c_many"],
+            "mjx_over_c": micros["mjx"] / micros["c_one"],
+            "threads_speedup": micros["c_one"] / micros["c_many"],
+            "mjx_memory_per_env_bytes": memory_bytes / self.batch,
+            "mjx_compile_s": compile_s,
+            **_machine(),
+        }
+        text = text_table(
+            ["engine", "us per environment-step", "relative to C on one core"],
+            [
+                [f"MJX, batch {self.batch}", f"{micros['mjx']:.2f}", f"{result['mjx_over_c']:.2f}"],
+                ["C MuJoCo, one core", f"{micros['c_one']:.2f}", "1.00"],
+                [
+                    f"C MuJoCo, {self.threads} threads",
+                    f"{micros['c_many']:.2f}",
+                    f"{micros['c_many'] / micros['c_one']:.2f} ({result['threads_speedup']:.2f} times as fast)",
+                ],
+            ],
+        )
+        return result, (
+            f"{text}\n\nMJX: {memory_bytes / self.batch / 1024:.0f} KiB per environment, "
+            f"compiled in {compile_s:.1f} s, on {result['device']}."
+        )
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class BenchMpc(Command):
+    """Time one call of the controller with the released model: fit the residual, plan, command."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Bench:
+    """Measure speed on this machine."""
+
+    what: Annotated[BenchSimulate, subcommand("simulate")] | Annotated[BenchMpc, subcommand("mpc")]
+
+
+def _median_seconds(contestants: dict[str, Callable[[], Any]], rounds: int) -> dict[str, float]:
+    """Median wall time [s] of each; they take turns, so that a busy moment of the machine hits all of them alike."""
+    import numpy as np
+
+    seconds: dict[str, list[float]] = {name: [] for name in contestants}
+    for run in contestants.values():
+        run()  # caches, and what is compiled on first use
+    for index in range(rounds):
+        for name, run in contestants.items():
+            begin = time.perf_counter()
+            run()
+            seconds[name].append(time.perf_counter() - begin)
+        say(f"round {index + 1} of {rounds}")
+    return {name: float(np.median(values)) for name, values in seconds.items()}
+
+
+def _machine() -> dict[str, Any]:
+    """What the numbers depend on."""
+    import jax
+
+    from cablejax.report.provenance import machine
+
+    return {"device": jax.devices()[0].device_kind, "machine": machine()}

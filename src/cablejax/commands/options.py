@@ -1,0 +1,110 @@
+"""What the subcommands share: their common options, where JAX computes, the output folder, and how results are told."""
+
+from __future__ import annotations
+
+import abc
+import contextlib
+import dataclasses
+import json as json_format
+import os
+import pathlib
+import sys
+from collections.abc import Mapping
+from typing import Any, ClassVar, Literal
+
+
+class UsageError(ValueError):
+    """A command line that cannot be carried out: says what came, what was expected and what to do."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Command(abc.ABC):
+    """Options of every subcommand."""
+
+    resume_hint: ClassVar[str] = "Run the same command again."
+    """What Ctrl-C tells the user to do to go on."""
+
+    seed: int = 0
+    """Seed of everything random; the same seed gives the same result."""
+
+    device: Literal["auto", "cpu", "gpu"] = "auto"
+    """Where JAX computes. auto: an accelerator if there is one."""
+
+    json: bool = False
+    """Print the result as one JSON object on stdout, and nothing else there; progress goes to stderr."""
+
+    @abc.abstractmethod
+    def execute(self) -> tuple[Mapping[str, Any], str]:
+        """Does the work. Returns the result as it goes into JSON, and as text for a person."""
+
+    def run(self) -> None:
+        """Chooses the device, does the work and prints the result."""
+        if self.seed < 0:
+            raise UsageError(f"--seed is {self.seed}, expected an integer >= 0.")
+        choose_device(self.device)
+        # Libraries print to stdout while they are imported; that place is for the result.
+        with contextlib.redirect_stdout(sys.stderr):
+            result, text = self.execute()
+        print(json_format.dumps(result, indent=2, allow_nan=False) if self.json else text)
+
+
+def choose_device(device: Literal["auto", "cpu", "gpu"]) -> None:
+    """Makes JAX compute on `device`.
+
+    Raises:
+        UsageError: if a GPU is asked for and JAX finds none.
+    """
+    if device == "auto":
+        return
+    import jax
+
+    if device == "cpu":
+        jax.config.update("jax_platforms", "cpu")
+        return
+    try:
+        gpus = jax.devices("gpu")
+    except RuntimeError:
+        gpus = []
+    if not gpus:
+        raise UsageError(
+            "--device gpu was asked for, but JAX finds no GPU here. Install the package with its CUDA extra "
+            "(pip install 'cablejax[cuda]') on a machine with an NVIDIA driver, or use --device cpu."
+        )
+    jax.config.update("jax_default_device", gpus[0])
+
+
+def output_folder(path: pathlib.Path, *, overwrite: bool) -> pathlib.Path:
+    """The folder, made if it is not there.
+
+    Raises:
+        UsageError: if it exists and holds anything, unless `overwrite`; or if it is a file.
+    """
+    if path.exists() and not path.is_dir():
+        raise UsageError(f"--out is {path}, which is a file; expected a folder. Name another one.")
+    if path.is_dir() and any(path.iterdir()) and not overwrite:
+        raise UsageError(f"{path} exists and is not empty. Give another folder with --out, or add --overwrite.")
+    path.mkdir(parents=True, exist_ok=True)
+    return path
+
+
+def write_json(path: pathlib.Path, value: Mapping[str, Any]) -> None:
+    """Writes a JSON file whole or not at all."""
+    scratch = path.with_name(path.name + ".part")
+    scratch.write_text(json_format.dumps(value, indent=2, allow_nan=False) + "\n", encoding="utf-8")
+    os.replace(scratch, path)
+
+
+def say(message: str) -> None:
+    """Tells a person how it goes, on stderr."""
+    print(message, file=sys.stderr, flush=True)
+
+
+def text_table(header: list[str], rows: list[list[str]]) -> str:
+    """Columns aligned for a terminal: the first to the left, the others to the right."""
+    widths = [max(len(line[k]) for line in [header, *rows]) for k in range(len(header))]
+
+    def line(cells: list[str]) -> str:
+        first, *others = (c.ljust(w) if k == 0 else c.rjust(w) for k, (c, w) in enumerate(zip(cells, widths, strict=True)))
+        return "  ".join([first, *others]).rstrip()
+
+    return "\n".join([line(header), "  ".join("-" * w for w in widths), *(line(row) for row in rows)])

@@ -1,0 +1,12 @@
+"""`cablejax shape`."""
+
+from __future__ import annotations
+
+import dataclasses
+
+from cablejax.commands.options import Command
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Shape(Command):
+    """To be wired."""

@@ -1,0 +1,223 @@
+"""Makes a data set: draws motions, simulates them, checks the result, writes it shard by shard.
+
+Trajectory i is a function of the configuration and i alone. Whoever simulates it, in whatever batch, on however many
+devices or processes, writes the same bytes (with the same engine on the same kind of machine).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+from collections.abc import Sequence
+from typing import Protocol
+
+import jax
+import numpy as np
+from tqdm import tqdm
+
+from cablejax.dataset.parallel import DeviceParallel
+from cablejax.dataset.schema import Block, DatasetConfig
+from cablejax.dataset.store import DatasetInfo, open_or_create
+from cablejax.simulate import MjxEngine, ThreadedEngine
+from cablejax.simulate.motions import random_motion
+from cablejax.types import CableParams, CableState, Trajectory
+
+MAX_ATTEMPTS = 10
+"""Motions drawn for one trajectory before generation gives up."""
+
+GRASP_TOLERANCE = 1e-2
+"""Largest distance of an end keypoint from its gripper [m]: a cable that snaps through pulls its ends off for a step."""
+
+STRETCH_TOLERANCE = 0.01
+"""Largest excess of the chord between neighbouring keypoints over the arc length between them, relative."""
+
+
+class Engine(Protocol):
+    """What generation needs of a simulator; `cablejax.simulate` has two."""
+
+    def initial_state(self, gripper_pose: np.ndarray) -> CableState:
+        """The settled cables between grippers at rest at poses [B, Q, 3], each computed by itself."""
+        ...
+
+    def rollout(
+        self, params: CableParams, state: CableState, twist: np.ndarray, interval: float
+    ) -> tuple[CableState, Trajectory]:
+        """Simulates a batch: every leaf of every argument has the leading axis B."""
+        ...
+
+
+class GenerationInterrupted(KeyboardInterrupt):
+    """Ctrl-C during generation: every shard written so far is kept. The message says how to go on."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Draw:
+    """The random part of one trajectory.
+
+    Attributes:
+        gripper_pose: where the grippers start, float32, shape [Q, 3].
+        gripper_twist: what they do, float32, shape [T, Q, 3].
+        parameters: the columns of `cablejax.dataset.schema.PARAMETERS`, float64, shape [3].
+    """
+
+    gripper_pose: np.ndarray
+    gripper_twist: np.ndarray
+    parameters: np.ndarray
+
+
+def draw(config: DatasetConfig, index: int, attempt: int = 0) -> Draw:
+    """Everything random about trajectory `index`, from (seed, index, attempt) alone."""
+    rng = np.random.default_rng(np.random.SeedSequence(config.seed, spawn_key=(index, attempt)))
+    ranges = config.randomisation
+    stiffness, friction, damping = (
+        1.0 if limits is None else float(np.exp(rng.uniform(*np.log(limits))))
+        for limits in (ranges.stiffness, ranges.friction, ranges.damping)
+    )
+    cable = config.cable
+    pose, twist = random_motion(rng, cable, config.n_steps, config.motion, config.interval)
+    return Draw(
+        gripper_pose=np.asarray(pose, np.float32),
+        gripper_twist=np.asarray(twist, np.float32),
+        parameters=np.array([stiffness, friction * cable.friction_coefficient, damping * cable.damping_time]),
+    )
+
+
+def cable_params(config: DatasetConfig, parameters: np.ndarray) -> CableParams:
+    """The simulator's parameters of one trajectory, from its row of the store's `parameters`."""
+    stiffness, friction, damping = parameters
+    nominal = config.cable.params(stiffness_ratio=float(stiffness))
+    return dataclasses.replace(
+        nominal, friction_coefficient=np.float32(friction), damping_time=np.float32(damping)
+    )
+
+
+def generate(
+    config: DatasetConfig,
+    path: str | os.PathLike[str],
+    *,
+    resume: bool = True,
+    process_index: int | None = None,
+    process_count: int | None = None,
+    progress: bool = True,
+    engine: Engine | None = None,
+) -> DatasetInfo:
+    """Makes this process' share of a data set, going on where an earlier run stopped.
+
+    Process p of P makes the shards p, p + P, p + 2 P, ... and may be started by hand, by a batch system, or under
+    `jax.distributed.initialize`, which then tells p and P. The store is the same for any P.
+
+    Args:
+        config: what to make.
+        path: folder of the store, new, empty or begun earlier with the same configuration.
+        resume: if False, refuse a store in which this process has shards already.
+        process_index: p; by default JAX's.
+        process_count: P; by default JAX's.
+        progress: show a bar with the time left, in trajectories.
+        engine: the simulator; by default the one that the configuration names.
+
+    Returns:
+        What is on disk afterwards; under `jax.distributed`, once every process has finished.
+
+    Raises:
+        ValueError: the folder holds something else (see `open_or_create`), or a trajectory failed its checks
+            `MAX_ATTEMPTS` times.
+        GenerationInterrupted: Ctrl-C. Complete shards are kept.
+    """
+    distributed = process_index is None and process_count is None and jax.process_count() > 1
+    index = jax.process_index() if process_index is None else process_index
+    count = jax.process_count() if process_count is None else process_count
+    if not 0 <= index < count:
+        raise ValueError(f"process_index is {index} and process_count {count}, expected 0 <= index < count.")
+    store = open_or_create(path, config)
+    mine = range(index, config.n_shards, count)
+    states = {shard: store.status(shard) for shard in mine}
+    if not resume and any(state != "missing" for state in states.values()):
+        raise ValueError(f"{path} exists and holds trajectories. Allow resuming, or give a new folder.")
+    todo = [shard for shard in mine if states[shard] != "complete"]
+    if todo and engine is None:
+        engine = make_engine(config)
+
+    total = sum(len(config.shard_rows(shard)) for shard in mine)
+    done = total - sum(len(config.shard_rows(shard)) for shard in todo)
+    label = "trajectories" if count == 1 else f"trajectories ({index + 1}/{count})"
+    with tqdm(total=total, initial=done, desc=label, unit="traj", disable=not progress) as bar:
+        try:
+            for shards in _groups(todo, getattr(engine, "shards_at_once", 1)):
+                for shard, block in zip(shards, simulate(config, engine, shards), strict=True):
+                    store.write_shard(shard, block)
+                    done += len(block)
+                    bar.update(len(block))
+        except KeyboardInterrupt:
+            raise GenerationInterrupted(
+                f"Stopped at {done} of {total} trajectories; they are kept in {path}. "
+                "Run the same generation again to go on from there."
+            ) from None
+    if distributed:
+        from jax.experimental import multihost_utils
+
+        multihost_utils.sync_global_devices("cablejax.dataset.generate")
+    return store.info()
+
+
+def simulate(config: DatasetConfig, engine: Engine, shards: Sequence[int]) -> list[Block]:
+    """The trajectories of some shards, each of which passes `faults`. What fails is drawn again, from the next attempt.
+
+    Raises:
+        ValueError: a trajectory failed `MAX_ATTEMPTS` times.
+    """
+    rows = np.concatenate([np.asarray(config.shard_rows(shard)) for shard in shards])
+    out = {name: np.zeros((len(rows), *shape), dtype) for name, (shape, dtype) in config.array_shapes().items()}
+    pending, problems = np.arange(len(rows)), {}
+    for attempt in range(MAX_ATTEMPTS):
+        draws = [draw(config, int(index), attempt) for index in rows[pending]]
+        trajectory = _rollout(config, engine, draws)
+        out["keypoints"][pending] = trajectory.keypoints
+        out["gripper_pose"][pending] = trajectory.gripper_pose
+        out["gripper_twist"][pending] = [item.gripper_twist for item in draws]
+        out["parameters"][pending] = [item.parameters for item in draws]
+        out["attempts"][pending] = attempt
+        problems = {k: fault for k in pending if (fault := find_fault(config, Block(**{n: a[k] for n, a in out.items()})))}
+        pending = np.array(sorted(problems), dtype=int)
+        if not problems:
+            block = Block(**out)
+            ends = np.cumsum([len(config.shard_rows(shard)) for shard in shards])[:-1]
+            parts = {name: np.split(getattr(block, name), ends) for name in out}
+            return [Block(**{name: part[i] for name, part in parts.items()}) for i in range(len(shards))]
+    raise ValueError(
+        f"{len(problems)} trajectories failed {MAX_ATTEMPTS} times in a row; number {rows[pending[0]]}: "
+        f"{problems[pending[0]]}. Check the cable's resolution (n_links, timestep) and the bounds of the motion."
+    )
+
+
+def find_fault(config: DatasetConfig, one: Block) -> str | None:
+    """Why one trajectory (a `Block` without its first axis) cannot be real, or None if it can."""
+    keypoints, grippers = one.keypoints, one.gripper_pose[..., :2]
+    if not (np.isfinite(keypoints).all() and np.isfinite(one.gripper_pose).all()):
+        return "the simulation diverged (not finite)"
+    gap = np.linalg.norm(keypoints[:, [0, -1]] - grippers, axis=-1).max()
+    if gap > GRASP_TOLERANCE:
+        return f"an end of the cable is {gap:.2g} m from its gripper (allowed: {GRASP_TOLERANCE:.2g} m)"
+    spacing = config.cable.length / (config.cable.n_keypoints - 1)
+    stretch = np.linalg.norm(np.diff(keypoints, axis=1), axis=-1).max() / spacing - 1
+    if stretch > STRETCH_TOLERANCE:
+        return f"the cable is stretched by {100 * stretch:.2g} % (allowed: {100 * STRETCH_TOLERANCE:.2g} %)"
+    return None
+
+
+def make_engine(config: DatasetConfig) -> Engine:
+    """The simulator that the configuration names, spread over this process' devices."""
+    if config.engine == "threaded":
+        return ThreadedEngine(config.cable)
+    return DeviceParallel(MjxEngine(config.cable), config.shard_size, tuple(jax.local_devices()))
+
+
+def _rollout(config: DatasetConfig, engine: Engine, draws: Sequence[Draw]) -> Trajectory:
+    state = engine.initial_state(np.stack([item.gripper_pose for item in draws]))
+    params = [cable_params(config, item.parameters) for item in draws]
+    twist = np.stack([item.gripper_twist for item in draws])
+    params = jax.tree.map(lambda *leaves: np.stack(leaves), *params)
+    return engine.rollout(params, state, twist, config.interval)[1]
+
+
+def _groups(shards: Sequence[int], size: int) -> list[list[int]]:
+    return [list(shards[first : first + size]) for first in range(0, len(shards), size)]

@@ -1,0 +1,180 @@
+"""What a data set is: its configuration, its arrays, and how both are written down."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+import types
+import typing
+from collections.abc import Mapping
+from typing import Any, Literal
+
+import numpy as np
+
+from cablejax.simulate.config import CableConfig
+from cablejax.simulate.motions import MotionConfig
+
+SCHEMA = "cablejax-dataset/1"
+"""Name and version of the store's layout. A reader refuses any other."""
+
+PARAMETERS = ("stiffness_ratio", "friction_coefficient", "damping_time")
+"""Columns of the `parameters` array: EI over nominal EI [-], Coulomb coefficient [-], Kelvin-Voigt time [s]."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Randomisation:
+    """Ranges (low, high) of factors on the nominal parameters, drawn log-uniformly per trajectory; None = nominal.
+
+    Wang et al., RA-L 2022, randomise stiffness and damping by factors of 0.1 to 3.
+    """
+
+    stiffness: tuple[float, float] | None = None
+    damping: tuple[float, float] | None = None
+    friction: tuple[float, float] | None = None
+
+    def __post_init__(self):
+        for field in dataclasses.fields(self):
+            value = getattr(self, field.name)
+            if value is not None and not (len(value) == 2 and np.all(np.isfinite(value)) and 0 < value[0] <= value[1]):
+                raise ValueError(
+                    f"Randomisation.{field.name} is {value}, expected None or two factors (low, high) with 0 < low <= high."
+                )
+
+
+@dataclasses.dataclass(frozen=True)
+class DatasetConfig:
+    """Everything that decides the content of a data set. The defaults follow Wang et al., RA-L 2022, section V.
+
+    Attributes:
+        n_trajectories: number of trajectories M.
+        n_steps: commands T per trajectory.
+        interval: time each command is held [s].
+        seed: trajectory i depends on (seed, i) only, never on who makes it or when.
+        motion: where the grippers start and how they move.
+        cable: the simulated cable.
+        randomisation: ranges of the physical parameters.
+        engine: "threaded", MuJoCo in threads on the CPU, or "mjx", batched on the accelerator.
+        shard_size: trajectories per shard: the unit that one process writes and that a kill can cost.
+    """
+
+    n_trajectories: int = 2000
+    n_steps: int = 200
+    interval: float = 1.0
+    seed: int = 0
+    motion: MotionConfig = dataclasses.field(default_factory=MotionConfig)
+    cable: CableConfig = dataclasses.field(default_factory=CableConfig)
+    randomisation: Randomisation = dataclasses.field(default_factory=Randomisation)
+    engine: Literal["threaded", "mjx"] = "threaded"
+    shard_size: int = 32
+
+    def __post_init__(self):
+        for name in ("n_trajectories", "n_steps", "shard_size"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"DatasetConfig.{name} is {getattr(self, name)}, expected at least 1.")
+        if not (np.isfinite(self.interval) and self.interval > 0):
+            raise ValueError(f"DatasetConfig.interval is {self.interval}, expected a positive number of seconds.")
+        if self.seed < 0:
+            raise ValueError(f"DatasetConfig.seed is {self.seed}, expected an integer >= 0.")
+        if self.engine not in ("threaded", "mjx"):
+            raise ValueError(f"DatasetConfig.engine is {self.engine!r}, expected 'threaded' or 'mjx'.")
+        if self.cable.dimension != 2:
+            raise ValueError("DatasetConfig.cable has dimension 3; data sets hold cables on a table: use dimension=2.")
+
+    @property
+    def n_shards(self) -> int:
+        """Number of shards; the last one may be smaller."""
+        return -(-self.n_trajectories // self.shard_size)
+
+    def shard_rows(self, shard: int) -> range:
+        """Trajectory indices of one shard."""
+        first = shard * self.shard_size
+        return range(first, min(first + self.shard_size, self.n_trajectories))
+
+    def array_shapes(self) -> dict[str, tuple[tuple[int, ...], str]]:
+        """Shape of one trajectory and dtype of every array in the store that holds data."""
+        steps, points = self.n_steps, self.cable.n_keypoints
+        return {
+            "keypoints": ((steps + 1, points, 2), "float32"),
+            "gripper_pose": ((steps + 1, 2, 3), "float32"),
+            "gripper_twist": ((steps, 2, 3), "float32"),
+            "parameters": ((len(PARAMETERS),), "float64"),
+            "attempts": ((), "int32"),
+        }
+
+
+@dataclasses.dataclass(frozen=True)
+class Block:
+    """Some trajectories in memory, as NumPy arrays. All but `parameters` and `attempts` is what an engine returned.
+
+    Attributes:
+        keypoints: [m], float32, shape [B, T + 1, N, 2].
+        gripper_pose: (x, y, theta), float32, shape [B, T + 1, Q, 3].
+        gripper_twist: twist held from sample t to t + 1 [m/s, rad/s], float32, shape [B, T, Q, 3].
+        parameters: the columns of `PARAMETERS`, float64, shape [B, 3].
+        attempts: motions drawn in vain before this one, int32, shape [B].
+    """
+
+    keypoints: np.ndarray
+    gripper_pose: np.ndarray
+    gripper_twist: np.ndarray
+    parameters: np.ndarray
+    attempts: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.keypoints)
+
+    def digests(self) -> np.ndarray:
+        """SHA-256 of every trajectory's bytes (little-endian, in the order of the fields), uint8, shape [B, 32]."""
+        arrays = [getattr(self, field.name) for field in dataclasses.fields(self)]
+        arrays = [np.ascontiguousarray(array, array.dtype.newbyteorder("<")) for array in arrays]
+        digests = [hashlib.sha256(b"".join(array[row].tobytes() for array in arrays)).digest() for row in range(len(self))]
+        return np.frombuffer(b"".join(digests), np.uint8).reshape(len(self), 32)
+
+
+def config_to_json(config: Any) -> dict[str, Any]:
+    """A (nested) configuration as a JSON object."""
+    return json.loads(json.dumps(dataclasses.asdict(config)))
+
+
+def config_from_json(cls: type, value: Mapping[str, Any]) -> Any:
+    """The inverse of `config_to_json`.
+
+    Raises:
+        ValueError: a field is missing or unknown; the message names it.
+    """
+    hints = typing.get_type_hints(cls)
+    names = {field.name for field in dataclasses.fields(cls)}
+    if names != set(value):
+        raise ValueError(
+            f"The recorded {cls.__name__} lacks {sorted(names - set(value))} and has the unknown {sorted(set(value) - names)}: "
+            "it was written by another version of cablejax. Make the data set again, or read it with that version."
+        )
+    return cls(**{name: _decode(hints[name], value[name]) for name in names})
+
+
+def _decode(hint: Any, value: Any) -> Any:
+    if value is None:
+        return None
+    if dataclasses.is_dataclass(hint):
+        return config_from_json(typing.cast(type, hint), value)
+    if typing.get_origin(hint) in (typing.Union, types.UnionType):
+        return _decode(next(option for option in typing.get_args(hint) if option is not type(None)), value)
+    return tuple(value) if isinstance(value, list) else value
+
+
+def differences(stored: Mapping[str, Any], asked: Mapping[str, Any], prefix: str = "") -> list[str]:
+    """The leaves in which two JSON objects differ, as text."""
+    found = []
+    for key in sorted(set(stored) | set(asked)):
+        old, new = stored.get(key, "absent"), asked.get(key, "absent")
+        if isinstance(old, Mapping) and isinstance(new, Mapping):
+            found += differences(old, new, f"{prefix}{key}.")
+        elif old != new:
+            found.append(f"{prefix}{key} is {old!r} in the store and {new!r} here")
+    return found
+
+
+def digest_of_config(config: DatasetConfig) -> str:
+    """SHA-256 of the configuration's canonical JSON."""
+    return hashlib.sha256(json.dumps(config_to_json(config), sort_keys=True).encode()).hexdigest()

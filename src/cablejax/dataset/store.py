@@ -1,0 +1,296 @@
+"""The data set on disk: a Zarr v3 group in which a shard exists once its digests do.
+
+    keypoints [M, T + 1, N, 2]   gripper_pose [M, T + 1, Q, 3]   gripper_twist [M, T, Q, 3]   float32
+    parameters [M, 3] float64    attempts [M] int32              digest [M, 32] uint8, SHA-256 of each trajectory
+
+Every array is sharded alike: one file per shard of trajectories; in the large ones, one inner chunk per trajectory. The digests of a
+shard are written last, each file by an atomic rename, so that a process killed at any instant leaves either a whole
+shard or one that the next run makes again. Shards belong to one process each, so processes never write the same file.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import hashlib
+import importlib.metadata
+import json
+import os
+import shutil
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import zarr
+
+from cablejax import __version__
+from cablejax.dataset.schema import (
+    PARAMETERS,
+    SCHEMA,
+    Block,
+    DatasetConfig,
+    config_from_json,
+    config_to_json,
+    differences,
+    digest_of_config,
+)
+
+PACKAGES = ("jax", "jaxlib", "mujoco", "mujoco-mjx", "numpy")
+"""Packages whose versions, beside that of cablejax, decide the content: a store is completed by the versions that began it."""
+
+_DIGEST = ((32,), "uint8")
+
+
+class MissingShardError(ValueError):
+    """A shard is read that has not been generated yet."""
+
+
+@dataclasses.dataclass(frozen=True)
+class DatasetInfo:
+    """What a store holds.
+
+    Attributes:
+        path: its folder.
+        config: what was asked for.
+        versions: package versions that made it.
+        n_complete: trajectories on disk in complete shards.
+        attempts: motions drawn in vain, over all complete shards.
+        digest: SHA-256 over all trajectories, or None until all are there. It does not depend on the shard size.
+    """
+
+    path: Path
+    config: DatasetConfig
+    versions: dict[str, str]
+    n_complete: int
+    attempts: int
+    digest: str | None
+
+    @property
+    def complete(self) -> bool:
+        """Whether every trajectory is there."""
+        return self.n_complete == self.config.n_trajectories
+
+
+@dataclasses.dataclass(frozen=True)
+class Store:
+    """An open data set. Made by `open_store` or `open_or_create`."""
+
+    path: Path
+    config: DatasetConfig
+    versions: dict[str, str]
+    group: zarr.Group
+
+    def status(self, shard: int) -> Literal["missing", "complete", "corrupt"]:
+        """Whether a shard is on disk and intact: reads it and compares the digests."""
+        try:
+            self.read_shard(shard)
+        except MissingShardError:
+            return "missing"
+        except ValueError:
+            return "corrupt"
+        return "complete"
+
+    def write_shard(self, shard: int, block: Block) -> None:
+        """Writes one whole shard; it counts from the moment its digests are on disk.
+
+        Raises:
+            ValueError: the block's arrays do not have the shapes and dtypes of this shard.
+        """
+        rows = self._slice(shard)
+        for name, (shape, dtype) in self.config.array_shapes().items():
+            array, expected = getattr(block, name), (rows.stop - rows.start, *shape)
+            if array.shape != expected or array.dtype != dtype:
+                raise ValueError(
+                    f"Shard {shard}: {name} is {array.dtype}{list(array.shape)}, expected {dtype}{list(expected)}."
+                )
+        self._clear(shard)
+        for name in self.config.array_shapes():
+            self._array(name)[rows] = getattr(block, name)
+        self._array("digest")[rows] = block.digests()
+
+    def read_shard(self, shard: int) -> Block:
+        """One shard, checked against its digests.
+
+        Raises:
+            ValueError: the shard is not complete, truncated or corrupt.
+        """
+        rows = self._slice(shard)
+        try:
+            block = Block(**{name: self._array(name)[rows] for name in self.config.array_shapes()})
+            digest = self._array("digest")[rows]
+        except Exception as error:  # a damaged file may fail in any codec
+            raise ValueError(self._damaged(shard, f"cannot be decoded ({error})")) from error
+        if not digest.any():
+            raise MissingShardError(
+                f"Shard {shard} of {self.path} has not been generated yet. Run the same generation again to complete it."
+            )
+        if not np.array_equal(digest, block.digests()):
+            raise ValueError(self._damaged(shard, "does not match its checksums"))
+        return block
+
+    def read(self, rows: Sequence[int] | np.ndarray | None = None) -> Block:
+        """The given trajectories (all by default), in that order, checked against their digests.
+
+        Raises:
+            ValueError: a shard that is needed is missing or damaged, or a row does not exist.
+        """
+        rows = np.arange(self.config.n_trajectories) if rows is None else np.asarray(rows, dtype=int)
+        if len(rows) == 0 or rows.min() < 0 or rows.max() >= self.config.n_trajectories:
+            raise ValueError(
+                f"Rows {rows[:5]}... asked of {self.path}, expected at least one in 0..{self.config.n_trajectories - 1}."
+            )
+        out = {
+            name: np.empty((len(rows), *shape), dtype) for name, (shape, dtype) in self.config.array_shapes().items()
+        }
+        for shard in np.unique(rows // self.config.shard_size):
+            block = self.read_shard(int(shard))
+            here = np.flatnonzero(rows // self.config.shard_size == shard)
+            for name, array in out.items():
+                array[here] = getattr(block, name)[rows[here] - shard * self.config.shard_size]
+        return Block(**out)
+
+    def info(self) -> DatasetInfo:
+        """What is on disk now, going by the digests alone: fast, and reads no trajectory."""
+        digest = np.zeros((self.config.n_trajectories, 32), np.uint8)
+        attempts = np.zeros(self.config.n_trajectories, np.int32)
+        for shard in range(self.config.n_shards):
+            with contextlib.suppress(Exception):  # a damaged shard counts as not there
+                rows = self._slice(shard)
+                attempts[rows], digest[rows] = self._array("attempts")[rows], self._array("digest")[rows]
+        done = digest.any(axis=1)
+        return DatasetInfo(
+            path=self.path,
+            config=self.config,
+            versions=self.versions,
+            n_complete=int(done.sum()),
+            attempts=int(attempts[done].sum()),
+            digest=hashlib.sha256(digest.tobytes()).hexdigest() if done.all() else None,
+        )
+
+    def _array(self, name: str) -> zarr.Array:
+        array = self.group[name]
+        assert isinstance(array, zarr.Array)
+        return array
+
+    def _slice(self, shard: int) -> slice:
+        if not 0 <= shard < self.config.n_shards:
+            raise ValueError(f"Shard {shard} asked of {self.path}, which has shards 0..{self.config.n_shards - 1}.")
+        rows = self.config.shard_rows(shard)
+        return slice(rows.start, rows.stop)
+
+    def _clear(self, shard: int) -> None:
+        """Removes a shard with whatever a killed writer left of it, the digests first."""
+        for name in ("digest", *self.config.array_shapes()):
+            folder = self.path / name / "c" / str(shard)
+            if folder.is_dir():
+                shutil.rmtree(folder)
+            else:  # a one-dimensional array keeps its shards as files
+                for file in folder.parent.glob(f"{shard}*"):
+                    if file.name == str(shard) or file.name.startswith(f"{shard}."):
+                        file.unlink()
+
+    def _damaged(self, shard: int, what: str) -> str:
+        rows = self.config.shard_rows(shard)
+        return (
+            f"Shard {shard} of {self.path} (trajectories {rows.start}..{rows.stop - 1}) {what}. "
+            "Run the same generation again: it makes this shard anew and leaves the others as they are."
+        )
+
+
+def open_store(path: str | os.PathLike[str], *, mode: Literal["r", "r+"] = "r") -> Store:
+    """Opens a data set, complete or not, to read ("r") or also to write its shards ("r+").
+
+    Raises:
+        ValueError: there is no data set, or one of another schema version.
+    """
+    path = Path(path)
+    if not (path / "zarr.json").is_file():
+        raise ValueError(f"{path} holds no data set (no zarr.json). Generate one there, or give another folder.")
+    try:
+        attributes: dict[str, Any] = json.loads((path / "zarr.json").read_text()).get("attributes", {})
+    except (ValueError, AttributeError) as error:
+        raise ValueError(f"{path}/zarr.json is damaged ({error}). Generate the data set again elsewhere.") from error
+    if attributes.get("schema") != SCHEMA:
+        raise ValueError(
+            f"{path} has schema {attributes.get('schema')!r}, expected {SCHEMA!r}. "
+            "Read it with the version of cablejax that wrote it, or generate it again in another folder."
+        )
+    config = config_from_json(DatasetConfig, attributes["config"])
+    if attributes["config_digest"] != digest_of_config(config):
+        raise ValueError(f"The configuration recorded in {path} was altered: it no longer matches its digest.")
+    return Store(path, config, attributes["versions"], zarr.open_group(path, mode=mode))
+
+
+def open_or_create(path: str | os.PathLike[str], config: DatasetConfig) -> Store:
+    """Opens the data set of `config` to continue it, or creates it. Safe when several processes do so at once.
+
+    Raises:
+        ValueError: the folder holds something else, another schema version, another configuration, or was begun by
+            other package versions.
+    """
+    path, versions = Path(path), package_versions()
+    if path.exists() and not path.is_dir():
+        raise ValueError(f"{path} is a file, expected a folder to write a data set to. Give another path.")
+    if path.is_dir() and any(path.iterdir()) and not (path / "zarr.json").is_file():
+        raise ValueError(f"{path} exists and holds no data set. Give an empty or new folder; nothing was changed.")
+    if not path.is_dir() or not any(path.iterdir()):
+        _create(path, config, versions)
+    store = open_store(path, mode="r+")
+    changes = differences(config_to_json(store.config), config_to_json(config))
+    if changes:
+        raise ValueError(
+            f"{path} holds a data set of another configuration: {'; '.join(changes)}. "
+            "Give another folder, or the configuration that the store was begun with. Nothing was changed."
+        )
+    changes = differences(store.versions, versions)
+    if changes and not store.info().complete:
+        raise ValueError(
+            f"{path} was begun with other packages: {'; '.join(changes)}. Trajectories of two versions are not mixed: "
+            "install those versions, or generate in another folder. Nothing was changed."
+        )
+    return store
+
+
+def package_versions() -> dict[str, str]:
+    """Versions of the packages that decide the content."""
+    versions = {"cablejax": __version__}
+    for name in PACKAGES:
+        try:
+            versions[name] = importlib.metadata.version(name)
+        except importlib.metadata.PackageNotFoundError:
+            versions[name] = "not installed"
+    return versions
+
+
+def _create(path: Path, config: DatasetConfig, versions: dict[str, str]) -> None:
+    """Makes the empty store beside its place and renames it there: it appears whole, and only once."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    draft = path.parent / f".{path.name}.{os.getpid()}.draft"
+    shutil.rmtree(draft, ignore_errors=True)
+    group = zarr.create_group(
+        draft,
+        attributes={
+            "schema": SCHEMA,
+            "config": config_to_json(config),
+            "config_digest": digest_of_config(config),
+            "versions": versions,
+            "parameters": list(PARAMETERS),
+        },
+    )
+    for name, (shape, dtype) in {**config.array_shapes(), "digest": _DIGEST}.items():
+        per_trajectory = dtype == "float32"  # the small arrays are one plain chunk per shard
+        group.create_array(
+            name,
+            shape=(config.n_trajectories, *shape),
+            dtype=dtype,
+            chunks=(1 if per_trajectory else config.shard_size, *shape),
+            shards=(config.shard_size, *shape) if per_trajectory else None,
+            fill_value=0,
+        )
+    try:
+        draft.rename(path)
+    except OSError:  # another process was first
+        shutil.rmtree(draft)
+        if not (path / "zarr.json").is_file():
+            raise

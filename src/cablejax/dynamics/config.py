@@ -1,0 +1,103 @@
+"""What is fixed about a learned model: the graph it sees, the sizes of its networks, the scales of its numbers."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+
+
+@dataclasses.dataclass(frozen=True)
+class Normalisation:
+    """Typical sizes that features and output are divided by. `fit_normalisation` measures them on training data.
+
+    Only scales, no offsets: every feature lives in a frame fixed to the grippers, where zero has a meaning.
+
+    Attributes:
+        position: keypoint positions in the grippers' frame [m].
+        displacement: movement of a keypoint over one interval [m].
+        linear_speed: gripper speed [m/s].
+        angular_speed: gripper turning rate [rad/s].
+        shortening: how much shorter a chord between connected keypoints is than the cable between them [m].
+        residual: displacement beyond the rigid interpolation of the grippers' motion [m]: the unit of output and loss.
+    """
+
+    position: float = 0.25
+    displacement: float = 0.02
+    linear_speed: float = 0.02
+    angular_speed: float = 0.1
+    shortening: float = 0.003
+    residual: float = 0.005
+
+    def __post_init__(self):
+        for field in dataclasses.fields(self):
+            value = getattr(self, field.name)
+            if not (np.isfinite(value) and value > 0):
+                raise ValueError(
+                    f"Normalisation.{field.name} is {value}, expected a positive finite scale in SI units."
+                )
+
+
+@dataclasses.dataclass(frozen=True)
+class GNSConfig:
+    """Static description of a graph network simulator of one cable. The defaults are those of Wang et al., RA-L 2022.
+
+    Attributes:
+        n_keypoints: observed keypoints N, uniform in arc length, both ends held by grippers.
+        length: free length of the cable [m].
+        radius: connective radius [m], measured along the cable at rest.
+        history: samples seen H = m + 1.
+        interval: duration of one step [s].
+        latent: size of latent node and edge vectors.
+        hidden: width of the hidden layers of every network.
+        hidden_layers: hidden layers of every network.
+        message_passing: message-passing steps, each with weights of its own.
+        normalisation: scales of features and output.
+    """
+
+    n_keypoints: int = 13
+    length: float = 1.0
+    radius: float = 0.2
+    history: int = 6
+    interval: float = 1.0
+    latent: int = 128
+    hidden: int = 128
+    hidden_layers: int = 2
+    message_passing: int = 10
+    normalisation: Normalisation = Normalisation()
+
+    def __post_init__(self):
+        for name, least in (
+            ("n_keypoints", 3),
+            ("history", 1),
+            ("latent", 1),
+            ("hidden", 1),
+            ("hidden_layers", 1),
+            ("message_passing", 1),
+        ):
+            if getattr(self, name) < least:
+                raise ValueError(f"GNSConfig.{name} is {getattr(self, name)}, expected an integer >= {least}.")
+        for name in ("length", "radius", "interval"):
+            value = getattr(self, name)
+            if not (np.isfinite(value) and value > 0):
+                raise ValueError(f"GNSConfig.{name} is {value}, expected a positive finite number in SI units.")
+        if self.radius < self.spacing:
+            raise ValueError(
+                f"GNSConfig.radius is {self.radius} m but keypoints are {self.spacing:.4g} m apart: no two would be "
+                "connected. Use a larger radius or more keypoints."
+            )
+
+    @property
+    def spacing(self) -> float:
+        """Arc length between neighbouring keypoints [m]."""
+        return self.length / (self.n_keypoints - 1)
+
+    @property
+    def node_features(self) -> int:
+        """Position, past displacements, arc length, control input and grasp, interpolated displacement."""
+        return 2 + 2 * (self.history - 1) + 2 + 7 + 2
+
+    @property
+    def edge_features(self) -> int:
+        """Relative position, its length, signed arc length."""
+        return 4

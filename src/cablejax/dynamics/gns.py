@@ -1,0 +1,139 @@
+"""Graph network simulator of a cable: encode, process by message passing, decode.
+
+    encode     v_i = f_V(node features),  e_ij = f_E(edge features)
+    process    e_ij <- e_ij + f^k_e(e_ij, v_i, v_j),  v_j <- v_j + f^k_v(v_j, sum_i e'_ij)      k = 1, ..., K
+    decode     output_j = f_D(v_j)
+
+after Sanchez-Gonzalez et al., "Learning to Simulate Complex Physics with Graph Networks", ICML 2020, with the sizes of
+Wang et al., RA-L 2022. Every f is a ReLU network, followed by layer normalisation except in the decoder.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+from flax import nnx
+from jaxtyping import Array, Float
+
+from cablejax.dynamics.config import GNSConfig
+from cablejax.dynamics.graph import build_graph, gripper_frame, interpolated, topology_of
+from cablejax.types import History
+
+Dynamics = Callable[[History, Float[Array, "Q 3"]], Float[Array, "N 2"]]
+"""A one-step model: the displacement X(t + 1) - X(t) [m] that a command causes after a history."""
+
+
+class MLP(nnx.Module):
+    """ReLU network whose first layer takes the sum of several inputs, each with a weight matrix of its own.
+
+    That sum is the same as one matrix on the inputs' concatenation; written apart, an input that many rows share can
+    be multiplied before it is copied to them.
+    """
+
+    def __init__(self, inputs: tuple[int, ...], output: int, config: GNSConfig, *, normalise: bool, rngs: nnx.Rngs):
+        share = nnx.initializers.variance_scaling(1.0 / len(inputs), "fan_in", "truncated_normal")
+        self.first = nnx.List(
+            [nnx.Linear(n, config.hidden, use_bias=i == 0, kernel_init=share, rngs=rngs) for i, n in enumerate(inputs)]
+        )
+        sizes = [config.hidden] * config.hidden_layers + [output]
+        self.rest = nnx.List([nnx.Linear(a, b, rngs=rngs) for a, b in itertools.pairwise(sizes)])
+        self.norm = nnx.LayerNorm(output, epsilon=1e-5, rngs=rngs) if normalise else None
+
+    def after_first(self, x: Float[Array, "rows hidden"]) -> Float[Array, "rows output"]:
+        """The network from the first layer's sum on."""
+        for layer in self.rest:
+            x = layer(jax.nn.relu(x))
+        return x if self.norm is None else self.norm(x)
+
+    def __call__(self, *inputs: Float[Array, "rows _"]) -> Float[Array, "rows output"]:
+        first = sum(layer(x) for layer, x in zip(self.first[1:], inputs[1:], strict=True))
+        return self.after_first(self.first[0](inputs[0]) + first)
+
+
+class MessagePassing(nnx.Module):
+    """One step: every edge reads its two nodes, every node reads the sum of its incoming edges."""
+
+    def __init__(self, config: GNSConfig, rngs: nnx.Rngs):
+        n = config.latent
+        self.offsets = topology_of(config).offsets
+        self.edge = MLP((n, n, n), n, config, normalise=True, rngs=rngs)
+        self.node = MLP((n, n), n, config, normalise=True, rngs=rngs)
+
+    def __call__(
+        self, nodes: Float[Array, "N latent"], edges: Float[Array, "E latent"]
+    ) -> tuple[Float[Array, "N latent"], Float[Array, "E latent"]]:
+        own, sender, receiver = self.edge.first
+        shared = gather(sender(nodes), receiver(nodes), self.offsets)
+        message = self.edge.after_first(own(edges) + shared)
+        update = self.node(nodes, aggregate(message, self.offsets, nodes.shape[0]))
+        return nodes + update, edges + message
+
+
+def gather(
+    sent: Float[Array, "N latent"], received: Float[Array, "N latent"], offsets: tuple[int, ...]
+) -> Float[Array, "E latent"]:
+    """`sent[senders] + received[receivers]` for edges in a `Topology`'s order."""
+    n = sent.shape[0]
+    return jnp.concatenate(
+        [sent[max(0, -k) : n - max(0, k)] + received[max(0, k) : n - max(0, -k)] for k in offsets], axis=0
+    )
+
+
+def aggregate(messages: Float[Array, "E latent"], offsets: tuple[int, ...], n: int) -> Float[Array, "N latent"]:
+    """Sum of the incoming messages of every node, for edges in a `Topology`'s order."""
+    total, start = 0.0, 0
+    for k in offsets:
+        part = messages[start : start + n - abs(k)]
+        total = total + jnp.pad(part, ((max(0, k), max(0, -k)), (0, 0)))
+        start += n - abs(k)
+    return total
+
+
+class GNS(nnx.Module):
+    """Predicts how the cable moves beyond `rigid_interpolation`, in the grippers' frame and in units of its scale."""
+
+    def __init__(self, config: GNSConfig, rngs: nnx.Rngs):
+        self.config = config
+        self.node_encoder = MLP((config.node_features,), config.latent, config, normalise=True, rngs=rngs)
+        self.edge_encoder = MLP((config.edge_features,), config.latent, config, normalise=True, rngs=rngs)
+        self.processor = nnx.List([MessagePassing(config, rngs) for _ in range(config.message_passing)])
+        self.decoder = MLP((config.latent,), 2, config, normalise=False, rngs=rngs)
+
+    def __call__(
+        self, node_features: Float[Array, "N node_features"], edge_features: Float[Array, "E edge_features"]
+    ) -> Float[Array, "N 2"]:
+        nodes, edges = self.node_encoder(node_features), self.edge_encoder(edge_features)
+        for step in self.processor:
+            nodes, edges = step(nodes, edges)
+        return self.decoder(nodes)
+
+
+def apply(
+    model: GNS | tuple[nnx.GraphDef, nnx.State], history: History, twist: Float[Array, "2 3"]
+) -> Float[Array, "N 2"]:
+    """Displacement X(t + 1) - X(t) [m] of every keypoint; at the two grasped ones it is the grippers', exactly.
+
+    Turns with the cable: rotating and shifting the input rotates the output. Differentiable in weights, history and
+    twist (almost everywhere: the activation is ReLU).
+
+    Args:
+        model: the network, or its split form `(graphdef, weights)`.
+        history: the last H samples; vmap for batches.
+        twist: control input of both grippers [m/s, rad/s], shape [2, 3].
+    """
+    if isinstance(model, tuple):
+        model = nnx.merge(*model)
+    config = model.config
+    graph = build_graph(history, twist, config)
+    frame = gripper_frame(history.gripper_pose)
+    beyond = model(graph.nodes, graph.edges)[1:-1] * config.normalisation.residual
+    # The interpolation is exact at the grasped nodes, where nothing is left to predict.
+    return interpolated(history, twist, config) + jnp.pad(beyond @ frame, ((1, 1), (0, 0)))
+
+
+def bind(graphdef: nnx.GraphDef, weights: nnx.State) -> Dynamics:
+    """The model as a function of history and twist alone."""
+    return lambda history, twist: apply((graphdef, weights), history, twist)

@@ -1,0 +1,141 @@
+"""The cable as a graph: keypoints are nodes, keypoints near each other along the cable are connected.
+
+Node features, in order, with N keypoints and H history samples (all in the grippers' frame, divided by their scales):
+
+    2            position at t
+    2 (H - 1)    displacements between the history's samples, oldest first
+    2            arc-length fraction s and 4 s (1 - s)
+    5            at a grasped node its gripper's control input (vx, vy, omega) and heading (cos, sin); elsewhere 0
+    2            1 at the node held by gripper 0, by gripper 1
+    2            displacement that `rigid_interpolation` expects
+
+Edge features: position of the receiver relative to the sender [2], how much shorter that chord is than the cable
+between them, and the signed arc length from sender to receiver.
+
+The physics of a cable on a level table does not change under translation and rotation, so everything is expressed in
+a frame whose origin is midway between the grippers and whose x axis runs from gripper 0 to gripper 1.
+This is the only file that imports jraph.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+
+import jax.numpy as jnp
+import jraph
+import numpy as np
+from jaxtyping import Array, Float
+
+from cablejax.dynamics.config import GNSConfig
+from cablejax.dynamics.interpolation import rigid_interpolation
+from cablejax.types import History
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Topology:
+    """Who is connected with whom: fixed by the rest shape, so built once and never padded.
+
+    Edges are sorted by their offset `receiver - sender`, then by sender. On keypoints uniform in arc length this makes
+    gathering and aggregating a matter of shifted slices, several times faster on a CPU than indexed scatter.
+
+    Attributes:
+        senders: int32, shape [E].
+        receivers: int32, shape [E].
+        offsets: the distinct values of `receiver - sender`, ascending; never 0.
+    """
+
+    senders: np.ndarray
+    receivers: np.ndarray
+    offsets: tuple[int, ...]
+
+
+@functools.lru_cache(maxsize=32)
+def cable_topology(n_keypoints: int, length: float, radius: float) -> Topology:
+    """Directed edges between all keypoints at most `radius` [m] apart along the cable. Not to be modified: cached."""
+    spacing = length / (n_keypoints - 1)
+    reach = min(int(np.floor(radius / spacing * (1 + 1e-9))), n_keypoints - 1)
+    offsets = tuple(k for k in range(-reach, reach + 1) if k != 0)
+    senders = [np.arange(max(0, -k), n_keypoints - max(0, k), dtype=np.int32) for k in offsets]
+    receivers = [part + np.int32(k) for part, k in zip(senders, offsets, strict=True)]
+    return Topology(np.concatenate(senders), np.concatenate(receivers), offsets)
+
+
+def topology_of(config: GNSConfig) -> Topology:
+    """The topology that a model of this configuration works on."""
+    return cable_topology(config.n_keypoints, config.length, config.radius)
+
+
+def gripper_frame(gripper_pose: Float[Array, "2 3"]) -> Float[Array, "2 2"]:
+    """Rows are the x and y axis of the grippers' frame: `frame @ v` expresses v in it, `v @ frame` brings it back.
+
+    Differentiable as long as the grippers are apart.
+    """
+    along = gripper_pose[1, :2] - gripper_pose[0, :2]
+    x = along / jnp.sqrt(jnp.sum(along**2))
+    return jnp.stack([x, jnp.stack([-x[1], x[0]])])
+
+
+def build_graph(history: History, twist: Float[Array, "2 3"], config: GNSConfig) -> jraph.GraphsTuple:
+    """The graph of one cable at one instant, see the top of this file. Differentiable in `history` and `twist`.
+
+    Args:
+        history: the last H samples; vmap for batches.
+        twist: control input of both grippers in the world's frame [m/s, rad/s], shape [2, 3].
+        config: of the model that reads the graph.
+    """
+    topology, scale = topology_of(config), config.normalisation
+    pose = history.gripper_pose
+    frame = gripper_frame(pose)
+    past = (history.keypoints - pose[:, :2].mean(axis=0)) @ frame.T
+    now = past[-1]
+
+    s = np.linspace(0.0, 1.0, config.n_keypoints)
+    arclength = jnp.asarray(np.stack([s, 4 * s * (1 - s)], axis=-1), now.dtype)
+    heading = jnp.stack([jnp.cos(pose[:, 2]), jnp.sin(pose[:, 2])], axis=-1) @ frame.T
+    control = jnp.concatenate(
+        [twist[:, :2] @ frame.T / scale.linear_speed, twist[:, 2:] / scale.angular_speed, heading], axis=-1
+    )
+    grasped = jnp.concatenate([control, jnp.eye(2, dtype=now.dtype)], axis=-1)
+    free = jnp.zeros((config.n_keypoints - 2, grasped.shape[-1]), now.dtype)
+    expected = interpolated(history, twist, config) @ frame.T
+    displacements = jnp.diff(past, axis=0).swapaxes(0, 1).reshape(config.n_keypoints, -1)
+    nodes = jnp.concatenate(
+        [
+            now / scale.position,
+            displacements / scale.displacement,
+            arclength,
+            jnp.concatenate([grasped[:1], free, grasped[1:]]),
+            expected / scale.displacement,
+        ],
+        axis=-1,
+    )
+
+    along = (topology.receivers - topology.senders) * config.spacing
+    chord = now[topology.receivers] - now[topology.senders]
+    # 1 nm keeps the derivative finite should two observed keypoints ever coincide.
+    shorter = np.abs(along) - jnp.sqrt(jnp.sum(chord**2, axis=-1) + 1e-18)
+    edges = jnp.concatenate(
+        [
+            chord / config.spacing,
+            shorter[:, None] / scale.shortening,
+            jnp.asarray(along / config.radius, now.dtype)[:, None],
+        ],
+        axis=-1,
+    )
+    return jraph.GraphsTuple(
+        nodes=nodes,
+        edges=edges,
+        senders=jnp.asarray(topology.senders),
+        receivers=jnp.asarray(topology.receivers),
+        globals=None,
+        n_node=jnp.asarray([config.n_keypoints]),
+        n_edge=jnp.asarray([topology.senders.size]),
+    )
+
+
+def interpolated(history: History, twist: Float[Array, "2 3"], config: GNSConfig) -> Float[Array, "N 2"]:
+    """`rigid_interpolation` for the cable that `config` describes [m]."""
+    return rigid_interpolation(
+        history.gripper_pose, twist, n_keypoints=config.n_keypoints, length=config.length, interval=config.interval
+    )

@@ -1,0 +1,266 @@
+"""Training a graph network simulator on trajectories, resumable to the bit.
+
+Many optimiser steps run in one compiled call. What a step sees depends on `(seed, step)` alone, a checkpoint holds the
+whole state, so a training that was killed and resumed ends in the same weights as one that ran through.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import hashlib
+import json
+import signal
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from flax import nnx
+from jaxtyping import Array
+from tqdm import tqdm
+
+from cablejax.dynamics.checkpoint import Checkpoints
+from cablejax.dynamics.config import GNSConfig
+from cablejax.dynamics.evaluate import HORIZONS, evaluation_windows, make_errors
+from cablejax.dynamics.gns import GNS, bind
+from cablejax.dynamics.loss import random_walk_noise, rollout_loss
+from cablejax.dynamics.metrics import MetricsLog
+from cablejax.dynamics.train_config import Phase, TrainConfig
+from cablejax.dynamics.windows import Window, check_trajectories, draw_windows, fit_normalisation
+from cablejax.types import Trajectory
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class TrainState:
+    """All that changes while training.
+
+    Attributes:
+        weights: of the network.
+        average: exponential moving average of the weights.
+        optimiser: state of the optimiser.
+        step: optimiser steps done, int32, shape [].
+    """
+
+    weights: nnx.State
+    average: nnx.State
+    optimiser: Any
+    step: Array
+
+
+@dataclasses.dataclass(frozen=True)
+class TrainResult:
+    """What a call of `train` leaves behind.
+
+    Attributes:
+        model: configuration of the network, with the normalisation measured on the data.
+        graphdef: structure of the network.
+        weights: averaged weights.
+        steps: optimiser steps done.
+        completed: false if Ctrl-C ended it early; calling `train` again goes on from there.
+        validation_cm: open-loop error of the averaged weights by horizon [cm], empty without validation data.
+    """
+
+    model: GNSConfig
+    graphdef: nnx.GraphDef
+    weights: nnx.State
+    steps: int
+    completed: bool
+    validation_cm: dict[int, float]
+
+
+def train(
+    config: TrainConfig,
+    data: Trajectory,
+    out_dir: Path,
+    *,
+    validation: Trajectory | None = None,
+    initial: nnx.State | None = None,
+    resume: bool = True,
+    progress: bool = True,
+) -> TrainResult:
+    """Trains from scratch, or goes on from the last checkpoint in `out_dir`.
+
+    Args:
+        config: decides the outcome, together with `data` and `initial`.
+        data: training trajectories, arrays [M, T + 1, N, 2], [M, T + 1, 2, 3], [M, T, 2, 3].
+        out_dir: receives `run.json`, `metrics.csv`, `tensorboard/`, `checkpoints/`.
+        validation: held-out trajectories, evaluated open loop every `config.evaluate_every` chunks.
+        initial: weights to start from instead of random ones, e.g. with pretrained encoders.
+        resume: false refuses a folder that holds a run already.
+        progress: show a progress bar with remaining time.
+
+    Raises:
+        ValueError: bad data, or `out_dir` holds a run of another configuration or data.
+    """
+    check_trajectories(data, config.model, steps=config.longest_rollout, what="training data")
+    model_config = dataclasses.replace(config.model, normalisation=fit_normalisation(data, config.model))
+    config = dataclasses.replace(config, model=model_config)
+    out_dir = Path(out_dir)
+    claim_folder(out_dir, {"config": dataclasses.asdict(config), "data": fingerprint(data, initial)}, resume)
+
+    graphdef, weights = nnx.split(GNS(model_config, nnx.Rngs(config.seed)))
+    if initial is not None:
+        weights = initial
+    optimiser = config.optimiser()
+    state = TrainState(weights, weights, optimiser.init(weights), jnp.zeros((), jnp.int32))
+    device_data = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), data)
+    evaluate = None if validation is None else Validation(validation, graphdef, config)
+    columns = ("phase", "learning_rate", "loss", "gradient_norm", *(f"open_loop_{h}_cm" for h in HORIZONS), "seconds")
+
+    scores: dict[int, float] = {}
+    with Checkpoints(out_dir / "checkpoints") as checkpoints, interrupt_flag() as interrupted:
+        if checkpoints.latest() is not None:
+            state = checkpoints.restore(state)
+        step, total = int(state.step), config.total_steps
+        bar = tqdm(total=total, initial=step, unit="step", disable=not progress, dynamic_ncols=True)
+        with MetricsLog(out_dir, columns, step) as log, bar:
+            while step < total and not interrupted.is_set():
+                index, end = config.phase_at(step)
+                update = chunk_update(config, index, graphdef, min(config.chunk, end - step))
+                began = time.perf_counter()
+                state, losses = jax.block_until_ready(update(state, device_data))
+                seconds, done, step = time.perf_counter() - began, int(state.step) - step, int(state.step)
+                row = {"phase": index, "learning_rate": float(config.learning_rate()(step - 1)), "seconds": seconds}
+                row |= {name: float(np.mean(values)) for name, values in losses.items()}
+                if not np.isfinite(row["loss"]):
+                    raise FloatingPointError(
+                        f"training loss is {row['loss']} after step {step}; the last good checkpoint is in "
+                        f"{out_dir / 'checkpoints'}. Lower the learning rate or the gradient clip."
+                    )
+                chunks = -(-step // config.chunk)
+                if evaluate is not None and (chunks % config.evaluate_every == 0 or step == total):
+                    scores = evaluate(state.average)
+                    row |= {f"open_loop_{h}_cm": score for h, score in scores.items()}
+                log.write(step, row)
+                if chunks % config.checkpoint_every == 0 or step == total or interrupted.is_set():
+                    checkpoints.save(step, state)
+                bar.update(done)
+                bar.set_postfix(loss=f"{row['loss']:.2e}", **{f"e{h}_cm": f"{s:.3f}" for h, s in scores.items()})
+    return TrainResult(model_config, graphdef, state.average, step, step == total, scores)
+
+
+@functools.lru_cache(maxsize=8)
+def chunk_update(config: TrainConfig, phase_index: int, graphdef: nnx.GraphDef, steps: int):
+    """Compiled `(state, data) -> (state, {"loss", "gradient_norm"} each [steps])` for `steps` optimiser steps."""
+    phase, model, optimiser = config.phases[phase_index], config.model, config.optimiser()
+
+    def update(state: TrainState, data: Trajectory):
+        def one(state: TrainState, _):
+            key = jax.random.fold_in(jax.random.key(config.seed), state.step)
+            windows = noisy_windows(key, data, phase, model.history)
+            loss, gradient = jax.value_and_grad(batch_loss)(state.weights, graphdef, windows, phase, model)
+            change, inner = optimiser.update(gradient, state.optimiser, state.weights)
+            weights = optax.apply_updates(state.weights, change)
+            # A short memory at first, so that the average does not remember the random start.
+            decay = jnp.minimum(config.ema, (1.0 + state.step) / (10.0 + state.step))
+            average = jax.tree.map(lambda a, w: a + (1.0 - decay) * (w - a), state.average, weights)
+            metrics = {"loss": loss, "gradient_norm": optax.tree.norm(gradient)}
+            return TrainState(weights, average, inner, state.step + 1), metrics
+
+        return jax.lax.scan(one, state, length=steps)
+
+    return jax.jit(update)
+
+
+def noisy_windows(key: Array, data: Trajectory, phase: Phase, history: int) -> Window:
+    """The windows of one optimiser step, with noise on their histories."""
+    key_window, key_noise = jax.random.split(key)
+    windows = draw_windows(key_window, data, batch=phase.batch, history=history, steps=phase.rollout)
+    if phase.noise == 0:
+        return windows
+    noisy = jax.vmap(lambda k, h: random_walk_noise(k, h, phase.noise))
+    return dataclasses.replace(windows, history=noisy(jax.random.split(key_noise, phase.batch), windows.history))
+
+
+def batch_loss(weights: nnx.State, graphdef: nnx.GraphDef, windows: Window, phase: Phase, model: GNSConfig) -> Array:
+    """Mean `rollout_loss` of a batch of windows."""
+    dynamics = bind(graphdef, weights)
+    scale, interval = model.normalisation.residual, model.interval
+
+    def one(window: Window):
+        return rollout_loss(dynamics, window, scale=scale, interval=interval, pushforward=phase.pushforward)
+
+    return jnp.mean(jax.vmap(one)(windows))
+
+
+class Validation:
+    """Open-loop error by horizon [cm] at fixed start points, spread over the held-out trajectories."""
+
+    def __init__(self, data: Trajectory, graphdef: nnx.GraphDef, config: TrainConfig):
+        commands = data.gripper_twist.shape[1]
+        self.horizons = tuple(h for h in HORIZONS if h <= commands)
+        windows = evaluation_windows(data, config.model, steps=self.horizons[-1], stride=5)
+        n = windows.twist.shape[0]
+        pick = np.unique(np.linspace(0, n - 1, min(n, config.evaluate_starts)).astype(int))
+        self.windows = jax.tree.map(lambda x: x[pick], windows)
+        self.errors = make_errors(lambda weights: bind(graphdef, weights), config.model.interval)
+
+    def __call__(self, weights: nnx.State) -> dict[int, float]:
+        error = np.asarray(self.errors((weights,), self.windows), np.float64)
+        return {h: float(100 * np.sqrt(np.mean(error[:, h - 1] ** 2))) for h in self.horizons}
+
+
+def fingerprint(data: Trajectory, initial: nnx.State | None) -> str:
+    """Hash of the arrays that a training starts from."""
+    digest = hashlib.blake2b(digest_size=16)
+    for leaf in jax.tree.leaves((data, initial)):
+        array = np.ascontiguousarray(leaf)
+        digest.update(f"{array.dtype}{array.shape}".encode())
+        digest.update(array.data)
+    return digest.hexdigest()
+
+
+def claim_folder(out_dir: Path, run: dict[str, Any], resume: bool) -> None:
+    """Writes `run.json` into a fresh folder; refuses one that holds another run, or any run unless `resume`."""
+    path = out_dir / "run.json"
+    run = json.loads(json.dumps(run))
+    if path.exists():
+        found = json.loads(path.read_text())
+        if not resume:
+            raise ValueError(f"{out_dir} holds a training already. Choose another folder, or resume it.")
+        if found != run:
+            raise ValueError(
+                f"{out_dir} holds a training that differs in {', '.join(differences(found, run))}. "
+                "Choose another folder, or repeat it with the same configuration and data."
+            )
+        return
+    out_dir.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps(run, indent=1) + "\n")
+
+
+def differences(old: Any, new: Any, name: str = "") -> list[str]:
+    """Where two JSON trees differ, as `path (old, now new)`."""
+    if isinstance(old, dict) and isinstance(new, dict):
+        keys = sorted(old.keys() | new.keys())
+        return [d for k in keys for d in differences(old.get(k), new.get(k), f"{name}.{k}" if name else k)]
+    return [] if old == new else [f"{name} ({old}, now {new})"]
+
+
+@contextmanager
+def interrupt_flag() -> Iterator[threading.Event]:
+    """An event that Ctrl-C or SIGTERM sets, once; a second Ctrl-C ends the program at once."""
+    flag = threading.Event()
+    if threading.current_thread() is not threading.main_thread():
+        yield flag
+        return
+    before = {s: signal.getsignal(s) for s in (signal.SIGINT, signal.SIGTERM)}
+
+    def handle(number, frame):
+        flag.set()
+        signal.signal(number, before[number])
+
+    for s in before:
+        signal.signal(s, handle)
+    try:
+        yield flag
+    finally:
+        for s, handler in before.items():
+            signal.signal(s, handler)

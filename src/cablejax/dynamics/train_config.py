@@ -1,0 +1,130 @@
+"""How a model is trained: phases, optimiser, what is written when."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Literal
+
+import optax
+
+from cablejax.dynamics.config import GNSConfig
+
+
+@dataclasses.dataclass(frozen=True)
+class Phase:
+    """A stretch of training with one kind of loss.
+
+    Attributes:
+        steps: optimiser steps.
+        batch: windows per step.
+        rollout: steps K that the model is rolled out and compared with the truth.
+        noise: final standard deviation of the random walk added to the history [m]; 0 = none.
+        lr_start: learning rate at the phase's beginning.
+        lr_end: at its end.
+        decay: exponential from start to end, or half a cosine.
+        pushforward: stop gradients between the steps of the rollout.
+    """
+
+    steps: int
+    batch: int = 32
+    rollout: int = 1
+    noise: float = 3e-4
+    lr_start: float = 1e-3
+    lr_end: float = 1e-4
+    decay: Literal["exponential", "cosine"] = "cosine"
+    pushforward: bool = False
+
+    def __post_init__(self):
+        for name in ("steps", "batch", "rollout"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"Phase.{name} is {getattr(self, name)}, expected an integer >= 1.")
+        if not self.noise >= 0:
+            raise ValueError(f"Phase.noise is {self.noise} m, expected >= 0.")
+        if not (self.lr_start > 0 and self.lr_end > 0):
+            raise ValueError(f"Phase learning rates are {self.lr_start} and {self.lr_end}, expected both > 0.")
+
+
+@dataclasses.dataclass(frozen=True)
+class TrainConfig:
+    """Everything that decides the outcome of a training. The number of steps is fixed, never the time.
+
+    Attributes:
+        model: sizes of the network; its normalisation is replaced by one measured on the training data.
+        phases: one after the other; optimiser state and averaged weights carry over.
+        seed: of initial weights, windows, augmentation and noise.
+        warmup: optimiser steps over which the learning rate rises from 0.
+        weight_decay: of AdamW.
+        clip: largest global gradient norm.
+        ema: decay of the weights' moving average, which is what is evaluated and kept.
+        chunk: optimiser steps per compiled call.
+        checkpoint_every: chunks between checkpoints.
+        evaluate_every: chunks between open-loop evaluations.
+        evaluate_starts: at most so many start points per evaluation.
+    """
+
+    model: GNSConfig = GNSConfig()
+    phases: tuple[Phase, ...] = (
+        Phase(steps=30_000, batch=32, rollout=1, noise=3e-4, lr_start=1e-3, lr_end=1e-4),
+        Phase(steps=5_000, batch=16, rollout=5, noise=1e-4, lr_start=1e-4, lr_end=1e-6),
+    )
+    seed: int = 0
+    warmup: int = 500
+    weight_decay: float = 1e-6
+    clip: float = 1.0
+    ema: float = 0.999
+    chunk: int = 50
+    checkpoint_every: int = 10
+    evaluate_every: int = 20
+    evaluate_starts: int = 128
+
+    def __post_init__(self):
+        if not self.phases:
+            raise ValueError("TrainConfig.phases is empty, expected at least one Phase.")
+        for name in ("chunk", "checkpoint_every", "evaluate_every", "evaluate_starts"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"TrainConfig.{name} is {getattr(self, name)}, expected an integer >= 1.")
+        if not 0 <= self.ema < 1:
+            raise ValueError(f"TrainConfig.ema is {self.ema}, expected 0 <= ema < 1.")
+
+    @property
+    def total_steps(self) -> int:
+        """Optimiser steps of all phases."""
+        return sum(phase.steps for phase in self.phases)
+
+    @property
+    def longest_rollout(self) -> int:
+        """Largest number of steps rolled out in any phase."""
+        return max(phase.rollout for phase in self.phases)
+
+    def phase_at(self, step: int) -> tuple[int, int]:
+        """Index of the phase that optimiser step `step` belongs to, and the step at which that phase ends."""
+        end = 0
+        for index, phase in enumerate(self.phases):
+            end += phase.steps
+            if step < end:
+                return index, end
+        return len(self.phases) - 1, end
+
+    def learning_rate(self) -> optax.Schedule:
+        """Learning rate as a function of the optimiser step."""
+        parts, ends, end = [], [], 0
+        for phase in self.phases:
+            ratio = phase.lr_end / phase.lr_start
+            parts.append(
+                optax.cosine_decay_schedule(phase.lr_start, phase.steps, alpha=ratio)
+                if phase.decay == "cosine"
+                else optax.exponential_decay(phase.lr_start, phase.steps, ratio)
+            )
+            end += phase.steps
+            ends.append(end)
+        schedule = optax.join_schedules(parts, ends[:-1])
+        if self.warmup == 0:
+            return schedule
+        rise = optax.linear_schedule(0.0, 1.0, self.warmup)
+        return lambda step: rise(step + 1) * schedule(step)
+
+    def optimiser(self) -> optax.GradientTransformation:
+        """AdamW on clipped gradients."""
+        return optax.chain(
+            optax.clip_by_global_norm(self.clip), optax.adamw(self.learning_rate(), weight_decay=self.weight_decay)
+        )

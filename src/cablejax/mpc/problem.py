@@ -1,0 +1,171 @@
+"""The planning problem of one control step, and what a solver of it takes and returns."""
+
+from __future__ import annotations
+
+import dataclasses
+import enum
+from typing import Any, Protocol
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from cablejax.mpc.feasible import FeasibleSet
+from cablejax.residual.corrected import Dynamics
+from cablejax.types import History, advance
+
+
+@dataclasses.dataclass(frozen=True)
+class ObjectiveConfig:
+    """What a plan is judged by.
+
+    Attributes:
+        terminal_weight: weight of the last predicted shape; every other shape has 1.
+        motion_weight: weight of the squared motion beside the squared keypoint error. It decides between plans that
+            shape the cable equally well: small enough not to be felt, large enough to make the problem well posed.
+        rotation_weight: w [m/rad], the length that a rotation of one radian counts as.
+        interval: duration of one control step [s].
+    """
+
+    terminal_weight: float = 1.0
+    motion_weight: float = 1e-3
+    rotation_weight: float = 0.15
+    interval: float = 1.0
+
+    def __post_init__(self):
+        for name in ("terminal_weight", "motion_weight"):
+            if not getattr(self, name) >= 0:
+                raise ValueError(f"ObjectiveConfig.{name} is {getattr(self, name)}, expected a number >= 0.")
+        for name in ("rotation_weight", "interval"):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"ObjectiveConfig.{name} is {getattr(self, name)}, expected a positive number.")
+
+    def to_twist(self, motion: Float[Array, "*batch 3"]) -> Float[Array, "*batch 3"]:
+        """The twist (vx, vy, omega) that makes a motion (metres, see `feasible`) within one interval."""
+        return motion / (self.interval * jnp.asarray([1.0, 1.0, self.rotation_weight]))
+
+    def to_motion(self, twist: Float[Array, "*batch 3"]) -> Float[Array, "*batch 3"]:
+        """The motion in metres that a twist makes within one interval; the inverse of `to_twist`."""
+        return twist * (self.interval * jnp.asarray([1.0, 1.0, self.rotation_weight]))
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class ShapingProblem:
+    """Bring the cable to a target shape within a horizon (Wang et al., RA-L 2022, "Model Predictive Control").
+
+        min over u in feasible   1/2 sum_t [ w_t / N ||X(t) - X_d||^2 + motion_weight ||u(t - 1)||^2 ],   t = 1, ..., T
+        with X(t + 1) = X(t) + f(X(t - m : t), R(t)),   R = `objective.to_twist(u)`
+
+    It is a nonlinear least squares problem: `value` is half the squared norm of `residuals`. All methods are pure and
+    differentiable in `motion`, `history`, `target` and `weights` as far as `dynamics` is.
+
+    Attributes:
+        dynamics: one-step model `(weights, history, twist) -> displacement`; static.
+        weights: its arrays, any pytree.
+        history: the last H samples and the grippers' poses.
+        target: desired keypoints X_d [m], shape [N, 2].
+        feasible: the set that plans are taken from.
+        objective: weights and units; static.
+    """
+
+    dynamics: Dynamics = dataclasses.field(metadata={"static": True})
+    weights: Any
+    history: History
+    target: Float[Array, "*batch N 2"]
+    feasible: FeasibleSet
+    objective: ObjectiveConfig = dataclasses.field(default=ObjectiveConfig(), metadata={"static": True})
+
+    def rollout(self, motion: Float[Array, "T Q 3"]) -> Float[Array, "T N 2"]:
+        """Predicted keypoints X(1), ..., X(T) [m] under a plan."""
+
+        def one_step(history, twist):
+            history = self._advance(history, twist)
+            return history, history.keypoints[-1]
+
+        return jax.lax.scan(one_step, self.history, self.objective.to_twist(motion))[1]
+
+    def residuals(self, motion: Float[Array, "T Q 3"]) -> Float[Array, " M"]:
+        """Weighted shape errors of all predicted steps, then weighted motions [m]; M = T (2N + 3Q)."""
+        return self._weigh(self.rollout(motion) - self.target, motion)
+
+    def value(self, motion: Float[Array, "T Q 3"]) -> Float[Array, ""]:
+        """The objective, half the sum of squared residuals [m^2]."""
+        return 0.5 * jnp.sum(self.residuals(motion) ** 2)
+
+    def linearise(self, motion: Float[Array, "T Q 3"]) -> tuple[Float[Array, " M"], Float[Array, "M P"]]:
+        """`residuals` and their Jacobian with respect to the flattened motion, P = 3 T Q.
+
+        Forward mode, one step linearised after the other: step t carries only the tangents of the commands 0, ..., t
+        that can have reached it, (T + 1) / 2 of T on average, where `jax.jacfwd(residuals)` carries all of them
+        through every step.
+        """
+        n_steps, width = motion.shape[0], motion[0].size
+        n_columns = n_steps * width
+        own = self.objective.to_twist(jnp.eye(width).reshape(width, *motion.shape[1:]))
+        entering = self._no_tangents(width)
+        history, shapes, tangents = self.history, [], []
+        for twist in self.objective.to_twist(motion):
+            history, step_jvp = jax.linearize(self._advance, history, twist)
+            earlier = jnp.zeros((entering.keypoints.shape[0] - width, *own.shape[1:]), own.dtype)
+            leaving = jax.vmap(step_jvp)(entering, jnp.concatenate([earlier, own]))
+            newest = leaving.keypoints[:, -1]
+            shapes.append(history.keypoints[-1])
+            tangents.append(jnp.pad(newest, [(0, n_columns - newest.shape[0]), (0, 0), (0, 0)]))
+            entering = jax.tree.map(lambda *x: jnp.concatenate(x), leaving, self._no_tangents(width))
+        columns = jnp.eye(n_columns).reshape(n_columns, *motion.shape)
+        jacobian = jax.vmap(self._weigh)(jnp.stack(tangents, axis=1), columns).T
+        return self._weigh(jnp.stack(shapes) - self.target, motion), jacobian
+
+    def shape_error(self, keypoints: Float[Array, "*batch N 2"]) -> Float[Array, "*batch"]:
+        """Root mean square distance of keypoints to the target [m]."""
+        return jnp.sqrt(jnp.mean(jnp.sum((keypoints - self.target) ** 2, axis=-1), axis=-1))
+
+    def _advance(self, history: History, twist: Float[Array, "Q 3"]) -> History:
+        return advance(history, self.dynamics(self.weights, history, twist), twist, self.objective.interval)
+
+    def _no_tangents(self, n_columns: int) -> History:
+        return jax.tree.map(lambda x: jnp.zeros((n_columns, *x.shape), x.dtype), self.history)
+
+    def _weigh(self, shape_error: Float[Array, "T N 2"], motion: Float[Array, "T Q 3"]) -> Float[Array, " M"]:
+        n_steps, n_keypoints = shape_error.shape[:2]
+        weight = jnp.ones(n_steps).at[-1].set(self.objective.terminal_weight)
+        shape = jnp.sqrt(weight / n_keypoints)[:, None, None] * shape_error
+        return jnp.concatenate([shape.ravel(), self.objective.motion_weight**0.5 * motion.ravel()])
+
+
+class Outcome(enum.IntEnum):
+    """How a solve ended. Inside compiled code it is an int32."""
+
+    CONVERGED = 0
+    """No feasible direction improves the plan by more than the tolerance."""
+    STEP_LIMIT = 1
+    """The evaluation budget was used up; the plan is feasible and no worse than the guess."""
+    HELD = 2
+    """The plan would hardly improve on holding still: the grippers hold."""
+    NONFINITE = 3
+    """The model or the observation gave NaN or infinity: the grippers hold."""
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Plan:
+    """What a solver returns.
+
+    Attributes:
+        motion: feasible motions [m], shape [T, Q, 3].
+        evaluations: rollouts of the model that were spent, shape [].
+        outcome: an `Outcome`, shape [].
+    """
+
+    motion: Float[Array, "*batch T Q 3"]
+    evaluations: Int[Array, "*batch"]
+    outcome: Int[Array, "*batch"]
+
+
+class Solver(Protocol):
+    """A hashable object, typically a frozen dataclass that is its own configuration, called inside compiled code."""
+
+    def __call__(self, problem: ShapingProblem, guess: Float[Array, "T Q 3"]) -> Plan:
+        """A plan no worse than `problem.feasible.project(guess)`."""
+        ...

@@ -1,0 +1,208 @@
+"""The report's figures: final shapes, error over time, the residual's share, the trust region, and snapshots.
+
+Each function takes the runs and gives a `matplotlib.figure.Figure` that belongs to nobody else: no pyplot, no global
+state, no display needed. Notebooks show it, `page.svg` inlines it, `figure.savefig` writes it.
+"""
+
+from __future__ import annotations
+
+import matplotlib
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+from cablejax.report.record import Method, RunRecord, pair_by_shape
+from cablejax.report.style import (
+    LIGHT,
+    METHOD_LABEL,
+    METHOD_ORDER,
+    cable_curve,
+    common_window,
+    gripper_outline,
+)
+
+_STYLE = {
+    "font.family": "sans-serif",
+    "font.size": 10.0,
+    "axes.edgecolor": LIGHT.muted,
+    "axes.labelcolor": LIGHT.ink,
+    "axes.titlecolor": LIGHT.ink,
+    "axes.titlelocation": "left",
+    "axes.titleweight": "bold",
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.linewidth": 0.8,
+    "text.color": LIGHT.ink,
+    "xtick.color": LIGHT.muted,
+    "ytick.color": LIGHT.muted,
+    "xtick.labelcolor": LIGHT.muted,
+    "ytick.labelcolor": LIGHT.muted,
+    "grid.color": LIGHT.faint,
+    "grid.linewidth": 0.6,
+    "legend.frameon": False,
+    "svg.fonttype": "none",
+}
+
+
+def final_shapes(records: list[RunRecord]) -> Figure:
+    """The cable at the end of each run over its target, one panel per shape, with the error in words."""
+    pairs = pair_by_shape(records)
+    views = common_window(records, margin=0.1, final_only=True)
+    x0, x1, y0, y1 = next(iter(views.values()))
+    panel_width = 3.3
+    panel_height = panel_width * (y1 - y0) / (x1 - x0)
+    with matplotlib.rc_context(_STYLE):
+        figure = Figure(figsize=(panel_width * len(pairs), panel_height + 1.15), layout="constrained")
+        axes = figure.subplots(1, len(pairs), squeeze=False)[0]
+        for ax, (shape, runs) in zip(axes, pairs.items(), strict=True):
+            _table_axes(ax, views[shape])
+            target = next(iter(runs.values())).target
+            ax.plot(*cable_curve(target).T, color=LIGHT.target, lw=7, alpha=0.45, solid_capstyle="round")
+            for method in _present(runs):
+                run = runs[method]
+                _draw_cable(ax, run, -1, method)
+            ax.set_title(shape, fontsize=14)
+            for row, method in enumerate(reversed(_present(runs))):
+                ax.text(
+                    0.0, -0.03 - 0.105 * row, f"{runs[method].final_error_cm:.2f} cm {METHOD_LABEL[method]}",
+                    transform=ax.transAxes, color=LIGHT.method(method), va="top", fontsize=10.5,
+                )  # fmt: skip
+        _scale_bar(axes[-1], views[next(reversed(views))])
+        handles = [Line2D([], [], color=LIGHT.target, lw=7, alpha=0.45, label="target")]
+        handles += [
+            Line2D([], [], color=LIGHT.method(m), lw=2.2, label=METHOD_LABEL[m])
+            for m in reversed(METHOD_ORDER)
+            if any(m in runs for runs in pairs.values())
+        ]
+        figure.legend(handles=handles, loc="outside upper left", ncols=3, handlelength=1.6)
+    return figure
+
+
+def error_over_time(records: list[RunRecord], goal_cm: float | None = 1.0) -> Figure:
+    """Shape error against time on a logarithmic axis, one panel per shape; `goal_cm` draws a line to stay under."""
+    pairs = pair_by_shape(records)
+    with matplotlib.rc_context(_STYLE):
+        figure, axes = _row_of_panels(list(pairs), "shape error [cm]")
+        low = min(float(np.nanmin(r.error_cm)) for r in records)
+        high = max(float(np.nanmax(r.error_cm)) for r in records)
+        for ax, (shape, runs) in zip(axes, pairs.items(), strict=True):
+            for method in _present(runs):
+                run = runs[method]
+                ax.plot(run.times, run.error_cm, color=LIGHT.method(method), lw=2.2, label=METHOD_LABEL[method])
+                ax.plot(run.times[-1], run.final_error_cm, "o", ms=5, color=LIGHT.method(method))
+            ax.set_yscale("log")
+            ax.set_ylim(low / 1.4, high * 1.3)
+            ax.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
+            ax.minorticks_off()
+            ax.set_yticks([t for t in (0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50) if low / 1.4 <= t <= high * 1.3])
+            if goal_cm is not None:
+                ax.axhline(goal_cm, color=LIGHT.target, lw=1.2, ls=(0, (5, 3)))
+            ax.set_title(shape, fontsize=13)
+        if goal_cm is not None:
+            axes[0].text(0.0, goal_cm / 1.08, f"{goal_cm:g} cm", ha="left", va="top", color=LIGHT.muted, fontsize=9)
+        _method_legend(figure, records)
+    return figure
+
+
+def residual_share(records: list[RunRecord]) -> Figure:
+    """How much of the predicted motion the online residual contributes [%], one panel per shape."""
+    return _one_method_panels(
+        records, lambda run: 100.0 * run.residual_share, "residual's share of\nthe predicted motion [%]", "residual"
+    )
+
+
+def trust_region(records: list[RunRecord]) -> Figure:
+    """Bound on the motion of one gripper in one step [cm], one panel per shape."""
+    pairs = pair_by_shape(records)
+    with matplotlib.rc_context(_STYLE):
+        figure, axes = _row_of_panels(list(pairs), "motion bound per step [cm]")
+        for ax, runs in zip(axes, pairs.values(), strict=True):
+            for method in _present(runs):
+                run = runs[method]
+                ax.step(run.times, 100.0 * run.radius, where="post", color=LIGHT.method(method), lw=2.0)
+            ax.set_ylim(bottom=0.0)
+        for ax, shape in zip(axes, pairs, strict=True):
+            ax.set_title(shape, fontsize=13)
+        _method_legend(figure, records)
+    return figure
+
+
+def snapshots(records: list[RunRecord], shape: str | None = None, method: Method = "residual", count: int = 5) -> Figure:
+    """One run as a film strip: the cable and its grippers at `count` instants, dense at the start, over the target."""
+    pairs = pair_by_shape(records)
+    shape = next(iter(pairs)) if shape is None else shape
+    if shape not in pairs or method not in pairs[shape]:
+        raise ValueError(f"No run of shape {shape!r} with method {method!r}; shapes: {', '.join(pairs)}.")
+    run = pairs[shape][method]
+    last = len(run.times) - 1
+    chosen = np.unique(np.round(last * np.linspace(0.0, 1.0, count) ** 1.6).astype(int))
+    view = common_window([run])[shape]
+    width = 2.3
+    with matplotlib.rc_context(_STYLE):
+        height = width * (view[3] - view[2]) / (view[1] - view[0])
+        figure = Figure(figsize=(width * len(chosen), height + 0.45), layout="constrained")
+        axes = figure.subplots(1, len(chosen), squeeze=False)[0]
+        for ax, index in zip(axes, chosen, strict=True):
+            _table_axes(ax, view)
+            ax.plot(*cable_curve(run.target).T, color=LIGHT.target, lw=1.6, ls=(0, (4, 3)))
+            _draw_cable(ax, run, int(index), method)
+            ax.set_title(f"{run.times[index]:.0f} s   {run.error_cm[index]:.2f} cm", fontsize=10)
+        _scale_bar(axes[-1], view)
+    return figure
+
+
+def _present(runs: dict[Method, RunRecord]) -> list[Method]:
+    return [method for method in METHOD_ORDER if method in runs]
+
+
+def _table_axes(ax: Axes, view: tuple[float, float, float, float]) -> None:
+    ax.set(xlim=view[:2], ylim=view[2:], aspect="equal")
+    ax.axis("off")
+
+
+def _draw_cable(ax: Axes, run: RunRecord, index: int, method: Method) -> None:
+    colour = LIGHT.method(method)
+    for end in range(2):
+        for polygon in gripper_outline(run.gripper_pose[index, end], end):
+            ax.fill(*polygon.T, color=LIGHT.gripper, alpha=0.85 if method == "residual" else 0.3, lw=0)
+    ax.plot(*cable_curve(run.keypoints[index], run.gripper_pose[index]).T, color=colour, lw=2.2)
+    ax.plot(*run.keypoints[index].T, "o", color=colour, ms=3.0)
+
+
+def _scale_bar(ax: Axes, view: tuple[float, float, float, float], length: float = 0.2) -> None:
+    x, y = view[1] - 0.02, view[2] + 0.02
+    ax.plot([x - length, x], [y, y], color=LIGHT.muted, lw=1.5, solid_capstyle="butt")
+    ax.text(x - length / 2, y + 0.012, f"{100 * length:.0f} cm", ha="center", va="bottom", color=LIGHT.muted, fontsize=9)
+
+
+def _row_of_panels(shapes: list[str], label: str) -> tuple[Figure, np.ndarray]:
+    figure = Figure(figsize=(3.3 * len(shapes), 2.75), layout="constrained")
+    axes = figure.subplots(1, len(shapes), squeeze=False, sharey=True)[0]
+    for ax in axes:
+        ax.grid(axis="y")
+        ax.set_xlabel("time [s]")
+    axes[0].set_ylabel(label)
+    return figure, axes
+
+
+def _one_method_panels(records, quantity, label: str, method: Method) -> Figure:
+    pairs = {s: runs[method] for s, runs in pair_by_shape(records).items() if method in runs}
+    if not pairs:
+        raise ValueError(f"This figure needs runs with method {method!r}, got none.")
+    top = max(float(np.nanmax(quantity(run), initial=0.0)) for run in pairs.values())
+    with matplotlib.rc_context(_STYLE):
+        figure, axes = _row_of_panels(list(pairs), label)
+        for ax, (shape, run) in zip(axes, pairs.items(), strict=True):
+            values = quantity(run)
+            ax.fill_between(run.times, 0.0, values, color=LIGHT.method(method), alpha=0.18, lw=0)
+            ax.plot(run.times, values, color=LIGHT.method(method), lw=2.2)
+            ax.set_title(shape, fontsize=13)
+            ax.set_ylim(0.0, 1.08 * top or 1.0)
+    return figure
+
+
+def _method_legend(figure: Figure, records: list[RunRecord]) -> None:
+    present = {record.method for record in records}
+    handles = [Line2D([], [], color=LIGHT.method(m), lw=2.2, label=METHOD_LABEL[m]) for m in METHOD_ORDER[::-1] if m in present]
+    figure.legend(handles=handles, loc="outside upper left", ncols=2, handlelength=1.6)

@@ -1,0 +1,213 @@
+"""The report as one HTML page that needs nothing else: no network, no second file.
+
+Figures are inline SVG whose colours follow the page's, so that they read on a light and on a dark screen. The animation
+is drawn by a small script from the recorded runs; without scripts the GIF stands in its place.
+"""
+
+from __future__ import annotations
+
+import base64
+import html
+import importlib.resources
+import io
+import json
+import os
+import pathlib
+import re
+import string
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from cablejax.report import figures
+from cablejax.report.record import Method, RunRecord, pair_by_shape
+from cablejax.report.style import LIGHT, METHOD_LABEL, METHOD_ORDER, cable_curve, common_window, gripper_outline
+
+_UNITS_PER_METRE = 10_000
+_CSS_CLASS: dict[Method, str] = {"residual": "with", "direct": "without"}
+
+_SECTIONS: tuple[tuple[str, Callable[[list[RunRecord]], Figure], str], ...] = (
+    (
+        "Where the cable ended",
+        figures.final_shapes,
+        "The last sample of each run over its target (broad grey line). Dots are the observed keypoints.",
+    ),
+    (
+        "How the error fell",
+        figures.error_over_time,
+        "Root mean square keypoint distance to the target, on a logarithmic axis.",
+    ),
+    (
+        "What the online residual contributes",
+        figures.residual_share,
+        "Size of the residual's prediction relative to the learned model's and its own together, at each command. "
+        "It is fitted anew on the last samples before every command.",
+    ),
+    (
+        "How far the planner trusts itself",
+        figures.trust_region,
+        "The bound on one gripper's motion in one step. It grows while the predicted progress is made and shrinks "
+        "while it is not.",
+    ),
+)
+
+
+def write_page(
+    path: str | os.PathLike[str],
+    records: list[RunRecord],
+    summary: Mapping[str, Any],
+    *,
+    about: str,
+    facts: Mapping[str, str],
+    gif: str | os.PathLike[str],
+) -> None:
+    """Writes the page.
+
+    Args:
+        path: the file to write.
+        records: the runs.
+        summary: the demo's summary: `{"shapes": {name: {...}}, "total_s": ...}`.
+        about: what plant and model these runs had, in a sentence or two.
+        facts: versions, seed, machine: whatever is needed to make the page again, in order.
+        gif: the animation's file, inlined for readers without scripts.
+    """
+    pairs = pair_by_shape(records)
+    title, lead = headline(pairs)
+    here = importlib.resources.files("cablejax.report")
+    page = string.Template((here / "page.html").read_text(encoding="utf-8")).substitute(
+        title=html.escape(title),
+        lead=lead,
+        about=html.escape(about),
+        css=(here / "page.css").read_text(encoding="utf-8"),
+        player=(here / "player.js").read_text(encoding="utf-8"),
+        panels="\n".join(_panel(shape, runs) for shape, runs in pairs.items()),
+        toggles="\n".join(_toggle(method) for method in METHOD_ORDER[::-1] if any(method in r for r in pairs.values())),
+        table=_table(summary["shapes"]),
+        figures="\n".join(_figures(records)),
+        facts="\n".join(f"<dt>{html.escape(k)}</dt><dd>{html.escape(v)}</dd>" for k, v in facts.items()),
+        fallback="data:image/gif;base64," + base64.b64encode(pathlib.Path(gif).read_bytes()).decode(),
+        # "</" would end the script element; "<\/" is the same JSON.
+        data=json.dumps(animation_data(records), separators=(",", ":"), allow_nan=False).replace("</", "<\\/"),
+    )
+    pathlib.Path(path).write_text(page, encoding="utf-8")
+
+
+def headline(pairs: Mapping[str, Mapping[Method, RunRecord]]) -> tuple[str, str]:
+    """The result as a title and, in HTML, a sentence that says the numbers with and without the residual."""
+    names = _list(list(pairs))
+    main = {shape: runs.get("residual") or runs["direct"] for shape, runs in pairs.items()}
+    worst = max(run.final_error_cm for run in main.values())
+    start = _list([f"{run.error_cm[0]:.1f}" for run in main.values()])
+    title = f"The cable reaches {names} to within {worst:.2f} cm"
+    parts = [f"It starts {start} cm away."]
+    for method in METHOD_ORDER[::-1]:
+        errors = [f"{runs[method].final_error_cm:.2f}" for runs in pairs.values() if method in runs]
+        if errors:
+            words = METHOD_LABEL[method].capitalize()
+            parts.append(f'<span class="{_CSS_CLASS[method]}">{words}</span> it ends {_list(errors)} cm away.')
+    return title, " ".join(parts)
+
+
+def animation_data(records: list[RunRecord]) -> dict[str, Any]:
+    """What the player draws, as JSON: curves in whole tenths of a millimetre, poses in metres and radians."""
+
+    def integers(points: np.ndarray) -> list[int | None]:
+        flat = np.asarray(points, dtype=float).ravel() * _UNITS_PER_METRE
+        return [None if not np.isfinite(v) else round(v) for v in flat.tolist()]
+
+    def run(record: RunRecord) -> dict[str, Any]:
+        return {
+            "method": record.method,
+            "times": [round(float(t), 3) for t in record.times],
+            "error": [round(float(e), 4) for e in record.error_cm],
+            "pose": np.round(record.gripper_pose.reshape(len(record.times), 6), 5).tolist(),
+            "points": [integers(x) for x in record.keypoints],
+            "curve": [
+                integers(cable_curve(x, g, 49)) for x, g in zip(record.keypoints, record.gripper_pose, strict=True)
+            ],
+        }
+
+    pairs = pair_by_shape(records)
+    return {
+        "end": max(float(r.times[-1]) for r in records),
+        "view": common_window(records, margin=0.1),
+        "gripper": [[polygon.tolist() for polygon in gripper_outline(np.zeros(3), end)] for end in range(2)],
+        "shapes": [
+            {
+                "name": shape,
+                "target": integers(cable_curve(next(iter(runs.values())).target, n_points=97)),
+                "runs": [run(runs[method]) for method in METHOD_ORDER if method in runs],
+            }
+            for shape, runs in pairs.items()
+        ],
+    }
+
+
+def svg(figure: Figure, name: str) -> str:
+    """A figure as an inline SVG element whose colours are the page's; `name` keeps its ids apart from other figures'."""
+    buffer = io.StringIO()
+    figure.savefig(buffer, format="svg", transparent=True, metadata={"Date": None})
+    text = buffer.getvalue()
+    text = text[text.index("<svg") :]
+    text = re.sub(r"<metadata>.*?</metadata>", "", text, flags=re.DOTALL)
+    text = re.sub(r'\bid="', f'id="{name}-', text)
+    text = re.sub(r"url\(#", f"url(#{name}-", text)
+    text = re.sub(r'xlink:href="#', f'xlink:href="#{name}-', text)
+    for role in ("ink", "muted", "faint", "gripper", "target", "residual", "direct"):
+        text = re.sub(getattr(LIGHT, role), f"var(--{role})", text, flags=re.IGNORECASE)
+    return text
+
+
+def _figures(records: list[RunRecord]):
+    methods = {record.method for record in records}
+    for index, (heading, draw, caption) in enumerate(_SECTIONS):
+        if draw is figures.residual_share and "residual" not in methods:
+            continue
+        picture = svg(draw(records), f"figure{index}")
+        yield f"<h2>{heading}</h2>\n<figure>{picture}<figcaption>{html.escape(caption)}</figcaption></figure>"
+
+
+def _panel(shape: str, runs: Mapping[Method, RunRecord]) -> str:
+    name = html.escape(shape, quote=True)
+    readings = "".join(
+        f'<p class="reading {_CSS_CLASS[m]}"><b data-method="{m}"></b> cm {METHOD_LABEL[m]}</p>'
+        for m in METHOD_ORDER[::-1]
+        if m in runs
+    )
+    return (
+        f'    <div data-shape="{name}"><h3>{name}</h3>'
+        f'<canvas role="img" aria-label="The cable and its target {name}"></canvas>{readings}</div>'
+    )
+
+
+def _toggle(method: Method) -> str:
+    label = METHOD_LABEL[method]
+    return (
+        f'    <label class="{_CSS_CLASS[method]}"><input type="checkbox" data-show="{method}" checked>{label}</label>'
+    )
+
+
+def _table(shapes: Mapping[str, Mapping[str, Any]]) -> str:
+    columns = (
+        ("initial_error_cm", "initial<br>error [cm]", "{:.2f}", ""),
+        ("terminal_error_cm", "final error<br>with residual [cm]", "{:.2f}", "with"),
+        ("terminal_error_without_residual_cm", "final error<br>without residual [cm]", "{:.2f}", "without"),
+        ("settling_time_s", "settling<br>time [s]", "{:.0f}", ""),
+        ("mpc_ms_p50", "MPC<br>median [ms]", "{:.0f}", ""),
+        ("mpc_ms_p95", "MPC<br>95 % [ms]", "{:.0f}", ""),
+    )
+    head = "".join(f"<th>{label}</th>" for _, label, _, _ in columns)
+    rows = []
+    for shape, values in shapes.items():
+        cells = "".join(
+            f'<td class="{css}">{"–" if values.get(key) is None else form.format(values[key])}</td>'
+            for key, _, form, css in columns
+        )
+        rows.append(f"<tr><th>{html.escape(shape)}</th>{cells}</tr>")
+    return f"<table><thead><tr><th>shape</th>{head}</tr></thead><tbody>{''.join(rows)}</tbody></table>"
+
+
+def _list(words: list[str]) -> str:
+    return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} and {words[-1]}"

@@ -1,0 +1,138 @@
+"""Colours, names and the drawn curve: what every picture of the report shares.
+
+The colours are those of Okabe and Ito, which stay apart for colour-blind readers and in grey.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+from jaxtyping import Float
+from scipy.interpolate import CubicSpline
+
+from cablejax.report.record import Method, RunRecord
+
+METHOD_ORDER: tuple[Method, ...] = ("direct", "residual")
+"""Drawing order: the corrected model lies on top."""
+
+METHOD_LABEL: dict[Method, str] = {
+    "residual": "with online residual",
+    "direct": "without residual",
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class Colours:
+    """One colour scheme, as hexadecimal strings."""
+
+    background: str
+    ink: str
+    muted: str
+    faint: str
+    gripper: str
+    target: str
+    residual: str
+    direct: str
+
+    def method(self, method: Method) -> str:
+        """The colour of one method's lines."""
+        return self.residual if method == "residual" else self.direct
+
+
+LIGHT = Colours(
+    background="#ffffff",
+    ink="#1c2228",
+    muted="#5c6670",
+    faint="#d9dee3",
+    gripper="#3c4650",
+    target="#8b949d",
+    residual="#0072b2",
+    direct="#d55e00",
+)
+DARK = Colours(
+    background="#14181c",
+    ink="#e8ecef",
+    muted="#9aa5af",
+    faint="#343c44",
+    gripper="#b9c3cc",
+    target="#7f8a94",
+    residual="#56b4e9",
+    direct="#ff9d4d",
+)
+
+
+def cable_curve(
+    keypoints: Float[np.ndarray, "N 2"], gripper_pose: Float[np.ndarray, "2 3"] | None = None, n_points: int = 61
+) -> Float[np.ndarray, "P 2"]:
+    """A smooth curve through the keypoints [m], for drawing: a cubic spline in chord length, shape [n_points, 2].
+
+    With `gripper_pose` its end tangents are those of the grippers, as a clamped cable's are. Missing (NaN) keypoints are
+    left out.
+    """
+    points = np.asarray(keypoints, dtype=float)
+    points = points[np.isfinite(points).all(axis=1)]
+    distance = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(points, axis=0).T))])
+    keep = np.concatenate([[True], np.diff(distance) > 1e-9])
+    points, distance = points[keep], distance[keep]
+    if len(points) < 2:
+        return np.repeat(points[:1], n_points, axis=0)
+    ends = "not-a-knot"
+    if gripper_pose is not None:
+        theta = np.asarray(gripper_pose)[:, 2]
+        tangent = np.stack([np.cos(theta), np.sin(theta)], axis=1)
+        ends = ((1, tangent[0]), (1, tangent[1]))
+    return CubicSpline(distance, points, bc_type=ends)(np.linspace(0.0, distance[-1], n_points))
+
+
+def common_window(
+    records: list[RunRecord], margin: float = 0.12, *, final_only: bool = False
+) -> dict[str, tuple[float, float, float, float]]:
+    """For each shape a view (x0, x1, y0, y1) [m] of the table that holds all its runs; every view has the same size.
+
+    Args:
+        records: the runs.
+        margin: free space around the cable, where the grippers' bodies are drawn [m].
+        final_only: whether only the last sample has to be in view.
+    """
+    boxes: dict[str, tuple[np.ndarray, np.ndarray]] = {}
+    for record in records:
+        drawn = record.keypoints[-1:] if final_only else record.keypoints
+        points = np.concatenate([drawn.reshape(-1, 2), record.target])
+        low, high = np.nanmin(points, axis=0), np.nanmax(points, axis=0)
+        if record.shape in boxes:
+            low, high = np.minimum(low, boxes[record.shape][0]), np.maximum(high, boxes[record.shape][1])
+        boxes[record.shape] = low, high
+    width, height = np.max([high - low for low, high in boxes.values()], axis=0) + 2 * margin
+    half = 0.5 * np.array([width, height])
+    views = {}
+    for shape, (low, high) in boxes.items():
+        centre = 0.5 * (low + high)
+        (x0, y0), (x1, y1) = centre - half, centre + half
+        views[shape] = float(x0), float(x1), float(y0), float(y1)
+    return views
+
+
+def gripper_outline(pose: Float[np.ndarray, "3"], end: int, scale: float = 1.0) -> list[Float[np.ndarray, "K 2"]]:
+    """Polygons [m] of a parallel-jaw gripper seen from above: two jaws along the cable, a palm and a wrist behind them.
+
+    Args:
+        pose: (x, y, theta), theta the direction of the cable's tangent.
+        end: 0 where the cable leaves the gripper along theta, 1 where it comes in along theta.
+        scale: factor on the drawn size, 1 for jaws 5 cm long.
+    """
+    x, y, theta = np.asarray(pose, dtype=float)
+    back = -1.0 if end == 0 else 1.0
+    rotation = np.array([[np.cos(theta), -np.sin(theta)], [np.sin(theta), np.cos(theta)]])
+
+    def box(along: tuple[float, float], across: tuple[float, float]) -> np.ndarray:
+        corners = [(along[0], across[0]), (along[1], across[0]), (along[1], across[1]), (along[0], across[1])]
+        local = scale * np.array([(back * a, c) for a, c in corners])
+        return local @ rotation.T + [x, y]
+
+    return [
+        box((-0.022, 0.030), (0.008, 0.020)),
+        box((-0.022, 0.030), (-0.020, -0.008)),
+        box((0.030, 0.048), (-0.032, 0.032)),
+        box((0.048, 0.078), (-0.014, 0.014)),
+    ]

@@ -1,0 +1,185 @@
+"""Static equilibrium of the planar chain with both ends clamped, without friction.
+
+Minimises the bending energy `sum_i EI/(2h) (phi_i - h kappa_0i)^2` over the joint angles phi, subject to the far end's
+position and tangent, by Newton's method in the null space of the constraints. Negative curvature is reflected, so that
+the iteration ends in a minimum, a shape in which a real cable would rest, never in a saddle.
+"""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from cablejax.simulate.composite import link_lengths
+from cablejax.simulate.config import CableConfig
+from cablejax.types import CableState
+
+_MAX_ITERATIONS = 200
+_MAX_TURN = 0.2  # largest change of a joint angle in one iteration [rad]
+_MAX_STRETCH = 0.2  # largest correction of the far end in one iteration, relative to the length
+_TOLERANCE = 1e-10
+
+
+def equilibrium_angles(
+    config: CableConfig, gripper_pose: Float[np.ndarray, "2 3"], guess: Float[np.ndarray, "J"]
+) -> Float[np.ndarray, "J"]:
+    """Joint angles [rad] of the settled cable between two planar gripper poses, near `guess`.
+
+    Raises:
+        ValueError: the poses are out of reach of the cable, or the iteration does not settle.
+    """
+    pose = np.asarray(gripper_pose, np.float64)
+    h, lengths = config.link_length, link_lengths(config)
+    span = np.linalg.norm(pose[1, :2] - pose[0, :2])
+    if not np.all(np.isfinite(pose)):
+        raise ValueError(f"The gripper poses contain NaN or infinity: {pose.tolist()}.")
+    if span > config.length * (1 + 1e-9):
+        raise ValueError(
+            f"The grippers are {span:.4f} m apart, more than the cable's length of {config.length} m: bring them closer."
+        )
+    angles = np.array(guess, np.float64)
+    for _ in range(_MAX_ITERATIONS):
+        theta = pose[0, 2] + np.concatenate([[0.0], np.cumsum(angles)])
+        steps = lengths[:, None] * np.stack([np.cos(theta), np.sin(theta)], axis=1)
+        tip = pose[0, :2] + steps.sum(axis=0)
+        # what lies beyond joint i turns about it
+        beyond = np.cumsum(steps[::-1], axis=0)[::-1][1:]
+        jacobian = np.stack([-beyond[:, 1], beyond[:, 0], np.ones_like(angles)])
+        error = np.array([*(pose[1, :2] - tip), pose[1, 2] - theta[-1]])
+        gradient = angles / h
+        multiplier, *_ = np.linalg.lstsq(jacobian.T, gradient, rcond=None)
+        # second derivative of the tip with respect to angles i, j: minus what lies beyond the later one
+        later = np.maximum.outer(np.arange(len(angles)), np.arange(len(angles)))
+        hessian = np.eye(len(angles)) / h + multiplier[0] * beyond[later, 0] + multiplier[1] * beyond[later, 1]
+        range_space, singular, transposed = np.linalg.svd(jacobian)
+        null = transposed[3:].T
+        shrink = min(1.0, _MAX_STRETCH * config.length / max(np.abs(error).max(), 1e-300))
+        inverse = singular / (singular**2 + 1e-12 * singular[0] ** 2)
+        correction = transposed[:3].T @ (inverse * (range_space.T @ (shrink * error)))
+        values, vectors = np.linalg.eigh(null.T @ hessian @ null)
+        reduced = vectors.T @ (null.T @ (gradient + hessian @ correction))
+        step = correction - null @ (vectors @ (reduced / np.maximum(np.abs(values), 1e-6 / h)))
+        step *= min(1.0, _MAX_TURN / max(np.abs(step).max(), 1e-300))
+        angles += step
+        if np.abs(step).max() < _TOLERANCE and np.abs(error).max() < 1e-8:
+            return angles
+    raise ValueError(
+        f"No equilibrium found between gripper poses {pose.tolist()} in {_MAX_ITERATIONS} iterations: the remaining error "
+        f"of the far end is {np.abs(error).max():.2e}. Give a `guess` nearer to the shape, or poses further from taut."
+    )
+
+
+def arch_angles(config: CableConfig, gripper_pose: Float[np.ndarray, "2 3"]) -> Float[np.ndarray, "J"]:
+    """A first guess for `equilibrium_angles`: the tangent turns linearly between the ends, plus one gentle arch."""
+    pose = np.asarray(gripper_pose, np.float64)
+    span = np.linalg.norm(pose[1, :2] - pose[0, :2]) / config.length
+    fraction = np.linspace(0.0, 1.0, config.n_links)
+    chord = np.arctan2(pose[1, 1] - pose[0, 1], pose[1, 0] - pose[0, 0])
+    # An arch theta = a sin(2 pi s) shortens the span by a^2 / 4. The side is that to which the ends already lean.
+    lean = _wrap(pose[0, 2] - chord) - _wrap(pose[1, 2] - chord)
+    amplitude = 2.0 * np.sqrt(max(1.0 - span, 1e-6))
+    theta = pose[0, 2] + (pose[1, 2] - pose[0, 2]) * fraction
+    if abs(lean) < 1.0:
+        theta += np.sign(lean if lean else 1.0) * min(amplitude, 1.5) * np.sin(2 * np.pi * fraction)
+    return np.diff(theta)
+
+
+def angles_of_keypoints(
+    config: CableConfig, gripper_pose: Float[np.ndarray, "2 3"], keypoints: Float[np.ndarray, "N 2"]
+) -> Float[np.ndarray, "J"]:
+    """Joint angles of the chain through given keypoints; missing ones (NaN) are bridged."""
+    pose = np.asarray(gripper_pose, np.float64)
+    points = np.asarray(keypoints, np.float64)
+    seen = np.all(np.isfinite(points), axis=1)
+    if seen.sum() < 3:
+        raise ValueError(f"Only {seen.sum()} of {len(points)} keypoints are finite, expected at least 3 as a guess.")
+    arclength = np.linspace(0.0, config.length, len(points))[seen]
+    tangents = np.unwrap(np.arctan2(*np.diff(points[seen], axis=0).T[::-1]))
+    tangents += 2 * np.pi * np.round((pose[0, 2] - tangents[0]) / (2 * np.pi))
+    s = np.concatenate([[0.0], (arclength[1:] + arclength[:-1]) / 2, [config.length]])
+    theta = np.concatenate([[pose[0, 2]], tangents, [pose[1, 2]]])
+    nodes = np.arange(config.n_links) * config.link_length
+    return np.diff(np.interp(nodes, s, theta))
+
+
+def equilibrium_state(config: CableConfig, gripper_pose, *, guess=None) -> CableState:
+    """The settled cable as a `CableState`, for one pair of grippers or a batch `[*B, Q, P]`.
+
+    Raises:
+        ValueError: wrong shape, grippers out of reach, or spatial poses that do not share a plane.
+    """
+    pose = np.asarray(gripper_pose, np.float64)
+    width = 3 if config.dimension == 2 else 7
+    if pose.shape[-2:] != (2, width):
+        raise ValueError(f"gripper_pose has shape {pose.shape}, expected (..., 2, {width}).")
+    batch = pose.shape[:-2]
+    flat = pose.reshape(-1, 2, width)
+    guesses = [None] * len(flat) if guess is None else np.asarray(guess).reshape(len(flat), -1, config.dimension)
+    solve = _planar_qpos if config.dimension == 2 else _spatial_qpos
+    qpos = np.stack([solve(config, p, g) for p, g in zip(flat, guesses, strict=True)])
+    nv = config.n_joints + 3 if config.dimension == 2 else 3 * config.n_joints + 6
+    return CableState(
+        qpos=jnp.asarray(qpos.reshape(*batch, -1), float),
+        qvel=jnp.zeros((*batch, nv)),
+        gripper_pose=jnp.asarray(pose, float),
+    )
+
+
+def _planar_qpos(config, pose, guess):
+    start = arch_angles(config, pose) if guess is None else angles_of_keypoints(config, pose, guess)
+    return np.concatenate([pose[0], equilibrium_angles(config, pose, start)])
+
+
+def _spatial_qpos(config, pose, guess):
+    """Spatial poses in one plane, the grippers not twisted against each other: a planar problem, tilted."""
+    frames = [_rotation_matrix(q) for q in pose[:, 3:]]
+    chord = pose[1, :3] - pose[0, :3]
+    tangents = [frame[:, 0] for frame in frames]
+    vectors = np.stack([chord / max(np.linalg.norm(chord), 1e-12), *tangents])
+    normal = np.linalg.svd(vectors)[2][-1]
+    if np.abs(vectors @ normal).max() > 1e-6:
+        raise ValueError(
+            "Spatial gripper poses must share a plane with the line between them for an initial equilibrium. Start "
+            "from coplanar grippers and move them by a rollout."
+        )
+    # of the planes that contain a straight cable, take one that the grippers' own axes suggest
+    if np.linalg.matrix_rank(vectors, tol=1e-6) == 1:
+        normal = frames[0][:, 2]
+    axis = frames[0].T @ normal
+    in_plane = np.cross(normal, tangents[0])
+    angle = np.arctan2(tangents[1] @ in_plane, tangents[1] @ tangents[0])
+    turned = _quaternion(normal * angle)
+    if np.abs(_rotation_matrix(turned) @ frames[0] - frames[1]).max() > 1e-6:
+        raise ValueError(
+            "The grippers are twisted against each other about the cable's axis. Start untwisted and turn one by a rollout."
+        )
+    planar = np.array([[0.0, 0.0, 0.0], [chord @ tangents[0], chord @ in_plane, angle]])
+    flat_guess = None
+    if guess is not None:
+        relative = guess - pose[0, :3]
+        flat_guess = np.stack([relative @ tangents[0], relative @ in_plane], axis=1)
+    angles = _planar_qpos(config, planar, flat_guess)[3:]
+    joints = np.concatenate([_quaternion(axis * phi) for phi in angles])
+    return np.concatenate([pose[0], joints])
+
+
+def _wrap(angle):
+    return (angle + np.pi) % (2 * np.pi) - np.pi
+
+
+def _quaternion(rotation):
+    angle = np.linalg.norm(rotation)
+    axis = rotation / angle if angle > 0 else rotation
+    return np.concatenate([[np.cos(angle / 2)], np.sin(angle / 2) * axis])
+
+
+def _rotation_matrix(quaternion):
+    w, x, y, z = quaternion / np.linalg.norm(quaternion)
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )

@@ -1,0 +1,190 @@
+"""The differentiable engine: the chain's kinematics and inertia by MJX, its grasps in closed form."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from jaxtyping import Array, Float
+from mujoco import mjx
+
+from cablejax.simulate.compile import compiler_options
+from cablejax.simulate.composite import build_chain, refuse_plugins
+from cablejax.simulate.config import GRAVITY, CableConfig
+from cablejax.simulate.engine import Engine
+from cablejax.simulate.equilibrium import equilibrium_state
+from cablejax.simulate.friction import drag_coefficient, implicit_drag
+from cablejax.simulate.grasp import constrained_acceleration
+from cablejax.simulate.keypoints import hermite_weights
+from cablejax.simulate.kinematics import chain_kinematics
+from cablejax.simulate.pose import integrate_pose, pose_velocity, quaternion_of, quaternion_product
+from cablejax.types import CableParams, CableState, Trajectory
+
+
+@dataclasses.dataclass(frozen=True)
+class MjxEngine(Engine):
+    """A cable in MJX: vmapped, jitted, differentiable in forward and reverse mode.
+
+    `rollout` is the entry for whole batches and compiles itself. `unroll` is the same for one cable as a pure function,
+    to be composed with `jax.grad`, `jax.vmap` and `jax.jit`. On CPU pass `cablejax.simulate.compiler_options()` to the
+    outermost `jax.jit`.
+
+    Attributes:
+        config: the cable, its resolution and time step.
+    """
+
+    config: CableConfig = CableConfig()
+
+    @functools.cached_property
+    def mj_model(self) -> mujoco.MjModel:
+        """The MuJoCo model of the bare chain."""
+        model = build_chain(self.config)
+        refuse_plugins(model)
+        return model
+
+    def initial_state(self, gripper_pose, *, guess=None) -> CableState:
+        return equilibrium_state(self.config, gripper_pose, guess=guess)
+
+    def keypoints(self, state: CableState) -> Float[Array, "N D"]:
+        """Keypoints of one cable [m]. Differentiable in `state.qpos`."""
+        model = mjx.put_model(self.mj_model)
+        data = chain_kinematics(self.config, mjx.make_data(model).replace(qpos=state.qpos))
+        return self._observe(data)
+
+    def rollout(self, params, state, twist, interval=1.0):
+        twist = jnp.asarray(twist)
+        self.check_twist(twist)
+        self.substeps(interval)
+        return _compiled_rollout(self, twist.ndim - 3, float(interval))(params, state, twist)
+
+    def unroll(
+        self, params: CableParams, state: CableState, twist: Float[Array, "T Q V"], interval: float = 1.0
+    ) -> tuple[CableState, Trajectory]:
+        """`rollout` of one cable, uncompiled. Differentiable in `params`, `state` and `twist`."""
+        count = self.substeps(interval)
+        model = self._with_params(mjx.put_model(self.mj_model), params)
+        template = mjx.make_data(model)
+
+        def interval_step(state: CableState, twist):
+            start = state.gripper_pose
+
+            def substep(carry, i):
+                qpos, qvel = carry
+                target = integrate_pose(start, twist, (i + 1) * self.config.timestep)
+                return self._step(model, template, params, qpos, qvel, target), None
+
+            # Remember the start of each interval only: reverse mode recomputes the inside.
+            (qpos, qvel), _ = jax.lax.scan(substep, (state.qpos, state.qvel), jnp.arange(count))
+            state = CableState(qpos=qpos, qvel=qvel, gripper_pose=integrate_pose(start, twist, interval))
+            return state, (qpos, state.gripper_pose)
+
+        final, (qpos, poses) = jax.lax.scan(jax.checkpoint(interval_step), state, twist)
+        qpos = jnp.concatenate([state.qpos[None], qpos])
+        trajectory = Trajectory(
+            keypoints=jax.vmap(lambda q: self._observe(chain_kinematics(self.config, template.replace(qpos=q))))(qpos),
+            gripper_pose=jnp.concatenate([state.gripper_pose[None], poses]),
+            gripper_twist=twist,
+        )
+        return final, trajectory
+
+    def _with_params(self, model: mjx.Model, params: CableParams) -> mjx.Model:
+        """The model with every differentiable parameter put in."""
+        h = self.config.link_length
+        stiffness = params.bending_stiffness / h
+        damping = params.damping_time * stiffness
+        density_ratio = params.linear_density / self.config.linear_density
+        if self.config.dimension == 2:
+            zeros = jnp.zeros(3, stiffness.dtype)
+            springref = jnp.concatenate([zeros, params.rest_curvature * h])
+            jnt_stiffness = jnp.concatenate([zeros, stiffness])
+            dof_damping = jnp.concatenate([zeros, damping])
+        else:
+            rest = quaternion_of(params.rest_curvature * h)
+            springref = jnp.concatenate([model.qpos_spring[:7], rest.reshape(-1)])
+            jnt_stiffness = jnp.concatenate([jnp.zeros(1, stiffness.dtype), stiffness])
+            dof_damping = jnp.concatenate([jnp.zeros(6, damping.dtype), jnp.repeat(damping, 3)])
+        return model.replace(
+            jnt_stiffness=jnt_stiffness,
+            dof_damping=dof_damping,
+            qpos_spring=springref,
+            body_mass=model.body_mass * density_ratio,
+            body_inertia=model.body_inertia * density_ratio,
+        )
+
+    def _step(self, model, template, params, qpos, qvel, target):
+        """One linearly implicit Euler step that ends with the grippers at `target`."""
+        dt = self.config.timestep
+        planar = self.config.dimension == 2
+        data = chain_kinematics(self.config, template.replace(qpos=qpos, qvel=qvel))
+        data = mjx.com_vel(model, mjx.crb(model, mjx.com_pos(model, data)))
+        data = mjx.rne(model, mjx.passive(model, data))
+        jacobian, rotation = self._node_jacobians(model, data)
+
+        inertia = mjx.full_m(model, data) + dt * jnp.diag(model.dof_damping)
+        force = data.qfrc_passive - data.qfrc_bias
+        if planar:
+            free = jacobian[1:-1, :, :2]
+            velocity = jnp.einsum("kid,i->kd", free, qvel)
+            load = params.linear_density * self.config.link_length * GRAVITY * jnp.ones(free.shape[0], qvel.dtype)
+            drag = drag_coefficient(velocity, load, params.friction_coefficient, self.config.friction_speed)
+            damping, drag_force = implicit_drag(free, drag, velocity)
+            inertia, force = inertia + dt * damping, force + drag_force
+
+        held = jnp.array([0, -1])
+        linear, angular = jacobian[held], rotation[held]
+        if planar:
+            rows = jnp.concatenate([linear[:, :, :2], angular[:, :, 2:]], axis=2)
+        else:
+            rows = jnp.concatenate([linear, angular], axis=2)
+        rows = rows.transpose(0, 2, 1).reshape(-1, qvel.shape[0])
+        wanted = pose_velocity(self._held_pose(data), target, dt).reshape(-1)
+        qacc = constrained_acceleration(inertia, force, rows, (wanted - rows @ qvel) / dt)
+        qvel = qvel + dt * qacc
+        return self._integrate(qpos, qvel, dt), qvel
+
+    def _node_jacobians(self, model, data) -> tuple[Float[Array, "n nv 3"], Float[Array, "n nv 3"]]:
+        """Jacobians of every node's position and every link's orientation, in the world's frame."""
+        nodes = data.xipos[1:]
+        # a joint moves all links beyond it; the tree is a chain, so the mask is a staircase known before tracing
+        mask = jnp.asarray(np.asarray(model.dof_bodyid)[None] <= np.arange(1, nodes.shape[0] + 1)[:, None], nodes.dtype)
+        angular, linear = data.cdof[:, :3], data.cdof[:, 3:]
+        offset = nodes - data.subtree_com[1]
+        jacobian = linear[None] + jnp.cross(angular[None], offset[:, None])
+        return jacobian * mask[..., None], angular[None] * mask[..., None]
+
+    def _held_pose(self, data) -> Float[Array, "Q P"]:
+        """Where the held ends are: (x, y, theta) or (position, quaternion)."""
+        ends = data.xipos[jnp.array([1, -1])]
+        if self.config.dimension == 3:
+            return jnp.concatenate([ends, data.xquat[jnp.array([1, -1])]], axis=1)
+        # the sum of the hinge angles, not an arctangent: theta is not wrapped
+        theta = jnp.stack([data.qpos[2], jnp.sum(data.qpos[2:])])
+        return jnp.concatenate([ends[:, :2], theta[:, None]], axis=1)
+
+    def _integrate(self, qpos, qvel, dt):
+        if self.config.dimension == 2:
+            return qpos + dt * qvel
+        position = qpos[:3] + dt * qvel[:3]
+        quaternions = jnp.concatenate([qpos[3:7][None], qpos[7:].reshape(-1, 4)])
+        # angular velocities of joints are in the child's own frame, hence the product from the right
+        turned = quaternion_product(quaternions, quaternion_of(dt * qvel[3:].reshape(-1, 3)))
+        return jnp.concatenate([position, turned.reshape(-1)])
+
+    def _observe(self, data) -> Float[Array, "N D"]:
+        positions_w, tangents_w = hermite_weights(self.config)
+        dimension = self.config.dimension
+        nodes = data.xipos[1:, :dimension]
+        tangents = data.xmat[1:, :dimension, 0]
+        return jnp.asarray(positions_w, nodes.dtype) @ nodes + jnp.asarray(tangents_w, nodes.dtype) @ tangents
+
+
+@functools.lru_cache(maxsize=32)
+def _compiled_rollout(engine: MjxEngine, batch_axes: int, interval: float):
+    function = functools.partial(engine.unroll, interval=interval)
+    for _ in range(batch_axes):
+        function = jax.vmap(function)
+    return jax.jit(function, compiler_options=compiler_options())

@@ -1,0 +1,137 @@
+"""Random gripper motions within what a cable can bear."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float
+
+from cablejax.simulate.config import CableConfig
+
+_MAX_REDRAWS = 50
+
+
+@dataclasses.dataclass(frozen=True)
+class MotionConfig:
+    """How the grippers move at random, and the poses they keep to.
+
+    Velocities follow a first-order autoregressive process in each gripper's (vx, vy, omega). Its scale and persistence
+    are drawn anew for every trajectory, so that the data hold slow and fast, jerky and steady motions.
+
+    Attributes:
+        start: "straight" (ends almost the full length apart, aligned) or "random" poses.
+        max_step: bound of `sqrt(vx^2 + vy^2 + (rotation_weight omega)^2)` times the interval [m].
+        rotation_weight: metres that one radian counts for [m/rad].
+        min_scale: the slowest trajectories move at this fraction of the bound.
+        max_persistence: correlation of the velocity from step to step is drawn from [0, max_persistence].
+        rest_probability: chance that the grippers stand still for one step.
+        straight_slack: of a straight start, relative to the length. A cable without slack could not move at all.
+        min_distance: least distance of the grippers, relative to the length.
+        max_angle: largest angle between a gripper and the line through both [rad].
+        max_curvature: that the grippers may force upon the cable near taut [1/m].
+    """
+
+    start: Literal["straight", "random"] = "straight"
+    max_step: float = 0.05
+    rotation_weight: float = 0.15
+    min_scale: float = 0.1
+    max_persistence: float = 0.95
+    rest_probability: float = 0.05
+    straight_slack: float = 0.002
+    min_distance: float = 0.15
+    max_angle: float = 2.2
+    max_curvature: float = 12.0
+
+
+def random_motion(
+    rng: np.random.Generator,
+    config: CableConfig,
+    n_steps: int,
+    motion: MotionConfig = MotionConfig(),
+    interval: float = 1.0,
+) -> tuple[Float[np.ndarray, "Q 3"], Float[np.ndarray, "T Q 3"]]:
+    """Draws a start pose and n_steps twists. Every pose on the way is within `admissible`.
+
+    Args:
+        rng: source of all randomness.
+        config: the cable.
+        n_steps: number of commands T.
+        motion: see `MotionConfig`.
+        interval: duration of each command [s].
+
+    Returns:
+        Gripper poses (x, y, theta) at the start [Q, 3] and twists [T, Q, 3] in m/s and rad/s.
+    """
+    pose = _straight_start(rng, config, motion) if motion.start == "straight" else _random_start(rng, config, motion)
+    first = pose.copy()
+    scale = np.exp(rng.uniform(np.log(motion.min_scale), 0.0))
+    persistence = rng.uniform(0.0, motion.max_persistence)
+    unit = np.array([1.0, 1.0, 1.0 / motion.rotation_weight]) * scale * motion.max_step / interval / np.sqrt(2.0)
+    velocity = rng.standard_normal((2, 3))
+    twists = np.zeros((n_steps, 2, 3))
+    for t in range(n_steps):
+        if rng.random() < motion.rest_probability:
+            continue
+        innovation = np.sqrt(1.0 - persistence**2)
+        proposal = persistence * velocity + innovation * rng.standard_normal((2, 3))
+        for _ in range(_MAX_REDRAWS):
+            twist = bound_twist(proposal * unit, motion.max_step / interval, motion.rotation_weight)
+            if admissible(config, motion, pose + interval * twist):
+                velocity, twists[t] = proposal, twist
+                pose = pose + interval * twist
+                break
+            proposal = rng.standard_normal((2, 3))
+        else:
+            velocity = np.zeros((2, 3))
+    return first, twists
+
+
+def bound_twist(
+    twist: Float[np.ndarray, "Q 3"], bound: float, rotation_weight: float
+) -> Float[np.ndarray, "Q 3"]:
+    """Scales each gripper's twist down to `sqrt(vx^2 + vy^2 + (rotation_weight omega)^2) <= bound`."""
+    size = np.linalg.norm(twist * np.array([1.0, 1.0, rotation_weight]), axis=-1, keepdims=True)
+    return twist * np.minimum(1.0, bound / np.maximum(size, 1e-12))
+
+
+def admissible(config: CableConfig, motion: MotionConfig, pose: Float[np.ndarray, "Q 3"]) -> bool:
+    """Whether the cable can take these poses without being pulled taut or bent beyond `max_curvature` at a grip.
+
+    An end that leaves the line through both grippers at angle a must bend there and back. On arcs of radius
+    R = 1 / max_curvature this takes 2 R (|a| - sin |a|) of the length.
+    """
+    chord = pose[1, :2] - pose[0, :2]
+    distance = np.linalg.norm(chord)
+    angles = np.abs(_wrap(pose[:, 2] - np.arctan2(chord[1], chord[0])))
+    detour = 2.0 / motion.max_curvature * np.sum(angles - np.sin(angles))
+    return bool(
+        distance >= motion.min_distance * config.length
+        and distance <= config.length * (1.0 - motion.straight_slack) - detour
+        and angles.max() <= motion.max_angle
+    )
+
+
+def _straight_start(rng, config, motion):
+    """Aligned grippers along a random direction; the slack lets the cable lean to a random side."""
+    half = 0.5 * config.length * (1.0 - 1.5 * motion.straight_slack)
+    lean = rng.choice([-1.0, 1.0]) * 0.01
+    heading = rng.uniform(-np.pi, np.pi)
+    offset = half * np.array([np.cos(heading), np.sin(heading)])
+    return np.array([[*-offset, heading + lean], [*offset, heading - lean]])
+
+
+def _random_start(rng, config, motion):
+    while True:
+        half = 0.5 * config.length * rng.uniform(motion.min_distance, 1.0)
+        heading = rng.uniform(-np.pi, np.pi)
+        offset = half * np.array([np.cos(heading), np.sin(heading)])
+        angles = heading + rng.uniform(-motion.max_angle, motion.max_angle, 2)
+        pose = np.array([[*-offset, angles[0]], [*offset, angles[1]]])
+        if admissible(config, motion, pose):
+            return pose
+
+
+def _wrap(angle):
+    return (angle + np.pi) % (2 * np.pi) - np.pi

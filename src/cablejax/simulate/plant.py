@@ -1,0 +1,284 @@
+"""The plant: a cable that stands for reality, with contact and friction that the trained simulator does not have.
+
+C MuJoCo, in space: a chain of capsules on ball joints lies on a table under gravity and touches it by capsule-plane
+contacts with elliptic friction cones. The planar simulator that yields training data has another resolution, another
+time step, hinges instead of ball joints and a regularised friction law without contacts.
+
+Two choices make it usable. MuJoCo's "discrete" integrator solves the constraints in the effective metric
+`M + dt D + dt^2 K` and so takes steps of 2-5 ms where the others blow up below 1 ms. And the grasp is a weld without
+damping whose stiffness is far above `m / dt^2`: under that integrator the held link is at the mocap body's pose at
+the end of every single step, so the grippers neither lag nor yield.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import mujoco
+import numpy as np
+from jaxtyping import Float
+
+from cablejax.simulate.composite import link_bodies, link_lengths, node_offsets
+from cablejax.simulate.config import GRAVITY, CableConfig
+from cablejax.simulate.elastica import solve_elastica
+from cablejax.simulate.keypoints import hermite_weights
+
+GRASP_STIFFNESS = 100.0
+"""Stiffness of the grasp in units of `1 / dt^2`: a held link trails a jump of the command's speed by dv dt / 100."""
+HELD_MASS, HELD_RADIUS = 10.0, 0.1
+"""Sphere [kg, m] at each held link: a gripper is heavy, and the heavier the link the stiffer MuJoCo's grasp."""
+TAUT = 0.999
+"""Largest distance between the grippers, in lengths of the cable, before the plant refuses to pull."""
+FRICTIONLESS = 1e-5
+"""MuJoCo's smallest friction coefficient."""
+
+
+class PlantError(RuntimeError):
+    """The simulation of the plant became unstable."""
+
+
+@dataclasses.dataclass(frozen=True)
+class PlantConfig:
+    """What the plant is made of; the defaults are the reference cable, finer than the trained one.
+
+    Attributes:
+        cable: geometry, links, time step and nominal physics. `friction_speed` has no meaning here and `dimension`
+            must be 3.
+        stiffness_ratio: the plant's EI over the nominal one, a factor on `cable.bending_stiffness`.
+        cone_ratio: MuJoCo's `impratio`: how much harder the friction cone's tangent is than its normal direction; it
+            sets how slowly a cable at rest creeps.
+        contact_time: time constant of the table's contacts [s].
+        keypoint_noise: standard deviation of the observed keypoints [m] per coordinate, the held ends included.
+        settle_time: simulated time [s] given to a new cable to settle, once without and once with friction.
+        seed: of the observation noise.
+    """
+
+    cable: CableConfig = CableConfig(n_links=40, dimension=3, timestep=0.004)
+    stiffness_ratio: float = 1.0
+    cone_ratio: float = 10.0
+    contact_time: float = 0.01
+    keypoint_noise: float = 0.0
+    settle_time: float = 1.0
+    seed: int = 0
+
+    def __post_init__(self):
+        if self.cable.dimension != 3:
+            raise ValueError(f"PlantConfig.cable.dimension is {self.cable.dimension}, expected 3: the plant is in space.")
+        for name in ("stiffness_ratio", "cone_ratio", "contact_time", "settle_time"):
+            value = getattr(self, name)
+            if not (np.isfinite(value) and value > 0):
+                raise ValueError(f"PlantConfig.{name} is {value}, expected a positive finite number.")
+        if not (np.isfinite(self.keypoint_noise) and self.keypoint_noise >= 0):
+            raise ValueError(f"PlantConfig.keypoint_noise is {self.keypoint_noise}, expected a finite number >= 0 [m].")
+
+
+@dataclasses.dataclass(frozen=True)
+class Observation:
+    """What a camera over the table and the arms' encoders report at one instant.
+
+    Attributes:
+        keypoints: [m], float64, shape [N, 2].
+        gripper_pose: (x, y, theta) of both grippers [m, rad], shape [Q, 3]; theta counts turns.
+        time: since the last reset [s].
+    """
+
+    keypoints: Float[np.ndarray, "N 2"]
+    gripper_pose: Float[np.ndarray, "Q 3"]
+    time: float
+
+
+def plant_model(config: PlantConfig) -> mujoco.MjModel:
+    """The MuJoCo model of the plant: table, composite cable, and one mocap body welded to each held link."""
+    cable = config.cable
+    h, dt = cable.link_length, cable.timestep
+    stiffness = config.stiffness_ratio * cable.bending_stiffness / h
+    vertices = np.concatenate([[0.0], np.cumsum(link_lengths(cable))])
+    spec = mujoco.MjSpec.from_string(f"""
+        <mujoco>
+          <option timestep="{dt}" integrator="discrete" cone="elliptic" impratio="{config.cone_ratio}"
+                  gravity="0 0 {-GRAVITY}" tolerance="1e-8"/>
+          <worldbody>
+            <geom name="table" type="plane" size="5 5 0.1" contype="1" conaffinity="0" condim="3" priority="1"
+                  solref="{config.contact_time} 1" solimp="0.95 0.99 0.001"/>
+            <composite type="cable" prefix="cable" initial="free" vertex="{" ".join(f"{s:.9g} 0 0" for s in vertices)}">
+              <joint kind="main" stiffness="{stiffness}" damping="{stiffness * cable.damping_time}"/>
+              <geom type="capsule" size="{cable.diameter / 2}" contype="0" conaffinity="1"/>
+            </composite>
+          </worldbody>
+        </mujoco>""")
+    links = link_bodies(spec)
+    for link, length in zip(links, link_lengths(cable), strict=True):
+        link.geoms[0].mass = cable.linear_density * length
+    for gripper, (link, offset) in enumerate(((links[0], 0.0), (links[-1], h / 2))):
+        link.geoms[0].conaffinity = 0  # the gripper carries its link: it neither rubs on the table nor weighs on it
+        link.gravcomp = 1.0
+        link.add_geom(
+            type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[HELD_RADIUS, 0, 0], pos=[offset, 0, 0], mass=HELD_MASS,
+            contype=0, conaffinity=0,
+        )  # fmt: skip
+        mocap = spec.worldbody.add_body(name=f"gripper_{gripper}", mocap=True)
+        weld = spec.add_equality(
+            type=mujoco.mjtEq.mjEQ_WELD, objtype=mujoco.mjtObj.mjOBJ_BODY, name1=mocap.name, name2=link.name,
+            solref=[-GRASP_STIFFNESS / dt**2, 0.0], solimp=[0.9999, 0.9999, 0.001, 0.5, 2.0],
+        )  # fmt: skip
+        data = np.zeros(12)
+        data[6], data[10] = 1.0, 1.0  # identity quaternion between mocap and link, unit weight of the rotation
+        weld.data = data
+    model = spec.compile()
+    model.geom("table").friction[0] = max(cable.friction_coefficient, FRICTIONLESS)
+    return model
+
+
+class Plant:
+    """A cable on a table between two grippers: `reset` once, then `step` it with commands.
+
+    Unlike everything else in the package the plant has a state of its own, as reality does.
+    """
+
+    def __init__(self, config: PlantConfig | None = None):
+        self.config = PlantConfig() if config is None else config
+        self.model = plant_model(self.config)
+        self._data = mujoco.MjData(self.model)
+        names = (self.model.body(i).name for i in range(self.model.nbody))
+        self._links = np.array([i for i, name in enumerate(names) if name.startswith("cable")])
+        self._offsets = node_offsets(self.config.cable)[:, None]
+        self._weights = hermite_weights(self.config.cable)
+        self._pose = np.full((2, 3), np.nan)
+        self._noise = np.random.default_rng(self.config.seed)
+        self._time = np.nan
+
+    def reset(
+        self, gripper_pose: Float[np.ndarray, "Q 3"], *, guess: Float[np.ndarray, "S 2"] | None = None
+    ) -> Observation:
+        """Lay a new cable on the table, at rest and with no friction locked in, and restart clock and noise.
+
+        Args:
+            gripper_pose: (x, y, theta) of both grippers [m, rad], shape [2, 3].
+            guess: points of a similar shape [m], where several shapes fit these grippers; see `solve_elastica`.
+
+        Raises:
+            ValueError: a pose is not finite, of another shape, or the grippers are too far apart; the cable at rest
+                between them could not be found.
+        """
+        pose = _checked("gripper_pose", gripper_pose)
+        self._check_distance(pose)
+        cable, data = self.config.cable, self._data
+        # A chain's links follow the elastica's chords; only the held ones have the exact direction of the grippers.
+        shape = solve_elastica(pose, cable.length, guess=guess, n_samples=2 * cable.n_joints + 1)
+        vertices = np.concatenate([shape.position[:1], shape.position[1:-1:2], shape.position[-1:]])
+        chords = np.diff(vertices, axis=0)
+        angles = np.unwrap(np.arctan2(chords[:, 1], chords[:, 0]))
+        angles[[0, -1]] = pose[:, 2]
+        mujoco.mj_resetData(self.model, data)
+        data.qpos[:2], data.qpos[2] = pose[0, :2], cable.diameter / 2
+        data.qpos[3:] = _quaternions(np.diff(angles, prepend=0.0)).ravel()
+        self._pose, self._time = pose, 0.0
+        self._noise = np.random.default_rng(self.config.seed)
+        friction = self.model.geom("table").friction
+        friction[0] = FRICTIONLESS
+        self._advance(np.zeros((2, 3)), self._steps(self.config.settle_time))
+        friction[0] = max(cable.friction_coefficient, FRICTIONLESS)
+        self._advance(np.zeros((2, 3)), self._steps(self.config.settle_time))
+        self._time = 0.0
+        return self.observe()
+
+    def step(self, twist: Float[np.ndarray, "Q 3"], interval: float = 1.0) -> Observation:
+        """Hold a command for one interval and observe the cable at its end.
+
+        Args:
+            twist: (vx, vy, omega) of both grippers in the world's frame [m/s, rad/s], shape [2, 3].
+            interval: [s], a whole number of time steps.
+
+        Raises:
+            ValueError: the command is not finite, of another shape, or would pull the cable taut; the plant has not
+                moved then.
+            PlantError: the simulation became unstable.
+        """
+        return self.record(twist, interval, samples=1)[-1]
+
+    def record(self, twist: Float[np.ndarray, "Q 3"], interval: float = 1.0, *, samples: int) -> list[Observation]:
+        """As `step`, with `samples` observations evenly spread over the interval, the last one at its end."""
+        if np.isnan(self._time):
+            raise ValueError("The plant has no cable yet: call reset(gripper_pose) first.")
+        twist = _checked("twist", twist)
+        steps = self._steps(interval)
+        if samples < 1 or steps % samples:
+            raise ValueError(
+                f"{samples} samples in {interval} s do not fall on time steps of {self.config.cable.timestep} s: "
+                f"choose a divisor of {steps}."
+            )
+        self._check_distance(self._pose + interval * twist)
+        observations = []
+        for _ in range(samples):
+            self._advance(twist, steps // samples)
+            observations.append(self.observe())
+        return observations
+
+    def observe(self) -> Observation:
+        """Keypoints and gripper poses now, with the configured noise (drawn anew by every call)."""
+        cable = self.config.cable
+        nodes, tangents = self.nodes()
+        keypoints = self._weights[0] @ nodes + self._weights[1] @ tangents
+        noise = self.config.keypoint_noise * self._noise.standard_normal((cable.n_keypoints, 2))
+        return Observation(keypoints=keypoints[:, :2] + noise, gripper_pose=self._pose.copy(), time=self._time)
+
+    def nodes(self) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
+        """Middle of every link, for the two held links the grasped end [m], and the links' unit directions."""
+        data = self._data
+        directions = data.xmat[self._links].reshape(-1, 3, 3)[:, :, 0]
+        return data.xpos[self._links] + self._offsets * directions, directions.copy()
+
+    def _advance(self, twist: np.ndarray, steps: int) -> None:
+        """`steps` time steps under one twist; the mocap bodies lead to the pose at the end of each."""
+        model, data, dt = self.model, self._data, self.config.cable.timestep
+        start = self._pose
+        for step in range(1, steps + 1):
+            self._place_grippers(start + (step * dt) * twist)
+            mujoco.mj_step(model, data)
+        mujoco.mj_kinematics(model, data)
+        self._pose = start + (steps * dt) * twist
+        self._time += steps * dt
+        if data.warning[mujoco.mjtWarning.mjWARN_BADQACC].number or not np.isfinite(data.qpos).all():
+            raise PlantError(
+                f"The plant's simulation became unstable at {self._time:.3f} s: use a shorter timestep than {dt} s or "
+                "gentler commands."
+            )
+
+    def _place_grippers(self, pose: np.ndarray) -> None:
+        """Mocap bodies coincide with the frames of the held links, whose origins are their starts."""
+        data, cable = self._data, self.config.cable
+        heading = np.array([np.cos(pose[1, 2]), np.sin(pose[1, 2])])
+        data.mocap_pos[:, :2] = pose[:, :2]
+        data.mocap_pos[1, :2] -= 0.5 * cable.link_length * heading
+        data.mocap_pos[:, 2] = cable.diameter / 2
+        data.mocap_quat[:] = _quaternions(pose[:, 2])
+
+    def _steps(self, interval: float) -> int:
+        steps = round(interval / self.config.cable.timestep)
+        if steps < 1 or abs(steps * self.config.cable.timestep - interval) > 1e-9:
+            raise ValueError(f"{interval} s is not a whole number of time steps of {self.config.cable.timestep} s.")
+        return steps
+
+    def _check_distance(self, pose: np.ndarray) -> None:
+        # A twist moves one gripper along a straight line relative to the other, so its end has the largest distance.
+        distance, length = np.hypot(*(pose[1, :2] - pose[0, :2])), self.config.cable.length
+        if distance > TAUT * length:
+            raise ValueError(
+                f"The grippers would be {distance:.4g} m apart and pull the cable of {length:.4g} m taut: keep them "
+                f"within {TAUT * length:.4g} m."
+            )
+
+
+def _checked(name: str, value: np.ndarray) -> np.ndarray:
+    array = np.array(value, dtype=float)
+    if array.shape != (2, 3):
+        raise ValueError(f"{name} has shape {array.shape}, expected (2, 3): one planar row for each of two grippers.")
+    if not np.isfinite(array).all():
+        raise ValueError(f"{name} is not finite: {array.tolist()}. Check what produced it; the plant has not moved.")
+    return array
+
+
+def _quaternions(angles: np.ndarray) -> np.ndarray:
+    """Rotations about z as (w, x, y, z), shape [..., 4]."""
+    zero = np.zeros_like(angles)
+    return np.stack([np.cos(angles / 2), zero, zero, np.sin(angles / 2)], axis=-1)

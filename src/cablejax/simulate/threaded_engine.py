@@ -1,0 +1,244 @@
+"""The engine for data on CPU: C MuJoCo in threads, one cable per thread, without Python inside the loop."""
+
+from __future__ import annotations
+
+import concurrent.futures
+import copy
+import ctypes
+import dataclasses
+import functools
+import os
+import pathlib
+
+import jax.numpy as jnp
+import mujoco
+import numba
+import numpy as np
+
+from cablejax.simulate.composite import build_grasped_chain
+from cablejax.simulate.config import GRAVITY, CableConfig
+from cablejax.simulate.engine import Engine
+from cablejax.simulate.equilibrium import equilibrium_state
+from cablejax.simulate.keypoints import hermite_weights
+from cablejax.types import CableParams, CableState, Trajectory
+
+
+@dataclasses.dataclass(frozen=True)
+class ThreadedEngine(Engine):
+    """C MuJoCo stepped by `mj_step1` and `mj_step2`, its grasps by MuJoCo's own constraint solver. Not differentiable.
+
+    The loop over time steps is compiled by numba and calls MuJoCo's C functions directly: friction depends on the
+    velocity, which `mujoco.rollout` cannot feed back, and a Python callback would hold the interpreter's lock.
+
+    Attributes:
+        config: the cable, its resolution and time step.
+        n_threads: threads to use; None = one per core.
+    """
+
+    config: CableConfig = CableConfig()
+    n_threads: int | None = None
+
+    @functools.cached_property
+    def mj_model(self) -> mujoco.MjModel:
+        """The MuJoCo model: the chain welded to two mocap bodies."""
+        return build_grasped_chain(self.config)
+
+    def initial_state(self, gripper_pose, *, guess=None) -> CableState:
+        return equilibrium_state(self.config, gripper_pose, guess=guess)
+
+    def rollout(self, params, state, twist, interval=1.0):
+        twist = np.asarray(twist, np.float64)
+        self.check_twist(twist)
+        count = self.substeps(interval)
+        batch = twist.shape[:-3]
+        size = int(np.prod(batch))
+        flatten = lambda leaf, rank: np.asarray(leaf, np.float64).reshape(size, *np.shape(leaf)[len(batch) :][:rank])
+        flat_twist = flatten(twist, 3)
+        flat_state = [flatten(leaf, 2) for leaf in (state.qpos, state.qvel, state.gripper_pose)]
+        flat_params = CableParams(
+            *(flatten(getattr(params, field.name), 2) for field in dataclasses.fields(CableParams))
+        )
+        samples = twist.shape[-3] + 1
+        keypoints = np.empty((size, samples, self.config.n_keypoints, self.config.dimension))
+        poses = np.empty((size, samples, *flat_state[2].shape[1:]))
+        finals = [np.empty_like(flat_state[0]), np.empty_like(flat_state[1])]
+
+        workers = min(self.n_threads or os.cpu_count() or 1, size) or 1
+
+        def run(worker: int) -> None:
+            simulation = _Simulation(self.config, self.mj_model)
+            for i in range(worker, size, workers):
+                one = CableParams(*(getattr(flat_params, f.name)[i] for f in dataclasses.fields(CableParams)))
+                start = [leaf[i] for leaf in flat_state]
+                simulation.run(one, *start, flat_twist[i], count, keypoints[i], poses[i])
+                finals[0][i], finals[1][i] = simulation.data.qpos, simulation.data.qvel
+
+        if workers == 1:
+            run(0)
+        else:
+            with concurrent.futures.ThreadPoolExecutor(workers) as pool:
+                list(pool.map(run, range(workers)))
+        shape = lambda leaf: jnp.asarray(leaf.reshape(*batch, *leaf.shape[1:]), float)
+        final = CableState(qpos=shape(finals[0]), qvel=shape(finals[1]), gripper_pose=shape(poses[:, -1]))
+        trajectory = Trajectory(shape(keypoints), shape(poses), jnp.asarray(twist, float))
+        return final, trajectory
+
+
+class _Simulation:
+    """One thread's own model and data: parameters are written into the model."""
+
+    def __init__(self, config: CableConfig, model: mujoco.MjModel):
+        self.config = config
+        self.model = copy.copy(model)
+        self.data = mujoco.MjData(self.model)
+        self.weights = hermite_weights(config)
+        self.nominal_mass = self.model.body_mass.copy()
+        self.nominal_inertia = self.model.body_inertia.copy()
+        self.links = np.array([i for i in range(self.model.nbody) if self.model.body(i).name.startswith("cable")])
+
+    def run(self, params, qpos, qvel, pose, twist, count, keypoints, poses) -> None:
+        """Simulates in place; writes samples into `keypoints` [T + 1, N, D] and `poses` [T + 1, Q, P]."""
+        config, model, data = self.config, self.model, self.data
+        self._write(params)
+        mujoco.mj_resetData(model, data)
+        data.qpos[:], data.qvel[:] = qpos, qvel
+        load = float(params.linear_density) * config.link_length * GRAVITY * float(params.friction_coefficient)
+        addresses = np.array([model._address, data._address], np.uint64)
+        nodes = np.empty((len(twist) + 1, len(self.links), 3))
+        tangents = np.empty_like(nodes)
+        _advance(
+            addresses,
+            data.mocap_pos,
+            data.mocap_quat,
+            data.actuator_velocity,
+            model.actuator_biasprm,
+            data.xipos,
+            data.xmat,
+            self.links,
+            np.array(pose),
+            np.array(twist),
+            count,
+            config.timestep,
+            load,
+            config.friction_speed,
+            nodes,
+            tangents,
+            poses,
+        )
+        positions_w, tangents_w = self.weights
+        keypoints[:] = (positions_w @ nodes + tangents_w @ tangents)[..., : config.dimension]
+
+    def _write(self, params: CableParams) -> None:
+        """Puts the parameters into the model."""
+        model, h = self.model, self.config.link_length
+        stiffness = np.asarray(params.bending_stiffness) / h
+        damping = float(params.damping_time) * stiffness
+        rest = np.asarray(params.rest_curvature) * h
+        if self.config.dimension == 2:
+            model.jnt_stiffness[3:] = stiffness
+            model.dof_damping[3:] = damping
+            model.qpos_spring[3:] = rest
+        else:
+            model.jnt_stiffness[1:] = stiffness
+            model.dof_damping[6:] = np.repeat(damping, 3)
+            quaternion = model.qpos_spring[7:].reshape(-1, 4)
+            for i, rotation in enumerate(rest):
+                angle = np.linalg.norm(rotation)
+                mujoco.mju_axisAngle2Quat(quaternion[i], rotation / angle if angle > 0 else np.eye(3)[0], angle)
+        free = self.links[1:-1]
+        ratio = float(params.linear_density) / self.config.linear_density
+        model.body_mass[free] = self.nominal_mass[free] * ratio
+        model.body_inertia[free] = self.nominal_inertia[free] * ratio
+
+
+def _c_function(name: str):
+    """A C function `void f(const mjModel*, mjData*)` of the very library that the Python bindings have loaded."""
+    folder = pathlib.Path(mujoco.__file__).parent
+    library = next(path for path in sorted(folder.iterdir()) if path.name.startswith(("libmujoco.", "mujoco.dll")))
+    function = getattr(ctypes.CDLL(str(library)), name)
+    function.argtypes, function.restype = (ctypes.c_void_p, ctypes.c_void_p), None
+    return function
+
+
+_step1, _step2, _kinematics = (_c_function(name) for name in ("mj_step1", "mj_step2", "mj_kinematics"))
+
+
+@numba.njit(nogil=True, cache=False)
+def _advance(
+    addresses,
+    mocap_pos,
+    mocap_quat,
+    actuator_velocity,
+    actuator_biasprm,
+    xipos,
+    xmat,
+    links,
+    pose,
+    twist,
+    count,
+    dt,
+    load,
+    friction_speed,
+    nodes,
+    tangents,
+    poses,
+):
+    """All time steps of one cable. `pose` [Q, P] is advanced in place; samples go to nodes, tangents and poses."""
+    model, data = addresses[0], addresses[1]
+    n_free = actuator_velocity.shape[0] // 2
+    _sample(model, data, xipos, xmat, links, nodes[0], tangents[0])
+    poses[0] = pose
+    for t in range(twist.shape[0]):
+        start = pose.copy()
+        for i in range(count):
+            _integrate(start, twist[t], (i + 1) * dt, pose)
+            _set_mocap(pose, mocap_pos, mocap_quat)
+            _step1(model, data)
+            for k in range(n_free):
+                vx, vy = actuator_velocity[2 * k], actuator_velocity[2 * k + 1]
+                drag = load / np.sqrt(vx * vx + vy * vy + friction_speed * friction_speed)
+                actuator_biasprm[2 * k, 2] = -drag
+                actuator_biasprm[2 * k + 1, 2] = -drag
+            _step2(model, data)
+        _sample(model, data, xipos, xmat, links, nodes[t + 1], tangents[t + 1])
+        poses[t + 1] = pose
+
+
+@numba.njit(nogil=True, cache=False)
+def _sample(model, data, xipos, xmat, links, nodes, tangents):
+    _kinematics(model, data)
+    for k in range(links.shape[0]):
+        for axis in range(3):
+            nodes[k, axis] = xipos[links[k], axis]
+            tangents[k, axis] = xmat[links[k], 3 * axis]
+
+
+@numba.njit(nogil=True, cache=False)
+def _integrate(start, twist, duration, pose):
+    """`pose.integrate_pose` in place."""
+    if start.shape[1] == 3:
+        pose[:] = start + duration * twist
+        return
+    for q in range(start.shape[0]):
+        pose[q, :3] = start[q, :3] + duration * twist[q, :3]
+        rotation = duration * twist[q, 3:]
+        angle = np.sqrt(np.sum(rotation**2))
+        w, sinc = np.cos(angle / 2), (np.sin(angle / 2) / angle if angle > 0 else 0.5)
+        x, y, z = sinc * rotation[0], sinc * rotation[1], sinc * rotation[2]
+        a, b, c, d = start[q, 3], start[q, 4], start[q, 5], start[q, 6]
+        pose[q, 3] = w * a - x * b - y * c - z * d
+        pose[q, 4] = w * b + x * a + y * d - z * c
+        pose[q, 5] = w * c - x * d + y * a + z * b
+        pose[q, 6] = w * d + x * c - y * b + z * a
+
+
+@numba.njit(nogil=True, cache=False)
+def _set_mocap(pose, mocap_pos, mocap_quat):
+    for q in range(pose.shape[0]):
+        if pose.shape[1] == 3:
+            mocap_pos[q, 0], mocap_pos[q, 1], mocap_pos[q, 2] = pose[q, 0], pose[q, 1], 0.0
+            mocap_quat[q, 0], mocap_quat[q, 1] = np.cos(pose[q, 2] / 2), 0.0
+            mocap_quat[q, 2], mocap_quat[q, 3] = 0.0, np.sin(pose[q, 2] / 2)
+        else:
+            mocap_pos[q] = pose[q, :3]
+            mocap_quat[q] = pose[q, 3:]

@@ -1,0 +1,178 @@
+"""Target shapes: the letters U, S and Z as shapes in which a cable rests, and targets from a user's file."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import pathlib
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float
+
+from cablejax.simulate.config import CableConfig
+from cablejax.simulate.elastica import elastica
+
+Shape = Literal["U", "S", "Z"]
+
+START_DISTANCE = 0.99
+"""Distance between the grippers of a straight cable, in lengths."""
+START_LEAN = 0.01
+"""Angle [rad] by which the ends of a straight cable lean, so that its slack lies on a known side."""
+LENGTH_TOLERANCE = 0.03
+"""How far the length of a target's polyline may be from the cable's length, relative to it."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Target:
+    """A shape to bring a cable to.
+
+    Attributes:
+        name: for tables and titles.
+        keypoints: wanted positions [m], from gripper 0 to gripper 1, shape [N, 2].
+        gripper_pose: (x, y, theta) [m, rad] of both grippers in that shape, shape [Q, 3].
+    """
+
+    name: str
+    keypoints: Float[np.ndarray, "N 2"]
+    gripper_pose: Float[np.ndarray, "Q 3"]
+
+
+@dataclasses.dataclass(frozen=True)
+class _Letter:
+    """Ends of a letter: angles [deg] of the end tangents against the chord, chord in lengths, its direction [deg]."""
+
+    start: float
+    end: float
+    distance: float
+    direction: float
+
+
+_LETTERS: dict[str, _Letter] = {
+    "U": _Letter(start=-90.0, end=90.0, distance=0.45, direction=0.0),
+    "S": _Letter(start=-90.0, end=-90.0, distance=0.60, direction=60.0),
+    "Z": _Letter(start=115.0, end=115.0, distance=0.52, direction=-60.0),
+}
+
+
+def make_target(shape: Shape, config: CableConfig = CableConfig()) -> Target:
+    """The letter U, S or Z as the elastica between two grippers, its chord's middle at the origin.
+
+    It is a stable equilibrium of a uniform cable without friction, whatever its stiffness.
+
+    Raises:
+        ValueError: another letter.
+    """
+    if shape not in _LETTERS:
+        raise ValueError(f"There is no shape {shape!r}, expected one of {', '.join(_LETTERS)}, or a file for load_target.")
+    letter = _LETTERS[shape]
+    direction = np.radians(letter.direction)
+    half = 0.5 * letter.distance * config.length * np.array([np.cos(direction), np.sin(direction)])
+    pose = np.array(
+        [[*-half, direction + np.radians(letter.start)], [*half, direction + np.radians(letter.end)]]
+    )  # fmt: skip
+    return Target(shape, elastica(pose, config.length, config.keypoint_arclength), pose)
+
+
+def straight_start(config: CableConfig = CableConfig()) -> Float[np.ndarray, "2 3"]:
+    """Gripper poses (x, y, theta) of an almost straight cable along +x, centred at the origin, its slack towards -y."""
+    half = 0.5 * START_DISTANCE * config.length
+    return np.array([[-half, 0.0, -START_LEAN], [half, 0.0, START_LEAN]])
+
+
+def target_from_keypoints(
+    name: str,
+    keypoints: Float[np.ndarray, "N 2"],
+    config: CableConfig = CableConfig(),
+    gripper_pose: Float[np.ndarray, "2 3"] | None = None,
+) -> Target:
+    """A target from points along the cable, checked against the cable it is meant for.
+
+    Args:
+        name: for tables and titles.
+        keypoints: positions [m], uniform in arc length, gripper 0 first, shape [N, 2].
+        config: the cable.
+        gripper_pose: poses of the grippers [m, rad]; without them the ends' positions and the directions that continue
+            the polyline's bend to its ends.
+
+    Raises:
+        ValueError: another number of points, points that are not finite, or a cable of another length.
+    """
+    points = np.asarray(keypoints, float)
+    if points.ndim != 2 or points.shape[1:] != (2,):
+        raise ValueError(f"Target {name!r} has keypoints of shape {points.shape}, expected ({config.n_keypoints}, 2).")
+    if len(points) != config.n_keypoints:
+        raise ValueError(
+            f"Target {name!r} has {len(points)} keypoints, but the cable is seen at {config.n_keypoints}: resample it "
+            "uniformly in arc length, both ends included."
+        )
+    if not np.isfinite(points).all():
+        rows = np.flatnonzero(~np.isfinite(points).all(axis=1)).tolist()
+        raise ValueError(f"Target {name!r} has keypoints that are not finite, at {rows}: fill them in or resample.")
+    edges = np.diff(points, axis=0)
+    angle = np.unwrap(np.arctan2(edges[:, 1], edges[:, 0]))
+    # An edge is the chord of an arc: turned by a it is shorter than the arc by sin(a / 2) / (a / 2).
+    turn = np.abs(np.gradient(angle))
+    length = float((np.hypot(*edges.T) / np.sinc(turn / 2 / np.pi)).sum())
+    if abs(length - config.length) > LENGTH_TOLERANCE * config.length:
+        raise ValueError(
+            f"Target {name!r} is {length:.4g} m long, but the cable is {config.length:.4g} m long and does not stretch: "
+            "scale the target, or give the cable's length in the configuration."
+        )
+    if gripper_pose is None:
+        ends = [1.5 * angle[0] - 0.5 * angle[1], 1.5 * angle[-1] - 0.5 * angle[-2]]
+        pose = np.concatenate([points[[0, -1]], np.array(ends)[:, None]], axis=1)
+    else:
+        pose = np.asarray(gripper_pose, float)
+        if pose.shape != (2, 3) or not np.isfinite(pose).all():
+            raise ValueError(f"Target {name!r} has a gripper_pose of shape {pose.shape} or not finite, expected (2, 3).")
+        gap = np.abs(pose[:, :2] - points[[0, -1]]).max()
+        if gap > 0.01 * config.length:
+            raise ValueError(
+                f"Target {name!r}: the grippers are {gap:.4g} m away from the first and last keypoint that they hold."
+            )
+    return Target(name, points, pose)
+
+
+def load_target(path: str | pathlib.Path, config: CableConfig = CableConfig()) -> Target:
+    """A target from a file: `.npz` or `.json` with "keypoints" (and "gripper_pose"), or `.csv` with rows `x,y`.
+
+    Raises:
+        ValueError: the file cannot be read as one of these, or its content does not fit the cable; see
+            `target_from_keypoints`.
+        FileNotFoundError: there is no such file.
+    """
+    path = pathlib.Path(path)
+    if path.suffix not in _READERS:
+        raise ValueError(f"{path} is none of {', '.join(_READERS)}: save the target's keypoints in one of these.")
+    try:
+        fields = _READERS[path.suffix](path)
+    except (ValueError, KeyError, TypeError, OSError, EOFError) as error:
+        if isinstance(error, FileNotFoundError):
+            raise
+        raise ValueError(f"{path} could not be read as a target: {error}") from error
+    if "keypoints" not in fields:
+        raise ValueError(f"{path} has no field 'keypoints', only {sorted(fields)}.")
+    return target_from_keypoints(path.stem, fields["keypoints"], config, fields.get("gripper_pose"))
+
+
+def _read_npz(path: pathlib.Path) -> dict[str, np.ndarray]:
+    with np.load(path, allow_pickle=False) as archive:
+        return {name: archive[name] for name in archive.files}
+
+
+def _read_json(path: pathlib.Path) -> dict[str, np.ndarray]:
+    content = json.loads(path.read_text())
+    if not isinstance(content, dict):
+        raise ValueError('expected an object with the field "keypoints"')
+    return {name: np.asarray(content[name], float) for name in ("keypoints", "gripper_pose") if name in content}
+
+
+def _read_csv(path: pathlib.Path) -> dict[str, np.ndarray]:
+    lines = [line for line in path.read_text().splitlines() if line.strip()]
+    if lines and not lines[0].lstrip()[0] in "+-.0123456789" and not lines[0].strip().lower().startswith("nan"):
+        lines = lines[1:]  # a heading
+    return {"keypoints": np.array([[float(cell) for cell in line.split(",")] for line in lines])}
+
+
+_READERS = {".npz": _read_npz, ".json": _read_json, ".csv": _read_csv}

@@ -1,0 +1,129 @@
+"""The pytrees that travel between the stages of the pipeline.
+
+Every class here is a frozen dataclass. Those that hold JAX arrays are registered as pytrees, so they pass through `jit`,
+`vmap`, `grad` and `scan` unchanged. Shapes are written as `[E, T, N, D]` with these letters throughout the package:
+
+    B batch   E episodes   T time samples   H history length   N keypoints   Q grippers   J bending joints   D 2 or 3
+
+SI units, radians, right-handed frames. Arrays may carry leading batch axes wherever a function is vmapped.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+# The gripper's pose in the plane is (x, y, theta); its twist is (vx, vy, omega), both in the world's frame.
+PLANAR_DOF = 3
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class CableParams:
+    """Physical parameters of one cable on one table: everything that a gradient may be taken in.
+
+    Attributes:
+        bending_stiffness: EI at each bending joint [N m^2], shape [J].
+        damping_time: Kelvin-Voigt time constant tau [s] in `M = EI (kappa - kappa_0 + tau dkappa/dt)`, shape [].
+        rest_curvature: kappa_0 at each bending joint [1/m], shape [J] in the plane, [J, 3] in space.
+        linear_density: mass per length [kg/m], shape [].
+        friction_coefficient: Coulomb coefficient mu of the table, kinetic, shape [].
+    """
+
+    bending_stiffness: Float[Array, "*batch J"]
+    damping_time: Float[Array, "*batch"]
+    rest_curvature: Float[Array, "*batch J"] | Float[Array, "*batch J 3"]
+    linear_density: Float[Array, "*batch"]
+    friction_coefficient: Float[Array, "*batch"]
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class CableState:
+    """Full state of a simulated cable.
+
+    Attributes:
+        qpos: generalised positions, shape [nq].
+        qvel: generalised velocities, shape [nv].
+        gripper_pose: (x, y, theta) of each gripper, shape [Q, 3]; in space (x, y, z, qw, qx, qy, qz), shape [Q, 7].
+    """
+
+    qpos: Float[Array, "*batch nq"]
+    qvel: Float[Array, "*batch nv"]
+    gripper_pose: Float[Array, "*batch Q P"]
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Trajectory:
+    """What a rollout yields: T commands and the T + 1 samples around them.
+
+    Attributes:
+        keypoints: keypoint positions [m], shape [T + 1, N, D]; sample 0 is the initial state.
+        gripper_pose: gripper poses at the same instants, shape [T + 1, Q, 3] or [T + 1, Q, 7].
+        gripper_twist: twist held from sample t to t + 1 [m/s, rad/s], shape [T, Q, 3] or [T, Q, 6].
+    """
+
+    keypoints: Float[Array, "*batch T1 N D"]
+    gripper_pose: Float[Array, "*batch T1 Q P"]
+    gripper_twist: Float[Array, "*batch T Q V"]
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class History:
+    """What a one-step model of the cable sees: the last H samples, oldest first.
+
+    Attributes:
+        keypoints: positions [m] at t - m, ..., t, shape [H, N, 2] with H = m + 1.
+        gripper_pose: (x, y, theta) of both grippers at t, shape [Q, 3].
+    """
+
+    keypoints: Float[Array, "*batch H N 2"]
+    gripper_pose: Float[Array, "*batch Q 3"]
+
+
+def advance(
+    history: History, displacement: Float[Array, "N 2"], twist: Float[Array, "Q 3"], interval: float = 1.0
+) -> History:
+    """The history one control interval later. Differentiable in every argument.
+
+    Args:
+        history: the last H samples.
+        displacement: `X(t + 1) - X(t)` [m], shape [N, 2].
+        twist: the command held over the interval [m/s, rad/s], shape [Q, 3].
+        interval: its duration [s].
+    """
+    newest = history.keypoints[-1] + displacement
+    return History(
+        keypoints=jnp.concatenate([history.keypoints[1:], newest[None]]),
+        gripper_pose=history.gripper_pose + interval * twist,
+    )
+
+
+@dataclasses.dataclass(frozen=True)
+class GapLog:
+    """A recorded cable run in memory: the arrays of the `cablejax-gap-log/1` format, unchanged, as NumPy arrays.
+
+    Attributes:
+        time: seconds from each episode's start, float64, shape [E, T].
+        keypoints: observed positions [m], NaN = not observed, float32, shape [E, T, N, D].
+        gripper_pose: measured poses, float32, shape [E, T, Q, 3 or 7].
+        gripper_command: commanded twist held from `time[t]` to `time[t + 1]`, float32, shape [E, T, Q, 3 or 6].
+        episode_length: valid samples of each episode, int32, shape [E].
+        meta: the JSON object of the format, with key "schema".
+        hold: true where grippers rest and the cable has settled, bool, shape [E, T], or None.
+    """
+
+    time: np.ndarray
+    keypoints: np.ndarray
+    gripper_pose: np.ndarray
+    gripper_command: np.ndarray
+    episode_length: np.ndarray
+    meta: dict[str, Any]
+    hold: np.ndarray | None = None

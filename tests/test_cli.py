@@ -1,0 +1,138 @@
+"""The command line as a person or a script meets it."""
+
+import json
+import os
+import pathlib
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+
+from cablejax.cli import main
+from cablejax.commands import options
+
+SUBCOMMANDS = (["demo"], ["simulate"], ["train"], ["shape"], ["bench"], ["bench", "simulate"], ["bench", "mpc"])
+
+
+def help_of(command: list[str], capsys) -> str:
+    with pytest.raises(SystemExit) as stop:
+        main([*command, "--help"])
+    assert stop.value.code == 0
+    return capsys.readouterr().out
+
+
+def test_help_names_every_command(capsys):
+    text = help_of([], capsys)
+    for command in ("demo", "simulate", "train", "shape", "bench"):
+        assert command in text
+
+
+@pytest.mark.parametrize("command", [c for c in SUBCOMMANDS if c != ["bench"]], ids=" ".join)
+def test_help_explains_every_option(command, capsys):
+    text = help_of(command, capsys)
+    assert "--seed" in text and "--json" in text and "--device" in text
+    options_box = text[text.index("--seed") :]
+    assert "(required)" not in options_box, "every command runs without options"
+
+
+def test_help_is_fast_because_it_loads_neither_jax_nor_mujoco():
+    check = (
+        "import sys, cablejax.cli\n"
+        "try: cablejax.cli.main(['train', '--help'])\n"
+        "except SystemExit: pass\n"
+        "sys.exit(sorted({'jax', 'mujoco', 'matplotlib', 'flax'} & set(sys.modules)) or 0)"
+    )
+    run = subprocess.run([sys.executable, "-c", check], capture_output=True, text=True, timeout=60)
+    assert run.returncode == 0, run.stderr
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["simulate", "--trajectories", "0"], "n_trajectories is 0"),
+        (["simulate", "--links", "1"], "n_links is 1"),
+        (["simulate", "--stiffness", "-1"], "bending_stiffness is -1"),
+        (["simulate", "--seed", "-1"], "--seed is -1"),
+        (["train", "--data", "nowhere.zarr"], "holds no data set"),
+        (["bench", "simulate", "--batch", "0"], "--batch is 0"),
+    ],
+    ids=lambda value: " ".join(value) if isinstance(value, list) else None,
+)
+def test_bad_input_is_told_without_a_traceback(arguments, message, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert main(arguments) == 2
+    told = capsys.readouterr()
+    assert message in told.err and "Traceback" not in told.err
+    assert told.out == ""
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_gpu_that_is_not_there_is_said_to_be_missing(tmp_path):
+    environment = {**os.environ, "JAX_PLATFORMS": "cpu"}
+    command = [sys.executable, "-m", "cablejax", "simulate", "--device", "gpu", "--out", str(tmp_path / "store")]
+    run = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=120)
+    assert run.returncode == 2
+    assert "--device gpu was asked for" in run.stderr and "--device cpu" in run.stderr
+    assert "Traceback" not in run.stderr and not (tmp_path / "store").exists()
+
+
+def test_simulate_says_its_result_as_json_and_repeats_it(tmp_path, capsys):
+    arguments = ["simulate", "--json", "--trajectories", "2", "--steps", "2", "--links", "5", "--seed", "3"]
+    results = []
+    for name in ("a", "b"):
+        assert main([*arguments, "--out", str(tmp_path / name)]) == 0
+        told = capsys.readouterr()
+        results.append(json.loads(told.out))
+        assert "2 trajectories" in told.err
+    assert results[0]["complete"] == results[0]["trajectories"] == 2
+    assert results[0]["digest"] == results[1]["digest"]
+
+
+def test_simulate_refuses_a_folder_that_holds_something_else(tmp_path, capsys):
+    (tmp_path / "notes.txt").write_text("mine")
+    assert main(["simulate", "--out", str(tmp_path), "--overwrite"]) == 2
+    assert "holds no data set" in capsys.readouterr().err
+    assert (tmp_path / "notes.txt").read_text() == "mine"
+
+
+def test_output_folder_that_exists_is_refused_unless_overwritten(tmp_path):
+    (tmp_path / "old.txt").write_text("mine")
+    with pytest.raises(options.UsageError, match=r"exists and is not empty.*--overwrite"):
+        options.output_folder(tmp_path, overwrite=False)
+    assert options.output_folder(tmp_path, overwrite=True) == tmp_path
+    assert (tmp_path / "old.txt").exists()
+    with pytest.raises(options.UsageError, match="which is a file"):
+        options.output_folder(tmp_path / "old.txt", overwrite=True)
+
+
+@pytest.mark.slow
+def test_interrupting_a_long_simulation_tells_how_to_go_on(tmp_path):
+    store = tmp_path / "store"
+    command = [sys.executable, "-m", "cablejax", "simulate", "--trajectories", "100000", "--steps", "20"]
+    process = subprocess.Popen([*command, "--links", "5", "--out", str(store)], stderr=subprocess.PIPE, text=True)
+    try:
+        deadline = time.monotonic() + 120
+        while not any((store / "digest" / "c").glob("*")) and time.monotonic() < deadline:
+            time.sleep(0.2)
+        process.send_signal(signal.SIGINT)
+        _, said = process.communicate(timeout=60)
+    finally:
+        process.kill()
+    assert process.returncode == 130
+    assert "Run the same generation again" in said and "Traceback" not in said
+
+
+def test_text_table_lines_up():
+    text = options.text_table(["shape", "error"], [["U", "0.5"], ["long name", "12.25"]])
+    assert text.splitlines()[1:] == ["---------  -----", "U            0.5", "long name  12.25"]
+
+
+def test_json_is_written_whole(tmp_path: pathlib.Path):
+    options.write_json(tmp_path / "a.json", {"x": 1.5})
+    assert json.loads((tmp_path / "a.json").read_text()) == {"x": 1.5}
+    assert [path.name for path in tmp_path.iterdir()] == ["a.json"]
+    with pytest.raises(ValueError, match="JSON"):
+        options.write_json(tmp_path / "b.json", {"x": float("nan")})
+    assert not (tmp_path / "b.json").exists()

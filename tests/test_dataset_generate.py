@@ -1,0 +1,240 @@
+"""A data set is the same, byte by byte, however it was made: in one go or after a kill, by one process or by two."""
+
+import dataclasses
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+from cablejax.dataset.generate import MAX_ATTEMPTS, GenerationInterrupted, draw, find_fault, generate, simulate
+from cablejax.dataset.schema import DatasetConfig, Randomisation
+from cablejax.dataset.store import open_store
+from cablejax.simulate import CableConfig, ThreadedEngine
+
+TINY = DatasetConfig(
+    n_trajectories=8,
+    n_steps=3,
+    shard_size=2,
+    seed=5,
+    cable=CableConfig(n_links=5, n_keypoints=4, timestep=0.02),
+    randomisation=Randomisation(stiffness=(0.1, 3.0), friction=(0.5, 2.0)),
+)
+
+# A second process makes the same configuration as this one: it is passed as the source text of a DatasetConfig.
+CHILD = """
+import sys
+from cablejax.dataset.generate import generate
+from cablejax.dataset.schema import *
+from cablejax.simulate import CableConfig
+from cablejax.simulate.motions import MotionConfig
+config, path = eval(sys.argv[1]), sys.argv[2]
+"""
+
+
+def tree(path: Path) -> dict[str, bytes]:
+    return {str(file.relative_to(path)): file.read_bytes() for file in sorted(path.rglob("*")) if file.is_file()}
+
+
+def child(code: str, config: DatasetConfig, path: Path, *arguments: str, **environment: str) -> subprocess.Popen:
+    return subprocess.Popen(
+        [sys.executable, "-c", CHILD + code, repr(config), str(path), *arguments],
+        env=os.environ | {"NPROC": "4"} | environment,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    )
+
+
+def finish(process: subprocess.Popen) -> str:
+    output, _ = process.communicate(timeout=300)
+    assert process.returncode == 0, output
+    return output
+
+
+@pytest.fixture(scope="module")
+def reference(tmp_path_factory) -> Path:
+    path = tmp_path_factory.mktemp("reference") / "data"
+    info = generate(TINY, path, progress=False)
+    assert info.complete and info.attempts == 0
+    return path
+
+
+def test_trajectories_obey_the_protocol(reference):
+    store = open_store(reference)
+    block = store.read()
+    assert block.keypoints.shape == (8, 4, 4, 2) and block.gripper_twist.shape == (8, 3, 2, 3)
+    # poses follow from the commands, end keypoints from the poses
+    moved = block.gripper_pose[:, :1] + np.cumsum(block.gripper_twist, axis=1)
+    np.testing.assert_allclose(block.gripper_pose[:, 1:], moved, atol=1e-6)
+    np.testing.assert_allclose(block.keypoints[:, :, [0, -1]], block.gripper_pose[..., :2], atol=1e-4)
+    # a straight start, but for the slack of a few thousandths: no keypoint far from the line between the grippers
+    first = block.keypoints[:, 0] - block.keypoints[:, :1, 0]
+    aside = (first[:, :, 0] * first[:, -1:, 1] - first[:, :, 1] * first[:, -1:, 0]) / TINY.cable.length
+    assert np.abs(aside).max() < 0.03
+    size = np.sqrt((block.gripper_twist[..., :2] ** 2).sum(-1) + (0.15 * block.gripper_twist[..., 2]) ** 2)
+    assert 0.005 < size.max() <= 0.05 * (1 + 1e-5)
+    assert len(np.unique(block.gripper_twist[:, 0, 0, 0])) == 8
+
+
+def test_parameters_are_drawn_log_uniformly_within_their_ranges():
+    drawn = np.array([draw(TINY, index).parameters for index in range(400)])
+    assert drawn[:, 0].min() >= 0.1 and drawn[:, 0].max() <= 3.0
+    assert np.median(drawn[:, 0]) == pytest.approx(np.sqrt(0.3), rel=0.25)
+    assert drawn[:, 1].min() >= 0.05 and drawn[:, 1].max() <= 0.2
+    np.testing.assert_array_equal(drawn[:, 2], TINY.cable.damping_time)
+    with pytest.raises(ValueError, match="Randomisation.friction"):
+        Randomisation(friction=(2.0, 1.0))
+
+
+def test_parameters_reach_the_simulator():
+    stiff, soft = (
+        dataclasses.replace(TINY, randomisation=Randomisation(stiffness=(ratio, ratio)), n_trajectories=1)
+        for ratio in (0.1, 10.0)
+    )
+    shapes = [simulate(config, ThreadedEngine(config.cable), [0])[0].keypoints for config in (stiff, soft)]
+    assert np.abs(shapes[0] - shapes[1]).max() > 1e-3
+
+
+def test_content_does_not_depend_on_the_shard_size(reference, tmp_path):
+    other = generate(dataclasses.replace(TINY, shard_size=5), tmp_path / "data", progress=False)
+    assert other.digest == open_store(reference).info().digest
+
+
+def test_shares_of_two_processes_make_the_same_store(reference, tmp_path):
+    first = generate(TINY, tmp_path / "data", progress=False, process_index=1, process_count=2)
+    assert (first.n_complete, first.digest) == (4, None)
+    assert generate(TINY, tmp_path / "data", progress=False, process_index=0, process_count=2).complete
+    assert tree(tmp_path / "data") == tree(reference)
+    with pytest.raises(ValueError, match="process_index is 2 and process_count 2"):
+        generate(TINY, tmp_path / "data", process_index=2, process_count=2)
+
+
+def test_sigkill_and_resume_bit_for_bit(tmp_path):
+    config = dataclasses.replace(TINY, n_trajectories=60, n_steps=40)
+    whole = generate(config, tmp_path / "whole", progress=False)
+    killed = tmp_path / "killed"
+    process = child("generate(config, path, progress=False)", config, killed)
+    deadline = time.monotonic() + 120
+    while len(list(killed.glob("digest/c/*/0"))) < 3:
+        assert process.poll() is None and time.monotonic() < deadline, process.communicate()
+        time.sleep(0.002)
+    process.send_signal(signal.SIGKILL)
+    process.communicate()
+    before = open_store(killed).info()
+    assert 6 <= before.n_complete < 60
+    assert generate(config, killed, progress=False).digest == whole.digest
+    assert tree(killed) == tree(tmp_path / "whole")
+
+
+@dataclasses.dataclass(frozen=True)
+class Interrupted(ThreadedEngine):
+    """Presses Ctrl-C during the third rollout."""
+
+    calls: list = dataclasses.field(default_factory=list, compare=False)
+
+    def rollout(self, params, state, twist, interval=1.0):
+        self.calls.append(len(twist))
+        if len(self.calls) == 3:
+            signal.raise_signal(signal.SIGINT)
+        return super().rollout(params, state, twist, interval)
+
+
+def test_ctrl_c_keeps_what_is_done_and_says_how_to_go_on(reference, tmp_path):
+    path = tmp_path / "data"
+    with pytest.raises(GenerationInterrupted, match=r"Stopped at 4 of 8 .* again to go on"):
+        generate(TINY, path, progress=False, engine=Interrupted(TINY.cable))
+    assert open_store(path).info().n_complete == 4
+    with pytest.raises(ValueError, match="exists and holds trajectories"):
+        generate(TINY, path, progress=False, resume=False)
+    engine = Interrupted(TINY.cable)
+    assert generate(TINY, path, progress=False, engine=engine).complete
+    assert engine.calls == [2, 2]  # the two shards that were left, and nothing twice
+    assert tree(path) == tree(reference)
+
+
+@dataclasses.dataclass(frozen=True)
+class Diverging(ThreadedEngine):
+    """Loses the cables whose gripper 0 first moves by exactly one of the given speeds."""
+
+    speeds: tuple = ()
+
+    def rollout(self, params, state, twist, interval=1.0):
+        final, trajectory = super().rollout(params, state, twist, interval)
+        lost = np.isin(twist[:, 0, 0, 0], self.speeds)
+        keypoints = np.where(lost[:, None, None, None], np.nan, trajectory.keypoints)
+        return final, dataclasses.replace(trajectory, keypoints=keypoints)
+
+
+def test_a_failed_trajectory_is_drawn_again_and_counted(reference, tmp_path):
+    lost = [draw(TINY, 3), draw(TINY, 6), draw(TINY, 6, attempt=1)]
+    engine = Diverging(TINY.cable, speeds=tuple(one.gripper_twist[0, 0, 0] for one in lost))
+    info = generate(TINY, tmp_path / "data", progress=False, engine=engine)
+    store = open_store(tmp_path / "data")
+    block, usual = store.read(), open_store(reference).read()
+    assert info.complete and info.attempts == 3
+    np.testing.assert_array_equal(block.attempts, [0, 0, 0, 1, 0, 0, 2, 0])
+    others = [0, 1, 2, 4, 5, 7]
+    np.testing.assert_array_equal(block.keypoints[others], usual.keypoints[others])
+    np.testing.assert_array_equal(block.gripper_twist[6], draw(TINY, 6, attempt=2).gripper_twist)
+
+
+def test_a_trajectory_that_never_works_is_an_error_not_data(tmp_path):
+    speeds = tuple(draw(TINY, 5, attempt).gripper_twist[0, 0, 0] for attempt in range(MAX_ATTEMPTS))
+    with pytest.raises(ValueError, match=rf"failed {MAX_ATTEMPTS} times in a row; number 5: .*not finite.*timestep"):
+        generate(TINY, tmp_path / "data", progress=False, engine=Diverging(TINY.cable, speeds=speeds))
+    assert open_store(tmp_path / "data").info().n_complete == 4  # shards 0 and 1
+
+
+def test_faults_are_told_apart(reference):
+    block = open_store(reference).read()
+    one = dataclasses.replace(block, **{f.name: getattr(block, f.name)[0] for f in dataclasses.fields(block)})
+    assert find_fault(TINY, one) is None
+
+    def spoil(scale):
+        return dataclasses.replace(one, keypoints=one.keypoints * np.float32(scale))
+
+    assert "not finite" in find_fault(TINY, spoil(np.nan))
+    assert "from its gripper" in find_fault(TINY, spoil(1.1))
+    middle = one.keypoints.copy()
+    middle[:, 1] += np.float32(0.2)
+    assert "stretched" in find_fault(TINY, dataclasses.replace(one, keypoints=middle))
+
+
+def test_two_processes_of_jax_distributed_on_loopback(reference, tmp_path):
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        address = f"127.0.0.1:{probe.getsockname()[1]}"
+    code = (
+        "import jax\n"
+        "jax.distributed.initialize(sys.argv[3], num_processes=2, process_id=int(sys.argv[4]))\n"
+        "info = generate(config, path, progress=False)\n"
+        "print(jax.process_index(), jax.process_count(), info.complete, info.digest)\n"
+    )
+    processes = [child(code, TINY, tmp_path / "data", address, str(p), JAX_PLATFORMS="cpu") for p in range(2)]
+    outputs = [finish(process) for process in processes]
+    digest = open_store(reference).info().digest
+    for p, output in enumerate(outputs):
+        assert f"{p} 2 True {digest}" in output
+    assert tree(tmp_path / "data") == tree(reference)
+
+
+def test_two_devices_make_the_bytes_of_one(tmp_path):
+    config = dataclasses.replace(TINY, engine="mjx", n_trajectories=7)
+    code = "import jax\nprint(jax.local_device_count(), generate(config, path, progress=False).complete)\n"
+    for count in (1, 2):
+        flags = f"--xla_force_host_platform_device_count={count}"
+        output = finish(child(code, config, tmp_path / str(count), XLA_FLAGS=flags, JAX_PLATFORMS="cpu"))
+        assert f"{count} True" in output
+    assert tree(tmp_path / "1") == tree(tmp_path / "2")
+    # and they are the trajectories of the other engine
+    here = open_store(tmp_path / "1").read()
+    block = simulate(config, ThreadedEngine(config.cable), range(config.n_shards))
+    other = np.concatenate([part.keypoints for part in block])
+    np.testing.assert_allclose(here.keypoints, other, atol=1e-3)

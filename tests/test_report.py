@@ -1,0 +1,200 @@
+"""The report: what is drawn is where the cable was, and the page stands alone and says the numbers."""
+
+import dataclasses
+import html.parser
+import json
+import re
+
+import numpy as np
+import pytest
+from PIL import Image
+from report_cases import arc, demo_runs, run
+
+from cablejax.report import figures, pair_by_shape
+from cablejax.report.animation import write_gif
+from cablejax.report.page import animation_data, headline, write_page
+from cablejax.report.style import LIGHT, cable_curve, common_window, gripper_outline
+
+
+def test_curve_follows_the_cable_between_its_keypoints():
+    fine = arc(1.3, n=2001)
+    curve = cable_curve(arc(1.3), np.array([[0, 0, -1.3], [0, 0, 1.3]]), n_points=101)
+    distance = np.linalg.norm(curve[:, None] - fine[None], axis=-1).min(axis=1)
+    assert distance.max() < 5e-4
+
+
+def test_curve_leaves_the_gripper_along_its_direction():
+    curve = cable_curve(arc(0.9), np.array([[0, 0, -0.9], [0, 0, 0.9]]), n_points=2001)
+    first, last = curve[1] - curve[0], curve[-1] - curve[-2]
+    assert np.arctan2(first[1], first[0]) == pytest.approx(-0.9, abs=5e-3)
+    assert np.arctan2(last[1], last[0]) == pytest.approx(0.9, abs=5e-3)
+
+
+def test_curve_bridges_missing_keypoints():
+    points = arc(0.9)
+    points[4] = np.nan
+    assert np.isfinite(cable_curve(points)).all()
+
+
+def test_windows_hold_every_cable_and_share_one_scale():
+    records = demo_runs()
+    views = common_window(records)
+    sizes = {(round(x1 - x0, 9), round(y1 - y0, 9)) for x0, x1, y0, y1 in views.values()}
+    assert len(sizes) == 1
+    for record in records:
+        x0, x1, y0, y1 = views[record.shape]
+        assert record.keypoints[..., 0].min() > x0 and record.keypoints[..., 0].max() < x1
+        assert record.keypoints[..., 1].min() > y0 and record.keypoints[..., 1].max() < y1
+
+
+@pytest.mark.parametrize("end", [0, 1])
+def test_gripper_stands_behind_the_end_that_it_holds(end):
+    theta = 0.7
+    wrist = gripper_outline(np.array([0.2, -0.1, theta]), end)[-1].mean(axis=0) - [0.2, -0.1]
+    along = wrist @ [np.cos(theta), np.sin(theta)]
+    assert np.sign(along) == (-1 if end == 0 else 1)
+
+
+@pytest.mark.parametrize(
+    "draw",
+    [figures.final_shapes, figures.error_over_time, figures.residual_share, figures.trust_region, figures.snapshots],
+)
+def test_every_figure_has_its_panels_and_marks(draw, tmp_path):
+    records = demo_runs()
+    figure = draw(records)
+    assert len(figure.axes) == (5 if draw is figures.snapshots else 2)
+    figure.savefig(tmp_path / "figure.png")
+    with Image.open(tmp_path / "figure.png") as picture:
+        colours = {colour for _, colour in picture.convert("RGB").getcolors(1 << 24)}
+    assert tuple(int(LIGHT.residual[i : i + 2], 16) for i in (1, 3, 5)) in colours
+
+
+def test_error_figure_shows_the_errors():
+    records = demo_runs()
+    panel = figures.error_over_time(records).axes[0]
+    drawn = {tuple(np.round(line.get_ydata(), 9)) for line in panel.lines if len(line.get_ydata()) > 2}
+    assert drawn == {tuple(np.round(r.error_cm, 9)) for r in records if r.shape == "U"}
+
+
+def test_gif_ends_on_the_last_sample_and_stays_small(tmp_path):
+    records = demo_runs()
+    size = write_gif(tmp_path / "demo.gif", records, width=480, frames_per_second=4)
+    assert size == (tmp_path / "demo.gif").stat().st_size < 3_000_000
+    with Image.open(tmp_path / "demo.gif") as gif:
+        assert gif.n_frames >= 3
+        first = np.asarray(gif.convert("RGB"), dtype=int)
+        gif.seek(gif.n_frames - 1)
+        last = np.asarray(gif.convert("RGB"), dtype=int)
+        assert gif.info["duration"] > 1000
+    assert (last[0, 0] == 255).all()
+    assert np.abs(first - last).sum(axis=-1).astype(bool).mean() > 0.01
+
+
+class _Outside(html.parser.HTMLParser):
+    """Collects what a page would fetch, and its scripts."""
+
+    def __init__(self):
+        super().__init__()
+        self.fetched: list[str] = []
+        self.text: list[str] = []
+
+    def handle_starttag(self, tag, attrs):
+        self.fetched += [value for name, value in attrs if name in ("src", "href", "data") and value]
+
+    def handle_data(self, data):
+        self.text.append(data)
+
+
+@pytest.fixture
+def page(tmp_path):
+    records = demo_runs()
+    write_gif(tmp_path / "demo.gif", records, width=240, frames_per_second=2)
+    shapes = {
+        shape: {
+            "initial_error_cm": 20.0,
+            "terminal_error_cm": runs["residual"].final_error_cm,
+            "terminal_error_without_residual_cm": runs["direct"].final_error_cm,
+            "settling_time_s": None,
+            "mpc_ms_p50": 100.0,
+            "mpc_ms_p95": 120.0,
+        }
+        for shape, runs in pair_by_shape(records).items()
+    }
+    facts = {"seed": "7", "machine": "two <cores>"}
+    write_page(
+        tmp_path / "report.html",
+        records,
+        {"shapes": shapes, "total_s": 1.0},
+        about="A test & nothing else.",
+        facts=facts,
+        gif=tmp_path / "demo.gif",
+    )
+    return (tmp_path / "report.html").read_text(encoding="utf-8")
+
+
+def test_page_needs_nothing_else(page):
+    parser = _Outside()
+    parser.feed(page)
+    assert all(link.startswith(("data:", "#")) for link in parser.fetched)
+    assert not re.search(r"@import|fetch\(|XMLHttpRequest|url\((?!#)", page)
+
+
+def test_page_says_the_numbers(page):
+    for record in demo_runs():
+        assert f"{record.final_error_cm:.2f}" in page
+    assert "two &lt;cores&gt;" in page and "A test &amp; nothing else." in page
+    assert page.count("<svg") == 4
+    assert "$" not in re.sub(r"<script>.*?</script>", "", page, flags=re.DOTALL)
+
+
+def test_pages_ids_are_unique(page):
+    ids = re.findall(r'\bid="([^"]+)"', page)
+    assert len(ids) == len(set(ids))
+
+
+def test_page_carries_the_runs_for_its_player(page):
+    data = json.loads(re.search(r'id="runs">(.*?)</script>', page, flags=re.DOTALL)[1])
+    record = demo_runs()[0]
+    run_ = next(r for r in data["shapes"][0]["runs"] if r["method"] == record.method)
+    np.testing.assert_allclose(np.reshape(run_["points"][-1], (-1, 2)) * 1e-4, record.keypoints[-1], atol=6e-5)
+
+
+def test_missing_keypoints_reach_the_player_as_null():
+    record = run()
+    keypoints = record.keypoints.copy()
+    keypoints[3, 5] = np.nan
+    data = animation_data([dataclasses.replace(record, keypoints=keypoints)])
+    assert data["shapes"][0]["runs"][0]["points"][3][10:12] == [None, None]
+
+
+def test_headline_does_not_claim_what_the_residual_did_not_do():
+    worse = [run("U", "residual", short=0.2), run("U", "direct", short=0.05)]
+    title, lead = headline(pair_by_shape(worse))
+    assert f"{worse[0].final_error_cm:.2f} cm" in title
+    assert f"{worse[1].final_error_cm:.2f}" in lead
+
+
+def test_a_shape_name_cannot_break_the_page(tmp_path):
+    records = [run("</script><b>", "residual")]
+    write_gif(tmp_path / "demo.gif", records, width=120, frames_per_second=1)
+    write_page(
+        tmp_path / "report.html",
+        records,
+        {"shapes": {}, "total_s": 1.0},
+        about="",
+        facts={},
+        gif=tmp_path / "demo.gif",
+    )
+    assert "</script><b>" not in (tmp_path / "report.html").read_text(encoding="utf-8")
+
+
+def test_records_of_the_wrong_shape_are_refused():
+    with pytest.raises(ValueError, match=r"error_cm of U/residual has shape \(3,\), expected \(9,\)"):
+        dataclasses.replace(run(), error_cm=np.zeros(3))
+
+
+def test_no_runs_or_two_of_a_kind_are_refused():
+    with pytest.raises(ValueError, match="at least one run"):
+        pair_by_shape([])
+    with pytest.raises(ValueError, match="Two runs of shape 'U'"):
+        pair_by_shape([run(), run()])
