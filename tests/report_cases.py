@@ -13,7 +13,9 @@ def arc(angle: float, n: int = 13) -> np.ndarray:
     return points[np.round(np.linspace(0, 2000, n)).astype(int)]
 
 
-def run(shape: str = "U", method: str = "residual", *, angle: float = 1.2, short: float = 0.01, n: int = 9) -> RunRecord:
+def run(
+    shape: str = "U", method: str = "residual", *, angle: float = 1.2, short: float = 0.01, n: int = 9
+) -> RunRecord:
     """A run that ends with the fraction `short` of the bend missing."""
     bends = angle * (1.0 - short) * np.linspace(0.02, 1.0, n)
     keypoints = np.stack([arc(bend) for bend in bends])

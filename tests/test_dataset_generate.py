@@ -9,7 +9,6 @@ import sys
 import time
 from pathlib import Path
 
-import jax
 import numpy as np
 import pytest
 
@@ -17,13 +16,16 @@ from cablejax.dataset.generate import MAX_ATTEMPTS, GenerationInterrupted, draw,
 from cablejax.dataset.schema import DatasetConfig, Randomisation
 from cablejax.dataset.store import open_store
 from cablejax.simulate import CableConfig, ThreadedEngine
+from cablejax.simulate.motions import MotionConfig
 
 TINY = DatasetConfig(
     n_trajectories=8,
     n_steps=3,
     shard_size=2,
     seed=5,
-    cable=CableConfig(n_links=5, n_keypoints=4, timestep=0.02),
+    # so few links can only take gentle motion
+    motion=MotionConfig(max_step=0.03, min_distance=0.6, max_angle=0.6, max_curvature=3.0),
+    cable=CableConfig(n_links=7, n_keypoints=4, timestep=0.02),
     randomisation=Randomisation(stiffness=(0.1, 3.0), friction=(0.5, 2.0)),
 )
 
@@ -79,7 +81,7 @@ def test_trajectories_obey_the_protocol(reference):
     aside = (first[:, :, 0] * first[:, -1:, 1] - first[:, :, 1] * first[:, -1:, 0]) / TINY.cable.length
     assert np.abs(aside).max() < 0.03
     size = np.sqrt((block.gripper_twist[..., :2] ** 2).sum(-1) + (0.15 * block.gripper_twist[..., 2]) ** 2)
-    assert 0.005 < size.max() <= 0.05 * (1 + 1e-5)
+    assert 0.003 < size.max() <= 0.03 * (1 + 1e-5)
     assert len(np.unique(block.gripper_twist[:, 0, 0, 0])) == 8
 
 
@@ -89,7 +91,7 @@ def test_parameters_are_drawn_log_uniformly_within_their_ranges():
     assert np.median(drawn[:, 0]) == pytest.approx(np.sqrt(0.3), rel=0.25)
     assert drawn[:, 1].min() >= 0.05 and drawn[:, 1].max() <= 0.2
     np.testing.assert_array_equal(drawn[:, 2], TINY.cable.damping_time)
-    with pytest.raises(ValueError, match="Randomisation.friction"):
+    with pytest.raises(ValueError, match=r"Randomisation\.friction"):
         Randomisation(friction=(2.0, 1.0))
 
 
@@ -117,7 +119,7 @@ def test_shares_of_two_processes_make_the_same_store(reference, tmp_path):
 
 
 def test_sigkill_and_resume_bit_for_bit(tmp_path):
-    config = dataclasses.replace(TINY, n_trajectories=60, n_steps=40)
+    config = dataclasses.replace(TINY, n_trajectories=60, n_steps=20)
     whole = generate(config, tmp_path / "whole", progress=False)
     killed = tmp_path / "killed"
     process = child("generate(config, path, progress=False)", config, killed)

@@ -8,12 +8,12 @@ import re
 import numpy as np
 import pytest
 from PIL import Image
-from report_cases import arc, demo_runs, run
 
 from cablejax.report import figures, pair_by_shape
 from cablejax.report.animation import write_gif
 from cablejax.report.page import animation_data, headline, write_page
 from cablejax.report.style import LIGHT, cable_curve, common_window, gripper_outline
+from report_cases import arc, demo_runs, run
 
 
 def test_curve_follows_the_cable_between_its_keypoints():

@@ -31,8 +31,8 @@ _COMMANDS: Any = (
 )
 _DESCRIPTION = """Two robot grippers bring a cable to a shape.
 
-Start with `cablejax demo`: it needs nothing else and writes a page to look at. To make your own model: `simulate` a data
-set, `train` on it, `shape` a cable with the result. `cablejax COMMAND --help` explains each one."""
+Start with `cablejax demo`: it needs nothing else and writes a page to look at. To make your own model: `simulate` a
+data set, `train` on it, `shape` a cable with the result. `cablejax COMMAND --help` explains each one."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -51,7 +51,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     command = command.what if isinstance(command, Bench) else command
     try:
         command.run()
-    except ValueError as error:
+    except (ValueError, OSError) as error:
         print(f"cablejax: {error}", file=sys.stderr)
         return USER_ERROR
     except KeyboardInterrupt as interrupt:

@@ -50,7 +50,7 @@ class _Letter:
 
 _LETTERS: dict[str, _Letter] = {
     "U": _Letter(start=-90.0, end=90.0, distance=0.45, direction=0.0),
-    "S": _Letter(start=-90.0, end=-90.0, distance=0.60, direction=60.0),
+    "S": _Letter(start=-90.0, end=-90.0, distance=0.65, direction=60.0),
     "Z": _Letter(start=115.0, end=115.0, distance=0.52, direction=-60.0),
 }
 
@@ -170,7 +170,7 @@ def _read_json(path: pathlib.Path) -> dict[str, np.ndarray]:
 
 def _read_csv(path: pathlib.Path) -> dict[str, np.ndarray]:
     lines = [line for line in path.read_text().splitlines() if line.strip()]
-    if lines and not lines[0].lstrip()[0] in "+-.0123456789" and not lines[0].strip().lower().startswith("nan"):
+    if lines and lines[0].lstrip()[0] not in "+-.0123456789" and not lines[0].strip().lower().startswith("nan"):
         lines = lines[1:]  # a heading
     return {"keypoints": np.array([[float(cell) for cell in line.split(",")] for line in lines])}
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import time
 from collections.abc import Callable
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from tyro.conf import subcommand
 
@@ -49,7 +49,7 @@ class BenchSimulate(Command):
         mjx, one, many = MjxEngine(config), ThreadedEngine(config, 1), ThreadedEngine(config, self.threads)
 
         # An arch, moved slowly: contact with the table, bending and grasps are all at work.
-        state = one.initial_state(np.array([[0.0, 0.0, 0.6], [0.8, 0.0, -0.6]]))
+        state = one.initial_state(jnp.array([[0.0, 0.0, 0.6], [0.8, 0.0, -0.6]]))
         rng = np.random.default_rng(self.seed)
         twist = jnp.asarray(rng.uniform(-0.01, 0.01, (self.batch, self.seconds, 2, 3)))
         params, states = jax.tree.map(
@@ -61,7 +61,7 @@ class BenchSimulate(Command):
         unroll = jax.vmap(functools.partial(mjx.unroll, interval=1.0))
         compiled = jax.jit(unroll, compiler_options=compiler_options()).lower(params, states, twist).compile()
         compile_s = time.perf_counter() - begin
-        memory = compiled.memory_analysis()
+        memory: Any = compiled.memory_analysis()
         memory_bytes = memory.temp_size_in_bytes + memory.argument_size_in_bytes + memory.output_size_in_bytes
 
         contestants = {
@@ -105,7 +105,43 @@ class BenchSimulate(Command):
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class BenchMpc(Command):
-    """Time one call of the controller with the released model: fit the residual, plan, command."""
+    """Time one call of the controller: take in an observation, fit the residual, plan, command."""
+
+    weights: str = "gns-reference"
+    """Released model by name, or the folder of a training by `cablejax train`."""
+
+    solver: Literal["trust-region", "projected-gradient"] = "trust-region"
+    """How the plan is found."""
+
+    repeats: int = 60
+    """Calls to time, after the first one, which compiles."""
+
+    def execute(self):
+        from cablejax.commands.shaping import initial_history, load_model, make_controller
+        from cablejax.mpc import time_control
+        from cablejax.simulate import CableConfig
+        from cablejax.targets import make_target
+
+        if self.repeats < 1:
+            raise UsageError(f"--repeats is {self.repeats}, expected at least 1.")
+        model = load_model(self.weights)
+        cable = CableConfig()
+        controller = make_controller(model, make_target("S", cable), method="residual", solver=self.solver)
+        say("compiling the control step ...")
+        timing = time_control(controller, initial_history(cable, model.config), self.repeats)
+        result = {
+            "solver": self.solver,
+            "horizon": controller.config.horizon,
+            "repeats": self.repeats,
+            "p50_ms": timing.p50_ms,
+            "p95_ms": timing.p95_ms,
+            "first_call_s": timing.first_call_s,
+            **_machine(),
+        }
+        return result, (
+            f"one control call ({self.solver}, horizon {controller.config.horizon}): median {timing.p50_ms:.1f} ms, "
+            f"95th percentile {timing.p95_ms:.1f} ms; the first one, which compiles, {timing.first_call_s:.1f} s"
+        )
 
 
 @dataclasses.dataclass(frozen=True)

@@ -1,12 +1,73 @@
-"""`cablejax demo`."""
+"""`cablejax demo`: the whole method on three shapes, with and without its online correction."""
 
 from __future__ import annotations
 
 import dataclasses
+import pathlib
+from typing import ClassVar, Literal
 
-from cablejax.commands.options import Command
+from cablejax.commands.options import Command, text_table
+
+STIFFNESS_RATIO = 2.0
+"""How much stiffer the plant's cable is than the one that the model was trained on."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Demo(Command):
-    """To be wired."""
+    """Shape a cable into a U, an S and a Z with the released model, and make a page about it.
+
+    The cable is twice as stiff as the one the model was trained on and rubs on the table by another law. Each shape is
+    made with and without the online residual. Writes summary.json, log.npz, report.html and demo.gif."""
+
+    resume_hint: ClassVar[str] = "Run the same command again: finished runs are kept and not repeated."
+
+    out: pathlib.Path = pathlib.Path("runs/demo")
+    """Folder for the results."""
+
+    overwrite: bool = False
+    """Replace the results that are in the folder."""
+
+    weights: str = "gns-reference"
+    """Released model by name, or the folder of a training by `cablejax train`."""
+
+    shapes: tuple[Literal["U", "S", "Z"], ...] = ("U", "S", "Z")
+    """Which shapes to make."""
+
+    steps: int = 40
+    """Commands per run, one second each."""
+
+    links: int = 24
+    """Links of the plant's cable."""
+
+    solver: Literal["trust-region", "projected-gradient"] = "trust-region"
+    """How the controller finds its plan."""
+
+    def execute(self):
+        from cablejax.commands.results import table_of
+        from cablejax.commands.shaping import METHODS, load_model, shape_and_report
+        from cablejax.simulate.plant import PlantConfig
+        from cablejax.targets import make_target
+
+        plant = PlantConfig(stiffness_ratio=STIFFNESS_RATIO, seed=self.seed)
+        plant = dataclasses.replace(plant, cable=dataclasses.replace(plant.cable, n_links=self.links))
+        summary = shape_and_report(
+            self.out,
+            overwrite=self.overwrite,
+            plant=plant,
+            model=load_model(self.weights),
+            targets=[make_target(shape, plant.cable) for shape in dict.fromkeys(self.shapes)],
+            methods=METHODS,
+            solver=self.solver,
+            steps=self.steps,
+            about=(
+                f"The cable is {STIFFNESS_RATIO:g} times as stiff as the one that the model was trained on. It touches "
+                "the table with contact and friction cones, where the training simulator has a smoothed friction law."
+            ),
+            facts={
+                "command": f"cablejax demo --seed {self.seed} --steps {self.steps} --links {self.links}",
+                "model": self.weights,
+                "solver": self.solver,
+            },
+        )
+        table = text_table(*table_of(summary))
+        return summary, f"{table}\n\n{summary['total_s']:.0f} s. Look at {self.out / 'report.html'}"

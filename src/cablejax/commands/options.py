@@ -104,7 +104,9 @@ def text_table(header: list[str], rows: list[list[str]]) -> str:
     widths = [max(len(line[k]) for line in [header, *rows]) for k in range(len(header))]
 
     def line(cells: list[str]) -> str:
-        first, *others = (c.ljust(w) if k == 0 else c.rjust(w) for k, (c, w) in enumerate(zip(cells, widths, strict=True)))
+        first, *others = (
+            c.ljust(w) if k == 0 else c.rjust(w) for k, (c, w) in enumerate(zip(cells, widths, strict=True))
+        )
         return "  ".join([first, *others]).rstrip()
 
     return "\n".join([line(header), "  ".join("-" * w for w in widths), *(line(row) for row in rows)])

@@ -1,12 +1,91 @@
-"""`cablejax shape`."""
+"""`cablejax shape`: one cable, one target, your own settings."""
 
 from __future__ import annotations
 
 import dataclasses
+import pathlib
+from typing import ClassVar, Literal
 
-from cablejax.commands.options import Command
+from cablejax.commands.options import Command, text_table
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Shape(Command):
-    """To be wired."""
+    """Shape one cable into a target of your own, on a simulated plant of your own.
+
+    The target is a letter or a file: .npz or .json with "keypoints" [N, 2] in metres, or .csv with rows x,y. Writes
+    summary.json, log.npz, report.html and demo.gif."""
+
+    resume_hint: ClassVar[str] = "Run the same command again: finished runs are kept and not repeated."
+
+    target: str = "U"
+    """U, S, Z, or a file with the keypoints to reach."""
+
+    out: pathlib.Path = pathlib.Path("runs/shape")
+    """Folder for the results."""
+
+    overwrite: bool = False
+    """Replace the results that are in the folder."""
+
+    method: Literal["residual", "direct", "both"] = "both"
+    """residual: correct the model online. direct: trust it as it was trained. both: one run of each."""
+
+    weights: str = "gns-reference"
+    """Released model by name, or the folder of a training by `cablejax train`."""
+
+    solver: Literal["trust-region", "projected-gradient"] = "trust-region"
+    """How the controller finds its plan."""
+
+    steps: int = 40
+    """Commands, one second each."""
+
+    stiffness_ratio: float = 2.0
+    """The plant's bending stiffness over that of the training."""
+
+    friction: float = 0.1
+    """Coulomb friction coefficient of the plant's table."""
+
+    noise_mm: float = 0.0
+    """Standard deviation of the observed keypoints, per coordinate [mm]."""
+
+    links: int = 24
+    """Links of the plant's cable."""
+
+    def execute(self):
+        from cablejax.commands.results import table_of
+        from cablejax.commands.shaping import METHODS, load_model, shape_and_report
+        from cablejax.simulate.plant import PlantConfig
+        from cablejax.targets import load_target, make_target
+
+        default = PlantConfig()
+        cable = dataclasses.replace(default.cable, n_links=self.links, friction_coefficient=self.friction)
+        plant = dataclasses.replace(
+            default,
+            cable=cable,
+            stiffness_ratio=self.stiffness_ratio,
+            keypoint_noise=1e-3 * self.noise_mm,
+            seed=self.seed,
+        )
+        target = make_target(self.target, cable) if self.target in ("U", "S", "Z") else load_target(self.target, cable)
+        summary = shape_and_report(
+            self.out,
+            overwrite=self.overwrite,
+            plant=plant,
+            model=load_model(self.weights),
+            targets=[target],
+            methods=METHODS if self.method == "both" else (self.method,),
+            solver=self.solver,
+            steps=self.steps,
+            about=(
+                f"The plant's cable is {self.stiffness_ratio:g} times as stiff as the one that the model was trained "
+                f"on; the table's friction coefficient is {self.friction:g}, and the keypoints are seen with "
+                f"{self.noise_mm:g} mm of noise."
+            ),
+            facts={
+                field.name.replace("_", " "): str(getattr(self, field.name))
+                for field in dataclasses.fields(self)
+                if field.name not in ("json", "out", "overwrite", "device")
+            },
+        )
+        table = text_table(*table_of(summary))
+        return summary, f"{table}\n\nLook at {self.out / 'report.html'}"

@@ -62,6 +62,7 @@ class Simulate(Command):
         from cablejax.dataset.schema import DatasetConfig, Randomisation
         from cablejax.dataset.store import open_store
         from cablejax.simulate import CableConfig
+        from cablejax.simulate.motions import MotionConfig
 
         cable = CableConfig(bending_stiffness=self.stiffness, friction_coefficient=self.friction)
         if self.links is not None:
@@ -70,7 +71,7 @@ class Simulate(Command):
             n_trajectories=self.trajectories,
             n_steps=self.steps,
             seed=self.seed,
-            start=self.start,
+            motion=MotionConfig(start=self.start),
             cable=cable,
             randomisation=Randomisation(stiffness=self.stiffness_range),
             engine=self.engine,

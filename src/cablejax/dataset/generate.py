@@ -9,41 +9,27 @@ from __future__ import annotations
 import dataclasses
 import os
 from collections.abc import Sequence
-from typing import Protocol
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from tqdm import tqdm
 
 from cablejax.dataset.parallel import DeviceParallel
 from cablejax.dataset.schema import Block, DatasetConfig
 from cablejax.dataset.store import DatasetInfo, open_or_create
-from cablejax.simulate import MjxEngine, ThreadedEngine
+from cablejax.simulate import Engine, MjxEngine, ThreadedEngine
 from cablejax.simulate.motions import random_motion
-from cablejax.types import CableParams, CableState, Trajectory
+from cablejax.types import CableParams, Trajectory
 
 MAX_ATTEMPTS = 10
 """Motions drawn for one trajectory before generation gives up."""
 
 GRASP_TOLERANCE = 1e-2
-"""Largest distance of an end keypoint from its gripper [m]: a cable that snaps through pulls its ends off for a step."""
+"""Largest distance of an end keypoint from its gripper [m]: a cable that snaps through pulls its ends off a bit."""
 
 STRETCH_TOLERANCE = 0.01
 """Largest excess of the chord between neighbouring keypoints over the arc length between them, relative."""
-
-
-class Engine(Protocol):
-    """What generation needs of a simulator; `cablejax.simulate` has two."""
-
-    def initial_state(self, gripper_pose: np.ndarray) -> CableState:
-        """The settled cables between grippers at rest at poses [B, Q, 3], each computed by itself."""
-        ...
-
-    def rollout(
-        self, params: CableParams, state: CableState, twist: np.ndarray, interval: float
-    ) -> tuple[CableState, Trajectory]:
-        """Simulates a batch: every leaf of every argument has the leading axis B."""
-        ...
 
 
 class GenerationInterrupted(KeyboardInterrupt):
@@ -86,9 +72,7 @@ def cable_params(config: DatasetConfig, parameters: np.ndarray) -> CableParams:
     """The simulator's parameters of one trajectory, from its row of the store's `parameters`."""
     stiffness, friction, damping = parameters
     nominal = config.cable.params(stiffness_ratio=float(stiffness))
-    return dataclasses.replace(
-        nominal, friction_coefficient=np.float32(friction), damping_time=np.float32(damping)
-    )
+    return dataclasses.replace(nominal, friction_coefficient=jnp.float32(friction), damping_time=jnp.float32(damping))
 
 
 def generate(
@@ -134,16 +118,17 @@ def generate(
     if not resume and any(state != "missing" for state in states.values()):
         raise ValueError(f"{path} exists and holds trajectories. Allow resuming, or give a new folder.")
     todo = [shard for shard in mine if states[shard] != "complete"]
-    if todo and engine is None:
-        engine = make_engine(config)
+    simulator = engine or make_engine(config)
+    at_once = simulator.shards_at_once if isinstance(simulator, DeviceParallel) else 1
 
     total = sum(len(config.shard_rows(shard)) for shard in mine)
     done = total - sum(len(config.shard_rows(shard)) for shard in todo)
     label = "trajectories" if count == 1 else f"trajectories ({index + 1}/{count})"
     with tqdm(total=total, initial=done, desc=label, unit="traj", disable=not progress) as bar:
         try:
-            for shards in _groups(todo, getattr(engine, "shards_at_once", 1)):
-                for shard, block in zip(shards, simulate(config, engine, shards), strict=True):
+            for first in range(0, len(todo), at_once):
+                shards = todo[first : first + at_once]
+                for shard, block in zip(shards, simulate(config, simulator, shards), strict=True):
                     store.write_shard(shard, block)
                     done += len(block)
                     bar.update(len(block))
@@ -160,7 +145,7 @@ def generate(
 
 
 def simulate(config: DatasetConfig, engine: Engine, shards: Sequence[int]) -> list[Block]:
-    """The trajectories of some shards, each of which passes `faults`. What fails is drawn again, from the next attempt.
+    """The trajectories of some shards, checked by `find_fault`. What fails is drawn again, as the next attempt.
 
     Raises:
         ValueError: a trajectory failed `MAX_ATTEMPTS` times.
@@ -176,7 +161,9 @@ def simulate(config: DatasetConfig, engine: Engine, shards: Sequence[int]) -> li
         out["gripper_twist"][pending] = [item.gripper_twist for item in draws]
         out["parameters"][pending] = [item.parameters for item in draws]
         out["attempts"][pending] = attempt
-        problems = {k: fault for k in pending if (fault := find_fault(config, Block(**{n: a[k] for n, a in out.items()})))}
+        problems = {
+            k: fault for k in pending if (fault := find_fault(config, Block(**{n: a[k] for n, a in out.items()})))
+        }
         pending = np.array(sorted(problems), dtype=int)
         if not problems:
             block = Block(**out)
@@ -212,12 +199,7 @@ def make_engine(config: DatasetConfig) -> Engine:
 
 
 def _rollout(config: DatasetConfig, engine: Engine, draws: Sequence[Draw]) -> Trajectory:
-    state = engine.initial_state(np.stack([item.gripper_pose for item in draws]))
-    params = [cable_params(config, item.parameters) for item in draws]
-    twist = np.stack([item.gripper_twist for item in draws])
-    params = jax.tree.map(lambda *leaves: np.stack(leaves), *params)
+    state = engine.initial_state(jnp.stack([item.gripper_pose for item in draws]))
+    params = jax.tree.map(lambda *leaves: np.stack(leaves), *[cable_params(config, item.parameters) for item in draws])
+    twist = jnp.stack([item.gripper_twist for item in draws])
     return engine.rollout(params, state, twist, config.interval)[1]
-
-
-def _groups(shards: Sequence[int], size: int) -> list[list[int]]:
-    return [list(shards[first : first + size]) for first in range(0, len(shards), size)]

@@ -8,12 +8,13 @@ import jax
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
+from cablejax.simulate.config import CableConfig
 from cablejax.simulate.engine import Engine
-from cablejax.types import CableParams, CableState, Trajectory
+from cablejax.types import CableState
 
 
 @dataclasses.dataclass(frozen=True)
-class DeviceParallel:
+class DeviceParallel(Engine):
     """Runs an engine with its batch sharded over devices, always the same number of cables on each.
 
     The last bits of a compiled batch may depend on its size. So every device gets `per_device` cables, padded by copies
@@ -27,26 +28,33 @@ class DeviceParallel:
 
     engine: Engine
     per_device: int
-    devices: tuple[jax.Device, ...]
+    devices: tuple[jax.Device, ...]  # pyright: ignore[reportInvalidTypeForm]
+
+    @property
+    def config(self) -> CableConfig:
+        """The simulated cable."""
+        return self.engine.config
 
     @property
     def shards_at_once(self) -> int:
         """Shards of `per_device` trajectories to be simulated together."""
         return len(self.devices)
 
-    def initial_state(self, gripper_pose: np.ndarray) -> CableState:
-        """As the engine's."""
-        return self.engine.initial_state(gripper_pose)
+    def initial_state(self, gripper_pose, *, guess=None) -> CableState:
+        return self.engine.initial_state(gripper_pose, guess=guess)
 
-    def rollout(
-        self, params: CableParams, state: CableState, twist: np.ndarray, interval: float = 1.0
-    ) -> tuple[CableState, Trajectory]:
-        """As the engine's, for a batch of up to `per_device` times the number of devices; returns NumPy arrays."""
+    def rollout(self, params, state, twist, interval=1.0):
+        """As the engine's, for a batch of up to `per_device` times the number of devices; returns NumPy arrays.
+
+        Raises:
+            ValueError: the batch is larger than that.
+        """
         size, width = len(twist), self.per_device * len(self.devices)
         if not 0 < size <= width:
             raise ValueError(f"The batch has {size} cables, expected 1 to {width}: {self.per_device} on each device.")
         rows = np.minimum(np.arange(width), size - 1)
         sharding = NamedSharding(Mesh(np.array(self.devices), ("device",)), PartitionSpec("device"))
-        inputs = jax.tree.map(lambda leaf: jax.device_put(np.asarray(leaf)[rows], sharding), (params, state, twist))
-        result = self.engine.rollout(*inputs, interval)
+        inputs = (params, state, twist)
+        params, state, twist = jax.tree.map(lambda leaf: jax.device_put(np.asarray(leaf)[rows], sharding), inputs)
+        result = self.engine.rollout(params, state, twist, interval)
         return jax.tree.map(lambda leaf: np.asarray(leaf)[:size], result)

@@ -38,7 +38,7 @@ class Randomisation:
             value = getattr(self, field.name)
             if value is not None and not (len(value) == 2 and np.all(np.isfinite(value)) and 0 < value[0] <= value[1]):
                 raise ValueError(
-                    f"Randomisation.{field.name} is {value}, expected None or two factors (low, high) with 0 < low <= high."
+                    f"Randomisation.{field.name} is {value}, expected None or factors (low, high), 0 < low <= high."
                 )
 
 
@@ -128,7 +128,9 @@ class Block:
         """SHA-256 of every trajectory's bytes (little-endian, in the order of the fields), uint8, shape [B, 32]."""
         arrays = [getattr(self, field.name) for field in dataclasses.fields(self)]
         arrays = [np.ascontiguousarray(array, array.dtype.newbyteorder("<")) for array in arrays]
-        digests = [hashlib.sha256(b"".join(array[row].tobytes() for array in arrays)).digest() for row in range(len(self))]
+        digests = [
+            hashlib.sha256(b"".join(array[row].tobytes() for array in arrays)).digest() for row in range(len(self))
+        ]
         return np.frombuffer(b"".join(digests), np.uint8).reshape(len(self), 32)
 
 
@@ -138,19 +140,19 @@ def config_to_json(config: Any) -> dict[str, Any]:
 
 
 def config_from_json(cls: type, value: Mapping[str, Any]) -> Any:
-    """The inverse of `config_to_json`.
+    """The inverse of `config_to_json`. A field that the record does not know yet takes its default.
 
     Raises:
-        ValueError: a field is missing or unknown; the message names it.
+        ValueError: the record has a field that this version does not know; the message names it.
     """
     hints = typing.get_type_hints(cls)
-    names = {field.name for field in dataclasses.fields(cls)}
-    if names != set(value):
+    unknown = sorted(set(value) - {field.name for field in dataclasses.fields(cls)})
+    if unknown:
         raise ValueError(
-            f"The recorded {cls.__name__} lacks {sorted(names - set(value))} and has the unknown {sorted(set(value) - names)}: "
-            "it was written by another version of cablejax. Make the data set again, or read it with that version."
+            f"The recorded {cls.__name__} has the unknown {', '.join(unknown)}: another version of cablejax wrote it. "
+            "Read it with that version, or make the data set again."
         )
-    return cls(**{name: _decode(hints[name], value[name]) for name in names})
+    return cls(**{name: _decode(hints[name], item) for name, item in value.items()})
 
 
 def _decode(hint: Any, value: Any) -> Any:
@@ -175,6 +177,6 @@ def differences(stored: Mapping[str, Any], asked: Mapping[str, Any], prefix: str
     return found
 
 
-def digest_of_config(config: DatasetConfig) -> str:
-    """SHA-256 of the configuration's canonical JSON."""
-    return hashlib.sha256(json.dumps(config_to_json(config), sort_keys=True).encode()).hexdigest()
+def digest_of_config(config: Mapping[str, Any]) -> str:
+    """SHA-256 of a configuration's canonical JSON."""
+    return hashlib.sha256(json.dumps(config, sort_keys=True).encode()).hexdigest()

@@ -3,9 +3,10 @@
     keypoints [M, T + 1, N, 2]   gripper_pose [M, T + 1, Q, 3]   gripper_twist [M, T, Q, 3]   float32
     parameters [M, 3] float64    attempts [M] int32              digest [M, 32] uint8, SHA-256 of each trajectory
 
-Every array is sharded alike: one file per shard of trajectories; in the large ones, one inner chunk per trajectory. The digests of a
-shard are written last, each file by an atomic rename, so that a process killed at any instant leaves either a whole
-shard or one that the next run makes again. Shards belong to one process each, so processes never write the same file.
+Every array is sharded alike: one file per shard of trajectories, in the large arrays with an inner chunk for each.
+The digests of a shard are written last, each file by an atomic rename, so that a process killed at any instant leaves
+either a whole shard or one that the next run makes again. Shards belong to one process each, so processes never write
+the same file.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ import os
 import shutil
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 import numpy as np
 import zarr
@@ -37,7 +38,7 @@ from cablejax.dataset.schema import (
 )
 
 PACKAGES = ("jax", "jaxlib", "mujoco", "mujoco-mjx", "numpy")
-"""Packages whose versions, beside that of cablejax, decide the content: a store is completed by the versions that began it."""
+"""Packages whose versions decide the content, beside cablejax itself: those that begin a store must complete it."""
 
 _DIGEST = ((32,), "uint8")
 
@@ -74,10 +75,19 @@ class DatasetInfo:
 
 @dataclasses.dataclass(frozen=True)
 class Store:
-    """An open data set. Made by `open_store` or `open_or_create`."""
+    """An open data set. Made by `open_store` or `open_or_create`.
+
+    Attributes:
+        path: its folder.
+        config: what was asked for; `recorded` as an object.
+        recorded: the configuration as it stands in the store.
+        versions: package versions that began it.
+        group: the Zarr group.
+    """
 
     path: Path
     config: DatasetConfig
+    recorded: dict[str, Any]
     versions: dict[str, str]
     group: zarr.Group
 
@@ -117,13 +127,13 @@ class Store:
         """
         rows = self._slice(shard)
         try:
-            block = Block(**{name: self._array(name)[rows] for name in self.config.array_shapes()})
-            digest = self._array("digest")[rows]
+            block = Block(**{name: self._load(name, rows) for name in self.config.array_shapes()})
+            digest = self._load("digest", rows)
         except Exception as error:  # a damaged file may fail in any codec
             raise ValueError(self._damaged(shard, f"cannot be decoded ({error})")) from error
         if not digest.any():
             raise MissingShardError(
-                f"Shard {shard} of {self.path} has not been generated yet. Run the same generation again to complete it."
+                f"Shard {shard} of {self.path} has not been generated yet. Run the same generation again to make it."
             )
         if not np.array_equal(digest, block.digests()):
             raise ValueError(self._damaged(shard, "does not match its checksums"))
@@ -138,7 +148,7 @@ class Store:
         rows = np.arange(self.config.n_trajectories) if rows is None else np.asarray(rows, dtype=int)
         if len(rows) == 0 or rows.min() < 0 or rows.max() >= self.config.n_trajectories:
             raise ValueError(
-                f"Rows {rows[:5]}... asked of {self.path}, expected at least one in 0..{self.config.n_trajectories - 1}."
+                f"Rows {rows[:5]}... asked of {self.path}, expected some of 0..{self.config.n_trajectories - 1}."
             )
         out = {
             name: np.empty((len(rows), *shape), dtype) for name, (shape, dtype) in self.config.array_shapes().items()
@@ -157,7 +167,7 @@ class Store:
         for shard in range(self.config.n_shards):
             with contextlib.suppress(Exception):  # a damaged shard counts as not there
                 rows = self._slice(shard)
-                attempts[rows], digest[rows] = self._array("attempts")[rows], self._array("digest")[rows]
+                attempts[rows], digest[rows] = self._load("attempts", rows), self._load("digest", rows)
         done = digest.any(axis=1)
         return DatasetInfo(
             path=self.path,
@@ -169,9 +179,10 @@ class Store:
         )
 
     def _array(self, name: str) -> zarr.Array:
-        array = self.group[name]
-        assert isinstance(array, zarr.Array)
-        return array
+        return cast(zarr.Array, self.group[name])
+
+    def _load(self, name: str, rows: slice) -> np.ndarray:
+        return np.asarray(self._array(name)[rows])
 
     def _slice(self, shard: int) -> slice:
         if not 0 <= shard < self.config.n_shards:
@@ -216,10 +227,14 @@ def open_store(path: str | os.PathLike[str], *, mode: Literal["r", "r+"] = "r") 
             f"{path} has schema {attributes.get('schema')!r}, expected {SCHEMA!r}. "
             "Read it with the version of cablejax that wrote it, or generate it again in another folder."
         )
-    config = config_from_json(DatasetConfig, attributes["config"])
-    if attributes["config_digest"] != digest_of_config(config):
-        raise ValueError(f"The configuration recorded in {path} was altered: it no longer matches its digest.")
-    return Store(path, config, attributes["versions"], zarr.open_group(path, mode=mode))
+    recorded = attributes.get("config", {})
+    if attributes.get("config_digest") != digest_of_config(recorded):
+        raise ValueError(
+            f"The configuration recorded in {path} was altered: it no longer matches its digest. "
+            "Restore its zarr.json, or generate the data set again elsewhere."
+        )
+    config = config_from_json(DatasetConfig, recorded)
+    return Store(path, config, recorded, attributes.get("versions", {}), zarr.open_group(path, mode=mode))
 
 
 def open_or_create(path: str | os.PathLike[str], config: DatasetConfig) -> Store:
@@ -237,7 +252,7 @@ def open_or_create(path: str | os.PathLike[str], config: DatasetConfig) -> Store
     if not path.is_dir() or not any(path.iterdir()):
         _create(path, config, versions)
     store = open_store(path, mode="r+")
-    changes = differences(config_to_json(store.config), config_to_json(config))
+    changes = differences(store.recorded, config_to_json(config))
     if changes:
         raise ValueError(
             f"{path} holds a data set of another configuration: {'; '.join(changes)}. "
@@ -273,7 +288,7 @@ def _create(path: Path, config: DatasetConfig, versions: dict[str, str]) -> None
         attributes={
             "schema": SCHEMA,
             "config": config_to_json(config),
-            "config_digest": digest_of_config(config),
+            "config_digest": digest_of_config(config_to_json(config)),
             "versions": versions,
             "parameters": list(PARAMETERS),
         },

@@ -101,21 +101,22 @@ def _largest_scale(
 
     A start that is itself outside counts as lying on the bound it breaks: it may come back, not go further.
     """
-    a = jnp.maximum(jnp.sum(change**2), 1e-20)
-    b = jnp.sum(separation * change)
-    square = jnp.sum(separation**2)
-    slack_upper = jnp.maximum(upper**2 - square, 0.0)
-    slack_lower = jnp.maximum(square - lower**2, 0.0)
+    a, b = jnp.sum(change**2), jnp.sum(separation * change)
+    start, end = jnp.sum(separation**2), jnp.sum((separation + change) ** 2)
+    moving = a > 1e-14
 
     # |separation + s change|^2 <= upper^2 up to the greater root, written without cancellation for either sign of b.
-    root = jnp.sqrt(jnp.maximum(b**2 + a * slack_upper, 1e-30))
-    to_upper = jnp.where(b > 0, slack_upper / (jnp.abs(b) + root), (root - b) / a)
-    # |separation + s change|^2 >= lower^2 up to the lesser root, if the motion approaches and the roots are real.
-    discriminant = b**2 - a * slack_lower
-    hits = (b < 0) & (discriminant > 0)
-    to_lower = slack_lower / (jnp.abs(b) + jnp.sqrt(jnp.where(hits, discriminant, 1.0)))
+    leaves = moving & (end > upper**2)
+    safe_a, safe_b = jnp.where(leaves, a, 1.0), jnp.where(leaves, b, 1.0)
+    slack = jnp.where(leaves, jnp.maximum(upper**2 - start, 0.0), 0.0)
+    root = jnp.sqrt(jnp.maximum(safe_b**2 + safe_a * slack, 1e-20))
+    to_upper = jnp.where(safe_b >= 0, slack / (jnp.abs(safe_b) + root), (root - safe_b) / safe_a)
 
-    end = jnp.sum((separation + change) ** 2)
-    scale = jnp.where(end > upper**2, to_upper, 1.0)
-    scale = jnp.where((end < lower**2) & hits, jnp.minimum(scale, to_lower), scale)
+    # |separation + s change|^2 >= lower^2 up to the lesser root, if the motion approaches and the roots are real.
+    slack = jnp.maximum(start - lower**2, 0.0)
+    discriminant = b**2 - a * slack
+    enters = moving & (end < lower**2) & (b < 0) & (discriminant > 0)
+    to_lower = slack / (jnp.abs(b) + jnp.sqrt(jnp.where(enters, discriminant, 1.0)))
+
+    scale = jnp.minimum(jnp.where(leaves, to_upper, 1.0), jnp.where(enters, to_lower, 1.0))
     return jnp.clip(scale, 0.0, 1.0)

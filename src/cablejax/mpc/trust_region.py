@@ -108,7 +108,7 @@ class _BoundedQuadratic(optx.AbstractDescent):
         largest = state.eigenvalues[-1] + jnp.finfo(state.y.dtype).tiny
         damped = state.eigenvalues + self.damping * largest / step_size
         # Fewest iterations over problems with none to all bounds active (1/100 and 1/5 of the largest need twice).
-        penalty = largest / 30.0
+        penalty = largest / 20.0
         basis = state.eigenvectors
 
         def solve(linear, diagonal):

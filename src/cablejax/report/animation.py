@@ -117,7 +117,7 @@ class _Scene:
         return image.resize(self.size, Image.Resampling.BOX)
 
     def _static(self) -> Image.Image:
-        image = Image.new("RGB", tuple(_OVERSAMPLING * n for n in self.size), LIGHT.background)
+        image = Image.new("RGB", (_OVERSAMPLING * self.size[0], _OVERSAMPLING * self.size[1]), LIGHT.background)
         canvas = _Canvas(image)
         canvas.text((16, 12), "Two grippers shape a cable", LIGHT.ink, 18, bold=True)
         canvas.dashes(np.array([(318.0, 24.0), (352.0, 24.0)]), LIGHT.target, 3.0)

@@ -6,6 +6,8 @@ state, no display needed. Notebooks show it, `page.svg` inlines it, `figure.save
 
 from __future__ import annotations
 
+from typing import Any
+
 import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
@@ -22,7 +24,7 @@ from cablejax.report.style import (
     gripper_outline,
 )
 
-_STYLE = {
+_STYLE: dict[Any, Any] = {
     "font.family": "sans-serif",
     "font.size": 10.0,
     "axes.edgecolor": LIGHT.muted,
@@ -128,7 +130,9 @@ def trust_region(records: list[RunRecord]) -> Figure:
     return figure
 
 
-def snapshots(records: list[RunRecord], shape: str | None = None, method: Method = "residual", count: int = 5) -> Figure:
+def snapshots(
+    records: list[RunRecord], shape: str | None = None, method: Method = "residual", count: int = 5
+) -> Figure:
     """One run as a film strip: the cable and its grippers at `count` instants, dense at the start, over the target."""
     pairs = pair_by_shape(records)
     shape = next(iter(pairs)) if shape is None else shape
@@ -173,7 +177,9 @@ def _draw_cable(ax: Axes, run: RunRecord, index: int, method: Method) -> None:
 def _scale_bar(ax: Axes, view: tuple[float, float, float, float], length: float = 0.2) -> None:
     x, y = view[1] - 0.02, view[2] + 0.02
     ax.plot([x - length, x], [y, y], color=LIGHT.muted, lw=1.5, solid_capstyle="butt")
-    ax.text(x - length / 2, y + 0.012, f"{100 * length:.0f} cm", ha="center", va="bottom", color=LIGHT.muted, fontsize=9)
+    ax.text(
+        x - length / 2, y + 0.012, f"{100 * length:.0f} cm", ha="center", va="bottom", color=LIGHT.muted, fontsize=9
+    )
 
 
 def _row_of_panels(shapes: list[str], label: str) -> tuple[Figure, np.ndarray]:
@@ -204,5 +210,7 @@ def _one_method_panels(records, quantity, label: str, method: Method) -> Figure:
 
 def _method_legend(figure: Figure, records: list[RunRecord]) -> None:
     present = {record.method for record in records}
-    handles = [Line2D([], [], color=LIGHT.method(m), lw=2.2, label=METHOD_LABEL[m]) for m in METHOD_ORDER[::-1] if m in present]
+    handles = [
+        Line2D([], [], color=LIGHT.method(m), lw=2.2, label=METHOD_LABEL[m]) for m in METHOD_ORDER[::-1] if m in present
+    ]
     figure.legend(handles=handles, loc="outside upper left", ncols=2, handlelength=1.6)

@@ -146,7 +146,7 @@ def animation_data(records: list[RunRecord]) -> dict[str, Any]:
 
 
 def svg(figure: Figure, name: str) -> str:
-    """A figure as an inline SVG element whose colours are the page's; `name` keeps its ids apart from other figures'."""
+    """A figure as an inline SVG element in the page's own colours; `name` keeps its ids apart from those of others."""
     buffer = io.StringIO()
     figure.savefig(buffer, format="svg", transparent=True, metadata={"Date": None})
     text = buffer.getvalue()
@@ -202,7 +202,7 @@ def _table(shapes: Mapping[str, Mapping[str, Any]]) -> str:
     rows = []
     for shape, values in shapes.items():
         cells = "".join(
-            f'<td class="{css}">{"–" if values.get(key) is None else form.format(values[key])}</td>'
+            f'<td class="{css}">{"n/a" if values.get(key) is None else form.format(values[key])}</td>'
             for key, _, form, css in columns
         )
         rows.append(f"<tr><th>{html.escape(shape)}</th>{cells}</tr>")

@@ -2,9 +2,20 @@
 
 from __future__ import annotations
 
+import importlib.metadata
 import os
 import pathlib
 import platform
+
+import cablejax
+
+_PACKAGES = ("jax", "jaxlib", "flax", "mujoco", "mujoco-mjx", "optimistix", "numpy")
+
+
+def versions() -> str:
+    """Versions of this package and of those that decide its numbers, in words."""
+    others = (f"{name} {importlib.metadata.version(name)}" for name in _PACKAGES)
+    return ", ".join([f"cablejax {cablejax.__version__}", f"Python {platform.python_version()}", *others])
 
 
 def machine() -> str:

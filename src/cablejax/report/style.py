@@ -6,6 +6,7 @@ The colours are those of Okabe and Ito, which stay apart for colour-blind reader
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -67,8 +68,8 @@ def cable_curve(
 ) -> Float[np.ndarray, "P 2"]:
     """A smooth curve through the keypoints [m], for drawing: a cubic spline in chord length, shape [n_points, 2].
 
-    With `gripper_pose` its end tangents are those of the grippers, as a clamped cable's are. Missing (NaN) keypoints are
-    left out.
+    With `gripper_pose` its end tangents are those of the grippers, as a clamped cable's are. Missing (NaN) keypoints
+    are left out.
     """
     points = np.asarray(keypoints, dtype=float)
     points = points[np.isfinite(points).all(axis=1)]
@@ -77,7 +78,7 @@ def cable_curve(
     points, distance = points[keep], distance[keep]
     if len(points) < 2:
         return np.repeat(points[:1], n_points, axis=0)
-    ends = "not-a-knot"
+    ends: Any = "not-a-knot"
     if gripper_pose is not None:
         theta = np.asarray(gripper_pose)[:, 2]
         tangent = np.stack([np.cos(theta), np.sin(theta)], axis=1)

@@ -7,6 +7,8 @@ the iteration ends in a minimum, a shape in which a real cable would rest, never
 
 from __future__ import annotations
 
+import dataclasses
+
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
@@ -21,24 +23,42 @@ _MAX_STRETCH = 0.2  # largest correction of the far end in one iteration, relati
 _TOLERANCE = 1e-10
 
 
-def equilibrium_angles(
+@dataclasses.dataclass(frozen=True)
+class Equilibrium:
+    """A shape in which the frictionless cable rests.
+
+    Attributes:
+        angles: joint angles [rad], shape [J].
+        stability: smallest eigenvalue of the bending energy's second derivative along the constraints, in units of
+            EI / L: 0 where the cable is about to snap through.
+    """
+
+    angles: Float[np.ndarray, "J"]
+    stability: float
+
+
+def find_equilibrium(
     config: CableConfig, gripper_pose: Float[np.ndarray, "2 3"], guess: Float[np.ndarray, "J"]
-) -> Float[np.ndarray, "J"]:
-    """Joint angles [rad] of the settled cable between two planar gripper poses, near `guess`.
+) -> Equilibrium:
+    """The settled cable between two planar gripper poses, near the joint angles `guess` [rad].
 
     Raises:
         ValueError: the poses are out of reach of the cable, or the iteration does not settle.
     """
     pose = np.asarray(gripper_pose, np.float64)
-    h, lengths = config.link_length, link_lengths(config)
-    span = np.linalg.norm(pose[1, :2] - pose[0, :2])
     if not np.all(np.isfinite(pose)):
         raise ValueError(f"The gripper poses contain NaN or infinity: {pose.tolist()}.")
+    span = np.linalg.norm(pose[1, :2] - pose[0, :2])
     if span > config.length * (1 + 1e-9):
         raise ValueError(
             f"The grippers are {span:.4f} m apart, more than the cable's length of {config.length} m: bring them closer."
         )
+    if span > config.length * (1 - 1e-9):
+        return _taut(config, pose)
+    h, lengths, joints = config.link_length, link_lengths(config), np.arange(config.n_joints)
+    later = np.maximum.outer(joints, joints)
     angles = np.array(guess, np.float64)
+    error = np.full(3, np.inf)
     for _ in range(_MAX_ITERATIONS):
         theta = pose[0, 2] + np.concatenate([[0.0], np.cumsum(angles)])
         steps = lengths[:, None] * np.stack([np.cos(theta), np.sin(theta)], axis=1)
@@ -47,31 +67,51 @@ def equilibrium_angles(
         beyond = np.cumsum(steps[::-1], axis=0)[::-1][1:]
         jacobian = np.stack([-beyond[:, 1], beyond[:, 0], np.ones_like(angles)])
         error = np.array([*(pose[1, :2] - tip), pose[1, 2] - theta[-1]])
-        gradient = angles / h
-        multiplier, *_ = np.linalg.lstsq(jacobian.T, gradient, rcond=None)
-        # second derivative of the tip with respect to angles i, j: minus what lies beyond the later one
-        later = np.maximum.outer(np.arange(len(angles)), np.arange(len(angles)))
-        hessian = np.eye(len(angles)) / h + multiplier[0] * beyond[later, 0] + multiplier[1] * beyond[later, 1]
-        range_space, singular, transposed = np.linalg.svd(jacobian)
-        null = transposed[3:].T
-        shrink = min(1.0, _MAX_STRETCH * config.length / max(np.abs(error).max(), 1e-300))
+        left, singular, right = np.linalg.svd(jacobian)
         inverse = singular / (singular**2 + 1e-12 * singular[0] ** 2)
-        correction = transposed[:3].T @ (inverse * (range_space.T @ (shrink * error)))
+        gradient = angles / h
+        multiplier = left @ (inverse * (right[:3] @ gradient))
+        # second derivative of the tip with respect to angles i, j: minus what lies beyond the later one
+        hessian = np.eye(len(angles)) / h + multiplier[0] * beyond[later, 0] + multiplier[1] * beyond[later, 1]
+        shrink = min(1.0, _MAX_STRETCH * config.length / max(np.abs(error).max(), 1e-300))
+        correction = right[:3].T @ (inverse * (left.T @ (shrink * error)))
+        null = right[3:].T
         values, vectors = np.linalg.eigh(null.T @ hessian @ null)
         reduced = vectors.T @ (null.T @ (gradient + hessian @ correction))
         step = correction - null @ (vectors @ (reduced / np.maximum(np.abs(values), 1e-6 / h)))
         step *= min(1.0, _MAX_TURN / max(np.abs(step).max(), 1e-300))
         angles += step
         if np.abs(step).max() < _TOLERANCE and np.abs(error).max() < 1e-8:
-            return angles
+            return Equilibrium(angles=angles, stability=float(values[0] * config.length))
     raise ValueError(
         f"No equilibrium found between gripper poses {pose.tolist()} in {_MAX_ITERATIONS} iterations: the remaining error "
         f"of the far end is {np.abs(error).max():.2e}. Give a `guess` nearer to the shape, or poses further from taut."
     )
 
 
+def _taut(config: CableConfig, pose: Float[np.ndarray, "2 3"]) -> Equilibrium:
+    """The only shape of a cable as long as the grippers are apart: straight."""
+    chord = pose[1, :2] - pose[0, :2]
+    off = np.abs(_wrap(pose[:, 2] - np.arctan2(chord[1], chord[0]))).max()
+    if off > 1e-6 or abs(pose[1, 2] - pose[0, 2]) > 1e-6:
+        raise ValueError(
+            f"The grippers are a whole cable length apart, but turned by {off:.3g} rad from the line between them: a taut "
+            "cable can only be straight. Bring them closer, or align them."
+        )
+    return Equilibrium(angles=np.zeros(config.n_joints), stability=np.inf)
+
+
+def chain_nodes(
+    config: CableConfig, gripper_pose: Float[np.ndarray, "2 3"], angles: Float[np.ndarray, "J"]
+) -> Float[np.ndarray, "J 2"]:
+    """Positions of the bending joints [m] of the chain that leaves gripper 0."""
+    theta = gripper_pose[0, 2] + np.concatenate([[0.0], np.cumsum(angles)])
+    steps = link_lengths(config)[:, None] * np.stack([np.cos(theta), np.sin(theta)], axis=1)
+    return gripper_pose[0, :2] + np.cumsum(steps, axis=0)[:-1]
+
+
 def arch_angles(config: CableConfig, gripper_pose: Float[np.ndarray, "2 3"]) -> Float[np.ndarray, "J"]:
-    """A first guess for `equilibrium_angles`: the tangent turns linearly between the ends, plus one gentle arch."""
+    """A first guess for `find_equilibrium`: the tangent turns linearly between the ends, plus one gentle arch."""
     pose = np.asarray(gripper_pose, np.float64)
     span = np.linalg.norm(pose[1, :2] - pose[0, :2]) / config.length
     fraction = np.linspace(0.0, 1.0, config.n_links)
@@ -128,7 +168,7 @@ def equilibrium_state(config: CableConfig, gripper_pose, *, guess=None) -> Cable
 
 def _planar_qpos(config, pose, guess):
     start = arch_angles(config, pose) if guess is None else angles_of_keypoints(config, pose, guess)
-    return np.concatenate([pose[0], equilibrium_angles(config, pose, start)])
+    return np.concatenate([pose[0], find_equilibrium(config, pose, start).angles])
 
 
 def _spatial_qpos(config, pose, guess):

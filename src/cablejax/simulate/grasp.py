@@ -12,6 +12,7 @@ velocity that carries both held ends exactly to where the grippers are at the en
 
 from __future__ import annotations
 
+import jax
 import jax.numpy as jnp
 import jax.scipy.linalg as jsl
 from jaxtyping import Array, Float
@@ -35,11 +36,22 @@ def constrained_acceleration(
         jacobian: rows of the held ends' velocities.
         acceleration: wanted acceleration of these rows [m/s^2, rad/s^2].
     """
-    factor = jsl.cho_factor(inertia, lower=True)
-    solved = jsl.cho_solve(factor, jnp.concatenate([force[:, None], jacobian.T], axis=1))
+    solved = solve_positive(inertia, jnp.concatenate([force[:, None], jacobian.T], axis=1))
     free, response = solved[:, 0], solved[:, 1:]
     dual = jacobian @ response
     scale = jnp.sqrt(jnp.diagonal(dual))
     scaled = dual / (scale[:, None] * scale) + _REGULARISATION * jnp.eye(dual.shape[0], dtype=dual.dtype)
-    multiplier = jsl.cho_solve(jsl.cho_factor(scaled, lower=True), (acceleration - jacobian @ free) / scale) / scale
+    multiplier = solve_positive(scaled, ((acceleration - jacobian @ free) / scale)[:, None])[:, 0] / scale
     return free + response @ multiplier
+
+
+def solve_positive(matrix: Float[Array, "n n"], rhs: Float[Array, "n k"]) -> Float[Array, "n k"]:
+    """Solves `matrix x = rhs` for a symmetric positive definite matrix.
+
+    Derivatives go through the solution, `dx = matrix^-1 (drhs - dmatrix x)`, with the factor at hand, instead of through
+    the Cholesky factorisation: many times faster in reverse mode.
+    """
+    factor = jsl.cho_factor(jax.lax.stop_gradient(matrix), lower=True)
+    return jax.lax.custom_linear_solve(
+        lambda x: matrix @ x, rhs, lambda _, b: jsl.cho_solve(factor, b), symmetric=True
+    )

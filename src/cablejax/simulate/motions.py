@@ -9,8 +9,10 @@ import numpy as np
 from jaxtyping import Float
 
 from cablejax.simulate.config import CableConfig
+from cablejax.simulate.equilibrium import arch_angles, chain_nodes, find_equilibrium
 
 _MAX_REDRAWS = 50
+_COARSE_LINKS = 13
 
 
 @dataclasses.dataclass(frozen=True)
@@ -31,6 +33,9 @@ class MotionConfig:
         min_distance: least distance of the grippers, relative to the length.
         max_angle: largest angle between a gripper and the line through both [rad].
         max_curvature: that the grippers may force upon the cable near taut [1/m].
+        max_amplification: largest movement of any point of the cable's equilibrium, relative to the sum of what the
+            grippers move. It keeps the cable from snapping through from one shape to another, which a small change of
+            the start can delay or prevent. A large number lets it snap.
     """
 
     start: Literal["straight", "random"] = "straight"
@@ -43,6 +48,7 @@ class MotionConfig:
     min_distance: float = 0.15
     max_angle: float = 2.2
     max_curvature: float = 12.0
+    max_amplification: float = 1.5
 
 
 def random_motion(
@@ -52,7 +58,8 @@ def random_motion(
     motion: MotionConfig = MotionConfig(),
     interval: float = 1.0,
 ) -> tuple[Float[np.ndarray, "Q 3"], Float[np.ndarray, "T Q 3"]]:
-    """Draws a start pose and n_steps twists. Every pose on the way is within `admissible`.
+    """Draws a start pose and n_steps twists. Every pose on the way is within `admissible`, and no command makes the
+    frictionless cable snap through.
 
     Args:
         rng: source of all randomness.
@@ -64,23 +71,28 @@ def random_motion(
     Returns:
         Gripper poses (x, y, theta) at the start [Q, 3] and twists [T, Q, 3] in m/s and rad/s.
     """
-    pose = _straight_start(rng, config, motion) if motion.start == "straight" else _random_start(rng, config, motion)
-    first = pose.copy()
+    start = _straight_start if motion.start == "straight" else _random_start
+    first = pose = start(rng, config, motion)
+    shape = _Shape.settled(config, pose) if np.isfinite(motion.max_amplification) else None
     scale = np.exp(rng.uniform(np.log(motion.min_scale), 0.0))
     persistence = rng.uniform(0.0, motion.max_persistence)
+    innovation = np.sqrt(1.0 - persistence**2)
     unit = np.array([1.0, 1.0, 1.0 / motion.rotation_weight]) * scale * motion.max_step / interval / np.sqrt(2.0)
     velocity = rng.standard_normal((2, 3))
     twists = np.zeros((n_steps, 2, 3))
     for t in range(n_steps):
         if rng.random() < motion.rest_probability:
             continue
-        innovation = np.sqrt(1.0 - persistence**2)
         proposal = persistence * velocity + innovation * rng.standard_normal((2, 3))
         for _ in range(_MAX_REDRAWS):
             twist = bound_twist(proposal * unit, motion.max_step / interval, motion.rotation_weight)
-            if admissible(config, motion, pose + interval * twist):
-                velocity, twists[t] = proposal, twist
-                pose = pose + interval * twist
+            following = pose + interval * twist
+            reach = motion.max_amplification * interval * twist_size(twist, motion.rotation_weight).sum()
+            if admissible(config, motion, following) and (
+                shape is None or (moved := shape.moved(following, reach)) is not None
+            ):
+                velocity, twists[t], pose = proposal, twist, following
+                shape = None if shape is None else moved
                 break
             proposal = rng.standard_normal((2, 3))
         else:
@@ -88,12 +100,40 @@ def random_motion(
     return first, twists
 
 
-def bound_twist(
-    twist: Float[np.ndarray, "Q 3"], bound: float, rotation_weight: float
-) -> Float[np.ndarray, "Q 3"]:
-    """Scales each gripper's twist down to `sqrt(vx^2 + vy^2 + (rotation_weight omega)^2) <= bound`."""
-    size = np.linalg.norm(twist * np.array([1.0, 1.0, rotation_weight]), axis=-1, keepdims=True)
-    return twist * np.minimum(1.0, bound / np.maximum(size, 1e-12))
+@dataclasses.dataclass(frozen=True)
+class _Shape:
+    """The frictionless equilibrium, on a coarse chain, that a motion carries along."""
+
+    config: CableConfig
+    angles: np.ndarray
+    nodes: np.ndarray
+
+    @classmethod
+    def settled(cls, config: CableConfig, pose: np.ndarray) -> _Shape:
+        coarse = dataclasses.replace(config, n_links=min(config.n_links, _COARSE_LINKS))
+        angles = find_equilibrium(coarse, pose, arch_angles(coarse, pose)).angles
+        return cls(coarse, angles, chain_nodes(coarse, pose, angles))
+
+    def moved(self, pose: np.ndarray, reach: float) -> _Shape | None:
+        """The equilibrium at the next pose, or None if a point of it is further than `reach` [m] from here."""
+        try:
+            angles = find_equilibrium(self.config, pose, self.angles).angles
+        except ValueError:
+            return None
+        nodes = chain_nodes(self.config, pose, angles)
+        if np.linalg.norm(nodes - self.nodes, axis=1).max() > reach:
+            return None
+        return _Shape(self.config, angles, nodes)
+
+
+def twist_size(twist: Float[np.ndarray, "Q 3"], rotation_weight: float) -> Float[np.ndarray, "Q"]:
+    """`sqrt(vx^2 + vy^2 + (rotation_weight omega)^2)` of each gripper [m/s]."""
+    return np.linalg.norm(twist * np.array([1.0, 1.0, rotation_weight]), axis=-1)
+
+
+def bound_twist(twist: Float[np.ndarray, "Q 3"], bound: float, rotation_weight: float) -> Float[np.ndarray, "Q 3"]:
+    """Scales each gripper's twist down to `twist_size <= bound`."""
+    return twist * np.minimum(1.0, bound / np.maximum(twist_size(twist, rotation_weight), 1e-12))[..., None]
 
 
 def admissible(config: CableConfig, motion: MotionConfig, pose: Float[np.ndarray, "Q 3"]) -> bool:

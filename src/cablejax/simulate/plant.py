@@ -49,8 +49,10 @@ class PlantConfig:
             sets how slowly a cable at rest creeps.
         contact_time: time constant of the table's contacts [s].
         keypoint_noise: standard deviation of the observed keypoints [m] per coordinate, the held ends included.
+        keypoint_dropout: probability with which a keypoint is not observed (NaN), except the first and last, which the
+            grippers hold.
         settle_time: simulated time [s] given to a new cable to settle, once without and once with friction.
-        seed: of the observation noise.
+        seed: of noise and gaps.
     """
 
     cable: CableConfig = CableConfig(n_links=40, dimension=3, timestep=0.004)
@@ -58,6 +60,7 @@ class PlantConfig:
     cone_ratio: float = 10.0
     contact_time: float = 0.01
     keypoint_noise: float = 0.0
+    keypoint_dropout: float = 0.0
     settle_time: float = 1.0
     seed: int = 0
 
@@ -70,6 +73,8 @@ class PlantConfig:
                 raise ValueError(f"PlantConfig.{name} is {value}, expected a positive finite number.")
         if not (np.isfinite(self.keypoint_noise) and self.keypoint_noise >= 0):
             raise ValueError(f"PlantConfig.keypoint_noise is {self.keypoint_noise}, expected a finite number >= 0 [m].")
+        if not 0 <= self.keypoint_dropout < 1:
+            raise ValueError(f"PlantConfig.keypoint_dropout is {self.keypoint_dropout}, expected a probability below 1.")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -77,7 +82,7 @@ class Observation:
     """What a camera over the table and the arms' encoders report at one instant.
 
     Attributes:
-        keypoints: [m], float64, shape [N, 2].
+        keypoints: [m], NaN = not observed, float64, shape [N, 2].
         gripper_pose: (x, y, theta) of both grippers [m, rad], shape [Q, 3]; theta counts turns.
         time: since the last reset [s].
     """
@@ -144,13 +149,13 @@ class Plant:
         self._offsets = node_offsets(self.config.cable)[:, None]
         self._weights = hermite_weights(self.config.cable)
         self._pose = np.full((2, 3), np.nan)
-        self._noise = np.random.default_rng(self.config.seed)
+        self._random = np.random.default_rng(self.config.seed)
         self._time = np.nan
 
     def reset(
         self, gripper_pose: Float[np.ndarray, "Q 3"], *, guess: Float[np.ndarray, "S 2"] | None = None
     ) -> Observation:
-        """Lay a new cable on the table, at rest and with no friction locked in, and restart clock and noise.
+        """Lay a new cable on the table, at rest and with no friction locked in, and restart the clock and the noise.
 
         Args:
             gripper_pose: (x, y, theta) of both grippers [m, rad], shape [2, 3].
@@ -173,7 +178,7 @@ class Plant:
         data.qpos[:2], data.qpos[2] = pose[0, :2], cable.diameter / 2
         data.qpos[3:] = _quaternions(np.diff(angles, prepend=0.0)).ravel()
         self._pose, self._time = pose, 0.0
-        self._noise = np.random.default_rng(self.config.seed)
+        self._random = np.random.default_rng(self.config.seed)
         friction = self.model.geom("table").friction
         friction[0] = FRICTIONLESS
         self._advance(np.zeros((2, 3)), self._steps(self.config.settle_time))
@@ -215,12 +220,15 @@ class Plant:
         return observations
 
     def observe(self) -> Observation:
-        """Keypoints and gripper poses now, with the configured noise (drawn anew by every call)."""
-        cable = self.config.cable
+        """Keypoints and gripper poses now, with the configured noise and gaps (drawn anew by every call)."""
+        config, random = self.config, self._random
         nodes, tangents = self.nodes()
-        keypoints = self._weights[0] @ nodes + self._weights[1] @ tangents
-        noise = self.config.keypoint_noise * self._noise.standard_normal((cable.n_keypoints, 2))
-        return Observation(keypoints=keypoints[:, :2] + noise, gripper_pose=self._pose.copy(), time=self._time)
+        keypoints = (self._weights[0] @ nodes + self._weights[1] @ tangents)[:, :2]
+        if config.keypoint_noise:
+            keypoints += config.keypoint_noise * random.standard_normal(keypoints.shape)
+        if config.keypoint_dropout:
+            keypoints[1:-1][random.random(len(keypoints) - 2) < config.keypoint_dropout] = np.nan
+        return Observation(keypoints=keypoints, gripper_pose=self._pose.copy(), time=self._time)
 
     def nodes(self) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
         """Middle of every link, for the two held links the grasped end [m], and the links' unit directions."""

@@ -1,0 +1,119 @@
+"""What the closed-loop commands leave behind: a summary, a gap log, a page and an animation."""
+
+from __future__ import annotations
+
+import dataclasses
+import pathlib
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from cablejax.closed_loop import ClosedLoopRun
+from cablejax.gaplog import gap_log_from_episodes, write_gap_log
+from cablejax.report.animation import write_gif
+from cablejax.report.page import write_page
+from cablejax.report.provenance import machine, versions
+from cablejax.report.record import Method, RunRecord
+from cablejax.simulate import CableConfig
+
+Runs = Mapping[tuple[str, Method], ClosedLoopRun]
+"""Runs by target's name and method."""
+
+
+def records_of(runs: Runs) -> list[RunRecord]:
+    """The runs as the report takes them."""
+    return [
+        RunRecord(
+            shape=shape,
+            method=method,
+            target=run.target.keypoints,
+            times=run.times,
+            keypoints=run.keypoints,
+            gripper_pose=run.gripper_pose,
+            error_cm=run.error_cm,
+            residual_share=run.residual_share,
+            radius=run.radius,
+            mpc_ms=run.mpc_ms,
+        )
+        for (shape, method), run in runs.items()
+    ]
+
+
+def summarise(runs: Runs, total_s: float) -> dict[str, Any]:
+    """The summary of the runs; a number that there is none of is null.
+
+    Settling and planning times are those of the run with the residual, where there is one.
+    """
+    shapes: dict[str, dict[str, float | None]] = {}
+    for shape in dict.fromkeys(shape for shape, _ in runs):
+        with_residual, direct = runs.get((shape, "residual")), runs.get((shape, "direct"))
+        main = with_residual or direct
+        assert main is not None
+        calls = main.mpc_ms[np.isfinite(main.mpc_ms)]
+        p50, p95 = np.percentile(calls, [50, 95]) if len(calls) else (np.nan, np.nan)
+        shapes[shape] = {
+            "initial_error_cm": _number(main.initial_error_cm),
+            "terminal_error_cm": _number(with_residual.terminal_error_cm if with_residual else np.nan),
+            "terminal_error_without_residual_cm": _number(direct.terminal_error_cm if direct else np.nan),
+            "settling_time_s": _number(main.settling_time_s),
+            "mpc_ms_p50": _number(p50),
+            "mpc_ms_p95": _number(p95),
+        }
+    return {"shapes": shapes, "total_s": round(total_s, 3)}
+
+
+def table_of(summary: Mapping[str, Any]) -> tuple[list[str], list[list[str]]]:
+    """The summary as header and rows for a terminal."""
+    columns = (
+        ("initial_error_cm", "start [cm]", ".2f"),
+        ("terminal_error_cm", "end, with residual [cm]", ".2f"),
+        ("terminal_error_without_residual_cm", "without [cm]", ".2f"),
+        ("settling_time_s", "settled [s]", ".0f"),
+        ("mpc_ms_p50", "MPC p50 [ms]", ".0f"),
+        ("mpc_ms_p95", "p95 [ms]", ".0f"),
+    )
+    rows = [
+        [shape, *("-" if values[key] is None else format(values[key], form) for key, _, form in columns)]
+        for shape, values in summary["shapes"].items()
+    ]
+    return ["shape", *(title for _, title, _ in columns)], rows
+
+
+def write_results(
+    out: pathlib.Path,
+    runs: Runs,
+    summary: Mapping[str, Any],
+    *,
+    believed: CableConfig,
+    about: str,
+    facts: Mapping[str, str],
+) -> None:
+    """Writes `log.npz`, `demo.gif` and `report.html` into a folder, replacing files of these names.
+
+    Args:
+        out: the folder.
+        runs: the runs, by shape and method.
+        summary: of these runs.
+        believed: the cable that the model was trained on, which is what the gap log states.
+        about: what plant and model these runs had.
+        facts: settings to print on the page beside versions and machine.
+    """
+    episodes = [
+        dataclasses.replace(run.episode, motion=f"{run.episode.motion}_{method}") for (_, method), run in runs.items()
+    ]
+    write_gap_log(out / "log.npz", gap_log_from_episodes(episodes, believed, source=about), overwrite=True)
+    records = records_of(runs)
+    write_gif(out / "demo.gif", records)
+    write_page(
+        out / "report.html",
+        records,
+        summary,
+        about=about,
+        facts={**facts, "versions": versions(), "machine": machine()},
+        gif=out / "demo.gif",
+    )
+
+
+def _number(value: float) -> float | None:
+    return round(float(value), 4) if np.isfinite(value) else None

@@ -1,0 +1,281 @@
+"""Reading and writing recorded cable runs: the `cablejax-gap-log/1` format, one `.npz` file per cable set-up.
+
+Files are read without unpickling, checked field by field, and written whole or not at all.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import pathlib
+import tempfile
+import zipfile
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from cablejax.simulate.config import GRAVITY, CableConfig
+from cablejax.types import GapLog
+
+SCHEMA = "cablejax-gap-log/1"
+
+_DTYPES = {
+    "time": np.float64,
+    "keypoints": np.float32,
+    "gripper_pose": np.float32,
+    "gripper_command": np.float32,
+    "episode_length": np.int32,
+    "hold": np.bool_,
+}
+_CABLE_FIELDS = ("length_m", "diameter_m", "linear_density_kg_per_m", "bending_stiffness_n_m2", "bending_damping_s")
+_META_FIELDS = (
+    "schema", "cable", "table", "gravity_m_per_s2", "keypoint_arclength_m", "grasp", "motion", "source",
+)  # fmt: skip
+# Columns of a pose and of a twist, by the dimension of the keypoints.
+_POSE_WIDTH, _TWIST_WIDTH = {2: 3, 3: 7}, {2: 3, 3: 6}
+
+
+class GapLogError(ValueError):
+    """A gap log that is not what the format says."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Episode:
+    """One episode of a gap log before padding; the arrays are those of `GapLog` without their leading axis.
+
+    Attributes:
+        motion: what the grippers did, for example "approach_u".
+        time: seconds from the episode's start, shape [T].
+        keypoints: [m], NaN = not observed, shape [T, N, D].
+        gripper_pose: shape [T, Q, 3 or 7].
+        gripper_command: twist held from `time[t]` to `time[t + 1]`, shape [T, Q, 3 or 6].
+        hold: both grippers at rest and the cable settled, shape [T].
+    """
+
+    motion: str
+    time: Float[np.ndarray, " T"]
+    keypoints: Float[np.ndarray, "T N D"]
+    gripper_pose: Float[np.ndarray, "T Q P"]
+    gripper_command: Float[np.ndarray, "T Q V"]
+    hold: np.ndarray
+
+
+def gap_log_from_episodes(
+    episodes: Sequence[Episode],
+    cable: CableConfig,
+    *,
+    source: str,
+    grasp: Sequence[str] = ("clamped", "clamped"),
+) -> GapLog:
+    """One gap log of several episodes of the same cable, padded to the longest.
+
+    Args:
+        episodes: at least one; their number of samples may differ.
+        cable: the cable and table as they are believed to be, which is what the nominal simulator uses.
+        source: free text: what recorded this.
+        grasp: how each gripper holds the cable.
+
+    Raises:
+        GapLogError: no episodes, or episodes that do not fit each other or the format.
+    """
+    if not episodes:
+        raise GapLogError("A gap log needs at least one episode, got none.")
+    lengths = [len(episode.time) for episode in episodes]
+
+    def padded(name: str, fill) -> np.ndarray:
+        arrays = [np.asarray(getattr(episode, name)) for episode in episodes]
+        rest = arrays[0].shape[1:]
+        for array, length in zip(arrays, lengths, strict=True):
+            if array.shape != (length, *rest):
+                raise GapLogError(
+                    f"An episode's {name} has shape {array.shape}, expected {(length, *rest)}: all arrays of an episode "
+                    "have its number of samples, and all episodes are of the same cable."
+                )
+        whole = np.empty((len(arrays), max(lengths), *rest), _DTYPES[name])
+        for row, array in zip(whole, arrays, strict=True):
+            row[: len(array)] = array
+            # Poses and times stay at their last value, so that a reader which ignores the lengths sees a cable at rest.
+            row[len(array) :] = array[-1] if fill is None else fill
+        return whole
+
+    log = GapLog(
+        time=padded("time", None),
+        keypoints=padded("keypoints", np.nan),
+        gripper_pose=padded("gripper_pose", None),
+        gripper_command=padded("gripper_command", 0.0),
+        episode_length=np.array(lengths, np.int32),
+        hold=padded("hold", False),
+        meta={
+            "schema": SCHEMA,
+            "cable": {
+                "length_m": cable.length,
+                "diameter_m": cable.diameter,
+                "linear_density_kg_per_m": cable.linear_density,
+                "bending_stiffness_n_m2": cable.bending_stiffness,
+                "bending_damping_s": cable.damping_time,
+            },
+            "table": {"friction_coefficient": cable.friction_coefficient} if cable.friction_coefficient > 0 else None,
+            "gravity_m_per_s2": [0.0, 0.0, -GRAVITY],
+            "keypoint_arclength_m": cable.keypoint_arclength.tolist(),
+            "grasp": list(grasp),
+            "motion": [episode.motion for episode in episodes],
+            "source": source,
+        },
+    )
+    validate(log)
+    return log
+
+
+def validate(log: GapLog) -> None:
+    """Checks a gap log against the format.
+
+    Raises:
+        GapLogError: names the field, what it is and what was expected.
+    """
+    _validate_arrays(log)
+    _validate_meta(log)
+
+
+def write_gap_log(path: str | os.PathLike, log: GapLog, *, overwrite: bool = False) -> pathlib.Path:
+    """Writes a checked gap log, whole or not at all, and returns its path.
+
+    Raises:
+        GapLogError: the log does not follow the format.
+        FileExistsError: there is such a file and `overwrite` is false.
+    """
+    path = pathlib.Path(path)
+    if path.suffix != ".npz":
+        raise GapLogError(f"A gap log is an .npz file, got {path.name!r}.")
+    validate(log)
+    if path.exists() and not overwrite:
+        raise FileExistsError(f"{path} exists: choose another name, or pass overwrite=True to replace it.")
+    arrays = {name: getattr(log, name) for name in _DTYPES if getattr(log, name) is not None}
+    path.parent.mkdir(parents=True, exist_ok=True)
+    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.stem}-", suffix=".npz")
+    try:
+        with os.fdopen(handle, "wb") as stream:
+            np.savez_compressed(stream, allow_pickle=False, meta=np.array(json.dumps(log.meta)), **arrays)
+        os.chmod(temporary, 0o644)
+        os.replace(temporary, path)
+    finally:
+        pathlib.Path(temporary).unlink(missing_ok=True)
+    return path
+
+
+def read_gap_log(path: str | os.PathLike) -> GapLog:
+    """Reads and checks a gap log; floating-point arrays come in the format's own precision.
+
+    Raises:
+        GapLogError: the file is no `.npz`, a field is missing, or a field is not what the format says.
+        FileNotFoundError: there is no such file.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            if not isinstance(archive, np.lib.npyio.NpzFile):
+                raise GapLogError(f"{path} holds a single array, expected an .npz archive with the fields of {SCHEMA}.")
+            fields: dict[str, Any] = {name: archive[name] for name in archive.files}
+    except (ValueError, EOFError, zipfile.BadZipFile) as error:
+        raise GapLogError(f"{path} could not be read as a gap log: {error}") from error
+    for name in (*_DTYPES, "meta"):
+        if name not in fields and name != "hold":
+            raise GapLogError(f"{path} has no field '{name}', only {sorted(fields)}.")
+    try:
+        meta = json.loads(str(fields["meta"]))
+    except json.JSONDecodeError as error:
+        raise GapLogError(f"{path}: field 'meta' is not JSON: {error}") from error
+    arrays = {}
+    for name, dtype in _DTYPES.items():
+        if name in fields:
+            if not np.can_cast(fields[name].dtype, dtype, casting="same_kind"):
+                raise GapLogError(f"{path}: field '{name}' has dtype {fields[name].dtype}, expected {np.dtype(dtype)}.")
+            arrays[name] = fields[name].astype(dtype)
+    log = GapLog(meta=meta, **arrays)
+    try:
+        validate(log)
+    except GapLogError as error:
+        raise GapLogError(f"{path}: {error}") from error
+    return log
+
+
+def _validate_arrays(log: GapLog) -> None:
+    for name, dtype in _DTYPES.items():
+        array = getattr(log, name)
+        if array is None and name == "hold":
+            continue
+        if not isinstance(array, np.ndarray) or array.dtype != dtype:
+            found = array.dtype if isinstance(array, np.ndarray) else type(array).__name__
+            raise GapLogError(f"Field '{name}' is {found}, expected an array of {np.dtype(dtype)}.")
+    if log.keypoints.ndim != 4 or log.keypoints.shape[3] not in _POSE_WIDTH:
+        raise GapLogError(f"Field 'keypoints' has shape {log.keypoints.shape}, expected (E, T, N, 2) or (E, T, N, 3).")
+    episodes, samples, _, dimension = log.keypoints.shape
+    grippers = log.gripper_pose.shape[2] if log.gripper_pose.ndim == 4 else 2
+    shapes = {
+        "time": (episodes, samples),
+        "gripper_pose": (episodes, samples, grippers, _POSE_WIDTH[dimension]),
+        "gripper_command": (episodes, samples, grippers, _TWIST_WIDTH[dimension]),
+        "episode_length": (episodes,),
+        "hold": (episodes, samples),
+    }
+    for name, shape in shapes.items():
+        array = getattr(log, name)
+        if array is not None and array.shape != shape:
+            raise GapLogError(f"Field '{name}' has shape {array.shape}, expected {shape} beside these keypoints.")
+    for index, length in enumerate(log.episode_length):
+        if not 1 <= length <= samples:
+            raise GapLogError(f"Field 'episode_length' is {length} in episode {index}, expected 1 to {samples}.")
+        time = log.time[index, :length]
+        if not np.isfinite(time).all() or (np.diff(time) <= 0).any():
+            raise GapLogError(f"Field 'time' does not increase, or is not finite, in episode {index}.")
+        for name in ("gripper_pose", "gripper_command"):
+            if not np.isfinite(getattr(log, name)[index, :length]).all():
+                raise GapLogError(f"Field '{name}' is not finite in episode {index}; only keypoints may be NaN.")
+        if np.isinf(log.keypoints[index, :length]).any():
+            raise GapLogError(f"Field 'keypoints' is infinite in episode {index}; a keypoint not observed is NaN.")
+        if dimension == 3:
+            norm = np.linalg.norm(log.gripper_pose[index, :length, :, 3:], axis=-1)
+            if np.abs(norm - 1).max() > 1e-3:
+                raise GapLogError(f"Field 'gripper_pose' has quaternions that are not of unit length in episode {index}.")
+
+
+def _validate_meta(log: GapLog) -> None:
+    meta = log.meta
+    if not isinstance(meta, dict):
+        raise GapLogError(f"Field 'meta' is a {type(meta).__name__}, expected a JSON object.")
+    if "schema" in meta and meta["schema"] != SCHEMA:
+        raise GapLogError(f"Field 'meta.schema' is {meta['schema']!r}, expected {SCHEMA!r}.")
+    for name in _META_FIELDS:
+        if name not in meta:
+            raise GapLogError(f"Field 'meta.{name}' is missing.")
+    _check_numbers("cable", meta["cable"], _CABLE_FIELDS)
+    if meta["table"] is not None:
+        _check_numbers("table", meta["table"], ("friction_coefficient",))
+    points, grippers = log.keypoints.shape[2], log.gripper_pose.shape[2]
+    for name, length in (("gravity_m_per_s2", 3), ("keypoint_arclength_m", points)):
+        value = meta[name]
+        if not isinstance(value, list) or len(value) != length or not all(_is_number(entry) for entry in value):
+            raise GapLogError(f"Field 'meta.{name}' is {value!r}, expected {length} finite numbers.")
+    if (np.diff(meta["keypoint_arclength_m"]) <= 0).any():
+        raise GapLogError("Field 'meta.keypoint_arclength_m' does not increase.")
+    for name, length in (("grasp", grippers), ("motion", len(log.episode_length))):
+        value = meta[name]
+        if not isinstance(value, list) or len(value) != length or not all(isinstance(entry, str) for entry in value):
+            raise GapLogError(f"Field 'meta.{name}' is {value!r}, expected {length} strings.")
+    if not isinstance(meta["source"], str):
+        raise GapLogError(f"Field 'meta.source' is {meta['source']!r}, expected text.")
+
+
+def _check_numbers(group: str, value: Any, names: Sequence[str]) -> None:
+    if not isinstance(value, dict):
+        raise GapLogError(f"Field 'meta.{group}' is {value!r}, expected an object with {', '.join(names)}.")
+    for name in names:
+        if name not in value:
+            raise GapLogError(f"Field 'meta.{group}.{name}' is missing.")
+        if not _is_number(value[name]) or value[name] < 0:
+            raise GapLogError(f"Field 'meta.{group}.{name}' is {value[name]!r}, expected a finite number >= 0.")
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and bool(np.isfinite(value))

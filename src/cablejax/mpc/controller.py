@@ -1,0 +1,402 @@
+"""The receding-horizon controller: observe, correct the model, plan, command; all of it one compiled call."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import math
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from cablejax.mpc.feasible import FeasibleSet
+from cablejax.mpc.problem import ObjectiveConfig, Outcome, Plan, ShapingProblem, Solver
+from cablejax.mpc.trust_region import TrustRegion
+from cablejax.residual.corrected import Dynamics, corrected
+from cablejax.residual.ridge import ResidualModel, RidgeConfig, apply, fit
+from cablejax.types import History
+
+
+@dataclasses.dataclass(frozen=True)
+class MPCConfig:
+    """Settings of the controller. The defaults are those of Wang et al., RA-L 2022, where it gives them.
+
+    Attributes:
+        horizon: h; a plan has h + 1 commands.
+        cable_length: free length of the cable L [m].
+        min_distance: least distance of the grippers, relative to L.
+        max_distance: greatest distance of the grippers, relative to L: a taut cable cannot be shaped.
+        radius: initial trust-region size epsilon, the bound on one step's motion of each gripper [m].
+        radius_min: it does not shrink below this [m].
+        radius_max: nor grow above this [m]: the model has not been trained on faster motions.
+        grow_above: eta+; the radius grows if actual over predicted error reduction is at least this.
+        shrink_below: eta-; it shrinks if the ratio is at most this.
+        grow: tau+.
+        shrink: tau-.
+        min_reduction: predicted changes of the error below this say nothing about the model: the radius stays [m].
+        hold_improvement: the grippers hold still if the plan lowers the error over the horizon, as a root mean square
+            distance, by less than this compared with holding still [m].
+        objective: weights and units of the planning problem.
+        residual: settings of the online residual; None = trust the offline model.
+        solver: any `Solver`.
+    """
+
+    horizon: int = 5
+    cable_length: float = 1.0
+    min_distance: float = 0.15
+    max_distance: float = 0.99
+    radius: float = 0.05
+    radius_min: float = 0.002
+    radius_max: float = 0.05
+    grow_above: float = 0.8
+    shrink_below: float = 0.4
+    grow: float = 1.05
+    shrink: float = 0.95
+    min_reduction: float = 1e-4
+    hold_improvement: float = 2e-5
+    objective: ObjectiveConfig = ObjectiveConfig()
+    residual: RidgeConfig | None = RidgeConfig()
+    solver: Solver = TrustRegion()
+
+    def __post_init__(self):
+        if self.horizon < 0:
+            raise ValueError(f"MPCConfig.horizon is {self.horizon}, expected at least 0 (plan one command).")
+        if not (math.isfinite(self.cable_length) and self.cable_length > 0):
+            raise ValueError(f"MPCConfig.cable_length is {self.cable_length}, expected a positive length [m].")
+        if not 0 <= self.min_distance < self.max_distance <= 1:
+            raise ValueError(
+                f"MPCConfig distances {self.min_distance} to {self.max_distance}: expected 0 <= min_distance < "
+                "max_distance <= 1, relative to the cable's length."
+            )
+        if not 0 < self.radius_min <= self.radius <= self.radius_max:
+            raise ValueError(
+                f"MPCConfig radii {self.radius_min}, {self.radius}, {self.radius_max}: expected "
+                "0 < radius_min <= radius <= radius_max."
+            )
+        if not (self.shrink_below < self.grow_above and 0 < self.shrink <= 1 <= self.grow):
+            raise ValueError(
+                f"MPCConfig trust region: thresholds {self.shrink_below}, {self.grow_above} must increase, and factors "
+                f"{self.shrink}, {self.grow} lie on either side of 1."
+            )
+        if not (self.min_reduction > 0 and self.hold_improvement >= 0):
+            raise ValueError("MPCConfig.min_reduction must be positive and hold_improvement not negative [m].")
+
+    @property
+    def n_commands(self) -> int:
+        """Commands of a plan, T = h + 1."""
+        return self.horizon + 1
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class ControllerState:
+    """What the controller remembers from one step to the next.
+
+    Attributes:
+        history: observations that the model sees, gaps filled.
+        delta: errors of the offline model's last W displacements, oldest first [m], shape [W, N, 2].
+        window_twist: commands of these steps, shape [W, Q, 3].
+        valid: which of them were observed, shape [W, N].
+        plan: the last plan, its first command executed [m], shape [T, Q, 3].
+        twist: the last command, shape [Q, 3].
+        model_displacement: what the offline model expected of it [m], shape [N, 2].
+        predicted: keypoints that model and residual expect now [m], shape [N, 2].
+        observed: keypoints seen at the last step, shape [N].
+        shape_error: root mean square distance to the target at the last step [m], shape [].
+        radius: trust-region size epsilon [m], shape [].
+        steps: control steps so far, shape [].
+        held: keypoint observations missing so far, shape [].
+    """
+
+    history: History
+    delta: Float[Array, "*batch W N 2"]
+    window_twist: Float[Array, "*batch W Q 3"]
+    valid: Bool[Array, "*batch W N"]
+    plan: Float[Array, "*batch T Q 3"]
+    twist: Float[Array, "*batch Q 3"]
+    model_displacement: Float[Array, "*batch N 2"]
+    predicted: Float[Array, "*batch N 2"]
+    observed: Bool[Array, "*batch N"]
+    shape_error: Float[Array, "*batch"]
+    radius: Float[Array, "*batch"]
+    steps: Int[Array, "*batch"]
+    held: Int[Array, "*batch"]
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class ControlInfo:
+    """What one control step reports; every field has shape [].
+
+    Attributes:
+        shape_error: root mean square distance to the target now [m].
+        predicted_error: the same, expected after the command [m].
+        rho: actual over predicted reduction of the error by the last command; 1 where it cannot be told.
+        radius: trust-region size that the command was planned with [m].
+        objective: value of the plan [m^2].
+        objective_hold: value of holding still [m^2].
+        evaluations: iterations of the solver.
+        outcome: an `Outcome`.
+        residual_share: |residual's displacement| / (|model's| + |residual's|) of the command, in [0, 1].
+        condition: condition number of the ridge system.
+        held: keypoints not observed now, replaced by their prediction.
+    """
+
+    shape_error: Float[Array, "*batch"]
+    predicted_error: Float[Array, "*batch"]
+    rho: Float[Array, "*batch"]
+    radius: Float[Array, "*batch"]
+    objective: Float[Array, "*batch"]
+    objective_hold: Float[Array, "*batch"]
+    evaluations: Int[Array, "*batch"]
+    outcome: Int[Array, "*batch"]
+    residual_share: Float[Array, "*batch"]
+    condition: Float[Array, "*batch"]
+    held: Int[Array, "*batch"]
+
+
+def initial_state(config: MPCConfig, history: History) -> ControllerState:
+    """The controller's state before its first step; pure, vmappable."""
+    n_keypoints, n_grippers = history.keypoints.shape[1], history.gripper_pose.shape[0]
+    window = 0 if config.residual is None else config.residual.window
+    dtype = history.keypoints.dtype
+    return ControllerState(
+        history=history,
+        delta=jnp.zeros((window, n_keypoints, 2), dtype),
+        window_twist=jnp.zeros((window, n_grippers, 3), dtype),
+        valid=jnp.zeros((window, n_keypoints), bool),
+        plan=jnp.zeros((config.n_commands, n_grippers, 3), dtype),
+        twist=jnp.zeros((n_grippers, 3), dtype),
+        model_displacement=jnp.zeros((n_keypoints, 2), dtype),
+        predicted=history.keypoints[-1],
+        observed=jnp.ones(n_keypoints, bool),
+        shape_error=jnp.zeros((), dtype),
+        radius=jnp.asarray(config.radius, dtype),
+        steps=jnp.zeros((), jnp.int32),
+        held=jnp.zeros((), jnp.int32),
+    )
+
+
+def control(
+    config: MPCConfig,
+    dynamics: Dynamics,
+    weights: Any,
+    target: Float[Array, "N 2"],
+    state: ControllerState,
+    keypoints: Float[Array, "N 2"],
+    gripper_pose: Float[Array, "Q 3"],
+) -> tuple[ControllerState, Float[Array, "Q 3"], ControlInfo]:
+    """One control step as a pure function: vmap it over `state`, `keypoints`, `gripper_pose` for many cables.
+
+    Args:
+        config: settings; static.
+        dynamics: the offline model `(weights, history, twist) -> displacement`; static.
+        weights: its arrays.
+        target: desired keypoints [m], shape [N, 2].
+        state: from the last step.
+        keypoints: observed now [m]; a keypoint with a NaN counts as not observed, shape [N, 2].
+        gripper_pose: measured now; NaN = not measured, shape [Q, 3].
+
+    Returns:
+        The state for the next step, the twist to hold until then (finite and within all bounds) and the report.
+    """
+    state, n_held = _take_in(config, state, keypoints, gripper_pose)
+    residual = _fit_residual(config, state)
+    problem = ShapingProblem(
+        dynamics=dynamics if residual is None else corrected(dynamics),
+        weights=weights if residual is None else (weights, residual),
+        history=state.history,
+        target=target,
+        feasible=_feasible_set(config, state),
+        objective=config.objective,
+    )
+    error = problem.shape_error(state.history.keypoints[-1])
+    rho, radius = _update_radius(config, state, error, problem.shape_error(state.predicted))
+    problem = dataclasses.replace(problem, feasible=dataclasses.replace(problem.feasible, radius=radius))
+    plan, value, value_hold = _plan_or_hold(config, problem, state.plan)
+
+    twist = config.objective.to_twist(plan.motion[0])
+    offline = dynamics(weights, state.history, twist)
+    online = jnp.zeros_like(offline) if residual is None else apply(residual, twist)
+    newest = state.history.keypoints[-1]
+    moved = newest + offline + online
+    predicted = jnp.where(jnp.isfinite(moved), moved, newest)
+    size_offline, size_online = jnp.linalg.norm(offline), jnp.linalg.norm(online)
+    info = ControlInfo(
+        shape_error=error,
+        predicted_error=problem.shape_error(predicted),
+        rho=rho,
+        radius=radius,
+        objective=value,
+        objective_hold=value_hold,
+        evaluations=plan.evaluations,
+        outcome=plan.outcome,
+        residual_share=jnp.nan_to_num(size_online / jnp.maximum(size_offline + size_online, 1e-12)),
+        condition=jnp.ones_like(error) if residual is None else residual.condition,
+        held=n_held,
+    )
+    state = dataclasses.replace(
+        state,
+        plan=plan.motion,
+        twist=twist,
+        model_displacement=offline,
+        predicted=predicted,
+        shape_error=error,
+        radius=radius,
+        steps=state.steps + 1,
+        held=state.held + n_held,
+    )
+    return state, twist, info
+
+
+def _take_in(
+    config: MPCConfig, state: ControllerState, keypoints: Float[Array, "N 2"], gripper_pose: Float[Array, "Q 3"]
+) -> tuple[ControllerState, Int[Array, ""]]:
+    """The state with the observation in its history and window, and how many keypoints had to be filled in.
+
+    What was not observed is taken from the prediction, and its error is not learned from: neither that of the step
+    which led here nor that of the next, which starts from a position not seen.
+    """
+    dtype = state.predicted.dtype
+    observed = jnp.isfinite(keypoints).all(axis=-1)
+    keypoints = jnp.where(observed[:, None], keypoints, state.predicted).astype(dtype)
+    expected_pose = state.history.gripper_pose + config.objective.interval * state.twist
+    gripper_pose = jnp.where(jnp.isfinite(gripper_pose), gripper_pose, expected_pose).astype(dtype)
+
+    first = state.steps == 0
+    past = state.history.keypoints
+    # The first observation is the history's own newest sample, seen again.
+    past = jnp.where(first, past, jnp.roll(past, -1, axis=0)).at[-1].set(keypoints)
+    delta = keypoints - state.history.keypoints[-1] - state.model_displacement
+    valid = observed & state.observed & jnp.isfinite(delta).all(axis=-1) & ~first
+    state = dataclasses.replace(
+        state,
+        history=History(keypoints=past, gripper_pose=gripper_pose),
+        delta=_push(state.delta, delta),
+        window_twist=_push(state.window_twist, state.twist),
+        valid=_push(state.valid, valid),
+        observed=observed,
+    )
+    return state, jnp.sum(~observed, dtype=jnp.int32)
+
+
+def _fit_residual(config: MPCConfig, state: ControllerState) -> ResidualModel | None:
+    if config.residual is None:
+        return None
+    return fit(state.delta, state.window_twist, state.valid, config.residual)
+
+
+def _feasible_set(config: MPCConfig, state: ControllerState) -> FeasibleSet:
+    pose = state.history.gripper_pose
+    return FeasibleSet(
+        separation=pose[1, :2] - pose[0, :2],
+        radius=state.radius,
+        min_distance=jnp.asarray(config.min_distance * config.cable_length, pose.dtype),
+        max_distance=jnp.asarray(config.max_distance * config.cable_length, pose.dtype),
+    )
+
+
+def _update_radius(
+    config: MPCConfig, state: ControllerState, error: Float[Array, ""], predicted_error: Float[Array, ""]
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """rho and the new trust-region size (Wang et al., RA-L 2022, algorithm 1).
+
+    A plan may accept a larger error now for a smaller one later. Then `rho = actual / predicted` would be large where
+    the plant did worse than predicted, so it is written `1 + (actual - predicted) / |predicted|`: the same for a
+    predicted reduction, and still above 1 exactly where the plant did better.
+    """
+    actual, predicted = state.shape_error - error, state.shape_error - predicted_error
+    telling = (state.steps > 0) & (jnp.abs(predicted) >= config.min_reduction)
+    rho = jnp.where(telling, 1.0 + (actual - predicted) / jnp.where(telling, jnp.abs(predicted), 1.0), 1.0)
+    factor = jnp.where(rho >= config.grow_above, config.grow, jnp.where(rho <= config.shrink_below, config.shrink, 1.0))
+    radius = state.radius * jnp.where(telling, factor, 1.0)
+    return rho, jnp.clip(radius, config.radius_min, config.radius_max)
+
+
+def _plan_or_hold(
+    config: MPCConfig, problem: ShapingProblem, last: Float[Array, "T Q 3"]
+) -> tuple[Plan, Float[Array, ""], Float[Array, ""]]:
+    """The solver's plan, or holding still where that is as good or nothing can be trusted; and both their values."""
+    still = jnp.zeros_like(last)
+    guess = jnp.roll(last, -1, axis=0).at[-1].set(0.0)
+    plan = config.solver(problem, guess)
+    value, value_hold = problem.value(plan.motion), problem.value(still)
+    improvement = jnp.sqrt(2.0 * value_hold / config.n_commands) - jnp.sqrt(2.0 * value / config.n_commands)
+    finite = jnp.isfinite(value) & jnp.isfinite(plan.motion).all()
+    worthwhile = finite & (improvement >= config.hold_improvement)
+    outcome = jnp.where(worthwhile, plan.outcome, jnp.where(finite, Outcome.HELD, Outcome.NONFINITE))
+    motion = jnp.where(worthwhile, plan.motion, still)
+    value = jnp.where(worthwhile, value, value_hold)
+    return Plan(motion=motion, evaluations=plan.evaluations, outcome=outcome.astype(jnp.int32)), value, value_hold
+
+
+def _push(window: Array, newest: Array) -> Array:
+    return jnp.concatenate([window, newest[None]])[1:]
+
+
+_compiled_control = jax.jit(control, static_argnums=(0, 1))
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Controller:
+    """Steers a cable towards a target shape: `init` once, then `step` at every control interval.
+
+    Attributes:
+        config: see `MPCConfig`.
+        dynamics: offline model `(weights, history, twist) -> displacement`, a pure function.
+        weights: its arrays; a traced argument of the compiled step, so that new weights do not compile anew.
+        target: desired keypoints [m], shape [N, 2].
+
+    Raises:
+        ValueError: if the target is not an array of finite keypoints.
+    """
+
+    config: MPCConfig
+    dynamics: Dynamics
+    weights: Any
+    target: Float[Array, "N 2"]
+
+    def __post_init__(self):
+        target = np.asarray(self.target)
+        if target.ndim != 2 or target.shape[1] != 2 or not np.isfinite(target).all():
+            raise ValueError(
+                f"The target has shape {target.shape}{'' if np.isfinite(target).all() else ' with non-finite values'}, "
+                "expected finite keypoints [N, 2] in metres."
+            )
+
+    def init(self, history: History) -> ControllerState:
+        """State for a cable seen at rest or in motion.
+
+        Raises:
+            ValueError: if the history is not finite or has another number of keypoints than the target.
+        """
+        self._check(history.keypoints[-1], history.gripper_pose)
+        if not (np.isfinite(history.keypoints).all() and np.isfinite(history.gripper_pose).all()):
+            raise ValueError("The initial history has non-finite values: start from a complete observation.")
+        return initial_state(self.config, jax.tree.map(jnp.asarray, history))
+
+    def step(
+        self, state: ControllerState, keypoints: Float[Array, "N 2"], gripper_pose: Float[Array, "Q 3"]
+    ) -> tuple[ControllerState, Float[Array, "Q 3"], ControlInfo]:
+        """One control step, compiled at its first call: see `control`.
+
+        Raises:
+            ValueError: if the observation has another shape than the target's keypoints and two grippers.
+        """
+        self._check(keypoints, gripper_pose)
+        return _compiled_control(self.config, self.dynamics, self.weights, self.target, state, keypoints, gripper_pose)
+
+    def vectorised(self):
+        """`step` over a leading batch axis of all its arguments, compiled: one controller for many cables."""
+        one = functools.partial(control, self.config, self.dynamics)
+        return jax.jit(lambda *args: jax.vmap(functools.partial(one, self.weights, self.target))(*args))
+
+    def _check(self, keypoints, gripper_pose):
+        if np.shape(keypoints) != np.shape(self.target) or np.shape(gripper_pose) != (2, 3):
+            raise ValueError(
+                f"Observation with keypoints {np.shape(keypoints)} and gripper poses {np.shape(gripper_pose)}, expected "
+                f"{np.shape(self.target)} as the target and (2, 3)."
+            )

@@ -1,0 +1,58 @@
+"""How long one control call takes."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+
+import jax
+import numpy as np
+from jaxtyping import Float
+
+from cablejax.mpc.controller import Controller
+from cablejax.types import History
+
+
+@dataclasses.dataclass(frozen=True)
+class ControlTiming:
+    """Wall times of one control call.
+
+    Attributes:
+        first_call_s: the first call, compilation included [s].
+        call_ms: each later call [ms], shape [repeats].
+    """
+
+    first_call_s: float
+    call_ms: Float[np.ndarray, " repeats"]
+
+    @property
+    def p50_ms(self) -> float:
+        """Median [ms]."""
+        return float(np.percentile(self.call_ms, 50))
+
+    @property
+    def p95_ms(self) -> float:
+        """95th percentile [ms]."""
+        return float(np.percentile(self.call_ms, 95))
+
+
+def time_control(controller: Controller, history: History, repeats: int = 30) -> ControlTiming:
+    """Times `controller.step`, from the observation to the command on the host.
+
+    The loop is closed through the controller's own prediction, so that its window fills, its plans are warm and the
+    work is that of a real run.
+
+    Raises:
+        ValueError: if `repeats` is not positive.
+    """
+    if repeats < 1:
+        raise ValueError(f"time_control got repeats={repeats}, expected at least 1.")
+    state = controller.init(history)
+    keypoints, pose = np.asarray(history.keypoints[-1]), np.asarray(history.gripper_pose)
+    seconds = []
+    for _ in range(repeats + 1):
+        start = time.perf_counter()
+        state, twist, _ = jax.block_until_ready(controller.step(state, keypoints, pose))
+        seconds.append(time.perf_counter() - start)
+        keypoints, pose = np.asarray(state.predicted), pose + controller.config.objective.interval * np.asarray(twist)
+    return ControlTiming(first_call_s=seconds[0], call_ms=1e3 * np.asarray(seconds[1:]))

@@ -1,0 +1,171 @@
+"""The gap log format: what is written comes back, and what does not follow the format is named."""
+
+import dataclasses
+import json
+import os
+import pathlib
+
+import numpy as np
+import pytest
+
+from cablejax.gaplog import Episode, GapLogError, gap_log_from_episodes, read_gap_log, validate, write_gap_log
+from cablejax.simulate.config import CableConfig
+from cablejax.types import GapLog
+
+CABLE = CableConfig(n_keypoints=5)
+
+
+def episode(samples: int, motion: str = "approach", seed: int = 0) -> Episode:
+    random = np.random.default_rng(seed)
+    return Episode(
+        motion=motion,
+        time=0.1 * np.arange(samples),
+        keypoints=random.normal(size=(samples, 5, 2)),
+        gripper_pose=random.normal(size=(samples, 2, 3)),
+        gripper_command=random.normal(size=(samples, 2, 3)),
+        hold=np.arange(samples) < 3,
+    )
+
+
+@pytest.fixture
+def log() -> GapLog:
+    return gap_log_from_episodes([episode(8), episode(5, "mirror", seed=1)], CABLE, source="test")
+
+
+def test_assembly_pads_short_episodes(log):
+    assert log.episode_length.tolist() == [8, 5]
+    assert np.isnan(log.keypoints[1, 5:]).all() and np.isfinite(log.keypoints[1, :5]).all()
+    np.testing.assert_array_equal(log.gripper_command[1, 5:], 0.0)
+    np.testing.assert_array_equal(log.gripper_pose[1, 5:], np.repeat(log.gripper_pose[1, 4:5], 3, axis=0))
+    assert log.meta["motion"] == ["approach", "mirror"]
+    assert log.meta["cable"] == {
+        "length_m": 1.0,
+        "diameter_m": 0.01,
+        "linear_density_kg_per_m": 0.08,
+        "bending_stiffness_n_m2": 0.02,
+        "bending_damping_s": 0.1,
+    }
+    assert log.meta["keypoint_arclength_m"] == [0.0, 0.25, 0.5, 0.75, 1.0]
+
+
+def test_frictionless_cable_has_no_table():
+    log = gap_log_from_episodes([episode(4)], CableConfig(n_keypoints=5, friction_coefficient=0.0), source="test")
+    assert log.meta["table"] is None
+
+
+def test_round_trip(tmp_path, log):
+    log.keypoints[0, 2, 3] = np.nan
+    path = write_gap_log(tmp_path / "new" / "run.npz", log)
+    back = read_gap_log(path)
+    assert back.meta == log.meta
+    for field in dataclasses.fields(GapLog):
+        if field.name != "meta":
+            written, read = getattr(log, field.name), getattr(back, field.name)
+            assert read.dtype == written.dtype
+            np.testing.assert_array_equal(read, written)
+
+
+def test_a_log_without_hold_is_complete(tmp_path, log):
+    path = write_gap_log(tmp_path / "run.npz", dataclasses.replace(log, hold=None))
+    assert read_gap_log(path).hold is None
+
+
+def test_nothing_is_overwritten_unasked_and_nothing_half_written(tmp_path, log):
+    path = write_gap_log(tmp_path / "run.npz", log)
+    before = path.read_bytes()
+    with pytest.raises(FileExistsError, match=r"run\.npz exists"):
+        write_gap_log(path, log)
+    broken = dataclasses.replace(log, time=log.time[:, ::-1].copy())
+    with pytest.raises(GapLogError, match="'time'"):
+        write_gap_log(path, broken, overwrite=True)
+    assert path.read_bytes() == before
+    other = gap_log_from_episodes([episode(4)], CABLE, source="other")
+    write_gap_log(path, other, overwrite=True)
+    assert read_gap_log(path).meta["source"] == "other"
+    assert [file.name for file in tmp_path.iterdir()] == ["run.npz"]
+
+
+@pytest.mark.parametrize("name", ["time", "keypoints", "gripper_pose", "gripper_command", "episode_length", "meta"])
+def test_a_missing_field_is_named(tmp_path, log, name):
+    fields = {
+        "time": log.time,
+        "keypoints": log.keypoints,
+        "gripper_pose": log.gripper_pose,
+        "gripper_command": log.gripper_command,
+        "episode_length": log.episode_length,
+        "meta": json.dumps(log.meta),
+    }
+    del fields[name]
+    np.savez(tmp_path / "run.npz", **fields)
+    with pytest.raises(GapLogError, match=f"no field '{name}'"):
+        read_gap_log(tmp_path / "run.npz")
+
+
+@pytest.mark.parametrize(
+    "name", ["schema", "cable", "table", "gravity_m_per_s2", "keypoint_arclength_m", "grasp", "motion", "source"]
+)
+def test_a_missing_meta_field_is_named(log, name):
+    meta = {key: value for key, value in log.meta.items() if key != name}
+    with pytest.raises(GapLogError, match=f"'meta.{name}' is missing"):
+        validate(dataclasses.replace(log, meta=meta))
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"schema": "cablejax-gap-log/2"}, r"meta\.schema"),
+        ({"cable": {"length_m": 1.0}}, r"meta\.cable\.diameter_m"),
+        ({"table": {}}, r"meta\.table\.friction_coefficient"),
+        ({"table": {"friction_coefficient": -0.1}}, r"meta\.table\.friction_coefficient"),
+        ({"gravity_m_per_s2": [0.0, -9.81]}, r"meta\.gravity_m_per_s2"),
+        ({"keypoint_arclength_m": [0.0, 0.5, 1.0]}, r"meta\.keypoint_arclength_m"),
+        ({"keypoint_arclength_m": [0.0, 0.5, 0.4, 0.8, 1.0]}, r"meta\.keypoint_arclength_m"),
+        ({"grasp": ["clamped"]}, r"meta\.grasp"),
+        ({"motion": "approach"}, r"meta\.motion"),
+        ({"source": None}, r"meta\.source"),
+    ],
+)
+def test_wrong_meta_is_named(log, changes, message):
+    with pytest.raises(GapLogError, match=message):
+        validate(dataclasses.replace(log, meta=log.meta | changes))
+
+
+def test_wrong_arrays_are_named(log):
+    def refuses(message, **changes):
+        with pytest.raises(GapLogError, match=message):
+            validate(dataclasses.replace(log, **changes))
+
+    refuses("'keypoints' is float64", keypoints=log.keypoints.astype(float))
+    refuses("'keypoints' has shape", keypoints=log.keypoints[..., :1])
+    refuses("'gripper_pose' has shape", gripper_pose=log.gripper_pose[..., :2])
+    refuses("'gripper_command' has shape", gripper_command=log.gripper_command[:, :-1])
+    refuses("'episode_length' is 9", episode_length=np.array([9, 5], np.int32))
+    refuses("'gripper_pose' is not finite", gripper_pose=np.full_like(log.gripper_pose, np.nan))
+    refuses("'keypoints' is infinite", keypoints=np.full_like(log.keypoints, np.inf))
+    with pytest.raises(GapLogError, match="at least one episode"):
+        gap_log_from_episodes([], CABLE, source="test")
+    with pytest.raises(GapLogError, match="gripper_pose has shape"):
+        gap_log_from_episodes([dataclasses.replace(episode(4), gripper_pose=np.zeros((3, 2, 3)))], CABLE, source="test")
+
+
+def test_nothing_is_unpickled(tmp_path, log):
+    np.savez(tmp_path / "run.npz", time=np.array([{}], dtype=object), meta="{}")
+    with pytest.raises(GapLogError, match="could not be read"):
+        read_gap_log(tmp_path / "run.npz")
+    (tmp_path / "text.npz").write_text("not an archive")
+    with pytest.raises(GapLogError, match="could not be read"):
+        read_gap_log(tmp_path / "text.npz")
+
+
+def test_logs_of_another_program():
+    data = os.environ.get("CABLEJAX_DATA")
+    files = sorted((pathlib.Path(data).parent / "gap-dev").glob("*.npz")) if data else []
+    if not files:
+        pytest.skip("CABLEJAX_DATA does not point to a folder with gap-dev beside it")
+    for path in files:
+        log = read_gap_log(path)
+        assert log.keypoints.dtype == np.float32 and log.gripper_pose.dtype == np.float32
+        assert log.hold is not None and log.hold.any()
+        held = log.keypoints[0, : log.episode_length[0]][:, [0, -1]]
+        apart = held - log.gripper_pose[0, : log.episode_length[0], :, :2]
+        assert np.nanmedian(np.linalg.norm(apart, axis=-1)) < 0.05

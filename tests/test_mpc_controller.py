@@ -1,0 +1,222 @@
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from mpc_cases import START, TARGETS, at_rest, hermite_shape, relaxing_cable
+
+from cablejax.mpc import Controller, MPCConfig, Outcome, ProjectedGradient, TrustRegion, time_control
+from cablejax.residual import RidgeConfig
+from cablejax.types import History
+
+N = 7
+CONFIG = MPCConfig(horizon=2)
+WITHOUT = dataclasses.replace(CONFIG, residual=None)
+
+
+class Cable:
+    """What stands for reality here: it relaxes more slowly than the model believes and sags to one side."""
+
+    def __init__(self, rate=0.5, sag=0.02, pose=START):
+        self.rate, self.pose = rate, np.asarray(pose, float)
+        self.sag = np.zeros((N, 2))
+        self.sag[:, 1] = sag * np.sin(np.linspace(0, np.pi, N))
+        self.keypoints = np.asarray(hermite_shape(pose, N), float)
+
+    def step(self, twist):
+        self.pose = self.pose + np.asarray(twist, float)
+        goal = np.asarray(hermite_shape(jnp.asarray(self.pose), N)) + self.sag
+        self.keypoints = self.keypoints + self.rate * (goal - self.keypoints)
+        self.keypoints[[0, -1]] = self.pose[:, :2]
+
+
+def controller(target="U", config=CONFIG, rate=0.8, dynamics=relaxing_cable):
+    return Controller(config, dynamics, jnp.asarray(rate), hermite_shape(TARGETS[target], N))
+
+
+def run(control, cable, steps, hide=None):
+    state = control.init(at_rest(jnp.asarray(cable.pose)))
+    infos, twists = [], []
+    for step in range(steps):
+        keypoints = cable.keypoints.copy()
+        if hide is not None:
+            keypoints[hide(step)] = np.nan
+        state, twist, info = control.step(state, keypoints, cable.pose)
+        cable.step(twist)
+        infos.append(info)
+        twists.append(np.asarray(twist))
+    return state, np.stack(twists), jax.tree.map(lambda *leaves: np.stack(leaves), *infos)
+
+
+@pytest.mark.parametrize("solver", [TrustRegion(), ProjectedGradient()])
+def test_brings_the_cable_to_the_target_and_holds_it_there(solver):
+    config = dataclasses.replace(CONFIG, solver=solver)
+    _, twists, info = run(controller(config=config), Cable(rate=0.8, sag=0.0), 25)
+    assert info.shape_error[0] > 0.2
+    assert info.shape_error[-1] < 2e-3
+    size = np.linalg.norm(twists * [1, 1, 0.15], axis=-1)
+    assert (size <= 0.05).all()
+    assert size[-3:].max() < 2e-3
+
+
+@pytest.mark.parametrize("target", ["U", "S"])
+def test_residual_removes_most_of_what_the_model_gets_wrong(target):
+    _, _, without = run(controller(target, WITHOUT), Cable(), 25)
+    _, _, info = run(controller(target), Cable(), 25)
+    assert without.shape_error[-1] > 0.01
+    assert info.shape_error[-1] < 0.7 * without.shape_error[-1]
+    assert (without.residual_share == 0).all() and (without.condition == 1).all()
+    assert (info.residual_share[2:] > 0).all() and (info.residual_share <= 1).all()
+    assert (info.condition[2:] > 1).all()
+
+
+def test_commands_respect_every_bound():
+    cable = Cable(pose=[[0.0, 0.0, -0.01], [0.99, 0.0, 0.01]])
+    control = controller()
+    state = control.init(at_rest(jnp.asarray(cable.pose)))
+    for _ in range(20):
+        state, twist, info = control.step(state, cable.keypoints, cable.pose)
+        size = np.linalg.norm(np.asarray(twist, float) * [1, 1, 0.15], axis=-1)
+        assert (size <= float(info.radius)).all() and float(info.radius) <= 0.05
+        cable.step(twist)
+        assert 0.15 <= np.hypot(*(cable.pose[1, :2] - cable.pose[0, :2])) <= 0.99
+
+
+def test_trust_region_shrinks_when_predictions_fail_and_grows_when_they_hold():
+    stuck = Cable(rate=0.0, sag=0.0)
+    _, _, info = run(controller(config=WITHOUT), stuck, 6)
+    assert (info.rho[1:] < 0.4).all()
+    np.testing.assert_allclose(info.radius, 0.05 * 0.95 ** np.arange(6), rtol=1e-5)
+    small = dataclasses.replace(WITHOUT, radius=0.01)
+    _, _, info = run(controller(config=small), Cable(rate=0.8, sag=0.0), 6)
+    np.testing.assert_allclose(info.rho[1:], 1.0, atol=0.05)
+    np.testing.assert_allclose(info.radius, 0.01 * 1.05 ** np.arange(6), rtol=1e-5)
+
+
+def test_trust_region_stays_within_its_limits():
+    config = dataclasses.replace(WITHOUT, radius=0.01, radius_min=0.0095, radius_max=0.0105)
+    _, _, shrinking = run(controller(config=config), Cable(rate=0.0, sag=0.0), 4)
+    _, _, growing = run(controller(config=config), Cable(rate=0.8, sag=0.0), 4)
+    assert shrinking.radius[-1] == pytest.approx(0.0095)
+    assert growing.radius[-1] == pytest.approx(0.0105)
+
+
+def test_missing_keypoints_are_held_and_counted_and_not_learned_from():
+    def hide(step):
+        return [2, 3] if step in (4, 5) else []
+
+    state, twists, info = run(controller(), Cable(), 8, hide)
+    assert info.held.tolist() == [0, 0, 0, 0, 2, 2, 0, 0]
+    assert int(state.held) == 4
+    assert np.isfinite(twists).all() and np.isfinite(info.shape_error).all()
+    # Steps that end at 4 and 5, and the one that starts from 5, say nothing about the two keypoints.
+    valid = np.asarray(state.valid)
+    assert valid[:, [0, 1, 4, 5, 6]].all()
+    assert valid[:, 2].tolist() == [True, False, False, False, True]
+    _, _, clear = run(controller(), Cable(), 25)
+    _, _, info = run(controller(), Cable(), 25, hide)
+    assert info.shape_error[-1] < clear.shape_error[-1] + 5e-3
+
+
+def test_nothing_observed_at_all_keeps_going_on_predictions():
+    control, cable = controller(), Cable(rate=0.8, sag=0.0)
+    state = control.init(at_rest(START))
+    for blind in (False, True, True):
+        nothing = np.full((N, 2), np.nan), np.full((2, 3), np.nan)
+        state, twist, _ = control.step(state, *(nothing if blind else (cable.keypoints, cable.pose)))
+        assert np.linalg.norm(twist) > 0.01
+        # The model is right here, so that what it expects is where the cable is.
+        np.testing.assert_allclose(state.history.keypoints[-1], cable.keypoints, atol=1e-5)
+        np.testing.assert_allclose(state.history.gripper_pose, cable.pose, atol=1e-5)
+        cable.step(twist)
+    assert int(state.held) == 2 * N
+    assert not state.valid.any()
+
+
+def test_a_model_that_yields_nan_makes_the_grippers_hold_still_and_says_so():
+    control, cable = controller(rate=float("nan")), Cable()
+    state, twists, info = run(control, cable, 4)
+    assert (twists == 0).all()
+    assert (info.outcome == Outcome.NONFINITE).all()
+    assert np.isfinite(info.shape_error).all() and np.isfinite(np.asarray(state.predicted)).all()
+    # It recovers as soon as the model does.
+    _, twist, info = dataclasses.replace(control, weights=jnp.asarray(0.8)).step(state, cable.keypoints, cable.pose)
+    assert np.linalg.norm(twist) > 0.01 and int(info.outcome) != Outcome.NONFINITE
+
+
+def test_at_the_target_the_grippers_rest():
+    pose = TARGETS["U"]
+    _, twists, info = run(controller(), Cable(rate=0.8, sag=0.0, pose=pose), 4)
+    assert (twists == 0).all()
+    assert (info.outcome == Outcome.HELD).all()
+
+
+def test_many_cables_in_one_call_are_the_same_as_one_by_one():
+    control = controller()
+    starts = [jnp.asarray([[0.0, 0.0, a], [d, 0.0, -a]]) for a, d in ((0.0, 0.97), (0.3, 0.9), (-0.4, 0.8))]
+    states = [control.init(at_rest(pose)) for pose in starts]
+    batch = jax.tree.map(lambda *leaves: jnp.stack(leaves), *states)
+    keypoints = jnp.stack([hermite_shape(pose, N) for pose in starts])
+    step = control.vectorised()
+    batch, twists, _ = step(batch, keypoints, jnp.stack(starts))
+    batch, twists, info = step(batch, batch.predicted, jnp.stack(starts) + twists)
+    for i, (state, pose) in enumerate(zip(states, starts, strict=True)):
+        state, twist, _ = control.step(state, keypoints[i], pose)
+        state, twist, alone = control.step(state, state.predicted, pose + twist)
+        np.testing.assert_allclose(twists[i], twist, atol=1e-4)
+        assert float(info.objective[i]) == pytest.approx(float(alone.objective), rel=1e-3)
+
+
+def test_new_weights_and_targets_do_not_compile_anew():
+    traces = []
+
+    def counting(weights, history, twist):
+        traces.append(1)
+        return relaxing_cable(weights, history, twist)
+
+    control, cable = controller(dynamics=counting), Cable()
+    state = control.init(at_rest(START))
+    control.step(state, cable.keypoints, cable.pose)
+    before = len(traces)
+    other = dataclasses.replace(control, weights=jnp.asarray(0.7), target=control.target + 0.01)
+    other.step(state, cable.keypoints, cable.pose)
+    assert len(traces) == before > 0
+
+
+def test_times_a_control_call():
+    timing = time_control(controller(), at_rest(START), repeats=3)
+    assert timing.call_ms.shape == (3,)
+    assert timing.first_call_s > 0
+    assert 0 < timing.call_ms.min() <= timing.p50_ms <= timing.p95_ms <= timing.call_ms.max()
+    with pytest.raises(ValueError, match="repeats=0"):
+        time_control(controller(), at_rest(START), repeats=0)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"horizon": -1}, "horizon"),
+        ({"cable_length": -1.0}, "cable_length"),
+        ({"min_distance": 0.995}, "min_distance"),
+        ({"radius": 0.06}, "radius_min"),
+        ({"shrink_below": 0.9}, "thresholds"),
+        ({"min_reduction": 0.0}, "min_reduction"),
+    ],
+)
+def test_impossible_settings_are_refused(change, message):
+    with pytest.raises(ValueError, match=message):
+        dataclasses.replace(MPCConfig(), **change)
+
+
+def test_impossible_inputs_are_refused():
+    with pytest.raises(ValueError, match="non-finite"):
+        Controller(CONFIG, relaxing_cable, jnp.ones(()), hermite_shape(START, N).at[2].set(jnp.nan))
+    control = controller()
+    with pytest.raises(ValueError, match=r"\(7, 2\) as the target"):
+        control.init(at_rest(START, n_keypoints=9))
+    with pytest.raises(ValueError, match="complete observation"):
+        control.init(jax.tree.map(lambda x: x.at[-1].set(jnp.nan), at_rest(START)))
+    state = control.init(History(np.tile(hermite_shape(START, N), (3, 1, 1)), np.asarray(START)))
+    with pytest.raises(ValueError, match="gripper poses"):
+        control.step(state, np.zeros((N, 2)), np.zeros((3, 3)))

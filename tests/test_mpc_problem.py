@@ -1,0 +1,102 @@
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from mpc_cases import START, TARGETS, at_rest, hermite_shape, poses, problem, random_motion
+
+from cablejax.mpc import ObjectiveConfig
+from cablejax.types import advance
+
+
+def central_difference(f, x, tangent, step=1e-6):
+    return (f(x + step * tangent) - f(x - step * tangent)) / (2 * step)
+
+
+def test_rollout_is_the_model_applied_step_by_step():
+    case = problem("U")
+    motion = random_motion(0)
+    history = case.history
+    for step, twist in enumerate(case.objective.to_twist(motion)):
+        history = advance(history, case.dynamics(case.weights, history, twist), twist)
+        np.testing.assert_allclose(case.rollout(motion)[step], history.keypoints[-1], atol=1e-6)
+
+
+def test_objective_is_the_weighted_sum_of_squares():
+    case = problem("S", terminal_weight=4.0, motion_weight=0.02)
+    motion = random_motion(1)
+    error = np.sum((case.rollout(motion) - case.target) ** 2, axis=(1, 2)) / case.target.shape[0]
+    expected = 0.5 * (error @ [1, 1, 1, 4] + 0.02 * np.sum(motion**2))
+    assert float(case.value(motion)) == pytest.approx(expected, rel=1e-5)
+    shape_error = case.shape_error(case.rollout(motion))
+    np.testing.assert_allclose(shape_error**2, error, rtol=1e-5)
+
+
+def test_motion_and_twist_are_inverse_and_a_rotation_counts_by_its_weight():
+    objective = ObjectiveConfig(rotation_weight=0.15, interval=0.5)
+    motion = random_motion(2)
+    np.testing.assert_allclose(objective.to_motion(objective.to_twist(motion)), motion, rtol=1e-6)
+    np.testing.assert_allclose(objective.to_twist(jnp.asarray([0.01, 0.02, 0.03])), [0.02, 0.04, 0.4], rtol=1e-6)
+
+
+@pytest.mark.parametrize("n_steps", [1, 2, 5])
+def test_structured_jacobian_is_the_jacobian(n_steps):
+    case, motion = problem("U"), random_motion(3, n_steps)
+    residuals, jacobian = jax.jit(lambda c, u: c.linearise(u))(case, motion)
+    np.testing.assert_allclose(residuals, case.residuals(motion), atol=1e-6)
+    expected = jax.jacrev(case.residuals)(motion).reshape(residuals.size, motion.size)
+    np.testing.assert_allclose(jacobian, expected, atol=2e-6)
+
+
+@pytest.mark.parametrize("name", ["generic", "straight cable at rest", "active bound", "active distance"])
+def test_gradient_of_the_objective(name):
+    """Central differences and JVP against VJP in float64, through the projection where a bound is active."""
+    with jax.enable_x64(True):
+        straight = poses(0.985)
+        case = problem("S", start=straight if name != "generic" else START)
+        motion = random_motion(4) if name == "generic" else jnp.zeros((4, 2, 3))
+        projected = name.startswith("active")
+        if name == "active bound":
+            motion = 3.0 * random_motion(5)
+        if name == "active distance":
+            motion = motion.at[:, 1, 0].set(0.02)
+        if projected:
+            assert float(case.feasible.violation(motion)) > 0
+
+        def value(motion):
+            return case.value(case.feasible.project(motion) if projected else motion)
+
+        tangent = random_motion(6, size=1.0)
+        _, forward = jax.jvp(value, (motion,), (tangent,))
+        backward = jnp.vdot(jax.grad(value)(motion), tangent)
+        assert abs(forward - central_difference(value, motion, tangent)) <= 1e-5 * abs(forward)
+        assert abs(forward - backward) <= 1e-8 * abs(forward)
+
+
+def test_gradient_in_weights_history_and_target():
+    with jax.enable_x64(True):
+        motion = random_motion(7)
+        history = at_rest(START)
+
+        def value(x):
+            case = problem("U", rate=x[0])
+            case = jax.tree.map(lambda leaf: leaf, case)
+            moved = jax.tree.map(lambda leaf: leaf + x[1] * 0.1, history)
+            return type(case)(
+                case.dynamics, case.weights, moved, case.target + x[2], case.feasible, case.objective
+            ).value(motion)
+
+        x, tangent = jnp.asarray([0.8, 0.02, -0.01]), jnp.asarray([0.3, -0.5, 0.8])
+        _, forward = jax.jvp(value, (x,), (tangent,))
+        assert abs(forward - central_difference(value, x, tangent)) <= 1e-5 * abs(forward)
+        assert abs(forward - jnp.vdot(jax.grad(value)(x), tangent)) <= 1e-8 * abs(forward)
+
+
+def test_target_shape_has_no_error():
+    case = problem("U")
+    assert float(case.shape_error(hermite_shape(TARGETS["U"], 7))) == 0.0
+
+
+@pytest.mark.parametrize("change", [{"terminal_weight": -1.0}, {"motion_weight": float("nan")}, {"interval": 0.0}])
+def test_impossible_objectives_are_refused(change):
+    with pytest.raises(ValueError, match=next(iter(change))):
+        ObjectiveConfig(**change)

@@ -1,0 +1,166 @@
+"""MJX, threaded C MuJoCo and other programs agree on how a cable moves."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+from cablejax.simulate import CableConfig, MjxEngine, ThreadedEngine
+from cablejax.simulate.composite import refuse_plugins
+
+PLANAR = CableConfig(n_links=25)
+SPATIAL = CableConfig(n_links=13, dimension=3, timestep=0.01, bending_stiffness=0.05)
+
+
+def planar_pose() -> np.ndarray:
+    return np.array([[-0.45, 0.0, 0.5], [0.45, 0.0, -0.5]])
+
+
+def planar_twist() -> np.ndarray:
+    twist = np.zeros((3, 2, 3))
+    twist[:, 0] = [0.03, 0.01, 0.15]
+    twist[:, 1] = [-0.03, -0.01, 0.1]
+    return twist
+
+
+def tilted(angle: float) -> list[float]:
+    """Quaternion of a turn about -y, which lifts the x axis."""
+    return [np.cos(angle / 2), 0.0, -np.sin(angle / 2), 0.0]
+
+
+def spatial_pose() -> np.ndarray:
+    return np.array([[-0.4, 0.0, 0.0, *tilted(-0.9)], [0.4, 0.0, 0.0, *tilted(0.9)]])
+
+
+def spatial_twist() -> np.ndarray:
+    twist = np.zeros((3, 2, 6))
+    twist[:, 0] = [0.03, 0.02, 0.01, 0.1, 0.0, 0.2]
+    twist[:, 1] = [-0.03, -0.01, 0.02, -0.1, 0.1, 0.1]
+    return twist
+
+
+@pytest.mark.parametrize(
+    ("config", "pose", "twist"),
+    [(PLANAR, planar_pose(), planar_twist()), (SPATIAL, spatial_pose(), spatial_twist())],
+    ids=["planar", "spatial"],
+)
+def test_mjx_follows_c_mujoco_within_a_hundredth_of_a_millimetre(config, pose, twist):
+    threaded, mjx = ThreadedEngine(config, n_threads=1), MjxEngine(config)
+    state, params = mjx.initial_state(pose), config.params()
+    _, reference = threaded.rollout(params, state, twist)
+    _, trajectory = mjx.rollout(params, state, twist)
+    moved = np.abs(np.asarray(reference.keypoints[-1] - reference.keypoints[0])).max()
+    assert moved > 0.02
+    assert np.abs(np.asarray(trajectory.keypoints - reference.keypoints)).max() <= 1e-5
+    np.testing.assert_allclose(trajectory.gripper_pose, reference.gripper_pose, atol=2e-6)
+
+
+def test_joint_springs_bend_like_the_cable_plugin():
+    """A cantilever of 24 links with the elasticity plugin, and with `stiffness = EI / link_length`."""
+    length, radius, count, bending_stiffness = 1.0, 0.005, 25, 0.02
+    link = length / (count - 1)
+    modulus = bending_stiffness / (np.pi * radius**4 / 4)
+    shear = bending_stiffness / (np.pi * radius**4 / 2)
+
+    def settle(plugin: str, stiffness: float) -> np.ndarray:
+        model = mujoco.MjModel.from_xml_string(f"""
+        <mujoco>
+          <extension><plugin plugin="mujoco.elasticity.cable"/></extension>
+          <option timestep="0.002" gravity="0 -0.3 -0.2" integrator="implicitfast"/>
+          <worldbody>
+            <composite type="cable" prefix="c" initial="none" curve="s" count="{count} 1 1" size="{length} 0 0">
+              {plugin}
+              <joint kind="main" damping="0.01" stiffness="{stiffness}"/>
+              <geom type="capsule" size="{radius}" density="1000" contype="0" conaffinity="0"/>
+            </composite>
+          </worldbody>
+        </mujoco>""")
+        data = mujoco.MjData(model)
+        mujoco.mj_step(model, data, nstep=1500)
+        return data.xpos[1:].copy()
+
+    plugin = f"""<plugin plugin="mujoco.elasticity.cable">
+      <config key="twist" value="{shear}"/><config key="bend" value="{modulus}"/><config key="flat" value="true"/>
+    </plugin>"""
+    by_plugin, by_springs = settle(plugin, 0.0), settle("", bending_stiffness / link)
+    assert np.abs(by_plugin[:, 1:]).max() > 0.05
+    assert np.abs(by_plugin - by_springs).max() <= 1e-6
+
+
+def test_a_model_with_a_plugin_is_refused():
+    model = mujoco.MjModel.from_xml_string("""
+    <mujoco>
+      <extension><plugin plugin="mujoco.elasticity.cable"/></extension>
+      <worldbody>
+        <composite type="cable" prefix="c" curve="s" count="4 1 1" size="1 0 0">
+          <plugin plugin="mujoco.elasticity.cable">
+            <config key="twist" value="1e6"/><config key="bend" value="1e6"/>
+          </plugin>
+          <joint kind="main"/><geom type="capsule" size="0.005"/>
+        </composite>
+      </worldbody>
+    </mujoco>""")
+    with pytest.raises(ValueError, match="plugin instance"):
+        refuse_plugins(model)
+
+
+@pytest.mark.parametrize("engine", [ThreadedEngine, MjxEngine])
+def test_ends_stay_at_the_grippers_while_they_move(engine):
+    config = CableConfig(n_links=13)
+    simulator = engine(config)
+    _, trajectory = simulator.rollout(config.params(), simulator.initial_state(planar_pose()), planar_twist())
+    ends = np.asarray(trajectory.keypoints)[:, [0, -1]]
+    np.testing.assert_allclose(ends, np.asarray(trajectory.gripper_pose)[..., :2], atol=5e-6)
+
+
+@pytest.mark.parametrize("engine", [ThreadedEngine, MjxEngine])
+def test_a_batch_equals_its_members(engine):
+    config = CableConfig(n_links=9)
+    simulator = engine(config)
+    poses = np.stack([planar_pose(), planar_pose() * [1, 1, -1]])
+    twists = np.stack([planar_twist(), 0.5 * planar_twist()])
+    params = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), config.params())
+    params = dataclasses.replace(params, friction_coefficient=jnp.array([0.1, 0.4]))
+    states = simulator.initial_state(poses)
+    _, batch = simulator.rollout(params, states, twists)
+    for i in range(2):
+        one = jax.tree.map(lambda leaf, i=i: leaf[i], (params, states))
+        _, alone = simulator.rollout(*one, twists[i])
+        np.testing.assert_allclose(batch.keypoints[i], alone.keypoints, atol=2e-6)
+
+
+def test_friction_holds_a_cable_that_was_shifted():
+    """After a shift, friction leaves the cable behind its frictionless shape, and it stays so while it is held."""
+    config = CableConfig(n_links=17, friction_coefficient=1.0)
+    engine = ThreadedEngine(config)
+    state, params = engine.initial_state(planar_pose()), config.params()
+    shift = np.zeros((1, 2, 3))
+    shift[..., 0] = 0.05
+    state, moved = engine.rollout(params, state, shift)
+    _, held = engine.rollout(params, state, np.zeros((20, 2, 3)))
+    lag = np.asarray(moved.keypoints[-1] - moved.keypoints[0]) - [0.05, 0.0]
+    assert np.abs(lag).max() > 5e-3
+    creep = np.abs(np.diff(np.asarray(held.keypoints), axis=0))[1:].max()
+    assert creep < config.friction_speed * 1.0, "a held cable creeps no faster than the regularisation speed"
+
+
+def test_bad_input_is_refused_with_what_came_and_what_was_expected():
+    engine = MjxEngine(CableConfig(n_links=5))
+    state, params = engine.initial_state(planar_pose()), engine.config.params()
+    with pytest.raises(ValueError, match=r"\(3, 2, 2\).*expected"):
+        engine.rollout(params, state, np.zeros((3, 2, 2)))
+    with pytest.raises(ValueError, match="multiple of the time step"):
+        engine.rollout(params, state, np.zeros((3, 2, 3)), 0.033)
+    with pytest.raises(ValueError, match="length is -1"):
+        CableConfig(length=-1)
+    with pytest.raises(ValueError, match="n_links is 1"):
+        CableConfig(n_links=1)
+    with pytest.raises(ValueError, match="more than the cable's length"):
+        engine.initial_state(np.array([[-0.6, 0.0, 0.0], [0.6, 0.0, 0.0]]))
+    with pytest.raises(ValueError, match="NaN"):
+        engine.initial_state(np.array([[np.nan, 0.0, 0.0], [0.5, 0.0, 0.0]]))

@@ -1,0 +1,47 @@
+"""The chain at rest against an independent boundary-value solver of the elastica."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from cablejax.simulate import CableConfig, MjxEngine
+from cablejax.simulate.elastica import elastica
+from cablejax.simulate.equilibrium import arch_angles, find_equilibrium
+
+POSE = np.array([[-0.3, 0.05, 1.2], [0.35, -0.02, -0.7]])
+
+
+def error(n_links: int) -> float:
+    """Largest distance of a keypoint from the elastica [m]."""
+    config = CableConfig(n_links=n_links)
+    engine = MjxEngine(config)
+    keypoints = np.asarray(engine.keypoints(engine.initial_state(POSE)))
+    exact = elastica(POSE, config.length, config.keypoint_arclength, guess=keypoints)
+    return float(np.linalg.norm(keypoints - exact, axis=1).max())
+
+
+def test_the_chain_converges_to_the_elastica_with_the_square_of_the_link_length():
+    errors = {n: error(n) for n in (13, 24, 25, 49)}
+    assert errors[24] <= 1e-3
+    assert 3.3 < errors[13] / errors[25] < 4.8
+    assert 3.3 < errors[25] / errors[49] < 4.8
+
+
+def test_equilibrium_is_a_minimum_and_stability_falls_towards_snap_through():
+    config = CableConfig(n_links=13)
+    stabilities = []
+    angles = None
+    for lean in (0.6, 0.3, 0.0, -0.15):
+        pose = np.array([[-0.45, 0.0, lean], [0.45, 0.0, -lean]])
+        found = find_equilibrium(config, pose, arch_angles(config, pose) if angles is None else angles)
+        angles = found.angles
+        stabilities.append(found.stability)
+    assert all(s > 0 for s in stabilities)
+    assert stabilities == sorted(stabilities, reverse=True)
+
+
+def test_a_pose_out_of_reach_is_refused():
+    config = CableConfig(n_links=13)
+    with pytest.raises(ValueError, match=r"1\.2000 m apart"):
+        find_equilibrium(config, np.array([[-0.6, 0, 0], [0.6, 0, 0.0]]), np.zeros(12))

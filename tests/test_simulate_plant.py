@@ -1,0 +1,147 @@
+"""The plant: rigid grasps, rest, friction, agreement with the elastica, and what it refuses."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from cablejax.simulate.config import GRAVITY, CableConfig
+from cablejax.simulate.elastica import elastica
+from cablejax.simulate.plant import Plant, PlantConfig, PlantError, plant_model
+
+CABLE = CableConfig(n_links=14, dimension=3, timestep=0.005)
+CONFIG = PlantConfig(cable=CABLE, settle_time=0.5)
+ARCH = np.array([[-0.45, 0.0, 0.0], [0.45, 0.0, 0.0]])
+STILL = np.zeros((2, 3))
+
+
+@pytest.fixture(scope="module")
+def plant() -> Plant:
+    return Plant(CONFIG)
+
+
+def test_grippers_hold_rigidly_and_without_lag(plant):
+    plant.reset(ARCH)
+    twist = np.array([[0.03, 0.02, -0.2], [-0.03, 0.03, 0.3]])
+    for observation in plant.record(twist, samples=10):
+        np.testing.assert_allclose(observation.keypoints[[0, -1]], observation.gripper_pose[:, :2], atol=2e-5)
+    np.testing.assert_allclose(observation.gripper_pose, ARCH + twist, atol=1e-12)
+    nodes, directions = plant.nodes()
+    angle = np.arctan2(directions[:, 1], directions[:, 0])
+    np.testing.assert_allclose(nodes[[0, -1], :2], observation.gripper_pose[:, :2], atol=1e-5)
+    np.testing.assert_allclose(angle[[0, -1]], observation.gripper_pose[:, 2], atol=1e-4)
+
+
+def test_cable_at_rest_stays_at_rest(plant):
+    before = plant.reset(ARCH)
+    after = plant.step(STILL, 10.0)
+    assert np.abs(after.keypoints - before.keypoints).max() / 10.0 < 1e-4  # [m/s]
+    heights = plant.nodes()[0][:, 2]
+    assert (np.abs(heights - CABLE.diameter / 2) < 1e-4).all()
+
+
+@pytest.mark.parametrize("ratio", [0.5, 3.0])
+def test_a_new_cable_has_the_shape_of_the_elastica_whatever_its_stiffness(ratio):
+    plant = Plant(dataclasses.replace(CONFIG, stiffness_ratio=ratio))
+    pose = np.array([[-0.3, 0.1, -1.2], [0.3, 0.0, 1.0]])
+    expected = elastica(pose, CABLE.length, CABLE.keypoint_arclength)
+    np.testing.assert_allclose(plant.reset(pose).keypoints, expected, atol=3e-3)
+
+
+def test_friction_of_a_sliding_cable_is_coulombs():
+    # Dragged along, all of the free cable slides, and the grippers carry mu times its weight.
+    cable = dataclasses.replace(CABLE, friction_coefficient=0.3)
+    plant = Plant(dataclasses.replace(CONFIG, cable=cable))
+    plant.reset(ARCH)
+    plant.step(np.array([[0.05, 0.0, 0.0]] * 2), 2.0)
+    data = plant._data
+    weld = data.efc_force[:12].reshape(2, 6)[:, :3].sum(axis=0)
+    weight = cable.linear_density * (cable.length - cable.link_length) * GRAVITY
+    assert np.abs(weld[0]) == pytest.approx(0.3 * weight, rel=0.05)
+
+
+def test_friction_keeps_a_cable_where_a_frictionless_one_springs_back():
+    twist = np.array([[0.0, 0.0, 0.5], [0.0, 0.0, 0.5]])
+    rubbing = Plant(dataclasses.replace(CONFIG, cable=dataclasses.replace(CABLE, friction_coefficient=1.0)))
+    gliding = Plant(dataclasses.replace(CONFIG, cable=dataclasses.replace(CABLE, friction_coefficient=0.0)))
+    shapes = []
+    for plant in (rubbing, gliding):
+        plant.reset(ARCH)
+        plant.step(twist)
+        shapes.append(plant.step(STILL, 2.0).keypoints)
+    rest = elastica(ARCH + twist, CABLE.length, CABLE.keypoint_arclength)
+    off = [np.abs(shape - rest).max() for shape in shapes]
+    assert off[1] < 2e-3
+    assert off[0] > 3 * off[1]
+
+
+def test_runs_repeat_exactly_and_noise_does_too():
+    config = dataclasses.replace(CONFIG, keypoint_noise=1e-3, keypoint_dropout=0.3, seed=7)
+    twist = np.array([[0.02, 0.0, 0.0], [0.0, 0.02, 0.1]])
+
+    def run(plant):
+        return np.stack([plant.reset(ARCH).keypoints, plant.step(twist, 0.5).keypoints])
+
+    plant = Plant(config)
+    first, again, other = run(plant), run(plant), run(Plant(config))
+    np.testing.assert_array_equal(first, again)
+    np.testing.assert_array_equal(first, other)
+    clean = run(Plant(CONFIG))
+    seen = np.isfinite(first)
+    assert 0 < (~seen).sum() < first.size / 2 and seen[:, [0, -1]].all()
+    assert 2e-4 < (first - clean)[seen].std() < 3e-3
+
+
+def test_recording_does_not_change_the_motion(plant):
+    twist = np.array([[0.03, 0.0, 0.2], [0.0, -0.03, 0.1]])
+    plant.reset(ARCH)
+    once = plant.step(twist)
+    plant.reset(ARCH)
+    samples = plant.record(twist, samples=10)
+    np.testing.assert_allclose(samples[-1].keypoints, once.keypoints, atol=1e-9)
+    np.testing.assert_allclose([sample.time for sample in samples], np.arange(1, 11) / 10)
+
+
+def test_bad_commands_are_refused_and_leave_the_plant_alone(plant):
+    before = plant.reset(ARCH)
+    with pytest.raises(ValueError, match="twist is not finite"):
+        plant.step(np.full((2, 3), np.nan))
+    with pytest.raises(ValueError, match=r"shape \(6,\), expected \(2, 3\)"):
+        plant.step(np.zeros(6))
+    with pytest.raises(ValueError, match="pull the cable of 1 m taut"):
+        plant.step(np.array([[-0.06, 0, 0], [0.06, 0, 0]]))
+    with pytest.raises(ValueError, match="whole number of time steps"):
+        plant.step(STILL, 0.0123)
+    with pytest.raises(ValueError, match="do not fall on time steps"):
+        plant.record(STILL, 1.0, samples=7)
+    after = plant.observe()
+    np.testing.assert_array_equal(after.keypoints, before.keypoints)
+    assert after.time == before.time
+
+
+def test_bad_set_ups_are_refused():
+    with pytest.raises(ValueError, match="reset"):
+        Plant(CONFIG).step(STILL)
+    with pytest.raises(ValueError, match="taut"):
+        Plant(CONFIG).reset(np.array([[-0.6, 0, 0], [0.6, 0, 0]]))
+    with pytest.raises(ValueError, match="gripper_pose is not finite"):
+        Plant(CONFIG).reset(np.full((2, 3), np.inf))
+    with pytest.raises(ValueError, match="dimension is 2"):
+        PlantConfig(cable=CableConfig())
+    with pytest.raises(ValueError, match="stiffness_ratio"):
+        PlantConfig(stiffness_ratio=0.0)
+    with pytest.raises(ValueError, match="keypoint_dropout"):
+        PlantConfig(keypoint_dropout=1.0)
+
+
+def test_an_unstable_simulation_is_reported(plant):
+    plant.reset(ARCH)
+    with pytest.raises(PlantError, match="unstable"):
+        plant.step(np.array([[0, 1e12, 0], [0, 1e12, 0]], float))
+
+
+def test_weight_and_plugins():
+    model = plant_model(CONFIG)
+    free = model.body_mass[[i for i in range(model.nbody) if model.body(i).name.startswith("cable")]][1:-1]
+    np.testing.assert_allclose(free, CABLE.linear_density * CABLE.link_length)
+    assert model.nplugin == 0
