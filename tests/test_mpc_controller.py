@@ -22,7 +22,7 @@ class Cable:
         self.rate, self.pose = rate, np.asarray(pose, float)
         self.sag = np.zeros((N, 2))
         self.sag[:, 1] = sag * np.sin(np.linspace(0, np.pi, N))
-        self.keypoints = np.asarray(hermite_shape(pose, N), float)
+        self.keypoints = np.asarray(hermite_shape(jnp.asarray(pose), N), float)
 
     def step(self, twist):
         self.pose = self.pose + np.asarray(twist, float)

@@ -170,8 +170,17 @@ def test_missing_keypoints_reach_the_player_as_null():
 def test_headline_does_not_claim_what_the_residual_did_not_do():
     worse = [run("U", "residual", short=0.2), run("U", "direct", short=0.05)]
     title, lead = headline(pair_by_shape(worse))
-    assert f"{worse[0].final_error_cm:.2f} cm" in title
+    assert title == f"The cable stays {worse[0].final_error_cm:.2f} cm away from U"
     assert f"{worse[1].final_error_cm:.2f}" in lead
+
+
+def test_headline_tells_reached_from_missed():
+    records = [run("U"), run("S", short=0.3), run("Z", short=0.02)]
+    ends = [record.final_error_cm for record in records]
+    title, _ = headline(pair_by_shape(records))
+    assert title == (
+        f"The cable reaches U and Z to within {max(ends[0], ends[2]):.2f} cm, but it stays {ends[1]:.2f} cm away from S"
+    )
 
 
 def test_a_shape_name_cannot_break_the_page(tmp_path):

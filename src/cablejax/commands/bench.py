@@ -117,8 +117,8 @@ class BenchMpc(Command):
     """Calls to time, after the first one, which compiles."""
 
     def execute(self):
-        from cablejax.commands.shaping import initial_history, load_model, make_controller
         from cablejax.mpc import time_control
+        from cablejax.shaping import initial_history, load_model, make_controller
         from cablejax.simulate import CableConfig
         from cablejax.targets import make_target
 

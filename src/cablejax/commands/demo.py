@@ -44,7 +44,8 @@ class Demo(Command):
 
     def execute(self):
         from cablejax.commands.results import table_of
-        from cablejax.commands.shaping import METHODS, load_model, shape_and_report
+        from cablejax.commands.runs import shape_and_report
+        from cablejax.shaping import METHODS, load_model
         from cablejax.simulate.plant import PlantConfig
         from cablejax.targets import make_target
 
@@ -60,8 +61,8 @@ class Demo(Command):
             solver=self.solver,
             steps=self.steps,
             about=(
-                f"The cable is {STIFFNESS_RATIO:g} times as stiff as the one that the model was trained on. It touches "
-                "the table with contact and friction cones, where the training simulator has a smoothed friction law."
+                "The cable is twice as stiff as the one that the model was trained on. It touches the table with "
+                "contact and friction cones, where the training simulator has a smoothed friction law."
             ),
             facts={
                 "command": f"cablejax demo --seed {self.seed} --steps {self.steps} --links {self.links}",

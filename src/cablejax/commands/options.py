@@ -5,6 +5,8 @@ from __future__ import annotations
 import abc
 import contextlib
 import dataclasses
+import importlib
+import io
 import json as json_format
 import os
 import pathlib
@@ -42,9 +44,10 @@ class Command(abc.ABC):
         if self.seed < 0:
             raise UsageError(f"--seed is {self.seed}, expected an integer >= 0.")
         choose_device(self.device)
-        # Libraries print to stdout while they are imported; that place is for the result.
-        with contextlib.redirect_stdout(sys.stderr):
-            result, text = self.execute()
+        # MJX prints that Warp is missing, which nothing here needs.
+        with contextlib.redirect_stdout(io.StringIO()):
+            importlib.import_module("mujoco.mjx")
+        result, text = self.execute()
         print(json_format.dumps(result, indent=2, allow_nan=False) if self.json else text)
 
 

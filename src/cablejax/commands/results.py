@@ -14,30 +14,11 @@ from cablejax.gaplog import gap_log_from_episodes, write_gap_log
 from cablejax.report.animation import write_gif
 from cablejax.report.page import write_page
 from cablejax.report.provenance import machine, versions
-from cablejax.report.record import Method, RunRecord
+from cablejax.report.record import Method, record_of
 from cablejax.simulate import CableConfig
 
 Runs = Mapping[tuple[str, Method], ClosedLoopRun]
 """Runs by target's name and method."""
-
-
-def records_of(runs: Runs) -> list[RunRecord]:
-    """The runs as the report takes them."""
-    return [
-        RunRecord(
-            shape=shape,
-            method=method,
-            target=run.target.keypoints,
-            times=run.times,
-            keypoints=run.keypoints,
-            gripper_pose=run.gripper_pose,
-            error_cm=run.error_cm,
-            residual_share=run.residual_share,
-            radius=run.radius,
-            mpc_ms=run.mpc_ms,
-        )
-        for (shape, method), run in runs.items()
-    ]
 
 
 def summarise(runs: Runs, total_s: float) -> dict[str, Any]:
@@ -103,7 +84,7 @@ def write_results(
         dataclasses.replace(run.episode, motion=f"{run.episode.motion}_{method}") for (_, method), run in runs.items()
     ]
     write_gap_log(out / "log.npz", gap_log_from_episodes(episodes, believed, source=about), overwrite=True)
-    records = records_of(runs)
+    records = [record_of(run, method) for (_, method), run in runs.items()]
     write_gif(out / "demo.gif", records)
     write_page(
         out / "report.html",

@@ -53,7 +53,8 @@ class Shape(Command):
 
     def execute(self):
         from cablejax.commands.results import table_of
-        from cablejax.commands.shaping import METHODS, load_model, shape_and_report
+        from cablejax.commands.runs import shape_and_report
+        from cablejax.shaping import METHODS, load_model
         from cablejax.simulate.plant import PlantConfig
         from cablejax.targets import load_target, make_target
 

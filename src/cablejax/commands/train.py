@@ -43,7 +43,7 @@ class Train(Command):
     def execute(self):
         from cablejax.dataset.store import open_store
         from cablejax.dataset.windows import read_trajectories, split
-        from cablejax.dynamics.evaluate import no_motion, open_loop_error, rigid_motion
+        from cablejax.dynamics.evaluate import no_motion, open_loop_error, prior_motion
         from cablejax.dynamics.train import train
 
         store = open_store(self.data)
@@ -64,7 +64,8 @@ class Train(Command):
             )
         errors = {
             "model": open_loop_error((result.graphdef, result.weights), validation, result.model),
-            "rigid interpolation": open_loop_error(rigid_motion(result.model), validation, result.model),
+            "elastic prior": open_loop_error(prior_motion(result.model, "elastic"), validation, result.model),
+            "rigid interpolation": open_loop_error(prior_motion(result.model, "rigid"), validation, result.model),
             "no motion": open_loop_error(no_motion, validation, result.model),
         }
         summary = {

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import Literal
 
 import numpy as np
 
@@ -19,7 +20,7 @@ class Normalisation:
         linear_speed: gripper speed [m/s].
         angular_speed: gripper turning rate [rad/s].
         shortening: how much shorter a chord between connected keypoints is than the cable between them [m].
-        residual: displacement beyond the rigid interpolation of the grippers' motion [m]: the unit of output and loss.
+        residual: displacement beyond the prior's [m]: the unit of output and loss.
     """
 
     position: float = 0.25
@@ -52,6 +53,8 @@ class GNSConfig:
         hidden: width of the hidden layers of every network.
         hidden_layers: hidden layers of every network.
         message_passing: message-passing steps, each with weights of its own.
+        prior: displacement that the network corrects: "elastic", see `cablejax.dynamics.prior`, or "rigid", the
+            interpolation of the grippers' motion.
         normalisation: scales of features and output.
     """
 
@@ -64,6 +67,7 @@ class GNSConfig:
     hidden: int = 128
     hidden_layers: int = 2
     message_passing: int = 10
+    prior: Literal["elastic", "rigid"] = "elastic"
     normalisation: Normalisation = Normalisation()
 
     def __post_init__(self):
@@ -81,6 +85,8 @@ class GNSConfig:
             value = getattr(self, name)
             if not (np.isfinite(value) and value > 0):
                 raise ValueError(f"GNSConfig.{name} is {value}, expected a positive finite number in SI units.")
+        if self.prior not in ("elastic", "rigid"):
+            raise ValueError(f'GNSConfig.prior is {self.prior!r}, expected "elastic" or "rigid".')
         if self.radius < self.spacing:
             raise ValueError(
                 f"GNSConfig.radius is {self.radius} m but keypoints are {self.spacing:.4g} m apart: no two would be "
@@ -94,7 +100,7 @@ class GNSConfig:
 
     @property
     def node_features(self) -> int:
-        """Position, past displacements, arc length, control input and grasp, interpolated displacement."""
+        """Position, past displacements, arc length, control input and grasp, prior displacement."""
         return 2 + 2 * (self.history - 1) + 2 + 7 + 2
 
     @property

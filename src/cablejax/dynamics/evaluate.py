@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Sequence
+from typing import Literal
 
 import jax
 import jax.numpy as jnp
@@ -13,7 +14,7 @@ from jaxtyping import Array, Float
 
 from cablejax.dynamics.config import GNSConfig
 from cablejax.dynamics.gns import Dynamics, bind
-from cablejax.dynamics.graph import interpolated
+from cablejax.dynamics.graph import prior_displacement
 from cablejax.dynamics.windows import Window, check_trajectories, window_at
 from cablejax.types import History, Trajectory, advance
 
@@ -66,9 +67,10 @@ def no_motion(history: History, twist: Float[Array, "2 3"]) -> Float[Array, "N 2
     return jnp.zeros_like(history.keypoints[-1])
 
 
-def rigid_motion(config: GNSConfig) -> Dynamics:
-    """The floor that interpolates the grippers' motion along the cable, `rigid_interpolation`, without learning."""
-    return lambda history, twist: interpolated(history, twist, config)
+def prior_motion(config: GNSConfig, prior: Literal["rigid", "elastic"]) -> Dynamics:
+    """The floor that a model's prior is without learning."""
+    config = dataclasses.replace(config, prior=prior)
+    return lambda history, twist: prior_displacement(history, twist, config)
 
 
 def evaluation_windows(data: Trajectory, config: GNSConfig, *, steps: int, stride: int) -> Window:

@@ -19,7 +19,7 @@ from flax import nnx
 from jaxtyping import Array, Float
 
 from cablejax.dynamics.config import GNSConfig
-from cablejax.dynamics.graph import build_graph, gripper_frame, interpolated, topology_of
+from cablejax.dynamics.graph import build_graph, gripper_frame, prior_displacement, topology_of
 from cablejax.types import History
 
 Dynamics = Callable[[History, Float[Array, "Q 3"]], Float[Array, "N 2"]]
@@ -93,7 +93,7 @@ def aggregate(messages: Float[Array, "E latent"], offsets: tuple[int, ...], n: i
 
 
 class GNS(nnx.Module):
-    """Predicts how the cable moves beyond `rigid_interpolation`, in the grippers' frame and in units of its scale."""
+    """Predicts how the cable moves beyond its prior, in the grippers' frame and in units of its scale."""
 
     def __init__(self, config: GNSConfig, rngs: nnx.Rngs):
         self.config = config
@@ -130,8 +130,8 @@ def apply(
     graph = build_graph(history, twist, config)
     frame = gripper_frame(history.gripper_pose)
     beyond = model(graph.nodes, graph.edges)[1:-1] * config.normalisation.residual
-    # The interpolation is exact at the grasped nodes, where nothing is left to predict.
-    return interpolated(history, twist, config) + jnp.pad(beyond @ frame, ((1, 1), (0, 0)))
+    # The prior is exact at the grasped nodes, where nothing is left to predict.
+    return prior_displacement(history, twist, config) + jnp.pad(beyond @ frame, ((1, 1), (0, 0)))
 
 
 def bind(graphdef: nnx.GraphDef, weights: nnx.State) -> Dynamics:

@@ -7,7 +7,7 @@ Node features, in order, with N keypoints and H history samples (all in the grip
     2            arc-length fraction s and 4 s (1 - s)
     5            at a grasped node its gripper's control input (vx, vy, omega) and heading (cos, sin); elsewhere 0
     2            1 at the node held by gripper 0, by gripper 1
-    2            displacement that `rigid_interpolation` expects
+    2            displacement that the prior expects
 
 Edge features: position of the receiver relative to the sender [2], how much shorter that chord is than the cable
 between them, and the signed arc length from sender to receiver.
@@ -29,6 +29,7 @@ from jaxtyping import Array, Float
 
 from cablejax.dynamics.config import GNSConfig
 from cablejax.dynamics.interpolation import rigid_interpolation
+from cablejax.dynamics.prior import elastic_step
 from cablejax.types import History
 
 
@@ -98,7 +99,7 @@ def build_graph(history: History, twist: Float[Array, "2 3"], config: GNSConfig)
     )
     grasped = jnp.concatenate([control, jnp.eye(2, dtype=now.dtype)], axis=-1)
     free = jnp.zeros((config.n_keypoints - 2, grasped.shape[-1]), now.dtype)
-    expected = interpolated(history, twist, config) @ frame.T
+    expected = prior_displacement(history, twist, config) @ frame.T
     displacements = jnp.diff(past, axis=0).swapaxes(0, 1).reshape(config.n_keypoints, -1)
     nodes = jnp.concatenate(
         [
@@ -134,8 +135,12 @@ def build_graph(history: History, twist: Float[Array, "2 3"], config: GNSConfig)
     )
 
 
-def interpolated(history: History, twist: Float[Array, "2 3"], config: GNSConfig) -> Float[Array, "N 2"]:
-    """`rigid_interpolation` for the cable that `config` describes [m]."""
+def prior_displacement(history: History, twist: Float[Array, "2 3"], config: GNSConfig) -> Float[Array, "N 2"]:
+    """Displacement [m] that the model's prior expects, exact at the two grasped nodes."""
+    if config.prior == "elastic":
+        return elastic_step(
+            history.keypoints[-1], history.gripper_pose, twist, length=config.length, interval=config.interval
+        )
     return rigid_interpolation(
         history.gripper_pose, twist, n_keypoints=config.n_keypoints, length=config.length, interval=config.interval
     )

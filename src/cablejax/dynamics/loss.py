@@ -25,10 +25,13 @@ def random_walk_noise(key: PRNGKeyArray, history: History, final_std: float) -> 
 
 
 def rollout_loss(
-    dynamics: Dynamics, window: Window, *, scale: float, interval: float, pushforward: bool
+    dynamics: Dynamics, window: Window, *, scale: float, robust: float, interval: float, pushforward: bool
 ) -> Float[Array, ""]:
-    """Mean squared position error over the K steps of a window, free keypoints and coordinates, in units of `scale`.
+    """Position error over the K steps of a window: the mean of `2 d^2 (sqrt(1 + m / d^2) - 1)` with m the mean square
+    over free keypoints and coordinates in units of `scale`, and d = `robust`.
 
+    Near zero this is m. Beyond d it grows like sqrt(m), so that steps in which the cable snaps through, which nobody
+    predicts to the millimetre, do not drown the rest: on random motions 1 % of the steps hold half of all m.
     With K = 1 and a noisy history this is the one-step loss whose target is corrected for the noise: the displacement
     that leads from the noisy position to the true next one. Differentiable in the weights behind `dynamics`.
 
@@ -36,6 +39,7 @@ def rollout_loss(
         dynamics: one-step model.
         window: history, commands and true future, unbatched.
         scale: unit of the error [m].
+        robust: error, in units of `scale`, from which on it counts linearly.
         interval: duration of one step [s].
         pushforward: no gradient from a step's input back into the steps before (Brandstetter et al. 2022).
     """
@@ -44,7 +48,8 @@ def rollout_loss(
         twist, truth = now
         history = advance(history, dynamics(history, twist), twist, interval)
         error = (history.keypoints[-1] - truth)[1:-1] / scale
-        return jax.lax.stop_gradient(history) if pushforward else history, jnp.mean(error**2)
+        loss = 2 * robust**2 * (jnp.sqrt(1 + jnp.mean(error**2) / robust**2) - 1)
+        return jax.lax.stop_gradient(history) if pushforward else history, loss
 
     _, errors = jax.lax.scan(step, window.history, (window.twist, window.future))
     return jnp.mean(errors)

@@ -22,6 +22,7 @@ class Phase:
         lr_start: learning rate at the phase's beginning.
         lr_end: at its end.
         decay: exponential from start to end, or half a cosine.
+        robust: error, in units of the residual's scale, from which on it counts linearly.
         pushforward: stop gradients between the steps of the rollout.
     """
 
@@ -32,12 +33,15 @@ class Phase:
     lr_start: float = 1e-3
     lr_end: float = 1e-4
     decay: Literal["exponential", "cosine"] = "cosine"
+    robust: float = 1.0
     pushforward: bool = False
 
     def __post_init__(self):
         for name in ("steps", "batch", "rollout"):
             if getattr(self, name) < 1:
                 raise ValueError(f"Phase.{name} is {getattr(self, name)}, expected an integer >= 1.")
+        if not self.robust > 0:
+            raise ValueError(f"Phase.robust is {self.robust}, expected > 0.")
         if not self.noise >= 0:
             raise ValueError(f"Phase.noise is {self.noise} m, expected >= 0.")
         if not (self.lr_start > 0 and self.lr_end > 0):

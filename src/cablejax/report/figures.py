@@ -66,9 +66,10 @@ def final_shapes(records: list[RunRecord]) -> Figure:
                 _draw_cable(ax, run, -1, method)
             ax.set_title(shape, fontsize=14)
             for row, method in enumerate(reversed(_present(runs))):
-                ax.text(
-                    0.0, -0.03 - 0.105 * row, f"{runs[method].final_error_cm:.2f} cm {METHOD_LABEL[method]}",
-                    transform=ax.transAxes, color=LIGHT.method(method), va="top", fontsize=10.5,
+                words = f"{runs[method].final_error_cm:.2f} cm {METHOD_LABEL[method]}"
+                ax.annotate(
+                    words, (0.0, 0.0), xycoords="axes fraction", xytext=(0.0, -4.0 - 15.0 * row),
+                    textcoords="offset points", color=LIGHT.method(method), va="top", fontsize=10.5,
                 )  # fmt: skip
         _scale_bar(axes[-1], views[next(reversed(views))])
         handles = [Line2D([], [], color=LIGHT.target, lw=7, alpha=0.45, label="target")]
@@ -118,7 +119,7 @@ def trust_region(records: list[RunRecord]) -> Figure:
     """Bound on the motion of one gripper in one step [cm], one panel per shape."""
     pairs = pair_by_shape(records)
     with matplotlib.rc_context(_STYLE):
-        figure, axes = _row_of_panels(list(pairs), "motion bound per step [cm]")
+        figure, axes = _row_of_panels(list(pairs), "motion bound [cm]")
         for ax, runs in zip(axes, pairs.values(), strict=True):
             for method in _present(runs):
                 run = runs[method]

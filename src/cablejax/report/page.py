@@ -25,6 +25,9 @@ from cablejax.report import figures
 from cablejax.report.record import Method, RunRecord, pair_by_shape
 from cablejax.report.style import LIGHT, METHOD_LABEL, METHOD_ORDER, cable_curve, common_window, gripper_outline
 
+REACHED_CM = 1.0
+"""Largest final error with which a target counts as reached [cm]."""
+
 _UNITS_PER_METRE = 10_000
 _CSS_CLASS: dict[Method, str] = {"residual": "with", "direct": "without"}
 
@@ -96,11 +99,18 @@ def write_page(
 
 def headline(pairs: Mapping[str, Mapping[Method, RunRecord]]) -> tuple[str, str]:
     """The result as a title and, in HTML, a sentence that says the numbers with and without the residual."""
-    names = _list(list(pairs))
     main = {shape: runs.get("residual") or runs["direct"] for shape, runs in pairs.items()}
-    worst = max(run.final_error_cm for run in main.values())
+    ends = {shape: run.final_error_cm for shape, run in main.items()}
+    reached = {shape: end for shape, end in ends.items() if end <= REACHED_CM}
+    missed = {shape: end for shape, end in ends.items() if shape not in reached}
+    parts = []
+    if reached:
+        parts.append(f"The cable reaches {_list(list(reached))} to within {max(reached.values()):.2f} cm")
+    if missed:
+        far = _list([f"{end:.2f}" for end in missed.values()])
+        parts.append(f"{'it' if reached else 'The cable'} stays {far} cm away from {_list(list(missed))}")
+    title = ", but ".join(parts)
     start = _list([f"{run.error_cm[0]:.1f}" for run in main.values()])
-    title = f"The cable reaches {names} to within {worst:.2f} cm"
     parts = [f"It starts {start} cm away."]
     for method in METHOD_ORDER[::-1]:
         errors = [f"{runs[method].final_error_cm:.2f}" for runs in pairs.values() if method in runs]
@@ -121,7 +131,7 @@ def animation_data(records: list[RunRecord]) -> dict[str, Any]:
         return {
             "method": record.method,
             "times": [round(float(t), 3) for t in record.times],
-            "error": [round(float(e), 4) for e in record.error_cm],
+            "error": np.round(_bridged(record.error_cm), 4).tolist(),
             "pose": np.round(record.gripper_pose.reshape(len(record.times), 6), 5).tolist(),
             "points": [integers(x) for x in record.keypoints],
             "curve": [
@@ -143,6 +153,12 @@ def animation_data(records: list[RunRecord]) -> dict[str, Any]:
             for shape, runs in pairs.items()
         ],
     }
+
+
+def _bridged(values: np.ndarray) -> np.ndarray:
+    """Instants at which nothing was observed, filled in from their neighbours."""
+    index, seen = np.arange(len(values)), np.isfinite(values)
+    return np.interp(index, index[seen], values[seen]) if seen.any() else np.zeros(len(values))
 
 
 def svg(figure: Figure, name: str) -> str:

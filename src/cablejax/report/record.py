@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from jaxtyping import Float
+
+if TYPE_CHECKING:
+    from cablejax.closed_loop import ClosedLoopRun
 
 Method = Literal["residual", "direct"]
 """`residual`: the learned model corrected online; `direct`: the learned model as it was trained."""
@@ -68,6 +71,22 @@ class RunRecord:
     def final_error_cm(self) -> float:
         """The last error [cm]."""
         return float(self.error_cm[-1])
+
+
+def record_of(run: ClosedLoopRun, method: Method) -> RunRecord:
+    """A closed-loop run as the report takes it."""
+    return RunRecord(
+        shape=run.target.name,
+        method=method,
+        target=run.target.keypoints,
+        times=run.times,
+        keypoints=run.keypoints,
+        gripper_pose=run.gripper_pose,
+        error_cm=run.error_cm,
+        residual_share=run.residual_share,
+        radius=run.radius,
+        mpc_ms=run.mpc_ms,
+    )
 
 
 def pair_by_shape(records: list[RunRecord]) -> dict[str, dict[Method, RunRecord]]:
