@@ -12,7 +12,7 @@ from cablejax.simulate.plant import Plant, PlantConfig
 from cablejax.targets import Target, make_target, straight_start
 
 CABLE = CableConfig(n_links=12, dimension=3, timestep=0.005)
-CONFIG = PlantConfig(cable=CABLE, settle_time=0.25)
+CONFIG = PlantConfig(cable=CABLE, settle_time=0.2)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -128,6 +128,21 @@ def test_truncated_shard_is_refused_by_name_and_made_again(tmp_path, name):
     assert tree(path) == whole
 
 
+def test_a_failed_write_leaves_no_shard_that_looks_whole(tmp_path):
+    path = tmp_path / "data"
+    store = open_or_create(path, SMALL)
+    complete(store)
+    # the last of the data arrays cannot be written: the digests, old or new, must not vouch for the shard
+    shutil.rmtree(path / "attempts" / "c")
+    (path / "attempts" / "c").write_text("in the way")
+    with pytest.raises(OSError):
+        store.write_shard(1, block(dataclasses.replace(SMALL, seed=9), 1))
+    assert store.status(1) == "missing"
+    (path / "attempts" / "c").unlink()
+    assert complete(store) == [0, 1, 2]  # attempts of 0 and 2 were lost too
+    assert store.info().complete
+
+
 def test_lost_data_file_is_noticed(tmp_path):
     # Zarr reads a missing chunk as zeros
     path = tmp_path / "data"

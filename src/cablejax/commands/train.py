@@ -64,7 +64,7 @@ class Train(Command):
             )
         errors = {
             "model": open_loop_error((result.graphdef, result.weights), validation, result.model),
-            "elastic prior": open_loop_error(prior_motion(result.model, "elastic"), validation, result.model),
+            "static prior": open_loop_error(prior_motion(result.model, "static"), validation, result.model),
             "rigid interpolation": open_loop_error(prior_motion(result.model, "rigid"), validation, result.model),
             "no motion": open_loop_error(no_motion, validation, result.model),
         }

@@ -53,8 +53,8 @@ class GNSConfig:
         hidden: width of the hidden layers of every network.
         hidden_layers: hidden layers of every network.
         message_passing: message-passing steps, each with weights of its own.
-        prior: displacement that the network corrects: "elastic", see `cablejax.dynamics.prior`, or "rigid", the
-            interpolation of the grippers' motion.
+        prior: movement that the network corrects: "static", towards the frictionless resting shape after the command,
+            see `cablejax.dynamics.statics`, or "rigid", the interpolation of the grippers' motion.
         normalisation: scales of features and output.
     """
 
@@ -67,7 +67,7 @@ class GNSConfig:
     hidden: int = 128
     hidden_layers: int = 2
     message_passing: int = 10
-    prior: Literal["elastic", "rigid"] = "elastic"
+    prior: Literal["static", "rigid"] = "static"
     normalisation: Normalisation = Normalisation()
 
     def __post_init__(self):
@@ -85,8 +85,8 @@ class GNSConfig:
             value = getattr(self, name)
             if not (np.isfinite(value) and value > 0):
                 raise ValueError(f"GNSConfig.{name} is {value}, expected a positive finite number in SI units.")
-        if self.prior not in ("elastic", "rigid"):
-            raise ValueError(f'GNSConfig.prior is {self.prior!r}, expected "elastic" or "rigid".')
+        if self.prior not in ("static", "rigid"):
+            raise ValueError(f'GNSConfig.prior is {self.prior!r}, expected "static" or "rigid".')
         if self.radius < self.spacing:
             raise ValueError(
                 f"GNSConfig.radius is {self.radius} m but keypoints are {self.spacing:.4g} m apart: no two would be "
@@ -100,8 +100,8 @@ class GNSConfig:
 
     @property
     def node_features(self) -> int:
-        """Position, past displacements, arc length, control input and grasp, prior displacement."""
-        return 2 + 2 * (self.history - 1) + 2 + 7 + 2
+        """Position, past displacements, arc length, control input and grasp, prior displacement, distance from rest."""
+        return 2 + 2 * (self.history - 1) + 2 + 7 + 2 + 2
 
     @property
     def edge_features(self) -> int:

@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 
 from cablejax.dynamics.config import GNSConfig
 from cablejax.dynamics.gns import Dynamics, bind
-from cablejax.dynamics.graph import prior_displacement
+from cablejax.dynamics.graph import prior_of
 from cablejax.dynamics.windows import Window, check_trajectories, window_at
 from cablejax.types import History, Trajectory, advance
 
@@ -67,10 +67,10 @@ def no_motion(history: History, twist: Float[Array, "2 3"]) -> Float[Array, "N 2
     return jnp.zeros_like(history.keypoints[-1])
 
 
-def prior_motion(config: GNSConfig, prior: Literal["rigid", "elastic"]) -> Dynamics:
+def prior_motion(config: GNSConfig, prior: Literal["rigid", "static"]) -> Dynamics:
     """The floor that a model's prior is without learning."""
     config = dataclasses.replace(config, prior=prior)
-    return lambda history, twist: prior_displacement(history, twist, config)
+    return lambda history, twist: prior_of(history, twist, config).displacement
 
 
 def evaluation_windows(data: Trajectory, config: GNSConfig, *, steps: int, stride: int) -> Window:

@@ -19,7 +19,7 @@ from flax import nnx
 from jaxtyping import Array, Float
 
 from cablejax.dynamics.config import GNSConfig
-from cablejax.dynamics.graph import build_graph, gripper_frame, prior_displacement, topology_of
+from cablejax.dynamics.graph import build_graph, gripper_frame, prior_of, topology_of
 from cablejax.types import History
 
 Dynamics = Callable[[History, Float[Array, "Q 3"]], Float[Array, "N 2"]]
@@ -40,6 +40,9 @@ class MLP(nnx.Module):
         )
         sizes = [config.hidden] * config.hidden_layers + [output]
         self.rest = nnx.List([nnx.Linear(a, b, rngs=rngs) for a, b in itertools.pairwise(sizes)])
+        if not normalise:
+            # The decoder starts at zero: an untrained model is its prior.
+            self.rest[-1].kernel.set_value(jnp.zeros_like(self.rest[-1].kernel))
         self.norm = nnx.LayerNorm(output, epsilon=1e-5, rngs=rngs) if normalise else None
 
     def after_first(self, x: Float[Array, "rows hidden"]) -> Float[Array, "rows output"]:
@@ -127,11 +130,11 @@ def apply(
     if isinstance(model, tuple):
         model = nnx.merge(*model)
     config = model.config
-    graph = build_graph(history, twist, config)
+    prior = prior_of(history, twist, config)
+    graph = build_graph(history, twist, prior, config)
     frame = gripper_frame(history.gripper_pose)
     beyond = model(graph.nodes, graph.edges)[1:-1] * config.normalisation.residual
-    # The prior is exact at the grasped nodes, where nothing is left to predict.
-    return prior_displacement(history, twist, config) + jnp.pad(beyond @ frame, ((1, 1), (0, 0)))
+    return prior.displacement + jnp.pad(beyond @ frame, ((1, 1), (0, 0)))
 
 
 def bind(graphdef: nnx.GraphDef, weights: nnx.State) -> Dynamics:

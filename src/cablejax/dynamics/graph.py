@@ -8,6 +8,7 @@ Node features, in order, with N keypoints and H history samples (all in the grip
     5            at a grasped node its gripper's control input (vx, vy, omega) and heading (cos, sin); elsewhere 0
     2            1 at the node held by gripper 0, by gripper 1
     2            displacement that the prior expects
+    2            distance from the frictionless resting shape: what friction holds (0 without a static prior)
 
 Edge features: position of the receiver relative to the sender [2], how much shorter that chord is than the cable
 between them, and the signed arc length from sender to receiver.
@@ -21,6 +22,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+from typing import NamedTuple
 
 import jax.numpy as jnp
 import jraph
@@ -29,7 +31,7 @@ from jaxtyping import Array, Float
 
 from cablejax.dynamics.config import GNSConfig
 from cablejax.dynamics.interpolation import rigid_interpolation
-from cablejax.dynamics.prior import elastic_step
+from cablejax.dynamics.statics import resting_shapes
 from cablejax.types import History
 
 
@@ -49,6 +51,18 @@ class Topology:
     senders: np.ndarray
     receivers: np.ndarray
     offsets: tuple[int, ...]
+
+
+class Prior(NamedTuple):
+    """What is known of a command's effect before any learning.
+
+    Attributes:
+        displacement: expected X(t + 1) - X(t) [m], shape [N, 2], exact at the two grasped nodes.
+        strain: X(t) minus the frictionless resting shape [m], shape [N, 2].
+    """
+
+    displacement: Float[Array, "N 2"]
+    strain: Float[Array, "N 2"]
 
 
 @functools.lru_cache(maxsize=32)
@@ -77,12 +91,13 @@ def gripper_frame(gripper_pose: Float[Array, "2 3"]) -> Float[Array, "2 2"]:
     return jnp.stack([x, jnp.stack([-x[1], x[0]])])
 
 
-def build_graph(history: History, twist: Float[Array, "2 3"], config: GNSConfig) -> jraph.GraphsTuple:
+def build_graph(history: History, twist: Float[Array, "2 3"], prior: Prior, config: GNSConfig) -> jraph.GraphsTuple:
     """The graph of one cable at one instant, see the top of this file. Differentiable in `history` and `twist`.
 
     Args:
         history: the last H samples; vmap for batches.
         twist: control input of both grippers in the world's frame [m/s, rad/s], shape [2, 3].
+        prior: what `prior_of` gives for these.
         config: of the model that reads the graph.
     """
     topology, scale = topology_of(config), config.normalisation
@@ -99,7 +114,6 @@ def build_graph(history: History, twist: Float[Array, "2 3"], config: GNSConfig)
     )
     grasped = jnp.concatenate([control, jnp.eye(2, dtype=now.dtype)], axis=-1)
     free = jnp.zeros((config.n_keypoints - 2, grasped.shape[-1]), now.dtype)
-    expected = prior_displacement(history, twist, config) @ frame.T
     displacements = jnp.diff(past, axis=0).swapaxes(0, 1).reshape(config.n_keypoints, -1)
     nodes = jnp.concatenate(
         [
@@ -107,7 +121,8 @@ def build_graph(history: History, twist: Float[Array, "2 3"], config: GNSConfig)
             displacements / scale.displacement,
             arclength,
             jnp.concatenate([grasped[:1], free, grasped[1:]]),
-            expected / scale.displacement,
+            prior.displacement @ frame.T / scale.displacement,
+            prior.strain @ frame.T / scale.residual,
         ],
         axis=-1,
     )
@@ -135,12 +150,16 @@ def build_graph(history: History, twist: Float[Array, "2 3"], config: GNSConfig)
     )
 
 
-def prior_displacement(history: History, twist: Float[Array, "2 3"], config: GNSConfig) -> Float[Array, "N 2"]:
-    """Displacement [m] that the model's prior expects, exact at the two grasped nodes."""
-    if config.prior == "elastic":
-        return elastic_step(
-            history.keypoints[-1], history.gripper_pose, twist, length=config.length, interval=config.interval
+def prior_of(history: History, twist: Float[Array, "2 3"], config: GNSConfig) -> Prior:
+    """What the model's prior expects of a command. Differentiable in `history` and `twist`."""
+    now, interval = history.keypoints[-1], config.interval
+    if config.prior == "rigid":
+        displacement = rigid_interpolation(
+            history.gripper_pose, twist, n_keypoints=config.n_keypoints, length=config.length, interval=interval
         )
-    return rigid_interpolation(
-        history.gripper_pose, twist, n_keypoints=config.n_keypoints, length=config.length, interval=config.interval
-    )
+        return Prior(displacement=displacement, strain=jnp.zeros_like(now))
+    pose = history.gripper_pose
+    before, after = resting_shapes(now, pose, pose + interval * twist, length=config.length)
+    # exact at the grasped nodes, where nothing is left to predict
+    displacement = (after - now).at[0].set(interval * twist[0, :2]).at[-1].set(interval * twist[1, :2])
+    return Prior(displacement=displacement, strain=now - before)

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from cablejax.dynamics.config import GNSConfig, Normalisation
-from cablejax.dynamics.graph import prior_displacement
+from cablejax.dynamics.graph import prior_of
 from cablejax.types import History, Trajectory
 
 GRASP_TOLERANCE = 2e-2
@@ -50,7 +50,7 @@ def window_at(trajectory: Trajectory, start: Array, *, history: int, steps: int)
 
 
 def draw_windows(key: PRNGKeyArray, data: Trajectory, *, batch: int, history: int, steps: int) -> Window:
-    """`batch` windows, uniform over trajectories [M, T, ...] and starts, mirrored and reversed half of the time each."""
+    """`batch` windows, uniform over trajectories [M, T, ...] and starts, mirrored and reversed at random."""
     m, t = data.gripper_twist.shape[:2]
     key_episode, key_start, key_mirror, key_reverse = jax.random.split(key, 4)
     episode = jax.random.randint(key_episode, (batch,), 0, m)
@@ -135,7 +135,7 @@ def fit_normalisation(data: Trajectory, config: GNSConfig) -> Normalisation:
     @jax.jit
     @jax.vmap
     def expected(keypoints, gripper_pose, twist):
-        one = jax.vmap(lambda k, p, u: prior_displacement(History(k[None], p), u, config))
+        one = jax.vmap(lambda k, p, u: prior_of(History(k[None], p), u, config).displacement)
         return one(keypoints[:-1], gripper_pose[:-1], twist)
 
     arrays = (jnp.asarray(leaf, jnp.float32) for leaf in (data.keypoints, data.gripper_pose, data.gripper_twist))

@@ -27,6 +27,9 @@ GRASP_STIFFNESS = 100.0
 """Stiffness of the grasp in units of `1 / dt^2`: a held link trails a jump of the command's speed by dv dt / 100."""
 HELD_MASS, HELD_RADIUS = 10.0, 0.1
 """Sphere [kg, m] at each held link: a gripper is heavy, and the heavier the link the stiffer MuJoCo's grasp."""
+CONTACT_IMPEDANCE = "0.3 0.99 0.0003"
+"""MuJoCo's impedance of the table's contacts: at first touch, at depth, and the depth [m]. Contacts that are stiff from the
+first touch on chatter: the mean normal force then is up to three times the weight, and so is friction."""
 TAUT = 0.999
 """Largest distance between the grippers, in lengths of the cable, before the plant refuses to pull."""
 FRICTIONLESS = 1e-5
@@ -51,17 +54,18 @@ class PlantConfig:
         keypoint_noise: standard deviation of the observed keypoints [m] per coordinate, the held ends included.
         keypoint_dropout: probability with which a keypoint is not observed (NaN), except the first and last, which the
             grippers hold.
-        settle_time: simulated time [s] given to a new cable to settle, once without and once with friction.
+        settle_time: simulated time [s] given to a new cable to settle: without friction, with it, and once more after
+            the grippers have come down to the height at which it lies.
         seed: of noise and gaps.
     """
 
     cable: CableConfig = CableConfig(n_links=40, dimension=3, timestep=0.004)
     stiffness_ratio: float = 1.0
-    cone_ratio: float = 10.0
+    cone_ratio: float = 100.0
     contact_time: float = 0.01
     keypoint_noise: float = 0.0
     keypoint_dropout: float = 0.0
-    settle_time: float = 1.0
+    settle_time: float = 0.5
     seed: int = 0
 
     def __post_init__(self):
@@ -104,7 +108,7 @@ def plant_model(config: PlantConfig) -> mujoco.MjModel:
                   gravity="0 0 {-GRAVITY}" tolerance="1e-8"/>
           <worldbody>
             <geom name="table" type="plane" size="5 5 0.1" contype="1" conaffinity="0" condim="3" priority="1"
-                  solref="{config.contact_time} 1" solimp="0.95 0.99 0.001"/>
+                  solref="{config.contact_time} 1" solimp="{CONTACT_IMPEDANCE}"/>
             <composite type="cable" prefix="cable" initial="free" vertex="{" ".join(f"{s:.9g} 0 0" for s in vertices)}">
               <joint kind="main" stiffness="{stiffness}" damping="{stiffness * cable.damping_time}"/>
               <geom type="capsule" size="{cable.diameter / 2}" contype="0" conaffinity="1"/>
@@ -151,6 +155,7 @@ class Plant:
         self._pose = np.full((2, 3), np.nan)
         self._random = np.random.default_rng(self.config.seed)
         self._time = np.nan
+        self._height = np.nan
 
     def reset(
         self, gripper_pose: Float[np.ndarray, "Q 3"], *, guess: Float[np.ndarray, "S 2"] | None = None
@@ -177,13 +182,17 @@ class Plant:
         mujoco.mj_resetData(self.model, data)
         data.qpos[:2], data.qpos[2] = pose[0, :2], cable.diameter / 2
         data.qpos[3:] = _quaternions(np.diff(angles, prepend=0.0)).ravel()
-        self._pose, self._time = pose, 0.0
+        self._pose, self._time, self._height = pose, 0.0, cable.diameter / 2
         self._random = np.random.default_rng(self.config.seed)
+        still, settle = np.zeros((2, 3)), self._steps(self.config.settle_time)
         friction = self.model.geom("table").friction
         friction[0] = FRICTIONLESS
-        self._advance(np.zeros((2, 3)), self._steps(self.config.settle_time))
+        self._advance(still, settle)
         friction[0] = max(cable.friction_coefficient, FRICTIONLESS)
-        self._advance(np.zeros((2, 3)), self._steps(self.config.settle_time))
+        self._advance(still, settle)
+        # Contacts yield a little. Held at the height at which the rest lies, the ends lift no weight off the table.
+        self._height = float(np.median(self.nodes()[0][1:-1, 2]))
+        self._advance(still, settle)
         self._time = 0.0
         return self.observe()
 
@@ -258,7 +267,7 @@ class Plant:
         heading = np.array([np.cos(pose[1, 2]), np.sin(pose[1, 2])])
         data.mocap_pos[:, :2] = pose[:, :2]
         data.mocap_pos[1, :2] -= 0.5 * cable.link_length * heading
-        data.mocap_pos[:, 2] = cable.diameter / 2
+        data.mocap_pos[:, 2] = self._height
         data.mocap_quat[:] = _quaternions(pose[:, 2])
 
     def _steps(self, interval: float) -> int:
