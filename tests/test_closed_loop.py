@@ -141,6 +141,7 @@ def test_shape_error_is_the_root_mean_square_distance():
         ([1.0, 1.0, 1.0, 1.0], 0.0),
         ([10, 8, 6, 4, 2], np.inf),
         ([10, 0.15, 0.12, 0.1, 0.05], 1.0),  # below a millimetre all is settled
+        ([60, 58, 56, 54, 52], np.inf),  # a far target is not settled just because 10 % of far is much
         ([10, 5, 5, np.nan], np.inf),
     ],
 )

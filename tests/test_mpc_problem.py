@@ -1,3 +1,5 @@
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -62,6 +64,7 @@ def test_gradient_of_the_objective(name):
         if projected:
             assert float(case.feasible.violation(motion)) > 0
 
+        @jax.jit
         def value(motion):
             return case.value(case.feasible.project(motion) if projected else motion)
 
@@ -77,13 +80,11 @@ def test_gradient_in_weights_history_and_target():
         motion = random_motion(7)
         history = at_rest(START)
 
+        @jax.jit
         def value(x):
             case = problem("U", rate=x[0])
-            case = jax.tree.map(lambda leaf: leaf, case)
             moved = jax.tree.map(lambda leaf: leaf + x[1] * 0.1, history)
-            return type(case)(
-                case.dynamics, case.weights, moved, case.target + x[2], case.feasible, case.objective
-            ).value(motion)
+            return dataclasses.replace(case, history=moved, target=case.target + x[2]).value(motion)
 
         x, tangent = jnp.asarray([0.8, 0.02, -0.01]), jnp.asarray([0.3, -0.5, 0.8])
         _, forward = jax.jvp(value, (x,), (tangent,))

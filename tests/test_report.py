@@ -76,6 +76,14 @@ def test_error_figure_shows_the_errors():
     assert drawn == {tuple(np.round(r.error_cm, 9)) for r in records if r.shape == "U"}
 
 
+def test_share_is_blank_where_the_grippers_rested():
+    record = run()
+    pose = record.gripper_pose.copy()
+    pose[5:] = pose[5]
+    line = figures.residual_share([dataclasses.replace(record, gripper_pose=pose)]).axes[0].lines[0]
+    np.testing.assert_array_equal(np.isfinite(line.get_ydata()), np.arange(9) < 5)
+
+
 def test_gif_ends_on_the_last_sample_and_stays_small(tmp_path):
     records = demo_runs()
     size = write_gif(tmp_path / "demo.gif", records, width=480, frames_per_second=4)

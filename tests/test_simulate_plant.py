@@ -51,13 +51,13 @@ def test_a_new_cable_has_the_shape_of_the_elastica_whatever_its_stiffness(ratio)
 
 def test_friction_of_a_sliding_cable_is_coulombs():
     # Dragged along, all of the free cable slides: every contact pushes back with mu times its load.
-    cable = dataclasses.replace(CABLE, friction_coefficient=0.3)
+    cable = dataclasses.replace(CABLE, friction_coefficient=0.1)
     plant = Plant(dataclasses.replace(CONFIG, cable=cable))
     plant.reset(ARCH)
     plant.step(np.array([[0.05, 0.0, 0.0]] * 2))
     force = contact_force(plant)
     weight = cable.linear_density * (cable.length - cable.link_length) * GRAVITY
-    assert force[0] == pytest.approx(-0.3 * force[2], rel=0.01)
+    assert force[0] == pytest.approx(-0.1 * force[2], rel=0.01)
     assert force[2] == pytest.approx(weight, rel=0.2)  # friction rolls the cable a little, so the grippers bear down on it
 
 
@@ -83,7 +83,7 @@ def test_the_table_carries_the_weight_steadily(plant):
 
 
 def test_friction_keeps_a_cable_where_a_frictionless_one_springs_back():
-    twist = np.array([[0.0, 0.0, 0.5], [0.0, 0.0, 0.5]])
+    twist = np.array([[0.0, 0.0, 0.4], [0.0, 0.0, -0.2]])
     rubbing = Plant(dataclasses.replace(CONFIG, cable=dataclasses.replace(CABLE, friction_coefficient=1.0)))
     gliding = Plant(dataclasses.replace(CONFIG, cable=dataclasses.replace(CABLE, friction_coefficient=0.0)))
     shapes = []

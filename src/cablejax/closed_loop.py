@@ -15,7 +15,8 @@ from cablejax.targets import Target
 from cablejax.types import History
 
 SETTLING_FRACTION = 0.1
-"""Half-width of the band around the terminal error in which a run counts as settled, relative to that error."""
+"""Half-width of the band around the terminal error in which a run counts as settled, relative to that error or, where
+that is less, to the change of the error over the run."""
 SETTLING_FLOOR_CM = 0.1
 """Smallest half-width of that band [cm]."""
 SETTLING_DWELL = 3
@@ -114,12 +115,13 @@ def shape_error_cm(keypoints: Float[np.ndarray, "*T N 2"], target: Float[np.ndar
 def settling_time(times: Float[np.ndarray, " T"], error_cm: Float[np.ndarray, " T"]) -> float:
     """First time from which on the error stays near its last value; infinite if it was still changing at the end.
 
-    Near means within 10 % of the last value or 1 mm, whichever is more. The last three samples must all be near.
+    Near means within 10 % of the last value, and within 10 % of the error's change over the run where the target stayed
+    far; 1 mm is near in any case. The last three samples must all be near.
     """
     error = np.asarray(error_cm)
     if not np.isfinite(error[-1]):
         return float("inf")
-    band = max(SETTLING_FRACTION * error[-1], SETTLING_FLOOR_CM)
+    band = max(SETTLING_FRACTION * min(error[-1], abs(error[0] - error[-1])), SETTLING_FLOOR_CM)
     outside = np.flatnonzero(~(np.abs(error - error[-1]) <= band))
     first = int(outside[-1]) + 1 if len(outside) else 0
     return float(times[first]) if len(error) - first >= min(SETTLING_DWELL, len(error)) else float("inf")

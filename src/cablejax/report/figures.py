@@ -24,6 +24,9 @@ from cablejax.report.style import (
     gripper_outline,
 )
 
+_REST = 5e-4
+"""Grippers that move by less than this in a step [m, rad] rest."""
+
 _STYLE: dict[Any, Any] = {
     "font.family": "sans-serif",
     "font.size": 10.0,
@@ -109,10 +112,16 @@ def error_over_time(records: list[RunRecord], goal_cm: float | None = 1.0) -> Fi
 
 
 def residual_share(records: list[RunRecord]) -> Figure:
-    """How much of the predicted motion the online residual contributes [%], one panel per shape."""
-    return _one_method_panels(
-        records, lambda run: 100.0 * run.residual_share, "residual's share of\nthe predicted motion [%]", "residual"
-    )
+    """How much of the predicted motion the online residual contributes [%], one panel per shape.
+
+    Blank where the grippers rested: a share of no motion means nothing.
+    """
+
+    def share(run: RunRecord) -> np.ndarray:
+        moved = np.abs(np.diff(run.gripper_pose, axis=0, append=np.nan)).max(axis=(1, 2))
+        return np.where(moved > _REST, 100.0 * run.residual_share, np.nan)
+
+    return _one_method_panels(records, share, "residual's share of\nthe predicted motion [%]", "residual")
 
 
 def trust_region(records: list[RunRecord]) -> Figure:

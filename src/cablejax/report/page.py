@@ -46,7 +46,7 @@ _SECTIONS: tuple[tuple[str, Callable[[list[RunRecord]], Figure], str], ...] = (
         "What the online residual contributes",
         figures.residual_share,
         "Size of the residual's prediction relative to the learned model's and its own together, at each command. "
-        "It is fitted anew on the last samples before every command.",
+        "It is fitted anew on the last samples before every command. Blank where the grippers rested.",
     ),
     (
         "How far the planner trusts itself",

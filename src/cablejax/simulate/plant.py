@@ -154,7 +154,7 @@ class Plant:
         self._weights = hermite_weights(self.config.cable)
         self._pose = np.full((2, 3), np.nan)
         self._random = np.random.default_rng(self.config.seed)
-        self._time = np.nan
+        self._steps_done: int | None = None
         self._height = np.nan
 
     def reset(
@@ -182,7 +182,7 @@ class Plant:
         mujoco.mj_resetData(self.model, data)
         data.qpos[:2], data.qpos[2] = pose[0, :2], cable.diameter / 2
         data.qpos[3:] = _quaternions(np.diff(angles, prepend=0.0)).ravel()
-        self._pose, self._time, self._height = pose, 0.0, cable.diameter / 2
+        self._pose, self._height = pose, cable.diameter / 2
         self._random = np.random.default_rng(self.config.seed)
         still, settle = np.zeros((2, 3)), self._steps(self.config.settle_time)
         friction = self.model.geom("table").friction
@@ -193,7 +193,7 @@ class Plant:
         # Contacts yield a little. Held at the height at which the rest lies, the ends lift no weight off the table.
         self._height = float(np.median(self.nodes()[0][1:-1, 2]))
         self._advance(still, settle)
-        self._time = 0.0
+        self._steps_done = 0
         return self.observe()
 
     def step(self, twist: Float[np.ndarray, "Q 3"], interval: float = 1.0) -> Observation:
@@ -212,7 +212,7 @@ class Plant:
 
     def record(self, twist: Float[np.ndarray, "Q 3"], interval: float = 1.0, *, samples: int) -> list[Observation]:
         """As `step`, with `samples` observations evenly spread over the interval, the last one at its end."""
-        if np.isnan(self._time):
+        if self._steps_done is None:
             raise ValueError("The plant has no cable yet: call reset(gripper_pose) first.")
         twist = _checked("twist", twist)
         steps = self._steps(interval)
@@ -228,6 +228,11 @@ class Plant:
             observations.append(self.observe())
         return observations
 
+    @property
+    def time(self) -> float:
+        """Simulated seconds since the last reset."""
+        return (self._steps_done or 0) * self.config.cable.timestep
+
     def observe(self) -> Observation:
         """Keypoints and gripper poses now, with the configured noise and gaps (drawn anew by every call)."""
         config, random = self.config, self._random
@@ -237,7 +242,7 @@ class Plant:
             keypoints += config.keypoint_noise * random.standard_normal(keypoints.shape)
         if config.keypoint_dropout:
             keypoints[1:-1][random.random(len(keypoints) - 2) < config.keypoint_dropout] = np.nan
-        return Observation(keypoints=keypoints, gripper_pose=self._pose.copy(), time=self._time)
+        return Observation(keypoints=keypoints, gripper_pose=self._pose.copy(), time=self.time)
 
     def nodes(self) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
         """Middle of every link, for the two held links the grasped end [m], and the links' unit directions."""
@@ -254,10 +259,10 @@ class Plant:
             mujoco.mj_step(model, data)
         mujoco.mj_kinematics(model, data)
         self._pose = start + (steps * dt) * twist
-        self._time += steps * dt
+        self._steps_done = (self._steps_done or 0) + steps
         if data.warning[mujoco.mjtWarning.mjWARN_BADQACC].number or not np.isfinite(data.qpos).all():
             raise PlantError(
-                f"The plant's simulation became unstable at {self._time:.3f} s: use a shorter timestep than {dt} s or "
+                f"The plant's simulation became unstable at {self.time:.3f} s: use a shorter timestep than {dt} s or "
                 "gentler commands."
             )
 
