@@ -25,9 +25,10 @@ def hermite_shape(gripper_pose, n_keypoints):
 
 
 def relaxing_cable(weights, history, twist):
-    """A cable that covers the fraction `weights` of the way to the Hermite curve of its grippers in each step."""
+    """Covers the fraction `weights` of the way to the Hermite curve of its grippers in each step; the ends, all of it."""
     newest = history.keypoints[-1]
-    return weights * (hermite_shape(history.gripper_pose + twist, newest.shape[0]) - newest)
+    way = hermite_shape(history.gripper_pose + twist, newest.shape[0]) - newest
+    return (weights * way).at[jnp.array([0, -1])].set(way[jnp.array([0, -1])])
 
 
 def poses(distance, turn0=0.0, turn1=0.0):

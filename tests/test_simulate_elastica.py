@@ -40,7 +40,9 @@ def test_balance_of_moments_and_inextensibility():
     np.testing.assert_allclose(np.linalg.norm(np.diff(shape.position, axis=0), axis=1), ds, rtol=1e-4)
 
 
-@pytest.mark.parametrize(("start", "end", "distance"), [(-90, 90, 0.45), (-90, -90, 0.65), (115, 115, 0.52), (0, 0, 0.99)])
+@pytest.mark.parametrize(
+    ("start", "end", "distance"), [(-90, 90, 0.45), (-90, -90, 0.65), (115, 115, 0.52), (0, 0, 0.99)]
+)
 def test_ends_are_met_and_the_shape_moves_with_them(start, end, distance):
     pose = ends(start, end, distance)
     shape = solve_elastica(pose, 1.0)
@@ -70,7 +72,9 @@ def test_guess_selects_the_other_arch():
 def test_second_bending_mode_is_unstable():
     # Clamped ends on their chord: the full sine wave in the angle is in equilibrium, but the arch has less energy.
     s = np.linspace(0, 1, 61)
-    wave = np.cumsum(np.stack([np.cos(0.9 * np.sin(3 * np.pi * s)), np.sin(0.9 * np.sin(3 * np.pi * s))], axis=1) / 60, axis=0)
+    wave = np.cumsum(
+        np.stack([np.cos(0.9 * np.sin(3 * np.pi * s)), np.sin(0.9 * np.sin(3 * np.pi * s))], axis=1) / 60, axis=0
+    )
     pose = ends(0, 0, 0.85)
     shape = solve_elastica(pose, 1.0, guess=wave - wave.mean(axis=0))
     assert np.ptp(shape.position[:, 1]) < np.ptp(solve_elastica(pose, 1.0).position[:, 1])

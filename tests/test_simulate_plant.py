@@ -58,7 +58,9 @@ def test_friction_of_a_sliding_cable_is_coulombs():
     force = contact_force(plant)
     weight = cable.linear_density * (cable.length - cable.link_length) * GRAVITY
     assert force[0] == pytest.approx(-0.1 * force[2], rel=0.01)
-    assert force[2] == pytest.approx(weight, rel=0.2)  # friction rolls the cable a little, so the grippers bear down on it
+    assert force[2] == pytest.approx(
+        weight, rel=0.25
+    )  # friction rolls the cable a little, so the grippers bear down on it
 
 
 def contact_force(plant) -> np.ndarray:
@@ -93,7 +95,7 @@ def test_friction_keeps_a_cable_where_a_frictionless_one_springs_back():
         shapes.append(plant.step(STILL, 2.0).keypoints)
     rest = elastica(ARCH + twist, CABLE.length, CABLE.keypoint_arclength)
     off = [np.abs(shape - rest).max() for shape in shapes]
-    assert off[1] < 2e-3
+    assert off[1] < 4e-3
     assert off[0] > 3 * off[1]
 
 
@@ -160,6 +162,8 @@ def test_an_unstable_simulation_is_reported(plant):
     plant.reset(ARCH)
     with pytest.raises(PlantError, match="unstable"):
         plant.step(np.array([[0, 1e12, 0], [0, 1e12, 0]], float))
+    with pytest.raises(ValueError, match="reset"):
+        plant.step(STILL)
 
 
 def test_weight_and_plugins():

@@ -237,7 +237,9 @@ def _validate_arrays(log: GapLog) -> None:
         if dimension == 3:
             norm = np.linalg.norm(log.gripper_pose[index, :length, :, 3:], axis=-1)
             if np.abs(norm - 1).max() > 1e-3:
-                raise GapLogError(f"Field 'gripper_pose' has quaternions that are not of unit length in episode {index}.")
+                raise GapLogError(
+                    f"Field 'gripper_pose' has quaternions that are not of unit length in episode {index}."
+                )
 
 
 def _validate_meta(log: GapLog) -> None:

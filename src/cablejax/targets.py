@@ -64,7 +64,9 @@ def make_target(shape: Shape, config: CableConfig = CableConfig()) -> Target:
         ValueError: another letter.
     """
     if shape not in _LETTERS:
-        raise ValueError(f"There is no shape {shape!r}, expected one of {', '.join(_LETTERS)}, or a file for load_target.")
+        raise ValueError(
+            f"There is no shape {shape!r}, expected one of {', '.join(_LETTERS)}, or a file for load_target."
+        )
     letter = _LETTERS[shape]
     direction = np.radians(letter.direction)
     half = 0.5 * letter.distance * config.length * np.array([np.cos(direction), np.sin(direction)])
@@ -125,7 +127,9 @@ def target_from_keypoints(
     else:
         pose = np.asarray(gripper_pose, float)
         if pose.shape != (2, 3) or not np.isfinite(pose).all():
-            raise ValueError(f"Target {name!r} has a gripper_pose of shape {pose.shape} or not finite, expected (2, 3).")
+            raise ValueError(
+                f"Target {name!r} has a gripper_pose of shape {pose.shape} or not finite, expected (2, 3)."
+            )
         gap = np.abs(pose[:, :2] - points[[0, -1]]).max()
         if gap > 0.01 * config.length:
             raise ValueError(

@@ -78,7 +78,7 @@ class Train(Command):
         write_json(self.out / "summary.json", summary)
         horizons = errors["model"].horizons
         table = text_table(
-            ["open-loop error [cm] after", *(f"{h} steps" for h in horizons)],
+            ["open-loop error [cm] after", *(f"{h} s" for h in horizons)],
             [[name, *(f"{e:.4f}" for e in error.rmse_cm)] for name, error in errors.items()],
         )
         return summary, table

@@ -39,6 +39,8 @@ def build_grasped_chain(config: CableConfig) -> mujoco.MjModel:
     `implicitfast` treats the force implicitly in `v`.
     """
     spec = _chain_spec(config)
+    # a simulation that diverges shall say so, not start again in silence
+    spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
     links = link_bodies(spec)
     for link in (links[0], links[-1]):
         link.mass = _HELD_MASS

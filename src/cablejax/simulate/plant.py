@@ -70,7 +70,9 @@ class PlantConfig:
 
     def __post_init__(self):
         if self.cable.dimension != 3:
-            raise ValueError(f"PlantConfig.cable.dimension is {self.cable.dimension}, expected 3: the plant is in space.")
+            raise ValueError(
+                f"PlantConfig.cable.dimension is {self.cable.dimension}, expected 3: the plant is in space."
+            )
         for name in ("stiffness_ratio", "cone_ratio", "contact_time", "settle_time"):
             value = getattr(self, name)
             if not (np.isfinite(value) and value > 0):
@@ -78,7 +80,9 @@ class PlantConfig:
         if not (np.isfinite(self.keypoint_noise) and self.keypoint_noise >= 0):
             raise ValueError(f"PlantConfig.keypoint_noise is {self.keypoint_noise}, expected a finite number >= 0 [m].")
         if not 0 <= self.keypoint_dropout < 1:
-            raise ValueError(f"PlantConfig.keypoint_dropout is {self.keypoint_dropout}, expected a probability below 1.")
+            raise ValueError(
+                f"PlantConfig.keypoint_dropout is {self.keypoint_dropout}, expected a probability below 1."
+            )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -182,7 +186,7 @@ class Plant:
         mujoco.mj_resetData(self.model, data)
         data.qpos[:2], data.qpos[2] = pose[0, :2], cable.diameter / 2
         data.qpos[3:] = _quaternions(np.diff(angles, prepend=0.0)).ravel()
-        self._pose, self._height = pose, cable.diameter / 2
+        self._pose, self._height, self._steps_done = pose, cable.diameter / 2, 0
         self._random = np.random.default_rng(self.config.seed)
         still, settle = np.zeros((2, 3)), self._steps(self.config.settle_time)
         friction = self.model.geom("table").friction
@@ -261,8 +265,9 @@ class Plant:
         self._pose = start + (steps * dt) * twist
         self._steps_done = (self._steps_done or 0) + steps
         if data.warning[mujoco.mjtWarning.mjWARN_BADQACC].number or not np.isfinite(data.qpos).all():
+            time, self._steps_done = self.time, None  # nothing but a reset makes sense now
             raise PlantError(
-                f"The plant's simulation became unstable at {self.time:.3f} s: use a shorter timestep than {dt} s or "
+                f"The plant's simulation became unstable at {time:.3f} s: use a shorter timestep than {dt} s or "
                 "gentler commands."
             )
 
