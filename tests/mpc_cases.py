@@ -25,7 +25,7 @@ def hermite_shape(gripper_pose, n_keypoints):
 
 
 def relaxing_cable(weights, history, twist):
-    """Covers the fraction `weights` of the way to the Hermite curve of its grippers in each step; the ends, all of it."""
+    """Covers the fraction `weights` of the way to its grippers' Hermite curve in each step; the ends, all of it."""
     newest = history.keypoints[-1]
     way = hermite_shape(history.gripper_pose + twist, newest.shape[0]) - newest
     return (weights * way).at[jnp.array([0, -1])].set(way[jnp.array([0, -1])])

@@ -81,7 +81,7 @@ def test_a_reachable_shape_is_reached_and_recorded(tmp_path):
 
 def test_an_unreachable_target_says_how_far_it_got():
     shape = make_target("U", CABLE)
-    far = Target("far", shape.keypoints + [0.0, 2.0], shape.gripper_pose + [0.0, 2.0, 0.0])
+    far = Target("far", shape.keypoints + np.array([0.0, 2.0]), shape.gripper_pose + np.array([0.0, 2.0, 0.0]))
     run = run_closed_loop(Plant(CONFIG), GoToPose(far.gripper_pose), far, 3, start=straight_start(CABLE), record_hz=1.0)
     assert run.settling_time_s == float("inf")
     assert f"from {run.initial_error_cm:.2f} to {run.terminal_error_cm:.2f} cm" in run.verdict()

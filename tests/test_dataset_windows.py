@@ -1,11 +1,26 @@
-"""Windows are what the trajectories say, at the first sample and at the last."""
+"""Windows are what the trajectories say, at the first sample and at the last, in a mirror and from the other end."""
+
+import dataclasses
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from cablejax.dataset.windows import draw_windows, split, windows
+from cablejax.dataset.schema import Block, DatasetConfig
+from cablejax.dataset.store import open_or_create
+from cablejax.dataset.windows import (
+    Window,
+    concatenate,
+    draw_windows,
+    mirrored,
+    read_split,
+    read_trajectories,
+    reversed_ends,
+    split,
+    window_at,
+)
+from cablejax.simulate import CableConfig
 from cablejax.types import Trajectory, advance
 
 M, T, N = 4, 9, 3
@@ -13,50 +28,78 @@ M, T, N = 4, 9, 3
 
 @pytest.fixture
 def trajectory() -> Trajectory:
-    """Numbers that tell where they come from: 100 row + time, and the pose that follows from the twist."""
-    stamp = 100.0 * np.arange(M)[:, None] + np.arange(T + 1)
-    keypoints = np.broadcast_to(stamp[:, :, None, None], (M, T + 1, N, 2)).astype(np.float32)
-    return Trajectory(
-        keypoints=keypoints,
-        gripper_pose=keypoints[:, :, :2, :1] + np.zeros(3, np.float32),
-        gripper_twist=np.ones((M, T, 2, 3), np.float32),
-    )
+    """Numbers that tell where they come from: 100 row + time in x, the keypoint's number in y, and poses alike."""
+    stamp = (100.0 * np.arange(M)[:, None] + np.arange(T + 1))[:, :, None]
+    keypoints = np.stack(np.broadcast_arrays(stamp, np.arange(1.0, N + 1)), axis=-1).astype(np.float32)
+    pose = np.zeros((M, T + 1, 2, 3), np.float32)
+    pose[..., 0], pose[..., 1], pose[..., 2] = stamp, [1, N], [0.1, 0.2]
+    twist = np.zeros((M, T, 2, 3), np.float32)
+    twist[..., 0] = 1.0
+    return Trajectory(keypoints, pose, twist)
+
+
+def one(trajectory: Trajectory, row: int, start: int, **sizes) -> Window:
+    return window_at(jax.tree.map(lambda x: jnp.asarray(x[row]), trajectory), jnp.asarray(start), **sizes)
 
 
 def test_a_window_holds_past_command_and_future(trajectory):
-    batch = windows(trajectory, jnp.array([2, 0]), jnp.array([6, 5]), horizon=3)
-    np.testing.assert_array_equal(
-        batch.history.keypoints[:, :, 0, 0], [[201, 202, 203, 204, 205, 206], [0, 1, 2, 3, 4, 5]]
-    )
-    np.testing.assert_array_equal(batch.history.gripper_pose[:, 0, 0], [206, 5])
-    np.testing.assert_array_equal(batch.keypoints[:, :, 0, 0], [[207, 208, 209], [6, 7, 8]])
-    assert batch.twist.shape == (2, 3, 2, 3)
+    window = one(trajectory, 2, 6, history=6, steps=3)
+    np.testing.assert_array_equal(window.history.keypoints[:, 0, 0], [201, 202, 203, 204, 205, 206])
+    np.testing.assert_array_equal(window.history.gripper_pose[:, 0], [206, 206])
+    np.testing.assert_array_equal(window.future[:, 0, 0], [207, 208, 209])
+    assert window.twist.shape == (3, 2, 3)
 
 
 def test_before_the_first_sample_the_cable_was_at_rest(trajectory):
-    batch = windows(trajectory, jnp.array([1, 1]), jnp.array([0, 2]), history=6)
-    np.testing.assert_array_equal(batch.history.keypoints[:, :, 0, 0], [[100] * 6, [100] * 4 + [101, 102]])
+    for start, expected in ((0, [100] * 6), (2, [100] * 4 + [101, 102])):
+        window = one(trajectory, 1, start, history=6, steps=1)
+        np.testing.assert_array_equal(window.history.keypoints[:, 0, 0], expected)
 
 
 def test_advancing_a_window_by_the_truth_gives_the_next(trajectory):
-    now, after = (windows(trajectory, jnp.array([3]), jnp.array([t])) for t in (4, 5))
-    displacement = now.keypoints[:, 0] - now.history.keypoints[:, -1]
-    stepped = jax.vmap(advance)(now.history, displacement, now.twist[:, 0])
+    now, after = (one(trajectory, 3, t, history=6, steps=1) for t in (4, 5))
+    stepped = advance(now.history, now.future[0] - now.history.keypoints[-1], now.twist[0])
     jax.tree.map(np.testing.assert_array_equal, stepped, after.history)
 
 
-def test_drawn_windows_fit_and_reach_both_ends(trajectory):
-    draw = jax.jit(draw_windows, static_argnames=("batch", "horizon"))
-    row, time = draw(jax.random.key(0), trajectory, 2000, horizon=4)
-    assert set(np.asarray(row)) == set(range(M))
-    assert set(np.asarray(time)) == set(range(T - 4 + 1))
-    again = draw(jax.random.key(0), trajectory, 2000, horizon=4)
-    np.testing.assert_array_equal(again[1], time)
-    batch = jax.jit(windows, static_argnames=("horizon",))(trajectory, row, time, horizon=4)
-    np.testing.assert_array_equal(batch.keypoints[:, -1, 0, 0], 100 * row + time + 4)
-    for wrong in (0, T + 1):
-        with pytest.raises(ValueError, match=f"horizon is {wrong}, expected 1 to {T}"):
-            draw_windows(jax.random.key(0), trajectory, 2, horizon=wrong)
+def test_drawn_windows_reach_both_ends_and_repeat(trajectory):
+    draw = jax.jit(draw_windows, static_argnames=("batch", "history", "steps"))
+    windows = draw(jax.random.key(0), trajectory, batch=2000, history=2, steps=4)
+    newest = np.asarray(windows.history.keypoints[:, -1, 0, 0])
+    assert set(newest // 100) == set(range(M))
+    assert set(newest % 100) == set(range(T - 4 + 1))
+    np.testing.assert_array_equal(windows.future[:, -1, 0, 0], newest + 4)
+    again = draw(jax.random.key(0), trajectory, batch=2000, history=2, steps=4)
+    jax.tree.map(np.testing.assert_array_equal, again, windows)
+    other = draw(jax.random.key(1), trajectory, batch=2000, history=2, steps=4)
+    assert (np.asarray(other.history.keypoints[:, -1, 0, 0]) != newest).any()
+
+
+def test_half_of_the_windows_are_mirrored_and_half_reversed(trajectory):
+    windows = draw_windows(jax.random.key(0), trajectory, batch=2000, history=2, steps=1)
+    y = np.asarray(windows.future[:, 0, :, 1])
+    flipped, swapped = y[:, 0] < 0, np.abs(y[:, 0]) == N
+    for share in (flipped.mean(), swapped.mean(), (flipped & swapped).mean() * 2):
+        assert 0.45 < share < 0.55
+
+
+def test_a_mirror_image_turns_the_other_way(trajectory):
+    window = one(trajectory, 1, 3, history=2, steps=2)
+    image = mirrored(window)
+    np.testing.assert_array_equal(image.future, window.future * np.array([1.0, -1.0]))
+    np.testing.assert_array_equal(image.history.gripper_pose, window.history.gripper_pose * np.array([1.0, -1.0, -1.0]))
+    jax.tree.map(np.testing.assert_array_equal, mirrored(image), window)
+    # the ends of the cable stay on the grippers
+    np.testing.assert_array_equal(image.history.keypoints[-1, [0, -1]], image.history.gripper_pose[:, :2])
+
+
+def test_from_the_other_end_the_tangent_points_the_other_way(trajectory):
+    window = one(trajectory, 1, 3, history=2, steps=2)
+    other = reversed_ends(window)
+    np.testing.assert_array_equal(other.future[:, 0], window.future[:, -1])
+    np.testing.assert_array_equal(other.twist[:, 0], window.twist[:, 1])
+    np.testing.assert_allclose(other.history.gripper_pose[:, 2], window.history.gripper_pose[::-1, 2] + np.pi)
+    np.testing.assert_array_equal(other.history.keypoints[-1, [0, -1]], other.history.gripper_pose[:, :2])
 
 
 @pytest.mark.parametrize(("count", "held_out"), [(2, 0.05), (2, 0.99), (20, 0.05), (1000, 0.05), (7, 0.5)])
@@ -64,7 +107,11 @@ def test_split_is_a_partition_with_both_parts(count, held_out):
     train, rest = split(count, held_out)
     np.testing.assert_array_equal(np.concatenate([train, rest]), np.arange(count))
     assert len(train) >= 1 and len(rest) >= 1
-    assert abs(len(rest) - held_out * count) <= 1
+    assert len(rest) <= max(1, held_out * count) and len(rest) > held_out * count - 1
+
+
+def test_split_of_the_released_models_data():
+    assert [len(split(count)[1]) for count in (896, 704, 320)] == [44, 35, 16]
 
 
 def test_split_refuses_what_it_cannot_do():
@@ -72,3 +119,38 @@ def test_split_refuses_what_it_cannot_do():
         split(10, 1.0)
     with pytest.raises(ValueError, match="1 trajectories"):
         split(1)
+
+
+def filled(path, config: DatasetConfig, shards: int | None = None):
+    """A store whose first shards hold random numbers."""
+    store, rng = open_or_create(path, config), np.random.default_rng(config.seed)
+    for shard in range(config.n_shards if shards is None else shards):
+        size = len(config.shard_rows(shard))
+        content = {n: rng.standard_normal((size, *s)).astype(d) for n, (s, d) in config.array_shapes().items()}
+        store.write_shard(shard, Block(**content))
+    return store
+
+
+CONFIG = DatasetConfig(n_trajectories=4, n_steps=2, shard_size=2, cable=CableConfig(n_links=5, n_keypoints=4))
+
+
+def test_several_stores_are_split_each_and_trained_on_one_after_the_other(tmp_path):
+    stores = [filled(tmp_path / str(k), dataclasses.replace(CONFIG, seed=k)) for k in range(2)]
+    training, held_out = read_split([tmp_path / "0", stores[1]], 0.3)
+    expected = concatenate([read_trajectories(store, range(3)) for store in stores])
+    jax.tree.map(np.testing.assert_array_equal, training, expected)
+    assert len(held_out) == 2
+    for part, store in zip(held_out, stores, strict=True):
+        jax.tree.map(np.testing.assert_array_equal, part, read_trajectories(store, [3]))
+
+
+def test_stores_that_do_not_belong_together_are_refused(tmp_path):
+    filled(tmp_path / "a", CONFIG)
+    filled(tmp_path / "short", dataclasses.replace(CONFIG, n_steps=3))
+    filled(tmp_path / "half", CONFIG, shards=1)
+    with pytest.raises(ValueError, match="same cable and protocol"):
+        read_split([tmp_path / "a", tmp_path / "short"])
+    with pytest.raises(ValueError, match="holds 2 of 4 trajectories"):
+        read_split([tmp_path / "half"])
+    with pytest.raises(ValueError, match="No data set given"):
+        read_split([])

@@ -4,11 +4,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from mpc_cases import START, TARGETS, at_rest, hermite_shape, relaxing_cable
 
 from cablejax.mpc import Controller, MPCConfig, Outcome, ProjectedGradient, TrustRegion, time_control
-from cablejax.residual import RidgeConfig
 from cablejax.types import History
+from mpc_cases import START, TARGETS, at_rest, hermite_shape, relaxing_cable
 
 N = 7
 CONFIG = MPCConfig(horizon=2)
@@ -76,7 +75,7 @@ def test_commands_respect_every_bound():
     control = controller()
     state = control.init(at_rest(jnp.asarray(cable.pose)))
     for _ in range(20):
-        state, twist, info = control.step(state, cable.keypoints, cable.pose)
+        state, twist, _ = control.step(state, cable.keypoints, cable.pose)
         size = np.linalg.norm(np.asarray(twist, float) * [1, 1, 0.15], axis=-1)
         assert (size <= 0.05).all()
         cable.step(twist)

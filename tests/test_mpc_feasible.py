@@ -5,9 +5,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
-from mpc_cases import feasible_set
 
 from cablejax.mpc import project_ball
+from mpc_cases import feasible_set
 
 T = 4
 LOWER, UPPER = 0.15, 0.99

@@ -4,10 +4,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from mpc_cases import START, TARGETS, at_rest, hermite_shape, poses, problem, random_motion
 
 from cablejax.mpc import ObjectiveConfig
 from cablejax.types import advance
+from mpc_cases import START, TARGETS, at_rest, hermite_shape, poses, problem, random_motion
 
 
 def central_difference(f, x, tangent, step=1e-6):

@@ -7,9 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.optimize
-from mpc_cases import TARGETS, problem, random_motion
 
 from cablejax.mpc import Outcome, ProjectedGradient, TrustRegion
+from mpc_cases import TARGETS, problem, random_motion
 
 STEPS = 3
 SOLVERS = {
@@ -62,7 +62,8 @@ def reference(name):
 def compiled(solver_name):
     def both(case, guess):
         plan = SOLVERS[solver_name](case, guess)
-        return plan, case.value(plan.motion), case.value(case.feasible.project(guess)), case.feasible.violation(plan.motion)
+        start = case.feasible.project(guess)
+        return plan, case.value(plan.motion), case.value(start), case.feasible.violation(plan.motion)
 
     return jax.jit(both)
 

@@ -56,6 +56,16 @@ def test_gripper_stands_behind_the_end_that_it_holds(end):
 
 
 @pytest.mark.parametrize(
+    "records",
+    [[run()], [run(n=2, short=0.5), run(method="direct", n=2, short=0.5)]],
+    ids=["one method", "two methods, far from the goal"],
+)
+def test_figures_of_one_shape_have_room_for_their_legends(records, tmp_path):
+    for draw in (figures.final_shapes, figures.error_over_time, figures.residual_share, figures.trust_region):
+        draw(records).savefig(tmp_path / "figure.svg")  # matplotlib warns where it has no room
+
+
+@pytest.mark.parametrize(
     "draw",
     [figures.final_shapes, figures.error_over_time, figures.residual_share, figures.trust_region, figures.snapshots],
 )

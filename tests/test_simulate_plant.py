@@ -58,9 +58,8 @@ def test_friction_of_a_sliding_cable_is_coulombs():
     force = contact_force(plant)
     weight = cable.linear_density * (cable.length - cable.link_length) * GRAVITY
     assert force[0] == pytest.approx(-0.1 * force[2], rel=0.01)
-    assert force[2] == pytest.approx(
-        weight, rel=0.25
-    )  # friction rolls the cable a little, so the grippers bear down on it
+    # Friction rolls the cable a little, so the grippers bear down on it.
+    assert force[2] == pytest.approx(weight, rel=0.25)
 
 
 def contact_force(plant) -> np.ndarray:

@@ -97,9 +97,9 @@ class ClosedLoopRun:
         distance = 100 * np.linalg.norm(self.keypoints[-1] - self.target.keypoints, axis=-1)
         best = int(np.nanargmin(self.error_cm))
         return (
-            f"{self.target.name}: not reached within {tolerance_cm:.2f} cm. The error went from {start:.2f} to {end:.2f} cm "
-            f"(lowest {self.error_cm[best]:.2f} cm after {self.times[best]:.0f} s); farthest off is keypoint "
-            f"{int(np.nanargmax(distance))}, by {np.nanmax(distance):.2f} cm.{early}"
+            f"{self.target.name}: not reached within {tolerance_cm:.2f} cm. The error went from {start:.2f} to "
+            f"{end:.2f} cm (lowest {self.error_cm[best]:.2f} cm after {self.times[best]:.0f} s); keypoint "
+            f"{int(np.nanargmax(distance))} is farthest off, by {np.nanmax(distance):.2f} cm.{early}"
         )
 
 
@@ -141,7 +141,7 @@ def run_closed_loop(
 ) -> ClosedLoopRun:
     """Lays a new cable between the grippers and lets a controller shape it.
 
-    A controller or plant that fails ends the run early but loses nothing: what was recorded is returned, with the reason.
+    A controller or plant that fails ends the run early but loses nothing: what was recorded comes back with the reason.
 
     Args:
         plant: what is shaped.
@@ -161,8 +161,8 @@ def run_closed_loop(
     samples = round(interval * record_hz)
     if steps < 1 or rest < 0 or samples < 1 or abs(samples - interval * record_hz) > 1e-9:
         raise ValueError(
-            f"A run of {steps} steps after {rest} at rest, with {record_hz} samples per second in intervals of {interval} "
-            "s, is not possible: give at least one step and a whole number of samples in an interval."
+            f"A run of {steps} steps after {rest} at rest, with {record_hz} samples per second in intervals of "
+            f"{interval} s, is not possible: give at least one step and a whole number of samples in an interval."
         )
     log = _Log(plant.reset(np.asarray(start, float)))
     observation = log.observations[0]

@@ -91,8 +91,8 @@ def gap_log_from_episodes(
         for array, length in zip(arrays, lengths, strict=True):
             if array.shape != (length, *rest):
                 raise GapLogError(
-                    f"An episode's {name} has shape {array.shape}, expected {(length, *rest)}: all arrays of an episode "
-                    "have its number of samples, and all episodes are of the same cable."
+                    f"An episode's {name} has shape {array.shape}, expected {(length, *rest)}: all arrays of an "
+                    "episode have its number of samples, and all episodes are of the same cable."
                 )
         whole = np.empty((len(arrays), max(lengths), *rest), _DTYPES[name])
         for row, array in zip(whole, arrays, strict=True):
@@ -237,9 +237,7 @@ def _validate_arrays(log: GapLog) -> None:
         if dimension == 3:
             norm = np.linalg.norm(log.gripper_pose[index, :length, :, 3:], axis=-1)
             if np.abs(norm - 1).max() > 1e-3:
-                raise GapLogError(
-                    f"Field 'gripper_pose' has quaternions that are not of unit length in episode {index}."
-                )
+                raise GapLogError(f"Field 'gripper_pose' has quaternions not of unit length in episode {index}.")
 
 
 def _validate_meta(log: GapLog) -> None:

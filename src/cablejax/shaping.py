@@ -7,6 +7,7 @@ from typing import Literal
 
 import numpy as np
 from flax import nnx
+from jaxtyping import Array, Float
 
 from cablejax.closed_loop import ClosedLoopRun, run_closed_loop
 from cablejax.dynamics.config import GNSConfig
@@ -34,7 +35,7 @@ class Model:
     Attributes:
         name: where it came from.
         config: its graph and sizes.
-        dynamics: `(weights, history, twist) -> displacement`, one function per model, so that it compiles once.
+        dynamics: `(weights, history, twist) -> displacement`.
         weights: its arrays.
     """
 
@@ -44,6 +45,20 @@ class Model:
     weights: nnx.State
 
 
+@dataclasses.dataclass(frozen=True)
+class NetworkDynamics:
+    """A network as a function of its weights. Equal structures are equal, so that the controller compiles once for all.
+
+    Attributes:
+        graphdef: the network's structure.
+    """
+
+    graphdef: nnx.GraphDef
+
+    def __call__(self, weights: nnx.State, history: History, twist: Float[Array, "2 3"]) -> Float[Array, "N 2"]:
+        return apply((self.graphdef, weights), history, twist)
+
+
 def load_model(name: str) -> Model:
     """A released model by name, or the one in a training's folder.
 
@@ -51,11 +66,7 @@ def load_model(name: str) -> Model:
         ValueError: there is no such model, or its file does not fit this version of the network.
     """
     config, graphdef, weights = load_weights(name)
-
-    def dynamics(weights: nnx.State, history: History, twist):
-        return apply((graphdef, weights), history, twist)
-
-    return Model(name, config, dynamics, weights)
+    return Model(name, config, NetworkDynamics(graphdef), weights)
 
 
 def make_controller(model: Model, target: Target, *, method: Method, solver: SolverName) -> Controller:

@@ -65,7 +65,7 @@ def make_target(shape: Shape, config: CableConfig = CableConfig()) -> Target:
     """
     if shape not in _LETTERS:
         raise ValueError(
-            f"There is no shape {shape!r}, expected one of {', '.join(_LETTERS)}, or a file for load_target."
+            f"There is no shape {shape!r}, expected one of {', '.join(_LETTERS)}; load_target reads files."
         )
     letter = _LETTERS[shape]
     direction = np.radians(letter.direction)
@@ -118,8 +118,8 @@ def target_from_keypoints(
     length = float((np.hypot(*edges.T) / np.sinc(turn / 2 / np.pi)).sum())
     if abs(length - config.length) > LENGTH_TOLERANCE * config.length:
         raise ValueError(
-            f"Target {name!r} is {length:.4g} m long, but the cable is {config.length:.4g} m long and does not stretch: "
-            "scale the target, or give the cable's length in the configuration."
+            f"Target {name!r} is {length:.4g} m long, but the cable is {config.length:.4g} m long and does not "
+            "stretch: scale the target, or give the cable's length in the configuration."
         )
     if gripper_pose is None:
         ends = [1.5 * angle[0] - 0.5 * angle[1], 1.5 * angle[-1] - 0.5 * angle[-2]]
@@ -127,9 +127,7 @@ def target_from_keypoints(
     else:
         pose = np.asarray(gripper_pose, float)
         if pose.shape != (2, 3) or not np.isfinite(pose).all():
-            raise ValueError(
-                f"Target {name!r} has a gripper_pose of shape {pose.shape} or not finite, expected (2, 3)."
-            )
+            raise ValueError(f"Target {name!r} has a gripper_pose not finite or of shape {pose.shape}, not (2, 3).")
         gap = np.abs(pose[:, :2] - points[[0, -1]]).max()
         if gap > 0.01 * config.length:
             raise ValueError(

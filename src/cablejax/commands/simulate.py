@@ -5,9 +5,12 @@ from __future__ import annotations
 import dataclasses
 import pathlib
 import time
-from typing import ClassVar, Literal
+from typing import TYPE_CHECKING, ClassVar, Literal
 
 from cablejax.commands.options import Command, say
+
+if TYPE_CHECKING:
+    from cablejax.dataset.schema import DatasetConfig
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -30,6 +33,10 @@ class Simulate(Command):
 
     start: Literal["straight", "random"] = "straight"
     """How each cable lies at first."""
+
+    max_amplification: float = 1.5
+    """Largest movement of any point of the frictionless cable, relative to what the grippers move together. It keeps
+    the cable from snapping through; 1000 lets it snap."""
 
     engine: Literal["threaded", "mjx"] = "threaded"
     """threaded: C MuJoCo on all CPU cores. mjx: batched in JAX, for an accelerator."""
@@ -59,23 +66,9 @@ class Simulate(Command):
         import shutil
 
         from cablejax.dataset.generate import generate
-        from cablejax.dataset.schema import DatasetConfig, Randomisation
         from cablejax.dataset.store import open_store
-        from cablejax.simulate import CableConfig
-        from cablejax.simulate.motions import MotionConfig
 
-        cable = CableConfig(bending_stiffness=self.stiffness, friction_coefficient=self.friction)
-        if self.links is not None:
-            cable = dataclasses.replace(cable, n_links=self.links)
-        config = DatasetConfig(
-            n_trajectories=self.trajectories,
-            n_steps=self.steps,
-            seed=self.seed,
-            motion=MotionConfig(start=self.start),
-            cable=cable,
-            randomisation=Randomisation(stiffness=self.stiffness_range),
-            engine=self.engine,
-        )
+        config = self.dataset_config()
         if self.overwrite and self.out.is_dir() and any(self.out.iterdir()) and open_store(self.out).config != config:
             shutil.rmtree(self.out)
         say(f"{config.n_trajectories} trajectories of {config.n_steps} steps into {self.out}")
@@ -92,4 +85,27 @@ class Simulate(Command):
         return result, (
             f"{info.n_complete} of {config.n_trajectories} trajectories are in {self.out} ({seconds:.0f} s).\n"
             f"Train on them: cablejax train --data {self.out}"
+        )
+
+    def dataset_config(self) -> DatasetConfig:
+        """What these options ask for.
+
+        Raises:
+            ValueError: an option is out of its range.
+        """
+        from cablejax.dataset.schema import DatasetConfig, Randomisation
+        from cablejax.simulate import CableConfig
+        from cablejax.simulate.motions import MotionConfig
+
+        cable = CableConfig(bending_stiffness=self.stiffness, friction_coefficient=self.friction)
+        if self.links is not None:
+            cable = dataclasses.replace(cable, n_links=self.links)
+        return DatasetConfig(
+            n_trajectories=self.trajectories,
+            n_steps=self.steps,
+            seed=self.seed,
+            motion=MotionConfig(start=self.start, max_amplification=self.max_amplification),
+            cable=cable,
+            randomisation=Randomisation(stiffness=self.stiffness_range),
+            engine=self.engine,
         )

@@ -1,94 +1,107 @@
-"""`cablejax train`: a graph network on a data set."""
+"""`cablejax train`: a graph network on data sets."""
 
 from __future__ import annotations
 
 import dataclasses
+import json
 import pathlib
-from typing import ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from cablejax.commands.options import Command, UsageError, say, text_table, write_json
+
+if TYPE_CHECKING:
+    from cablejax.dataset.store import Store
+    from cablejax.dynamics.error_report import ErrorReport
+    from cablejax.dynamics.train_config import TrainConfig
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Train(Command):
-    """Train a model of the cable's dynamics on a data set made by `cablejax simulate`.
+    """Train a model of the cable's dynamics on data sets made by `cablejax simulate`.
 
-    Writes checkpoints, metrics (CSV and TensorBoard), the trained weights and the error on held-out trajectories. The
-    defaults are those of the released model. A training that was interrupted goes on with the same command and ends in
-    the very same weights."""
+    Writes checkpoints, metrics (CSV and TensorBoard), weights.safetensors, a model card, and the error on held-out
+    trajectories. A training that was interrupted goes on with the same command and ends in the very same weights."""
 
     resume_hint: ClassVar[str] = "The last checkpoint is kept; run the same command again to go on."
 
-    data: pathlib.Path = pathlib.Path("runs/data.zarr")
-    """Folder of the data set."""
+    data: tuple[pathlib.Path, ...] = (pathlib.Path("runs/data.zarr"),)
+    """Folders of the data sets, in this order."""
 
     out: pathlib.Path = pathlib.Path("runs/train")
     """Folder for what the training writes; one that holds the same training is resumed."""
 
+    preset: Literal["released", "small", "smoke"] = "released"
+    """released: as the released model was trained. small: to compare variants, some minutes. smoke: a few steps."""
+
+    pretrain: int = 0
+    """Steps for which the encoders are first trained as auto-encoders; 0 for none."""
+
     held_out: float = 0.05
-    """Fraction of the trajectories kept away from training to measure the error on."""
+    """Fraction of each data set kept away from training to measure the error on."""
 
     steps: int | None = None
-    """Optimiser steps in all; by default those of the released model. Its phases keep their proportions."""
+    """Optimiser steps in all; by default those of the preset. Its phases keep their proportions."""
 
     batch: int | None = None
-    """Windows per optimiser step, in every phase; by default those of the released model."""
+    """Windows per optimiser step, in every phase; by default those of the preset."""
 
     latent: int | None = None
-    """Width of every hidden layer and latent vector; by default that of the released model."""
+    """Width of every hidden layer and latent vector; by default that of the preset."""
 
     message_passing: int | None = None
-    """Message-passing steps; by default those of the released model."""
+    """Message-passing steps; by default those of the preset."""
 
     def execute(self):
         from cablejax.dataset.store import open_store
-        from cablejax.dataset.windows import read_trajectories, split
-        from cablejax.dynamics.evaluate import no_motion, open_loop_error, prior_motion
+        from cablejax.dataset.windows import concatenate, read_split
+        from cablejax.dynamics.autoencoder import PretrainConfig, pretrain
+        from cablejax.dynamics.error_report import error_report
         from cablejax.dynamics.train import train
+        from cablejax.dynamics.weights import FILE_NAME, save_weights
 
-        store = open_store(self.data)
-        if not store.info().complete:
-            raise UsageError(
-                f"{self.data} holds {store.info().n_complete} of {store.config.n_trajectories} trajectories. "
-                "Complete it first: run the command that began it again."
-            )
-        config = self._config(store.config.cable.n_keypoints, store.config.cable.length)
-        rows = split(store.config.n_trajectories, self.held_out)
-        training, validation = (read_trajectories(store, r) for r in rows)
-        say(f"{len(rows[0])} trajectories to train on, {len(rows[1])} held out; {config.total_steps} steps")
-        result = train(config, training, self.out, validation=validation)
+        if self.pretrain < 0:
+            raise UsageError(f"--pretrain is {self.pretrain}, expected 0 or a number of steps.")
+        stores = [open_store(path) for path in self.data]
+        if not stores:
+            raise UsageError("--data names no data set, expected at least one.")
+        config = self._config(stores[0])
+        training, held_out = read_split(stores, self.held_out)
+        count = sum(len(part.gripper_twist) for part in held_out)
+        say(f"{len(training.gripper_twist)} trajectories to train on, {count} held out; {config.total_steps} steps")
+        initial = pretrain(config, training, PretrainConfig(steps=self.pretrain)).weights if self.pretrain else None
+        result = train(config, training, self.out, validation=concatenate(held_out), initial=initial)
         if not result.completed:
             raise KeyboardInterrupt(
                 f"Stopped after step {result.steps} of {config.total_steps}; the checkpoint is in {self.out}. "
                 "Run the same command again to go on."
             )
-        errors = {
-            "model": open_loop_error((result.graphdef, result.weights), validation, result.model),
-            "static prior": open_loop_error(prior_motion(result.model, "static"), validation, result.model),
-            "rigid interpolation": open_loop_error(prior_motion(result.model, "rigid"), validation, result.model),
-            "no motion": open_loop_error(no_motion, validation, result.model),
-        }
-        summary = {
-            "out": str(self.out),
-            "steps": result.steps,
-            "open_loop_rmse_cm": {
-                name: dict(zip(map(str, error.horizons), error.rmse_cm, strict=True)) for name, error in errors.items()
-            },
-        }
+        info = self._info(config, stores, [len(part.gripper_twist) for part in held_out])
+        save_weights(self.out / FILE_NAME, result.model, result.weights, info)
+        say("measuring the error on the held-out trajectories ...")
+        names = [data["name"] for data in info["data"]]
+        report = error_report((result.graphdef, result.weights), dict(zip(names, held_out, strict=True)), result.model)
+        self._write_card(result.model, info, stores, report)
+        summary = {"out": str(self.out), "steps": result.steps, **report.to_json()}
         write_json(self.out / "summary.json", summary)
-        horizons = errors["model"].horizons
+        errors = report.errors["all windows"]
         table = text_table(
-            ["open-loop error [cm] after", *(f"{h} s" for h in horizons)],
-            [[name, *(f"{e:.4f}" for e in error.rmse_cm)] for name, error in errors.items()],
+            ["open-loop error [cm] after", *(f"{h} s" for h in errors["network"].horizons)],
+            [
+                [f"{name}, {kind}", *(f"{e:.4f}" for e in getattr(error, f"{kind}_cm"))]
+                for kind in ("median", "rmse")
+                for name, error in errors.items()
+            ],
         )
-        return summary, table
+        return summary, f"{table}\n\nThe weights are in {self.out / FILE_NAME}; read {self.out / 'card.md'}"
 
-    def _config(self, n_keypoints: int, length: float):
-        """The released model's training with what the options change."""
-        from cablejax.dynamics.train_config import TrainConfig
+    def _config(self, store: Store) -> TrainConfig:
+        """The preset's training with what the data and the options change."""
+        from cablejax.dynamics.train_config import PRESETS
 
-        config = TrainConfig(seed=self.seed)
-        model = dataclasses.replace(config.model, n_keypoints=n_keypoints, length=length)
+        config, cable = PRESETS[self.preset], store.config.cable
+        model = dataclasses.replace(
+            config.model, n_keypoints=cable.n_keypoints, length=cable.length, interval=store.config.interval
+        )
         if self.latent is not None:
             model = dataclasses.replace(model, latent=self.latent, hidden=self.latent)
         if self.message_passing is not None:
@@ -99,4 +112,46 @@ class Train(Command):
             phases = tuple(dataclasses.replace(p, steps=max(1, round(share * p.steps))) for p in phases)
         if self.batch is not None:
             phases = tuple(dataclasses.replace(p, batch=self.batch) for p in phases)
-        return dataclasses.replace(config, model=model, phases=phases)
+        return dataclasses.replace(config, seed=self.seed, model=model, phases=phases)
+
+    def _info(self, config: TrainConfig, stores: list[Store], held_out: list[int]) -> dict[str, Any]:
+        """Where the weights come from, without local paths."""
+        from cablejax.dataset.schema import config_to_json
+        from cablejax.report.provenance import machine, versions
+
+        stems = [store.path.name.removesuffix(".zarr") for store in stores]
+        names = [stem if stems.count(stem) == 1 else f"{stem} {k + 1}" for k, stem in enumerate(stems)]
+        training = json.loads(json.dumps(dataclasses.asdict(config)))
+        del training["model"]  # the weights file has it, with the normalisation
+        return {
+            "data": [
+                {
+                    "name": name,
+                    "digest": store.info().digest,
+                    "config": config_to_json(store.config),
+                    "versions": store.versions,
+                    "held_out": count,
+                }
+                for name, store, count in zip(names, stores, held_out, strict=True)
+            ],
+            "training": training | {"pretrain": self.pretrain},
+            "versions": versions(),
+            "machine": machine(),
+        }
+
+    def _write_card(self, model, info: dict[str, Any], stores: list[Store], report: ErrorReport) -> None:
+        from cablejax.commands.reproduce import command_line, simulate_command
+        from cablejax.dynamics.card import write_card
+
+        write_card(
+            self.out / "card.md",
+            name=self.out.name,
+            config=model,
+            info=info,
+            metrics=self.out / "metrics.csv",
+            report=report,
+            commands=[
+                *(simulate_command(store.config, store.path.name) for store in stores),
+                command_line(self, "train"),
+            ],
+        )

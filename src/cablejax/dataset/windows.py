@@ -1,7 +1,8 @@
 """From trajectories to what a one-step model is trained on: a history, the commands that follow, and what happened.
 
-`read_trajectories` loads into memory, `split` sets rows aside, `draw_windows` picks (row, time) pairs from a key, and
-`windows` gathers them inside jit.
+`read_trajectories` loads into memory, `split` sets rows aside, `read_split` does both for several stores, and
+`draw_windows` draws and augments inside jit. A draw depends on its key alone, so a training whose keys are counted, not
+carried along, sees after a kill what it would have seen without.
 """
 
 from __future__ import annotations
@@ -13,29 +14,10 @@ from collections.abc import Sequence
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Float, PRNGKeyArray
 
 from cablejax.dataset.store import Store, open_store
 from cablejax.types import History, Trajectory
-
-HISTORY = 6
-"""Samples in a history, H = m + 1, in Wang et al., RA-L 2022."""
-
-
-@jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True)
-class WindowBatch:
-    """Training windows.
-
-    Attributes:
-        history: the samples t - m, ..., t, keypoints [B, H, N, 2] and gripper_pose [B, Q, 3].
-        twist: commands from t on [m/s, rad/s], shape [B, K, Q, 3].
-        keypoints: what followed, the samples t + 1, ..., t + K [m], shape [B, K, N, 2].
-    """
-
-    history: History
-    twist: Float[Array, "*batch K Q 3"]
-    keypoints: Float[Array, "*batch K N 2"]
 
 
 def read_trajectories(
@@ -56,7 +38,7 @@ def read_trajectories(
 
 
 def split(n_trajectories: int, held_out: float = 0.05) -> tuple[np.ndarray, np.ndarray]:
-    """Rows to train on and rows held out: the last ones, at least one of each.
+    """Rows to train on and rows held out: the last `held_out` of them, rounded down, but at least one of each.
 
     Raises:
         ValueError: `held_out` is not a fraction in (0, 1), or there are fewer than two trajectories.
@@ -65,54 +47,119 @@ def split(n_trajectories: int, held_out: float = 0.05) -> tuple[np.ndarray, np.n
         raise ValueError(f"held_out is {held_out}, expected a fraction between 0 and 1.")
     if n_trajectories < 2:
         raise ValueError(f"{n_trajectories} trajectories cannot be split: generate at least 2.")
-    first = n_trajectories - min(max(1, round(held_out * n_trajectories)), n_trajectories - 1)
+    first = n_trajectories - min(max(1, int(held_out * n_trajectories)), n_trajectories - 1)
     return np.arange(first), np.arange(first, n_trajectories)
 
 
-def draw_windows(
-    key: PRNGKeyArray, trajectory: Trajectory, batch: int, *, horizon: int = 1
-) -> tuple[Int[Array, " B"], Int[Array, " B"]]:
-    """Uniform (row, time) pairs whose next `horizon` samples exist.
+def read_split(
+    sources: Sequence[str | os.PathLike[str] | Store], held_out: float = 0.05
+) -> tuple[Trajectory, list[Trajectory]]:
+    """Trajectories to train on, of all stores one after the other, and those that `split` holds out of each store.
 
     Raises:
-        ValueError: the trajectories are shorter than the horizon.
+        ValueError: a store is not complete or damaged, or they differ in keypoints, length of trajectories, interval or
+            length of the cable.
     """
-    rows, steps = trajectory.gripper_twist.shape[:2]
-    if not 1 <= horizon <= steps:
-        raise ValueError(f"The horizon is {horizon}, expected 1 to {steps}, the commands in a trajectory.")
-    row_key, time_key = jax.random.split(key)
-    return (
-        jax.random.randint(row_key, (batch,), 0, rows),
-        jax.random.randint(time_key, (batch,), 0, steps - horizon + 1),
+    stores = [source if isinstance(source, Store) else open_store(source) for source in sources]
+    if not stores:
+        raise ValueError("No data set given: expected at least one.")
+    first = stores[0].config
+    for store in stores:
+        info, cable = store.info(), store.config.cable
+        if not info.complete:
+            raise ValueError(
+                f"{store.path} holds {info.n_complete} of {store.config.n_trajectories} trajectories. "
+                "Complete it first: run the command that began it again."
+            )
+        came = (cable.n_keypoints, cable.length, store.config.n_steps, store.config.interval)
+        expected = (first.cable.n_keypoints, first.cable.length, first.n_steps, first.interval)
+        if came != expected:
+            raise ValueError(
+                f"{store.path} has (keypoints, cable length [m], commands, interval [s]) = {came}, but "
+                f"{stores[0].path} has {expected}: only data sets of the same cable and protocol can be used together."
+            )
+    training, rest = [], []
+    for store in stores:
+        rows = split(store.config.n_trajectories, held_out)
+        training.append(read_trajectories(store, rows[0]))
+        rest.append(read_trajectories(store, rows[1]))
+    return concatenate(training), rest
+
+
+def concatenate(parts: Sequence[Trajectory]) -> Trajectory:
+    """Trajectories [M, ...] one after the other, as NumPy arrays."""
+    return jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Window:
+    """A history and what followed it.
+
+    Attributes:
+        history: the H samples up to t.
+        twist: commands held from t on, shape [K, 2, 3].
+        future: keypoints [m] at t + 1, ..., t + K, shape [K, N, 2].
+    """
+
+    history: History
+    twist: Float[Array, "*batch K 2 3"]
+    future: Float[Array, "*batch K N 2"]
+
+
+def window_at(trajectory: Trajectory, start: Array, *, history: int, steps: int) -> Window:
+    """The window whose newest history sample is sample `start` of an unbatched trajectory.
+
+    Before the trajectory's beginning the cable rested, so missing history repeats sample 0.
+    """
+    past = jnp.maximum(start - history + 1 + jnp.arange(history), 0)
+    return Window(
+        history=History(keypoints=trajectory.keypoints[past], gripper_pose=trajectory.gripper_pose[start]),
+        twist=jax.lax.dynamic_slice_in_dim(trajectory.gripper_twist, start, steps),
+        future=jax.lax.dynamic_slice_in_dim(trajectory.keypoints, start + 1, steps),
     )
 
 
-def windows(
-    trajectory: Trajectory,
-    row: Int[Array, " B"],
-    time: Int[Array, " B"],
-    *,
-    horizon: int = 1,
-    history: int = HISTORY,
-) -> WindowBatch:
-    """Gathers windows from trajectories [M, ...] in memory. Pure; to be jitted with the arrays on the device.
+def draw_windows(key: PRNGKeyArray, data: Trajectory, *, batch: int, history: int, steps: int) -> Window:
+    """`batch` windows, uniform over trajectories [M, T, ...] and starts, mirrored and reversed at random."""
+    data = jax.tree.map(jnp.asarray, data)
+    m, t = data.gripper_twist.shape[:2]
+    key_episode, key_start, key_mirror, key_reverse = jax.random.split(key, 4)
+    episode = jax.random.randint(key_episode, (batch,), 0, m)
+    start = jax.random.randint(key_start, (batch,), 0, t - steps + 1)
+    flip = jax.random.bernoulli(key_mirror, shape=(batch,))
+    swap = jax.random.bernoulli(key_reverse, shape=(batch,))
 
-    Before the first sample the cable was at rest: those places of a history repeat sample 0.
+    def one(episode, start, flip, swap):
+        trajectory = jax.tree.map(lambda x: x[episode], data)
+        window = window_at(trajectory, start, history=history, steps=steps)
+        window = jax.tree.map(lambda a, b: jnp.where(flip, a, b), mirrored(window), window)
+        return jax.tree.map(lambda a, b: jnp.where(swap, a, b), reversed_ends(window), window)
 
-    Args:
-        trajectory: with leading axis [M].
-        row: trajectory of each window.
-        time: index t of each history's newest sample, at most T - horizon.
-        horizon: commands and samples after t.
-        history: samples up to and including t.
-    """
-    past = jnp.maximum(time[:, None] + jnp.arange(1 - history, 1), 0)
-    ahead = time[:, None] + jnp.arange(horizon)
-    keypoints = jnp.asarray(trajectory.keypoints)
-    return WindowBatch(
+    return jax.vmap(one)(episode, start, flip, swap)
+
+
+def mirrored(window: Window) -> Window:
+    """The same motion seen in a mirror, y -> -y: as likely as the original for a uniform straight cable."""
+    point, pose = jnp.array([1.0, -1.0]), jnp.array([1.0, -1.0, -1.0])
+    return Window(
         history=History(
-            keypoints=keypoints[row[:, None], past], gripper_pose=jnp.asarray(trajectory.gripper_pose)[row, time]
+            keypoints=(window.history.keypoints * point).astype(window.history.keypoints.dtype),
+            gripper_pose=(window.history.gripper_pose * pose).astype(window.history.gripper_pose.dtype),
         ),
-        twist=jnp.asarray(trajectory.gripper_twist)[row[:, None], ahead],
-        keypoints=keypoints[row[:, None], ahead + 1],
+        twist=(window.twist * pose).astype(window.twist.dtype),
+        future=(window.future * point).astype(window.future.dtype),
+    )
+
+
+def reversed_ends(window: Window) -> Window:
+    """The same motion with the cable counted from its other end: the tangent, and so theta, turns by pi."""
+    turn = jnp.asarray([0.0, 0.0, jnp.pi], window.history.gripper_pose.dtype)
+    return Window(
+        history=History(
+            keypoints=window.history.keypoints[..., ::-1, :],
+            gripper_pose=window.history.gripper_pose[..., ::-1, :] + turn,
+        ),
+        twist=window.twist[..., ::-1, :],
+        future=window.future[..., ::-1, :],
     )

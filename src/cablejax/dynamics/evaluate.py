@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Callable, Sequence
 from typing import Literal
 
@@ -10,16 +11,24 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import nnx
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
+from cablejax.dataset.windows import Window, window_at
 from cablejax.dynamics.config import GNSConfig
 from cablejax.dynamics.gns import Dynamics, bind
 from cablejax.dynamics.graph import prior_of
-from cablejax.dynamics.windows import Window, check_trajectories, window_at
+from cablejax.dynamics.normalisation import check_trajectories
+from cablejax.simulate.motions import MotionConfig, twist_size
 from cablejax.types import History, Trajectory, advance
 
 HORIZONS = (1, 5, 10, 20)
 """Steps after which errors are reported unless asked otherwise."""
+
+SNAP_FACTOR = 2.5
+"""A keypoint that moves more than so many times the sum of what both grippers move was not led by them."""
+
+SNAP_MARGIN = 0.01
+"""And at least so much further [m]."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -28,26 +37,28 @@ class OpenLoopError:
 
     Attributes:
         horizons: steps k after the start.
+        starts: number of start points that count, per horizon. Where there is none, the rest is NaN.
         rmse_cm: root of the mean over start points of the squared error, per horizon.
         median_cm: median over start points.
-        p95_cm: 95th percentile over start points.
-        worst_cm: maximum over start points.
+        p90_cm: 90th percentile over start points.
+        p95_cm: 95th percentile.
+        p99_cm: 99th percentile.
         moved_cm: root mean square distance that the keypoints really moved over k steps.
-        starts: number of start points.
     """
 
     horizons: tuple[int, ...]
+    starts: tuple[int, ...]
     rmse_cm: tuple[float, ...]
     median_cm: tuple[float, ...]
+    p90_cm: tuple[float, ...]
     p95_cm: tuple[float, ...]
-    worst_cm: tuple[float, ...]
+    p99_cm: tuple[float, ...]
     moved_cm: tuple[float, ...]
-    starts: int
 
     @property
     def relative(self) -> tuple[float, ...]:
-        """Error as a fraction of the movement, per horizon."""
-        return tuple(e / m for e, m in zip(self.rmse_cm, self.moved_cm, strict=True))
+        """Root mean square error as a fraction of the movement, per horizon; NaN where nothing moved."""
+        return tuple(e / m if m else math.nan for e, m in zip(self.rmse_cm, self.moved_cm, strict=True))
 
 
 def predict(
@@ -107,6 +118,7 @@ def open_loop_error(
     horizons: Sequence[int] = HORIZONS,
     stride: int = 10,
     batch: int = 64,
+    count: Bool[np.ndarray, "W K"] | None = None,
 ) -> OpenLoopError:
     """Rolls `model` from every `stride`-th sample of every trajectory and summarises the errors.
 
@@ -117,35 +129,67 @@ def open_loop_error(
         horizons: steps after which errors are reported.
         stride: samples between start points.
         batch: windows rolled out at once.
+        count: which windows to count after which step, as from `snapping`; all by default.
     """
-    horizons = tuple(horizons)
     steps = max(horizons)
     windows = evaluation_windows(data, config, steps=steps, stride=stride)
+    error = window_errors(model, windows, config, batch=batch)
+    return summarise(error, windows, horizons=horizons, count=count)
+
+
+def window_errors(
+    model: Dynamics | tuple[nnx.GraphDef, nnx.State], windows: Window, config: GNSConfig, *, batch: int = 64
+) -> Float[np.ndarray, "W K"]:
+    """Error [m] of every window after every step; arguments as in `open_loop_error`."""
     if isinstance(model, tuple):
         graphdef, weights = model
         errors, arguments = make_errors(lambda w: bind(graphdef, w), config.interval), (weights,)
     else:
         errors, arguments = make_errors(lambda: model, config.interval), ()
-    n = windows.twist.shape[0]
     parts = [
         np.asarray(errors(arguments, jax.tree.map(lambda x, i=i: x[i : i + batch], windows)), np.float64)
-        for i in range(0, n, batch)
+        for i in range(0, windows.twist.shape[0], batch)
     ]
-    error = np.concatenate(parts)
-    still = windows.future - windows.history.keypoints[:, -1:]
-    moved = np.sqrt(np.mean(np.sum(np.asarray(still, np.float64) ** 2, axis=-1), axis=-1))
-    pick = [h - 1 for h in horizons]
-    error, moved = 100 * error[:, pick], 100 * moved[:, pick]
+    return np.concatenate(parts)
 
-    def row(values: np.ndarray) -> tuple[float, ...]:
-        return tuple(float(v) for v in values)
 
+def summarise(
+    error: Float[np.ndarray, "W K"],
+    windows: Window,
+    *,
+    horizons: Sequence[int] = HORIZONS,
+    count: Bool[np.ndarray, "W K"] | None = None,
+) -> OpenLoopError:
+    """Statistics of errors [m] over windows, those that `count` marks as true or all."""
+    truth = np.asarray(windows.future, np.float64) - np.asarray(windows.history.keypoints[:, -1:], np.float64)
+    moved = np.sqrt(np.mean(np.sum(truth**2, axis=-1), axis=-1))
+    count = np.ones(error.shape, bool) if count is None else count
+
+    def column(h: int) -> tuple[float, ...]:
+        mine = count[:, h - 1]
+        if not mine.any():
+            return (0, *[np.nan] * 6)
+        e, m = 100 * error[mine, h - 1], 100 * moved[mine, h - 1]
+        quantiles = np.percentile(e, [50, 90, 95, 99])
+        return (mine.sum(), np.sqrt(np.mean(e**2)), *quantiles, np.sqrt(np.mean(m**2)))
+
+    starts, *rest = zip(*(column(h) for h in horizons), strict=True)
     return OpenLoopError(
-        horizons=horizons,
-        rmse_cm=row(np.sqrt(np.mean(error**2, axis=0))),
-        median_cm=row(np.median(error, axis=0)),
-        p95_cm=row(np.percentile(error, 95, axis=0)),
-        worst_cm=row(error.max(axis=0)),
-        moved_cm=row(np.sqrt(np.mean(moved**2, axis=0))),
-        starts=n,
+        tuple(horizons), tuple(int(n) for n in starts), *(tuple(float(v) for v in row) for row in rest)
     )
+
+
+def snapping(data: Trajectory, *, steps: int, stride: int, interval: float = 1.0) -> Bool[np.ndarray, "W K"]:
+    """Whether the true cable snaps through within the first k steps of a window or in the two steps before it.
+
+    It does in a step in which some keypoint moves further than `SNAP_FACTOR` times the sum of what both grippers move,
+    plus `SNAP_MARGIN`. Windows are those of `evaluation_windows`.
+    """
+    moved = np.linalg.norm(np.diff(np.asarray(data.keypoints, np.float64), axis=1), axis=-1).max(axis=-1)
+    reach = interval * twist_size(np.asarray(data.gripper_twist, np.float64), MotionConfig().rotation_weight).sum(-1)
+    snaps = moved > SNAP_FACTOR * reach + SNAP_MARGIN
+    m, t = snaps.shape
+    padded = np.concatenate([np.zeros((m, 2), bool), snaps], axis=1)
+    starts = np.arange(0, t - steps + 1, stride)
+    within = padded[:, starts[:, None] + np.arange(steps + 2)]
+    return np.logical_or.accumulate(within, axis=-1)[..., 2:].reshape(m * starts.size, steps)

@@ -42,7 +42,7 @@ class MLP(nnx.Module):
         self.rest = nnx.List([nnx.Linear(a, b, rngs=rngs) for a, b in itertools.pairwise(sizes)])
         if not normalise:
             # The decoder starts at zero: an untrained model is its prior.
-            self.rest[-1].kernel.set_value(jnp.zeros_like(self.rest[-1].kernel))
+            self.rest[-1].kernel.set_value(jnp.zeros_like(self.rest[-1].kernel.get_value()))
         self.norm = nnx.LayerNorm(output, epsilon=1e-5, rngs=rngs) if normalise else None
 
     def after_first(self, x: Float[Array, "rows hidden"]) -> Float[Array, "rows output"]:
@@ -92,7 +92,7 @@ def aggregate(messages: Float[Array, "E latent"], offsets: tuple[int, ...], n: i
         part = messages[start : start + n - abs(k)]
         total = total + jnp.pad(part, ((max(0, k), max(0, -k)), (0, 0)))
         start += n - abs(k)
-    return total
+    return total  # pyright: ignore[reportReturnType]
 
 
 class GNS(nnx.Module):
@@ -127,13 +127,13 @@ def apply(
         history: the last H samples; vmap for batches.
         twist: control input of both grippers [m/s, rad/s], shape [2, 3].
     """
-    if isinstance(model, tuple):
-        model = nnx.merge(*model)
-    config = model.config
+    network: GNS = nnx.merge(*model) if isinstance(model, tuple) else model
+    config = network.config
     prior = prior_of(history, twist, config)
     graph = build_graph(history, twist, prior, config)
     frame = gripper_frame(history.gripper_pose)
-    beyond = model(graph.nodes, graph.edges)[1:-1] * config.normalisation.residual
+    output = network(graph.nodes, graph.edges)  # pyright: ignore[reportArgumentType]
+    beyond = output[1:-1] * config.normalisation.residual
     return prior.displacement + jnp.pad(beyond @ frame, ((1, 1), (0, 0)))
 
 

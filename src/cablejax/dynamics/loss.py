@@ -6,8 +6,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
+from cablejax.dataset.windows import Window
 from cablejax.dynamics.gns import Dynamics
-from cablejax.dynamics.windows import Window
 from cablejax.types import History, advance
 
 

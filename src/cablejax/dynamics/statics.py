@@ -2,8 +2,8 @@
 
 Without friction, a uniform inextensible cable clamped at both ends rests in a shape that depends on nothing but the
 gripper poses and the branch it is on (up or down, S or mirrored S): not on its stiffness, not on its weight. This file
-finds that shape by a few Newton steps on a chain of rigid links, from the observed keypoints before a command to the poses
-after it. An error in the keypoints fades instead of adding up over a rollout, since they only choose the branch.
+finds that shape by a few Newton steps on a chain of rigid links, from the observed keypoints before a command to the
+poses after it. An error in the keypoints fades instead of adding up over a rollout, since they only choose the branch.
 
 What is left for the network is what this leaves out: friction, damping, snap-through.
 """
@@ -11,7 +11,7 @@ What is left for the network is what this leaves out: friction, damping, snap-th
 from __future__ import annotations
 
 import functools
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -32,8 +32,8 @@ FOLLOWING_STEPS = 4
 """Newton steps at the poses after it."""
 
 DAMPING = 0.3
-"""Added to the second derivative, in units of EI / L (a stable cable's own is between 0 and 12): on the verge of snapping
-through a Newton step would be without bound."""
+"""Added to the second derivative, in units of EI / L (a stable cable's own is between 0 and 12): on the verge of
+snapping through a Newton step would be without bound."""
 
 MAX_TURN = 0.2
 """Largest change of a joint angle in one Newton step [rad]."""
@@ -42,15 +42,15 @@ _SMALL = 1e-6
 
 
 class Chain(NamedTuple):
-    """Constant matrices of one cable; n = LINKS, N keypoints, J = n - 1 joints."""
+    """Constant matrices of one cable, NumPy or JAX arrays; n = LINKS, N keypoints, J = n - 1 joints."""
 
-    tangents_of_keypoints: np.ndarray  # [n, N], with the next: tangents at the nodes of the clamped cubic spline
-    tangents_of_ends: np.ndarray  # [n, 2]
-    keypoints_of_nodes: np.ndarray  # [N, n]
-    keypoints_of_tangents: np.ndarray  # [N, n]
-    link_lengths: np.ndarray  # [n]
-    node_offsets: np.ndarray  # [n]
-    later: np.ndarray  # [J, J], the later one of two joints
+    tangents_of_keypoints: Any  # [n, N], with the next: tangents at the nodes of the clamped cubic spline
+    tangents_of_ends: Any  # [n, 2]
+    keypoints_of_nodes: Any  # [N, n]
+    keypoints_of_tangents: Any  # [N, n]
+    link_lengths: Any  # [n]
+    node_offsets: Any  # [n]
+    later: Any  # [J, J], the later one of two joints
 
 
 @functools.lru_cache(maxsize=32)
@@ -60,12 +60,13 @@ def chain(n_keypoints: int, length: float) -> Chain:
     nodes = np.linspace(0.0, length, LINKS)
 
     def derivative(values: np.ndarray, first: float, last: float) -> np.ndarray:
-        return CubicSpline(config.keypoint_arclength, values, bc_type=((1, first), (1, last)))(nodes, 1)
+        return CubicSpline(config.keypoint_arclength, values, bc_type=((1, first), (1, last)))(nodes, 1)  # pyright: ignore[reportArgumentType]
 
     of_keypoints = np.stack([derivative(unit, 0.0, 0.0) for unit in np.eye(n_keypoints)], axis=1)
     zero = np.zeros(n_keypoints)
     of_ends = np.stack([derivative(zero, 1.0, 0.0), derivative(zero, 0.0, 1.0)], axis=1)
-    joints = np.arange(LINKS - 1)
+    # int32 whether or not JAX is in 64-bit mode
+    joints = np.arange(LINKS - 1, dtype=np.int32)
     return Chain(
         of_keypoints,
         of_ends,
@@ -114,7 +115,7 @@ def _newton_step(matrices: Chain, angles: Array, pose: Array, turn: Array, lengt
     """One step on `min sum angles^2 / 2h` with the far end at gripper 1's position and the angles' sum equal `turn`."""
     joints = len(angles)
     h = length / joints
-    theta, links = _links(matrices, angles, pose)
+    _, links = _links(matrices, angles, pose)
     # what lies beyond joint i turns about it
     beyond = jnp.cumsum(links[::-1], axis=0)[::-1][1:]
     jacobian = jnp.stack([-beyond[:, 1], beyond[:, 0], jnp.full(joints, length, angles.dtype)])

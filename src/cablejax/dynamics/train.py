@@ -26,14 +26,15 @@ from flax import nnx
 from jaxtyping import Array
 from tqdm import tqdm
 
+from cablejax.dataset.windows import Window, draw_windows
 from cablejax.dynamics.checkpoint import Checkpoints
 from cablejax.dynamics.config import GNSConfig
 from cablejax.dynamics.evaluate import HORIZONS, evaluation_windows, make_errors
 from cablejax.dynamics.gns import GNS, bind
 from cablejax.dynamics.loss import random_walk_noise, rollout_loss
 from cablejax.dynamics.metrics import MetricsLog
+from cablejax.dynamics.normalisation import check_trajectories, fit_normalisation
 from cablejax.dynamics.train_config import Phase, TrainConfig
-from cablejax.dynamics.windows import Window, check_trajectories, draw_windows, fit_normalisation
 from cablejax.types import Trajectory
 
 
@@ -128,7 +129,8 @@ def train(
                 began = time.perf_counter()
                 state, losses = jax.block_until_ready(update(state, device_data))
                 seconds, done, step = time.perf_counter() - began, int(state.step) - step, int(state.step)
-                row = {"phase": index, "learning_rate": float(config.learning_rate()(step - 1)), "seconds": seconds}
+                rate = float(np.asarray(config.learning_rate()(step - 1)))
+                row = {"phase": index, "learning_rate": rate, "seconds": seconds}
                 row |= {name: float(np.mean(values)) for name, values in losses.items()}
                 if not np.isfinite(row["loss"]):
                     raise FloatingPointError(
@@ -143,7 +145,7 @@ def train(
                 if chunks % config.checkpoint_every == 0 or step == total or interrupted.is_set():
                     checkpoints.save(step, state)
                 bar.update(done)
-                bar.set_postfix(loss=f"{row['loss']:.2e}", **{f"e{h}_cm": f"{s:.3f}" for h, s in scores.items()})
+                bar.set_postfix({"loss": f"{row['loss']:.2e}"} | {f"e{h}_cm": f"{s:.3f}" for h, s in scores.items()})
     return TrainResult(model_config, graphdef, state.average, step, step == total, scores)
 
 
@@ -163,7 +165,7 @@ def chunk_update(config: TrainConfig, phase_index: int, graphdef: nnx.GraphDef, 
             decay = jnp.minimum(config.ema, (1.0 + state.step) / (10.0 + state.step))
             average = jax.tree.map(lambda a, w: a + (1.0 - decay) * (w - a), state.average, weights)
             metrics = {"loss": loss, "gradient_norm": optax.tree.norm(gradient)}
-            return TrainState(weights, average, inner, state.step + 1), metrics
+            return TrainState(weights, average, inner, state.step + 1), metrics  # pyright: ignore[reportArgumentType]
 
         return jax.lax.scan(one, state, length=steps)
 

@@ -68,8 +68,8 @@ class TrainConfig:
 
     model: GNSConfig = GNSConfig()
     phases: tuple[Phase, ...] = (
-        Phase(steps=30_000, batch=32, rollout=1, noise=3e-4, lr_start=1e-3, lr_end=1e-4),
-        Phase(steps=5_000, batch=16, rollout=5, noise=1e-4, lr_start=1e-4, lr_end=1e-6),
+        Phase(steps=30_000, batch=32, rollout=1, noise=1e-4, lr_start=1e-3, lr_end=2e-4),
+        Phase(steps=12_000, batch=16, rollout=4, noise=3e-5, lr_start=2e-4, lr_end=1e-6),
     )
     seed: int = 0
     warmup: int = 500
@@ -77,8 +77,8 @@ class TrainConfig:
     clip: float = 1.0
     ema: float = 0.999
     chunk: int = 50
-    checkpoint_every: int = 10
-    evaluate_every: int = 20
+    checkpoint_every: int = 20
+    evaluate_every: int = 40
     evaluate_starts: int = 128
 
     def __post_init__(self):
@@ -132,3 +132,29 @@ class TrainConfig:
         return optax.chain(
             optax.clip_by_global_norm(self.clip), optax.adamw(self.learning_rate(), weight_decay=self.weight_decay)
         )
+
+
+PRESETS: dict[str, TrainConfig] = {
+    "released": TrainConfig(),
+    "small": TrainConfig(
+        model=GNSConfig(latent=64, hidden=64, message_passing=3),
+        phases=(
+            Phase(steps=1_200, batch=16, rollout=1, noise=1e-4, lr_start=1e-3, lr_end=2e-4),
+            Phase(steps=300, batch=16, rollout=4, noise=3e-5, lr_start=2e-4, lr_end=1e-6),
+        ),
+        warmup=100,
+        evaluate_every=5,
+        checkpoint_every=5,
+    ),
+    "smoke": TrainConfig(
+        model=GNSConfig(latent=8, hidden=8, hidden_layers=1, message_passing=1),
+        phases=(Phase(steps=4, batch=4, rollout=1), Phase(steps=2, batch=2, rollout=2)),
+        warmup=2,
+        chunk=2,
+        evaluate_every=2,
+        checkpoint_every=1,
+        evaluate_starts=8,
+    ),
+}
+"""Trainings by name: that of the released model (hours), one to compare variants by (minutes), one that shows that all
+parts run (seconds)."""

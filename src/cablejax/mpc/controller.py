@@ -184,10 +184,10 @@ def control(
     config: MPCConfig,
     dynamics: Dynamics,
     weights: Any,
-    target: Float[Array, "N 2"],
+    target: Float[Array | np.ndarray, "N 2"],
     state: ControllerState,
-    keypoints: Float[Array, "N 2"],
-    gripper_pose: Float[Array, "Q 3"],
+    keypoints: Float[Array | np.ndarray, "N 2"],
+    gripper_pose: Float[Array | np.ndarray, "Q 3"],
 ) -> tuple[ControllerState, Float[Array, "Q 3"], ControlInfo]:
     """One control step as a pure function: vmap it over `state`, `keypoints`, `gripper_pose` for many cables.
 
@@ -203,13 +203,13 @@ def control(
     Returns:
         The state for the next step, the twist to hold until then (finite and within all bounds) and the report.
     """
-    state, n_held = _take_in(config, state, keypoints, gripper_pose)
+    state, n_held = _take_in(config, state, jnp.asarray(keypoints), jnp.asarray(gripper_pose))
     residual = _fit_residual(config, state)
     problem = ShapingProblem(
         dynamics=dynamics if residual is None else corrected(dynamics),
         weights=weights if residual is None else (weights, residual),
         history=state.history,
-        target=target,
+        target=jnp.asarray(target),
         feasible=_feasible_set(config, state),
         objective=config.objective,
     )
@@ -323,7 +323,7 @@ def _plan_or_hold(
     still = jnp.zeros_like(last)
     guess = jnp.roll(last, -1, axis=0).at[-1].set(0.0)
     plan = config.solver(problem, guess)
-    value, value_hold = problem.value(plan.motion), problem.value(still)
+    value, value_hold = jax.vmap(problem.value)(jnp.stack([plan.motion, still]))
     improvement = jnp.sqrt(2.0 * value_hold / config.n_commands) - jnp.sqrt(2.0 * value / config.n_commands)
     finite = jnp.isfinite(value) & jnp.isfinite(plan.motion).all()
     worthwhile = finite & (improvement >= config.hold_improvement)
@@ -357,7 +357,7 @@ class Controller:
     config: MPCConfig
     dynamics: Dynamics
     weights: Any
-    target: Float[Array, "N 2"]
+    target: Float[Array | np.ndarray, "N 2"]
 
     def __post_init__(self):
         target = np.asarray(self.target)
@@ -379,7 +379,10 @@ class Controller:
         return initial_state(self.config, jax.tree.map(jnp.asarray, history))
 
     def step(
-        self, state: ControllerState, keypoints: Float[Array, "N 2"], gripper_pose: Float[Array, "Q 3"]
+        self,
+        state: ControllerState,
+        keypoints: Float[Array | np.ndarray, "N 2"],
+        gripper_pose: Float[Array | np.ndarray, "Q 3"],
     ) -> tuple[ControllerState, Float[Array, "Q 3"], ControlInfo]:
         """One control step, compiled at its first call: see `control`.
 
@@ -397,6 +400,6 @@ class Controller:
     def _check(self, keypoints, gripper_pose):
         if np.shape(keypoints) != np.shape(self.target) or np.shape(gripper_pose) != (2, 3):
             raise ValueError(
-                f"Observation with keypoints {np.shape(keypoints)} and gripper poses {np.shape(gripper_pose)}, expected "
-                f"{np.shape(self.target)} as the target and (2, 3)."
+                f"Observation with keypoints {np.shape(keypoints)} and gripper poses {np.shape(gripper_pose)}, "
+                f"expected {np.shape(self.target)} as the target and (2, 3)."
             )

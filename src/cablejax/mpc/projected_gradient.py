@@ -112,7 +112,7 @@ class _MemoryState(eqx.Module):
 
 
 class _NonmonotoneArmijo(optx.AbstractSearch):
-    """Backtracking until `f(u + d) <= max of the last M accepted values + slope g'd`."""
+    """Backtracking until `f(u + d) <= max of the last M accepted values + slope g'd`, up to rounding."""
 
     memory: int = eqx.field(static=True)
     slope: float = 1e-4
@@ -124,7 +124,9 @@ class _NonmonotoneArmijo(optx.AbstractSearch):
     def step(self, first_step, y, y_eval, f_info, f_eval_info, state):
         predicted = f_info.compute_grad_dot(y_eval - y)
         value = f_eval_info.as_min()
-        sufficient = value <= state.values.max() + self.slope * predicted
+        reference = state.values.max()
+        rounding = 4 * jnp.finfo(value.dtype).eps * jnp.abs(reference)
+        sufficient = value <= reference + self.slope * predicted + rounding
         accept = first_step | (sufficient & (predicted <= 0))
         values = jnp.where(accept, jnp.roll(state.values, 1).at[0].set(value), state.values)
         step_size = jnp.where(accept, 1.0, self.shrink * state.step_size).astype(state.step_size.dtype)

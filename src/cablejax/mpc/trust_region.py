@@ -131,7 +131,7 @@ class _BoundedQuadratic(optx.AbstractDescent):
 
 
 class _GaussNewtonState(eqx.Module):
-    f_info: optx.FunctionInfo.ResidualJac
+    f_info: Any  # FunctionInfo.ResidualJac
     descent_state: _QuadraticState
     search_state: Any
     step_size: Scalar
@@ -199,5 +199,5 @@ class _BoundedGaussNewton(optx.AbstractLeastSquaresSolver):
         return y, aux, {}
 
 
-def _info(residual: Float[Array, " M"], jacobian: Float[Array, "M P"]) -> optx.FunctionInfo.ResidualJac:
+def _info(residual: Float[Array, " M"], jacobian: Float[Array, "M P"]):
     return optx.FunctionInfo.ResidualJac(residual, lx.MatrixLinearOperator(jacobian))

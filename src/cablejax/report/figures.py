@@ -55,7 +55,7 @@ def final_shapes(records: list[RunRecord]) -> Figure:
     pairs = pair_by_shape(records)
     views = common_window(records, margin=0.1, final_only=True)
     x0, x1, y0, y1 = next(iter(views.values()))
-    panel_width = 3.3
+    panel_width = _panel_width(len(pairs))
     panel_height = panel_width * (y1 - y0) / (x1 - x0)
     with matplotlib.rc_context(_STYLE):
         figure = Figure(figsize=(panel_width * len(pairs), panel_height + 1.15), layout="constrained")
@@ -92,6 +92,8 @@ def error_over_time(records: list[RunRecord], goal_cm: float | None = 1.0) -> Fi
         figure, axes = _row_of_panels(list(pairs), "shape error [cm]")
         low = min(float(np.nanmin(r.error_cm)) for r in records)
         high = max(float(np.nanmax(r.error_cm)) for r in records)
+        if goal_cm is not None:
+            low, high = min(low, goal_cm), max(high, goal_cm)
         for ax, (shape, runs) in zip(axes, pairs.items(), strict=True):
             for method in _present(runs):
                 run = runs[method]
@@ -192,8 +194,13 @@ def _scale_bar(ax: Axes, view: tuple[float, float, float, float], length: float 
     )
 
 
+def _panel_width(n_panels: int) -> float:
+    """Inches; few panels are wider, so that the legend above them fits."""
+    return max(3.3, 5.4 / n_panels)
+
+
 def _row_of_panels(shapes: list[str], label: str) -> tuple[Figure, np.ndarray]:
-    figure = Figure(figsize=(3.3 * len(shapes), 2.75), layout="constrained")
+    figure = Figure(figsize=(_panel_width(len(shapes)) * len(shapes), 2.75), layout="constrained")
     axes = figure.subplots(1, len(shapes), squeeze=False, sharey=True)[0]
     for ax in axes:
         ax.grid(axis="y")

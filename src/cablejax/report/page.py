@@ -167,6 +167,9 @@ def svg(figure: Figure, name: str) -> str:
     figure.savefig(buffer, format="svg", transparent=True, metadata={"Date": None})
     text = buffer.getvalue()
     text = text[text.index("<svg") :]
+    # As wide as the page, but a figure of one panel not blown up.
+    width = figure.get_size_inches()[0]
+    text = re.sub(r'width="[\d.]+pt" height="[\d.]+pt"', f'style="max-width: {1.4 * width:.1f}in"', text, count=1)
     text = re.sub(r"<metadata>.*?</metadata>", "", text, flags=re.DOTALL)
     text = re.sub(r'\bid="', f'id="{name}-', text)
     text = re.sub(r"url\(#", f"url(#{name}-", text)

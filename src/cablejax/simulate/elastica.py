@@ -26,6 +26,9 @@ SMALL_ANGLE = 0.15
 SMALLEST_STEP = 1 / 512
 """Smallest step of the continuation, as a fraction of the whole way, before it gives up."""
 
+LARGEST_TURN = 0.6
+"""Largest change of the tangent's angle [rad] anywhere in one step of the continuation."""
+
 
 class ElasticaError(ValueError):
     """No equilibrium was found for these ends."""
@@ -78,8 +81,8 @@ def solve_elastica(
     """Equilibrium shape of a uniform rod between two clamps.
 
     Several shapes can fit the same clamps. Without `guess` the solver follows the one that grows out of a nearly
-    straight rod as the ends turn and approach in proportion; for ends (almost) on their chord that is an arch to the side
-    to which they lean, to the left of the chord where they do not.
+    straight rod as the ends turn and approach in proportion; for ends (almost) on their chord that is an arch to the
+    side to which they lean, to the left of the chord where they do not.
 
     Args:
         gripper_pose: (x, y, theta) of the two ends [m, rad], shape [2, 3]; theta is the tangent's direction in the
@@ -104,12 +107,12 @@ def solve_elastica(
     direction = np.arctan2(delta[1], delta[0]) if chord > 0 else 0.0
     direction += 2 * np.pi * np.round((pose[:, 2].mean() - direction) / (2 * np.pi))
     ends = np.array([pose[0, 2] - direction, pose[1, 2] - direction, chord])
-    if guess is not None:
+    if guess is None:
+        solution = _continue(ends)
+    else:
         solution = _solve(ends, *_from_points(np.asarray(guess, float), length, direction))
         if solution is None:
             raise ElasticaError("No equilibrium near the given guess: pass a guess closer to the wanted shape.")
-    else:
-        solution = _continue(ends)
     s = np.linspace(0.0, 1.0, n_samples)
     x, y, angle, curvature = solution.sol(s)
     cos, sin = np.cos(direction), np.sin(direction)
@@ -162,7 +165,7 @@ def _continue(ends):
         trial = _solve(start + fraction * (ends - start), solution.x, solution.y, solution.p)
         # A jump to another branch shows as an angle that changes by much more than the ends did.
         moved = np.inf if trial is None else np.abs(trial.sol(_PROBE)[2] - solution.sol(_PROBE)[2]).max()
-        if moved < 0.6:
+        if trial is not None and moved < LARGEST_TURN:
             solution, done = trial, fraction
             step *= 1.5
         else:

@@ -28,8 +28,8 @@ GRASP_STIFFNESS = 100.0
 HELD_MASS, HELD_RADIUS = 10.0, 0.1
 """Sphere [kg, m] at each held link: a gripper is heavy, and the heavier the link the stiffer MuJoCo's grasp."""
 CONTACT_IMPEDANCE = "0.3 0.99 0.0003"
-"""MuJoCo's impedance of the table's contacts: at first touch, at depth, and the depth [m]. Contacts that are stiff from the
-first touch on chatter: the mean normal force then is up to three times the weight, and so is friction."""
+"""MuJoCo's impedance of the table's contacts: at first touch, at depth, and the depth [m]. Contacts that are stiff from
+the first touch on chatter: the mean normal force then is up to three times the weight, and so is friction."""
 TAUT = 0.999
 """Largest distance between the grippers, in lengths of the cable, before the plant refuses to pull."""
 FRICTIONLESS = 1e-5
@@ -59,7 +59,7 @@ class PlantConfig:
         seed: of noise and gaps.
     """
 
-    cable: CableConfig = CableConfig(n_links=40, dimension=3, timestep=0.004)
+    cable: CableConfig = CableConfig(n_links=40, dimension=3, timestep=0.005)
     stiffness_ratio: float = 1.0
     cone_ratio: float = 100.0
     contact_time: float = 0.01
@@ -70,9 +70,7 @@ class PlantConfig:
 
     def __post_init__(self):
         if self.cable.dimension != 3:
-            raise ValueError(
-                f"PlantConfig.cable.dimension is {self.cable.dimension}, expected 3: the plant is in space."
-            )
+            raise ValueError(f"PlantConfig.cable.dimension is {self.cable.dimension}, expected 3, the plant's.")
         for name in ("stiffness_ratio", "cone_ratio", "contact_time", "settle_time"):
             value = getattr(self, name)
             if not (np.isfinite(value) and value > 0):
@@ -80,9 +78,7 @@ class PlantConfig:
         if not (np.isfinite(self.keypoint_noise) and self.keypoint_noise >= 0):
             raise ValueError(f"PlantConfig.keypoint_noise is {self.keypoint_noise}, expected a finite number >= 0 [m].")
         if not 0 <= self.keypoint_dropout < 1:
-            raise ValueError(
-                f"PlantConfig.keypoint_dropout is {self.keypoint_dropout}, expected a probability below 1."
-            )
+            raise ValueError(f"PlantConfig.keypoint_dropout is {self.keypoint_dropout}, expected a number in [0, 1).")
 
 
 @dataclasses.dataclass(frozen=True)

@@ -1,7 +1,4 @@
-"""Training windows: short pieces of trajectories, drawn and augmented by a counter-based generator.
-
-The draw depends on `(seed, step)` alone, so a training that was killed and resumed sees what it would have seen.
-"""
+"""Scales of features and output, measured on training data, and the check that the data can be measured at all."""
 
 from __future__ import annotations
 
@@ -10,7 +7,6 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, PRNGKeyArray
 
 from cablejax.dynamics.config import GNSConfig, Normalisation
 from cablejax.dynamics.graph import prior_of
@@ -18,79 +14,6 @@ from cablejax.types import History, Trajectory
 
 GRASP_TOLERANCE = 2e-2
 """Largest distance of an end keypoint from its gripper [m] that is taken for a grasp: cables that snap through pull."""
-
-
-@jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True)
-class Window:
-    """A history and what followed it.
-
-    Attributes:
-        history: the H samples up to t.
-        twist: commands held from t on, shape [K, 2, 3].
-        future: keypoints [m] at t + 1, ..., t + K, shape [K, N, 2].
-    """
-
-    history: History
-    twist: Float[Array, "*batch K 2 3"]
-    future: Float[Array, "*batch K N 2"]
-
-
-def window_at(trajectory: Trajectory, start: Array, *, history: int, steps: int) -> Window:
-    """The window whose newest history sample is sample `start` of an unbatched trajectory.
-
-    Before the trajectory's beginning the cable rested, so missing history repeats sample 0.
-    """
-    past = jnp.maximum(start - history + 1 + jnp.arange(history), 0)
-    return Window(
-        history=History(keypoints=trajectory.keypoints[past], gripper_pose=trajectory.gripper_pose[start]),
-        twist=jax.lax.dynamic_slice_in_dim(trajectory.gripper_twist, start, steps),
-        future=jax.lax.dynamic_slice_in_dim(trajectory.keypoints, start + 1, steps),
-    )
-
-
-def draw_windows(key: PRNGKeyArray, data: Trajectory, *, batch: int, history: int, steps: int) -> Window:
-    """`batch` windows, uniform over trajectories [M, T, ...] and starts, mirrored and reversed at random."""
-    m, t = data.gripper_twist.shape[:2]
-    key_episode, key_start, key_mirror, key_reverse = jax.random.split(key, 4)
-    episode = jax.random.randint(key_episode, (batch,), 0, m)
-    start = jax.random.randint(key_start, (batch,), 0, t - steps + 1)
-    flip = jax.random.bernoulli(key_mirror, shape=(batch,))
-    swap = jax.random.bernoulli(key_reverse, shape=(batch,))
-
-    def one(episode, start, flip, swap):
-        trajectory = jax.tree.map(lambda x: x[episode], data)
-        window = window_at(trajectory, start, history=history, steps=steps)
-        window = jax.tree.map(lambda a, b: jnp.where(flip, a, b), mirrored(window), window)
-        return jax.tree.map(lambda a, b: jnp.where(swap, a, b), reversed_ends(window), window)
-
-    return jax.vmap(one)(episode, start, flip, swap)
-
-
-def mirrored(window: Window) -> Window:
-    """The same motion seen in a mirror, y -> -y: as likely as the original for a uniform straight cable."""
-    point, pose = jnp.array([1.0, -1.0]), jnp.array([1.0, -1.0, -1.0])
-    return Window(
-        history=History(
-            keypoints=(window.history.keypoints * point).astype(window.history.keypoints.dtype),
-            gripper_pose=(window.history.gripper_pose * pose).astype(window.history.gripper_pose.dtype),
-        ),
-        twist=(window.twist * pose).astype(window.twist.dtype),
-        future=(window.future * point).astype(window.future.dtype),
-    )
-
-
-def reversed_ends(window: Window) -> Window:
-    """The same motion with the cable counted from its other end: the tangent, and so theta, turns by pi."""
-    turn = jnp.asarray([0.0, 0.0, jnp.pi], window.history.gripper_pose.dtype)
-    return Window(
-        history=History(
-            keypoints=window.history.keypoints[..., ::-1, :],
-            gripper_pose=window.history.gripper_pose[..., ::-1, :] + turn,
-        ),
-        twist=window.twist[..., ::-1, :],
-        future=window.future[..., ::-1, :],
-    )
 
 
 def check_trajectories(data: Trajectory, config: GNSConfig, *, steps: int, what: str) -> None:

@@ -1,0 +1,106 @@
+"""How far off are the learned model's predictions? The table of open-loop errors on cables that training did not see.
+
+The weights' file says from which data sets they were trained and how many trajectories of each were held out. Those are
+read from the stores given, or simulated again: a trajectory depends on its number and seed alone.
+
+    python experiments/03_model_error.py --out docs/results/model_error.md
+    python experiments/03_model_error.py --weights runs/train --data runs/random.zarr runs/straight.zarr runs/free.zarr
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import os
+import sys
+from pathlib import Path
+
+os.environ.setdefault("NPROC", "4")
+
+import numpy as np
+
+from cablejax.dataset.generate import make_engine, simulate
+from cablejax.dataset.schema import DatasetConfig, config_from_json
+from cablejax.dataset.store import open_store
+from cablejax.dataset.windows import concatenate, read_trajectories
+from cablejax.dynamics.error_report import MODEL, error_report
+from cablejax.dynamics.evaluate import SNAP_FACTOR, SNAP_MARGIN
+from cablejax.dynamics.weights import load_info, load_weights
+from cablejax.report.provenance import machine, versions
+from cablejax.types import Trajectory
+
+TOGETHER = 8
+
+
+def simulated(config: DatasetConfig, rows: range) -> Trajectory:
+    """Some trajectories of a data set, made anew."""
+    # The shard size does not change a trajectory: one each, so that any row can be made alone.
+    config = dataclasses.replace(config, engine="threaded", shard_size=1)
+    engine, parts = make_engine(config), []
+    for first in range(rows.start, rows.stop, TOGETHER):
+        blocks = simulate(config, engine, range(first, min(first + TOGETHER, rows.stop)))
+        parts += [Trajectory(block.keypoints, block.gripper_pose, block.gripper_twist) for block in blocks]
+        print(f"{len(parts)} of {len(rows)} simulated", file=sys.stderr, flush=True)
+    return concatenate(parts)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--weights", default="gns-reference", help="released name, weights file or training's folder")
+    parser.add_argument("--data", nargs="*", default=[], help="the stores that the weights were trained on, in order")
+    parser.add_argument("--stride", type=int, default=10, help="samples between start points")
+    parser.add_argument("--limit", type=int, help="only so many held-out trajectories of each data set")
+    parser.add_argument("--out", type=Path, help="write the page there as Markdown")
+    options = parser.parse_args()
+    config, graphdef, weights = load_weights(options.weights)
+    sets = load_info(options.weights)["data"]
+    if options.data and len(options.data) != len(sets):
+        parser.error(f"--data names {len(options.data)} stores, but the weights were trained on {len(sets)}")
+
+    held_out = {}
+    for k, one in enumerate(sets):
+        data = config_from_json(DatasetConfig, one["config"])
+        count = one["held_out"] if options.limit is None else min(options.limit, one["held_out"])
+        rows = range(data.n_trajectories - count, data.n_trajectories)
+        if options.data:
+            store = open_store(options.data[k])
+            if store.info().digest != one["digest"]:
+                parser.error(f"{options.data[k]} is not the data set {one['name']} that the weights were trained on")
+            held_out[one["name"]] = read_trajectories(store, np.asarray(rows))
+        else:
+            held_out[one["name"]] = simulated(data, rows)
+
+    report = error_report((graphdef, weights), held_out, config, stride=options.stride)
+    horizons = report.errors["all windows"][MODEL].horizons
+    snaps = ", ".join(f"{100 * f:.1f} % ({h})" for h, f in zip(horizons, report.snapping_fraction(), strict=True))
+    sizes = ", ".join(f"{len(part.gripper_twist)} {name}" for name, part in held_out.items())
+    page = "\n".join(
+        [
+            "# Open-loop error of the learned model",
+            "",
+            "Made by `python experiments/03_model_error.py --out docs/results/model_error.md`.",
+            f"{versions()}; {machine()}.",
+            "",
+            f"Held-out trajectories: {sizes}; a window starts at every {options.stride}. sample. The model sees "
+            f"{config.history} samples and then only the commands. The error of a shape is the root mean square "
+            "distance of its keypoints from the simulated ones; the columns are its root mean square, median and "
+            "percentiles over windows, and its root mean square over that of the distance that the cable moved.",
+            "",
+            "Predictors: the network; the static prior that it corrects, alone; the rigid interpolation of the "
+            "grippers' motion; and the expectation that nothing moves.",
+            "",
+            "A window counts as a snap-through if in one of its steps, or in the two before it, some keypoint of the "
+            f"true cable moves further than {SNAP_FACTOR:g} times the weighted motion of both grippers plus "
+            f"{100 * SNAP_MARGIN:g} cm. Windows with one, after so many steps: {snaps}.",
+            "",
+            *report.markdown(),
+            "",
+        ]
+    )
+    print(page)
+    if options.out is not None:
+        options.out.write_text(page, encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,119 @@
+"""The model card: what a person must know of trained weights before relying on them, as Markdown."""
+
+from __future__ import annotations
+
+import csv
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from cablejax.dynamics.config import GNSConfig
+from cablejax.dynamics.error_report import ErrorReport
+
+_POINTS = 12
+_CURVE = ("step", "phase", "learning_rate", "loss")
+
+
+def write_card(
+    path: str | os.PathLike[str],
+    *,
+    name: str,
+    config: GNSConfig,
+    info: Mapping[str, Any],
+    metrics: Path,
+    report: ErrorReport,
+    commands: Sequence[str],
+) -> None:
+    """Writes a model card.
+
+    Args:
+        path: the Markdown file.
+        name: of the model.
+        config: of the network.
+        info: what the weights file says of their origin: "data", "training", "versions", "machine".
+        metrics: the training's `metrics.csv`.
+        report: accuracy on held-out trajectories.
+        commands: command lines that make the data and train the model again.
+    """
+    snapped = ", ".join(
+        f"{100 * share:.1f} % within {h}"
+        for h, share in zip(report.errors["all windows"]["network"].horizons, report.snapping_fraction(), strict=True)
+    )
+    lines = [
+        f"# {name}",
+        "",
+        f"A graph network of the dynamics of a cable of {config.length:g} m held at both ends: {config.n_keypoints} "
+        f"keypoints, one step of {config.interval:g} s, {config.history} samples of history, {config.message_passing} "
+        f"message-passing steps, latent size {config.latent}. It corrects the {config.prior} prior.",
+        "",
+        "## Data",
+        "",
+        "| data set | trajectories | held out | commands each | seed | SHA-256 |",
+        "| --- | ---: | ---: | ---: | ---: | --- |",
+        *(
+            f"| {d['name']} | {d['config']['n_trajectories']} | {d['held_out']} | {d['config']['n_steps']} "
+            f"| {d['config']['seed']} | `{d['digest']}` |"
+            for d in info["data"]
+        ),
+        "",
+        "Held out are the last trajectories of each. Differences between the data sets' configurations: "
+        + (_differences([d["config"] for d in info["data"]]) or "none")
+        + ".",
+        "",
+        "## Training",
+        "",
+        f"Seed {info['training']['seed']}. Phases:",
+        "",
+        *(f"- {', '.join(f'{key} {value}' for key, value in phase.items())}" for phase in info["training"]["phases"]),
+        "",
+        "The loss is a mean over the 50 steps or so of one compiled call; open-loop errors are medians on held-out "
+        "trajectories [cm] of the averaged weights, after the steps named.",
+        "",
+        *_curve(metrics),
+        "",
+        "## Accuracy on held-out trajectories",
+        "",
+        f"Windows in which the true cable snaps through count apart: {snapped} steps.",
+        "",
+        *report.markdown(),
+        "",
+        "## Made with",
+        "",
+        f"{info['versions']}; {info['machine']}.",
+        "",
+        "```sh",
+        *commands,
+        "```",
+        "",
+    ]
+    Path(path).write_text("\n".join(lines), encoding="utf-8")
+
+
+def _curve(metrics: Path) -> list[str]:
+    """A dozen rows of the training's metrics, from those with an open-loop evaluation where there are any."""
+    with metrics.open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    if not rows:
+        return ["No metrics were recorded."]
+    scores = [column for column in rows[0] if column.startswith("open_loop_")]
+    scored = [row for row in rows if any(row[column] for column in scores)] or rows
+    pick = np.unique(np.linspace(0, len(scored) - 1, min(_POINTS, len(scored))).round().astype(int))
+    columns = [*_CURVE, *scores]
+    header = [column.replace("open_loop_", "after ").replace("_cm", "").replace("_", " ") for column in columns]
+    lines = [header, ["---:"] * len(columns), *([scored[i][column] for column in columns] for i in pick)]
+    return ["| " + " | ".join(line) + " |" for line in lines]
+
+
+def _differences(configs: Sequence[Mapping[str, Any]], prefix: str = "") -> str:
+    """The fields in which several configurations differ, with the values of each."""
+    found = []
+    for key in configs[0]:
+        values = [config[key] for config in configs]
+        if all(isinstance(value, Mapping) for value in values):
+            found.append(_differences(values, f"{prefix}{key}."))
+        elif any(value != values[0] for value in values):
+            found.append(f"{prefix}{key} ({', '.join(map(str, values))})")
+    return ", ".join(part for part in found if part)

@@ -1,0 +1,206 @@
+"""Trained weights on disk: one safetensors file with all that is needed to use them, and nothing that runs code.
+
+The file's metadata has one key, "cablejax", whose JSON object holds
+
+    schema   "cablejax-weights/1"
+    config   the `GNSConfig`, normalisation included
+    info     where the weights come from: data sets and their digests, seeds, package versions, kind of machine
+
+and its tensors are the network's, named by their place in it: "processor.0.edge.first.1.kernel".
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib.resources
+import json
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from flax import nnx
+from safetensors import SafetensorError, safe_open
+from safetensors.numpy import save_file
+
+from cablejax.dynamics.config import GNSConfig, Normalisation
+from cablejax.dynamics.gns import GNS
+
+SCHEMA = "cablejax-weights/1"
+"""Name and version of the file's layout. A reader refuses any other."""
+
+FILE_NAME = "weights.safetensors"
+"""Name of the file in a training's folder."""
+
+SUFFIX = ".safetensors"
+
+_KEY = "cablejax"
+
+
+class WeightsError(ValueError):
+    """A weights file that cannot be used: says what came, what was expected and what to do."""
+
+
+def save_weights(
+    path: str | os.PathLike[str], model_config: GNSConfig, weights: nnx.State, info: Mapping[str, Any]
+) -> None:
+    """Writes weights and their description, whole or not at all.
+
+    Args:
+        path: the file, by custom `*.safetensors`.
+        model_config: of the network, with the normalisation that it was trained with.
+        weights: all arrays of a `GNS` of this configuration.
+        info: a JSON object: where they come from. It goes into the file as it is, so it should name no local path.
+
+    Raises:
+        WeightsError: the weights do not fit the configuration.
+    """
+    path = Path(path)
+    tensors = {name: np.asarray(leaf) for name, leaf in _named(weights).items()}
+    _check_tensors(tensors, _named(_abstract(model_config)[1]), f"The weights to be saved in {path}")
+    content = {"schema": SCHEMA, "config": dataclasses.asdict(model_config), "info": dict(info)}
+    part = path.with_name(path.name + ".part")
+    save_file(tensors, part, metadata={_KEY: json.dumps(content, allow_nan=False)})
+    os.replace(part, path)
+
+
+def load_weights(
+    source: str | os.PathLike[str], *, expect: GNSConfig | None = None
+) -> tuple[GNSConfig, nnx.GraphDef, nnx.State]:
+    """The network in a file, in a training's folder, or released under a name, as `apply` takes it.
+
+    Args:
+        source: a weights file, a folder that `cablejax train` wrote, or the name of a released model.
+        expect: refuse a network of any other configuration; its normalisation does not matter.
+
+    Raises:
+        WeightsError: there is no such file, it is no weights file or one of another schema, its tensors do not fit its
+            configuration, or that is not the expected one.
+    """
+    path, content = _open(source)
+    config = _config_of(content, path)
+    if expect is not None:
+        _check_expected(config, expect, path)
+    graphdef, expected = _abstract(config)
+    with safe_open(path, framework="numpy") as file:
+        tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+    _check_tensors(tensors, _named(expected), path)
+    flat = nnx.to_flat_state(expected)
+    leaves = [(key, variable.replace(jnp.asarray(tensors[_name(key)]))) for key, variable in flat]
+    return config, graphdef, nnx.from_flat_state(leaves)
+
+
+def load_released(
+    name: str = "gns-reference", *, expect: GNSConfig | None = None
+) -> tuple[GNSConfig, nnx.GraphDef, nnx.State]:
+    """The network released with this package under `name`.
+
+    Raises:
+        WeightsError: nothing is released under that name, or see `load_weights`.
+    """
+    return load_weights(_released(name), expect=expect)
+
+
+def load_info(source: str | os.PathLike[str]) -> dict[str, Any]:
+    """Where the weights come from, as `save_weights` was told; `source` as in `load_weights`."""
+    return _open(source)[1]["info"]
+
+
+def released_names() -> tuple[str, ...]:
+    """Names of the models released with this package."""
+    folder = _folder()
+    if not folder.is_dir():
+        return ()
+    return tuple(sorted(p.name.removesuffix(SUFFIX) for p in folder.iterdir() if p.name.endswith(SUFFIX)))
+
+
+def _folder():
+    return importlib.resources.files("cablejax") / "weights"
+
+
+def _released(name: str) -> Path:
+    if name not in released_names():
+        known = ", ".join(released_names()) or "none in this installation"
+        raise WeightsError(
+            f"No model is released under the name {name!r} (released: {known}). "
+            "Give one of these, or the folder or file of a training of your own."
+        )
+    return Path(str(_folder() / f"{name}{SUFFIX}"))
+
+
+def _open(source: str | os.PathLike[str]) -> tuple[Path, dict[str, Any]]:
+    """The file that is meant and its description, of this schema."""
+    path = Path(source)
+    if path.is_dir():
+        path = path / FILE_NAME
+        if not path.is_file():
+            raise WeightsError(f"{path.parent} holds no {FILE_NAME}: is its training complete? Run it again to go on.")
+    elif not path.is_file():
+        if path.suffix or len(path.parts) != 1:
+            raise WeightsError(f"There is no weights file {path}. Train one with `cablejax train`.")
+        path = _released(str(source))
+    try:
+        with safe_open(path, framework="numpy") as file:
+            metadata = file.metadata() or {}
+        content = json.loads(metadata.get(_KEY, "null"))
+    except (SafetensorError, OSError, ValueError) as error:
+        raise WeightsError(f"{path} is no safetensors file, or a damaged one ({error}).") from error
+    schema = content.get("schema") if isinstance(content, dict) else None
+    if not isinstance(content, dict) or schema != SCHEMA or not {"config", "info"} <= content.keys():
+        raise WeightsError(
+            f"{path} has schema {schema!r}, expected {SCHEMA!r}. Read it with the version of cablejax that wrote it."
+        )
+    return path, content
+
+
+def _config_of(content: dict[str, Any], path: Path) -> GNSConfig:
+    try:
+        recorded: dict[str, Any] = dict(content["config"])
+        recorded["normalisation"] = Normalisation(**recorded["normalisation"])
+        return GNSConfig(**recorded)
+    except (TypeError, KeyError) as error:
+        raise WeightsError(
+            f"{path} records a configuration that this version of cablejax does not know ({error}). "
+            "Read it with the version that wrote it."
+        ) from error
+    except ValueError as error:
+        raise WeightsError(f"{path} records an impossible configuration: {error}") from error
+
+
+def _check_expected(config: GNSConfig, expect: GNSConfig, path: Path) -> None:
+    came, asked = (dataclasses.asdict(dataclasses.replace(c, normalisation=Normalisation())) for c in (config, expect))
+    other = [f"{name} is {came[name]}, expected {asked[name]}" for name in came if came[name] != asked[name]]
+    if other:
+        raise WeightsError(
+            f"{path} holds weights for another graph: {'; '.join(other)}. Train a model of this configuration."
+        )
+
+
+def _abstract(config: GNSConfig) -> tuple[nnx.GraphDef, nnx.State]:
+    """Structure of a network of this configuration, and the shapes and dtypes of its weights, without any memory."""
+    return nnx.split(nnx.eval_shape(lambda: GNS(config, nnx.Rngs(0))))
+
+
+def _name(key: tuple[Any, ...]) -> str:
+    return ".".join(map(str, key))
+
+
+def _named(weights: nnx.State) -> dict[str, Any]:
+    return {_name(key): variable.get_value() for key, variable in nnx.to_flat_state(weights)}
+
+
+def _check_tensors(tensors: Mapping[str, np.ndarray], expected: Mapping[str, Any], what: Path | str) -> None:
+    """Raises unless there is exactly one finite tensor of the right shape and dtype for every weight."""
+    faults = [f"{name} is missing" for name in expected if name not in tensors]
+    faults += [f"{name} is unknown" for name in tensors if name not in expected]
+    for name in expected.keys() & tensors.keys():
+        came, wanted = tensors[name], expected[name]
+        if came.shape != wanted.shape or came.dtype != wanted.dtype:
+            faults.append(f"{name} is {came.dtype}{list(came.shape)}, expected {wanted.dtype}{list(wanted.shape)}")
+        elif not np.isfinite(came).all():
+            faults.append(f"{name} holds NaN or infinity")
+    if faults:
+        shown = "; ".join(sorted(faults)[:4]) + (f"; and {len(faults) - 4} more" if len(faults) > 4 else "")
+        raise WeightsError(f"{what} does not fit its configuration: {shown}. Save the weights again.")

@@ -1,0 +1,112 @@
+"""`cablejax shape` and `cablejax demo` on a short run of a coarse plant: what they write, refuse and resume."""
+
+import json
+
+import numpy as np
+import pytest
+
+from cablejax.cli import main
+from cablejax.commands import runs
+from cablejax.gaplog import read_gap_log
+from cli_cases import small_model
+
+SHAPE_KEYS = {
+    "initial_error_cm",
+    "terminal_error_cm",
+    "terminal_error_without_residual_cm",
+    "settling_time_s",
+    "mpc_ms_p50",
+    "mpc_ms_p95",
+}
+
+
+@pytest.fixture(scope="module")
+def weights(tmp_path_factory):
+    return small_model(tmp_path_factory.mktemp("model"))
+
+
+def shape_arguments(weights, out) -> list[str]:
+    return ["shape", "--weights", str(weights), "--out", str(out), "--steps", "2", "--links", "12", "--target", "U"]
+
+
+def test_shape_is_resumed_where_it_was_interrupted_and_writes_everything(weights, tmp_path, capsys, monkeypatch):
+    out = tmp_path / "run"
+    done = []
+    real = runs.shape_once
+
+    def interrupted_in_the_second_run(*args, method, **kwargs):
+        if done:
+            raise KeyboardInterrupt
+        done.append(method)
+        return real(*args, method=method, **kwargs)
+
+    monkeypatch.setattr(runs, "shape_once", interrupted_in_the_second_run)
+    assert main(shape_arguments(weights, out)) == 130
+    assert "Run the same command again" in capsys.readouterr().err
+    assert not (out / "summary.json").exists()
+
+    def counted(*args, method, **kwargs):
+        done.append(method)
+        return real(*args, method=method, **kwargs)
+
+    monkeypatch.setattr(runs, "shape_once", counted)
+    assert main([*shape_arguments(weights, out), "--json"]) == 0
+    assert done == ["residual", "direct"]
+    summary = json.loads(capsys.readouterr().out)
+    assert summary == json.loads((out / "summary.json").read_text())
+    assert set(summary) == {"shapes", "total_s"} and set(summary["shapes"]["U"]) == SHAPE_KEYS
+    assert sorted(path.name for path in out.iterdir()) == ["demo.gif", "log.npz", "report.html", "summary.json"]
+
+    log = read_gap_log(out / "log.npz")
+    assert log.meta["motion"] == ["approach_u_residual", "approach_u_direct"]
+    target = json.loads((out / "report.html").read_text().split('id="runs">')[1].split("</script>")[0])
+    wanted = np.reshape(target["shapes"][0]["target"], (-1, 2))[::8] * 1e-4
+    last = log.keypoints[0, log.episode_length[0] - 1]
+    error = 100 * np.sqrt(((last - wanted) ** 2).sum(-1).mean())
+    assert error == pytest.approx(summary["shapes"]["U"]["terminal_error_cm"], abs=0.02)
+    assert summary["shapes"]["U"]["terminal_error_cm"] < summary["shapes"]["U"]["initial_error_cm"]
+
+
+def test_results_are_not_overwritten_unasked(weights, tmp_path, capsys):
+    (tmp_path / "summary.json").write_text("mine")
+    assert main(shape_arguments(weights, tmp_path)) == 2
+    assert "exists and is not empty" in capsys.readouterr().err
+    assert (tmp_path / "summary.json").read_text() == "mine"
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (["--target", "Q"], "Q"),
+        (["--target", "missing.csv"], "missing.csv"),
+        (["--weights", "nothing"], "nothing"),
+        (["--steps", "0"], "--steps is 0"),
+        (["--links", "2"], "n_links is 2"),
+        (["--stiffness-ratio", "-1"], "stiffness_ratio is -1"),
+    ],
+    ids=lambda value: " ".join(value) if isinstance(value, list) else None,
+)
+def test_bad_input_is_told_before_anything_is_written(change, message, weights, tmp_path, capsys):
+    assert main([*shape_arguments(weights, tmp_path / "run"), *change]) == 2
+    told = capsys.readouterr().err
+    assert message in told and "Traceback" not in told
+    assert not (tmp_path / "run").exists()
+
+
+def test_targets_of_another_cable_are_refused(weights, tmp_path, capsys):
+    line = np.stack([np.linspace(0.0, 2.0, 13), np.zeros(13)], axis=1)
+    for name, points, message in (("long", line, "2 m long"), ("few", line[:5] / 2, "5 keypoints")):
+        np.savez(tmp_path / f"{name}.npz", keypoints=points)
+        arguments = [*shape_arguments(weights, tmp_path / "run"), "--target", str(tmp_path / f"{name}.npz")]
+        assert main(arguments) == 2
+        assert message in capsys.readouterr().err
+
+
+def test_demo_tells_its_story_in_a_table(weights, tmp_path, capsys):
+    out = tmp_path / "demo"
+    arguments = ["demo", "--weights", str(weights), "--out", str(out), "--steps", "1", "--links", "12", "--shapes", "S"]
+    assert main(arguments) == 0
+    told = capsys.readouterr()
+    assert told.out.startswith("shape") and "\nS " in told.out and "report.html" in told.out
+    assert "with online residual" in told.err and "without residual" in told.err
+    assert set(json.loads((out / "summary.json").read_text())["shapes"]) == {"S"}

@@ -1,0 +1,237 @@
+"""Training: repeatable, resumable to the bit after a kill, and honest about data it cannot use."""
+
+import csv
+import dataclasses
+import os
+import pathlib
+import signal
+import subprocess
+import sys
+import time
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from cablejax.dataset.windows import draw_windows
+from cablejax.dynamics.checkpoint import Checkpoints
+from cablejax.dynamics.evaluate import open_loop_error
+from cablejax.dynamics.gns import GNS, bind
+from cablejax.dynamics.loss import random_walk_noise, rollout_loss
+from cablejax.dynamics.metrics import MetricsLog
+from cablejax.dynamics.normalisation import fit_normalisation
+from cablejax.dynamics.train import train
+from cablejax.dynamics.train_config import PRESETS, Phase, TrainConfig
+from dynamics_cases import SMALL, TINY_TRAINING, network, resized, trajectories
+
+DATA = trajectories()
+LONG = dataclasses.replace(TINY_TRAINING, phases=(Phase(steps=60, batch=4), Phase(steps=4, batch=2, rollout=2)))
+
+CHILD = """
+import sys
+sys.path.insert(0, sys.argv[1])
+from test_dynamics_train import DATA, LONG
+from cablejax.dynamics.train import train
+train(LONG, DATA, sys.argv[2], progress=False)
+"""
+
+
+def run(config, folder, **options):
+    return train(config, DATA, folder, progress=False, **options)
+
+
+def same(a, b) -> None:
+    jax.tree.map(np.testing.assert_array_equal, a, b)
+
+
+def test_killed_and_resumed_ends_in_the_same_bits(tmp_path):
+    folder = tmp_path / "killed"
+    here = pathlib.Path(__file__).parent
+    child = subprocess.Popen(
+        [sys.executable, "-c", CHILD, str(here), str(folder)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        env=os.environ | {"NPROC": "4"},
+    )
+    try:
+        deadline = time.monotonic() + 400
+        while not any((folder / "checkpoints").glob("[0-9]*")) and time.monotonic() < deadline:
+            assert child.poll() is None, child.communicate()[0]
+            time.sleep(0.01)
+    finally:
+        child.send_signal(signal.SIGKILL)
+        child.communicate()
+    with Checkpoints(folder / "checkpoints") as checkpoints:
+        reached = checkpoints.latest()
+    assert reached is not None and 0 < reached < LONG.total_steps
+    resumed = run(LONG, folder)
+    whole = run(LONG, tmp_path / "whole")
+    assert resumed.completed and resumed.steps == whole.steps == LONG.total_steps
+    same(resumed.weights, whole.weights)
+    with (folder / "metrics.csv").open() as first, (tmp_path / "whole" / "metrics.csv").open() as second:
+        rows = [[row | {"seconds": ""} for row in csv.DictReader(file)] for file in (first, second)]
+    assert rows[0] == rows[1]
+
+
+def test_a_complete_training_is_not_repeated_and_learns(tmp_path):
+    config = dataclasses.replace(TINY_TRAINING, phases=(Phase(steps=80, batch=16, noise=0.0),), chunk=40)
+    result = run(config, tmp_path / "run", validation=DATA)
+    assert set(result.validation_cm) == {1, 5}
+    untrained = open_loop_error(network(result.model, last=0.0), DATA, result.model, horizons=(1,), stride=2)
+    learned = open_loop_error((result.graphdef, result.weights), DATA, result.model, horizons=(1,), stride=2)
+    assert learned.rmse_cm[0] < 0.8 * untrained.rmse_cm[0]
+    before = (tmp_path / "run" / "metrics.csv").read_text()
+    again = run(config, tmp_path / "run", validation=DATA)
+    assert again.completed and (tmp_path / "run" / "metrics.csv").read_text() == before
+    same(again.weights, result.weights)
+
+
+def test_a_folder_with_another_training_is_left_alone(tmp_path):
+    run(TINY_TRAINING, tmp_path)
+    with pytest.raises(ValueError, match=r"differs in config.seed \(0, now 1\)"):
+        run(dataclasses.replace(TINY_TRAINING, seed=1), tmp_path)
+    with pytest.raises(ValueError, match=r"differs in .*data"):
+        train(TINY_TRAINING, trajectories(seed=3), tmp_path, progress=False)
+    with pytest.raises(ValueError, match="holds a training already"):
+        run(TINY_TRAINING, tmp_path, resume=False)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"keypoints": np.full_like(DATA.keypoints, np.inf)}, "keypoints holds NaN or infinity in 4 of 4"),
+        ({"gripper_twist": DATA.gripper_twist[:, :1]}, "Is the data of another cable"),
+        ({"keypoints": DATA.keypoints[:, :, ::-1]}, "Keypoint 0 belongs to gripper 0"),
+    ],
+    ids=["not finite", "too few commands", "reversed"],
+)
+def test_bad_data_is_refused_before_anything_is_written(change, message, tmp_path):
+    with pytest.raises(ValueError, match=message):
+        train(TINY_TRAINING, dataclasses.replace(DATA, **change), tmp_path / "run", progress=False)
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_rollout_longer_than_the_data_is_refused(tmp_path):
+    config = dataclasses.replace(TINY_TRAINING, phases=(Phase(steps=1, rollout=9),))
+    with pytest.raises(ValueError, match="8 commands per trajectory, but 9 are rolled out"):
+        run(config, tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: Phase(steps=0), "Phase.steps is 0"),
+        (lambda: Phase(steps=1, noise=-1.0), "Phase.noise is -1.0 m"),
+        (lambda: Phase(steps=1, lr_end=0.0), "learning rates"),
+        (lambda: Phase(steps=1, robust=0.0), "Phase.robust is 0"),
+        (lambda: TrainConfig(phases=()), "phases is empty"),
+        (lambda: TrainConfig(ema=1.0), "ema is 1.0"),
+        (lambda: TrainConfig(chunk=0), "chunk is 0"),
+    ],
+)
+def test_impossible_trainings_are_refused(make, message):
+    with pytest.raises(ValueError, match=message):
+        make()
+
+
+def test_phases_follow_each_other():
+    config = TINY_TRAINING
+    assert [config.phase_at(step) for step in (0, 3, 4, 6, 99)] == [(0, 4), (0, 4), (1, 7), (1, 7), (1, 7)]
+    assert config.total_steps == 7 and config.longest_rollout == 2
+    rate = PRESETS["released"].learning_rate()
+    assert rate(0) == pytest.approx(2e-6) and rate(499) == pytest.approx(1e-3, rel=1e-2)
+    assert rate(30_000) == pytest.approx(2e-4) and rate(41_999) == pytest.approx(1e-6, rel=1e-2)
+
+
+def test_the_released_training_is_the_default():
+    assert PRESETS["released"] == TrainConfig() and TrainConfig().total_steps == 42_000
+    assert [phase.rollout for phase in TrainConfig().phases] == [1, 4]
+
+
+def test_loss_is_quadratic_near_zero_and_linear_far_away():
+    window = jax.tree.map(lambda x: x[0], draw_windows(jax.random.key(0), DATA, batch=1, history=3, steps=2))
+
+    def loss(error):
+        def dynamics(history, twist):
+            """Exact on the first step, off by `error` in every coordinate from then on."""
+            step = jnp.argmin(jnp.abs(window.future - history.keypoints[-1]).sum((1, 2)))
+            known = jnp.abs(window.history.keypoints[-1] - history.keypoints[-1]).sum() == 0
+            truth = jnp.where(known, window.future[0], window.future[jnp.minimum(step + 1, 1)])
+            return truth + jnp.where(known, 0.0, error) - history.keypoints[-1]
+
+        return float(rollout_loss(dynamics, window, scale=1e-2, robust=1.0, interval=1.0, pushforward=False))
+
+    assert loss(0.0) == pytest.approx(0.0, abs=1e-6)
+    assert loss(1e-3) == pytest.approx(0.5 * 0.01, rel=1e-2)
+    assert loss(1.0) == pytest.approx(0.5 * 2 * (np.sqrt(1 + 100**2) - 1), rel=1e-4)
+
+
+def test_pushforward_stops_gradients_between_steps():
+    graphdef, weights = network(SMALL)
+    window = jax.tree.map(lambda x: x[0], draw_windows(jax.random.key(1), DATA, batch=1, history=3, steps=3))
+
+    def slope(pushforward, keypoint):
+        def loss(shift):
+            moved = window.history.keypoints.at[:, 2].add(shift)
+            history = dataclasses.replace(window.history, keypoints=moved)
+            return rollout_loss(
+                bind(graphdef, weights),
+                dataclasses.replace(window, history=history),
+                scale=1e-2,
+                robust=1.0,
+                interval=1.0,
+                pushforward=pushforward,
+            )
+
+        return np.asarray(jax.grad(loss)(jnp.zeros(2)))[keypoint]
+
+    one = dataclasses.replace(window, twist=window.twist[:1], future=window.future[:1])
+    assert slope(True, 0) != pytest.approx(slope(False, 0), rel=1e-3)
+    window = one
+    assert slope(True, 0) == pytest.approx(slope(False, 0), rel=1e-5)
+
+
+def test_noise_walks_to_its_size_and_spares_the_held_ends():
+    history = jax.tree.map(lambda x: x[0], draw_windows(jax.random.key(2), DATA, batch=1, history=3, steps=1)).history
+    keys = jax.random.split(jax.random.key(3), 4000)
+    noise = jax.vmap(lambda key: random_walk_noise(key, history, 2e-3).keypoints)(keys) - history.keypoints
+    np.testing.assert_allclose(noise[:, -1, 1:-1].std(axis=0), 2e-3, rtol=0.1)
+    np.testing.assert_allclose(noise[:, 0, 1:-1].std(axis=0), 2e-3 / 3**0.5, rtol=0.1)
+    assert not noise[:, :, [0, -1]].any()
+
+
+def test_normalisation_is_measured_and_leaves_out_the_wildest_steps():
+    scales = fit_normalisation(DATA, SMALL)
+    moved = np.diff(DATA.keypoints, axis=1)
+    assert scales.displacement == pytest.approx(np.sqrt(np.mean(moved**2)), rel=1e-3)
+    assert scales.linear_speed == pytest.approx(np.sqrt(np.mean(DATA.gripper_twist[..., :2] ** 2)), rel=1e-3)
+    assert scales.angular_speed == pytest.approx(np.sqrt(np.mean(DATA.gripper_twist[..., 2] ** 2)), rel=1e-3)
+    jump = jax.tree.map(np.copy, DATA)
+    jump.keypoints[0, -1:, 2] += 0.5
+    assert fit_normalisation(jump, SMALL).residual == pytest.approx(scales.residual, rel=0.2)
+    still = jax.tree.map(lambda x: np.zeros_like(x) + x[:, :1], DATA)
+    still = dataclasses.replace(still, gripper_twist=np.zeros_like(DATA.gripper_twist))
+    assert fit_normalisation(still, SMALL).displacement == 1e-5
+
+
+def test_metrics_forget_what_was_lost_with_the_process(tmp_path):
+    with MetricsLog(tmp_path, ("loss",), 0) as log:
+        for step in (10, 20, 30):
+            log.write(step, {"loss": step / 100})
+    with (tmp_path / "metrics.csv").open("a") as file:
+        file.write("4")  # killed while writing
+    with MetricsLog(tmp_path, ("loss",), 20) as log:
+        log.write(30, {})
+    assert (tmp_path / "metrics.csv").read_text().split() == ["step,loss", "10,0.1", "20,0.2", "30,"]
+
+
+def test_sizes_of_the_network_follow_the_configuration():
+    from flax import nnx
+
+    config = resized(TINY_TRAINING, latent=6, message_passing=1).model
+    model = GNS(config, nnx.Rngs(0))
+    assert len(model.processor) == 1
+    assert model.node_encoder.first[0].kernel.shape == (config.node_features, config.hidden)
+    assert model.decoder.rest[-1].kernel.shape == (config.hidden, 2)

@@ -1,0 +1,140 @@
+"""Weights on disk come back bit for bit, and what is not such a file is refused by name."""
+
+import dataclasses
+import json
+
+import jax
+import numpy as np
+import pytest
+from flax import nnx
+from safetensors import safe_open
+from safetensors.numpy import save_file
+
+from cablejax.dynamics import weights as files
+from cablejax.dynamics.config import GNSConfig, Normalisation
+from cablejax.dynamics.gns import GNS, apply
+from cablejax.dynamics.weights import (
+    WeightsError,
+    load_info,
+    load_released,
+    load_weights,
+    released_names,
+    save_weights,
+)
+from dynamics_cases import SMALL, arched_history, network
+
+CONFIG = dataclasses.replace(SMALL, normalisation=Normalisation(residual=0.0123))
+INFO = {"data": [{"name": "a", "digest": "00"}], "training": {"seed": 3}}
+
+
+@pytest.fixture
+def saved(tmp_path):
+    path = tmp_path / files.FILE_NAME
+    save_weights(path, CONFIG, network(CONFIG)[1], INFO)
+    return path
+
+
+def altered(path, tensors=lambda t: t, content=lambda c: c):
+    """The file with other tensors or another description."""
+    with safe_open(path, framework="numpy") as file:
+        described = json.loads(file.metadata()["cablejax"])
+        found = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+    save_file(tensors(found), path, metadata={"cablejax": json.dumps(content(described))})
+    return path
+
+
+def test_weights_survive_bit_for_bit(saved):
+    graphdef, weights = network(CONFIG)
+    for source in (saved, str(saved), saved.parent):
+        config, found_def, found = load_weights(source, expect=CONFIG)
+        assert config == CONFIG and found_def == graphdef
+        assert jax.tree.structure(found) == jax.tree.structure(weights)
+        jax.tree.map(np.testing.assert_array_equal, found, weights)
+    assert load_info(saved) == INFO
+    history, twist = arched_history(CONFIG), np.full((2, 3), 0.01, np.float32)
+    np.testing.assert_array_equal(apply((found_def, found), history, twist), apply((graphdef, weights), history, twist))
+    assert [file.name for file in saved.parent.iterdir()] == [saved.name], "nothing half-written is left"
+
+
+def test_a_model_for_another_graph_is_refused(saved):
+    assert load_weights(saved, expect=dataclasses.replace(CONFIG, normalisation=Normalisation()))[0] == CONFIG
+    asked = dataclasses.replace(CONFIG, n_keypoints=6, length=2.0, history=4)
+    with pytest.raises(WeightsError, match="weights for another graph") as refusal:
+        load_weights(saved, expect=asked)
+    for part in ("n_keypoints is 5, expected 6", "length is 1.0, expected 2.0", "history is 3, expected 4"):
+        assert part in str(refusal.value)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda t: {k: v for k, v in t.items() if k != "decoder.rest.0.bias"}, "decoder.rest.0.bias is missing"),
+        (lambda t: t | {"spare": np.zeros(2, np.float32)}, "spare is unknown"),
+        (lambda t: t | {"decoder.rest.0.bias": np.zeros(3, np.float32)}, r"float32\[3\], expected float32\[2\]"),
+        (lambda t: t | {"decoder.rest.0.bias": np.zeros(2, np.float64)}, r"float64\[2\], expected float32\[2\]"),
+        (lambda t: t | {"decoder.rest.0.bias": np.full(2, np.nan, np.float32)}, "NaN"),
+    ],
+    ids=["missing", "extra", "misshapen", "other dtype", "not finite"],
+)
+def test_tensors_that_do_not_fit_are_refused(saved, change, message):
+    with pytest.raises(WeightsError, match=message):
+        load_weights(altered(saved, tensors=change))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda c: c | {"schema": "cablejax-weights/2"}, "schema 'cablejax-weights/2', expected 'cablejax-weights/1'"),
+        (lambda c: c | {"config": c["config"] | {"heads": 4}}, "does not know.*heads"),
+        (lambda c: c | {"config": c["config"] | {"latent": 0}}, "impossible configuration.*latent is 0"),
+        (lambda c: {"schema": c["schema"]}, "schema"),
+        (lambda c: [], "schema None"),
+    ],
+    ids=["schema", "unknown field", "impossible", "no config", "no object"],
+)
+def test_descriptions_that_do_not_fit_are_refused(saved, change, message):
+    with pytest.raises(WeightsError, match=message):
+        load_weights(altered(saved, content=change))
+
+
+def test_a_file_that_is_something_else_is_refused(tmp_path, saved):
+    (tmp_path / "text.safetensors").write_text("not tensors")
+    (tmp_path / "cut.safetensors").write_bytes(saved.read_bytes()[:-100])
+    save_file({"x": np.zeros(1)}, tmp_path / "foreign.safetensors")
+    for name, message in (("text", "no safetensors file"), ("cut", "damaged"), ("foreign", "schema None")):
+        with pytest.raises(WeightsError, match=message):
+            load_weights(tmp_path / f"{name}.safetensors")
+    with pytest.raises(WeightsError, match="There is no weights file"):
+        load_weights(tmp_path / "absent.safetensors")
+    (tmp_path / "run").mkdir()
+    with pytest.raises(WeightsError, match="is its training complete"):
+        load_weights(tmp_path / "run")
+
+
+def test_weights_of_another_network_are_not_saved(tmp_path):
+    other = network(dataclasses.replace(CONFIG, latent=4))[1]
+    with pytest.raises(WeightsError, match="expected float32"):
+        save_weights(tmp_path / "x.safetensors", CONFIG, other, {})
+    with pytest.raises(ValueError, match="JSON"):
+        save_weights(tmp_path / "x.safetensors", CONFIG, network(CONFIG)[1], {"loss": float("nan")})
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_released_models_are_found_by_name(saved, monkeypatch):
+    monkeypatch.setattr(files.importlib.resources, "files", lambda package: saved.parent.parent)
+    folder = saved.parent.parent / "weights"
+    saved.parent.rename(folder)
+    (folder / saved.name).rename(folder / "mine.safetensors")
+    assert released_names() == ("mine",)
+    assert load_released("mine")[0] == load_weights("mine")[0] == CONFIG
+    with pytest.raises(WeightsError, match=r"'other' \(released: mine\)"):
+        load_released("other")
+
+
+def test_whatever_this_package_releases_can_be_loaded():
+    for name in released_names():
+        config, graphdef, weights = load_released(name)
+        assert isinstance(config, GNSConfig)
+        assert nnx.split(nnx.eval_shape(lambda config=config: GNS(config, nnx.Rngs(0))))[0] == graphdef
+        assert {"data", "training", "versions", "machine"} <= load_info(name).keys()
+        assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(weights))
