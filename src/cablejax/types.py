@@ -1,7 +1,8 @@
 """The pytrees that travel between the stages of the pipeline.
 
-Every class here is a frozen dataclass. Those that hold JAX arrays are registered as pytrees, so they pass through `jit`,
-`vmap`, `grad` and `scan` unchanged. Shapes are written as `[E, T, N, D]` with these letters throughout the package:
+Every class here is a frozen dataclass. Those that hold JAX arrays are registered as pytrees, so they pass through
+`jit`, `vmap`, `grad` and `scan` unchanged. Shapes are written as `[E, T, N, D]`, with these letters throughout the
+package:
 
     B batch   E episodes   T time samples   H history length   N keypoints   Q grippers   J bending joints   D 2 or 3
 

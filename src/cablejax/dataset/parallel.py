@@ -49,7 +49,7 @@ class DeviceParallel(Engine):
         Raises:
             ValueError: the batch is larger than that.
         """
-        size, width = len(twist), self.per_device * len(self.devices)
+        size, width = np.shape(twist)[0], self.per_device * len(self.devices)
         if not 0 < size <= width:
             raise ValueError(f"The batch has {size} cables, expected 1 to {width}: {self.per_device} on each device.")
         rows = np.minimum(np.arange(width), size - 1)

@@ -1,7 +1,7 @@
 """The cable as a MuJoCo composite: a chain of capsules, in the plane (z-hinges) or in space (ball joints).
 
-Bending stiffness is a joint spring, `EI / link_length`. The elasticity plugin of MuJoCo states the same law, but MJX drops
-plugins without a word, so a model that carries one is refused.
+Bending stiffness is a joint spring, `EI / link_length`. The elasticity plugin of MuJoCo states the same law, but MJX
+drops plugins without a word, so a model that carries one is refused.
 
 Two variants of the same chain are built:
 
@@ -18,7 +18,7 @@ from cablejax.simulate.config import GRAVITY, CableConfig
 
 # A weld is as soft as the lighter body is light. The held links are held anyway, so C MuJoCo gets them heavy.
 _HELD_MASS = 10.0  # [kg]
-_HELD_INERTIA = 0.04 # [kg m^2], a sphere of 10 cm
+_HELD_INERTIA = 0.04  # [kg m^2], a sphere of 10 cm
 # Constraint impedance, as close to a rigid weld as MuJoCo allows.
 _RIGID = (0.9999, 0.9999, 0.001, 0.5, 2.0)
 
@@ -31,8 +31,8 @@ def build_chain(config: CableConfig) -> mujoco.MjModel:
 def build_grasped_chain(config: CableConfig) -> mujoco.MjModel:
     """The chain welded at both ends to mocap bodies `gripper_0`, `gripper_1`, with friction actuators in the plane.
 
-    The welds are deadbeat: with `k = 1/dt^2` and `b = 1/dt` the held end reaches the mocap pose within the very step, so
-    a mocap pose set to the end of the step leaves no lag.
+    The welds are deadbeat: with `k = 1/dt^2` and `b = 1/dt` the held end reaches the mocap pose within the very step,
+    so a mocap pose set to the end of the step leaves no lag.
 
     Friction: MuJoCo has no Coulomb friction in a plane without contacts. Every free link carries two actuators along
     the world's x and y with force `-c v`; the engine sets `c = mu w / sqrt(|v|^2 + v0^2)` before each step, and
@@ -124,9 +124,7 @@ def _chain_spec(config: CableConfig) -> mujoco.MjSpec:
     </mujoco>""")
     stiffness = config.bending_stiffness / config.link_length
     origins = np.concatenate([[0.0], vertices[1:-1] - vertices[:-2]])
-    for k, (link, length, offset, origin) in enumerate(
-        zip(link_bodies(spec), lengths, offsets, origins, strict=True)
-    ):
+    for k, (link, length, offset, origin) in enumerate(zip(link_bodies(spec), lengths, offsets, origins, strict=True)):
         link.pos = [origin, 0.0, 0.0]  # the composite keeps vertices in single precision
         link.explicitinertial = True
         link.mass = config.linear_density * length

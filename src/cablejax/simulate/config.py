@@ -58,7 +58,9 @@ class CableConfig:
             if not (np.isfinite(value) and value >= 0):
                 raise ValueError(f"CableConfig.{name} is {value}, expected a finite number >= 0.")
         if self.n_links < 3:
-            raise ValueError(f"CableConfig.n_links is {self.n_links}, expected at least 3: two held links and one free.")
+            raise ValueError(
+                f"CableConfig.n_links is {self.n_links}, expected at least 3: two held links and one free."
+            )
         if self.n_keypoints < 2:
             raise ValueError(f"CableConfig.n_keypoints is {self.n_keypoints}, expected at least 2.")
         if self.dimension not in (2, 3):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import abc
 
-from jaxtyping import Array, Float
+from jaxtyping import ArrayLike, Float
 
 from cablejax.simulate.config import CableConfig
 from cablejax.types import CableParams, CableState, Trajectory
@@ -21,7 +21,7 @@ class Engine(abc.ABC):
 
     @abc.abstractmethod
     def initial_state(
-        self, gripper_pose: Float[Array, "*B Q P"], *, guess: Float[Array, "*B N D"] | None = None
+        self, gripper_pose: Float[ArrayLike, "*B Q P"], *, guess: Float[ArrayLike, "*B N D"] | None = None
     ) -> CableState:
         """The cable at rest in static equilibrium, without friction locked in.
 
@@ -32,7 +32,7 @@ class Engine(abc.ABC):
 
     @abc.abstractmethod
     def rollout(
-        self, params: CableParams, state: CableState, twist: Float[Array, "*B T Q V"], interval: float = 1.0
+        self, params: CableParams, state: CableState, twist: Float[ArrayLike, "*B T Q V"], interval: float = 1.0
     ) -> tuple[CableState, Trajectory]:
         """Moves the grippers by T twists, each held for `interval` seconds.
 

@@ -51,7 +51,8 @@ def find_equilibrium(
     span = np.linalg.norm(pose[1, :2] - pose[0, :2])
     if span > config.length * (1 + 1e-9):
         raise ValueError(
-            f"The grippers are {span:.4f} m apart, more than the cable's length of {config.length} m: bring them closer."
+            f"The grippers are {span:.4f} m apart, more than the cable's length of {config.length} m: bring them "
+            "closer."
         )
     if span > config.length * (1 - 1e-9):
         return _taut(config, pose)
@@ -84,8 +85,9 @@ def find_equilibrium(
         if np.abs(step).max() < _TOLERANCE and np.abs(error).max() < 1e-8:
             return Equilibrium(angles=angles, stability=float(values[0] * config.length))
     raise ValueError(
-        f"No equilibrium found between gripper poses {pose.tolist()} in {_MAX_ITERATIONS} iterations: the remaining error "
-        f"of the far end is {np.abs(error).max():.2e}. Give a `guess` nearer to the shape, or poses further from taut."
+        f"No equilibrium found between gripper poses {pose.tolist()} in {_MAX_ITERATIONS} iterations: the remaining "
+        f"error of the far end is {np.abs(error).max():.2e}. Give a `guess` nearer to the shape, or poses further from "
+        "taut."
     )
 
 
@@ -95,8 +97,8 @@ def _taut(config: CableConfig, pose: Float[np.ndarray, "2 3"]) -> Equilibrium:
     off = np.abs(_wrap(pose[:, 2] - np.arctan2(chord[1], chord[0]))).max()
     if off > 1e-6 or abs(pose[1, 2] - pose[0, 2]) > 1e-6:
         raise ValueError(
-            f"The grippers are a whole cable length apart, but turned by {off:.3g} rad from the line between them: a taut "
-            "cable can only be straight. Bring them closer, or align them."
+            f"The grippers are a whole cable length apart, but turned by {off:.3g} rad from the line between them: a "
+            "taut cable can only be straight. Bring them closer, or align them."
         )
     return Equilibrium(angles=np.zeros(config.n_joints), stability=np.inf)
 
@@ -192,7 +194,8 @@ def _spatial_qpos(config, pose, guess):
     turned = _quaternion(normal * angle)
     if np.abs(_rotation_matrix(turned) @ frames[0] - frames[1]).max() > 1e-6:
         raise ValueError(
-            "The grippers are twisted against each other about the cable's axis. Start untwisted and turn one by a rollout."
+            "The grippers are twisted against each other about the cable's axis. Start untwisted and turn one by a "
+            "rollout."
         )
     planar = np.array([[0.0, 0.0, 0.0], [chord @ tangents[0], chord @ in_plane, angle]])
     flat_guess = None

@@ -1,7 +1,7 @@
 """Both ends held rigidly: the constrained step of the chain in closed form.
 
-MJX's own constraint solver iterates and gives wrong derivatives. The grasps are equality constraints, so one step of the
-linearly implicit Euler method has a closed form, differentiable in both modes:
+MJX's own constraint solver iterates and gives wrong derivatives. The grasps are equality constraints, so one step of
+the linearly implicit Euler method has a closed form, differentiable in both modes:
 
     (M + dt D) a = f + J' lambda,        J (v + dt a) = v*
 
@@ -48,10 +48,8 @@ def constrained_acceleration(
 def solve_positive(matrix: Float[Array, "n n"], rhs: Float[Array, "n k"]) -> Float[Array, "n k"]:
     """Solves `matrix x = rhs` for a symmetric positive definite matrix.
 
-    Derivatives go through the solution, `dx = matrix^-1 (drhs - dmatrix x)`, with the factor at hand, instead of through
-    the Cholesky factorisation: many times faster in reverse mode.
+    Derivatives go through the solution, `dx = matrix^-1 (drhs - dmatrix x)`, with the factor at hand, instead of
+    through the Cholesky factorisation: many times faster in reverse mode.
     """
     factor = jsl.cho_factor(jax.lax.stop_gradient(matrix), lower=True)
-    return jax.lax.custom_linear_solve(
-        lambda x: matrix @ x, rhs, lambda _, b: jsl.cho_solve(factor, b), symmetric=True
-    )
+    return jax.lax.custom_linear_solve(lambda x: matrix @ x, rhs, lambda _, b: jsl.cho_solve(factor, b), symmetric=True)

@@ -14,7 +14,7 @@ def hermite_weights(config: CableConfig) -> tuple[np.ndarray, np.ndarray]:
     that of the chain itself, which is of order h^2.
 
     Returns:
-        Weights of the node positions [N, n_links] and of the unit tangents at the nodes [N, n_links], the latter in metres.
+        Weights of the node positions [N, n_links] and of the unit tangents at the nodes [N, n_links], these in metres.
     """
     h = config.link_length
     s = config.keypoint_arclength / h

@@ -37,7 +37,9 @@ def chain_kinematics(config: CableConfig, data: mjx.Data) -> mjx.Data:
     if config.dimension == 2:
         # the root's two slides and its hinge, then one hinge a link; only the slides have another axis than z
         anchor = jnp.concatenate([origin[:1], origin[:1], origin])
-        axis = jnp.concatenate([jnp.eye(3, dtype=qpos.dtype), jnp.tile(jnp.eye(3, dtype=qpos.dtype)[2:], (len(origin) - 1, 1))])
+        axis = jnp.concatenate(
+            [jnp.eye(3, dtype=qpos.dtype), jnp.tile(jnp.eye(3, dtype=qpos.dtype)[2:], (len(origin) - 1, 1))]
+        )
     else:
         anchor, axis = origin, jnp.tile(jnp.eye(3, dtype=qpos.dtype)[2:], (len(origin), 1))
     return data.replace(

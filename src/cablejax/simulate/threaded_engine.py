@@ -10,6 +10,7 @@ import functools
 import os
 import pathlib
 
+import jax
 import jax.numpy as jnp
 import mujoco
 import numba
@@ -52,36 +53,34 @@ class ThreadedEngine(Engine):
         count = self.substeps(interval)
         batch = twist.shape[:-3]
         size = int(np.prod(batch))
-        flatten = lambda leaf, rank: np.asarray(leaf, np.float64).reshape(size, *np.shape(leaf)[len(batch) :][:rank])
-        flat_twist = flatten(twist, 3)
-        flat_state = [flatten(leaf, 2) for leaf in (state.qpos, state.qvel, state.gripper_pose)]
-        flat_params = CableParams(
-            *(flatten(getattr(params, field.name), 2) for field in dataclasses.fields(CableParams))
-        )
+
+        def flatten(leaf):
+            return np.asarray(leaf, np.float64).reshape(size, *np.shape(leaf)[len(batch) :])
+
+        def restore(leaf):
+            return jnp.asarray(leaf.reshape(*batch, *leaf.shape[1:]), float)
+
+        params, state, commands = jax.tree.map(flatten, (params, state, twist))
         samples = twist.shape[-3] + 1
         keypoints = np.empty((size, samples, self.config.n_keypoints, self.config.dimension))
-        poses = np.empty((size, samples, *flat_state[2].shape[1:]))
-        finals = [np.empty_like(flat_state[0]), np.empty_like(flat_state[1])]
-
-        workers = min(self.n_threads or os.cpu_count() or 1, size) or 1
+        poses = np.empty((size, samples, *state.gripper_pose.shape[1:]))
+        qpos, qvel = np.empty_like(state.qpos), np.empty_like(state.qvel)
+        workers = max(min(self.n_threads or os.cpu_count() or 1, size), 1)
 
         def run(worker: int) -> None:
             simulation = _Simulation(self.config, self.mj_model)
             for i in range(worker, size, workers):
-                one = CableParams(*(getattr(flat_params, f.name)[i] for f in dataclasses.fields(CableParams)))
-                start = [leaf[i] for leaf in flat_state]
-                simulation.run(one, *start, flat_twist[i], count, keypoints[i], poses[i])
-                finals[0][i], finals[1][i] = simulation.data.qpos, simulation.data.qvel
+                one, start = jax.tree.map(lambda leaf: leaf[i], (params, state))  # noqa: B023, used at once
+                simulation.run(one, start, commands[i], count, keypoints[i], poses[i])
+                qpos[i], qvel[i] = simulation.data.qpos, simulation.data.qvel
 
         if workers == 1:
             run(0)
         else:
             with concurrent.futures.ThreadPoolExecutor(workers) as pool:
                 list(pool.map(run, range(workers)))
-        shape = lambda leaf: jnp.asarray(leaf.reshape(*batch, *leaf.shape[1:]), float)
-        final = CableState(qpos=shape(finals[0]), qvel=shape(finals[1]), gripper_pose=shape(poses[:, -1]))
-        trajectory = Trajectory(shape(keypoints), shape(poses), jnp.asarray(twist, float))
-        return final, trajectory
+        final = CableState(restore(qpos), restore(qvel), restore(poses[:, -1]))
+        return final, Trajectory(restore(keypoints), restore(poses), restore(commands))
 
 
 class _Simulation:
@@ -96,12 +95,12 @@ class _Simulation:
         self.nominal_inertia = self.model.body_inertia.copy()
         self.links = np.array([i for i in range(self.model.nbody) if self.model.body(i).name.startswith("cable")])
 
-    def run(self, params, qpos, qvel, pose, twist, count, keypoints, poses) -> None:
+    def run(self, params: CableParams, state: CableState, twist, count: int, keypoints, poses) -> None:
         """Simulates in place; writes samples into `keypoints` [T + 1, N, D] and `poses` [T + 1, Q, P]."""
         config, model, data = self.config, self.model, self.data
         self._write(params)
         mujoco.mj_resetData(model, data)
-        data.qpos[:], data.qvel[:] = qpos, qvel
+        data.qpos[:], data.qvel[:] = state.qpos, state.qvel
         load = float(params.linear_density) * config.link_length * GRAVITY * float(params.friction_coefficient)
         addresses = np.array([model._address, data._address], np.uint64)
         nodes = np.empty((len(twist) + 1, len(self.links), 3))
@@ -115,8 +114,8 @@ class _Simulation:
             data.xipos,
             data.xmat,
             self.links,
-            np.array(pose),
-            np.array(twist),
+            np.array(state.gripper_pose),
+            twist,
             count,
             config.timestep,
             load,

@@ -1,0 +1,51 @@
+"""The experiment and the notebook that tell the story, executed at smoke size."""
+
+import importlib.util
+import pathlib
+
+import nbformat
+import pytest
+from cli_cases import small_model
+from nbclient import NotebookClient
+
+ROOT = pathlib.Path(__file__).parents[1]
+
+
+@pytest.fixture(scope="module")
+def weights(tmp_path_factory):
+    return small_model(tmp_path_factory.mktemp("model"))
+
+
+def load(script: str):
+    spec = importlib.util.spec_from_file_location("experiment", ROOT / "experiments" / script)
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_experiment_shapes_a_cable(weights, tmp_path, capsys):
+    arguments = ["--steps", "1", "--links", "12", "--weights", str(weights), "--out", str(tmp_path)]
+    load("01_shape_a_cable.py").main(arguments)
+    told = capsys.readouterr().out
+    assert told.startswith("residual") and "\ndirect" in told
+    assert sorted(path.name for path in tmp_path.iterdir()) == [
+        "error_over_time.png",
+        "final_shapes.png",
+        "residual_share.png",
+        "shape.gif",
+        "snapshots.png",
+    ]
+
+
+@pytest.mark.slow
+def test_notebook_shapes_a_cable(weights, monkeypatch):
+    monkeypatch.setenv("CABLEJAX_NOTEBOOK_STEPS", "1")
+    monkeypatch.setenv("CABLEJAX_NOTEBOOK_LINKS", "12")
+    monkeypatch.setenv("CABLEJAX_NOTEBOOK_WEIGHTS", str(weights))
+    notebook = nbformat.read(ROOT / "notebooks" / "01_shape_a_cable.ipynb", as_version=4)
+    NotebookClient(notebook, timeout=500, kernel_name="python3").execute()
+    outputs = [output for cell in notebook.cells if cell.cell_type == "code" for output in cell.outputs]
+    pictures = [output for output in outputs if "image/png" in output.get("data", {})]
+    assert len(pictures) == 4
+    assert any("U:" in text or "S:" in text for text in (output.get("text", "") for output in outputs))
