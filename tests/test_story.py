@@ -5,8 +5,9 @@ import pathlib
 
 import nbformat
 import pytest
-from cli_cases import small_model
 from nbclient import NotebookClient
+
+from cli_cases import small_model
 
 ROOT = pathlib.Path(__file__).parents[1]
 

@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from cablejax.mpc.feasible import FeasibleSet
+from cablejax.mpc.goal import goal_pose, straight_plan
 from cablejax.mpc.problem import ObjectiveConfig, Outcome, Plan, ShapingProblem, Solver
 from cablejax.mpc.trust_region import TrustRegion
 from cablejax.residual.corrected import Dynamics, corrected
@@ -321,8 +322,7 @@ def _plan_or_hold(
 ) -> tuple[Plan, Float[Array, ""], Float[Array, ""]]:
     """The solver's plan, or holding still where that is as good or nothing can be trusted; and both their values."""
     still = jnp.zeros_like(last)
-    guess = jnp.roll(last, -1, axis=0).at[-1].set(0.0)
-    plan = config.solver(problem, guess)
+    plan = config.solver(problem, _best_guess(config, problem, last))
     value, value_hold = jax.vmap(problem.value)(jnp.stack([plan.motion, still]))
     improvement = jnp.sqrt(2.0 * value_hold / config.n_commands) - jnp.sqrt(2.0 * value / config.n_commands)
     finite = jnp.isfinite(value) & jnp.isfinite(plan.motion).all()
@@ -331,6 +331,21 @@ def _plan_or_hold(
     motion = jnp.where(worthwhile, plan.motion, still)
     value = jnp.where(worthwhile, value, value_hold)
     return Plan(motion=motion, evaluations=plan.evaluations, outcome=outcome.astype(jnp.int32)), value, value_hold
+
+
+def _best_guess(config: MPCConfig, problem: ShapingProblem, last: Float[Array, "T Q 3"]) -> Float[Array, "T Q 3"]:
+    """The better of two starts: the last plan, shifted by the command that was executed, and the straight way."""
+    shifted = jnp.roll(last, -1, axis=0).at[-1].set(0.0)
+    straight = straight_plan(
+        problem.history.gripper_pose,
+        goal_pose(problem.target),
+        problem.feasible.radius,
+        config.objective.rotation_weight,
+        config.n_commands,
+    )
+    guesses = jnp.stack([problem.feasible.project(shifted), problem.feasible.project(straight)])
+    values = jax.vmap(problem.value)(guesses)
+    return guesses[jnp.argmin(jnp.where(jnp.isfinite(values), values, jnp.inf))]
 
 
 def _push(window: Array, newest: Array) -> Array:
