@@ -1,7 +1,7 @@
 """A plan without a model: both grippers on straight lines to where the target's ends are held.
 
-A local solver started from the last plan can stay in a valley: between an arch and an S, say, the shape error rises before
-it falls. This plan crosses such ridges, and is a guess for the solver, not a command.
+A local solver started from the last plan can stay in a valley: between an arch and an S, say, the shape error hardly
+falls for several steps. This plan crosses such ridges, and is a guess for the solver, not a command.
 """
 
 from __future__ import annotations
