@@ -1,6 +1,6 @@
 """Runs both benchmarks of the command line and writes their numbers as one Markdown page.
 
-    python benchmarks/speed.py --out docs/results/speed.md
+python benchmarks/speed.py --out docs/results/speed.md
 """
 
 from __future__ import annotations
