@@ -124,6 +124,15 @@ def test_interrupting_a_long_simulation_tells_how_to_go_on(tmp_path):
     assert "Run the same generation again" in said and "Traceback" not in said
 
 
+@pytest.mark.slow
+def test_bench_simulate_relates_the_engines(capsys):
+    assert main(["bench", "simulate", "--json", "--links", "5", "--batch", "4", "--rounds", "2"]) == 0
+    result = json.loads(capsys.readouterr().out)
+    ratio = result["mjx_us_per_env_step"] / result["c_us_per_env_step"]
+    assert result["mjx_over_c"] == pytest.approx(ratio) and ratio > 0
+    assert result["mjx_memory_per_env_bytes"] > 0 and result["mjx_compile_s"] > 0
+
+
 def test_text_table_lines_up():
     text = options.text_table(["shape", "error"], [["U", "0.5"], ["long name", "12.25"]])
     assert text.splitlines()[1:] == ["---------  -----", "U            0.5", "long name  12.25"]

@@ -110,3 +110,9 @@ def test_demo_tells_its_story_in_a_table(weights, tmp_path, capsys):
     assert told.out.startswith("shape") and "\nS " in told.out and "report.html" in told.out
     assert "with online residual" in told.err and "without residual" in told.err
     assert set(json.loads((out / "summary.json").read_text())["shapes"]) == {"S"}
+
+
+def test_bench_mpc_times_the_control_call(weights, capsys):
+    assert main(["bench", "mpc", "--weights", str(weights), "--repeats", "3", "--json"]) == 0
+    result = json.loads(capsys.readouterr().out)
+    assert 0 < result["p50_ms"] <= result["p95_ms"] < 1e3 * max(result["first_call_s"], 60.0)

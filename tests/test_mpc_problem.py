@@ -28,7 +28,7 @@ def test_objective_is_the_weighted_sum_of_squares():
     motion = random_motion(1)
     error = np.sum((case.rollout(motion) - case.target) ** 2, axis=(1, 2)) / case.target.shape[0]
     expected = 0.5 * (np.dot(error, [1, 1, 1, 4]) + 0.02 * np.sum(motion**2))
-    assert float(case.value(motion)) == pytest.approx(expected, rel=1e-5)
+    assert float(case.value(motion)) == pytest.approx(float(expected), rel=1e-5)
     shape_error = case.shape_error(case.rollout(motion))
     np.testing.assert_allclose(shape_error**2, error, rtol=1e-5)
 
