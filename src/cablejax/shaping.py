@@ -15,7 +15,7 @@ from cablejax.dynamics.gns import apply
 from cablejax.dynamics.weights import load_weights
 from cablejax.mpc import Controller, MPCConfig, ProjectedGradient, TrustRegion
 from cablejax.report.record import Method
-from cablejax.residual import Dynamics, RidgeConfig
+from cablejax.residual import Dynamics
 from cablejax.simulate import CableConfig
 from cablejax.simulate.elastica import elastica
 from cablejax.simulate.plant import Plant, PlantConfig
@@ -73,9 +73,10 @@ def make_controller(model: Model, target: Target, *, method: Method, solver: Sol
     """The controller for one target, with or without the online residual."""
     config = MPCConfig(
         cable_length=model.config.length,
-        residual=RidgeConfig() if method == "residual" else None,
         solver=TrustRegion() if solver == "trust-region" else ProjectedGradient(),
     )
+    if method == "direct":
+        config = dataclasses.replace(config, residual=None)
     return Controller(config, model.dynamics, model.weights, target.keypoints)
 
 

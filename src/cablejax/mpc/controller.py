@@ -59,7 +59,7 @@ class MPCConfig:
     min_reduction: float = 1e-4
     hold_improvement: float = 2e-5
     objective: ObjectiveConfig = ObjectiveConfig()
-    residual: RidgeConfig | None = RidgeConfig()
+    residual: RidgeConfig | None = RidgeConfig(forgetting=0.5)
     solver: Solver = TrustRegion()
 
     def __post_init__(self):

@@ -46,9 +46,9 @@ def write_gif(
     """
     pairs = pair_by_shape(records)
     end = max(float(r.times[-1]) for r in records)
-    # The cable moves most at the start, so time runs slower there: frame times grow with the power 1.5.
+    # The cable moves most at the start, so time runs slower there: frame times grow with the square.
     n_frames = max(2, round(end / speed * frames_per_second))
-    instants = end * np.linspace(0.0, 1.0, n_frames) ** 1.5
+    instants = end * np.linspace(0.0, 1.0, n_frames) ** 2
     scene = _Scene(pairs, common_window(records, margin=0.1), width)
     frames = [scene.draw(t) for t in instants]
     palette = _palette()

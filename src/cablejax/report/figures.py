@@ -218,6 +218,7 @@ def _one_method_panels(records, quantity, label: str, method: Method) -> Figure:
         figure, axes = _row_of_panels(list(pairs), label)
         for ax, (shape, run) in zip(axes, pairs.items(), strict=True):
             values = quantity(run)
+            ax.set_xlim(run.times[0], run.times[-1])
             ax.fill_between(run.times, 0.0, values, color=LIGHT.method(method), alpha=0.18, lw=0)
             ax.plot(run.times, values, color=LIGHT.method(method), lw=2.2)
             ax.set_title(shape, fontsize=13)

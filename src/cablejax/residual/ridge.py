@@ -32,7 +32,7 @@ class RidgeConfig:
         bias: whether the error at rest is fitted too. Without it an error that does not vanish with the motion (a wrong
             steady state, friction) ends up in the gain, or nowhere once the grippers are still.
         bias_scale: value of the constant regressor; larger is a weaker penalty on the bias. At 5, five samples have
-            `W * 5**2 = 125`, so that lambda = 10 shrinks the bias by 7 % (by 17 % with forgetting 0.5).
+            `W * 5**2 = 125`, so that lambda = 10 shrinks the bias by 7 %.
         forgetting: weight ratio of a sample and the next newer one, in (0, 1]; 1 weighs all alike. On the way to a
             shape the error changes from step to step, so the newest sample says most about the next.
     """
@@ -43,7 +43,7 @@ class RidgeConfig:
     rotation_weight: float = 0.15
     bias: bool = True
     bias_scale: float = 5.0
-    forgetting: float = 0.5
+    forgetting: float = 1.0
 
     def __post_init__(self):
         if self.window < 1:
