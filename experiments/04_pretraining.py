@@ -59,7 +59,7 @@ def main() -> None:
             began = time.perf_counter()
             pretrained = pretrain(config, data, PretrainConfig(steps=options.steps))
             seconds = time.perf_counter() - began
-            for name, initial in (("end to end", None), ("pretrained", pretrained.weights)):
+            for name, initial in (("end to end", None), ("pretrained", (pretrained.model, pretrained.weights))):
                 result = train(config, data, Path(scratch) / f"{name} {seed}", initial=initial)
                 error = open_loop_error((result.graphdef, result.weights), held_out, result.model)
                 lines.append(row(f"{name}, seed {seed}", error))

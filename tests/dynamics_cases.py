@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from flax import nnx
 
-from cablejax.dynamics.config import GNSConfig
+from cablejax.dynamics.config import ModelConfig
 from cablejax.dynamics.gns import GNS
 from cablejax.dynamics.train_config import Phase, TrainConfig
 from cablejax.types import History, Trajectory
 
-SMALL = GNSConfig(
+SMALL = ModelConfig(
     n_keypoints=5,
     radius=0.5,
     history=3,
@@ -51,7 +51,7 @@ def trajectories(m: int = 4, t: int = 8, n: int = 5, seed: int = 0) -> Trajector
     return Trajectory(*(a.astype(np.float32) for a in (keypoints, pose, twist)))
 
 
-def network(config: GNSConfig, seed: int = 0, last: float = 0.1) -> tuple[nnx.GraphDef, nnx.State]:
+def network(config: ModelConfig, seed: int = 0, last: float = 0.1) -> tuple[nnx.GraphDef, nnx.State]:
     """A network whose decoder does not start at zero."""
     model = GNS(config, nnx.Rngs(seed))
     kernel = model.decoder.rest[-1].kernel
@@ -59,7 +59,7 @@ def network(config: GNSConfig, seed: int = 0, last: float = 0.1) -> tuple[nnx.Gr
     return nnx.split(model)
 
 
-def arched_history(config: GNSConfig, seed: int = 0) -> History:
+def arched_history(config: ModelConfig, seed: int = 0) -> History:
     """An arched cable that has been moving a little."""
     rng = np.random.default_rng(seed)
     s = np.linspace(0.0, 1.0, config.n_keypoints)[:, None]
@@ -70,7 +70,7 @@ def arched_history(config: GNSConfig, seed: int = 0) -> History:
     return History(jnp.asarray(past), jnp.asarray(pose))
 
 
-def straight_history(config: GNSConfig) -> History:
+def straight_history(config: ModelConfig) -> History:
     """A straight cable at rest, the grippers a whole length apart."""
     x = np.linspace(-0.5, 0.5, config.n_keypoints) * config.length
     shape = np.stack([x, np.zeros_like(x)], axis=1)

@@ -9,8 +9,9 @@ from flax import nnx
 
 from cablejax.dataset.windows import draw_windows
 from cablejax.dynamics.autoencoder import AutoEncoders, PretrainConfig, features, pretrain
-from cablejax.dynamics.gns import GNS, apply
+from cablejax.dynamics.gns import GNS
 from cablejax.dynamics.graph import build_graph, prior_of
+from cablejax.dynamics.model import apply
 from cablejax.dynamics.normalisation import fit_normalisation
 from cablejax.dynamics.train import train
 from dynamics_cases import SMALL, TINY_TRAINING, arched_history, trajectories
@@ -50,7 +51,7 @@ def test_pretraining_repeats_to_the_bit_and_training_goes_on_from_it(pretrained,
     again = pretrain(TINY_TRAINING, DATA, PretrainConfig(steps=150, batch=8, lr_start=1e-2), progress=False)
     jax.tree.map(np.testing.assert_array_equal, again.weights, pretrained.weights)
     config = dataclasses.replace(TINY_TRAINING, ema=0.0)
-    result = train(config, DATA, tmp_path / "run", initial=pretrained.weights, progress=False)
+    result = train(config, DATA, tmp_path / "run", initial=(pretrained.model, pretrained.weights), progress=False)
     kernel = ("node_encoder", "first", 0, "kernel")
     of = {
         name: dict(nnx.to_flat_state(w))[kernel].get_value()

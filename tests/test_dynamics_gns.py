@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 from flax import nnx
 
-from cablejax.dynamics.config import GNSConfig
+from cablejax.dynamics.config import ModelConfig
 from cablejax.dynamics.evaluate import predict
-from cablejax.dynamics.gns import GNS, aggregate, apply, bind, gather
+from cablejax.dynamics.gns import GNS, aggregate, gather
 from cablejax.dynamics.graph import cable_topology, prior_of
+from cablejax.dynamics.model import apply, bind
 from dynamics_cases import (
     SMALL,
     arched_history,
@@ -25,7 +26,7 @@ from dynamics_cases import (
 )
 
 TWIST = jnp.array([[0.01, -0.02, 0.1], [-0.03, 0.005, -0.2]])
-STATIC = GNSConfig(history=3, latent=8, hidden=8, hidden_layers=1, message_passing=2)
+STATIC = ModelConfig(history=3, latent=8, hidden=8, hidden_layers=1, message_passing=2)
 COMMANDS = np.array([[[0.02, -0.01, 0.1], [-0.015, 0.02, -0.08]], [[0.01, 0.0, 0.0], [-0.02, 0.01, 0.1]]])
 
 

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from cablejax.dynamics.config import GNSConfig, Normalisation
+from cablejax.dynamics.config import ModelConfig, Normalisation
 from cablejax.dynamics.graph import build_graph, cable_topology, gripper_frame, prior_of
 from cablejax.dynamics.interpolation import rigid_interpolation
 from dynamics_cases import SMALL, arched_history, moved_rigidly, straight_history, turned_twist
@@ -39,13 +39,13 @@ def test_edges_are_those_within_the_radius_sorted_by_offset(n, radius):
 
 def test_a_radius_below_the_spacing_is_refused():
     with pytest.raises(ValueError, match="no two would be connected"):
-        GNSConfig(n_keypoints=5, radius=0.2)
+        ModelConfig(n_keypoints=5, radius=0.2)
 
 
 @pytest.mark.parametrize(("name", "value"), [("n_keypoints", 2), ("length", -1.0), ("history", 0), ("prior", "none")])
 def test_impossible_configurations_are_refused(name, value):
-    with pytest.raises(ValueError, match=f"GNSConfig.{name} is"):
-        dataclasses.replace(GNSConfig(), **{name: value})
+    with pytest.raises(ValueError, match=f"ModelConfig.{name} is"):
+        dataclasses.replace(ModelConfig(), **{name: value})
     with pytest.raises(ValueError, match=r"Normalisation.residual is 0"):
         Normalisation(residual=0.0)
 

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from cablejax.dynamics.config import GNSConfig
+from cablejax.dynamics.config import ModelConfig
 from cablejax.dynamics.graph import prior_of
 from cablejax.dynamics.statics import resting_shapes
 from cablejax.simulate import CableConfig
@@ -14,7 +14,7 @@ from cablejax.simulate.equilibrium import arch_angles, find_equilibrium
 from cablejax.simulate.keypoints import hermite_weights
 from dynamics_cases import arched_history, check_derivatives, moved_rigidly, straight_history
 
-CONFIG = GNSConfig()
+CONFIG = ModelConfig()
 CABLE = CableConfig(n_links=49)
 POSES = {
     "arch": np.array([[-0.3, 0.05, 1.2], [0.35, -0.02, -0.7]]),

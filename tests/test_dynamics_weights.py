@@ -11,8 +11,9 @@ from safetensors import safe_open
 from safetensors.numpy import save_file
 
 from cablejax.dynamics import weights as files
-from cablejax.dynamics.config import GNSConfig, Normalisation
-from cablejax.dynamics.gns import GNS, apply
+from cablejax.dynamics.config import ModelConfig, Normalisation
+from cablejax.dynamics.gns import GNS
+from cablejax.dynamics.model import apply
 from cablejax.dynamics.weights import (
     WeightsError,
     load_info,
@@ -134,7 +135,7 @@ def test_released_models_are_found_by_name(saved, monkeypatch):
 def test_whatever_this_package_releases_can_be_loaded():
     for name in released_names():
         config, graphdef, weights = load_released(name)
-        assert isinstance(config, GNSConfig)
+        assert isinstance(config, ModelConfig)
         assert nnx.split(nnx.eval_shape(lambda config=config: GNS(config, nnx.Rngs(0))))[0] == graphdef
         assert {"data", "training", "versions", "machine"} <= load_info(name).keys()
         assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(weights))

@@ -9,9 +9,10 @@ import numpy as np
 from flax import nnx
 from jaxtyping import Array, Float
 
+from cablejax.adaptation.belief import AdaptationConfig
 from cablejax.closed_loop import ClosedLoopRun, run_closed_loop
-from cablejax.dynamics.config import GNSConfig
-from cablejax.dynamics.gns import apply
+from cablejax.dynamics.config import ModelConfig
+from cablejax.dynamics.model import apply
 from cablejax.dynamics.weights import load_weights
 from cablejax.mpc import Controller, MPCConfig, ProjectedGradient, TrustRegion
 from cablejax.report.record import Method
@@ -40,7 +41,7 @@ class Model:
     """
 
     name: str
-    config: GNSConfig
+    config: ModelConfig
     dynamics: Dynamics
     weights: nnx.State
 
@@ -70,9 +71,10 @@ def load_model(name: str) -> Model:
 
 
 def make_controller(model: Model, target: Target, *, method: Method, solver: SolverName) -> Controller:
-    """The controller for one target, with or without the online residual."""
+    """The controller for one target, with or without the online residual; a conditioned model adapts in any case."""
     config = MPCConfig(
         cable_length=model.config.length,
+        adaptation=AdaptationConfig() if model.config.conditioned else None,
         solver=TrustRegion() if solver == "trust-region" else ProjectedGradient(),
     )
     if method == "direct":
@@ -80,7 +82,7 @@ def make_controller(model: Model, target: Target, *, method: Method, solver: Sol
     return Controller(config, model.dynamics, model.weights, target.keypoints)
 
 
-def initial_history(cable: CableConfig, config: GNSConfig) -> History:
+def initial_history(cable: CableConfig, config: ModelConfig) -> History:
     """A straight cable at rest, as the controller meets it before its first command."""
     pose = straight_start(cable)
     keypoints = elastica(pose, cable.length, cable.keypoint_arclength)

@@ -68,11 +68,13 @@ class Trajectory:
         keypoints: keypoint positions [m], shape [T + 1, N, D]; sample 0 is the initial state.
         gripper_pose: gripper poses at the same instants, shape [T + 1, Q, 3] or [T + 1, Q, 7].
         gripper_twist: twist held from sample t to t + 1 [m/s, rad/s], shape [T, Q, 3] or [T, Q, 6].
+        cable: what is known of the cable, see `cable_descriptor`, shape [2]; None = not recorded.
     """
 
     keypoints: Float[Array, "*batch T1 N D"]
     gripper_pose: Float[Array, "*batch T1 Q P"]
     gripper_twist: Float[Array, "*batch T Q V"]
+    cable: Float[Array, "*batch 2"] | None = None
 
 
 @jax.tree_util.register_dataclass
@@ -83,10 +85,31 @@ class History:
     Attributes:
         keypoints: positions [m] at t - m, ..., t, shape [H, N, 2] with H = m + 1.
         gripper_pose: (x, y, theta) of both grippers at t, shape [Q, 3].
+        cable: what is known of the cable, see `cable_descriptor`, shape [2]; None for a model that does not ask.
     """
 
     keypoints: Float[Array, "*batch H N 2"]
     gripper_pose: Float[Array, "*batch Q 3"]
+    cable: Float[Array, "*batch 2"] | None = None
+
+
+REFERENCE_STIFFNESS = 0.02
+"""EI of the reference cable [N m^2]."""
+REFERENCE_FRICTION = 0.1 * 0.08 * 9.81
+"""Friction force per length of the reference cable on its table, `mu w` [N/m]."""
+
+
+def cable_descriptor(stiffness: Array, friction: Array) -> Float[Array, "*batch 2"]:
+    """`[ln(EI / EI_0), ln(mu w / (mu w)_0)]`: what decides a uniform cable's slow motion on a table; 0 = reference.
+
+    Friction below a thousandth of the reference's counts as that.
+
+    Args:
+        stiffness: EI [N m^2].
+        friction: friction force per length `mu w` [N/m].
+    """
+    friction = jnp.maximum(friction, 1e-3 * REFERENCE_FRICTION)
+    return jnp.stack([jnp.log(stiffness / REFERENCE_STIFFNESS), jnp.log(friction / REFERENCE_FRICTION)], axis=-1)
 
 
 def advance(
@@ -104,6 +127,7 @@ def advance(
     return History(
         keypoints=jnp.concatenate([history.keypoints[1:], newest[None]]),
         gripper_pose=history.gripper_pose + interval * twist,
+        cable=history.cable,
     )
 
 

@@ -36,6 +36,8 @@ def simulate_command(config: DatasetConfig, out: str) -> str:
         stiffness=config.cable.bending_stiffness,
         friction=config.cable.friction_coefficient,
         stiffness_range=config.randomisation.stiffness,
+        damping_range=config.randomisation.damping,
+        friction_range=config.randomisation.friction,
     )
     if command.dataset_config() != dataclasses.replace(config, shard_size=DatasetConfig.shard_size):
         return f"# {out}: cablejax.dataset.generate.generate with the configuration recorded in the weights file"

@@ -53,6 +53,12 @@ class Simulate(Command):
     stiffness_range: tuple[float, float] | None = None
     """Draw each cable's stiffness between these two factors of --stiffness; by default all are alike."""
 
+    damping_range: tuple[float, float] | None = None
+    """Draw each cable's damping time between these two factors of the nominal one."""
+
+    friction_range: tuple[float, float] | None = None
+    """Draw each cable's friction coefficient between these two factors of --friction."""
+
     process_index: int = 0
     """Number of this process, from 0."""
 
@@ -106,6 +112,8 @@ class Simulate(Command):
             seed=self.seed,
             motion=MotionConfig(start=self.start, max_amplification=self.max_amplification),
             cable=cable,
-            randomisation=Randomisation(stiffness=self.stiffness_range),
+            randomisation=Randomisation(
+                stiffness=self.stiffness_range, damping=self.damping_range, friction=self.friction_range
+            ),
             engine=self.engine,
         )

@@ -1,4 +1,4 @@
-"""`cablejax train`: a graph network on data sets."""
+"""`cablejax train`: a model on data sets."""
 
 from __future__ import annotations
 
@@ -33,6 +33,21 @@ class Train(Command):
     preset: Literal["released", "small", "smoke"] = "released"
     """released: as the released model was trained. small: to compare variants, some minutes. smoke: a few steps."""
 
+    network: Literal["gns", "mlp", "lstm"] = "gns"
+    """gns: the graph network. mlp, lstm: the networks that it is compared with."""
+
+    prior: Literal["static", "rigid"] = "static"
+    """What the network corrects. static: the frictionless resting shape. rigid: the grippers' motion, interpolated."""
+
+    conditioned: bool = False
+    """Tell the network each cable's stiffness and friction; the data should vary in them."""
+
+    start_from: str | None = None
+    """Weights to start from instead of random ones: a released model by name, or a training's folder."""
+
+    lr: float | None = None
+    """Learning rate at the beginning; the whole schedule is scaled with it. By default that of the preset."""
+
     pretrain: int = 0
     """Steps for which the encoders are first trained as auto-encoders; 0 for none."""
 
@@ -56,9 +71,12 @@ class Train(Command):
         from cablejax.dataset.windows import concatenate, read_split
         from cablejax.dynamics.autoencoder import PretrainConfig, pretrain
         from cablejax.dynamics.error_report import error_report
+        from cablejax.dynamics.fine_tune import starting_from
         from cablejax.dynamics.train import train
         from cablejax.dynamics.weights import FILE_NAME, save_weights
 
+        if self.start_from is not None and self.pretrain:
+            raise UsageError("--start-from and --pretrain both say where to start: give one of them.")
         if self.pretrain < 0:
             raise UsageError(f"--pretrain is {self.pretrain}, expected 0 or a number of steps.")
         stores = [open_store(path) for path in self.data]
@@ -68,7 +86,12 @@ class Train(Command):
         training, held_out = read_split(stores, self.held_out)
         count = sum(len(part.gripper_twist) for part in held_out)
         say(f"{len(training.gripper_twist)} trajectories to train on, {count} held out; {config.total_steps} steps")
-        initial = pretrain(config, training, PretrainConfig(steps=self.pretrain)).weights if self.pretrain else None
+        initial = None
+        if self.pretrain:
+            pretrained = pretrain(config, training, PretrainConfig(steps=self.pretrain))
+            initial = pretrained.model, pretrained.weights
+        if self.start_from is not None:
+            initial = starting_from(self.start_from, config.model)
         result = train(config, training, self.out, validation=concatenate(held_out), initial=initial)
         if not result.completed:
             raise KeyboardInterrupt(
@@ -100,7 +123,13 @@ class Train(Command):
 
         config, cable = PRESETS[self.preset], store.config.cable
         model = dataclasses.replace(
-            config.model, n_keypoints=cable.n_keypoints, length=cable.length, interval=store.config.interval
+            config.model,
+            network=self.network,
+            prior=self.prior,
+            conditioned=self.conditioned,
+            n_keypoints=cable.n_keypoints,
+            length=cable.length,
+            interval=store.config.interval,
         )
         if self.latent is not None:
             model = dataclasses.replace(model, latent=self.latent, hidden=self.latent)
@@ -110,6 +139,9 @@ class Train(Command):
         if self.steps is not None:
             share = self.steps / config.total_steps
             phases = tuple(dataclasses.replace(p, steps=max(1, round(share * p.steps))) for p in phases)
+        if self.lr is not None:
+            share = self.lr / phases[0].lr_start
+            phases = tuple(dataclasses.replace(p, lr_start=share * p.lr_start, lr_end=share * p.lr_end) for p in phases)
         if self.batch is not None:
             phases = tuple(dataclasses.replace(p, batch=self.batch) for p in phases)
         return dataclasses.replace(config, seed=self.seed, model=model, phases=phases)

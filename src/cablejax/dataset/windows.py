@@ -17,7 +17,8 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from cablejax.dataset.store import Store, open_store
-from cablejax.types import History, Trajectory
+from cablejax.simulate.config import GRAVITY
+from cablejax.types import History, Trajectory, cable_descriptor
 
 
 def read_trajectories(
@@ -29,11 +30,15 @@ def read_trajectories(
         ValueError: a shard is missing or damaged, or a row does not exist.
     """
     store = source if isinstance(source, Store) else open_store(source)
-    block = store.read(rows)
+    block, cable = store.read(rows), store.config.cable
+    stiffness_ratio, friction_coefficient, _ = block.parameters.T
+    weight = cable.linear_density * GRAVITY
+    known = cable_descriptor(stiffness_ratio * cable.bending_stiffness, friction_coefficient * weight)
     return Trajectory(
         keypoints=block.keypoints,  # pyright: ignore[reportArgumentType]
         gripper_pose=block.gripper_pose,  # pyright: ignore[reportArgumentType]
         gripper_twist=block.gripper_twist,  # pyright: ignore[reportArgumentType]
+        cable=np.asarray(known, np.float32),  # pyright: ignore[reportArgumentType]
     )
 
 
@@ -114,7 +119,11 @@ def window_at(trajectory: Trajectory, start: Array, *, history: int, steps: int)
     """
     past = jnp.maximum(start - history + 1 + jnp.arange(history), 0)
     return Window(
-        history=History(keypoints=trajectory.keypoints[past], gripper_pose=trajectory.gripper_pose[start]),
+        history=History(
+            keypoints=trajectory.keypoints[past],
+            gripper_pose=trajectory.gripper_pose[start],
+            cable=trajectory.cable,
+        ),
         twist=jax.lax.dynamic_slice_in_dim(trajectory.gripper_twist, start, steps),
         future=jax.lax.dynamic_slice_in_dim(trajectory.keypoints, start + 1, steps),
     )
@@ -146,6 +155,7 @@ def mirrored(window: Window) -> Window:
         history=History(
             keypoints=(window.history.keypoints * point).astype(window.history.keypoints.dtype),
             gripper_pose=(window.history.gripper_pose * pose).astype(window.history.gripper_pose.dtype),
+            cable=window.history.cable,
         ),
         twist=(window.twist * pose).astype(window.twist.dtype),
         future=(window.future * point).astype(window.future.dtype),
@@ -159,6 +169,7 @@ def reversed_ends(window: Window) -> Window:
         history=History(
             keypoints=window.history.keypoints[..., ::-1, :],
             gripper_pose=window.history.gripper_pose[..., ::-1, :] + turn,
+            cable=window.history.cable,
         ),
         twist=window.twist[..., ::-1, :],
         future=window.future[..., ::-1, :],

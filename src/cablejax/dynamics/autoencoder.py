@@ -19,9 +19,10 @@ from jaxtyping import Array, Float
 from tqdm import tqdm
 
 from cablejax.dataset.windows import Window, draw_windows
-from cablejax.dynamics.config import GNSConfig
-from cablejax.dynamics.gns import GNS, MLP
+from cablejax.dynamics.config import ModelConfig
+from cablejax.dynamics.gns import GNS
 from cablejax.dynamics.graph import build_graph, prior_of
+from cablejax.dynamics.layers import MLP
 from cablejax.dynamics.normalisation import check_trajectories, fit_normalisation
 from cablejax.dynamics.train_config import TrainConfig
 from cablejax.types import Trajectory
@@ -60,11 +61,13 @@ class Pretrained:
     """What pretraining leaves behind.
 
     Attributes:
-        weights: of the whole network, for `train(..., initial=...)`.
+        model: configuration of the network, with the normalisation measured on the data.
+        weights: of the whole network, for `train(..., initial=(model, weights))`.
         node_error: root mean square error of reconstructed node features over their root mean square.
         edge_error: the same of edge features.
     """
 
+    model: ModelConfig
     weights: nnx.State
     node_error: float
     edge_error: float
@@ -85,7 +88,7 @@ class AutoEncoders(nnx.Module):
         return self.psi_v(self.phi_v(nodes)), self.psi_e(self.phi_e(edges))
 
 
-def features(windows: Window, config: GNSConfig) -> tuple[Float[Array, "rows F"], Float[Array, "rows_e G"]]:
+def features(windows: Window, config: ModelConfig) -> tuple[Float[Array, "rows F"], Float[Array, "rows_e G"]]:
     """Node and edge features of a batch of windows, one row for every node and every edge of every window."""
 
     def one(window: Window) -> tuple[Array, Array]:
@@ -103,8 +106,10 @@ def pretrain(
     """Initial weights of `train(config, data, ...)` whose encoders have learned to keep what the features say.
 
     Raises:
-        ValueError: bad data.
+        ValueError: bad data, or a network without encoders.
     """
+    if config.model.network != "gns":
+        raise ValueError(f"A {config.model.network} network has no encoders of nodes and edges: train it from scratch.")
     check_trajectories(data, config.model, steps=1, what="training data")
     model = dataclasses.replace(config.model, normalisation=fit_normalisation(data, config.model))
     rngs = nnx.Rngs(config.seed)
@@ -145,7 +150,7 @@ def pretrain(
             bar.update(steps.size)
     nnx.update(pair, weights)  # and with it the encoders of `gns`, which are the same objects
     _take_over(gns.decoder, pair.psi_v)
-    return Pretrained(nnx.split(gns)[1], float(relative[0]), float(relative[1]))
+    return Pretrained(model, nnx.split(gns)[1], float(relative[0]), float(relative[1]))
 
 
 def _take_over(decoder: MLP, psi: MLP) -> None:

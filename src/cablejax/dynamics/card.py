@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from cablejax.dynamics.config import GNSConfig
+from cablejax.dynamics.config import ModelConfig
 from cablejax.dynamics.error_report import ErrorReport
 
 _POINTS = 12
@@ -21,7 +21,7 @@ def write_card(
     path: str | os.PathLike[str],
     *,
     name: str,
-    config: GNSConfig,
+    config: ModelConfig,
     info: Mapping[str, Any],
     metrics: Path,
     report: ErrorReport,

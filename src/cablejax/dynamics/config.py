@@ -40,28 +40,33 @@ class Normalisation:
 
 
 @dataclasses.dataclass(frozen=True)
-class GNSConfig:
-    """Static description of a graph network simulator of one cable. The defaults are those of Wang et al., RA-L 2022.
+class ModelConfig:
+    """Static description of a learned model of one cable. The defaults are those of Wang et al., RA-L 2022.
 
     Attributes:
+        network: "gns", the graph network, or for comparison "mlp", one perceptron over all keypoints, or "lstm",
+            bidirectional recurrence along the cable.
         n_keypoints: observed keypoints N, uniform in arc length, both ends held by grippers.
         length: free length of the cable [m].
         radius: connective radius [m], measured along the cable at rest.
         history: samples seen H = m + 1.
+        conditioned: whether the network is told what is known of the cable, `History.cable`.
         interval: duration of one step [s].
-        latent: size of latent node and edge vectors.
+        latent: size of latent node and edge vectors; of the recurrent state.
         hidden: width of the hidden layers of every network.
-        hidden_layers: hidden layers of every network.
+        hidden_layers: hidden layers of every network; recurrent layers.
         message_passing: message-passing steps, each with weights of its own.
         prior: movement that the network corrects: "static", towards the frictionless resting shape after the command,
             see `cablejax.dynamics.statics`, or "rigid", the interpolation of the grippers' motion.
         normalisation: scales of features and output.
     """
 
+    network: Literal["gns", "mlp", "lstm"] = "gns"
     n_keypoints: int = 13
     length: float = 1.0
     radius: float = 0.2
     history: int = 6
+    conditioned: bool = False
     interval: float = 1.0
     latent: int = 128
     hidden: int = 128
@@ -80,16 +85,18 @@ class GNSConfig:
             ("message_passing", 1),
         ):
             if getattr(self, name) < least:
-                raise ValueError(f"GNSConfig.{name} is {getattr(self, name)}, expected an integer >= {least}.")
+                raise ValueError(f"ModelConfig.{name} is {getattr(self, name)}, expected an integer >= {least}.")
         for name in ("length", "radius", "interval"):
             value = getattr(self, name)
             if not (np.isfinite(value) and value > 0):
-                raise ValueError(f"GNSConfig.{name} is {value}, expected a positive finite number in SI units.")
+                raise ValueError(f"ModelConfig.{name} is {value}, expected a positive finite number in SI units.")
+        if self.network not in ("gns", "mlp", "lstm"):
+            raise ValueError(f'ModelConfig.network is {self.network!r}, expected "gns", "mlp" or "lstm".')
         if self.prior not in ("static", "rigid"):
-            raise ValueError(f'GNSConfig.prior is {self.prior!r}, expected "static" or "rigid".')
+            raise ValueError(f'ModelConfig.prior is {self.prior!r}, expected "static" or "rigid".')
         if self.radius < self.spacing:
             raise ValueError(
-                f"GNSConfig.radius is {self.radius} m but keypoints are {self.spacing:.4g} m apart: no two would be "
+                f"ModelConfig.radius is {self.radius} m but keypoints are {self.spacing:.4g} m apart: no two would be "
                 "connected. Use a larger radius or more keypoints."
             )
 
@@ -100,8 +107,9 @@ class GNSConfig:
 
     @property
     def node_features(self) -> int:
-        """Position, past displacements, arc length, control input and grasp, prior displacement, distance from rest."""
-        return 2 + 2 * (self.history - 1) + 2 + 7 + 2 + 2
+        """Position, past displacements, arc length, control input and grasp, prior displacement, distance from rest,
+        and what is known of the cable."""
+        return 2 + 2 * (self.history - 1) + 2 + 7 + 2 + 2 + (2 if self.conditioned else 0)
 
     @property
     def edge_features(self) -> int:

@@ -15,7 +15,7 @@ import numpy as np
 from flax import nnx
 
 from cablejax.dataset.windows import concatenate
-from cablejax.dynamics.config import GNSConfig
+from cablejax.dynamics.config import ModelConfig
 from cablejax.dynamics.evaluate import (
     HORIZONS,
     OpenLoopError,
@@ -77,7 +77,7 @@ class ErrorReport:
 def error_report(
     model: tuple[nnx.GraphDef, nnx.State],
     held_out: Mapping[str, Trajectory],
-    config: GNSConfig,
+    config: ModelConfig,
     *,
     horizons: Sequence[int] = HORIZONS,
     stride: int = 10,

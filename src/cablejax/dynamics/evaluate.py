@@ -14,9 +14,9 @@ from flax import nnx
 from jaxtyping import Array, Bool, Float
 
 from cablejax.dataset.windows import Window, window_at
-from cablejax.dynamics.config import GNSConfig
-from cablejax.dynamics.gns import Dynamics, bind
+from cablejax.dynamics.config import ModelConfig
 from cablejax.dynamics.graph import prior_of
+from cablejax.dynamics.model import Dynamics, bind
 from cablejax.dynamics.normalisation import check_trajectories
 from cablejax.simulate.motions import MotionConfig, twist_size
 from cablejax.types import History, Trajectory, advance
@@ -78,13 +78,13 @@ def no_motion(history: History, twist: Float[Array, "2 3"]) -> Float[Array, "N 2
     return jnp.zeros_like(history.keypoints[-1])
 
 
-def prior_motion(config: GNSConfig, prior: Literal["rigid", "static"]) -> Dynamics:
+def prior_motion(config: ModelConfig, prior: Literal["rigid", "static"]) -> Dynamics:
     """The floor that a model's prior is without learning."""
     config = dataclasses.replace(config, prior=prior)
     return lambda history, twist: prior_of(history, twist, config).displacement
 
 
-def evaluation_windows(data: Trajectory, config: GNSConfig, *, steps: int, stride: int) -> Window:
+def evaluation_windows(data: Trajectory, config: ModelConfig, *, steps: int, stride: int) -> Window:
     """Windows of `steps` steps starting at every `stride`-th sample of every trajectory [M, T, ...]."""
     check_trajectories(data, config, steps=steps, what="evaluation data")
     m, t = data.gripper_twist.shape[:2]
@@ -113,7 +113,7 @@ def make_errors(rollout: Callable[..., Dynamics], interval: float) -> Callable[.
 def open_loop_error(
     model: Dynamics | tuple[nnx.GraphDef, nnx.State],
     data: Trajectory,
-    config: GNSConfig,
+    config: ModelConfig,
     *,
     horizons: Sequence[int] = HORIZONS,
     stride: int = 10,
@@ -138,7 +138,7 @@ def open_loop_error(
 
 
 def window_errors(
-    model: Dynamics | tuple[nnx.GraphDef, nnx.State], windows: Window, config: GNSConfig, *, batch: int = 64
+    model: Dynamics | tuple[nnx.GraphDef, nnx.State], windows: Window, config: ModelConfig, *, batch: int = 64
 ) -> Float[np.ndarray, "W K"]:
     """Error [m] of every window after every step; arguments as in `open_loop_error`."""
     if isinstance(model, tuple):

@@ -10,56 +10,19 @@ Wang et al., RA-L 2022. Every f is a ReLU network, followed by layer normalisati
 
 from __future__ import annotations
 
-import itertools
-from collections.abc import Callable
-
-import jax
 import jax.numpy as jnp
 from flax import nnx
 from jaxtyping import Array, Float
 
-from cablejax.dynamics.config import GNSConfig
-from cablejax.dynamics.graph import build_graph, gripper_frame, prior_of, topology_of
-from cablejax.types import History
-
-Dynamics = Callable[[History, Float[Array, "Q 3"]], Float[Array, "N 2"]]
-"""A one-step model: the displacement X(t + 1) - X(t) [m] that a command causes after a history."""
-
-
-class MLP(nnx.Module):
-    """ReLU network whose first layer takes the sum of several inputs, each with a weight matrix of its own.
-
-    That sum is the same as one matrix on the inputs' concatenation; written apart, an input that many rows share can
-    be multiplied before it is copied to them.
-    """
-
-    def __init__(self, inputs: tuple[int, ...], output: int, config: GNSConfig, *, normalise: bool, rngs: nnx.Rngs):
-        share = nnx.initializers.variance_scaling(1.0 / len(inputs), "fan_in", "truncated_normal")
-        self.first = nnx.List(
-            [nnx.Linear(n, config.hidden, use_bias=i == 0, kernel_init=share, rngs=rngs) for i, n in enumerate(inputs)]
-        )
-        sizes = [config.hidden] * config.hidden_layers + [output]
-        self.rest = nnx.List([nnx.Linear(a, b, rngs=rngs) for a, b in itertools.pairwise(sizes)])
-        if not normalise:
-            # The decoder starts at zero: an untrained model is its prior.
-            self.rest[-1].kernel.set_value(jnp.zeros_like(self.rest[-1].kernel.get_value()))
-        self.norm = nnx.LayerNorm(output, epsilon=1e-5, rngs=rngs) if normalise else None
-
-    def after_first(self, x: Float[Array, "rows hidden"]) -> Float[Array, "rows output"]:
-        """The network from the first layer's sum on."""
-        for layer in self.rest:
-            x = layer(jax.nn.relu(x))
-        return x if self.norm is None else self.norm(x)
-
-    def __call__(self, *inputs: Float[Array, "rows _"]) -> Float[Array, "rows output"]:
-        first = sum(layer(x) for layer, x in zip(self.first[1:], inputs[1:], strict=True))
-        return self.after_first(self.first[0](inputs[0]) + first)
+from cablejax.dynamics.config import ModelConfig
+from cablejax.dynamics.graph import topology_of
+from cablejax.dynamics.layers import MLP
 
 
 class MessagePassing(nnx.Module):
     """One step: every edge reads its two nodes, every node reads the sum of its incoming edges."""
 
-    def __init__(self, config: GNSConfig, rngs: nnx.Rngs):
+    def __init__(self, config: ModelConfig, rngs: nnx.Rngs):
         n = config.latent
         self.offsets = topology_of(config).offsets
         self.edge = MLP((n, n, n), n, config, normalise=True, rngs=rngs)
@@ -98,7 +61,7 @@ def aggregate(messages: Float[Array, "E latent"], offsets: tuple[int, ...], n: i
 class GNS(nnx.Module):
     """Predicts how the cable moves beyond its prior, in the grippers' frame and in units of its scale."""
 
-    def __init__(self, config: GNSConfig, rngs: nnx.Rngs):
+    def __init__(self, config: ModelConfig, rngs: nnx.Rngs):
         self.config = config
         self.node_encoder = MLP((config.node_features,), config.latent, config, normalise=True, rngs=rngs)
         self.edge_encoder = MLP((config.edge_features,), config.latent, config, normalise=True, rngs=rngs)
@@ -112,31 +75,3 @@ class GNS(nnx.Module):
         for step in self.processor:
             nodes, edges = step(nodes, edges)
         return self.decoder(nodes)
-
-
-def apply(
-    model: GNS | tuple[nnx.GraphDef, nnx.State], history: History, twist: Float[Array, "2 3"]
-) -> Float[Array, "N 2"]:
-    """Displacement X(t + 1) - X(t) [m] of every keypoint; at the two grasped ones it is the grippers', exactly.
-
-    Turns with the cable: rotating and shifting the input rotates the output. Differentiable in weights, history and
-    twist (almost everywhere: the activation is ReLU).
-
-    Args:
-        model: the network, or its split form `(graphdef, weights)`.
-        history: the last H samples; vmap for batches.
-        twist: control input of both grippers [m/s, rad/s], shape [2, 3].
-    """
-    network: GNS = nnx.merge(*model) if isinstance(model, tuple) else model
-    config = network.config
-    prior = prior_of(history, twist, config)
-    graph = build_graph(history, twist, prior, config)
-    frame = gripper_frame(history.gripper_pose)
-    output = network(graph.nodes, graph.edges)  # pyright: ignore[reportArgumentType]
-    beyond = output[1:-1] * config.normalisation.residual
-    return prior.displacement + jnp.pad(beyond @ frame, ((1, 1), (0, 0)))
-
-
-def bind(graphdef: nnx.GraphDef, weights: nnx.State) -> Dynamics:
-    """The model as a function of history and twist alone."""
-    return lambda history, twist: apply((graphdef, weights), history, twist)

@@ -9,6 +9,7 @@ Node features, in order, with N keypoints and H history samples (all in the grip
     2            1 at the node held by gripper 0, by gripper 1
     2            displacement that the prior expects
     2            distance from the frictionless resting shape: what friction holds (0 without a static prior)
+    2            of a conditioned model: log stiffness and log friction over those of the reference cable
 
 Edge features: position of the receiver relative to the sender [2], how much shorter that chord is than the cable
 between them, and the signed arc length from sender to receiver.
@@ -29,7 +30,7 @@ import jraph
 import numpy as np
 from jaxtyping import Array, Float
 
-from cablejax.dynamics.config import GNSConfig
+from cablejax.dynamics.config import ModelConfig
 from cablejax.dynamics.interpolation import rigid_interpolation
 from cablejax.dynamics.statics import resting_shapes
 from cablejax.types import History
@@ -76,7 +77,7 @@ def cable_topology(n_keypoints: int, length: float, radius: float) -> Topology:
     return Topology(np.concatenate(senders), np.concatenate(receivers), offsets)
 
 
-def topology_of(config: GNSConfig) -> Topology:
+def topology_of(config: ModelConfig) -> Topology:
     """The topology that a model of this configuration works on."""
     return cable_topology(config.n_keypoints, config.length, config.radius)
 
@@ -91,7 +92,7 @@ def gripper_frame(gripper_pose: Float[Array, "2 3"]) -> Float[Array, "2 2"]:
     return jnp.stack([x, jnp.stack([-x[1], x[0]])])
 
 
-def build_graph(history: History, twist: Float[Array, "2 3"], prior: Prior, config: GNSConfig) -> jraph.GraphsTuple:
+def build_graph(history: History, twist: Float[Array, "2 3"], prior: Prior, config: ModelConfig) -> jraph.GraphsTuple:
     """The graph of one cable at one instant, see the top of this file. Differentiable in `history` and `twist`.
 
     Args:
@@ -115,6 +116,11 @@ def build_graph(history: History, twist: Float[Array, "2 3"], prior: Prior, conf
     grasped = jnp.concatenate([control, jnp.eye(2, dtype=now.dtype)], axis=-1)
     free = jnp.zeros((config.n_keypoints - 2, grasped.shape[-1]), now.dtype)
     displacements = jnp.diff(past, axis=0).swapaxes(0, 1).reshape(config.n_keypoints, -1)
+    known = []
+    if config.conditioned:
+        if history.cable is None:
+            raise ValueError("A conditioned model needs History.cable: see `cablejax.types.cable_descriptor`.")
+        known = [jnp.broadcast_to(history.cable, (config.n_keypoints, 2)).astype(now.dtype)]
     nodes = jnp.concatenate(
         [
             now / scale.position,
@@ -123,6 +129,7 @@ def build_graph(history: History, twist: Float[Array, "2 3"], prior: Prior, conf
             jnp.concatenate([grasped[:1], free, grasped[1:]]),
             prior.displacement @ frame.T / scale.displacement,
             prior.strain @ frame.T / scale.residual,
+            *known,
         ],
         axis=-1,
     )
@@ -150,7 +157,7 @@ def build_graph(history: History, twist: Float[Array, "2 3"], prior: Prior, conf
     )
 
 
-def prior_of(history: History, twist: Float[Array, "2 3"], config: GNSConfig) -> Prior:
+def prior_of(history: History, twist: Float[Array, "2 3"], config: ModelConfig) -> Prior:
     """What the model's prior expects of a command. Differentiable in `history` and `twist`."""
     now, interval = history.keypoints[-1], config.interval
     if config.prior == "rigid":

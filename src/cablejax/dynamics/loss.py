@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from cablejax.dataset.windows import Window
-from cablejax.dynamics.gns import Dynamics
+from cablejax.dynamics.model import Dynamics
 from cablejax.types import History, advance
 
 
@@ -19,9 +21,7 @@ def random_walk_noise(key: PRNGKeyArray, history: History, final_std: float) -> 
     """
     h, n, d = history.keypoints.shape
     walk = jnp.cumsum(jax.random.normal(key, (h, n - 2, d), history.keypoints.dtype), axis=0) * (final_std / h**0.5)
-    return History(
-        keypoints=history.keypoints + jnp.pad(walk, ((0, 0), (1, 1), (0, 0))), gripper_pose=history.gripper_pose
-    )
+    return dataclasses.replace(history, keypoints=history.keypoints + jnp.pad(walk, ((0, 0), (1, 1), (0, 0))))
 
 
 def rollout_loss(

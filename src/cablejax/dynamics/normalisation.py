@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from cablejax.dynamics.config import GNSConfig, Normalisation
+from cablejax.dynamics.config import ModelConfig, Normalisation
 from cablejax.dynamics.graph import prior_of
 from cablejax.types import History, Trajectory
 
@@ -16,7 +14,7 @@ GRASP_TOLERANCE = 2e-2
 """Largest distance of an end keypoint from its gripper [m] that is taken for a grasp: cables that snap through pull."""
 
 
-def check_trajectories(data: Trajectory, config: GNSConfig, *, steps: int, what: str) -> None:
+def check_trajectories(data: Trajectory, config: ModelConfig, *, steps: int, what: str) -> None:
     """Raises ValueError unless `data` are float arrays [M, T + 1, N, 2], [M, T + 1, 2, 3], [M, T, 2, 3], all finite,
     for this configuration, with ends on the grippers and at least `steps` commands."""
     x, pose, twist = np.shape(data.keypoints), np.shape(data.gripper_pose), np.shape(data.gripper_twist)
@@ -32,11 +30,16 @@ def check_trajectories(data: Trajectory, config: GNSConfig, *, steps: int, what:
         raise ValueError(
             f"{what} has {t} commands per trajectory, but {steps} are rolled out: use longer trajectories."
         )
-    for field in dataclasses.fields(data):
-        bad = ~np.isfinite(np.asarray(getattr(data, field.name))).all(axis=(1, 2, 3))
+    if config.conditioned and np.shape(data.cable) != (m, 2):
+        raise ValueError(
+            f"{what} has cable {np.shape(data.cable)}, but a conditioned model is trained on what is known of every "
+            f"cable: expected ({m}, 2), see `cablejax.types.cable_descriptor`."
+        )
+    for name in ("keypoints", "gripper_pose", "gripper_twist"):
+        bad = ~np.isfinite(np.asarray(getattr(data, name))).all(axis=(1, 2, 3))
         if bad.any():
             raise ValueError(
-                f"{what}.{field.name} holds NaN or infinity in {bad.sum()} of {m} trajectories (first: number "
+                f"{what}.{name} holds NaN or infinity in {bad.sum()} of {m} trajectories (first: number "
                 f"{int(np.argmax(bad))}). Drop or regenerate them."
             )
     gap = np.abs(np.asarray(data.keypoints)[:, :, [0, -1]] - np.asarray(data.gripper_pose)[..., :2]).max()
@@ -47,7 +50,7 @@ def check_trajectories(data: Trajectory, config: GNSConfig, *, steps: int, what:
         )
 
 
-def fit_normalisation(data: Trajectory, config: GNSConfig) -> Normalisation:
+def fit_normalisation(data: Trajectory, config: ModelConfig) -> Normalisation:
     """Root mean squares of features and targets over trajectories [M, T, ...], see `Normalisation`.
 
     The residual's leaves out the 5 % of steps with the largest."""

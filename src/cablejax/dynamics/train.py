@@ -28,11 +28,11 @@ from tqdm import tqdm
 
 from cablejax.dataset.windows import Window, draw_windows
 from cablejax.dynamics.checkpoint import Checkpoints
-from cablejax.dynamics.config import GNSConfig
+from cablejax.dynamics.config import ModelConfig
 from cablejax.dynamics.evaluate import HORIZONS, evaluation_windows, make_errors
-from cablejax.dynamics.gns import GNS, bind
 from cablejax.dynamics.loss import random_walk_noise, rollout_loss
 from cablejax.dynamics.metrics import MetricsLog
+from cablejax.dynamics.model import bind, make_network
 from cablejax.dynamics.normalisation import check_trajectories, fit_normalisation
 from cablejax.dynamics.train_config import Phase, TrainConfig
 from cablejax.types import Trajectory
@@ -69,7 +69,7 @@ class TrainResult:
         validation_cm: median open-loop error of the averaged weights by horizon [cm], empty without validation data.
     """
 
-    model: GNSConfig
+    model: ModelConfig
     graphdef: nnx.GraphDef
     weights: nnx.State
     steps: int
@@ -83,7 +83,7 @@ def train(
     out_dir: Path,
     *,
     validation: Trajectory | None = None,
-    initial: nnx.State | None = None,
+    initial: tuple[ModelConfig, nnx.State] | None = None,
     resume: bool = True,
     progress: bool = True,
 ) -> TrainResult:
@@ -94,7 +94,8 @@ def train(
         data: training trajectories, arrays [M, T + 1, N, 2], [M, T + 1, 2, 3], [M, T, 2, 3].
         out_dir: receives `run.json`, `metrics.csv`, `tensorboard/`, `checkpoints/`.
         validation: held-out trajectories, evaluated open loop every `config.evaluate_every` chunks.
-        initial: weights to start from instead of random ones, e.g. with pretrained encoders.
+        initial: a model to start from instead of random weights. Its scales stay, since its weights mean nothing
+            without them.
         resume: false refuses a folder that holds a run already.
         progress: show a progress bar with remaining time.
 
@@ -102,14 +103,22 @@ def train(
         ValueError: bad data, or `out_dir` holds a run of another configuration or data.
     """
     check_trajectories(data, config.model, steps=config.longest_rollout, what="training data")
-    model_config = dataclasses.replace(config.model, normalisation=fit_normalisation(data, config.model))
+    scales = fit_normalisation(data, config.model) if initial is None else initial[0].normalisation
+    model_config = dataclasses.replace(config.model, normalisation=scales)
+    if initial is not None and initial[0] != model_config:
+        raise ValueError(
+            f"The model to start from is {initial[0]}, but {model_config} is to be trained: "
+            "use `cablejax.dynamics.fine_tune.starting_from`."
+        )
     config = dataclasses.replace(config, model=model_config)
     out_dir = Path(out_dir)
-    claim_folder(out_dir, {"config": dataclasses.asdict(config), "data": fingerprint(data, initial)}, resume)
+    claim_folder(
+        out_dir, {"config": dataclasses.asdict(config), "data": fingerprint(data, initial and initial[1])}, resume
+    )
 
-    graphdef, weights = nnx.split(GNS(model_config, nnx.Rngs(config.seed)))
+    graphdef, weights = nnx.split(make_network(model_config, nnx.Rngs(config.seed)))
     if initial is not None:
-        weights = initial
+        weights = initial[1]
     optimiser = config.optimiser()
     state = TrainState(weights, weights, optimiser.init(weights), jnp.zeros((), jnp.int32))
     device_data = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), data)
@@ -182,7 +191,7 @@ def noisy_windows(key: Array, data: Trajectory, phase: Phase, history: int) -> W
     return dataclasses.replace(windows, history=noisy(jax.random.split(key_noise, phase.batch), windows.history))
 
 
-def batch_loss(weights: nnx.State, graphdef: nnx.GraphDef, windows: Window, phase: Phase, model: GNSConfig) -> Array:
+def batch_loss(weights: nnx.State, graphdef: nnx.GraphDef, windows: Window, phase: Phase, model: ModelConfig) -> Array:
     """Mean `rollout_loss` of a batch of windows."""
     dynamics = bind(graphdef, weights)
     scale, interval = model.normalisation.residual, model.interval

@@ -7,7 +7,7 @@ from typing import Literal
 
 import optax
 
-from cablejax.dynamics.config import GNSConfig
+from cablejax.dynamics.config import ModelConfig
 
 
 @dataclasses.dataclass(frozen=True)
@@ -66,7 +66,7 @@ class TrainConfig:
         evaluate_starts: at most so many start points per evaluation.
     """
 
-    model: GNSConfig = GNSConfig()
+    model: ModelConfig = ModelConfig()
     phases: tuple[Phase, ...] = (
         Phase(steps=30_000, batch=32, rollout=1, noise=1e-4, lr_start=1e-3, lr_end=2e-4),
         Phase(steps=12_000, batch=16, rollout=4, noise=3e-5, lr_start=2e-4, lr_end=1e-6),
@@ -137,7 +137,7 @@ class TrainConfig:
 PRESETS: dict[str, TrainConfig] = {
     "released": TrainConfig(),
     "small": TrainConfig(
-        model=GNSConfig(latent=64, hidden=64, message_passing=3),
+        model=ModelConfig(latent=64, hidden=64, message_passing=3),
         phases=(
             Phase(steps=1_200, batch=16, rollout=1, noise=1e-4, lr_start=1e-3, lr_end=2e-4),
             Phase(steps=300, batch=16, rollout=4, noise=3e-5, lr_start=2e-4, lr_end=1e-6),
@@ -147,7 +147,7 @@ PRESETS: dict[str, TrainConfig] = {
         checkpoint_every=5,
     ),
     "smoke": TrainConfig(
-        model=GNSConfig(latent=8, hidden=8, hidden_layers=1, message_passing=1),
+        model=ModelConfig(latent=8, hidden=8, hidden_layers=1, message_passing=1),
         phases=(Phase(steps=4, batch=4, rollout=1), Phase(steps=2, batch=2, rollout=2)),
         warmup=2,
         chunk=2,

@@ -3,7 +3,7 @@
 The file's metadata has one key, "cablejax", whose JSON object holds
 
     schema   "cablejax-weights/1"
-    config   the `GNSConfig`, normalisation included
+    config   the `ModelConfig`, normalisation included
     info     where the weights come from: data sets and their digests, seeds, package versions, kind of machine
 
 and its tensors are the network's, named by their place in it: "processor.0.edge.first.1.kernel".
@@ -25,8 +25,8 @@ from flax import nnx
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save_file
 
-from cablejax.dynamics.config import GNSConfig, Normalisation
-from cablejax.dynamics.gns import GNS
+from cablejax.dynamics.config import ModelConfig, Normalisation
+from cablejax.dynamics.model import make_network
 
 SCHEMA = "cablejax-weights/1"
 """Name and version of the file's layout. A reader refuses any other."""
@@ -44,14 +44,14 @@ class WeightsError(ValueError):
 
 
 def save_weights(
-    path: str | os.PathLike[str], model_config: GNSConfig, weights: nnx.State, info: Mapping[str, Any]
+    path: str | os.PathLike[str], model_config: ModelConfig, weights: nnx.State, info: Mapping[str, Any]
 ) -> None:
     """Writes weights and their description, whole or not at all.
 
     Args:
         path: the file, by custom `*.safetensors`.
         model_config: of the network, with the normalisation that it was trained with.
-        weights: all arrays of a `GNS` of this configuration.
+        weights: all arrays of a network of this configuration.
         info: a JSON object: where they come from. It goes into the file as it is, so it should name no local path.
 
     Raises:
@@ -67,8 +67,8 @@ def save_weights(
 
 
 def load_weights(
-    source: str | os.PathLike[str], *, expect: GNSConfig | None = None
-) -> tuple[GNSConfig, nnx.GraphDef, nnx.State]:
+    source: str | os.PathLike[str], *, expect: ModelConfig | None = None
+) -> tuple[ModelConfig, nnx.GraphDef, nnx.State]:
     """The network in a file, in a training's folder, or released under a name, as `apply` takes it.
 
     Args:
@@ -93,8 +93,8 @@ def load_weights(
 
 
 def load_released(
-    name: str = "gns-reference", *, expect: GNSConfig | None = None
-) -> tuple[GNSConfig, nnx.GraphDef, nnx.State]:
+    name: str = "gns-reference", *, expect: ModelConfig | None = None
+) -> tuple[ModelConfig, nnx.GraphDef, nnx.State]:
     """The network released with this package under `name`.
 
     Raises:
@@ -155,11 +155,11 @@ def _open(source: str | os.PathLike[str]) -> tuple[Path, dict[str, Any]]:
     return path, content
 
 
-def _config_of(content: dict[str, Any], path: Path) -> GNSConfig:
+def _config_of(content: dict[str, Any], path: Path) -> ModelConfig:
     try:
         recorded: dict[str, Any] = dict(content["config"])
         recorded["normalisation"] = Normalisation(**recorded["normalisation"])
-        return GNSConfig(**recorded)
+        return ModelConfig(**recorded)
     except (TypeError, KeyError) as error:
         raise WeightsError(
             f"{path} records a configuration that this version of cablejax does not know ({error}). "
@@ -169,7 +169,7 @@ def _config_of(content: dict[str, Any], path: Path) -> GNSConfig:
         raise WeightsError(f"{path} records an impossible configuration: {error}") from error
 
 
-def _check_expected(config: GNSConfig, expect: GNSConfig, path: Path) -> None:
+def _check_expected(config: ModelConfig, expect: ModelConfig, path: Path) -> None:
     came, asked = (dataclasses.asdict(dataclasses.replace(c, normalisation=Normalisation())) for c in (config, expect))
     other = [f"{name} is {came[name]}, expected {asked[name]}" for name in came if came[name] != asked[name]]
     if other:
@@ -178,9 +178,9 @@ def _check_expected(config: GNSConfig, expect: GNSConfig, path: Path) -> None:
         )
 
 
-def _abstract(config: GNSConfig) -> tuple[nnx.GraphDef, nnx.State]:
+def _abstract(config: ModelConfig) -> tuple[nnx.GraphDef, nnx.State]:
     """Structure of a network of this configuration, and the shapes and dtypes of its weights, without any memory."""
-    return nnx.split(nnx.eval_shape(lambda: GNS(config, nnx.Rngs(0))))
+    return nnx.split(nnx.eval_shape(lambda: make_network(config, nnx.Rngs(0))))
 
 
 def _name(key: tuple[Any, ...]) -> str:

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from cablejax.adaptation.belief import AdaptationConfig, CableBelief, prior_belief, update
 from cablejax.mpc.feasible import FeasibleSet
 from cablejax.mpc.goal import goal_pose, straight_plan
 from cablejax.mpc.problem import ObjectiveConfig, Outcome, Plan, ShapingProblem, Solver
@@ -42,6 +43,7 @@ class MPCConfig:
             distance, by less than this compared with holding still [m].
         objective: weights and units of the planning problem.
         residual: settings of the online residual; None = trust the offline model.
+        adaptation: settings of the online estimate of the cable, for a conditioned model; None = no estimate.
         solver: any `Solver`.
     """
 
@@ -60,6 +62,7 @@ class MPCConfig:
     hold_improvement: float = 2e-5
     objective: ObjectiveConfig = ObjectiveConfig()
     residual: RidgeConfig | None = RidgeConfig(forgetting=0.5)
+    adaptation: AdaptationConfig | None = None
     solver: Solver = TrustRegion()
 
     def __post_init__(self):
@@ -108,6 +111,8 @@ class ControllerState:
         observed: keypoints seen at the last step, shape [N].
         shape_error: root mean square distance to the target at the last step [m], shape [].
         radius: trust-region size epsilon [m], shape [].
+        cable: what is believed of the cable, and the derivative of `model_displacement` by it [m], shape [N, 2, 2];
+            None without adaptation.
         steps: control steps so far, shape [].
         held: keypoint observations missing so far, shape [].
     """
@@ -123,6 +128,7 @@ class ControllerState:
     observed: Bool[Array, "*batch N"]
     shape_error: Float[Array, "*batch"]
     radius: Float[Array, "*batch"]
+    cable: tuple[CableBelief, Float[Array, "*batch N 2 2"]] | None
     steps: Int[Array, "*batch"]
     held: Int[Array, "*batch"]
 
@@ -144,6 +150,7 @@ class ControlInfo:
         residual_share: |residual's displacement| / (|model's| + |residual's|) of the command, in [0, 1].
         condition: condition number of the ridge system.
         held: keypoints not observed now, replaced by their prediction.
+        cable: what is believed of the cable now, None without adaptation.
     """
 
     shape_error: Float[Array, "*batch"]
@@ -157,6 +164,7 @@ class ControlInfo:
     residual_share: Float[Array, "*batch"]
     condition: Float[Array, "*batch"]
     held: Int[Array, "*batch"]
+    cable: CableBelief | None
 
 
 def initial_state(config: MPCConfig, history: History) -> ControllerState:
@@ -164,6 +172,10 @@ def initial_state(config: MPCConfig, history: History) -> ControllerState:
     n_keypoints, n_grippers = history.keypoints.shape[1], history.gripper_pose.shape[0]
     window = 0 if config.residual is None else config.residual.window
     dtype = history.keypoints.dtype
+    cable = None
+    if config.adaptation is not None:
+        cable = prior_belief(config.adaptation), jnp.zeros((n_keypoints, 2, 2), dtype)
+        history = dataclasses.replace(history, cable=cable[0].mean)
     return ControllerState(
         history=history,
         delta=jnp.zeros((window, n_keypoints, 2), dtype),
@@ -176,6 +188,7 @@ def initial_state(config: MPCConfig, history: History) -> ControllerState:
         observed=jnp.ones(n_keypoints, bool),
         shape_error=jnp.zeros((), dtype),
         radius=jnp.asarray(config.radius, dtype),
+        cable=cable,
         steps=jnp.zeros((), jnp.int32),
         held=jnp.zeros((), jnp.int32),
     )
@@ -220,7 +233,7 @@ def control(
     plan, value, value_hold = _plan_or_hold(config, problem, state.plan)
 
     twist = config.objective.to_twist(plan.motion[0])
-    offline = dynamics(weights, state.history, twist)
+    offline, cable = _displacement(dynamics, weights, state, twist)
     online = jnp.zeros_like(offline) if residual is None else apply(residual, twist)
     newest = state.history.keypoints[-1]
     moved = newest + offline + online
@@ -238,10 +251,12 @@ def control(
         residual_share=jnp.nan_to_num(size_online / jnp.maximum(size_offline + size_online, 1e-12)),
         condition=jnp.ones_like(error) if residual is None else residual.condition,
         held=n_held,
+        cable=None if cable is None else cable[0],
     )
     state = dataclasses.replace(
         state,
         plan=plan.motion,
+        cable=cable,
         twist=twist,
         model_displacement=offline,
         predicted=predicted,
@@ -251,6 +266,22 @@ def control(
         held=state.held + n_held,
     )
     return state, twist, info
+
+
+def _displacement(
+    dynamics: Dynamics, weights: Any, state: ControllerState, twist: Float[Array, "Q 3"]
+) -> tuple[Float[Array, "N 2"], tuple[CableBelief, Float[Array, "N 2 2"]] | None]:
+    """What the offline model expects of a command [m], and how that depends on what is believed of the cable."""
+    if state.cable is None:
+        return dynamics(weights, state.history, twist), None
+
+    def of_cable(cable: Float[Array, "2"]):
+        displacement = dynamics(weights, dataclasses.replace(state.history, cable=cable), twist)
+        return displacement, displacement
+
+    belief = state.cable[0]
+    sensitivity, displacement = jax.jacfwd(of_cable, has_aux=True)(belief.mean)
+    return displacement, (belief, sensitivity)
 
 
 def _take_in(
@@ -273,9 +304,15 @@ def _take_in(
     past = jnp.where(first, past, jnp.roll(past, -1, axis=0)).at[-1].set(keypoints)
     delta = keypoints - state.history.keypoints[-1] - state.model_displacement
     valid = observed & state.observed & jnp.isfinite(delta).all(axis=-1) & ~first
+    cable, known = state.cable, state.history.cable
+    if config.adaptation is not None and cable is not None:
+        belief, sensitivity = cable
+        belief = update(config.adaptation, belief, sensitivity, delta, valid)
+        cable, known = (belief, sensitivity), belief.mean
     state = dataclasses.replace(
         state,
-        history=History(keypoints=past, gripper_pose=gripper_pose),
+        history=History(keypoints=past, gripper_pose=gripper_pose, cable=known),
+        cable=cable,
         delta=_push(state.delta, delta),
         window_twist=_push(state.window_twist, state.twist),
         valid=_push(state.valid, valid),

@@ -1,0 +1,107 @@
+"""Which cable is in hand: an extended Kalman filter on the two numbers that a conditioned model is told.
+
+A conditioned model predicts `f(X, R; c)` with `c = cable_descriptor(...)`. The error of one step says by how much c was
+wrong: with H = df/dc at the belief's mean,
+
+    Lambda <- phi Lambda + (1 - phi) Lambda_0 + w H'H / sigma^2,      c <- c + Lambda^-1 w H' (dX - f) / sigma^2
+
+in information form, phi = `memory`, so that old evidence fades and a changed cable is followed. In slow motion
+stiffness and friction are seen as a ratio only; along the direction that nothing is seen in, c stays where the prior
+put it.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+
+@dataclasses.dataclass(frozen=True)
+class AdaptationConfig:
+    """Settings of the filter; logarithms are natural.
+
+    Attributes:
+        prior_std: standard deviation of the log ratios before anything was seen: a factor of e either way.
+        error_std: standard deviation of a keypoint's coordinate that no cable explains [m]. Errors of neighbouring
+            keypoints are alike, so this is above the error of one.
+        memory: phi, the share of the information that one step leaves, in (0, 1].
+        outlier: root mean square error of one step, in units of `error_std`, beyond which it counts less and less: a
+            cable that snaps through says nothing about its stiffness.
+        max_step: largest change of a log ratio in one step: the model is linearised.
+        limits: smallest and largest log ratio believed: what conditioned models are trained on.
+    """
+
+    prior_std: float = 1.0
+    error_std: float = 3e-3
+    memory: float = 0.95
+    outlier: float = 3.0
+    max_step: float = 0.5
+    limits: tuple[float, float] = (-2.4, 1.2)
+
+    def __post_init__(self):
+        for name in ("prior_std", "error_std", "outlier", "max_step"):
+            value = getattr(self, name)
+            if not (math.isfinite(value) and value > 0):
+                raise ValueError(f"AdaptationConfig.{name} is {value}, expected a positive finite number.")
+        if not 0 < self.memory <= 1:
+            raise ValueError(f"AdaptationConfig.memory is {self.memory}, expected a number in (0, 1].")
+        if not self.limits[0] < 0 < self.limits[1]:
+            raise ValueError(f"AdaptationConfig.limits are {self.limits}, expected one below and one above 0.")
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class CableBelief:
+    """What is believed of the cable after the observations so far.
+
+    Attributes:
+        mean: of the log ratios of stiffness and friction, see `cable_descriptor`, shape [2].
+        information: inverse covariance, shape [2, 2].
+    """
+
+    mean: Float[Array, "*batch 2"]
+    information: Float[Array, "*batch 2 2"]
+
+    @property
+    def std(self) -> Float[Array, "*batch 2"]:
+        """Standard deviations of the log ratios."""
+        return jnp.sqrt(jnp.diagonal(jnp.linalg.inv(self.information), axis1=-2, axis2=-1))
+
+
+def prior_belief(config: AdaptationConfig) -> CableBelief:
+    """The reference cable, give or take."""
+    return CableBelief(mean=jnp.zeros(2), information=jnp.eye(2) / config.prior_std**2)
+
+
+def update(
+    config: AdaptationConfig,
+    belief: CableBelief,
+    sensitivity: Float[Array, "N 2 2"],
+    error: Float[Array, "N 2"],
+    valid: Bool[Array, " N"],
+) -> CableBelief:
+    """The belief after one more step. Differentiable in `sensitivity` and `error`; never leaves `config.limits`.
+
+    Args:
+        config: settings.
+        belief: before.
+        sensitivity: derivative of the model's displacement by `belief.mean` [m], shape [N, 2, 2]: keypoint, coordinate,
+            log ratio.
+        error: displacement that was observed minus that of the model [m], shape [N, 2].
+        valid: keypoints whose error is known, shape [N]; values elsewhere are ignored, NaN included.
+    """
+    finite = valid & jnp.isfinite(error).all(axis=-1) & jnp.isfinite(sensitivity).all(axis=(-2, -1))
+    rows = jnp.where(finite[:, None, None], sensitivity, 0.0).reshape(-1, 2) / config.error_std
+    innovation = jnp.where(finite[:, None], error, 0.0).reshape(-1) / config.error_std
+    size = jnp.sum(innovation**2) / jnp.maximum(2 * jnp.sum(finite), 1)
+    # Geman and McClure's: the pull of an error falls as its third power, so that no snap-through moves the belief
+    weight = 1.0 / (1.0 + size / config.outlier**2) ** 2
+    faded = config.memory * belief.information + (1.0 - config.memory) * prior_belief(config).information
+    information = faded + weight * rows.T @ rows
+    step = jnp.linalg.solve(information, weight * rows.T @ innovation)
+    step = jnp.clip(step, -config.max_step, config.max_step)
+    return CableBelief(mean=jnp.clip(belief.mean + step, *config.limits), information=information)

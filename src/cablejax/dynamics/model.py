@@ -1,0 +1,54 @@
+"""A learned one-step model: a network between the features of a cable and what it moves beyond its prior."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import jax.numpy as jnp
+from flax import nnx
+from jaxtyping import Array, Float
+
+from cablejax.dynamics.chain_networks import BiLSTM, FlatMLP
+from cablejax.dynamics.config import ModelConfig
+from cablejax.dynamics.gns import GNS
+from cablejax.dynamics.graph import build_graph, gripper_frame, prior_of
+from cablejax.types import History
+
+Dynamics = Callable[[History, Float[Array, "Q 3"]], Float[Array, "N 2"]]
+"""A one-step model: the displacement X(t + 1) - X(t) [m] that a command causes after a history."""
+
+Network = GNS | FlatMLP | BiLSTM
+"""Node features [N, F] and edge features [E, G] to movement beyond the prior [N, 2], in units of its scale."""
+
+
+def make_network(config: ModelConfig, rngs: nnx.Rngs) -> Network:
+    """An untrained network of the kind that the configuration names."""
+    return {"gns": GNS, "mlp": FlatMLP, "lstm": BiLSTM}[config.network](config, rngs)
+
+
+def apply(
+    model: Network | tuple[nnx.GraphDef, nnx.State], history: History, twist: Float[Array, "2 3"]
+) -> Float[Array, "N 2"]:
+    """Displacement X(t + 1) - X(t) [m] of every keypoint; at the two grasped ones it is the grippers', exactly.
+
+    Turns with the cable: rotating and shifting the input rotates the output. Differentiable in weights, history and
+    twist (almost everywhere: the activation is ReLU).
+
+    Args:
+        model: the network, or its split form `(graphdef, weights)`.
+        history: the last H samples; vmap for batches.
+        twist: control input of both grippers [m/s, rad/s], shape [2, 3].
+    """
+    network: Network = nnx.merge(*model) if isinstance(model, tuple) else model
+    config = network.config
+    prior = prior_of(history, twist, config)
+    graph = build_graph(history, twist, prior, config)
+    frame = gripper_frame(history.gripper_pose)
+    output = network(graph.nodes, graph.edges)  # pyright: ignore[reportArgumentType]
+    beyond = output[1:-1] * config.normalisation.residual
+    return prior.displacement + jnp.pad(beyond @ frame, ((1, 1), (0, 0)))
+
+
+def bind(graphdef: nnx.GraphDef, weights: nnx.State) -> Dynamics:
+    """The model as a function of history and twist alone."""
+    return lambda history, twist: apply((graphdef, weights), history, twist)
