@@ -60,7 +60,7 @@ def test_missing_keypoints_and_snap_throughs_say_nothing():
 
 
 def test_it_never_leaves_its_limits_and_follows_a_change():
-    config = AdaptationConfig(memory=0.9)
+    config = AdaptationConfig(memory=0.9, outlier=1e6)
     sensitivity, noise, _ = linear_world(3, [0, 0], steps=60)
     belief = run(config, sensitivity, noise, np.array([9.0, -9.0]))
     np.testing.assert_allclose(belief.mean, [config.limits[1], config.limits[0]], atol=1e-6)

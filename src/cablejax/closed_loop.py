@@ -19,6 +19,8 @@ SETTLING_FRACTION = 0.1
 that is less, to the change of the error over the run."""
 SETTLING_FLOOR_CM = 0.1
 """Smallest half-width of that band [cm]."""
+RESTING_CM = 0.01
+"""Range of the error [cm] over `patience` commands in which nothing more is expected to happen."""
 SETTLING_DWELL = 3
 """Samples at the end that must lie in the band, or the run has not settled."""
 
@@ -51,12 +53,14 @@ class ClosedLoopRun:
         keypoints: observed cable [m], NaN = not observed, shape [T, N, 2].
         gripper_pose: (x, y, theta) [m, rad], shape [T, Q, 3].
         twist: commands [m/s, rad/s], shape [T, Q, 3].
-        error_cm: root mean square distance of the observed keypoints to the target [cm], shape [T].
+        error_cm: root mean square distance to the target [cm], shape [T]: of the true keypoints where the cable is a
+            simulated one and tells them, otherwise of the observed ones.
         residual_share: the controller's report, NaN where it makes none, shape [T].
         radius: the controller's bound on one step's motion [m], NaN where it reports none, shape [T].
         mpc_ms: wall time of each control call [ms], compilation excluded, shape [T].
         held: keypoints that were not observed, over the whole run.
         stopped: why the run ended early, or None.
+        observed_error_cm: the same error of the observed keypoints, which is all that the controller knows, shape [T].
         episode: the run for the gap log, resting time before the first command included.
     """
 
@@ -71,6 +75,7 @@ class ClosedLoopRun:
     mpc_ms: Float[np.ndarray, " T"]
     held: int
     stopped: str | None
+    observed_error_cm: Float[np.ndarray, " T"]
     episode: Episode
 
     @property
@@ -138,6 +143,7 @@ def run_closed_loop(
     record_hz: float = 10.0,
     history_length: int = 6,
     rest: int = 1,
+    patience: int | None = None,
 ) -> ClosedLoopRun:
     """Lays a new cable between the grippers and lets a controller shape it.
 
@@ -153,6 +159,7 @@ def run_closed_loop(
         record_hz: samples per second of the recorded episode.
         history_length: samples H of the history that the controller starts from, all of them the cable at rest.
         rest: intervals without motion recorded before the first command, for the noise floor.
+        patience: end the run once the error has stayed within `RESTING_CM` for so many commands; None = never.
 
     Raises:
         ValueError: `steps` is not positive, `record_hz` does not divide the interval, the target has another number of
@@ -201,19 +208,24 @@ def run_closed_loop(
             break
         log.extend(observations, row.twist)
         rows.append(_Row(observations[-1]))
+        if patience is not None and _at_rest(rows[-patience - 1 :], patience, target):
+            break
     keypoints = np.stack([row.observation.keypoints for row in rows])
+    known = [row.observation.true_keypoints for row in rows]
+    truth = np.stack([seen if true is None else true for true, seen in zip(known, keypoints, strict=True)])
     return ClosedLoopRun(
         target=target,
         times=np.array([row.observation.time for row in rows]) - rows[0].observation.time,
         keypoints=keypoints,
         gripper_pose=np.stack([row.observation.gripper_pose for row in rows]),
         twist=np.stack([np.full_like(still, np.nan) if row.twist is None else row.twist for row in rows]),
-        error_cm=shape_error_cm(keypoints, target.keypoints),
+        error_cm=shape_error_cm(truth, target.keypoints),
         residual_share=np.array([row.residual_share for row in rows]),
         radius=np.array([row.radius for row in rows]),
         mpc_ms=np.array([row.mpc_ms for row in rows]),
         held=int(np.isnan(keypoints).any(axis=-1).sum()),
         stopped=stopped,
+        observed_error_cm=shape_error_cm(keypoints, target.keypoints),
         episode=log.episode(f"approach_{target.name.lower()}", resting),
     )
 
@@ -256,6 +268,11 @@ class _Log:
             gripper_command=np.stack(commands),
             hold=np.arange(len(commands)) < resting,
         )
+
+
+def _at_rest(last: list[_Row], patience: int, target: Target) -> bool:
+    error = shape_error_cm(np.stack([row.observation.keypoints for row in last]), target.keypoints)
+    return len(last) > patience and bool(np.ptp(error) <= RESTING_CM)
 
 
 def _filled(keypoints: np.ndarray) -> np.ndarray:

@@ -3,11 +3,12 @@
 A conditioned model predicts `f(X, R; c)` with `c = cable_descriptor(...)`. The error of one step says by how much c was
 wrong: with H = df/dc at the belief's mean,
 
-    Lambda <- phi Lambda + (1 - phi) Lambda_0 + w H'H / sigma^2,      c <- c + Lambda^-1 w H' (dX - f) / sigma^2
+    Lambda' = phi Lambda + (1 - phi) Lambda_0                          c' = Lambda'^-1 phi Lambda c
+    Lambda <- Lambda' + w H'H / sigma^2                                c <- c' + Lambda^-1 w H' (dX - f') / sigma^2
 
-in information form, phi = `memory`, so that old evidence fades and a changed cable is followed. In slow motion
-stiffness and friction are seen as a ratio only; along the direction that nothing is seen in, c stays where the prior
-put it.
+in information form, with phi = `memory` and the prior (0, Lambda_0): old evidence fades and the prior takes its place,
+so that a changed cable is followed (stabilised forgetting, Kulhavy and Zarrop 1993). In slow motion stiffness and
+friction are seen as a ratio only; in the direction in which nothing is seen, c stays at the prior's mean.
 """
 
 from __future__ import annotations
@@ -102,6 +103,9 @@ def update(
     weight = 1.0 / (1.0 + size / config.outlier**2) ** 2
     faded = config.memory * belief.information + (1.0 - config.memory) * prior_belief(config).information
     information = faded + weight * rows.T @ rows
-    step = jnp.linalg.solve(information, weight * rows.T @ innovation)
+    # what fades comes back as the prior, whose mean is zero: in a direction in which nothing is seen any more, the
+    # belief returns there instead of drifting
+    returning = jnp.linalg.solve(faded, config.memory * belief.information @ belief.mean) - belief.mean
+    step = returning + jnp.linalg.solve(information, weight * rows.T @ (innovation - rows @ returning))
     step = jnp.clip(step, -config.max_step, config.max_step)
     return CableBelief(mean=jnp.clip(belief.mean + step, *config.limits), information=information)

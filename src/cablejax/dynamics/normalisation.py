@@ -30,9 +30,10 @@ def check_trajectories(data: Trajectory, config: ModelConfig, *, steps: int, wha
         raise ValueError(
             f"{what} has {t} commands per trajectory, but {steps} are rolled out: use longer trajectories."
         )
-    if config.conditioned and np.shape(data.cable) != (m, 2):
+    cable = None if data.cable is None else np.shape(data.cable)
+    if config.conditioned and cable != (m, 2):
         raise ValueError(
-            f"{what} has cable {np.shape(data.cable)}, but a conditioned model is trained on what is known of every "
+            f"{what} has cable {cable}, but a conditioned model is trained on what is known of every "
             f"cable: expected ({m}, 2), see `cablejax.types.cable_descriptor`."
         )
     for name in ("keypoints", "gripper_pose", "gripper_twist"):

@@ -1,0 +1,32 @@
+"""Table III of Wang et al., RA-L 2022: U, S and Z by cables of 0.1 to 3 times the trained stiffness, by every method.
+
+python experiments/06_stiffness.py                    # one seed, three methods, two stiffnesses: some minutes
+python experiments/06_stiffness.py --full             # all of it, hours on two cores; resumable
+python experiments/06_stiffness.py --full --process 1 2 &     # the second half of it, beside --process 0 2
+python experiments/06_stiffness.py --full --report docs/results/stiffness.md    # the page, of what is done so far
+"""
+
+from __future__ import annotations
+
+import os
+
+os.environ.setdefault("NPROC", "4")
+
+from cablejax.evaluation.cases import STIFFNESS_RATIOS, stiffness_cases
+from cablejax.evaluation.methods import ADAPTED_RESIDUAL, METHODS
+from cablejax.evaluation.paper import DIRECT, RESIDUAL
+from cablejax.evaluation.run import Experiment, main
+
+if __name__ == "__main__":
+    main(
+        Experiment(
+            name="stiffness",
+            title="U, S and Z by cables of other stiffness",
+            about=__doc__.splitlines()[0],
+            small=lambda: stiffness_cases(("U", "S", "Z"), (0.5, 2.0), seeds=(0,)),
+            small_methods=(DIRECT, RESIDUAL, ADAPTED_RESIDUAL),
+            full=lambda: stiffness_cases(("U", "S", "Z"), STIFFNESS_RATIOS, seeds=range(5)),
+            full_methods=tuple(METHODS),
+            tables=("III",),
+        )
+    )

@@ -1,0 +1,65 @@
+"""The ways across the gap that are compared: what model each believes, and what it learns while it shapes."""
+
+from __future__ import annotations
+
+import dataclasses
+
+from cablejax.closed_loop import ShapeController
+from cablejax.evaluation.paper import DIRECT, FINE_TUNED, METHOD_LABEL, RANDOMISED, RESIDUAL, VISUAL_SERVO
+from cablejax.servo import ServoConfig, VisualServo
+from cablejax.shaping import Model, make_controller
+from cablejax.targets import Target
+
+ADAPTED = "adapted"
+ADAPTED_RESIDUAL = "adapted residual"
+
+LABEL = METHOD_LABEL | {
+    ADAPTED: "conditioned GNS + online estimate",
+    ADAPTED_RESIDUAL: "conditioned GNS + estimate + residual",
+}
+"""Names for readers."""
+
+
+@dataclasses.dataclass(frozen=True)
+class MethodSpec:
+    """One row of the tables.
+
+    Attributes:
+        name: in trials, see `LABEL`.
+        weights: released model that it plans with; None = it has no model.
+        residual: whether the model's errors are corrected online.
+        fine_tuned: whether the model is first trained on transitions of the very cable that it will shape.
+    """
+
+    name: str
+    weights: str | None
+    residual: bool = False
+    fine_tuned: bool = False
+
+
+METHODS: dict[str, MethodSpec] = {
+    spec.name: spec
+    for spec in (
+        MethodSpec(VISUAL_SERVO, None),
+        MethodSpec(DIRECT, "gns-reference"),
+        MethodSpec(RANDOMISED, "gns-randomised"),
+        MethodSpec(FINE_TUNED, "gns-reference", fine_tuned=True),
+        MethodSpec(RESIDUAL, "gns-reference", residual=True),
+        MethodSpec(ADAPTED, "gns-conditioned"),
+        MethodSpec(ADAPTED_RESIDUAL, "gns-conditioned", residual=True),
+    )
+}
+"""The paper's methods in its order, then two beyond it. A conditioned model estimates its cable in any case."""
+
+
+def controller_of(spec: MethodSpec, model: Model | None, target: Target) -> ShapeController:
+    """What shapes the cable.
+
+    Args:
+        spec: the method.
+        model: as the method's weights say, fine-tuned if it asks for that; None for one without a model.
+        target: the wanted shape.
+    """
+    if model is None:
+        return VisualServo(ServoConfig(), target.keypoints)
+    return make_controller(model, target, method="residual" if spec.residual else "direct", solver="trust-region")

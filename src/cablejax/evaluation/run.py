@@ -1,0 +1,120 @@
+"""The command line that the experiments on closed loops share: run what is missing, then write the page."""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import functools
+import pathlib
+from collections.abc import Callable, Sequence
+
+from cablejax.evaluation import tables
+from cablejax.evaluation.failures import failure_figure, worst
+from cablejax.evaluation.fine_tuning import FineTuneConfig, fine_tune, record
+from cablejax.evaluation.methods import ADAPTED_RESIDUAL, LABEL, METHODS
+from cablejax.evaluation.suite import Case, read_suite, run_suite
+from cablejax.evaluation.trials import LIANG_TABLE, Trial
+from cablejax.report.provenance import machine, versions
+from cablejax.shaping import Model
+
+WORST = 10
+"""Runs shown as pictures: the ones that ended farthest off."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Experiment:
+    """What one script of `experiments/` measures.
+
+    Attributes:
+        name: of its default folder under runs/.
+        title: of its page.
+        about: what was done, in a few sentences, for the page.
+        small: cases of the short version.
+        small_methods: names of its methods.
+        full: cases of the whole table.
+        full_methods: names of its methods.
+        tables: tables that the cases belong to, in the page's order.
+    """
+
+    name: str
+    title: str
+    about: str
+    small: Callable[[], list[Case]]
+    small_methods: tuple[str, ...]
+    full: Callable[[], list[Case]]
+    full_methods: tuple[str, ...]
+    tables: tuple[str, ...]
+
+
+def main(experiment: Experiment, arguments: Sequence[str] | None = None) -> None:
+    """Runs what is missing of an experiment and prints its page."""
+    parser = argparse.ArgumentParser(description=experiment.about)
+    parser.add_argument("--full", action="store_true", help="the whole table instead of the small version")
+    parser.add_argument("--out", type=pathlib.Path, help="folder for trials; a run goes on where it stopped")
+    parser.add_argument("--methods", nargs="*", choices=tuple(METHODS), help="only these")
+    parser.add_argument("--seeds", nargs="*", type=int, help="only these")
+    parser.add_argument(
+        "--process", nargs=2, type=int, default=(0, 1), metavar=("INDEX", "COUNT"), help="share of work"
+    )
+    parser.add_argument("--report", type=pathlib.Path, help="run nothing; write the page on what is done to this file")
+    options = parser.parse_args(arguments)
+    folder = options.out or pathlib.Path("runs") / (experiment.name if options.full else f"{experiment.name}-small")
+    if options.report is None:
+        cases = (experiment.full if options.full else experiment.small)()
+        names = options.methods or (experiment.full_methods if options.full else experiment.small_methods)
+        run_suite(
+            [case for case in cases if options.seeds is None or case.seed in options.seeds],
+            [METHODS[name] for name in names],
+            folder,
+            fine_tuned=functools.partial(fine_tuned_model, folder / "fine-tuned"),
+            process=tuple(options.process),
+        )
+    trials, snapshots = read_suite(folder)
+    if options.report is None:
+        print(page(experiment, trials, command(experiment, full=options.full), picture=None))
+        return
+    picture = options.report.with_name(f"{experiment.name}_worst.png")
+    failure_figure(worst(snapshots, WORST)).savefig(picture, dpi=110, bbox_inches="tight")
+    text = page(experiment, trials, command(experiment, full=options.full), picture=picture.name)
+    options.report.write_text(text, encoding="utf-8")
+    print(text)
+
+
+def fine_tuned_model(folder: pathlib.Path, case: Case) -> Model:
+    """The model trained on a case's cable, made when it is first asked for. Two processes must not make the same."""
+    config, home = FineTuneConfig(), folder / case.cable
+    return _fine_tuned(case.plant, case.cable, config, home)
+
+
+@functools.lru_cache(maxsize=16)
+def _fine_tuned(plant: Callable, cable: str, config: FineTuneConfig, home: pathlib.Path) -> Model:
+    made = plant()
+    return fine_tune(record(made, made.config.cable, config, home / "recording.npz"), config, home)
+
+
+def page(experiment: Experiment, trials: Sequence[Trial], command: str, picture: str | None) -> str:
+    """The Markdown page of an experiment's trials."""
+    lines = [f"# {experiment.title}", "", f"Made by `{command}`.", f"{versions()}; {machine()}.", "", experiment.about]
+    for table in experiment.tables:
+        mine = [trial for trial in trials if trial.table == table]
+        if not mine:
+            continue
+        seeds = ", ".join(map(str, sorted({trial.seed for trial in mine})))
+        lines += ["", f"## Table {table}", "", f"Seeds: {seeds}.", ""]
+        if table == LIANG_TABLE:
+            lines += [tables.success_table(mine, labels=LABEL)]
+            continue
+        lines += [tables.comparison_table(mine, table, labels=LABEL)]
+        lines += ["", "### By stiffness", "", tables.stiffness_table(mine, table, labels=LABEL)]
+        lines += ["", "### Intervals and failures", "", tables.interval_table(mine, table, labels=LABEL)]
+        methods = {trial.method for trial in mine}
+        if ADAPTED_RESIDUAL in methods and len(methods) > 1:
+            lines += ["", "### In pairs", "", tables.paired_table(mine, table, ADAPTED_RESIDUAL, labels=LABEL)]
+    if picture is not None:
+        lines += ["", "## The runs that ended farthest off", "", f"![start, end and target of each]({picture})"]
+    return "\n".join([*lines, ""])
+
+
+def command(experiment: Experiment, *, full: bool) -> str:
+    """The call that makes the page."""
+    return f"python experiments/*_{experiment.name}.py{' --full' if full else ''}"
