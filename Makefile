@@ -8,11 +8,12 @@ STAMP := $(VENV)/.stamp
 NPROC ?= 4
 export NPROC
 
-.PHONY: help demo test test-full lint clean
+.PHONY: help demo tables test test-full lint clean
 .DEFAULT_GOAL := help
 
 help:
 	@echo "make demo       shape a cable into a U, an S and a Z; writes runs/demo/report.html"
+	@echo "make tables     the paper's tables at a small size; experiments/*.py --full is the rest"
 	@echo "make test       lint, types and the quick tests"
 	@echo "make test-full  lint, types and every test"
 	@echo "make lint       ruff and pyright"
@@ -27,6 +28,13 @@ $(STAMP): pyproject.toml constraints.txt
 
 demo: $(STAMP)
 	$(BIN)/python -m cablejax demo --overwrite
+
+tables: $(STAMP)
+	$(BIN)/python experiments/05_dynamics_models.py
+	$(BIN)/python experiments/06_stiffness.py
+	$(BIN)/python experiments/07_other_simulator.py
+	$(BIN)/python experiments/08_random_targets.py
+	$(BIN)/python experiments/09_perception.py
 
 lint: $(STAMP)
 	$(BIN)/ruff format --check .

@@ -128,10 +128,26 @@ def test_forgetting_follows_the_newest_sample():
     assert (recent > 2 * even).all()
 
 
+def test_a_model_on_another_branch_is_not_carried_over_the_horizon():
+    config = RidgeConfig(outlier=0.02)
+    delta, twist, valid = window()
+    lost = jnp.full_like(delta, 0.06)
+    rest = np.zeros((Q, 3))
+    assert np.abs(apply(fit(lost, twist, valid, config), rest)).max() < 0.05 * 0.06
+    assert np.abs(apply(fit(lost, twist, valid, RidgeConfig()), rest)).max() > 0.5 * 0.06
+    # errors of millimetres are corrected as they would be without a bound
+    np.testing.assert_allclose(
+        apply(fit(delta, twist, valid, config), rest), apply(fit(delta, twist, valid, RidgeConfig()), rest), atol=2e-4
+    )
+    # one lost sample among good ones leaves them what they say
+    mixed = apply(fit(delta.at[2].set(0.3), twist, valid, config), rest)
+    np.testing.assert_allclose(mixed, apply(fit(delta, twist, valid.at[2].set(False), config), rest), atol=2e-4)
+
+
 @pytest.mark.parametrize("bias", [False, True])
 def test_gradients(bias):
     """Central differences in float64, and JVP against VJP, through fit and prediction."""
-    config = RidgeConfig(bias=bias, forgetting=0.9)
+    config = RidgeConfig(bias=bias, forgetting=0.9, outlier=5e-3)
     with jax.enable_x64(True):
         delta, twist, valid = window(3)
         query = twist[0] + 0.01

@@ -17,6 +17,15 @@ _POINTS = 12
 _CURVE = ("step", "phase", "learning_rate", "loss")
 
 
+def _network(config: ModelConfig) -> str:
+    """Kind and size of the network, to begin a sentence with."""
+    if config.network == "mlp":
+        return f"A perceptron of {config.hidden_layers} hidden layers of {config.hidden}"
+    if config.network == "lstm":
+        return f"A bidirectional recurrence along the cable, {config.hidden_layers} layers of {config.latent},"
+    return f"A graph network of {config.message_passing} message-passing steps, latent size {config.latent},"
+
+
 def write_card(
     path: str | os.PathLike[str],
     *,
@@ -45,9 +54,10 @@ def write_card(
     lines = [
         f"# {name}",
         "",
-        f"A graph network of the dynamics of a cable of {config.length:g} m held at both ends: {config.n_keypoints} "
-        f"keypoints, one step of {config.interval:g} s, {config.history} samples of history, {config.message_passing} "
-        f"message-passing steps, latent size {config.latent}. It corrects the {config.prior} prior.",
+        f"{_network(config)} of the dynamics of a cable of {config.length:g} m held at both ends: "
+        f"{config.n_keypoints} keypoints, one step of {config.interval:g} s, {config.history} samples of history. It "
+        f"corrects the {config.prior} prior"
+        + (" and is told the cable's stiffness and friction." if config.conditioned else "."),
         "",
         "## Data",
         "",

@@ -26,7 +26,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save_file
 
 from cablejax.dynamics.config import ModelConfig, Normalisation
-from cablejax.dynamics.model import make_network
+from cablejax.dynamics.transfer import structure_of
 
 SCHEMA = "cablejax-weights/1"
 """Name and version of the file's layout. A reader refuses any other."""
@@ -59,7 +59,7 @@ def save_weights(
     """
     path = Path(path)
     tensors = {name: np.asarray(leaf) for name, leaf in _named(weights).items()}
-    _check_tensors(tensors, _named(_abstract(model_config)[1]), f"The weights to be saved in {path}")
+    _check_tensors(tensors, _named(structure_of(model_config)[1]), f"The weights to be saved in {path}")
     content = {"schema": SCHEMA, "config": dataclasses.asdict(model_config), "info": dict(info)}
     part = path.with_name(path.name + ".part")
     save_file(tensors, part, metadata={_KEY: json.dumps(content, allow_nan=False)})
@@ -83,7 +83,7 @@ def load_weights(
     config = _config_of(content, path)
     if expect is not None:
         _check_expected(config, expect, path)
-    graphdef, expected = _abstract(config)
+    graphdef, expected = structure_of(config)
     with safe_open(path, framework="numpy") as file:
         tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
     _check_tensors(tensors, _named(expected), path)
@@ -176,11 +176,6 @@ def _check_expected(config: ModelConfig, expect: ModelConfig, path: Path) -> Non
         raise WeightsError(
             f"{path} holds weights for another graph: {'; '.join(other)}. Train a model of this configuration."
         )
-
-
-def _abstract(config: ModelConfig) -> tuple[nnx.GraphDef, nnx.State]:
-    """Structure of a network of this configuration, and the shapes and dtypes of its weights, without any memory."""
-    return nnx.split(nnx.eval_shape(lambda: make_network(config, nnx.Rngs(0))))
 
 
 def _name(key: tuple[Any, ...]) -> str:

@@ -61,7 +61,7 @@ class MPCConfig:
     min_reduction: float = 1e-4
     hold_improvement: float = 2e-5
     objective: ObjectiveConfig = ObjectiveConfig()
-    residual: RidgeConfig | None = RidgeConfig(forgetting=0.5)
+    residual: RidgeConfig | None = RidgeConfig(forgetting=0.5, outlier=0.02)
     adaptation: AdaptationConfig | None = None
     solver: Solver = TrustRegion()
 

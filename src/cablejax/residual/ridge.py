@@ -35,6 +35,10 @@ class RidgeConfig:
             `W * 5**2 = 125`, so that lambda = 10 shrinks the bias by 7 %.
         forgetting: weight ratio of a sample and the next newer one, in (0, 1]; 1 weighs all alike. On the way to a
             shape the error changes from step to step, so the newest sample says most about the next.
+        outlier: root mean square error of a sample [m] beyond which it counts less and less. Where the model follows
+            another branch than the cable (one has snapped through, the other is held by friction) it is off by
+            decimetres, not by something linear in the command; carried over a horizon, such a residual makes every
+            plan look worse than standing still. Infinite = all samples are believed.
     """
 
     window: int = 5
@@ -44,6 +48,7 @@ class RidgeConfig:
     bias: bool = True
     bias_scale: float = 5.0
     forgetting: float = 1.0
+    outlier: float = math.inf
 
     def __post_init__(self):
         if self.window < 1:
@@ -52,6 +57,8 @@ class RidgeConfig:
             value = getattr(self, name)
             if not (math.isfinite(value) and value > 0):
                 raise ValueError(f"RidgeConfig.{name} is {value}, expected a positive finite number.")
+        if not self.outlier > 0:
+            raise ValueError(f"RidgeConfig.outlier is {self.outlier}, expected a positive number [m], or infinity.")
         if not 0 < self.forgetting <= 1:
             raise ValueError(f"RidgeConfig.forgetting is {self.forgetting}, expected a number in (0, 1].")
 
@@ -88,7 +95,7 @@ def fit(
     """Ridge regression in closed form: the minimiser of `||S (dX - A C)||_F^2 + lambda ||C||_F^2` over C.
 
     `A = [R / scale, bias_scale]` are the W scaled regressors and S holds the square roots of the samples' weights
-    (0 where a sample is not valid). The minimiser is `C = (A' S^2 A + lambda I)^-1 A' S^2 dX`. (The paper prints it
+    (by age and by size, 0 where a sample is not valid). The minimiser is `C = (A' S^2 A + lambda I)^-1 A' S^2 dX`. (The paper prints it
     with regressors and targets swapped.) It is computed in its dual form, `C = (S A)' (S A A' S + lambda I)^-1 S dX`:
     the same C, from a W x W system (5 x 5) instead of one of 7 x 7, whose smallest eigenvalue is never below that of
     the primal, so that it is never worse conditioned. All columns of one keypoint share a system; keypoints have their
@@ -121,7 +128,10 @@ def fit(
     if config.bias:
         regressors = jnp.concatenate([regressors, jnp.full((window, 1), config.bias_scale, regressors.dtype)], axis=1)
     age = jnp.arange(window - 1, -1, -1)
-    root_weight = valid * jnp.sqrt(config.forgetting**age)[:, None]
+    size = jnp.sum(delta**2, axis=(1, 2)) / jnp.maximum(jnp.sum(valid, axis=1), 1)
+    # the root of Geman and McClure's weight
+    belief = 1.0 / (1.0 + size / config.outlier**2)
+    root_weight = valid * (belief * jnp.sqrt(config.forgetting**age))[:, None]
 
     coefficients = jax.vmap(_dual_ridge, in_axes=(None, 1, 1, None), out_axes=1)(
         regressors, delta, root_weight, config.regularisation

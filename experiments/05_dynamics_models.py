@@ -1,0 +1,238 @@
+"""Which model of the cable? Open-loop error of every model over 1 to 20 steps, over 100, and on other cables.
+
+The models: the released graph network, a perceptron and a recurrence along the cable trained on the same data, each
+with and without the static prior; the graph network that is told stiffness and friction; and the training simulator
+itself, started from the keypoints. The rivals' weights are in experiments/weights; their cards say how they were made.
+
+    python experiments/05_dynamics_models.py            # a part of the held-out trajectories: some minutes
+    python experiments/05_dynamics_models.py --full     # all of them; writes docs/results/dynamics_models.md and .png
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import os
+import sys
+from pathlib import Path
+
+os.environ.setdefault("NPROC", "4")
+
+import jax
+import matplotlib.pyplot as plt
+import numpy as np
+
+from cablejax.dataset.generate import make_engine, simulate
+from cablejax.dataset.schema import DatasetConfig, config_from_json
+from cablejax.dataset.windows import Window, concatenate
+from cablejax.dynamics.config import ModelConfig
+from cablejax.dynamics.evaluate import evaluation_windows, no_motion, prior_motion, snapping, window_errors
+from cablejax.dynamics.transfer import on_another_cable
+from cablejax.dynamics.weights import load_info, load_weights
+from cablejax.report.provenance import machine, versions
+from cablejax.simulate import CableConfig, ThreadedEngine
+from cablejax.simulate.equilibrium import angles_of_keypoints
+from cablejax.types import CableState, Trajectory
+
+HERE = Path(__file__).parent
+MODELS = {
+    "GNS": "gns-reference",
+    "GNS, told the cable": "gns-conditioned",
+    "Bi-LSTM": HERE / "weights" / "lstm-static",
+    "MLP": HERE / "weights" / "mlp-static",
+    "GNS, no statics": HERE / "weights" / "gns-rigid",
+    "Bi-LSTM, no statics": HERE / "weights" / "lstm-rigid",
+    "MLP, no statics": HERE / "weights" / "mlp-rigid",
+}
+SIMULATOR = "training simulator"
+FLOORS = ("statics alone", "no motion")
+STEPS = (1, 2, 3, 5, 10, 15, 20)
+LONG = (1, 20, 50, 100)
+CABLES = ((1.0, 13), (0.7, 13), (1.5, 13), (1.0, 9), (1.0, 17), (1.0, 25))
+"""Lengths [m] and keypoints of the cables that the networks were not trained on; the first is theirs."""
+
+COLOURS = ("#0072b2", "#009e73", "#d55e00", "#000000", "#cc79a7", "#999999")
+
+
+def simulated(config: DatasetConfig, count: int) -> Trajectory:
+    """The last trajectories of a data set, made anew: those that training did not see."""
+    config = dataclasses.replace(config, engine="threaded", shard_size=1)
+    engine = make_engine(config)
+    blocks = simulate(config, engine, range(config.n_trajectories - count, config.n_trajectories))
+    known = np.zeros((1, 2), np.float32)
+    parts = [Trajectory(b.keypoints, b.gripper_pose, b.gripper_twist, known) for b in blocks]  # pyright: ignore[reportArgumentType]
+    return concatenate(parts)
+
+
+def simulator_errors(windows: Window, cable: CableConfig) -> np.ndarray:
+    """Error [m] of the training simulator, its state taken from the keypoints, at rest."""
+    engine, history = ThreadedEngine(cable), windows.history
+    pose = np.asarray(history.gripper_pose, float)
+    now = np.asarray(history.keypoints[:, -1], float)
+    qpos = [np.concatenate([p[0], angles_of_keypoints(cable, p, x)]) for p, x in zip(pose, now, strict=True)]
+    state = CableState(np.stack(qpos), np.zeros((len(pose), cable.n_joints + 3)), pose)  # pyright: ignore[reportArgumentType]
+    params = jax.tree.map(lambda leaf: np.broadcast_to(leaf, (len(pose), *leaf.shape)), cable.params())
+    seen = engine.rollout(params, state, np.asarray(windows.twist, float))[1].keypoints[:, 1:]
+    return np.sqrt(np.mean(np.sum((np.asarray(seen) - windows.future) ** 2, axis=-1), axis=-1))
+
+
+def all_errors(data: Trajectory, steps: int, stride: int) -> dict[str, np.ndarray]:
+    """Error [cm] of every model in every window after every step."""
+    errors = {}
+    for name, source in MODELS.items():
+        config, graphdef, weights = load_weights(source)
+        windows = evaluation_windows(data, config, steps=steps, stride=stride)
+        errors[name] = window_errors((graphdef, weights), windows, config)
+        print(f"{name}: {100 * np.median(errors[name][:, -1]):.3f} cm after {steps} steps", file=sys.stderr, flush=True)
+    config = ModelConfig()
+    windows = evaluation_windows(data, config, steps=steps, stride=stride)
+    errors[SIMULATOR] = simulator_errors(windows, CableConfig())
+    errors["statics alone"] = window_errors(prior_motion(config, "static"), windows, config)
+    errors["no motion"] = window_errors(no_motion, windows, config)
+    return {name: 100 * np.asarray(error) for name, error in errors.items()}
+
+
+def other_cable(length: float, n_keypoints: int, trajectories: int) -> Trajectory:
+    """Random motions of a cable that no network was trained on; all lengths scaled alike."""
+    cable = CableConfig(length=length, n_keypoints=n_keypoints)
+    config = DatasetConfig(n_trajectories=trajectories, n_steps=60, seed=7, cable=cable, shard_size=1)
+    return simulated(config, trajectories)
+
+
+def statistics(error: np.ndarray, step: int) -> list[str]:
+    column = error[:, step - 1]
+    return [f"{value:.3f}" for value in (column.mean(), *np.percentile(column, [50, 90]))]
+
+
+def draw(errors: dict[str, np.ndarray], calm: np.ndarray, path: Path) -> None:
+    """Median and the band of the middle 80 % over steps, on a log scale."""
+    figure, axes = plt.subplots(1, 2, figsize=(10.5, 4.2), sharey=True, layout="constrained")
+    networks = ("GNS", "Bi-LSTM", "MLP")
+    groups = (
+        ("network corrects the statics of the cable", [*networks, SIMULATOR, *FLOORS]),
+        ("network corrects the grippers' interpolated motion", [*(f"{n}, no statics" for n in networks), "no motion"]),
+    )
+    colours = dict(zip((*networks, SIMULATOR, *FLOORS), COLOURS, strict=True))
+    for axis, (title, names) in zip(axes, groups, strict=True):
+        for name in names:
+            kind = name.split(",")[0]
+            x = np.arange(1, errors[name].shape[1] + 1)
+            columns = [errors[name][calm[:, k], k] for k in range(len(x))]
+            low, middle, high = np.array([np.percentile(c, [10, 50, 90]) for c in columns]).T
+            axis.fill_between(x, low, high, color=colours[kind], alpha=0.12, linewidth=0)
+            axis.plot(x, middle, color=colours[kind], label=name, linewidth=1.8)
+        axis.axhline(0.02, color="#999999", linewidth=0.8, linestyle=":")
+        axis.set(yscale="log", xlabel="steps of 1 s", title=title, xlim=(1, 20))
+        axis.title.set_fontsize(10)
+        axis.legend(fontsize=8, frameon=False)
+    axes[0].set_ylabel("keypoint error [cm]: median, 10 to 90 %")
+    figure.savefig(path, dpi=140)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--full", action="store_true", help="all held-out trajectories")
+    parser.add_argument("--out", type=Path, help="write the page there, the figure beside it")
+    options = parser.parse_args()
+
+    parts = []
+    for one in load_info("gns-reference")["data"]:
+        count = one["held_out"] if options.full else 4
+        parts.append(simulated(config_from_json(DatasetConfig, one["config"]), count))
+    data = concatenate(parts)
+    steps, stride = STEPS[-1], 10 if options.full else 20
+    errors = all_errors(data, steps, stride)
+    calm = ~snapping(data, steps=steps, stride=stride)
+    long_errors = all_errors(data, LONG[-1], 25)
+    calm_long = ~snapping(data, steps=LONG[-1], stride=25)
+
+    rows = [
+        ["model", *(f"{k}: {what}" for k in STEPS for what in ("mean", "median", "90 %"))],
+        *([name, *(v for k in STEPS for v in statistics(error, k))] for name, error in errors.items()),
+    ]
+    gentle = [
+        ["model", *(f"{k}: {what}" for k in STEPS for what in ("mean", "median", "90 %"))],
+        *([name, *(v for k in STEPS for v in statistics(e[calm[:, -1]], k))] for name, e in errors.items()),
+    ]
+    far = [
+        ["model", *(f"{k}: {what}" for k in LONG for what in ("mean", "median", "90 %"))],
+        *([name, *(v for k in LONG for v in statistics(e[calm_long[:, -1]], k))] for name, e in long_errors.items()),
+    ]
+    cables = [["cable", *(name for name in MODELS), *FLOORS]]
+    for length, n in CABLES:
+        moved = other_cable(length, n, 24 if options.full else 4)
+        calm_moved = ~snapping(moved, steps=20, stride=10)[:, -1]
+        row = [f"{length:g} m, {n} keypoints"]
+        for source in MODELS.values():
+            config, _, weights = load_weights(source)
+            try:
+                other, graphdef = on_another_cable(config, n_keypoints=n, length=length)
+            except ValueError:
+                row.append("cannot")
+                continue
+            windows = evaluation_windows(moved, other, steps=20, stride=10)
+            error = window_errors((graphdef, weights), windows, other)[calm_moved, -1]
+            row.append(f"{100 * np.median(error) / length:.3f} / {100 * np.percentile(error, 90) / length:.3f}")
+        config = ModelConfig(n_keypoints=n, length=length)
+        windows = evaluation_windows(moved, config, steps=20, stride=10)
+        for floor in (prior_motion(config, "static"), no_motion):
+            error = window_errors(floor, windows, config)[calm_moved, -1]
+            row.append(f"{100 * np.median(error) / length:.3f} / {100 * np.percentile(error, 90) / length:.3f}")
+        cables.append(row)
+        print(" ".join(row), file=sys.stderr, flush=True)
+
+    worse = {name: np.median(errors[name][:, -1]) / np.median(errors["GNS"][:, -1]) for name in errors}
+    page = "\n".join(
+        [
+            "# Which model of the cable?",
+            "",
+            f"Made by `python experiments/05_dynamics_models.py{' --full' if options.full else ''}`.",
+            f"{versions()}; {machine()}.",
+            "",
+            f"{len(data.gripper_twist)} held-out trajectories of the released model's data, a window every {stride} "
+            "samples. All errors are root mean square keypoint distances in cm; a cell has mean, median and 90th "
+            "percentile over windows. The mean is decided by windows in which the cable snaps through or takes the "
+            "other of two shapes, see [model_error](model_error.md).",
+            "",
+            "![Error over steps](../images/dynamics_models.png)",
+            "",
+            f"After 20 steps the median of the MLP is {worse['MLP']:.1f} times the GNS's where both correct the "
+            f"statics of the cable, and {worse['MLP, no statics']:.0f} times without statics; that of the Bi-LSTM "
+            f"{worse['Bi-LSTM']:.1f} and {worse['Bi-LSTM, no statics']:.0f} times, that of the GNS without statics "
+            f"{worse['GNS, no statics']:.0f} times. What the prior knows, no network has to learn, and there the "
+            "choice of the network matters little.",
+            "",
+            "## All windows",
+            "",
+            *markdown(rows),
+            "",
+            "## Windows without a snap-through",
+            "",
+            *markdown(gentle),
+            "",
+            "## 100 steps, windows without a snap-through",
+            "",
+            *markdown(far),
+            "",
+            "## Other cables, 20 steps: median / 90 % in cm per metre of cable",
+            "",
+            "The first row is the cable that the networks were trained on.",
+            "",
+            *markdown(cables),
+            "",
+        ]
+    )
+    print(page)
+    if options.out is not None:
+        options.out.write_text(page, encoding="utf-8")
+        draw(errors, calm, options.out.parent.parent / "images" / "dynamics_models.png")
+
+
+def markdown(rows: list[list[str]]) -> list[str]:
+    """A table, the first row its title."""
+    title, *rest = ["| " + " | ".join(row) + " |" for row in rows]
+    return [title, "|" + " --- |" * len(rows[0]), *rest]
+
+
+if __name__ == "__main__":
+    main()
