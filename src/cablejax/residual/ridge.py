@@ -95,11 +95,11 @@ def fit(
     """Ridge regression in closed form: the minimiser of `||S (dX - A C)||_F^2 + lambda ||C||_F^2` over C.
 
     `A = [R / scale, bias_scale]` are the W scaled regressors and S holds the square roots of the samples' weights
-    (by age and by size, 0 where a sample is not valid). The minimiser is `C = (A' S^2 A + lambda I)^-1 A' S^2 dX`. (The paper prints it
-    with regressors and targets swapped.) It is computed in its dual form, `C = (S A)' (S A A' S + lambda I)^-1 S dX`:
-    the same C, from a W x W system (5 x 5) instead of one of 7 x 7, whose smallest eigenvalue is never below that of
-    the primal, so that it is never worse conditioned. All columns of one keypoint share a system; keypoints have their
-    own because each may have been unobserved at other instants.
+    (by age and by size, 0 where a sample is not valid). The minimiser is `C = (A' S^2 A + lambda I)^-1 A' S^2 dX`. (The
+    paper prints it with regressors and targets swapped.) It is computed in its dual form,
+    `C = (S A)' (S A A' S + lambda I)^-1 S dX`: the same C, from a W x W system (5 x 5) instead of one of 7 x 7, whose
+    smallest eigenvalue is never below that of the primal, so that it is never worse conditioned. All columns of one
+    keypoint share a system; keypoints have their own because each may have been unobserved at other instants.
 
     Differentiable in `delta` and `twist` (the reported condition number is not).
 

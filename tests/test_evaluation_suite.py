@@ -1,0 +1,110 @@
+"""Suites of trials: what is run, what is kept, what is not run again."""
+
+import functools
+
+import jax
+import numpy as np
+import pytest
+
+from cablejax.closed_loop import run_closed_loop
+from cablejax.dynamics.train_config import Phase
+from cablejax.evaluation.cases import mujoco_plant, random_cases, stiffness_cases
+from cablejax.evaluation.fine_tuning import FineTuneConfig, fine_tune, record
+from cablejax.evaluation.methods import LABEL, METHODS, controller_of
+from cablejax.evaluation.paper import VISUAL_SERVO
+from cablejax.evaluation.protocols import LaidOut, letter_task
+from cablejax.evaluation.run import Experiment, page
+from cablejax.evaluation.suite import Case, key_of, read_suite, run_suite
+from cablejax.mpc import Controller
+from cablejax.servo import VisualServo
+from cablejax.shaping import load_model
+from cablejax.simulate.config import CableConfig
+from cablejax.simulate.plant import Plant, PlantConfig
+from cablejax.targets import make_target
+from cli_cases import small_model
+
+CABLE = CableConfig(n_links=12, dimension=3, timestep=0.005)
+SERVO = METHODS[VISUAL_SERVO]
+
+
+@functools.lru_cache
+def small_plant():
+    return Plant(PlantConfig(cable=CABLE, settle_time=0.1))
+
+
+def case(seed, scenario="U"):
+    task = functools.partial(letter_task, scenario, seed, CABLE)
+    return Case("III", scenario, 1.0, seed, task, small_plant, "small", steps=2)
+
+
+def no_model(case):
+    raise AssertionError("a method without a model asks for none")
+
+
+def test_a_suite_is_shared_resumed_and_read_whole(tmp_path):
+    cases = [case(1), case(0)]
+    for index in (0, 1):
+        run_suite(cases, [SERVO], tmp_path, fine_tuned=no_model, process=(index, 2), progress=False)
+    trials, snapshots = read_suite(tmp_path)
+    assert {t.key for t in trials} == {key_of(c, SERVO) for c in cases} == {s.key for s in snapshots}
+    assert [t.seed for t in trials] == [0, 1], "seeds go first, whatever the order of the cases"
+    assert all(t.steps == 2 and 20 < t.initial_error_cm < 60 for t in trials)
+    before = {path: path.read_bytes() for path in tmp_path.iterdir()}
+    run_suite(cases, [SERVO], tmp_path, fine_tuned=no_model, progress=False)
+    assert before == {path: path.read_bytes() for path in tmp_path.iterdir()}
+    experiment = Experiment("x", "Title", "About.", lambda: cases, (), lambda: cases, (), ("III", "IV"))
+    text = page(experiment, trials, "python x.py", picture=None)
+    assert "| online visual servo | 2 |" in text and "Table IV" not in text and "Seeds: 0, 1." in text
+
+
+def test_cases_are_those_of_the_paper():
+    cases = stiffness_cases(("U", "S", "Z"), (0.1, 3.0), seeds=range(2))
+    assert len({(c.scenario, c.stiffness, c.seed) for c in cases}) == len(cases) == 12
+    assert mujoco_plant(0.1).config.stiffness_ratio == 0.1
+    pairs = random_cases(seeds=range(2))
+    assert {(c.scenario, c.seed) for c in pairs} == {(s, k) for s in ("straight", "diverse") for k in range(2)}
+    assert all(c.steps == 250 for c in pairs)
+    assert set(METHODS) == set(LABEL)
+
+
+def test_every_method_has_its_controller(tmp_path):
+    small_model(tmp_path)
+    model, target = load_model(str(tmp_path)), make_target("U")
+    assert isinstance(controller_of(SERVO, None, target), VisualServo)
+    for spec in METHODS.values():
+        if spec.weights is not None:
+            controller = controller_of(spec, model, target)
+            assert isinstance(controller, Controller)
+            assert (controller.config.residual is not None) == spec.residual
+
+
+def test_fine_tuning_records_the_cable_at_hand_and_changes_the_weights(tmp_path):
+    small_model(tmp_path / "source")
+    phase = Phase(steps=2, batch=2, rollout=1)
+    config = FineTuneConfig(str(tmp_path / "source"), trajectories=2, commands=3, phases=(phase,))
+    data = record(small_plant(), CABLE, config, tmp_path / "tuned" / "recording.npz")
+    assert data.keypoints.shape == (2, 4, 13, 2) and data.gripper_twist.shape == (2, 3, 2, 3)
+    np.testing.assert_allclose(data.keypoints[:, :, [0, -1]], data.gripper_pose[..., :2], atol=5e-3)
+    again = record(small_plant(), CABLE, config, tmp_path / "tuned" / "recording.npz")
+    np.testing.assert_array_equal(again.keypoints, data.keypoints)
+    tuned, source = fine_tune(data, config, tmp_path / "tuned"), load_model(config.weights)
+    assert tuned.config == source.config, "scales stay"
+    change = jax.tree.map(lambda a, b: float(np.abs(a - b).max()), tuned.weights, source.weights)
+    assert max(jax.tree.leaves(change)) > 0
+
+
+def test_a_run_ends_when_nothing_happens_any_more():
+    class Still:
+        def init(self, history):
+            return None
+
+        def step(self, state, keypoints, gripper_pose):
+            return None, np.zeros((2, 3)), None
+
+    task = letter_task("U", 0, CABLE)
+    run = run_closed_loop(
+        LaidOut(small_plant(), task.start_shape), Still(), task.target, 30, start=task.start_pose, patience=3
+    )
+    assert len(run.times) == 4 and run.stopped is None
+    with pytest.raises(ValueError, match="no shape"):
+        letter_task("Q", 0, CABLE)
