@@ -159,7 +159,7 @@ def main() -> None:
         *([name, *(v for k in LONG for v in statistics(e[calm_long[:, -1]], k))] for name, e in long_errors.items()),
     ]
     cables = [["cable", *(name for name in MODELS), *FLOORS]]
-    for length, n in CABLES:
+    for length, n in CABLES if options.full else CABLES[:3]:
         moved = other_cable(length, n, 24 if options.full else 4)
         calm_moved = ~snapping(moved, steps=20, stride=10)[:, -1]
         row = [f"{length:g} m, {n} keypoints"]

@@ -42,7 +42,9 @@ def stiffness_cases(
     ]
 
 
-def real_cable_cases(shapes: Sequence[Shape], seeds: Sequence[int], steps: int = 120) -> list[Case]:
+def real_cable_cases(
+    shapes: Sequence[Shape], seeds: Sequence[int], steps: int = 120, tables: Sequence[str] = ("IV", "V")
+) -> list[Case]:
     """Tables IV and V: letters by two cables of another simulator family.
 
     Raises:
@@ -63,6 +65,7 @@ def real_cable_cases(shapes: Sequence[Shape], seeds: Sequence[int], steps: int =
         )
         for seed in seeds
         for table, name, config in (("IV", "ethernet", ETHERNET), ("V", "usb", USB))
+        if table in tables
         for shape in shapes
     ]
 
