@@ -26,9 +26,10 @@ if __name__ == "__main__":
             about=(
                 "The plant is C MuJoCo in space with contact and friction cones, its cable of 24 links 0.1 to 3 times "
                 "as stiff as the one trained on. Every trial starts from a straight cable whose heading, place and "
-                "slack depend on the seed; a cell is the mean over stiffnesses and seeds. A run ends after 60 commands, or "
-                f"after {PATIENCE} in which the error does not change. The settling time is the first from which on "
-                "the error stays within a tenth, or 1 mm, of its last value; Wang et al. do not define theirs."
+                "slack depend on the seed; a cell is the mean over stiffnesses and seeds. A run ends after 60 "
+                f"commands, or after {PATIENCE} in which the error does not change. The settling time is the first "
+                "from which on the error stays within a tenth, or 1 mm, of its last value; Wang et al. do not define "
+                "theirs."
             ),
             small=lambda: stiffness_cases(("U", "S", "Z"), (2.0,), seeds=(0,)),
             small_methods=(DIRECT, RESIDUAL, ADAPTED_RESIDUAL),
