@@ -15,6 +15,8 @@ from cablejax.dynamics.config import ModelConfig
 from cablejax.dynamics.model import apply
 from cablejax.dynamics.weights import load_weights
 from cablejax.mpc import Controller, MPCConfig, ProjectedGradient, TrustRegion
+from cablejax.perceive.camera import CameraConfig
+from cablejax.perceive.plant import CloudPlant
 from cablejax.report.record import Method
 from cablejax.residual import Dynamics
 from cablejax.simulate import CableConfig
@@ -93,9 +95,25 @@ def initial_history(cable: CableConfig, config: ModelConfig) -> History:
 
 
 def shape_once(
-    plant: PlantConfig, model: Model, target: Target, *, method: Method, solver: SolverName, steps: int
+    plant: PlantConfig,
+    model: Model,
+    target: Target,
+    *,
+    method: Method,
+    solver: SolverName,
+    steps: int,
+    camera: CameraConfig | None = None,
 ) -> ClosedLoopRun:
     """One straight cable brought to one target on a plant of its own.
+
+    Args:
+        plant: what the cable and its table really are.
+        model: what the controller believes.
+        target: the wanted shape.
+        method: with the online residual, or without.
+        solver: how plans are found.
+        steps: commands.
+        camera: what the cable is seen with; None = its keypoints are told.
 
     Raises:
         ValueError: the plant's cable is not the one that the model was made for.
@@ -107,7 +125,7 @@ def shape_once(
             f"plant has {cable.n_keypoints} on {cable.length} m: train one for this cable, or change the plant."
         )
     return run_closed_loop(
-        Plant(plant),
+        Plant(plant) if camera is None else CloudPlant(plant, camera=camera),
         make_controller(model, target, method=method, solver=solver),
         target,
         steps,

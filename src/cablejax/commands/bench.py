@@ -1,4 +1,4 @@
-"""`cablejax bench simulate | mpc`: how fast this machine runs the simulators and the controller."""
+"""`cablejax bench simulate | mpc | loop | perception`: how fast simulators, controller and tracker run here."""
 
 from __future__ import annotations
 
@@ -144,11 +144,138 @@ class BenchMpc(Command):
         )
 
 
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class BenchPerception(Command):
+    """Time the tracker: one frame of a moving cable, and a first frame without a prior."""
+
+    points: int = 2000
+    """Points in the cloud."""
+
+    repeats: int = 200
+    """Frames to time, after the first ones, which compile."""
+
+    def execute(self):
+        import numpy as np
+
+        from cablejax.perceive import Status, Tracker, TrackerConfig
+        from cablejax.perceive.synthetic import Clutter, scatter
+        from cablejax.simulate.elastica import solve_elastica
+
+        for name in ("points", "repeats"):
+            if getattr(self, name) < 1:
+                raise UsageError(f"--{name} is {getattr(self, name)}, expected at least 1.")
+        tracker = Tracker(dataclasses.replace(TrackerConfig(), capacity=self.points))
+        random = np.random.default_rng(self.seed)
+        # An arch that is carried to and fro by a millimetre per frame.
+        pose = np.array([[-0.3, 0.0, 0.8], [0.35, 0.0, -0.6]])
+        curve = solve_elastica(pose, tracker.config.registration.length).position
+        shifts = 0.01 * np.sin(0.1 * np.arange(self.repeats + 2))
+        clouds = [scatter(curve + np.array([shift, 0.0]), Clutter(points=self.points), random) for shift in shifts]
+        poses = [pose + np.array([shift, 0.0, 0.0]) for shift in shifts]
+        say("compiling the tracker ...")
+        state, seen = tracker.init(clouds[0], poses[0])
+        first, frame = [], []
+        for _ in range(5):
+            begin = time.perf_counter()
+            tracker.init(clouds[0], poses[0])[1].keypoints.block_until_ready()
+            first.append(1e3 * (time.perf_counter() - begin))
+        for cloud, now in zip(clouds, poses, strict=True):
+            begin = time.perf_counter()
+            state, seen = tracker.step(state, cloud, now)
+            seen.keypoints.block_until_ready()
+            frame.append(1e3 * (time.perf_counter() - begin))
+            if seen.status != Status.TRACKED:
+                raise UsageError(
+                    f"{self.points} points are too few to follow a cable: {tracker.explain(seen, cloud, now)}"
+                )
+        p50, p95 = np.percentile(frame[2:], [50, 95])
+        result = {
+            "points": self.points,
+            "keypoints": tracker.config.registration.n_keypoints,
+            "repeats": self.repeats,
+            "p50_ms": float(p50),
+            "p95_ms": float(p95),
+            "frames_per_second": float(1e3 / p50),
+            "first_frame_ms": float(np.median(first)),
+            **_machine(),
+        }
+        return result, (
+            f"one frame of {self.points} points: median {p50:.1f} ms, 95th percentile {p95:.1f} ms, "
+            f"{1e3 / p50:.0f} frames per second; a first frame without a prior {result['first_frame_ms']:.0f} ms"
+        )
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class BenchLoop(Command):
+    """Time the closed loop in batches: simulated plant, residual, plan and command of many cables in one call."""
+
+    weights: str = "gns-reference"
+    """Released model by name, or the folder of a training by `cablejax train`."""
+
+    solver: Literal["trust-region", "projected-gradient"] = "trust-region"
+    """How the plan is found."""
+
+    batches: tuple[int, ...] = (1, 8)
+    """Numbers of cables to shape at once."""
+
+    steps: int = 5
+    """Control steps per round."""
+
+    rounds: int = 3
+    """How often each batch takes its turn."""
+
+    def execute(self):
+        import functools
+
+        import jax
+        import numpy as np
+
+        from cablejax.batched_loop import LoopConfig, MpcPolicy, shape_batch, varied_params
+        from cablejax.shaping import load_model, make_controller
+        from cablejax.simulate import CableConfig, MjxEngine
+        from cablejax.targets import make_target, straight_start
+
+        if not self.batches or min(*self.batches, self.steps, self.rounds) < 1:
+            raise UsageError(
+                f"--batches {self.batches}, --steps {self.steps} and --rounds {self.rounds}: expected at least 1 each."
+            )
+        model, cable = load_model(self.weights), CableConfig()
+        target = make_target("S", cable)
+        controller = make_controller(model, target, method="residual", solver=self.solver)
+        config = LoopConfig(self.steps, interval=model.config.interval, history_length=model.config.history)
+        policy, engine = MpcPolicy(controller.config, model.dynamics), MjxEngine(cable)
+
+        def run(size: int):
+            state = engine.initial_state(np.stack([straight_start(cable)] * size))
+            params = varied_params(cable, np.linspace(0.5, 2.0, size))
+            goals = np.stack([target.keypoints] * size)
+            return jax.block_until_ready(shape_batch(engine, params, state, policy, model.weights, goals, config))
+
+        say(f"compiling the closed loop for batches of {', '.join(map(str, self.batches))} ...")
+        contestants = {str(size): functools.partial(run, size) for size in self.batches}
+        seconds = _median_seconds(contestants, self.rounds)
+        rates = {size: int(size) * self.steps / seconds[size] for size in contestants}
+        result = {
+            "solver": self.solver,
+            "horizon": controller.config.horizon,
+            "steps": self.steps,
+            "control_steps_per_second": rates,
+            **_machine(),
+        }
+        rows = [[size, f"{rate:.2f}", f"{1e3 / rate:.1f}"] for size, rate in rates.items()]
+        return result, text_table(["cables at once", "control steps per second", "ms per control step"], rows)
+
+
 @dataclasses.dataclass(frozen=True)
 class Bench:
     """Measure speed on this machine."""
 
-    what: Annotated[BenchSimulate, subcommand("simulate")] | Annotated[BenchMpc, subcommand("mpc")]
+    what: (
+        Annotated[BenchSimulate, subcommand("simulate")]
+        | Annotated[BenchMpc, subcommand("mpc")]
+        | Annotated[BenchLoop, subcommand("loop")]
+        | Annotated[BenchPerception, subcommand("perception")]
+    )
 
 
 def _median_seconds(contestants: dict[str, Callable[[], Any]], rounds: int) -> dict[str, float]:

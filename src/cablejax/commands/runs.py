@@ -12,6 +12,7 @@ from cablejax.closed_loop import ClosedLoopRun
 from cablejax.commands.options import UsageError, output_folder, say, write_json
 from cablejax.commands.parts import Parts
 from cablejax.commands.results import summarise, write_results
+from cablejax.perceive.camera import CameraConfig
 from cablejax.report.record import Method
 from cablejax.report.style import METHOD_LABEL
 from cablejax.shaping import Model, SolverName, shape_once
@@ -32,6 +33,7 @@ def shape_and_report(
     steps: int,
     about: str,
     facts: Mapping[str, str],
+    camera: CameraConfig | None = None,
 ) -> dict[str, Any]:
     """Brings a cable to every target by every method and writes the results. Goes on where the same call was stopped.
 
@@ -46,6 +48,7 @@ def shape_and_report(
         steps: commands per run.
         about: plant and model in a sentence or two, for the page and the log.
         facts: settings to print on the page.
+        camera: what the cable is seen with; None = its keypoints are told.
 
     Returns:
         The summary.
@@ -59,6 +62,7 @@ def shape_and_report(
     settings = {
         "model": model.name,
         "plant": dataclasses.asdict(plant),
+        "camera": None if camera is None else dataclasses.asdict(camera),
         "targets": [target.keypoints.tolist() for target in targets],
         "solver": solver,
         "steps": steps,
@@ -73,7 +77,7 @@ def shape_and_report(
             name = f"{target.name}-{method}"
             run = parts.load(name)
             if run is None:
-                run = shape_once(plant, model, target, method=method, solver=solver, steps=steps)
+                run = shape_once(plant, model, target, method=method, solver=solver, steps=steps, camera=camera)
                 parts.save(name, run)
             runs[target.name, method] = run
             say(f"{time.perf_counter() - begin:5.0f} s  {METHOD_LABEL[method]:22s}{run.verdict()}")

@@ -45,8 +45,13 @@ class Shape(Command):
     friction: float = 0.1
     """Coulomb friction coefficient of the plant's table."""
 
-    noise_mm: float = 0.0
-    """Standard deviation of the observed keypoints, per coordinate [mm]."""
+    perception: Literal["true", "cloud"] = "true"
+    """true: the controller is told the keypoints. cloud: it gets what is found in the clouds of a depth camera; the
+    errors printed remain those of the true keypoints."""
+
+    noise_mm: float | None = None
+    """Noise: standard deviation of the observed keypoints, per coordinate, or of the camera's range [mm]. By default 0
+    for the first and 2 for the second."""
 
     links: int = 24
     """Links of the plant's cable."""
@@ -54,19 +59,23 @@ class Shape(Command):
     def execute(self):
         from cablejax.commands.results import table_of
         from cablejax.commands.runs import shape_and_report
+        from cablejax.perceive.camera import CameraConfig
         from cablejax.shaping import METHODS, load_model
         from cablejax.simulate.plant import PlantConfig
         from cablejax.targets import load_target, make_target
 
+        cloud = self.perception == "cloud"
+        noise_mm = (2.0 if cloud else 0.0) if self.noise_mm is None else self.noise_mm
         default = PlantConfig()
         cable = dataclasses.replace(default.cable, n_links=self.links, friction_coefficient=self.friction)
         plant = dataclasses.replace(
             default,
             cable=cable,
             stiffness_ratio=self.stiffness_ratio,
-            keypoint_noise=1e-3 * self.noise_mm,
+            keypoint_noise=0.0 if cloud else 1e-3 * noise_mm,
             seed=self.seed,
         )
+        seen = "The cable is seen by a depth camera" if cloud else "The keypoints are seen"
         target = make_target(self.target, cable) if self.target in ("U", "S", "Z") else load_target(self.target, cable)
         summary = shape_and_report(
             self.out,
@@ -77,10 +86,11 @@ class Shape(Command):
             methods=METHODS if self.method == "both" else (self.method,),
             solver=self.solver,
             steps=self.steps,
+            camera=CameraConfig(range_noise=1e-3 * noise_mm, seed=self.seed) if cloud else None,
             about=(
                 f"The plant's cable is {self.stiffness_ratio:g} times as stiff as the one that the model was trained "
-                f"on; the table's friction coefficient is {self.friction:g}, and the keypoints are seen with "
-                f"{self.noise_mm:g} mm of noise."
+                f"on; the table's friction coefficient is {self.friction:g}. {seen} "
+                f"with {noise_mm:g} mm of noise."
             ),
             facts={
                 field.name.replace("_", " "): str(getattr(self, field.name))

@@ -89,11 +89,13 @@ class Observation:
         keypoints: [m], NaN = not observed, float64, shape [N, 2].
         gripper_pose: (x, y, theta) of both grippers [m, rad], shape [Q, 3]; theta counts turns.
         time: since the last reset [s].
+        true_keypoints: where they really are [m], shape [N, 2], which only a simulation knows; else None.
     """
 
     keypoints: Float[np.ndarray, "N 2"]
     gripper_pose: Float[np.ndarray, "Q 3"]
     time: float
+    true_keypoints: Float[np.ndarray, "N 2"] | None = None
 
 
 def plant_model(config: PlantConfig) -> mujoco.MjModel:
@@ -237,12 +239,13 @@ class Plant:
         """Keypoints and gripper poses now, with the configured noise and gaps (drawn anew by every call)."""
         config, random = self.config, self._random
         nodes, tangents = self.nodes()
-        keypoints = (self._weights[0] @ nodes + self._weights[1] @ tangents)[:, :2]
+        truth = (self._weights[0] @ nodes + self._weights[1] @ tangents)[:, :2]
+        keypoints = truth.copy()
         if config.keypoint_noise:
             keypoints += config.keypoint_noise * random.standard_normal(keypoints.shape)
         if config.keypoint_dropout:
             keypoints[1:-1][random.random(len(keypoints) - 2) < config.keypoint_dropout] = np.nan
-        return Observation(keypoints=keypoints, gripper_pose=self._pose.copy(), time=self.time)
+        return Observation(keypoints=keypoints, gripper_pose=self._pose.copy(), time=self.time, true_keypoints=truth)
 
     def nodes(self) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
         """Middle of every link, for the two held links the grasped end [m], and the links' unit directions."""

@@ -1,0 +1,16 @@
+"""From point clouds to keypoints: registration, first frame, tracking, a depth camera and recorded sequences."""
+
+from cablejax.perceive.registration import Fit, RegistrationConfig, register
+from cablejax.perceive.tracker import Status, Track, Tracker, TrackerConfig, TrackState, track
+
+__all__ = [
+    "Fit",
+    "RegistrationConfig",
+    "Status",
+    "Track",
+    "TrackState",
+    "Tracker",
+    "TrackerConfig",
+    "register",
+    "track",
+]

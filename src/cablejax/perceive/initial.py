@@ -1,0 +1,172 @@
+"""The first frame: where the cable is if nothing is known but one cloud and the grippers that hold its ends.
+
+Two kinds of guesses compete. Paths along the cloud: the shortest way from gripper to gripper over a graph of occupied
+cells, where a jump costs more than the same distance in small steps. And bent curves that need no cloud: arches,
+S-curves and loops to both sides. All are registered at once; the most likely one that explains
+the cloud wins.
+"""
+
+from __future__ import annotations
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float
+
+from cablejax.perceive.path import cloud_path
+from cablejax.perceive.registration import Fit, RegistrationConfig, register
+
+JUMPS = (2.0, 4.0)
+"""Paths to try: powers of the step length that they pay."""
+BOWS = (1.2, -1.2, 2.2, -2.2)
+"""Amplitudes [rad] of the arches and S-curves."""
+GUESS_SIGMA, PATH_SIGMA = 0.1, 0.03
+"""Standard deviation from which the guesses anneal, in lengths of the cable: those without the cloud, and along it."""
+ITERATIONS = 30
+SAMPLE = 500
+"""Points by which the guesses are judged at first; the best few are refined with all."""
+FINALISTS = 4
+REFINEMENTS = 8
+SAME = 0.01
+"""Mean distance of keypoints, in lengths, up to which two fits are the same."""
+
+
+def first_fit(
+    config: RegistrationConfig,
+    points: Float[np.ndarray, "S 2"],
+    mask: Bool[np.ndarray, " S"],
+    gripper_pose: Float[np.ndarray, "Q 3"],
+    *,
+    reach: float = 0.015,
+) -> Fit:
+    """The most likely cable in a cloud, without any prior.
+
+    Not differentiable: it chooses. Deterministic.
+
+    Args:
+        config: the cable.
+        points: the cloud on the table [m]; rows outside `mask` are padding.
+        mask: at least one true.
+        gripper_pose: (x, y, theta) of both grippers; turns between them are found, not read.
+        reach: see `register`.
+
+    Returns:
+        The fit. Whether it explains the cloud is for the caller to judge, by `support` and `sigma`.
+    """
+    guesses = guessed_fits(config, points, mask, gripper_pose, reach=reach)
+    keypoints = np.asarray(guesses.keypoints)
+    chosen: list[int] = []
+    for index in range(len(keypoints)):
+        apart = [np.linalg.norm(keypoints[index] - keypoints[k], axis=-1).mean() for k in chosen]
+        if not apart or min(apart) > SAME * config.length:
+            chosen.append(index)
+    chosen = (chosen * FINALISTS)[:FINALISTS]
+    best = jax.tree.map(lambda leaf: np.asarray(leaf)[chosen], guesses)
+    dtype = best.angles.dtype
+    refined = _register_all(
+        config,
+        jnp.asarray(points, dtype),
+        jnp.asarray(mask),
+        best.gripper_pose,
+        best.angles,
+        2.0 * best.sigma,
+        reach,
+        REFINEMENTS,
+    )
+    merit = _merit(config, refined)
+    return jax.tree.map(lambda leaf: jnp.asarray(np.asarray(leaf)[int(np.argmax(merit))]), refined)
+
+
+def guessed_fits(
+    config: RegistrationConfig,
+    points: Float[np.ndarray, "S 2"],
+    mask: Bool[np.ndarray, " S"],
+    gripper_pose: Float[np.ndarray, "Q 3"],
+    *,
+    reach: float = 0.015,
+) -> Fit:
+    """The fits of all guesses to a sample of the cloud, batched, best first; arguments as of `first_fit`."""
+    present = np.asarray(points, float)[np.asarray(mask)]
+    pose = np.asarray(gripper_pose, float)
+    profiles = [_path_profile(config, cloud_path(present, pose, config.length, power), pose) for power in JUMPS]
+    n_paths = len(profiles)
+    profiles += _bowed_profiles(config, pose)
+    tangents = np.stack(profiles)
+    poses = np.repeat(pose[None], len(tangents), axis=0)
+    poses[:, 0, 2] = pose[0, 2]
+    turn = tangents[:, -1] - tangents[:, 0]
+    between = pose[1, 2] - pose[0, 2]
+    poses[:, 1, 2] = pose[1, 2] + 2 * np.pi * np.round((turn - between) / (2 * np.pi))
+    sigma = config.length * np.where(np.arange(len(tangents)) < n_paths, PATH_SIGMA, GUESS_SIGMA)
+
+    sample = _sample(present)
+    dtype = jnp.asarray(0.0).dtype
+    fits = _register_all(
+        config,
+        jnp.asarray(sample, dtype),
+        jnp.asarray(np.arange(SAMPLE) < min(len(present), SAMPLE)),
+        jnp.asarray(poses, dtype),
+        jnp.asarray(np.diff(tangents, axis=1), dtype),
+        jnp.asarray(sigma, dtype),
+        reach,
+        ITERATIONS,
+    )
+    order = np.argsort(-_merit(config, fits), kind="stable")
+    return jax.tree.map(lambda leaf: np.asarray(leaf)[order], fits)
+
+
+@functools.partial(jax.jit, static_argnames=("config", "reach", "iterations"))
+def _register_all(config, points, mask, poses, angles, sigma, reach, iterations) -> Fit:
+    def one(pose, angles, sigma):
+        return register(
+            config, points, mask, pose, angles, pose, sigma, iterations=iterations, coherent=False, reach=reach
+        )
+
+    return jax.vmap(one)(poses, angles, sigma)
+
+
+def _merit(config: RegistrationConfig, fits: Fit) -> np.ndarray:
+    """Log posterior of every fit, minus infinity where the curve does not end in the gripper."""
+    merit = np.asarray(fits.log_posterior, float)
+    return np.where(np.isfinite(merit) & (np.asarray(fits.gap) < 0.02 * config.length), merit, -np.inf)
+
+
+def _sample(points: np.ndarray) -> np.ndarray:
+    """As many of the points as the guesses are judged by, evenly taken, padded with zeros."""
+    if len(points) > SAMPLE:
+        points = points[np.random.default_rng(0).choice(len(points), SAMPLE, replace=False)]
+    return np.concatenate([points, np.zeros((SAMPLE - len(points), 2))])
+
+
+def _bowed_profiles(config: RegistrationConfig, pose: np.ndarray) -> list[np.ndarray]:
+    """Tangent angles of the links: from one gripper's over the chord's to the other's, with whole turns on the way."""
+    s = config.matrices.arclength
+    chord = np.arctan2(*(pose[1, :2] - pose[0, :2])[::-1])
+    first, last = chord + _wrap(pose[:, 2] - chord)
+    found = []
+    for middle_turns in (0, 1, -1):
+        for end_turns in (0, 1, -1):
+            end, middle = last + 2 * np.pi * end_turns, chord + 2 * np.pi * middle_turns
+            base = first + (end - first) * s + (middle - 0.5 * (first + end)) * np.sin(np.pi * s) ** 2
+            found.append(base)
+            if middle_turns == end_turns == 0:
+                found += [base + bow * np.sin(mode * np.pi * s) for mode in (1, 2) for bow in BOWS]
+    return found
+
+
+def _path_profile(config: RegistrationConfig, even: np.ndarray, pose: np.ndarray) -> np.ndarray:
+    """Tangent angles of the links along a path; at its ends those of the grippers, on the nearest turn."""
+    steps = np.gradient(even, axis=0)
+    angle = np.unwrap(np.arctan2(steps[:, 1], steps[:, 0]))
+    profile = np.interp(config.matrices.arclength, np.linspace(0.0, 1.0, len(angle)), angle)
+    # The ends have the grippers' directions, on the turn that is nearest to the path's.
+    profile = profile + pose[0, 2] - (profile[0] - _wrap(profile[0] - pose[0, 2]))
+    profile = np.array(profile)
+    profile[0], profile[-1] = pose[0, 2], profile[-1] - _wrap(profile[-1] - pose[1, 2])
+    return profile
+
+
+def _wrap(angle):
+    return (angle + np.pi) % (2 * np.pi) - np.pi

@@ -1,0 +1,101 @@
+"""The cloud as samples from a Gaussian mixture along the cable, with one uniform component for outliers.
+
+Wang et al., RA-L 2022, place one round Gaussian on each keypoint, all of the same weight and variance, and one uniform
+component of weight mu for noise and outliers. Round Gaussians pull their centres along the cable towards wherever
+points are dense, although a cloud says nothing about sliding along the cable. Here every link of a fine chain has a
+Gaussian of its own that is as long as the link and as wide as sigma, and its residual is the distance across the cable
+alone. Links of the same length have the same weight, as in the paper.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from cablejax.perceive.curve import Curve, perpendicular
+
+ELONGATION = 0.4
+"""Standard deviation of a Gaussian along its link, in lengths of the link."""
+
+
+class Moments(NamedTuple):
+    """Sums over the points, weighted with the responsibility of each link for each point.
+
+    With `a` a point's position along the link and `r` its distance across:
+
+    Attributes:
+        weight: sum of the responsibilities, shape [n].
+        along: sum of a [m], shape [n].
+        along_squared: sum of a^2 [m^2], shape [n].
+        across: sum of r [m], shape [n].
+        along_across: sum of a r [m^2], shape [n].
+        across_squared: sum of r^2 [m^2], shape [n].
+        log_likelihood: of all points [nats; areas in m^2], shape [].
+    """
+
+    weight: Float[Array, " n"]
+    along: Float[Array, " n"]
+    along_squared: Float[Array, " n"]
+    across: Float[Array, " n"]
+    along_across: Float[Array, " n"]
+    across_squared: Float[Array, " n"]
+    log_likelihood: Float[Array, ""]
+
+
+def expectation(
+    points: Float[Array, "S 2"],
+    mask: Bool[Array, " S"],
+    shape: Curve,
+    lengths: Any,
+    sigma: Float[Array, ""],
+    *,
+    outlier_weight: float,
+    area: float,
+) -> Moments:
+    """E-step: how far each link answers for each point. Differentiable in `points`, `shape` and `sigma`.
+
+    A point's distance across a link is taken to the osculating parabola, `n d - curvature a^2 / 2`, so that a bent
+    cable is not drawn to the inside of its bend.
+
+    Args:
+        points: the cloud on the table [m].
+        mask: false where a row of `points` is only padding.
+        shape: the cable's curve.
+        lengths: of its links [m], shape [n].
+        sigma: standard deviation of the points across the cable [m].
+        outlier_weight: mu, prior probability that a point is an outlier.
+        area: over which outliers are spread [m^2].
+    """
+    lengths = jnp.asarray(lengths, points.dtype)
+    normal = perpendicular(shape.tangent)
+    along = points @ shape.tangent.T - jnp.sum(shape.centre * shape.tangent, axis=-1)
+    across = points @ normal.T - jnp.sum(shape.centre * normal, axis=-1) - 0.5 * shape.curvature * along**2
+    spread = (ELONGATION * lengths) ** 2 + sigma**2
+    scale = jnp.log((1.0 - outlier_weight) * lengths / jnp.sum(lengths)) - jnp.log(
+        2.0 * jnp.pi * sigma * jnp.sqrt(spread)
+    )
+    density = jnp.exp(scale - 0.5 * along**2 / spread - 0.5 * (across / sigma) ** 2)
+    total = jnp.sum(density, axis=-1) + outlier_weight / area
+    share = jnp.where(mask[:, None], density / total[:, None], 0.0)
+    return Moments(
+        weight=jnp.sum(share, axis=0),
+        along=jnp.sum(share * along, axis=0),
+        along_squared=jnp.sum(share * along**2, axis=0),
+        across=jnp.sum(share * across, axis=0),
+        along_across=jnp.sum(share * along * across, axis=0),
+        across_squared=jnp.sum(share * across**2, axis=0),
+        log_likelihood=jnp.sum(jnp.where(mask, jnp.log(total), 0.0)),
+    )
+
+
+def distance_to(points: Float[Array, "S 2"], shape: Curve, lengths: Any) -> Float[Array, " S"]:
+    """Distance [m] of every point to the curve, shape [S]."""
+    half = 0.5 * jnp.asarray(lengths, points.dtype)
+    normal = perpendicular(shape.tangent)
+    along = points @ shape.tangent.T - jnp.sum(shape.centre * shape.tangent, axis=-1)
+    across = points @ normal.T - jnp.sum(shape.centre * normal, axis=-1) - 0.5 * shape.curvature * along**2
+    excess = jax.nn.relu(jnp.abs(along) - half)
+    return jnp.sqrt(jnp.min(across**2 + excess**2, axis=-1))

@@ -1,0 +1,83 @@
+"""The plant seen through a camera: the same two calls, but its keypoints come from clouds."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+from jaxtyping import Float
+
+from cablejax.perceive.camera import CameraConfig, DepthCamera
+from cablejax.perceive.registration import RegistrationConfig
+from cablejax.perceive.tracker import Status, Track, Tracker, TrackerConfig, TrackState
+from cablejax.simulate.config import CableConfig
+from cablejax.simulate.plant import Observation, Plant, PlantConfig
+
+
+class CloudPlant(Plant):
+    """A plant whose keypoints are what a tracker makes of a depth camera's clouds.
+
+    `reset` and `record` are those of `Plant`; every observation is one frame of the camera. Where a frame is held, its
+    inner keypoints are NaN: a controller then goes by its own prediction. The true keypoints travel beside them.
+
+    Attributes:
+        camera: the camera.
+        tracker: what follows the cable.
+        track: what came of the last frame, None before the first.
+        cloud: the last frame's points [m], shape [S, 3].
+        held: frames held since the last reset.
+    """
+
+    def __init__(
+        self,
+        config: PlantConfig | None = None,
+        *,
+        camera: CameraConfig | None = None,
+        tracker: TrackerConfig | None = None,
+    ):
+        super().__init__(config)
+        cable = self.config.cable
+        self.camera = DepthCamera(CameraConfig() if camera is None else camera, cable)
+        self.tracker = Tracker(tracker_for(cable) if tracker is None else tracker)
+        wanted = self.tracker.config.registration
+        if wanted.n_keypoints != cable.n_keypoints or abs(wanted.length - cable.length) > 1e-9:
+            raise ValueError(
+                f"The tracker looks for {wanted.n_keypoints} keypoints on {wanted.length} m of cable, but the plant "
+                f"has {cable.n_keypoints} on {cable.length} m: give both the same, for example by tracker_for(cable)."
+            )
+        self._forget()
+
+    def _forget(self) -> None:
+        self._state: TrackState | None = None
+        self.track: Track | None = None
+        self.cloud: Float[np.ndarray, "S 3"] = np.zeros((0, 3))
+        self.held = 0
+
+    def reset(
+        self, gripper_pose: Float[np.ndarray, "Q 3"], *, guess: Float[np.ndarray, "S 2"] | None = None
+    ) -> Observation:
+        """As `Plant.reset`; the tracker finds the new cable without a prior, and the camera's noise starts again."""
+        self._forget()
+        self.camera.reset()
+        return super().reset(gripper_pose, guess=guess)
+
+    def observe(self) -> Observation:
+        """One frame: cloud, tracker, and the keypoints that it makes of them."""
+        truth = super().observe()
+        nodes, directions = self.nodes()
+        self.cloud = self.camera.look(nodes, directions, truth.gripper_pose)
+        if self._state is None:
+            self._state, self.track = self.tracker.init(self.cloud, truth.gripper_pose)
+        else:
+            self._state, self.track = self.tracker.step(self._state, self.cloud, truth.gripper_pose)
+        keypoints = np.array(self.track.keypoints, float)
+        keypoints[[0, -1]] = truth.gripper_pose[:, :2]
+        if self.track.status != Status.TRACKED:
+            keypoints[1:-1] = np.nan
+            self.held += 1
+        return dataclasses.replace(truth, keypoints=keypoints)
+
+
+def tracker_for(cable: CableConfig) -> TrackerConfig:
+    """A tracker's settings for a cable, the default ones but for its length and keypoints."""
+    return TrackerConfig(registration=RegistrationConfig(length=cable.length, n_keypoints=cable.n_keypoints))

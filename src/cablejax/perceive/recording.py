@@ -1,0 +1,132 @@
+"""Recorded cloud sequences: one `.npz` file, or a folder of PCD files beside the grippers' poses."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import pathlib
+import zipfile
+
+import numpy as np
+from jaxtyping import Float
+
+from cablejax.perceive.pcd import read_pcd
+
+POSES_FILE = "poses.csv"
+POSES_HEADER = ("time", "x0", "y0", "theta0", "x1", "y1", "theta1")
+
+
+@dataclasses.dataclass(frozen=True)
+class CloudSequence:
+    """Clouds over time, with the grippers' poses of the same instants, all in one frame.
+
+    Attributes:
+        time: [s], increasing, shape [T].
+        clouds: T arrays [m], shape [S, 2 or 3]; S varies and may be 0, NaN = no measurement.
+        gripper_pose: (x, y, theta) [m, rad], shape [T, Q, 3].
+    """
+
+    time: Float[np.ndarray, " T"]
+    clouds: list[Float[np.ndarray, "S D"]]
+    gripper_pose: Float[np.ndarray, "T Q 3"]
+
+    def __post_init__(self):
+        count = len(self.clouds)
+        if count == 0:
+            raise ValueError("A cloud sequence has no frame, expected at least one.")
+        if self.time.shape != (count,) or self.gripper_pose.shape != (count, 2, 3):
+            raise ValueError(
+                f"A cloud sequence of {count} frames has times of shape {self.time.shape} and gripper poses of shape "
+                f"{self.gripper_pose.shape}, expected ({count},) and ({count}, 2, 3)."
+            )
+        if not (np.isfinite(self.time).all() and (np.diff(self.time) > 0).all()):
+            raise ValueError("The times of a cloud sequence are not finite and increasing: sort and check its frames.")
+        if not np.isfinite(self.gripper_pose).all():
+            frame = int(np.argwhere(~np.isfinite(self.gripper_pose))[0, 0])
+            raise ValueError(f"The gripper pose of frame {frame} is not finite, expected (x, y, theta) in every frame.")
+        for frame, cloud in enumerate(self.clouds):
+            if cloud.ndim != 2 or cloud.shape[1] not in (2, 3) or not np.issubdtype(cloud.dtype, np.floating):
+                raise ValueError(
+                    f"The cloud of frame {frame} has shape {cloud.shape} and type {cloud.dtype}, expected floating "
+                    "point numbers of shape [S, 2] or [S, 3]."
+                )
+
+
+def read_clouds(path: str | os.PathLike[str]) -> CloudSequence:
+    """Reads a recorded sequence. Nothing is unpickled.
+
+    An `.npz` file has `time` [T] in seconds, `gripper_pose` [T, 2, 3], and `points`: either [T, S, D], padded with NaN,
+    or the points of all frames in a row, [M, D], with `count` [T], how many belong to each frame.
+
+    A folder has PCD files, one per frame in the order of their names, and `poses.csv` with the header
+    `time,x0,y0,theta0,x1,y1,theta1` and one row per frame.
+
+    Raises:
+        ValueError: there is no such sequence, or something in it is missing or does not fit together.
+    """
+    path = pathlib.Path(path)
+    if path.is_dir():
+        return _read_folder(path)
+    if not path.is_file():
+        raise ValueError(f"{path} does not exist, expected an .npz file or a folder of PCD files.")
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            arrays = {name: archive[name] for name in archive.files}
+    except (OSError, ValueError, AttributeError, zipfile.BadZipFile) as error:
+        raise ValueError(f"{path} is not an .npz file of plain arrays: {error}") from None
+    if missing := {"time", "gripper_pose", "points"} - set(arrays):
+        raise ValueError(
+            f"{path} lacks {', '.join(sorted(missing))}: expected time [T], gripper_pose [T, 2, 3] and points."
+        )
+    points = arrays["points"]
+    if "count" in arrays:
+        count = arrays["count"]
+        if points.ndim != 2 or not np.issubdtype(count.dtype, np.integer) or count.sum() != len(points):
+            raise ValueError(
+                f"{path}: count {count.shape} of type {count.dtype} sums up to {count.sum()}, but points has shape "
+                f"{points.shape}: expected as many rows."
+            )
+        clouds = np.split(points, np.cumsum(count)[:-1]) if len(count) else []
+    elif points.ndim == 3:
+        clouds = [frame[~np.isnan(frame).all(axis=1)] for frame in points]
+    else:
+        raise ValueError(f"{path}: points has shape {points.shape}, expected [T, S, D], or [M, D] with count [T].")
+    return CloudSequence(np.asarray(arrays["time"], float), clouds, np.asarray(arrays["gripper_pose"], float))
+
+
+def write_clouds(path: str | os.PathLike[str], sequence: CloudSequence) -> pathlib.Path:
+    """Writes a sequence as an `.npz` file that `read_clouds` reads, replacing a file of that name."""
+    path = pathlib.Path(path)
+    with path.open("wb") as file:  # NumPy would add a suffix to a mere name
+        np.savez_compressed(
+            file,
+            time=sequence.time,
+            gripper_pose=sequence.gripper_pose,
+            points=np.concatenate(sequence.clouds).astype(np.float32),
+            count=np.array([len(cloud) for cloud in sequence.clouds]),
+        )
+    return path
+
+
+def _read_folder(folder: pathlib.Path) -> CloudSequence:
+    files = sorted(folder.glob("*.pcd"))
+    poses = folder / POSES_FILE
+    if not files or not poses.is_file():
+        raise ValueError(
+            f"{folder} has {len(files)} PCD files and {'a' if poses.is_file() else 'no'} {POSES_FILE}, expected at "
+            f"least one, and the grippers' poses with the header {','.join(POSES_HEADER)}."
+        )
+    with poses.open(encoding="utf-8") as text:
+        header = tuple(name.strip() for name in text.readline().split(","))
+        if header != POSES_HEADER:
+            raise ValueError(f"{poses} begins with {','.join(header)!r}, expected {','.join(POSES_HEADER)!r}.")
+        lines = [line for line in text if line.strip()]
+    try:
+        rows = np.array([[float(value) for value in line.split(",")] for line in lines])
+    except ValueError as error:
+        raise ValueError(f"{poses} has a row that is not seven numbers: {error}") from None
+    if rows.shape != (len(files), len(POSES_HEADER)):
+        raise ValueError(
+            f"{poses} has rows of shape {rows.shape}, expected {len(files)} rows of {len(POSES_HEADER)}: one per file."
+        )
+    return CloudSequence(rows[:, 0], [read_pcd(file) for file in files], rows[:, 1:].reshape(-1, 2, 3))

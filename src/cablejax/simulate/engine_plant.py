@@ -1,0 +1,76 @@
+"""A simulator behind the plant's two calls, for a closed loop on the very model that is trained on or batched."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float
+
+from cablejax.simulate.engine import Engine
+from cablejax.simulate.plant import Observation, PlantError
+from cablejax.types import CableParams, CableState, Trajectory
+
+
+class EnginePlant:
+    """One planar cable in an `Engine`: `reset` once, then `record` what commands do to it. See `Plant` for both.
+
+    Unlike `Plant` it shows what it simulates without noise or gaps, and it does not refuse a taut pull.
+
+    Args:
+        engine: planar.
+        params: of this cable; by default the nominal ones.
+
+    Raises:
+        ValueError: the engine simulates a cable in space.
+    """
+
+    def __init__(self, engine: Engine, params: CableParams | None = None):
+        if engine.config.dimension != 2:
+            raise ValueError(f"The engine's dimension is {engine.config.dimension}, expected 2, a cable on a table.")
+        self.engine = engine
+        self.params = engine.config.params() if params is None else params
+        self._state: CableState | None = None
+        self._time = 0.0
+
+    def reset(
+        self, gripper_pose: Float[np.ndarray, "Q 3"], *, guess: Float[np.ndarray, "S 2"] | None = None
+    ) -> Observation:
+        """A new cable at rest between the grippers, without friction locked in.
+
+        Args:
+            gripper_pose: (x, y, theta) of both grippers [m, rad], shape [2, 3].
+            guess: points of a similar shape [m], where several shapes fit these grippers.
+
+        Raises:
+            ValueError: the grippers are out of the cable's reach.
+        """
+        state = self.engine.initial_state(gripper_pose, guess=guess)
+        self._state, shown = self.engine.rollout(self.params, state, np.zeros((0, 2, 3)))
+        self._time = 0.0
+        return self._last_of(shown)
+
+    def record(self, twist: Float[np.ndarray, "Q 3"], interval: float = 1.0, *, samples: int) -> list[Observation]:
+        """Hold a command for one interval and observe the cable `samples` times, evenly spaced, last at its end.
+
+        Raises:
+            ValueError: there is no cable yet, the command is not finite, or the samples do not fall on time steps.
+            PlantError: the simulation diverged.
+        """
+        if self._state is None:
+            raise ValueError("The plant has no cable yet: call reset(gripper_pose) first.")
+        if np.shape(twist) != (2, 3) or not np.isfinite(twist).all():
+            raise ValueError(f"The command is not finite or not of shape (2, 3): {np.asarray(twist).tolist()}.")
+        observations = []
+        for _ in range(samples):
+            self._state, shown = self.engine.rollout(
+                self.params, self._state, np.asarray(twist)[None], interval / samples
+            )
+            self._time += interval / samples
+            observations.append(self._last_of(shown))
+        if not np.isfinite(observations[-1].keypoints).all():
+            self._state = None  # nothing but a reset makes sense now
+            raise PlantError(f"The simulation diverged within {self._time:.3f} s: use a shorter timestep.")
+        return observations
+
+    def _last_of(self, shown: Trajectory) -> Observation:
+        last = [np.asarray(leaf[-1], float) for leaf in (shown.keypoints, shown.gripper_pose)]
+        return Observation(keypoints=last[0], gripper_pose=last[1], time=self._time)

@@ -1,0 +1,126 @@
+"""The loop over the time steps of a Cosserat rod, compiled around PyElastica's kernels.
+
+A file of its own because it cannot be imported without PyElastica, and because compiled code is kept on disk only for
+functions at the top level of a file.
+
+One step is PyElastica's position Verlet: half a step of positions and directors, forces and torques there, a whole
+step of the velocities, half a step of positions and directors. The velocities' step is split: elastic force, filter,
+friction impulse, implicit bending damper.
+"""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+from elastica.dissipation import nb_filter_rate
+from elastica.rod.cosserat_rod import _compute_internal_forces, _compute_internal_torques, _update_accelerations
+from elastica.rod.data_structures import overload_operator_kinematic_numba
+
+FILTER_ORDER = 3
+"""Of PyElastica's filter of velocities that alternate from node to node; it hardly touches long wavelengths. Axial
+waves have no other damping, and friction that falls with the speed feeds them."""
+
+
+@numba.njit(cache=True)
+def advance(
+    x, v, a, q, omega, alpha, mass, inertia, inverse_inertia, stiffness, geometry, strain, stress, external,
+    ghosts, pose, twist, steps, dt, damper, friction, static_ratio, stribeck_speed, damping,
+):  # fmt: skip
+    """Advances a rod by `steps` time steps in place; the arrays are those of `elastica.CosseratRod`.
+
+    Args:
+        x, v, a: positions, velocities and accelerations of the nodes, shape [3, n + 1].
+        q, omega, alpha: directors [3, 3, n] of the elements, their angular velocities and accelerations [3, n].
+        mass: of the nodes [kg], shape [n + 1].
+        inertia, inverse_inertia: of the elements' rotation, shape [3, 3, n].
+        stiffness: shear and bend matrices, sigma and kappa at rest.
+        geometry: volume, lengths, lengths at rest, Voronoi lengths at rest, tangents, radius.
+        strain: dilatation, Voronoi dilatation, dilatation rate, sigma, kappa.
+        stress: internal stress, couple, force and torque.
+        external: force and torque; the force becomes the table's friction in the last step.
+        ghosts: PyElastica's indices between rods that share memory; empty.
+        pose: of the grippers at the beginning [m, rad], shape [2, 3].
+        twist: of the grippers [m/s, rad/s], shape [2, 3].
+        steps: number of time steps.
+        dt: time step [s].
+        damper: couple between neighbours per difference of their angular velocities [N m s].
+        friction: mu_k g [m/s^2].
+        static_ratio: mu_s / mu_k.
+        stribeck_speed: v_s [m/s].
+        damping: rate at which all motion dies [1/s].
+    """
+    shear_matrix, bend_matrix, rest_sigma, rest_kappa = stiffness
+    volume, lengths, rest_lengths, rest_voronoi, tangents, radius = geometry
+    dilatation, voronoi_dilatation, dilatation_rate, sigma, kappa = strain
+    internal_stress, internal_couple, force, torque = stress
+    rubbing, external_torque = external
+    n_nodes = x.shape[1]
+    n_elements = n_nodes - 1
+    upper, rough = np.zeros(n_elements), np.zeros_like(v)
+    keep = np.exp(-damping * dt)
+    for step in range(steps):
+        _hold(x, v, q, omega, rest_lengths, pose, twist, step * dt)
+        overload_operator_kinematic_numba(0.5 * dt, x, q, v, omega)
+        _compute_internal_forces(
+            x, volume, lengths, tangents, radius, rest_lengths, rest_voronoi, dilatation, voronoi_dilatation, q,
+            sigma, rest_sigma, shear_matrix, internal_stress, force, ghosts,
+        )  # fmt: skip
+        _compute_internal_torques(
+            x, v, tangents, lengths, rest_lengths, q, rest_voronoi, bend_matrix, rest_kappa, kappa,
+            voronoi_dilatation, inertia, omega, internal_stress, internal_couple, dilatation, dilatation_rate,
+            torque, ghosts,
+        )  # fmt: skip
+        _update_accelerations(a, force, rubbing, mass, alpha, inverse_inertia, torque, external_torque, dilatation)
+        for node in range(2, n_nodes - 2):
+            v[0, node] = keep * (v[0, node] + dt * a[0, node])
+            v[1, node] = keep * (v[1, node] + dt * a[1, node])
+        # With the last step's friction in it a cable that slides steadily has nothing to be filtered.
+        nb_filter_rate(v, rough, FILTER_ORDER)
+        for node in range(2, n_nodes - 2):
+            vx = v[0, node] - keep * dt * rubbing[0, node] / mass[node]
+            vy = v[1, node] - keep * dt * rubbing[1, node] / mass[node]
+            speed = np.sqrt(vx * vx + vy * vy)
+            loss = friction * dt * (1.0 + (static_ratio - 1.0) * np.exp(-((speed / stribeck_speed) ** 2)))
+            left = 1.0 - loss / speed if speed > loss else 0.0
+            v[0, node], v[1, node], v[2, node] = left * vx, left * vy, 0.0
+            rubbing[0, node] = (left - 1.0) * vx * mass[node] / dt
+            rubbing[1, node] = (left - 1.0) * vy * mass[node] / dt
+        for element in range(1, n_elements - 1):
+            omega[0, element] = keep * (omega[0, element] + dt * alpha[0, element])
+            omega[1, element], omega[2, element] = 0.0, 0.0
+        _damp_bending(omega[0], inertia[0, 0], dt * damper, upper)
+        overload_operator_kinematic_numba(0.5 * dt, x, q, v, omega)
+    _hold(x, v, q, omega, rest_lengths, pose, twist, steps * dt)
+
+
+@numba.njit(cache=True)
+def _hold(x, v, q, omega, rest_lengths, pose, twist, time):
+    """Puts the two end elements where the grippers are at `time`, with their velocities."""
+    n_nodes = x.shape[1]
+    for gripper in range(2):
+        angle, rate = pose[gripper, 2] + time * twist[gripper, 2], twist[gripper, 2]
+        cos, sin = np.cos(angle), np.sin(angle)
+        outer, inner, element, inward = 0, 1, 0, rest_lengths[0]
+        if gripper == 1:
+            outer, inner, element, inward = n_nodes - 1, n_nodes - 2, n_nodes - 2, -rest_lengths[-1]
+        for axis in range(2):
+            x[axis, outer] = pose[gripper, axis] + time * twist[gripper, axis]
+            v[axis, outer] = twist[gripper, axis]
+        x[0, inner], x[1, inner] = x[0, outer] + inward * cos, x[1, outer] + inward * sin
+        v[0, inner], v[1, inner] = v[0, outer] - inward * rate * sin, v[1, outer] + inward * rate * cos
+        q[1, 0, element], q[1, 1, element] = sin, -cos
+        q[2, 0, element], q[2, 1, element] = cos, sin
+        omega[0, element], omega[1, element], omega[2, element] = rate, 0.0, 0.0
+
+
+@numba.njit(cache=True)
+def _damp_bending(omega, inertia, damper, upper):
+    """The implicit step `(J + dt D) omega = J omega*` of dampers between neighbouring elements, the ends held."""
+    n = omega.shape[0]
+    upper[0] = 0.0
+    for i in range(1, n - 1):
+        pivot = inertia[i] + 2.0 * damper - damper * upper[i - 1]
+        upper[i] = damper / pivot
+        omega[i] = (inertia[i] * omega[i] + damper * omega[i - 1]) / pivot
+    for i in range(n - 2, 0, -1):
+        omega[i] += upper[i] * omega[i + 1]

@@ -1,0 +1,355 @@
+"""A plant of another simulator family: a Cosserat rod of PyElastica on a table with Stribeck friction.
+
+`Plant` shares MuJoCo's link chain with the simulator that yields training data, and its Coulomb friction law. This one
+shares neither. PyElastica discretises the rod as nodes and directed elements that stretch, shear and bend (Gazzola et
+al., Royal Society Open Science 2018) and steps it explicitly; the table holds a node at rest by static friction and
+rubs on a sliding one by
+
+    |f| = w (mu_k + (mu_s - mu_k) exp(-(|v| / v_s)^2)),
+
+Stribeck's law, which falls with the speed, so that the cable may move by jerks where a slow gripper drags it. Friction
+acts as an impulse at the end of every time step (Moreau's time stepping): it takes away speed, at most all of it, and
+needs no regularisation. A node within the friction cone does not creep.
+
+What makes it fast enough for a closed loop:
+
+- Explicit steps are as short as axial and shear waves need per element. Stretch and shear are much stiffer than
+  bending in any cable and invisible in its motion, so they are only as stiff as `axial_ratio` says, and the elements'
+  inertia of rotation, invisible too, is that of a ball as large as the element.
+- Bending damping (Kelvin-Voigt) would need far shorter explicit steps; it is a tridiagonal implicit step of its own.
+- The loop over time steps is compiled and calls PyElastica's compiled kernels, without Python in between.
+
+The rod lies in the table's plane. Its end elements are held rigidly and are half as long as the others, as in
+`CableConfig`, so that the middles of the elements have the arc lengths of the chain's nodes.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+from jaxtyping import Float
+
+from cablejax.simulate.composite import link_lengths
+from cablejax.simulate.config import GRAVITY, CableConfig
+from cablejax.simulate.elastica import solve_elastica
+from cablejax.simulate.keypoints import hermite_weights
+from cablejax.simulate.plant import TAUT, Observation, PlantError
+
+SETTLE_DAMPING = 10.0
+"""Rate [1/s] at which all motion is damped while a new cable settles."""
+LARGEST_STRETCH = 0.1
+"""Relative change of an element's length beyond which the simulation counts as unstable."""
+
+
+@dataclasses.dataclass(frozen=True)
+class RodPlantConfig:
+    """What the rod is made of; the defaults are the reference cable.
+
+    Attributes:
+        cable: geometry, elements (`n_links`), time step and physics. `friction_coefficient` is the kinetic one mu_k,
+            `friction_speed` has no meaning here, and `dimension` must be 2.
+        static_ratio: mu_s / mu_k >= 1.
+        stribeck_speed: v_s [m/s], the speed at which sliding has taken away most of the difference.
+        axial_ratio: EA / EI [1/m^2]; `4 / r^2` for a solid rod of radius r. The stretch is the internal force over EI,
+            at most about 100 / m^2 in the shapes of interest, over this.
+        rest_curvature: kappa_0 everywhere [1/m].
+        keypoint_noise: standard deviation of the observed keypoints [m] per coordinate, the held ends included.
+        keypoint_dropout: probability with which a keypoint is not observed (NaN), except the first and last.
+        settle_time: simulated time [s] given to a new cable to settle without friction.
+        seed: of noise and gaps.
+    """
+
+    cable: CableConfig = CableConfig(n_links=27, timestep=2e-4)
+    static_ratio: float = 1.3
+    stribeck_speed: float = 0.005
+    axial_ratio: float = 1e5
+    rest_curvature: float = 0.0
+    keypoint_noise: float = 0.0
+    keypoint_dropout: float = 0.0
+    settle_time: float = 1.0
+    seed: int = 0
+
+    def __post_init__(self):
+        if self.cable.dimension != 2:
+            raise ValueError(
+                f"RodPlantConfig.cable.dimension is {self.cable.dimension}, expected 2: the rod lies in a plane."
+            )
+        for name in ("stribeck_speed", "axial_ratio", "settle_time"):
+            value = getattr(self, name)
+            if not (np.isfinite(value) and value > 0):
+                raise ValueError(f"RodPlantConfig.{name} is {value}, expected a positive finite number.")
+        if not (np.isfinite(self.static_ratio) and self.static_ratio >= 1):
+            raise ValueError(f"RodPlantConfig.static_ratio is {self.static_ratio}, expected a finite number >= 1.")
+        if not np.isfinite(self.rest_curvature):
+            raise ValueError(f"RodPlantConfig.rest_curvature is {self.rest_curvature}, expected a finite number [1/m].")
+        if not (np.isfinite(self.keypoint_noise) and self.keypoint_noise >= 0):
+            raise ValueError(f"RodPlantConfig.keypoint_noise is {self.keypoint_noise}, expected a number >= 0 [m].")
+        if not 0 <= self.keypoint_dropout < 1:
+            raise ValueError(f"RodPlantConfig.keypoint_dropout is {self.keypoint_dropout}, expected one in [0, 1).")
+        if self.cable.timestep > self.longest_timestep:
+            raise ValueError(
+                f"RodPlantConfig.cable.timestep is {self.cable.timestep} s, but this rod is stable only up to "
+                f"{self.longest_timestep:.2g} s: use a shorter time step, fewer links or a lower axial_ratio."
+            )
+
+    @property
+    def longest_timestep(self) -> float:
+        """Longest stable time step [s]: an axial wave crosses an element in it, and a tenth less for safety."""
+        speed = np.sqrt(self.axial_ratio * self.cable.bending_stiffness / self.cable.linear_density)
+        return 0.9 * self.cable.link_length / speed
+
+
+ETHERNET = RodPlantConfig(
+    cable=CableConfig(
+        n_links=27,
+        timestep=1e-4,
+        diameter=0.008,
+        bending_stiffness=0.044,
+        damping_time=0.1,
+        linear_density=0.06,
+        friction_coefficient=0.2,
+    ),
+)
+"""A shielded installation cable (Cat 7 S/FTP), stiffer than the reference: see docs/simulator.md for the values."""
+
+USB = RodPlantConfig(
+    cable=CableConfig(
+        n_links=27,
+        timestep=2e-4,
+        diameter=0.0045,
+        bending_stiffness=0.008,
+        damping_time=0.3,
+        linear_density=0.035,
+        friction_coefficient=0.15,
+    ),
+)
+"""A USB 2.0 cable, softer and lighter than the reference: see docs/simulator.md for the values."""
+
+
+class RodPlant:
+    """A Cosserat rod on a table between two grippers, with the calls of `Plant`: `reset` once, then `step` it.
+
+    Raises:
+        ImportError: PyElastica is not installed.
+    """
+
+    def __init__(self, config: RodPlantConfig | None = None):
+        self.config = RodPlantConfig() if config is None else config
+        _import_elastica()
+        from cablejax.simulate import rod_loop
+
+        self._loop = rod_loop.advance
+        self._weights = hermite_weights(self.config.cable)
+        self._pose = np.full((2, 3), np.nan)
+        self._random = np.random.default_rng(self.config.seed)
+        self._steps_done: int | None = None
+        self._rod = _straight_rod(self.config)
+
+    def reset(
+        self, gripper_pose: Float[np.ndarray, "Q 3"], *, guess: Float[np.ndarray, "S 2"] | None = None
+    ) -> Observation:
+        """Lay a new cable on the table, at rest and with no friction locked in, and restart the clock and the noise.
+
+        Args:
+            gripper_pose: (x, y, theta) of both grippers [m, rad], shape [2, 3].
+            guess: points of a similar shape [m], where several shapes fit these grippers; see `solve_elastica`.
+
+        Raises:
+            ValueError: a pose is not finite, of another shape, or the grippers are too far apart; the cable at rest
+                between them could not be found.
+        """
+        pose = _checked("gripper_pose", gripper_pose)
+        self._check_distance(pose)
+        shape = solve_elastica(
+            pose, self.config.cable.length, guess=guess, n_samples=2 * self.config.cable.n_joints + 1
+        )
+        rod = _straight_rod(self.config)
+        rod.position_collection[:2] = np.concatenate(
+            [shape.position[:1], shape.position[1:-1:2], shape.position[-1:]]
+        ).T
+        _set_directors(rod, np.concatenate([pose[:1, 2], shape.angle[2:-1:2], pose[1:, 2]]))
+        self._rod, self._pose, self._steps_done = rod, pose, 0
+        self._random = np.random.default_rng(self.config.seed)
+        self._advance(np.zeros((2, 3)), self._steps(self.config.settle_time), settling=True)
+        rod.velocity_collection[:], rod.omega_collection[:] = 0.0, 0.0
+        self._steps_done = 0
+        return self.observe()
+
+    def step(self, twist: Float[np.ndarray, "Q 3"], interval: float = 1.0) -> Observation:
+        """Hold a command for one interval and observe the cable at its end.
+
+        Args:
+            twist: (vx, vy, omega) of both grippers in the world's frame [m/s, rad/s], shape [2, 3].
+            interval: [s], a whole number of time steps.
+
+        Raises:
+            ValueError: the command is not finite, of another shape, or would pull the cable taut; the plant has not
+                moved then.
+            PlantError: the simulation became unstable.
+        """
+        return self.record(twist, interval, samples=1)[-1]
+
+    def record(self, twist: Float[np.ndarray, "Q 3"], interval: float = 1.0, *, samples: int) -> list[Observation]:
+        """As `step`, with `samples` observations evenly spread over the interval, the last one at its end."""
+        if self._steps_done is None:
+            raise ValueError("The plant has no cable yet: call reset(gripper_pose) first.")
+        twist = _checked("twist", twist)
+        steps = self._steps(interval)
+        if samples < 1 or steps % samples:
+            raise ValueError(
+                f"{samples} samples in {interval} s do not fall on time steps of {self.config.cable.timestep} s: "
+                f"choose a divisor of {steps}."
+            )
+        self._check_distance(self._pose + interval * twist)
+        observations = []
+        for _ in range(samples):
+            self._advance(twist, steps // samples)
+            observations.append(self.observe())
+        return observations
+
+    @property
+    def time(self) -> float:
+        """Simulated seconds since the last reset."""
+        return (self._steps_done or 0) * self.config.cable.timestep
+
+    def observe(self) -> Observation:
+        """Keypoints and gripper poses now, with the configured noise and gaps (drawn anew by every call)."""
+        config, random = self.config, self._random
+        nodes, tangents = self.nodes()
+        truth = self._weights[0] @ nodes + self._weights[1] @ tangents
+        keypoints = truth.copy()
+        if config.keypoint_noise:
+            keypoints += config.keypoint_noise * random.standard_normal(keypoints.shape)
+        if config.keypoint_dropout:
+            keypoints[1:-1][random.random(len(keypoints) - 2) < config.keypoint_dropout] = np.nan
+        return Observation(keypoints=keypoints, gripper_pose=self._pose.copy(), time=self.time, true_keypoints=truth)
+
+    def nodes(self) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2"]]:
+        """Middle of every element, for the two held ones the grasped end [m], and the elements' unit directions."""
+        position = self._rod.position_collection[:2].T
+        middle = 0.5 * (position[1:] + position[:-1])
+        middle[0], middle[-1] = position[0], position[-1]
+        return middle, self._rod.director_collection[2, :2].T.copy()
+
+    def stretch(self) -> float:
+        """Largest relative change of an element's length: small against one, or `axial_ratio` is too low."""
+        return float(np.abs(self._rod.dilatation - 1.0).max())
+
+    def _advance(self, twist: np.ndarray, steps: int, *, settling: bool = False) -> None:
+        """`steps` time steps under one twist; settling is without friction and with all motion damped."""
+        config, rod = self.config, self._rod
+        cable, h = config.cable, config.cable.link_length
+        friction = 0.0 if settling else cable.friction_coefficient
+        self._loop(
+            rod.position_collection,
+            rod.velocity_collection,
+            rod.acceleration_collection,
+            rod.director_collection,
+            rod.omega_collection,
+            rod.alpha_collection,
+            rod.mass,
+            rod.mass_second_moment_of_inertia,
+            rod.inv_mass_second_moment_of_inertia,
+            (rod.shear_matrix, rod.bend_matrix, rod.rest_sigma, rod.rest_kappa),
+            (rod.volume, rod.lengths, rod.rest_lengths, rod.rest_voronoi_lengths, rod.tangents, rod.radius),
+            (rod.dilatation, rod.voronoi_dilatation, rod.dilatation_rate, rod.sigma, rod.kappa),
+            (rod.internal_stress, rod.internal_couple, rod.internal_forces, rod.internal_torques),
+            (rod.external_forces, rod.external_torques),
+            rod.ghost_elems_idx,
+            self._pose,
+            twist,
+            steps,
+            cable.timestep,
+            cable.bending_stiffness * cable.damping_time / h,
+            GRAVITY * friction,
+            config.static_ratio,
+            config.stribeck_speed,
+            SETTLE_DAMPING if settling else 0.0,
+        )
+        self._pose = self._pose + (steps * cable.timestep) * twist
+        self._steps_done = (self._steps_done or 0) + steps
+        if not (np.isfinite(rod.position_collection).all() and self.stretch() < LARGEST_STRETCH):
+            time, self._steps_done = self.time, None  # nothing but a reset makes sense now
+            raise PlantError(
+                f"The plant's simulation became unstable at {time:.3f} s: use a shorter timestep than "
+                f"{cable.timestep} s or gentler commands."
+            )
+
+    def _steps(self, interval: float) -> int:
+        steps = round(interval / self.config.cable.timestep)
+        if steps < 1 or abs(steps * self.config.cable.timestep - interval) > 1e-9:
+            raise ValueError(f"{interval} s is not a whole number of time steps of {self.config.cable.timestep} s.")
+        return steps
+
+    def _check_distance(self, pose: np.ndarray) -> None:
+        # A twist moves one gripper along a straight line relative to the other, so its end has the largest distance.
+        distance, length = np.hypot(*(pose[1, :2] - pose[0, :2])), self.config.cable.length
+        if distance > TAUT * length:
+            raise ValueError(
+                f"The grippers would be {distance:.4g} m apart and pull the cable of {length:.4g} m taut: keep them "
+                f"within {TAUT * length:.4g} m."
+            )
+
+
+def _checked(name: str, value: np.ndarray) -> np.ndarray:
+    array = np.array(value, dtype=float)
+    if array.shape != (2, 3):
+        raise ValueError(f"{name} has shape {array.shape}, expected (2, 3): one planar row for each of two grippers.")
+    if not np.isfinite(array).all():
+        raise ValueError(f"{name} is not finite: {array.tolist()}. Check what produced it; the plant has not moved.")
+    return array
+
+
+def _straight_rod(config: RodPlantConfig):
+    """A PyElastica rod along x, at rest, with the stiffness, inertia and unstressed shape of the configuration.
+
+    Directors are the table's normal, the in-plane normal and the tangent; bending in the plane is about the first.
+    """
+    elastica = _import_elastica()
+    cable, h = config.cable, config.cable.link_length
+    lengths = link_lengths(cable)
+    position = np.zeros((3, cable.n_links + 1))
+    position[0, 1:] = np.cumsum(lengths)
+    area = np.pi * cable.diameter**2 / 4
+    rod = elastica.CosseratRod.straight_rod(
+        cable.n_links,
+        np.zeros(3),
+        np.array([1.0, 0.0, 0.0]),
+        np.array([0.0, 0.0, 1.0]),
+        cable.length,
+        cable.diameter / 2,
+        cable.linear_density / area,
+        youngs_modulus=1.0,
+        shear_modulus=1.0,
+        position=position,
+    )
+    axial, bending = config.axial_ratio * cable.bending_stiffness, cable.bending_stiffness
+    # Shear at half the axial stiffness, and inertia of rotation with the gyration radius h / 2: then the fastest shear
+    # mode is as fast as the fastest axial one.
+    rod.shear_matrix[:] = np.diag([0.5 * axial, 0.5 * axial, axial])[:, :, None]
+    inertia = cable.linear_density * lengths * (h / 2) ** 2
+    rod.mass_second_moment_of_inertia[:] = np.eye(3)[:, :, None] * inertia
+    rod.inv_mass_second_moment_of_inertia[:] = np.eye(3)[:, :, None] / inertia
+    # All joints bend alike, EI / h, those beside the half-length elements too: h is the cable's length per joint.
+    rod.bend_matrix[:] = np.eye(3)[:, :, None] * (bending * rod.rest_voronoi_lengths / h)
+    rod.rest_kappa[0] = config.rest_curvature * h / rod.rest_voronoi_lengths
+    return rod
+
+
+def _set_directors(rod, angle: Float[np.ndarray, " n"]) -> None:
+    """Elements turned to these angles in the plane."""
+    cos, sin, zero = np.cos(angle), np.sin(angle), np.zeros_like(angle)
+    rod.director_collection[0] = np.stack([zero, zero, zero + 1.0])
+    rod.director_collection[1] = np.stack([sin, -cos, zero])
+    rod.director_collection[2] = np.stack([cos, sin, zero])
+
+
+def _import_elastica():
+    try:
+        import elastica
+    except ImportError as error:
+        raise ImportError(
+            "The plant made of a Cosserat rod needs PyElastica, which is not installed: pip install pyelastica==1.0.0"
+        ) from error
+    return elastica

@@ -1,0 +1,111 @@
+"""Tables say what the trials say, failures included; the figure shows them."""
+
+import math
+
+import numpy as np
+import pytest
+
+from cablejax.evaluation.failures import Snapshot, append_snapshot, failure_figure, read_snapshots, worst
+from cablejax.evaluation.tables import (
+    comparison_table,
+    interval_table,
+    paired_table,
+    stiffness_table,
+    success_table,
+)
+from evaluation_cases import small_table, trial
+from report_cases import arc
+
+
+def cells(table: str) -> list[list[str]]:
+    lines = table.strip().split("\n")
+    rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
+    assert len({len(row) for row in rows}) == 1, "every row has as many cells as the title"
+    return rows
+
+
+def test_comparison_has_the_papers_layout():
+    title, _, *rows = cells(comparison_table(small_table(), "III"))
+    assert title[2:4] == ["U: terminal error [cm]", "U: settling time [s]"]
+    assert [row[0] for row in rows] == [
+        "direct transfer", "*in the paper*", "GNS + online residual", "*in the paper*",
+        "*best in the paper*",
+    ]  # fmt: skip
+    errors = [t.terminal_error_cm for t in small_table() if t.method == "residual" and t.scenario == "U"]
+    assert rows[2][1:4] == ["6", f"{np.mean(errors):.2f} ± {np.std(errors, ddof=1):.2f}", "8.00 ± 0.00"]
+    assert rows[1][2:] == ["*1.54 ± 0.53*", "*11.32 ± 1.46*", "*1.61 ± 0.42*", "*13.98 ± 1.31*"]
+    assert rows[4][2:] == ["*0.42*", "*8.31*", "*0.57*", "*13.58*"]
+
+
+def test_failures_stand_in_their_cells():
+    trials = [*small_table(), trial(seed=7, settling_time_s=math.inf), trial(seed=8, terminal_error_cm=math.nan)]
+    row = next(r for r in cells(comparison_table(trials, "III")) if r[0] == "GNS + online residual")
+    assert row[1] == "6 to 8"
+    assert "(1 of 8 lost)" in row[2] and "(1 of 8 did not settle)" in row[3]
+    only = [trial(settling_time_s=math.inf)]
+    assert cells(comparison_table(only, "III"))[2][3] == "none (1 of 1 did not settle)"
+    row = next(r for r in cells(interval_table(trials, "III", "settling")) if r[:2] == ["GNS + online residual", "U"])
+    assert row[2:5] == ["8", "1", "0"] and row[8] == "failed"
+
+
+def test_a_table_of_ones_own_has_no_published_rows():
+    rows = cells(comparison_table(small_table("mine"), "mine", methods=("residual",), labels={"residual": "ours"}))
+    assert [row[0] for row in rows[2:]] == ["ours"]
+    with pytest.raises(ValueError, match=r"No trial of table 'IV', only of \['mine'\]"):
+        comparison_table(small_table("mine"), "IV")
+
+
+def test_stiffness_rows_split_the_comparison():
+    rows = cells(stiffness_table(small_table(), "III"))[2:]
+    assert [row[:3] for row in rows] == [
+        ["direct transfer", "0.5", "3"], ["direct transfer", "2", "3"],
+        ["GNS + online residual", "0.5", "3"], ["GNS + online residual", "2", "3"],
+    ]  # fmt: skip
+
+
+def test_pairs_show_the_difference_of_every_trial():
+    rows = cells(paired_table(small_table(), "III", "direct"))[2:]
+    assert [row[1] for row in rows] == ["U", "S"]
+    assert rows[0][2:] == ["6", "0", "0", "-0.100", "-0.100 to -0.100", "6 / 0"]
+    with pytest.raises(ValueError, match="no trial of 'fine-tuned'"):
+        paired_table(small_table(), "III", "fine-tuned")
+
+
+def test_success_is_counted_at_the_end():
+    runs = [trial(table="Liang", scenario="straight", seed=s, terminal_error_cm=0.1 + 0.05 * s) for s in range(8)]
+    runs += [
+        trial(table="Liang", scenario="straight", seed=8, terminal_error_cm=2.0, best_error_cm=0.9),
+        trial(table="Liang", scenario="straight", seed=9, terminal_error_cm=math.nan, best_error_cm=3.0),
+        trial(table="Liang", scenario="diverse", terminal_error_cm=0.2),
+    ]
+    rows = cells(success_table(runs))[2:]
+    assert rows[0] == [
+        "GNS + online residual", "straight", "8/10", "0.44 to 0.97", "9/10", "2.75", "4.67 (1 lost)", "3.25", "40",
+    ]  # fmt: skip
+    assert rows[1][1:3] == ["diverse", "1/1"]
+    assert [row[2] for row in rows[2:4]] == ["*47/50*", "*43/50*"]
+
+
+def snapshot(seed: int, error: float, final: np.ndarray) -> Snapshot:
+    return Snapshot(("Liang", "residual", "diverse", 1.0, seed), arc(0.1), final, arc(1.0), error, None)
+
+
+def test_failures_become_one_figure(tmp_path):
+    path = tmp_path / "snapshots.jsonl"
+    shots = [snapshot(0, 0.2, arc(0.99)), snapshot(1, 9.0, arc(0.5)), snapshot(2, math.nan, np.full((13, 2), np.nan))]
+    for shot in shots:
+        append_snapshot(path, shot)
+    kept = read_snapshots(path)
+    np.testing.assert_allclose(kept[1].final, arc(0.5), atol=1e-6)
+    bad = worst(kept, 5, above_cm=1.0)
+    assert [s.key[-1] for s in bad] == [2, 1]
+    figure = failure_figure(bad)
+    words = [text.get_text() for ax in figure.axes for text in ax.texts]
+    assert words == ["lost", "9.00 cm"]
+    figure.savefig(tmp_path / "failures.png")
+    assert (tmp_path / "failures.png").stat().st_size > 5000
+    with pytest.raises(ValueError, match="no run to show"):
+        failure_figure([])
+    path.write_text('{"key": [1]}\n')
+    with pytest.raises(ValueError, match="line 1 is not a snapshot"):
+        read_snapshots(path)

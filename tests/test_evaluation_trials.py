@@ -1,0 +1,91 @@
+"""Files of trials survive whatever stops their writer."""
+
+import math
+
+import numpy as np
+import pytest
+
+from cablejax.batched_loop import BatchRun
+from cablejax.evaluation.trials import append_trial, finished_keys, read_trials, trial_of, trials_of_batch
+from evaluation_cases import TRIAL, trial
+
+
+def test_trials_come_back_as_they_were(tmp_path):
+    path = tmp_path / "new" / "trials.jsonl"
+    written = [TRIAL, trial(seed=1, settling_time_s=math.inf, stopped="taut"), trial(stiffness=0.1)]
+    for row in written:
+        append_trial(path, row)
+    assert read_trials(path) == written
+    assert finished_keys(written) == {("III", "residual", "U", k, s) for k, s in ((2.0, 0), (2.0, 1), (0.1, 0))}
+    append_trial(path, trial(seed=2, terminal_error_cm=math.nan))
+    assert math.isnan(read_trials(path)[-1].terminal_error_cm)
+    assert read_trials(tmp_path / "none.jsonl") == []
+
+
+@pytest.mark.parametrize("left", [1, 40, 200])
+def test_a_torn_last_line_is_ignored_and_then_cut_off(tmp_path, left):
+    path = tmp_path / "trials.jsonl"
+    append_trial(path, TRIAL)
+    append_trial(path, trial(seed=1))
+    whole = path.read_bytes()
+    first = whole.index(b"\n") + 1
+    path.write_bytes(whole[: first + left])  # killed in the middle of the second line
+    assert read_trials(path) == [TRIAL]
+    append_trial(path, trial(seed=2))
+    assert read_trials(path) == [TRIAL, trial(seed=2)]
+    assert path.read_bytes().count(b"\n") == 2
+
+
+def test_the_later_of_two_equal_keys_counts(tmp_path):
+    path = tmp_path / "trials.jsonl"
+    for row in (TRIAL, trial(seed=1), trial(terminal_error_cm=0.5)):
+        append_trial(path, row)
+    assert [row.terminal_error_cm for row in read_trials(path)] == [0.5, 0.25]
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("{", "line 1 is not JSON"),
+        ("[1]", "line 1 is list"),
+        ('{"table": "III"}', "missing fields"),
+    ],
+)
+def test_a_line_that_is_no_trial_is_refused(tmp_path, line, message):
+    path = tmp_path / "trials.jsonl"
+    path.write_text(line + "\n")
+    with pytest.raises(ValueError, match=message):
+        read_trials(path)
+
+
+def test_a_value_that_is_no_number_is_refused(tmp_path):
+    path = tmp_path / "trials.jsonl"
+    append_trial(path, TRIAL)
+    path.write_text(path.read_text().replace("12.5", '"fast"'))
+    with pytest.raises(ValueError, match=r"line 1 is not a trial: .*fast"):
+        read_trials(path)
+
+
+def test_a_run_becomes_a_trial():
+    class Run:
+        error_cm = np.array([20.0, 0.4, np.nan, 0.5])
+        mpc_ms = np.array([90.0, 110.0, 130.0, np.nan])
+        initial_error_cm, terminal_error_cm, settling_time_s, stopped = 20.0, 0.5, 1.0, None
+
+    row = trial_of(Run(), table="III", method="direct", scenario="Z", stiffness=3, seed=4, wall_s=2)  # pyright: ignore[reportArgumentType]
+    assert (row.best_error_cm, row.steps, row.mpc_ms_median) == (0.4, 3, 110.0)
+    assert row.key == ("III", "direct", "Z", 3.0, 4)
+
+
+def test_a_batch_becomes_trials():
+    error = np.array([[9.0, 2.0, 0.3, 0.25, 0.25], [9.0, np.nan, np.nan, np.nan, np.nan], [9.0, 8.0, 6.0, 4.0, 2.0]])
+    nothing = np.zeros((3, 1))
+    run = BatchRun(nothing, nothing, nothing, error, nothing, nothing)  # pyright: ignore[reportArgumentType]
+    rows = trials_of_batch(
+        run, table="III", method="residual", scenarios="USZ", stiffnesses=[1, 2, 3], seeds=[7, 8, 9], wall_s=6.0
+    )  # fmt: skip
+    assert [row.key[2:] for row in rows] == [("U", 1.0, 7), ("S", 2.0, 8), ("Z", 3.0, 9)]
+    assert [row.settling_time_s for row in rows] == [2.0, math.inf, math.inf]
+    assert [row.best_error_cm for row in rows] == [0.25, 9.0, 2.0]
+    assert math.isnan(rows[1].terminal_error_cm) and rows[2].terminal_error_cm == 2.0
+    assert [(row.steps, row.wall_s) for row in rows] == [(4, 2.0)] * 3

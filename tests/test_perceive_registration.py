@@ -1,0 +1,135 @@
+"""Registration: accuracy, what it must not depend on, and its derivatives."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from cablejax.perceive import RegistrationConfig, register
+from cablejax.perceive.cloud import padded
+from perceive_cases import ARCH, CAPACITY, REGISTRATION, S_SHAPE, cloud, mean_error, moved, shape, start_angles
+
+SIGMA = 0.015
+STEP = 1e-4
+
+
+@pytest.fixture(scope="module", params=[ARCH, S_SHAPE], ids=["arch", "S"])
+def case(request):
+    """A cable, and where it was before its grippers moved by a centimetre."""
+    before = shape(request.param)
+    return before, shape(moved(request.param), guess=before)
+
+
+def fitted(points, before, after, *, iterations=8):
+    rows = padded(points, CAPACITY)
+    return register(
+        REGISTRATION,
+        jnp.asarray(rows.points),
+        jnp.asarray(rows.mask),
+        jnp.asarray(after.pose, jnp.float32),
+        jnp.asarray(start_angles(before), jnp.float32),
+        jnp.asarray(before.pose, jnp.float32),
+        jnp.asarray(SIGMA, jnp.float32),
+        iterations=iterations,
+    )
+
+
+@pytest.mark.parametrize(
+    ("clutter", "bound"),
+    [({}, 1e-3), ({"hidden": (0.25, 0.55), "outliers": 0.1}, 3e-3), ({"noise": 0.0}, 1e-3)],
+    ids=["2 mm noise", "30 % hidden, 10 % outliers", "no noise"],
+)
+def test_keypoints_are_found(case, clutter, bound):
+    before, after = case
+    fit = fitted(cloud(after, 1, **clutter), before, after)
+    assert mean_error(fit.keypoints, after) < bound
+    # The start was wrong by more than that.
+    assert mean_error(before.keypoints, after) > 1.5 * bound
+    assert fit.gap < 1e-4
+    np.testing.assert_allclose(fit.keypoints[jnp.array([0, -1])], after.pose[:, :2], atol=1e-4)
+
+
+def test_what_is_estimated_about_the_cloud_is_right(case):
+    before, after = case
+    fit = fitted(cloud(after, 2, hidden=(0.25, 0.55), outliers=0.1), before, after)
+    assert float(fit.sigma) == pytest.approx(2e-3, rel=0.1)
+    assert float(fit.support) == pytest.approx(0.9, abs=0.04)
+    assert float(fit.seen) == pytest.approx(0.7, abs=0.06)
+
+
+def test_dense_points_do_not_pull_the_keypoints_along(case):
+    before, after = case
+    dense = cloud(after, 3, n=700, hidden=(0.4, 1.0))
+    sparse = cloud(after, 4, n=100, hidden=(0.0, 0.4))
+    fit = fitted(np.concatenate([dense, sparse]), before, after)
+    assert mean_error(fit.keypoints, after) < 1e-3
+
+
+def test_turning_everything_turns_the_result(case):
+    before, after = case
+    points = cloud(after, 5)
+    angle, shift = 2.0, np.array([0.3, -0.2])
+    turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+
+    def carried(cable):
+        pose = np.concatenate([cable.pose[:, :2] @ turn.T + shift, cable.pose[:, 2:] + angle], axis=1)
+        return dataclasses.replace(cable, pose=pose, points=cable.points @ turn.T + shift)
+
+    fit = fitted(points, before, after)
+    turned = fitted(points @ turn.T + shift, carried(before), carried(after))
+    np.testing.assert_allclose(turned.keypoints, np.asarray(fit.keypoints) @ turn.T + shift, atol=2e-5)
+
+
+def test_padding_and_the_order_of_points_do_not_matter(case):
+    before, after = case
+    points = cloud(after, 6, n=CAPACITY // 2)
+    fit = fitted(points, before, after)
+    shuffled = np.full((CAPACITY, 2), np.nan)
+    shuffled[1::2] = points[::-1]
+    np.testing.assert_allclose(fitted(shuffled, before, after).keypoints, fit.keypoints, atol=2e-5)
+
+
+@pytest.mark.slow
+def test_derivatives():
+    """Central differences, and JVP against VJP, in float64 through all iterations."""
+    with jax.enable_x64(True):
+        before = shape(ARCH)
+        after = shape(moved(ARCH), guess=before)
+        points = jnp.asarray(cloud(after, 7, n=120))
+        inputs = (
+            points,
+            jnp.asarray(after.pose),
+            jnp.asarray(start_angles(before)),
+            jnp.asarray(before.pose),
+            jnp.asarray(SIGMA),
+        )
+
+        def keypoints(points, pose, angles, angles_pose, sigma):
+            mask = jnp.ones(len(points), bool)
+            return register(REGISTRATION, points, mask, pose, angles, angles_pose, sigma, iterations=4).keypoints
+
+        push = jax.jit(lambda at, directions: jax.jvp(keypoints, at, directions))
+        random = np.random.default_rng(8)
+        cotangent = jnp.asarray(random.standard_normal((13, 2)))
+        pulled = jax.jit(lambda cotangent: jax.vjp(keypoints, *inputs)[1](cotangent))(cotangent)
+        for index, (value, back) in enumerate(zip(inputs, pulled, strict=True)):
+            direction = jnp.asarray(random.standard_normal(value.shape)) * 1e-3
+            directions = tuple(jnp.zeros_like(v) if i != index else direction for i, v in enumerate(inputs))
+            forward = push(inputs, directions)[1]
+            up, down = (
+                push(jax.tree.map(lambda v, d, s=sign: v + s * STEP * d, inputs, directions), directions)[0]
+                for sign in (1, -1)
+            )
+            np.testing.assert_allclose(forward, (up - down) / (2 * STEP), atol=1e-6 * np.abs(forward).max() + 1e-10)
+            assert float(jnp.vdot(cotangent, forward)) == pytest.approx(float(jnp.vdot(back, direction)), rel=1e-8)
+            assert np.abs(forward).max() > 0
+
+
+@pytest.mark.parametrize(
+    "change", [{"length": -1.0}, {"outlier_weight": 1.0}, {"n_links": 3}, {"coherence": np.nan}, {"bending": 0.0}]
+)
+def test_impossible_settings_are_refused(change):
+    with pytest.raises(ValueError, match=next(iter(change)).replace("n_links", "links")):
+        RegistrationConfig(**change)

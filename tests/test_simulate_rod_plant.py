@@ -1,0 +1,208 @@
+"""The Cosserat rod's plant: rest, grasps, friction law, agreement with the elastica, and what it refuses."""
+
+import builtins
+import dataclasses
+
+import numpy as np
+import pytest
+
+pytest.importorskip("elastica", reason="PyElastica is not installed: pip install pyelastica==1.0.0")
+
+from cablejax.closed_loop import run_closed_loop
+from cablejax.simulate import rod_plant
+from cablejax.simulate.config import GRAVITY, CableConfig
+from cablejax.simulate.elastica import elastica
+from cablejax.simulate.plant import PlantError
+from cablejax.simulate.rod_plant import ETHERNET, USB, RodPlant, RodPlantConfig
+from cablejax.targets import make_target, straight_start
+
+CABLE = CableConfig(n_links=15, timestep=4e-4)
+CONFIG = RodPlantConfig(cable=CABLE)
+ARCH = np.array([[-0.45, 0.0, 0.0], [0.45, 0.0, 0.0]])
+STILL = np.zeros((2, 3))
+
+
+@pytest.fixture(scope="module")
+def plant() -> RodPlant:
+    return RodPlant(CONFIG)
+
+
+def rubbing(friction, **changes) -> RodPlant:
+    cable = dataclasses.replace(CABLE, friction_coefficient=friction)
+    return RodPlant(dataclasses.replace(CONFIG, cable=cable, **changes))
+
+
+@pytest.mark.parametrize("letter", ["U", "S", "Z"])
+def test_a_new_cable_has_the_shape_of_the_elastica(letter):
+    plant = RodPlant(RodPlantConfig(cable=CableConfig(n_links=27, timestep=2e-4)))
+    target = make_target(letter, plant.config.cable)
+    np.testing.assert_allclose(plant.reset(target.gripper_pose).keypoints, target.keypoints, atol=2e-3)
+    assert plant.stretch() < 1e-3
+
+
+def test_grippers_hold_rigidly_and_without_lag(plant):
+    plant.reset(ARCH)
+    twist = np.array([[0.03, 0.02, -0.2], [-0.03, 0.03, 0.3]])
+    for observation in plant.record(twist, samples=10):
+        np.testing.assert_allclose(observation.keypoints[[0, -1]], observation.gripper_pose[:, :2], atol=1e-9)
+    np.testing.assert_allclose(observation.gripper_pose, ARCH + twist, atol=1e-12)
+    _, directions = plant.nodes()
+    angle = np.arctan2(directions[:, 1], directions[:, 0])
+    np.testing.assert_allclose(angle[[0, -1]], observation.gripper_pose[:, 2], atol=1e-9)
+
+
+def test_cable_at_rest_does_not_creep(plant):
+    plant.reset(ARCH)
+    before = plant.step(np.array([[0.03, 0.02, -0.2], [-0.03, 0.03, 0.3]]))
+    rest = plant.step(STILL)
+    assert np.abs(plant.step(STILL, 10.0).keypoints - rest.keypoints).max() < 1e-6
+    assert np.abs(rest.keypoints - before.keypoints).max() < 2e-3
+
+
+@pytest.mark.parametrize("speed", [0.01, 0.05])
+def test_friction_of_a_sliding_cable_is_stribecks(speed):
+    # Dragged along, all of the free cable slides; its nodes gain what the elastic force leaves over, so both agree.
+    mu, static_ratio, stribeck_speed = 0.1, 1.5, 0.01
+    plant = rubbing(mu, stribeck_speed=stribeck_speed, static_ratio=static_ratio)
+    plant.reset(ARCH)
+    twist = np.array([[speed, 0.0, 0.0]] * 2)
+    plant.step(twist, 2.0)
+    rod, free, forces = plant._rod, slice(2, -2), []
+    for _ in range(500):
+        plant.step(twist, CABLE.timestep)
+        forces.append([rod.internal_forces[0, free].sum(), -rod.external_forces[0, free].sum()])
+    assert np.abs(rod.velocity_collection[0, free] - speed).max() < 0.1 * speed
+    weight = rod.mass[free].sum() * GRAVITY
+    expected = mu * weight * (1.0 + (static_ratio - 1.0) * np.exp(-((speed / stribeck_speed) ** 2)))
+    np.testing.assert_allclose(np.mean(forces, axis=0), expected, rtol=0.02)
+
+
+def test_friction_keeps_a_cable_where_a_frictionless_one_springs_back():
+    twist = np.array([[0.0, 0.0, 0.4], [0.0, 0.0, -0.2]])
+    rest = elastica(ARCH + twist, CABLE.length, CABLE.keypoint_arclength)
+    off = []
+    for friction in (1.0, 0.0):
+        plant = rubbing(friction)
+        plant.reset(ARCH)
+        plant.step(twist)
+        off.append(np.abs(plant.step(STILL, 3.0).keypoints - rest).max())
+    assert off[1] < 6e-3
+    assert off[0] > 3 * off[1]
+
+
+def test_a_uniform_rest_curvature_does_not_show_between_two_clamps():
+    shapes = []
+    for curvature in (0.0, 2.0):
+        plant = rubbing(0.0, rest_curvature=curvature)
+        shapes.append(plant.reset(ARCH).keypoints)
+    np.testing.assert_allclose(shapes[1], shapes[0], atol=5e-4)
+    assert plant._rod.rest_kappa[0, 3] == pytest.approx(2.0)
+
+
+def test_runs_repeat_exactly_and_noise_does_too():
+    config = dataclasses.replace(CONFIG, keypoint_noise=1e-3, keypoint_dropout=0.3, seed=7)
+    twist = np.array([[0.02, 0.0, 0.0], [0.0, 0.02, 0.1]])
+
+    def run(plant):
+        return np.stack([plant.reset(ARCH).keypoints, plant.step(twist, 0.5).keypoints])
+
+    plant = RodPlant(config)
+    first, again, other = run(plant), run(plant), run(RodPlant(config))
+    np.testing.assert_array_equal(first, again)
+    np.testing.assert_array_equal(first, other)
+    clean = run(RodPlant(CONFIG))
+    seen = np.isfinite(first)
+    assert 0 < (~seen).sum() < first.size / 2 and seen[:, [0, -1]].all()
+    assert 2e-4 < (first - clean)[seen].std() < 3e-3
+    np.testing.assert_allclose(plant.observe().true_keypoints, clean[1], atol=1e-12)
+
+
+def test_recording_does_not_change_the_motion(plant):
+    twist = np.array([[0.03, 0.0, 0.2], [0.0, -0.03, 0.1]])
+    plant.reset(ARCH)
+    once = plant.step(twist)
+    plant.reset(ARCH)
+    samples = plant.record(twist, samples=10)
+    np.testing.assert_allclose(samples[-1].keypoints, once.keypoints, atol=1e-6)
+    np.testing.assert_allclose([sample.time for sample in samples], np.arange(1, 11) / 10)
+
+
+def test_bad_commands_are_refused_and_leave_the_plant_alone(plant):
+    before = plant.reset(ARCH)
+    with pytest.raises(ValueError, match="twist is not finite"):
+        plant.step(np.full((2, 3), np.nan))
+    with pytest.raises(ValueError, match=r"shape \(6,\), expected \(2, 3\)"):
+        plant.step(np.zeros(6))
+    with pytest.raises(ValueError, match="pull the cable of 1 m taut"):
+        plant.step(np.array([[-0.06, 0, 0], [0.06, 0, 0]]))
+    with pytest.raises(ValueError, match="whole number of time steps"):
+        plant.step(STILL, 0.0123)
+    with pytest.raises(ValueError, match="do not fall on time steps"):
+        plant.record(STILL, 1.0, samples=7)
+    after = plant.observe()
+    np.testing.assert_array_equal(after.keypoints, before.keypoints)
+    assert after.time == before.time
+
+
+def test_bad_set_ups_are_refused():
+    with pytest.raises(ValueError, match="reset"):
+        RodPlant(CONFIG).step(STILL)
+    with pytest.raises(ValueError, match="taut"):
+        RodPlant(CONFIG).reset(np.array([[-0.6, 0, 0], [0.6, 0, 0]]))
+    with pytest.raises(ValueError, match="gripper_pose is not finite"):
+        RodPlant(CONFIG).reset(np.full((2, 3), np.inf))
+    for changes, message in [
+        ({"cable": CableConfig(dimension=3, timestep=1e-4)}, "dimension is 3"),
+        ({"cable": CableConfig(n_links=27, timestep=1e-3)}, "stable only up to"),
+        ({"static_ratio": 0.9}, "static_ratio"),
+        ({"axial_ratio": 0.0}, "axial_ratio"),
+        ({"rest_curvature": np.nan}, "rest_curvature"),
+        ({"keypoint_noise": -1.0}, "keypoint_noise"),
+        ({"keypoint_dropout": 1.0}, "keypoint_dropout"),
+    ]:
+        with pytest.raises(ValueError, match=message):
+            dataclasses.replace(CONFIG, **changes)
+
+
+def test_an_unstable_simulation_is_reported(plant):
+    plant.reset(ARCH)
+    with pytest.raises(PlantError, match="unstable"):
+        plant.step(np.array([[0, 1e12, 0], [0, 1e12, 0]], float))
+    with pytest.raises(ValueError, match="reset"):
+        plant.step(STILL)
+    assert np.isfinite(plant.reset(ARCH).keypoints).all()
+
+
+def test_a_missing_library_says_how_to_get_it(monkeypatch):
+    real = builtins.__import__
+
+    def without(name, *args, **kwargs):
+        if name.startswith("elastica"):
+            raise ImportError(name)
+        return real(name, *args, **kwargs)
+
+    monkeypatch.setattr(builtins, "__import__", without)
+    with pytest.raises(ImportError, match="pip install pyelastica"):
+        rod_plant._import_elastica()
+
+
+def test_the_closed_loop_takes_it_for_a_plant():
+    @dataclasses.dataclass(frozen=True)
+    class Still:
+        def init(self, history):
+            return None
+
+        def step(self, state, keypoints, gripper_pose):
+            return None, STILL, None
+
+    run = run_closed_loop(RodPlant(CONFIG), Still(), make_target("U", CABLE), 2, start=straight_start(CABLE))
+    assert run.stopped is None and len(run.episode.time) == 3 * 10 + 1
+    assert np.abs(run.keypoints[-1] - run.keypoints[0]).max() < 1e-6
+
+
+def test_the_named_cables_differ_from_the_reference_in_opposite_directions():
+    nominal = CableConfig()
+    assert USB.cable.bending_stiffness < nominal.bending_stiffness < ETHERNET.cable.bending_stiffness
+    for config in (ETHERNET, USB):
+        assert config.cable.n_keypoints == 13 and config.cable.length == 1.0
+        assert config.rest_curvature == 0.0
