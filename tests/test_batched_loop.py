@@ -182,7 +182,11 @@ print(jax.device_count()); np.save({path!r}, run.keypoints)
 
 @pytest.mark.slow
 def test_the_batch_ends_where_the_contact_plant_ends():
-    """U, the released model: terminal errors of the planar simulator and of C MuJoCo with contacts, within 1 mm."""
+    """U by the released model, on the planar simulator and in C MuJoCo with contacts.
+
+    On the way the two are within 1.5 mm. In the end a very soft cable parts them: contacts hold it where it lies, while
+    the simulator's friction, viscous below `friction_speed`, lets it creep on towards the target.
+    """
     cable, ratios, steps = CableConfig(), np.array([0.1, 1.0, 3.0]), 20
     engine, model, target = MjxEngine(cable), load_model("gns-reference"), make_target("U", cable)
     controller = make_controller(model, target, method="residual", solver="trust-region")
@@ -193,10 +197,11 @@ def test_the_batch_ends_where_the_contact_plant_ends():
         engine, varied_params(cable, ratios), state, policy, model.weights, goals, LoopConfig(steps=steps)
     )  # fmt: skip
     fine = CableConfig(n_links=24, dimension=3, timestep=0.005)
-    for i, ratio in enumerate(ratios):
+    for i, (ratio, tolerance_cm) in enumerate(zip(ratios, (0.15, 0.05, 0.05), strict=True)):
         plant = Plant(PlantConfig(cable=fine, stiffness_ratio=float(ratio)))
         one = run_closed_loop(plant, controller, target, steps, start=straight_start(cable), record_hz=1.0)
-        assert abs(one.terminal_error_cm - float(run.terminal_error_cm[i])) < 0.1
+        assert np.abs(one.keypoints[:10] - run.keypoints[i, :10]).max() < 1.5e-3
+        assert abs(one.terminal_error_cm - run.terminal_error_cm[i]) < tolerance_cm
 
 
 def test_wrong_requests_are_refused():
@@ -221,6 +226,8 @@ def test_the_adapter_refuses_what_a_plant_refuses():
     np.testing.assert_allclose(first.keypoints[[0, -1]], straight_start(CABLE)[:, :2], atol=1e-6)
     with pytest.raises(ValueError, match="not finite"):
         plant.record(np.full((2, 3), np.nan), 1.0, samples=1)
+    with pytest.raises(ValueError, match="samples is 0"):
+        plant.record(np.zeros((2, 3)), 1.0, samples=0)
     with pytest.raises(PlantError, match="diverged"):
         plant.record(np.full((2, 3), 1e30), 1.0, samples=1)
     with pytest.raises(ValueError, match="call reset"):

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from cablejax.mpc import Controller, MPCConfig, Outcome, ProjectedGradient, TrustRegion, time_control
+from cablejax.mpc.goal import goal_pose
 from cablejax.types import History
 from mpc_cases import START, TARGETS, at_rest, hermite_shape, relaxing_cable
 
@@ -149,6 +150,27 @@ def test_at_the_target_the_grippers_rest():
     _, twists, info = run(controller(), Cable(rate=0.8, sag=0.0, pose=pose), 4)
     assert (twists == 0).all()
     assert (info.outcome == Outcome.HELD).all()
+
+
+def stubborn_cable(weights, history, twist):
+    """A model in whose eyes every motion but a whole way to the target makes things worse: a valley."""
+    newest = history.keypoints[-1]
+    away = weights * jnp.sum(jnp.abs(twist)) * jnp.ones_like(newest)
+    return away.at[jnp.array([0, -1])].set(twist[:, :2])
+
+
+def test_out_of_a_valley_the_grippers_travel_to_where_the_target_is_held():
+    control = controller("S", WITHOUT, rate=5.0, dynamics=stubborn_cable)
+    cable = Cable(rate=0.8, sag=0.0)
+    state, twists, info = run(control, cable, 30)
+    travelled = info.outcome == Outcome.TRAVELLING
+    assert info.outcome[0] == Outcome.TRAVELLING and (info.outcome[~travelled] == Outcome.HELD).all()
+    assert (np.linalg.norm(twists * [1, 1, 0.15], axis=-1) <= 0.05 * (1 + 1e-5)).all()
+    way = (np.asarray(goal_pose(control.target)) - cable.pose) * [1, 1, 0.15]
+    assert np.linalg.norm(way, axis=1).max() < 0.05, "it ends a step before the goal, where planning takes over"
+    assert int(state.travels) == 1 and int(state.travel) == 0
+    never = dataclasses.replace(control, config=dataclasses.replace(WITHOUT, max_travels=0))
+    assert (run(never, Cable(rate=0.8, sag=0.0), 3)[2].outcome == Outcome.HELD).all()
 
 
 def test_many_cables_in_one_call_are_the_same_as_one_by_one():

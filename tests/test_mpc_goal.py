@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from cablejax.mpc.goal import goal_pose, straight_plan
+from cablejax.mpc.goal import continued, goal_pose, straight_plan, total_turn
 from cablejax.targets import make_target
 
 
@@ -29,8 +29,24 @@ def test_straight_plan_arrives_together_within_the_bound_and_then_rests():
     np.testing.assert_allclose(plan[-1], 0.0, atol=1e-6)
 
 
-def test_rotations_take_the_shorter_way():
-    pose = jnp.array([[0.0, 0.0, 3.0], [0.5, 0.0, -3.0]])
-    goal = jnp.array([[0.0, 0.0, -3.0], [0.5, 0.0, 3.0]])
+def test_both_grippers_turn_the_shorter_way_and_the_cable_keeps_its_turn():
+    pose = jnp.array([[0.0, 0.0, 3.0], [0.5, 0.0, 3.2]])
+    goal = jnp.array([[0.0, 0.0, -3.0], [0.5, 0.0, -3.1]])
     plan = np.asarray(straight_plan(pose, goal, jnp.asarray(1.0), 0.15, 1))
-    np.testing.assert_allclose(np.abs(plan[0, :, 2]), 0.15 * (2 * np.pi - 6.0), rtol=1e-4)
+    np.testing.assert_allclose(plan[0, :, 2], 0.15 * (np.array([-6.0, -6.3]) + 2 * np.pi), rtol=1e-4)
+    # wound up by a whole turn: nothing but turning back by one helps, half of it at either end
+    wound = pose.at[1, 2].add(2 * np.pi)
+    plan = np.asarray(straight_plan(wound, pose, jnp.asarray(9.0), 0.15, 1))
+    assert plan[0, 1, 2] - plan[0, 0, 2] == pytest.approx(-0.15 * 2 * np.pi, rel=1e-5)
+
+
+@pytest.mark.parametrize("turn", [0.0, 1.0, -4.0, 7.0])
+def test_turn_is_read_off_the_keypoints_whole_turns_included(turn):
+    angle = np.linspace(0.3, 0.3 + turn, 400)
+    curve = np.cumsum(np.stack([np.cos(angle), np.sin(angle)], axis=1), axis=0) / 400
+    keypoints = jnp.asarray(curve[np.linspace(0, 399, 13).astype(int)])
+    assert float(total_turn(keypoints)) == pytest.approx(turn, abs=0.03)
+    pose = jnp.array([[0.0, 0.0, 0.3], [0.5, 0.0, 0.3 + turn - 4 * np.pi]])
+    assert float(continued(pose, keypoints)[1, 2]) == pytest.approx(0.3 + turn, abs=1e-5)
+    goal = np.asarray(goal_pose(keypoints))
+    np.testing.assert_allclose(goal[:, 2], [0.3, 0.3 + turn], atol=0.03)

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from cablejax.mpc import ObjectiveConfig
-from cablejax.types import advance
-from mpc_cases import START, TARGETS, at_rest, hermite_shape, poses, problem, random_motion
+from cablejax.mpc.goal import total_turn
+from cablejax.types import History, advance
+from mpc_cases import START, TARGETS, at_rest, feasible_set, hermite_shape, poses, problem, random_motion
 
 
 def central_difference(f, x, tangent, step=1e-6):
@@ -90,6 +91,28 @@ def test_gradient_in_weights_history_and_target():
         _, forward = jax.jvp(value, (x,), (tangent,))
         assert abs(forward - central_difference(value, x, tangent)) <= 1e-5 * abs(forward)
         assert abs(forward - jnp.vdot(jax.grad(value)(x), tangent)) <= 1e-8 * abs(forward)
+
+
+def test_a_wound_up_cable_pays_for_more_than_half_a_turn_and_nothing_else_does():
+    """The straight target seen from a cable whose far end was turned by 1.7 pi: a curl, not a reflection."""
+    with jax.enable_x64(True):
+        angle = np.linspace(0.0, 1.7 * np.pi, 13)
+        curl = np.cumsum(np.stack([np.cos(angle), np.sin(angle)], axis=1), axis=0) / 12
+        pose = jnp.asarray([[*curl[0], 0.0], [*curl[-1], 1.7 * np.pi - 2 * np.pi]])
+        history = History(keypoints=jnp.asarray(np.tile(curl, (3, 1, 1))), gripper_pose=pose)
+        case = dataclasses.replace(
+            problem("near"), history=history, target=hermite_shape(TARGETS["near"], 13), feasible=feasible_set(pose)
+        )
+        motion = random_motion(3)
+        turn = 1.7 * np.pi + np.cumsum(np.asarray(motion[:, 1, 2] - motion[:, 0, 2])) / 0.15
+        wound = np.asarray(case.residuals(motion)[-len(motion) :])
+        np.testing.assert_allclose(wound, 0.15 * (turn - float(total_turn(case.target)) - np.pi), rtol=1e-9)
+        assert wound.min() > 0.05
+        residuals, jacobian = case.linearise(motion)
+        np.testing.assert_allclose(residuals, case.residuals(motion), atol=1e-12)
+        np.testing.assert_allclose(jacobian, jax.jacfwd(case.residuals)(motion).reshape(jacobian.shape), atol=1e-10)
+    for name in TARGETS:
+        assert not problem(name).residuals(random_motion(4))[-4:].any()
 
 
 def test_target_shape_has_no_error():

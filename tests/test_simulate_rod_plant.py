@@ -183,7 +183,7 @@ def test_a_missing_library_says_how_to_get_it(monkeypatch):
 
     monkeypatch.setattr(builtins, "__import__", without)
     with pytest.raises(ImportError, match="pip install pyelastica"):
-        rod_plant._import_elastica()
+        rod_plant._import_rod_class()
 
 
 def test_the_closed_loop_takes_it_for_a_plant():

@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from cablejax.adaptation.belief import AdaptationConfig, CableBelief, prior_belief, update
 from cablejax.mpc.feasible import FeasibleSet
-from cablejax.mpc.goal import goal_pose, straight_plan
+from cablejax.mpc.goal import continued, goal_pose, straight_plan, way_to
 from cablejax.mpc.problem import ObjectiveConfig, Outcome, Plan, ShapingProblem, Solver
 from cablejax.mpc.trust_region import TrustRegion
 from cablejax.residual.corrected import Dynamics, corrected
@@ -41,6 +41,9 @@ class MPCConfig:
         min_reduction: predicted changes of the error below this say nothing about the model: the radius stays [m].
         hold_improvement: the grippers hold still if the plan lowers the error over the horizon, as a root mean square
             distance, by less than this compared with holding still [m].
+        travel_beyond: where no plan is better than holding, and the way to where the target's ends are held is longer
+            than this [m], the grippers travel there by the straight way: the plans are in a valley of the objective.
+        max_travels: how often that may happen; a valley that is fallen into again and again is the model's.
         objective: weights and units of the planning problem.
         residual: settings of the online residual; None = trust the offline model.
         adaptation: settings of the online estimate of the cable, for a conditioned model; None = no estimate.
@@ -60,6 +63,8 @@ class MPCConfig:
     shrink: float = 0.95
     min_reduction: float = 1e-4
     hold_improvement: float = 2e-5
+    travel_beyond: float = 0.08
+    max_travels: int = 3
     objective: ObjectiveConfig = ObjectiveConfig()
     residual: RidgeConfig | None = RidgeConfig(forgetting=0.5, outlier=0.02)
     adaptation: AdaptationConfig | None = None
@@ -85,6 +90,8 @@ class MPCConfig:
                 f"MPCConfig trust region: thresholds {self.shrink_below}, {self.grow_above} must increase, and factors "
                 f"{self.shrink}, {self.grow} lie on either side of 1."
             )
+        if not (self.travel_beyond > 0 and self.max_travels >= 0):
+            raise ValueError("MPCConfig.travel_beyond must be positive [m] and max_travels not negative.")
         if not (self.min_reduction > 0 and self.hold_improvement >= 0):
             raise ValueError("MPCConfig.min_reduction must be positive and hold_improvement not negative [m].")
 
@@ -111,6 +118,8 @@ class ControllerState:
         observed: keypoints seen at the last step, shape [N].
         shape_error: root mean square distance to the target at the last step [m], shape [].
         radius: trust-region size epsilon [m], shape [].
+        travel: commands left of a way to the target's ends, shape []; 0 = planning.
+        travels: how many such ways were begun, shape [].
         cable: what is believed of the cable, and the derivative of `model_displacement` by it [m], shape [N, 2, 2];
             None without adaptation.
         steps: control steps so far, shape [].
@@ -128,6 +137,8 @@ class ControllerState:
     observed: Bool[Array, "*batch N"]
     shape_error: Float[Array, "*batch"]
     radius: Float[Array, "*batch"]
+    travel: Int[Array, "*batch"]
+    travels: Int[Array, "*batch"]
     cable: tuple[CableBelief, Float[Array, "*batch N 2 2"]] | None
     steps: Int[Array, "*batch"]
     held: Int[Array, "*batch"]
@@ -188,6 +199,8 @@ def initial_state(config: MPCConfig, history: History) -> ControllerState:
         observed=jnp.ones(n_keypoints, bool),
         shape_error=jnp.zeros((), dtype),
         radius=jnp.asarray(config.radius, dtype),
+        travel=jnp.zeros((), jnp.int32),
+        travels=jnp.zeros((), jnp.int32),
         cable=cable,
         steps=jnp.zeros((), jnp.int32),
         held=jnp.zeros((), jnp.int32),
@@ -231,6 +244,7 @@ def control(
     rho, radius = _update_radius(config, state, error, problem.shape_error(state.predicted))
     problem = dataclasses.replace(problem, feasible=dataclasses.replace(problem.feasible, radius=radius))
     plan, value, value_hold = _plan_or_hold(config, problem, state.plan)
+    plan, value, travel = _plan_or_travel(config, problem, state, plan, value)
 
     twist = config.objective.to_twist(plan.motion[0])
     offline, cable = _displacement(dynamics, weights, state, twist)
@@ -256,6 +270,8 @@ def control(
     state = dataclasses.replace(
         state,
         plan=plan.motion,
+        travel=travel,
+        travels=state.travels + ((travel > 0) & (state.travel == 0)),
         cable=cable,
         twist=twist,
         model_displacement=offline,
@@ -370,11 +386,31 @@ def _plan_or_hold(
     return Plan(motion=motion, evaluations=plan.evaluations, outcome=outcome.astype(jnp.int32)), value, value_hold
 
 
+def _plan_or_travel(
+    config: MPCConfig, problem: ShapingProblem, state: ControllerState, plan: Plan, value: Float[Array, ""]
+) -> tuple[Plan, Float[Array, ""], Int[Array, ""]]:
+    """The plan, or the next step of a straight way out of a valley; the value; how many steps of the way are left."""
+    pose, goal = continued(problem.history.gripper_pose, problem.history.keypoints[-1]), goal_pose(problem.target)
+    weight, radius = config.objective.rotation_weight, problem.feasible.radius
+    longest = jnp.linalg.norm(way_to(pose, goal, weight), axis=1).max()
+    stuck = (plan.outcome == Outcome.HELD) & (longest > config.travel_beyond) & (state.travels < config.max_travels)
+    # half as many steps again as the way is long: the bounds on the grippers' distance may lead it round
+    needed = jnp.ceil(1.5 * longest / radius).astype(jnp.int32)
+    left = jnp.where(state.travel > 0, state.travel - 1, jnp.where(stuck, needed, 0))
+    left = jnp.where((longest > radius) & (plan.outcome != Outcome.NONFINITE), left, 0)
+    way = problem.feasible.project(straight_plan(pose, goal, radius, weight, config.n_commands))
+    travelling = left > 0
+    outcome = jnp.where(travelling, Outcome.TRAVELLING, plan.outcome).astype(jnp.int32)
+    motion = jnp.where(travelling, way, plan.motion)
+    value = jnp.where(travelling, problem.value(way), value)
+    return Plan(motion=motion, evaluations=plan.evaluations, outcome=outcome), value, left
+
+
 def _best_guess(config: MPCConfig, problem: ShapingProblem, last: Float[Array, "T Q 3"]) -> Float[Array, "T Q 3"]:
     """The better of two starts: the last plan, shifted by the command that was executed, and the straight way."""
     shifted = jnp.roll(last, -1, axis=0).at[-1].set(0.0)
     straight = straight_plan(
-        problem.history.gripper_pose,
+        continued(problem.history.gripper_pose, problem.history.keypoints[-1]),
         goal_pose(problem.target),
         problem.feasible.radius,
         config.objective.rotation_weight,

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from cablejax.mpc.feasible import FeasibleSet
+from cablejax.mpc.goal import continued, total_turn
 from cablejax.residual.corrected import Dynamics
 from cablejax.types import History, advance
 
@@ -54,8 +55,12 @@ class ObjectiveConfig:
 class ShapingProblem:
     """Bring the cable to a target shape within a horizon (Wang et al., RA-L 2022, "Model Predictive Control").
 
-        min over u in feasible   1/2 sum_t [ w_t / N ||X(t) - X_d||^2 + motion_weight ||u(t - 1)||^2 ],   t = 1, ..., T
-        with X(t + 1) = X(t) + f(X(t - m : t), R(t)),   R = `objective.to_twist(u)`
+        min over u in feasible   1/2 sum_t [ w_t / N ||X(t) - X_d||^2 + motion_weight ||u(t - 1)||^2 + l(t)^2 ]
+        with X(t + 1) = X(t) + f(X(t - m : t), R(t)),   R = `objective.to_twist(u)`,   t = 1, ..., T
+
+    The last term is zero unless the cable is wound up: `l = rotation_weight max(|turn - turn_d| - pi, 0)`, where turn
+    is the angle from one gripper's theta to the other's along the cable. A loop cannot be shaped away with the
+    grippers' directions as they are, and next to it the keypoint error alone has a minimum.
 
     It is a nonlinear least squares problem: `value` is half the squared norm of `residuals`. All methods are pure and
     differentiable in `motion`, `history`, `target` and `weights` as far as `dynamics` is.
@@ -86,8 +91,8 @@ class ShapingProblem:
         return jax.lax.scan(one_step, self.history, self.objective.to_twist(motion))[1]
 
     def residuals(self, motion: Float[Array, "T Q 3"]) -> Float[Array, " M"]:
-        """Weighted shape errors of all predicted steps, then weighted motions [m]; M = T (2N + 3Q)."""
-        return self._weigh(self.rollout(motion) - self.target, motion)
+        """Weighted shape errors of all predicted steps, weighted motions, winding [m]; M = T (2N + 3Q + 1)."""
+        return jnp.concatenate([self._weigh(self.rollout(motion) - self.target, motion), self._winding(motion)])
 
     def value(self, motion: Float[Array, "T Q 3"]) -> Float[Array, ""]:
         """The objective, half the sum of squared residuals [m^2]."""
@@ -123,7 +128,9 @@ class ShapingProblem:
             slopes.append(_pad_to(slope, motion.size, axis=1))
         slope = jnp.swapaxes(jnp.concatenate(slopes), 0, 1)
         jacobian = jax.vmap(self._weigh)(slope, unit_motions).T
-        return self._weigh(jnp.concatenate(shapes) - self.target, motion), jacobian
+        residuals = jnp.concatenate([self._weigh(jnp.concatenate(shapes) - self.target, motion), self._winding(motion)])
+        winding = jax.jacfwd(self._winding)(motion).reshape(n_steps, motion.size)
+        return residuals, jnp.concatenate([jacobian, winding])
 
     def shape_error(self, keypoints: Float[Array, "*batch N 2"]) -> Float[Array, "*batch"]:
         """Root mean square distance of keypoints to the target [m]."""
@@ -137,6 +144,13 @@ class ShapingProblem:
         weight = jnp.ones(n_steps).at[-1].set(self.objective.terminal_weight)
         shape = jnp.sqrt(weight / n_keypoints)[:, None, None] * shape_error
         return jnp.concatenate([shape.ravel(), self.objective.motion_weight**0.5 * motion.ravel()])
+
+    def _winding(self, motion: Float[Array, "T Q 3"]) -> Float[Array, " T"]:
+        """By how much more than half a turn the cable is wound up after every step, as a length [m]."""
+        theta = continued(self.history.gripper_pose, self.history.keypoints[-1])[:, 2]
+        turn = theta[1] - theta[0] + jnp.cumsum(motion[:, 1, 2] - motion[:, 0, 2]) / self.objective.rotation_weight
+        excess = jnp.abs(turn - total_turn(self.target)) - jnp.pi
+        return self.objective.rotation_weight * jnp.maximum(excess, 0.0)
 
 
 def _pad_to(x: Float[Array, "..."], size: int, axis: int) -> Float[Array, "..."]:
@@ -155,6 +169,8 @@ class Outcome(enum.IntEnum):
     """The plan would hardly improve on holding still: the grippers hold."""
     NONFINITE = 3
     """The model or the observation gave NaN or infinity: the grippers hold."""
+    TRAVELLING = 4
+    """No plan was better than holding, far from where the target's ends are held: the grippers go there."""
 
 
 @jax.tree_util.register_dataclass

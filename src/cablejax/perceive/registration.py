@@ -51,7 +51,9 @@ class RegistrationConfig:
         coherence: weight of coherent motion [1/m^2]: 1/2 of it times the squared norm of the displacement field.
         kernel_width: distance over which motion coheres, in lengths of the cable.
         structure: weight of the local linear embedding [1/m^2].
-        bending: weight of the bending energy `1/2 int curvature^2 ds` [m]. It decides where nothing is seen.
+        bending: weight of the bending energy `1/2 int curvature^2 ds` [m]. A uniform cable rests where this energy
+            is least, so the term does not move it, and it decides where nothing is seen. A cable with bends of its own
+            is drawn to the straight: give less for one.
     """
 
     length: float = 1.0
@@ -64,7 +66,7 @@ class RegistrationConfig:
     coherence: float = 1e3
     kernel_width: float = 0.2
     structure: float = 1e4
-    bending: float = 10.0
+    bending: float = 100.0
 
     def __post_init__(self):
         for name in ("length", "area", "min_sigma", "settled_sigma", "kernel_width", "bending"):

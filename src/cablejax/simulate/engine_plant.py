@@ -43,10 +43,10 @@ class EnginePlant:
         Raises:
             ValueError: the grippers are out of the cable's reach.
         """
-        state = self.engine.initial_state(gripper_pose, guess=guess)
-        self._state, shown = self.engine.rollout(self.params, state, np.zeros((0, 2, 3)))
-        self._time = 0.0
-        return self._last_of(shown)
+        self._state, self._time = self.engine.initial_state(gripper_pose, guess=guess), 0.0
+        # A rollout begins by showing where it starts; an engine that compiles has this one at hand for `record`.
+        _, shown = self.engine.rollout(self.params, self._state, np.zeros((1, 2, 3)))
+        return self._sample(shown, 0)
 
     def record(self, twist: Float[np.ndarray, "Q 3"], interval: float = 1.0, *, samples: int) -> list[Observation]:
         """Hold a command for one interval and observe the cable `samples` times, evenly spaced, last at its end.
@@ -59,18 +59,20 @@ class EnginePlant:
             raise ValueError("The plant has no cable yet: call reset(gripper_pose) first.")
         if np.shape(twist) != (2, 3) or not np.isfinite(twist).all():
             raise ValueError(f"The command is not finite or not of shape (2, 3): {np.asarray(twist).tolist()}.")
+        if samples < 1:
+            raise ValueError(f"samples is {samples}, expected at least 1.")
         observations = []
         for _ in range(samples):
             self._state, shown = self.engine.rollout(
                 self.params, self._state, np.asarray(twist)[None], interval / samples
             )
             self._time += interval / samples
-            observations.append(self._last_of(shown))
+            observations.append(self._sample(shown, -1))
         if not np.isfinite(observations[-1].keypoints).all():
             self._state = None  # nothing but a reset makes sense now
             raise PlantError(f"The simulation diverged within {self._time:.3f} s: use a shorter timestep.")
         return observations
 
-    def _last_of(self, shown: Trajectory) -> Observation:
-        last = [np.asarray(leaf[-1], float) for leaf in (shown.keypoints, shown.gripper_pose)]
-        return Observation(keypoints=last[0], gripper_pose=last[1], time=self._time)
+    def _sample(self, shown: Trajectory, index: int) -> Observation:
+        keypoints, pose = (np.asarray(leaf[index], float) for leaf in (shown.keypoints, shown.gripper_pose))
+        return Observation(keypoints=keypoints, gripper_pose=pose, time=self._time)

@@ -136,7 +136,7 @@ class RodPlant:
 
     def __init__(self, config: RodPlantConfig | None = None):
         self.config = RodPlantConfig() if config is None else config
-        _import_elastica()
+        _import_rod_class()
         from cablejax.simulate import rod_loop
 
         self._loop = rod_loop.advance
@@ -306,13 +306,13 @@ def _straight_rod(config: RodPlantConfig):
 
     Directors are the table's normal, the in-plane normal and the tangent; bending in the plane is about the first.
     """
-    elastica = _import_elastica()
+    rod_class = _import_rod_class()
     cable, h = config.cable, config.cable.link_length
     lengths = link_lengths(cable)
     position = np.zeros((3, cable.n_links + 1))
     position[0, 1:] = np.cumsum(lengths)
     area = np.pi * cable.diameter**2 / 4
-    rod = elastica.CosseratRod.straight_rod(
+    rod = rod_class.straight_rod(
         cable.n_links,
         np.zeros(3),
         np.array([1.0, 0.0, 0.0]),
@@ -345,11 +345,11 @@ def _set_directors(rod, angle: Float[np.ndarray, " n"]) -> None:
     rod.director_collection[2] = np.stack([cos, sin, zero])
 
 
-def _import_elastica():
+def _import_rod_class():
     try:
-        import elastica
+        from elastica.rod.cosserat_rod import CosseratRod
     except ImportError as error:
         raise ImportError(
             "The plant made of a Cosserat rod needs PyElastica, which is not installed: pip install pyelastica==1.0.0"
         ) from error
-    return elastica
+    return CosseratRod
