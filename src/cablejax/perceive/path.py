@@ -7,7 +7,7 @@ from jaxtyping import Float
 from scipy.ndimage import gaussian_filter1d
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import dijkstra
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 CELL = 0.01
 """Side of the cells that a cloud is thinned to, in lengths of the cable."""
@@ -35,10 +35,10 @@ def cloud_path(
     _, label, count = np.unique(np.round(points / cell), axis=0, return_inverse=True, return_counts=True)
     label = label.ravel()
     middle = np.stack([np.bincount(label, points[:, axis]) for axis in range(2)], axis=1) / count[:, None]
-    crowd = cKDTree(middle).query_ball_point(middle, 2.5 * cell, return_length=True)
+    crowd = KDTree(middle).query_ball_point(middle, 2.5 * cell, return_length=True)
     middle = middle[(crowd >= min(3, crowd.max())) & (count >= 0.2 * np.median(count))]
     nodes = np.concatenate([ends, middle])
-    distance, neighbour = cKDTree(nodes).query(nodes, k=min(len(nodes), NEIGHBOURS))
+    distance, neighbour = KDTree(nodes).query(nodes, k=min(len(nodes), NEIGHBOURS))
     row = np.repeat(np.arange(len(nodes)), neighbour.shape[1])
     # The grippers reach everything, so that there always is a path, however bad.
     direct = np.linalg.norm(nodes[:, None] - nodes[:2], axis=-1)

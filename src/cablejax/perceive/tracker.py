@@ -281,7 +281,7 @@ class Tracker:
         if count >= config.min_points:
             fit = first_fit(config.registration, cloud.points, cloud.mask, pose, reach=config.reach)
             status = judge(config, fit, jnp.asarray(count))
-            if status == Status.TRACKED:
+            if int(status) == Status.TRACKED:
                 zero = jnp.zeros_like(state.held)
                 found = TrackState(
                     angles=fit.angles,
