@@ -98,6 +98,16 @@ def other_cable(length: float, n_keypoints: int, trajectories: int) -> Trajector
     return simulated(config, trajectories)
 
 
+def budgets() -> str:
+    """How long each model was trained, in words."""
+
+    def steps(source: str | Path) -> int:
+        training = load_info(source)["training"]
+        return sum(phase["steps"] for phase in training["phases"])
+
+    return "; ".join(f"{name} {steps(source)}" for name, source in MODELS.items())
+
+
 def statistics(error: np.ndarray, step: int) -> list[str]:
     column = error[:, step - 1]
     return [f"{value:.3f}" for value in (column.mean(), *np.percentile(column, [50, 90]))]
@@ -192,6 +202,9 @@ def main() -> None:
             "samples. All errors are root mean square keypoint distances in cm; a cell has mean, median and 90th "
             "percentile over windows. The mean is decided by windows in which the cable snaps through or takes the "
             "other of two shapes, see [model_error](model_error.md).",
+            "",
+            f"Optimiser steps: {budgets()}. The network that is told the cable started from the first one. The budgets "
+            "are not equal, so read differences between networks without statics with care.",
             "",
             "![Error over steps](../images/dynamics_models.png)",
             "",
