@@ -38,8 +38,9 @@ def cloud_path(
     crowd = KDTree(middle).query_ball_point(middle, 2.5 * cell, return_length=True)
     middle = middle[(crowd >= min(3, crowd.max())) & (count >= 0.2 * np.median(count))]
     nodes = np.concatenate([ends, middle])
-    distance, neighbour = KDTree(nodes).query(nodes, k=min(len(nodes), NEIGHBOURS))
-    row = np.repeat(np.arange(len(nodes)), neighbour.shape[1])
+    nearest = min(len(nodes), NEIGHBOURS)
+    distance, neighbour = map(np.asarray, KDTree(nodes).query(nodes, k=nearest))
+    row = np.repeat(np.arange(len(nodes)), nearest)
     # The grippers reach everything, so that there always is a path, however bad.
     direct = np.linalg.norm(nodes[:, None] - nodes[:2], axis=-1)
     start = np.concatenate([row, np.tile(np.arange(len(nodes)), 2)])
