@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -13,7 +13,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from cablejax.adaptation.belief import AdaptationConfig, CableBelief, prior_belief, update
-from cablejax.mpc.feasible import FeasibleSet
+from cablejax.mpc.edge import check_observation, check_start, check_target
+from cablejax.mpc.feasible import FeasibleSet, feasible_from
 from cablejax.mpc.goal import continued, goal_pose, straight_plan, way_to
 from cablejax.mpc.problem import ObjectiveConfig, Outcome, Plan, ShapingProblem, Solver
 from cablejax.mpc.trust_region import TrustRegion
@@ -243,8 +244,11 @@ def control(
     error = problem.shape_error(state.history.keypoints[-1])
     rho, radius = _update_radius(config, state, error, problem.shape_error(state.predicted))
     problem = dataclasses.replace(problem, feasible=dataclasses.replace(problem.feasible, radius=radius))
-    plan, value, value_hold = _plan_or_hold(config, problem, state.plan)
-    plan, value, travel = _plan_or_travel(config, problem, state, plan, value)
+    way = _straight_way(config, problem)
+    guess, value_way = _best_guess(problem, state.plan, way)
+    plan, value, value_hold = _plan_or_hold(config, problem, guess)
+    plan, travel = _plan_or_travel(config, state, way, radius, plan)
+    value = jnp.where(travel > 0, value_way, value)
 
     twist = config.objective.to_twist(plan.motion[0])
     offline, cable = _displacement(dynamics, weights, state, twist)
@@ -344,13 +348,8 @@ def _fit_residual(config: MPCConfig, state: ControllerState) -> ResidualModel | 
 
 
 def _feasible_set(config: MPCConfig, state: ControllerState) -> FeasibleSet:
-    pose = state.history.gripper_pose
-    return FeasibleSet(
-        separation=pose[1, :2] - pose[0, :2],
-        radius=state.radius,
-        min_distance=jnp.asarray(config.min_distance * config.cable_length, pose.dtype),
-        max_distance=jnp.asarray(config.max_distance * config.cable_length, pose.dtype),
-    )
+    limits = config.min_distance * config.cable_length, config.max_distance * config.cable_length
+    return feasible_from(state.history.gripper_pose, state.radius, limits)
 
 
 def _update_radius(
@@ -371,11 +370,11 @@ def _update_radius(
 
 
 def _plan_or_hold(
-    config: MPCConfig, problem: ShapingProblem, last: Float[Array, "T Q 3"]
+    config: MPCConfig, problem: ShapingProblem, guess: Float[Array, "T Q 3"]
 ) -> tuple[Plan, Float[Array, ""], Float[Array, ""]]:
     """The solver's plan, or holding still where that is as good or nothing can be trusted; and both their values."""
-    still = jnp.zeros_like(last)
-    plan = config.solver(problem, _best_guess(config, problem, last))
+    still = jnp.zeros_like(guess)
+    plan = config.solver(problem, guess)
     value, value_hold = jax.vmap(problem.value)(jnp.stack([plan.motion, still]))
     improvement = jnp.sqrt(2.0 * value_hold / config.n_commands) - jnp.sqrt(2.0 * value / config.n_commands)
     finite = jnp.isfinite(value) & jnp.isfinite(plan.motion).all()
@@ -387,38 +386,49 @@ def _plan_or_hold(
 
 
 def _plan_or_travel(
-    config: MPCConfig, problem: ShapingProblem, state: ControllerState, plan: Plan, value: Float[Array, ""]
-) -> tuple[Plan, Float[Array, ""], Int[Array, ""]]:
-    """The plan, or the next step of a straight way out of a valley; the value; how many steps of the way are left."""
-    pose, goal = continued(problem.history.gripper_pose, problem.history.keypoints[-1]), goal_pose(problem.target)
-    weight, radius = config.objective.rotation_weight, problem.feasible.radius
-    longest = jnp.linalg.norm(way_to(pose, goal, weight), axis=1).max()
-    stuck = (plan.outcome == Outcome.HELD) & (longest > config.travel_beyond) & (state.travels < config.max_travels)
+    config: MPCConfig, state: ControllerState, way: _StraightWay, radius: Float[Array, ""], plan: Plan
+) -> tuple[Plan, Int[Array, ""]]:
+    """The plan, or the next step of a straight way out of a valley; and how many steps of the way are left."""
+    stuck = (plan.outcome == Outcome.HELD) & (way.length > config.travel_beyond) & (state.travels < config.max_travels)
     # half as many steps again as the way is long: the bounds on the grippers' distance may lead it round
-    needed = jnp.ceil(1.5 * longest / radius).astype(jnp.int32)
+    needed = jnp.ceil(1.5 * way.length / radius).astype(jnp.int32)
     left = jnp.where(state.travel > 0, state.travel - 1, jnp.where(stuck, needed, 0))
-    left = jnp.where((longest > radius) & (plan.outcome != Outcome.NONFINITE), left, 0)
-    way = problem.feasible.project(straight_plan(pose, goal, radius, weight, config.n_commands))
+    left = jnp.where((way.length > radius) & (plan.outcome != Outcome.NONFINITE), left, 0)
     travelling = left > 0
     outcome = jnp.where(travelling, Outcome.TRAVELLING, plan.outcome).astype(jnp.int32)
-    motion = jnp.where(travelling, way, plan.motion)
-    value = jnp.where(travelling, problem.value(way), value)
-    return Plan(motion=motion, evaluations=plan.evaluations, outcome=outcome), value, left
+    motion = jnp.where(travelling, way.motion, plan.motion)
+    return Plan(motion=motion, evaluations=plan.evaluations, outcome=outcome), left
 
 
-def _best_guess(config: MPCConfig, problem: ShapingProblem, last: Float[Array, "T Q 3"]) -> Float[Array, "T Q 3"]:
-    """The better of two starts: the last plan, shifted by the command that was executed, and the straight way."""
+class _StraightWay(NamedTuple):
+    """The straight way to where the target's ends are held.
+
+    Attributes:
+        motion: its first steps, feasible [m], shape [T, Q, 3].
+        length: of the gripper that has farther to go, all the way [m], shape [].
+    """
+
+    motion: Float[Array, "T Q 3"]
+    length: Float[Array, ""]
+
+
+def _straight_way(config: MPCConfig, problem: ShapingProblem) -> _StraightWay:
+    pose, goal = continued(problem.history.gripper_pose, problem.history.keypoints[-1]), goal_pose(problem.target)
+    weight = config.objective.rotation_weight
+    motion = straight_plan(pose, goal, problem.feasible.radius, weight, config.n_commands)
+    length = jnp.linalg.norm(way_to(pose, goal, weight), axis=1).max()
+    return _StraightWay(problem.feasible.project(motion), length)
+
+
+def _best_guess(
+    problem: ShapingProblem, last: Float[Array, "T Q 3"], way: _StraightWay
+) -> tuple[Float[Array, "T Q 3"], Float[Array, ""]]:
+    """The better of two starts: the last plan, shifted by the command that was executed, and the straight way; and the
+    value of the latter."""
     shifted = jnp.roll(last, -1, axis=0).at[-1].set(0.0)
-    straight = straight_plan(
-        continued(problem.history.gripper_pose, problem.history.keypoints[-1]),
-        goal_pose(problem.target),
-        problem.feasible.radius,
-        config.objective.rotation_weight,
-        config.n_commands,
-    )
-    guesses = jnp.stack([problem.feasible.project(shifted), problem.feasible.project(straight)])
+    guesses = jnp.stack([problem.feasible.project(shifted), way.motion])
     values = jax.vmap(problem.value)(guesses)
-    return guesses[jnp.argmin(jnp.where(jnp.isfinite(values), values, jnp.inf))]
+    return guesses[jnp.argmin(jnp.where(jnp.isfinite(values), values, jnp.inf))], values[1]
 
 
 def _push(window: Array, newest: Array) -> Array:
@@ -448,12 +458,7 @@ class Controller:
     target: Float[Array | np.ndarray, "N 2"]
 
     def __post_init__(self):
-        target = np.asarray(self.target)
-        if target.ndim != 2 or target.shape[1] != 2 or not np.isfinite(target).all():
-            raise ValueError(
-                f"The target has shape {target.shape}{'' if np.isfinite(target).all() else ' with non-finite values'}, "
-                "expected finite keypoints [N, 2] in metres."
-            )
+        check_target(self.target)
 
     def init(self, history: History) -> ControllerState:
         """State for a cable seen at rest or in motion.
@@ -461,9 +466,7 @@ class Controller:
         Raises:
             ValueError: if the history is not finite or has another number of keypoints than the target.
         """
-        self._check(history.keypoints[-1], history.gripper_pose)
-        if not (np.isfinite(history.keypoints).all() and np.isfinite(history.gripper_pose).all()):
-            raise ValueError("The initial history has non-finite values: start from a complete observation.")
+        check_start(self.target, history)
         return initial_state(self.config, jax.tree.map(jnp.asarray, history))
 
     def step(
@@ -477,17 +480,10 @@ class Controller:
         Raises:
             ValueError: if the observation has another shape than the target's keypoints and two grippers.
         """
-        self._check(keypoints, gripper_pose)
+        check_observation(self.target, keypoints, gripper_pose)
         return _compiled_control(self.config, self.dynamics, self.weights, self.target, state, keypoints, gripper_pose)
 
     def vectorised(self):
         """`step` over a leading batch axis of all its arguments, compiled: one controller for many cables."""
         one = functools.partial(control, self.config, self.dynamics)
         return jax.jit(lambda *args: jax.vmap(functools.partial(one, self.weights, self.target))(*args))
-
-    def _check(self, keypoints, gripper_pose):
-        if np.shape(keypoints) != np.shape(self.target) or np.shape(gripper_pose) != (2, 3):
-            raise ValueError(
-                f"Observation with keypoints {np.shape(keypoints)} and gripper poses {np.shape(gripper_pose)}, "
-                f"expected {np.shape(self.target)} as the target and (2, 3)."
-            )

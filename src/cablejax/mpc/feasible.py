@@ -80,6 +80,25 @@ class FeasibleSet:
         return motion * _largest_scale(separation, motion[1, :2] - motion[0, :2], self.min_distance, upper)
 
 
+def feasible_from(
+    gripper_pose: Float[Array, "2 3"], radius: Float[Array, ""] | float, distance: tuple[float, float]
+) -> FeasibleSet:
+    """The motions allowed from where the grippers are.
+
+    Args:
+        gripper_pose: (x, y, theta) of both [m, rad].
+        radius: bound on the norm of each gripper's motion in each step [m].
+        distance: least and greatest distance between the grippers [m].
+    """
+    dtype = gripper_pose.dtype
+    return FeasibleSet(
+        separation=gripper_pose[1, :2] - gripper_pose[0, :2],
+        radius=jnp.asarray(radius, dtype),
+        min_distance=jnp.asarray(distance[0], dtype),
+        max_distance=jnp.asarray(distance[1], dtype),
+    )
+
+
 def _into_annulus(
     separation: Float[Array, " 2"], motion: Float[Array, "2 3"], lower: Float[Array, ""], upper: Float[Array, ""]
 ) -> Float[Array, "2 3"]:

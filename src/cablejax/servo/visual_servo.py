@@ -28,7 +28,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from cablejax.mpc.feasible import FeasibleSet
+from cablejax.mpc.edge import check_observation, check_start, check_target
+from cablejax.mpc.feasible import feasible_from
 from cablejax.mpc.problem import ObjectiveConfig
 from cablejax.types import History
 
@@ -193,7 +194,8 @@ def servo(
 
     probing = state.steps < config.n_probes
     motion = jnp.where(probing, _probe(config, state), _towards(config, state.jacobian, error))
-    motion = _feasible_set(config, state).project(motion[None])[0]
+    limits = config.min_distance * config.cable_length, config.max_distance * config.cable_length
+    motion = feasible_from(state.gripper_pose, config.radius, limits).project(motion[None])[0]
     motion = jnp.where(jnp.isfinite(motion).all(), motion, 0.0)
     info = ServoInfo(
         shape_error=_root_mean_square(error),
@@ -277,16 +279,6 @@ def _towards(config: ServoConfig, jacobian: Float[Array, "N 2 R"], error: Float[
     return motion * jnp.minimum(1.0, config.radius / jnp.maximum(largest, 1e-12))
 
 
-def _feasible_set(config: ServoConfig, state: ServoState) -> FeasibleSet:
-    pose = state.gripper_pose
-    return FeasibleSet(
-        separation=pose[1, :2] - pose[0, :2],
-        radius=jnp.asarray(config.radius, pose.dtype),
-        min_distance=jnp.asarray(config.min_distance * config.cable_length, pose.dtype),
-        max_distance=jnp.asarray(config.max_distance * config.cable_length, pose.dtype),
-    )
-
-
 def _root_mean_square(error: Float[Array, "N 2"]) -> Float[Array, ""]:
     return jnp.sqrt(jnp.mean(jnp.sum(error**2, axis=-1)))
 
@@ -314,12 +306,7 @@ class VisualServo:
     target: Float[Array | np.ndarray, "N 2"]
 
     def __post_init__(self):
-        target = np.asarray(self.target)
-        if target.ndim != 2 or target.shape[1] != 2 or not np.isfinite(target).all():
-            raise ValueError(
-                f"The target has shape {target.shape}{'' if np.isfinite(target).all() else ' with non-finite values'}, "
-                "expected finite keypoints [N, 2] in metres."
-            )
+        check_target(self.target)
 
     def init(self, history: History) -> ServoState:
         """State for a cable seen at rest; only the newest sample of the history is used.
@@ -327,9 +314,7 @@ class VisualServo:
         Raises:
             ValueError: if the history is not finite or has another number of keypoints than the target.
         """
-        self._check(history.keypoints[-1], history.gripper_pose)
-        if not (np.isfinite(history.keypoints).all() and np.isfinite(history.gripper_pose).all()):
-            raise ValueError("The initial history has non-finite values: start from a complete observation.")
+        check_start(self.target, history)
         return initial_state(self.config, jax.tree.map(jnp.asarray, history))
 
     def step(
@@ -343,12 +328,5 @@ class VisualServo:
         Raises:
             ValueError: if the observation has another shape than the target's keypoints and two grippers.
         """
-        self._check(keypoints, gripper_pose)
+        check_observation(self.target, keypoints, gripper_pose)
         return _compiled_servo(self.config, self.target, state, keypoints, gripper_pose)
-
-    def _check(self, keypoints, gripper_pose):
-        if np.shape(keypoints) != np.shape(self.target) or np.shape(gripper_pose) != (2, 3):
-            raise ValueError(
-                f"Observation with keypoints {np.shape(keypoints)} and gripper poses {np.shape(gripper_pose)}, "
-                f"expected {np.shape(self.target)} as the target and (2, 3)."
-            )
