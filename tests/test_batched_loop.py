@@ -18,7 +18,8 @@ from cablejax.mpc.goal import goal_pose
 from cablejax.shaping import NetworkDynamics, load_model, make_controller
 from cablejax.simulate import CableConfig, MjxEngine
 from cablejax.simulate.engine_plant import EnginePlant
-from cablejax.simulate.plant import Plant, PlantConfig, PlantError
+from cablejax.simulate.plant import Plant, PlantConfig
+from cablejax.simulate.table_plant import PlantError
 from cablejax.targets import Target, make_target, straight_start
 from cablejax.types import CableParams, History
 from dynamics_cases import SMALL, network

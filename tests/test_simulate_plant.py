@@ -1,4 +1,4 @@
-"""The plant: rigid grasps, rest, friction, agreement with the elastica, and what it refuses."""
+"""The plant: rigid grasps, rest, friction, agreement with the elastica."""
 
 import dataclasses
 
@@ -8,7 +8,7 @@ import pytest
 
 from cablejax.simulate.config import GRAVITY, CableConfig
 from cablejax.simulate.elastica import elastica
-from cablejax.simulate.plant import Plant, PlantConfig, PlantError, plant_model
+from cablejax.simulate.plant import Plant, PlantConfig, plant_model
 
 CABLE = CableConfig(n_links=14, dimension=3, timestep=0.005)
 CONFIG = PlantConfig(cable=CABLE, settle_time=0.3)
@@ -98,71 +98,13 @@ def test_friction_keeps_a_cable_where_a_frictionless_one_springs_back():
     assert off[0] > 3 * off[1]
 
 
-def test_runs_repeat_exactly_and_noise_does_too():
-    config = dataclasses.replace(CONFIG, keypoint_noise=1e-3, keypoint_dropout=0.3, seed=7)
-    twist = np.array([[0.02, 0.0, 0.0], [0.0, 0.02, 0.1]])
-
-    def run(plant):
-        return np.stack([plant.reset(ARCH).keypoints, plant.step(twist, 0.5).keypoints])
-
-    plant = Plant(config)
-    first, again, other = run(plant), run(plant), run(Plant(config))
-    np.testing.assert_array_equal(first, again)
-    np.testing.assert_array_equal(first, other)
-    clean = run(Plant(CONFIG))
-    seen = np.isfinite(first)
-    assert 0 < (~seen).sum() < first.size / 2 and seen[:, [0, -1]].all()
-    assert 2e-4 < (first - clean)[seen].std() < 3e-3
-
-
-def test_recording_does_not_change_the_motion(plant):
-    twist = np.array([[0.03, 0.0, 0.2], [0.0, -0.03, 0.1]])
-    plant.reset(ARCH)
-    once = plant.step(twist)
-    plant.reset(ARCH)
-    samples = plant.record(twist, samples=10)
-    np.testing.assert_allclose(samples[-1].keypoints, once.keypoints, atol=1e-9)
-    np.testing.assert_allclose([sample.time for sample in samples], np.arange(1, 11) / 10)
-
-
-def test_bad_commands_are_refused_and_leave_the_plant_alone(plant):
-    before = plant.reset(ARCH)
-    with pytest.raises(ValueError, match="twist is not finite"):
-        plant.step(np.full((2, 3), np.nan))
-    with pytest.raises(ValueError, match=r"shape \(6,\), expected \(2, 3\)"):
-        plant.step(np.zeros(6))
-    with pytest.raises(ValueError, match="pull the cable of 1 m taut"):
-        plant.step(np.array([[-0.06, 0, 0], [0.06, 0, 0]]))
-    with pytest.raises(ValueError, match="whole number of time steps"):
-        plant.step(STILL, 0.0123)
-    with pytest.raises(ValueError, match="do not fall on time steps"):
-        plant.record(STILL, 1.0, samples=7)
-    after = plant.observe()
-    np.testing.assert_array_equal(after.keypoints, before.keypoints)
-    assert after.time == before.time
-
-
 def test_bad_set_ups_are_refused():
-    with pytest.raises(ValueError, match="reset"):
-        Plant(CONFIG).step(STILL)
-    with pytest.raises(ValueError, match="taut"):
-        Plant(CONFIG).reset(np.array([[-0.6, 0, 0], [0.6, 0, 0]]))
-    with pytest.raises(ValueError, match="gripper_pose is not finite"):
-        Plant(CONFIG).reset(np.full((2, 3), np.inf))
     with pytest.raises(ValueError, match="dimension is 2"):
         PlantConfig(cable=CableConfig())
     with pytest.raises(ValueError, match="stiffness_ratio"):
         PlantConfig(stiffness_ratio=0.0)
     with pytest.raises(ValueError, match="keypoint_dropout"):
         PlantConfig(keypoint_dropout=1.0)
-
-
-def test_an_unstable_simulation_is_reported(plant):
-    plant.reset(ARCH)
-    with pytest.raises(PlantError, match="unstable"):
-        plant.step(np.array([[0, 1e12, 0], [0, 1e12, 0]], float))
-    with pytest.raises(ValueError, match="reset"):
-        plant.step(STILL)
 
 
 def test_weight_and_plugins():

@@ -25,6 +25,7 @@ from cablejax.residual.corrected import Dynamics
 from cablejax.simulate.compile import compiler_options
 from cablejax.simulate.config import CableConfig
 from cablejax.simulate.mjx_engine import MjxEngine
+from cablejax.simulate.table_plant import check_camera
 from cablejax.types import CableParams, CableState, History
 
 
@@ -93,10 +94,7 @@ class LoopConfig:
         for name, least in (("steps", 1), ("history_length", 1), ("rest", 0)):
             if getattr(self, name) < least:
                 raise ValueError(f"LoopConfig.{name} is {getattr(self, name)}, expected an integer >= {least}.")
-        if not (np.isfinite(self.keypoint_noise) and self.keypoint_noise >= 0):
-            raise ValueError(f"LoopConfig.keypoint_noise is {self.keypoint_noise}, expected a finite number >= 0 [m].")
-        if not 0 <= self.keypoint_dropout < 1:
-            raise ValueError(f"LoopConfig.keypoint_dropout is {self.keypoint_dropout}, expected a number in [0, 1).")
+        check_camera(self)
 
 
 @jax.tree_util.register_dataclass

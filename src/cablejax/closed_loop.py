@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from cablejax.gaplog import Episode
-from cablejax.simulate.plant import Observation, PlantError
+from cablejax.simulate.table_plant import Observation, PlantError
 from cablejax.targets import Target
 from cablejax.types import History
 

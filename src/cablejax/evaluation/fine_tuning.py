@@ -16,7 +16,7 @@ from cablejax.evaluation.protocols import GuessingCable
 from cablejax.shaping import Model, load_model
 from cablejax.simulate.config import CableConfig
 from cablejax.simulate.motions import MotionConfig, random_motion
-from cablejax.simulate.plant import PlantError
+from cablejax.simulate.table_plant import PlantError
 from cablejax.types import Trajectory
 
 

@@ -31,7 +31,7 @@ from cablejax.simulate.config import CableConfig
 from cablejax.simulate.elastica import Elastica, ElasticaError, elastica, solve_elastica
 from cablejax.simulate.equilibrium import arch_angles, chain_nodes, find_equilibrium
 from cablejax.simulate.motions import MotionConfig, admissible
-from cablejax.simulate.plant import Observation
+from cablejax.simulate.table_plant import Observation
 from cablejax.targets import START_LEAN, Shape, Target, make_target
 
 StartKind = Literal["straight", "diverse"]

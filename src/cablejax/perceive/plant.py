@@ -11,7 +11,8 @@ from cablejax.perceive.camera import CameraConfig, DepthCamera
 from cablejax.perceive.registration import RegistrationConfig
 from cablejax.perceive.tracker import Status, Track, Tracker, TrackerConfig, TrackState
 from cablejax.simulate.config import CableConfig
-from cablejax.simulate.plant import Observation, Plant, PlantConfig
+from cablejax.simulate.plant import Plant, PlantConfig
+from cablejax.simulate.table_plant import Observation
 
 
 class CloudPlant(Plant):

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float
 
 from cablejax.simulate.engine import Engine
-from cablejax.simulate.plant import Observation, PlantError
+from cablejax.simulate.table_plant import Observation, PlantError, checked
 from cablejax.types import CableParams, CableState, Trajectory
 
 
@@ -57,15 +57,12 @@ class EnginePlant:
         """
         if self._state is None:
             raise ValueError("The plant has no cable yet: call reset(gripper_pose) first.")
-        if np.shape(twist) != (2, 3) or not np.isfinite(twist).all():
-            raise ValueError(f"The command is not finite or not of shape (2, 3): {np.asarray(twist).tolist()}.")
+        twist = checked("twist", twist)
         if samples < 1:
             raise ValueError(f"samples is {samples}, expected at least 1.")
         observations = []
         for _ in range(samples):
-            self._state, shown = self.engine.rollout(
-                self.params, self._state, np.asarray(twist)[None], interval / samples
-            )
+            self._state, shown = self.engine.rollout(self.params, self._state, twist[None], interval / samples)
             self._time += interval / samples
             observations.append(self._sample(shown, -1))
         if not np.isfinite(observations[-1].keypoints).all():

@@ -21,7 +21,7 @@ from jaxtyping import Float
 from cablejax.simulate.composite import link_bodies, link_lengths, node_offsets
 from cablejax.simulate.config import GRAVITY, CableConfig
 from cablejax.simulate.elastica import solve_elastica
-from cablejax.simulate.keypoints import hermite_weights
+from cablejax.simulate.table_plant import Observation, TablePlant, check_camera
 
 GRASP_STIFFNESS = 100.0
 """Stiffness of the grasp in units of `1 / dt^2`: a held link trails a jump of the command's speed by dv dt / 100."""
@@ -30,14 +30,8 @@ HELD_MASS, HELD_RADIUS = 10.0, 0.1
 CONTACT_IMPEDANCE = "0.3 0.99 0.0003"
 """MuJoCo's impedance of the table's contacts: at first touch, at depth, and the depth [m]. Contacts that are stiff from
 the first touch on chatter: the mean normal force then is up to three times the weight, and so is friction."""
-TAUT = 0.999
-"""Largest distance between the grippers, in lengths of the cable, before the plant refuses to pull."""
 FRICTIONLESS = 1e-5
 """MuJoCo's smallest friction coefficient."""
-
-
-class PlantError(RuntimeError):
-    """The simulation of the plant became unstable."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -75,27 +69,7 @@ class PlantConfig:
             value = getattr(self, name)
             if not (np.isfinite(value) and value > 0):
                 raise ValueError(f"PlantConfig.{name} is {value}, expected a positive finite number.")
-        if not (np.isfinite(self.keypoint_noise) and self.keypoint_noise >= 0):
-            raise ValueError(f"PlantConfig.keypoint_noise is {self.keypoint_noise}, expected a finite number >= 0 [m].")
-        if not 0 <= self.keypoint_dropout < 1:
-            raise ValueError(f"PlantConfig.keypoint_dropout is {self.keypoint_dropout}, expected a number in [0, 1).")
-
-
-@dataclasses.dataclass(frozen=True)
-class Observation:
-    """What a camera over the table and the arms' encoders report at one instant.
-
-    Attributes:
-        keypoints: [m], NaN = not observed, float64, shape [N, 2].
-        gripper_pose: (x, y, theta) of both grippers [m, rad], shape [Q, 3]; theta counts turns.
-        time: since the last reset [s].
-        true_keypoints: where they really are [m], shape [N, 2], which only a simulation knows; else None.
-    """
-
-    keypoints: Float[np.ndarray, "N 2"]
-    gripper_pose: Float[np.ndarray, "Q 3"]
-    time: float
-    true_keypoints: Float[np.ndarray, "N 2"] | None = None
+        check_camera(self)
 
 
 def plant_model(config: PlantConfig) -> mujoco.MjModel:
@@ -140,40 +114,25 @@ def plant_model(config: PlantConfig) -> mujoco.MjModel:
     return model
 
 
-class Plant:
-    """A cable on a table between two grippers: `reset` once, then `step` it with commands.
+class Plant(TablePlant):
+    """The cable in C MuJoCo, with the calls of every `TablePlant`."""
 
-    Unlike everything else in the package the plant has a state of its own, as reality does.
-    """
+    config: PlantConfig
 
     def __init__(self, config: PlantConfig | None = None):
-        self.config = PlantConfig() if config is None else config
+        super().__init__(PlantConfig() if config is None else config)
         self.model = plant_model(self.config)
         self._data = mujoco.MjData(self.model)
         names = (self.model.body(i).name for i in range(self.model.nbody))
         self._links = np.array([i for i, name in enumerate(names) if name.startswith("cable")])
         self._offsets = node_offsets(self.config.cable)[:, None]
-        self._weights = hermite_weights(self.config.cable)
-        self._pose = np.full((2, 3), np.nan)
-        self._random = np.random.default_rng(self.config.seed)
-        self._steps_done: int | None = None
         self._height = np.nan
 
     def reset(
         self, gripper_pose: Float[np.ndarray, "Q 3"], *, guess: Float[np.ndarray, "S 2"] | None = None
     ) -> Observation:
-        """Lay a new cable on the table, at rest and with no friction locked in, and restart the clock and the noise.
-
-        Args:
-            gripper_pose: (x, y, theta) of both grippers [m, rad], shape [2, 3].
-            guess: points of a similar shape [m], where several shapes fit these grippers; see `solve_elastica`.
-
-        Raises:
-            ValueError: a pose is not finite, of another shape, or the grippers are too far apart; the cable at rest
-                between them could not be found.
-        """
-        pose = _checked("gripper_pose", gripper_pose)
-        self._check_distance(pose)
+        """See `TablePlant.reset`."""
+        pose = self._checked_start(gripper_pose)
         cable, data = self.config.cable, self._data
         # A chain's links follow the elastica's chords; only the held ones have the exact direction of the grippers.
         shape = solve_elastica(pose, cable.length, guess=guess, n_samples=2 * cable.n_joints + 1)
@@ -184,8 +143,8 @@ class Plant:
         mujoco.mj_resetData(self.model, data)
         data.qpos[:2], data.qpos[2] = pose[0, :2], cable.diameter / 2
         data.qpos[3:] = _quaternions(np.diff(angles, prepend=0.0)).ravel()
-        self._pose, self._height, self._steps_done = pose, cable.diameter / 2, 0
-        self._random = np.random.default_rng(self.config.seed)
+        self._height = cable.diameter / 2
+        self._restart(pose)
         still, settle = np.zeros((2, 3)), self._steps(self.config.settle_time)
         friction = self.model.geom("table").friction
         friction[0] = FRICTIONLESS
@@ -197,55 +156,6 @@ class Plant:
         self._advance(still, settle)
         self._steps_done = 0
         return self.observe()
-
-    def step(self, twist: Float[np.ndarray, "Q 3"], interval: float = 1.0) -> Observation:
-        """Hold a command for one interval and observe the cable at its end.
-
-        Args:
-            twist: (vx, vy, omega) of both grippers in the world's frame [m/s, rad/s], shape [2, 3].
-            interval: [s], a whole number of time steps.
-
-        Raises:
-            ValueError: the command is not finite, of another shape, or would pull the cable taut; the plant has not
-                moved then.
-            PlantError: the simulation became unstable.
-        """
-        return self.record(twist, interval, samples=1)[-1]
-
-    def record(self, twist: Float[np.ndarray, "Q 3"], interval: float = 1.0, *, samples: int) -> list[Observation]:
-        """As `step`, with `samples` observations evenly spread over the interval, the last one at its end."""
-        if self._steps_done is None:
-            raise ValueError("The plant has no cable yet: call reset(gripper_pose) first.")
-        twist = _checked("twist", twist)
-        steps = self._steps(interval)
-        if samples < 1 or steps % samples:
-            raise ValueError(
-                f"{samples} samples in {interval} s do not fall on time steps of {self.config.cable.timestep} s: "
-                f"choose a divisor of {steps}."
-            )
-        self._check_distance(self._pose + interval * twist)
-        observations = []
-        for _ in range(samples):
-            self._advance(twist, steps // samples)
-            observations.append(self.observe())
-        return observations
-
-    @property
-    def time(self) -> float:
-        """Simulated seconds since the last reset."""
-        return (self._steps_done or 0) * self.config.cable.timestep
-
-    def observe(self) -> Observation:
-        """Keypoints and gripper poses now, with the configured noise and gaps (drawn anew by every call)."""
-        config, random = self.config, self._random
-        nodes, tangents = self.nodes()
-        truth = (self._weights[0] @ nodes + self._weights[1] @ tangents)[:, :2]
-        keypoints = truth.copy()
-        if config.keypoint_noise:
-            keypoints += config.keypoint_noise * random.standard_normal(keypoints.shape)
-        if config.keypoint_dropout:
-            keypoints[1:-1][random.random(len(keypoints) - 2) < config.keypoint_dropout] = np.nan
-        return Observation(keypoints=keypoints, gripper_pose=self._pose.copy(), time=self.time, true_keypoints=truth)
 
     def nodes(self) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
         """Middle of every link, for the two held links the grasped end [m], and the links' unit directions."""
@@ -261,14 +171,8 @@ class Plant:
             self._place_grippers(start + (step * dt) * twist)
             mujoco.mj_step(model, data)
         mujoco.mj_kinematics(model, data)
-        self._pose = start + (steps * dt) * twist
-        self._steps_done = (self._steps_done or 0) + steps
-        if data.warning[mujoco.mjtWarning.mjWARN_BADQACC].number or not np.isfinite(data.qpos).all():
-            time, self._steps_done = self.time, None  # nothing but a reset makes sense now
-            raise PlantError(
-                f"The plant's simulation became unstable at {time:.3f} s: use a shorter timestep than {dt} s or "
-                "gentler commands."
-            )
+        unstable = data.warning[mujoco.mjtWarning.mjWARN_BADQACC].number or not np.isfinite(data.qpos).all()
+        self._moved(twist, steps, stable=not unstable)
 
     def _place_grippers(self, pose: np.ndarray) -> None:
         """Mocap bodies coincide with the frames of the held links, whose origins are their starts."""
@@ -278,30 +182,6 @@ class Plant:
         data.mocap_pos[1, :2] -= 0.5 * cable.link_length * heading
         data.mocap_pos[:, 2] = self._height
         data.mocap_quat[:] = _quaternions(pose[:, 2])
-
-    def _steps(self, interval: float) -> int:
-        steps = round(interval / self.config.cable.timestep)
-        if steps < 1 or abs(steps * self.config.cable.timestep - interval) > 1e-9:
-            raise ValueError(f"{interval} s is not a whole number of time steps of {self.config.cable.timestep} s.")
-        return steps
-
-    def _check_distance(self, pose: np.ndarray) -> None:
-        # A twist moves one gripper along a straight line relative to the other, so its end has the largest distance.
-        distance, length = np.hypot(*(pose[1, :2] - pose[0, :2])), self.config.cable.length
-        if distance > TAUT * length:
-            raise ValueError(
-                f"The grippers would be {distance:.4g} m apart and pull the cable of {length:.4g} m taut: keep them "
-                f"within {TAUT * length:.4g} m."
-            )
-
-
-def _checked(name: str, value: np.ndarray) -> np.ndarray:
-    array = np.array(value, dtype=float)
-    if array.shape != (2, 3):
-        raise ValueError(f"{name} has shape {array.shape}, expected (2, 3): one planar row for each of two grippers.")
-    if not np.isfinite(array).all():
-        raise ValueError(f"{name} is not finite: {array.tolist()}. Check what produced it; the plant has not moved.")
-    return array
 
 
 def _quaternions(angles: np.ndarray) -> np.ndarray:

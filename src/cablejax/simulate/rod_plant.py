@@ -33,8 +33,7 @@ from jaxtyping import Float
 from cablejax.simulate.composite import link_lengths
 from cablejax.simulate.config import GRAVITY, CableConfig
 from cablejax.simulate.elastica import solve_elastica
-from cablejax.simulate.keypoints import hermite_weights
-from cablejax.simulate.plant import TAUT, Observation, PlantError
+from cablejax.simulate.table_plant import Observation, TablePlant, check_camera
 
 SETTLE_DAMPING = 10.0
 """Rate [1/s] at which all motion is damped while a new cable settles."""
@@ -83,10 +82,7 @@ class RodPlantConfig:
             raise ValueError(f"RodPlantConfig.static_ratio is {self.static_ratio}, expected a finite number >= 1.")
         if not np.isfinite(self.rest_curvature):
             raise ValueError(f"RodPlantConfig.rest_curvature is {self.rest_curvature}, expected a finite number [1/m].")
-        if not (np.isfinite(self.keypoint_noise) and self.keypoint_noise >= 0):
-            raise ValueError(f"RodPlantConfig.keypoint_noise is {self.keypoint_noise}, expected a number >= 0 [m].")
-        if not 0 <= self.keypoint_dropout < 1:
-            raise ValueError(f"RodPlantConfig.keypoint_dropout is {self.keypoint_dropout}, expected one in [0, 1).")
+        check_camera(self)
         if self.cable.timestep > self.longest_timestep:
             raise ValueError(
                 f"RodPlantConfig.cable.timestep is {self.cable.timestep} s, but this rod is stable only up to "
@@ -127,40 +123,28 @@ USB = RodPlantConfig(
 """A USB 2.0 cable, softer and lighter than the reference: see docs/simulator.md for the values."""
 
 
-class RodPlant:
-    """A Cosserat rod on a table between two grippers, with the calls of `Plant`: `reset` once, then `step` it.
+class RodPlant(TablePlant):
+    """A Cosserat rod, with the calls of every `TablePlant`.
 
     Raises:
         ImportError: PyElastica is not installed.
     """
 
+    config: RodPlantConfig
+
     def __init__(self, config: RodPlantConfig | None = None):
-        self.config = RodPlantConfig() if config is None else config
+        super().__init__(RodPlantConfig() if config is None else config)
         _import_rod_class()
         from cablejax.simulate import rod_loop
 
         self._loop = rod_loop.advance
-        self._weights = hermite_weights(self.config.cable)
-        self._pose = np.full((2, 3), np.nan)
-        self._random = np.random.default_rng(self.config.seed)
-        self._steps_done: int | None = None
         self._rod = _straight_rod(self.config)
 
     def reset(
         self, gripper_pose: Float[np.ndarray, "Q 3"], *, guess: Float[np.ndarray, "S 2"] | None = None
     ) -> Observation:
-        """Lay a new cable on the table, at rest and with no friction locked in, and restart the clock and the noise.
-
-        Args:
-            gripper_pose: (x, y, theta) of both grippers [m, rad], shape [2, 3].
-            guess: points of a similar shape [m], where several shapes fit these grippers; see `solve_elastica`.
-
-        Raises:
-            ValueError: a pose is not finite, of another shape, or the grippers are too far apart; the cable at rest
-                between them could not be found.
-        """
-        pose = _checked("gripper_pose", gripper_pose)
-        self._check_distance(pose)
+        """See `TablePlant.reset`."""
+        pose = self._checked_start(gripper_pose)
         shape = solve_elastica(
             pose, self.config.cable.length, guess=guess, n_samples=2 * self.config.cable.n_joints + 1
         )
@@ -169,61 +153,12 @@ class RodPlant:
             [shape.position[:1], shape.position[1:-1:2], shape.position[-1:]]
         ).T
         _set_directors(rod, np.concatenate([pose[:1, 2], shape.angle[2:-1:2], pose[1:, 2]]))
-        self._rod, self._pose, self._steps_done = rod, pose, 0
-        self._random = np.random.default_rng(self.config.seed)
+        self._rod = rod
+        self._restart(pose)
         self._advance(np.zeros((2, 3)), self._steps(self.config.settle_time), settling=True)
         rod.velocity_collection[:], rod.omega_collection[:] = 0.0, 0.0
         self._steps_done = 0
         return self.observe()
-
-    def step(self, twist: Float[np.ndarray, "Q 3"], interval: float = 1.0) -> Observation:
-        """Hold a command for one interval and observe the cable at its end.
-
-        Args:
-            twist: (vx, vy, omega) of both grippers in the world's frame [m/s, rad/s], shape [2, 3].
-            interval: [s], a whole number of time steps.
-
-        Raises:
-            ValueError: the command is not finite, of another shape, or would pull the cable taut; the plant has not
-                moved then.
-            PlantError: the simulation became unstable.
-        """
-        return self.record(twist, interval, samples=1)[-1]
-
-    def record(self, twist: Float[np.ndarray, "Q 3"], interval: float = 1.0, *, samples: int) -> list[Observation]:
-        """As `step`, with `samples` observations evenly spread over the interval, the last one at its end."""
-        if self._steps_done is None:
-            raise ValueError("The plant has no cable yet: call reset(gripper_pose) first.")
-        twist = _checked("twist", twist)
-        steps = self._steps(interval)
-        if samples < 1 or steps % samples:
-            raise ValueError(
-                f"{samples} samples in {interval} s do not fall on time steps of {self.config.cable.timestep} s: "
-                f"choose a divisor of {steps}."
-            )
-        self._check_distance(self._pose + interval * twist)
-        observations = []
-        for _ in range(samples):
-            self._advance(twist, steps // samples)
-            observations.append(self.observe())
-        return observations
-
-    @property
-    def time(self) -> float:
-        """Simulated seconds since the last reset."""
-        return (self._steps_done or 0) * self.config.cable.timestep
-
-    def observe(self) -> Observation:
-        """Keypoints and gripper poses now, with the configured noise and gaps (drawn anew by every call)."""
-        config, random = self.config, self._random
-        nodes, tangents = self.nodes()
-        truth = self._weights[0] @ nodes + self._weights[1] @ tangents
-        keypoints = truth.copy()
-        if config.keypoint_noise:
-            keypoints += config.keypoint_noise * random.standard_normal(keypoints.shape)
-        if config.keypoint_dropout:
-            keypoints[1:-1][random.random(len(keypoints) - 2) < config.keypoint_dropout] = np.nan
-        return Observation(keypoints=keypoints, gripper_pose=self._pose.copy(), time=self.time, true_keypoints=truth)
 
     def nodes(self) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2"]]:
         """Middle of every element, for the two held ones the grasped end [m], and the elements' unit directions."""
@@ -267,38 +202,8 @@ class RodPlant:
             config.stribeck_speed,
             SETTLE_DAMPING if settling else 0.0,
         )
-        self._pose = self._pose + (steps * cable.timestep) * twist
-        self._steps_done = (self._steps_done or 0) + steps
-        if not (np.isfinite(rod.position_collection).all() and self.stretch() < LARGEST_STRETCH):
-            time, self._steps_done = self.time, None  # nothing but a reset makes sense now
-            raise PlantError(
-                f"The plant's simulation became unstable at {time:.3f} s: use a shorter timestep than "
-                f"{cable.timestep} s or gentler commands."
-            )
-
-    def _steps(self, interval: float) -> int:
-        steps = round(interval / self.config.cable.timestep)
-        if steps < 1 or abs(steps * self.config.cable.timestep - interval) > 1e-9:
-            raise ValueError(f"{interval} s is not a whole number of time steps of {self.config.cable.timestep} s.")
-        return steps
-
-    def _check_distance(self, pose: np.ndarray) -> None:
-        # A twist moves one gripper along a straight line relative to the other, so its end has the largest distance.
-        distance, length = np.hypot(*(pose[1, :2] - pose[0, :2])), self.config.cable.length
-        if distance > TAUT * length:
-            raise ValueError(
-                f"The grippers would be {distance:.4g} m apart and pull the cable of {length:.4g} m taut: keep them "
-                f"within {TAUT * length:.4g} m."
-            )
-
-
-def _checked(name: str, value: np.ndarray) -> np.ndarray:
-    array = np.array(value, dtype=float)
-    if array.shape != (2, 3):
-        raise ValueError(f"{name} has shape {array.shape}, expected (2, 3): one planar row for each of two grippers.")
-    if not np.isfinite(array).all():
-        raise ValueError(f"{name} is not finite: {array.tolist()}. Check what produced it; the plant has not moved.")
-    return array
+        stable = np.isfinite(rod.position_collection).all() and self.stretch() < LARGEST_STRETCH
+        self._moved(twist, steps, stable=bool(stable))
 
 
 def _straight_rod(config: RodPlantConfig):
