@@ -1,0 +1,149 @@
+"""What a diagnosis returns."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any, Literal
+
+import numpy as np
+from jaxtyping import Float
+
+from cablejax.diagnose.where import Where
+from cablejax.types import GapLog
+
+Verdict = Literal["none", "named", "ambiguous", "named+unknown", "unknown"]
+
+
+@dataclasses.dataclass(frozen=True)
+class ParameterEstimate:
+    """One parameter of a named effect.
+
+    Attributes:
+        value: in `unit`; an integer or a list of integers for a choice such as the gripper.
+        ci90: 90 % interval, None for a choice.
+        unit: "" for a pure number.
+    """
+
+    value: Any
+    ci90: tuple[float, float] | list[tuple[float, float]] | None
+    unit: str
+
+
+@dataclasses.dataclass(frozen=True)
+class NamedEffect:
+    """An effect that the diagnosis holds to be (part of) the cause.
+
+    Attributes:
+        name: from the gap log's list of names.
+        probability: that this effect is a cause.
+        parameters: by the names of the format.
+        location: keys "along_cable_m", "time_s", "table_m"; None where an effect has no such place.
+    """
+
+    name: str
+    probability: float
+    parameters: dict[str, ParameterEstimate]
+    location: dict[str, Any]
+
+
+@dataclasses.dataclass(frozen=True)
+class Ranked:
+    """One effect that was tried alone.
+
+    Attributes:
+        name: of the effect.
+        probability: posterior among all single effects.
+        held_out_shrinkage: share of the squared gap that goes away on episodes left out of the fit.
+        leftover_mm: gap above the noise that is left on the episodes fitted, root mean square per coordinate [mm].
+    """
+
+    name: str
+    probability: float
+    held_out_shrinkage: float
+    leftover_mm: float
+
+
+@dataclasses.dataclass(frozen=True)
+class Gap:
+    """How large the gap is before and after, on episodes that no fit has seen. Root mean squares per coordinate [mm].
+
+    Attributes:
+        before_rmse_mm, after_rmse_mm: nominal simulator, and with the named effects; noise included.
+        noise_floor_mm: of the recording.
+        shrinkage: `1 - (after^2 - floor^2) / (before^2 - floor^2)`; None where the gap is not resolvable.
+        shrinkage_ci90: by resampling episodes.
+        ridge_after_rmse_mm: what an online ridge residual alone leaves of it, one sample ahead; None if not computed.
+        horizons_mm: {seconds since the episode's start: (before, after)}.
+        held_out_episodes: those scored; all of them where every episode was held out once.
+        split: shares of the squared error before: "noise", "named", "learnable", "unexplained"; they sum to 1.
+    """
+
+    before_rmse_mm: float
+    after_rmse_mm: float
+    noise_floor_mm: float
+    shrinkage: float | None
+    shrinkage_ci90: tuple[float, float] | None
+    ridge_after_rmse_mm: float | None
+    horizons_mm: dict[float, tuple[float, float]]
+    held_out_episodes: tuple[int, ...]
+    split: dict[str, float]
+
+
+@dataclasses.dataclass(frozen=True)
+class NextMotion:
+    """The motion that would best separate what could not be told apart, or sharpen what was named.
+
+    Attributes:
+        motion: its name, from `cablejax.diagnose.next_motion`.
+        separates: the two explanations that it is meant to separate; empty if it sharpens a single one.
+        separation: root mean square difference between their predictions on that motion, in noise units, after each was
+            fitted to this log.
+        alternatives: the same number for every motion of the library.
+    """
+
+    motion: str
+    separates: tuple[str, str] | tuple[()]
+    separation: float
+    alternatives: dict[str, float]
+
+
+@dataclasses.dataclass(frozen=True)
+class Diagnosis:
+    """Where a simulator is wrong, which effect causes it, how far the gap shrinks with it.
+
+    Attributes:
+        verdict: see the format.
+        sentence: the verdict in words.
+        effects: what is named as the cause; empty for "none" and "unknown".
+        equivalent: sets of effects that this log cannot tell apart.
+        ranking: every effect tried, most probable first.
+        gap: before and after.
+        where: along the cable, in time, by regime, by frame.
+        next_motion: None if nothing would be gained.
+        caveats: what the log did not allow, in words.
+        log: what was diagnosed.
+        nominal: keypoints of the nominal simulator [m], NaN beyond an episode's end, shape [E, T, N, 2].
+        explained: keypoints of the simulator with the named (or best) effects, each episode from a fit that left it
+            out [m], shape [E, T, N, 2]; None for the verdict "none".
+        noise_mm: standard deviation of each keypoint's coordinates [mm], shape [N].
+        noise_correlation: autocorrelation of the noise at lags 1, 2, ... samples.
+        seconds: run time.
+        settings: versions and options, for the record.
+    """
+
+    verdict: Verdict
+    sentence: str
+    effects: tuple[NamedEffect, ...]
+    equivalent: tuple[tuple[str, ...], ...]
+    ranking: tuple[Ranked, ...]
+    gap: Gap
+    where: Where
+    next_motion: NextMotion | None
+    caveats: tuple[str, ...]
+    log: GapLog
+    nominal: Float[np.ndarray, "E T N 2"]
+    explained: Float[np.ndarray, "E T N 2"] | None
+    noise_mm: Float[np.ndarray, "N"]
+    noise_correlation: Float[np.ndarray, "K"]
+    seconds: float
+    settings: dict[str, Any]

@@ -1,0 +1,146 @@
+"""What an effect is: named parameters, and how they change the simulator."""
+
+from __future__ import annotations
+
+import abc
+import dataclasses
+from collections.abc import Sequence
+from typing import Any, ClassVar, Literal
+
+import numpy as np
+from jaxtyping import Float
+
+from cablejax.diagnose.physics import Physics
+from cablejax.simulate.config import CableConfig
+
+
+@dataclasses.dataclass(frozen=True)
+class Parameter:
+    """One parameter of an effect.
+
+    A fit works in coordinates `z`, in which the prior is a normal distribution: `value = centre + scale z`, or
+    `value = centre exp(scale z)` where `log` is set.
+
+    Attributes:
+        name: as in the verdict.
+        unit: "" for a pure number.
+        low, high: bounds of the value.
+        centre: prior median.
+        scale: prior standard deviation, of the logarithm where `log` is set.
+        log: the value is positive and known in its order of magnitude.
+    """
+
+    name: str
+    unit: str
+    low: float
+    high: float
+    centre: float
+    scale: float
+    log: bool = False
+
+    def __post_init__(self):
+        if not (self.low <= self.centre <= self.high and self.scale > 0 and (not self.log or self.low > 0)):
+            raise ValueError(
+                f"Parameter {self.name!r}: expected low <= centre <= high and scale > 0, and low > 0 if log; got low "
+                f"{self.low}, centre {self.centre}, high {self.high}, scale {self.scale}, log {self.log}."
+            )
+
+    def value(self, z: Any) -> Any:
+        """The value at coordinate `z`, a NumPy or JAX number."""
+        if self.log:
+            return self.centre * z.__array_namespace__().exp(self.scale * z)
+        return self.centre + self.scale * z
+
+    def coordinate(self, value: float) -> float:
+        """The coordinate `z` of a value."""
+        if self.log:
+            return float(np.log(value / self.centre) / self.scale)
+        return (value - self.centre) / self.scale
+
+    @property
+    def z_bounds(self) -> tuple[float, float]:
+        """Bounds of the coordinate."""
+        return self.coordinate(self.low), self.coordinate(self.high)
+
+
+@dataclasses.dataclass(frozen=True)
+class Context:
+    """What is known of a log before any effect is fitted: where `Effect.starts` takes its guesses from.
+
+    Attributes:
+        config: the nominal cable.
+        keypoints: as the nominal simulator has them [m], shape [E, T, N, 2].
+        residual: observed less nominal keypoints [m], NaN = not observed, shape [E, T, N, 2].
+        duration: of the shortest episode [s].
+        max_curvature: largest curvature of the nominal cable in each episode [1/m], shape [E].
+    """
+
+    config: CableConfig
+    keypoints: Float[np.ndarray, "E T N 2"]
+    residual: Float[np.ndarray, "E T N 2"]
+    duration: float
+    max_curvature: Float[np.ndarray, "E"]
+
+
+class Effect(abc.ABC):
+    """Something that a real cable does and the nominal simulator does not.
+
+    To add one of your own, subclass this in a dozen lines and pass it to `diagnose(log, effects=(*LIBRARY, Mine()))`;
+    `check_effect` says whether it behaves. Effects are stateless.
+    """
+
+    name: ClassVar[str]
+    parameters: ClassVar[tuple[Parameter, ...]]
+    null: ClassVar[tuple[float, ...]]
+    """Parameter values at which nothing changes."""
+    side: ClassVar[Literal["dynamics", "observation"]] = "dynamics"
+    """Whether the cable moves differently, or is only seen differently."""
+    amplitude: ClassVar[int | None] = None
+    """Which parameter makes the effect larger, counted from its null value; None = no single one does."""
+    reversible: ClassVar[bool] = False
+    """Whether that parameter may lie on the other side of its null value too."""
+    variants: ClassVar[tuple[int, ...]] = (0,)
+    """Discrete choices that are fitted one by one, for example the gripper."""
+    variant_name: ClassVar[str | None] = None
+    """What a variant is called in the verdict; None = there is only one."""
+
+    @abc.abstractmethod
+    def apply(self, physics: Physics, values: Sequence[Any], variant: int, config: CableConfig) -> Physics:
+        """The physics with this effect. NumPy in, NumPy out; JAX in, JAX out, differentiable in `values`.
+
+        Args:
+            physics: of one cable, other effects included.
+            values: of `parameters`, in their order and units.
+            variant: one of `variants`.
+            config: the nominal cable.
+        """
+
+    @abc.abstractmethod
+    def starts(self, context: Context) -> Sequence[tuple[int, Sequence[float]]]:
+        """Pairs (variant, values) from which fits begin; enough of them that one is within reach of the truth."""
+
+    def location(self, values: Sequence[float], variant: int, config: CableConfig) -> dict[str, Any]:
+        """Where the effect sits: keys "along_cable_m", "time_s", "table_m" of the verdict, where they apply."""
+        del values, variant, config
+        return {}
+
+
+def section(centre: Any, width: Any, config: CableConfig) -> Any:
+    """Share of each joint's stretch of cable within `[centre - width/2, centre + width/2]`, shape [J].
+
+    Smooth in both: the edges are as wide as half a link.
+    """
+    xp = centre.__array_namespace__()
+    s = (np.arange(config.n_joints) + 0.5).astype(np.float32) * config.link_length
+    edge = 0.25 * config.link_length
+    # bounded exponents: no overflow far from an edge
+    begin = xp.clip((centre - 0.5 * width - s) / edge, -30.0, 30.0)
+    end = xp.clip((s - centre - 0.5 * width) / edge, -30.0, 30.0)
+    return 1.0 / ((1.0 + xp.exp(begin)) * (1.0 + xp.exp(end)))
+
+
+def hat(centre: Any, config: CableConfig) -> Any:
+    """Weights that split a point at arc length `centre` between its two neighbouring nodes, shape [n]."""
+    xp = centre.__array_namespace__()
+    nodes = np.arange(config.n_links).astype(np.float32)
+    return xp.maximum(1.0 - xp.abs(nodes - centre / config.link_length), 0.0)

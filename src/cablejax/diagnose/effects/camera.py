@@ -1,0 +1,89 @@
+"""Effects of how the cable is seen. The cable itself moves as believed."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from cablejax.diagnose.effects.base import Effect, Parameter
+
+
+class CameraSimilarity(Effect):
+    """Scale, rotation and offset of the keypoints' frame."""
+
+    name = "camera_similarity"
+    parameters = (
+        Parameter("scale", "", 0.5, 2.0, 1.0, 0.02),
+        Parameter("angle_rad", "rad", -1.0, 1.0, 0.0, 0.02),
+        Parameter("x_m", "m", -0.5, 0.5, 0.0, 0.01),
+        Parameter("y_m", "m", -0.5, 0.5, 0.0, 0.01),
+    )
+    null = (1.0, 0.0, 0.0, 0.0)
+    side = "observation"
+
+    def apply(self, physics, values, variant, config):
+        xp = values[0].__array_namespace__()
+        return replace(
+            physics,
+            camera_scale=physics.camera_scale * values[0],
+            camera_angle=physics.camera_angle + values[1],
+            camera_offset=physics.camera_offset + xp.stack([values[2], values[3]]),
+        )
+
+    def starts(self, context):
+        return [(0, self.null)]
+
+
+class CameraLag(Effect):
+    """Keypoints are stamped late."""
+
+    name = "camera_lag"
+    parameters = (Parameter("time_s", "s", 0.0, 5.0, 0.2, 0.2),)
+    null = (0.0,)
+    side = "observation"
+
+    def apply(self, physics, values, variant, config):
+        return replace(physics, camera_lag=physics.camera_lag + values[0])
+
+    def starts(self, context):
+        return [(0, (0.15,)), (0, (0.6,))]
+
+
+class KeypointBias(Effect):
+    """One keypoint sits off its nominal arc length or off the centreline; several are found one after the other.
+
+    The variant is twice the keypoint's index, plus one for an offset across the cable.
+    """
+
+    name = "keypoint_bias"
+    parameters = (Parameter("offset_m", "m", -0.1, 0.1, 0.0, 0.01),)
+    null = (0.0,)
+    amplitude, reversible = 0, True
+    side = "observation"
+    variants = tuple(range(128))
+    variant_name = "index"
+
+    def apply(self, physics, values, variant, config):
+        index, across = divmod(variant, 2)
+        xp = values[0].__array_namespace__()
+        one = (np.arange(config.n_keypoints) == index).astype(np.float32)
+        field = "bias_across" if across else "bias_along"
+        return replace(physics, **{field: getattr(physics, field) + values[0] * xp.asarray(one)})
+
+    def starts(self, context):
+        """The three offsets that take away most of the residual, by least squares against tangent and normal."""
+        tangent = np.gradient(context.keypoints, axis=2)
+        tangent = tangent / np.linalg.norm(tangent, axis=-1, keepdims=True)
+        normal = np.stack([-tangent[..., 1], tangent[..., 0]], axis=-1)
+        gains = []
+        for index in range(1, context.config.n_keypoints - 1):
+            for across, direction in ((0, tangent), (1, normal)):
+                projected = np.sum(context.residual[:, :, index] * direction[:, :, index], axis=-1)
+                mean = float(np.nanmean(projected))
+                gains.append((mean**2, 2 * index + across, mean))
+        return [(variant, (mean,)) for _, variant, mean in sorted(gains, reverse=True)[:3]]
+
+    def location(self, values, variant, config):
+        s = float(config.keypoint_arclength[variant // 2])
+        return {"along_cable_m": [s, s]}

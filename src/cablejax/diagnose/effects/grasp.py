@@ -1,0 +1,83 @@
+"""Effects of how the grippers hold the cable."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from cablejax.diagnose.effects.base import Effect, Parameter
+
+
+def _at(gripper: int, value):
+    """`value` at one gripper, zero at the other."""
+    xp = value.__array_namespace__()
+    return xp.stack([value, value * 0.0] if gripper == 0 else [value * 0.0, value])
+
+
+def _end(gripper: int, config):
+    s = 0.0 if gripper == 0 else config.length
+    return {"along_cable_m": [s, s]}
+
+
+class GripperSlip(Effect):
+    """The cable slides through a gripper, once in every episode."""
+
+    name = "gripper_slip"
+    parameters = (
+        Parameter("time_s", "s", 0.0, 300.0, 10.0, 8.0),
+        Parameter("distance_m", "m", -0.2, 0.2, 0.0, 0.02),
+    )
+    null = (10.0, 0.0)
+    amplitude, reversible = 1, True
+    variants = (0, 1)
+    variant_name = "gripper"
+
+    def apply(self, physics, values, variant, config):
+        return replace(
+            physics, slip=physics.slip + _at(variant, values[1]), slip_time=physics.slip_time * 0.0 + values[0]
+        )
+
+    def starts(self, context):
+        times = [context.duration * f for f in (0.15, 0.4, 0.7)]
+        return [(g, (t, d)) for g in (0, 1) for t in times for d in (-0.01, 0.01)]
+
+    def location(self, values, variant, config):
+        return {**_end(variant, config), "time_s": float(values[0])}
+
+
+class GripperRotationOffset(Effect):
+    """The grasp angle is off."""
+
+    name = "gripper_rotation_offset"
+    parameters = (Parameter("angle_rad", "rad", -1.0, 1.0, 0.0, 0.15),)
+    null = (0.0,)
+    amplitude, reversible = 0, True
+    variants = (0, 1)
+    variant_name = "gripper"
+
+    def apply(self, physics, values, variant, config):
+        return replace(physics, rotation_offset=physics.rotation_offset + _at(variant, values[0]))
+
+    def starts(self, context):
+        return [(g, (0.05,)) for g in (0, 1)]
+
+    def location(self, values, variant, config):
+        return _end(variant, config)
+
+
+class GripperCompliance(Effect):
+    """The grasp yields in rotation."""
+
+    name = "gripper_compliance"
+    parameters = (Parameter("stiffness_n_m_per_rad", "N m/rad", 1e-3, 1e4, 0.3, 1.2, log=True),)
+    null = (float("inf"),)
+    variants = (0, 1)
+    variant_name = "gripper"
+
+    def apply(self, physics, values, variant, config):
+        return replace(physics, rotation_compliance=physics.rotation_compliance + _at(variant, 1.0 / values[0]))
+
+    def starts(self, context):
+        return [(g, (k,)) for g in (0, 1) for k in (0.08, 0.4)]
+
+    def location(self, values, variant, config):
+        return _end(variant, config)

@@ -1,0 +1,172 @@
+"""Effects of the cable itself."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from cablejax.diagnose.effects.base import Effect, Parameter, hat, section
+
+
+def _within(values, config):
+    centre, width = float(values[0]), float(values[1])
+    return {"along_cable_m": [max(centre - width / 2, 0.0), min(centre + width / 2, config.length)]}
+
+
+class BendingStiffness(Effect):
+    """EI differs everywhere by one factor."""
+
+    name = "bending_stiffness"
+    parameters = (Parameter("ratio", "", 0.02, 50.0, 1.0, 1.0, log=True),)
+    null = (1.0,)
+    amplitude, reversible = 0, True
+
+    def apply(self, physics, values, variant, config):
+        return replace(physics, stiffness=physics.stiffness * values[0])
+
+    def starts(self, context):
+        return [(0, (0.4,)), (0, (2.5,))]
+
+
+class StiffnessProfile(Effect):
+    """EI differs over part of the cable."""
+
+    name = "stiffness_profile"
+    parameters = (
+        Parameter("centre_m", "m", 0.0, 1.0, 0.5, 0.3),
+        Parameter("width_m", "m", 0.03, 1.0, 0.25, 0.7, log=True),
+        Parameter("ratio", "", 0.05, 30.0, 1.0, 1.0, log=True),
+    )
+    null = (0.5, 0.25, 1.0)
+    amplitude, reversible = 2, True
+
+    def apply(self, physics, values, variant, config):
+        part = section(values[0] * config.length, values[1] * config.length, config)
+        return replace(physics, stiffness=physics.stiffness * values[2] ** part)
+
+    def starts(self, context):
+        return [(0, (c, 0.25, r)) for c in (0.1, 0.3, 0.5, 0.7, 0.9) for r in (0.5, 2.0)]
+
+    location = staticmethod(lambda values, variant, config: _within(values, config))
+
+
+class IntrinsicCurvature(Effect):
+    """The rest shape is curved, over part of the cable or all of it."""
+
+    name = "intrinsic_curvature"
+    parameters = (
+        Parameter("centre_m", "m", 0.0, 1.0, 0.5, 0.3),
+        Parameter("width_m", "m", 0.03, 1.0, 0.25, 0.7, log=True),
+        Parameter("curvature_per_m", "1/m", -30.0, 30.0, 0.0, 3.0),
+    )
+    null = (0.5, 0.25, 0.0)
+    amplitude, reversible = 2, True
+
+    def apply(self, physics, values, variant, config):
+        part = section(values[0] * config.length, values[1] * config.length, config)
+        return replace(physics, rest_curvature=physics.rest_curvature + values[2] * part)
+
+    def starts(self, context):
+        return [(0, (c, 0.2, k)) for c in (0.1, 0.3, 0.5, 0.7, 0.9) for k in (-1.0, 1.0)]
+
+    location = staticmethod(lambda values, variant, config: _within(values, config))
+
+
+class Plasticity(Effect):
+    """Bends beyond a yield curvature stay."""
+
+    name = "plasticity"
+    parameters = (Parameter("yield_curvature_per_m", "1/m", 0.2, 100.0, 5.0, 0.8, log=True),)
+    null = (100.0,)
+
+    def apply(self, physics, values, variant, config):
+        return replace(physics, yield_curvature=physics.yield_curvature * 0.0 + values[0])
+
+    def starts(self, context):
+        # the bends that the nominal cable makes in its sharpest episodes, and less
+        sharpest = np.quantile(context.max_curvature, (0.5, 1.0))
+        values = [*(0.85 * sharpest), 0.6 * sharpest[1], 0.4 * sharpest[1]]
+        return [(0, (float(np.clip(k, 0.3, 90.0)),)) for k in values]
+
+
+class BendingHysteresis(Effect):
+    """Rate-independent internal friction in bending, by Dahl's law."""
+
+    name = "bending_hysteresis"
+    parameters = (
+        Parameter("moment_n_m", "N m", 1e-5, 1.0, 0.01, 1.2, log=True),
+        Parameter("transition_curvature_per_m", "1/m", 0.02, 20.0, 0.5, 0.8, log=True),
+    )
+    null = (0.0, 0.5)
+
+    def apply(self, physics, values, variant, config):
+        still = physics.hysteresis_moment * 0.0
+        return replace(physics, hysteresis_moment=still + values[0], hysteresis_curvature=still + values[1])
+
+    def starts(self, context):
+        stiffness = context.config.bending_stiffness
+        return [(0, (m * stiffness, k)) for m in (0.15, 0.6) for k in (0.15, 1.0)]
+
+
+class BendingDamping(Effect):
+    """Internal viscous damping differs."""
+
+    name = "bending_damping"
+    parameters = (Parameter("time_s", "s", 1e-3, 60.0, 0.3, 1.5, log=True),)
+    null = (0.1,)
+
+    def apply(self, physics, values, variant, config):
+        return replace(physics, damping_time=physics.damping_time * 0.0 + values[0])
+
+    def starts(self, context):
+        return [(0, (factor * context.config.damping_time + 0.01,)) for factor in (4.0, 20.0)]
+
+
+class AxialStretch(Effect):
+    """The cable is extensible."""
+
+    name = "axial_stretch"
+    parameters = (Parameter("stiffness_n", "N", 0.05, 1e6, 20.0, 1.5, log=True),)
+    null = (np.inf,)
+
+    def apply(self, physics, values, variant, config):
+        return replace(physics, axial_compliance=physics.axial_compliance + 1.0 / values[0])
+
+    def starts(self, context):
+        return [(0, (2.0,)), (0, (15.0,)), (0, (150.0,))]
+
+
+class LinearDensity(Effect):
+    """Mass per length differs: weight, and with it friction, and inertia."""
+
+    name = "linear_density"
+    parameters = (Parameter("ratio", "", 0.05, 20.0, 1.0, 0.7, log=True),)
+    null = (1.0,)
+    amplitude, reversible = 0, True
+
+    def apply(self, physics, values, variant, config):
+        return replace(physics, density=physics.density * values[0])
+
+    def starts(self, context):
+        return [(0, (0.5,)), (0, (2.0,))]
+
+
+class LumpedMass(Effect):
+    """A connector or clip."""
+
+    name = "lumped_mass"
+    parameters = (
+        Parameter("centre_m", "m", 0.0, 1.0, 0.5, 0.3),
+        Parameter("mass_kg", "kg", 1e-4, 1.0, 0.03, 1.0, log=True),
+    )
+    null = (0.5, 0.0)
+
+    def apply(self, physics, values, variant, config):
+        return replace(physics, extra_mass=physics.extra_mass + values[1] * hat(values[0] * config.length, config))
+
+    def starts(self, context):
+        return [(0, (c, 0.03)) for c in (0.15, 0.3, 0.5, 0.7, 0.85)]
+
+    def location(self, values, variant, config):
+        return {"along_cable_m": [float(values[0]), float(values[0])]}

@@ -1,0 +1,158 @@
+"""Effects of the table and of what lies on it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from cablejax.diagnose.effects.base import Context, Effect, Parameter
+from cablejax.simulate.config import GRAVITY
+
+
+class TableFriction(Effect):
+    """The Coulomb coefficient differs everywhere."""
+
+    name = "table_friction"
+    parameters = (Parameter("coefficient", "", 1e-3, 10.0, 0.2, 1.0, log=True),)
+    null = (0.1,)
+    amplitude, reversible = 0, True
+
+    def apply(self, physics, values, variant, config):
+        return replace(physics, friction=physics.friction * 0.0 + values[0])
+
+    def starts(self, context):
+        nominal = max(context.config.friction_coefficient, 0.02)
+        return [(0, (factor * nominal,)) for factor in (0.3, 2.5)]
+
+
+def _swept(context: Context, spacing: float) -> np.ndarray:
+    """Centres of the squares of the table that the cable sweeps [m], the most visited first, shape [K, 2]."""
+    points = context.keypoints[:, :, 1:-1].reshape(-1, 2)
+    points = points[np.isfinite(points).all(axis=1)]
+    squares, visits = np.unique(np.round(points / spacing).astype(int), axis=0, return_counts=True)
+    return squares[np.argsort(-visits)] * spacing
+
+
+class FrictionPatch(Effect):
+    """Another coefficient inside a round region of the table."""
+
+    name = "friction_patch"
+    parameters = (
+        Parameter("x_m", "m", -3.0, 3.0, 0.4, 0.4),
+        Parameter("y_m", "m", -3.0, 3.0, 0.1, 0.4),
+        Parameter("radius_m", "m", 0.02, 0.6, 0.12, 0.5, log=True),
+        Parameter("coefficient", "", 1e-3, 10.0, 0.3, 1.0, log=True),
+    )
+    null = (0.4, 0.1, 0.12, 0.1)
+    amplitude, reversible = 3, True
+
+    def apply(self, physics, values, variant, config):
+        x, y, radius, coefficient = values
+        xp = coefficient.__array_namespace__()
+        return replace(
+            physics,
+            patch_centre=xp.stack([x, y]),
+            patch_radius=physics.patch_radius * 0.0 + radius,
+            patch_friction=coefficient - physics.friction,
+        )
+
+    def starts(self, context):
+        nominal = max(context.config.friction_coefficient, 0.05)
+        return [(0, (x, y, 0.12, 4.0 * nominal)) for x, y in _swept(context, 0.14)[:14]]
+
+    def location(self, values, variant, config):
+        return {"table_m": [float(values[0]), float(values[1])]}
+
+
+class ViscousDrag(Effect):
+    """Drag per length proportional to velocity."""
+
+    name = "viscous_drag"
+    parameters = (Parameter("coefficient_n_s_per_m2", "N s/m^2", 1e-3, 1e3, 1.0, 1.2, log=True),)
+    null = (0.0,)
+
+    def apply(self, physics, values, variant, config):
+        return replace(physics, drag=physics.drag + values[0])
+
+    def starts(self, context):
+        return [(0, (1.0,)), (0, (8.0,))]
+
+
+class GravityTilt(Effect):
+    """The table is tilted: gravity has a part in its plane. Fitted as that part's x and y over g."""
+
+    name = "gravity_tilt"
+    parameters = (
+        Parameter("sine_x", "", -0.9, 0.9, 0.0, 0.15),
+        Parameter("sine_y", "", -0.9, 0.9, 0.0, 0.15),
+    )
+    null = (0.0, 0.0)
+
+    def apply(self, physics, values, variant, config):
+        xp = values[0].__array_namespace__()
+        return replace(physics, tilt=physics.tilt + GRAVITY * xp.stack([values[0], values[1]]))
+
+    def starts(self, context):
+        return [(0, (0.05, 0.0)), (0, (0.0, 0.05))]
+
+
+class Obstacle(Effect):
+    """An unmodelled fixed disc touches the cable."""
+
+    name = "obstacle"
+    parameters = (
+        Parameter("x_m", "m", -3.0, 3.0, 0.4, 0.4),
+        Parameter("y_m", "m", -3.0, 3.0, 0.1, 0.4),
+        Parameter("radius_m", "m", 0.005, 0.2, 0.03, 0.5, log=True),
+    )
+    null = (3.0, 3.0, 0.005)
+
+    def apply(self, physics, values, variant, config):
+        x, y, radius = values
+        return replace(
+            physics,
+            obstacle_centre=x.__array_namespace__().stack([x, y]),
+            obstacle_radius=physics.obstacle_radius * 0.0 + radius,
+        )
+
+    def starts(self, context):
+        return [(0, (x, y, 0.03)) for x, y in _pushed(context)]
+
+    def location(self, values, variant, config):
+        return {"table_m": [float(values[0]), float(values[1])]}
+
+
+def _pushed(context: Context, radius: float = 0.03, count: int = 10) -> list[tuple[float, float]]:
+    """Where a disc may stand: beside the observed cable, on the side from which it is pushed, never inside it.
+
+    The candidates are points a radius away from observed keypoints that deviate, against the deviation. An observed
+    cable never passes through the obstacle, so candidates that it comes closer to than half a radius are dropped.
+    """
+    deviation = np.linalg.norm(context.residual, axis=-1)
+    observed = context.keypoints + context.residual
+    usable = np.isfinite(deviation)
+    usable[:, :, [0, -1]] = False
+    if not usable.any():
+        return []
+    limit = np.nanquantile(deviation[usable], 0.95)
+    chosen = usable & (deviation >= limit)
+    at = observed[chosen]
+    against = -context.residual[chosen] / deviation[chosen][:, None]
+    centres = at + radius * against
+    squares, first, visits = np.unique(
+        np.round(centres / 0.03).astype(int), axis=0, return_index=True, return_counts=True
+    )
+    del squares
+    every = observed[:, ::3].reshape(-1, 2)
+    every = every[np.isfinite(every).all(axis=1)]
+    result = []
+    for index in first[np.argsort(-visits)]:
+        centre = centres[index]
+        clear = np.sqrt(((every - centre) ** 2).sum(axis=1).min()) > 0.5 * radius
+        apart = all(np.hypot(*(centre - other)) > 0.05 for other in result)
+        if clear and apart:
+            result.append((float(centre[0]), float(centre[1])))
+        if len(result) == count:
+            break
+    return result

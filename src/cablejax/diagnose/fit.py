@@ -1,0 +1,272 @@
+"""Fits of effects to a log: damped Gauss-Newton on whole rollouts, many candidates in lockstep.
+
+All candidates share one batch of replays per iteration: the step of each, evaluated together with its derivatives.
+Derivatives are forward differences in the prior's own units. They serve smooth effects and those with a threshold
+(yield, contact, slip) alike, where a derivative in the limit sees nothing at all on one side.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from cablejax.diagnose.effects.base import Effect
+from cablejax.diagnose.physics import Physics
+from cablejax.diagnose.playback import Playback
+from cablejax.simulate.config import CableConfig
+
+_DIFFERENCE = 0.03
+_FIRST_DAMPING = 1e-2
+# Largest change of one coordinate in one step, in prior standard deviations.
+_LARGEST_STEP = 1.5
+_BREAKDOWN = 1e12
+
+
+@dataclasses.dataclass(frozen=True)
+class Term:
+    """One effect as it takes part in a candidate explanation.
+
+    Attributes:
+        effect: from the library.
+        variant: one of `effect.variants`.
+    """
+
+    effect: Effect
+    variant: int
+
+    @property
+    def size(self) -> int:
+        return len(self.effect.parameters)
+
+
+@dataclasses.dataclass(frozen=True)
+class Candidate:
+    """An explanation of the gap: effects that act together, and coordinates to start from.
+
+    Attributes:
+        terms: applied in this order; none = the nominal cable.
+        z: coordinates of all parameters, in the order of the terms, see `Parameter.value`.
+    """
+
+    terms: tuple[Term, ...]
+    z: Float[np.ndarray, "P"]
+
+    def values(self) -> list[np.ndarray]:
+        """Parameter values of every term."""
+        parts, begin = [], 0
+        for term in self.terms:
+            z = self.z[begin : begin + term.size]
+            parts.append(
+                np.array([p.value(np.float64(x)) for p, x in zip(term.effect.parameters, z, strict=True)])
+            )
+            begin += term.size
+        return parts
+
+    def physics(self, nominal: Physics, config: CableConfig, z: Any = None) -> Physics:
+        """The nominal physics with all terms applied. Differentiable in `z`, if that is a JAX array."""
+        z = np.asarray(self.z, np.float32) if z is None else z
+        begin = 0
+        for term in self.terms:
+            values = [p.value(x) for p, x in zip(term.effect.parameters, z[begin : begin + term.size], strict=True)]
+            nominal = term.effect.apply(nominal, values, term.variant, config)
+            begin += term.size
+        return nominal
+
+    @property
+    def bounds(self) -> Float[np.ndarray, "P 2"]:
+        """Bounds of the coordinates."""
+        return np.array([p.z_bounds for term in self.terms for p in term.effect.parameters]).reshape(-1, 2)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the effects."""
+        return tuple(term.effect.name for term in self.terms)
+
+
+def candidate(*parts: tuple[Effect, int, Sequence[float]]) -> Candidate:
+    """A candidate from (effect, variant, parameter values)."""
+    z = [
+        np.clip(p.coordinate(float(value)), *p.z_bounds)
+        for effect, _, values in parts
+        for p, value in zip(effect.parameters, values, strict=True)
+    ]
+    return Candidate(terms=tuple(Term(effect, variant) for effect, variant, _ in parts), z=np.array(z, np.float64))
+
+
+@dataclasses.dataclass(frozen=True)
+class Evidence:
+    """What a log says, ready for fitting.
+
+    Attributes:
+        playback: the log's motions at the resolution of the fits.
+        target: observed keypoints less the discretisation error of that resolution [m], NaN = not observed.
+        noise: standard deviation of each observed coordinate [m], shape [N].
+        temper: how many correlated samples count as one independent, see `belief`.
+    """
+
+    playback: Playback
+    target: Float[np.ndarray, "E T N 2"]
+    noise: Float[np.ndarray, "N"]
+    temper: float
+
+    def restricted(self, episodes: Sequence[int]) -> Evidence:
+        """The evidence of some episodes only."""
+        chosen = np.asarray(episodes, int)
+        playback = dataclasses.replace(
+            self.playback,
+            gripper_pose=self.playback.gripper_pose[chosen],
+            angles=self.playback.angles[chosen],
+            interval=self.playback.interval[chosen],
+        )
+        return dataclasses.replace(self, playback=playback, target=self.target[chosen])
+
+    def residuals(self, keypoints: Float[np.ndarray, "*P E T N 2"]) -> Float[np.ndarray, "*P E M"]:
+        """Whitened differences of simulations from the target, 0 where nothing was observed."""
+        difference = (keypoints - self.target) / self.noise[:, None]
+        difference = np.where(np.isfinite(self.target), difference, 0.0)
+        return difference.reshape(*difference.shape[:-3], -1)
+
+    @property
+    def count(self) -> Float[np.ndarray, "E"]:
+        """Observed coordinates of each episode."""
+        return np.isfinite(self.target).sum(axis=(1, 2, 3))
+
+
+@dataclasses.dataclass(frozen=True)
+class Fit:
+    """A candidate after fitting. Sums over an episode's whitened residuals r and their derivatives J.
+
+    Attributes:
+        candidate: with the fitted coordinates.
+        sse: r'r of every episode, shape [E]; huge where the simulation broke down.
+        gradient: J'r, shape [E, P].
+        curvature: J'J, shape [E, P, P].
+    """
+
+    candidate: Candidate
+    sse: Float[np.ndarray, "E"]
+    gradient: Float[np.ndarray, "E P"]
+    curvature: Float[np.ndarray, "E P P"]
+
+    def cost(self, temper: float) -> float:
+        """Negative log posterior density up to a constant."""
+        return 0.5 * float(self.sse.sum()) / temper + 0.5 * float(self.candidate.z @ self.candidate.z)
+
+    def precision(self, temper: float) -> Float[np.ndarray, "P P"]:
+        """Inverse posterior covariance of the coordinates, by Laplace's approximation."""
+        return self.curvature.sum(axis=0) / temper + np.eye(len(self.candidate.z))
+
+    def held_out_sse(self, temper: float) -> Float[np.ndarray, "E"]:
+        """r'r of every episode if it had been left out of the fit, by one Gauss-Newton step without it."""
+        precision = self.precision(temper)
+        result = np.empty_like(self.sse)
+        for e in range(len(self.sse)):
+            rest = precision - self.curvature[e] / temper
+            step = np.linalg.solve(rest, self.gradient[e] / temper)
+            step = np.clip(step, -_LARGEST_STEP, _LARGEST_STEP)
+            result[e] = self.sse[e] + 2 * self.gradient[e] @ step + step @ self.curvature[e] @ step
+        return np.maximum(result, self.sse)
+
+
+def evaluate(evidence: Evidence, candidates: Sequence[Candidate]) -> list[Fit]:
+    """Replays candidates together with their forward differences."""
+    nominal, config = evidence.playback.nominal(), evidence.playback.config
+    physics, steps = [], []
+    for c in candidates:
+        physics.append(c.physics(nominal, config))
+        # inwards where the upper bound is near
+        sign = np.where(c.z + _DIFFERENCE > c.bounds[:, 1], -_DIFFERENCE, _DIFFERENCE)
+        steps.append(sign)
+        for i in range(len(c.z)):
+            moved = c.z.astype(np.float64)
+            moved[i] += sign[i]
+            physics.append(c.physics(nominal, config, np.asarray(moved, np.float32)))
+    fits, begin = [], 0
+    # in portions, since residuals are larger than what they are summed up to
+    for c, sign in zip(candidates, steps, strict=True):
+        count = 1 + len(c.z)
+        fits.append((c, sign, physics[begin : begin + count]))
+        begin += count
+    return [fit for portion in _portions(fits, 64) for fit in _evaluate_portion(evidence, portion)]
+
+
+def _portions(fits, size):
+    portion, count = [], 0
+    for item in fits:
+        portion.append(item)
+        count += len(item[2])
+        if count >= size:
+            yield portion
+            portion, count = [], 0
+    if portion:
+        yield portion
+
+
+def _evaluate_portion(evidence, portion):
+    keypoints = evidence.playback.keypoints([p for _, _, group in portion for p in group])
+    residuals = evidence.residuals(keypoints)
+    begin = 0
+    for c, sign, group in portion:
+        r, moved = residuals[begin], residuals[begin + 1 : begin + len(group)]
+        begin += len(group)
+        broken = ~np.isfinite(r).all(axis=1)
+        with np.errstate(invalid="ignore"):
+            jacobian = (moved - r) / sign[:, None, None]
+        # a breakdown next door gives no derivative
+        jacobian = np.where(np.isfinite(jacobian).all(axis=2, keepdims=True), jacobian, 0.0)
+        r = np.where(broken[:, None], 0.0, r)
+        jacobian = np.where(broken[None, :, None], 0.0, jacobian).astype(np.float64)
+        yield Fit(
+            candidate=c,
+            sse=np.where(broken, _BREAKDOWN, np.einsum("em,em->e", r, r)),
+            gradient=np.einsum("pem,em->ep", jacobian, r),
+            curvature=np.einsum("pem,qem->epq", jacobian, jacobian, optimize=True),
+        )
+
+
+def improve(evidence: Evidence, fits: Sequence[Fit], *, max_iterations: int, tolerance: float = 0.02) -> list[Fit]:
+    """Damped Gauss-Newton (Levenberg 1944, Marquardt 1963) from evaluated candidates, all in lockstep.
+
+    Args:
+        evidence: to fit.
+        fits: from `evaluate`; each keeps its terms.
+        max_iterations: steps, accepted or not.
+        tolerance: a candidate is done once a step promises to lower its cost by less than this, in nats.
+    """
+    fits = list(fits)
+    damping = np.full(len(fits), _FIRST_DAMPING)
+    running = [len(fit.candidate.z) > 0 for fit in fits]
+    for _ in range(max_iterations):
+        trials = {}
+        for i, fit in enumerate(fits):
+            if not running[i]:
+                continue
+            z, bounds = fit.candidate.z, fit.candidate.bounds
+            precision = fit.precision(evidence.temper)
+            gradient = fit.gradient.sum(axis=0) / evidence.temper + z
+            # coordinates at a bound that want to leave it stay there
+            stuck = ((z <= bounds[:, 0] + 1e-9) & (gradient > 0)) | ((z >= bounds[:, 1] - 1e-9) & (gradient < 0))
+            free = ~stuck
+            step = np.zeros_like(z)
+            damped = precision + damping[i] * np.diag(np.diagonal(precision))
+            step[free] = -np.linalg.solve(damped[np.ix_(free, free)], gradient[free])
+            promised = -(gradient @ step + 0.5 * step @ precision @ step)
+            step *= min(1.0, _LARGEST_STEP / max(np.abs(step).max(), 1e-12))
+            if promised < tolerance:
+                running[i] = False
+                continue
+            moved = np.clip(z + step, bounds[:, 0], bounds[:, 1])
+            trials[i] = dataclasses.replace(fit.candidate, z=moved)
+        if not trials:
+            break
+        for i, trial in zip(trials, evaluate(evidence, list(trials.values())), strict=True):
+            if trial.cost(evidence.temper) < fits[i].cost(evidence.temper):
+                fits[i], damping[i] = trial, max(damping[i] / 5, 1e-4)
+            else:
+                damping[i] = max(damping[i] * 8, 0.1)
+                running[i] = damping[i] < 1e3
+    return fits

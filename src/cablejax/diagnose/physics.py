@@ -1,0 +1,122 @@
+"""What the diagnosing simulator can do: the nominal cable and, switched off, every effect of the library."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from cablejax.simulate.config import GRAVITY, CableConfig
+
+# Far enough to be out of the game, near enough for single precision.
+_NEVER = 1e3
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Physics:
+    """Everything that moves one planar cable, or how it is seen, apart from the grippers' motion.
+
+    One pytree for all effects: the simulator is compiled once, and an effect is a function from one `Physics` to
+    another. At its null value every field leaves the nominal rollout as it is, to the last bit.
+
+    Attributes:
+        stiffness: EI at each joint [N m^2], shape [J].
+        rest_curvature: kappa_0 at each joint [1/m], shape [J].
+        damping_time: Kelvin-Voigt time constant [s].
+        yield_curvature: elastic curvature beyond which a bend stays [1/m].
+        hysteresis_moment: largest moment of the internal friction in bending [N m].
+        hysteresis_curvature: curvature over which that moment builds up [1/m].
+        axial_compliance: 1 / EA [1/N].
+        friction: Coulomb coefficient of the table.
+        patch_centre: middle of a round patch of the table [m], shape [2].
+        patch_radius: [m].
+        patch_friction: coefficient inside the patch less the one outside.
+        drag: viscous drag per length and speed [N s/m^2].
+        tilt: in-plane part of the gravity [m/s^2], shape [2].
+        density: mass per length [kg/m].
+        extra_mass: mass added at each node [kg], shape [n].
+        slip: change of the free length at either gripper [m], shape [2].
+        slip_time: when it happens [s], in each episode.
+        rotation_offset: of the cable's clamp against either gripper's angle [rad], shape [2].
+        rotation_compliance: of either clamp [rad/(N m)], shape [2].
+        obstacle_centre: of a fixed disc [m], shape [2].
+        obstacle_radius: to the cable's centreline [m]; 0 = none.
+        bias_along: how far each keypoint sits beyond its nominal arc length [m], shape [N].
+        bias_across: how far each sits to the left of the centreline [m], shape [N].
+        camera_scale: of the keypoints about the world's origin.
+        camera_angle: rotation of the keypoints about the world's origin [rad].
+        camera_offset: added after scale and rotation [m], shape [2].
+        camera_lag: by which the keypoints' stamps are late [s].
+    """
+
+    stiffness: Float[Array, "*B J"]
+    rest_curvature: Float[Array, "*B J"]
+    damping_time: Float[Array, "*B"]
+    yield_curvature: Float[Array, "*B"]
+    hysteresis_moment: Float[Array, "*B"]
+    hysteresis_curvature: Float[Array, "*B"]
+    axial_compliance: Float[Array, "*B"]
+    friction: Float[Array, "*B"]
+    patch_centre: Float[Array, "*B 2"]
+    patch_radius: Float[Array, "*B"]
+    patch_friction: Float[Array, "*B"]
+    drag: Float[Array, "*B"]
+    tilt: Float[Array, "*B 2"]
+    density: Float[Array, "*B"]
+    extra_mass: Float[Array, "*B n"]
+    slip: Float[Array, "*B 2"]
+    slip_time: Float[Array, "*B"]
+    rotation_offset: Float[Array, "*B 2"]
+    rotation_compliance: Float[Array, "*B 2"]
+    obstacle_centre: Float[Array, "*B 2"]
+    obstacle_radius: Float[Array, "*B"]
+    bias_along: Float[Array, "*B N"]
+    bias_across: Float[Array, "*B N"]
+    camera_scale: Float[Array, "*B"]
+    camera_angle: Float[Array, "*B"]
+    camera_offset: Float[Array, "*B 2"]
+    camera_lag: Float[Array, "*B"]
+
+
+def nominal_physics(config: CableConfig, dtype=jnp.float32) -> Physics:
+    """The cable as it is believed to be: no effect."""
+    joints, links, points = config.n_joints, config.n_links, config.n_keypoints
+    values = {
+        "stiffness": np.full(joints, config.bending_stiffness),
+        "rest_curvature": np.zeros(joints),
+        "damping_time": config.damping_time,
+        "yield_curvature": _NEVER,
+        "hysteresis_moment": 0.0,
+        "hysteresis_curvature": 1.0,
+        "axial_compliance": 0.0,
+        "friction": config.friction_coefficient,
+        "patch_centre": np.zeros(2),
+        "patch_radius": 0.1,
+        "patch_friction": 0.0,
+        "drag": 0.0,
+        "tilt": np.zeros(2),
+        "density": config.linear_density,
+        "extra_mass": np.zeros(links),
+        "slip": np.zeros(2),
+        "slip_time": 0.0,
+        "rotation_offset": np.zeros(2),
+        "rotation_compliance": np.zeros(2),
+        "obstacle_centre": np.full(2, _NEVER),
+        "obstacle_radius": 0.0,
+        "bias_along": np.zeros(points),
+        "bias_across": np.zeros(points),
+        "camera_scale": 1.0,
+        "camera_angle": 0.0,
+        "camera_offset": np.zeros(2),
+        "camera_lag": 0.0,
+    }
+    return Physics(**{name: np.asarray(value, np.dtype(dtype)) for name, value in values.items()})
+
+
+def normal_gravity(tilt: Float[Array, "2"]) -> Float[Array, ""]:
+    """Gravity across a tilted table [m/s^2]; the part in the plane is `tilt`."""
+    return jnp.sqrt(jnp.maximum(GRAVITY**2 - jnp.sum(tilt**2), 0.0))

@@ -1,0 +1,117 @@
+"""Replays of one log under many physics at once."""
+
+from __future__ import annotations
+
+import concurrent.futures
+import dataclasses
+import functools
+import math
+import os
+from collections.abc import Sequence
+
+import jax
+import numpy as np
+from jaxtyping import Float
+
+from cablejax.diagnose.chain import LARGEST_STEP, Chain, seen_by_camera
+from cablejax.diagnose.physics import Physics, nominal_physics
+from cablejax.simulate.compile import compiler_options
+from cablejax.simulate.config import CableConfig
+from cablejax.simulate.equilibrium import equilibrium_state
+
+# Samples that one compiled call replays, and cables that it replays at once: logs of any length share two programs.
+_SAMPLES = 50
+_ROWS = 24
+
+
+@dataclasses.dataclass(frozen=True)
+class Playback:
+    """A log's gripper motions, ready to be replayed.
+
+    Attributes:
+        config: nominal cable and resolution.
+        gripper_pose: measured, theta continuous, the last one held over the padding, shape [E, T, 2, 3].
+        angles: of the settled nominal cable at the first pose [rad], shape [E, n].
+        interval: between samples [s], shape [E].
+    """
+
+    config: CableConfig
+    gripper_pose: Float[np.ndarray, "E T 2 3"]
+    angles: Float[np.ndarray, "E n"]
+    interval: Float[np.ndarray, "E"]
+
+    @classmethod
+    def of_motion(
+        cls,
+        config: CableConfig,
+        gripper_pose: Float[np.ndarray, "E T 2 3"],
+        first_keypoints: Float[np.ndarray, "E N 2"] | None,
+        interval: Float[np.ndarray, "E"],
+    ) -> Playback:
+        """Finds the settled start of every episode near its first keypoints."""
+        angles = [
+            np.asarray(
+                equilibrium_state(config, pose[0], guess=None if first_keypoints is None else first_keypoints[e]).qpos
+            )[2:]
+            for e, pose in enumerate(np.asarray(gripper_pose, np.float64))
+        ]
+        return cls(
+            config=config,
+            gripper_pose=np.asarray(gripper_pose, np.float32),
+            angles=np.asarray(angles, np.float32),
+            interval=np.asarray(interval, np.float32),
+        )
+
+    def nominal(self) -> Physics:
+        """The cable without any effect."""
+        return nominal_physics(self.config)
+
+    def keypoints(
+        self, physics: Sequence[Physics], episodes: Sequence[int] | None = None
+    ) -> Float[np.ndarray, "P E T N 2"]:
+        """What the camera would have seen under each physics [m]; NaN where a simulation broke down.
+
+        Args:
+            physics: of one cable each.
+            episodes: to replay; None = all.
+        """
+        chosen = np.arange(len(self.gripper_pose)) if episodes is None else np.asarray(episodes, int)
+        n_physics, n_samples = len(physics), self.gripper_pose.shape[1]
+        rows = [(p, e) for p in range(n_physics) for e in chosen]
+        stacked = Physics(
+            **{
+                field.name: np.stack([np.asarray(getattr(p, field.name), np.float32) for p in physics])
+                for field in dataclasses.fields(Physics)
+            }
+        )
+        substeps = max(1, math.ceil(float(self.interval.max()) / LARGEST_STEP - 1e-6))
+        replay = _compiled(self.config, n_samples, substeps)
+
+        def one_chunk(begin: int) -> np.ndarray:
+            chunk = rows[begin : begin + _ROWS]
+            full = chunk + [chunk[0]] * (_ROWS - len(chunk))
+            p, e = np.array(full).T
+            batch = jax.tree.map(lambda leaf: leaf[p], stacked)
+            result = replay(batch, self.angles[e], self.gripper_pose[e], self.interval[e])
+            return np.asarray(result)[: len(chunk)]
+
+        begins = range(0, len(rows), _ROWS)
+        with concurrent.futures.ThreadPoolExecutor(max_workers=_workers()) as pool:
+            parts = list(pool.map(one_chunk, begins))
+        points = np.concatenate(parts)
+        return points.reshape(n_physics, len(chosen), *points.shape[1:])
+
+
+def _workers() -> int:
+    return max(1, len(os.sched_getaffinity(0)))
+
+
+@functools.lru_cache(maxsize=16)
+def _compiled(config: CableConfig, n_samples: int, n_substeps: int):
+    chain = Chain(config)
+
+    def one(physics, angles, pose, interval):
+        points = chain.rollout(physics, angles, pose, interval, n_substeps=n_substeps)
+        return seen_by_camera(physics, points, interval)
+
+    return jax.jit(jax.vmap(one), compiler_options=compiler_options())
