@@ -1,4 +1,4 @@
-"""The command line: `cablejax demo | simulate | train | shape | bench`."""
+"""The command line: `cablejax demo | simulate | train | shape | diagnose | bench`."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from tyro.conf import subcommand
 
 from cablejax.commands.bench import Bench
 from cablejax.commands.demo import Demo
+from cablejax.commands.diagnose import Diagnose
 from cablejax.commands.options import Command
 from cablejax.commands.shape import Shape
 from cablejax.commands.simulate import Simulate
@@ -27,12 +28,13 @@ _COMMANDS: Any = (
     | Annotated[Simulate, subcommand("simulate")]
     | Annotated[Train, subcommand("train")]
     | Annotated[Shape, subcommand("shape")]
+    | Annotated[Diagnose, subcommand("diagnose")]
     | Annotated[Bench, subcommand("bench")]
 )
 _DESCRIPTION = """Two robot grippers bring a cable to a shape.
 
 Start with `cablejax demo`: it needs nothing else and writes a page to look at. To make your own model: `simulate` a
-data set, `train` on it, `shape` a cable with the result. `cablejax COMMAND --help` explains each one."""
+data set, `train` on it, `shape` a cable with the result, `diagnose` what the simulator lacks. `cablejax COMMAND --help` explains each one."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -39,6 +39,8 @@ _CONTACT_STIFFNESS = 300.0
 _PATCH_EDGE = 0.005
 _CONTACT_EDGE = 0.0005
 _SLIP_DURATION = 0.1
+# Speed at which sliding has taken away most of the static excess [m/s].
+_STRIBECK_SPEED = 0.004
 _REGULARISATION = 1e-7
 
 
@@ -161,7 +163,9 @@ class Chain:
         where = root + nodes
         patch = jax.nn.sigmoid((physics.patch_radius - _length(where - physics.patch_centre)) / _PATCH_EDGE)
         coefficient = physics.friction + physics.patch_friction * patch
-        speed = jnp.sqrt(jnp.sum(velocity**2, axis=1) + self.config.friction_speed**2)
+        squared_speed = jnp.sum(velocity**2, axis=1)
+        coefficient = coefficient * (1.0 + physics.static_excess * jnp.exp(-squared_speed / _STRIBECK_SPEED**2))
+        speed = jnp.sqrt(squared_speed + self.config.friction_speed**2)
         drag = free * (coefficient * mass * normal_gravity(physics.tilt) / speed + physics.drag * h)
         away = where - physics.obstacle_centre
         distance = _length(away)
@@ -257,15 +261,14 @@ class Chain:
         change = angles[1:] / h - curvature
         sign = jnp.where(change < 0, -1.0, 1.0)
         rubbed = sign + (state.friction_state - sign) * jnp.exp(-jnp.abs(change) / physics.hysteresis_curvature)
-        bent = angles[1:] / h - physics.rest_curvature
-        held = bent - state.set_curvature
-        set_curvature = bent - jnp.clip(held, -physics.yield_curvature, physics.yield_curvature)
-        yielded = jnp.abs(held) > physics.yield_curvature
+        # Return mapping of plasticity with linear kinematic hardening (Simo and Hughes 1998, 1.5).
+        driven = angles[1:] / h - physics.rest_curvature - (1.0 + physics.hardening) * state.set_curvature
+        beyond = driven - jnp.clip(driven, -physics.yield_curvature, physics.yield_curvature)
         return ChainState(
             angles=angles,
             stretch=state.stretch + dt * speeds[-1],
             velocity=speeds,
-            set_curvature=jnp.where(yielded, set_curvature, state.set_curvature),
+            set_curvature=state.set_curvature + beyond / (1.0 + physics.hardening),
             friction_state=rubbed,
             root_velocity=root_velocity,
         )

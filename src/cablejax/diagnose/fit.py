@@ -105,13 +105,15 @@ class Evidence:
         playback: the log's motions at the resolution of the fits.
         target: observed keypoints less the discretisation error of that resolution [m], NaN = not observed.
         noise: standard deviation of each observed coordinate [m], shape [N].
-        temper: how many correlated samples count as one independent, see `belief`.
+        temper: how many correlated samples of each episode count as one independent, see `belief`, shape [E].
+        freedom: of Student's distribution over episodes, see `belief`.
     """
 
     playback: Playback
     target: Float[np.ndarray, "E T N 2"]
     noise: Float[np.ndarray, "N"]
-    temper: float
+    temper: Float[np.ndarray, "E"]
+    freedom: float
 
     def restricted(self, episodes: Sequence[int]) -> Evidence:
         """The evidence of some episodes only."""
@@ -122,13 +124,25 @@ class Evidence:
             angles=self.playback.angles[chosen],
             interval=self.playback.interval[chosen],
         )
-        return dataclasses.replace(self, playback=playback, target=self.target[chosen])
+        return dataclasses.replace(self, playback=playback, target=self.target[chosen], temper=self.temper[chosen])
 
     def residuals(self, keypoints: Float[np.ndarray, "*P E T N 2"]) -> Float[np.ndarray, "*P E M"]:
         """Whitened differences of simulations from the target, 0 where nothing was observed."""
         difference = (keypoints - self.target) / self.noise[:, None]
         difference = np.where(np.isfinite(self.target), difference, 0.0)
         return difference.reshape(*difference.shape[:-3], -1)
+
+    def surprise(self, sse: Float[np.ndarray, "E"]) -> Float[np.ndarray, "E"]:
+        """Q of every episode: squared error above the noise, in units of what is to be expected."""
+        return np.maximum(sse - self.count, 0.0) / self.temper
+
+    def log_likelihood(self, sse: Float[np.ndarray, "E"]) -> float:
+        """Student's log likelihood up to a constant, see `belief`."""
+        return float(-0.5 * (self.freedom + 1) * np.log1p(self.surprise(sse) / self.freedom).sum())
+
+    def weight(self, sse: Float[np.ndarray, "E"]) -> Float[np.ndarray, "E"]:
+        """Weight of each episode's squared residuals in an equivalent least squares problem."""
+        return (self.freedom + 1) / (self.freedom + self.surprise(sse)) / self.temper
 
     @property
     def count(self) -> Float[np.ndarray, "E"]:
@@ -152,21 +166,21 @@ class Fit:
     gradient: Float[np.ndarray, "E P"]
     curvature: Float[np.ndarray, "E P P"]
 
-    def cost(self, temper: float) -> float:
+    def cost(self, evidence: Evidence) -> float:
         """Negative log posterior density up to a constant."""
-        return 0.5 * float(self.sse.sum()) / temper + 0.5 * float(self.candidate.z @ self.candidate.z)
+        return -evidence.log_likelihood(self.sse) + 0.5 * float(self.candidate.z @ self.candidate.z)
 
-    def precision(self, temper: float) -> Float[np.ndarray, "P P"]:
-        """Inverse posterior covariance of the coordinates, by Laplace's approximation."""
-        return self.curvature.sum(axis=0) / temper + np.eye(len(self.candidate.z))
+    def precision(self, evidence: Evidence) -> Float[np.ndarray, "P P"]:
+        """Inverse posterior covariance of the coordinates, by Laplace's approximation with fixed weights."""
+        return np.einsum("epq,e->pq", self.curvature, evidence.weight(self.sse)) + np.eye(len(self.candidate.z))
 
-    def held_out_sse(self, temper: float) -> Float[np.ndarray, "E"]:
+    def held_out_sse(self, evidence: Evidence) -> Float[np.ndarray, "E"]:
         """r'r of every episode if it had been left out of the fit, by one Gauss-Newton step without it."""
-        precision = self.precision(temper)
+        precision, weight = self.precision(evidence), evidence.weight(self.sse)
         result = np.empty_like(self.sse)
         for e in range(len(self.sse)):
-            rest = precision - self.curvature[e] / temper
-            step = np.linalg.solve(rest, self.gradient[e] / temper)
+            rest = precision - weight[e] * self.curvature[e]
+            step = np.linalg.solve(rest, weight[e] * self.gradient[e])
             step = np.clip(step, -_LARGEST_STEP, _LARGEST_STEP)
             result[e] = self.sse[e] + 2 * self.gradient[e] @ step + step @ self.curvature[e] @ step
         return np.maximum(result, self.sse)
@@ -246,8 +260,8 @@ def improve(evidence: Evidence, fits: Sequence[Fit], *, max_iterations: int, tol
             if not running[i]:
                 continue
             z, bounds = fit.candidate.z, fit.candidate.bounds
-            precision = fit.precision(evidence.temper)
-            gradient = fit.gradient.sum(axis=0) / evidence.temper + z
+            precision = fit.precision(evidence)
+            gradient = fit.gradient.T @ evidence.weight(fit.sse) + z
             # coordinates at a bound that want to leave it stay there
             stuck = ((z <= bounds[:, 0] + 1e-9) & (gradient > 0)) | ((z >= bounds[:, 1] - 1e-9) & (gradient < 0))
             free = ~stuck
@@ -264,7 +278,7 @@ def improve(evidence: Evidence, fits: Sequence[Fit], *, max_iterations: int, tol
         if not trials:
             break
         for i, trial in zip(trials, evaluate(evidence, list(trials.values())), strict=True):
-            if trial.cost(evidence.temper) < fits[i].cost(evidence.temper):
+            if trial.cost(evidence) < fits[i].cost(evidence):
                 fits[i], damping[i] = trial, max(damping[i] / 5, 1e-4)
             else:
                 damping[i] = max(damping[i] * 8, 0.1)

@@ -28,10 +28,12 @@ class Physics:
         rest_curvature: kappa_0 at each joint [1/m], shape [J].
         damping_time: Kelvin-Voigt time constant [s].
         yield_curvature: elastic curvature beyond which a bend stays [1/m].
+        hardening: h, kinematic: beyond yielding the moment grows with slope `EI h / (1 + h)`; 0 = perfectly plastic.
         hysteresis_moment: largest moment of the internal friction in bending [N m].
         hysteresis_curvature: curvature over which that moment builds up [1/m].
         axial_compliance: 1 / EA [1/N].
-        friction: Coulomb coefficient of the table.
+        friction: kinetic Coulomb coefficient of the table.
+        static_excess: relative excess of the static coefficient over the kinetic one (Stribeck).
         patch_centre: middle of a round patch of the table [m], shape [2].
         patch_radius: [m].
         patch_friction: coefficient inside the patch less the one outside.
@@ -57,10 +59,12 @@ class Physics:
     rest_curvature: Float[Array, "*B J"]
     damping_time: Float[Array, "*B"]
     yield_curvature: Float[Array, "*B"]
+    hardening: Float[Array, "*B"]
     hysteresis_moment: Float[Array, "*B"]
     hysteresis_curvature: Float[Array, "*B"]
     axial_compliance: Float[Array, "*B"]
     friction: Float[Array, "*B"]
+    static_excess: Float[Array, "*B"]
     patch_centre: Float[Array, "*B 2"]
     patch_radius: Float[Array, "*B"]
     patch_friction: Float[Array, "*B"]
@@ -90,10 +94,12 @@ def nominal_physics(config: CableConfig, dtype=jnp.float32) -> Physics:
         "rest_curvature": np.zeros(joints),
         "damping_time": config.damping_time,
         "yield_curvature": _NEVER,
+        "hardening": 0.0,
         "hysteresis_moment": 0.0,
         "hysteresis_curvature": 1.0,
         "axial_compliance": 0.0,
         "friction": config.friction_coefficient,
+        "static_excess": 0.0,
         "patch_centre": np.zeros(2),
         "patch_radius": 0.1,
         "patch_friction": 0.0,

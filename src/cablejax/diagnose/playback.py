@@ -19,8 +19,7 @@ from cablejax.simulate.compile import compiler_options
 from cablejax.simulate.config import CableConfig
 from cablejax.simulate.equilibrium import equilibrium_state
 
-# Samples that one compiled call replays, and cables that it replays at once: logs of any length share two programs.
-_SAMPLES = 50
+# Cables that one compiled call replays at once.
 _ROWS = 24
 
 
@@ -85,7 +84,14 @@ class Playback:
             }
         )
         substeps = max(1, math.ceil(float(self.interval.max()) / LARGEST_STEP - 1e-6))
-        replay = _compiled(self.config, n_samples, substeps)
+        geometry = CableConfig(
+            length=self.config.length,
+            diameter=self.config.diameter,
+            n_links=self.config.n_links,
+            n_keypoints=self.config.n_keypoints,
+            friction_speed=self.config.friction_speed,
+        )
+        replay = _compiled(geometry, n_samples, substeps)
 
         def one_chunk(begin: int) -> np.ndarray:
             chunk = rows[begin : begin + _ROWS]
@@ -107,8 +113,8 @@ def _workers() -> int:
 
 
 @functools.lru_cache(maxsize=16)
-def _compiled(config: CableConfig, n_samples: int, n_substeps: int):
-    chain = Chain(config)
+def _compiled(geometry: CableConfig, n_samples: int, n_substeps: int):
+    chain = Chain(geometry)
 
     def one(physics, angles, pose, interval):
         points = chain.rollout(physics, angles, pose, interval, n_substeps=n_substeps)

@@ -21,11 +21,12 @@ class Template:
 
     Attributes:
         start: the candidate, moved along its amplitude to meet the gap where that is possible.
-        similarity: squared cosine between the template and the gap, the noise taken out of the latter; at most about 1.
+        explained: share of the squared gap that it takes away, the noise taken out of the gap: of the template at its
+            best length where a parameter decides on that, else of the template as it is. At most about 1.
     """
 
     start: Candidate
-    similarity: float
+    explained: float
 
 
 def screen(
@@ -58,12 +59,12 @@ def screen(
         if not np.isfinite(size) or size < 1e-6:
             continue
         product = float(template @ gap)
-        similarity = product**2 / size / power
-        # a template that points the other way explains nothing, unless it may be reversed
         stretched = _stretch(start, len(base.z), product / size)
         if stretched is None:
-            similarity, stretched = 0.0, start
-        result.append(Template(start=stretched, similarity=similarity))
+            explained = (2 * product - size) / power
+        else:
+            start, explained = stretched, product**2 / size / power
+        result.append(Template(start=start, explained=explained))
     return result
 
 
@@ -72,28 +73,31 @@ def _parts(base: Candidate):
 
 
 def _stretch(start: Candidate, n_base: int, amplitude: float) -> Candidate | None:
-    """The start with its effect's amplitude times `amplitude`; None where it cannot point that way."""
+    """The start with its last effect made `amplitude` times as large; None where no parameter does that."""
     effect = start.terms[-1].effect
-    if effect.amplitude is None:
-        return start if amplitude > 0 else None
-    if amplitude <= 0 and not effect.reversible:
+    if effect.amplitude is None or (amplitude <= 0 and not effect.reversible):
         return None
     amplitude = float(np.clip(amplitude, -_LARGEST_AMPLITUDE, _LARGEST_AMPLITUDE))
-    z = start.z.copy()
     index = n_base + effect.amplitude
-    parameter = effect.parameters[effect.amplitude]
-    null = parameter.coordinate(effect.null[effect.amplitude]) if np.isfinite(effect.null[effect.amplitude]) else None
-    if null is not None:
-        z[index] = np.clip(null + amplitude * (z[index] - null), *parameter.z_bounds)
+    parameter, null = effect.parameters[effect.amplitude], effect.null[effect.amplitude]
+    z = start.z.copy()
+    if parameter.log and null in (0.0, np.inf):
+        # the effect grows with the value, or with its inverse
+        factor = amplitude if null == 0.0 else 1.0 / amplitude
+        z[index] = parameter.coordinate(float(parameter.value(np.float64(z[index]))) * factor)
+    else:
+        origin = parameter.coordinate(null)
+        z[index] = origin + amplitude * (z[index] - origin)
+    z[index] = np.clip(z[index], *parameter.z_bounds)
     return dataclasses.replace(start, z=z)
 
 
-def shortlist(templates: Sequence[Template], per_variant: int = 1, per_effect: int = 3) -> list[Candidate]:
+def shortlist(templates: Sequence[Template], per_variant: int = 2, per_effect: int = 3) -> list[Candidate]:
     """The best starts: so many of each effect, of these so many of each variant."""
     chosen: list[Candidate] = []
     taken: dict[str, int] = {}
     variants: dict[tuple[str, int], int] = {}
-    for template in sorted(templates, key=lambda t: -t.similarity):
+    for template in sorted(templates, key=lambda t: -t.explained):
         term = template.start.terms[-1]
         name, key = term.effect.name, (term.effect.name, term.variant)
         if taken.get(name, 0) < per_effect and variants.get(key, 0) < per_variant:

@@ -92,7 +92,7 @@ class Effect(abc.ABC):
     name: ClassVar[str]
     parameters: ClassVar[tuple[Parameter, ...]]
     null: ClassVar[tuple[float, ...]]
-    """Parameter values at which nothing changes."""
+    """Parameter values at which nothing changes. An effect that differs from a nominal value has a ratio to it."""
     side: ClassVar[Literal["dynamics", "observation"]] = "dynamics"
     """Whether the cable moves differently, or is only seen differently."""
     amplitude: ClassVar[int | None] = None
@@ -118,6 +118,11 @@ class Effect(abc.ABC):
     @abc.abstractmethod
     def starts(self, context: Context) -> Sequence[tuple[int, Sequence[float]]]:
         """Pairs (variant, values) from which fits begin; enough of them that one is within reach of the truth."""
+
+    def reported(self, values: Sequence[float], variant: int, config: CableConfig) -> dict[str, tuple[Any, str]]:
+        """Parameters by the names of the verdict, as (value, unit). Choices are integers."""
+        named = {p.name: (float(v), p.unit) for p, v in zip(self.parameters, values, strict=True)}
+        return named if self.variant_name is None else {self.variant_name: (variant, ""), **named}
 
     def location(self, values: Sequence[float], variant: int, config: CableConfig) -> dict[str, Any]:
         """Where the effect sits: keys "along_cable_m", "time_s", "table_m" of the verdict, where they apply."""

@@ -32,7 +32,13 @@ class CameraSimilarity(Effect):
         )
 
     def starts(self, context):
-        return [(0, self.null)]
+        """The similarity nearest to the observed keypoints, by linear least squares."""
+        seen = np.isfinite(context.residual).all(axis=-1)
+        x, y = context.keypoints[seen].T
+        zero, one = np.zeros_like(x), np.ones_like(x)
+        columns = np.concatenate([np.stack([x, -y, one, zero], axis=1), np.stack([y, x, zero, one], axis=1)])
+        a, b, dx, dy = np.linalg.lstsq(columns, context.residual[seen].T.ravel(), rcond=None)[0]
+        return [(0, (np.hypot(1 + a, b), np.arctan2(b, 1 + a), dx, dy))]
 
 
 class CameraLag(Effect):
@@ -83,6 +89,9 @@ class KeypointBias(Effect):
                 mean = float(np.nanmean(projected))
                 gains.append((mean**2, 2 * index + across, mean))
         return [(variant, (mean,)) for _, variant, mean in sorted(gains, reverse=True)[:3]]
+
+    def reported(self, values, variant, config):
+        return {"index": (variant // 2, ""), "offset_m": (float(values[0]), "m")}
 
     def location(self, values, variant, config):
         s = float(config.keypoint_arclength[variant // 2])

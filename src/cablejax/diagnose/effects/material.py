@@ -9,9 +9,20 @@ import numpy as np
 from cablejax.diagnose.effects.base import Effect, Parameter, hat, section
 
 
-def _within(values, config):
-    centre, width = float(values[0]), float(values[1])
-    return {"along_cable_m": [max(centre - width / 2, 0.0), min(centre + width / 2, config.length)]}
+class _Section(Effect):
+    """An effect on a section of the cable; its first two parameters are centre and width over the cable's length."""
+
+    def reported(self, values, variant, config):
+        last = self.parameters[2]
+        return {
+            "centre_m": (float(values[0]) * config.length, "m"),
+            "width_m": (float(values[1]) * config.length, "m"),
+            last.name: (float(values[2]), last.unit),
+        }
+
+    def location(self, values, variant, config):
+        centre, width = float(values[0]) * config.length, float(values[1]) * config.length
+        return {"along_cable_m": [max(centre - width / 2, 0.0), min(centre + width / 2, config.length)]}
 
 
 class BendingStiffness(Effect):
@@ -29,13 +40,13 @@ class BendingStiffness(Effect):
         return [(0, (0.4,)), (0, (2.5,))]
 
 
-class StiffnessProfile(Effect):
+class StiffnessProfile(_Section):
     """EI differs over part of the cable."""
 
     name = "stiffness_profile"
     parameters = (
-        Parameter("centre_m", "m", 0.0, 1.0, 0.5, 0.3),
-        Parameter("width_m", "m", 0.03, 1.0, 0.25, 0.7, log=True),
+        Parameter("centre", "", 0.0, 1.0, 0.5, 0.3),
+        Parameter("width", "", 0.03, 1.0, 0.25, 0.7, log=True),
         Parameter("ratio", "", 0.05, 30.0, 1.0, 1.0, log=True),
     )
     null = (0.5, 0.25, 1.0)
@@ -48,16 +59,14 @@ class StiffnessProfile(Effect):
     def starts(self, context):
         return [(0, (c, 0.25, r)) for c in (0.1, 0.3, 0.5, 0.7, 0.9) for r in (0.5, 2.0)]
 
-    location = staticmethod(lambda values, variant, config: _within(values, config))
 
-
-class IntrinsicCurvature(Effect):
+class IntrinsicCurvature(_Section):
     """The rest shape is curved, over part of the cable or all of it."""
 
     name = "intrinsic_curvature"
     parameters = (
-        Parameter("centre_m", "m", 0.0, 1.0, 0.5, 0.3),
-        Parameter("width_m", "m", 0.03, 1.0, 0.25, 0.7, log=True),
+        Parameter("centre", "", 0.0, 1.0, 0.5, 0.3),
+        Parameter("width", "", 0.03, 1.0, 0.25, 0.7, log=True),
         Parameter("curvature_per_m", "1/m", -30.0, 30.0, 0.0, 3.0),
     )
     null = (0.5, 0.25, 0.0)
@@ -70,24 +79,31 @@ class IntrinsicCurvature(Effect):
     def starts(self, context):
         return [(0, (c, 0.2, k)) for c in (0.1, 0.3, 0.5, 0.7, 0.9) for k in (-1.0, 1.0)]
 
-    location = staticmethod(lambda values, variant, config: _within(values, config))
-
 
 class Plasticity(Effect):
-    """Bends beyond a yield curvature stay."""
+    """Bends beyond a yield curvature stay; what a bend beyond it costs more, the hardening, is fitted beside it."""
 
     name = "plasticity"
-    parameters = (Parameter("yield_curvature_per_m", "1/m", 0.2, 100.0, 5.0, 0.8, log=True),)
-    null = (100.0,)
+    parameters = (
+        Parameter("yield_curvature_per_m", "1/m", 0.2, 100.0, 5.0, 0.8, log=True),
+        Parameter("hardening", "", 1e-3, 30.0, 0.3, 1.5, log=True),
+    )
+    null = (100.0, 0.3)
 
     def apply(self, physics, values, variant, config):
-        return replace(physics, yield_curvature=physics.yield_curvature * 0.0 + values[0])
+        still = physics.hardening * 0.0
+        return replace(physics, yield_curvature=still + values[0], hardening=still + values[1])
 
     def starts(self, context):
-        # the bends that the nominal cable makes in its sharpest episodes, and less
-        sharpest = np.quantile(context.max_curvature, (0.5, 1.0))
-        values = [*(0.85 * sharpest), 0.6 * sharpest[1], 0.4 * sharpest[1]]
-        return [(0, (float(np.clip(k, 0.3, 90.0)),)) for k in values]
+        sharpest = float(context.max_curvature.max())
+        return [
+            (0, (float(np.clip(f * sharpest, 0.3, 90.0)), h))
+            for f in (0.9, 0.75, 0.6, 0.45, 0.3)
+            for h in (0.05, 1.0)
+        ]
+
+    def reported(self, values, variant, config):
+        return {"yield_curvature_per_m": (float(values[0]), "1/m")}
 
 
 class BendingHysteresis(Effect):
@@ -99,6 +115,7 @@ class BendingHysteresis(Effect):
         Parameter("transition_curvature_per_m", "1/m", 0.02, 20.0, 0.5, 0.8, log=True),
     )
     null = (0.0, 0.5)
+    amplitude = 0
 
     def apply(self, physics, values, variant, config):
         still = physics.hysteresis_moment * 0.0
@@ -113,14 +130,19 @@ class BendingDamping(Effect):
     """Internal viscous damping differs."""
 
     name = "bending_damping"
-    parameters = (Parameter("time_s", "s", 1e-3, 60.0, 0.3, 1.5, log=True),)
-    null = (0.1,)
+    parameters = (Parameter("ratio", "", 0.01, 1000.0, 1.0, 1.5, log=True),)
+    null = (1.0,)
 
     def apply(self, physics, values, variant, config):
-        return replace(physics, damping_time=physics.damping_time * 0.0 + values[0])
+        # a cable believed to be undamped gets one millisecond to be a multiple of
+        nominal = physics.damping_time + (0.001 if config.damping_time == 0 else 0.0)
+        return replace(physics, damping_time=nominal * values[0])
 
     def starts(self, context):
-        return [(0, (factor * context.config.damping_time + 0.01,)) for factor in (4.0, 20.0)]
+        return [(0, (0.2,)), (0, (4.0,)), (0, (20.0,))]
+
+    def reported(self, values, variant, config):
+        return {"time_s": (float(values[0]) * (config.damping_time or 0.001), "s")}
 
 
 class AxialStretch(Effect):
@@ -129,6 +151,7 @@ class AxialStretch(Effect):
     name = "axial_stretch"
     parameters = (Parameter("stiffness_n", "N", 0.05, 1e6, 20.0, 1.5, log=True),)
     null = (np.inf,)
+    amplitude = 0
 
     def apply(self, physics, values, variant, config):
         return replace(physics, axial_compliance=physics.axial_compliance + 1.0 / values[0])
@@ -157,10 +180,11 @@ class LumpedMass(Effect):
 
     name = "lumped_mass"
     parameters = (
-        Parameter("centre_m", "m", 0.0, 1.0, 0.5, 0.3),
+        Parameter("centre", "", 0.0, 1.0, 0.5, 0.3),
         Parameter("mass_kg", "kg", 1e-4, 1.0, 0.03, 1.0, log=True),
     )
     null = (0.5, 0.0)
+    amplitude = 1
 
     def apply(self, physics, values, variant, config):
         return replace(physics, extra_mass=physics.extra_mass + values[1] * hat(values[0] * config.length, config))
@@ -168,5 +192,9 @@ class LumpedMass(Effect):
     def starts(self, context):
         return [(0, (c, 0.03)) for c in (0.15, 0.3, 0.5, 0.7, 0.85)]
 
+    def reported(self, values, variant, config):
+        return {"centre_m": (float(values[0]) * config.length, "m"), "mass_kg": (float(values[1]), "kg")}
+
     def location(self, values, variant, config):
-        return {"along_cable_m": [float(values[0]), float(values[0])]}
+        s = float(values[0]) * config.length
+        return {"along_cable_m": [s, s]}

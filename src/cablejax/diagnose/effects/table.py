@@ -7,23 +7,35 @@ from dataclasses import replace
 import numpy as np
 
 from cablejax.diagnose.effects.base import Context, Effect, Parameter
-from cablejax.simulate.config import GRAVITY
+from cablejax.simulate.config import GRAVITY, CableConfig
+
+
+def _believed(config: CableConfig) -> float:
+    """The nominal coefficient; a table believed to be smooth gets a small one to be a multiple of."""
+    return config.friction_coefficient or 0.01
 
 
 class TableFriction(Effect):
-    """The Coulomb coefficient differs everywhere."""
+    """The Coulomb coefficient differs everywhere. Variant 1 also sticks harder than it slides, by a fitted excess."""
 
     name = "table_friction"
-    parameters = (Parameter("coefficient", "", 1e-3, 10.0, 0.2, 1.0, log=True),)
-    null = (0.1,)
+    parameters = (
+        Parameter("ratio", "", 0.01, 50.0, 1.0, 1.0, log=True),
+        Parameter("static_excess", "", 0.0, 1.5, 0.0, 0.2),
+    )
+    null = (1.0, 0.0)
+    variants = (0, 1)
     amplitude, reversible = 0, True
 
     def apply(self, physics, values, variant, config):
-        return replace(physics, friction=physics.friction * 0.0 + values[0])
+        nominal = physics.friction + (_believed(config) if config.friction_coefficient == 0 else 0.0)
+        return replace(physics, friction=nominal * values[0], static_excess=physics.static_excess + variant * values[1])
 
     def starts(self, context):
-        nominal = max(context.config.friction_coefficient, 0.02)
-        return [(0, (factor * nominal,)) for factor in (0.3, 2.5)]
+        return [(0, (0.4, 0.0)), (0, (2.5, 0.0)), (1, (0.4, 0.2)), (1, (2.5, 0.2))]
+
+    def reported(self, values, variant, config):
+        return {"coefficient": (float(values[0]) * _believed(config), "")}
 
 
 def _swept(context: Context, spacing: float) -> np.ndarray:
@@ -42,24 +54,27 @@ class FrictionPatch(Effect):
         Parameter("x_m", "m", -3.0, 3.0, 0.4, 0.4),
         Parameter("y_m", "m", -3.0, 3.0, 0.1, 0.4),
         Parameter("radius_m", "m", 0.02, 0.6, 0.12, 0.5, log=True),
-        Parameter("coefficient", "", 1e-3, 10.0, 0.3, 1.0, log=True),
+        Parameter("ratio", "", 0.01, 50.0, 1.0, 1.2, log=True),
     )
-    null = (0.4, 0.1, 0.12, 0.1)
+    null = (0.4, 0.1, 0.12, 1.0)
     amplitude, reversible = 3, True
 
     def apply(self, physics, values, variant, config):
-        x, y, radius, coefficient = values
-        xp = coefficient.__array_namespace__()
+        x, y, radius, ratio = values
+        xp = ratio.__array_namespace__()
         return replace(
             physics,
             patch_centre=xp.stack([x, y]),
             patch_radius=physics.patch_radius * 0.0 + radius,
-            patch_friction=coefficient - physics.friction,
+            patch_friction=(ratio - 1.0) * _believed(config),
         )
 
     def starts(self, context):
-        nominal = max(context.config.friction_coefficient, 0.05)
-        return [(0, (x, y, 0.12, 4.0 * nominal)) for x, y in _swept(context, 0.14)[:14]]
+        return [(0, (x, y, 0.12, 3.0)) for x, y in _swept(context, 0.14)[:14]]
+
+    def reported(self, values, variant, config):
+        x, y, radius, ratio = (float(v) for v in values)
+        return {"x_m": (x, "m"), "y_m": (y, "m"), "radius_m": (radius, "m"), "coefficient": (ratio * _believed(config), "")}
 
     def location(self, values, variant, config):
         return {"table_m": [float(values[0]), float(values[1])]}
@@ -71,6 +86,7 @@ class ViscousDrag(Effect):
     name = "viscous_drag"
     parameters = (Parameter("coefficient_n_s_per_m2", "N s/m^2", 1e-3, 1e3, 1.0, 1.2, log=True),)
     null = (0.0,)
+    amplitude = 0
 
     def apply(self, physics, values, variant, config):
         return replace(physics, drag=physics.drag + values[0])
@@ -94,7 +110,13 @@ class GravityTilt(Effect):
         return replace(physics, tilt=physics.tilt + GRAVITY * xp.stack([values[0], values[1]]))
 
     def starts(self, context):
-        return [(0, (0.05, 0.0)), (0, (0.0, 0.05))]
+        angle = np.arange(8) * np.pi / 4
+        return [(0, (0.1 * np.cos(a), 0.1 * np.sin(a))) for a in angle]
+
+    def reported(self, values, variant, config):
+        x, y = float(values[0]), float(values[1])
+        sine = float(np.clip(np.hypot(x, y), 0.0, 1.0))
+        return {"angle_rad": (float(np.arcsin(sine)), "rad"), "direction_rad": (float(np.arctan2(y, x)), "rad")}
 
 
 class Obstacle(Effect):

@@ -1,0 +1,57 @@
+"""`cablejax diagnose`: where a simulator is wrong on a recorded run, and which effect causes it."""
+
+from __future__ import annotations
+
+import dataclasses
+import pathlib
+from typing import Annotated
+
+import tyro
+
+from cablejax.commands.options import Command, UsageError, output_folder, say
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Diagnose(Command):
+    """Diagnose the gap between the simulator and a recorded run: where it lies, what causes it, how far it shrinks.
+
+    Reads a gap log (`cablejax-gap-log/1`, as `cablejax shape` writes it) and writes report.html, verdict.json and the
+    figures. A log of six episodes takes about half a minute."""
+
+    log: Annotated[pathlib.Path, tyro.conf.Positional]
+    """The recorded run, an .npz file."""
+
+    out: pathlib.Path = pathlib.Path("runs/diagnosis")
+    """Folder of the report."""
+
+    commissioning: tuple[pathlib.Path, ...] = ()
+    """Logs known to have no effect, of the same set-up: they tell the simulator's own error from the gap."""
+
+    only: tuple[str, ...] = ()
+    """Names of the effects to look for; by default all."""
+
+    overwrite: bool = False
+    """Replace a report that is there."""
+
+    def execute(self):
+        from cablejax.diagnose import LIBRARY, diagnose, verdict_json, write_verdict
+        from cablejax.gaplog import read_gap_log
+        from cablejax.report.diagnosis_page import write_diagnosis_page
+
+        known = {effect.name: effect for effect in LIBRARY}
+        for name in self.only:
+            if name not in known:
+                raise UsageError(f"--only names the effect {name!r}, expected some of {', '.join(known)}.")
+        log = read_gap_log(self.log)
+        commissioning = [read_gap_log(path) for path in self.commissioning]
+        folder = output_folder(self.out, overwrite=self.overwrite)
+        result = diagnose(
+            log,
+            effects=[known[name] for name in self.only] or LIBRARY,
+            commissioning=commissioning,
+            progress=lambda text: say(f"{text} ..."),
+        )
+        write_verdict(folder / "verdict.json", result)
+        page = write_diagnosis_page(result, folder)
+        summary = verdict_json(result)
+        return {**summary, "report": str(page)}, f"{result.verdict}: {result.sentence}\n{page}"

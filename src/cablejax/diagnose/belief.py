@@ -1,0 +1,108 @@
+"""How sure a diagnosis may be: from fits to probabilities.
+
+A simulator that has the right effect still differs from a real cable, by more samples than a likelihood of white noise
+believes independent, and by more where the effect is large. So the squared error of each episode, above the noise, is
+measured against
+
+    temper_e = 1 + n (b^2 + (rho g_e)^2) / sigma^2,      Q_e = (SSE_e - count_e) / temper_e,
+
+with b the error of the baseline simulator, rho the relative error of an effect's law (real friction is not quite
+Coulomb's), g_e the gap of that episode, sigma the noise, and n the number of samples over which these errors stay the
+same. An explanation's log likelihood is that of Student's distribution over episodes,
+
+    log p(log | c) = -(nu + 1) / 2 sum_e log(1 + Q_e / nu),
+
+so that no single episode, where the cable snapped a moment too early, decides alone. `SSE_e` comes from a fit that left
+out episode e: parameters that serve one episode only cost more than they gain.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float
+
+from cablejax.diagnose.fit import Candidate, Evidence, Fit
+
+
+@dataclasses.dataclass(frozen=True)
+class Calibration:
+    """Constants that were set on labelled development logs, see docs/diagnosis.md.
+
+    Attributes:
+        baseline: root mean square error per coordinate of the simulator without any effect [m]; commissioning logs
+            replace it.
+        law_error: rho, of an effect's law relative to the gap it makes.
+        correlated_samples: n, over which errors of simulators stay the same.
+        freedom: nu of Student's distribution.
+        term_cost: nats that each effect must pay for itself.
+        resolvable: a gap up to this many baseline errors is none.
+        noise_share: so much of the noise is added to the baseline error in that comparison, for the noise floor itself
+            is an estimate.
+        adequate: an explanation that leaves less than this share of the gap, root mean square, is complete.
+        telling: below this share of explained squared gap nothing is named.
+        set_odds: an effect belongs to the reported set if its odds against the best are at least these.
+        max_terms: effects in one explanation at most.
+    """
+
+    baseline: float = 2.0e-4
+    law_error: float = 0.1
+    correlated_samples: float = 500.0
+    freedom: float = 6.0
+    term_cost: float = 4.0
+    resolvable: float = 1.6
+    noise_share: float = 0.15
+    adequate: float = 0.25
+    telling: float = 0.6
+    set_odds: float = 0.08
+    max_terms: int = 3
+
+    def temper(self, gap: Float[np.ndarray, "E"], noise: float) -> Float[np.ndarray, "E"]:
+        """See the module's docstring; `gap` of each episode and `noise` in metres per coordinate."""
+        return 1.0 + self.correlated_samples * (self.baseline**2 + (self.law_error * gap) ** 2) / noise**2
+
+    def smallest_gap(self, noise: float) -> float:
+        """The gap [m] from which on there is one."""
+        return self.resolvable * float(np.hypot(self.baseline, self.noise_share * noise))
+
+
+def excess(sse: float, evidence: Evidence) -> float:
+    """Root mean square per coordinate above the noise [m] that whitened residuals of this sum mean."""
+    count = float(evidence.count.sum())
+    return float(np.sqrt(max(sse - count, 0.0) / count)) * level(evidence)
+
+
+def level(evidence: Evidence) -> float:
+    """Noise of a coordinate, root mean square over keypoints [m]."""
+    return float(np.sqrt(np.mean(evidence.noise**2)))
+
+
+def log_scores(fits: Sequence[Fit], evidence: Evidence, calibration: Calibration) -> Float[np.ndarray, "F"]:
+    """Log posterior of every candidate, all sets of effects with as many members being equally likely beforehand."""
+    scores = [
+        evidence.log_likelihood(fit.held_out_sse(evidence))
+        - calibration.term_cost * len(set(fit.candidate.terms))
+        for fit in fits
+    ]
+    return np.array(scores)
+
+
+def probabilities(scores: Float[np.ndarray, "F"]) -> Float[np.ndarray, "F"]:
+    """Normalised exponentials."""
+    weights = np.exp(scores - scores.max())
+    return weights / weights.sum()
+
+
+def effect_names(candidate: Candidate) -> tuple[str, ...]:
+    """Names of the distinct effects of a candidate, sorted."""
+    return tuple(sorted(set(candidate.names)))
+
+
+def best_by_effects(fits: Sequence[Fit], scores: Float[np.ndarray, "F"]) -> dict[tuple[str, ...], int]:
+    """The best fit of every set of effects, by its index; variants and starts of one effect compete here."""
+    best: dict[tuple[str, ...], int] = {}
+    for i in np.argsort(-scores):
+        best.setdefault(effect_names(fits[i].candidate), int(i))
+    return best

@@ -1,0 +1,172 @@
+"""From fitted explanations to a verdict."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from cablejax.diagnose.belief import Calibration, effect_names, excess, level, probabilities
+from cablejax.diagnose.diagnosis import NamedEffect, ParameterEstimate, Ranked, Verdict
+from cablejax.diagnose.fit import Evidence, Fit
+from cablejax.diagnose.search import Search
+from cablejax.simulate.config import CableConfig
+
+_DRAWS = 400
+
+
+@dataclasses.dataclass(frozen=True)
+class Conclusion:
+    """What the search amounts to.
+
+    Attributes:
+        verdict: see the format.
+        best: the most probable explanation, the nominal cable included.
+        effects: named; empty for "none" and "unknown".
+        equivalent: sets of effects that this log cannot tell apart.
+        ranking: of single effects.
+        explained: share of the squared gap that the best explanation takes away.
+    """
+
+    verdict: Verdict
+    best: Fit
+    effects: tuple[NamedEffect, ...]
+    equivalent: tuple[tuple[str, ...], ...]
+    ranking: tuple[Ranked, ...]
+    explained: float
+
+
+def conclude(found: Search, evidence: Evidence, calibration: Calibration) -> Conclusion:
+    """Probabilities, equivalence sets and the verdict."""
+    chances = probabilities(found.scores)
+    best = found.fits[0]
+    null = next(fit for fit in found.fits if not fit.candidate.terms)
+    gap = excess(float(null.sse.sum()), evidence)
+    left = excess(float(best.sse.sum()), evidence)
+    explained = 1.0 - (left / gap) ** 2 if gap > 0 else 0.0
+    ranking = _ranking(found, evidence, calibration)
+    smallest = calibration.smallest_gap(level(evidence))
+    if gap <= smallest:
+        return Conclusion("none", null, (), (), ranking, 0.0)
+
+    effects, equivalent = [], []
+    for name in effect_names(best.candidate):
+        rest = set(effect_names(best.candidate)) - {name}
+        odds: dict[str, float] = {}
+        for fit, chance in zip(found.fits, chances, strict=True):
+            names = set(effect_names(fit.candidate))
+            # the same explanation with another effect in this one's place
+            if len(names) == len(rest) + 1 and rest <= names:
+                (other,) = names - rest
+                odds[other] = odds.get(other, 0.0) + float(chance)
+        total = sum(odds.values())
+        alike = sorted((n for n in odds if odds[n] >= calibration.set_odds * odds[name]), key=lambda n: -odds[n])
+        if len(alike) > 1:
+            equivalent.append(tuple(alike))
+        effects.append(_named(name, best, odds[name] / total, evidence))
+    complete = left <= max(calibration.adequate * gap, smallest)
+    if not effects or (explained < calibration.telling and not complete):
+        return Conclusion("unknown", best, (), (), ranking, explained)
+    if not complete:
+        verdict: Verdict = "named+unknown"
+    else:
+        verdict = "ambiguous" if equivalent else "named"
+    order = np.argsort([-e.probability for e in effects])
+    return Conclusion(verdict, best, tuple(effects[i] for i in order), tuple(equivalent), ranking, explained)
+
+
+def _ranking(found: Search, evidence: Evidence, calibration: Calibration) -> tuple[Ranked, ...]:
+    singles = [(f, s) for f, s in zip(found.fits, found.scores, strict=True) if len(effect_names(f.candidate)) == 1]
+    if not singles:
+        return ()
+    chances = probabilities(np.array([s for _, s in singles]))
+    null = next(fit for fit in found.fits if not fit.candidate.terms)
+    before = max(float(null.sse.sum()) - evidence.count.sum(), 1e-9)
+    result = []
+    for (fit, _), chance in zip(singles, chances, strict=True):
+        held_out = float(fit.held_out_sse(evidence).sum()) - evidence.count.sum()
+        result.append(
+            Ranked(
+                name=fit.candidate.names[0],
+                probability=float(chance),
+                held_out_shrinkage=float(np.clip(1 - held_out / before, -1.0, 1.0)),
+                leftover_mm=1e3 * excess(float(fit.sse.sum()), evidence),
+            )
+        )
+    tried = {r.name for r in result}
+    # effects whose best template explained too little to be fitted
+    result += [
+        Ranked(name, 0.0, float(np.clip(share, 0.0, 1.0)), 1e3 * excess(float(null.sse.sum()), evidence))
+        for name, share in found.screened.items()
+        if name not in tried
+    ]
+    return tuple(sorted(result, key=lambda r: -r.probability))
+
+
+def _named(name: str, fit: Fit, probability: float, evidence: Evidence) -> NamedEffect:
+    """One effect of a fit, with intervals from Laplace's approximation in the prior's coordinates."""
+    config = evidence.playback.config
+    rng = np.random.default_rng(0)
+    covariance = np.linalg.inv(fit.precision(evidence))
+    draws = rng.multivariate_normal(fit.candidate.z, covariance, size=_DRAWS, method="cholesky")
+    draws = np.clip(draws, *fit.candidate.bounds.T)
+    parts: list[dict[str, ParameterEstimate]] = []
+    location: dict[str, Any] = {"along_cable_m": None, "time_s": None, "table_m": None}
+    begin = 0
+    for term in fit.candidate.terms:
+        slots = slice(begin, begin + term.size)
+        begin += term.size
+        if term.effect.name != name:
+            continue
+        fitted = _values(term, fit.candidate.z[slots])
+        sampled = [term.effect.reported(_values(term, z), term.variant, config) for z in draws[:, slots]]
+        parameters = {}
+        for key, (value, unit) in term.effect.reported(fitted, term.variant, config).items():
+            column = [sample[key][0] for sample in sampled]
+            parameters[key] = ParameterEstimate(value, _interval(value, column, unit), unit)
+        parts.append(parameters)
+        location.update(term.effect.location(fitted, term.variant, config))
+    return NamedEffect(name, probability, _merged(parts), location)
+
+
+def _values(term, z):
+    return [p.value(np.float64(x)) for p, x in zip(term.effect.parameters, z, strict=True)]
+
+
+def _interval(value, column: Sequence[Any], unit: str):
+    if isinstance(value, int):
+        return None
+    column = np.asarray(column, float)
+    if unit == "rad":
+        # angles near the turn of the circle
+        column = value + (column - value + np.pi) % (2 * np.pi) - np.pi
+    low, high = np.quantile(column, (0.05, 0.95))
+    return float(low), float(high)
+
+
+def _merged(parts: list[dict[str, ParameterEstimate]]) -> dict[str, ParameterEstimate]:
+    """Several pieces of one effect as lists, which the format allows."""
+    if len(parts) == 1:
+        return parts[0]
+    merged = {}
+    for key, first in parts[0].items():
+        every = [part[key] for part in parts]
+        intervals = None if first.ci90 is None else [e.ci90 for e in every]
+        merged[key] = ParameterEstimate([e.value for e in every], intervals, first.unit)
+    return merged
+
+
+def sentence(conclusion: Conclusion, config: CableConfig) -> str:
+    """The verdict in words."""
+    share = f"{100 * conclusion.explained:.0f} %"
+    names = " and ".join(e.name.replace("_", " ") for e in conclusion.effects)
+    alike = "; ".join(" or ".join(n.replace("_", " ") for n in group) for group in conclusion.equivalent)
+    return {
+        "none": "The simulator explains this log within what the noise and its own resolution allow.",
+        "named": f"The gap comes from {names}, which explains {share} of it.",
+        "ambiguous": f"The gap comes from {names} or a look-alike, which this log cannot tell apart: {alike}.",
+        "named+unknown": f"Part of the gap comes from {names} ({share}); the rest has a cause not in the library.",
+        "unknown": f"The gap has a cause that is not in the library: the best explanation takes away {share} of it.",
+    }[conclusion.verdict]

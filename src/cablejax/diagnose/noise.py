@@ -1,0 +1,110 @@
+"""The noise floor of a recording: how far keypoints scatter that do not move."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+from jaxtyping import Float
+
+# Shortest hold that tells anything, in samples.
+_SHORTEST_HOLD = 10
+_LAGS = 5
+# A keypoint counts as noisier than the others beyond this many standard errors.
+_DISTINCT = 4.0
+
+
+@dataclasses.dataclass(frozen=True)
+class NoiseFloor:
+    """What no simulator can explain.
+
+    Attributes:
+        std: standard deviation of each keypoint's coordinates [m], shape [N].
+        correlation: autocorrelation at lags 1, 2, ... samples, shape [K].
+        from_holds: whether the recording had holds to learn it from; otherwise the noise is taken to be white.
+    """
+
+    std: Float[np.ndarray, "N"]
+    correlation: Float[np.ndarray, "K"]
+    from_holds: bool
+
+
+def noise_floor(keypoints: Float[np.ndarray, "E T N 2"], hold: np.ndarray | None) -> NoiseFloor:
+    """Noise from holds, each detrended by a line since a cable may creep; without holds, from third differences.
+
+    If the noise in the holds is white, third differences of the whole recording sharpen its level: there are many more
+    of them, and no cable moves by jerks that fast. Keypoints share one level unless one is clearly noisier.
+
+    Raises:
+        ValueError: fewer than 20 observed samples of every keypoint, or no noise at all.
+    """
+    rapid, n_rapid = _third_differences(keypoints)
+    held = _held(keypoints, hold) if hold is not None else None
+    if held is None:
+        variance, count, correlation, from_holds = rapid, n_rapid, np.zeros(_LAGS), False
+    else:
+        variance, count, correlation = held
+        from_holds = True
+        if abs(correlation[0]) < 4.0 / np.sqrt(max(count.sum(), 1)) + 0.02:
+            level = float(np.average(rapid, weights=np.maximum(n_rapid, 1e-9)))
+            slow = float(np.average(variance, weights=np.maximum(count, 1e-9)))
+            # white noise has one level at all frequencies; a jerky recording does not
+            if abs(level / slow - 1) < 0.1:
+                variance, count = rapid, n_rapid
+    if count.max() < 20:
+        raise ValueError(f"The log shows a keypoint at most {int(count.max())} times, expected at least 20 samples.")
+    common = float(np.average(variance, weights=np.maximum(count, 1e-9)))
+    if not common > 0:
+        raise ValueError(
+            "The keypoints have no noise at all. A diagnosis weighs the gap against the noise of the recording; if this "
+            "log was simulated, record it with the camera's noise."
+        )
+    error = common * np.sqrt(2.0 / np.maximum(count, 1.0))
+    distinct = (np.abs(variance - common) > _DISTINCT * error) & (count >= 20)
+    return NoiseFloor(
+        std=np.sqrt(np.where(distinct, variance, common)), correlation=correlation, from_holds=from_holds
+    )
+
+
+def _third_differences(keypoints):
+    difference = np.diff(keypoints, n=3, axis=1)
+    difference = difference.transpose(2, 0, 1, 3).reshape(keypoints.shape[2], -1)
+    variance, count = np.zeros(len(difference)), np.zeros(len(difference))
+    for n, row in enumerate(difference):
+        row = row[np.isfinite(row)]
+        if len(row) >= 20:
+            # without the few where something snapped
+            inner = row[np.abs(row) <= 4.0 * 1.4826 * np.median(np.abs(row))]
+            variance[n] = np.mean(inner**2) / 20.0
+            # overlapping differences: 20^2 / 924 of them are independent
+            count[n] = 0.43 * len(inner)
+    return variance, count
+
+
+def _held(keypoints, hold):
+    """Variance and count per keypoint, pooled autocorrelation; None without a hold."""
+    n_points = keypoints.shape[2]
+    squares, count, products = np.zeros(n_points), np.zeros(n_points), np.zeros((_LAGS, 2))
+    for episode, flags in zip(keypoints, hold, strict=True):
+        edges = np.flatnonzero(np.diff(np.concatenate([[0], flags.astype(int), [0]])))
+        for begin, end in edges.reshape(-1, 2):
+            if end - begin < _SHORTEST_HOLD:
+                continue
+            for n in range(n_points):
+                for axis in range(2):
+                    values = episode[begin:end, n, axis]
+                    seen = np.isfinite(values)
+                    if seen.sum() < _SHORTEST_HOLD:
+                        continue
+                    t = np.arange(end - begin, dtype=float)
+                    rest = values - np.polyval(np.polyfit(t[seen], values[seen], 1), t)
+                    squares[n] += np.nansum(rest**2)
+                    count[n] += seen.sum() - 2
+                    for lag in range(1, _LAGS + 1):
+                        pair = rest[lag:] * rest[:-lag]
+                        products[lag - 1] += np.nansum(pair), np.isfinite(pair).sum()
+    if count.max(initial=0) < 20:
+        return None
+    variance = squares / np.maximum(count, 1)
+    level = squares.sum() / count.sum()
+    return variance, count, products[:, 0] / np.maximum(products[:, 1], 1) / level

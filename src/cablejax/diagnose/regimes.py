@@ -1,0 +1,128 @@
+"""In which regime the cable is at every sample of a log: what the grippers do, and how it lies."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from cablejax.types import GapLog
+
+_METRES_PER_RADIAN = 0.15
+# Grippers slower than this rest [m/s].
+_REST_SPEED = 1e-3
+_FAST_SPEED = 0.02
+_REVERSAL_EDGES = (0.0, 1.0, 3.0, 10.0)
+
+
+@dataclasses.dataclass(frozen=True)
+class Regimes:
+    """Which samples are of which regime.
+
+    Attributes:
+        masks: by "what: class", shape [E, T] each; the classes of one "what" do not overlap.
+        pairs: two regimes that are worth holding against each other, by the name of the first.
+        hold: the grippers rest and the cable has settled, shape [E, T].
+        since_reversal: seconds since the grippers last reversed; NaN before the first time, shape [E, T].
+    """
+
+    masks: dict[str, Bool[np.ndarray, "E T"]]
+    pairs: dict[str, tuple[Bool[np.ndarray, "E T"], Bool[np.ndarray, "E T"]]]
+    hold: Bool[np.ndarray, "E T"]
+    since_reversal: Float[np.ndarray, "E T"]
+
+
+def regimes_of(log: GapLog, nominal: Float[np.ndarray, "E T N 2"], valid: Bool[np.ndarray, "E T"]) -> Regimes:
+    """Regimes from the measured gripper poses and the nominal cable.
+
+    Args:
+        log: of a cable on a table, held by two grippers.
+        nominal: simulated keypoints [m].
+        valid: samples that are no padding.
+    """
+    speed, since = np.zeros(valid.shape), np.full(valid.shape, np.nan)
+    for e, length in enumerate(log.episode_length):
+        if length < 3:
+            continue
+        velocity = _velocity(log.gripper_pose[e, :length], log.time[e, :length])
+        speed[e, :length] = np.linalg.norm(velocity, axis=-1).max(axis=-1)
+        since[e, :length] = _since_reversal(velocity, log.time[e, :length])
+    rest = valid & (speed < _REST_SPEED)
+    hold = rest if log.hold is None else valid & log.hold
+    fast = valid & (speed >= _FAST_SPEED)
+    distance = np.linalg.norm(log.gripper_pose[:, :, 1, :2] - log.gripper_pose[:, :, 0, :2], axis=-1)
+    curvature = _largest_curvature(nominal, np.asarray(log.meta["keypoint_arclength_m"]))
+    length = float(log.meta["cable"]["length_m"])
+    rate = np.zeros(valid.shape)
+    if valid.shape[1] > 1:
+        rate[:, 1:] = np.diff(distance, axis=1) / np.maximum(np.diff(log.time, axis=1), 1e-9)
+    closing, opening = valid & (rate < -_REST_SPEED), valid & (rate > _REST_SPEED)
+    moving = valid & ~rest
+    masks = {
+        "speed: hold": hold,
+        "speed: slow": moving & ~fast & ~hold,
+        "speed: fast": fast & ~hold,
+        **_halves("curvature", curvature, valid, ("low", "high")),
+        **_halves("gripper distance", distance / length, valid, ("short", "long")),
+        "direction: grippers closing": closing,
+        "direction: grippers opening": opening,
+        "direction: grippers moving together": moving & ~closing & ~opening,
+        "reversal: before the first": moving & np.isnan(since),
+    }
+    edges = (*_REVERSAL_EDGES, np.inf)
+    for low, high in itertools.pairwise(edges):
+        words = f"{low:g} to {high:g} s after" if np.isfinite(high) else f"more than {low:g} s after"
+        with np.errstate(invalid="ignore"):
+            masks[f"reversal: {words}"] = valid & (since >= low) & (since < high)
+    late = np.isfinite(since)
+    pairs = {
+        "speed: hold": (hold, moving & ~hold),
+        "speed: fast": (masks["speed: fast"], masks["speed: slow"]),
+        "direction: grippers closing": (closing, opening),
+        "reversal: after": (moving & late, moving & ~late),
+    }
+    for name, other in (("curvature: high", "curvature: low"), ("gripper distance: short", "gripper distance: long")):
+        if name in masks and other in masks:
+            pairs[name] = masks[name], masks[other]
+    return Regimes(masks={k: m for k, m in masks.items() if m.any()}, pairs=pairs, hold=hold, since_reversal=since)
+
+
+def _velocity(pose: Float[np.ndarray, "T Q 3"], time: Float[np.ndarray, "T"]) -> Float[np.ndarray, "T Q 3"]:
+    """Twists [m/s], rotation times 0.15 m/rad."""
+    pose = pose.astype(np.float64)
+    pose[..., 2] = _METRES_PER_RADIAN * np.unwrap(pose[..., 2], axis=0)
+    return np.gradient(pose, time, axis=0)
+
+
+def _since_reversal(velocity: Float[np.ndarray, "T Q 3"], time: Float[np.ndarray, "T"]) -> Float[np.ndarray, "T"]:
+    """Seconds since the joint motion of the grippers last turned against the direction it had before."""
+    result = np.full(len(time), np.nan)
+    flat = velocity.reshape(len(time), -1)
+    direction, reversed_at = None, np.nan
+    for t, v in enumerate(flat):
+        size = np.linalg.norm(v)
+        if size > 2 * _REST_SPEED:
+            unit = v / size
+            if direction is not None and unit @ direction < -0.5:
+                reversed_at = time[t]
+            direction = unit
+        result[t] = time[t] - reversed_at
+    return result
+
+
+def _halves(name: str, values, valid, classes: tuple[str, str]) -> dict[str, np.ndarray]:
+    """Samples below and above the median."""
+    median = np.nanmedian(values[valid]) if np.isfinite(values[valid]).any() else np.nan
+    with np.errstate(invalid="ignore"):
+        low, high = valid & (values <= median), valid & (values > median)
+    return {f"{name}: {c}": mask for c, mask in zip(classes, (low, high), strict=True)}
+
+
+def _largest_curvature(points: Float[np.ndarray, "E T N 2"], arclength) -> Float[np.ndarray, "E T"]:
+    edges = np.diff(points, axis=2)
+    heading = np.arctan2(edges[..., 1], edges[..., 0])
+    turn = (np.diff(heading, axis=-1) + np.pi) % (2 * np.pi) - np.pi
+    curvature = np.abs(turn) / np.gradient(np.asarray(arclength, np.float64))[1:-1]
+    return np.max(curvature, axis=-1, initial=0.0)

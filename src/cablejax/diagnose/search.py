@@ -1,0 +1,118 @@
+"""The search for explanations: every effect alone, then sets of effects as far as they pay."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from jaxtyping import Float
+
+from cablejax.diagnose.belief import Calibration, best_by_effects, effect_names, excess, log_scores
+from cablejax.diagnose.effects.base import Context, Effect
+from cablejax.diagnose.fit import Candidate, Evidence, Fit, candidate, evaluate, improve
+from cablejax.diagnose.screen import residual_of, screen, shortlist
+
+_FIRST_STEPS = 3
+_LAST_STEPS = 8
+_FINALISTS = 9
+_BASES = 3
+_PARTNERS = 6
+
+
+@dataclasses.dataclass(frozen=True)
+class Search:
+    """All explanations that were fitted.
+
+    Attributes:
+        fits: best first.
+        scores: their log posterior, see `belief.log_scores`.
+        screened: {effect: share of the squared gap that its best template takes away}.
+    """
+
+    fits: tuple[Fit, ...]
+    scores: Float[np.ndarray, "F"]
+    screened: dict[str, float]
+
+
+def search(
+    evidence: Evidence,
+    effects: Sequence[Effect],
+    context: Context,
+    calibration: Calibration,
+    progress: Callable[[str], None],
+) -> Search:
+    """Fits every effect alone, and sets of effects if none alone is an adequate explanation."""
+    null = evaluate(evidence, [candidate()])[0]
+    gap = excess(float(null.sse.sum()), evidence)
+    progress(f"screening {len(effects)} effects")
+    templates = screen(evidence, null.candidate, effects, context)
+    screened: dict[str, float] = {}
+    for template in templates:
+        name = template.start.names[-1]
+        screened[name] = max(screened.get(name, 0.0), template.explained)
+    progress("fitting every effect")
+    singles = improve(evidence, evaluate(evidence, shortlist(templates)), max_iterations=_FIRST_STEPS)
+    singles = _best(singles, evidence, calibration)
+    fits = improve(evidence, singles[:_FINALISTS], max_iterations=_LAST_STEPS) + singles[_FINALISTS:]
+    fits = _best([null, *fits], evidence, calibration)
+
+    def adequate(fit: Fit) -> bool:
+        left = excess(float(fit.sse.sum()), evidence)
+        return left <= max(calibration.adequate * gap, calibration.smallest_gap(float(evidence.noise.mean())))
+
+    bases = [fit for fit in fits if fit.candidate.terms][:_BASES]
+    for size in range(2, calibration.max_terms + 1):
+        if adequate(fits[0]):
+            break
+        progress(f"fitting sets of {size} effects")
+        grown = [fit for base in bases for fit in _grown(evidence, base.candidate, effects, context)]
+        best_before = log_scores(fits[:1], evidence, calibration)[0]
+        fits = _best([*fits, *grown], evidence, calibration)
+        if log_scores(fits[:1], evidence, calibration)[0] < best_before + 1.0:
+            break
+        bases = fits[:1]
+    if len(effect_names(fits[0].candidate)) > 1:
+        progress("exchanging the effects of the best set one by one")
+        exchanged = [fit for rest in _without_one(fits[0]) for fit in _grown(evidence, rest, effects, context)]
+        fits = _best([*fits, *exchanged], evidence, calibration)
+    return Search(tuple(fits), log_scores(fits, evidence, calibration), screened)
+
+
+def _without_one(fit: Fit) -> list[Candidate]:
+    """The explanation without each of its effects."""
+    result = []
+    for name in effect_names(fit.candidate):
+        kept = [(t, z) for t, z in zip(fit.candidate.terms, _by_term(fit.candidate), strict=True) if t.effect.name != name]
+        result.append(Candidate(tuple(t for t, _ in kept), np.concatenate([z for _, z in kept])))
+    return result
+
+
+def _by_term(explanation: Candidate) -> list[np.ndarray]:
+    ends = np.cumsum([term.size for term in explanation.terms])
+    return np.split(explanation.z, ends[:-1])
+
+
+def _grown(evidence: Evidence, base: Candidate, effects: Sequence[Effect], context: Context) -> list[Fit]:
+    """The base with one more effect each, the most promising ones fitted together with it."""
+    rest = dataclasses.replace(context, residual=residual_of(evidence, base))
+    # a second piece of the same effect makes sense only for marks on the cable
+    partners = [e for e in effects if e.name not in base.names or e.name == "keypoint_bias"]
+    templates = screen(evidence, base, partners, rest)
+    starts = [
+        start for start in shortlist(templates, per_variant=1, per_effect=2) if not _repeats(start)
+    ][:_PARTNERS]
+    return improve(evidence, evaluate(evidence, starts), max_iterations=5)
+
+
+def _repeats(start: Candidate) -> bool:
+    return start.terms[-1] in start.terms[:-1]
+
+
+def _best(fits: Sequence[Fit], evidence: Evidence, calibration: Calibration) -> list[Fit]:
+    """The best fit of every set of effects, best first."""
+    scores = log_scores(fits, evidence, calibration)
+    return [fits[i] for i in best_by_effects(fits, scores).values()]
+
+
+__all__ = ["Search", "effect_names", "search"]

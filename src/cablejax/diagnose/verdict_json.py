@@ -1,0 +1,125 @@
+"""The verdict in the format `cablejax-verdict/1`: strict JSON, for other programs to read."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import pathlib
+import tempfile
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from cablejax.diagnose.diagnosis import Diagnosis, NamedEffect
+
+SCHEMA = "cablejax-verdict/1"
+_PLACES = ("along_cable_m", "time_s", "table_m")
+
+
+def verdict_json(diagnosis: Diagnosis) -> dict[str, Any]:
+    """The verdict as a JSON object; what is not a finite number is null.
+
+    Beside the fields of the format it has `sentence`, `caveats` and `seconds`; `gap` has also `horizons`, `split` and
+    `ridge_after_rmse_mm`, `ranking` also `leftover_mm`, and `where` also `sentences`, `per_horizon_mm` and `frames`.
+    """
+    gap, where = diagnosis.gap, diagnosis.where
+    return _plain(
+        {
+            "schema": SCHEMA,
+            "verdict": diagnosis.verdict,
+            "sentence": diagnosis.sentence,
+            "effects": [_effect(effect) for effect in diagnosis.effects],
+            "equivalent": diagnosis.equivalent,
+            "ranking": [
+                {
+                    "name": ranked.name,
+                    "probability": ranked.probability,
+                    "held_out_shrinkage": ranked.held_out_shrinkage,
+                    "leftover_mm": ranked.leftover_mm,
+                }
+                for ranked in diagnosis.ranking
+            ],
+            "gap": {
+                "horizon_s": _whole_episode(diagnosis),
+                "before_rmse_mm": gap.before_rmse_mm,
+                "noise_floor_mm": gap.noise_floor_mm,
+                "after_rmse_mm": gap.after_rmse_mm,
+                "shrinkage": gap.shrinkage,
+                "shrinkage_ci90": gap.shrinkage_ci90,
+                "held_out_episodes": gap.held_out_episodes,
+                "ridge_after_rmse_mm": gap.ridge_after_rmse_mm,
+                "horizons": [
+                    {"horizon_s": seconds, "before_rmse_mm": before, "after_rmse_mm": after}
+                    for seconds, (before, after) in sorted(gap.horizons_mm.items())
+                ],
+                "split": gap.split,
+            },
+            "where": {
+                "along_cable_mm": where.along_cable_mm,
+                "per_episode_mm": where.per_episode_mm,
+                "regimes": where.regimes,
+                "per_horizon_mm": [
+                    {"horizon_s": seconds, "gap_mm": size} for seconds, size in sorted(where.horizons_mm.items())
+                ],
+                "frames": where.frames,
+                "sentences": where.sentences,
+            },
+            "next_motion": None if diagnosis.next_motion is None else diagnosis.next_motion.motion,
+            "caveats": diagnosis.caveats,
+            "seconds": diagnosis.seconds,
+        }
+    )
+
+
+def write_verdict(path: str | os.PathLike[str], diagnosis: Diagnosis) -> pathlib.Path:
+    """Writes the verdict, whole or not at all, over what was there, and returns its path."""
+    path = pathlib.Path(path)
+    text = json.dumps(verdict_json(diagnosis), indent=1, allow_nan=False) + "\n"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.stem}-", suffix=".json")
+    try:
+        with os.fdopen(handle, "w", encoding="utf-8") as stream:
+            stream.write(text)
+        os.chmod(temporary, 0o644)
+        os.replace(temporary, path)
+    finally:
+        pathlib.Path(temporary).unlink(missing_ok=True)
+    return path
+
+
+def _whole_episode(diagnosis: Diagnosis) -> float:
+    """The gap is scored open loop over whole episodes: the longest one's duration [s]."""
+    log = diagnosis.log
+    return max(float(time[length - 1] - time[0]) for time, length in zip(log.time, log.episode_length, strict=True))
+
+
+def _effect(effect: NamedEffect) -> dict[str, Any]:
+    return {
+        "name": effect.name,
+        "probability": effect.probability,
+        "parameters": {
+            name: {"value": estimate.value, "ci90": estimate.ci90, "unit": estimate.unit}
+            for name, estimate in effect.parameters.items()
+        },
+        "location": {place: effect.location.get(place) for place in _PLACES},
+    }
+
+
+def _plain(value: Any) -> Any:
+    """The same with Python's own types only; numbers to six digits, and None for those that are not finite."""
+    if isinstance(value, Mapping):
+        return {str(key): _plain(entry) for key, entry in value.items()}
+    if isinstance(value, np.ndarray):
+        return _plain(value.tolist())
+    if isinstance(value, (list, tuple)):
+        return [_plain(entry) for entry in value]
+    if isinstance(value, (bool, np.bool_)):
+        return bool(value)
+    if isinstance(value, (int, np.integer)):
+        return int(value)
+    if isinstance(value, (float, np.floating)):
+        number = float(value)
+        return float(f"{number:.6g}") if math.isfinite(number) else None
+    return value

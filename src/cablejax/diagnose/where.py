@@ -1,0 +1,234 @@
+"""Where the gap lies: along the cable, in which episodes, when, in which regime and in which frame.
+
+Looks at the open-loop residual only, observed less nominal keypoints over whole episodes, and at no explanation of it.
+Every size is a root mean square per coordinate with the noise taken out, `sqrt(max(ms - sigma^2, 0))`.
+
+Two kinds of test, since each sees what the other cannot. Against the noise floor, episode by episode: a chi-square test
+of the whitened residuals, corrected for their correlation in time and by Holm (1979) for the number of episodes.
+Between parts of the cable and between regimes: signs of per-episode contrasts are flipped together (episodes are the
+independent unit), and a contrast is held against the largest of all that are looked at (Westfall and Young 1993).
+Flipping the signs of E episodes cannot give less than 2^-E: fewer than 6 episodes never make a contrast significant.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from cablejax.diagnose.regimes import Regimes, regimes_of
+from cablejax.diagnose.significance import (
+    NOISE_TOLERANCE,
+    contrast_p,
+    exceedance_p,
+    smallest_gap,
+    variance_inflation,
+)
+from cablejax.diagnose.where_words import describe
+from cablejax.types import GapLog
+
+LEVEL = 0.05
+"""Family-wise level of every statement."""
+HORIZONS = (1.0, 2.0, 5.0, 10.0, 20.0, 30.0)
+"""Seconds since an episode's start; the value at one is taken from the one before on."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Where:
+    """Sizes and places of the gap. All `_mm` are root mean squares per coordinate above the noise [mm].
+
+    Attributes:
+        gap_mm: over the whole log.
+        smallest_mm: the least gap over the whole log that would have been told from noise.
+        along_cable_mm: at each keypoint, shape [N].
+        bend_per_m: root mean square difference of the curvature at each inner keypoint, above the noise [1/m]. The gap
+            itself is always small near the grippers, which hold the cable; this points closer to a cause that is local.
+            Shape [N - 2].
+        per_episode_mm: shape [E].
+        episode_p: of no gap in this episode, corrected for the number of episodes, shape [E].
+        keypoint_p: of no gap at this keypoint, corrected for the number of keypoints, shape [N].
+        heat: whitened gap, `sqrt(mean of two squared coordinates)` in noise units, NaN = not observed, shape [E, T, N].
+        horizons_mm: by seconds since the episode's start, see `HORIZONS`.
+        regimes: by "what: class", for example "speed: hold"; classes that a log does not visit are left out.
+        frames: share of the squared gap that an error constant in one frame would explain: "body" (each keypoint
+            displaced along and across the cable), "table" (each displaced in x and y), "image" (one similarity of the
+            whole picture).
+        contrasts: by name: (ratio of the two sizes, p-value corrected for the number of contrasts).
+        regime_masks: which samples each regime holds, for drawing, shape [E, T] each.
+        sentences: what stands out, in words.
+    """
+
+    gap_mm: float
+    smallest_mm: float
+    along_cable_mm: Float[np.ndarray, "N"]
+    bend_per_m: Float[np.ndarray, "N2"]
+    per_episode_mm: Float[np.ndarray, "E"]
+    episode_p: Float[np.ndarray, "E"]
+    keypoint_p: Float[np.ndarray, "N"]
+    heat: Float[np.ndarray, "E T N"]
+    horizons_mm: dict[float, float]
+    regimes: dict[str, float]
+    frames: dict[str, float]
+    contrasts: dict[str, tuple[float, float]]
+    regime_masks: dict[str, Bool[np.ndarray, "E T"]]
+    sentences: tuple[str, ...]
+
+    @property
+    def episodes(self) -> tuple[int, ...]:
+        """Those whose gap stands out from the noise."""
+        return tuple(int(e) for e in np.flatnonzero(self.episode_p < LEVEL))
+
+
+def localise(log: GapLog, nominal: Float[np.ndarray, "E T N 2"], noise: Float[np.ndarray, "N"]) -> Where:
+    """Localises the gap between a log and its nominal simulation.
+
+    Args:
+        log: of a cable on a table; keypoints may be missing, and so may the hold flags.
+        nominal: simulated keypoints at the log's samples [m], NaN where there are none.
+        noise: standard deviation of each keypoint's coordinates [m].
+
+    Raises:
+        ValueError: shapes that do not fit the log, a noise that is not positive, or nothing observed at all.
+    """
+    if nominal.shape != log.keypoints.shape or nominal.shape[-1] != 2:
+        raise ValueError(f"nominal has shape {nominal.shape}, expected the planar log's {log.keypoints.shape}.")
+    noise = np.broadcast_to(np.asarray(noise, np.float64), nominal.shape[2])
+    if not (np.isfinite(noise) & (noise > 0)).all():
+        raise ValueError(f"noise is {noise} m, expected positive finite standard deviations.")
+    valid = np.arange(nominal.shape[1]) < log.episode_length[:, None]
+    residual = np.where(valid[..., None, None], log.keypoints.astype(np.float64) - nominal, np.nan)
+    if not np.isfinite(residual).any():
+        raise ValueError("Not one keypoint is both observed and simulated: there is no gap to look at.")
+    regimes = regimes_of(log, nominal, valid)
+
+    whitened = residual / noise[:, None]
+    squared = (whitened**2).mean(axis=-1)
+    above = functools.partial(_above, residual, noise)
+    everywhere = np.isfinite(squared)
+    inflation = variance_inflation(whitened, log, regimes.hold)
+    where = Where(
+        gap_mm=above(everywhere),
+        smallest_mm=smallest_gap(noise, 2 * everywhere.sum() / inflation, LEVEL),
+        along_cable_mm=np.array([above(_only(everywhere, 2, i)) for i in range(nominal.shape[2])]),
+        bend_per_m=_bending(log, residual, noise),
+        per_episode_mm=np.array([above(_only(everywhere, 0, e)) for e in range(len(nominal))]),
+        episode_p=exceedance_p(squared.reshape(len(squared), -1), inflation),
+        keypoint_p=exceedance_p(squared.reshape(-1, squared.shape[-1]).T, inflation),
+        heat=np.sqrt(squared),
+        horizons_mm=_horizons(log, valid, everywhere, above),
+        regimes={name: above(mask[..., None] & everywhere) for name, mask in regimes.masks.items() if mask.any()},
+        frames=_frames(residual, noise, nominal, log),
+        contrasts=_contrasts(residual, noise, squared, regimes),
+        regime_masks=regimes.masks,
+        sentences=(),
+    )
+    sentences = describe(where, np.asarray(log.meta["keypoint_arclength_m"]), noise, LEVEL)
+    return dataclasses.replace(where, sentences=sentences)
+
+
+def _above(residual, noise, mask) -> float:
+    """Root mean square [mm] above the noise over the keypoints of a mask [E, T, N]; 0 where it holds none."""
+    seen = mask & np.isfinite(residual[..., 0])
+    if not seen.any():
+        return 0.0
+    square = (residual**2).mean(axis=-1)[seen].mean()
+    floor = np.broadcast_to(noise**2, seen.shape)[seen].mean()
+    return 1e3 * float(np.sqrt(max(square - floor, 0.0)))
+
+
+def _only(mask, axis: int, index: int):
+    chosen = np.zeros(mask.shape[axis], bool)
+    chosen[index] = True
+    return mask & np.expand_dims(chosen, tuple(a for a in range(mask.ndim) if a != axis))
+
+
+def _bending(log: GapLog, residual, noise) -> np.ndarray:
+    """Root mean square difference of curvature above the noise [1/m], by second differences across the cable."""
+    spacing = np.gradient(np.asarray(log.meta["keypoint_arclength_m"], np.float64))[1:-1]
+    second = residual[:, :, 2:] - 2 * residual[:, :, 1:-1] + residual[:, :, :-2]
+    floor = noise[2:] ** 2 + 4 * noise[1:-1] ** 2 + noise[:-2] ** 2
+    seen = np.isfinite(second[..., 0])
+    count = np.maximum(2 * seen.sum(axis=(0, 1)), 1)
+    square = np.where(seen[..., None], second**2, 0.0).sum(axis=(0, 1, 3)) / count
+    # across the cable only: twice the mean of both coordinates
+    return np.sqrt(np.maximum(2 * (square - floor), 0.0) * (seen.any(axis=(0, 1)))) / spacing**2
+
+
+def _horizons(log: GapLog, valid, everywhere, above) -> dict[float, float]:
+    end = float(log.time[valid].max())
+    result, before = {}, 0.0
+    for horizon in HORIZONS:
+        if before >= end:
+            break
+        mask = valid & (log.time > before) & (log.time <= horizon)
+        if mask.any():
+            result[horizon] = above(mask[..., None] & everywhere)
+        before = horizon
+    return result
+
+
+def _frames(residual, noise, nominal, log: GapLog) -> dict[str, float]:
+    """How much of the squared gap a constant error in each frame explains, noise taken out of both."""
+    seen = np.isfinite(residual).all(axis=-1)
+    floor = np.broadcast_to(noise**2, seen.shape)
+    power = (np.where(seen[..., None], residual**2, 0.0)).sum() - 2 * floor[seen].sum()
+    if power <= 2 * floor[seen].sum() * (NOISE_TOLERANCE - 1):
+        return {}
+    tangent = np.gradient(nominal, axis=2)
+    tangent = tangent / np.maximum(np.linalg.norm(tangent, axis=-1, keepdims=True), 1e-12)
+    normal = np.stack([-tangent[..., 1], tangent[..., 0]], axis=-1)
+    count = np.maximum(seen.sum(axis=(0, 1)), 1)
+
+    def of_means(parts) -> float:
+        explained = 0.0
+        for part in parts:
+            mean = np.where(seen, part, 0.0).sum(axis=(0, 1)) / count
+            explained += float((count * mean**2).sum() - (noise**2).sum())
+        return explained
+
+    body = of_means([(residual * tangent).sum(axis=-1), (residual * normal).sum(axis=-1)])
+    table = of_means([residual[..., 0], residual[..., 1]])
+    x, y = nominal[seen].T
+    ones, zeros = np.ones_like(x), np.zeros_like(x)
+    design = np.concatenate([np.stack([x, -y, ones, zeros], axis=1), np.stack([y, x, zeros, ones], axis=1)])
+    target = residual[seen].T.ravel()
+    solution, *_ = np.linalg.lstsq(design, target, rcond=None)
+    image = float(((design @ solution) ** 2).sum() - 4 * (noise**2).mean())
+    return {
+        name: float(np.clip(v / power, 0.0, 1.0)) for name, v in (("body", body), ("table", table), ("image", image))
+    }
+
+
+def _contrasts(residual, noise, squared, regimes: Regimes) -> dict[str, tuple[float, float]]:
+    """Ratios of the gap in one part to that in its opposite, with p-values against the largest of all contrasts."""
+    everywhere = np.isfinite(squared)
+    pairs = {name: (a[..., None] & everywhere, b[..., None] & everywhere) for name, (a, b) in regimes.pairs.items()}
+    third = np.linspace(0, 1, squared.shape[2])
+    for name, part in (
+        ("cable: first third", third < 1 / 3),
+        ("cable: middle third", (third >= 1 / 3) & (third <= 2 / 3)),
+        ("cable: last third", third > 2 / 3),
+    ):
+        pairs[name] = everywhere & part, everywhere & ~part
+    floor = float((noise**2).mean())
+
+    def size(mask) -> np.ndarray:
+        """log of the square above the noise of each episode; bounded where it is all noise."""
+        square = np.where(mask, (squared - 1.0) * noise**2, 0.0).sum(axis=(1, 2)) / np.maximum(mask.sum(axis=(1, 2)), 1)
+        return np.log(np.maximum(square, 0.0) + 0.1 * floor)
+
+    names, columns, ratios = [], [], []
+    for name, (a, b) in pairs.items():
+        both = a.any(axis=(1, 2)) & b.any(axis=(1, 2))
+        if both.sum() < 2:
+            continue
+        names.append(name)
+        columns.append(np.where(both, 0.5 * (size(a) - size(b)), np.nan))
+        low = max(_above(residual, noise, b), 0.1 * np.sqrt(floor) * 1e3)
+        ratios.append(max(_above(residual, noise, a), 0.1 * np.sqrt(floor) * 1e3) / low)
+    if not names:
+        return {}
+    p = contrast_p(np.stack(columns, axis=1))
+    return {name: (float(r), float(q)) for name, r, q in zip(names, ratios, p, strict=True)}

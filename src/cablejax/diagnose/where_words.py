@@ -1,0 +1,145 @@
+"""The place of the gap in a few plain sentences."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from cablejax.diagnose.where import Where
+
+# How many times larger a gap has to be for a sentence about it.
+_CLEAR_RATIO = 1.5
+# Share of the squared gap that one frame has to explain.
+_FRAME_SHARE = 0.7
+
+
+def describe(where: Where, arclength: np.ndarray, noise: np.ndarray, level: float) -> tuple[str, ...]:
+    """Two to five sentences for a lab engineer.
+
+    Args:
+        where: the numbers; its own sentences are not read.
+        arclength: of the keypoints [m].
+        noise: standard deviation of each keypoint's coordinates [m].
+        level: below which a p-value counts.
+    """
+    floor = 1e3 * float(np.sqrt((noise**2).mean()))
+    shown = [e for e in range(len(where.episode_p)) if where.episode_p[e] < level]
+    points = [i for i in range(len(where.keypoint_p)) if where.keypoint_p[i] < level]
+    if not shown and not points:
+        return (
+            f"No episode deviates from the simulator by more than its noise of {floor:.1f} mm.",
+            f"A gap of {max(where.smallest_mm, 0.01):.1f} mm or more over the whole log would have shown.",
+        )
+    sentences = [_size(where, shown, floor), *_along(where, arclength), *_when(where, level), *_frame(where)][:5]
+    if len(where.per_episode_mm) < 6 and len(sentences) < 5:
+        number = _count(len(where.per_episode_mm), "episode")
+        sentences.append(f"With {number} no comparison between regimes can be tested at the 5 % level: six are needed.")
+    return tuple(sentences)
+
+
+def _size(where: Where, shown: list[int], floor: float) -> str:
+    total = len(where.per_episode_mm)
+    size = f"The gap is {where.gap_mm:.1f} mm above the noise of {floor:.1f} mm"
+    if not shown:
+        return f"{size}, too small to show in any single episode."
+    if len(shown) == total:
+        sizes = where.per_episode_mm
+        worst = int(np.argmax(sizes))
+        others = np.delete(sizes, worst)
+        if total > 1 and sizes[worst] > 2.5 * np.median(others):
+            return f"{size}, in every episode but mostly in episode {worst + 1}: {sizes[worst]:.1f} mm."
+        return f"{size}, in {'every episode' if total > 1 else 'the one episode'}."
+    names = _listed([str(e + 1) for e in shown])
+    return f"{size}; it shows in {'episode' if len(shown) == 1 else 'episodes'} {names} of {total} only."
+
+
+def _along(where: Where, arclength: np.ndarray) -> list[str]:
+    profile = where.along_cable_mm
+    if len(profile) < 4 or profile.max() <= 0:
+        return []
+    peak = int(np.argmax(profile))
+    ends = profile[[0, -1]]
+    if ends.min() > 0.5 * profile.max():
+        return [
+            f"It reaches the grippers, {ends.min():.1f} mm at the smaller end against {profile.max():.1f} mm at most: "
+            "the picture or the grasp points are off, not only the cable between them."
+        ]
+    near = np.flatnonzero(profile >= 0.5 * profile.max())
+    low, high = arclength[near[0]], arclength[near[-1]]
+    outside = np.delete(profile, np.arange(near[0], near[-1] + 1))
+    rest = f" against {np.sqrt((outside**2).mean()):.1f} mm elsewhere" if len(outside) else ""
+    place = f"between {low:.2f} and {high:.2f} m" if high > low else f"at {low:.2f} m"
+    sentence = f"Along the cable it is largest {place}, {profile[peak]:.1f} mm at {arclength[peak]:.2f} m{rest}."
+    bend = where.bend_per_m
+    if bend.max() > 0:
+        strong = np.flatnonzero(bend >= 0.7 * bend.max())
+        at = arclength[1:-1][strong]
+        together = strong[-1] - strong[0] == len(strong) - 1
+        if together and at[-1] - at[0] < 0.4 * (arclength[-1] - arclength[0]):
+            place = f"between {at[0]:.2f} and {at[-1]:.2f} m" if at[-1] > at[0] else f"around {at[0]:.2f} m"
+            sentence = sentence[:-1] + f"; the cable bends differently {place} most."
+    return [sentence]
+
+
+def _when(where: Where, level: float) -> list[str]:
+    sentences = []
+    known = {name: (ratio, p) for name, (ratio, p) in where.contrasts.items() if p < level}
+    hold, moving = where.regimes.get("speed: hold"), _moving(where)
+    if hold is not None and moving is not None:
+        if "speed: hold" in known and known["speed: hold"][0] < 1 / _CLEAR_RATIO:
+            sentences.append(
+                f"It comes with motion, {moving:.1f} mm against {hold:.1f} mm in holds: look for a lag or drag."
+            )
+        elif hold > 0.7 * moving and hold > 0:
+            sentences.append(f"It stays while the grippers rest, {hold:.1f} mm in holds: not a lag.")
+    horizons = list(where.horizons_mm.items())
+    if len(horizons) > 2:
+        first, early = horizons[0]
+        last, late = max(horizons, key=lambda item: item[1])
+        if early > 0.7 * late:
+            sentences.append(f"It is there from the start, {early:.1f} mm within the first {first:g} s.")
+        elif late > 3 * max(early, 0.05):
+            sentences.append(f"It builds up: {early:.1f} mm in the first {first:g} s, {late:.1f} mm by {last:g} s.")
+    words = {
+        "speed: fast": ("when the grippers move fast", "when the grippers move slowly"),
+        "curvature: high": ("where the cable is strongly bent", "where the cable is nearly straight"),
+        "gripper distance: short": ("when the grippers are close", "when the grippers are far apart"),
+        "direction: grippers closing": ("while the grippers close", "while the grippers open"),
+        "reversal: after": ("after a reversal", "before the first reversal"),
+    }
+    for name, (ratio, _) in sorted(known.items(), key=lambda item: -abs(np.log(item[1][0]))):
+        if name in words and abs(np.log(ratio)) > np.log(_CLEAR_RATIO):
+            more = words[name][0 if ratio > 1 else 1]
+            sentences.append(f"It is {max(ratio, 1 / ratio):.1f} times larger {more}.")
+            break
+    return sentences
+
+
+def _frame(where: Where) -> list[str]:
+    frames = where.frames
+    if frames.get("image", 0.0) > _FRAME_SHARE:
+        return [f"Shifting, turning and scaling the whole picture would remove {100 * frames['image']:.0f} % of it."]
+    best = max(("body", "table"), key=lambda name: frames.get(name, 0.0))
+    if frames.get(best, 0.0) > _FRAME_SHARE:
+        words = {
+            "body": "each keypoint is displaced by the same amount along and across the cable",
+            "table": "each keypoint is displaced by the same amount in x and y",
+        }
+        return [f"{100 * frames[best]:.0f} % of it does not change with the motion: {words[best]}."]
+    return []
+
+
+def _moving(where: Where) -> float | None:
+    sizes = [where.regimes[name] for name in ("speed: slow", "speed: fast") if name in where.regimes]
+    return float(np.sqrt(np.mean(np.square(sizes)))) if sizes else None
+
+
+def _listed(words: Sequence[str]) -> str:
+    return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} and {words[-1]}"
+
+
+def _count(number: int, word: str) -> str:
+    return f"{number} {word}{'' if number == 1 else 's'}"
