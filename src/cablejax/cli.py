@@ -34,7 +34,8 @@ _COMMANDS: Any = (
 _DESCRIPTION = """Two robot grippers bring a cable to a shape.
 
 Start with `cablejax demo`: it needs nothing else and writes a page to look at. To make your own model: `simulate` a
-data set, `train` on it, `shape` a cable with the result, `diagnose` what the simulator lacks. `cablejax COMMAND --help` explains each one."""
+data set, `train` on it, `shape` a cable with the result, and `diagnose` what the simulator lacks.
+`cablejax COMMAND --help` explains each one."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -82,8 +82,7 @@ def level(evidence: Evidence) -> float:
 def log_scores(fits: Sequence[Fit], evidence: Evidence, calibration: Calibration) -> Float[np.ndarray, "F"]:
     """Log posterior of every candidate, all sets of effects with as many members being equally likely beforehand."""
     scores = [
-        evidence.log_likelihood(fit.held_out_sse(evidence))
-        - calibration.term_cost * len(set(fit.candidate.terms))
+        evidence.log_likelihood(fit.held_out_sse(evidence)) - calibration.term_cost * len(set(fit.candidate.terms))
         for fit in fits
     ]
     return np.array(scores)

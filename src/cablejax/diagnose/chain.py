@@ -121,7 +121,7 @@ class Chain:
             None,
             length=_SETTLE_STEPS,
         )
-        start = dataclasses.replace(start, velocity=jnp.zeros_like(start.velocity))
+        start = dataclasses.replace(start, velocity=jnp.zeros_like(start.velocity), friction_state=zeros)
         dt = interval / n_substeps
 
         def sample(carry, target):
@@ -181,10 +181,8 @@ class Chain:
         # Joints: elastic, viscous, and internal friction (Dahl 1968), which saturates at its moment.
         curvature = state.angles[1:] / h
         elastic = curvature - physics.rest_curvature - state.set_curvature
-        bending_rate = state.velocity[1:-1] / h
-        direction = jnp.where(bending_rate < 0, -1.0, 1.0)
-        dahl = physics.hysteresis_moment / physics.hysteresis_curvature
-        stiffness = (physics.stiffness + dahl * (1.0 - direction * state.friction_state)) / h
+        # the implicit part takes its slope at zero, the same in both directions: a sign would jump at rest
+        stiffness = (physics.stiffness + physics.hysteresis_moment / physics.hysteresis_curvature) / h
         moment = physics.stiffness * elastic + physics.hysteresis_moment * state.friction_state
         joint_implicit = dt * (physics.damping_time * physics.stiffness / h) + dt**2 * stiffness
 
@@ -192,7 +190,9 @@ class Chain:
         weight = mass + dt * drag
         stiff = dt**2 * rigidity
         across = _turned(normal)  # R' n up to sign, which the outer product forgets
-        xx, xy, yy = (weight * e + stiff * across[:, i] * across[:, j] for i, j, e in ((0, 0, 1.0), (0, 1, 0.0), (1, 1, 1.0)))
+        xx, xy, yy = (
+            weight * e + stiff * across[:, i] * across[:, j] for i, j, e in ((0, 0, 1.0), (0, 1, 0.0), (1, 1, 1.0))
+        )
         first_moment = jnp.stack([xx * nodes[:, 0] + xy * nodes[:, 1], xy * nodes[:, 0] + yy * nodes[:, 1]], axis=1)
         second_moment = jnp.sum(first_moment * nodes, axis=1)
         inertia = mass * lengths**2 / 12
@@ -206,9 +206,14 @@ class Chain:
         coupling = -_cross(joints, weighted) / scale
         corner = jnp.sum(weight[:, None] * nodes**2) / scale**2 + 1e-9
         matrix = jnp.concatenate(
-            [jnp.concatenate([matrix, jnp.zeros((n, 1), dtype)], axis=1), jnp.concatenate([coupling, corner[None]])[None]]
+            [
+                jnp.concatenate([matrix, jnp.zeros((n, 1), dtype)], axis=1),
+                jnp.concatenate([coupling, corner[None]])[None],
+            ]
         )
-        impulse = mass[:, None] * (velocity - root_velocity - dt * bias) + dt * force - dt * drag[:, None] * root_velocity
+        impulse = (
+            mass[:, None] * (velocity - root_velocity - dt * bias) + dt * force - dt * drag[:, None] * root_velocity
+        )
         impulse = impulse - (stiff * jnp.sum(normal * root_velocity, axis=1))[:, None] * normal
         total = _beyond(jnp.concatenate([impulse, _cross(nodes, impulse)[:, None] + (inertia * rate)[:, None]], axis=1))
         rhs = total[:, 2] - _cross(joints, total[:, :2])

@@ -60,9 +60,7 @@ class Candidate:
         parts, begin = [], 0
         for term in self.terms:
             z = self.z[begin : begin + term.size]
-            parts.append(
-                np.array([p.value(np.float64(x)) for p, x in zip(term.effect.parameters, z, strict=True)])
-            )
+            parts.append(np.array([p.value(np.float64(x)) for p, x in zip(term.effect.parameters, z, strict=True)]))
             begin += term.size
         return parts
 

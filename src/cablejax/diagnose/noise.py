@@ -61,9 +61,7 @@ def noise_floor(keypoints: Float[np.ndarray, "E T N 2"], hold: np.ndarray | None
         )
     error = common * np.sqrt(2.0 / np.maximum(count, 1.0))
     distinct = (np.abs(variance - common) > _DISTINCT * error) & (count >= 20)
-    return NoiseFloor(
-        std=np.sqrt(np.where(distinct, variance, common)), correlation=correlation, from_holds=from_holds
-    )
+    return NoiseFloor(std=np.sqrt(np.where(distinct, variance, common)), correlation=correlation, from_holds=from_holds)
 
 
 def _third_differences(keypoints):

@@ -163,9 +163,7 @@ def _plausible(log: GapLog, recording: Recording) -> list[str]:
                 "gripper: are the keypoints and the poses in one frame, in metres, and of one cable?"
             )
     length = log.meta["cable"]["length_m"]
-    span = np.linalg.norm(
-        recording.gripper_pose[:, :, 1, :2] - recording.gripper_pose[:, :, 0, :2], axis=-1
-    )
+    span = np.linalg.norm(recording.gripper_pose[:, :, 1, :2] - recording.gripper_pose[:, :, 0, :2], axis=-1)
     if span[valid].max() > 1.001 * length:
         raise DiagnosisError(
             f"The grippers are up to {span[valid].max():.3f} m apart, more than the cable's length of {length} m: "
@@ -173,7 +171,9 @@ def _plausible(log: GapLog, recording: Recording) -> list[str]:
         )
     nominal = np.diff(log.meta["keypoint_arclength_m"])
     chord = np.linalg.norm(np.diff(points, axis=2), axis=-1)
-    ratio = float(np.nanmedian(np.nansum(chord, axis=2)[seen.all(axis=2)])) / nominal.sum() if seen.all(2).any() else 1.0
+    ratio = (
+        float(np.nanmedian(np.nansum(chord, axis=2)[seen.all(axis=2)])) / nominal.sum() if seen.all(2).any() else 1.0
+    )
     if abs(ratio - 1) > _WRONG_LENGTH:
         raise DiagnosisError(
             f"The keypoints lie {ratio:.2f} times as far apart as meta.keypoint_arclength_m says: correct the length, the "

@@ -271,7 +271,9 @@ def _after(case: _Case, conclusion: Conclusion, explained):
     """What the simulator gives once the named effects are in it, driven by commands where the arms deviate."""
     if not case.arms.deviates:
         return explained
-    return explained + case.simulate(conclusion.best.candidate, predicted=True) - case.simulate(conclusion.best.candidate)
+    return (
+        explained + case.simulate(conclusion.best.candidate, predicted=True) - case.simulate(conclusion.best.candidate)
+    )
 
 
 def _gap(case: _Case, before, after, held_out, verdict) -> Gap:

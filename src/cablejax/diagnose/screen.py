@@ -44,9 +44,7 @@ def screen(
     nominal, config = playback.nominal(), playback.config
     begin = _parts(base)
     starts = [
-        candidate(*begin, (effect, variant, values))
-        for effect in effects
-        for variant, values in effect.starts(context)
+        candidate(*begin, (effect, variant, values)) for effect in effects for variant, values in effect.starts(context)
     ]
     simulated = playback.keypoints([base.physics(nominal, config), *(s.physics(nominal, config) for s in starts)])
     residuals = evidence.residuals(simulated).reshape(1 + len(starts), -1)

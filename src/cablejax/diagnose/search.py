@@ -83,7 +83,9 @@ def _without_one(fit: Fit) -> list[Candidate]:
     """The explanation without each of its effects."""
     result = []
     for name in effect_names(fit.candidate):
-        kept = [(t, z) for t, z in zip(fit.candidate.terms, _by_term(fit.candidate), strict=True) if t.effect.name != name]
+        kept = [
+            (t, z) for t, z in zip(fit.candidate.terms, _by_term(fit.candidate), strict=True) if t.effect.name != name
+        ]
         result.append(Candidate(tuple(t for t, _ in kept), np.concatenate([z for _, z in kept])))
     return result
 
@@ -99,9 +101,7 @@ def _grown(evidence: Evidence, base: Candidate, effects: Sequence[Effect], conte
     # a second piece of the same effect makes sense only for marks on the cable
     partners = [e for e in effects if e.name not in base.names or e.name == "keypoint_bias"]
     templates = screen(evidence, base, partners, rest)
-    starts = [
-        start for start in shortlist(templates, per_variant=1, per_effect=2) if not _repeats(start)
-    ][:_PARTNERS]
+    starts = [start for start in shortlist(templates, per_variant=1, per_effect=2) if not _repeats(start)][:_PARTNERS]
     return improve(evidence, evaluate(evidence, starts), max_iterations=5)
 
 

@@ -97,9 +97,7 @@ class Plasticity(Effect):
     def starts(self, context):
         sharpest = float(context.max_curvature.max())
         return [
-            (0, (float(np.clip(f * sharpest, 0.3, 90.0)), h))
-            for f in (0.9, 0.75, 0.6, 0.45, 0.3)
-            for h in (0.05, 1.0)
+            (0, (float(np.clip(f * sharpest, 0.3, 90.0)), h)) for f in (0.9, 0.75, 0.6, 0.45, 0.3) for h in (0.05, 1.0)
         ]
 
     def reported(self, values, variant, config):

@@ -74,7 +74,12 @@ class FrictionPatch(Effect):
 
     def reported(self, values, variant, config):
         x, y, radius, ratio = (float(v) for v in values)
-        return {"x_m": (x, "m"), "y_m": (y, "m"), "radius_m": (radius, "m"), "coefficient": (ratio * _believed(config), "")}
+        return {
+            "x_m": (x, "m"),
+            "y_m": (y, "m"),
+            "radius_m": (radius, "m"),
+            "coefficient": (ratio * _believed(config), ""),
+        }
 
     def location(self, values, variant, config):
         return {"table_m": [float(values[0]), float(values[1])]}

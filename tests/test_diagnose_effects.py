@@ -1,0 +1,97 @@
+"""The effect library: null values, sensitivities and derivatives of every entry."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from cablejax.diagnose import LIBRARY, Effect, Parameter
+from cablejax.diagnose.chain import Chain
+from cablejax.diagnose.check import check_effect
+from cablejax.diagnose.physics import nominal_physics
+from cablejax.simulate import CableConfig, MjxEngine, compiler_options
+
+NAMES = {
+    "bending_stiffness", "stiffness_profile", "intrinsic_curvature", "plasticity", "bending_hysteresis",
+    "bending_damping", "axial_stretch", "table_friction", "friction_patch", "viscous_drag", "gravity_tilt",
+    "linear_density", "lumped_mass", "gripper_slip", "gripper_rotation_offset", "gripper_compliance",
+    "camera_similarity", "keypoint_bias", "camera_lag", "obstacle",
+}  # fmt: skip
+
+
+def test_library_has_every_effect_of_cable_and_camera():
+    assert {effect.name for effect in LIBRARY} == NAMES
+
+
+@pytest.mark.parametrize("effect", LIBRARY, ids=lambda e: e.name)
+def test_effect_passes_its_check(effect):
+    check_effect(effect)
+
+
+class _Shift(Effect):
+    """Moves all keypoints aside, even at its null value if told so."""
+
+    name = "shift"
+    parameters = (Parameter("offset_m", "m", -1.0, 1.0, 0.0, 0.01),)
+    null = (0.0,)
+    bias = 0.0
+    gain = 1.0
+
+    def apply(self, physics, values, variant, config):
+        return dataclasses.replace(physics, camera_angle=physics.camera_angle + self.gain * values[0] + self.bias)
+
+    def starts(self, context):
+        return [(0, (0.01,))]
+
+
+def test_check_accepts_an_effect_of_a_users_own():
+    check_effect(_Shift())
+
+
+def test_check_refuses_a_null_value_that_changes_something():
+    effect = _Shift()
+    effect.bias = 0.1
+    with pytest.raises(ValueError, match="null value"):
+        check_effect(effect)
+
+
+def test_check_refuses_an_effect_that_does_nothing():
+    effect = _Shift()
+    effect.gain = 0.0
+    with pytest.raises(ValueError, match="micrometre"):
+        check_effect(effect)
+
+
+def test_check_refuses_a_hidden_derivative():
+    class Hidden(_Shift):
+        def apply(self, physics, values, variant, config):
+            return dataclasses.replace(physics, camera_angle=physics.camera_angle + jax.lax.stop_gradient(values[0]))
+
+    with pytest.raises(ValueError, match="derivative"):
+        check_effect(Hidden())
+
+
+def test_chain_moves_like_the_mjx_engine():
+    config = CableConfig(n_links=13, timestep=0.002)
+    engine = MjxEngine(config)
+    pose = np.array([[0.0, 0.0, 0.5], [0.8, 0.0, -0.4]])
+    twist = np.zeros((10, 2, 3))
+    twist[:, 0] = [0.01, 0.02, 0.1]
+    twist[:, 1] = [-0.02, 0.01, -0.2]
+    with jax.enable_x64(True):
+        state = engine.initial_state(pose)
+        _, trajectory = engine.rollout(config.params(), state, twist, 0.1)
+        poses = np.concatenate([pose[None], pose + np.cumsum(twist, axis=0) * 0.1])
+        rollout = jax.jit(
+            lambda *args: Chain(config).rollout(*args, n_substeps=50), compiler_options=compiler_options()
+        )
+        physics = nominal_physics(config, dtype=jnp.float64)
+        points = rollout(physics, state.qpos[2:], jnp.asarray(poses), jnp.asarray(0.1))
+        difference = np.abs(np.asarray(points) - np.asarray(trajectory.keypoints)).max()
+    moved = np.abs(np.asarray(points[-1] - points[0])).max()
+    assert moved > 0.01
+    assert difference < 2e-5
