@@ -7,6 +7,8 @@ wrong is told from commands and poses alone. It neither hides an effect of the c
 from __future__ import annotations
 
 import dataclasses
+import itertools
+from typing import Any
 
 import numpy as np
 import scipy.optimize
@@ -81,7 +83,7 @@ def actuation(
     if deviation < _NEGLIGIBLE:
         return Actuation({}, deviation, deviation, wanted, wanted, deviates=False)
 
-    best = None
+    best: tuple[float, Any, bool, bool] | None = None
     for gain_free, lag_free in ((True, False), (False, True), (True, True)):
         starts = [[0.1, 0.05], [0.02, 0.2], [0.4, 0.2]] if lag_free else [[]]
         for start in starts:
@@ -99,6 +101,7 @@ def actuation(
             threshold = 0.5 if gain_free and lag_free else 0.999
             if best is None or left < threshold * best[0]:
                 best = left, result, gain_free, lag_free
+    assert best is not None  # there are always starts
     left, result, gain_free, lag_free = best
     scale = max(left / _ENCODER_NOISE, 1.0)
     # residuals of one motion are far from independent: a hundred samples count as one
@@ -133,7 +136,7 @@ def _lagged(poses, interval, delay, slow):
         if slow > 1e-6:
             decay = np.exp(-dt / slow)
             state, out = late[0].copy(), [late[0]]
-            for a, b in zip(late[:-1], late[1:], strict=True):
+            for a, b in itertools.pairwise(late):
                 slope = (b - a) / dt
                 # exact response of slow * y' + y = u on a ramp u = a + slope t
                 state = (state - a + slope * slow) * decay + b - slope * slow

@@ -317,7 +317,7 @@ def seen_by_camera(
     cosine, sine = jnp.cos(physics.camera_angle), jnp.sin(physics.camera_angle)
     x, y = late[..., 0], late[..., 1]
     turned = jnp.stack([cosine * x - sine * y, sine * x + cosine * y], axis=-1)
-    return physics.camera_scale * turned + physics.camera_offset
+    return jnp.asarray(physics.camera_scale * turned + physics.camera_offset)
 
 
 def _chained(steps: Float[Array, "n 2"]) -> Float[Array, "n 2"]:

@@ -37,8 +37,8 @@ def check_effect(effect: Effect) -> None:
             null = effect.apply(nominal, [np.float64(v) for v in effect.null], variant, _CONFIG)
             if not np.array_equal(np.asarray(_replay(null, motion, angles)), still):
                 raise ValueError(
-                    f"Effect {effect.name!r}: its null value {effect.null} (variant {variant}) changes the nominal rollout; "
-                    "expected no change at all."
+                    f"Effect {effect.name!r}: its null value {effect.null} (variant {variant}) changes the nominal "
+                    "rollout; expected no change at all."
                 )
         starts = effect.starts(_context(still))
         if not starts:
@@ -73,7 +73,8 @@ def _derivatives(best: Candidate, i: int, nominal, motion, angles):
     def physics(z):
         return jax.tree.map(jnp.asarray, best.physics(nominal, _CONFIG, z))
 
-    exact = _replay_jvp(*jax.jvp(physics, (z,), (direction,)), motion, angles)
+    value, change = jax.jvp(physics, (z,), (direction,))
+    exact = _replay_jvp(value, change, motion, angles)
     ahead, behind = (_replay(physics(z + s * _STEP * direction), motion, angles) for s in (1, -1))
     return np.asarray(exact), np.asarray(ahead - behind) / (2 * _STEP)
 

@@ -138,11 +138,11 @@ def _values(term, z):
 def _interval(value, column: Sequence[Any], unit: str):
     if isinstance(value, int):
         return None
-    column = np.asarray(column, float)
+    drawn = np.asarray(column, float)
     if unit == "rad":
         # angles near the turn of the circle
-        column = value + (column - value + np.pi) % (2 * np.pi) - np.pi
-    low, high = np.quantile(column, (0.05, 0.95))
+        drawn = value + (drawn - value + np.pi) % (2 * np.pi) - np.pi
+    low, high = np.quantile(drawn, (0.05, 0.95))
     return float(low), float(high)
 
 
@@ -153,7 +153,7 @@ def _merged(parts: list[dict[str, ParameterEstimate]]) -> dict[str, ParameterEst
     merged = {}
     for key, first in parts[0].items():
         every = [part[key] for part in parts]
-        intervals = None if first.ci90 is None else [e.ci90 for e in every]
+        intervals: Any = None if first.ci90 is None else [e.ci90 for e in every]
         merged[key] = ParameterEstimate([e.value for e in every], intervals, first.unit)
     return merged
 

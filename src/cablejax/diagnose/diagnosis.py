@@ -72,7 +72,9 @@ class Gap:
         noise_floor_mm: of the recording.
         shrinkage: `1 - (after^2 - floor^2) / (before^2 - floor^2)`; None where the gap is not resolvable.
         shrinkage_ci90: by resampling episodes.
-        ridge_after_rmse_mm: what an online ridge residual alone leaves of it, one sample ahead; None if not computed.
+        ahead_mm: errors of predictions five seconds ahead of the last observation, by "nominal", "ridge" (the nominal
+            simulator with the controller's online residual, which knows no cause) and "named" (the simulator with the
+            named effects, without a residual); None if no episode is long enough.
         horizons_mm: {seconds since the episode's start: (before, after)}.
         held_out_episodes: those scored; all of them where every episode was held out once.
         split: shares of the squared error before: "noise", "named", "learnable", "unexplained"; they sum to 1.
@@ -83,7 +85,7 @@ class Gap:
     noise_floor_mm: float
     shrinkage: float | None
     shrinkage_ci90: tuple[float, float] | None
-    ridge_after_rmse_mm: float | None
+    ahead_mm: dict[str, float] | None
     horizons_mm: dict[float, tuple[float, float]]
     held_out_episodes: tuple[int, ...]
     split: dict[str, float]

@@ -56,8 +56,8 @@ def noise_floor(keypoints: Float[np.ndarray, "E T N 2"], hold: np.ndarray | None
     common = float(np.average(variance, weights=np.maximum(count, 1e-9)))
     if not common > 0:
         raise ValueError(
-            "The keypoints have no noise at all. A diagnosis weighs the gap against the noise of the recording; if this "
-            "log was simulated, record it with the camera's noise."
+            "The keypoints have no noise at all. A diagnosis weighs the gap against the noise of the recording; if "
+            "this log was simulated, record it with the camera's noise."
         )
     error = common * np.sqrt(2.0 / np.maximum(count, 1.0))
     distinct = (np.abs(variance - common) > _DISTINCT * error) & (count >= 20)

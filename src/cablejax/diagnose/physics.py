@@ -55,35 +55,35 @@ class Physics:
         camera_lag: by which the keypoints' stamps are late [s].
     """
 
-    stiffness: Float[Array, "*B J"]
-    rest_curvature: Float[Array, "*B J"]
-    damping_time: Float[Array, "*B"]
-    yield_curvature: Float[Array, "*B"]
-    hardening: Float[Array, "*B"]
-    hysteresis_moment: Float[Array, "*B"]
-    hysteresis_curvature: Float[Array, "*B"]
-    axial_compliance: Float[Array, "*B"]
-    friction: Float[Array, "*B"]
-    static_excess: Float[Array, "*B"]
-    patch_centre: Float[Array, "*B 2"]
-    patch_radius: Float[Array, "*B"]
-    patch_friction: Float[Array, "*B"]
-    drag: Float[Array, "*B"]
-    tilt: Float[Array, "*B 2"]
-    density: Float[Array, "*B"]
-    extra_mass: Float[Array, "*B n"]
-    slip: Float[Array, "*B 2"]
-    slip_time: Float[Array, "*B"]
-    rotation_offset: Float[Array, "*B 2"]
-    rotation_compliance: Float[Array, "*B 2"]
-    obstacle_centre: Float[Array, "*B 2"]
-    obstacle_radius: Float[Array, "*B"]
-    bias_along: Float[Array, "*B N"]
-    bias_across: Float[Array, "*B N"]
-    camera_scale: Float[Array, "*B"]
-    camera_angle: Float[Array, "*B"]
-    camera_offset: Float[Array, "*B 2"]
-    camera_lag: Float[Array, "*B"]
+    stiffness: Float[Array | np.ndarray, "*B J"]
+    rest_curvature: Float[Array | np.ndarray, "*B J"]
+    damping_time: Float[Array | np.ndarray, "*B"]
+    yield_curvature: Float[Array | np.ndarray, "*B"]
+    hardening: Float[Array | np.ndarray, "*B"]
+    hysteresis_moment: Float[Array | np.ndarray, "*B"]
+    hysteresis_curvature: Float[Array | np.ndarray, "*B"]
+    axial_compliance: Float[Array | np.ndarray, "*B"]
+    friction: Float[Array | np.ndarray, "*B"]
+    static_excess: Float[Array | np.ndarray, "*B"]
+    patch_centre: Float[Array | np.ndarray, "*B 2"]
+    patch_radius: Float[Array | np.ndarray, "*B"]
+    patch_friction: Float[Array | np.ndarray, "*B"]
+    drag: Float[Array | np.ndarray, "*B"]
+    tilt: Float[Array | np.ndarray, "*B 2"]
+    density: Float[Array | np.ndarray, "*B"]
+    extra_mass: Float[Array | np.ndarray, "*B n"]
+    slip: Float[Array | np.ndarray, "*B 2"]
+    slip_time: Float[Array | np.ndarray, "*B"]
+    rotation_offset: Float[Array | np.ndarray, "*B 2"]
+    rotation_compliance: Float[Array | np.ndarray, "*B 2"]
+    obstacle_centre: Float[Array | np.ndarray, "*B 2"]
+    obstacle_radius: Float[Array | np.ndarray, "*B"]
+    bias_along: Float[Array | np.ndarray, "*B N"]
+    bias_across: Float[Array | np.ndarray, "*B N"]
+    camera_scale: Float[Array | np.ndarray, "*B"]
+    camera_angle: Float[Array | np.ndarray, "*B"]
+    camera_offset: Float[Array | np.ndarray, "*B 2"]
+    camera_lag: Float[Array | np.ndarray, "*B"]
 
 
 def nominal_physics(config: CableConfig, dtype=jnp.float32) -> Physics:
@@ -123,6 +123,6 @@ def nominal_physics(config: CableConfig, dtype=jnp.float32) -> Physics:
     return Physics(**{name: np.asarray(value, np.dtype(dtype)) for name, value in values.items()})
 
 
-def normal_gravity(tilt: Float[Array, "2"]) -> Float[Array, ""]:
+def normal_gravity(tilt: Float[Array | np.ndarray, "2"]) -> Float[Array, ""]:
     """Gravity across a tilted table [m/s^2]; the part in the plane is `tilt`."""
     return jnp.sqrt(jnp.maximum(GRAVITY**2 - jnp.sum(tilt**2), 0.0))

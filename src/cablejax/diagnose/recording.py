@@ -147,7 +147,7 @@ def _continuous(pose):
 def _plausible(log: GapLog, recording: Recording) -> list[str]:
     """Refuses keypoints of another cable; reports what weakens the diagnosis."""
     points, caveats = recording.keypoints, []
-    seen = np.isfinite(points).all(axis=-1)
+    seen = np.asarray(np.isfinite(points).all(axis=-1))
     valid = np.arange(points.shape[1])[None] < recording.length[:, None]
     missing = 1 - seen[valid].mean()
     if missing > 0.9:
@@ -171,13 +171,11 @@ def _plausible(log: GapLog, recording: Recording) -> list[str]:
         )
     nominal = np.diff(log.meta["keypoint_arclength_m"])
     chord = np.linalg.norm(np.diff(points, axis=2), axis=-1)
-    ratio = (
-        float(np.nanmedian(np.nansum(chord, axis=2)[seen.all(axis=2)])) / nominal.sum() if seen.all(2).any() else 1.0
-    )
+    ratio = float(np.nanmedian(chord / nominal)) if np.isfinite(chord).any() else 1.0
     if abs(ratio - 1) > _WRONG_LENGTH:
         raise DiagnosisError(
-            f"The keypoints lie {ratio:.2f} times as far apart as meta.keypoint_arclength_m says: correct the length, the "
-            "unit, or the marks."
+            f"The keypoints lie {ratio:.2f} times as far apart as meta.keypoint_arclength_m says: correct the length, "
+            "the unit, or the marks."
         )
     uneven = np.abs(np.asarray(log.meta["keypoint_arclength_m"]) - np.linspace(0, length, points.shape[2])).max()
     if uneven > 1e-3 * length:

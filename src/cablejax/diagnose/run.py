@@ -6,6 +6,7 @@ import dataclasses
 import importlib.metadata
 import time
 from collections.abc import Callable, Sequence
+from typing import get_args
 
 import numpy as np
 from jaxtyping import Float
@@ -20,6 +21,7 @@ from cablejax.diagnose.next_motion import next_motion
 from cablejax.diagnose.noise import NoiseFloor, noise_floor
 from cablejax.diagnose.playback import Playback
 from cablejax.diagnose.recording import DiagnosisError, Recording, prepare
+from cablejax.diagnose.reference import predicted_ahead
 from cablejax.diagnose.search import Search, search
 from cablejax.diagnose.where import localise
 from cablejax.simulate.config import CableConfig
@@ -236,17 +238,17 @@ def _with_arms(conclusion: Conclusion, arms: Actuation) -> Conclusion:
         for key in ("gain" if name == "actuation_gain" else "time_s",)
     )
     ranked = tuple(Ranked(e.name, e.probability, 1 - (arms.leftover / arms.deviation) ** 2, 0.0) for e in named)
-    verdict: Verdict = conclusion.verdict
+    changed: dict[Verdict, Verdict] = {}
     if named and arms.explained:
-        verdict = {"none": "named", "unknown": "named+unknown"}.get(verdict, verdict)
+        changed = {"none": "named", "unknown": "named+unknown"}
     elif named:
-        verdict = "named+unknown"
+        changed = dict.fromkeys(get_args(Verdict), "named+unknown")
     else:
-        verdict = {"none": "unknown", "named": "named+unknown", "ambiguous": "named+unknown"}.get(verdict, verdict)
+        changed = {"none": "unknown", "named": "named+unknown", "ambiguous": "named+unknown"}
     share = 1 - (arms.leftover / arms.deviation) ** 2
     return dataclasses.replace(
         conclusion,
-        verdict=verdict,
+        verdict=changed.get(conclusion.verdict, conclusion.verdict),
         effects=(*named, *conclusion.effects),
         ranking=(*ranked, *conclusion.ranking),
         explained=share if conclusion.verdict == "none" else conclusion.explained,
@@ -276,6 +278,22 @@ def _after(case: _Case, conclusion: Conclusion, explained):
     )
 
 
+def _ahead(case: _Case, before, after) -> tuple[dict[str, float] | None, float]:
+    """Errors five seconds ahead [mm], and the share of the squared leftover that the online residual takes away."""
+    recording = case.recording
+    arguments = recording.gripper_pose, recording.interval, recording.length
+    nominal = predicted_ahead(recording.keypoints, before, *arguments)
+    named = predicted_ahead(recording.keypoints, after, *arguments)
+    if nominal is None or named is None:
+        return None, 0.0
+    # both ends of the prediction are observed with noise
+    noise = 2 * float(np.mean(case.noise.std**2))
+    left = max(named.alone**2 - noise, 0.0)
+    learnable = (named.alone**2 - max(named.corrected**2, noise)) / left if left > 0.1 * noise else 0.0
+    errors = {"nominal": 1e3 * nominal.alone, "ridge": 1e3 * nominal.corrected, "named": 1e3 * named.alone}
+    return errors, float(np.clip(learnable, 0.0, 1.0))
+
+
 def _gap(case: _Case, before, after, held_out, verdict) -> Gap:
     observed, interval = case.recording.keypoints, case.recording.interval
     floor = float(np.sqrt(np.mean(case.noise.std**2)))
@@ -301,23 +319,24 @@ def _gap(case: _Case, before, after, held_out, verdict) -> Gap:
     if resolvable and len(b) > 1:
         rng = np.random.default_rng(0)
         draws = [shrinkage(rng.integers(0, len(b), len(b))) for _ in range(1000)]
-        interval90 = tuple(float(x) for x in np.nanquantile(draws, (0.05, 0.95)))
+        low, high = np.nanquantile(draws, (0.05, 0.95))
+        interval90 = float(low), float(high)
     total = b.sum()
-    unexplained = max((a - noise).sum(), 0.0)
     share = {
         "noise": float(min(noise.sum() / total, 1.0)),
         "named": float(max((b - np.maximum(a, noise)).sum(), 0.0) / total) if resolvable else 0.0,
     }
-    share["learnable"] = 0.0
-    share["unexplained"] = max(1.0 - share["noise"] - share["named"], 0.0)
-    del unexplained
+    left = max(1.0 - share["noise"] - share["named"], 0.0)
+    ahead, learnable = _ahead(case, before, after)
+    share["learnable"] = learnable * left
+    share["unexplained"] = left - share["learnable"]
     return Gap(
         before_rmse_mm=1e3 * rmse(before),
         after_rmse_mm=1e3 * rmse(after),
         noise_floor_mm=1e3 * floor,
         shrinkage=float(shrinkage(np.arange(len(b)))) if resolvable else None,
         shrinkage_ci90=interval90,
-        ridge_after_rmse_mm=None,
+        ahead_mm=ahead,
         horizons_mm={
             h: (1e3 * rmse(before, h), 1e3 * rmse(after, h))
             for h in (*_HORIZONS, float(np.round((interval * (case.recording.length - 1)).max(), 3)))

@@ -66,8 +66,8 @@ def screen(
     return result
 
 
-def _parts(base: Candidate):
-    return [(t.effect, t.variant, v) for t, v in zip(base.terms, base.values(), strict=True)]
+def _parts(base: Candidate) -> list[tuple[Effect, int, Sequence[float]]]:
+    return [(t.effect, t.variant, [float(x) for x in v]) for t, v in zip(base.terms, base.values(), strict=True)]
 
 
 def _stretch(start: Candidate, n_base: int, amplitude: float) -> Candidate | None:
@@ -90,7 +90,7 @@ def _stretch(start: Candidate, n_base: int, amplitude: float) -> Candidate | Non
     return dataclasses.replace(start, z=z)
 
 
-def shortlist(templates: Sequence[Template], per_variant: int = 2, per_effect: int = 3) -> list[Candidate]:
+def shortlist(templates: Sequence[Template], per_variant: int = 3, per_effect: int = 3) -> list[Candidate]:
     """The best starts: so many of each effect, of these so many of each variant."""
     chosen: list[Candidate] = []
     taken: dict[str, int] = {}

@@ -18,6 +18,7 @@ _LAST_STEPS = 8
 _FINALISTS = 9
 _BASES = 3
 _PARTNERS = 6
+_NEGLIGIBLE = 0.1
 
 
 @dataclasses.dataclass(frozen=True)
@@ -52,10 +53,13 @@ def search(
         name = template.start.names[-1]
         screened[name] = max(screened.get(name, 0.0), template.explained)
     progress("fitting every effect")
-    singles = improve(evidence, evaluate(evidence, shortlist(templates)), max_iterations=_FIRST_STEPS)
+    starts = _promising(shortlist(templates), screened)
+    singles = improve(evidence, evaluate(evidence, starts), max_iterations=_FIRST_STEPS)
     singles = _best(singles, evidence, calibration)
     fits = improve(evidence, singles[:_FINALISTS], max_iterations=_LAST_STEPS) + singles[_FINALISTS:]
     fits = _best([null, *fits], evidence, calibration)
+    # the leaders until they rest: what is taken for a missing second effect may be a valley not walked to its end
+    fits = _best([*improve(evidence, fits[:_BASES], max_iterations=_LAST_STEPS), *fits[_BASES:]], evidence, calibration)
 
     def adequate(fit: Fit) -> bool:
         left = excess(float(fit.sse.sum()), evidence)
@@ -77,6 +81,14 @@ def search(
         exchanged = [fit for rest in _without_one(fits[0]) for fit in _grown(evidence, rest, effects, context)]
         fits = _best([*fits, *exchanged], evidence, calibration)
     return Search(tuple(fits), log_scores(fits, evidence, calibration), screened)
+
+
+def _promising(starts: Sequence[Candidate], screened: dict[str, float]) -> list[Candidate]:
+    """Starts of effects whose best template explains a part of the gap worth a fit, and of the next best ones."""
+    ordered = sorted(screened, key=lambda name: -screened[name])
+    threshold = _NEGLIGIBLE * max(screened[ordered[0]], 0.0)
+    kept = {name for rank, name in enumerate(ordered) if rank < _FINALISTS or screened[name] > threshold}
+    return [start for start in starts if start.names[-1] in kept]
 
 
 def _without_one(fit: Fit) -> list[Candidate]:

@@ -22,7 +22,7 @@ def verdict_json(diagnosis: Diagnosis) -> dict[str, Any]:
     """The verdict as a JSON object; what is not a finite number is null.
 
     Beside the fields of the format it has `sentence`, `caveats` and `seconds`; `gap` has also `horizons`, `split` and
-    `ridge_after_rmse_mm`, `ranking` also `leftover_mm`, and `where` also `sentences`, `per_horizon_mm` and `frames`.
+    `ahead_mm`, `ranking` also `leftover_mm`, and `where` also `sentences`, `per_horizon_mm` and `frames`.
     """
     gap, where = diagnosis.gap, diagnosis.where
     return _plain(
@@ -49,7 +49,7 @@ def verdict_json(diagnosis: Diagnosis) -> dict[str, Any]:
                 "shrinkage": gap.shrinkage,
                 "shrinkage_ci90": gap.shrinkage_ci90,
                 "held_out_episodes": gap.held_out_episodes,
-                "ridge_after_rmse_mm": gap.ridge_after_rmse_mm,
+                "ahead_mm": gap.ahead_mm,
                 "horizons": [
                     {"horizon_s": seconds, "before_rmse_mm": before, "after_rmse_mm": after}
                     for seconds, (before, after) in sorted(gap.horizons_mm.items())

@@ -37,8 +37,8 @@ class GripperSlip(Effect):
         )
 
     def starts(self, context):
-        times = [context.duration * f for f in (0.15, 0.4, 0.7)]
-        return [(g, (t, d)) for g in (0, 1) for t in times for d in (-0.01, 0.01)]
+        times = [context.duration * f for f in (0.1, 0.25, 0.4, 0.55, 0.7, 0.85)]
+        return [(g, (t, -0.01)) for g in (0, 1) for t in times]
 
     def location(self, values, variant, config):
         return {**_end(variant, config), "time_s": float(values[0])}

@@ -8,6 +8,9 @@ import numpy as np
 
 from cablejax.diagnose.effects.base import Effect, Parameter, hat, section
 
+# Where along the cable fits of local effects begin; a section of another sign is reached from the same place.
+_CENTRES = (0.08, 0.2, 0.32, 0.44, 0.56, 0.68, 0.8, 0.92)
+
 
 class _Section(Effect):
     """An effect on a section of the cable; its first two parameters are centre and width over the cable's length."""
@@ -57,7 +60,7 @@ class StiffnessProfile(_Section):
         return replace(physics, stiffness=physics.stiffness * values[2] ** part)
 
     def starts(self, context):
-        return [(0, (c, 0.25, r)) for c in (0.1, 0.3, 0.5, 0.7, 0.9) for r in (0.5, 2.0)]
+        return [(0, (c, 0.2, 0.5)) for c in _CENTRES]
 
 
 class IntrinsicCurvature(_Section):
@@ -77,7 +80,7 @@ class IntrinsicCurvature(_Section):
         return replace(physics, rest_curvature=physics.rest_curvature + values[2] * part)
 
     def starts(self, context):
-        return [(0, (c, 0.2, k)) for c in (0.1, 0.3, 0.5, 0.7, 0.9) for k in (-1.0, 1.0)]
+        return [(0, (c, 0.15, 1.0)) for c in _CENTRES]
 
 
 class Plasticity(Effect):
@@ -188,7 +191,7 @@ class LumpedMass(Effect):
         return replace(physics, extra_mass=physics.extra_mass + values[1] * hat(values[0] * config.length, config))
 
     def starts(self, context):
-        return [(0, (c, 0.03)) for c in (0.15, 0.3, 0.5, 0.7, 0.85)]
+        return [(0, (c, 0.03)) for c in _CENTRES]
 
     def reported(self, values, variant, config):
         return {"centre_m": (float(values[0]) * config.length, "m"), "mass_kg": (float(values[1]), "kg")}

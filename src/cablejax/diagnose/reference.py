@@ -1,0 +1,79 @@
+"""What a correction gives that knows no cause: the online ridge residual of the controller, on a recorded run."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from cablejax.residual.ridge import RidgeConfig, apply, fit
+
+HORIZON = 5
+"""Steps that the residual is carried on."""
+_STEP = 1.0
+_RIDGE = RidgeConfig()
+
+
+@dataclasses.dataclass(frozen=True)
+class Ahead:
+    """Errors of predictions from the last observation, over `HORIZON` control steps of one second.
+
+    Attributes:
+        alone: root mean square per coordinate of the simulator's displacement [m].
+        corrected: with the residual of the last five steps added.
+    """
+
+    alone: float
+    corrected: float
+
+
+def predicted_ahead(
+    observed: Float[np.ndarray, "E T N 2"],
+    simulated: Float[np.ndarray, "E T N 2"],
+    gripper_pose: Float[np.ndarray, "E T 2 3"],
+    interval: Float[np.ndarray, "E"],
+    length: np.ndarray,
+) -> Ahead | None:
+    """Corrects a simulator's displacements as the controller does: `delta = R J + b` over the last five steps.
+
+    The residual is fitted to what the last five steps of one second got wrong, and carried on for `HORIZON` steps with
+    the grippers' true motion. Errors contain the noise of two observations.
+
+    Returns:
+        None if no episode is long enough.
+    """
+    alone, corrected = [], []
+    for e in range(len(observed)):
+        stride = max(1, round(_STEP / float(interval[e])))
+        samples = slice(0, int(length[e]), stride)
+        error = observed[e, samples] - simulated[e, samples]
+        pose = gripper_pose[e, samples]
+        twist = np.diff(pose, axis=0) / (stride * float(interval[e]))
+        delta = np.diff(error, axis=0)
+        window = _RIDGE.window
+        n_starts = len(delta) - window - HORIZON + 1
+        if n_starts < 1:
+            continue
+        past = np.arange(n_starts)[:, None] + np.arange(window)
+        ahead = window + np.arange(n_starts)[:, None] + np.arange(HORIZON)
+        guess = np.asarray(_carried()(delta[past], twist[past], np.isfinite(delta[past]).all(axis=-1), twist[ahead]))
+        # what the simulator's displacement over the whole horizon gets wrong
+        wrong = error[window + HORIZON :][:n_starts] - error[window : window + n_starts]
+        alone.append(wrong)
+        corrected.append(wrong - guess)
+    if not alone:
+        return None
+    return Ahead(*(float(np.sqrt(np.nanmean(np.concatenate(x) ** 2))) for x in (alone, corrected)))
+
+
+@functools.cache
+def _carried():
+    def one(delta, twist, valid, ahead):
+        residual = fit(delta, twist, valid, _RIDGE)
+        return jnp.sum(jax.vmap(lambda r: apply(residual, r))(ahead), axis=0)
+
+    return jax.jit(jax.vmap(one))

@@ -1,0 +1,143 @@
+"""Effects, parameters, places, motions and quantities in the words of a lab."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+EFFECTS: dict[str, str] = {
+    "bending_stiffness": "the bending stiffness differs everywhere by one factor",
+    "stiffness_profile": "the bending stiffness differs over part of the cable",
+    "intrinsic_curvature": "the cable is curved at rest",
+    "plasticity": "bends beyond a yield curvature stay",
+    "bending_hysteresis": "internal friction in bending, whatever the speed",
+    "bending_damping": "the internal viscous damping differs",
+    "axial_stretch": "the cable stretches",
+    "table_friction": "the friction of the table differs everywhere",
+    "friction_patch": "another friction inside a region of the table",
+    "viscous_drag": "a drag that grows with speed",
+    "gravity_tilt": "the table is tilted",
+    "linear_density": "the mass per length differs",
+    "lumped_mass": "a connector or clip on the cable",
+    "gripper_slip": "the cable slides through a gripper",
+    "gripper_rotation_offset": "the cable is gripped at another angle than measured",
+    "gripper_compliance": "the grasp yields in rotation",
+    "actuation_gain": "the arm moves more or less than commanded",
+    "actuation_lag": "the arm moves later than commanded",
+    "camera_similarity": "scale, rotation or offset of the camera's frame",
+    "keypoint_bias": "keypoints sit off their nominal places",
+    "camera_lag": "the keypoints are stamped late",
+    "obstacle": "a fixed object touches the cable",
+}
+"""What each effect of the format is."""
+
+_PARAMETERS: dict[str, str] = {
+    "centre_m": "centre, from gripper 0",
+    "width_m": "length of the section",
+    "ratio": "ratio to the believed value",
+    "curvature_per_m": "rest curvature",
+    "yield_curvature_per_m": "yield curvature",
+    "moment_n_m": "largest moment of internal friction",
+    "transition_curvature_per_m": "curvature over which it builds up",
+    "stiffness_n": "axial stiffness EA",
+    "coefficient": "Coulomb coefficient",
+    "x_m": "x on the table",
+    "y_m": "y on the table",
+    "radius_m": "radius",
+    "coefficient_n_s_per_m2": "drag per length and speed",
+    "angle_rad": "angle",
+    "direction_rad": "direction on the table",
+    "mass_kg": "mass",
+    "gripper": "gripper",
+    "time_s": "time",
+    "distance_m": "change of the free length",
+    "stiffness_n_m_per_rad": "stiffness of the grasp",
+    "gain": "gain",
+    "scale": "scale",
+    "index": "keypoint",
+    "offset_m": "offset",
+}
+
+MOTIONS: dict[str, str] = {
+    "mirror": "Start mirrored in the line between the grippers, close in, and go back.",
+    "translation": "Move both grippers across the cable by 20 % of its length, hold, and go back.",
+    "ramp_hold": "Close in fast, hold, go back, then the same at a quarter of the speed.",
+    "overload_return": "Bend the cable tightly, to 30 % of its length between the grippers, and go back.",
+    "taut": "Pull the cable nearly straight, to 99.5 % of its length, hold, and go back.",
+    "shifted_repeat": "Close in and go back; repeat it shifted across the table by 20 % of the cable's length.",
+}
+"""What each motion of `cablejax.diagnose.safe_motions` is, in an instruction."""
+
+
+def effect_title(name: str) -> str:
+    """The name of an effect as words."""
+    return name.replace("_", " ")
+
+
+def parameter_title(name: str) -> str:
+    """A parameter in words; one that is not of the format keeps its name."""
+    return _PARAMETERS.get(name, name.replace("_", " "))
+
+
+def quantity(value: Any, unit: str, ci90: Any = None, *, interval: bool = True) -> str:
+    """A value with its interval and unit, to the digits that the interval supports: "9.3 mm (8.7 to 10.0)".
+
+    Lengths below 5 cm come in millimetres. Lists are joined. With `interval` false it is not shown.
+    """
+    if isinstance(value, (list, tuple)):
+        intervals: Sequence[Any] = [None] * len(value) if ci90 is None else ci90
+        return ", ".join(quantity(v, unit, c, interval=interval) for v, c in zip(value, intervals, strict=True))
+    if value is None or not math.isfinite(value):
+        return "n/a"
+    if isinstance(value, int):
+        return f"{value} {unit}".strip()
+    ends = list(ci90) if ci90 is not None and all(math.isfinite(x) for x in ci90) else []
+    scale, shown = 1.0, unit
+    if unit == "m" and max(abs(x) for x in (value, *ends)) < 0.05:
+        scale, shown = 1e3, "mm"
+    numbers = [scale * x for x in (value, *ends)]
+    digits = _digits(numbers)
+    text = f"{numbers[0]:.{digits}f} {shown}".strip()
+    return f"{text} ({numbers[1]:.{digits}f} to {numbers[2]:.{digits}f})" if ends and interval else text
+
+
+def millimetres(value: float) -> str:
+    """A length in millimetres to two digits, at least whole tenths below ten: "0.04 mm", "1.3 mm", "27 mm"."""
+    return f"{_short(value)} mm"
+
+
+def _short(value: float) -> str:
+    if abs(value) >= 9.95:
+        return f"{value:.0f}"
+    return f"{value:.1f}" if abs(value) >= 0.095 or value == 0 else f"{value:.2f}"
+
+
+def place(location: dict[str, Any], gripper: Any = None) -> str:
+    """Where an effect sits: "between 0.19 and 0.42 m from gripper 0"; "" where it has no place."""
+    parts = []
+    along, time, table = (location.get(key) for key in ("along_cable_m", "time_s", "table_m"))
+    if gripper is not None:
+        parts.append(f"at gripper {gripper}")
+    elif along is not None:
+        low, high = along
+        parts.append(
+            f"at {low:.2f} m from gripper 0" if high - low < 5e-3 else f"{low:.2f} to {high:.2f} m from gripper 0"
+        )
+    if table is not None:
+        parts.append(f"at x = {table[0]:.2f} m, y = {table[1]:.2f} m on the table")
+    if time is not None:
+        parts.append(f"{time:.1f} s into the episode")
+    return ", ".join(parts)
+
+
+def listed(words: Sequence[str], last: str = "and") -> str:
+    """ "a, b and c"."""
+    return "" if not words else words[0] if len(words) == 1 else f"{', '.join(words[:-1])} {last} {words[-1]}"
+
+
+def _digits(numbers: Sequence[float]) -> int:
+    """Decimals that show an interval to a few per cent of its width, or a value to three digits."""
+    low, *_, high = numbers[1:] or numbers
+    size = 0.25 * abs(high - low) or 0.01 * abs(numbers[0])
+    return int(min(max(math.ceil(-math.log10(size)), 0), 6)) if size > 0 else 1
