@@ -51,7 +51,7 @@ class Actuation:
 
 def actuation(
     pose: Float[np.ndarray, "E T 2 3"],
-    command: Float[np.ndarray, "E T 2 3"],
+    command: Float[np.ndarray, "E T 2 3"] | None,
     interval: Float[np.ndarray, "E"],
     length: Float[np.ndarray, "E"],
 ) -> Actuation:
@@ -61,10 +61,12 @@ def actuation(
 
     Args:
         pose: measured, theta continuous.
-        command: twists held from one sample to the next.
+        command: twists held from one sample to the next; None = not logged, nothing can be told.
         interval: between samples [s].
         length: valid samples of each episode.
     """
+    if command is None:
+        return Actuation({}, 0.0, 0.0, pose, pose, deviates=False)
     valid = np.arange(pose.shape[1])[None] < np.asarray(length)[:, None]
     weight = np.array([1.0, 1.0, _ROTATION_WEIGHT]) * valid[:, :, None, None]
     wanted = _integrated(pose[:, 0], command, interval)

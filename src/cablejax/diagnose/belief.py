@@ -49,7 +49,7 @@ class Calibration:
 
     baseline: float = 2.0e-4
     law_error: float = 0.1
-    correlated_samples: float = 500.0
+    correlated_samples: float = 800.0
     freedom: float = 6.0
     term_cost: float = 4.0
     resolvable: float = 1.6

@@ -33,8 +33,9 @@ LARGEST_STEP = 0.05
 """Longest time step [s]; docs/results/resolution.md shows that shorter ones change little."""
 _SETTLE_STEPS = 20
 _SETTLE_STEP = 0.2
-# Stiffness of a contact [N/m]: a cable of 0.1 N presses 0.3 mm into an obstacle.
-_CONTACT_STIFFNESS = 300.0
+# Stiffness of a contact of one link's length [N/m]: a cable of 0.1 N presses 0.1 mm into an obstacle.
+_CONTACT_STIFFNESS = 1000.0
+_CONTACT_POINTS = 4
 # Over which the edge of a friction patch and the onset of a contact are smoothed [m].
 _PATCH_EDGE = 0.005
 _CONTACT_EDGE = 0.0005
@@ -71,10 +72,12 @@ class Chain:
     """Replays gripper poses. Pure, to be vmapped and jitted by the caller.
 
     Attributes:
-        config: geometry, resolution and nominal values; its time step is not used.
+        config: geometry and resolution; its time step and nominal values are not used.
+        with_contact: whether the obstacle can be touched. Looking for contacts is a quarter of a step's work.
     """
 
     config: CableConfig
+    with_contact: bool = True
 
     def rollout(
         self,
@@ -167,15 +170,7 @@ class Chain:
         coefficient = coefficient * (1.0 + physics.static_excess * jnp.exp(-squared_speed / _STRIBECK_SPEED**2))
         speed = jnp.sqrt(squared_speed + self.config.friction_speed**2)
         drag = free * (coefficient * mass * normal_gravity(physics.tilt) / speed + physics.drag * h)
-        away = where - physics.obstacle_centre
-        distance = _length(away)
-        normal = away / distance[:, None]
-        depth = physics.obstacle_radius - distance
-        # a smooth ramp: nothing at all half a millimetre off
-        overlap = jnp.clip(depth + _CONTACT_EDGE, 0.0)
-        pressing = jnp.where(depth < _CONTACT_EDGE, overlap**2 / (4 * _CONTACT_EDGE), depth)
-        rigidity = free * _CONTACT_STIFFNESS * jnp.clip(overlap / (2 * _CONTACT_EDGE), 0.0, 1.0)
-        push = (free * _CONTACT_STIFFNESS * pressing)[:, None] * normal
+        push, contact = self._contact(physics, where, h * along)
         force = mass[:, None] * physics.tilt + push
 
         # Joints: elastic, viscous, and internal friction (Dahl 1968), which saturates at its moment.
@@ -188,11 +183,10 @@ class Chain:
 
         # A u = b, lower triangle of A.
         weight = mass + dt * drag
-        stiff = dt**2 * rigidity
-        across = _turned(normal)  # R' n up to sign, which the outer product forgets
-        xx, xy, yy = (
-            weight * e + stiff * across[:, i] * across[:, j] for i, j, e in ((0, 0, 1.0), (0, 1, 0.0), (1, 1, 1.0))
-        )
+        # R' W R: a quarter turn swaps the axes of the contact's stiffness
+        xx = weight + dt**2 * contact[:, 2]
+        xy = -(dt**2) * contact[:, 1]
+        yy = weight + dt**2 * contact[:, 0]
         first_moment = jnp.stack([xx * nodes[:, 0] + xy * nodes[:, 1], xy * nodes[:, 0] + yy * nodes[:, 1]], axis=1)
         second_moment = jnp.sum(first_moment * nodes, axis=1)
         inertia = mass * lengths**2 / 12
@@ -214,7 +208,14 @@ class Chain:
         impulse = (
             mass[:, None] * (velocity - root_velocity - dt * bias) + dt * force - dt * drag[:, None] * root_velocity
         )
-        impulse = impulse - (stiff * jnp.sum(normal * root_velocity, axis=1))[:, None] * normal
+        contact_drag = jnp.stack(
+            [
+                contact[:, 0] * root_velocity[0] + contact[:, 1] * root_velocity[1],
+                contact[:, 1] * root_velocity[0] + contact[:, 2] * root_velocity[1],
+            ],
+            axis=1,
+        )
+        impulse = impulse - dt**2 * contact_drag
         total = _beyond(jnp.concatenate([impulse, _cross(nodes, impulse)[:, None] + (inertia * rate)[:, None]], axis=1))
         rhs = total[:, 2] - _cross(joints, total[:, :2])
         rhs = rhs.at[1:].add(-dt * moment)
@@ -277,6 +278,44 @@ class Chain:
             friction_state=rubbed,
             root_velocity=root_velocity,
         )
+
+    def _contact(
+        self, physics: Physics, nodes: Float[Array, "n 2"], slope: Float[Array, "n 2"]
+    ) -> tuple[Float[Array, "n 2"], Float[Array, "n 3"]]:
+        """Forces of the obstacle on the nodes [N] and their stiffness (xx, xy, yy) [N/m].
+
+        The obstacle is narrower than a link is long, so the cable touches it by points between the nodes too, on the
+        cubic through nodes and tangents; what acts on them is shared by the two nodes next to them.
+
+        Args:
+            physics: with the obstacle.
+            nodes: positions [m].
+            slope: derivative of the position over one link length [m].
+        """
+        force, stiffness = jnp.zeros_like(nodes), jnp.zeros((nodes.shape[0], 3), nodes.dtype)
+        if not self.with_contact:
+            return force, stiffness
+        a, b, da, db = nodes[:-1], nodes[1:], slope[:-1], slope[1:]
+        for i in range(_CONTACT_POINTS):
+            t = i / _CONTACT_POINTS
+            point = (1 - 3 * t**2 + 2 * t**3) * a + (3 * t**2 - 2 * t**3) * b
+            point = point + (t - 2 * t**2 + t**3) * da + (t**3 - t**2) * db
+            away = point - physics.obstacle_centre
+            distance = _length(away)
+            normal = away / distance[:, None]
+            depth = physics.obstacle_radius - distance
+            # a smooth ramp: nothing at all half a millimetre off
+            overlap = jnp.clip(depth + _CONTACT_EDGE, 0.0)
+            pressing = jnp.where(depth < _CONTACT_EDGE, overlap**2 / (4 * _CONTACT_EDGE), depth)
+            rigidity = _CONTACT_STIFFNESS / _CONTACT_POINTS * jnp.clip(overlap / (2 * _CONTACT_EDGE), 0.0, 1.0)
+            push = (_CONTACT_STIFFNESS / _CONTACT_POINTS * pressing)[:, None] * normal
+            tensor = rigidity[:, None] * jnp.stack(
+                [normal[:, 0] ** 2, normal[:, 0] * normal[:, 1], normal[:, 1] ** 2], axis=1
+            )
+            for end, share in ((slice(None, -1), 1 - t), (slice(1, None), t)):
+                force = force.at[end].add(share * push)
+                stiffness = stiffness.at[end].add(share * tensor)
+        return force, stiffness
 
     def _keypoints(self, physics: Physics, state: ChainState, root, time) -> Float[Array, "N 2"]:
         """Points of the centreline where the keypoints are, by cubic Hermite interpolation between the nodes."""

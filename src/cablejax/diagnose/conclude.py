@@ -77,6 +77,23 @@ def conclude(found: Search, evidence: Evidence, calibration: Calibration) -> Con
     return Conclusion(verdict, best, tuple(effects[i] for i in order), tuple(equivalent), ranking, explained)
 
 
+def baselines(found: Search, evidence: Evidence) -> dict[str, str]:
+    """What simpler rules would have named, see `Diagnosis.baselines`."""
+    singles = [fit for fit in found.fits if len(effect_names(fit.candidate)) == 1]
+    if not singles:
+        return {}
+    samples = float(evidence.count.sum())
+
+    def bic(fit: Fit) -> float:
+        return float(fit.sse.sum()) + len(fit.candidate.z) * float(np.log(samples))
+
+    return {
+        "lowest_cost": min(singles, key=lambda fit: float(fit.sse.sum())).candidate.names[0],
+        "bic": min(singles, key=bic).candidate.names[0],
+        "sparse_regression": max(found.screened, key=lambda name: found.screened[name]),
+    }
+
+
 def _ranking(found: Search, evidence: Evidence, calibration: Calibration) -> tuple[Ranked, ...]:
     singles = [(f, s) for f, s in zip(found.fits, found.scores, strict=True) if len(effect_names(f.candidate)) == 1]
     if not singles:

@@ -122,6 +122,9 @@ class Diagnosis:
         gap: before and after.
         where: along the cable, in time, by regime, by frame.
         next_motion: None if nothing would be gained.
+        baselines: the single effect that simpler rules would have named: "lowest_cost" (best fit in sample), "bic" (the
+            same with Schwarz's penalty, all samples taken to be independent) and "sparse_regression" (the best template
+            without any fit); empty for the verdict "none".
         caveats: what the log did not allow, in words.
         log: what was diagnosed.
         nominal: keypoints of the nominal simulator [m], NaN beyond an episode's end, shape [E, T, N, 2].
@@ -141,6 +144,7 @@ class Diagnosis:
     gap: Gap
     where: Where
     next_motion: NextMotion | None
+    baselines: dict[str, str]
     caveats: tuple[str, ...]
     log: GapLog
     nominal: Float[np.ndarray, "E T N 2"]

@@ -19,7 +19,6 @@ from cablejax.diagnose.physics import Physics
 from cablejax.diagnose.playback import Playback
 from cablejax.simulate.config import CableConfig
 
-_DIFFERENCE = 0.03
 _FIRST_DAMPING = 1e-2
 # Largest change of one coordinate in one step, in prior standard deviations.
 _LARGEST_STEP = 1.5
@@ -173,8 +172,15 @@ class Fit:
         return np.einsum("epq,e->pq", self.curvature, evidence.weight(self.sse)) + np.eye(len(self.candidate.z))
 
     def held_out_sse(self, evidence: Evidence) -> Float[np.ndarray, "E"]:
-        """r'r of every episode if it had been left out of the fit, by one Gauss-Newton step without it."""
+        """r'r of every episode if it had been left out of the fit, by one Gauss-Newton step without it.
+
+        A single episode cannot be left out: it pays twice the parameters' effective number instead, as in Akaike's
+        criterion.
+        """
         precision, weight = self.precision(evidence), evidence.weight(self.sse)
+        if len(self.sse) == 1:
+            effective = np.trace(np.linalg.solve(precision, weight[0] * self.curvature[0]))
+            return self.sse + 2.0 * effective * evidence.temper
         result = np.empty_like(self.sse)
         for e in range(len(self.sse)):
             rest = precision - weight[e] * self.curvature[e]
@@ -191,7 +197,8 @@ def evaluate(evidence: Evidence, candidates: Sequence[Candidate]) -> list[Fit]:
     for c in candidates:
         physics.append(c.physics(nominal, config))
         # inwards where the upper bound is near
-        sign = np.where(c.z + _DIFFERENCE > c.bounds[:, 1], -_DIFFERENCE, _DIFFERENCE)
+        size = np.array([p.difference for term in c.terms for p in term.effect.parameters])
+        sign = np.where(c.z + size > c.bounds[:, 1], -size, size)
         steps.append(sign)
         for i in range(len(c.z)):
             moved = c.z.astype(np.float64)

@@ -13,7 +13,6 @@ from cablejax.diagnose.physics import Physics
 from cablejax.diagnose.playback import Playback
 from cablejax.diagnose.safe_motions import INTERVAL, safe_motions
 
-_DIFFERENCE = 0.03
 # Motions as long as the log's share its compiled program, if they are neither cut short nor mostly rest.
 _SAMPLES = (250, 400)
 _USUAL_SAMPLES = 300
@@ -87,7 +86,9 @@ def _sensitivity(playback, library, candidate: Candidate, noise, temper: float) 
     if n_parameters == 0:
         return np.full(len(library.gripper_pose), np.nan)
     base = candidate.physics(playback.nominal(), config)
-    steps = np.where(candidate.z + _DIFFERENCE > candidate.bounds[:, 1], -_DIFFERENCE, _DIFFERENCE)
+    size = np.array([p.difference for term in candidate.terms for p in term.effect.parameters])
+    # inwards where the upper bound is near
+    steps = np.where(candidate.z + size > candidate.bounds[:, 1], -size, size)
     moved = [
         candidate.physics(playback.nominal(), config, (candidate.z + step).astype(np.float32))
         for step in np.diag(steps)

@@ -13,6 +13,9 @@ _LAGS = 5
 # A keypoint counts as noisier than the others beyond this many standard errors.
 _DISTINCT = 4.0
 
+SMALLEST = 5e-5
+"""Least noise that is believed [m]: a simulated log may have none, and no camera has less."""
+
 
 @dataclasses.dataclass(frozen=True)
 class NoiseFloor:
@@ -36,7 +39,7 @@ def noise_floor(keypoints: Float[np.ndarray, "E T N 2"], hold: np.ndarray | None
     of them, and no cable moves by jerks that fast. Keypoints share one level unless one is clearly noisier.
 
     Raises:
-        ValueError: fewer than 20 observed samples of every keypoint, or no noise at all.
+        ValueError: fewer than 20 observed samples of every keypoint.
     """
     rapid, n_rapid = _third_differences(keypoints)
     held = _held(keypoints, hold) if hold is not None else None
@@ -54,11 +57,7 @@ def noise_floor(keypoints: Float[np.ndarray, "E T N 2"], hold: np.ndarray | None
     if count.max() < 20:
         raise ValueError(f"The log shows a keypoint at most {int(count.max())} times, expected at least 20 samples.")
     common = float(np.average(variance, weights=np.maximum(count, 1e-9)))
-    if not common > 0:
-        raise ValueError(
-            "The keypoints have no noise at all. A diagnosis weighs the gap against the noise of the recording; if "
-            "this log was simulated, record it with the camera's noise."
-        )
+    common, variance = max(common, SMALLEST**2), np.maximum(variance, SMALLEST**2)
     error = common * np.sqrt(2.0 / np.maximum(count, 1.0))
     distinct = (np.abs(variance - common) > _DISTINCT * error) & (count >= 20)
     return NoiseFloor(std=np.sqrt(np.where(distinct, variance, common)), correlation=correlation, from_holds=from_holds)

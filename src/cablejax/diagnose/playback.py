@@ -44,10 +44,10 @@ class Playback:
         cls,
         config: CableConfig,
         gripper_pose: Float[np.ndarray, "E T 2 3"],
-        first_keypoints: Float[np.ndarray, "E N 2"] | None,
+        first_keypoints: Sequence[Float[np.ndarray, "N 2"] | None] | None,
         interval: Float[np.ndarray, "E"],
     ) -> Playback:
-        """Finds the settled start of every episode near its first keypoints."""
+        """Finds the settled start of every episode near its first keypoints, or a gentle arch where there are none."""
         angles = [
             np.asarray(
                 equilibrium_state(config, pose[0], guess=None if first_keypoints is None else first_keypoints[e]).qpos
@@ -76,7 +76,6 @@ class Playback:
         """
         chosen = np.arange(len(self.gripper_pose)) if episodes is None else np.asarray(episodes, int)
         n_physics, n_samples = len(physics), self.gripper_pose.shape[1]
-        rows = [(p, e) for p in range(n_physics) for e in chosen]
         stacked = Physics(
             **{
                 field.name: np.stack([np.asarray(getattr(p, field.name), np.float32) for p in physics])
@@ -91,21 +90,29 @@ class Playback:
             n_keypoints=self.config.n_keypoints,
             friction_speed=self.config.friction_speed,
         )
-        replay = _compiled(geometry, n_samples, substeps)
+        points = np.empty((n_physics, len(chosen), n_samples, self.config.n_keypoints, 2), np.float32)
 
-        def one_chunk(begin: int) -> np.ndarray:
-            chunk = rows[begin : begin + _ROWS]
-            full = chunk + [chunk[0]] * (_ROWS - len(chunk))
-            p, e = np.array(full).T
+        def one_chunk(rows: np.ndarray, with_contact: bool) -> None:
+            full = np.concatenate([rows, np.broadcast_to(rows[:1], (_ROWS - len(rows), 2))])
+            p, e = full[:, 0], chosen[full[:, 1]]
             batch = jax.tree.map(lambda leaf: leaf[p], stacked)
+            replay = _compiled(Chain(geometry, with_contact), substeps)
             result = replay(batch, self.angles[e], self.gripper_pose[e], self.interval[e])
-            return np.asarray(result)[: len(chunk)]
+            points[rows[:, 0], rows[:, 1]] = np.asarray(result)[: len(rows)]
 
-        begins = range(0, len(rows), _ROWS)
+        touching = stacked.obstacle_radius > 0
         with concurrent.futures.ThreadPoolExecutor(max_workers=_workers()) as pool:
-            parts = list(pool.map(one_chunk, begins))
-        points = np.concatenate(parts)
-        return points.reshape(n_physics, len(chosen), *points.shape[1:])
+            tasks = []
+            for with_contact in (False, True):
+                which = np.flatnonzero(touching == with_contact)
+                rows = np.stack(np.meshgrid(which, np.arange(len(chosen)), indexing="ij"), axis=-1).reshape(-1, 2)
+                tasks += [
+                    pool.submit(one_chunk, rows[begin : begin + _ROWS], with_contact)
+                    for begin in range(0, len(rows), _ROWS)
+                ]
+            for task in tasks:
+                task.result()
+        return points
 
 
 def _workers() -> int:
@@ -113,9 +120,7 @@ def _workers() -> int:
 
 
 @functools.lru_cache(maxsize=16)
-def _compiled(geometry: CableConfig, n_samples: int, n_substeps: int):
-    chain = Chain(geometry)
-
+def _compiled(chain: Chain, n_substeps: int):
     def one(physics, angles, pose, interval):
         points = chain.rollout(physics, angles, pose, interval, n_substeps=n_substeps)
         return seen_by_camera(physics, points, interval)

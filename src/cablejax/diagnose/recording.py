@@ -43,6 +43,11 @@ class Recording:
     length: np.ndarray
     caveats: tuple[str, ...]
 
+    @property
+    def has_commands(self) -> bool:
+        """Whether commands were logged; all zero while the grippers move means that they were not."""
+        return bool(np.abs(self.gripper_command).any()) or float(np.ptp(self.gripper_pose, axis=1).max()) <= 1e-3
+
     def as_log(self, meta: dict[str, Any]) -> GapLog:
         """The log after repairs, without the padding."""
         longest = int(self.length.max())
@@ -115,7 +120,7 @@ def prepare(log: GapLog) -> Recording:
     caveats += _plausible(log, recording)
     if log.hold is None or not hold.any():
         caveats.append("No holds are marked: the noise is taken to be white, and a slow drift would count as a gap.")
-    if not np.abs(command).any() and np.ptp(pose, axis=1).max() > 1e-3:
+    if not recording.has_commands:
         caveats.append("No commands were logged although the grippers move: effects of the arms cannot be told.")
     return dataclasses.replace(recording, caveats=tuple(caveats))
 

@@ -13,12 +13,12 @@ from jaxtyping import Float
 
 from cablejax.diagnose.actuation import Actuation, actuation
 from cablejax.diagnose.belief import Calibration, excess, level
-from cablejax.diagnose.conclude import Conclusion, conclude, sentence
+from cablejax.diagnose.conclude import Conclusion, baselines, conclude, sentence
 from cablejax.diagnose.diagnosis import Diagnosis, Gap, NamedEffect, ParameterEstimate, Ranked, Verdict
 from cablejax.diagnose.effects import LIBRARY, Context, Effect
 from cablejax.diagnose.fit import Candidate, Evidence, Fit, candidate, evaluate, improve
 from cablejax.diagnose.next_motion import next_motion
-from cablejax.diagnose.noise import NoiseFloor, noise_floor
+from cablejax.diagnose.noise import SMALLEST, NoiseFloor, noise_floor
 from cablejax.diagnose.playback import Playback
 from cablejax.diagnose.recording import DiagnosisError, Recording, prepare
 from cablejax.diagnose.reference import predicted_ahead
@@ -71,6 +71,8 @@ def diagnose(
             "No commissioning logs were given: the simulator's own error is not separated from the cable's gap; "
             f"{1e3 * calibration.baseline:.2g} mm of it is assumed."
         )
+    if case.noise.std.max() <= SMALLEST:
+        caveats.append(f"The keypoints carry no noise to speak of; {1e3 * SMALLEST:g} mm is assumed.")
     arms = case.arms
     evidence = case.evidence(calibration)
     null = evaluate(evidence, [candidate()])[0]
@@ -102,6 +104,7 @@ def diagnose(
         gap=measured,
         where=localise(repaired, case.to_log(reference), case.noise.std),
         next_motion=following,
+        baselines=baselines(found, evidence),
         caveats=tuple(caveats),
         log=repaired,
         nominal=case.to_log(reference),
@@ -146,7 +149,12 @@ class _Case:
     def of(cls, log: GapLog) -> _Case:
         recording = prepare(log)
         noise = noise_floor(recording.keypoints, recording.hold)
-        arms = actuation(recording.gripper_pose, recording.gripper_command, recording.interval, recording.length)
+        arms = actuation(
+            recording.gripper_pose,
+            recording.gripper_command if recording.has_commands else None,
+            recording.interval,
+            recording.length,
+        )
         config = config_of_log(log, n_links=FIT_LINKS)
         first = _first_shapes(recording)
 
@@ -211,16 +219,16 @@ class _Case:
         return np.where(valid[..., None, None], keypoints, np.nan)[:, : self.recording.length.max()]
 
 
-def _first_shapes(recording: Recording) -> Float[np.ndarray, "E N 2"]:
-    """Keypoints at the start of every episode, averaged over the first half second against noise and gaps."""
-    few = recording.keypoints[:, :5]
-    moved = np.abs(np.diff(recording.gripper_pose[:, :5], axis=1)).max(axis=(1, 2, 3), initial=0)
-    shapes = []
-    for points, speed in zip(few, moved, strict=True):
-        chosen = points if speed < 1e-3 else points[:1]
-        count = np.isfinite(chosen).sum(axis=0)
-        shapes.append(np.where(count > 0, np.nansum(chosen, axis=0) / np.maximum(count, 1), np.nan))
-    return np.stack(shapes)
+def _first_shapes(recording: Recording) -> list[np.ndarray | None]:
+    """Keypoints at the start of every episode, averaged over its first samples at rest; None where too few are seen."""
+    shapes: list[np.ndarray | None] = []
+    for points, pose in zip(recording.keypoints, recording.gripper_pose, strict=True):
+        moved = np.abs(pose - pose[0]).max(axis=(1, 2)) > 1e-3
+        still = points[: max(int(np.argmax(moved)) if moved.any() else len(points), 1)][:10]
+        count = np.isfinite(still).sum(axis=0)
+        mean = np.where(count > 0, np.nansum(still, axis=0) / np.maximum(count, 1), np.nan)
+        shapes.append(mean if np.isfinite(mean).all(axis=1).sum() >= 3 else None)
+    return shapes
 
 
 def _with_arms(conclusion: Conclusion, arms: Actuation) -> Conclusion:

@@ -109,7 +109,8 @@ def _by_term(explanation: Candidate) -> list[np.ndarray]:
 
 def _grown(evidence: Evidence, base: Candidate, effects: Sequence[Effect], context: Context) -> list[Fit]:
     """The base with one more effect each, the most promising ones fitted together with it."""
-    rest = dataclasses.replace(context, residual=residual_of(evidence, base))
+    rest = residual_of(evidence, base)
+    rest = dataclasses.replace(context, keypoints=context.keypoints + context.residual - rest, residual=rest)
     # a second piece of the same effect makes sense only for marks on the cable
     partners = [e for e in effects if e.name not in base.names or e.name == "keypoint_bias"]
     templates = screen(evidence, base, partners, rest)

@@ -32,6 +32,7 @@ def verdict_json(diagnosis: Diagnosis) -> dict[str, Any]:
             "sentence": diagnosis.sentence,
             "effects": [_effect(effect) for effect in diagnosis.effects],
             "equivalent": diagnosis.equivalent,
+            "baselines": diagnosis.baselines,
             "ranking": [
                 {
                     "name": ranked.name,

@@ -33,11 +33,12 @@ def describe(where: Where, arclength: np.ndarray, noise: np.ndarray, level: floa
             f"No episode deviates from the simulator by more than its noise of {floor:.1f} mm.",
             f"A gap of {max(where.smallest_mm, 0.01):.1f} mm or more over the whole log would have shown.",
         )
-    sentences = [_size(where, shown, floor), *_along(where, arclength), *_when(where, level), *_frame(where)][:5]
-    if len(where.per_episode_mm) < 6 and len(sentences) < 5:
-        number = _count(len(where.per_episode_mm), "episode")
-        sentences.append(f"With {number} no comparison between regimes can be tested at the 5 % level: six are needed.")
-    return tuple(sentences)
+    sentences = [_size(where, shown, floor), *_along(where, arclength), *_when(where, level), *_frame(where)]
+    if len(where.per_episode_mm) >= 6:
+        return tuple(sentences[:5])
+    number = _count(len(where.per_episode_mm), "episode")
+    few = f"With {number} no comparison between regimes can be tested at the 5 % level: six are needed."
+    return (*sentences[:4], few)
 
 
 def _size(where: Where, shown: list[int], floor: float) -> str:
@@ -65,7 +66,7 @@ def _along(where: Where, arclength: np.ndarray) -> list[str]:
     if ends.min() > 0.5 * profile.max():
         return [
             f"It reaches the grippers, {ends.min():.1f} mm at the smaller end against {profile.max():.1f} mm at most: "
-            "the picture or the grasp points are off, not only the cable between them."
+            "the picture, the arms or the grasps are off, not only the cable between them."
         ]
     near = np.flatnonzero(profile >= 0.5 * profile.max())
     low, high = arclength[near[0]], arclength[near[-1]]

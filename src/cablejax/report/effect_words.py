@@ -6,6 +6,8 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
+from cablejax.diagnose.diagnosis import NamedEffect
+
 EFFECTS: dict[str, str] = {
     "bending_stiffness": "the bending stiffness differs everywhere by one factor",
     "stiffness_profile": "the bending stiffness differs over part of the cable",
@@ -44,6 +46,7 @@ _PARAMETERS: dict[str, str] = {
     "coefficient": "Coulomb coefficient",
     "x_m": "x on the table",
     "y_m": "y on the table",
+    "hardening": "hardening beyond the yield",
     "radius_m": "radius",
     "coefficient_n_s_per_m2": "drag per length and speed",
     "angle_rad": "angle",
@@ -62,7 +65,7 @@ _PARAMETERS: dict[str, str] = {
 MOTIONS: dict[str, str] = {
     "mirror": "Start mirrored in the line between the grippers, close in, and go back.",
     "translation": "Move both grippers across the cable by 20 % of its length, hold, and go back.",
-    "ramp_hold": "Close in fast, hold, go back, then the same at a quarter of the speed.",
+    "ramp_hold": "Close in fast, hold, go back, then the same at 30 % of the speed.",
     "overload_return": "Bend the cable tightly, to 30 % of its length between the grippers, and go back.",
     "taut": "Pull the cable nearly straight, to 99.5 % of its length, hold, and go back.",
     "shifted_repeat": "Close in and go back; repeat it shifted across the table by 20 % of the cable's length.",
@@ -113,7 +116,7 @@ def _short(value: float) -> str:
     return f"{value:.1f}" if abs(value) >= 0.095 or value == 0 else f"{value:.2f}"
 
 
-def place(location: dict[str, Any], gripper: Any = None) -> str:
+def _place(location: dict[str, Any], gripper: Any = None) -> str:
     """Where an effect sits: "between 0.19 and 0.42 m from gripper 0"; "" where it has no place."""
     parts = []
     along, time, table = (location.get(key) for key in ("along_cable_m", "time_s", "table_m"))
@@ -136,8 +139,32 @@ def listed(words: Sequence[str], last: str = "and") -> str:
     return "" if not words else words[0] if len(words) == 1 else f"{', '.join(words[:-1])} {last} {words[-1]}"
 
 
+def effect_place(effect: NamedEffect) -> str:
+    index = effect.parameters.get("index")
+    if index is not None and isinstance(index.value, list):
+        return f"at keypoints {listed([str(i) for i in sorted(index.value)])}"
+    gripper = effect.parameters.get("gripper")
+    return _place(effect.location, None if gripper is None else gripper.value)
+
+
+def share(value: float) -> str:
+    """A share in per cent; never 0 or 100 where it is only close."""
+    percent = 100 * value
+    if percent >= 99.5:
+        return "> 99 %"
+    if 0 < percent < 0.5:
+        return "< 1 %"
+    return f"{percent:.0f} %"
+
+
+def between(low: float, high: float) -> str:
+    """An interval of shares, "88 % to 93 %"; a single one where both ends read the same."""
+    ends = share(low), share(high)
+    return f"{ends[0]} throughout" if ends[0] == ends[1] else f"{ends[0]} to {ends[1]}"
+
+
 def _digits(numbers: Sequence[float]) -> int:
     """Decimals that show an interval to a few per cent of its width, or a value to three digits."""
-    low, *_, high = numbers[1:] or numbers
-    size = 0.25 * abs(high - low) or 0.01 * abs(numbers[0])
+    size = 0.25 * abs(numbers[-1] - numbers[1]) if len(numbers) > 2 else 0.0
+    size = size or 0.01 * abs(numbers[0])
     return int(min(max(math.ceil(-math.log10(size)), 0), 6)) if size > 0 else 1

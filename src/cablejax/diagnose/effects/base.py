@@ -28,6 +28,7 @@ class Parameter:
         centre: prior median.
         scale: prior standard deviation, of the logarithm where `log` is set.
         log: the value is positive and known in its order of magnitude.
+        difference: step of forward differences, in prior standard deviations.
     """
 
     name: str
@@ -37,6 +38,7 @@ class Parameter:
     centre: float
     scale: float
     log: bool = False
+    difference: float = 0.03
 
     def __post_init__(self):
         if not (self.low <= self.centre <= self.high and self.scale > 0 and (not self.log or self.low > 0)):

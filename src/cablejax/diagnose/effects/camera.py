@@ -86,6 +86,8 @@ class KeypointBias(Effect):
         for index in range(1, context.config.n_keypoints - 1):
             for across, direction in ((0, tangent), (1, normal)):
                 projected = np.sum(context.residual[:, :, index] * direction[:, :, index], axis=-1)
+                if not np.isfinite(projected).any():
+                    continue
                 mean = float(np.nanmean(projected))
                 gains.append((mean**2, 2 * index + across, mean))
         return [(variant, (mean,)) for _, variant, mean in sorted(gains, reverse=True)[:3]]

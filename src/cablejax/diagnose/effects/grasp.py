@@ -23,7 +23,7 @@ class GripperSlip(Effect):
 
     name = "gripper_slip"
     parameters = (
-        Parameter("time_s", "s", 0.0, 300.0, 10.0, 8.0),
+        Parameter("time_s", "s", 0.0, 300.0, 10.0, 8.0, difference=0.01),
         Parameter("distance_m", "m", -0.2, 0.2, 0.0, 0.02),
     )
     null = (10.0, 0.0)

@@ -51,8 +51,8 @@ class FrictionPatch(Effect):
 
     name = "friction_patch"
     parameters = (
-        Parameter("x_m", "m", -3.0, 3.0, 0.4, 0.4),
-        Parameter("y_m", "m", -3.0, 3.0, 0.1, 0.4),
+        Parameter("x_m", "m", -3.0, 3.0, 0.4, 0.4, difference=0.01),
+        Parameter("y_m", "m", -3.0, 3.0, 0.1, 0.4, difference=0.01),
         Parameter("radius_m", "m", 0.02, 0.6, 0.12, 0.5, log=True),
         Parameter("ratio", "", 0.01, 50.0, 1.0, 1.2, log=True),
     )
@@ -129,8 +129,8 @@ class Obstacle(Effect):
 
     name = "obstacle"
     parameters = (
-        Parameter("x_m", "m", -3.0, 3.0, 0.4, 0.4),
-        Parameter("y_m", "m", -3.0, 3.0, 0.1, 0.4),
+        Parameter("x_m", "m", -3.0, 3.0, 0.4, 0.4, difference=0.003),
+        Parameter("y_m", "m", -3.0, 3.0, 0.1, 0.4, difference=0.003),
         Parameter("radius_m", "m", 0.005, 0.2, 0.03, 0.5, log=True),
     )
     null = (3.0, 3.0, 0.005)

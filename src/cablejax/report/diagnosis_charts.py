@@ -1,0 +1,201 @@
+"""Charts of a diagnosis: which effect causes the gap, how far it shrinks, and what to record next.
+
+Each takes a `Diagnosis` and gives a `matplotlib.figure.Figure` that belongs to nobody else, or None if there is nothing
+to draw.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import matplotlib
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from cablejax.diagnose.diagnosis import Diagnosis
+from cablejax.diagnose.safe_motions import INTERVAL, safe_motions
+from cablejax.report.diagnosis_style import STYLE, explained_label
+from cablejax.report.effect_words import effect_title
+from cablejax.report.style import LIGHT, gripper_outline
+from cablejax.simulate.config import CableConfig
+from cablejax.simulate.equilibrium import arch_angles, chain_nodes, find_equilibrium
+from cablejax.simulate.replay import config_of_log
+
+_MAX_RANKED = 8
+_MAX_FRAMES = 5
+_LIGHT_BLUE = "#56b4e9"
+_SPLIT = (
+    ("noise", "noise of the recording", LIGHT.faint),
+    ("named", "named effects", LIGHT.residual),
+    ("learnable", "learnable, unnamed", _LIGHT_BLUE),
+    ("unexplained", "unexplained", LIGHT.direct),
+)
+
+
+def ranking_figure(diagnosis: Diagnosis) -> Figure | None:
+    """Effects that were tried alone: how probable each is, and how much of the gap it takes away; None without any."""
+    ranked = [r for r in diagnosis.ranking if max(r.probability, r.held_out_shrinkage) >= 5e-3]
+    ranked = (ranked if len(ranked) >= 3 else list(diagnosis.ranking))[:_MAX_RANKED]
+    if not ranked:
+        return None
+    named = {effect.name for effect in diagnosis.effects}
+    alike = {name for group in diagnosis.equivalent for name in group} - named
+    colours = [LIGHT.residual if r.name in named else _LIGHT_BLUE if r.name in alike else LIGHT.target for r in ranked]
+    # few bars are not blown up
+    rows = max(len(ranked), 3)
+    y = rows - 1 - np.arange(len(ranked))
+    # were there no other causes than those of the library
+    chance = "probability [%]" if diagnosis.effects else "probability, were it in the library [%]"
+    with matplotlib.rc_context(STYLE):
+        figure = Figure(figsize=(10.0, 0.9 + 0.36 * rows), layout="constrained")
+        left, right = figure.subplots(1, 2, sharey=True)
+        for ax, values, title in (
+            (left, [100 * r.probability for r in ranked], chance),
+            (right, [100 * max(r.held_out_shrinkage, 0.0) for r in ranked], "share of the gap that it takes away [%]"),
+        ):
+            ax.barh(y, values, color=colours, height=0.62)
+            for row, value in zip(y, values, strict=True):
+                ax.text(value + 1.5, row, _percent(value), va="center", fontsize=10)
+            ax.set(xlim=(0, 112), ylim=(-0.6, rows - 0.4), xticks=[])
+            ax.spines[["bottom"]].set_visible(False)
+            ax.set_title(title)
+        left.set_yticks(y, [effect_title(r.name) for r in ranked])
+        left.tick_params(length=0, labelcolor=LIGHT.ink)
+        right.tick_params(length=0)
+    return figure
+
+
+def shrinkage_figure(diagnosis: Diagnosis) -> Figure:
+    """Error before and after by horizon over the noise floor, five seconds ahead beside a correction that knows no
+    cause, and what the error before consists of."""
+    gap = diagnosis.gap
+    explained = diagnosis.explained is not None
+    believed = LIGHT.target if diagnosis.verdict == "none" else LIGHT.direct
+    with matplotlib.rc_context(STYLE):
+        figure = Figure(figsize=(10.0, 4.0), layout="constrained")
+        grid = figure.add_gridspec(2, 2, height_ratios=[3.4, 0.5], width_ratios=[2.4, 1.0])
+        ax = figure.add_subplot(grid[0, 0] if gap.ahead_mm else grid[0, :])
+        horizons = sorted(gap.horizons_mm.items())
+        x = np.arange(len(horizons))
+        before, after = np.array([values for _, values in horizons]).reshape(-1, 2).T
+        wide = 0.38 if explained else 0.5
+        _bars(ax, x - (wide / 2 if explained else 0), before, wide, believed, "simulator as believed")
+        if explained:
+            _bars(ax, x + wide / 2, after, wide, LIGHT.residual, explained_label(diagnosis))
+        noise = f"noise of the recording, {gap.noise_floor_mm:.1f} mm"
+        ax.axhline(gap.noise_floor_mm, color=LIGHT.ink, lw=1.2, ls=(0, (5, 3)), label=noise)
+        longest = max((seconds for seconds, _ in horizons), default=0.0)
+        ax.set_xticks(x, [f"first {seconds:g} s" if seconds < longest else "all" for seconds, _ in horizons])
+        ax.set_ylim(0, 1.15 * max(before.max(initial=0), after.max(initial=0), gap.noise_floor_mm))
+        ax.set_ylabel("RMS error [mm]")
+        ax.tick_params(axis="x", length=0)
+        ax.set_title("Simulated from the start of each episode")
+        if gap.ahead_mm:
+            _ahead(figure.add_subplot(grid[0, 1]), gap.ahead_mm, believed, explained)
+        _split_bar(figure.add_subplot(grid[1, :]), gap.split)
+        figure.legend(*ax.get_legend_handles_labels(), loc="outside upper left", ncols=3)
+    return figure
+
+
+def motion_figure(diagnosis: Diagnosis) -> Figure | None:
+    """The motion to record next, and how well each motion of the library tells the explanations apart."""
+    following = diagnosis.next_motion
+    if following is None:
+        return None
+    config = config_of_log(diagnosis.log)
+    poses = safe_motions(config, diagnosis.log.gripper_pose[0, 0]).get(following.motion)
+    names = sorted(following.alternatives, key=lambda n: following.alternatives[n])
+    values = [following.alternatives[n] for n in names]
+    colours = [LIGHT.residual if n == following.motion else LIGHT.target for n in names]
+    with matplotlib.rc_context(STYLE):
+        figure = Figure(figsize=(10.0, 4.2), layout="constrained")
+        halves: Any = figure.subfigures(2, 1, height_ratios=[1.0, 1.15])
+        frames, bars = halves
+        if poses is not None:
+            _film(frames, config, poses)
+        ax = bars.subplots()
+        ax.barh(range(len(names)), values, color=colours, height=0.62)
+        for row, value in enumerate(values):
+            ax.text(value + 0.01 * max(values), row, f"{value:.2g}", va="center", fontsize=10)
+        ax.set_yticks(range(len(names)), [effect_title(n) for n in names])
+        ax.set(xticks=[], xlim=(0, 1.08 * max(values) or 1.0))
+        ax.spines[["bottom"]].set_visible(False)
+        ax.tick_params(length=0, labelcolor=LIGHT.ink)
+        what = "Difference of the two explanations" if following.separates else "Change of the prediction"
+        ax.set_title(f"{what} on each safe motion, in units of the noise")
+    return figure
+
+
+def _bars(ax: Axes, x: np.ndarray, heights: np.ndarray, width: float, colour: Any, label: str | None = None) -> None:
+    """Bars with their heights written on top."""
+    ax.bar(x, heights, width, color=colour, label=label)
+    for at, height in zip(x, heights, strict=True):
+        ax.text(at, height, f"{height:.1f}", ha="center", va="bottom", fontsize=9.5)
+
+
+def _ahead(ax: Axes, errors: dict[str, float], believed: str, explained: bool) -> None:
+    """Errors five seconds ahead of an observation; the online residual is a correction that knows no cause."""
+    kinds = {"nominal": ("as\nbelieved", believed), "ridge": ("online\nresidual", LIGHT.target)}
+    if explained:
+        kinds["named"] = ("cause\nadded", LIGHT.residual)
+    shown = [kind for kind in kinds if np.isfinite(errors.get(kind, np.nan))]
+    heights = np.array([errors[kind] for kind in shown])
+    _bars(ax, np.arange(len(shown)), heights, 0.6, [kinds[kind][1] for kind in shown])
+    ax.set_xticks(range(len(shown)), [kinds[kind][0] for kind in shown])
+    ax.set_ylim(0, 1.15 * heights.max(initial=0.1))
+    ax.tick_params(axis="x", length=0)
+    ax.set_title("5 s ahead, from an observation")
+
+
+def _split_bar(ax: Axes, split: dict[str, float]) -> None:
+    """What the squared error before consists of."""
+    begin = 0.0
+    for key, label, colour in _SPLIT:
+        share = split.get(key, 0.0)
+        if share >= 5e-3:
+            ax.barh(0, share, left=begin, color=colour, height=0.6, label=f"{label} {100 * share:.0f} %")
+            begin += share
+    ax.set(xlim=(0, 1), ylim=(-0.4, 0.4), yticks=[], xticks=[])
+    ax.spines[:].set_visible(False)
+    ax.set_title("The squared error before consists of")
+    if begin:
+        ax.legend(loc="upper left", bbox_to_anchor=(0.0, 0.05), ncols=4, fontsize=9.5, handlelength=1.0, borderpad=0.0)
+
+
+def _film(figure: Any, config: CableConfig, poses: np.ndarray) -> None:
+    """The motion as a few frames: where it begins, and where the grippers turn or stop."""
+    speed = np.diff(poses, axis=0).reshape(len(poses) - 1, -1)
+    turns = 1 + np.flatnonzero(np.abs(np.diff(speed, axis=0)).max(axis=1) > 1e-3)
+    moving = np.flatnonzero(np.abs(speed).max(axis=1) > 1e-9)
+    stops = sorted({int(t) for t in turns if np.abs(speed[t - 1]).max() > 1e-9} | {int(m) + 1 for m in moving[-1:]})
+    apart = [0]
+    for sample in stops:
+        if np.abs(poses[sample] - poses[apart[-1]]).max() > 0.02:
+            apart.append(sample)
+    chosen = apart[:_MAX_FRAMES]
+    nodes, angles = [], arch_angles(config, poses[0])
+    for sample in chosen:
+        try:
+            angles = find_equilibrium(config, poses[sample], angles).angles
+            nodes.append(np.concatenate([chain_nodes(config, poses[sample], angles), poses[sample, 1:, :2]]))
+        except ValueError:
+            # a picture without its cable is better than none
+            nodes.append(np.full((1, 2), np.nan))
+    every = np.concatenate([poses[chosen, :, :2].reshape(-1, 2), *nodes])
+    low, high = np.nanmin(every, axis=0) - 0.1, np.nanmax(every, axis=0) + 0.1
+    for ax, sample, line in zip(figure.subplots(1, len(chosen), squeeze=False)[0], chosen, nodes, strict=True):
+        for gripper in range(2):
+            ax.plot(*poses[:, gripper, :2].T, color=LIGHT.faint, lw=1.5)
+            for polygon in gripper_outline(poses[sample, gripper], gripper):
+                ax.fill(*polygon.T, color=LIGHT.gripper, alpha=0.85, lw=0)
+        ax.plot(*line.T, color=LIGHT.residual, lw=2.2)
+        ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal", xticks=[], yticks=[])
+        ax.spines[:].set_visible(False)
+        ax.set_title(f"{INTERVAL * sample:.0f} s", fontsize=10)
+
+
+def _percent(value: float) -> str:
+    if value >= 99.5:
+        return "> 99"
+    return f"{value:.0f}" if value >= 0.5 or value == 0 else "< 1"

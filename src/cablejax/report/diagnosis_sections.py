@@ -1,0 +1,204 @@
+"""The sections of a diagnosis' page, in HTML: which effect, how far, what next, and everything in detail."""
+
+from __future__ import annotations
+
+import html
+import json
+from collections.abc import Sequence
+
+from cablejax.diagnose.diagnosis import Diagnosis
+from cablejax.report.effect_words import (
+    EFFECTS,
+    MOTIONS,
+    between,
+    effect_place,
+    effect_title,
+    listed,
+    millimetres,
+    parameter_title,
+    quantity,
+    share,
+)
+
+SEPARABLE = 0.3
+"""A motion on which two explanations differ by less than this many noise units does not tell them apart."""
+
+_RULES = {
+    "lowest_cost": "best fit to the log itself",
+    "bic": "best fit with Schwarz's penalty",
+    "sparse_regression": "best template without a fit",
+}
+
+
+def which_section(diagnosis: Diagnosis, ranking: str) -> str:
+    parts = []
+    if diagnosis.verdict == "none":
+        parts.append("<p>There is no gap to explain, so no effect is named.</p>")
+    for effect in diagnosis.effects:
+        rows = "".join(
+            f"<tr><td>{html.escape(parameter_title(name))}</td>"
+            f"<td>{html.escape(quantity(estimate.value, estimate.unit, estimate.ci90))}</td></tr>"
+            for name, estimate in effect.parameters.items()
+        )
+        meaning = EFFECTS.get(effect.name, "an effect of your own")
+        where = effect_place(effect)
+        parts.append(
+            f"<p><b>{html.escape(effect_title(effect.name).capitalize())}</b>: {html.escape(meaning)}"
+            f"{', ' + html.escape(where) if where else ''}. Probability {share(effect.probability)}.</p>"
+            f'<div class="scroll"><table><thead><tr><th>parameter</th><th>estimate (90 % interval)</th></tr></thead>'
+            f"<tbody>{rows}</tbody></table></div>"
+        )
+    for group in diagnosis.equivalent:
+        names = listed([f"<b>{html.escape(effect_title(name))}</b>" for name in group])
+        parts.append(
+            f"<p>This log cannot tell {names} apart: each explains the gap as well, within what noise and simulator "
+            "allow.</p>"
+        )
+    if diagnosis.verdict in ("unknown", "named+unknown"):
+        left = millimetres(_left(diagnosis))
+        parts.append(
+            f"<p>What is left after the best explanation, {left} above the noise, has none in the library.</p>"
+        )
+    if ranking:
+        note = "Every effect alone, the most probable first."
+        if len(diagnosis.effects) > 1:
+            note += " The cause named above is a set; alone, none of its members is enough."
+        parts.append(f"<figure>{ranking}<figcaption>{note}</figcaption></figure>")
+    return "\n".join(parts)
+
+
+def _left(diagnosis: Diagnosis) -> float:
+    gap = diagnosis.gap
+    return max(gap.after_rmse_mm**2 - gap.noise_floor_mm**2, 0.0) ** 0.5
+
+
+def far_section(diagnosis: Diagnosis, picture: str) -> str:
+    gap = diagnosis.gap
+    added = listed([effect_title(e.name) for e in diagnosis.effects]) or "the best explanation"
+    if gap.shrinkage is None:
+        text = "There is no gap above the noise that could shrink."
+    elif diagnosis.explained is None:
+        text = "Nothing was put into the simulator, so nothing shrinks."
+    else:
+        held = [str(e + 1) for e in gap.held_out_episodes]
+        word = "episode" if len(held) == 1 else "episodes"
+        seen = (
+            f"on {word} {listed(held)}, each left out of the fit that predicts it"
+            if held
+            else "on the very episode that was fitted: there was no other to check on"
+        )
+        interval = ""
+        if gap.shrinkage_ci90 is not None:
+            interval = f" (90 % interval over episodes: {between(*gap.shrinkage_ci90)})"
+        text = (
+            f"With {added} in the simulator, {share(gap.shrinkage)} of the squared gap above the noise goes "
+            f"away{interval}, {seen}. The error falls from {millimetres(gap.before_rmse_mm)} to "
+            f"{millimetres(gap.after_rmse_mm)}; nothing can go below the noise of {millimetres(gap.noise_floor_mm)}."
+        )
+    if gap.ahead_mm is not None:
+        ahead = {name: millimetres(value) for name, value in gap.ahead_mm.items()}
+        text += (
+            f" Five seconds ahead of an observation, the simulator as believed is off by {ahead['nominal']}; "
+            f"with an online ridge residual, which knows no cause, by {ahead['ridge']}"
+        )
+        text += f"; with {added} and no residual by {ahead['named']}." if diagnosis.explained is not None else "."
+    caption = "Root mean square per coordinate. A prediction from an observation inherits its noise."
+    return f"<p>{html.escape(text)}</p>\n<figure>{picture}<figcaption>{caption}</figcaption></figure>"
+
+
+def next_section(diagnosis: Diagnosis, picture: str) -> str:
+    following = diagnosis.next_motion
+    if following is None:
+        settled = diagnosis.verdict in ("none", "named")
+        words = "There is nothing left to tell apart." if settled else "No motion of the library would help."
+        return f"<p>{words}</p>"
+    motion = f"<b>{html.escape(effect_title(following.motion))}</b>"
+    instruction = html.escape(MOTIONS.get(following.motion, ""))
+    if following.separates:
+        one, other = (f"<b>{html.escape(_explanation(name))}</b>" for name in following.separates)
+        if following.separation < SEPARABLE:
+            text = (
+                f"No safe motion tells {one} from {other}, the two most probable explanations: on the best, {motion}, "
+                f"they differ by {following.separation:.2g} of the noise. Measure one of the two by other means."
+            )
+        else:
+            text = (
+                f"Record {motion}. {instruction} It tells {one} from {other}, the two most probable explanations: "
+                f"there they differ by {following.separation:.2g} times the noise."
+            )
+    else:
+        text = f"Record {motion}: it sharpens the parameters most. {instruction}"
+    return f"<p>{text}</p>\n<figure>{picture}<figcaption>Top: the motion, seen from above.</figcaption></figure>"
+
+
+def _explanation(names: str) -> str:
+    return listed([effect_title(name) for name in names.split(" + ")])
+
+
+def limits_section(diagnosis: Diagnosis) -> str:
+    if not diagnosis.caveats:
+        return ""
+    rows = "".join(f"<li>{html.escape(caveat)}</li>" for caveat in diagnosis.caveats)
+    return f'<h2>What limits this verdict</h2>\n<ul class="limits">{rows}</ul>'
+
+
+def details_section(diagnosis: Diagnosis) -> str:
+    where = diagnosis.where
+    tried = _table(
+        ("effect", "what it is", "probability", "share taken away", "left"),
+        [
+            (
+                effect_title(r.name),
+                EFFECTS.get(r.name, ""),
+                share(r.probability),
+                share(r.held_out_shrinkage),
+                millimetres(r.leftover_mm),
+            )
+            for r in diagnosis.ranking
+        ],
+    )
+    regimes = _table(
+        ("regime", "gap"),
+        [(name, millimetres(size)) for name, size in where.regimes.items()]
+        + [(f"within {seconds:g} s of the start", millimetres(size)) for seconds, size in where.horizons_mm.items()],
+    )
+    contrasts = _table(
+        ("comparison", "ratio of the gaps", "p-value, corrected"),
+        [(name, f"{ratio:.2f}", f"{p:.3f}") for name, (ratio, p) in where.contrasts.items()],
+    )
+    frames = _table(
+        ("an error that is constant in", "would explain"),
+        [(name, share(part)) for name, part in where.frames.items()],
+    )
+    rules = _table(
+        ("rule", "would have named"),
+        [(_RULES.get(rule, rule), effect_title(name)) for rule, name in diagnosis.baselines.items()],
+    )
+    noise = ", ".join(f"{v:.2f}" for v in diagnosis.noise_mm)
+    lags = ", ".join(f"{v:.2f}" for v in diagnosis.noise_correlation)
+    facts = {
+        "noise of each keypoint [mm]": noise,
+        "its correlation at 1, 2, ... samples": lags or "n/a",
+        "source of the log": str(diagnosis.log.meta.get("source", "")),
+        "run time": f"{diagnosis.seconds:.0f} s",
+        **{
+            name: value if isinstance(value, str) else json.dumps(value, default=str)
+            for name, value in diagnosis.settings.items()
+        },
+    }
+    rows = "".join(f"<dt>{html.escape(k)}</dt><dd>{html.escape(v)}</dd>" for k, v in facts.items())
+    return (
+        '<div class="details">'
+        + (f"<h3>All effects tried alone</h3>{tried}" if diagnosis.ranking else "")
+        + f"<h3>Gap above the noise by regime</h3>{regimes}"
+        + (f"<h3>Comparisons, tested over episodes</h3>{contrasts}" if where.contrasts else "")
+        + (f"<h3>Frames</h3>{frames}" if where.frames else "")
+        + (f"<h3>What simpler rules would have named</h3>{rules}" if diagnosis.baselines else "")
+        + f"<h3>Record</h3><dl>{rows}</dl></div>"
+    )
+
+
+def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    top = "".join(f"<th>{html.escape(cell)}</th>" for cell in head)
+    body = "".join("<tr>" + "".join(f"<td>{html.escape(cell)}</td>" for cell in row) + "</tr>" for row in rows)
+    return f'<div class="scroll"><table><thead><tr>{top}</tr></thead><tbody>{body}</tbody></table></div>'
