@@ -56,14 +56,14 @@ def _nearest(feasible: AbstractSet, flat: Float[Array, " P"]) -> tuple[Float[Arr
     """The nearest point and the multipliers of its bounds."""
 
     def search():
-        identity = jnp.eye(flat.size, dtype=flat.dtype)
-        start = feasible.restore(flat)
-        found = minimise_quadratic(feasible, start, start - flat, identity, _ITERATIONS)
-        return feasible.restore(start + found.step), found.multipliers
+        still = jnp.zeros_like(flat)
+        found = minimise_quadratic(feasible, flat, still, jnp.eye(flat.size, dtype=flat.dtype), _ITERATIONS)
+        return flat + found.step, found.multipliers
 
     def leave():
-        return feasible.restore(flat), jnp.zeros_like(feasible.constraints(flat))
+        return flat, jnp.zeros_like(feasible.constraints(flat))
 
     # NaN counts as inside: there is nothing to search.
     outside = feasible.violation(flat) > 0.0
-    return jax.lax.cond(outside, search, leave)
+    point, multipliers = jax.lax.cond(outside, search, leave)
+    return feasible.restore(point), multipliers

@@ -78,7 +78,7 @@ def minimise_quadratic(
     )
     # A clip that moved its argument has a multiplier: the bounds that hold something back.
     active = feasible.gauge(z + dual) > 0.0
-    exact, multipliers = _newton(feasible, flat, gradient, hessian, step, active)
+    exact, multipliers = _newton(feasible, flat, gradient, hessian, step, active, lift)
     slack = jnp.sqrt(jnp.finfo(flat.dtype).eps) * jnp.abs(gradient).max()
     rounding = tolerance * (1.0 + jnp.abs(exact).max())
     right = jnp.isfinite(exact).all() & (multipliers >= -slack).all() & (feasible.violation(flat + exact) <= rounding)
@@ -110,24 +110,30 @@ def stationarity_matrix(
     multipliers: Float[Array, " K"],
     hessian: Float[Array, "P P"],
     active: Bool[Array, " K"],
+    lift: Float[Array, "M P"] | None = None,
 ) -> Float[Array, "P+K P+K"]:
-    """The derivative of `stationarity` by (point, multipliers), kept regular where active normals depend."""
+    """The derivative of `stationarity` by (point, multipliers), kept regular where active normals depend.
+
+    `lift` is the matrix of the set's affine map, if it is known already.
+    """
+    lift = jax.jacfwd(feasible.lift)(jnp.zeros_like(point)) if lift is None else lift
     used = jnp.where(active, multipliers, 0.0)
-    normals = jnp.where(active[:, None], jax.jacfwd(feasible.constraints)(point), 0.0)
-    bend = jax.jacfwd(lambda p: jax.vjp(feasible.constraints, p)[1](used)[0])(point)
+    place = feasible.lift(point)
+    normals = jnp.where(active[:, None], jax.jacfwd(feasible.gauge)(place) @ lift, 0.0)
+    bend = lift.T @ jax.jacfwd(lambda z: jax.vjp(feasible.gauge, z)[1](used)[0])(place) @ lift
     shift = jnp.finfo(point.dtype).eps * (1.0 + jnp.abs(hessian).max())
     lower = jnp.where(active, -shift, 1.0)
     return jnp.block([[hessian + bend, normals.T], [normals, jnp.diag(lower)]])
 
 
-def _newton(feasible, flat, gradient, hessian, step, active):
+def _newton(feasible, flat, gradient, hessian, step, active, lift):
     """Newton's method for the minimiser with given active bounds, from the splitting's step."""
     size = flat.size
 
     def refine(_, carry):
         step, multipliers = carry
         error = stationarity(feasible, flat + step, multipliers, gradient + hessian @ step, active)
-        matrix = stationarity_matrix(feasible, flat + step, multipliers, hessian, active)
+        matrix = stationarity_matrix(feasible, flat + step, multipliers, hessian, active, lift)
         change = jnp.linalg.solve(matrix, -error)
         return step + change[:size], multipliers + change[size:]
 

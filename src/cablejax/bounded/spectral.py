@@ -18,6 +18,7 @@ class _ArcState(eqx.Module):
     grad: Array
     length: Scalar
     first: Bool[Array, ""]
+    projected_gradient: Array
 
 
 class ProjectionArc(optx.AbstractDescent):
@@ -37,7 +38,7 @@ class ProjectionArc(optx.AbstractDescent):
 
     def init(self, y, f_info_struct):
         del f_info_struct
-        return _ArcState(y, jnp.zeros_like(y), jnp.asarray(self.initial_length, y.dtype), jnp.array(True))
+        return _ArcState(y, jnp.zeros_like(y), jnp.asarray(self.initial_length, y.dtype), jnp.array(True), y)
 
     def query(self, y, f_info, state):
         moved, bent = y - state.y, f_info.grad - state.grad
@@ -46,15 +47,14 @@ class ProjectionArc(optx.AbstractDescent):
         spectral = jnp.sum(moved**2) / jnp.where(curved, curvature, 1.0)
         # Along a direction of no or negative curvature the model gives no length: try a longer one than before.
         length = jnp.clip(jnp.where(curved, spectral, 4.0 * state.length), self.shortest, self.longest)
-        return _ArcState(y, f_info.grad, jnp.where(state.first, state.length, length), jnp.array(False))
+        length = jnp.where(state.first, state.length, length)
+        # 0 exactly at a stationary point
+        projected_gradient = self.feasible.project(y - f_info.grad) - y
+        return _ArcState(y, f_info.grad, length, jnp.array(False), projected_gradient)
 
     def step(self, step_size, state):
         target = state.y - step_size * state.length * state.grad
         return self.feasible.project(target) - state.y, optx.RESULTS.successful
-
-    def projected_gradient(self, state: _ArcState) -> Array:
-        """`P(y - g) - y`: 0 exactly at a stationary point."""
-        return self.feasible.project(state.y - state.grad) - state.y
 
 
 class _MemoryState(eqx.Module):
@@ -141,7 +141,7 @@ class SpectralProjectedGradient(optx.AbstractGradientDescent):
     def terminate(self, fn, y, args, options, state, tags) -> tuple[Bool[Array, ""], optx.RESULTS]:
         del fn, args, options, tags
         queried = ~state.first_step
-        optimality = self.measure(self.descent.projected_gradient(state.descent_state))
+        optimality = self.measure(state.descent_state.projected_gradient)
         broken = queried & ~jnp.isfinite(state.f_info.f)
         done = queried & (optimality <= self.atol + self.rtol * self.measure(y))
         result = optx.RESULTS.where(broken, optx.RESULTS.nonfinite, state.result)
@@ -149,4 +149,4 @@ class SpectralProjectedGradient(optx.AbstractGradientDescent):
 
     def postprocess(self, fn, y, aux, args, options, state, tags, result) -> tuple[Any, Any, dict[str, Any]]:
         del fn, args, options, tags, result
-        return y, aux, {"optimality": self.measure(self.descent.projected_gradient(state.descent_state))}
+        return y, aux, {"optimality": self.measure(state.descent_state.projected_gradient)}

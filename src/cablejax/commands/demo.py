@@ -6,7 +6,7 @@ import dataclasses
 import pathlib
 from typing import ClassVar, Literal
 
-from cablejax.commands.options import Command, text_table
+from cablejax.commands.options import Command, say, text_table
 
 STIFFNESS_RATIO = 2.0
 """How much stiffer the plant's cable is than the one that the model was trained on."""
@@ -17,7 +17,8 @@ class Demo(Command):
     """Shape a cable into a U, an S and a Z with the released model, and make a page about it.
 
     The cable is twice as stiff as the one the model was trained on and rubs on the table by another law. Each shape is
-    made with and without the online residual. Writes summary.json, log.npz, report.html and demo.gif."""
+    made with and without the online residual. Writes summary.json, log.npz, report.html and demo.gif, and ends by
+    diagnosing its own run: diagnosis/report.html says what the simulator lacks."""
 
     resume_hint: ClassVar[str] = "Run the same command again: finished runs are kept and not repeated."
 
@@ -71,4 +72,24 @@ class Demo(Command):
             },
         )
         table = text_table(*table_of(summary))
-        return summary, f"{table}\n\n{summary['total_s']:.0f} s. Look at {self.out / 'report.html'}"
+        text = f"{table}\n\n{summary['total_s']:.0f} s. Look at {self.out / 'report.html'}"
+        gap = self._diagnosed()
+        return {
+            **summary,
+            "diagnosis": gap,
+        }, text if gap is None else f"{text}\nThe gap: {gap['sentence']}\n{gap['report']}"
+
+    def _diagnosed(self) -> dict[str, str] | None:
+        """What the run tells about the gap between the plant and the simulator; None where it is too short to."""
+        from cablejax.commands.diagnose import diagnose_and_report
+        from cablejax.diagnose import DiagnosisError
+        from cablejax.gaplog import read_gap_log
+
+        folder = self.out / "diagnosis"
+        try:
+            folder.mkdir(exist_ok=True)
+            result, page = diagnose_and_report(read_gap_log(self.out / "log.npz"), folder)
+        except DiagnosisError as error:
+            say(f"The gap was not diagnosed: {error}")
+            return None
+        return {"verdict": result.verdict, "sentence": result.sentence, "report": str(page)}

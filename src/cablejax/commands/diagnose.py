@@ -4,11 +4,16 @@ from __future__ import annotations
 
 import dataclasses
 import pathlib
-from typing import Annotated
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
 from cablejax.commands.options import Command, UsageError, output_folder, say
+
+if TYPE_CHECKING:
+    from cablejax.diagnose import Diagnosis, Effect
+    from cablejax.types import GapLog
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -34,9 +39,8 @@ class Diagnose(Command):
     """Replace a report that is there."""
 
     def execute(self):
-        from cablejax.diagnose import LIBRARY, diagnose, verdict_json, write_verdict
+        from cablejax.diagnose import LIBRARY, verdict_json
         from cablejax.gaplog import read_gap_log
-        from cablejax.report.diagnosis_page import write_diagnosis_page
 
         known = {effect.name: effect for effect in LIBRARY}
         for name in self.only:
@@ -45,13 +49,31 @@ class Diagnose(Command):
         log = read_gap_log(self.log)
         commissioning = [read_gap_log(path) for path in self.commissioning]
         folder = output_folder(self.out, overwrite=self.overwrite)
-        result = diagnose(
-            log,
-            effects=[known[name] for name in self.only] or LIBRARY,
-            commissioning=commissioning,
-            progress=lambda text: say(f"{text} ..."),
-        )
-        write_verdict(folder / "verdict.json", result)
-        page = write_diagnosis_page(result, folder)
-        summary = verdict_json(result)
-        return {**summary, "report": str(page)}, f"{result.verdict}: {result.sentence}\n{page}"
+        effects = [known[name] for name in self.only] or LIBRARY
+        result, page = diagnose_and_report(log, folder, effects=effects, commissioning=commissioning)
+        return {**verdict_json(result), "report": str(page)}, f"{result.verdict}: {result.sentence}\n{page}"
+
+
+def diagnose_and_report(
+    log: GapLog,
+    folder: pathlib.Path,
+    *,
+    effects: Sequence[Effect] | None = None,
+    commissioning: Sequence[GapLog] = (),
+) -> tuple[Diagnosis, pathlib.Path]:
+    """Diagnoses a log, tells how it goes, and writes verdict.json, report.html and the figures into an existing folder.
+
+    Returns:
+        The diagnosis and its page.
+    """
+    from cablejax.diagnose import LIBRARY, diagnose, write_verdict
+    from cablejax.report.diagnosis_page import write_diagnosis_page
+
+    result = diagnose(
+        log,
+        effects=LIBRARY if effects is None else effects,
+        commissioning=commissioning,
+        progress=lambda text: say(f"{text} ..."),
+    )
+    write_verdict(folder / "verdict.json", result)
+    return result, write_diagnosis_page(result, folder)

@@ -44,6 +44,7 @@ class Calibration:
         adequate: an explanation that leaves less than this share of the gap, root mean square, is complete.
         telling: below this share of explained squared gap nothing is named.
         set_odds: an effect belongs to the reported set if its odds against the best are at least these.
+        widening: of the intervals of parameters, for a law that is not quite the real one shifts them too.
         max_terms: effects in one explanation at most.
     """
 
@@ -57,6 +58,7 @@ class Calibration:
     adequate: float = 0.25
     telling: float = 0.6
     set_odds: float = 0.08
+    widening: float = 1.25
     max_terms: int = 3
 
     def temper(self, gap: Float[np.ndarray, "E"], noise: float) -> Float[np.ndarray, "E"]:

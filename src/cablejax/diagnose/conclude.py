@@ -65,7 +65,7 @@ def conclude(found: Search, evidence: Evidence, calibration: Calibration) -> Con
         alike = sorted((n for n in odds if odds[n] >= calibration.set_odds * odds[name]), key=lambda n: -odds[n])
         if len(alike) > 1:
             equivalent.append(tuple(alike))
-        effects.append(_named(name, best, odds[name] / total, evidence))
+        effects.append(_named(name, best, odds[name] / total, evidence, calibration.widening))
     complete = left <= max(calibration.adequate * gap, smallest)
     if not effects or (explained < calibration.telling and not complete):
         return Conclusion("unknown", best, (), (), ranking, explained)
@@ -122,11 +122,11 @@ def _ranking(found: Search, evidence: Evidence, calibration: Calibration) -> tup
     return tuple(sorted(result, key=lambda r: -r.probability))
 
 
-def _named(name: str, fit: Fit, probability: float, evidence: Evidence) -> NamedEffect:
+def _named(name: str, fit: Fit, probability: float, evidence: Evidence, widening: float) -> NamedEffect:
     """One effect of a fit, with intervals from Laplace's approximation in the prior's coordinates."""
     config = evidence.playback.config
     rng = np.random.default_rng(0)
-    covariance = np.linalg.inv(fit.precision(evidence))
+    covariance = widening**2 * np.linalg.inv(fit.precision(evidence))
     draws = rng.multivariate_normal(fit.candidate.z, covariance, size=_DRAWS, method="cholesky")
     draws = np.clip(draws, *fit.candidate.bounds.T)
     parts: list[dict[str, ParameterEstimate]] = []

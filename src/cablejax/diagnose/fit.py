@@ -22,6 +22,8 @@ from cablejax.simulate.config import CableConfig
 _FIRST_DAMPING = 1e-2
 # Largest change of one coordinate in one step, in prior standard deviations.
 _LARGEST_STEP = 1.5
+# Beyond this, the linear picture of a fit without one episode is not believed.
+_LARGEST_HELD_OUT_STEP = 0.5
 _BREAKDOWN = 1e12
 
 
@@ -172,21 +174,21 @@ class Fit:
         return np.einsum("epq,e->pq", self.curvature, evidence.weight(self.sse)) + np.eye(len(self.candidate.z))
 
     def held_out_sse(self, evidence: Evidence) -> Float[np.ndarray, "E"]:
-        """r'r of every episode if it had been left out of the fit, by one Gauss-Newton step without it.
+        """r'r of every episode if it had been left out of the fit.
 
-        A single episode cannot be left out: it pays twice the parameters' effective number instead, as in Akaike's
-        criterion.
+        By one Gauss-Newton step without the episode. Where that leads too far to be believed, because this episode
+        alone shows the effect, or because there is no other, the episode pays twice the number of parameters that it
+        decides on instead, as in Akaike's criterion.
         """
         precision, weight = self.precision(evidence), evidence.weight(self.sse)
-        if len(self.sse) == 1:
-            effective = np.trace(np.linalg.solve(precision, weight[0] * self.curvature[0]))
-            return self.sse + 2.0 * effective * evidence.temper
         result = np.empty_like(self.sse)
         for e in range(len(self.sse)):
-            rest = precision - weight[e] * self.curvature[e]
-            step = np.linalg.solve(rest, weight[e] * self.gradient[e])
-            step = np.clip(step, -_LARGEST_STEP, _LARGEST_STEP)
-            result[e] = self.sse[e] + 2 * self.gradient[e] @ step + step @ self.curvature[e] @ step
+            informed = weight[e] * self.curvature[e]
+            step = np.linalg.solve(precision - informed, weight[e] * self.gradient[e])
+            if np.abs(step).max(initial=0.0) <= _LARGEST_HELD_OUT_STEP:
+                result[e] = self.sse[e] + 2 * self.gradient[e] @ step + step @ self.curvature[e] @ step
+            else:
+                result[e] = self.sse[e] + 2.0 * np.trace(np.linalg.solve(precision, informed)) / weight[e]
         return np.maximum(result, self.sse)
 
 

@@ -22,7 +22,7 @@ from cablejax.diagnose.noise import SMALLEST, NoiseFloor, noise_floor
 from cablejax.diagnose.playback import Playback
 from cablejax.diagnose.recording import DiagnosisError, Recording, prepare
 from cablejax.diagnose.reference import predicted_ahead
-from cablejax.diagnose.search import Search, search
+from cablejax.diagnose.search import Search, search, without_one
 from cablejax.diagnose.where import localise
 from cablejax.simulate.config import CableConfig
 from cablejax.simulate.replay import config_of_log
@@ -34,6 +34,9 @@ FINE_LINKS = 65
 """Links of the nominal cable that the log is compared with."""
 _HORIZONS = (1.0, 2.0, 5.0, 10.0)
 _FOLD_STEPS = 2
+_FOLDS = 6
+# Nats that an effect must be worth on the other episodes to be used on one that no fit has seen.
+_WORTH = 2.0
 
 
 def _silent(text: str) -> None:
@@ -264,15 +267,22 @@ def _with_arms(conclusion: Conclusion, arms: Actuation) -> Conclusion:
 
 
 def _explained(case: _Case, evidence: Evidence, best: Fit):
-    """Keypoints of every episode from a fit that has not seen it, and which episodes could be held out."""
+    """Keypoints of every episode from a fit that has not seen it, and which episodes could be held out.
+
+    An effect that the other episodes do not show is left out: nothing would be known of it before this episode.
+    """
     n_episodes = len(case.recording.length)
     if not best.candidate.terms or n_episodes == 1:
         return case.simulate(best.candidate), tuple(range(n_episodes)) if n_episodes > 1 else ()
-    groups = [list(g) for g in np.array_split(np.arange(n_episodes), min(n_episodes, 6))]
+    groups = [list(g) for g in np.array_split(np.arange(n_episodes), min(n_episodes, _FOLDS))]
     result = np.empty_like(case.nominal)
     for group in groups:
         rest = evidence.restricted([e for e in range(n_episodes) if e not in group])
-        fit = improve(rest, evaluate(rest, [best.candidate]), max_iterations=_FOLD_STEPS)[0]
+        fits = evaluate(rest, [best.candidate, *without_one(best.candidate)])
+        fit = improve(rest, fits[:1], max_iterations=_FOLD_STEPS)[0]
+        simpler = min(fits[1:], key=lambda other: other.cost(rest))
+        if simpler.cost(rest) < fits[0].cost(rest) + _WORTH:
+            fit = simpler
         result[group] = case.simulate(fit.candidate, group)
     return result, tuple(range(n_episodes))
 

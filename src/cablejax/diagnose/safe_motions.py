@@ -102,7 +102,6 @@ def safe_motions(
         "translation": [(start, 1.0, 1.0), (moved, 0.6, _HOLD), (start, 0.6, _HOLD)],
         "ramp_hold": [
             (start, 1.0, 1.0),
-            (at(_FAR), 1.0, 1.0),
             (at(_NEAR), 1.0, _HOLD),
             (at(_FAR), 1.0, 1.0),
             (at(_NEAR), _SLOW, _HOLD),

@@ -78,7 +78,7 @@ def search(
         bases = fits[:1]
     if len(effect_names(fits[0].candidate)) > 1:
         progress("exchanging the effects of the best set one by one")
-        exchanged = [fit for rest in _without_one(fits[0]) for fit in _grown(evidence, rest, effects, context)]
+        exchanged = [fit for rest in without_one(fits[0].candidate) for fit in _grown(evidence, rest, effects, context)]
         fits = _best([*fits, *exchanged], evidence, calibration)
     return Search(tuple(fits), log_scores(fits, evidence, calibration), screened)
 
@@ -91,14 +91,12 @@ def _promising(starts: Sequence[Candidate], screened: dict[str, float]) -> list[
     return [start for start in starts if start.names[-1] in kept]
 
 
-def _without_one(fit: Fit) -> list[Candidate]:
+def without_one(explanation: Candidate) -> list[Candidate]:
     """The explanation without each of its effects."""
     result = []
-    for name in effect_names(fit.candidate):
-        kept = [
-            (t, z) for t, z in zip(fit.candidate.terms, _by_term(fit.candidate), strict=True) if t.effect.name != name
-        ]
-        result.append(Candidate(tuple(t for t, _ in kept), np.concatenate([z for _, z in kept])))
+    for name in effect_names(explanation):
+        kept = [(t, z) for t, z in zip(explanation.terms, _by_term(explanation), strict=True) if t.effect.name != name]
+        result.append(Candidate(tuple(t for t, _ in kept), np.concatenate([np.zeros(0), *(z for _, z in kept)])))
     return result
 
 
@@ -126,6 +124,3 @@ def _best(fits: Sequence[Fit], evidence: Evidence, calibration: Calibration) -> 
     """The best fit of every set of effects, best first."""
     scores = log_scores(fits, evidence, calibration)
     return [fits[i] for i in best_by_effects(fits, scores).values()]
-
-
-__all__ = ["Search", "effect_names", "search"]

@@ -123,8 +123,9 @@ class FeasibleSet(AbstractSet):
             separation, position = carry
             step, corner = given
             step = project_ball(step, radius)
-            for _ in range(_ROUNDS):
-                step = project_ball(_into_annulus(separation, step, lower, upper), radius)
+            step = jax.lax.fori_loop(
+                0, _ROUNDS, lambda _, u: project_ball(_into_annulus(separation, u, lower, upper), radius), step
+            )
             if self.box is not None:
                 step = jnp.clip(step, *self.box)
             if self.workspace is not None:

@@ -71,10 +71,10 @@ def guarded_plan(problem: ShapingProblem, solver: Solver, guess: Float[Array, "T
     harmless = jax.tree.map(lambda leaf: jnp.where(possible, leaf, 0.0 * leaf), feasible)
     harmless = jax.tree.map(lambda leaf: jnp.where(jnp.isfinite(leaf), leaf, 0.0), harmless)
     problem = dataclasses.replace(problem, feasible=harmless)
-    start = harmless.project(jnp.where(jnp.isfinite(guess), guess, 0.0))
+    start = jnp.where(jnp.isfinite(guess), guess, 0.0)
     plan = solver(problem, start)
     kept = jnp.isfinite(plan.motion).all() & possible
-    motion = jnp.where(kept, plan.motion, jnp.where(possible, start, 0.0))
+    motion = jnp.where(kept, plan.motion, jnp.where(possible, harmless.restore(start), 0.0))
     outcome = jnp.where(harmless.starts_outside() & (plan.outcome <= Outcome.STEP_LIMIT), Outcome.OUTSIDE, plan.outcome)
     outcome = jnp.where(feasible.radius > 0, outcome, Outcome.NO_ROOM)
     outcome = jnp.where(jnp.isfinite(plan.motion).all(), outcome, Outcome.NONFINITE)

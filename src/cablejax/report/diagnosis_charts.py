@@ -92,7 +92,8 @@ def shrinkage_figure(diagnosis: Diagnosis) -> Figure:
         ax.tick_params(axis="x", length=0)
         ax.set_title("Simulated from the start of each episode")
         if gap.ahead_mm:
-            _ahead(figure.add_subplot(grid[0, 1]), gap.ahead_mm, believed, explained)
+            label = "cause\nadded" if diagnosis.effects else "best found\nadded"
+            _ahead(figure.add_subplot(grid[0, 1]), gap.ahead_mm, believed, label if explained else None)
         _split_bar(figure.add_subplot(grid[1, :]), gap.split)
         figure.legend(*ax.get_legend_handles_labels(), loc="outside upper left", ncols=3)
     return figure
@@ -134,11 +135,11 @@ def _bars(ax: Axes, x: np.ndarray, heights: np.ndarray, width: float, colour: An
         ax.text(at, height, f"{height:.1f}", ha="center", va="bottom", fontsize=9.5)
 
 
-def _ahead(ax: Axes, errors: dict[str, float], believed: str, explained: bool) -> None:
+def _ahead(ax: Axes, errors: dict[str, float], believed: str, label: str | None) -> None:
     """Errors five seconds ahead of an observation; the online residual is a correction that knows no cause."""
     kinds = {"nominal": ("as\nbelieved", believed), "ridge": ("online\nresidual", LIGHT.target)}
-    if explained:
-        kinds["named"] = ("cause\nadded", LIGHT.residual)
+    if label is not None:
+        kinds["named"] = (label, LIGHT.residual)
     shown = [kind for kind in kinds if np.isfinite(errors.get(kind, np.nan))]
     heights = np.array([errors[kind] for kind in shown])
     _bars(ax, np.arange(len(shown)), heights, 0.6, [kinds[kind][1] for kind in shown])

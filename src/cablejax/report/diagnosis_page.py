@@ -8,6 +8,9 @@ import os
 import pathlib
 import string
 
+import numpy as np
+
+from cablejax.diagnose.belief import Calibration
 from cablejax.diagnose.diagnosis import Diagnosis, NamedEffect, Verdict
 from cablejax.diagnose.verdict_json import write_verdict
 from cablejax.report.diagnosis_charts import motion_figure, ranking_figure, shrinkage_figure
@@ -125,8 +128,7 @@ def _cards(diagnosis: Diagnosis):
         places = [p for p in (effect_place(e) for e in diagnosis.effects) if p]
         yield _card("Place of the cause", listed(places) if places else "no single place", _peak(diagnosis))
     elif diagnosis.verdict == "none":
-        least = millimetres(max(diagnosis.where.smallest_mm, 0.01))
-        yield _card("Cause", "none needed", f"a gap of {least} would have shown")
+        yield _card("Cause", "none needed", f"a gap of {millimetres(_least(diagnosis))} would have shown")
     else:
         best = diagnosis.ranking[0] if diagnosis.ranking else None
         note = "" if best is None else f"closest: {effect_title(best.name)}, which is not enough"
@@ -143,6 +145,13 @@ def _cards(diagnosis: Diagnosis):
         )
     else:
         yield _card("Error", millimetres(gap.before_rmse_mm), f"noise {millimetres(gap.noise_floor_mm)}")
+
+
+def _least(diagnosis: Diagnosis) -> float:
+    """The gap [mm] from which on the verdict would not have been "none"."""
+    calibration = Calibration(**diagnosis.settings.get("calibration", {}))
+    noise = float(np.sqrt(np.mean(diagnosis.noise_mm**2)))
+    return max(diagnosis.where.smallest_mm, 1e3 * calibration.smallest_gap(1e-3 * noise))
 
 
 def _peak(diagnosis: Diagnosis) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import html
+import itertools
 import json
 from collections.abc import Sequence
 
@@ -57,7 +58,7 @@ def which_section(diagnosis: Diagnosis, ranking: str) -> str:
     if diagnosis.verdict in ("unknown", "named+unknown"):
         left = millimetres(_left(diagnosis))
         parts.append(
-            f"<p>What is left after the best explanation, {left} above the noise, has none in the library.</p>"
+            f"<p>What is left after the best explanation, {left} above the noise, has no cause in the library.</p>"
         )
     if ranking:
         note = "Every effect alone, the most probable first."
@@ -160,7 +161,10 @@ def details_section(diagnosis: Diagnosis) -> str:
     regimes = _table(
         ("regime", "gap"),
         [(name, millimetres(size)) for name, size in where.regimes.items()]
-        + [(f"within {seconds:g} s of the start", millimetres(size)) for seconds, size in where.horizons_mm.items()],
+        + [
+            (f"time: {begin:g} to {end:g} s after the start", millimetres(where.horizons_mm[end]))
+            for begin, end in itertools.pairwise([0.0, *where.horizons_mm])
+        ],
     )
     contrasts = _table(
         ("comparison", "ratio of the gaps", "p-value, corrected"),

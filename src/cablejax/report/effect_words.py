@@ -154,7 +154,7 @@ def share(value: float) -> str:
         return "> 99 %"
     if 0 < percent < 0.5:
         return "< 1 %"
-    return f"{percent:.0f} %"
+    return "0 %" if -0.5 <= percent <= 0 else f"{percent:.0f} %"
 
 
 def between(low: float, high: float) -> str:
