@@ -4,8 +4,8 @@ The models: the released graph network; a perceptron and a recurrence along the 
 and without the static prior; the graph network that is told stiffness and friction; and the training simulator itself,
 started from the keypoints. The rivals' weights are in experiments/weights; their cards say how they were made.
 
-    python experiments/05_dynamics_models.py            # a part of the held-out trajectories: some minutes
-    python experiments/05_dynamics_models.py --full     # all of them; writes docs/results/dynamics_models.md and .png
+    python experiments/05_dynamics_models.py                   # a part of the held-out trajectories: some minutes
+    python experiments/05_dynamics_models.py --full --out docs/results/dynamics_models.md
 """
 
 from __future__ import annotations

@@ -22,6 +22,7 @@ if __name__ == "__main__":
     main(
         Experiment(
             name="stiffness",
+            script="06_stiffness.py",
             title="U, S and Z by cables of other stiffness",
             about=(
                 "The plant is C MuJoCo in space with contact and friction cones, its cable of 24 links 0.1 to 3 times "

@@ -20,6 +20,7 @@ if __name__ == "__main__":
     main(
         Experiment(
             name="other_simulator",
+            script="07_other_simulator.py",
             title="U and S by cables of another simulator family",
             about=(
                 "The plants are Cosserat rods of PyElastica on a table with Stribeck friction "

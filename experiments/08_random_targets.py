@@ -21,6 +21,7 @@ if __name__ == "__main__":
     main(
         Experiment(
             name="random_targets",
+            script="08_random_targets.py",
             title="Random targets from random starts",
             about=(
                 "Planar shaping by two arms, 13 keypoints, at most 250 commands of one second; success is a root mean "

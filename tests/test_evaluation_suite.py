@@ -52,7 +52,7 @@ def test_a_suite_is_shared_resumed_and_read_whole(tmp_path):
     before = {path: path.read_bytes() for path in tmp_path.iterdir()}
     run_suite(cases, [SERVO], tmp_path, fine_tuned=no_model, progress=False)
     assert before == {path: path.read_bytes() for path in tmp_path.iterdir()}
-    experiment = Experiment("x", "Title", "About.", lambda: cases, (), lambda: cases, (), ("III", "IV"))
+    experiment = Experiment("x", "x.py", "Title", "About.", lambda: cases, (), lambda: cases, (), ("III", "IV"))
     text = page(experiment, trials, "python x.py", picture=None)
     assert "| online visual servo | 2 |" in text and "Table IV" not in text and "Seeds: 0, 1." in text
 

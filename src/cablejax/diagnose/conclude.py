@@ -12,7 +12,6 @@ from cablejax.diagnose.belief import Calibration, effect_names, excess, level, p
 from cablejax.diagnose.diagnosis import NamedEffect, ParameterEstimate, Ranked, Verdict
 from cablejax.diagnose.fit import Evidence, Fit
 from cablejax.diagnose.search import Search
-from cablejax.simulate.config import CableConfig
 
 _DRAWS = 400
 
@@ -175,15 +174,18 @@ def _merged(parts: list[dict[str, ParameterEstimate]]) -> dict[str, ParameterEst
     return merged
 
 
-def sentence(conclusion: Conclusion, config: CableConfig) -> str:
+def sentence(conclusion: Conclusion) -> str:
     """The verdict in words."""
     share = f"{100 * conclusion.explained:.0f} %"
     names = " and ".join(e.name.replace("_", " ") for e in conclusion.effects)
     alike = "; ".join(" or ".join(n.replace("_", " ") for n in group) for group in conclusion.equivalent)
+    rivals = f" (this log cannot tell apart: {alike})" if alike else ""
     return {
         "none": "The simulator explains this log within what the noise and its own resolution allow.",
         "named": f"The gap comes from {names}, which explains {share} of it.",
         "ambiguous": f"The gap comes from {names} or a look-alike, which this log cannot tell apart: {alike}.",
-        "named+unknown": f"Part of the gap comes from {names} ({share}); the rest has a cause not in the library.",
+        "named+unknown": (
+            f"Part of the gap, {share}, is explained by {names}{rivals}; the rest by no effect of the library."
+        ),
         "unknown": f"The gap has a cause that is not in the library: the best explanation takes away {share} of it.",
     }[conclusion.verdict]

@@ -100,7 +100,7 @@ def diagnose(
     repaired = recording.as_log(log.meta)
     return Diagnosis(
         verdict=conclusion.verdict,
-        sentence=sentence(conclusion, case.config),
+        sentence=sentence(conclusion),
         effects=conclusion.effects,
         equivalent=conclusion.equivalent,
         ranking=conclusion.ranking,

@@ -7,12 +7,14 @@ import dataclasses
 import functools
 import pathlib
 from collections.abc import Callable, Sequence
+from typing import Any
 
+from cablejax.dynamics.weights import FILE_NAME
 from cablejax.evaluation import tables
 from cablejax.evaluation.failures import failure_figure, worst
 from cablejax.evaluation.fine_tuning import FineTuneConfig, fine_tune, record
 from cablejax.evaluation.methods import ADAPTED_RESIDUAL, LABEL, METHODS
-from cablejax.evaluation.suite import Case, read_suite, run_suite
+from cablejax.evaluation.suite import Case, read_suite, released, run_suite
 from cablejax.evaluation.trials import LIANG_TABLE, Trial
 from cablejax.report.provenance import machine, versions
 from cablejax.shaping import Model
@@ -27,6 +29,7 @@ class Experiment:
 
     Attributes:
         name: of its default folder under runs/.
+        script: its file in experiments/.
         title: of its page.
         about: what was done, in a few sentences, for the page.
         small: cases of the short version.
@@ -37,6 +40,7 @@ class Experiment:
     """
 
     name: str
+    script: str
     title: str
     about: str
     small: Callable[[], list[Case]]
@@ -75,7 +79,7 @@ def main(experiment: Experiment, arguments: Sequence[str] | None = None) -> None
         return
     picture = options.report.with_name(f"{experiment.name}_worst.png")
     failure_figure(worst(snapshots, WORST)).savefig(picture, dpi=110, bbox_inches="tight")
-    text = page(experiment, trials, command(experiment, full=options.full), picture=picture.name)
+    text = page(experiment, trials, command(experiment, full=options.full, report=options.report), picture=picture.name)
     options.report.write_text(text, encoding="utf-8")
     print(text)
 
@@ -83,13 +87,10 @@ def main(experiment: Experiment, arguments: Sequence[str] | None = None) -> None
 def fine_tuned_model(folder: pathlib.Path, case: Case) -> Model:
     """The model trained on a case's cable, made when it is first asked for. Two processes must not make the same."""
     config, home = FineTuneConfig(), folder / case.cable
-    return _fine_tuned(case.plant, case.cable, config, home)
-
-
-@functools.lru_cache(maxsize=16)
-def _fine_tuned(plant: Callable, cable: str, config: FineTuneConfig, home: pathlib.Path) -> Model:
-    made = plant()
-    return fine_tune(record(made, made.config.cable, config, home / "recording.npz"), config, home)
+    if not (home / FILE_NAME).is_file():
+        plant: Any = case.plant()
+        fine_tune(record(plant, plant.config.cable, config, home / "recording.npz"), config, home)
+    return released(str(home))
 
 
 def page(experiment: Experiment, trials: Sequence[Trial], command: str, picture: str | None) -> str:
@@ -115,6 +116,7 @@ def page(experiment: Experiment, trials: Sequence[Trial], command: str, picture:
     return "\n".join([*lines, ""])
 
 
-def command(experiment: Experiment, *, full: bool) -> str:
+def command(experiment: Experiment, *, full: bool, report: pathlib.Path | None = None) -> str:
     """The call that makes the page."""
-    return f"python experiments/*_{experiment.name}.py{' --full' if full else ''}"
+    options = f"{' --full' if full else ''}{'' if report is None else f' --report {report}'}"
+    return f"python experiments/{experiment.script}{options}"
