@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 
+from cablejax.diagnose.actuation import Actuation
 from cablejax.diagnose.belief import Calibration, effect_names, excess, level, probabilities
 from cablejax.diagnose.diagnosis import NamedEffect, ParameterEstimate, Ranked, Verdict
 from cablejax.diagnose.fit import Evidence, Fit
@@ -74,6 +75,38 @@ def conclude(found: Search, evidence: Evidence, calibration: Calibration) -> Con
         verdict = "ambiguous" if equivalent else "named"
     order = np.argsort([-e.probability for e in effects])
     return Conclusion(verdict, best, tuple(effects[i] for i in order), tuple(equivalent), ranking, explained)
+
+
+def with_arms(conclusion: Conclusion, arms: Actuation) -> Conclusion:
+    """Adds what the encoders show to what the keypoints show."""
+    if not arms.deviates:
+        return conclusion
+    named = tuple(
+        NamedEffect(
+            name=name,
+            probability=0.99 if arms.explained else 0.7,
+            parameters={key: ParameterEstimate(value, (float(ci[0]), float(ci[1])), unit)},
+            location={"along_cable_m": None, "time_s": None, "table_m": None},
+        )
+        for name, (value, ci, unit) in arms.effects.items()
+        for key in ("gain" if name == "actuation_gain" else "time_s",)
+    )
+    ranked = tuple(Ranked(e.name, e.probability, 1 - (arms.leftover / arms.deviation) ** 2, 0.0) for e in named)
+    changed: dict[Verdict, Verdict] = {}
+    if named and arms.explained:
+        changed = {"none": "named", "unknown": "named+unknown"}
+    elif named:
+        changed = dict.fromkeys(get_args(Verdict), "named+unknown")
+    else:
+        changed = {"none": "unknown", "named": "named+unknown", "ambiguous": "named+unknown"}
+    share = 1 - (arms.leftover / arms.deviation) ** 2
+    return dataclasses.replace(
+        conclusion,
+        verdict=changed.get(conclusion.verdict, conclusion.verdict),
+        effects=(*named, *conclusion.effects),
+        ranking=(*ranked, *conclusion.ranking),
+        explained=share if conclusion.verdict == "none" else conclusion.explained,
+    )
 
 
 def baselines(found: Search, evidence: Evidence) -> dict[str, str]:

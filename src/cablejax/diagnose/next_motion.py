@@ -11,7 +11,7 @@ from cablejax.diagnose.diagnosis import NextMotion
 from cablejax.diagnose.fit import Candidate
 from cablejax.diagnose.physics import Physics
 from cablejax.diagnose.playback import Playback
-from cablejax.diagnose.safe_motions import INTERVAL, safe_motions
+from cablejax.diagnose.safe_motions import INTERVAL, safe_motions, starting_pose
 
 # Motions as long as the log's share its compiled program, if they are neither cut short nor mostly rest.
 _SAMPLES = (250, 400)
@@ -21,7 +21,7 @@ _USUAL_SAMPLES = 300
 def next_motion(
     playback: Playback, candidates: Sequence[Candidate], noise: Float[np.ndarray, "N"], temper: float = 1.0
 ) -> NextMotion | None:
-    """Simulates every safe motion from the log's first pose under the two most probable explanations.
+    """Simulates every safe motion from a first pose of the log under the two most probable explanations.
 
     Of a single explanation the motion is chosen that changes most with its parameters, each moved by one standard
     deviation of its posterior on this log.
@@ -40,7 +40,7 @@ def next_motion(
     """
     if not candidates:
         raise ValueError("next_motion needs at least one fitted explanation, got none.")
-    config, first = playback.config, playback.gripper_pose[0, 0].astype(np.float64)
+    config, first = playback.config, starting_pose(playback.gripper_pose)
     n_samples = playback.gripper_pose.shape[1]
     n_samples = n_samples if _SAMPLES[0] <= n_samples <= _SAMPLES[1] else _USUAL_SAMPLES
     motions = {}

@@ -60,8 +60,12 @@ def regimes_of(log: GapLog, nominal: Float[np.ndarray, "E T N 2"], valid: Bool[n
         rate[:, 1:] = np.diff(distance, axis=1) / np.maximum(np.diff(log.time, axis=1), 1e-9)
     closing, opening = valid & (rate < -_REST_SPEED), valid & (rate > _REST_SPEED)
     moving = valid & ~rest
+    # before anything moved hardly any effect shows: such a rest is no evidence that a gap needs motion
+    moved = np.maximum.accumulate(moving, axis=1)
+    settled = hold & moved
     masks = {
-        "speed: hold": hold,
+        "start: at rest": hold & ~moved,
+        "speed: hold": settled,
         "speed: slow": moving & ~fast & ~hold,
         "speed: fast": fast & ~hold,
         **_halves("curvature", curvature, valid, ("low", "high")),
@@ -78,7 +82,7 @@ def regimes_of(log: GapLog, nominal: Float[np.ndarray, "E T N 2"], valid: Bool[n
             masks[f"reversal: {words}"] = valid & (since >= low) & (since < high)
     late = np.isfinite(since)
     pairs = {
-        "speed: hold": (hold, moving & ~hold),
+        "speed: hold": (settled, moving & ~hold),
         "speed: fast": (masks["speed: fast"], masks["speed: slow"]),
         "direction: grippers closing": (closing, opening),
         "reversal: after": (moving & late, moving & ~late),

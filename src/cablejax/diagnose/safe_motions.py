@@ -49,6 +49,13 @@ class _Pair:
         return np.array([*self.middle, self.heading, self.distance, *self.angles])
 
 
+def starting_pose(gripper_pose: Float[np.ndarray, "E T 2 3"]) -> Float[np.ndarray, "2 3"]:
+    """The first pose from which a next motion starts: that of the episode that begins with the grippers furthest apart,
+    whatever the order of the episodes."""
+    first = np.asarray(gripper_pose, np.float64)[:, 0]
+    return first[np.argmax(np.linalg.norm(first[:, 1, :2] - first[:, 0, :2], axis=-1))]
+
+
 def safe_motions(
     config: CableConfig, first: Float[np.ndarray, "2 3"], n_samples: int = 300
 ) -> dict[str, Float[np.ndarray, "T 2 3"]]:

@@ -30,8 +30,8 @@ def describe(where: Where, arclength: np.ndarray, noise: np.ndarray, level: floa
     points = [i for i in range(len(where.keypoint_p)) if where.keypoint_p[i] < level]
     if not shown and not points:
         return (
-            f"No episode deviates from the simulator by more than its noise of {floor:.1f} mm.",
-            f"A gap of {max(where.smallest_mm, 0.01):.1f} mm or more over the whole log would have shown.",
+            f"No episode deviates from the simulator by more than its noise of {_mm(floor)}.",
+            f"A gap of {_mm(max(where.smallest_mm, 0.01))} or more over the whole log would have shown.",
         )
     sentences = [_size(where, shown, floor), *_along(where, arclength), *_when(where, level), *_frame(where)]
     if len(where.per_episode_mm) >= 6:
@@ -43,7 +43,7 @@ def describe(where: Where, arclength: np.ndarray, noise: np.ndarray, level: floa
 
 def _size(where: Where, shown: list[int], floor: float) -> str:
     total = len(where.per_episode_mm)
-    size = f"The gap is {where.gap_mm:.1f} mm above the noise of {floor:.1f} mm"
+    size = f"The gap is {_mm(where.gap_mm)} above the noise of {_mm(floor)}"
     if not shown:
         return f"{size}, too small to show in any single episode."
     if len(shown) == total:
@@ -136,6 +136,10 @@ def _frame(where: Where) -> list[str]:
 def _moving(where: Where) -> float | None:
     sizes = [where.regimes[name] for name in ("speed: slow", "speed: fast") if name in where.regimes]
     return float(np.sqrt(np.mean(np.square(sizes)))) if sizes else None
+
+
+def _mm(value: float) -> str:
+    return f"{value:.2f} mm" if 0.0 < value < 0.095 else f"{value:.1f} mm"
 
 
 def _listed(words: Sequence[str]) -> str:

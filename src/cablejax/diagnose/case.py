@@ -1,0 +1,152 @@
+"""One log under the nominal simulator: what a diagnosis starts from."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float
+
+from cablejax.diagnose.actuation import Actuation, actuation
+from cablejax.diagnose.belief import Calibration, level
+from cablejax.diagnose.effects import Context
+from cablejax.diagnose.fit import Candidate, Evidence
+from cablejax.diagnose.noise import NoiseFloor, noise_floor
+from cablejax.diagnose.playback import Playback
+from cablejax.diagnose.recording import DiagnosisError, Recording, prepare
+from cablejax.simulate.config import CableConfig
+from cablejax.simulate.replay import config_of_log
+from cablejax.types import GapLog
+
+FIT_LINKS = 33
+"""Links of the cable in fits, which only need what an effect changes."""
+FINE_LINKS = 65
+"""Links of the nominal cable that the log is compared with."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Case:
+    """A log, replayed by the nominal simulator.
+
+    Attributes:
+        recording: the log after checks and repairs.
+        config: the nominal cable at the resolution of the fits.
+        arms: how the grippers followed their commands.
+        noise: floor of the recording.
+        playback: of the measured gripper poses.
+        nominal: keypoints of a fine nominal cable under the measured poses [m], shape [E, T, N, 2].
+        coarse: the same at the resolution of the fits; the difference is the error of discretisation.
+        commanded_nominal: as `nominal`, under the poses that exact arms would have had.
+        predicted_playback: of the poses that the arms' effects predict.
+    """
+
+    recording: Recording
+    config: CableConfig
+    arms: Actuation
+    noise: NoiseFloor
+    playback: Playback
+    nominal: Float[np.ndarray, "E T N 2"]
+    coarse: Float[np.ndarray, "E T N 2"]
+    commanded_nominal: Float[np.ndarray, "E T N 2"]
+    predicted_playback: Playback
+
+    @classmethod
+    def of(cls, log: GapLog) -> Case:
+        """Checks a log and replays it.
+
+        Raises:
+            DiagnosisError: the log cannot be diagnosed; the message says why and what to do.
+        """
+        recording = prepare(log)
+        noise = noise_floor(recording.keypoints, recording.hold)
+        arms = actuation(
+            recording.gripper_pose,
+            recording.gripper_command if recording.has_commands else None,
+            recording.interval,
+            recording.length,
+        )
+        config = config_of_log(log, n_links=FIT_LINKS)
+        first = _first_shapes(recording)
+
+        def replay(n_links, pose):
+            of_links = dataclasses.replace(config, n_links=n_links)
+            try:
+                return Playback.of_motion(of_links, pose, first, recording.interval)
+            except ValueError as error:
+                raise DiagnosisError(f"The nominal cable has no settled shape at a first pose: {error}") from error
+
+        def run(playback):
+            return playback.keypoints([playback.nominal()])[0].astype(np.float64)
+
+        playback = replay(FIT_LINKS, recording.gripper_pose)
+        nominal = run(replay(FINE_LINKS, recording.gripper_pose))
+        if not np.isfinite(nominal).all():
+            raise DiagnosisError("The nominal simulation of this log breaks down: are the poses continuous, in metres?")
+        moved = arms.deviates
+        return cls(
+            recording=recording,
+            config=config,
+            arms=arms,
+            noise=noise,
+            playback=playback,
+            nominal=nominal,
+            coarse=run(playback),
+            commanded_nominal=run(replay(FINE_LINKS, arms.commanded)) if moved else nominal,
+            predicted_playback=replay(FIT_LINKS, arms.predicted) if moved else playback,
+        )
+
+    def evidence(self, calibration: Calibration) -> Evidence:
+        """What the log says, weighed by the noise and by what simulators get wrong without any effect."""
+        observed = self.recording.keypoints
+        target = observed - self.nominal + self.coarse
+        bare = Evidence(self.playback, target, self.noise.std, temper=np.ones(len(target)), freedom=calibration.freedom)
+        squares = (bare.residuals(self.coarse) ** 2).sum(axis=1)
+        gap = level(bare) * np.sqrt(np.maximum(squares / np.maximum(bare.count, 1) - 1, 0.0))
+        return dataclasses.replace(bare, temper=calibration.temper(gap, level(bare)))
+
+    def context(self) -> Context:
+        """What effects take their first guesses from."""
+        chord = np.diff(self.nominal, axis=2)
+        turn = np.diff(np.arctan2(chord[..., 1], chord[..., 0]), axis=-1)
+        turn = np.abs((turn + np.pi) % (2 * np.pi) - np.pi)
+        spacing = self.config.length / (self.config.n_keypoints - 1)
+        return Context(
+            config=self.config,
+            keypoints=self.nominal,
+            residual=self.recording.keypoints - self.nominal,
+            duration=float((self.recording.interval * self.recording.length).min()),
+            max_curvature=turn.max(axis=(1, 2)) / spacing,
+        )
+
+    def simulate(
+        self, explanation: Candidate, episodes: Sequence[int] | None = None, *, predicted: bool = False
+    ) -> Float[np.ndarray, "E T N 2"]:
+        """Keypoints under an explanation [m], the error of discretisation taken out.
+
+        Args:
+            explanation: effects and their parameters.
+            episodes: to simulate; None = all.
+            predicted: drive the cable by what the arms' effects predict instead of the measured poses.
+        """
+        playback = self.predicted_playback if predicted else self.playback
+        chosen = slice(None) if episodes is None else list(episodes)
+        physics = explanation.physics(playback.nominal(), self.config)
+        return playback.keypoints([physics], episodes)[0] - self.coarse[chosen] + self.nominal[chosen]
+
+    def to_log(self, keypoints: Float[np.ndarray, "E T N 2"]) -> Float[np.ndarray, "E T1 N 2"]:
+        """NaN beyond an episode's end, and as long as the log."""
+        valid = np.arange(keypoints.shape[1])[None] < self.recording.length[:, None]
+        return np.where(valid[..., None, None], keypoints, np.nan)[:, : self.recording.length.max()]
+
+
+def _first_shapes(recording: Recording) -> list[np.ndarray | None]:
+    """Keypoints at the start of every episode, averaged over its first samples at rest; None where too few are seen."""
+    shapes: list[np.ndarray | None] = []
+    for points, pose in zip(recording.keypoints, recording.gripper_pose, strict=True):
+        moved = np.abs(pose - pose[0]).max(axis=(1, 2)) > 1e-3
+        still = points[: max(int(np.argmax(moved)) if moved.any() else len(points), 1)][:10]
+        count = np.isfinite(still).sum(axis=0)
+        mean = np.where(count > 0, np.nansum(still, axis=0) / np.maximum(count, 1), np.nan)
+        shapes.append(mean if np.isfinite(mean).all(axis=1).sum() >= 3 else None)
+    return shapes
