@@ -25,6 +25,7 @@ class _State(eqx.Module):
     step_size: Scalar
     optimality: Scalar
     stale: Bool[Array, ""]
+    rounded: Bool[Array, ""]
     terminate: Bool[Array, ""]
     result: optx.RESULTS
     linearisations: Int[Array, ""]
@@ -75,6 +76,7 @@ class AbstractProjectedLeastSquares(optx.AbstractLeastSquaresSolver):
             step_size=jnp.ones((), y.dtype),
             optimality=jnp.asarray(jnp.inf, y.dtype),
             stale=jnp.array(True),
+            rounded=jnp.array(False),
             terminate=jnp.array(False),
             result=optx.RESULTS.successful,
             linearisations=jnp.zeros((), jnp.int32),
@@ -100,16 +102,18 @@ class AbstractProjectedLeastSquares(optx.AbstractLeastSquaresSolver):
         step_size, accept, _, search_state = self.search.step(
             jnp.array(False), y, trial, state.f_info, optx.FunctionInfo.Eval(value), state.search_state
         )
-        accept = accept & jnp.isfinite(value)
         hessian = state.f_info.hessian.as_matrix()
         promised = -(jnp.sum(state.f_info.grad * move) + 0.5 * move @ hessian @ move)
-        rounded = promised <= 4 * jnp.finfo(y.dtype).eps * jnp.abs(state.f_info.f)
+        rounding = 4 * jnp.finfo(y.dtype).eps * jnp.abs(state.f_info.f)
+        rounded = promised <= rounding
+        # Gradients are known better than values: two more steps are taken on trust where values cannot tell.
+        accept = (accept | (rounded & (value <= state.f_info.f + rounding))) & jnp.isfinite(value)
         result = optx.RESULTS.where(finite, result, optx.RESULTS.nonfinite)
         failed = result != optx.RESULTS.successful
         state = eqx.tree_at(
-            lambda s: (s.search_state, s.step_size, s.stale, s.terminate, s.result),
+            lambda s: (s.search_state, s.step_size, s.stale, s.rounded, s.terminate, s.result),
             state,
-            (search_state, step_size, accept, converged | rounded | failed, result),
+            (search_state, step_size, accept, rounded, converged | (rounded & state.rounded) | failed, result),
         )
         return jnp.where(accept & ~failed, trial, y), state, None
 

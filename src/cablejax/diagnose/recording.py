@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from cablejax.gaplog import validate
 from cablejax.types import GapLog
 
 # Samples are padded to a multiple of this, so that logs of nearly equal length share one compiled program.
@@ -67,8 +68,10 @@ def prepare(log: GapLog) -> Recording:
     """Checks a planar log and puts its samples on an even clock.
 
     Raises:
+        GapLogError: the log does not follow its format.
         DiagnosisError: not planar, not two grippers, too short, or keypoints that do not fit the cable or the grippers.
     """
+    validate(log)
     if log.keypoints.shape[-1] != 2 or log.gripper_pose.shape[2] != 2:
         raise DiagnosisError(
             f"The log has keypoints in {log.keypoints.shape[-1]} dimensions and {log.gripper_pose.shape[2]} grippers, "

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import importlib.metadata
+import math
 import time
 from collections.abc import Callable, Sequence
 
@@ -33,6 +34,7 @@ def diagnose(
     effects: Sequence[Effect] = LIBRARY,
     commissioning: Sequence[GapLog] = (),
     calibration: Calibration = Calibration(),
+    budget: float = math.inf,
     progress: Callable[[str], None] = _silent,
 ) -> Diagnosis:
     """Says where the nominal simulator is wrong on this log, which effect causes it, how far the gap shrinks with it.
@@ -42,6 +44,7 @@ def diagnose(
         effects: what to look for; `LIBRARY` and effects of your own.
         commissioning: logs known to have no effect: how far the simulator is off without any.
         calibration: constants of the judgement.
+        budget: seconds after which no larger set of effects is tried; what was fitted until then counts.
         progress: called with a line of text now and then.
 
     Raises:
@@ -65,7 +68,7 @@ def diagnose(
     null = evaluate(evidence, [candidate()])[0]
     gap = excess(float(null.sse.sum()), evidence)
     if gap > calibration.smallest_gap(level(evidence)):
-        found = search(evidence, effects, case.context(), calibration, progress)
+        found = search(evidence, effects, case.context(), calibration, deadline=begin + budget, progress=progress)
     else:
         found = Search((null,), np.zeros(1), {})
     conclusion = conclude(found, evidence, calibration)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import time
 from collections.abc import Callable, Sequence
 
 import numpy as np
@@ -41,9 +42,20 @@ def search(
     effects: Sequence[Effect],
     context: Context,
     calibration: Calibration,
+    *,
+    deadline: float,
     progress: Callable[[str], None],
 ) -> Search:
-    """Fits every effect alone, and sets of effects if none alone is an adequate explanation."""
+    """Fits every effect alone, and sets of effects if none alone is an adequate explanation.
+
+    Args:
+        evidence: to explain.
+        effects: to try.
+        context: of the log.
+        calibration: of the judgement.
+        deadline: on `time.perf_counter`; from then on no larger set is begun [s].
+        progress: called with a line of text before each stage.
+    """
     null = evaluate(evidence, [candidate()])[0]
     gap = excess(float(null.sse.sum()), evidence)
     progress(f"screening {len(effects)} effects")
@@ -67,7 +79,7 @@ def search(
 
     bases = [fit for fit in fits if fit.candidate.terms][:_BASES]
     for size in range(2, calibration.max_terms + 1):
-        if adequate(fits[0]):
+        if adequate(fits[0]) or time.perf_counter() > deadline:
             break
         progress(f"fitting sets of {size} effects")
         grown = [fit for base in bases for fit in _grown(evidence, base.candidate, effects, context)]
@@ -76,7 +88,7 @@ def search(
         if log_scores(fits[:1], evidence, calibration)[0] < best_before + 1.0:
             break
         bases = fits[:1]
-    if len(effect_names(fits[0].candidate)) > 1:
+    if len(effect_names(fits[0].candidate)) > 1 and time.perf_counter() < deadline:
         progress("exchanging the effects of the best set one by one")
         exchanged = [fit for rest in without_one(fits[0].candidate) for fit in _grown(evidence, rest, effects, context)]
         fits = _best([*fits, *exchanged], evidence, calibration)

@@ -121,8 +121,9 @@ def _first(problem: ShapingProblem, motion: Float[Array, "T Q 3"]) -> _Valued:
 
 def _drawn(problem: ShapingProblem, key: Array, mean: Array, deviation: Array, samples: int) -> _Valued:
     noise = jax.random.normal(key, (samples, *mean.shape), mean.dtype)
-    # Step by step is near enough for samples, and much cheaper than the nearest plan.
-    motion = jax.vmap(problem.feasible.restore)(mean + deviation * noise)
+    # Step by step is near enough for samples, and much cheaper than the nearest plan; but it knows no bound on changes.
+    inside = problem.feasible.restore if problem.feasible.change is None else problem.feasible.project
+    motion = jax.vmap(inside)(mean + deviation * noise)
     value = jax.vmap(problem.value)(motion)
     return _Valued(motion, jnp.where(jnp.isfinite(value), value, jnp.inf))
 

@@ -14,7 +14,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from cablejax.diagnose.diagnosis import Diagnosis
-from cablejax.diagnose.safe_motions import INTERVAL, safe_motions
+from cablejax.diagnose.safe_motions import INTERVAL, safe_motions, starting_pose
 from cablejax.report.diagnosis_style import STYLE, explained_label
 from cablejax.report.effect_words import effect_title
 from cablejax.report.style import LIGHT, gripper_outline
@@ -105,7 +105,7 @@ def motion_figure(diagnosis: Diagnosis) -> Figure | None:
     if following is None:
         return None
     config = config_of_log(diagnosis.log)
-    poses = safe_motions(config, diagnosis.log.gripper_pose[0, 0]).get(following.motion)
+    poses = safe_motions(config, starting_pose(diagnosis.log.gripper_pose)).get(following.motion)
     names = sorted(following.alternatives, key=lambda n: following.alternatives[n])
     values = [following.alternatives[n] for n in names]
     colours = [LIGHT.residual if n == following.motion else LIGHT.target for n in names]

@@ -185,9 +185,11 @@ def _strip(ax: Axes, diagnosis: Diagnosis, arclength: np.ndarray) -> None:
 def _mark_holds(ax: Axes, diagnosis: Diagnosis, episode: int, top: float) -> None:
     """Bars over the time in which the grippers rest and the cable has settled."""
     length = int(diagnosis.log.episode_length[episode])
-    hold = diagnosis.where.regime_masks.get("speed: hold")
-    if hold is None:
+    masks = diagnosis.where.regime_masks
+    rests = [masks[name] for name in ("start: at rest", "speed: hold") if name in masks]
+    if not rests:
         return
+    hold = np.any(rests, axis=0)
     edges = np.flatnonzero(np.diff(np.concatenate([[0], hold[episode, :length].astype(int), [0]])))
     time = diagnosis.log.time[episode]
     for begin, end in edges.reshape(-1, 2):

@@ -1,6 +1,6 @@
 """What all plants share: a cable between two grippers, commanded and observed as a robot's would be.
 
-A plant brings its own physics (`reset`, `nodes` and what moves them); checks, clock, sampling and the camera's noise are
+A plant brings its own physics (`reset`, `nodes` and what moves them); checks, clock, sampling and camera noise are
 the same for all of them and live here.
 """
 

@@ -1,0 +1,72 @@
+"""Makes cable logs whose cause is withheld, and locks what is true of them.
+
+python experiments/20_blind_generate.py --plan small --out DIR --labels DIR       # five cases, a quarter of a minute
+python experiments/20_blind_generate.py --plan stored --out DIR --labels DIR      # 155 cases, resumable, half an hour
+python experiments/20_blind_generate.py ... --family A --process 0 2              # shares the work
+
+Writes `<8 hex>.npz` to --out, `locked/<8 hex>.json` and `hashes.json` to --labels. The hashes are published before any
+diagnosis runs, the labels after it. Same seed, same logs.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import pathlib
+import time
+
+os.environ.setdefault("NPROC", "4")
+
+from blind.cases import make_case
+from blind.families import FAMILIES
+from blind.plan import PLANS
+from blind.record import Unreachable
+from blind.store import is_done, publish_hashes, read_labels, write_case, write_open_labels
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--plan", choices=PLANS, default="small")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--out", type=pathlib.Path, required=True, help="folder of the logs")
+    parser.add_argument("--labels", type=pathlib.Path, required=True, help="folder of the locked labels and the hashes")
+    parser.add_argument("--family", default="ABC", help="letters of the families to make now")
+    parser.add_argument(
+        "--process", type=int, nargs=2, metavar=("I", "N"), default=(0, 1), help="this is process I of N"
+    )
+    parser.add_argument("--limit", type=int, help="stop after so many cases")
+    parser.add_argument("--open-labels", action="store_true", help="also write labels.json beside the logs: not blind")
+    options = parser.parse_args()
+    options.out.mkdir(parents=True, exist_ok=True)
+    cases = [case for case in PLANS[options.plan](options.seed) if case.family in options.family]
+    mine = [case for case in cases if case.index % options.process[1] == options.process[0]][: options.limit]
+    start, made, failed = time.time(), 0, []
+    for number, case in enumerate(mine, 1):
+        name = case.name(options.seed)
+        if not is_done(name, options.out, options.labels):
+            try:
+                write_case(
+                    case,
+                    make_case(case, options.seed, FAMILIES[case.family]()),
+                    options.seed,
+                    options.out,
+                    options.labels,
+                )
+                publish_hashes(options.labels)
+                made += 1
+            except Unreachable as error:
+                failed.append(case.index)
+                print(f"case {case.index}: {error}", flush=True)
+        # Says nothing of what a case is: the log of a run may be read by those who diagnose.
+        seconds = time.time() - start
+        line = f"{number}/{len(mine)} of families {options.family}, {seconds:.0f} s, {len(failed)} not possible"
+        print(line, flush=True)
+        (options.out / "STATUS.txt").write_text(line + "\n")
+    total = publish_hashes(options.labels)
+    if options.open_labels:
+        write_open_labels(options.out, read_labels(options.labels))
+    print(f"{made} cases made, {total} in {options.labels}; not possible: {failed}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,128 @@
+"""Small synthetic gap logs: the diagnosing simulator's own chain with any effects in it, seen through a noisy camera.
+
+Four episodes of ten seconds, each a motion that tells other causes apart, with the grippers at rest before and after.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from cablejax.diagnose import LIBRARY, Context, Effect
+from cablejax.diagnose.fit import Evidence, candidate
+from cablejax.diagnose.playback import Playback
+from cablejax.diagnose.screen import residual_of
+from cablejax.gaplog import Episode, gap_log_from_episodes
+from cablejax.simulate import CableConfig
+from cablejax.types import GapLog
+
+CABLE = CableConfig()
+INTERVAL = 0.1
+SAMPLES = 100
+MOTIONS = ("approach", "mirror", "translation", "ramp_hold")
+BY_NAME = {effect.name: effect for effect in LIBRARY}
+# Distance of the grippers, angle of gripper 0, of gripper 1 to the line between them, shift across that line. The first
+# and the last pose of each motion are held.
+_WAYPOINTS = {
+    "approach": [(0.85, 0.3, -0.2, 0.0), (0.45, 0.9, -0.2, 0.05), (0.7, 0.1, -0.6, 0.1)],
+    "mirror": [(0.85, -0.2, 0.3, 0.0), (0.5, -0.2, 1.0, 0.0), (0.75, -0.7, 0.2, -0.05)],
+    "translation": [(0.7, 0.6, -0.5, 0.0), (0.7, 0.6, -0.5, 0.25), (0.7, 0.6, -0.5, 0.05)],
+    "ramp_hold": [(0.9, 0.2, -0.3, 0.0), (0.5, 0.2, -0.8, 0.0), (0.5, 0.2, -0.8, 0.0), (0.85, 0.5, -0.3, 0.0)],
+}
+_REST = 16
+_SETTLING = 6
+
+
+def poses(motion: str, samples: int = SAMPLES) -> Float[np.ndarray, "T 2 3"]:
+    """Gripper poses (x, y, theta) of a motion."""
+    way = np.array(_WAYPOINTS[motion])
+    progress = np.clip((np.arange(samples) - _REST) / (samples - 1 - 2 * _REST), 0.0, 1.0) * (len(way) - 1)
+    begin = np.minimum(progress.astype(int), len(way) - 2)
+    fraction = progress - begin
+    smooth = (fraction**2 * (3 - 2 * fraction))[:, None]
+    distance, first, second, shift = (way[begin] + smooth * (way[begin + 1] - way[begin])).T
+    zero = np.zeros(samples)
+    return np.stack(
+        [np.stack([zero, shift, first], axis=1), np.stack([distance, shift + 0.02, second], axis=1)], axis=1
+    )
+
+
+def holds(samples: int = SAMPLES) -> np.ndarray:
+    """At rest before the motion, and after it once the cable has settled."""
+    index = np.arange(samples)
+    return (index <= _REST) | (index >= samples - 1 - _REST + _SETTLING)
+
+
+@functools.cache
+def playback(n_links: int) -> Playback:
+    """The four motions at a resolution."""
+    config = dataclasses.replace(CABLE, n_links=n_links)
+    return Playback.of_motion(config, np.stack([poses(m) for m in MOTIONS]), None, np.full(len(MOTIONS), INTERVAL))
+
+
+def parts(*effects: tuple[str, Any]) -> list[tuple[Effect, int, Sequence[float]]]:
+    """(name, values) or (name, variant, values) as `candidate` takes them."""
+    return [(BY_NAME[e[0]], e[1] if len(e) == 3 else 0, e[-1]) for e in effects]
+
+
+@functools.cache
+def clean(*effects: tuple[Any, ...], n_links: int = 65) -> Float[np.ndarray, "E T N 2"]:
+    """Keypoints without noise [m]; `effects` as for `parts`, with tuples throughout."""
+    player = playback(n_links)
+    return player.keypoints([candidate(*parts(*effects)).physics(player.nominal(), player.config)])[0]
+
+
+def noise(shape: Sequence[int], noise_mm: float, seed: int) -> np.ndarray:
+    """White Gaussian noise [m]."""
+    return 1e-3 * noise_mm * np.random.default_rng(seed).normal(size=shape)
+
+
+def evidence(*effects: tuple[Any, ...], noise_mm: float = 0.5, seed: int = 0, n_links: int = 17) -> Evidence:
+    """What a log says if the simulator is exact but for the effects: white noise, no error of its own."""
+    return evidence_of(clean(*effects, n_links=n_links), noise_mm=noise_mm, seed=seed, n_links=n_links)
+
+
+def evidence_of(
+    points: Float[np.ndarray, "E T N 2"], *, noise_mm: float = 0.5, seed: int = 0, n_links: int = 17
+) -> Evidence:
+    """The same for keypoints without noise [m] that the simulator gave at this resolution."""
+    return Evidence(
+        playback=playback(n_links),
+        target=points + noise(points.shape, noise_mm, seed),
+        noise=np.full(points.shape[2], 1e-3 * noise_mm),
+        temper=np.ones(len(points)),
+        freedom=1e6,
+    )
+
+
+def context(facts: Evidence) -> Context:
+    """What is known before any fit: the nominal cable and how the log differs from it."""
+    residual = residual_of(facts, candidate())
+    return Context(
+        config=facts.playback.config,
+        keypoints=facts.target - residual,
+        residual=residual,
+        duration=INTERVAL * SAMPLES,
+        max_curvature=np.full(len(facts.target), 6.0),
+    )
+
+
+def log_of(keypoints: Float[np.ndarray, "E T N 2"], motions: Sequence[str] = MOTIONS) -> GapLog:
+    """A gap log of these keypoints under the motions, with exact arms."""
+    episodes = []
+    for motion, points in zip(motions, keypoints, strict=True):
+        pose = poses(motion)
+        command = np.concatenate([np.diff(pose, axis=0) / INTERVAL, np.zeros((1, 2, 3))])
+        episodes.append(Episode(motion, INTERVAL * np.arange(len(pose)), points, pose, command, holds()))
+    return gap_log_from_episodes(episodes, CABLE, source="the diagnosing simulator itself")
+
+
+def record(*effects: tuple[Any, ...], noise_mm: float = 0.5, seed: int = 0) -> GapLog:
+    """A log of the fine simulator with these effects."""
+    points = clean(*effects)
+    return log_of(points + noise(points.shape, noise_mm, seed))

@@ -1,0 +1,131 @@
+"""`cablejax diagnose` as a person or a script meets it."""
+
+import json
+import pathlib
+
+import numpy as np
+import pytest
+
+from cablejax.cli import main
+from cablejax.gaplog import write_gap_log
+from diagnose_cases import record
+
+ONLY = ["--only", "gripper_rotation_offset", "bending_stiffness", "keypoint_bias"]
+OFFSET = ("gripper_rotation_offset", 0, (0.08,))
+VERDICT = {
+    "schema", "verdict", "effects", "equivalent", "ranking", "gap", "where", "next_motion", "sentence", "caveats",
+    "seconds",
+}  # fmt: skip
+GAP = {
+    "horizon_s", "before_rmse_mm", "noise_floor_mm", "after_rmse_mm", "shrinkage", "shrinkage_ci90",
+    "held_out_episodes",
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory) -> pathlib.Path:
+    return write_gap_log(tmp_path_factory.mktemp("logs") / "offset.npz", record(OFFSET))
+
+
+@pytest.fixture(scope="module")
+def report(log, tmp_path_factory) -> pathlib.Path:
+    folder = tmp_path_factory.mktemp("diagnosis") / "report"
+    assert main(["diagnose", str(log), "--out", str(folder), *ONLY]) == 0
+    return folder
+
+
+def test_verdict_follows_the_format(report):
+    verdict = json.loads((report / "verdict.json").read_text())
+    assert verdict["schema"] == "cablejax-verdict/1" and set(verdict) >= VERDICT
+    assert verdict["verdict"] == "named"
+    (effect,) = verdict["effects"]
+    assert effect["name"] == "gripper_rotation_offset" and 0.5 < effect["probability"] <= 1
+    assert effect["parameters"]["gripper"]["value"] == 0
+    angle = effect["parameters"]["angle_rad"]
+    assert angle["unit"] == "rad" and angle["ci90"][0] < angle["value"] < angle["ci90"][1]
+    assert angle["value"] == pytest.approx(0.08, abs=0.004)
+    assert effect["location"] == {"along_cable_m": [0.0, 0.0], "time_s": None, "table_m": None}
+    assert {entry["name"] for entry in verdict["ranking"]} == set(ONLY[1:])
+    assert all(set(entry) >= {"name", "probability", "held_out_shrinkage"} for entry in verdict["ranking"])
+    gap = verdict["gap"]
+    assert set(gap) >= GAP and gap["held_out_episodes"] == [0, 1, 2, 3]
+    assert gap["before_rmse_mm"] > gap["after_rmse_mm"] >= 0.9 * gap["noise_floor_mm"] > 0
+    assert 0.9 < gap["shrinkage"] <= 1
+    where = verdict["where"]
+    assert len(where["along_cable_mm"]) == 13 and len(where["per_episode_mm"]) == 4 and where["regimes"]
+
+
+def test_report_stands_alone_and_says_the_verdict(report):
+    page = (report / "report.html").read_text()
+    assert "rotation offset" in page
+    assert 'src="http' not in page and "<script src" not in page
+
+
+def test_what_is_there_stays_unless_told_otherwise(log, tmp_path, capsys):
+    mine = tmp_path / "mine.txt"
+    mine.write_text("keep me")
+    assert main(["diagnose", str(log), "--out", str(tmp_path), *ONLY]) == 2
+    said = capsys.readouterr().err
+    assert "is not empty" in said and "--overwrite" in said
+    assert [path.name for path in tmp_path.iterdir()] == ["mine.txt"]
+
+
+@pytest.mark.slow
+def test_script_gets_json_and_replaces_a_report_when_told(log, tmp_path, capsys):
+    (tmp_path / "verdict.json").write_text("of yesterday")
+    assert main(["diagnose", str(log), "--out", str(tmp_path), "--overwrite", "--json", *ONLY]) == 0
+    told = capsys.readouterr()
+    summary = json.loads(told.out)
+    assert summary["verdict"] == "named" and pathlib.Path(summary["report"]).is_file()
+    assert json.loads((tmp_path / "verdict.json").read_text())["verdict"] == "named"
+    assert "screening 3 effects" in told.err, "progress goes to stderr"
+
+
+def refused(arguments, capsys) -> str:
+    assert main(["diagnose", *map(str, arguments)]) == 2
+    told = capsys.readouterr()
+    assert told.out == "" and told.err.startswith("cablejax: ") and told.err.count("\n") == 1
+    return told.err
+
+
+def test_unknown_effect_is_refused_with_the_known_ones(log, tmp_path, capsys):
+    said = refused([log, "--out", tmp_path / "report", "--only", "gremlins"], capsys)
+    assert "'gremlins'" in said and "bending_stiffness" in said
+    assert not (tmp_path / "report").exists()
+
+
+def test_missing_file_is_refused(tmp_path, capsys):
+    assert "nowhere.npz" in refused([tmp_path / "nowhere.npz", "--out", tmp_path / "report"], capsys)
+    assert not (tmp_path / "report").exists()
+
+
+def test_other_file_is_refused(tmp_path, capsys):
+    other = tmp_path / "other.npz"
+    np.savez(other, something=np.zeros(3))
+    assert "has no field 'time'" in refused([other, "--out", tmp_path / "report"], capsys)
+    text = tmp_path / "notes.txt"
+    text.write_text("not a log")
+    assert "could not be read as a gap log" in refused([text, "--out", tmp_path / "report"], capsys)
+    assert not (tmp_path / "report").exists()
+
+
+def test_file_in_the_place_of_the_folder_is_refused(log, tmp_path, capsys):
+    taken = tmp_path / "taken"
+    taken.write_text("")
+    assert "expected a folder" in refused([log, "--out", taken], capsys)
+
+
+def test_log_without_noise_is_taken_with_a_caveat(tmp_path):
+    path = write_gap_log(tmp_path / "clean.npz", still())
+    assert main(["diagnose", str(path), "--out", str(tmp_path / "report"), *ONLY]) == 0
+    verdict = json.loads((tmp_path / "report" / "verdict.json").read_text())
+    assert verdict["verdict"] == "none" and any("no noise" in text for text in verdict["caveats"])
+
+
+def still():
+    """A log that a simulator wrote without a camera's noise, at rest."""
+    log = record(noise_mm=0.0)
+    log.keypoints[:] = log.keypoints[:, :1]
+    log.gripper_pose[:] = log.gripper_pose[:, :1]
+    log.gripper_command[:] = 0.0
+    return log

@@ -1,0 +1,110 @@
+"""What the arms do wrong is told from commands and encoders alone."""
+
+import numpy as np
+import pytest
+
+from cablejax.diagnose.actuation import actuation
+from diagnose_cases import INTERVAL, MOTIONS, poses
+
+FINE = 20
+"""Steps between two samples in which the true lag is integrated."""
+
+
+def commands() -> np.ndarray:
+    """Twists that carry the grippers along the motions, shape [E, T, 2, 3]."""
+    wanted = np.stack([poses(m) for m in MOTIONS])
+    twist = np.zeros_like(wanted)
+    twist[:, :-1] = np.diff(wanted, axis=1) / INTERVAL
+    return twist
+
+
+def arms(*, gain: float = 1.0, delay: float = 0.0, slow: float = 0.0, backlash: float = 0.0, noise: float = 2e-5):
+    """Measured poses of arms that scale, delay, smooth, and play; integrated in small steps."""
+    wanted = np.stack([poses(m) for m in MOTIONS])
+    moved = wanted[:, :1] + gain * (wanted - wanted[:, :1])
+    n = moved.shape[1]
+    fine = np.arange((n - 1) * FINE + 1) / FINE
+    before = np.minimum(fine.astype(int), n - 2)
+    share = (fine - before)[:, None, None]
+
+    def at(path, times):
+        times = np.clip(times, 0, n - 1)
+        lower = np.minimum(times.astype(int), n - 2)
+        weight = (times - lower)[:, None, None]
+        return (1 - weight) * path[lower] + weight * path[lower + 1]
+
+    measured = []
+    for path in moved:
+        target = at(path, fine - delay / INTERVAL) if delay else (1 - share) * path[before] + share * path[before + 1]
+        state, states = target[0].copy(), [target[0].copy()]
+        for goal in target[1:]:
+            if slow:
+                state = state + (goal - state) * (INTERVAL / FINE / slow)
+            elif backlash:
+                state = np.clip(state, goal - backlash / 2, goal + backlash / 2)
+            else:
+                state = goal
+            states.append(state)
+        measured.append(np.stack(states[::FINE]))
+    result = np.stack(measured)
+    return result + noise * np.random.default_rng(0).normal(size=result.shape)
+
+
+def told(**faults):
+    measured = arms(**faults)
+    return actuation(measured, commands(), np.full(len(MOTIONS), INTERVAL), np.full(len(MOTIONS), measured.shape[1]))
+
+
+def test_exact_arms_do_not_deviate():
+    result = told()
+    assert not result.deviates and result.explained and result.effects == {}
+    np.testing.assert_allclose(result.commanded, arms(noise=0.0), atol=2e-4)
+
+
+@pytest.mark.parametrize("gain", [0.92, 1.08])
+def test_a_gain_is_told(gain):
+    result = told(gain=gain)
+    assert set(result.effects) == {"actuation_gain"} and result.explained
+    value, (low, high), unit = result.effects["actuation_gain"]
+    assert value == pytest.approx(gain, abs=0.002) and low <= gain <= high and unit == ""
+
+
+@pytest.mark.parametrize(
+    ("delay", "slow"), [(0.25, 0.0), (0.0, 0.25), (0.15, 0.2)], ids=["delay", "first order", "delay and first order"]
+)
+def test_a_lag_is_told_by_its_total(delay, slow):
+    result = told(delay=delay, slow=slow)
+    assert set(result.effects) == {"actuation_lag"} and result.explained
+    value, (low, high), unit = result.effects["actuation_lag"]
+    assert value == pytest.approx(delay + slow, abs=0.02) and unit == "s"
+    assert low - 0.01 <= delay + slow <= high + 0.01
+    assert result.leftover < 0.1 * result.deviation
+
+
+def test_gain_and_lag_are_told_together():
+    result = told(gain=1.08, delay=0.1, slow=0.15)
+    assert set(result.effects) == {"actuation_gain", "actuation_lag"} and result.explained
+    assert result.effects["actuation_gain"][0] == pytest.approx(1.08, abs=0.004)
+    assert result.effects["actuation_lag"][0] == pytest.approx(0.25, abs=0.02)
+
+
+def test_backlash_is_seen_but_has_no_name():
+    result = told(backlash=0.012)
+    assert result.deviates and not result.explained
+
+
+def test_poses_with_the_effects_are_the_measured_ones():
+    measured = arms(gain=1.08, slow=0.2)
+    result = told(gain=1.08, slow=0.2)
+    assert np.abs(result.predicted - measured).max() < 1e-3 < np.abs(result.commanded - measured).max()
+
+
+def test_padding_does_not_count():
+    measured, twist = arms(gain=1.08), commands()
+    length = np.array([measured.shape[1]] * len(MOTIONS))
+    padded = np.concatenate([measured, np.full((*measured.shape[:1], 30, 2, 3), 9.0)], axis=1)
+    more = np.concatenate([twist, np.zeros((*twist.shape[:1], 30, 2, 3))], axis=1)
+    plain = actuation(measured, twist, np.full(4, INTERVAL), length)
+    result = actuation(padded, more, np.full(4, INTERVAL), length)
+    assert result.effects["actuation_gain"][0] == pytest.approx(plain.effects["actuation_gain"][0], abs=1e-6)
+    assert result.deviation == pytest.approx(plain.deviation)

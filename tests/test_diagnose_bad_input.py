@@ -1,0 +1,212 @@
+"""Recordings that are not as they should be: a clear error or a stated loss of power, never a confident wrong name."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from cablejax.diagnose import Diagnosis, DiagnosisError, diagnose
+from cablejax.diagnose.recording import prepare
+from cablejax.types import GapLog
+from diagnose_cases import BY_NAME, SAMPLES, clean, log_of, noise, record
+
+FEW = tuple(BY_NAME[n] for n in ("gripper_rotation_offset", "bending_stiffness", "keypoint_bias"))
+NAME = "gripper_rotation_offset"
+OFFSET = (NAME, 0, (0.08,))
+
+
+def told(log: GapLog) -> Diagnosis:
+    return diagnose(log, effects=FEW)
+
+
+def not_misled(result: Diagnosis, *true: str) -> bool:
+    """No name but the true ones is given without a doubt."""
+    return result.verdict != "named" or {e.name for e in result.effects} <= set(true)
+
+
+def caveat(result: Diagnosis, words: str) -> bool:
+    return any(words in text for text in result.caveats)
+
+
+def episodes(log: GapLog, chosen: list[int]) -> GapLog:
+    arrays = {f.name: getattr(log, f.name)[chosen] for f in dataclasses.fields(GapLog) if f.name != "meta"}
+    return GapLog(meta={**log.meta, "motion": [log.meta["motion"][i] for i in chosen]}, **arrays)
+
+
+def samples(log: GapLog, chosen: np.ndarray) -> GapLog:
+    arrays = {
+        f.name: getattr(log, f.name)[:, chosen]
+        for f in dataclasses.fields(GapLog)
+        if f.name not in ("meta", "episode_length")
+    }
+    return GapLog(meta=log.meta, episode_length=np.full_like(log.episode_length, len(chosen)), **arrays)
+
+
+def of_length(log: GapLog, length: float) -> GapLog:
+    meta = {**log.meta, "cable": {**log.meta["cable"], "length_m": length}}
+    meta["keypoint_arclength_m"] = np.linspace(0, length, log.keypoints.shape[2]).tolist()
+    return dataclasses.replace(log, meta=meta)
+
+
+def holed(log: GapLog, share: float) -> GapLog:
+    keypoints = log.keypoints.copy()
+    keypoints[np.random.default_rng(0).random(keypoints.shape[:3]) < share] = np.nan
+    return dataclasses.replace(log, keypoints=keypoints)
+
+
+# Less than there should be.
+
+
+@pytest.mark.parametrize("effect", [(OFFSET,), ()], ids=["effect", "none"])
+def test_one_episode_is_told_to_be_little(effect):
+    result = told(episodes(record(*effect), [0]))
+    assert caveat(result, "One episode only") and not_misled(result, NAME)
+    assert (result.verdict == "none") == (effect == ())
+
+
+@pytest.mark.slow
+def test_without_holds_the_noise_is_assumed():
+    result = told(dataclasses.replace(record(OFFSET), hold=None))
+    assert caveat(result, "No holds") and not_misled(result, NAME)
+    assert result.noise_mm.mean() == pytest.approx(0.5, rel=0.05)
+
+
+def test_without_commands_the_arms_are_not_judged():
+    log = record()
+    result = told(dataclasses.replace(log, gripper_command=np.zeros_like(log.gripper_command)))
+    assert caveat(result, "No commands") and result.verdict == "none"
+
+
+def test_a_fifth_of_the_keypoints_may_be_missing():
+    result = told(holed(record(OFFSET), 0.2))
+    assert caveat(result, "keypoints are missing")
+    assert [e.name for e in result.effects] == [NAME] and result.verdict in ("named", "ambiguous")
+    assert result.effects[0].parameters["angle_rad"].value == pytest.approx(0.08, abs=0.004)
+
+
+@pytest.mark.slow
+def test_a_keypoint_never_seen_does_not_matter():
+    log = record(OFFSET)
+    log.keypoints[:, :, 4] = np.nan
+    result = told(log)
+    assert [e.name for e in result.effects] == [NAME]
+
+
+def test_nothing_seen_is_refused():
+    with pytest.raises(DiagnosisError, match="keypoints are missing"):
+        told(holed(record(), 0.95))
+
+
+def test_a_moment_is_refused():
+    with pytest.raises(DiagnosisError, match="expected at least 20"):
+        told(samples(record(), np.arange(15)))
+
+
+# Other than it says.
+
+
+@pytest.mark.parametrize(("length", "message"), [(0.7, "more than the cable's length"), (1.3, "times as far apart")])
+def test_a_wrong_length_is_refused(length, message):
+    with pytest.raises(DiagnosisError, match=message):
+        told(of_length(record(), length))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("length", [0.95, 1.05])
+def test_a_length_a_little_wrong_gets_no_wrong_name(length):
+    """None of these effects is a wrong length."""
+    result = told(of_length(record(), length))
+    assert result.verdict != "none" and not_misled(result)
+
+
+def test_millimetres_are_refused():
+    log = record()
+    with pytest.raises(DiagnosisError, match="in metres"):
+        told(dataclasses.replace(log, keypoints=1e3 * log.keypoints))
+    pose = log.gripper_pose * np.array([1e3, 1e3, 1.0], np.float32)
+    with pytest.raises(DiagnosisError, match="in metres"):
+        told(dataclasses.replace(log, keypoints=1e3 * log.keypoints, gripper_pose=pose))
+
+
+def test_another_frame_is_refused():
+    log = record()
+    with pytest.raises(DiagnosisError, match="in one frame"):
+        told(dataclasses.replace(log, keypoints=log.keypoints + np.float32(0.5)))
+
+
+def test_space_is_refused():
+    log = record()
+    height = np.zeros_like(log.keypoints[..., :1])
+    upright = np.zeros((*log.gripper_pose.shape[:3], 7), np.float32)
+    upright[..., :2], upright[..., 3] = log.gripper_pose[..., :2], 1.0
+    still = np.zeros((*log.gripper_pose.shape[:3], 6), np.float32)
+    solid = np.concatenate([log.keypoints, height], axis=-1)
+    with pytest.raises(DiagnosisError, match="3 dimensions"):
+        told(dataclasses.replace(log, keypoints=solid, gripper_pose=upright, gripper_command=still))
+
+
+@pytest.mark.parametrize("sample", [0, 40])
+def test_a_pose_that_is_no_number_is_refused(sample):
+    log = record()
+    log.gripper_pose[1, sample, 0, 1] = np.nan
+    with pytest.raises(ValueError, match="finite"):
+        told(log)
+
+
+def test_two_cables_end_to_end_are_refused():
+    """Keypoints of a second, shorter cable in one frame with the first."""
+    log = record()
+    keypoints = log.keypoints.copy()
+    keypoints[:, :, 7:] = keypoints[:, :, 7:][:, :, ::-1] + np.float32(0.3)
+    with pytest.raises(DiagnosisError):
+        told(dataclasses.replace(log, keypoints=keypoints))
+
+
+def test_two_cables_in_one_file_get_no_name_for_both():
+    """Half of the episodes with one grasp, half with the opposite one: no single angle explains both."""
+    one, other = (clean((NAME, 0, (angle,))) for angle in (0.08, -0.08))
+    both = np.concatenate([one[:2], other[2:]])
+    result = told(log_of(both + noise(both.shape, 0.5, 3)))
+    assert result.verdict in ("unknown", "named+unknown")
+    assert result.gap.shrinkage < 0.6
+
+
+# Clocks.
+
+
+def test_a_second_lost_is_bridged():
+    log = samples(record(OFFSET), np.delete(np.arange(SAMPLES), np.arange(50, 60)))
+    result = told(log)
+    assert caveat(result, "clock of episode 0 jumps 1 times")
+    assert [e.name for e in result.effects] == [NAME]
+    assert result.effects[0].parameters["angle_rad"].value == pytest.approx(0.08, abs=0.004)
+
+
+@pytest.mark.slow
+def test_a_clock_that_leaps_gets_no_wrong_name():
+    """The stamps leap by three seconds in the middle of the motion, the cable does not wait."""
+    log = record()
+    log.time[:, 50:] += 3.0
+    result = told(log)
+    assert caveat(result, "clock") and not_misled(result)
+
+
+def test_lost_samples_leave_the_rest_in_place():
+    log = record()
+    whole = prepare(log)
+    gap = prepare(samples(log, np.delete(np.arange(SAMPLES), np.arange(50, 60))))
+    np.testing.assert_array_equal(gap.length, SAMPLES)
+    assert np.isnan(gap.keypoints[:, 50:60]).all()
+    kept = np.delete(np.arange(SAMPLES), np.arange(50, 60))
+    np.testing.assert_array_equal(gap.keypoints[:, kept], whole.keypoints[:, kept])
+    np.testing.assert_allclose(gap.gripper_pose[:, kept], whole.gripper_pose[:, kept], atol=1e-6)
+
+
+def test_turns_beyond_half_a_circle_stay_continuous():
+    log = record()
+    wrapped = log.gripper_pose.copy()
+    wrapped[..., 2] = (wrapped[..., 2] + 3.0 + np.pi) % (2 * np.pi) - np.pi
+    pose = prepare(dataclasses.replace(log, gripper_pose=wrapped, keypoints=log.keypoints)).gripper_pose
+    assert np.abs(np.diff(pose[..., 2], axis=1)).max() < 0.2

@@ -1,0 +1,199 @@
+"""Fits in lockstep: known parameters come back from noisy data, within their bounds, and nothing broken ever wins."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from cablejax.diagnose import LIBRARY, Calibration, Effect, Parameter
+from cablejax.diagnose.belief import log_scores
+from cablejax.diagnose.effects import BendingStiffness
+from cablejax.diagnose.fit import Candidate, Evidence, Fit, Term, candidate, evaluate, improve
+from cablejax.diagnose.screen import residual_of, screen, shortlist
+from diagnose_cases import BY_NAME, context, evidence, parts
+
+OFFSET = ("gripper_rotation_offset", 1, (0.08,))
+
+
+def fitted(facts: Evidence, effect: Effect, base: Candidate | None = None) -> Fit:
+    """The best of an effect's starts after fitting."""
+    starts = shortlist(screen(facts, base or candidate(), [effect], context(facts)))
+    return min(improve(facts, evaluate(facts, starts), max_iterations=15), key=lambda fit: fit.cost(facts))
+
+
+RECOVERED = {
+    "bending_stiffness": (0, (0.5,)),
+    "gripper_rotation_offset": (1, (0.08,)),
+    "viscous_drag": (0, (2.0,)),
+    "keypoint_bias": (9, (0.006,)),
+    "intrinsic_curvature": (0, (0.35, 0.2, 1.5)),
+    "camera_similarity": (0, (1.01, 0.005, 0.003, -0.002)),
+}
+
+
+@pytest.mark.parametrize("name", RECOVERED)
+def test_known_parameters_come_back(name):
+    variant, truth = RECOVERED[name]
+    facts = evidence((name, variant, truth))
+    fit = fitted(facts, BY_NAME[name])
+    assert fit.candidate.terms == (Term(BY_NAME[name], variant),)
+    true_z = candidate(*parts((name, variant, truth))).z
+    deviation = np.sqrt(np.diagonal(np.linalg.inv(fit.precision(facts))))
+    assert deviation.max() < 0.1, "the log tells the parameters well"
+    np.testing.assert_array_less(np.abs(fit.candidate.z - true_z), 4.5 * deviation)
+    # what is left is the noise: a chi-square of as many degrees of freedom
+    left = facts.count.sum() - len(true_z)
+    assert abs(fit.sse.sum() - left) < 4.5 * np.sqrt(2 * left)
+
+
+def test_two_effects_come_back_together():
+    stiff = ("bending_stiffness", (0.5,))
+    facts = evidence(stiff, OFFSET)
+    one = fitted(facts, BY_NAME["gripper_rotation_offset"])
+    both = fitted(facts, BY_NAME["bending_stiffness"], one.candidate)
+    (angle,), (ratio,) = both.candidate.values()
+    assert angle == pytest.approx(0.08, abs=0.002) and ratio == pytest.approx(0.5, rel=0.05)
+    assert both.sse.sum() < 0.5 * one.sse.sum()
+
+
+def test_the_true_effect_explains_most_at_first_sight():
+    facts = evidence(OFFSET)
+    effects = [BY_NAME[n] for n in ("bending_stiffness", "gripper_rotation_offset", "keypoint_bias", "viscous_drag")]
+    templates = screen(facts, candidate(), effects, context(facts))
+    best = max(templates, key=lambda t: t.explained)
+    assert best.start.terms[0] == Term(BY_NAME["gripper_rotation_offset"], 1)
+    assert 0.97 < best.explained < 1.03
+    assert best.start.values()[0][0] == pytest.approx(0.08, abs=0.006), "stretched to the size of the gap"
+
+
+def test_what_an_effect_leaves_is_the_noise():
+    facts = evidence(OFFSET)
+    left = residual_of(facts, candidate(*parts(OFFSET)))
+    assert left.std() == pytest.approx(5e-4, rel=0.03)
+
+
+class _Bounded(BendingStiffness):
+    name = "bounded"
+    parameters = (Parameter("ratio", "", 0.7, 1.3, 1.0, 1.0, log=True),)
+
+    def starts(self, context):
+        return [(0, (0.9,)), (0, (1.1,))]
+
+
+@pytest.mark.parametrize(("truth", "bound"), [(0.4, 0.7), (2.5, 1.3)])
+def test_bounds_are_respected(truth, bound):
+    facts = evidence(("bending_stiffness", (truth,)))
+    fit = fitted(facts, _Bounded())
+    assert fit.candidate.values()[0][0] == pytest.approx(bound, rel=1e-6)
+    low, high = fit.candidate.bounds.T
+    assert (fit.candidate.z >= low).all() and (fit.candidate.z <= high).all()
+
+
+def test_a_start_beyond_the_bounds_is_brought_back():
+    (term_bounds,) = candidate((_Bounded(), 0, (5.0,))).bounds
+    assert candidate((_Bounded(), 0, (5.0,))).z[0] == term_bounds[1]
+
+
+class _Broken(Effect):
+    """Breaks the simulation down once its parameter exceeds a limit, and explains nothing."""
+
+    name = "broken"
+    parameters = (Parameter("amount", "", -1.0, 10.0, 0.0, 1.0),)
+    null = (0.0,)
+    limit = 0.0
+
+    def apply(self, physics, values, variant, config):
+        bad = np.float32(np.nan if float(values[0]) > self.limit else 1.0)
+        return dataclasses.replace(physics, stiffness=physics.stiffness * bad)
+
+    def starts(self, context):
+        return [(0, (1.0,))]
+
+
+def test_a_broken_simulation_never_wins():
+    facts = evidence(OFFSET)
+    broken = candidate((_Broken(), 0, (1.0,)))
+    null, dead, good = evaluate(facts, [candidate(), broken, candidate(*parts(OFFSET))])
+    assert (dead.sse > 1e9).all() and not dead.gradient.any() and not dead.curvature.any()
+    assert np.isfinite(dead.cost(facts)) and dead.cost(facts) > null.cost(facts) > good.cost(facts)
+    scores = log_scores([null, dead, good], facts, Calibration())
+    assert np.isfinite(scores).all() and scores.argmin() == 1 and scores.argmax() == 2
+    assert screen(facts, candidate(), [_Broken()], context(facts)) == [], "no template of a breakdown"
+
+
+def test_a_fit_does_not_step_into_a_breakdown():
+    class Edge(BendingStiffness):
+        """Stiffness that the simulation only bears above 0.55."""
+
+        def apply(self, physics, values, variant, config):
+            bad = np.float32(np.nan if float(values[0]) < 0.55 else 1.0)
+            return dataclasses.replace(physics, stiffness=physics.stiffness * values[0] * bad)
+
+    facts = evidence(("bending_stiffness", (0.4,)))
+    start = evaluate(facts, [candidate((Edge(), 0, (0.9,)))])[0]
+    fit = improve(facts, [start], max_iterations=15)[0]
+    assert np.isfinite(fit.candidate.z).all() and (fit.sse < 1e9).all()
+    assert 0.55 <= fit.candidate.values()[0][0] < 0.7 and fit.cost(facts) < start.cost(facts)
+
+
+def test_iterations_never_make_a_fit_worse():
+    facts = evidence(("bending_stiffness", (0.5,)), OFFSET)
+    starts = shortlist(
+        screen(facts, candidate(), [BY_NAME["bending_stiffness"], BY_NAME["viscous_drag"]], context(facts))
+    )
+    before = evaluate(facts, starts)
+    after = improve(facts, before, max_iterations=3)
+    assert all(a.cost(facts) <= b.cost(facts) for a, b in zip(after, before, strict=True))
+
+
+def test_candidates_do_not_disturb_each_other():
+    """Many candidates share a batch; each must come out as it does alone."""
+    facts = evidence(OFFSET)
+    several = [candidate(*parts(OFFSET)), candidate(), candidate(*parts(("bending_stiffness", (0.5,)), OFFSET))]
+    for together, one in zip(evaluate(facts, several), several, strict=True):
+        (alone,) = evaluate(facts, [one])
+        np.testing.assert_allclose(together.sse, alone.sse, rtol=1e-5)
+        np.testing.assert_allclose(together.curvature, alone.curvature, rtol=1e-3, atol=1e-3)
+
+
+def test_missing_keypoints_do_not_count():
+    facts = evidence(OFFSET)
+    target = facts.target.copy()
+    target[0, 10:20, 3] = np.nan
+    some = dataclasses.replace(facts, target=target)
+    np.testing.assert_array_equal(facts.count - some.count, [20, 0, 0, 0])
+    (fit,) = evaluate(some, [candidate(*parts(OFFSET))])
+    assert np.isfinite(fit.sse).all() and np.isfinite(fit.gradient).all()
+
+
+def test_restricted_evidence_is_that_of_the_episodes():
+    facts = evidence(OFFSET)
+    whole, part = (evaluate(f, [candidate(*parts(OFFSET))])[0] for f in (facts, facts.restricted([2, 0])))
+    np.testing.assert_allclose(part.sse, whole.sse[[2, 0]], rtol=1e-5)
+
+
+def test_held_out_errors_are_those_of_a_fit_without_the_episode():
+    effects = (("bending_stiffness", (0.5,)), OFFSET)
+    facts = evidence(*effects, noise_mm=2.0)
+    (fit,) = improve(facts, evaluate(facts, [candidate(*parts(*effects))]), max_iterations=10)
+    short = fit.held_out_sse(facts)
+    assert (short >= fit.sse).all() and (short - fit.sse).max() > 0.1
+    without = []
+    for episode in range(len(short)):
+        rest = fit.precision(facts) - fit.curvature[episode]
+        step = np.linalg.solve(rest, fit.gradient[episode])
+        without.append(dataclasses.replace(fit.candidate, z=fit.candidate.z + step))
+    for episode, seen in enumerate(evaluate(facts, without)):
+        expected = max(seen.sse[episode], fit.sse[episode])
+        assert short[episode] == pytest.approx(expected, abs=0.3 + 0.1 * abs(expected - fit.sse[episode]))
+
+
+def test_every_start_of_the_library_lies_within_its_bounds():
+    facts = evidence(OFFSET)
+    for effect in LIBRARY:
+        for variant, values in effect.starts(context(facts)):
+            assert variant in effect.variants
+            for parameter, value in zip(effect.parameters, values, strict=True):
+                assert parameter.low <= value <= parameter.high, (effect.name, parameter.name, value)

@@ -1,0 +1,146 @@
+"""The noise floor: what is put into a recording comes out again."""
+
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+
+from cablejax.diagnose.noise import SMALLEST, noise_floor
+from diagnose_cases import holds, log_of, poses
+
+EPISODES, SAMPLES, POINTS = 4, 300, 13
+
+
+def moving(seed: int = 0) -> np.ndarray:
+    """Points on a straight line that sways, without noise [m]."""
+    t = 0.1 * np.arange(SAMPLES)
+    x = np.linspace(0, 1, POINTS)[None] + 0.1 * np.sin(0.5 * t + seed)[:, None]
+    y = 0.2 * np.sin(0.3 * t)[:, None] * np.linspace(0, 1, POINTS)[None]
+    return np.stack([np.stack([x, y], axis=-1)] * EPISODES)
+
+
+def held(begin: int = 100, end: int = 200) -> tuple[np.ndarray, np.ndarray]:
+    """The same, at rest from `begin` to `end`, and the flags."""
+    index = np.arange(SAMPLES)
+    index = np.where(index < begin, index, np.where(index < end, begin, index - (end - begin)))
+    flags = np.zeros((EPISODES, SAMPLES), bool)
+    flags[:, begin:end] = True
+    return moving()[:, index], flags
+
+
+def white(std: float, seed: int = 0) -> np.ndarray:
+    return std * np.random.default_rng(seed).normal(size=(EPISODES, SAMPLES, POINTS, 2))
+
+
+def coloured(std: float, rho: float, seed: int = 0) -> np.ndarray:
+    """First-order autoregressive noise of that standard deviation."""
+    drive = white(std * np.sqrt(1 - rho**2), seed)
+    drive[:, 0] /= np.sqrt(1 - rho**2)
+    return lfilter([1.0], [1.0, -rho], drive, axis=1)
+
+
+def test_white_noise_is_found_in_holds():
+    points, flags = held()
+    floor = noise_floor(points + white(7e-4), flags)
+    assert floor.from_holds
+    np.testing.assert_allclose(floor.std, 7e-4, rtol=0.04)
+    assert np.ptp(floor.std) == 0, "keypoints share one level unless one stands out"
+    assert np.abs(floor.correlation).max() < 0.06
+
+
+def test_correlation_in_time_is_found_in_holds():
+    points, flags = held()
+    floor = noise_floor(points + coloured(7e-4, 0.6), flags)
+    assert floor.from_holds
+    np.testing.assert_allclose(floor.std, 7e-4, rtol=0.1)
+    # a line is taken out of each hold, and a little of slow noise with it
+    np.testing.assert_allclose(floor.correlation[:3], [0.6, 0.36, 0.216], atol=0.08)
+
+
+def test_correlated_noise_is_not_sharpened_by_differences():
+    """Third differences see only the fast part of slow noise: half of it here."""
+    points, flags = held()
+    noisy = points + coloured(7e-4, 0.8)
+    assert noise_floor(noisy, flags).std[0] > 5.5e-4 > noise_floor(noisy, None).std[0]
+
+
+@pytest.mark.parametrize("flags", [None, np.zeros((EPISODES, SAMPLES), bool)], ids=["no flags", "never held"])
+def test_without_holds_the_noise_is_taken_to_be_white(flags):
+    floor = noise_floor(moving() + white(7e-4), flags)
+    assert not floor.from_holds
+    np.testing.assert_allclose(floor.std, 7e-4, rtol=0.04)
+    np.testing.assert_array_equal(floor.correlation, 0.0)
+
+
+def test_a_hold_too_short_tells_nothing():
+    points, flags = held(100, 108)
+    assert not noise_floor(points + white(7e-4), flags).from_holds
+
+
+@pytest.mark.parametrize("with_holds", [True, False])
+def test_one_noisier_keypoint_has_its_own_level(with_holds):
+    points, flags = held()
+    noise = white(7e-4)
+    noise[:, :, 5] *= 3
+    std = noise_floor(points + noise, flags if with_holds else None).std
+    others = np.delete(std, 5)
+    assert std[5] == pytest.approx(2.1e-3, rel=0.08)
+    np.testing.assert_allclose(others, 7e-4, rtol=0.25)
+    assert std[5] > 2.2 * others.max()
+
+
+def test_a_noisier_keypoint_does_not_raise_the_others():
+    points, flags = held()
+    noise = white(7e-4)
+    noise[:, :, 5] *= 3
+    np.testing.assert_allclose(np.delete(noise_floor(points + noise, flags).std, 5), 7e-4, rtol=0.1)
+
+
+def test_noise_scales_with_the_recording():
+    points, flags = held()
+    single, double = (noise_floor(points + k * white(7e-4), flags) for k in (1, 2))
+    # the jerks with which the motion stops and starts do not scale
+    np.testing.assert_allclose(double.std, 2 * single.std, rtol=0.01)
+
+
+def test_missing_keypoints_do_not_change_the_level():
+    points, flags = held()
+    noisy = points + white(7e-4)
+    noisy[np.random.default_rng(1).random(noisy.shape[:3]) < 0.2] = np.nan
+    floor = noise_floor(noisy, flags)
+    assert floor.from_holds
+    np.testing.assert_allclose(floor.std, 7e-4, rtol=0.06)
+
+
+def test_a_cable_that_creeps_in_its_holds_adds_no_noise():
+    points, flags = held()
+    creep = np.where(flags, np.clip(np.arange(SAMPLES) - 100, 0, 100) * 2e-5, 0.0)
+    floor = noise_floor(points + creep[..., None, None] + white(7e-4), flags)
+    np.testing.assert_allclose(floor.std, 7e-4, rtol=0.04)
+
+
+def test_a_cable_that_snaps_adds_no_noise():
+    points, flags = held()
+    points[:, 250:, 4:9] += 0.05
+    np.testing.assert_allclose(noise_floor(points + white(7e-4), flags).std, 7e-4, rtol=0.04)
+
+
+def test_a_real_motion_adds_no_noise():
+    pose = poses("ramp_hold")
+    between = np.linspace(0, 1, POINTS)[None, :, None]
+    line = pose[:, :1, :2] * (1 - between) + pose[:, 1:, :2] * between
+    points = np.stack([line] * EPISODES) + white(5e-4)[:, : len(line)]
+    log = log_of(points)
+    assert log.hold is not None and holds().any()
+    np.testing.assert_allclose(noise_floor(log.keypoints.astype(float), log.hold).std, 5e-4, rtol=0.06)
+
+
+def test_without_noise_the_least_that_is_believed_is_assumed():
+    floor = noise_floor(np.zeros((1, SAMPLES, POINTS, 2)), None)
+    np.testing.assert_array_equal(floor.std, SMALLEST)
+
+
+def test_too_few_observations_are_refused():
+    points = np.full((1, SAMPLES, POINTS, 2), np.nan)
+    points[:, :10] = white(1e-3)[:1, :10]
+    with pytest.raises(ValueError, match="expected at least 20"):
+        noise_floor(points, None)

@@ -1,0 +1,256 @@
+"""The page of a diagnosis and its verdict: what they say for every kind of verdict, and that they need nothing else."""
+
+from __future__ import annotations
+
+import dataclasses
+import html.parser
+import json
+import re
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from cablejax.diagnose.diagnosis import Diagnosis, Gap, NamedEffect, NextMotion, ParameterEstimate, Ranked
+from cablejax.diagnose.verdict_json import verdict_json, write_verdict
+from cablejax.diagnose.where import localise
+from cablejax.report.diagnosis_page import write_diagnosis_page
+from cablejax.report.effect_words import effect_place, quantity, share
+from diagnose_cases import log_of, poses
+
+MOTIONS = ("approach", "translation")
+POINTS = 13
+CURVED = NamedEffect(
+    "intrinsic_curvature",
+    0.93,
+    {
+        "centre_m": ParameterEstimate(0.31, (0.29, 0.33), "m"),
+        "curvature_per_m": ParameterEstimate(1.25, (1.1, 1.4), "1/m"),
+    },
+    {"along_cable_m": [0.2, 0.42], "time_s": None, "table_m": None},
+)
+MARKS = NamedEffect(
+    "keypoint_bias",
+    0.8,
+    {
+        "index": ParameterEstimate([8, 4], None, ""),
+        "offset_m": ParameterEstimate([0.0055, -0.004], [(0.005, 0.006), (-0.005, -0.003)], "m"),
+    },
+    {"along_cable_m": [0.33, 0.33], "time_s": None, "table_m": None},
+)
+OBSTACLE = NamedEffect(
+    "obstacle",
+    0.7,
+    {"x_m": ParameterEstimate(0.4, (0.39, 0.41), "m"), "radius_m": ParameterEstimate(0.03, (0.02, 0.04), "m")},
+    {"along_cable_m": None, "time_s": None, "table_m": [0.4, 0.1]},
+)
+RANKING = (
+    Ranked("intrinsic_curvature", 0.93, 0.97, 0.4),
+    Ranked("gripper_rotation_offset", 0.07, 0.7, 1.6),
+    Ranked("obstacle", 0.0, float("nan"), 2.9),
+)
+
+
+def diagnosis(verdict="named", **changes) -> Diagnosis:
+    """A made-up diagnosis of two episodes whose gap is 3 mm in the middle of the cable."""
+    s = np.linspace(0.0, 1.0, POINTS)
+    pose = np.stack([poses(m) for m in MOTIONS])[..., :2]
+    nominal = pose[:, :, None, 0] * (1 - s)[:, None] + pose[:, :, None, 1] * s[:, None]
+    nominal = nominal + 0.2 * np.sin(np.pi * s)[:, None] * np.array([0.0, 1.0])
+    gap = 0.0 if verdict == "none" else 4e-3 * np.sin(np.pi * s)[:, None]
+    noise = 1e-3 * np.random.default_rng(0).normal(size=nominal.shape)
+    log = log_of((nominal + gap + noise).astype(np.float32), MOTIONS)
+    values = {
+        "verdict": verdict,
+        "sentence": f"A sentence about {verdict} & nothing < else.",
+        "effects": (CURVED,),
+        "equivalent": (),
+        "ranking": RANKING,
+        "gap": Gap(
+            before_rmse_mm=3.2,
+            after_rmse_mm=1.1,
+            noise_floor_mm=1.0,
+            shrinkage=0.977,
+            shrinkage_ci90=(0.95, 0.99),
+            ahead_mm={"nominal": 2.9, "ridge": 2.2, "named": 1.4},
+            horizons_mm={1.0: (2.0, 1.0), 5.0: (2.8, 1.1), 9.9: (3.2, 1.1)},
+            held_out_episodes=(0, 1),
+            split={"noise": 0.1, "named": 0.87, "learnable": 0.02, "unexplained": 0.01},
+        ),
+        "where": localise(log, nominal, np.full(POINTS, 1e-3)),
+        "next_motion": NextMotion(
+            "mirror", ("intrinsic_curvature", "gripper_rotation_offset + obstacle"), 3.4, {"mirror": 3.4, "taut": 0.2}
+        ),
+        "baselines": {"lowest_cost": "plasticity", "bic": "intrinsic_curvature"},
+        "caveats": ("No holds & <no> commissioning.",),
+        "log": log,
+        "nominal": nominal,
+        "explained": nominal + gap,
+        "noise_mm": np.ones(POINTS),
+        "noise_correlation": np.zeros(3),
+        "seconds": 12.3,
+        "settings": {"jax": "0", "links": {"fit": 33}},
+    }
+    return Diagnosis(**{**values, **changes})
+
+
+NO_GAP = Gap(
+    before_rmse_mm=1.0,
+    after_rmse_mm=1.0,
+    noise_floor_mm=1.0,
+    shrinkage=None,
+    shrinkage_ci90=None,
+    ahead_mm=None,
+    horizons_mm={1.0: (1.0, 1.0)},
+    held_out_episodes=(),
+    split={"noise": 1.0, "named": 0.0, "learnable": 0.0, "unexplained": 0.0},
+)
+ALIKE = (("intrinsic_curvature", "gripper_rotation_offset"),)
+FAINT = NextMotion("taut", ("bending_stiffness", "table_friction"), 0.03, {"taut": 0.03, "mirror": 0.01})
+CASES = {
+    "named": (
+        lambda: diagnosis(),
+        "Cause named",
+        ["0.31 m (0.29 to 0.33)", "98 %", "95 % to 99 %", "Record <b>mirror"],
+    ),
+    "none": (
+        lambda: diagnosis("none", effects=(), ranking=(), gap=NO_GAP, next_motion=None, explained=None, caveats=()),
+        "No gap found",
+        ["no effect is named", "nothing left to tell apart", "would have shown"],
+    ),
+    "ambiguous": (
+        lambda: diagnosis("ambiguous", equivalent=ALIKE, next_motion=FAINT),
+        "Cause narrowed down",
+        ["intrinsic curvature or gripper rotation offset", "cannot tell", "No safe motion tells"],
+    ),
+    "named+unknown": (
+        lambda: diagnosis("named+unknown", effects=(CURVED, MARKS, OBSTACLE), next_motion=None),
+        "Part of the cause named",
+        ["at keypoints 4 and 8", "x = 0.40 m", "-4.0 mm (-5.0 to -3.0)", "No motion of the library would help"],
+    ),
+    "unknown": (
+        lambda: diagnosis("unknown", effects=()),
+        "Cause not in the library",
+        ["not in the library", "has no cause in the library", "closest: intrinsic curvature"],
+    ),
+}
+
+
+@pytest.fixture(scope="module", params=CASES)
+def written(request, tmp_path_factory):
+    build, badge, words = CASES[request.param]
+    folder = tmp_path_factory.mktemp("diagnosis")
+    (folder / "ranking.png").write_bytes(b"of an earlier diagnosis")
+    result = build()
+    page = write_diagnosis_page(result, folder)
+    return result, folder, page.read_text(encoding="utf-8"), badge, words
+
+
+class _Outside(html.parser.HTMLParser):
+    """Collects what a page would fetch."""
+
+    def __init__(self):
+        super().__init__()
+        self.fetched: list[str] = []
+
+    def handle_starttag(self, tag, attrs):
+        self.fetched += [v for name, v in attrs if name in ("src", "href", "xlink:href", "data") and v]
+
+
+def test_page_says_the_verdict_and_what_belongs_to_it(written):
+    _, _, page, badge, words = written
+    assert badge in page
+    for word in words:
+        assert word in page, word
+
+
+def test_page_needs_nothing_else(written):
+    _, _, page, _, _ = written
+    parser = _Outside()
+    parser.feed(page)
+    assert parser.fetched and all(link.startswith(("data:", "#")) for link in parser.fetched)
+    assert not re.search(r"<script|@import|url\((?!#)", page)
+    ids = re.findall(r'\bid="([^"]+)"', page)
+    assert len(ids) == len(set(ids))
+
+
+def test_text_from_outside_cannot_break_the_page(written):
+    result, _, page, _, _ = written
+    assert "&amp; nothing &lt; else." in page
+    if result.caveats:
+        assert "No holds &amp; &lt;no&gt; commissioning." in page
+
+
+def test_figures_lie_beside_the_page(written):
+    result, folder, _, _, _ = written
+    names = {path.stem for path in folder.glob("*.png")}
+    assert names == {"cable", "where", "shrinkage"} | ({"ranking"} if result.ranking else set())
+    for path in folder.glob("*.png"):
+        with Image.open(path) as picture:
+            assert min(picture.size) > 100
+
+
+def test_verdict_beside_the_page_is_strict_json_of_the_format(written):
+    result, folder, _, _, _ = written
+    verdict = json.loads((folder / "verdict.json").read_text(encoding="utf-8"), parse_constant=_refuse)
+    assert verdict["schema"] == "cablejax-verdict/1" and verdict["verdict"] == result.verdict
+    assert {"effects", "equivalent", "ranking", "gap", "where", "next_motion"} <= set(verdict)
+    assert [e["name"] for e in verdict["effects"]] == [e.name for e in result.effects]
+    assert len(verdict["where"]["along_cable_mm"]) == POINTS and len(verdict["where"]["per_episode_mm"]) == 2
+    assert verdict["gap"]["shrinkage"] == result.gap.shrinkage
+    assert verdict["gap"]["horizon_s"] == pytest.approx(9.9)
+
+
+def _refuse(constant):
+    raise AssertionError(f"{constant} is not JSON")
+
+
+def test_verdict_has_the_formats_effects():
+    verdict = verdict_json(diagnosis())
+    assert verdict["effects"][0] == {
+        "name": "intrinsic_curvature",
+        "probability": 0.93,
+        "parameters": {
+            "centre_m": {"value": 0.31, "ci90": [0.29, 0.33], "unit": "m"},
+            "curvature_per_m": {"value": 1.25, "ci90": [1.1, 1.4], "unit": "1/m"},
+        },
+        "location": {"along_cable_m": [0.2, 0.42], "time_s": None, "table_m": None},
+    }
+    assert verdict["ranking"][2]["held_out_shrinkage"] is None
+    assert verdict["next_motion"] == "mirror" and verdict["seconds"] == 12.3
+
+
+def test_failed_write_leaves_the_verdict_that_was_there(tmp_path):
+    path = write_verdict(tmp_path / "verdict.json", diagnosis())
+    before = path.read_text(encoding="utf-8")
+    broken = dataclasses.replace(diagnosis(), sentence=object())
+    with pytest.raises(TypeError):
+        write_verdict(path, broken)
+    assert path.read_text(encoding="utf-8") == before
+    assert list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ((0.31, "m", (0.29, 0.33)), "0.31 m (0.29 to 0.33)"),
+        ((0.0093, "m", (0.0087, 0.01)), "9.3 mm (8.7 to 10.0)"),
+        ((0.2695, "", (0.2654, 0.2739)), "0.270 (0.265 to 0.274)"),
+        ((1, ""), "1"),
+        ((float("nan"), "m"), "n/a"),
+        ((12.0, "s"), "12.0 s"),
+        ((0.3, "rad", (0.3, 0.3)), "0.300 rad (0.300 to 0.300)"),
+    ],
+)
+def test_quantities_have_the_digits_that_their_intervals_support(arguments, words):
+    assert quantity(*arguments) == words
+
+
+def test_shares_are_never_rounded_to_certainty():
+    assert share(0.9999) == share(1.0) == "> 99 %" and share(0.001) == "< 1 %" and share(0.0) == share(-1e-4) == "0 %"
+
+
+def test_places_in_words():
+    assert effect_place(CURVED) == "0.20 to 0.42 m from gripper 0"
+    held = dataclasses.replace(CURVED, parameters={"gripper": ParameterEstimate(1, None, "")})
+    assert effect_place(held) == "at gripper 1"
