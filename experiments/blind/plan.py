@@ -91,7 +91,18 @@ def small_plan(seed: int) -> list[Case]:
     return [Case(index, *row) for index, row in enumerate(rows)]
 
 
-PLANS = {"stored": stored_plan, "development": development_plan, "small": small_plan}
+def commissioning_plan(seed: int) -> list[Case]:
+    """Two cases without any effect of every family, as a user would record on a set-up before it is trusted."""
+    del seed
+    return [Case(index, "none", family, (), 0) for index, family in enumerate("AABBCC")]
+
+
+PLANS = {
+    "stored": stored_plan,
+    "development": development_plan,
+    "small": small_plan,
+    "commissioning": commissioning_plan,
+}
 
 
 def _pair(rng: np.random.Generator, family: str) -> tuple[str, ...]:
