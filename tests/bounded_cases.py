@@ -118,7 +118,9 @@ PROBLEMS = {
     "Rosenbrock, start outside": Problem(rosenbrock, [1.5, -3.0], [4.0, 3.0], [-1.2, 1.0], 0.125 + 0.0),
     "Beale in a box": Problem(beale, [0.6, 0.5], [10.0, 100.0], [1.0, 1.0]),
     "Powell singular": Problem(powell_singular, _minus(FREE4), FREE4, [3.0, -1.0, 0.0, 1.0], 0.0),
-    "Powell singular in a box": Problem(powell_singular, [0.1, -20.0, -1.0, -1.0], [100.0, 20.0, 1.0, 50.0], [3.0, -1.0, 0.0, 1.0]),
+    "Powell singular in a box": Problem(
+        powell_singular, [0.1, -20.0, -1.0, -1.0], [100.0, 20.0, 1.0, 50.0], [3.0, -1.0, 0.0, 1.0]
+    ),
     "Wood in a box": Problem(wood, [-100.0] * 4, [0.0, 10.0, 100.0, 100.0], [-3.0, -1.0, -3.0, -1.0]),
     "helical valley in a box": Problem(helical_valley, [-100.0, -1.0, -1.0], [0.8, 1.0, 1.0], [-1.0, 0.0, 0.0]),
     "Brown badly scaled in a box": Problem(brown_badly_scaled, [0.0, 3e-5], [1e6, 100.0], [1.0, 1.0], 0.5 * 784.0),
