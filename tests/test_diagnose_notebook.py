@@ -6,7 +6,7 @@ import nbformat
 import pytest
 from nbclient import NotebookClient
 
-PATH = pathlib.Path(__file__).parents[1] / "notebooks" / "03_an_effect_of_your_own.ipynb"
+PATH = pathlib.Path(__file__).parents[1] / "notebooks" / "02_an_effect_of_your_own.ipynb"
 
 
 def printed(notebook) -> list[str]:

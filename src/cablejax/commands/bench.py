@@ -105,83 +105,43 @@ class BenchSimulate(Command):
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class BenchMpc(Command):
-    """Time one call of the controller: take in an observation, fit the residual, plan, command.
-
-    The loop is closed through the controller's own predictions, so that plans are warm. With --compare, all solvers;
-    with --batches, many cables in one compiled call."""
+    """Time one call of the controller: take in an observation, fit the residual, plan, command."""
 
     weights: str = "gns-reference"
     """Released model by name, or the folder of a training by `cablejax train`."""
 
-    solver: Literal[
-        "trust-region",
-        "deadline",
-        "gauss-newton",
-        "dogleg",
-        "projected-gradient",
-        "cross-entropy",
-        "path-integral",
-    ] = "trust-region"
+    solver: Literal["trust-region", "projected-gradient"] = "trust-region"
     """How the plan is found."""
-
-    compare: bool = False
-    """Time every solver, one after the other; each takes some 20 seconds to compile."""
-
-    batches: tuple[int, ...] = ()
-    """Numbers of cables to control in one call, for example 1 64; compiles once for each."""
 
     repeats: int = 60
     """Calls to time, after the first one, which compiles."""
 
     def execute(self):
-        from cablejax.mpc import SOLVERS, time_control
+        from cablejax.mpc import time_control
         from cablejax.shaping import initial_history, load_model, make_controller
         from cablejax.simulate import CableConfig
         from cablejax.targets import make_target
 
         if self.repeats < 1:
             raise UsageError(f"--repeats is {self.repeats}, expected at least 1.")
-        if min(self.batches, default=1) < 1:
-            raise UsageError(f"--batches is {self.batches}, expected numbers of cables, at least 1 each.")
         model = load_model(self.weights)
         cable = CableConfig()
-        base = make_controller(model, make_target("S", cable), method="residual", solver="trust-region")
-        history = initial_history(cable, model.config)
-
-        def controller_by(solver: str):
-            return dataclasses.replace(base, config=dataclasses.replace(base.config, solver=SOLVERS[solver]))
-
-        names = [self.solver]
-        if self.compare:
-            names += [name for name in SOLVERS if name not in (self.solver, "converged")]
-        solvers = {}
-        for name in names:
-            say(f"compiling the control step with {name} ...")
-            timing = time_control(controller_by(name), history, self.repeats)
-            solvers[name] = {"p50_ms": timing.p50_ms, "p95_ms": timing.p95_ms, "first_call_s": timing.first_call_s}
-        batches = {}
-        for size in self.batches:
-            say(f"compiling the control step for {size} cables ...")
-            p50 = _batched_control_ms(controller_by(self.solver), history, size, max(3, self.repeats // 10))
-            batches[str(size)] = {"p50_ms": p50, "cables_per_second": 1e3 * size / p50}
+        controller = make_controller(model, make_target("S", cable), method="residual", solver=self.solver)
+        say("compiling the control step ...")
+        timing = time_control(controller, initial_history(cable, model.config), self.repeats)
         result = {
             "solver": self.solver,
-            "horizon": base.config.horizon,
+            "horizon": controller.config.horizon,
             "repeats": self.repeats,
-            **solvers[self.solver],
-            "solvers": solvers,
-            "batches": batches,
+            "p50_ms": timing.p50_ms,
+            "p95_ms": timing.p95_ms,
+            "first_call_s": timing.first_call_s,
             **_machine(),
         }
-        rows = [
-            [name, f"{t['p50_ms']:.1f}", f"{t['p95_ms']:.1f}", f"{t['first_call_s']:.1f}"]
-            for name, t in solvers.items()
-        ]
-        text = text_table(["solver", "median [ms]", "95th percentile [ms]", "first call [s]"], rows)
-        if batches:
-            rows = [[size, f"{t['p50_ms']:.0f}", f"{t['cables_per_second']:.1f}"] for size, t in batches.items()]
-            text += "\n\n" + text_table(["cables in one call", "median [ms]", "cables per second"], rows)
-        return result, f"one control call, horizon {base.config.horizon}\n\n{text}"
+        return result, (
+            f"one control call ({self.solver}, horizon {controller.config.horizon}): median {timing.p50_ms:.1f} ms, "
+            f"95th percentile {timing.p95_ms:.1f} ms; the first one, which compiles, {timing.first_call_s:.1f} s"
+        )
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -332,23 +292,6 @@ def _median_seconds(contestants: dict[str, Callable[[], Any]], rounds: int) -> d
             seconds[name].append(time.perf_counter() - begin)
         say(f"round {index + 1} of {rounds}")
     return {name: float(np.median(values)) for name, values in seconds.items()}
-
-
-def _batched_control_ms(controller: Any, history: Any, size: int, repeats: int) -> float:
-    """Median wall time [ms] of one control call for `size` cables at once; each follows its own predictions."""
-    import jax
-    import jax.numpy as jnp
-    import numpy as np
-
-    state = jax.tree.map(lambda leaf: jnp.stack([leaf] * size), controller.init(history))
-    step, pose = controller.vectorised(), jnp.stack([jnp.asarray(history.gripper_pose)] * size)
-    milliseconds = []
-    for _ in range(repeats + 1):
-        begin = time.perf_counter()
-        state, twist, _ = jax.block_until_ready(step(state, state.predicted, pose))
-        milliseconds.append(1e3 * (time.perf_counter() - begin))
-        pose = pose + controller.config.objective.interval * twist
-    return float(np.median(milliseconds[1:]))
 
 
 def _machine() -> dict[str, Any]:

@@ -16,9 +16,7 @@ from cablejax.adaptation.belief import AdaptationConfig, CableBelief, prior_beli
 from cablejax.mpc.edge import check_observation, check_start, check_target
 from cablejax.mpc.feasible import FeasibleSet, feasible_from
 from cablejax.mpc.goal import continued, goal_pose, straight_plan, way_to
-from cablejax.mpc.outcome import Outcome, Plan, Solver
-from cablejax.mpc.problem import ObjectiveConfig, ShapingProblem
-from cablejax.mpc.solution import guarded_plan
+from cablejax.mpc.problem import ObjectiveConfig, Outcome, Plan, ShapingProblem, Solver
 from cablejax.mpc.trust_region import TrustRegion
 from cablejax.residual.corrected import Dynamics, corrected
 from cablejax.residual.ridge import ResidualModel, RidgeConfig, apply, fit
@@ -47,8 +45,6 @@ class MPCConfig:
         travel_beyond: where no plan is better than holding, and the way to where the target's ends are held is longer
             than this [m], the grippers travel there by the straight way: the plans are in a valley of the objective.
         max_travels: how often that may happen; a valley that is fallen into again and again is the model's.
-        workspace: lowest and highest corner (x, y) of where the grippers may be [m]; None = anywhere.
-        max_change: bound on how much each gripper's motion may change from step to step [m]; None = any.
         objective: weights and units of the planning problem.
         residual: settings of the online residual; None = trust the offline model.
         adaptation: settings of the online estimate of the cable, for a conditioned model; None = no estimate.
@@ -70,8 +66,6 @@ class MPCConfig:
     hold_improvement: float = 2e-5
     travel_beyond: float = 0.08
     max_travels: int = 3
-    workspace: tuple[tuple[float, float], tuple[float, float]] | None = None
-    max_change: float | None = None
     objective: ObjectiveConfig = ObjectiveConfig()
     residual: RidgeConfig | None = RidgeConfig(forgetting=0.5, outlier=0.02)
     adaptation: AdaptationConfig | None = None
@@ -99,12 +93,6 @@ class MPCConfig:
             )
         if not (self.travel_beyond > 0 and self.max_travels >= 0):
             raise ValueError("MPCConfig.travel_beyond must be positive [m] and max_travels not negative.")
-        if self.workspace is not None and not all(low < high for low, high in zip(*self.workspace, strict=True)):
-            raise ValueError(
-                f"MPCConfig.workspace is {self.workspace}, expected its lowest and its highest corner [m]."
-            )
-        if self.max_change is not None and not self.max_change > 0:
-            raise ValueError(f"MPCConfig.max_change is {self.max_change}, expected a positive length [m], or None.")
         if not (self.min_reduction > 0 and self.hold_improvement >= 0):
             raise ValueError("MPCConfig.min_reduction must be positive and hold_improvement not negative [m].")
 
@@ -243,10 +231,19 @@ def control(
     Returns:
         The state for the next step, the twist to hold until then (finite and within all bounds) and the report.
     """
-    state, residual, problem, rho, n_held = _state_problem(
-        config, dynamics, weights, target, state, keypoints, gripper_pose
+    state, n_held = _take_in(config, state, jnp.asarray(keypoints), jnp.asarray(gripper_pose))
+    residual = _fit_residual(config, state)
+    problem = ShapingProblem(
+        dynamics=dynamics if residual is None else corrected(dynamics),
+        weights=weights if residual is None else (weights, residual),
+        history=state.history,
+        target=jnp.asarray(target),
+        feasible=_feasible_set(config, state),
+        objective=config.objective,
     )
-    error, radius = problem.shape_error(state.history.keypoints[-1]), problem.feasible.radius
+    error = problem.shape_error(state.history.keypoints[-1])
+    rho, radius = _update_radius(config, state, error, problem.shape_error(state.predicted))
+    problem = dataclasses.replace(problem, feasible=dataclasses.replace(problem.feasible, radius=radius))
     way = _straight_way(config, problem)
     guess, value_way = _best_guess(problem, state.plan, way)
     plan, value, value_hold = _plan_or_hold(config, problem, guess)
@@ -289,40 +286,6 @@ def control(
         held=state.held + n_held,
     )
     return state, twist, info
-
-
-def planning_problem(
-    config: MPCConfig,
-    dynamics: Dynamics,
-    weights: Any,
-    target: Float[Array | np.ndarray, "N 2"],
-    state: ControllerState,
-    keypoints: Float[Array | np.ndarray, "N 2"],
-    gripper_pose: Float[Array | np.ndarray, "Q 3"],
-) -> tuple[ShapingProblem, Float[Array, "T Q 3"]]:
-    """What `control` would solve with the same arguments, and the guess that it would start from; pure."""
-    state, _, problem, _, _ = _state_problem(config, dynamics, weights, target, state, keypoints, gripper_pose)
-    return problem, _best_guess(problem, state.plan, _straight_way(config, problem))[0]
-
-
-def _state_problem(
-    config: MPCConfig, dynamics: Dynamics, weights: Any, target: Array | np.ndarray, state: ControllerState, *observed
-) -> tuple[ControllerState, ResidualModel | None, ShapingProblem, Float[Array, ""], Int[Array, ""]]:
-    """The state with the observation in it, its residual, the problem now, rho, and how many keypoints it filled in."""
-    state, n_held = _take_in(config, state, *map(jnp.asarray, observed))
-    residual = _fit_residual(config, state)
-    problem = ShapingProblem(
-        dynamics=dynamics if residual is None else corrected(dynamics),
-        weights=weights if residual is None else (weights, residual),
-        history=state.history,
-        target=jnp.asarray(target),
-        feasible=_feasible_set(config, state),
-        objective=config.objective,
-    )
-    error = problem.shape_error(state.history.keypoints[-1])
-    rho, radius = _update_radius(config, state, error, problem.shape_error(state.predicted))
-    feasible = dataclasses.replace(problem.feasible, radius=radius)
-    return state, residual, dataclasses.replace(problem, feasible=feasible), rho, n_held
 
 
 def _displacement(
@@ -386,14 +349,7 @@ def _fit_residual(config: MPCConfig, state: ControllerState) -> ResidualModel | 
 
 def _feasible_set(config: MPCConfig, state: ControllerState) -> FeasibleSet:
     limits = config.min_distance * config.cable_length, config.max_distance * config.cable_length
-    return feasible_from(
-        state.history.gripper_pose,
-        state.radius,
-        limits,
-        workspace=config.workspace,
-        change=config.max_change,
-        previous=config.objective.to_motion(state.twist),
-    )
+    return feasible_from(state.history.gripper_pose, state.radius, limits)
 
 
 def _update_radius(
@@ -418,17 +374,15 @@ def _plan_or_hold(
 ) -> tuple[Plan, Float[Array, ""], Float[Array, ""]]:
     """The solver's plan, or holding still where that is as good or nothing can be trusted; and both their values."""
     still = jnp.zeros_like(guess)
-    plan = guarded_plan(problem, config.solver, guess)
+    plan = config.solver(problem, guess)
     value, value_hold = jax.vmap(problem.value)(jnp.stack([plan.motion, still]))
     improvement = jnp.sqrt(2.0 * value_hold / config.n_commands) - jnp.sqrt(2.0 * value / config.n_commands)
     finite = jnp.isfinite(value) & jnp.isfinite(plan.motion).all()
     worthwhile = finite & (improvement >= config.hold_improvement)
-    # A plan that must be carried out although it does not pay: the grippers are outside, or nothing is possible.
-    told = (plan.outcome == Outcome.INFEASIBLE) | (plan.outcome == Outcome.NO_ROOM)
-    outcome = jnp.where(worthwhile | told, plan.outcome, jnp.where(finite, Outcome.HELD, Outcome.NONFINITE))
+    outcome = jnp.where(worthwhile, plan.outcome, jnp.where(finite, Outcome.HELD, Outcome.NONFINITE))
     motion = jnp.where(worthwhile, plan.motion, still)
     value = jnp.where(worthwhile, value, value_hold)
-    return dataclasses.replace(plan, motion=motion, outcome=outcome.astype(jnp.int32)), value, value_hold
+    return Plan(motion=motion, evaluations=plan.evaluations, outcome=outcome.astype(jnp.int32)), value, value_hold
 
 
 def _plan_or_travel(
@@ -443,7 +397,7 @@ def _plan_or_travel(
     travelling = left > 0
     outcome = jnp.where(travelling, Outcome.TRAVELLING, plan.outcome).astype(jnp.int32)
     motion = jnp.where(travelling, way.motion, plan.motion)
-    return dataclasses.replace(plan, motion=motion, outcome=outcome), left
+    return Plan(motion=motion, evaluations=plan.evaluations, outcome=outcome), left
 
 
 class _StraightWay(NamedTuple):
