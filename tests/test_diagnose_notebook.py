@@ -26,7 +26,7 @@ def pictures(notebook) -> int:
 
 def tells_the_story(notebook):
     without, mine = printed(notebook)
-    assert not without.startswith("named -")
+    assert "intrinsic curvature" in without and "figure of eight" not in without
     assert mine.startswith("named -") and "figure_of_eight: curvature_per_m = 1." in mine
     assert pictures(notebook) == 1
 
