@@ -44,6 +44,7 @@ def before(commands):
     return record(Setup(WORLD), commands, quick)
 
 
+@pytest.mark.slow
 def test_a_cable_without_load_has_one_shape_whatever_its_stiffness(commands):
     path = commands[0].fine_path(FRAMES)[:2]
     soft, stiff = (

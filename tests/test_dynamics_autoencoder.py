@@ -47,6 +47,7 @@ def test_training_begins_at_the_prior(pretrained):
     np.testing.assert_array_equal(moved, prior_of(history, twist, SMALL).displacement)
 
 
+@pytest.mark.slow
 def test_pretraining_repeats_to_the_bit_and_training_goes_on_from_it(pretrained, tmp_path):
     again = pretrain(TINY_TRAINING, DATA, PretrainConfig(steps=150, batch=8, lr_start=1e-2), progress=False)
     jax.tree.map(np.testing.assert_array_equal, again.weights, pretrained.weights)

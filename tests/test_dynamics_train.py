@@ -91,6 +91,7 @@ def test_a_complete_training_is_not_repeated_and_learns(tmp_path):
     same(again.weights, result.weights)
 
 
+@pytest.mark.slow
 def test_a_folder_with_another_training_is_left_alone(tmp_path):
     run(TINY_TRAINING, tmp_path)
     with pytest.raises(ValueError, match=r"differs in config.seed \(0, now 1\)"):

@@ -72,6 +72,7 @@ def test_ball_projection_is_nonexpansive_and_nearest(first, second, radius):
     assert (to_projection <= to_other * (1 + 1e-5) + 1e-6).all()
 
 
+@pytest.mark.slow
 @profile
 @given(motions, radii, separations)
 def test_projection_is_hardly_farther_than_any_feasible_plan(motion, radius, separation):

@@ -18,7 +18,8 @@ from cablejax.simulate.equilibrium import equilibrium_state
 
 _CONFIG = CableConfig(n_links=13)
 _SAMPLES, _INTERVAL = 60, 0.1
-_STEP = 1e-5
+# Of central differences, in prior standard deviations: so small that no contact, yield or slip begins within it.
+_STEP = 1e-6
 _TOLERANCE = 1e-4
 
 
