@@ -10,13 +10,13 @@ PATH = pathlib.Path(__file__).parents[1] / "notebooks" / "02_an_effect_of_your_o
 
 
 def printed(notebook) -> list[str]:
-    """What each cell of code printed, without those that printed nothing."""
+    """What each cell of code printed, without those that printed nothing, or what MJX prints on import."""
     texts = [
         "".join(output.get("text", "") for output in cell.outputs if output.get("name") == "stdout")
         for cell in notebook.cells
         if cell.cell_type == "code"
     ]
-    return [text for text in texts if text]
+    return [text for text in texts if text and "warp" not in text]
 
 
 def pictures(notebook) -> int:

@@ -44,7 +44,7 @@ def predicted_ahead(
     the grippers' true motion. Errors contain the noise of two observations.
 
     Returns:
-        None if no episode is long enough.
+        None if no episode is long enough, or none was observed for so long.
     """
     alone, corrected = [], []
     for e in range(len(observed)):
@@ -65,7 +65,7 @@ def predicted_ahead(
         wrong = error[window + HORIZON :][:n_starts] - error[window : window + n_starts]
         alone.append(wrong)
         corrected.append(wrong - guess)
-    if not alone:
+    if not alone or not np.isfinite(np.concatenate(corrected)).any():
         return None
     return Ahead(*(float(np.sqrt(np.nanmean(np.concatenate(x) ** 2))) for x in (alone, corrected)))
 
