@@ -69,6 +69,10 @@ class Calibration:
         """The gap [m] from which on there is one."""
         return self.resolvable * float(np.hypot(self.baseline, self.noise_share * noise))
 
+    def complete(self, left: float, gap: float, noise: float) -> bool:
+        """Whether an explanation that leaves so much of the gap, all in metres per coordinate, needs no other."""
+        return left <= max(self.adequate * gap, self.smallest_gap(noise))
+
 
 def excess(sse: float, evidence: Evidence) -> float:
     """Root mean square per coordinate above the noise [m] that whitened residuals of this sum mean."""

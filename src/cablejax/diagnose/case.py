@@ -16,6 +16,7 @@ from cablejax.diagnose.noise import NoiseFloor, noise_floor
 from cablejax.diagnose.playback import Playback
 from cablejax.diagnose.recording import DiagnosisError, Recording, prepare
 from cablejax.simulate.config import CableConfig
+from cablejax.simulate.pose import wrapped
 from cablejax.simulate.replay import config_of_log
 from cablejax.types import GapLog
 
@@ -109,7 +110,7 @@ class Case:
         """What effects take their first guesses from."""
         chord = np.diff(self.nominal, axis=2)
         turn = np.diff(np.arctan2(chord[..., 1], chord[..., 0]), axis=-1)
-        turn = np.abs((turn + np.pi) % (2 * np.pi) - np.pi)
+        turn = np.abs(wrapped(turn))
         spacing = self.config.length / (self.config.n_keypoints - 1)
         return Context(
             config=self.config,

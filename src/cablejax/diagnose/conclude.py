@@ -13,6 +13,7 @@ from cablejax.diagnose.belief import Calibration, effect_names, excess, level, p
 from cablejax.diagnose.diagnosis import NamedEffect, ParameterEstimate, Ranked, Verdict
 from cablejax.diagnose.fit import Evidence, Fit
 from cablejax.diagnose.search import Search
+from cablejax.simulate.pose import wrapped
 
 _DRAWS = 400
 
@@ -66,7 +67,7 @@ def conclude(found: Search, evidence: Evidence, calibration: Calibration) -> Con
         if len(alike) > 1:
             equivalent.append(tuple(alike))
         effects.append(_named(name, best, odds[name] / total, evidence, calibration.widening))
-    complete = left <= max(calibration.adequate * gap, smallest)
+    complete = calibration.complete(left, gap, level(evidence))
     if not effects or (explained < calibration.telling and not complete):
         return Conclusion("unknown", best, (), (), ranking, explained)
     if not complete:
@@ -163,14 +164,12 @@ def _named(name: str, fit: Fit, probability: float, evidence: Evidence, widening
     draws = np.clip(draws, *fit.candidate.bounds.T)
     parts: list[dict[str, ParameterEstimate]] = []
     location: dict[str, Any] = {"along_cable_m": None, "time_s": None, "table_m": None}
-    begin = 0
-    for term in fit.candidate.terms:
-        slots = slice(begin, begin + term.size)
-        begin += term.size
+    drawn = [fit.candidate.by_term(draw) for draw in draws]
+    for i, (term, z) in enumerate(fit.candidate.by_term()):
         if term.effect.name != name:
             continue
-        fitted = _values(term, fit.candidate.z[slots])
-        sampled = [term.effect.reported(_values(term, z), term.variant, config) for z in draws[:, slots]]
+        fitted = term.values(z)
+        sampled = [term.effect.reported(term.values(draw[i][1]), term.variant, config) for draw in drawn]
         parameters = {}
         for key, (value, unit) in term.effect.reported(fitted, term.variant, config).items():
             column = [sample[key][0] for sample in sampled]
@@ -180,17 +179,13 @@ def _named(name: str, fit: Fit, probability: float, evidence: Evidence, widening
     return NamedEffect(name, probability, _merged(parts), location)
 
 
-def _values(term, z):
-    return [p.value(np.float64(x)) for p, x in zip(term.effect.parameters, z, strict=True)]
-
-
 def _interval(value, column: Sequence[Any], unit: str):
     if isinstance(value, int):
         return None
     drawn = np.asarray(column, float)
     if unit == "rad":
         # angles near the turn of the circle
-        drawn = value + (drawn - value + np.pi) % (2 * np.pi) - np.pi
+        drawn = value + wrapped(drawn - value)
     low, high = np.quantile(drawn, (0.05, 0.95))
     return float(low), float(high)
 

@@ -43,6 +43,10 @@ class Term:
     def size(self) -> int:
         return len(self.effect.parameters)
 
+    def values(self, z: Sequence[float]) -> list[Any]:
+        """Parameter values at the term's coordinates."""
+        return [p.value(np.float64(x)) for p, x in zip(self.effect.parameters, z, strict=True)]
+
 
 @dataclasses.dataclass(frozen=True)
 class Candidate:
@@ -56,24 +60,27 @@ class Candidate:
     terms: tuple[Term, ...]
     z: Float[np.ndarray, "P"]
 
+    def by_term(self, z: Any = None) -> list[tuple[Term, Any]]:
+        """Every term with its part of the coordinates."""
+        z, ends = self.z if z is None else z, np.cumsum([0, *(term.size for term in self.terms)])
+        return [(term, z[begin:end]) for term, begin, end in zip(self.terms, ends[:-1], ends[1:], strict=True)]
+
     def values(self) -> list[np.ndarray]:
         """Parameter values of every term."""
-        parts, begin = [], 0
-        for term in self.terms:
-            z = self.z[begin : begin + term.size]
-            parts.append(np.array([p.value(np.float64(x)) for p, x in zip(term.effect.parameters, z, strict=True)]))
-            begin += term.size
-        return parts
+        return [np.array(term.values(z)) for term, z in self.by_term()]
 
     def physics(self, nominal: Physics, config: CableConfig, z: Any = None) -> Physics:
         """The nominal physics with all terms applied. Differentiable in `z`, if that is a JAX array."""
-        z = np.asarray(self.z, np.float32) if z is None else z
-        begin = 0
-        for term in self.terms:
-            values = [p.value(x) for p, x in zip(term.effect.parameters, z[begin : begin + term.size], strict=True)]
+        for term, part in self.by_term(np.asarray(self.z, np.float32) if z is None else z):
+            values = [p.value(x) for p, x in zip(term.effect.parameters, part, strict=True)]
             nominal = term.effect.apply(nominal, values, term.variant, config)
-            begin += term.size
         return nominal
+
+    @property
+    def differences(self) -> Float[np.ndarray, "P"]:
+        """Steps of forward differences in the coordinates, inwards where the upper bound is near."""
+        size = np.array([p.difference for term in self.terms for p in term.effect.parameters])
+        return np.where(self.z + size > self.bounds[:, 1], -size, size)
 
     @property
     def bounds(self) -> Float[np.ndarray, "P 2"]:
@@ -198,9 +205,7 @@ def evaluate(evidence: Evidence, candidates: Sequence[Candidate]) -> list[Fit]:
     physics, steps = [], []
     for c in candidates:
         physics.append(c.physics(nominal, config))
-        # inwards where the upper bound is near
-        size = np.array([p.difference for term in c.terms for p in term.effect.parameters])
-        sign = np.where(c.z + size > c.bounds[:, 1], -size, size)
+        sign = c.differences
         steps.append(sign)
         for i in range(len(c.z)):
             moved = c.z.astype(np.float64)

@@ -86,9 +86,7 @@ def _sensitivity(playback, library, candidate: Candidate, noise, temper: float) 
     if n_parameters == 0:
         return np.full(len(library.gripper_pose), np.nan)
     base = candidate.physics(playback.nominal(), config)
-    size = np.array([p.difference for term in candidate.terms for p in term.effect.parameters])
-    # inwards where the upper bound is near
-    steps = np.where(candidate.z + size > candidate.bounds[:, 1], -size, size)
+    steps = candidate.differences
     moved = [
         candidate.physics(playback.nominal(), config, (candidate.z + step).astype(np.float32))
         for step in np.diag(steps)

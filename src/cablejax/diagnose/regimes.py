@@ -8,6 +8,7 @@ import itertools
 import numpy as np
 from jaxtyping import Bool, Float
 
+from cablejax.simulate.pose import wrapped
 from cablejax.types import GapLog
 
 _METRES_PER_RADIAN = 0.15
@@ -127,6 +128,6 @@ def _halves(name: str, values, valid, classes: tuple[str, str]) -> dict[str, np.
 def _largest_curvature(points: Float[np.ndarray, "E T N 2"], arclength) -> Float[np.ndarray, "E T"]:
     edges = np.diff(points, axis=2)
     heading = np.arctan2(edges[..., 1], edges[..., 0])
-    turn = (np.diff(heading, axis=-1) + np.pi) % (2 * np.pi) - np.pi
+    turn = wrapped(np.diff(heading, axis=-1))
     curvature = np.abs(turn) / np.gradient(np.asarray(arclength, np.float64))[1:-1]
     return np.max(curvature, axis=-1, initial=0.0)

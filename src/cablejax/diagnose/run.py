@@ -68,7 +68,7 @@ def diagnose(
     null = evaluate(evidence, [candidate()])[0]
     gap = excess(float(null.sse.sum()), evidence)
     if gap > calibration.smallest_gap(level(evidence)):
-        found = search(evidence, effects, case.context(), calibration, deadline=begin + budget, progress=progress)
+        found = search(evidence, null, effects, case.context(), calibration, deadline=begin + budget, progress=progress)
     else:
         found = Search((null,), np.zeros(1), {})
     conclusion = conclude(found, evidence, calibration)

@@ -15,6 +15,7 @@ from scipy.special import j0
 
 from cablejax.simulate.config import CableConfig
 from cablejax.simulate.motions import MotionConfig, admissible
+from cablejax.simulate.pose import wrapped
 
 INTERVAL = 0.1
 """Between two samples of a motion [s]."""
@@ -41,7 +42,7 @@ class _Pair:
     def of(cls, pose: Float[np.ndarray, "2 3"]) -> _Pair:
         chord = pose[1, :2] - pose[0, :2]
         heading = float(np.arctan2(chord[1], chord[0]))
-        angles = (pose[:, 2] - heading + np.pi) % (2 * np.pi) - np.pi
+        angles = wrapped(pose[:, 2] - heading)
         return cls(pose[:, :2].mean(axis=0), heading, float(np.hypot(*chord)), angles)
 
     @property

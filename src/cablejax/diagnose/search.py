@@ -9,9 +9,9 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from jaxtyping import Float
 
-from cablejax.diagnose.belief import Calibration, best_by_effects, effect_names, excess, log_scores
+from cablejax.diagnose.belief import Calibration, best_by_effects, effect_names, excess, level, log_scores
 from cablejax.diagnose.effects.base import Context, Effect
-from cablejax.diagnose.fit import Candidate, Evidence, Fit, candidate, evaluate, improve
+from cablejax.diagnose.fit import Candidate, Evidence, Fit, evaluate, improve
 from cablejax.diagnose.screen import residual_of, screen, shortlist
 
 _FIRST_STEPS = 3
@@ -39,6 +39,7 @@ class Search:
 
 def search(
     evidence: Evidence,
+    null: Fit,
     effects: Sequence[Effect],
     context: Context,
     calibration: Calibration,
@@ -50,13 +51,13 @@ def search(
 
     Args:
         evidence: to explain.
+        null: the nominal cable, evaluated.
         effects: to try.
         context: of the log.
         calibration: of the judgement.
         deadline: on `time.perf_counter`; from then on no larger set is begun [s].
         progress: called with a line of text before each stage.
     """
-    null = evaluate(evidence, [candidate()])[0]
     gap = excess(float(null.sse.sum()), evidence)
     progress(f"screening {len(effects)} effects")
     templates = screen(evidence, null.candidate, effects, context)
@@ -74,8 +75,7 @@ def search(
     fits = _best([*improve(evidence, fits[:_BASES], max_iterations=_LAST_STEPS), *fits[_BASES:]], evidence, calibration)
 
     def adequate(fit: Fit) -> bool:
-        left = excess(float(fit.sse.sum()), evidence)
-        return left <= max(calibration.adequate * gap, calibration.smallest_gap(float(evidence.noise.mean())))
+        return calibration.complete(excess(float(fit.sse.sum()), evidence), gap, level(evidence))
 
     bases = [fit for fit in fits if fit.candidate.terms][:_BASES]
     for size in range(2, calibration.max_terms + 1):
@@ -107,14 +107,9 @@ def without_one(explanation: Candidate) -> list[Candidate]:
     """The explanation without each of its effects."""
     result = []
     for name in effect_names(explanation):
-        kept = [(t, z) for t, z in zip(explanation.terms, _by_term(explanation), strict=True) if t.effect.name != name]
+        kept = [(t, z) for t, z in explanation.by_term() if t.effect.name != name]
         result.append(Candidate(tuple(t for t, _ in kept), np.concatenate([np.zeros(0), *(z for _, z in kept)])))
     return result
-
-
-def _by_term(explanation: Candidate) -> list[np.ndarray]:
-    ends = np.cumsum([term.size for term in explanation.terms])
-    return np.split(explanation.z, ends[:-1])
 
 
 def _grown(evidence: Evidence, base: Candidate, effects: Sequence[Effect], context: Context) -> list[Fit]:

@@ -17,6 +17,7 @@ from jaxtyping import Bool, Float
 
 from cablejax.perceive.path import cloud_path
 from cablejax.perceive.registration import Fit, RegistrationConfig, register
+from cablejax.simulate.pose import wrapped
 
 JUMPS = (2.0, 4.0)
 """Paths to try: powers of the step length that they pay."""
@@ -144,7 +145,7 @@ def _bowed_profiles(config: RegistrationConfig, pose: np.ndarray) -> list[np.nda
     """Tangent angles of the links: from one gripper's over the chord's to the other's, with whole turns on the way."""
     s = config.matrices.arclength
     chord = np.arctan2(*(pose[1, :2] - pose[0, :2])[::-1])
-    first, last = chord + _wrap(pose[:, 2] - chord)
+    first, last = chord + wrapped(pose[:, 2] - chord)
     found = []
     for middle_turns in (0, 1, -1):
         for end_turns in (0, 1, -1):
@@ -162,11 +163,7 @@ def _path_profile(config: RegistrationConfig, even: np.ndarray, pose: np.ndarray
     angle = np.unwrap(np.arctan2(steps[:, 1], steps[:, 0]))
     profile = np.interp(config.matrices.arclength, np.linspace(0.0, 1.0, len(angle)), angle)
     # The ends have the grippers' directions, on the turn that is nearest to the path's.
-    profile = profile + pose[0, 2] - (profile[0] - _wrap(profile[0] - pose[0, 2]))
+    profile = profile + pose[0, 2] - (profile[0] - wrapped(profile[0] - pose[0, 2]))
     profile = np.array(profile)
-    profile[0], profile[-1] = pose[0, 2], profile[-1] - _wrap(profile[-1] - pose[1, 2])
+    profile[0], profile[-1] = pose[0, 2], profile[-1] - wrapped(profile[-1] - pose[1, 2])
     return profile
-
-
-def _wrap(angle):
-    return (angle + np.pi) % (2 * np.pi) - np.pi

@@ -15,6 +15,7 @@ from jaxtyping import Float
 
 from cablejax.simulate.composite import link_lengths
 from cablejax.simulate.config import CableConfig
+from cablejax.simulate.pose import wrapped
 from cablejax.types import CableState
 
 _MAX_ITERATIONS = 200
@@ -94,7 +95,7 @@ def find_equilibrium(
 def _taut(config: CableConfig, pose: Float[np.ndarray, "2 3"]) -> Equilibrium:
     """The only shape of a cable as long as the grippers are apart: straight."""
     chord = pose[1, :2] - pose[0, :2]
-    off = np.abs(_wrap(pose[:, 2] - np.arctan2(chord[1], chord[0]))).max()
+    off = np.abs(wrapped(pose[:, 2] - np.arctan2(chord[1], chord[0]))).max()
     if off > 1e-6 or abs(pose[1, 2] - pose[0, 2]) > 1e-6:
         raise ValueError(
             f"The grippers are a whole cable length apart, but turned by {off:.3g} rad from the line between them: a "
@@ -119,7 +120,7 @@ def arch_angles(config: CableConfig, gripper_pose: Float[np.ndarray, "2 3"]) -> 
     fraction = np.linspace(0.0, 1.0, config.n_links)
     chord = np.arctan2(pose[1, 1] - pose[0, 1], pose[1, 0] - pose[0, 0])
     # An arch theta = a sin(2 pi s) shortens the span by a^2 / 4. The side is that to which the ends already lean.
-    lean = _wrap(pose[0, 2] - chord) - _wrap(pose[1, 2] - chord)
+    lean = wrapped(pose[0, 2] - chord) - wrapped(pose[1, 2] - chord)
     amplitude = 2.0 * np.sqrt(max(1.0 - span, 1e-6))
     theta = pose[0, 2] + (pose[1, 2] - pose[0, 2]) * fraction
     if abs(lean) < 1.0:
@@ -205,10 +206,6 @@ def _spatial_qpos(config, pose, guess):
     angles = _planar_qpos(config, planar, flat_guess)[3:]
     joints = np.concatenate([_quaternion(axis * phi) for phi in angles])
     return np.concatenate([pose[0], joints])
-
-
-def _wrap(angle):
-    return (angle + np.pi) % (2 * np.pi) - np.pi
 
 
 def _quaternion(rotation):

@@ -10,6 +10,7 @@ from jaxtyping import Float
 
 from cablejax.simulate.config import CableConfig
 from cablejax.simulate.equilibrium import arch_angles, chain_nodes, find_equilibrium
+from cablejax.simulate.pose import wrapped
 
 _MAX_REDRAWS = 50
 _COARSE_LINKS = 13
@@ -144,7 +145,7 @@ def admissible(config: CableConfig, motion: MotionConfig, pose: Float[np.ndarray
     """
     chord = pose[1, :2] - pose[0, :2]
     distance = np.linalg.norm(chord)
-    angles = np.abs(_wrap(pose[:, 2] - np.arctan2(chord[1], chord[0])))
+    angles = np.abs(wrapped(pose[:, 2] - np.arctan2(chord[1], chord[0])))
     detour = 2.0 / motion.max_curvature * np.sum(angles - np.sin(angles))
     return bool(
         distance >= motion.min_distance * config.length
@@ -171,7 +172,3 @@ def _random_start(rng, config, motion):
         pose = np.array([[*-offset, angles[0]], [*offset, angles[1]]])
         if admissible(config, motion, pose):
             return pose
-
-
-def _wrap(angle):
-    return (angle + np.pi) % (2 * np.pi) - np.pi
