@@ -14,6 +14,8 @@ import numpy as np
 from jaxtyping import Float
 
 from cablejax.diagnose import LIBRARY, Context, Effect
+from cablejax.diagnose.case import FINE_LINKS
+from cablejax.diagnose.chain import FINE_STEP, LARGEST_STEP
 from cablejax.diagnose.fit import Evidence, candidate
 from cablejax.diagnose.playback import Playback
 from cablejax.diagnose.screen import residual_of
@@ -60,9 +62,11 @@ def holds(samples: int = SAMPLES) -> np.ndarray:
 
 @functools.cache
 def playback(n_links: int) -> Playback:
-    """The four motions at a resolution."""
+    """The four motions at a resolution; where it is that of the nominal cable, in time too."""
     config = dataclasses.replace(CABLE, n_links=n_links)
-    return Playback.of_motion(config, np.stack([poses(m) for m in MOTIONS]), None, np.full(len(MOTIONS), INTERVAL))
+    step = FINE_STEP if n_links == FINE_LINKS else LARGEST_STEP
+    motions = np.stack([poses(m) for m in MOTIONS])
+    return Playback.of_motion(config, motions, None, np.full(len(MOTIONS), INTERVAL), step)
 
 
 def parts(*effects: tuple[str, Any]) -> list[tuple[Effect, int, Sequence[float]]]:
@@ -71,7 +75,7 @@ def parts(*effects: tuple[str, Any]) -> list[tuple[Effect, int, Sequence[float]]
 
 
 @functools.cache
-def clean(*effects: tuple[Any, ...], n_links: int = 65) -> Float[np.ndarray, "E T N 2"]:
+def clean(*effects: tuple[Any, ...], n_links: int = FINE_LINKS) -> Float[np.ndarray, "E T N 2"]:
     """Keypoints without noise [m]; `effects` as for `parts`, with tuples throughout."""
     player = playback(n_links)
     return player.keypoints([candidate(*parts(*effects)).physics(player.nominal(), player.config)])[0]

@@ -43,12 +43,13 @@ class Calibration:
             is an estimate.
         adequate: an explanation that leaves less than this share of the gap, root mean square, is complete.
         telling: below this share of explained squared gap nothing is named.
-        set_odds: an effect belongs to the reported set if its odds against the best are at least these.
+        set_odds: an effect belongs to the reported set if its odds against the best are at least these,
+        as_good: or if it leaves at most this many times what the best leaves of the gap, root mean square.
         widening: of the intervals of parameters, for a law that is not quite the real one shifts them too.
         max_terms: effects in one explanation at most.
     """
 
-    baseline: float = 2.0e-4
+    baseline: float = 3.5e-4
     law_error: float = 0.1
     correlated_samples: float = 800.0
     freedom: float = 6.0
@@ -58,6 +59,7 @@ class Calibration:
     adequate: float = 0.25
     telling: float = 0.6
     set_odds: float = 0.08
+    as_good: float = 1.25
     widening: float = 1.25
     max_terms: int = 3
 

@@ -10,6 +10,7 @@ from jaxtyping import Float
 
 from cablejax.diagnose.actuation import Actuation, actuation
 from cablejax.diagnose.belief import Calibration, level
+from cablejax.diagnose.chain import FINE_STEP, LARGEST_STEP
 from cablejax.diagnose.effects import Context
 from cablejax.diagnose.fit import Candidate, Evidence
 from cablejax.diagnose.noise import NoiseFloor, noise_floor
@@ -70,18 +71,18 @@ class Case:
         config = config_of_log(log, n_links=FIT_LINKS)
         first = _first_shapes(recording)
 
-        def replay(n_links, pose):
+        def replay(n_links, step, pose):
             of_links = dataclasses.replace(config, n_links=n_links)
             try:
-                return Playback.of_motion(of_links, pose, first, recording.interval)
+                return Playback.of_motion(of_links, pose, first, recording.interval, step)
             except ValueError as error:
                 raise DiagnosisError(f"The nominal cable has no settled shape at a first pose: {error}") from error
 
         def run(playback):
             return playback.keypoints([playback.nominal()])[0].astype(np.float64)
 
-        playback = replay(FIT_LINKS, recording.gripper_pose)
-        nominal = run(replay(FINE_LINKS, recording.gripper_pose))
+        playback = replay(FIT_LINKS, LARGEST_STEP, recording.gripper_pose)
+        nominal = run(replay(FINE_LINKS, FINE_STEP, recording.gripper_pose))
         if not np.isfinite(nominal).all():
             raise DiagnosisError("The nominal simulation of this log breaks down: are the poses continuous, in metres?")
         moved = arms.deviates
@@ -93,8 +94,8 @@ class Case:
             playback=playback,
             nominal=nominal,
             coarse=run(playback),
-            commanded_nominal=run(replay(FINE_LINKS, arms.commanded)) if moved else nominal,
-            predicted_playback=replay(FIT_LINKS, arms.predicted) if moved else playback,
+            commanded_nominal=run(replay(FINE_LINKS, FINE_STEP, arms.commanded)) if moved else nominal,
+            predicted_playback=replay(FIT_LINKS, LARGEST_STEP, arms.predicted) if moved else playback,
         )
 
     def evidence(self, calibration: Calibration) -> Evidence:

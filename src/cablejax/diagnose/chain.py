@@ -12,7 +12,8 @@ whole cable, which carries both elasticity along the cable and a slip through a 
 grasps are five rows `G u = g` in the dual form of `cablejax.simulate.grasp`; a compliant grasp is a number on that
 matrix's diagonal, so that zero compliance is the rigid grasp itself.
 
-Stiffness is implicit too: a cable that damps less than believed must not make the simulation unstable.
+Stiffness is implicit too, by the trapezoidal rule: a cable that damps less than believed must not make the simulation
+unstable, and the step must not damp for it.
 """
 
 from __future__ import annotations
@@ -30,7 +31,9 @@ from cablejax.simulate.config import CableConfig
 from cablejax.simulate.grasp import solve_positive
 
 LARGEST_STEP = 0.05
-"""Longest time step [s]; docs/results/resolution.md shows that shorter ones change little."""
+"""Longest time step of a fit [s]. What it is off for the nominal cable is known from one replay with `FINE_STEP`."""
+FINE_STEP = 0.01
+"""Longest time step of the nominal cable that a log is compared with [s]."""
 _SETTLE_STEPS = 20
 _SETTLE_STEP = 0.2
 # Stiffness of a contact of one link's length [N/m]: a cable of 0.1 N presses 0.1 mm into an obstacle.
@@ -176,8 +179,10 @@ class Chain:
         # Joints: elastic, viscous, and internal friction (Dahl 1968), which saturates at its moment.
         curvature = state.angles[1:] / h
         elastic = curvature - physics.rest_curvature - state.set_curvature
-        # the implicit part takes its slope at zero, the same in both directions: a sign would jump at rest
-        stiffness = (physics.stiffness + physics.hysteresis_moment / physics.hysteresis_curvature) / h
+        # Elastic moments as they are in the middle of the step: at its end, as implicit Euler has them, they would add
+        # dt / 2 to the damping time. The internal friction takes its slope at zero, the same in both directions: a
+        # sign would jump at rest.
+        stiffness = (0.5 * physics.stiffness + physics.hysteresis_moment / physics.hysteresis_curvature) / h
         moment = physics.stiffness * elastic + physics.hysteresis_moment * state.friction_state
         joint_implicit = dt * (physics.damping_time * physics.stiffness / h) + dt**2 * stiffness
 

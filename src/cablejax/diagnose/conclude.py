@@ -56,14 +56,24 @@ def conclude(found: Search, evidence: Evidence, calibration: Calibration) -> Con
     for name in effect_names(best.candidate):
         rest = set(effect_names(best.candidate)) - {name}
         odds: dict[str, float] = {}
+        leaves: dict[str, float] = {}
         for fit, chance in zip(found.fits, chances, strict=True):
             names = set(effect_names(fit.candidate))
             # the same explanation with another effect in this one's place
             if len(names) == len(rest) + 1 and rest <= names:
                 (other,) = names - rest
                 odds[other] = odds.get(other, 0.0) + float(chance)
+                leaves[other] = min(leaves.get(other, np.inf), excess(float(fit.sse.sum()), evidence))
         total = sum(odds.values())
-        alike = sorted((n for n in odds if odds[n] >= calibration.set_odds * odds[name]), key=lambda n: -odds[n])
+        # In a wide gap a likelihood is sure of differences that are small beside what any law leaves.
+        alike = sorted(
+            (
+                n
+                for n in odds
+                if odds[n] >= calibration.set_odds * odds[name] or leaves[n] <= calibration.as_good * left
+            ),
+            key=lambda n: -odds[n],
+        )
         if len(alike) > 1:
             equivalent.append(tuple(alike))
         effects.append(_named(name, best, odds[name] / total, evidence, calibration.widening))

@@ -32,12 +32,14 @@ class Playback:
         gripper_pose: measured, theta continuous, the last one held over the padding, shape [E, T, 2, 3].
         angles: of the settled nominal cable at the first pose [rad], shape [E, n].
         interval: between samples [s], shape [E].
+        largest_step: longest time step [s].
     """
 
     config: CableConfig
     gripper_pose: Float[np.ndarray, "E T 2 3"]
     angles: Float[np.ndarray, "E n"]
     interval: Float[np.ndarray, "E"]
+    largest_step: float = LARGEST_STEP
 
     @classmethod
     def of_motion(
@@ -46,6 +48,7 @@ class Playback:
         gripper_pose: Float[np.ndarray, "E T 2 3"],
         first_keypoints: Sequence[Float[np.ndarray, "N 2"] | None] | None,
         interval: Float[np.ndarray, "E"],
+        largest_step: float = LARGEST_STEP,
     ) -> Playback:
         """Finds the settled start of every episode near its first keypoints, or a gentle arch where there are none."""
         angles = [
@@ -59,6 +62,7 @@ class Playback:
             gripper_pose=np.asarray(gripper_pose, np.float32),
             angles=np.asarray(angles, np.float32),
             interval=np.asarray(interval, np.float32),
+            largest_step=largest_step,
         )
 
     def nominal(self) -> Physics:
@@ -82,7 +86,7 @@ class Playback:
                 for field in dataclasses.fields(Physics)
             }
         )
-        substeps = max(1, math.ceil(float(self.interval.max()) / LARGEST_STEP - 1e-6))
+        substeps = max(1, math.ceil(float(self.interval.max()) / self.largest_step - 1e-6))
         geometry = CableConfig(
             length=self.config.length,
             diameter=self.config.diameter,
