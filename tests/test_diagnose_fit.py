@@ -9,11 +9,16 @@ import pytest
 
 from cablejax.diagnose import LIBRARY, Calibration, Effect, Parameter
 from cablejax.diagnose.belief import log_scores
+from cablejax.diagnose.chain import LARGEST_STEP
+from cablejax.diagnose.conclude import conclude
 from cablejax.diagnose.effects import BendingStiffness
 from cablejax.diagnose.fit import Candidate, Evidence, Fit, Term, candidate, evaluate, improve
+from cablejax.diagnose.playback import Playback
 from cablejax.diagnose.screen import residual_of, screen, shortlist
-from diagnose_cases import BY_NAME, context, evidence, parts
+from cablejax.diagnose.search import Search
+from diagnose_cases import BY_NAME, CABLE, context, evidence, parts
 
+LOOK_ALIKES = (("bending_stiffness", (0.3,)), ("table_friction", (0.3, 0.0)))
 OFFSET = ("gripper_rotation_offset", 1, (0.08,))
 
 
@@ -46,6 +51,35 @@ def test_known_parameters_come_back(name):
     # what is left is the noise: a chi-square of as many degrees of freedom
     left = facts.count.sum() - len(true_z)
     assert abs(fit.sse.sum() - left) < 4.5 * np.sqrt(2 * left)
+
+
+def test_the_time_step_does_not_damp():
+    """A light cable without friction creeps to rest after a turn of a gripper at a rate of its damping alone."""
+    pose = np.tile(np.array([[0.0, 0.0, 0.6], [0.7, 0.0, -0.6]]), (1, 16, 1, 1))
+    pose[0, 1:, 0, 2] += 0.2
+    config = dataclasses.replace(CABLE, n_links=17, friction_coefficient=0.0, linear_density=1e-3)
+
+    def relaxation_time(step: float) -> float:
+        player = Playback.of_motion(config, pose, None, np.full(1, 0.1), step)
+        points = player.keypoints([player.nominal()])[0, 0]
+        distance = np.linalg.norm((points - points[-1]).reshape(len(points), -1), axis=1)
+        return 0.3 / np.log(distance[2] / distance[5])
+
+    assert relaxation_time(LARGEST_STEP) == pytest.approx(relaxation_time(0.002), rel=0.06)
+
+
+def test_a_rival_that_leaves_as_little_is_a_look_alike():
+    """However sure the likelihood is: in a wide gap it tells small differences between two laws from each other."""
+    facts = evidence(("bending_stiffness", (0.25,)), ("viscous_drag", (0.3,)), noise_mm=0.02)
+    fits = improve(facts, evaluate(facts, [candidate(*parts((n, v))) for n, v in LOOK_ALIKES]), max_iterations=15)
+    null = evaluate(facts, [candidate()])[0]
+    scores = log_scores([*fits, null], facts, Calibration())
+    order = np.argsort(-scores)
+    found = Search(tuple([*fits, null][i] for i in order), scores[order], {})
+    ((_, rival),) = conclude(found, facts, Calibration(as_good=1e3)).equivalent
+    assert rival == "table_friction"
+    strict = conclude(found, facts, Calibration(as_good=1.0))
+    assert strict.equivalent == () and strict.effects[0].probability > 0.99
 
 
 def test_two_effects_come_back_together():
