@@ -1,4 +1,4 @@
-"""The command line: `cablejax demo | simulate | train | shape | diagnose | bench`."""
+"""The command line: `cablejax demo | simulate | train | shape | import | diagnose | bench`."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from tyro.conf import subcommand
 from cablejax.commands.bench import Bench
 from cablejax.commands.demo import Demo
 from cablejax.commands.diagnose import Diagnose
+from cablejax.commands.import_recording import Import
 from cablejax.commands.options import Command
 from cablejax.commands.shape import Shape
 from cablejax.commands.simulate import Simulate
@@ -28,14 +29,15 @@ _COMMANDS: Any = (
     | Annotated[Simulate, subcommand("simulate")]
     | Annotated[Train, subcommand("train")]
     | Annotated[Shape, subcommand("shape")]
+    | Annotated[Import, subcommand("import")]
     | Annotated[Diagnose, subcommand("diagnose")]
     | Annotated[Bench, subcommand("bench")]
 )
 _DESCRIPTION = """Two robot grippers bring a cable to a shape.
 
 Start with `cablejax demo`: it needs nothing else and writes a page to look at. To make your own model: `simulate` a
-data set, `train` on it, `shape` a cable with the result, and `diagnose` what the simulator lacks.
-`cablejax COMMAND --help` explains each one."""
+data set, `train` on it, `shape` a cable with the result, and `diagnose` what the simulator lacks. A recording of a
+real cable is `import`ed first. `cablejax COMMAND --help` explains each one."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -44,14 +46,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Args:
         arguments: what follows `cablejax` on the command line; by default that of this process.
     """
-    command: Command | Bench = tyro.cli(
+    command: Command | Bench | Import = tyro.cli(
         _COMMANDS,
         prog="cablejax",
         description=_DESCRIPTION,
         args=arguments,
         config=(tyro.conf.OmitArgPrefixes, tyro.conf.OmitSubcommandPrefixes, tyro.conf.FlagCreatePairsOff),
     )
-    command = command.what if isinstance(command, Bench) else command
+    command = command.what if isinstance(command, (Bench, Import)) else command
     try:
         command.run()
     except (ValueError, OSError) as error:

@@ -11,7 +11,7 @@ import os
 import pathlib
 import tempfile
 import zipfile
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -69,6 +69,8 @@ def gap_log_from_episodes(
     *,
     source: str,
     grasp: Sequence[str] = ("clamped", "clamped"),
+    keypoint_arclength: Sequence[float] | None = None,
+    extra: Mapping[str, Any] | None = None,
 ) -> GapLog:
     """One gap log of several episodes of the same cable, padded to the longest.
 
@@ -77,12 +79,17 @@ def gap_log_from_episodes(
         cable: the cable and table as they are believed to be, which is what the nominal simulator uses.
         source: free text: what recorded this.
         grasp: how each gripper holds the cable.
+        keypoint_arclength: of each keypoint [m], shape [N]; by default uniform over the cable.
+        extra: fields of `meta` beyond those of the format, which readers that do not know them leave alone.
 
     Raises:
-        GapLogError: no episodes, or episodes that do not fit each other or the format.
+        GapLogError: no episodes, episodes that do not fit each other or the format, or an extra field that it has.
     """
     if not episodes:
         raise GapLogError("A gap log needs at least one episode, got none.")
+    if taken := set(extra or {}) & set(_META_FIELDS):
+        raise GapLogError(f"The extra fields {', '.join(sorted(taken))} are fields of the format: choose other names.")
+    arclength = cable.keypoint_arclength if keypoint_arclength is None else np.asarray(keypoint_arclength, float)
     lengths = [len(episode.time) for episode in episodes]
 
     def padded(name: str, fill) -> np.ndarray:
@@ -119,10 +126,11 @@ def gap_log_from_episodes(
             },
             "table": {"friction_coefficient": cable.friction_coefficient} if cable.friction_coefficient > 0 else None,
             "gravity_m_per_s2": [0.0, 0.0, -GRAVITY],
-            "keypoint_arclength_m": cable.keypoint_arclength.tolist(),
+            "keypoint_arclength_m": arclength.tolist(),
             "grasp": list(grasp),
             "motion": [episode.motion for episode in episodes],
             "source": source,
+            **(extra or {}),
         },
     )
     validate(log)

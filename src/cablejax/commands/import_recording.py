@@ -1,0 +1,152 @@
+"""`cablejax import`: real recordings to gap logs."""
+
+from __future__ import annotations
+
+import abc
+import dataclasses
+import pathlib
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import tyro
+from tyro.conf import subcommand
+
+from cablejax.commands.options import Command, UsageError
+
+if TYPE_CHECKING:
+    from cablejax.types import GapLog
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class _Import(Command, abc.ABC):
+    """What the kinds of recording share."""
+
+    source: Annotated[pathlib.Path, tyro.conf.Positional]
+    """The recording."""
+
+    out: pathlib.Path = pathlib.Path("log.npz")
+    """The gap log to write."""
+
+    overwrite: bool = False
+    """Replace a log that is there."""
+
+    @abc.abstractmethod
+    def logs(self) -> list[tuple[pathlib.Path, GapLog, Sequence[str]]]:
+        """Where to write each log, the log, and what was repaired."""
+
+    def execute(self):
+        from cablejax.gaplog import write_gap_log
+
+        if self.out.suffix != ".npz":
+            raise UsageError(f"--out is {self.out}, expected a file name that ends in .npz.")
+        logs = self.logs()
+        for path, _, _ in logs:
+            if path.exists() and not self.overwrite:
+                raise UsageError(f"{path} exists. Give another file with --out, or add --overwrite.")
+        written = [(write_gap_log(path, log, overwrite=self.overwrite), log, told) for path, log, told in logs]
+        results = [_summary(path, log, told) for path, log, told in written]
+        return {"logs": results}, "\n\n".join(map(_told, results))
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Deform(_Import):
+    """Import recordings of the DEFORM data set: three-dimensional motion capture of one cable.
+
+    SOURCE is upstream's folder of one cable, with pickles in train/ and eval/, one such pickle, or an .npz. Pickles are
+    read without running anything that they say."""
+
+    unit: Literal["m", "cm", "mm", "in"] | None = None
+    """Unit of length. By default metres, or another one where the length of the cable leaves no doubt."""
+
+    up: Literal["x", "y", "z", "-x", "-y", "-z"] = "z"
+    """The axis that points up."""
+
+    handedness: Literal["right", "left"] = "right"
+    """left: the coordinates are of a left-handed frame."""
+
+    def logs(self):
+        from cablejax.recordings.deform import import_deform
+        from cablejax.recordings.frames import Frame
+
+        log, told = import_deform(self.source, unit=self.unit, frame=Frame(self.up, self.handedness))
+        return [(self.out, log, told)]
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Wires(_Import):
+    """Import photographs of hanging wires: one log for each wire, --out with the wire's name before .npz."""
+
+    def logs(self):
+        from cablejax.recordings.wires import read_wires, wire_log
+
+        return [
+            (self.out.with_name(f"{self.out.stem}-{wire.name}.npz"), wire_log(wire), ())
+            for wire in read_wires(self.source)
+        ]
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Csv(_Import):
+    """Import a csv file of your own, one row per sample; a small TOML file names its columns and units."""
+
+    layout: pathlib.Path = pathlib.Path("layout.toml")
+    """The TOML file; docs/recordings.md has an example."""
+
+    def logs(self):
+        from cablejax.recordings.table import import_csv
+
+        return [(self.out, *import_csv(self.source, self.layout))]
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Mcap(_Import):
+    """Import a ROS 2 bag or MCAP file with pose arrays; a small TOML file names its topics and units."""
+
+    layout: pathlib.Path = pathlib.Path("layout.toml")
+    """The TOML file; docs/recordings.md has an example."""
+
+    def logs(self):
+        from cablejax.recordings.bags import import_mcap
+
+        return [(self.out, *import_mcap(self.source, self.layout))]
+
+
+@dataclasses.dataclass(frozen=True)
+class Import:
+    """Import a real recording as a gap log, which `cablejax diagnose` reads."""
+
+    what: (
+        Annotated[Deform, subcommand("deform")]
+        | Annotated[Wires, subcommand("wires")]
+        | Annotated[Csv, subcommand("csv")]
+        | Annotated[Mcap, subcommand("mcap")]
+    )
+
+
+def _summary(path: pathlib.Path, log: GapLog, told: Sequence[str]) -> dict[str, Any]:
+    import numpy as np
+
+    samples = log.episode_length
+    seen = [np.isfinite(points[:n]).all(axis=-1).mean() for points, n in zip(log.keypoints, samples, strict=True)]
+    return {
+        "log": str(path),
+        "episodes": len(samples),
+        "samples": int(samples.sum()),
+        "keypoints": int(log.keypoints.shape[2]),
+        "dimension": int(log.keypoints.shape[3]),
+        "length_m": float(log.meta["cable"]["length_m"]),
+        "observed": float(np.average(seen, weights=samples)),
+        "repairs": list(told),
+    }
+
+
+def _told(result: dict[str, Any]) -> str:
+    lines = [
+        f"{result['log']}: {result['episodes']} episodes, {result['samples']} samples of {result['keypoints']} "
+        f"keypoints in "
+        f"{'space' if result['dimension'] == 3 else 'the plane'}, {100 * result['observed']:.4g} % of them observed; "
+        f"the "
+        f"cable is {result['length_m']:.4g} m long.",
+        *result["repairs"],
+    ]
+    return "\n".join(lines if result["repairs"] else [*lines, "Nothing had to be repaired."])

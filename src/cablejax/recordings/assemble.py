@@ -1,0 +1,121 @@
+"""From checked takes to a gap log."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float
+from scipy.interpolate import CubicSpline
+
+from cablejax.gaplog import Episode, gap_log_from_episodes
+from cablejax.recordings.poses import twists
+from cablejax.recordings.take import Take, typical_spacing
+from cablejax.simulate.config import CableConfig
+from cablejax.types import GapLog
+
+_MOST_SAMPLES = 1000
+_PER_SEGMENT = 12
+
+
+@dataclasses.dataclass(frozen=True)
+class Nominal:
+    """The values of a cable that are believed true, or guessed: what the nominal simulator starts from.
+
+    Attributes:
+        diameter: [m].
+        linear_density: [kg/m].
+        bending_stiffness: EI [N m^2].
+        damping_time: [s].
+        friction_coefficient: of the table; None = the cable hangs free.
+        arclength: of each keypoint [m], starting at 0, shape [N]; None = measured along the keypoints.
+    """
+
+    diameter: float
+    linear_density: float
+    bending_stiffness: float
+    damping_time: float = 0.0
+    friction_coefficient: float | None = None
+    arclength: tuple[float, ...] | None = None
+
+
+def gap_log_from_takes(takes: Sequence[Take], nominal: Nominal, *, source: str, repairs: Sequence[str] = ()) -> GapLog:
+    """One gap log with an episode per take, with the labels of the takes as further fields of `meta`.
+
+    `gripper_command` is the twist that carries each measured pose to the next, since the recording holds no commands.
+    `hold` is left out: nobody said when the grippers rested.
+
+    Args:
+        takes: as `prepare` yields them.
+        nominal: what is believed of the cable.
+        source: where the recording is from, and which values are guesses.
+        repairs: what was changed; told in the log's source.
+
+    Raises:
+        ValueError: takes or values that make no gap log.
+    """
+    points = takes[0].keypoints.shape[1]
+    arclength = measured_arclength(takes) if nominal.arclength is None else np.asarray(nominal.arclength, float)
+    if arclength.shape != (points,) or arclength[0] != 0 or (np.diff(arclength) <= 0).any():
+        raise ValueError(
+            f"The arc lengths of the keypoints are {arclength.tolist()}, expected {points} increasing numbers from 0."
+        )
+    cable = CableConfig(
+        length=float(arclength[-1]),
+        diameter=nominal.diameter,
+        n_links=3,  # how finely the cable is simulated is no matter of the log
+        n_keypoints=points,
+        bending_stiffness=nominal.bending_stiffness,
+        damping_time=nominal.damping_time,
+        linear_density=nominal.linear_density,
+        friction_coefficient=nominal.friction_coefficient or 0.0,
+    )
+    episodes = []
+    for take in takes:
+        assert take.gripper_pose is not None
+        time = take.time - take.time[0]
+        episodes.append(
+            Episode(
+                motion=str(take.labels.get("motion", "recorded")),
+                time=time,
+                keypoints=take.keypoints,
+                gripper_pose=take.gripper_pose,
+                gripper_command=twists(time, take.gripper_pose),
+                hold=np.zeros(len(time), bool),
+            )
+        )
+    names = [name for name in takes[0].labels if name != "motion"]
+    log = gap_log_from_episodes(
+        episodes,
+        cable,
+        source=" ".join([source, *repairs]),
+        keypoint_arclength=arclength.tolist(),
+        extra={
+            "take": [take.name for take in takes],
+            **{name: [take.labels[name] for take in takes] for name in names},
+        },
+    )
+    return dataclasses.replace(log, hold=None)
+
+
+def measured_arclength(takes: Sequence[Take]) -> Float[np.ndarray, " N"]:
+    """Arc length of each keypoint [m], along a smooth curve through the keypoints: the median over samples.
+
+    A cubic spline in the usual distance along the keypoints. It undoes what a straight line from one keypoint to the
+    next cuts short, about `(kappa h)^2 / 24` of a spacing h at curvature kappa: a hundredth of the length where markers
+    are 0.1 m apart on a bend of 0.2 m radius.
+    """
+    usual = typical_spacing(tuple(takes))
+    knots = np.concatenate([[0.0], np.cumsum(usual)])
+    points = np.concatenate([take.keypoints for take in takes])
+    points = points[np.isfinite(points).all(axis=(1, 2))]
+    if len(points) == 0 or len(knots) < 4:
+        return knots
+    points = points[:: max(1, len(points) // _MOST_SAMPLES)]
+    pieces = [np.linspace(a, b, _PER_SEGMENT, endpoint=False) for a, b in itertools.pairwise(knots)]
+    fine = np.concatenate([*pieces, knots[-1:]])
+    curve = CubicSpline(knots, points, axis=1)(fine)
+    steps = np.linalg.norm(np.diff(curve, axis=1), axis=-1).reshape(len(points), len(usual), _PER_SEGMENT)
+    return np.concatenate([[0.0], np.cumsum(np.median(steps.sum(axis=-1), axis=0))])

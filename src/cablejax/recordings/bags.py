@@ -1,0 +1,133 @@
+"""ROS 2 bags and MCAP files: keypoints as `geometry_msgs/PoseArray`, grippers as `geometry_msgs/PoseStamped`.
+
+Read through the library rosbags, which needs no ROS: `pip install 'cablejax[recordings]'`.
+"""
+
+from __future__ import annotations
+
+import os
+import pathlib
+from typing import Any
+
+import numpy as np
+
+from cablejax.recordings.assemble import gap_log_from_takes
+from cablejax.recordings.layout import Fields, Layout, read_layout
+from cablejax.recordings.prepare import prepare
+from cablejax.recordings.table import unit_quaternions
+from cablejax.recordings.take import Take
+from cablejax.types import GapLog
+
+POSE_ARRAY, POSE_STAMPED = "geometry_msgs/msg/PoseArray", "geometry_msgs/msg/PoseStamped"
+
+LARGEST_LAG = 0.05
+"""Farthest from a sample of the keypoints [s] that the poses of a gripper on both sides of it may be."""
+
+
+def import_mcap(path: str | os.PathLike[str], layout: str | os.PathLike[str]) -> tuple[GapLog, list[str]]:
+    """Reads, checks and repairs a recording in a ROS 2 bag (a folder), an .mcap or a .db3 file.
+
+    Times are those in the headers. Gripper poses are interpolated to the times of the keypoints.
+
+    Args:
+        path: of the bag.
+        layout: TOML file that names the topics, see `docs/recordings.md`.
+
+    Returns:
+        A gap log in space, and a sentence on each repair.
+
+    Raises:
+        ValueError: rosbags is not installed, a file or topic is missing or of another type, or the recording cannot be
+            used without guessing.
+    """
+    how = read_layout(layout, "topics")
+    take = _take(pathlib.Path(path), how)
+    takes, repairs = prepare((take,), how.setup)
+    return gap_log_from_takes(takes, how.nominal, source=how.source, repairs=repairs), repairs
+
+
+def _take(path: pathlib.Path, how: Layout) -> Take:
+    fields: Fields = how.place
+    keypoints_topic = fields.take("keypoints", str, "the topic of the keypoints")
+    gripper_topics = fields.names("grippers", (2,), "the topics of gripper 0 and gripper 1", None)
+    motion = fields.take("motion", str, "what the grippers did", "recorded")
+    fields.nothing_left()
+    wanted = {keypoints_topic: POSE_ARRAY, **{topic: POSE_STAMPED for topic in gripper_topics or []}}
+    messages = _messages(path, wanted)
+    time, rows = _sorted(messages[keypoints_topic])
+    count = {len(row) for row in rows}
+    if len(count) > 1:
+        raise ValueError(
+            f"{path}: the messages on {keypoints_topic} have {min(count)} to {max(count)} poses, expected the same "
+            f"number "
+            "in each, NaN where a keypoint was not observed."
+        )
+    poses = None
+    if gripper_topics is not None:
+        tracks = [_at(time, *_sorted(messages[topic])) for topic in gripper_topics]
+        poses = unit_quaternions(np.stack(tracks, axis=1), str(path))
+    return Take(path.stem, time - time[0], np.array(rows)[..., :3], poses, labels={"motion": motion})
+
+
+def _messages(path: pathlib.Path, wanted: dict[str, str]) -> dict[str, list[tuple[float, np.ndarray]]]:
+    """Time [s] and poses (x, y, z, qw, qx, qy, qz) of every message on the wanted topics."""
+    try:
+        from rosbags.highlevel import AnyReader, AnyReaderError
+        from rosbags.typesys import Stores, get_typestore
+    except ModuleNotFoundError:
+        raise ValueError("Reading bags needs the library rosbags: pip install 'cablejax[recordings]'.") from None
+    if not path.exists():
+        raise ValueError(
+            f"{path} does not exist, expected a bag: a folder with metadata.yaml, an .mcap or a .db3 file."
+        )
+    found: dict[str, list[tuple[float, np.ndarray]]] = {topic: [] for topic in wanted}
+    try:
+        # Bags of older releases hold no message definitions; these messages have been the same in all of them.
+        with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as bag:
+            _require_topics(path, {c.topic: c.msgtype for c in bag.connections}, wanted)
+            connections = [c for c in bag.connections if c.topic in wanted]
+            for connection, _, data in bag.messages(connections=connections):
+                message: Any = bag.deserialize(data, connection.msgtype)
+                stamp = message.header.stamp
+                poses = message.poses if wanted[connection.topic] == POSE_ARRAY else [message.pose]
+                found[connection.topic].append(
+                    (stamp.sec + 1e-9 * stamp.nanosec, np.array([_numbers(p) for p in poses]))
+                )
+    except (AnyReaderError, OSError) as error:
+        raise ValueError(f"{path} could not be read as a bag: {error}") from None
+    for topic, messages in found.items():
+        if len(messages) < 2:
+            raise ValueError(f"{path} has {len(messages)} messages on {topic}, expected at least two.")
+    return found
+
+
+def _require_topics(path: pathlib.Path, types: dict[str, str], wanted: dict[str, str]) -> None:
+    for topic, kind in wanted.items():
+        if topic not in types:
+            listed = ", ".join(f"{name} ({of})" for name, of in sorted(types.items()))
+            raise ValueError(f"{path} has no topic {topic}; it has {listed}. Correct the name in the layout.")
+        if types[topic] != kind:
+            raise ValueError(f"{path}: {topic} has messages of type {types[topic]}, expected {kind}.")
+
+
+def _numbers(pose: Any) -> list[float]:
+    p, q = pose.position, pose.orientation
+    return [p.x, p.y, p.z, q.w, q.x, q.y, q.z]
+
+
+def _sorted(messages: list[tuple[float, np.ndarray]]) -> tuple[np.ndarray, list[np.ndarray]]:
+    ordered = sorted(messages, key=lambda message: message[0])
+    return np.array([time for time, _ in ordered]), [poses for _, poses in ordered]
+
+
+def _at(time: np.ndarray, stamps: np.ndarray, rows: list[np.ndarray]) -> np.ndarray:
+    """Poses at other times, shape [T, 7]: a straight line, and the shorter way between quaternions; NaN in gaps."""
+    poses = np.array(rows)[:, 0]
+    flips = np.cumprod(np.sign((poses[1:, 3:] * poses[:-1, 3:]).sum(axis=1) + 1e-300))
+    poses[1:, 3:] *= flips[:, None]
+    track = np.stack([np.interp(time, stamps, column, np.nan, np.nan) for column in poses.T], axis=1)
+    track[:, 3:] /= np.linalg.norm(track[:, 3:], axis=1, keepdims=True)
+    after = np.clip(np.searchsorted(stamps, time), 1, len(stamps) - 1)
+    far = (stamps[after] - time > LARGEST_LAG) | (time - stamps[after - 1] > LARGEST_LAG)
+    track[far & (stamps[after] != time)] = np.nan
+    return track

@@ -1,0 +1,178 @@
+"""Coordinate frames: which way is up, and whether positions and orientations are of the same frame.
+
+What can be known of a frame from the numbers themselves is little. A hanging cable shows the vertical, so a wrong one
+is noticed. A left-handed frame is not, by itself: seen in a mirror, positions, orientations and motions all obey the
+same laws, and the mirror image of a cable is a cable. It has to be told, and is then mirrored into a right-handed one.
+What shows is a mixture, positions of one frame beside orientations of another: on a rigid gripper the direction from
+one marker to the other does not turn against the gripper, and in a mixture it does.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float
+
+from cablejax.recordings.poses import rotated
+from cablejax.recordings.take import Take
+
+Axis = Literal["x", "y", "z", "-x", "-y", "-z"]
+AXES: tuple[Axis, ...] = ("x", "y", "z", "-x", "-y", "-z")
+
+LARGEST_TILT = np.radians(50)
+"""Angle between what hangs and what was told to be up, above which the frame is refused."""
+
+RIGID = np.radians(8)
+"""Largest root-mean-square angle by which a pair of markers may turn against the gripper that it is on."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Frame:
+    """The frame of a recording in space.
+
+    Attributes:
+        up: the coordinate axis that points up.
+        handedness: "left" for a left-handed frame, as game engines have it.
+    """
+
+    up: Axis = "z"
+    handedness: Literal["right", "left"] = "right"
+
+    def __post_init__(self):
+        if self.up not in AXES:
+            raise ValueError(f"The frame's up is {self.up!r}, expected one of {', '.join(AXES)}.")
+        if self.handedness not in ("right", "left"):
+            raise ValueError(f"The frame's handedness is {self.handedness!r}, expected 'right' or 'left'.")
+
+    @property
+    def matrix(self) -> Float[np.ndarray, "3 3"]:
+        """Takes coordinates of this frame to those of a right-handed frame with z up.
+
+        The coordinates are permuted in cycles until the vertical is last; half a turn about x if it points down; and y
+        is mirrored if the frame is left-handed.
+        """
+        first = {"x": 1, "y": 2, "z": 0}[self.up[-1]]
+        matrix = np.eye(3)[[first, (first + 1) % 3, (first + 2) % 3]]
+        if self.up.startswith("-"):
+            matrix = np.diag([1.0, -1.0, -1.0]) @ matrix
+        return np.diag([1.0, -1.0, 1.0]) @ matrix if self.handedness == "left" else matrix
+
+
+def into_frame(take: Take, frame: Frame) -> Take:
+    """The take in a right-handed frame with z up; planar takes stay as they are."""
+    if take.keypoints.shape[2] == 2:
+        return take
+    matrix = frame.matrix
+    pose = take.gripper_pose
+    if pose is not None:
+        # A reflection M turns a rotation about the axis a by an angle into that about -M a by the same angle.
+        sign = np.linalg.det(matrix)
+        pose = np.concatenate([pose[..., :3] @ matrix.T, pose[..., 3:4], sign * pose[..., 4:] @ matrix.T], axis=-1)
+    return dataclasses.replace(take, keypoints=take.keypoints @ matrix.T, gripper_pose=pose)
+
+
+def require_hanging(takes: tuple[Take, ...], frame: Frame) -> None:
+    """Refuses a frame in which the cable does not hang down.
+
+    Args:
+        takes: already in a right-handed frame with z up, of a cable that hangs free.
+        frame: what was told, for the message.
+
+    Raises:
+        ValueError: names the axis along which the cable hangs.
+    """
+    above = np.concatenate([_above(take.keypoints) for take in takes])
+    above = above[np.isfinite(above).all(axis=1)]
+    mean = above.mean(axis=0) if len(above) else np.zeros(3)
+    size = np.linalg.norm(mean)
+    # A cable that is stretched or swirled around does not say where up is.
+    if size < 0.3 * np.sqrt((above**2).sum(axis=1).mean() if len(above) else 1.0):
+        return
+    if np.arccos(np.clip(mean[2] / size, -1, 1)) <= LARGEST_TILT:
+        return
+    told = frame.matrix.T @ mean
+    axis = int(np.argmax(abs(told)))
+    found = ("" if told[axis] > 0 else "-") + "xyz"[axis]
+    raise ValueError(
+        f"The frame was said to have {frame.up} up, but the cable hangs from its ends along the other way of {found}: "
+        f"say "
+        f"that {found} is up, or check the order of the coordinates."
+    )
+
+
+def _above(points: Float[np.ndarray, "T N 3"]) -> Float[np.ndarray, "T 3"]:
+    """From the middle of the cable to the middle of its ends [m]; NaN where not all keypoints are observed."""
+    return points[:, [0, -1]].mean(axis=1) - points.mean(axis=1)
+
+
+def require_rigid(takes: tuple[Take, ...], pairs: tuple[tuple[int, int], ...]) -> None:
+    """Refuses orientations that do not fit the markers on the same gripper.
+
+    Args:
+        takes: with measured poses in space.
+        pairs: the two keypoints on each gripper.
+
+    Raises:
+        ValueError: says by how much they differ, and which convention would fit.
+    """
+    for gripper, (first, second) in enumerate(pairs):
+        along, turn = [], []
+        for take in takes:
+            if take.gripper_pose is None:
+                continue
+            along.append(take.keypoints[:, second] - take.keypoints[:, first])
+            turn.append(take.gripper_pose[:, gripper, 3:])
+        if not along:
+            continue
+        direction, quaternion = np.concatenate(along), np.concatenate(turn)
+        seen = np.isfinite(direction).all(axis=1) & np.isfinite(quaternion).all(axis=1)
+        direction, quaternion = direction[seen], quaternion[seen]
+        direction = direction / np.linalg.norm(direction, axis=-1, keepdims=True)
+        spread = _spread(quaternion, direction)
+        if spread <= RIGID:
+            continue
+        fitting = [name for name, change in _CONVENTIONS.items() if _spread(*change(quaternion, direction)) <= RIGID]
+        raise ValueError(
+            f"The markers {first} and {second} on gripper {gripper} turn against its orientation by "
+            f"{np.degrees(spread):.0f} degrees (root mean square), expected at most {np.degrees(RIGID):.0f}: "
+            f"positions and "
+            "orientations are not of one frame. "
+            + (f"They fit if {' or if '.join(fitting)}." if fitting else "Check which gripper and markers these are.")
+        )
+
+
+def _spread(quaternion: Float[np.ndarray, "S 4"], direction: Float[np.ndarray, "S 3"]) -> float:
+    """Root-mean-square angle of a direction, in the gripper's own frame, about its mean [rad]."""
+    own = rotated(quaternion * np.array([1.0, -1.0, -1.0, -1.0]), direction)
+    mean = own.mean(axis=0)
+    mean = mean / max(float(np.linalg.norm(mean)), 1e-12)
+    return float(np.sqrt((np.arccos(np.clip(own @ mean, -1, 1)) ** 2).mean()))
+
+
+def _mirrored(axis: int):
+    sign = np.ones(3)
+    sign[axis] = -1
+    return lambda quaternion, direction: (quaternion, direction * sign)
+
+
+def _exchanged(a: int, b: int):
+    order = [0, 1, 2]
+    order[a], order[b] = b, a
+    return lambda quaternion, direction: (quaternion, direction[:, order])
+
+
+_CONVENTIONS = {
+    "the quaternions have their scalar last": lambda quaternion, direction: (np.roll(quaternion, 1, axis=1), direction),
+    "the quaternions are inverted": lambda quaternion, direction: (quaternion * [1.0, -1.0, -1.0, -1.0], direction),
+    **{
+        f"the positions are mirrored along {name}, as from a left-handed frame": _mirrored(k)
+        for k, name in enumerate("xyz")
+    },
+    **{
+        f"{'xyz'[a]} and {'xyz'[b]} of the positions are exchanged, as from a left-handed frame": _exchanged(a, b)
+        for a, b in itertools.combinations(range(3), 2)
+    },
+}

@@ -1,0 +1,150 @@
+"""How a laboratory's own recording is laid out, told in a small TOML file.
+
+Tables `[cable]`, `[table]`, `[frame]` and `[source]` are the same for every kind of file; `[columns]` is for csv and
+`[topics]` for bags. `docs/recordings.md` has a full example of each.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import os
+import pathlib
+import tomllib
+from typing import Any
+
+from cablejax.recordings.assemble import Nominal
+from cablejax.recordings.frames import Frame
+from cablejax.recordings.prepare import Setup
+
+
+@dataclasses.dataclass(frozen=True)
+class Layout:
+    """What a layout file says.
+
+    Attributes:
+        nominal: what is believed of the cable.
+        setup: unit, frame, and which keypoints are on the grippers.
+        source: free text.
+        place: the table `[columns]` or `[topics]`, as it is.
+        path: of the layout file, for messages.
+    """
+
+    nominal: Nominal
+    setup: Setup
+    source: str
+    place: Fields
+    path: pathlib.Path
+
+
+class Fields:
+    """A table of a TOML file that is read field by field, and complains about what was not read.
+
+    Args:
+        path: of the file, for messages.
+        name: of the table.
+        values: its fields.
+    """
+
+    def __init__(self, path: pathlib.Path, name: str, values: Any):
+        if not isinstance(values, dict):
+            raise ValueError(f"{path}: [{name}] is {values!r}, expected a table.")
+        self.path, self.name, self._left = path, name, dict(values)
+
+    def __contains__(self, field: str) -> bool:
+        return field in self._left
+
+    def take(self, field: str, kind: type | tuple[type, ...], what: str, default: Any = ...) -> Any:
+        """Removes a field and returns its value.
+
+        Raises:
+            ValueError: it is missing and has no default, or is of another kind.
+        """
+        if field not in self._left:
+            if default is ...:
+                raise ValueError(f"{self.path}: [{self.name}] lacks {field}, expected {what}.")
+            return default
+        value = self._left.pop(field)
+        if not isinstance(value, kind) or isinstance(value, bool):
+            raise ValueError(f"{self.path}: [{self.name}] {field} is {value!r}, expected {what}.")
+        return value
+
+    def number(self, field: str, default: Any = ..., *, positive: bool = True) -> Any:
+        """Removes a field with a finite number > 0, or >= 0."""
+        value = self.take(field, (int, float), "a number", default)
+        if value is not default and not (0 < value < math.inf or (value == 0 and not positive)):
+            limit = "> 0" if positive else ">= 0"
+            raise ValueError(f"{self.path}: [{self.name}] {field} is {value!r}, expected a finite number {limit}.")
+        return value
+
+    def names(self, field: str, counts: tuple[int, ...], what: str, default: Any = ...) -> Any:
+        """Removes a field with a list of strings, of one of some lengths."""
+        value = self.take(field, list, what, default)
+        if value is not default and (len(value) not in counts or not all(isinstance(name, str) for name in value)):
+            raise ValueError(f"{self.path}: [{self.name}] {field} is {value!r}, expected {what}.")
+        return value
+
+    def nothing_left(self) -> None:
+        """Complains about fields that nobody asked for.
+
+        Raises:
+            ValueError: names them.
+        """
+        if self._left:
+            raise ValueError(f"{self.path}: [{self.name}] has the unknown fields {', '.join(sorted(self._left))}.")
+
+
+def read_layout(path: str | os.PathLike[str], place: str) -> Layout:
+    """Reads a layout file.
+
+    Args:
+        path: of the TOML file.
+        place: the table that says where things are: "columns" or "topics".
+
+    Raises:
+        ValueError: there is no such file, it is no TOML, or a field is missing, unknown or of another kind.
+    """
+    path = pathlib.Path(path)
+    try:
+        values = tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ValueError(
+            f"The layout {path} could not be read: {error.strerror}. docs/recordings.md has one."
+        ) from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise ValueError(f"The layout {path} is no TOML: {error}") from None
+    if unknown := set(values) - {"cable", "table", "frame", "source", place}:
+        raise ValueError(
+            f"{path} has the unknown tables {', '.join(sorted(unknown))}, expected [cable], [table], [frame], [source] "
+            f"and [{place}]."
+        )
+    if place not in values:
+        raise ValueError(f"{path} lacks the table [{place}], which says where the keypoints are.")
+    cable = Fields(path, "cable", values.get("cable", {}))
+    table = Fields(path, "table", values["table"]) if "table" in values else None
+    frame = Fields(path, "frame", values.get("frame", {}))
+    source = Fields(path, "source", values.get("source", {}))
+    arclength = cable.take("keypoint_arclength_m", list, "a list of numbers", None)
+    if arclength is not None and not all(isinstance(s, (int, float)) for s in arclength):
+        raise ValueError(f"{path}: [cable] keypoint_arclength_m is {arclength!r}, expected a list of numbers.")
+    nominal = Nominal(
+        diameter=cable.number("diameter_m"),
+        linear_density=cable.number("linear_density_kg_per_m"),
+        bending_stiffness=cable.number("bending_stiffness_n_m2"),
+        damping_time=cable.number("bending_damping_s", 0.0, positive=False),
+        friction_coefficient=None if table is None else table.number("friction_coefficient"),
+        arclength=None if arclength is None else tuple(map(float, arclength)),
+    )
+    try:
+        setup = Setup(
+            unit=frame.take("unit", str, "m, cm, mm or in"),
+            frame=Frame(frame.take("up", str, "an axis", "z"), frame.take("handedness", str, "right or left", "right")),
+            on_grippers=cable.take("keypoints_on_grippers", str, "pairs or ends", "pairs"),
+            hangs=table is None,
+        )
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from None
+    text = source.take("text", str, "a sentence", f"Imported by the layout {path.name}.")
+    for fields in (cable, frame, source, *([] if table is None else [table])):
+        fields.nothing_left()
+    return Layout(nominal, setup, text, Fields(path, place, values[place]), path)

@@ -1,0 +1,143 @@
+"""Markers that exchange their names in part of a recording, as motion capture does after it has lost them.
+
+A cable does not fold back within one spacing of its markers, and no marker crosses the distance to another one within
+one sample. Where the order breaks this, and another order does not, the other one is right. Positions alone cannot show
+a reversal of the whole order throughout a take whose spacings read alike from both ends.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+
+import numpy as np
+from jaxtyping import Float
+from scipy.optimize import linear_sum_assignment
+
+from cablejax.recordings.take import Take, spacing, typical_spacing
+
+FOLDED = -0.5
+"""Cosine of the turn at a marker below which the cable folds back there: 120 degrees."""
+
+STRETCHED = 1.6
+"""Two neighbours this many times their usual distance apart are no neighbours."""
+
+CLEARLY = 0.25
+"""Another order must shorten the steps of the markers to this, where the cable does not fold back either way."""
+
+# Spacings of a take that differ by more than the first factor from the usual ones, and read from the other end by less
+# than the second, are in reverse.
+_OTHER, _SAME = np.log(1.25), np.log(1.1)
+
+
+def restore_order(takes: tuple[Take, ...]) -> tuple[tuple[Take, ...], list[str]]:
+    """Puts exchanged markers back in their places.
+
+    Args:
+        takes: of one cable.
+
+    Returns:
+        The takes, and one sentence for each that was changed.
+
+    Raises:
+        ValueError: in most samples the cable folds back: the keypoints are not in the order of the cable.
+    """
+    usual = typical_spacing(takes)
+    folded = np.concatenate([_worst_turn(take.keypoints) < FOLDED for take in takes])
+    if folded.mean() > 0.5:
+        raise ValueError(
+            f"The cable folds back between neighbouring keypoints in {100 * folded.mean():.0f} % of the samples: give "
+            "the keypoints in their order along the cable, from gripper 0 to gripper 1."
+        )
+    restored, told = [], []
+    for take in takes:
+        turned = _reversed(take, usual)
+        tracked = _tracked(take.keypoints[:, ::-1] if turned else take.keypoints, usual)
+        changed = (tracked != np.arange(len(usual) + 1)).any(axis=1)
+        if turned:
+            told.append(f"Take {take.name}: its keypoints ran from gripper 1 to gripper 0 and were reversed.")
+            take = dataclasses.replace(take, keypoints=take.keypoints[:, ::-1])
+        if changed.any():
+            markers = np.flatnonzero((tracked != np.arange(len(usual) + 1)).any(axis=0)).tolist()
+            told.append(
+                f"Take {take.name}: keypoints {', '.join(map(str, markers))} had exchanged their names in "
+                f"{changed.sum()} of {len(changed)} samples, from sample {int(np.argmax(changed))}, and were put back."
+            )
+            points = np.take_along_axis(take.keypoints, tracked[:, :, None], axis=1)
+            take = dataclasses.replace(take, keypoints=points)
+        restored.append(take)
+    return tuple(restored), told
+
+
+def _worst_turn(points: Float[np.ndarray, "*B N D"]) -> Float[np.ndarray, "*B"]:
+    """Least cosine between neighbouring segments; 1 where none is observed."""
+    along = np.diff(points, axis=-2)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        along = along / np.linalg.norm(along, axis=-1, keepdims=True)
+    cosine = (along[..., 1:, :] * along[..., :-1, :]).sum(axis=-1)
+    return np.where(np.isfinite(cosine), cosine, 1.0).min(axis=-1)
+
+
+def _broken(points: Float[np.ndarray, "*B N D"], usual: Float[np.ndarray, " M"]) -> np.ndarray:
+    ratio = spacing(points) / usual
+    return (_worst_turn(points) < FOLDED) | (np.where(np.isfinite(ratio), ratio, 1.0).max(axis=-1) > STRETCHED)
+
+
+def _reversed(take: Take, usual: Float[np.ndarray, " M"]) -> bool:
+    seen = spacing(take.keypoints)
+    if not np.isfinite(seen).any(axis=0).all():
+        return False
+    own = np.log(np.nanmedian(seen, axis=0))
+    return bool(abs(own - np.log(usual)).max() > _OTHER and abs(own[::-1] - np.log(usual)).max() < _SAME)
+
+
+def _tracked(points: Float[np.ndarray, "T N D"], usual: Float[np.ndarray, " M"]) -> np.ndarray:
+    """Which of the given keypoints is at each place of the cable, shape [T, N]."""
+    samples, count, _ = points.shape
+    order = np.tile(np.arange(count), (samples, 1))
+    broken = _broken(points, usual)
+    step = np.linalg.norm(np.diff(points, axis=0), axis=-1)
+    typical = np.median(np.nan_to_num(step), axis=-1)
+    # A sample is looked at where the cable is broken, or where the markers jump by more than half their distance.
+    if not broken.any() and not (typical > 0.5 * np.median(usual)).any():
+        return order
+    swaps = _swaps(count)
+    current = np.arange(count)
+    for t in range(samples):
+        here = points[t]
+        before = points[t - 1][order[t - 1]] if t else None
+        if np.isfinite(here).all() and (before is None or np.isfinite(before).all()):
+            current = _best(here, before, current, swaps, usual)
+        order[t] = current
+    return order
+
+
+def _swaps(count: int) -> np.ndarray:
+    """All exchanges of two places, and the reversal, shape [C, N]."""
+    rows = [np.arange(count)[::-1]]
+    for i, j in itertools.combinations(range(count), 2):
+        row = np.arange(count)
+        row[[i, j]] = j, i
+        rows.append(row)
+    return np.array(rows)
+
+
+def _best(here, before, current, swaps, usual) -> np.ndarray:
+    """The order at one sample, given the cable at the sample before, in order, and the order it had."""
+    broken_now = bool(_broken(here[current], usual))
+    now = np.inf if before is None else float(np.linalg.norm(here[current] - before, axis=-1).max())
+    if not broken_now and (before is None or now < 0.5 * np.median(usual)):
+        return current
+    candidates = [np.arange(len(current))[None], current[swaps]]
+    if before is not None:
+        distance = np.linalg.norm(before[:, None] - here[None], axis=-1)
+        candidates.append(linear_sum_assignment(distance**2)[1][None])
+    orders = np.concatenate(candidates)
+    orders = orders[~_broken(here[orders], usual)]
+    if len(orders) == 0:
+        return current
+    if before is None:  # of the orders that do not fold back, the shortest way along the markers
+        return orders[np.argmin(spacing(here[orders]).sum(axis=-1))]
+    moved = np.linalg.norm(here[orders] - before, axis=-1).max(axis=-1)
+    best = int(np.argmin(moved))
+    return orders[best] if broken_now or moved[best] < CLEARLY * now else current

@@ -1,0 +1,102 @@
+"""Gripper poses from the two markers on each gripper, and twists from poses.
+
+Two markers show a position and a tangent; the rotation about the tangent, the roll, is not observed. In space the
+quaternion of the first sample is the smallest rotation that takes the x axis to the tangent, and from then on the frame
+is carried along by parallel transport: from each sample to the next by the smallest rotation that takes one tangent to
+the other. So it is continuous, and turns about the tangent only as much as the path of the tangent makes it. It says
+nothing of how the cable was twisted by the gripper: a model has to fit the roll, or to leave the twist out.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float
+
+_X = np.array([1.0, 0.0, 0.0])
+
+
+def poses_from_markers(
+    first: Float[np.ndarray, "T D"], second: Float[np.ndarray, "T D"], at: Float[np.ndarray, "T D"]
+) -> Float[np.ndarray, "T P"]:
+    """Poses of one gripper (x, y, theta) or (x, y, z, qw, qx, qy, qz), shape [T, 3] or [T, 7].
+
+    Args:
+        first: marker at the smaller arc length [m].
+        second: marker at the larger one [m]: the tangent points from the first to it.
+        at: position of the gripper [m].
+
+    Raises:
+        ValueError: the two markers are in one place.
+    """
+    along = second - first
+    length = np.linalg.norm(along, axis=-1, keepdims=True)
+    if (length < 1e-6).any():
+        sample = int(np.argmin(length))
+        raise ValueError(
+            f"The two markers of a gripper are in one place in sample {sample}, so they show no tangent: choose two "
+            "markers some millimetres apart."
+        )
+    tangent = along / length
+    if tangent.shape[1] == 2:
+        angle = np.unwrap(np.arctan2(tangent[:, 1], tangent[:, 0]))
+        return np.concatenate([at, angle[:, None]], axis=1)
+    return np.concatenate([at, transported_frames(tangent)], axis=1)
+
+
+def transported_frames(tangent: Float[np.ndarray, "T 3"]) -> Float[np.ndarray, "T 4"]:
+    """Unit quaternions (scalar first) of frames whose x axis is the tangent, without a roll of their own, [T, 4]."""
+    quaternion = np.empty((len(tangent), 4))
+    quaternion[0] = smallest_rotation(_X, tangent[0])
+    turns = smallest_rotation(tangent[:-1], tangent[1:])
+    for t, turn in enumerate(turns):
+        quaternion[t + 1] = product(turn, quaternion[t])
+    return quaternion / np.linalg.norm(quaternion, axis=-1, keepdims=True)
+
+
+def smallest_rotation(start: Float[np.ndarray, "*B 3"], end: Float[np.ndarray, "*B 3"]) -> Float[np.ndarray, "*B 4"]:
+    """Quaternion of the smallest rotation from one unit vector to another; half a turn about z if x goes to -x."""
+    cosine = (start * end).sum(axis=-1, keepdims=True)
+    quaternion = np.concatenate([1 + cosine, np.cross(start, end)], axis=-1)
+    norm = np.linalg.norm(quaternion, axis=-1, keepdims=True)
+    opposite = norm < 1e-7
+    sideways = np.cross(start, np.where(abs(start[..., 1:2]) < 0.9, [0.0, 1.0, 0.0], _X))
+    sideways = sideways / np.linalg.norm(sideways, axis=-1, keepdims=True)
+    half_turn = np.concatenate([np.zeros_like(cosine), sideways], axis=-1)
+    return np.where(opposite, half_turn, quaternion / np.where(opposite, 1.0, norm))
+
+
+def product(a: Float[np.ndarray, "*B 4"], b: Float[np.ndarray, "*B 4"]) -> Float[np.ndarray, "*B 4"]:
+    """Hamilton product, scalar first."""
+    scalar = a[..., :1] * b[..., :1] - (a[..., 1:] * b[..., 1:]).sum(axis=-1, keepdims=True)
+    vector = a[..., :1] * b[..., 1:] + b[..., :1] * a[..., 1:] + np.cross(a[..., 1:], b[..., 1:])
+    return np.concatenate([scalar, vector], axis=-1)
+
+
+def rotated(quaternion: Float[np.ndarray, "*B 4"], vector: Float[np.ndarray, "*B 3"]) -> Float[np.ndarray, "*B 3"]:
+    """The vector turned by a unit quaternion."""
+    axis = quaternion[..., 1:]
+    twice = 2 * np.cross(axis, vector)
+    return vector + quaternion[..., :1] * twice + np.cross(axis, twice)
+
+
+def twists(time: Float[np.ndarray, " T"], pose: Float[np.ndarray, "T Q P"]) -> Float[np.ndarray, "T Q V"]:
+    """The twist that carries each pose to the next one, by finite differences; zero after the last sample.
+
+    Linear [m/s] and angular [rad/s], both in the world's frame, shape [T, Q, 3 or 6].
+    """
+    interval = np.diff(time)[:, None, None]
+    if pose.shape[-1] == 3:
+        change = np.diff(pose, axis=0)
+    else:
+        start = pose[:-1, :, 3:] * np.array([1.0, -1.0, -1.0, -1.0])
+        turn = product(pose[1:, :, 3:], start)
+        turn = turn * np.where(turn[..., :1] < 0, -1.0, 1.0)
+        sine = np.linalg.norm(turn[..., 1:], axis=-1, keepdims=True)
+        angle = 2 * np.arctan2(sine, turn[..., :1])
+        vector = turn[..., 1:] * np.where(sine > 1e-12, angle / np.where(sine > 1e-12, sine, 1.0), 2.0)
+        change = np.concatenate([np.diff(pose[..., :3], axis=0), vector], axis=-1)
+    return (
+        np.concatenate([change / interval, np.zeros_like(change[:1])])
+        if len(change)
+        else np.zeros((1, pose.shape[1], 3 if pose.shape[-1] == 3 else 6))
+    )

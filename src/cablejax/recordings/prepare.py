@@ -1,0 +1,133 @@
+"""From takes as they were read to takes that a gap log may hold: every repair told, everything else refused."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Literal
+
+import numpy as np
+
+from cablejax.recordings.frames import Frame, into_frame, require_hanging, require_rigid
+from cablejax.recordings.gaps import cut_at_gaps
+from cablejax.recordings.marker_order import restore_order
+from cablejax.recordings.poses import poses_from_markers
+from cablejax.recordings.take import Take, typical_spacing
+from cablejax.recordings.units import METRES, metres_per, recognised_unit, require_metres
+
+
+@dataclasses.dataclass(frozen=True)
+class Setup:
+    """What has to be told of a recording, because its numbers do not show it.
+
+    Attributes:
+        unit: of all lengths: "m", "cm", "mm" or "in"; None = metres, or another unit if the length of the cable leaves
+            no doubt.
+        frame: the coordinate frame; planar recordings have none.
+        on_grippers: "pairs" if the first two and the last two keypoints are on the grippers; "ends" if only the first
+            and the last are.
+        hangs: the cable hangs free and is not on a table.
+        plausible_length: what the cable may measure [m], for a unit that is not told.
+    """
+
+    unit: str | None = "m"
+    frame: Frame = Frame()
+    on_grippers: Literal["pairs", "ends"] = "pairs"
+    hangs: bool = True
+    plausible_length: tuple[float, float] = (0.3, 3.0)
+
+    def __post_init__(self):
+        if self.unit is not None:
+            metres_per(self.unit)
+        if self.on_grippers not in ("pairs", "ends"):
+            raise ValueError(f"on_grippers is {self.on_grippers!r}, expected 'pairs' or 'ends'.")
+
+
+def prepare(takes: tuple[Take, ...], setup: Setup) -> tuple[tuple[Take, ...], list[str]]:
+    """Checks and repairs takes of one cable, and gives each the poses of both grippers.
+
+    In this order: the unit of length; the frame; the order of the markers; gaps in time; orientations against markers.
+
+    Returns:
+        The takes in metres, z up, right-handed, without gaps, each with gripper poses; and a sentence on each repair.
+
+    Raises:
+        ValueError: something is wrong that cannot be repaired without guessing; says what came, what was expected and
+            what to do.
+    """
+    if not takes:
+        raise ValueError("The recording has no take, expected at least one.")
+    shapes = sorted({take.keypoints.shape[1:] for take in takes})
+    if len(shapes) > 1 or shapes[0][0] < (5 if setup.on_grippers == "pairs" else 3):
+        raise ValueError(
+            f"The takes have keypoints of the shapes {', '.join(map(str, shapes))}, expected one shape with at least "
+            f"three "
+            "keypoints, or five if the first two and the last two are on the grippers."
+        )
+    for take in takes:
+        if np.isinf(take.keypoints).any():
+            raise ValueError(f"Take {take.name} has infinite positions; a keypoint that was not observed is NaN.")
+    measured = takes[0].gripper_pose is not None
+    if not measured and setup.on_grippers == "ends":
+        raise ValueError(
+            "The grippers' poses are not told, and only one keypoint is on each: name the columns or topics of the "
+            "poses, "
+            "or two keypoints on each gripper."
+        )
+    takes, told = _in_metres(takes, setup)
+    takes = tuple(into_frame(take, setup.frame) for take in takes)
+    takes, exchanged = restore_order(takes)
+    if setup.hangs and takes[0].keypoints.shape[2] == 3:
+        require_hanging(takes, setup.frame)
+    last = takes[0].keypoints.shape[1] - 1
+    pairs = ((0, 1), (last - 1, last))
+    takes, cut = cut_at_gaps(takes, None if measured else (*pairs[0], *pairs[1]))
+    if measured and setup.on_grippers == "pairs" and takes[0].keypoints.shape[2] == 3:
+        require_rigid(takes, pairs)
+    if not measured:
+        takes = tuple(_with_poses(take, pairs) for take in takes)
+    return takes, [*told, *exchanged, *cut]
+
+
+def _in_metres(takes: tuple[Take, ...], setup: Setup) -> tuple[tuple[Take, ...], list[str]]:
+    length = float(typical_spacing(takes).sum())
+    told: list[str] = []
+    unit = setup.unit
+    if unit is None:
+        low, high = setup.plausible_length
+        candidates = recognised_unit(length, setup.plausible_length)
+        if "m" in candidates:
+            unit = "m"
+        elif len(candidates) == 1:
+            unit = candidates[0]
+            told.append(
+                f"The cable measures {length:.4g} along its keypoints, which can only be {unit}: all lengths were "
+                "converted to metres."
+            )
+        else:
+            raise ValueError(
+                f"The cable measures {length:.4g} along its keypoints, expected {low:g} to {high:g} m. "
+                + (f"It may be in {' or in '.join(candidates)}: say which. " if candidates else "")
+                + "Name the unit of length, or check the order of the coordinates."
+            )
+    require_metres(length * METRES[unit], unit)
+    if unit == "m":
+        return takes, told
+    scale = METRES[unit]
+
+    def scaled(take: Take) -> Take:
+        pose = take.gripper_pose
+        if pose is not None:
+            positions = take.keypoints.shape[2]
+            pose = np.concatenate([pose[..., :positions] * scale, pose[..., positions:]], axis=-1)
+        return dataclasses.replace(take, keypoints=take.keypoints * scale, gripper_pose=pose)
+
+    return tuple(map(scaled, takes)), told
+
+
+def _with_poses(take: Take, pairs: tuple[tuple[int, int], tuple[int, int]]) -> Take:
+    points = take.keypoints
+    poses = [
+        poses_from_markers(points[:, first], points[:, second], points[:, end])
+        for (first, second), end in zip(pairs, (0, -1), strict=True)
+    ]
+    return dataclasses.replace(take, gripper_pose=np.stack(poses, axis=1))

@@ -1,0 +1,160 @@
+"""A laboratory's own csv: one row per sample, columns named in a layout file."""
+
+from __future__ import annotations
+
+import csv
+import itertools
+import math
+import os
+import pathlib
+
+import numpy as np
+
+from cablejax.recordings.assemble import gap_log_from_takes
+from cablejax.recordings.layout import Fields, Layout, read_layout
+from cablejax.recordings.prepare import prepare
+from cablejax.recordings.take import Take
+from cablejax.types import GapLog
+
+SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+"""Seconds in one of each unit of time."""
+
+_ANGLES = {"rad": 1.0, "deg": math.pi / 180}
+_EMPTY = ("", "nan", "NaN", "NAN", "null", "NA")
+
+
+def import_csv(path: str | os.PathLike[str], layout: str | os.PathLike[str]) -> tuple[GapLog, list[str]]:
+    """Reads, checks and repairs a csv file with one row per sample.
+
+    Args:
+        path: comma-separated, with a header; empty or "nan" where nothing was observed.
+        layout: TOML file that names the columns and units, see `docs/recordings.md`.
+
+    Returns:
+        A gap log, planar or in space, and a sentence on each repair.
+
+    Raises:
+        ValueError: a file is missing, a column is missing or holds no numbers, or the recording cannot be used without
+            guessing; names it.
+    """
+    how = read_layout(layout, "columns")
+    takes, repairs = prepare(_takes(pathlib.Path(path), how), how.setup)
+    return gap_log_from_takes(takes, how.nominal, source=how.source, repairs=repairs), repairs
+
+
+def _takes(path: pathlib.Path, how: Layout) -> tuple[Take, ...]:
+    columns = _read(path)
+    fields = how.place
+    time_unit = fields.take("time_unit", str, "s, ms, us or ns", "s")
+    if time_unit not in SECONDS:
+        raise ValueError(f"{how.path}: [columns] time_unit is {time_unit!r}, expected one of {', '.join(SECONDS)}.")
+    time = _numbers(path, columns, [fields.take("time", str, "the name of a column")])[:, 0] * SECONDS[time_unit]
+    keypoints = _keypoints(path, columns, fields)
+    pose = _poses(path, columns, fields, keypoints.shape[2])
+    episode = fields.take("episode", str, "the name of a column", None)
+    motion = fields.take("motion", str, "the name of a column", None)
+    fields.nothing_left()
+    episodes = ["1"] * len(time) if episode is None else _column(path, columns, episode)
+    motions = ["recorded"] * len(time) if motion is None else _column(path, columns, motion)
+    edges = [0, *(t for t in range(1, len(time)) if episodes[t] != episodes[t - 1]), len(time)]
+    takes = []
+    for a, b in itertools.pairwise(edges):
+        if b - a < 2:
+            raise ValueError(f"{path}: episode {episodes[a]!r} has one row only (line {a + 2}), expected at least two.")
+        takes.append(
+            Take(
+                name=episodes[a],
+                time=time[a:b],
+                keypoints=keypoints[a:b],
+                gripper_pose=None if pose is None else pose[a:b],
+                labels={"motion": motions[a]},
+            )
+        )
+    return tuple(takes)
+
+
+def _read(path: pathlib.Path) -> dict[str, list[str]]:
+    try:
+        with path.open(encoding="utf-8-sig", newline="") as text:
+            rows = [row for row in csv.reader(text) if row]
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise ValueError(f"{path} could not be read as csv: {error}") from None
+    if len(rows) < 3:
+        raise ValueError(f"{path} has {len(rows)} rows, expected a header and at least two samples.")
+    header = [name.strip() for name in rows[0]]
+    if len(set(header)) < len(header):
+        twice = next(name for name in header if header.count(name) > 1)
+        raise ValueError(f"{path} has the column {twice!r} twice: give each column a name of its own.")
+    for line, row in enumerate(rows[1:], 2):
+        if len(row) != len(header):
+            raise ValueError(f"{path}, line {line}: {len(row)} cells, expected {len(header)} as in the header.")
+    return {name: [row[index].strip() for row in rows[1:]] for index, name in enumerate(header)}
+
+
+def _column(path: pathlib.Path, columns: dict[str, list[str]], name: str) -> list[str]:
+    if name not in columns:
+        shown = ", ".join(list(columns)[:12]) + (", ..." if len(columns) > 12 else "")
+        raise ValueError(f"{path} has no column {name!r}; it has {shown}. Correct the name in the layout.")
+    return columns[name]
+
+
+def _numbers(path: pathlib.Path, columns: dict[str, list[str]], names: list[str]) -> np.ndarray:
+    """The named columns, shape [T, number of names]."""
+    values = np.empty((len(next(iter(columns.values()))), len(names)))
+    for place, name in enumerate(names):
+        for row, cell in enumerate(_column(path, columns, name)):
+            try:
+                values[row, place] = np.nan if cell in _EMPTY else float(cell)
+            except ValueError:
+                raise ValueError(f"{path}, line {row + 2}: column {name!r} is {cell!r}, expected a number.") from None
+    return values
+
+
+def _keypoints(path: pathlib.Path, columns: dict[str, list[str]], fields: Fields) -> np.ndarray:
+    templates = fields.names("keypoint", (2, 3), "two or three names such as 'm{i}_x', where {i} counts the keypoints")
+    first = fields.take("first", int, "the number of the first keypoint", 0)
+    count = fields.take("count", int, "how many keypoints there are")
+    if bad := [name for name in templates if "{i}" not in name]:
+        raise ValueError(f"{fields.path}: [columns] keypoint has {bad[0]!r}, expected a name with {{i}} in it.")
+    names = [name.replace("{i}", str(i)) for i in range(first, first + count) for name in templates]
+    return _numbers(path, columns, names).reshape(-1, count, len(templates))
+
+
+def _poses(path: pathlib.Path, columns: dict[str, list[str]], fields: Fields, dimension: int) -> np.ndarray | None:
+    width = 3 if dimension == 2 else 7
+    what = "x, y and the angle" if dimension == 2 else "x, y, z, qw, qx, qy and qz"
+    names = [fields.names(f"gripper_{q}", (width,), f"the {width} columns of {what}", None) for q in (0, 1)]
+    unit = fields.take("angle_unit", str, "rad or deg", "rad")
+    if unit not in _ANGLES:
+        raise ValueError(f"{fields.path}: [columns] angle_unit is {unit!r}, expected rad or deg.")
+    if names[0] is None and names[1] is None:
+        return None
+    if None in names:
+        missing = names.index(None)
+        raise ValueError(
+            f"{fields.path}: [columns] names gripper_{1 - missing} but not gripper_{missing}: both grippers must be "
+            f"known. "
+            "Leave both out to find them from two markers on each."
+        )
+    pose = np.stack([_numbers(path, columns, row) for row in names], axis=1)
+    if dimension == 2:
+        pose[..., 2] *= _ANGLES[unit]
+        return pose
+    return unit_quaternions(pose, str(path))
+
+
+def unit_quaternions(pose: np.ndarray, where: str) -> np.ndarray:
+    """Poses with quaternions of exactly unit length.
+
+    Raises:
+        ValueError: one is far from it, so that it is no quaternion.
+    """
+    norm = np.linalg.norm(pose[..., 3:], axis=-1, keepdims=True)
+    if (np.abs(norm[np.isfinite(norm)] - 1) > 0.02).any():
+        sample = int(np.argmax(np.nan_to_num(np.abs(norm - 1)).max(axis=(1, 2))))
+        raise ValueError(
+            f"{where}: sample {sample} has a gripper quaternion of length {float(np.nanmax(norm[sample])):.3g}, "
+            f"expected 1: "
+            "check the columns of qw, qx, qy and qz."
+        )
+    return np.concatenate([pose[..., :3], pose[..., 3:] / norm], axis=-1)

@@ -1,0 +1,89 @@
+"""What every reader yields: stretches of a recording, before they are checked and become episodes of a gap log."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+
+@dataclasses.dataclass(frozen=True)
+class Take:
+    """One uninterrupted stretch of a recording. D is 2 (on a table) or 3.
+
+    Attributes:
+        name: what a person calls it, for example the number of its file.
+        time: [s], increasing, shape [T].
+        keypoints: [m], in the order of the cable, NaN = not observed, shape [T, N, D].
+        gripper_pose: measured poses (x, y, theta) or (x, y, z, qw, qx, qy, qz), shape [T, 2, 3 or 7]; None = to be
+            found from the two markers on each gripper.
+        labels: what else is known of it and travels with the log, for example its split.
+    """
+
+    name: str
+    time: Float[np.ndarray, " T"]
+    keypoints: Float[np.ndarray, "T N D"]
+    gripper_pose: Float[np.ndarray, "T 2 P"] | None = None
+    labels: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+
+    def __post_init__(self):
+        samples = len(self.time)
+        if self.keypoints.ndim != 3 or self.keypoints.shape[0] != samples or self.keypoints.shape[2] not in (2, 3):
+            raise ValueError(
+                f"Take {self.name}: keypoints has shape {self.keypoints.shape}, expected ({samples}, N, 2 or 3)."
+            )
+        if not np.isfinite(self.time).all() or (np.diff(self.time) <= 0).any():
+            row = int(np.argmax(~(np.diff(self.time) > 0))) + 1
+            raise ValueError(
+                f"Take {self.name}: its times do not increase (sample {row}: {self.time[row]!r} after "
+                f"{self.time[row - 1]!r}): sort the samples and leave out what is there twice."
+            )
+        shape = (samples, 2, 3 if self.keypoints.shape[2] == 2 else 7)
+        if self.gripper_pose is not None and self.gripper_pose.shape != shape:
+            raise ValueError(
+                f"Take {self.name}: gripper_pose has shape {self.gripper_pose.shape}, expected {shape}: two grippers "
+                "with x, y, theta in the plane, or x, y, z, qw, qx, qy, qz in space."
+            )
+
+    def part(self, begin: int, end: int, name: str) -> Take:
+        """The samples from `begin` up to `end` as a take of their own."""
+        pose = None if self.gripper_pose is None else self.gripper_pose[begin:end]
+        return dataclasses.replace(
+            self, name=name, time=self.time[begin:end], keypoints=self.keypoints[begin:end], gripper_pose=pose
+        )
+
+
+def spacing(keypoints: Float[np.ndarray, "*B N D"]) -> Float[np.ndarray, "*B M"]:
+    """Distances of neighbouring keypoints [m], shape [..., N - 1]."""
+    return np.linalg.norm(np.diff(keypoints, axis=-2), axis=-1)
+
+
+def typical_spacing(takes: tuple[Take, ...]) -> Float[np.ndarray, " M"]:
+    """Median distance of each pair of neighbouring keypoints over all samples [m], shape [N - 1].
+
+    Raises:
+        ValueError: a keypoint that is never observed beside its neighbour.
+    """
+    distances = np.concatenate([spacing(take.keypoints) for take in takes])
+    seen = np.isfinite(distances).any(axis=0)
+    if not seen.all():
+        index = int(np.argmin(seen))
+        raise ValueError(
+            f"Keypoints {index} and {index + 1} are never observed together: leave out the one that is missing."
+        )
+    return np.nanmedian(distances, axis=0)
+
+
+def median_step(points: Float[np.ndarray, "T N D"]) -> Float[np.ndarray, " S"]:
+    """How far the middle one of the observed keypoints moves from each sample to the next [m], shape [T - 1].
+
+    NaN where none is observed in both.
+    """
+    step = np.linalg.norm(np.diff(points, axis=0), axis=-1)
+    seen = np.isfinite(step).any(axis=1)
+    middle = np.full(len(step), np.nan)
+    middle[seen] = np.nanmedian(step[seen], axis=1)
+    return middle

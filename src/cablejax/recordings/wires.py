@@ -1,0 +1,133 @@
+"""Photographs of wires that hang between two clamps: planar, at rest, with a bending stiffness measured by others.
+
+From the repository qj25/adapteddlo_muj (MIT), arXiv 2310.00911: white silicone wire, and black and red copper wire in
+PVC, each hung several times.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import pathlib
+import zipfile
+
+import numpy as np
+from jaxtyping import Float
+
+from cablejax.gaplog import Episode, gap_log_from_episodes
+from cablejax.recordings.poses import poses_from_markers
+from cablejax.recordings.units import require_metres
+from cablejax.simulate.config import CableConfig
+from cablejax.types import GapLog
+
+_FIELDS = ("wire", "keypoints", "length_m", "mass_per_length_kg_m", "EI_published_Nm2")
+_DIAMETER = 0.003
+
+
+@dataclasses.dataclass(frozen=True)
+class HangingWire:
+    """One wire, hung several times.
+
+    Attributes:
+        name: its colour.
+        keypoints: points at equal distances along it [m], z up, y = 0, shape [R, N, 3].
+        length: [m].
+        linear_density: [kg/m].
+        published_stiffness: EI that the authors found for each repeat [N m^2], shape [R].
+    """
+
+    name: str
+    keypoints: Float[np.ndarray, "R N 3"]
+    length: float
+    linear_density: float
+    published_stiffness: Float[np.ndarray, " R"]
+
+
+def read_wires(path: str | os.PathLike[str]) -> tuple[HangingWire, ...]:
+    """Reads an `.npz` with `wire` [W], `keypoints` [W, R, N, 3], `length_m`, `mass_per_length_kg_m` [W] and
+    `EI_published_Nm2` [W, R].
+
+    Raises:
+        ValueError: there is no such file, or something in it is missing, not finite or does not fit together.
+    """
+    path = pathlib.Path(path)
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            arrays = {name: archive[name] for name in archive.files}
+    except (OSError, ValueError, AttributeError, zipfile.BadZipFile) as error:
+        raise ValueError(f"{path} is not an .npz file of plain arrays: {error}") from None
+    if missing := set(_FIELDS) - set(arrays):
+        raise ValueError(f"{path} lacks {', '.join(sorted(missing))}; it has {', '.join(sorted(arrays))}.")
+    points = arrays["keypoints"]
+    count = points.shape[:2]
+    shapes = {"wire": count[:1], "length_m": (), "mass_per_length_kg_m": count[:1], "EI_published_Nm2": count}
+    if points.ndim != 4 or points.shape[3] != 3 or points.shape[2] < 5:
+        raise ValueError(f"{path}: keypoints has shape {points.shape}, expected [W, R, N, 3] with N at least 5.")
+    for name, shape in shapes.items():
+        if arrays[name].shape != shape:
+            raise ValueError(f"{path}: {name} has shape {arrays[name].shape}, expected {shape} beside these keypoints.")
+    for name in _FIELDS[1:]:
+        if not np.issubdtype(arrays[name].dtype, np.floating) or not np.isfinite(arrays[name]).all():
+            raise ValueError(f"{path}: {name} is not made of finite numbers.")
+    length = float(arrays["length_m"])
+    require_metres(length, "m")
+    return tuple(
+        HangingWire(str(name), keypoints, length, float(density), stiffness)
+        for name, keypoints, density, stiffness in zip(
+            arrays["wire"].tolist(),
+            points.astype(float),
+            arrays["mass_per_length_kg_m"],
+            arrays["EI_published_Nm2"].astype(float),
+            strict=True,
+        )
+    )
+
+
+def wire_log(wire: HangingWire) -> GapLog:
+    """A gap log in space with an episode of one sample for each time that the wire was hung.
+
+    The mean of the published stiffnesses is what is believed true; the diameter is a guess. Gripper poses are the first
+    and last point with the direction to the point beside it, since the photographs do not show the clamps.
+    """
+    repeats, count, _ = wire.keypoints.shape
+    cable = CableConfig(
+        length=wire.length,
+        diameter=_DIAMETER,
+        n_links=3,
+        n_keypoints=count,
+        bending_stiffness=float(wire.published_stiffness.mean()),
+        damping_time=0.0,
+        linear_density=wire.linear_density,
+        friction_coefficient=0.0,
+    )
+    episodes = []
+    for points in wire.keypoints:
+        ends = [
+            poses_from_markers(points[None, 0], points[None, 1], points[None, 0]),
+            poses_from_markers(points[None, -2], points[None, -1], points[None, -1]),
+        ]
+        episodes.append(
+            Episode(
+                motion="hang",
+                time=np.zeros(1),
+                keypoints=points[None],
+                gripper_pose=np.stack(ends, axis=1),
+                gripper_command=np.zeros((1, 2, 6)),
+                hold=np.ones(1, bool),
+            )
+        )
+    return gap_log_from_episodes(
+        episodes,
+        cable,
+        source=(
+            f"{wire.name} wire of qj25/adapteddlo_muj (arXiv 2310.00911), traced in photographs while it hung between "
+            f"two "
+            "clamps. Bending stiffness: mean of the published values; the diameter is a guess. Gripper poses are from "
+            "the "
+            "first and last two points."
+        ),
+        extra={
+            "take": [f"{wire.name} {index}" for index in range(repeats)],
+            "published_stiffness_n_m2": wire.published_stiffness.tolist(),
+        },
+    )

@@ -1,0 +1,187 @@
+"""ROS 2 bags and MCAP files, written here by the library that reads them."""
+
+import re
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+rosbags = pytest.importorskip("rosbags", reason="rosbags is not installed: pip install 'cablejax[recordings]'")
+
+from rosbags.rosbag2 import StoragePlugin, Writer  # noqa: E402
+from rosbags.typesys import Stores, get_typestore  # noqa: E402
+
+from cablejax.gaplog import validate  # noqa: E402
+from cablejax.recordings.bags import import_mcap  # noqa: E402
+from cablejax.recordings.poses import poses_from_markers, rotated  # noqa: E402
+from recording_cases import DT, swinging  # noqa: E402
+
+DOCUMENTATION = Path(__file__).parents[1] / "docs" / "recordings.md"
+STORE = get_typestore(Stores.ROS2_HUMBLE)
+POINT = STORE.types["geometry_msgs/msg/Point"]
+QUATERNION = STORE.types["geometry_msgs/msg/Quaternion"]
+POSE = STORE.types["geometry_msgs/msg/Pose"]
+ARRAY = STORE.types["geometry_msgs/msg/PoseArray"]
+STAMPED = STORE.types["geometry_msgs/msg/PoseStamped"]
+HEADER = STORE.types["std_msgs/msg/Header"]
+TIME = STORE.types["builtin_interfaces/msg/Time"]
+
+LAYOUT = """
+[cable]
+diameter_m = 0.006
+linear_density_kg_per_m = 0.04
+bending_stiffness_n_m2 = 6e-4
+[frame]
+unit = "m"
+[topics]
+keypoints = "/cable/keypoints"
+grippers = ["/left/pose", "/right/pose"]
+"""
+
+
+def header(time: float):
+    return HEADER(TIME(int(time), round(1e9 * (time % 1))), "world")
+
+
+def pose_of(values: np.ndarray):
+    x, y, z, w, i, j, k = map(float, values)
+    return POSE(POINT(x, y, z), QUATERNION(i, j, k, w))
+
+
+def write_bag(path: Path, points: np.ndarray, grippers: dict[str, tuple[np.ndarray, np.ndarray]], storage) -> Path:
+    """Keypoints every 10 ms, and each gripper's poses at times of its own."""
+    with Writer(path, version=9, storage_plugin=storage) as bag:
+        connection = bag.add_connection("/cable/keypoints", ARRAY.__msgtype__, typestore=STORE)
+        for t, frame in enumerate(points):
+            time = 1000.0 + DT * t
+            message = ARRAY(header(time), [pose_of(np.append(p, [1.0, 0, 0, 0])) for p in frame])
+            bag.write(connection, round(1e9 * time), STORE.serialize_cdr(message, ARRAY.__msgtype__))
+        for topic, (times, poses) in grippers.items():
+            connection = bag.add_connection(topic, STAMPED.__msgtype__, typestore=STORE)
+            for time, values in zip(1000.0 + times, poses, strict=True):
+                message = STAMPED(header(time), pose_of(values))
+                # Written in any order and with the recorder's own delay: the stamps in the headers count.
+                bag.write(connection, round(1e9 * (time + 0.2)), STORE.serialize_cdr(message, STAMPED.__msgtype__))
+    return path
+
+
+def grippers_of(points: np.ndarray, stride: int = 2) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """Poses of both grippers at every other sample; every third quaternion with the other sign."""
+    times = DT * np.arange(len(points))[::stride]
+    result = {}
+    for topic, (a, b) in {"/left/pose": (0, 1), "/right/pose": (7, 8)}.items():
+        pose = poses_from_markers(points[:, a], points[:, b], points[:, a if a == 0 else b])[::stride]
+        pose[::3, 3:] *= -1
+        result[topic] = times, pose
+    return result
+
+
+def layout(folder: Path, text: str = LAYOUT) -> Path:
+    (folder / "layout.toml").write_text(text)
+    return folder / "layout.toml"
+
+
+@pytest.mark.parametrize("storage", [StoragePlugin.MCAP, StoragePlugin.SQLITE3])
+def test_a_bag_is_read_with_both_kinds_of_storage(tmp_path, storage):
+    points = swinging(201)
+    points[30, 4] = np.nan
+    bag = write_bag(tmp_path / "bag", points, grippers_of(points), storage)
+    log, told = import_mcap(bag, layout(tmp_path))
+    validate(log)
+    assert told == [] and log.keypoints.shape == (1, 201, 9, 3)
+    np.testing.assert_allclose(log.keypoints[0], points, atol=1e-6)
+    np.testing.assert_allclose(log.time[0], DT * np.arange(201), atol=1e-6)
+    np.testing.assert_allclose(log.gripper_pose[0, ::2, 0, :3], points[::2, 0], atol=1e-5)
+    x = np.tile([1.0, 0, 0], (201, 1))
+    for q, (a, b) in enumerate(((0, 1), (7, 8))):
+        along = points[:, b] - points[:, a]
+        along /= np.linalg.norm(along, axis=1, keepdims=True)
+        own = rotated(log.gripper_pose[0, :, q, 3:].astype(float), x)
+        assert np.degrees(np.arccos(np.clip((own * along).sum(axis=1), -1, 1))).max() < 4  # noise of 0.3 mm on 30
+    assert abs(np.diff(log.gripper_pose[0, :, :, 3:], axis=0)).max() < 0.05
+
+
+def test_a_single_mcap_file_is_read_like_its_bag(tmp_path):
+    points = swinging()
+    bag = write_bag(tmp_path / "bag", points, {}, StoragePlugin.MCAP)
+    file = next(bag.glob("*.mcap"))
+    text = LAYOUT.replace('grippers = ["/left/pose", "/right/pose"]', "")
+    log, told = import_mcap(file, layout(tmp_path, text))
+    assert told == []
+    np.testing.assert_allclose(log.gripper_pose[0, :, 1, :3], points[:, 8], atol=1e-6)
+
+
+def test_a_gap_in_a_gripper_cuts_the_recording(tmp_path):
+    points = swinging(201)
+    grippers = grippers_of(points)
+    times, poses = grippers["/left/pose"]
+    keep = (times < 0.795) | (times > 1.095)
+    grippers["/left/pose"] = times[keep], poses[keep]
+    log, told = import_mcap(write_bag(tmp_path / "bag", points, grippers, StoragePlugin.MCAP), layout(tmp_path))
+    assert log.episode_length.tolist() == [79, 91] and "one of the grippers is not seen" in told[0]
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("/cable/keypoints", "/cable", r"has no topic /cable; it has /cable/keypoints \(geometry_msgs/msg/PoseArray\)"),
+        ("/right/pose", "/cable/keypoints", "PoseArray, expected geometry_msgs/msg/PoseStamped"),
+        ('["/left/pose", "/right/pose"]', '["/left/pose"]', "expected the topics of gripper 0 and gripper 1"),
+        ('unit = "m"', 'unit = "mm"', "expected 0.05 to 20"),
+        ('unit = "m"', 'unit = "m"\nup = "x"', "say that z is up"),
+        ("[topics]", '[topics]\nclock = "/clock"', "unknown fields clock"),
+    ],
+)
+def test_a_wrong_layout_is_told(tmp_path, old, new, message):
+    points = swinging(60)
+    bag = write_bag(tmp_path / "bag", points, grippers_of(points), StoragePlugin.MCAP)
+    with pytest.raises(ValueError, match=message):
+        import_mcap(bag, layout(tmp_path, LAYOUT.replace(old, new)))
+
+
+def test_positions_of_a_left_handed_frame_beside_quaternions_of_another_are_told(tmp_path):
+    points = swinging(201)
+    grippers = grippers_of(points)
+    mirrored = {topic: (times, poses * [1, -1, 1, 1, 1, 1, 1]) for topic, (times, poses) in grippers.items()}
+    bag = write_bag(tmp_path / "bag", points * [1, -1, 1], mirrored, StoragePlugin.MCAP)
+    with pytest.raises(ValueError, match="positions are mirrored along y"):
+        import_mcap(bag, layout(tmp_path))
+
+
+def test_messages_that_change_their_size_are_told(tmp_path):
+    with Writer(tmp_path / "bag", version=9, storage_plugin=StoragePlugin.MCAP) as bag:
+        connection = bag.add_connection("/cable/keypoints", ARRAY.__msgtype__, typestore=STORE)
+        for t, count in enumerate((9, 9, 8)):
+            message = ARRAY(header(float(t)), [pose_of(np.eye(7)[3])] * count)
+            bag.write(connection, 10**9 * t, STORE.serialize_cdr(message, ARRAY.__msgtype__))
+    text = LAYOUT.replace('grippers = ["/left/pose", "/right/pose"]', "")
+    with pytest.raises(ValueError, match="have 8 to 9 poses, expected the same number"):
+        import_mcap(tmp_path / "bag", layout(tmp_path, text))
+
+
+def test_what_is_no_bag_is_told(tmp_path):
+    (tmp_path / "run.mcap").write_bytes(b"nothing")
+    (tmp_path / "run.txt").write_bytes(b"nothing")
+    (tmp_path / "folder").mkdir()
+    for name in ("run.mcap", "run.txt", "folder"):
+        with pytest.raises(ValueError, match="could not be read as a bag"):
+            import_mcap(tmp_path / name, layout(tmp_path))
+    with pytest.raises(ValueError, match="does not exist, expected a bag"):
+        import_mcap(tmp_path / "absent", layout(tmp_path))
+
+
+def test_without_the_library_its_extra_is_named(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "rosbags.highlevel", None)
+    with pytest.raises(ValueError, match=r"pip install 'cablejax\[recordings\]'"):
+        import_mcap(tmp_path, layout(tmp_path))
+
+
+def test_the_example_in_the_documentation_works(tmp_path):
+    text = next(
+        block for block in re.findall(r"```toml\n(.*?)```", DOCUMENTATION.read_text(), re.S) if "[topics]" in block
+    )
+    points = swinging(120)
+    bag = write_bag(tmp_path / "bag", points, grippers_of(points), StoragePlugin.MCAP)
+    log, _ = import_mcap(bag, layout(tmp_path, text))
+    assert log.keypoints.shape == (1, 119, 9, 3)  # the last sample is after the last pose of a gripper

@@ -1,0 +1,186 @@
+"""A laboratory's own csv, with the layout file that the documentation shows."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cablejax.gaplog import validate
+from cablejax.recordings.table import import_csv
+from recording_cases import DT, swinging
+
+DOCUMENTATION = Path(__file__).parents[1] / "docs" / "recordings.md"
+
+PAIRS = """
+[cable]
+diameter_m = 0.006
+linear_density_kg_per_m = 0.04
+bending_stiffness_n_m2 = 6e-4
+[frame]
+unit = "mm"
+[columns]
+time = "t"
+time_unit = "ms"
+keypoint = ["m{i}x", "m{i}y", "m{i}z"]
+first = 1
+count = 9
+"""
+
+PLANAR = """
+[cable]
+diameter_m = 0.01
+linear_density_kg_per_m = 0.08
+bending_stiffness_n_m2 = 0.02
+bending_damping_s = 0.1
+keypoint_arclength_m = [0, 0.2, 0.4, 0.6]
+keypoints_on_grippers = "ends"
+[table]
+friction_coefficient = 0.1
+[frame]
+unit = "m"
+[columns]
+time = "t"
+keypoint = ["x{i}", "y{i}"]
+count = 4
+gripper_0 = ["gx0", "gy0", "a0"]
+gripper_1 = ["gx1", "gy1", "a1"]
+angle_unit = "deg"
+episode = "run"
+motion = "what"
+"""
+
+
+def written(folder: Path, table: dict[str, np.ndarray], layout: str) -> tuple[Path, Path]:
+    """A csv of the columns, and its layout."""
+    rows = [",".join(table)]
+    for values in zip(*table.values(), strict=True):
+        rows.append(",".join("" if v is None or v != v else str(v) for v in values))
+    (folder / "run.csv").write_text("\n".join(rows) + "\n")
+    (folder / "layout.toml").write_text(layout)
+    return folder / "run.csv", folder / "layout.toml"
+
+
+def in_space() -> dict[str, np.ndarray]:
+    points = swinging()
+    table = {"t": 1000 * DT * np.arange(200) + 5e5}
+    for i in range(9):
+        for k, name in enumerate("xyz"):
+            table[f"m{i + 1}{name}"] = 1000 * points[:, i, k]
+    return table
+
+
+def in_the_plane() -> dict[str, list | np.ndarray]:
+    time = np.tile(0.1 * np.arange(20), 2)
+    table: dict[str, list | np.ndarray] = {"t": time, "run": ["1"] * 20 + ["2"] * 20}
+    table["what"] = ["approach"] * 20 + ["mirror"] * 20
+    for i in range(4):
+        table |= {f"x{i}": 0.2 * i + 0.01 * time, f"y{i}": 0.05 * np.sin(time + i)}
+    for q in (0, 1):
+        table |= {f"gx{q}": 0.6 * q + 0.01 * time, f"gy{q}": 0 * time, f"a{q}": 90 * time}
+    return table
+
+
+def test_markers_in_millimetres(tmp_path):
+    table = in_space()
+    table["m5y"][40] = np.nan
+    log, told = import_csv(*written(tmp_path, table, PAIRS))
+    validate(log)
+    assert told == [] and log.keypoints.shape == (1, 200, 9, 3)
+    expected = swinging().astype(np.float32)
+    assert np.isnan(log.keypoints[0, 40, 4, 1])
+    np.testing.assert_allclose(np.delete(log.keypoints[0], 40, 0), np.delete(expected, 40, 0), atol=1e-5)
+    np.testing.assert_allclose(log.time[0], DT * np.arange(200), atol=1e-9)
+
+
+def test_a_table_seen_from_above_with_measured_grippers(tmp_path):
+    log, told = import_csv(*written(tmp_path, in_the_plane(), PLANAR))
+    validate(log)
+    assert told == [] and log.keypoints.shape == (2, 20, 4, 2)
+    assert log.meta["motion"] == ["approach", "mirror"] and log.meta["take"] == ["1", "2"]
+    assert log.meta["table"] == {"friction_coefficient": 0.1}
+    assert log.meta["keypoint_arclength_m"] == [0.0, 0.2, 0.4, 0.6]
+    np.testing.assert_allclose(log.gripper_pose[0, :, 1, 2], np.radians(90 * 0.1 * np.arange(20)), atol=1e-6)
+    np.testing.assert_allclose(log.gripper_command[0, :-1, 0], np.tile([0.01, 0, np.pi / 2], (19, 1)), atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ('unit = "mm"', 'unit = "m"', "measures 684.* 0.684 m if they are in mm"),
+        ('unit = "mm"', 'unit = "ft"', "unit of length is 'ft'"),
+        ('unit = "mm"', "", r"\[frame\] lacks unit, expected m, cm, mm or in"),
+        ('unit = "mm"', 'unit = "mm"\nup = "y"', "say that z is up"),
+        ('unit = "mm"', 'unit = "mm"\nup = "w"', "up is 'w'"),
+        ("count = 9", "count = 10", "has no column 'm10x'"),
+        ("count = 9", 'count = "9"', r"\[columns\] count is '9', expected how many"),
+        ("count = 9", "count = 9\ngriper_0 = 3", "unknown fields griper_0"),
+        ("count = 9", 'count = 9\ngripper_0 = ["a", "b", "c", "d", "e", "f", "g"]', "but not gripper_1"),
+        ("count = 9", 'count = 9\ngripper_0 = ["a", "b", "c"]', "expected the 7 columns"),
+        ('"m{i}x"', '"mx"', "with {i} in it"),
+        ('time_unit = "ms"', 'time_unit = "min"', "time_unit is 'min'"),
+        ("diameter_m = 0.006", "diameter_m = -1", "expected a finite number > 0"),
+        ("diameter_m = 0.006", "diameter_m = inf", "expected a finite number > 0"),
+        ("diameter_m = 0.006", "", r"\[cable\] lacks diameter_m"),
+        ("diameter_m = 0.006", "diameter_m = 0.006\nkeypoint_arclength_m = [0, 1]", "expected 9 increasing numbers"),
+        ("[cable]", "[cables]", "unknown tables cables"),
+        ("[columns]", "[columns", "is no TOML"),
+        ("[columns]", "[source]", r"lacks the table \[columns\]"),
+    ],
+)
+def test_a_wrong_layout_is_told(tmp_path, old, new, message):
+    assert old in PAIRS
+    path, layout = written(tmp_path, in_space(), PAIRS.replace(old, new))
+    with pytest.raises(ValueError, match=message):
+        import_csv(path, layout)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda text: text.replace("m1x", "m1y", 1), "the column 'm1y' twice"),
+        (lambda text: "\n".join(text.split("\n")[:2]), "has 2 rows"),
+        (lambda text: re.sub(r"\n500010.0,[^,]*,", "\n500010.0,oops,", text), "line 3: column 'm1x' is 'oops'"),
+        (lambda text: text.replace("\n500020.0,", "\n500020.0,7,"), "line 4: 29 cells, expected 28"),
+        (lambda text: text.replace("\n500020.0,", "\n500000.0,"), r"times do not increase \(sample 2"),
+    ],
+    ids=["twice", "empty", "text", "cells", "time"],
+)
+def test_a_wrong_table_is_told(tmp_path, change, message):
+    path, layout = written(tmp_path, in_space(), PAIRS)
+    path.write_text(change(path.read_text()))
+    with pytest.raises(ValueError, match=message):
+        import_csv(path, layout)
+
+
+def test_a_quaternion_in_the_wrong_columns_is_told(tmp_path):
+    table = in_space()
+    pose = {f"g{q}{name}": np.zeros(200) for q in (0, 1) for name in ("x", "y", "z", "qw", "qx", "qy", "qz")}
+    grippers = "".join(
+        f"gripper_{q} = {[f'g{q}{name}' for name in ('x', 'y', 'z', 'qw', 'qx', 'qy', 'qz')]}\n" for q in (0, 1)
+    )
+    path, layout = written(tmp_path, table | pose, PAIRS + grippers)
+    with pytest.raises(ValueError, match="quaternion of length 0, expected 1"):
+        import_csv(path, layout)
+
+
+def test_missing_files_are_told(tmp_path):
+    path, layout = written(tmp_path, in_space(), PAIRS)
+    with pytest.raises(ValueError, match=r"absent\.csv could not be read"):
+        import_csv(tmp_path / "absent.csv", layout)
+    with pytest.raises(ValueError, match=r"absent\.toml could not be read"):
+        import_csv(path, tmp_path / "absent.toml")
+
+
+def test_the_example_in_the_documentation_works(tmp_path):
+    layout = next(
+        block for block in re.findall(r"```toml\n(.*?)```", DOCUMENTATION.read_text(), re.S) if "[columns]" in block
+    )
+    points = swinging(400)
+    table: dict[str, list | np.ndarray] = {"t_ms": 1000 * DT * np.tile(np.arange(200), 2), "run": [1] * 200 + [2] * 200}
+    table["motion"] = ["swing"] * 400
+    for i in range(9):
+        for k, name in enumerate("xyz"):
+            table[f"m{i}_{name}"] = 1000 * points[:, i, k]
+    log, _ = import_csv(*written(tmp_path, table, layout))
+    assert log.meta["motion"] == ["swing", "swing"] and log.keypoints.shape == (2, 200, 9, 3)

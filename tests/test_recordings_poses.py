@@ -1,0 +1,163 @@
+"""Poses from marker pairs, frames and units."""
+
+import jax
+import numpy as np
+import pytest
+
+from cablejax.recordings.frames import AXES, Frame, into_frame, require_hanging, require_rigid
+from cablejax.recordings.poses import (
+    poses_from_markers,
+    product,
+    rotated,
+    smallest_rotation,
+    transported_frames,
+    twists,
+)
+from cablejax.recordings.take import Take
+from cablejax.recordings.units import metres_per, recognised_unit, require_metres
+from cablejax.simulate.pose import integrate_pose
+from recording_cases import swinging, take
+
+RANDOM = np.random.default_rng(0)
+
+
+def unit(vectors: np.ndarray) -> np.ndarray:
+    return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
+
+
+def wandering(samples: int = 200) -> np.ndarray:
+    """Quaternions that turn smoothly."""
+    steps = 0.05 * RANDOM.normal(size=(samples, 4))
+    steps[0, 0] += 1
+    return unit(np.cumsum(steps, axis=0))
+
+
+def test_the_smallest_rotation_turns_one_into_the_other_about_their_normal():
+    start, end = unit(RANDOM.normal(size=(2, 100, 3)))
+    turn = smallest_rotation(start, end)
+    np.testing.assert_allclose(rotated(turn, start), end, atol=1e-12)
+    np.testing.assert_allclose((turn[:, 1:] * start).sum(axis=1), 0, atol=1e-12)
+    np.testing.assert_allclose(rotated(smallest_rotation(start, -start), start), -start, atol=1e-12)
+    np.testing.assert_array_equal(smallest_rotation(np.array([1.0, 0, 0]), np.array([-1.0, 0, 0])), [0, 0, 0, 1])
+
+
+def test_frames_are_transported_without_turning_about_the_tangent():
+    angle = np.linspace(0, 1, 400)[:, None]
+    tangent = unit(np.concatenate([np.cos(3 * angle), np.sin(2 * angle), np.sin(5 * angle)], axis=1))
+    quaternion = transported_frames(tangent)
+    np.testing.assert_allclose(rotated(quaternion, np.tile([1.0, 0, 0], (400, 1))), tangent, atol=1e-12)
+    np.testing.assert_allclose(quaternion[0], smallest_rotation(np.array([1.0, 0, 0]), tangent[0]), atol=1e-15)
+    spin = product(quaternion[1:], quaternion[:-1] * [1.0, -1, -1, -1])[:, 1:]
+    middle = unit(tangent[1:] + tangent[:-1])
+    assert abs((spin * middle).sum(axis=1)).max() < 1e-12
+    assert abs(np.diff(quaternion, axis=0)).max() < 0.02
+
+
+def test_planar_poses_have_a_continuous_angle():
+    angle = np.linspace(0, 9, 50)
+    first = RANDOM.normal(size=(50, 2))
+    along = 0.03 * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    pose = poses_from_markers(first, first + along, first)
+    np.testing.assert_allclose(pose[:, 2], angle, atol=1e-12)
+    np.testing.assert_array_equal(pose[:, :2], first)
+
+
+def test_markers_in_one_place_are_refused():
+    points = np.zeros((3, 3))
+    with pytest.raises(ValueError, match="in one place in sample 0"):
+        poses_from_markers(points, points, points)
+
+
+@pytest.mark.parametrize("width", [3, 7])
+def test_twists_lead_from_pose_to_pose(width):
+    time = np.cumsum(RANDOM.uniform(0.01, 0.03, 20))
+    pose = RANDOM.normal(size=(20, 2, width))
+    if width == 7:
+        pose[..., 3:] = np.stack([wandering(20), -wandering(20)], axis=1)
+    speed = twists(time, pose)
+    assert speed.shape == (20, 2, 3 if width == 3 else 6) and (speed[-1] == 0).all()
+    with jax.enable_x64(True):
+        for t in range(19):
+            there = np.asarray(integrate_pose(pose[t], speed[t], float(time[t + 1] - time[t])))
+            np.testing.assert_allclose(there, pose[t + 1], atol=1e-9)
+
+
+@pytest.mark.parametrize("handedness", ["right", "left"])
+@pytest.mark.parametrize("up", AXES)
+def test_every_frame_becomes_right_handed_with_z_up(up, handedness):
+    frame = Frame(up, handedness)
+    axis = np.zeros(3)
+    axis["xyz".index(up[-1])] = -1 if up[0] == "-" else 1
+    np.testing.assert_array_equal(frame.matrix @ axis, [0, 0, 1])
+    assert np.linalg.det(frame.matrix) == pytest.approx(1 if handedness == "right" else -1)
+    # Orientations follow the positions: a direction fixed to a gripper stays so.
+    quaternion = wandering()
+    points = swinging()
+    points[:, 1] = points[:, 0] + 0.03 * rotated(quaternion, np.tile([0.6, 0.8, 0.0], (200, 1)))
+    pose = np.concatenate([points[:, [0, -1]], np.stack([quaternion, wandering()], axis=1)], axis=-1)
+    turned = into_frame(take(points, pose=pose), frame)
+    require_rigid((turned,), ((0, 1),))
+    np.testing.assert_allclose(turned.keypoints @ frame.matrix, points, atol=1e-12)
+
+
+def test_a_planar_take_has_no_frame():
+    flat = take(swinging()[..., :2])
+    assert into_frame(flat, Frame("y", "left")) is flat
+
+
+@pytest.mark.parametrize("up", AXES)
+def test_a_cable_that_does_not_hang_down_names_the_vertical(up):
+    told = Frame()
+    points = swinging() @ Frame(up).matrix  # a recording whose vertical is `up`
+    require_hanging((into_frame(take(points), Frame(up)),), Frame(up))
+    if up != "z":
+        with pytest.raises(ValueError, match=f"say that {up} is up"):
+            require_hanging((into_frame(take(points), told),), told)
+
+
+def test_a_taut_cable_does_not_say_what_is_up():
+    straight = np.linspace([0.0, 0, 1], [0.8, 0, 1], 9) + RANDOM.normal(scale=1e-3, size=(50, 9, 3))
+    require_hanging((take(straight),), Frame("-z"))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda points, pose: (points * [1, -1, 1], pose), "positions are mirrored along y"),
+        (lambda points, pose: (points[..., [1, 0, 2]], pose), "x and y of the positions are exchanged"),
+        (lambda points, pose: (points, np.concatenate([pose[..., :3], np.roll(pose[..., 3:], -1, -1)], -1)), "last"),
+        (lambda points, pose: (points, pose * [1, 1, 1, 1, -1, -1, -1]), "inverted"),
+        (lambda points, pose: (points, pose[:, ::-1]), "Check which gripper"),
+    ],
+    ids=["mirrored", "exchanged", "scalar last", "inverted", "other gripper"],
+)
+def test_orientations_of_another_frame_are_refused_and_the_frame_named(change, message):
+    quaternion = wandering(600)
+    points = swinging(600)
+    points[:, 1] = points[:, 0] + 0.03 * rotated(quaternion, np.tile([0.6, 0.5, 0.62], (600, 1)))
+    pose = np.concatenate([points[:, [0, -1]], np.stack([quaternion, wandering(600)], axis=1)], axis=-1)
+    require_rigid((take(points, pose=pose),), ((0, 1),))
+    wrong, other = change(points, pose)
+    with pytest.raises(ValueError, match=message) as told:
+        require_rigid((take(wrong, pose=other),), ((0, 1),))
+    assert "turn against its orientation" in str(told.value)
+
+
+def test_units_are_recognised_by_the_length_of_the_cable():
+    assert [metres_per(unit) for unit in ("m", "cm", "mm", "in")] == [1, 0.01, 0.001, 0.0254]
+    assert recognised_unit(1037.0, (0.3, 3.0)) == ("mm",)
+    assert recognised_unit(41.0, (0.3, 3.0)) == ("cm", "in")
+    require_metres(1.0, "m")
+    with pytest.raises(ValueError, match=r"measures 1037 m, expected 0.05 to 20.*1.04 m if they are in mm"):
+        require_metres(1037.0, "m")
+    with pytest.raises(ValueError, match="'furlong', expected one of m, cm, mm, in"):
+        metres_per("furlong")
+
+
+def test_a_take_of_wrong_shape_is_refused():
+    with pytest.raises(ValueError, match=r"times do not increase \(sample 2"):
+        Take("a", np.array([0.0, 0.1, 0.1]), np.zeros((3, 5, 3)))
+    with pytest.raises(ValueError, match=r"keypoints has shape \(3, 5\)"):
+        Take("a", np.arange(3.0), np.zeros((3, 5)))
+    with pytest.raises(ValueError, match=r"gripper_pose has shape \(3, 2, 3\), expected \(3, 2, 7\)"):
+        Take("a", np.arange(3.0), np.zeros((3, 5, 3)), np.zeros((3, 2, 3)))

@@ -1,0 +1,246 @@
+"""Bad recordings: repaired and told, or refused with what to do."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from cablejax.recordings.assemble import Nominal, gap_log_from_takes, measured_arclength
+from cablejax.recordings.frames import Frame
+from cablejax.recordings.gaps import cut_at_gaps
+from cablejax.recordings.marker_order import restore_order
+from cablejax.recordings.prepare import Setup, prepare
+from cablejax.recordings.take import Take
+from recording_cases import DT, SPACING, swinging, take
+
+HELD = (0, 1, 7, 8)
+PAIRS = Setup(unit="m", on_grippers="pairs")
+NOMINAL = Nominal(diameter=0.006, linear_density=0.04, bending_stiffness=6e-4)
+
+
+def others(count: int = 3) -> tuple[Take, ...]:
+    return tuple(take(swinging(seed=seed, phase=seed), str(seed)) for seed in range(1, count + 1))
+
+
+def exchanged(points: np.ndarray, rows: slice, order: list[int]) -> np.ndarray:
+    points = points.copy()
+    points[rows] = points[rows][:, order]
+    return points
+
+
+@pytest.mark.parametrize(
+    ("rows", "order"),
+    [
+        (slice(60, 130), [0, 1, 2, 4, 3, 5, 6, 7, 8]),
+        (slice(60, 130), [1, 0, 2, 3, 4, 5, 6, 7, 8]),
+        (slice(60, 130), [0, 1, 6, 3, 4, 5, 2, 7, 8]),
+        (slice(150, 200), [8, 7, 6, 5, 4, 3, 2, 1, 0]),
+        (slice(60, 130), [3, 8, 1, 0, 7, 2, 6, 5, 4]),
+        (slice(0, 200), [0, 1, 2, 3, 4, 5, 6, 8, 7]),
+        (slice(0, 90), [0, 3, 2, 1, 4, 5, 6, 7, 8]),
+        (slice(0, 200), [8, 7, 6, 5, 4, 3, 2, 1, 0]),
+    ],
+    ids=["two", "a pair", "far apart", "reversed", "all", "a whole take", "from the start", "a whole take reversed"],
+)
+def test_exchanged_markers_are_put_back(rows, order):
+    right = swinging()
+    restored, told = restore_order((take(exchanged(right, rows, order)), *others()))
+    np.testing.assert_array_equal(restored[0].keypoints, right)
+    assert len(told) == 1 and told[0].startswith("Take a: ")
+    for before, after in zip(others(), restored[1:], strict=True):
+        np.testing.assert_array_equal(after.keypoints, before.keypoints)
+
+
+def test_exchanged_markers_are_told_by_number_and_sample():
+    points = exchanged(swinging(), slice(60, 130), [0, 1, 2, 4, 3, 5, 6, 7, 8])
+    _, told = restore_order((take(points), *others()))
+    assert told == [
+        "Take a: keypoints 3, 4 had exchanged their names in 70 of 200 samples, from sample 60, and were put back."
+    ]
+
+
+def test_missing_markers_do_not_hinder():
+    right = swinging()
+    right[np.random.default_rng(0).random(right.shape[:2]) < 0.05] = np.nan
+    points = exchanged(right, slice(60, 130), [0, 1, 2, 5, 4, 3, 6, 7, 8])
+    restored, told = restore_order((take(points), *others()))
+    wrong = ~np.isclose(restored[0].keypoints, right, equal_nan=True).all(axis=(1, 2))
+    # Where a marker is missing the order of the sample before is kept: it is late by at most a few samples.
+    assert wrong.sum() <= 8 and len(told) == 1
+    unchanged, told = restore_order((take(right), *others()))
+    np.testing.assert_array_equal(unchanged[0].keypoints, right)
+    assert told == []
+
+
+def test_columns_in_a_wrong_order_are_refused():
+    points = swinging()[:, [0, 4, 1, 5, 2, 6, 3, 7, 8]]
+    with pytest.raises(ValueError, match=r"folds back .* 100 % of the samples: give the keypoints in their order"):
+        restore_order((take(points),))
+
+
+def samples_of(takes: tuple[Take, ...]) -> list[tuple[str, int]]:
+    return [(part.name, len(part.time)) for part in takes]
+
+
+def test_a_gap_in_the_times_cuts_a_take():
+    keep = np.r_[0:80, 110:200]
+    points = swinging()
+    late = dataclasses.replace(take(points), time=DT * np.arange(200))
+    late = Take("a", late.time[keep], points[keep])
+    parts, told = cut_at_gaps((late,), HELD)
+    assert samples_of(parts) == [("a/1", 80), ("a/2", 90)]
+    assert len(told) == 1 and "no samples for 0.31 s after sample 79, where 0.01 s is usual" in told[0]
+    np.testing.assert_array_equal(parts[1].keypoints, points[110:])
+
+
+def test_a_gap_that_the_times_do_not_tell_cuts_a_take():
+    points = swinging()[np.r_[0:80, 110:200]]
+    parts, told = cut_at_gaps((take(points),), HELD)
+    assert samples_of(parts) == [("a/1", 80), ("a/2", 90)]
+    assert "the whole cable jumps between samples 79 and 80" in told[0]
+
+
+@pytest.mark.parametrize("column", [0, 7])
+def test_a_gripper_not_seen_for_long_cuts_a_take(column):
+    points = swinging()
+    points[80:110, column] = np.nan
+    parts, told = cut_at_gaps((take(points),), HELD)
+    assert samples_of(parts) == [("a/1", 80), ("a/2", 90)]
+    assert "in 30 samples one of the grippers is not seen" in told[0]
+
+
+def test_a_gripper_not_seen_for_a_moment_is_filled_in():
+    right = swinging()
+    points = right.copy()
+    points[80:83, 7:] = np.nan
+    parts, told = cut_at_gaps((take(points),), HELD)
+    assert samples_of(parts) == [("a", 200)] and "3 samples without one of the grippers were filled in" in told[0]
+    assert np.linalg.norm(parts[0].keypoints - right, axis=-1).max() < 2e-3
+
+
+def test_keypoints_between_the_grippers_may_be_missing():
+    points = swinging()
+    points[20:180, 3:5] = np.nan
+    parts, told = cut_at_gaps((take(points),), HELD)
+    assert samples_of(parts) == [("a", 200)] and told == []
+    np.testing.assert_array_equal(parts[0].keypoints, points)
+
+
+def test_a_tracker_that_holds_its_last_values_cuts_a_take():
+    points = swinging()
+    points[80:110] = points[79]
+    parts, told = cut_at_gaps((take(points),), HELD)
+    assert samples_of(parts) == [("a/1", 80), ("a/2", 90)]
+    assert "30 samples repeat the one before to the last digit" in told[0]
+
+
+def test_a_recording_without_noise_at_rest_is_no_gap():
+    points = np.repeat(swinging(1), 200, axis=0)
+    parts, told = cut_at_gaps((take(points),), HELD)
+    assert samples_of(parts) == [("a", 200)] and told == []
+
+
+def test_a_gripper_never_seen_is_refused():
+    points = swinging()
+    points[:, 8] = np.nan
+    with pytest.raises(ValueError, match="Gripper 1 is told by the keypoints 7 and 8, which are in no sample both obs"):
+        cut_at_gaps((take(points),), HELD)
+    with pytest.raises(ValueError, match="never observed together"):
+        prepare((take(points),), PAIRS)
+    pose = np.full((200, 2, 7), np.nan)
+    pose[:, 0] = [0, 0, 0, 1, 0, 0, 0]
+    with pytest.raises(ValueError, match="Gripper 1 has no pose in any sample"):
+        cut_at_gaps((take(swinging(), pose=pose),), None)
+
+
+def test_nothing_left_between_gaps_is_refused():
+    points = swinging()
+    points[::8, 0] = np.nan
+    points[np.arange(200) % 16 < 9, 0] = np.nan
+    with pytest.raises(ValueError, match=r"no stretch of at least 0\.5 s"):
+        cut_at_gaps((take(points),), HELD)
+
+
+def test_millimetres_are_recognised_or_refused():
+    points = swinging()
+    takes, told = prepare((take(1000 * points),), Setup(unit=None))
+    np.testing.assert_allclose(takes[0].keypoints, points, rtol=1e-12)
+    assert "can only be mm" in told[0]
+    takes, told = prepare((take(1000 * points),), Setup(unit="mm"))
+    np.testing.assert_allclose(takes[0].keypoints, points, rtol=1e-12)
+    assert told == []
+    with pytest.raises(ValueError, match=r"0\.684 m if they are in mm"):
+        prepare((take(1000 * points),), Setup(unit="m"))
+    with pytest.raises(ValueError, match="It may be in cm or in in: say which"):
+        prepare((take(1.5 * points / 0.0254),), Setup(unit=None))
+
+
+def test_poses_in_other_units_are_converted_too():
+    points = swinging()
+    pose = np.zeros((200, 2, 7))
+    pose[..., :3], pose[..., 3] = points[:, [0, -1]], 1.0
+    setup = Setup(unit="mm", on_grippers="ends")
+    scaled = pose * [1000, 1000, 1000, 1, 1, 1, 1]
+    takes, _ = prepare((take(1000 * points, pose=scaled),), setup)
+    np.testing.assert_allclose(takes[0].gripper_pose, pose, atol=1e-12)
+
+
+def test_a_left_handed_frame_is_mirrored_when_told():
+    points = swinging()
+    frame = Frame("y", "left")
+    takes, told = prepare((take(points @ frame.matrix),), Setup(frame=frame))
+    np.testing.assert_allclose(takes[0].keypoints, points, atol=1e-12)
+    assert told == []
+    with pytest.raises(ValueError, match="say that y is up"):
+        prepare((take(points @ frame.matrix),), Setup())
+
+
+@pytest.mark.parametrize(
+    ("points", "message"),
+    [
+        (np.full((50, 9, 3), np.inf), "infinite positions"),
+        (np.full((50, 9, 3), np.nan), "never observed together"),
+        (np.zeros((50, 4, 3)), "at least three keypoints, or five"),
+        (np.zeros((50, 9, 3)), "expected 0.05 to 20"),
+    ],
+    ids=["infinite", "nothing observed", "too few", "all in one place"],
+)
+def test_numbers_that_are_no_recording_are_refused(points, message):
+    with pytest.raises(ValueError, match=message):
+        prepare((take(points),), PAIRS)
+
+
+def test_takes_of_different_cables_are_refused():
+    with pytest.raises(ValueError, match=r"shapes \(8, 3\), \(9, 3\)"):
+        prepare((take(swinging()), take(swinging()[:, :8])), PAIRS)
+
+
+def test_a_single_marker_on_a_gripper_does_not_tell_its_pose():
+    with pytest.raises(ValueError, match="poses are not told, and only one keypoint is on each"):
+        prepare((take(swinging()),), Setup(on_grippers="ends"))
+
+
+def test_the_log_tells_of_repairs_and_carries_labels():
+    points = exchanged(swinging(), slice(60, 130), [0, 1, 2, 4, 3, 5, 6, 7, 8])
+    labelled = dataclasses.replace(take(points), labels={"split": "train", "motion": "swing"})
+    second = dataclasses.replace(take(swinging(150, seed=5), "b"), labels={"split": "eval", "motion": "swing"})
+    takes, told = prepare((labelled, second), PAIRS)
+    log = gap_log_from_takes(takes, NOMINAL, source="Made up.", repairs=told)
+    assert log.meta["source"].startswith("Made up. Take a: keypoints 3, 4 had exchanged")
+    assert log.meta["split"] == ["train", "eval"] and log.meta["take"] == ["a", "b"]
+    assert log.meta["motion"] == ["swing", "swing"] and log.meta["table"] is None and log.hold is None
+    assert log.episode_length.tolist() == [200, 150]
+    tangent = log.keypoints[0, :, 1] - log.keypoints[0, :, 0]
+    w, x, y, z = np.moveaxis(log.gripper_pose[0, :, 0, 3:], -1, 0)
+    own_x = np.stack([1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)], axis=-1)
+    np.testing.assert_allclose(own_x, tangent / np.linalg.norm(tangent, axis=1, keepdims=True), atol=1e-4)
+    np.testing.assert_array_equal(log.gripper_pose[0, :, 1, :3], log.keypoints[0, :, 8])
+
+
+def test_the_arc_length_is_that_of_the_curve_and_not_of_its_chords():
+    # The markers are on half a circle, at these arc lengths; straight lines between them are 0.3 % shorter.
+    measured = measured_arclength((take(swinging()),))
+    true = np.concatenate([[0.0], np.cumsum(SPACING)])
+    assert abs(measured - true).max() < 5e-4
+    chords = np.linalg.norm(np.diff(swinging(), axis=1), axis=-1).mean(axis=0).sum()
+    assert true[-1] - chords > 4 * abs(measured[-1] - true[-1])
