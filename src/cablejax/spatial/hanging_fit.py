@@ -1,0 +1,338 @@
+"""Which effects explain photographs of a hanging wire: fits, and what each fit foretells of a photograph left out.
+
+An explanation is a set of effects with values that all photographs of the wire share. The angles of both clamps in each
+photograph are nuisances: fitted with a normal prior about the horizontal, in every explanation alike. Priors,
+likelihood and cost per effect are those of the planar diagnosis (`cablejax.diagnose.belief`): the squared residual of a
+photograph is measured against `n (b^2 + (rho g)^2)`, with n all its coordinates, for the errors of one photograph are
+one error; b the position error that the rig itself shows; g the gap of the wire as it is believed to be, and rho the
+error of a law. A photograph's probability is Student's, from a fit to the others.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import itertools
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from cablejax.diagnose.belief import Calibration
+from cablejax.diagnose.effects import BendingStiffness, IntrinsicCurvature, StiffnessProfile
+from cablejax.diagnose.effects.base import Parameter
+from cablejax.spatial.hanging import Wire, hanging_angles, hanging_points, joint_arclength
+
+CALIBRATION = Calibration()
+
+LINKS_PER_SPACING = 2
+"""Links of the model from one traced point to the next."""
+
+CLAMP_ANGLE = np.radians(10.0)
+"""Prior standard deviation of a clamp's angle [rad]: a wire leaves a clamp as level as one can hold it."""
+
+PROFILE_SPREAD = 0.3
+"""Prior standard deviation of the logarithm of EI along a wire, which is drawn in one piece: a third."""
+
+LEVEL = 0.014
+"""Prior standard deviation of the angle between a photograph and the plumb line [rad]: the slope that the line between
+the two clamps, which the rig keeps level, has in the published photographs, root mean square."""
+
+EFFECTS: dict[str, tuple[Parameter, ...]] = {
+    "bending_stiffness": BendingStiffness.parameters,
+    "intrinsic_curvature": IntrinsicCurvature.parameters,
+    "stiffness_profile": (
+        *StiffnessProfile.parameters[:2],
+        dataclasses.replace(StiffnessProfile.parameters[2], scale=PROFILE_SPREAD),
+    ),
+    "gravity_tilt": (Parameter("angle_rad", "rad", -0.5, 0.5, 0.0, LEVEL),),
+}
+"""Effects that a hanging wire can show, with the parameters of the planar diagnosis where these exist."""
+
+_PARAMETERS = tuple(parameter for group in EFFECTS.values() for parameter in group)
+_SLICES = {
+    name: slice(sum(map(len, list(EFFECTS.values())[:k])), sum(map(len, list(EFFECTS.values())[: k + 1])))
+    for k, name in enumerate(EFFECTS)
+}
+_CENTRES = (0.2, 0.5, 0.8)
+_MOST_ITERATIONS = 25
+
+
+@dataclasses.dataclass(frozen=True)
+class Photographs:
+    """Photographs of one wire.
+
+    Attributes:
+        points: traced at equal arc lengths, horizontal and vertical coordinate [m], shape [R, N, 2].
+        length: of the wire [m].
+        stiffness: EI over the weight per length that is believed true [m^3].
+        error: root mean square error of a coordinate that the rig shows [m].
+    """
+
+    points: Float[np.ndarray, "R N 2"]
+    length: float
+    stiffness: float
+    error: float
+
+    def __post_init__(self):
+        shape = self.points.shape
+        if len(shape) != 3 or shape[0] < 3 or shape[1] < 5 or shape[2] != 2 or not np.isfinite(self.points).all():
+            raise ValueError(
+                f"Photographs have points of shape {shape}, expected finite ones of shape [R, N, 2] with at least "
+                f"three "
+                "photographs, so that one can be left out, and five points."
+            )
+        for name in ("length", "stiffness", "error"):
+            if not (np.isfinite(getattr(self, name)) and getattr(self, name) > 0):
+                raise ValueError(f"Photographs.{name} is {getattr(self, name)}, expected a positive number.")
+        longest = np.linalg.norm(np.diff(self.points, axis=1), axis=-1).sum(axis=1).max()
+        if not 0.9 * self.length < longest < 1.02 * self.length:
+            raise ValueError(
+                f"Along its traced points the wire measures {longest:.4g} m, expected its length, {self.length:g} m: "
+                f"check "
+                "the scale of the photographs."
+            )
+
+
+@dataclasses.dataclass(frozen=True)
+class WireFit:
+    """An explanation after fitting.
+
+    Attributes:
+        names: of its effects.
+        z: coordinates of all parameters, see `Parameter`; 0 for those of other effects, shape [P].
+        clamps: fitted angles of both clamps in each photograph, from the horizontal [rad], shape [R, 2].
+        residual: fitted less traced points of each photograph [m], shape [R, 2 N - 4].
+        held_out: root mean square residual of each photograph, from a fit to the others [m], shape [R].
+        left_out_z: coordinates from these fits, shape [R, P].
+        spread: posterior standard deviation of z from the fit to all, shape [P].
+        score: log probability of the photographs, each from the others, less the cost of the effects and their priors.
+    """
+
+    names: tuple[str, ...]
+    z: Float[np.ndarray, " P"]
+    clamps: Float[np.ndarray, "R 2"]
+    residual: Float[np.ndarray, "R C"]
+    held_out: Float[np.ndarray, " R"]
+    left_out_z: Float[np.ndarray, "R P"]
+    spread: Float[np.ndarray, " P"]
+    score: float
+
+    def values(self, name: str) -> tuple[float, ...]:
+        """The fitted values of an effect's parameters."""
+        pairs = zip(EFFECTS[name], self.z[_SLICES[name]], strict=True)
+        return tuple(float(parameter.value(np.asarray(z))) for parameter, z in pairs)
+
+
+def wire_shape(
+    z: Float[Array, " P"],
+    clamps: Float[Array, " 2"],
+    traced: Float[Array, "N 2"],
+    guess: Float[Array, " M"],
+    stiffness: Any,
+    length: Any,
+) -> Float[Array, "N 2"]:
+    """Points of the wire at rest [m], between the ends of the traced one, shape [N, 2]. Differentiable in z and clamps.
+
+    Args:
+        z: coordinates of the parameters of all effects.
+        clamps: how far the wire's direction at each clamp, first to last, is off the horizontal [rad].
+        traced: points of the photograph [m].
+        guess: angles of the links [rad].
+        stiffness: EI over the weight per length that is believed true [m^3].
+        length: [m].
+    """
+    ratio, centre, width, curvature, other_centre, other_width, other_ratio, tilt = (
+        parameter.value(z[k]) for k, parameter in enumerate(_PARAMETERS)
+    )
+    links = guess.shape[0]
+    s = joint_arclength(links, 1.0)
+    profile = other_ratio ** _section(s, other_centre, other_width)
+    wire = Wire(
+        stiffness=stiffness * ratio * profile,
+        rest_curvature=curvature * _section(s, centre, width),
+        length=jnp.asarray(length),
+    )
+    cosine, sine = jnp.cos(tilt), jnp.sin(tilt)
+    turned = jnp.stack([jnp.stack([cosine, -sine]), jnp.stack([sine, cosine])])
+    ends = traced[jnp.array([0, -1])] @ turned.T
+    # The wire's direction turns by the same whole number of turns as the traced one.
+    turns = 2 * jnp.pi * jnp.round((guess[jnp.array([0, -1])]) / (2 * jnp.pi))
+    placed = jnp.concatenate([ends, (turns + clamps + tilt)[:, None]], axis=1)
+    angles = hanging_angles(wire, placed, guess + tilt)
+    return hanging_points(angles, placed, wire.length, traced.shape[0]) @ turned
+
+
+def _section(s: Array, centre: Any, width: Any) -> Array:
+    """Share of the wire about each joint in a section, all over the length; edges of a hundredth of it."""
+    return jax.nn.sigmoid((s - centre + 0.5 * width) / 0.01) * jax.nn.sigmoid((centre + 0.5 * width - s) / 0.01)
+
+
+@jax.jit
+def _linearised(z, clamps, traced, guess, stiffness, length):
+    """Residuals of each photograph, and their derivatives in z and its clamps' angles."""
+
+    def residual(z, clamps, traced, guess):
+        return (wire_shape(z, clamps, traced, guess, stiffness, length) - traced)[1:-1].ravel()
+
+    def one(clamps, traced, guess):
+        both = functools.partial(residual, traced=traced, guess=guess)
+        return (both(z, clamps), *jax.jacfwd(both, (0, 1))(z, clamps))
+
+    return jax.vmap(one)(clamps, traced, guess)
+
+
+EXPLANATIONS: tuple[tuple[str, ...], ...] = (
+    (),
+    *((name,) for name in EFFECTS),
+    *itertools.combinations(EFFECTS, 2),
+)
+"""No effect, each effect, and each two: more than five photographs of a shape at rest can tell apart."""
+
+
+def fit_wire(
+    photographs: Photographs,
+    explanations: Sequence[tuple[str, ...]] = EXPLANATIONS,
+    progress: Callable[[str], None] = lambda text: None,
+) -> list[WireFit]:
+    """Fits each explanation to all photographs, and to all but one in turn. Needs JAX in double precision.
+
+    Args:
+        photographs: of one wire.
+        explanations: sets of effects by name; the empty one is the wire as it is believed to be.
+        progress: is told how it goes.
+
+    Raises:
+        ValueError: JAX computes in single precision.
+    """
+    if jnp.zeros(()).dtype != jnp.float64:
+        raise ValueError("Fits of hanging wires need double precision: call them under jax.enable_x64(True).")
+    problem = _Problem(photographs)
+    fits: list[WireFit] = []
+    for names in explanations:
+        fits.append(problem.explain(names, fits))
+        progress(
+            f"{' + '.join(names) or 'no effect'}: {1e3 * np.sqrt((fits[-1].held_out ** 2).mean()):.2f} mm left out"
+        )
+    return fits
+
+
+class _Problem:
+    """Photographs with what does not depend on the explanation: guesses, and the scale of their residuals."""
+
+    def __init__(self, photographs: Photographs):
+        self.photographs = photographs
+        along = np.diff(photographs.points, axis=1)
+        traced = np.unwrap(np.arctan2(along[..., 1], along[..., 0]), axis=1)
+        self.guess = np.repeat(traced, LINKS_PER_SPACING, axis=1)
+        self.count = 2 * (photographs.points.shape[1] - 2)
+        everyone = np.arange(len(photographs.points))
+        self.scale = np.full(len(everyone), np.sqrt(self.count) * photographs.error)
+        _, _, residual, _ = self._fit(np.zeros(len(_PARAMETERS)), (), everyone)
+        gap = np.sqrt((residual**2).mean(axis=1))
+        self.scale = np.sqrt(self.count * (photographs.error**2 + (CALIBRATION.law_error * gap) ** 2))
+
+    def explain(self, names: tuple[str, ...], simpler: Sequence[WireFit]) -> WireFit:
+        """Begins at fixed places, and at the parts of the explanation that were fitted before by themselves."""
+        everyone = np.arange(len(self.photographs.points))
+        parts = [fit.z for fit in simpler if len(fit.names) == 1 and fit.names[0] in names]
+        starts = _starts(names) if len(names) < 2 else parts
+        starts = [*starts, np.sum(parts, axis=0)] if len(parts) > 1 else starts or _starts(names)
+        z, clamps, residual, spread = min(
+            (self._fit(start, names, everyone) for start in starts), key=lambda fit: self._cost(*fit[:3], everyone)
+        )
+        left_out_z, held_out = [], []
+        for one in everyone:
+            others = np.delete(everyone, one)
+            there = self._fit(z, names, others, clamps[others])[0]
+            foretold = self._fit(there, (), np.array([one]), clamps[[one]])[2]
+            left_out_z.append(there)
+            held_out.append(np.sqrt((foretold**2).mean()))
+        surprise = self.count * np.square(held_out) / self.scale**2
+        freedom = CALIBRATION.freedom
+        likelihood = -0.5 * (freedom + 1) * np.log1p(surprise / freedom).sum()
+        score = float(likelihood - CALIBRATION.term_cost * len(names) - 0.5 * (z**2).sum())
+        return WireFit(names, z, clamps, residual, np.array(held_out), np.array(left_out_z), spread, score)
+
+    def _cost(self, z, clamps, residual, members) -> float:
+        data = ((residual / self.scale[members][:, None]) ** 2).sum()
+        return float(data + (z**2).sum() + ((clamps / CLAMP_ANGLE) ** 2).sum())
+
+    def _linearise(self, z, clamps, members):
+        # Always as many photographs, so that one program is compiled.
+        places = np.resize(members, len(self.photographs.points))
+        rows = np.resize(np.arange(len(members)), len(places))
+        parts = _linearised(
+            z, clamps[rows], self.photographs.points[places], self.guess[places], self.photographs.stiffness,
+            self.photographs.length,
+        )  # fmt: skip
+        return [np.asarray(part)[: len(members)] for part in parts]
+
+    def _fit(self, start, names, members, clamps=None):
+        """Levenberg-Marquardt in the parameters of the named effects, and in the clamps' angles.
+
+        Returns:
+            Coordinates, clamp angles, residuals and posterior standard deviations of the coordinates.
+        """
+        free = (
+            np.concatenate([np.arange(len(_PARAMETERS))[_SLICES[name]] for name in names])
+            if names
+            else np.zeros(0, int)
+        )
+        z, clamps = start.copy(), np.zeros((len(members), 2)) if clamps is None else clamps
+        residual, by_z, by_clamps = self._linearise(z, clamps, members)
+        cost, damping = self._cost(z, clamps, residual, members), 1e-3
+        size = len(free) + 2 * len(members)
+        low, high = np.array([parameter.z_bounds for parameter in _PARAMETERS]).T
+        normal = np.eye(size)
+        for _ in range(_MOST_ITERATIONS):
+            normal, slope = np.zeros((size, size)), np.zeros(size)
+            for k, member in enumerate(members):
+                columns = np.r_[np.arange(len(free)), len(free) + 2 * k, len(free) + 2 * k + 1]
+                jacobian = np.concatenate([by_z[k][:, free], by_clamps[k]], axis=1) / self.scale[member]
+                normal[np.ix_(columns, columns)] += jacobian.T @ jacobian
+                slope[columns] -= jacobian.T @ residual[k] / self.scale[member]
+            prior = np.r_[np.ones(len(free)), np.full(2 * len(members), CLAMP_ANGLE**-2)]
+            normal[np.diag_indices(size)] += prior
+            slope -= prior * np.r_[z[free], clamps.ravel()]
+            better = False
+            while damping < 1e6 and not better:
+                step = np.linalg.solve(normal + damping * np.diag(np.diag(normal)), slope)
+                step *= min(1.0, 1.0 / max(abs(step).max(), 1e-12))
+                tried = z.copy()
+                tried[free] = np.clip(z[free] + step[: len(free)], low[free], high[free])
+                turned = clamps + step[len(free) :].reshape(-1, 2)
+                there = self._linearise(tried, turned, members)
+                lower = self._cost(tried, turned, there[0], members)
+                better = bool(np.isfinite(lower) and lower < cost)
+                damping *= 0.2 if better else 8.0
+            if not better:
+                break
+            gain, cost = cost - lower, lower
+            z, clamps, (residual, by_z, by_clamps) = tried, turned, there
+            if gain < 1e-5 * (1 + cost):
+                break
+        spread = np.zeros(len(_PARAMETERS))
+        spread[free] = np.sqrt(np.diag(np.linalg.inv(normal))[: len(free)])
+        return z, clamps, residual, spread
+
+
+def _starts(names: tuple[str, ...]) -> list[np.ndarray]:
+    """Where fits begin: local effects at some places, with either sign."""
+    starts = [np.zeros(len(_PARAMETERS))]
+    for name in names:
+        if name not in ("intrinsic_curvature", "stiffness_profile"):
+            continue
+        group = EFFECTS[name]
+        spread = []
+        for start in starts:
+            for centre in _CENTRES:
+                for sign in (-0.5, 0.5):
+                    z = start.copy()
+                    z[_SLICES[name]] = group[0].coordinate(centre), group[1].coordinate(0.3), sign
+                    spread.append(z)
+        starts = spread
+    return starts
