@@ -25,10 +25,7 @@ def main() -> None:
     options = parser.parse_args()
 
     simulate = measure("bench", "simulate")
-    solvers = [
-        measure("bench", "mpc", "--weights", options.weights, "--solver", solver)
-        for solver in ("trust-region", "projected-gradient")
-    ]
+    mpc = measure("bench", "mpc", "--weights", options.weights)
     lines = [
         "# Speed",
         "",
@@ -52,7 +49,16 @@ def main() -> None:
         "",
         "| solver | median [ms] | 95th percentile [ms] | first call, compiled [s] |",
         "| --- | --- | --- | --- |",
-        *(f"| {s['solver']} | {s['p50_ms']:.1f} | {s['p95_ms']:.1f} | {s['first_call_s']:.1f} |" for s in solvers),
+        *(
+            f"| {name} | {s['p50_ms']:.1f} | {s['p95_ms']:.1f} | {s['first_call_s']:.1f} |"
+            for name, s in mpc["solvers"].items()
+        ),
+        "",
+        f"## Many cables at once, {mpc['solver']}",
+        "",
+        "| cables | ms per call | plans per second |",
+        "| --- | --- | --- |",
+        *(f"| {size} | {b['ms']:.1f} | {b['plans_per_second']:.1f} |" for size, b in mpc["batched"].items()),
         "",
     ]
     options.out.parent.mkdir(parents=True, exist_ok=True)

@@ -5,11 +5,16 @@ from __future__ import annotations
 import dataclasses
 import time
 from collections.abc import Callable
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
 
 from tyro.conf import subcommand
 
 from cablejax.commands.options import Command, UsageError, say, text_table
+
+if TYPE_CHECKING:
+    from cablejax.mpc import Controller
+    from cablejax.shaping import Model
+    from cablejax.types import History
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -103,45 +108,80 @@ class BenchSimulate(Command):
         )
 
 
+SolverChoice = Literal[
+    "trust-region", "projected-gradient", "dogleg", "gauss-newton", "deadline", "cross-entropy", "path-integral"
+]
+
+
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class BenchMpc(Command):
-    """Time one call of the controller: take in an observation, fit the residual, plan, command."""
+    """Time the controller's call (observe, fit the residual, plan, command) with every solver, and in batches; and the
+    default solver against IPOPT on the same planning problems."""
 
     weights: str = "gns-reference"
     """Released model by name, or the folder of a training by `cablejax train`."""
 
-    solver: Literal["trust-region", "projected-gradient"] = "trust-region"
-    """How the plan is found."""
+    solvers: tuple[SolverChoice, ...] = get_args(SolverChoice)
+    """How plans are found; the first one is also timed in batches."""
 
     repeats: int = 60
     """Calls to time, after the first one, which compiles."""
 
-    def execute(self):
-        from cablejax.mpc import time_control
-        from cablejax.shaping import initial_history, load_model, make_controller
-        from cablejax.simulate import CableConfig
-        from cablejax.targets import make_target
+    batches: tuple[int, ...] = ()
+    """Cables to control at once; by default 1 and 16 on a processor, and 1, 64 and 1024 on an accelerator."""
 
-        if self.repeats < 1:
-            raise UsageError(f"--repeats is {self.repeats}, expected at least 1.")
-        model = load_model(self.weights)
-        cable = CableConfig()
-        controller = make_controller(model, make_target("S", cable), method="residual", solver=self.solver)
-        say("compiling the control step ...")
-        timing = time_control(controller, initial_history(cable, model.config), self.repeats)
+    referee: int = 3
+    """Planning problems to solve with IPOPT too, in float64; 0 = none. It needs ipyopt."""
+
+    def execute(self):
+        import jax
+
+        from cablejax.mpc import time_control
+        from cablejax.shaping import initial_history, load_model
+        from cablejax.simulate import CableConfig
+
+        if not self.solvers or self.repeats < 1 or min(self.batches, default=1) < 1 or self.referee < 0:
+            raise UsageError(
+                f"--solvers {self.solvers}, --repeats is {self.repeats}, --batches {self.batches}, --referee is "
+                f"{self.referee}: expected at least one solver, 1 repeat, batches of 1 and 0 problems."
+            )
+        on_processor = jax.devices()[0].platform == "cpu"
+        batches = self.batches or ((1, 16) if on_processor else (1, 64, 1024))
+        model, cable = load_model(self.weights), CableConfig()
+        history = initial_history(cable, model.config)
+        solvers = {}
+        for name in self.solvers:
+            say(f"compiling the control step with {name} ...")
+            timing = time_control(_controller(model, name), history, self.repeats)
+            solvers[name] = {"p50_ms": timing.p50_ms, "p95_ms": timing.p95_ms, "first_call_s": timing.first_call_s}
+        first = _controller(model, self.solvers[0])
+        batched = {str(size): _batched_ms(first, history, size, self.repeats) for size in batches}
+        ipopt, why = _against_ipopt(model, self.referee)
         result = {
-            "solver": self.solver,
-            "horizon": controller.config.horizon,
+            "solver": self.solvers[0],
+            "horizon": first.config.horizon,
             "repeats": self.repeats,
-            "p50_ms": timing.p50_ms,
-            "p95_ms": timing.p95_ms,
-            "first_call_s": timing.first_call_s,
+            **solvers[self.solvers[0]],
+            "solvers": solvers,
+            "deadline": solvers.get("deadline"),
+            "batched": {k: {"ms": v, "plans_per_second": 1e3 * int(k) / v} for k, v in batched.items()},
+            "ipopt": ipopt,
             **_machine(),
         }
-        return result, (
-            f"one control call ({self.solver}, horizon {controller.config.horizon}): median {timing.p50_ms:.1f} ms, "
-            f"95th percentile {timing.p95_ms:.1f} ms; the first one, which compiles, {timing.first_call_s:.1f} s"
-        )
+        rows = [
+            [name, f"{s['p50_ms']:.1f}", f"{s['p95_ms']:.1f}", f"{s['first_call_s']:.1f}"]
+            for name, s in solvers.items()
+        ]
+        text = [
+            f"one control call, horizon {first.config.horizon}",
+            text_table(["solver", "median [ms]", "95th percentile [ms]", "first call, compiled [s]"], rows),
+            text_table(
+                [f"cables at once, {self.solvers[0]}", "ms", "plans per second"],
+                [[k, f"{v:.1f}", f"{1e3 * int(k) / v:.1f}"] for k, v in batched.items()],
+            ),
+            why,
+        ]
+        return result, "\n\n".join(text)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -276,6 +316,92 @@ class Bench:
         | Annotated[BenchLoop, subcommand("loop")]
         | Annotated[BenchPerception, subcommand("perception")]
     )
+
+
+def _controller(model: Model, solver: SolverChoice) -> Controller:
+    """The controller with the online residual on the way to an S, with one of the solvers at its defaults."""
+    from cablejax import mpc
+    from cablejax.shaping import make_controller
+    from cablejax.targets import make_target
+
+    known = {
+        "trust-region": mpc.TrustRegion(),
+        "projected-gradient": mpc.ProjectedGradient(),
+        "dogleg": mpc.Dogleg(),
+        "gauss-newton": mpc.GaussNewton(),
+        "deadline": mpc.Deadline(),
+        "cross-entropy": mpc.CrossEntropy(),
+        "path-integral": mpc.PathIntegral(),
+    }
+    usual = make_controller(model, make_target("S"), method="residual", solver="trust-region")
+    return dataclasses.replace(usual, config=dataclasses.replace(usual.config, solver=known[solver]))
+
+
+def _batched_ms(controller: Controller, history: History, size: int, repeats: int) -> float:
+    """Median wall time [ms] of one call that controls so many cables, after the one that compiles."""
+    import jax
+    import jax.numpy as jnp
+    import numpy as np
+
+    say(f"compiling the control step for {size} cables ...")
+    step = controller.vectorised()
+    state, keypoints, pose = jax.tree.map(
+        lambda leaf: jnp.broadcast_to(jnp.asarray(leaf), (size, *jnp.shape(leaf))),
+        (controller.init(history), history.keypoints[-1], history.gripper_pose),
+    )
+    seconds = []
+    for _ in range(min(repeats, 10) + 1):
+        begin = time.perf_counter()
+        state, twist, _ = jax.block_until_ready(step(state, keypoints, pose))
+        seconds.append(time.perf_counter() - begin)
+        keypoints, pose = state.predicted, pose + controller.config.objective.interval * twist
+    return 1e3 * float(np.median(seconds[1:]))
+
+
+def _against_ipopt(model: Model, problems: int) -> tuple[dict[str, Any] | None, str]:
+    """The accurate setting against IPOPT on random problems, in float64; None and the reason where that cannot be."""
+    import importlib.util
+
+    if not problems:
+        return None, "IPOPT was not asked."
+    if importlib.util.find_spec("ipyopt") is None:
+        return None, "IPOPT was not asked: install ipyopt for that."
+    if model.config.conditioned:
+        return None, "IPOPT was not asked: its problems are for a model that is not told its cable."
+
+    import jax
+    import numpy as np
+
+    from cablejax.evaluation.against_ipopt import EQUAL, comparable_seconds, contestant, excess, judge
+    from cablejax.evaluation.planning_problems import random_cases
+    from cablejax.evaluation.referee import RefereeConfig
+
+    with jax.enable_x64(True):
+        ours, cases = contestant(model), random_cases(model, range(problems))
+        say("compiling the planning problem in float64 ...")
+        judge(ours, cases[0], [RefereeConfig()])
+        rows = []
+        for index, case in enumerate(cases):
+            rows.append(judge(ours, case, [RefereeConfig()]))
+            say(f"IPOPT: {index + 1} of {problems}")
+    mine, theirs = comparable_seconds(rows, "limited")
+    as_good = sum(excess(row, "limited") <= EQUAL for row in rows)
+    ratio = float(np.median(theirs) / np.median(mine)) if len(mine) else None
+    result = {
+        "problems": problems,
+        "as_good": as_good,
+        "compared": len(mine),
+        "ours_s": float(np.median(mine)) if len(mine) else None,
+        "ipopt_s": float(np.median(theirs)) if len(mine) else None,
+        "ratio": ratio,
+        "largest_violation_m": max(row["violation"] for row in rows),
+        "largest_kkt": max(row["kkt"] for row in rows),
+        "float32_loss": float(np.median([row["single_objective"] / row["objective"] - 1 for row in rows])),
+    }
+    text = f"against IPOPT: as good or better on {as_good} of {problems} problems"
+    if ratio is not None:
+        text += f"; {result['ipopt_s']:.2f} s by IPOPT, {result['ours_s']:.2f} s by ours: {ratio:.1f} times as fast"
+    return result, text
 
 
 def _median_seconds(contestants: dict[str, Callable[[], Any]], rounds: int) -> dict[str, float]:

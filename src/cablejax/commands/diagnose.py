@@ -69,6 +69,18 @@ def diagnose_and_report(
     from cablejax.diagnose import LIBRARY, diagnose, write_verdict
     from cablejax.report.diagnosis_page import write_diagnosis_page
 
+    if log.keypoints.shape[-1] == 3:
+        from cablejax.spatial.diagnose import diagnose_space
+
+        names = None
+        if effects is not None and len(effects) < len(LIBRARY):
+            names = [effect.name for effect in effects]
+        # beside the folder, which must be empty to begin with
+        state = folder.parent / f".{folder.name}.json"
+        spatial = diagnose_space(log, only=names, state=state, progress=say)
+        page = write_diagnosis_page(spatial, folder)
+        state.unlink(missing_ok=True)
+        return spatial, page
     result = diagnose(
         log,
         effects=LIBRARY if effects is None else effects,

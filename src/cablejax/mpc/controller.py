@@ -16,7 +16,8 @@ from cablejax.adaptation.belief import AdaptationConfig, CableBelief, prior_beli
 from cablejax.mpc.edge import check_observation, check_start, check_target
 from cablejax.mpc.feasible import FeasibleSet, feasible_from
 from cablejax.mpc.goal import continued, goal_pose, straight_plan, way_to
-from cablejax.mpc.problem import ObjectiveConfig, Outcome, Plan, ShapingProblem, Solver
+from cablejax.mpc.plan import Outcome, Plan, Solver
+from cablejax.mpc.problem import ObjectiveConfig, ShapingProblem
 from cablejax.mpc.trust_region import TrustRegion
 from cablejax.residual.corrected import Dynamics, corrected
 from cablejax.residual.ridge import ResidualModel, RidgeConfig, apply, fit
@@ -378,11 +379,13 @@ def _plan_or_hold(
     value, value_hold = jax.vmap(problem.value)(jnp.stack([plan.motion, still]))
     improvement = jnp.sqrt(2.0 * value_hold / config.n_commands) - jnp.sqrt(2.0 * value / config.n_commands)
     finite = jnp.isfinite(value) & jnp.isfinite(plan.motion).all()
-    worthwhile = finite & (improvement >= config.hold_improvement)
-    outcome = jnp.where(worthwhile, plan.outcome, jnp.where(finite, Outcome.HELD, Outcome.NONFINITE))
+    sound = finite & (plan.outcome != Outcome.NONFINITE) & (plan.outcome != Outcome.INFEASIBLE)
+    worthwhile = sound & (improvement >= config.hold_improvement)
+    outcome = jnp.where(finite, jnp.where(sound, Outcome.HELD, plan.outcome), Outcome.NONFINITE)
+    outcome = jnp.where(worthwhile, plan.outcome, outcome)
     motion = jnp.where(worthwhile, plan.motion, still)
     value = jnp.where(worthwhile, value, value_hold)
-    return Plan(motion=motion, evaluations=plan.evaluations, outcome=outcome.astype(jnp.int32)), value, value_hold
+    return dataclasses.replace(plan, motion=motion, outcome=outcome.astype(jnp.int32)), value, value_hold
 
 
 def _plan_or_travel(
@@ -397,7 +400,7 @@ def _plan_or_travel(
     travelling = left > 0
     outcome = jnp.where(travelling, Outcome.TRAVELLING, plan.outcome).astype(jnp.int32)
     motion = jnp.where(travelling, way.motion, plan.motion)
-    return Plan(motion=motion, evaluations=plan.evaluations, outcome=outcome), left
+    return dataclasses.replace(plan, motion=motion, outcome=outcome), left
 
 
 class _StraightWay(NamedTuple):

@@ -6,82 +6,218 @@ A plan is a motion `u` of shape [T, Q, 3]: what each gripper moves in each inter
 
 from __future__ import annotations
 
-import dataclasses
+import math
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+import numpy as np
+from jaxtyping import Array, Bool, Float
 
-# Alternating projections between the balls and the distance bounds, per step of the plan. Each round shrinks what is
-# left of the violation; the scaling at the end removes the rest exactly, at the price of some motion.
-_ROUNDS = 4
-# Relative distance kept from every bound, so that a projected plan satisfies it strictly in float32.
-_MARGIN = 2e-6
+from cablejax.bounded.sets import (
+    AbstractSet,
+    AffineBalls,
+    Balls,
+    Box,
+    ConvexSet,
+    Halfspaces,
+    Intersection,
+    project_ball,
+)
+from cablejax.mpc.step_by_step import keep_each_step
+
+__all__ = ["FeasibleSet", "feasible_from", "project_ball"]
+
+# Relative distance kept from every bound, in units of rounding, so that a projected plan satisfies it strictly.
+_MARGIN_ULP = 16
+# Grippers that start outside come back at this share of the fastest way, so that there is room for other aims.
+_RETURN_SPEED = 0.9
 
 
-def project_ball(motion: Float[Array, "*batch D"], radius: Float[Array, ""] | float) -> Float[Array, "*batch D"]:
-    """Nearest point of the Euclidean ball of `radius` around 0 to each last-axis vector.
+class FeasibleSet(AbstractSet):
+    """Motions of two grippers within all their bounds. Those that are None are not there, and cost nothing.
 
-    Differentiable in both arguments, at the centre too.
-    """
-    square = jnp.sum(motion**2, axis=-1, keepdims=True)
-    outside = square > radius**2
-    return jnp.where(outside, motion * (radius / jnp.sqrt(jnp.where(outside, square, 1.0))), motion)
-
-
-@jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True)
-class FeasibleSet:
-    """Motions of two grippers within a step bound that keep the distance between the grippers within its bounds.
+    The set is convex but for the least distance, whose bound leaves out a disc: `at` has a half-plane of relative
+    positions instead, which touches the disc on the side where the grippers are. It is never empty for distances and a
+    workspace in order: grippers that start outside have a bound that closes in on them as they can follow. A bound on
+    the change may contradict the others (it takes a way to stop), which `violation` of a projected plan tells.
 
     Attributes:
         separation: position of gripper 1 relative to gripper 0 at the plan's start [m], shape [2].
         radius: bound epsilon on the norm of each gripper's motion in each step [m], shape [].
         min_distance: least distance between the grippers after every step [m], shape [].
-        max_distance: greatest distance between the grippers after every step [m], shape [].
+        max_distance: greatest distance between the grippers after every step [m]: a cable does not stretch, shape [].
+        box: least and greatest motion of each gripper in each step [m], shape [2, Q, 3]; must include rest.
+        position: of both grippers at the plan's start [m], shape [Q, 2]; goes with `workspace`.
+        workspace: lowest and highest corner of where the grippers may be [m], shape [2, 2].
+        change: bound on the norm of the change of each gripper's motion from step to step [m], shape [].
+        previous: motion of the step before the plan [m], shape [Q, 3]; goes with `change`.
     """
 
     separation: Float[Array, "*batch 2"]
     radius: Float[Array, "*batch"]
     min_distance: Float[Array, "*batch"]
     max_distance: Float[Array, "*batch"]
+    box: Float[Array, "*batch 2 Q 3"] | None = None
+    position: Float[Array, "*batch Q 2"] | None = None
+    workspace: Float[Array, "*batch 2 2"] | None = None
+    change: Float[Array, "*batch"] | None = None
+    previous: Float[Array, "*batch Q 3"] | None = None
 
-    def project(self, motion: Float[Array, "T 2 3"]) -> Float[Array, "T 2 3"]:
-        """A feasible plan close to `motion`; a feasible plan is left as it is.
+    def at(self, y: Float[Array, "T 2 3"]) -> ConvexSet:
+        """The convex part of the set around a feasible plan, and within all bounds by rounding."""
+        n_steps, dtype = len(y), y.dtype
+        tight = 1.0 - _MARGIN_ULP * jnp.finfo(dtype).eps
+        lower, upper = self._distance_bounds(n_steps)
+        apart = jnp.asarray(_sums(n_steps)[:, 1] - _sums(n_steps)[:, 0], dtype)
+        start = jnp.broadcast_to(self.separation, (n_steps, 2)).astype(dtype)
+        relative = start + jnp.cumsum(y[:, 1, :2] - y[:, 0, :2], axis=0)
+        length = jnp.linalg.norm(relative, axis=-1, keepdims=True)
+        # where the grippers are at one point no direction is better than another
+        outward = jnp.where(length > 1e-9, relative / jnp.maximum(length, 1e-9), jnp.asarray([1.0, 0.0], dtype))
+        members: list[ConvexSet] = [
+            Balls(self.radius * tight),
+            AffineBalls(apart, start, upper * tight),
+            Halfspaces(
+                -jnp.einsum("ti,tip->tp", outward, apart),
+                jnp.sum(outward * start, axis=-1) - lower * (2.0 - tight),
+            ),
+        ]
+        if self.box is not None:
+            members.append(Box(self.box[0], self.box[1]))
+        if self.workspace is not None and self.position is not None:
+            members.append(self._workspace_planes(n_steps, dtype))
+        if self.change is not None and self.previous is not None:
+            members.append(self._change_balls(n_steps, dtype))
+        return Intersection(tuple(members))
 
-        Steps are projected in the order in which they will be executed, each from where the previous ones have taken
-        the grippers. Within a step the projection is the exact one where only the balls bind, and alternating
-        projections onto the balls and the distance bounds otherwise. Holding still is always feasible, so that a step
-        which these rounds leave outside is scaled towards it until it is inside. If the grippers start outside the
-        distance bounds, the plan brings them back as fast as the balls allow. Differentiable almost everywhere.
+    def project(self, y: Float[Array, "T 2 3"]) -> Float[Array, "T 2 3"]:
+        """The nearest feasible plan, on the side of the least distance that the plan is on; a feasible one is left.
+
+        The side is that of the plan with each step made feasible in the order in which they will be executed, each from
+        where the previous ones have taken the grippers. If the grippers start outside the distance bounds, the plan
+        brings them back. Differentiable almost everywhere.
         """
+        return _nearest_plan(self, y)
 
-        def one_step(separation, step):
-            step = self._project_step(separation, step)
-            return separation + step[1, :2] - step[0, :2], step
+    def restore(self, y: Float[Array, "T 2 3"]) -> Float[Array, "T 2 3"]:
+        """A plan that keeps every bound but that on the change, cheaply: see `keep_each_step`."""
+        tight = 1.0 - _MARGIN_ULP * jnp.finfo(y.dtype).eps
+        corners = None
+        if self.workspace is not None:
+            corners = jnp.stack(self._workspace_bounds(len(y)), axis=1).astype(y.dtype)
+        lower, upper = self._distance_bounds(len(y))
+        return keep_each_step(
+            y,
+            separation=self.separation.astype(y.dtype),
+            radius=self.radius * tight,
+            lower=lower * (2.0 - tight),
+            upper=upper * tight,
+            box=self.box,
+            position=self.position,
+            corners=corners,
+        )
 
-        return jax.lax.scan(one_step, self.separation, motion)[1]
+    def constraints(self, y: Float[Array, "T 2 3"]) -> Float[Array, " K"]:
+        """By how much each bound is broken [m], smooth: norms, greatest and least distance, box, workspace, changes."""
+        lower, upper = self._distance_bounds(len(y))
+        relative = self._separations(y)
+        parts = [
+            _ball_excess(y, self.radius).ravel(),
+            _ball_excess(relative, upper),
+            -_ball_excess(relative, jnp.maximum(lower, 0.1 * upper), lower),
+        ]
+        if self.box is not None:
+            parts += [(self.box[0] - y).ravel(), (y - self.box[1]).ravel()]
+        if self.workspace is not None:
+            low, high = self._workspace_bounds(len(y))
+            parts += [(low - self._positions(y)).ravel(), (self._positions(y) - high).ravel()]
+        if self.change is not None:
+            parts.append(_ball_excess(self._changes(y), self._change_bounds(len(y))).ravel())
+        return jnp.concatenate(parts)
 
-    def violation(self, motion: Float[Array, "T 2 3"]) -> Float[Array, ""]:
+    def violation(self, y: Float[Array, "T 2 3"]) -> Float[Array, ""]:
         """By how much the worst step of a plan breaks its worst bound [m]; 0 for a feasible plan."""
-        norm = jnp.linalg.norm(motion, axis=-1)
-        relative = self.separation + jnp.cumsum(motion[:, 1, :2] - motion[:, 0, :2], axis=0)
-        distance = jnp.linalg.norm(relative, axis=-1)
-        worst = jnp.stack([(norm - self.radius).max(), (distance - self.max_distance).max()])
-        return jnp.maximum(jnp.maximum(worst.max(), (self.min_distance - distance).max()), 0.0)
+        lower, upper = self._distance_bounds(len(y))
+        distance = jnp.linalg.norm(self._separations(y), axis=-1)
+        excess = [
+            (jnp.linalg.norm(y, axis=-1) - self.radius).max(),
+            (distance - upper).max(),
+            (lower - distance).max(),
+        ]
+        if self.box is not None:
+            excess += [(self.box[0] - y).max(), (y - self.box[1]).max()]
+        if self.workspace is not None:
+            low, high = self._workspace_bounds(len(y))
+            excess += [(low - self._positions(y)).max(), (self._positions(y) - high).max()]
+        if self.change is not None:
+            excess.append((jnp.linalg.norm(self._changes(y), axis=-1) - self._change_bounds(len(y))).max())
+        return jnp.maximum(jnp.stack(excess).max(), 0.0)
 
-    def _project_step(self, separation: Float[Array, " 2"], motion: Float[Array, "2 3"]) -> Float[Array, "2 3"]:
-        radius = self.radius * (1.0 - _MARGIN)
-        lower = self.min_distance * (1.0 + _MARGIN)
-        upper = self.max_distance * (1.0 - _MARGIN)
-        motion = project_ball(motion, radius)
-        for _ in range(_ROUNDS):
-            motion = project_ball(_into_annulus(separation, motion, lower, upper), radius)
-        return motion * _largest_scale(separation, motion[1, :2] - motion[0, :2], self.min_distance, upper)
+    def empty(self) -> Bool[Array, ""]:
+        """Whether bounds contradict themselves or are not numbers; a zero radius leaves rest, which is something."""
+        pairs = [(self.min_distance, self.max_distance), (0.0, self.radius)]
+        if self.box is not None:
+            pairs += [(self.box[0], 0.0), (0.0, self.box[1])]
+        if self.workspace is not None:
+            pairs.append((self.workspace[0], self.workspace[1]))
+        if self.change is not None:
+            pairs.append((0.0, self.change))
+        ordered = jnp.stack([jnp.all(lower <= upper) for lower, upper in pairs]).all()
+        return ~(ordered & jnp.isfinite(self.separation).all() & jnp.isfinite(self.radius))
+
+    def _separations(self, motion: Float[Array, "T 2 3"]) -> Float[Array, "T 2"]:
+        """Position of gripper 1 relative to gripper 0 after each step [m]."""
+        return self.separation + jnp.cumsum(motion[:, 1, :2] - motion[:, 0, :2], axis=0)
+
+    def _positions(self, motion: Float[Array, "T 2 3"]) -> Float[Array, "T 2 2"]:
+        return self.position + jnp.cumsum(motion[..., :2], axis=0)  # pyright: ignore[reportOptionalOperand]
+
+    def _changes(self, motion: Float[Array, "T 2 3"]) -> Float[Array, "T 2 3"]:
+        return jnp.diff(motion, axis=0, prepend=self.previous[None])  # pyright: ignore[reportOptionalSubscript]
+
+    def _distance_bounds(self, n_steps: int) -> tuple[Float[Array, " T"], Float[Array, " T"]]:
+        """Least and greatest distance after each step, wider while the grippers come back from outside."""
+        distance = jnp.linalg.norm(self.separation)
+        reach = 2.0 * _RETURN_SPEED * self.radius * jnp.arange(1, n_steps + 1)
+        return jnp.minimum(self.min_distance, distance + reach), jnp.maximum(self.max_distance, distance - reach)
+
+    def _workspace_bounds(self, n_steps: int) -> tuple[Float[Array, "T 2 2"], Float[Array, "T 2 2"]]:
+        """Lowest and highest positions after each step, wider while the grippers come back from outside."""
+        reach = _RETURN_SPEED / math.sqrt(2.0) * self.radius * jnp.arange(1, n_steps + 1)[:, None, None]
+        lower, upper = self.workspace  # pyright: ignore[reportGeneralTypeIssues]
+        position: Array = self.position  # pyright: ignore[reportAssignmentType]
+        return jnp.minimum(lower, position + reach), jnp.maximum(upper, position - reach)
+
+    def _workspace_planes(self, n_steps: int, dtype) -> Halfspaces:
+        low, high = self._workspace_bounds(n_steps)
+        rows = jnp.asarray(_sums(n_steps).reshape(-1, 6 * n_steps), dtype)
+        start = jnp.broadcast_to(self.position, low.shape)  # pyright: ignore[reportArgumentType]
+        margin = _MARGIN_ULP * jnp.finfo(dtype).eps * (jnp.abs(low) + jnp.abs(high))
+        bounds = jnp.concatenate([(high - margin - start).ravel(), (start - low - margin).ravel()])
+        return Halfspaces(jnp.concatenate([rows, -rows]), bounds)
+
+    def _change_bounds(self, n_steps: int) -> Float[Array, "T 2"]:
+        """Bound on each change; the first is wider where the last command was faster than is allowed now."""
+        excess = jnp.linalg.norm(self.previous, axis=-1) - self.radius  # pyright: ignore[reportArgumentType]
+        return jnp.broadcast_to(self.change, (n_steps, 2)).at[0].max(excess)  # pyright: ignore[reportArgumentType]
+
+    def _change_balls(self, n_steps: int, dtype) -> AffineBalls:
+        difference = np.kron(np.eye(n_steps) - np.eye(n_steps, k=-1), np.eye(6)).reshape(2 * n_steps, 3, 6 * n_steps)
+        previous = jnp.zeros((n_steps, 2, 3), dtype).at[0].set(-self.previous.astype(dtype))  # pyright: ignore[reportOptionalMemberAccess]
+        tight = 1.0 - _MARGIN_ULP * jnp.finfo(dtype).eps
+        return AffineBalls(
+            jnp.asarray(difference, dtype), previous.reshape(-1, 3), self._change_bounds(n_steps).ravel() * tight
+        )
 
 
 def feasible_from(
-    gripper_pose: Float[Array, "2 3"], radius: Float[Array, ""] | float, distance: tuple[float, float]
+    gripper_pose: Float[Array, "2 3"],
+    radius: Float[Array, ""] | float,
+    distance: tuple[float, float],
+    *,
+    workspace: tuple[tuple[float, float], tuple[float, float]] | None = None,
+    change: float | None = None,
+    previous: Float[Array, "2 3"] | None = None,
 ) -> FeasibleSet:
     """The motions allowed from where the grippers are.
 
@@ -89,6 +225,9 @@ def feasible_from(
         gripper_pose: (x, y, theta) of both [m, rad].
         radius: bound on the norm of each gripper's motion in each step [m].
         distance: least and greatest distance between the grippers [m].
+        workspace: lowest and highest corner (x, y) of where the grippers may be [m]; None = anywhere.
+        change: bound on the norm of the change of each gripper's motion from step to step [m]; None = any.
+        previous: motion of the step before [m], shape [2, 3]; None = rest.
     """
     dtype = gripper_pose.dtype
     return FeasibleSet(
@@ -96,46 +235,34 @@ def feasible_from(
         radius=jnp.asarray(radius, dtype),
         min_distance=jnp.asarray(distance[0], dtype),
         max_distance=jnp.asarray(distance[1], dtype),
+        position=None if workspace is None else gripper_pose[:, :2],
+        workspace=None if workspace is None else jnp.asarray(workspace, dtype),
+        change=None if change is None else jnp.asarray(change, dtype),
+        previous=None if change is None else (jnp.zeros((2, 3), dtype) if previous is None else previous),
     )
 
 
-def _into_annulus(
-    separation: Float[Array, " 2"], motion: Float[Array, "2 3"], lower: Float[Array, ""], upper: Float[Array, ""]
-) -> Float[Array, "2 3"]:
-    """Nearest motion that ends with the grippers' distance within bounds: both give way by the same amount."""
-    relative = separation + motion[1, :2] - motion[0, :2]
-    distance = jnp.sqrt(jnp.maximum(jnp.sum(relative**2), 1e-12))
-    excess = distance - jnp.clip(distance, lower, upper)
-    share = 0.5 * excess * relative / distance
-    return motion.at[0, :2].add(share).at[1, :2].add(-share)
+@jax.jit
+def _nearest_plan(feasible: FeasibleSet, y: Float[Array, "T 2 3"]) -> Float[Array, "T 2 3"]:
+    """See `FeasibleSet.project`; compiled once also where nothing around it is."""
+
+    def nearest():
+        convex = feasible.at(feasible.restore(y))
+        return convex.restore(convex.project(y))
+
+    # a plan that is not a number is not broken either
+    return jax.lax.cond(feasible.violation(y) > 0.0, nearest, lambda: y)
 
 
-def _largest_scale(
-    separation: Float[Array, " 2"],
-    change: Float[Array, " 2"],
-    lower: Float[Array, ""],
-    upper: Float[Array, ""],
-) -> Float[Array, ""]:
-    """Largest s in [0, 1] with `lower <= |separation + s change| <= upper`, from the roots of the two quadratics.
+def _sums(n_steps: int) -> np.ndarray:
+    """Rows that give both grippers' displacements (x, y) after each step from the flattened plan, [T, Q, 2, P]."""
+    so_far = np.tril(np.ones((n_steps, n_steps)))
+    return np.einsum("ts,qr,ij->tqisrj", so_far, np.eye(2), np.eye(2, 3)).reshape(n_steps, 2, 2, 6 * n_steps)
 
-    A start that is itself outside counts as lying on the bound it breaks: it may come back, not go further.
-    """
-    a, b = jnp.sum(change**2), jnp.sum(separation * change)
-    start, end = jnp.sum(separation**2), jnp.sum((separation + change) ** 2)
-    moving = a > 1e-14
 
-    # |separation + s change|^2 <= upper^2 up to the greater root, written without cancellation for either sign of b.
-    leaves = moving & (end > upper**2)
-    safe_a, safe_b = jnp.where(leaves, a, 1.0), jnp.where(leaves, b, 1.0)
-    slack = jnp.where(leaves, jnp.maximum(upper**2 - start, 0.0), 0.0)
-    root = jnp.sqrt(jnp.maximum(safe_b**2 + safe_a * slack, 1e-20))
-    to_upper = jnp.where(safe_b >= 0, slack / (jnp.abs(safe_b) + root), (root - safe_b) / safe_a)
-
-    # |separation + s change|^2 >= lower^2 up to the lesser root, if the motion approaches and the roots are real.
-    slack = jnp.maximum(start - lower**2, 0.0)
-    discriminant = b**2 - a * slack
-    enters = moving & (end < lower**2) & (b < 0) & (discriminant > 0)
-    to_lower = slack / (jnp.abs(b) + jnp.sqrt(jnp.where(enters, discriminant, 1.0)))
-
-    scale = jnp.minimum(jnp.where(leaves, to_upper, 1.0), jnp.where(enters, to_lower, 1.0))
-    return jnp.clip(scale, 0.0, 1.0)
+def _ball_excess(
+    vectors: Float[Array, "*batch D"], scale: Float[Array, "..."], radius: Float[Array, "..."] | None = None
+) -> Float[Array, "*batch"]:
+    """`(|v|^2 - r^2) / 2 s`, smooth, and for s = r about `|v| - r` near the bound."""
+    radius = scale if radius is None else radius
+    return (jnp.sum(vectors**2, axis=-1) - radius**2) / (2.0 * jnp.maximum(scale, 1e-9))

@@ -1,14 +1,13 @@
-"""The planning problem of one control step, and what a solver of it takes and returns."""
+"""The planning problem of one control step."""
 
 from __future__ import annotations
 
 import dataclasses
-import enum
-from typing import Any, Protocol
+from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 
 from cablejax.mpc.feasible import FeasibleSet
 from cablejax.mpc.goal import continued, total_turn
@@ -156,42 +155,3 @@ class ShapingProblem:
 def _pad_to(x: Float[Array, "..."], size: int, axis: int) -> Float[Array, "..."]:
     """`x` with zeros appended along one axis."""
     return jnp.pad(x, [(0, size - x.shape[i] if i == axis else 0) for i in range(x.ndim)])
-
-
-class Outcome(enum.IntEnum):
-    """How a solve ended. Inside compiled code it is an int32."""
-
-    CONVERGED = 0
-    """No feasible direction improves the plan by more than the tolerance."""
-    STEP_LIMIT = 1
-    """The evaluation budget was used up; the plan is feasible and no worse than the guess."""
-    HELD = 2
-    """The plan would hardly improve on holding still: the grippers hold."""
-    NONFINITE = 3
-    """The model or the observation gave NaN or infinity: the grippers hold."""
-    TRAVELLING = 4
-    """No plan was better than holding, far from where the target's ends are held: the grippers go there."""
-
-
-@jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True)
-class Plan:
-    """What a solver returns.
-
-    Attributes:
-        motion: feasible motions [m], shape [T, Q, 3].
-        evaluations: rollouts of the model that were spent, shape [].
-        outcome: an `Outcome`, shape [].
-    """
-
-    motion: Float[Array, "*batch T Q 3"]
-    evaluations: Int[Array, "*batch"]
-    outcome: Int[Array, "*batch"]
-
-
-class Solver(Protocol):
-    """A hashable object, typically a frozen dataclass that is its own configuration, called inside compiled code."""
-
-    def __call__(self, problem: ShapingProblem, guess: Float[Array, "T Q 3"]) -> Plan:
-        """A plan no worse than `problem.feasible.project(guess)`."""
-        ...

@@ -33,6 +33,7 @@ from cablejax.report.effect_words import (
     share,
 )
 from cablejax.report.page import svg
+from cablejax.report.spatial_figures import cable_still, files_figure, orbit
 
 PAGE = "report.html"
 _BADGES: dict[Verdict, tuple[str, str]] = {
@@ -43,6 +44,15 @@ _BADGES: dict[Verdict, tuple[str, str]] = {
     "unknown": ("unknown", "Cause not in the library"),
 }
 _DPI = 150
+_SPACE_CAPTION = (
+    "Five seconds from two observations on, in the files with the largest, middling and smallest gaps. Drag to turn, "
+    "scroll to zoom. The solid line is a fit to recordings that this file is not part of."
+)
+_FILES_CAPTION = (
+    "Each column is a file, each row a keypoint. The cable's own gap fades towards the grippers that hold it; a "
+    "file that "
+    "differs from its neighbours was recorded with something changed."
+)
 
 
 def write_diagnosis_page(diagnosis: Diagnosis, out: str | os.PathLike[str]) -> pathlib.Path:
@@ -53,9 +63,10 @@ def write_diagnosis_page(diagnosis: Diagnosis, out: str | os.PathLike[str]) -> p
     out = pathlib.Path(out)
     out.mkdir(parents=True, exist_ok=True)
     write_verdict(out / "verdict.json", diagnosis)
+    in_space = diagnosis.log.keypoints.shape[-1] == 3
     drawn = {
-        "cable": cable_figure(diagnosis),
-        "where": where_figure(diagnosis),
+        "cable": cable_still(diagnosis) if in_space else cable_figure(diagnosis),
+        "where": files_figure(diagnosis) if in_space else where_figure(diagnosis),
         "ranking": ranking_figure(diagnosis),
         "shrinkage": shrinkage_figure(diagnosis),
         "motion": motion_figure(diagnosis),
@@ -80,11 +91,13 @@ def write_diagnosis_page(diagnosis: Diagnosis, out: str | os.PathLike[str]) -> p
         headline=html.escape(diagnosis.sentence),
         lead=_lead(diagnosis),
         cards="\n".join(_cards(diagnosis)),
-        cable=inline["cable"],
-        cable_caption=_cable_caption(diagnosis),
+        cable=orbit(diagnosis) if in_space else inline["cable"],
+        cable_caption=_SPACE_CAPTION if in_space else _cable_caption(diagnosis),
         where="\n".join(f"<li>{html.escape(sentence)}</li>" for sentence in diagnosis.where.sentences),
         where_figure=inline["where"],
-        where_caption=(
+        where_caption=_FILES_CAPTION
+        if in_space
+        else (
             "Top: the gap of each keypoint over the whole log. Below: each episode over time; the darker, the further "
             "beyond the noise. Black bars mark holds. The cable's own gap fades towards the grippers that hold it."
         ),

@@ -1,0 +1,232 @@
+"""How far to look ahead, and with which solver: closed loops over horizons and solvers, error against milliseconds.
+
+Every pair of a horizon (1, 2, 5, 10) and a solver brings a straight cable, twice as stiff as the trained one, to U, S
+and Z on the plant in C MuJoCo, with the online residual; everything else is the controller's default.
+
+    python experiments/12_horizon_and_solver.py --shapes U --horizons 5      # a part of it: some minutes
+    python experiments/12_horizon_and_solver.py                              # all of it: an hour on two idle cores
+    python experiments/12_horizon_and_solver.py --report docs/results/horizon_and_solver.md   # the page of that
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+import os
+from pathlib import Path
+
+os.environ.setdefault("NPROC", "4")
+
+import matplotlib.pyplot as plt
+import numpy as np
+from tqdm import tqdm
+
+from cablejax.closed_loop import run_closed_loop
+from cablejax.evaluation.cases import PLANT_CABLE, mujoco_plant
+from cablejax.evaluation.protocols import LaidOut, letter_task
+from cablejax.mpc import (
+    Controller,
+    CrossEntropy,
+    Deadline,
+    Dogleg,
+    GaussNewton,
+    MPCConfig,
+    PathIntegral,
+    ProjectedGradient,
+    TrustRegion,
+)
+from cablejax.report.provenance import machine, versions
+from cablejax.shaping import load_model
+
+SOLVERS = {
+    "Levenberg-Marquardt": TrustRegion(),
+    "Levenberg-Marquardt, converged": TrustRegion(max_iterations=12),
+    "dogleg": Dogleg(),
+    "Gauss-Newton": GaussNewton(),
+    "spectral gradient": ProjectedGradient(),
+    "deadline": Deadline(),
+    "CEM": CrossEntropy(),
+    "MPPI": PathIntegral(),
+}
+CONVERGED = "Levenberg-Marquardt, converged"
+HORIZONS = (1, 2, 5, 10)
+SHAPES = ("U", "S", "Z")
+STIFFNESS = 2.0
+STEPS = 35
+SEEDS = (0,)
+COLOURS = ("#0072b2", "#56b4e9", "#009e73", "#e69f00", "#d55e00", "#000000", "#cc79a7", "#999999")
+MARKERS = ("o", "s", "D", "^")
+CACHE = Path("runs") / "horizon_and_solver.jsonl"
+
+
+@dataclasses.dataclass(frozen=True)
+class Trial:
+    """One closed loop."""
+
+    solver: str
+    horizon: int
+    shape: str
+    seed: int
+    terminal_cm: float
+    settling_s: float
+    p50_ms: float
+    p95_ms: float
+    stopped: str | None
+
+    @property
+    def key(self) -> tuple:
+        return self.solver, self.horizon, self.shape, self.seed
+
+
+def run(model, solver: str, horizon: int, shape: str, seed: int) -> Trial:
+    """One of them; what is compiled is kept for the next target."""
+    task = letter_task(shape, seed, PLANT_CABLE)
+    config = dataclasses.replace(MPCConfig(), horizon=horizon, solver=SOLVERS[solver])
+    controller = Controller(config, model.dynamics, model.weights, task.target.keypoints)
+    plant = LaidOut(mujoco_plant(STIFFNESS), task.start_shape)
+    out = run_closed_loop(plant, controller, task.target, STEPS, start=task.start_pose, record_hz=1.0)
+    p50, p95 = np.nanpercentile(out.mpc_ms, [50, 95])
+    values = (out.terminal_error_cm, out.settling_time_s, float(p50), float(p95), out.stopped)
+    return Trial(solver, horizon, shape, seed, *values)
+
+
+def read(path: Path) -> list[Trial]:
+    if not path.is_file():
+        return []
+    return [Trial(**json.loads(line)) for line in path.read_text(encoding="utf-8").splitlines()]
+
+
+def run_all(path: Path, wanted: list[tuple]) -> None:
+    """Runs what the file does not have yet."""
+    model, done = load_model("gns-reference"), {trial.key for trial in read(path)}
+    path.parent.mkdir(parents=True, exist_ok=True)
+    for key in tqdm([key for key in wanted if key not in done], unit="run", dynamic_ncols=True):
+        with path.open("a", encoding="utf-8") as file:
+            file.write(json.dumps(dataclasses.asdict(run(model, *key))) + "\n")
+
+
+def cells(trials: list[Trial]) -> dict[tuple[str, int], dict[str, float]]:
+    """Means over targets and seeds; times are medians of the runs' percentiles."""
+    out = {}
+    for solver in SOLVERS:
+        for horizon in HORIZONS:
+            mine = [t for t in trials if (t.solver, t.horizon) == (solver, horizon)]
+            if mine:
+                out[solver, horizon] = {
+                    "runs": len(mine),
+                    "error": float(np.mean([t.terminal_cm for t in mine])),
+                    "worst": float(np.max([t.terminal_cm for t in mine])),
+                    "p50": float(np.median([t.p50_ms for t in mine])),
+                    "p95": float(np.median([t.p95_ms for t in mine])),
+                }
+    return out
+
+
+def draw(table: dict, path: Path) -> None:
+    """Terminal error against milliseconds per call; the default is ringed."""
+    figure, axis = plt.subplots(figsize=(8.2, 5.0), layout="constrained")
+    for solver, colour in zip(SOLVERS, COLOURS, strict=True):
+        known = [h for h in HORIZONS if (solver, h) in table]
+        points = np.array([[table[solver, h]["p50"], table[solver, h]["error"]] for h in known]).reshape(-1, 2)
+        axis.plot(*points.T, color=colour, linewidth=1.0, alpha=0.7, label=solver if known else None)
+        for horizon, point in zip(known, points, strict=True):
+            axis.plot(*point, MARKERS[HORIZONS.index(horizon)], color=colour, markersize=6)
+    default = MPCConfig()
+    chosen = next((name for name, solver in SOLVERS.items() if solver == default.solver), None)
+    if (chosen, default.horizon) in table:
+        cell = table[chosen, default.horizon]
+        axis.plot(cell["p50"], cell["error"], "o", markersize=17, fillstyle="none", color="black", markeredgewidth=1.4)
+        axis.annotate("default", (cell["p50"], cell["error"]), xytext=(10, 12), textcoords="offset points", fontsize=9)
+    for horizon, marker in zip(HORIZONS, MARKERS, strict=True):
+        axis.plot([], [], marker, color="#555555", label=f"horizon {horizon}")
+    axis.set(xscale="log", yscale="log", xlabel="median of one control call [ms]")
+    axis.set_ylabel(f"error after {STEPS} commands, mean over {', '.join(SHAPES)} [cm]")
+    axis.grid(alpha=0.25, which="both", linewidth=0.5)
+    axis.legend(fontsize=8, frameon=False, loc="center left", bbox_to_anchor=(1.0, 0.5))
+    figure.savefig(path, dpi=140)
+
+
+def page(trials: list[Trial], table: dict, picture: str | None) -> str:
+    """The Markdown page."""
+    lines = [
+        "# Horizon and solver",
+        "",
+        "Made by `python experiments/12_horizon_and_solver.py --report docs/results/horizon_and_solver.md`.",
+        f"{versions()}; {machine()}.",
+        "",
+        f"{len(trials)} closed loops: a straight cable, {STIFFNESS:g} times as stiff as the trained one, brought to "
+        f"{', '.join(sorted({t.shape for t in trials}))} by {STEPS} commands on the contact plant; seeds "
+        f"{', '.join(map(str, sorted({t.seed for t in trials})))}; gns-reference with the online residual. A horizon h "
+        "plans h + 1 commands. Milliseconds are those of a control call in the loop, beside whatever else this machine "
+        "did at the time: compare rows, and see [speed](speed.md) for the default alone.",
+    ]
+    if picture is not None:
+        lines += ["", f"![Error against milliseconds]({picture})"]
+    lines += [
+        "",
+        "| solver | horizon | runs | error, mean [cm] | worst [cm] | call p50 [ms] | p95 [ms] |",
+        "| --- | --- | --- | --- | --- | --- | --- |",
+        *(
+            f"| {solver} | {h} | {c['runs']} | {c['error']:.3f} | {c['worst']:.3f} | {c['p50']:.0f} | {c['p95']:.0f} |"
+            for (solver, h), c in table.items()
+        ),
+    ]
+    pairs = [
+        (h, table["deadline", h], table[CONVERGED, h])
+        for h in HORIZONS
+        if {("deadline", h), (CONVERGED, h)} <= set(table)
+    ]
+    if pairs:
+        lines += ["", "## Deadline mode against converged", ""]
+        lines += [
+            f"- horizon {h}: {fast['error']:.3f} cm in {fast['p50']:.0f} ms against {slow['error']:.3f} cm in "
+            f"{slow['p50']:.0f} ms ({100 * (fast['error'] / slow['error'] - 1):+.1f} %)"
+            for h, fast, slow in pairs
+        ]
+    stopped = [t for t in trials if t.stopped]
+    lines += ["", "## Runs that ended early", ""]
+    lines += [f"- {' '.join(map(str, t.key))}: {t.stopped}" for t in stopped] or ["None."]
+    lines += ["", "## Every run", "", "| solver | horizon | target | seed | error [cm] | settled [s] | p50 [ms] |"]
+    lines += ["| --- | --- | --- | --- | --- | --- | --- |"]
+    lines += [
+        f"| {t.solver} | {t.horizon} | {t.shape} | {t.seed} | {t.terminal_cm:.3f} | {t.settling_s:.0f} | "
+        f"{t.p50_ms:.0f} |"
+        for t in sorted(trials, key=lambda t: t.key)
+    ]
+    return "\n".join([*lines, ""])
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--shapes", nargs="*", choices=SHAPES, default=SHAPES)
+    parser.add_argument("--horizons", nargs="*", type=int, choices=HORIZONS, default=(5, 2, 1, 10))
+    parser.add_argument("--solvers", nargs="*", choices=tuple(SOLVERS), default=tuple(SOLVERS))
+    parser.add_argument("--seeds", nargs="*", type=int, default=SEEDS)
+    parser.add_argument("--cache", type=Path, default=CACHE, help="finished runs; a run goes on where it stopped")
+    parser.add_argument("--report", type=Path, help="run nothing; write the page on what is done to this file")
+    options = parser.parse_args()
+    if options.report is None:
+        wanted = [
+            (solver, horizon, shape, seed)
+            for seed in options.seeds
+            for horizon in options.horizons
+            for solver in options.solvers
+            for shape in options.shapes
+        ]
+        run_all(options.cache, wanted)
+    trials = read(options.cache)
+    table = cells(trials)
+    picture = None
+    if options.report is not None:
+        image = options.report.parent.parent / "images" / "horizon_and_solver.png"
+        draw(table, image)
+        picture = f"../images/{image.name}"
+    text = page(trials, table, picture)
+    print(text)
+    if options.report is not None:
+        options.report.write_text(text, encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,192 @@
+"""What the bounded least squares solvers share: one linearisation, one model, one trial point after the other."""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import lineax as lx
+import optimistix as optx
+from equinox import AbstractVar
+from jaxtyping import Array, Bool, Float, Int, PyTree, Scalar
+
+from cablejax.bounded.secant import secant_update
+
+
+class _State(eqx.Module):
+    f_info: Any  # FunctionInfo.EvalGradHessian
+    residual: Float[Array, " M"]
+    jacobian: Float[Array, "M P"]
+    secant: Float[Array, "P P"]
+    linearised_at: Array
+    descent_state: Any
+    search_state: Any
+    step_size: Scalar
+    optimality: Scalar
+    stale: Bool[Array, ""]
+    rounded: Bool[Array, ""]
+    terminate: Bool[Array, ""]
+    result: optx.RESULTS
+    linearisations: Int[Array, ""]
+    evaluations: Int[Array, ""]
+
+
+class AbstractBoundedLeastSquares(optx.AbstractLeastSquaresSolver):
+    """Base of the bounded least squares solvers; `y` is one array, `fn` gives one flat array of residuals.
+
+    One step linearises at y (unless the last trial was rejected: then the linearisation there still holds), proposes
+    one trial point and evaluates the residuals there; `optimistix.AbstractGaussNewton` would linearise at every trial
+    point, used or not. It ends where `|P(y - g) - y|_inf <= atol + rtol |y|_inf`, or where the model promises less than
+    rounding can tell (`RESULTS.stagnation`, if the former does not hold).
+
+    The descent is given `FunctionInfo.EvalGradHessian` of the flattened point with the Hessian `J'J + S`. Without
+    `secant`, S = 0 (Gauss and Newton). With it, S is what the residuals' own curvature contributes, learned from the
+    change of the Jacobian, which makes the last steps fast where residuals stay large.
+
+    Options: `feasible`, the set; `linearise`, a function `(y, args) -> (residuals, Jacobian [M, P])`, if there is a
+    cheaper one than `jax.jacfwd`.
+    """
+
+    rtol: AbstractVar[float]
+    atol: AbstractVar[float]
+    norm: AbstractVar[Callable[[PyTree], Scalar]]
+    descent: AbstractVar[Any]
+    search: AbstractVar[optx.AbstractSearch]
+    secant: AbstractVar[bool]
+
+    def init(self, fn, y, args, options, f_struct, aux_struct, tags):
+        del fn, args, aux_struct, tags
+        if len(f_struct.shape) != 1:
+            raise ValueError(f"{type(self).__name__} got residuals of shape {f_struct.shape}, expected a flat array.")
+        dtype = f_struct.dtype
+        square = jnp.zeros((y.size, y.size), dtype)
+        info = _info(jnp.zeros((), dtype), jnp.zeros(y.size, dtype), square)
+        descent = self.descent.within(options["feasible"].at(y), y)
+        zero = jnp.zeros((), jnp.int32)
+        return _State(
+            f_info=info,
+            residual=jnp.zeros(f_struct.shape, dtype),
+            jacobian=jnp.zeros((*f_struct.shape, y.size), dtype),
+            secant=square,
+            linearised_at=y,
+            descent_state=descent.init(y.ravel(), info),
+            search_state=self.search.init(y.ravel(), info),
+            step_size=jnp.ones((), dtype),
+            optimality=jnp.asarray(jnp.inf, dtype),
+            stale=jnp.array(True),
+            rounded=jnp.array(False),
+            terminate=jnp.array(False),
+            result=optx.RESULTS.successful,
+            linearisations=zero,
+            evaluations=zero,
+        )
+
+    def step(self, fn, y, args, options, state, tags):
+        del tags
+        feasible = options["feasible"].at(y)
+        linearise = options.get("linearise", None) or _forward(fn)
+        descent = self.descent.within(feasible, y)
+
+        def renewed():
+            return self._renewed(linearise, feasible, descent, y, args, state)
+
+        state = jax.lax.cond(state.stale, renewed, lambda: state)
+        converged = state.optimality <= self.atol + self.rtol * self.norm(y)
+        finite = jnp.isfinite(state.f_info.f) & jnp.isfinite(state.f_info.grad).all()
+        info = state.f_info
+
+        def stay():
+            return y, jnp.full_like(info.f, jnp.inf)
+
+        def go():
+            move, _ = descent.step(state.step_size, state.descent_state)
+            move = jnp.where(jnp.isfinite(move).all(), move, 0.0)
+            trial = feasible.restore(y + move.reshape(y.shape))
+            return trial, 0.5 * jnp.sum(fn(trial, args)[0] ** 2)
+
+        trial, value = jax.lax.cond(converged | ~finite, stay, go)
+        move = (trial - y).ravel()
+        step_size, accept, _, search_state = self.search.step(
+            jnp.array(False), y.ravel(), trial.ravel(), info, optx.FunctionInfo.Eval(value), state.search_state
+        )
+        promised = -(jnp.sum(info.grad * move) + 0.5 * move @ info.hessian.as_matrix() @ move)
+        rounding = 4 * jnp.finfo(y.dtype).eps * jnp.abs(info.f)
+        rounded = promised <= rounding
+        # Gradients are known better than values: two more steps are taken on trust where values cannot tell.
+        accept = (accept | (rounded & (value <= info.f + rounding))) & jnp.isfinite(value)
+        stalled = rounded & state.rounded & ~converged
+        result = optx.RESULTS.where(stalled, optx.RESULTS.stagnation, state.result)  # pyright: ignore[reportArgumentType]
+        result = optx.RESULTS.where(finite, result, optx.RESULTS.nonfinite)
+        state = eqx.tree_at(
+            lambda s: (
+                *(s.search_state, s.step_size, s.stale, s.rounded, s.terminate, s.result),
+                s.evaluations,
+            ),
+            state,
+            (
+                *(search_state, step_size.astype(y.dtype), accept, rounded, converged | stalled | ~finite, result),
+                state.evaluations + jnp.where(converged | ~finite, 0, 1),
+            ),
+        )
+        return jnp.where(accept & finite, trial, y), state, None
+
+    def terminate(self, fn, y, args, options, state, tags):
+        del fn, y, args, options, tags
+        return state.terminate, state.result
+
+    def postprocess(self, fn, y, aux, args, options, state, tags, result):
+        del fn, args, options, tags, result
+        stats = {
+            "optimality": state.optimality,
+            "evaluations": state.evaluations,
+            "linearisations": state.linearisations,
+            "projections": state.linearisations + state.evaluations,
+        }
+        return y, aux, stats
+
+    def _renewed(self, linearise, feasible, descent, y, args, state: _State) -> _State:
+        """The state with everything that belongs to a new point."""
+        residual, jacobian = linearise(y, args)
+        gradient = jacobian.T @ residual
+        secant, learned = state.secant, jnp.zeros_like(state.secant)
+        if self.secant:
+            moved = (y - state.linearised_at).ravel()
+            bent = gradient - state.jacobian.T @ residual
+            slope = gradient - state.jacobian.T @ state.residual
+            # Used as long as it has foretold the change of the gradient better than nothing would have.
+            left = slope - state.jacobian.T @ (state.jacobian @ moved)
+            telling = jnp.linalg.norm(left - secant @ moved) <= jnp.linalg.norm(left)
+            secant = jnp.where(state.linearisations > 0, secant_update(secant, moved, bent, slope), secant)
+            learned = jnp.where(telling, secant, 0.0)
+        info = _info(0.5 * jnp.sum(residual**2), gradient, jacobian.T @ jacobian + learned)
+        optimality = jnp.abs(feasible.project(y - gradient.reshape(y.shape)) - y).max()
+        return eqx.tree_at(
+            lambda s: (
+                *(s.f_info, s.residual, s.jacobian, s.secant, s.linearised_at),
+                *(s.descent_state, s.optimality, s.linearisations),
+            ),
+            state,
+            (
+                *(info, residual, jacobian, secant, y),
+                *(descent.query(y.ravel(), info, state.descent_state), optimality, state.linearisations + 1),
+            ),
+        )
+
+
+def _info(value: Scalar, gradient: Float[Array, " P"], hessian: Float[Array, "P P"]):
+    return optx.FunctionInfo.EvalGradHessian(value, gradient, lx.MatrixLinearOperator(hessian))
+
+
+def _forward(fn):
+    """`fn` and its Jacobian in forward mode."""
+
+    def linearise(y, args):
+        def twice(y):
+            residual = fn(y, args)[0]
+            return residual, residual
+
+        jacobian, residual = jax.jacfwd(twice, has_aux=True)(y)
+        return residual, jacobian.reshape(residual.size, y.size)
+
+    return linearise

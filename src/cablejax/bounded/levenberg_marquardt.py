@@ -1,0 +1,111 @@
+"""Levenberg-Marquardt steps that stay inside a feasible set."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import optimistix as optx
+from jaxtyping import Array, Float, PyTree, Scalar
+
+from cablejax.bounded.gain_ratio import GainRatio
+from cablejax.bounded.least_squares import AbstractBoundedLeastSquares
+from cablejax.bounded.quadratic import minimise_quadratic
+from cablejax.bounded.sets import ConvexSet
+
+
+class ModelState(eqx.Module):
+    """What a descent keeps of the model at a point.
+
+    Attributes:
+        gradient: shape [P].
+        hessian: positive semi-definite, shape [P, P].
+    """
+
+    gradient: Float[Array, " P"]
+    hessian: Float[Array, "P P"]
+
+
+class DampedQuadratic(optx.AbstractDescent):
+    """`step(s)` minimises `g'd + d'(H + damping / s diag H) d / 2` over the d with y + d feasible.
+
+    Attributes:
+        damping: at s = 1, relative to the diagonal of H.
+        secant: whether H may have negative eigenvalues; these are cut off.
+        feasible: the convex set; None until a solver has put in that of its options.
+        y: where the model is made, in the set's own shape; likewise.
+    """
+
+    damping: float
+    secant: bool = eqx.field(static=True)
+    feasible: ConvexSet | None = None
+    y: Array | None = None
+
+    def within(self, feasible: ConvexSet, y: Array) -> DampedQuadratic:
+        """The same descent on a set, around a point."""
+        return DampedQuadratic(self.damping, self.secant, feasible, y)
+
+    def init(self, y, f_info_struct):
+        del f_info_struct
+        return ModelState(jnp.zeros_like(y), jnp.eye(y.size, dtype=y.dtype))
+
+    def query(self, y, f_info, state):
+        del y, state
+        hessian = f_info.hessian.as_matrix()
+        return ModelState(f_info.grad, convex_part(hessian) if self.secant else hessian)
+
+    def step(self, step_size, state):
+        diagonal = jnp.diag(state.hessian)
+        # no more than keeps what the model does not see at all from being singular: scales differ by as much as 1e10
+        floor = jnp.finfo(diagonal.dtype).eps * diagonal.max() + jnp.finfo(diagonal.dtype).tiny
+        damped = state.hessian + jnp.diag(self.damping / step_size * jnp.maximum(diagonal, floor))
+        found = minimise_quadratic(damped, state.gradient, self.feasible, self.y)  # pyright: ignore[reportArgumentType]
+        return found.point - self.y.ravel(), optx.RESULTS.successful  # pyright: ignore[reportOptionalMemberAccess]
+
+
+class BoundedLevenbergMarquardt(AbstractBoundedLeastSquares):
+    """Damped Gauss-Newton models, each minimised over the feasible set, so that active bounds are part of the model.
+
+    A plain Levenberg-Marquardt step projected back onto the set need not be a descent (Bertsekas, SIAM J. Control
+    Optim. 20, 1982). Singular Jacobians do no harm.
+    """
+
+    rtol: float
+    atol: float
+    norm: Callable[[PyTree], Scalar]
+    descent: DampedQuadratic
+    search: optx.AbstractSearch
+    secant: bool = eqx.field(static=True)
+
+    def __init__(
+        self,
+        rtol: float = 0.0,
+        atol: float = 1e-8,
+        damping: float = 1e-3,
+        secant: bool = True,
+        search: Any = None,
+    ):
+        """**Arguments:**
+
+        - `rtol`: relative tolerance on the projected gradient.
+        - `atol`: absolute tolerance on it.
+        - `damping`: at the start, relative to the diagonal of the model's Hessian.
+        - `secant`: whether the curvature of the residuals is learned.
+        - `search`: how the damping follows the reductions; None = `GainRatio()`.
+        """
+        self.rtol, self.atol, self.norm = rtol, atol, optx.max_norm
+        self.descent = DampedQuadratic(damping, secant)
+        self.search = GainRatio() if search is None else search
+        self.secant = secant
+
+
+def convex_part(hessian: Float[Array, "P P"]) -> Float[Array, "P P"]:
+    """The matrix without its negative eigenvalues, those of the matrix scaled to a unit diagonal."""
+    diagonal = jnp.abs(jnp.diag(hessian))
+    floor = jnp.finfo(diagonal.dtype).eps * diagonal.max() + jnp.finfo(diagonal.dtype).tiny
+    unit = jnp.sqrt(jnp.maximum(diagonal, floor))
+    eigenvalues, basis = jnp.linalg.eigh(hessian / jnp.outer(unit, unit))
+    root = unit[:, None] * basis
+    return (root * jnp.maximum(eigenvalues, 0.0)) @ root.T

@@ -1,0 +1,81 @@
+"""Bounds as smooth convex quadratics, in the one form that the interior-point method takes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax.numpy as jnp
+import jax.scipy.linalg
+import numpy as np
+from jaxtyping import Array, Float
+
+
+class Quadrics(eqx.Module):
+    """Functions of a point x, `c(x) = G (q z^2 / 2 + p z) + e` with `z = L x + l`, products of vectors by element.
+
+    A ball `|A x + b| <= r` has q = 1 / r, e = -r / 2; an interval's end has q = 0, p = 1. All derivatives follow from
+    products with the constant matrix L, so that a quadratic program over such bounds is dense linear algebra.
+
+    Attributes:
+        matrix: L, shape [M, P].
+        offset: l, shape [M].
+        curvature: q, not negative, shape [M].
+        slope: p, shape [M].
+        level: e, -inf for a bound that is not there, shape [K].
+        groups: G, which rows of L belong to which function: of 0 and 1, shape [K, M].
+    """
+
+    matrix: Float[Array, "M P"]
+    offset: Float[Array, " M"]
+    curvature: Float[Array, " M"]
+    slope: Float[Array, " M"]
+    level: Float[Array, " K"]
+    groups: Float[Array, "K M"]
+
+    def lift(self, x: Float[Array, " P"]) -> Float[Array, " M"]:
+        """z at a point."""
+        return self.matrix @ x + self.offset
+
+    def of_lift(self, z: Float[Array, " M"]) -> Float[Array, " K"]:
+        """c where the lifted point is z."""
+        return self.groups @ (0.5 * self.curvature * z**2 + self.slope * z) + self.level
+
+    def values(self, x: Float[Array, " P"]) -> Float[Array, " K"]:
+        """c at a point."""
+        return self.of_lift(self.lift(x))
+
+    def jacobian(self, z: Float[Array, " M"]) -> Float[Array, "K P"]:
+        """dc/dx where the lifted point is z."""
+        return self.groups @ ((self.curvature * z + self.slope)[:, None] * self.matrix)
+
+    def bend(self, multipliers: Float[Array, " K"]) -> Float[Array, "P P"]:
+        """`sum_k lambda_k d2 c_k / dx2`."""
+        return self.matrix.T @ ((self.curvature * (multipliers @ self.groups))[:, None] * self.matrix)
+
+
+def ball_quadrics(matrix: Float[Array, "K D P"], offset: Float[Array, "K D"], radius: Float[Array, " K"]) -> Quadrics:
+    """`(|A_k x + b_k|^2 - r_k^2) / (2 r_k)`; a radius below rounding counts as that."""
+    n_balls, width, size = matrix.shape
+    dtype = matrix.dtype
+    radius = jnp.maximum(radius, jnp.finfo(dtype).eps)
+    return Quadrics(
+        matrix=matrix.reshape(-1, size),
+        offset=offset.ravel(),
+        curvature=jnp.repeat(1.0 / radius, width),
+        slope=jnp.zeros(n_balls * width, dtype),
+        level=-0.5 * radius,
+        groups=jnp.asarray(np.kron(np.eye(n_balls), np.ones(width)), dtype),
+    )
+
+
+def joined(parts: Sequence[Quadrics]) -> Quadrics:
+    """The functions of several, one after the other."""
+    return Quadrics(
+        matrix=jnp.concatenate([part.matrix for part in parts]),
+        offset=jnp.concatenate([part.offset for part in parts]),
+        curvature=jnp.concatenate([part.curvature for part in parts]),
+        slope=jnp.concatenate([part.slope for part in parts]),
+        level=jnp.concatenate([part.level for part in parts]),
+        groups=jax.scipy.linalg.block_diag(*[part.groups for part in parts]),
+    )

@@ -1,0 +1,91 @@
+"""How a bounded solve ended, what it cost and where."""
+
+from __future__ import annotations
+
+import dataclasses
+import enum
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from cablejax.bounded.certificate import Certificate, certify
+from cablejax.bounded.sets import AbstractSet
+
+
+class Result(enum.IntEnum):
+    """How a solve ended. Inside compiled code it is an int32."""
+
+    CONVERGED = 0
+    """The projected gradient is within the tolerance."""
+    STEP_LIMIT = 1
+    """The steps were used up."""
+    NONFINITE = 2
+    """The function or its derivatives gave NaN or infinity where the solve could not go round."""
+    EMPTY_SET = 3
+    """The bounds contradict each other: there is no feasible point."""
+    STALLED = 4
+    """No step improves the function by more than rounding, though the projected gradient is above the tolerance."""
+
+    @property
+    def message(self) -> str:
+        """The result as a sentence that says what to do."""
+        return _MESSAGES[self]
+
+
+_MESSAGES = {
+    Result.CONVERGED: "Converged: the projected gradient is within the tolerance.",
+    Result.STEP_LIMIT: "The steps were used up, the projected gradient is still above the tolerance: raise max_steps.",
+    Result.NONFINITE: "The function or its derivatives are NaN or infinite: check it at `solution.value`.",
+    Result.EMPTY_SET: "The bounds contradict each other: there is no feasible point.",
+    Result.STALLED: "No step improves the function by more than rounding: use float64, or a greater tolerance.",
+}
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Stats:
+    """What a solve cost; every field has shape [].
+
+    Attributes:
+        iterations: trial points.
+        evaluations: of the function alone.
+        linearisations: gradients or Jacobians.
+        projections: nearest points and quadratic programs.
+    """
+
+    iterations: Int[Array, "*batch"]
+    evaluations: Int[Array, "*batch"]
+    linearisations: Int[Array, "*batch"]
+    projections: Int[Array, "*batch"]
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Solution:
+    """What `minimise` and `least_squares` return.
+
+    Attributes:
+        value: the best feasible point found.
+        objective: the function there, for least squares half the sum of squares, shape [].
+        result: a `Result`, shape [].
+        stats: what it cost.
+        optimality: largest element of `P(y - g) - y` at the last point whose gradient was taken, shape [].
+    """
+
+    value: Float[Array, "*shape"]
+    objective: Float[Array, "*batch"]
+    result: Int[Array, "*batch"]
+    stats: Stats
+    optimality: Float[Array, "*batch"]
+
+    def certificate(self, fn: Callable[[Array, Any], Array], feasible: AbstractSet, args: Any = None) -> Certificate:
+        """The first-order conditions at `value`, from the gradient of `fn` there; of residuals, half their squares'."""
+
+        def objective(y):
+            out = fn(y, args)
+            return out if out.ndim == 0 else 0.5 * jnp.sum(out**2)
+
+        return certify(jax.grad(objective)(self.value), feasible, self.value)

@@ -1,0 +1,129 @@
+"""The two ways in: minimise a function, or a sum of squares, over a feasible set."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import jax.numpy as jnp
+import optimistix as optx
+from jax.core import Tracer
+from jaxtyping import Array
+
+from cablejax.bounded.implicit import FixedPointAdjoint
+from cablejax.bounded.results import Result, Solution, Stats
+from cablejax.bounded.sets import AbstractSet
+
+
+def minimise(
+    fn: Callable[[Array, Any], Array],
+    solver: optx.AbstractMinimiser,
+    y0: Array,
+    feasible: AbstractSet,
+    args: Any = None,
+    *,
+    max_steps: int = 1000,
+    throw: bool = True,
+) -> Solution:
+    """Minimises `fn(y, args)`, a scalar, over the y in a set.
+
+    Args:
+        fn: the function.
+        solver: `SpectralProjectedGradient(...)`.
+        y0: where to start; projected onto the set first.
+        feasible: the set.
+        args: what else the function depends on.
+        max_steps: trial points at most.
+        throw: whether to raise outside compiled code; within, the result code is all there is.
+
+    Returns:
+        The solution, differentiable in `args` and the set where it has converged, see `FixedPointAdjoint`.
+
+    Raises:
+        ValueError: the set is empty.
+        RuntimeError: the solve ended in another way than convergence.
+    """
+    start = feasible.project(jnp.asarray(y0))
+    out = optx.minimise(
+        fn, solver, start, args, {"feasible": feasible}, max_steps=max_steps, adjoint=FixedPointAdjoint(), throw=False
+    )
+    return _finish(out, out.stats["objective"], feasible, start, throw)
+
+
+def least_squares(
+    residual_fn: Callable[[Array, Any], Array],
+    solver: optx.AbstractLeastSquaresSolver | optx.AbstractMinimiser,
+    y0: Array,
+    feasible: AbstractSet,
+    args: Any = None,
+    *,
+    linearise: Callable[[Array, Any], tuple[Array, Array]] | None = None,
+    max_steps: int = 200,
+    throw: bool = True,
+) -> Solution:
+    """Minimises half the sum of squares of `residual_fn(y, args)`, a flat array, over the y in a set.
+
+    Args:
+        residual_fn: the residuals.
+        solver: `BoundedLevenbergMarquardt(...)`, `BoundedDogleg(...)`, `BoundedGaussNewton(...)`, or a solver for
+            `minimise`, which is given half the sum of squares.
+        y0: where to start; projected onto the set first.
+        feasible: the set.
+        args: what else the residuals depend on.
+        linearise: residuals and Jacobian [M, P], if there is a cheaper way than `jax.jacfwd`.
+        max_steps: trial points at most.
+        throw: whether to raise outside compiled code; within, the result code is all there is.
+
+    Returns:
+        The solution, differentiable in `args` and the set where it has converged, see `FixedPointAdjoint`.
+
+    Raises:
+        ValueError: the set is empty.
+        RuntimeError: the solve ended in another way than convergence.
+    """
+    if isinstance(solver, optx.AbstractMinimiser):
+
+        def half_squares(y, args):
+            return 0.5 * jnp.sum(residual_fn(y, args) ** 2)
+
+        return minimise(half_squares, solver, y0, feasible, args, max_steps=max_steps, throw=throw)
+    start = feasible.project(jnp.asarray(y0))
+    options = {"feasible": feasible, "linearise": linearise}
+    out = optx.least_squares(
+        residual_fn, solver, start, args, options, max_steps=max_steps, adjoint=FixedPointAdjoint(), throw=False
+    )
+    objective = 0.5 * jnp.sum(residual_fn(out.value, args) ** 2)
+    return _finish(out, objective, feasible, start, throw)
+
+
+def _finish(out: optx.Solution, objective: Array, feasible: AbstractSet, start: Array, throw: bool) -> Solution:
+    known = (
+        (optx.RESULTS.successful, Result.CONVERGED),
+        (optx.RESULTS.nonfinite, Result.NONFINITE),
+        (optx.RESULTS.stagnation, Result.STALLED),
+    )
+    code = jnp.asarray(Result.STEP_LIMIT, jnp.int32)
+    for theirs, ours in known:
+        code = jnp.where(out.result == theirs, ours, code)
+    rounding = jnp.finfo(start.dtype).eps ** 0.5 * (1.0 + jnp.abs(start).max())
+    empty = feasible.empty() | ~(feasible.violation(start) <= rounding)
+    code = jnp.where(empty, Result.EMPTY_SET, code).astype(jnp.int32)
+    solution = Solution(
+        value=out.value,
+        objective=objective,
+        result=code,
+        stats=Stats(
+            iterations=jnp.asarray(out.stats["num_steps"], jnp.int32),
+            evaluations=out.stats["evaluations"],
+            linearisations=out.stats["linearisations"],
+            projections=out.stats["projections"],
+        ),
+        optimality=out.stats["optimality"],
+    )
+    if throw and not isinstance(code, Tracer):
+        result = Result(int(code))
+        if result is Result.EMPTY_SET:
+            raise ValueError(result.message)
+        if result is not Result.CONVERGED:
+            raise RuntimeError(f"{result.message} (objective {float(objective):.6g})")
+    return solution

@@ -1,0 +1,195 @@
+"""Spectral projected gradient descent (Birgin, Martinez, Raydan, SIAM J. Optim. 10, 2000)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import optimistix as optx
+from jaxtyping import Array, Bool, Float, Int, PyTree, Scalar
+
+from cablejax.bounded.sets import ConvexSet
+
+
+class _ArcState(eqx.Module):
+    feasible: Any
+    y: Array
+    grad: Array
+    length: Scalar
+    first: Bool[Array, ""]
+    optimality: Scalar
+
+
+class ProjectionArc(optx.AbstractDescent):
+    """`step(s) = P(y - s a g) - y`, where a is the Barzilai-Borwein length `s's / s'y` of the last accepted step.
+
+    Attributes:
+        feasible: the convex set that P projects onto; None until a solver has put in that of its options.
+        initial_length: a before the first curvature is known.
+        shortest: least a.
+        longest: greatest a.
+    """
+
+    feasible: ConvexSet | None
+    initial_length: float
+    shortest: float = 1e-10
+    longest: float = 1e10
+
+    def init(self, y, f_info_struct):
+        del f_info_struct
+        inf = jnp.asarray(jnp.inf, y.dtype)
+        start = jnp.asarray(self.initial_length, y.dtype)
+        return _ArcState(self.feasible, y, jnp.zeros_like(y), start, jnp.array(True), inf)
+
+    def query(self, y, f_info, state):
+        moved, bent = y - state.y, f_info.grad - state.grad
+        curvature = jnp.sum(moved * bent)
+        curved = curvature > 0
+        spectral = jnp.sum(moved**2) / jnp.where(curved, curvature, 1.0)
+        # Along a direction of no or negative curvature the model gives no length: try a longer one than before.
+        length = jnp.clip(jnp.where(curved, spectral, 4.0 * state.length), self.shortest, self.longest)
+        length = jnp.where(state.first, state.length, length)
+        feasible = _set(self.feasible)
+        optimality = jnp.abs(feasible.project(y - f_info.grad) - y).max()
+        return _ArcState(feasible, y, f_info.grad, length, jnp.array(False), optimality)
+
+    def step(self, step_size, state):
+        target = state.y - step_size * state.length * state.grad
+        return state.feasible.project(target) - state.y, optx.RESULTS.successful
+
+
+def _set(feasible: ConvexSet | None) -> ConvexSet:
+    if feasible is None:
+        raise ValueError('There is no feasible set: give one as options={"feasible": ...}.')
+    return feasible
+
+
+class _MemoryState(eqx.Module):
+    step_size: Scalar
+    values: Float[Array, " M"]
+    shrunk: Int[Array, ""]
+
+
+class NonmonotoneArmijo(optx.AbstractSearch):
+    """Backtracking until `f(y + d) <= max of the last M accepted values + slope g'd`, up to rounding.
+
+    Grippo, Lampariello, Lucidi, SIAM J. Numer. Anal. 23, 1986.
+
+    Attributes:
+        memory: M; 1 makes every accepted step a descent.
+        slope: share of the linear decrease that is asked for.
+        shrink: ratio of a step size and the one tried before.
+    """
+
+    memory: int = eqx.field(static=True)
+    slope: float = 1e-4
+    shrink: float = 0.3
+
+    def init(self, y, f_info_struct):
+        values = jnp.full(self.memory, -jnp.inf, f_info_struct.f.dtype)
+        return _MemoryState(jnp.ones((), y.dtype), values, jnp.zeros((), jnp.int32))
+
+    def step(self, first_step, y, y_eval, f_info, f_eval_info, state):
+        predicted = f_info.compute_grad_dot(y_eval - y)
+        value = f_eval_info.as_min()
+        reference = state.values.max()
+        rounding = 4 * jnp.finfo(value.dtype).eps * jnp.abs(reference)
+        sufficient = value <= reference + self.slope * predicted + rounding
+        accept = first_step | (sufficient & (predicted <= rounding))
+        values = jnp.where(accept, jnp.roll(state.values, 1).at[0].set(value), state.values)
+        step_size = jnp.where(accept, 1.0, self.shrink * state.step_size).astype(state.step_size.dtype)
+        shrunk = jnp.where(accept, 0, state.shrunk + 1)
+        return step_size, accept, optx.RESULTS.successful, _MemoryState(step_size, values, shrunk)
+
+
+class _SpectralState(eqx.Module):
+    inner: Any
+    best: Array
+    best_value: Scalar
+    linearisations: Int[Array, ""]
+    steps: Int[Array, ""]
+
+
+class SpectralProjectedGradient(optx.AbstractGradientDescent):
+    """Minimiser over a feasible set: gradient steps of Barzilai-Borwein length along the projection arc.
+
+    It ends where `|P(y - g) - y|_inf <= atol + rtol |y|_inf`. Every trial point costs one evaluation of the function,
+    every accepted one its gradient. All points are feasible if the first is; the best one is returned.
+
+    Options: `feasible`, the set.
+    """
+
+    rtol: float
+    atol: float
+    norm: Callable[[PyTree], Scalar]
+    descent: ProjectionArc
+    search: NonmonotoneArmijo
+
+    def __init__(
+        self,
+        rtol: float = 0.0,
+        atol: float = 1e-8,
+        memory: int = 10,
+        initial_length: float = 1.0,
+        lengths: tuple[float, float] = (1e-10, 1e10),
+    ):
+        """**Arguments:**
+
+        - `rtol`: relative tolerance on the projected gradient.
+        - `atol`: absolute tolerance on it.
+        - `memory`: a trial is compared with the worst of so many last accepted values.
+        - `initial_length`: length of the first step, relative to the gradient.
+        - `lengths`: least and greatest length of a step, relative to the gradient.
+        """
+        self.descent = ProjectionArc(None, initial_length, *lengths)
+        self.search = NonmonotoneArmijo(memory)
+        self.rtol, self.atol, self.norm = rtol, atol, optx.max_norm
+
+    def within(self, feasible: ConvexSet) -> SpectralProjectedGradient:
+        """The same solver on a convex set."""
+        return eqx.tree_at(lambda s: s.descent.feasible, self, feasible, is_leaf=lambda x: x is None)
+
+    def init(self, fn, y, args, options, f_struct, aux_struct, tags):
+        solver = self.within(options["feasible"].at(y))
+        inner = super(SpectralProjectedGradient, solver).init(fn, y, args, options, f_struct, aux_struct, tags)
+        zero, inf = jnp.zeros((), jnp.int32), jnp.asarray(jnp.inf, f_struct.dtype)
+        return _SpectralState(inner, y, inf, zero, zero)
+
+    def step(self, fn, y, args, options, state: Any, tags):
+        solver = self.within(options["feasible"].at(state.inner.y_eval))
+        y, inner, aux = super(SpectralProjectedGradient, solver).step(fn, y, args, options, state.inner, tags)
+        accepted = inner.search_state.shrunk == 0
+        better = inner.f_info.f < state.best_value
+        state = _SpectralState(
+            inner=inner,
+            best=jnp.where(better, y, state.best),
+            best_value=jnp.where(better, inner.f_info.f, state.best_value),
+            linearisations=state.linearisations + accepted,
+            steps=state.steps + 1,
+        )
+        return y, state, aux
+
+    def terminate(self, fn, y, args, options, state: Any, tags) -> tuple[Bool[Array, ""], optx.RESULTS]:
+        del fn, args, options, tags
+        inner = state.inner
+        started = ~inner.first_step
+        optimality = inner.descent_state.optimality
+        broken = started & ~(jnp.isfinite(inner.f_info.f) & jnp.isfinite(optimality))
+        done = started & (optimality <= self.atol + self.rtol * self.norm(inner.descent_state.y))
+        stalled = inner.search_state.step_size < jnp.finfo(y.dtype).eps
+        result = optx.RESULTS.where(broken, optx.RESULTS.nonfinite, inner.result)
+        result = optx.RESULTS.where(stalled & ~done, optx.RESULTS.stagnation, result)  # pyright: ignore[reportArgumentType]
+        return done | broken | stalled, result
+
+    def postprocess(self, fn, y, aux, args, options, state: Any, tags, result) -> tuple[Any, Any, dict[str, Any]]:
+        del fn, y, args, options, tags, result
+        stats = {
+            "optimality": state.inner.descent_state.optimality,
+            "objective": state.best_value,
+            "evaluations": state.steps,
+            "linearisations": state.linearisations,
+            "projections": state.steps + state.linearisations,
+        }
+        return state.best, aux, stats

@@ -1,0 +1,52 @@
+"""What planning by sampling needs: plans drawn, made feasible and valued."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from cablejax.mpc.plan import Outcome, Plan
+from cablejax.mpc.problem import ShapingProblem
+
+
+class Valued(NamedTuple):
+    """Plans and their values.
+
+    Attributes:
+        motion: [m], shape [S, T, Q, 3].
+        value: infinite where the model gives NaN, shape [S].
+    """
+
+    motion: Float[Array, "*S T Q 3"]
+    value: Float[Array, "*S"]
+
+
+def first_plan(problem: ShapingProblem, motion: Float[Array, "T Q 3"]) -> Valued:
+    """A plan made feasible, and its value."""
+    motion = problem.feasible.project(motion)
+    value = problem.value(motion)
+    return Valued(motion, jnp.where(jnp.isfinite(value), value, jnp.inf))
+
+
+def drawn_plans(problem: ShapingProblem, key: Array, mean: Array, deviation: Array, samples: int) -> Valued:
+    """Feasible plans from a normal distribution, and their values."""
+    noise = jax.random.normal(key, (samples, *mean.shape), mean.dtype)
+    # Step by step is near enough for samples, and much cheaper than the nearest plan; but it knows no bound on changes.
+    inside = problem.feasible.restore if problem.feasible.change is None else problem.feasible.project
+    motion = jax.vmap(inside)(mean + deviation * noise)
+    value = jax.vmap(problem.value)(motion)
+    return Valued(motion, jnp.where(jnp.isfinite(value), value, jnp.inf))
+
+
+def better_plan(best: Valued, drawn: Valued, index: Array) -> Valued:
+    """The better one of a plan and one of those drawn."""
+    return jax.tree.map(lambda old, new: jnp.where(drawn.value[index] < best.value, new[index], old), best, drawn)
+
+
+def sampled_plan(best: Valued, evaluations: int) -> Plan:
+    """The best plan as a solver returns it."""
+    outcome = jnp.where(jnp.isfinite(best.value), Outcome.STEP_LIMIT, Outcome.NONFINITE)
+    return Plan(best.motion, jnp.asarray(evaluations, jnp.int32), outcome.astype(jnp.int32))

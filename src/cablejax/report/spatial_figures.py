@@ -1,0 +1,149 @@
+"""Figures of a diagnosis in space: a view that can be turned, and what is left in which file."""
+
+from __future__ import annotations
+
+import html
+import importlib.resources
+import json
+from typing import Any
+
+import matplotlib
+import numpy as np
+from matplotlib.figure import Figure
+
+from cablejax.diagnose.diagnosis import Diagnosis
+from cablejax.report.diagnosis_style import STYLE, explained_label
+from cablejax.report.style import LIGHT
+
+_FRAME = 0.04  # [s] between two pictures of the player
+_SHOWN = 4
+
+
+def error_per_file(diagnosis: Diagnosis, predicted: np.ndarray) -> np.ndarray:
+    """Root mean square error of each keypoint in each episode [mm], shape [E, N]; NaN where nothing was predicted."""
+    squared = np.minimum(np.abs(np.asarray(diagnosis.log.keypoints, float) - predicted), 1.0) ** 2
+    count = np.isfinite(squared).sum(axis=(1, 3))
+    return 1e3 * np.sqrt(np.where(count > 0, np.nansum(squared, axis=(1, 3)) / np.maximum(count, 1), np.nan))
+
+
+def _names(diagnosis: Diagnosis) -> list[str]:
+    meta = diagnosis.log.meta
+    return [str(n) for n in meta.get("file", meta.get("take", range(len(diagnosis.log.episode_length))))]
+
+
+def files_figure(diagnosis: Diagnosis) -> Figure:
+    """The error of every keypoint in every file, before and after."""
+    parts = [("simulator as believed", diagnosis.nominal)]
+    if diagnosis.explained is not None and diagnosis.effects:
+        parts.append((explained_label(diagnosis), diagnosis.explained))
+    with matplotlib.rc_context(STYLE):
+        figure = Figure(figsize=(11.0, 2.4 * len(parts) + 0.8), layout="constrained")
+        panels = np.atleast_1d(figure.subplots(len(parts), 1, sharex=True))
+        maps = [error_per_file(diagnosis, predicted) for _, predicted in parts]
+        used = np.flatnonzero(np.isfinite(maps[0]).any(axis=1))
+        top = float(np.nanpercentile(maps[0], 95))
+        names = _names(diagnosis)
+        image = None
+        for ax, (label, _), error in zip(panels, parts, maps, strict=True):
+            image = ax.imshow(error[used].T, aspect="auto", origin="lower", cmap="cividis", vmin=0, vmax=top)
+            ax.set_title(f"Error, {label}")
+            ax.set_ylabel("keypoint")
+        every = max(1, len(used) // 20)
+        panels[-1].set_xticks(range(0, len(used), every), [names[e] for e in used[::every]])
+        panels[-1].set_xlabel("file")
+        assert image is not None
+        figure.colorbar(image, ax=list(panels), label="mm, root mean square", shrink=0.8)
+    return figure
+
+
+def cable_still(diagnosis: Diagnosis) -> Figure:
+    """The moment of the largest gap, from the front and from the side."""
+    e, t = _worst(diagnosis)
+    points = {"observed": np.asarray(diagnosis.log.keypoints[e, t], float), "nominal": diagnosis.nominal[e, t]}
+    if diagnosis.explained is not None and diagnosis.effects:
+        points["explained"] = diagnosis.explained[e, t]
+    look = {
+        "nominal": {"color": LIGHT.direct, "ls": "--", "label": "simulator as believed"},
+        "explained": {"color": LIGHT.residual, "lw": 2.5, "label": explained_label(diagnosis)},
+        "observed": {"color": LIGHT.ink, "ls": "", "marker": "o", "ms": 5, "label": "recorded"},
+    }
+    with matplotlib.rc_context(STYLE):
+        figure = Figure(figsize=(11.0, 4.4), layout="constrained")
+        axes = figure.subplots(1, 2, sharey=True)
+        for ax, axis, name in zip(axes, (0, 1), "xy", strict=True):
+            for key in ("nominal", "explained", "observed"):
+                if key in points:
+                    ax.plot(points[key][:, axis], points[key][:, 2], **look[key])
+            ax.set_aspect("equal")
+            ax.set_xlabel(f"{name} [m]")
+        axes[0].set_ylabel("z [m]")
+        axes[0].legend(loc="best")
+    return figure
+
+
+def orbit(diagnosis: Diagnosis) -> str:
+    """The player as HTML: a canvas, its controls, the data and the script; nothing is fetched."""
+    script = (importlib.resources.files("cablejax.report") / "orbit.js").read_text(encoding="utf-8")
+    data = json.dumps(orbit_data(diagnosis), separators=(",", ":")).replace("</", "<\\/")
+    explained = ""
+    if diagnosis.explained is not None and diagnosis.effects:
+        label = html.escape(explained_label(diagnosis))
+        explained = f'<span><i class="key" style="border-color: var(--residual)"></i>{label}</span>'
+    dot = '<i class="key" style="border: 0; height: auto; width: auto">&#9679;</i>'
+    dashes = '<i class="key" style="border-top-style: dashed; border-color: var(--direct)"></i>'
+    return f"""<div class="player" id="orbit-player" hidden>
+<canvas id="orbit" style="display: block; width: 100%; touch-action: none; cursor: grab" role="img"
+ aria-label="The recorded cable and the simulated ones in space"></canvas>
+<p class="reading"><span>{dot} recorded</span>
+<span>{dashes}simulator as believed</span>
+{explained}</p>
+<div class="controls"><button id="orbit-play" type="button">Play</button>
+<input type="range" id="orbit-time" min="0" step="0.02" value="0" aria-label="time">
+<output id="orbit-clock"></output>
+<label>file <select id="orbit-window"></select></label></div>
+</div>
+<script type="application/json" id="cables">{data}</script>
+<script>{script}</script>"""
+
+
+def orbit_data(diagnosis: Diagnosis) -> dict[str, Any]:
+    """What the player draws: the files with the largest, the smallest and middling gaps, in whole millimetres."""
+    log, names = diagnosis.log, _names(diagnosis)
+    size = np.asarray(diagnosis.where.per_episode_mm, float)
+    used = np.flatnonzero(np.isfinite(size))
+    order = used[np.argsort(-size[used])]
+    chosen = list(dict.fromkeys(order[np.linspace(0, len(order) - 1, _SHOWN).round().astype(int)].tolist()))
+    interval = float(np.median(np.diff(log.time[0, : log.episode_length[0]])))
+    every = max(1, round(_FRAME / interval))
+
+    def whole(points):
+        rows = np.round(1e3 * np.clip(np.nan_to_num(points, nan=9.0), -9.0, 9.0)).astype(int)
+        return [
+            [row.tolist() if np.isfinite(p).all() else None for row, p in zip(frame, points[k], strict=True)]
+            for k, frame in enumerate(rows)
+        ]
+
+    windows = []
+    for e in chosen:
+        count = int(min(log.episode_length[e], round(5.0 / interval)))
+        samples = slice(0, count, every)
+        observed = np.asarray(log.keypoints[e, samples], float)
+        entry: dict[str, Any] = {
+            "name": f"{names[e]} ({size[e]:.0f} mm)",
+            "observed": whole(observed),
+            "nominal": whole(diagnosis.nominal[e, samples]),
+            "middle": np.nanmean(observed, axis=(0, 1)).round(4).tolist(),
+            "reach": float(np.nanmax(np.ptp(observed.reshape(-1, 3), axis=0))),
+            "floor": round(1e3 * float(np.nanmin(observed[..., 2])) - 50),
+        }
+        if diagnosis.explained is not None and diagnosis.effects:
+            entry["explained"] = whole(diagnosis.explained[e, samples])
+        windows.append(entry)
+    return {"interval": every * interval, "windows": windows}
+
+
+def _worst(diagnosis: Diagnosis) -> tuple[int, int]:
+    off = np.minimum(np.abs(np.asarray(diagnosis.log.keypoints, float) - diagnosis.nominal), 0.3)
+    size = np.where(np.isfinite(off), off, 0.0).sum(axis=(2, 3))
+    e, t = divmod(int(size.argmax()), size.shape[1])
+    return e, t

@@ -1,0 +1,109 @@
+"""Local changes of the set-up between recordings: markers or grips that sit elsewhere than in the other files.
+
+The distance between neighbouring keypoints is read at its largest over an episode, where the cable between them is
+straightest; between two keypoints of one gripper it does not change at all. An episode stands out where this distance
+differs from the median over episodes by far more than episodes scatter.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float
+
+from cablejax.types import GapLog
+
+_SCATTERS = 6.0
+_SMALLEST = 0.002  # [m]
+# Differences of free neighbours move with bending; they need to be larger.
+_SMALLEST_FREE = 0.006  # [m]
+_QUANTILE = 0.9
+
+
+@dataclasses.dataclass(frozen=True)
+class LocalChange:
+    """One pair of neighbouring keypoints that is further apart or closer in some episodes than in the others.
+
+    Attributes:
+        pair: the two keypoints.
+        arclength: nominal places of the two [m].
+        episodes: in which.
+        files: names of those episodes.
+        usual, here: distance in the other episodes and in these [m].
+        gripper: that holds both, None = a free part of the cable.
+    """
+
+    pair: tuple[int, int]
+    arclength: tuple[float, float]
+    episodes: tuple[int, ...]
+    files: tuple[str, ...]
+    usual: float
+    here: float
+    gripper: int | None
+
+    @property
+    def sentence(self) -> str:
+        where = f"at gripper {self.gripper}" if self.gripper is not None else "on the free cable"
+        files = f"file{'' if len(self.files) == 1 else 's'} {_ranges(self.files)}"
+        return (
+            f"In {files}, keypoints {self.pair[0]} and {self.pair[1]} {where} ({self.arclength[0]:.2f} to "
+            f"{self.arclength[1]:.2f} m) are {1e3 * self.here:.1f} mm apart instead of {1e3 * self.usual:.1f} mm: "
+            f"{'it was gripped anew' if self.gripper is not None else 'a marker or the cable between has moved'}."
+        )
+
+
+def local_changes(log: GapLog, held: tuple[int, int]) -> tuple[LocalChange, ...]:
+    """Finds where the geometry of some episodes differs, the largest change first."""
+    points = log.keypoints.shape[2]
+    grippers = [0 if k + 1 < held[0] else 1 if k >= points - held[1] else None for k in range(points - 1)]
+    spacing = pair_distances(log, [gripper is not None for gripper in grippers])
+    arclength = np.asarray(log.meta["keypoint_arclength_m"], float)
+    names = log.meta.get("file", log.meta.get("take", list(range(len(spacing)))))
+    found = []
+    for k in range(points - 1):
+        gripper = grippers[k]
+        column = spacing[:, k]
+        usual = np.nanmedian(column)
+        scatter = 1.4826 * np.nanmedian(np.abs(column - usual))
+        least = _SMALLEST if gripper is not None else _SMALLEST_FREE
+        odd = np.flatnonzero(np.abs(column - usual) > max(_SCATTERS * scatter, least))
+        for sign in (-1, 1):
+            part = odd[np.sign(column[odd] - usual) == sign]
+            if len(part):
+                found.append(
+                    LocalChange(
+                        pair=(k, k + 1),
+                        arclength=(float(arclength[k]), float(arclength[k + 1])),
+                        episodes=tuple(int(e) for e in part),
+                        files=tuple(dict.fromkeys(str(names[e]) for e in part)),
+                        usual=float(usual),
+                        here=float(np.median(column[part])),
+                        gripper=gripper,
+                    )
+                )
+    return tuple(sorted(found, key=lambda change: -abs(change.here - change.usual)))
+
+
+def pair_distances(log: GapLog, rigid: Sequence[bool]) -> Float[np.ndarray, "E M"]:
+    """Distance of neighbouring keypoints in every episode [m]: the median where `rigid`, else nearly the largest."""
+    rows = []
+    for points, count in zip(log.keypoints, log.episode_length, strict=True):
+        distance = np.linalg.norm(np.diff(np.asarray(points[:count], float), axis=1), axis=-1)
+        rows.append(np.where(rigid, np.nanmedian(distance, axis=0), np.nanquantile(distance, _QUANTILE, axis=0)))
+    return np.array(rows)
+
+
+def _ranges(files):
+    """ "102 to 106, 111"."""
+    if not all(name.isdecimal() for name in files):
+        return ", ".join(files)
+    numbers = sorted(int(name) for name in files)
+    runs = [[numbers[0], numbers[0]]]
+    for number in numbers[1:]:
+        if number == runs[-1][1] + 1:
+            runs[-1][1] = number
+        else:
+            runs.append([number, number])
+    return ", ".join(str(first) if first == last else f"{first} to {last}" for first, last in runs)

@@ -1,0 +1,164 @@
+"""A gap log in space as windows of equal length, ready for the simulator."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from cablejax.spatial.rod import frames_along
+from cablejax.types import GapLog
+
+WINDOW = 5.0
+"""Length of a window [s]: so far ahead the simulator predicts from two observations."""
+_SHORTEST = 1.0
+# A keypoint whose place in the gripper's frame stays within this is held by it [m].
+_HELD = 0.003
+
+
+@dataclasses.dataclass(frozen=True)
+class Windows:
+    """Windows of one cable. F free markers of N lie between the held ones.
+
+    Attributes:
+        keypoints: observed, free ones only [m], NaN = not observed, shape [W, T, F, 3].
+        position: of the two clamps [m], shape [W, T, 2, 3].
+        frames: of the two grippers, rows are axes, shape [W, T, 2, 3, 3].
+        valid: samples that are recorded, shape [W, T].
+        interval: between samples [s].
+        episode: that each window is part of, shape [W].
+        begin: first sample of each in its episode, shape [W].
+        group: recording that each is part of: what is split between fit and check, shape [W].
+        split: "train", "eval" or "" of each window, shape [W].
+        name: of each window's episode, for a reader.
+        held: number of keypoints held at either end.
+        arclength: of the free markers and the second clamp, from the first clamp [m], shape [F + 1].
+        n_keypoints: N.
+    """
+
+    keypoints: Float[np.ndarray, "W T F 3"]
+    position: Float[np.ndarray, "W T 2 3"]
+    frames: Float[np.ndarray, "W T 2 3 3"]
+    valid: Bool[np.ndarray, "W T"]
+    interval: float
+    episode: Int[np.ndarray, "W"]
+    begin: Int[np.ndarray, "W"]
+    group: Int[np.ndarray, "W"]
+    split: tuple[str, ...]
+    name: tuple[str, ...]
+    held: tuple[int, int]
+    arclength: Float[np.ndarray, "F1"]
+    n_keypoints: int
+
+    def __len__(self) -> int:
+        return len(self.keypoints)
+
+    def chosen(self, index) -> Windows:
+        """Some of the windows."""
+        index = np.asarray(index, int)
+        return dataclasses.replace(
+            self,
+            **{
+                f: getattr(self, f)[index]
+                for f in ("keypoints", "position", "frames", "valid", "episode", "begin", "group")
+            },
+            **{f: tuple(getattr(self, f)[i] for i in index) for f in ("split", "name")},
+        )
+
+
+def windows_of(log: GapLog, *, length: float = WINDOW) -> Windows:
+    """Cuts every episode into windows.
+
+    Raises:
+        ValueError: a log in the plane, of unequal sample intervals, or one that has no window of a second.
+    """
+    if log.keypoints.shape[-1] != 3:
+        raise ValueError(f"The log has keypoints in {log.keypoints.shape[-1]} dimensions, expected 3.")
+    if log.meta["table"] is not None:
+        raise ValueError("The log has a table; a cable in space is expected to hang free (`table` null).")
+    intervals = np.concatenate([np.diff(t[:n]) for t, n in zip(log.time, log.episode_length, strict=True)])
+    interval = float(np.median(intervals))
+    if np.abs(intervals - interval).max() > 0.05 * interval:
+        raise ValueError(
+            f"Samples are {intervals.min():.4g} to {intervals.max():.4g} s apart, expected one interval: resample."
+        )
+    samples = min(round(length / interval), int(log.episode_length.max()))
+    points = np.asarray(log.keypoints, float)
+    pose = np.asarray(log.gripper_pose, float)
+    valid = np.arange(points.shape[1]) < log.episode_length[:, None]
+    tangent = _first_axis(pose[..., 3:])
+    held = _held(points, pose[..., :3], tangent, valid)
+    s = np.asarray(log.meta["keypoint_arclength_m"], float)
+    reach = np.array([s[held[0] - 1] - s[0] if held[0] else 0.0, s[-1] - s[len(s) - held[1]] if held[1] else 0.0])
+    # the second gripper's tangent points along the cable too: towards its end
+    clamp = pose[..., :3] + np.array([1.0, -1.0])[:, None] * reach[:, None] * tangent
+    # the innermost held keypoint is where the cable leaves the gripper: it is observed, so it is what moves the clamp
+    for q, k in enumerate((held[0] - 1, len(s) - held[1])):
+        if held[q]:
+            clamp[:, :, q] = np.where(np.isfinite(points[:, :, k]), points[:, :, k], clamp[:, :, q])
+    first = s[held[0] - 1] if held[0] else s[0]
+    last = s[len(s) - held[1]] if held[1] else s[-1]
+    free = slice(held[0], len(s) - held[1])
+    flat = tangent[valid]
+    frames = np.zeros((*tangent.shape[:3], 3, 3))
+    for q in range(2):
+        frames[valid, q] = frames_along(flat[:, q])
+
+    meta = log.meta
+    recording = meta.get("recording", list(range(len(points))))
+    groups = {r: i for i, r in enumerate(dict.fromkeys(recording))}
+    files = meta.get("file", meta.get("take", [str(e) for e in range(len(points))]))
+    pieces = []
+    for e, count in enumerate(log.episode_length):
+        for begin in range(0, int(count), samples):
+            size = min(samples, int(count) - begin)
+            if size * interval >= _SHORTEST and np.isfinite(points[e, begin : begin + 2, free]).all():
+                pieces.append((e, begin, size))
+    if not pieces:
+        raise ValueError(f"No episode has {_SHORTEST:g} s that begin with two samples of all keypoints.")
+
+    def cut(array):
+        rows = []
+        for e, begin, size in pieces:
+            row = array[e, begin : begin + size]
+            rows.append(np.concatenate([row, np.repeat(row[-1:], samples - size, axis=0)]))
+        return np.stack(rows)
+
+    mask = np.stack([np.arange(samples) < size for _, _, size in pieces])
+    return Windows(
+        keypoints=cut(points[:, :, free]),
+        position=cut(clamp),
+        frames=cut(frames),
+        valid=mask,
+        interval=interval,
+        episode=np.array([e for e, _, _ in pieces]),
+        begin=np.array([begin for _, begin, _ in pieces]),
+        group=np.array([groups[recording[e]] for e, _, _ in pieces]),
+        split=tuple(str(meta.get("split", [""] * len(points))[e]) for e, _, _ in pieces),
+        name=tuple(str(files[e]) for e, _, _ in pieces),
+        held=held,
+        arclength=np.append(s[free], last) - first,
+        n_keypoints=len(s),
+    )
+
+
+def _first_axis(quaternion):
+    w, x, y, z = np.moveaxis(quaternion, -1, 0)
+    return np.stack([1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)], axis=-1)
+
+
+def _held(points, position, tangent, valid):
+    """How many keypoints of either end move with the gripper."""
+    count = []
+    for q, order in enumerate((range(points.shape[2]), range(points.shape[2] - 1, -1, -1))):
+        n = 0
+        for k in order:
+            offset = (points[:, :, k] - position[:, :, q])[valid]
+            along = np.sum(offset * tangent[:, :, q][valid], axis=-1)
+            across = np.linalg.norm(offset - along[:, None] * tangent[:, :, q][valid], axis=-1)
+            if np.nanpercentile(across, 95) > _HELD:
+                break
+            n += 1
+        count.append(n)
+    return tuple(count)

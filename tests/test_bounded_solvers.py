@@ -1,0 +1,200 @@
+"""The bounded solvers on problems with known minima, their result codes, certificates and derivatives."""
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from cablejax.bounded import (
+    Balls,
+    BoundedDogleg,
+    BoundedGaussNewton,
+    BoundedLevenbergMarquardt,
+    Box,
+    Halfspaces,
+    Intersection,
+    Result,
+    SpectralProjectedGradient,
+    certify,
+    least_squares,
+    minimise,
+)
+from cablejax.bounded.implicit import with_derivatives
+
+SOLVERS = {
+    "Levenberg-Marquardt": BoundedLevenbergMarquardt(atol=1e-9),
+    "dogleg": BoundedDogleg(atol=1e-9),
+    "Gauss-Newton": BoundedGaussNewton(atol=1e-9),
+    "spectral": SpectralProjectedGradient(atol=1e-9),
+}
+
+
+def rosenbrock(y, args):
+    return jnp.stack([10.0 * (y[1] - y[0] ** 2), args - y[0]])
+
+
+@functools.partial(jax.jit, static_argnums=(0, 1))
+def solve(fn, solver, start, feasible, args):
+    solution = least_squares(fn, SOLVERS[solver], start, feasible, args, max_steps=500)
+    return solution, solution.certificate(fn, feasible, args)
+
+
+# Lower and upper bounds, the minimum, and its value; from the Karush-Kuhn-Tucker conditions by hand.
+BOXES = {
+    "inactive": ([-2.0, -2.0], [2.0, 2.0], [1.0, 1.0], 0.0),
+    "one active": ([-1.5, -1.5], [0.8, 1.5], [0.8, 0.64], 0.02),
+    "start outside": ([1.5, -3.0], [4.0, 3.0], [1.5, 2.25], 0.125),
+    "corner": ([1.5, -3.0], [4.0, 1.0], [1.5, 1.0], 0.5 * (12.5**2 + 0.5**2)),
+    "fixed": ([0.5, -3.0], [0.5, 3.0], [0.5, 0.25], 0.125),
+}
+
+
+@pytest.mark.parametrize("solver", SOLVERS)
+@pytest.mark.parametrize("name", BOXES)
+def test_reaches_the_minimum_of_rosenbrock_in_a_box(solver, name):
+    lower, upper, minimum, value = BOXES[name]
+    with jax.enable_x64(True):
+        feasible = Box(jnp.asarray(lower), jnp.asarray(upper))
+        solution, certificate = solve(rosenbrock, solver, jnp.asarray([-1.2, 1.0]), feasible, jnp.asarray(1.0))
+        assert Result(int(solution.result)) is Result.CONVERGED
+        np.testing.assert_allclose(solution.value, minimum, atol=1e-6)
+        assert float(solution.objective) == pytest.approx(value, abs=1e-9)
+        assert float(feasible.violation(solution.value)) == 0.0
+        assert float(certificate.residual) < 1e-7 and float(certificate.multipliers.min()) >= 0.0
+        assert 0 < int(solution.stats.linearisations) <= int(solution.stats.iterations) <= 500
+
+
+def test_certificate_tells_a_minimum_from_other_points():
+    with jax.enable_x64(True):
+        feasible = Intersection((Balls(jnp.asarray(1.0)), Halfspaces(jnp.asarray([[1.0, 1.0]]), jnp.asarray([0.5]))))
+        # pulled along (1, 0): the ball and the plane meet at a corner with both multipliers positive
+        x = (0.5 + np.sqrt(2 - 0.25)) / 2
+        corner = jnp.asarray([x, 0.5 - x])
+        certificate = certify(jnp.asarray([-2.0, 0.0]), feasible, corner)
+        assert float(certificate.residual) < 1e-12 and float(certificate.smallest_multiplier) > 0.1
+        assert float(certificate.projected_gradient) < 1e-9
+        away = certify(jnp.asarray([0.0, 1.0]), feasible, corner)
+        assert float(away.stationarity) > 0.1 and float(away.projected_gradient) > 0.1
+        outside = certify(jnp.asarray([-2.0, 0.0]), feasible, 1.1 * corner)
+        assert float(outside.feasibility) > 0.01
+
+
+# --- bad input --------------------------------------------------------------------------------------------------------
+
+UNIT = np.array([-1.0, -1.0]), np.array([1.0, 1.0])
+
+
+def ended(fn, solver, start=(0.5, 0.5), bounds=UNIT):
+    feasible = Box(jnp.asarray(bounds[0]), jnp.asarray(bounds[1]))
+    solution = least_squares(fn, SOLVERS[solver], jnp.asarray(start), feasible, max_steps=100, throw=False)
+    return Result(int(solution.result)), np.asarray(solution.value)
+
+
+@pytest.mark.parametrize("solver", ["Levenberg-Marquardt", pytest.param("spectral", marks=pytest.mark.slow)])
+def test_a_function_that_is_not_a_number_ends_the_solve_with_a_feasible_point(solver):
+    with jax.enable_x64(True):
+        result, value = ended(lambda y, _: y * jnp.nan, solver)
+        assert result is Result.NONFINITE
+        np.testing.assert_array_equal(value, [0.5, 0.5])
+        # NaN on the way only: beyond y = 0.2, short of the minimum at 0
+        result, value = ended(lambda y, _: jnp.where(y < 0.2, jnp.nan, y), solver)
+        assert result is not Result.CONVERGED
+        assert np.isfinite(value).all() and (value >= 0.2).all() and (value < 0.5).all()
+
+
+@pytest.mark.parametrize("solver", [s if s == "dogleg" else pytest.param(s, marks=pytest.mark.slow) for s in SOLVERS])
+def test_a_singular_jacobian_does_no_harm(solver):
+    with jax.enable_x64(True):
+        result, value = ended(lambda y, _: jnp.stack([y.sum() - 0.4, 2 * y.sum() - 0.8]), solver)
+        assert result is Result.CONVERGED
+        assert value.sum() == pytest.approx(0.4, abs=1e-8)
+
+
+def test_an_empty_set_is_told_from_a_point_set():
+    with jax.enable_x64(True):
+        for bounds in ((UNIT[1], UNIT[0]), (UNIT[0], UNIT[1] * np.nan)):
+            assert ended(lambda y, _: y, "Levenberg-Marquardt", bounds=bounds)[0] is Result.EMPTY_SET
+        result, value = ended(lambda y, _: y, "Levenberg-Marquardt", bounds=(UNIT[1], UNIT[1]))
+        assert result is Result.CONVERGED
+        np.testing.assert_array_equal(value, UNIT[1])
+        apart = Intersection((Box(*map(jnp.asarray, UNIT)), Halfspaces(jnp.ones((1, 2)), jnp.asarray([-3.0]))))
+        out = least_squares(lambda y, _: y, SOLVERS["dogleg"], jnp.zeros(2), apart, max_steps=5, throw=False)
+        assert Result(int(out.result)) is Result.EMPTY_SET
+
+
+def test_a_zero_radius_holds_the_point():
+    with jax.enable_x64(True):
+        solver, zero = SOLVERS["Levenberg-Marquardt"], Balls(jnp.asarray(0.0))
+        solution = least_squares(lambda y, _: y.ravel() - 1.0, solver, jnp.ones((2, 3)), zero, throw=False)
+        np.testing.assert_allclose(solution.value, 0.0, atol=1e-12)
+        assert Result(int(solution.result)) in (Result.CONVERGED, Result.STALLED)
+
+
+def test_outside_compiled_code_failures_are_raised_with_what_to_do():
+    with jax.enable_x64(True):
+        box = Box(*map(jnp.asarray, UNIT))
+        solver = SOLVERS["spectral"]
+        with pytest.raises(RuntimeError, match="raise max_steps"):
+            minimise(lambda y, _: jnp.sum((y - 0.3) ** 4), solver, jnp.ones(2), box, max_steps=2)
+        with pytest.raises(ValueError, match="no feasible point"):
+            minimise(lambda y, _: jnp.sum(y**2), solver, jnp.ones(2), Box(box.upper, box.lower))
+        assert all(result.message for result in Result)
+
+
+# --- derivatives of the solution --------------------------------------------------------------------------------------
+
+# None active; a ball; a ball and a plane. Where a bound is touched with a zero multiplier there is no derivative.
+REGIMES = {"inactive": 5.0, "ball": 0.5, "ball and plane": 0.5}
+
+
+def curved(y, args):
+    """Residuals that cannot all vanish, so that their own curvature counts."""
+    return jnp.concatenate([jnp.sin(y).ravel() - 1.5 * args[:3], jnp.stack([y.sum() ** 2 - args[3], y[0] * y[1]])])
+
+
+def regime(name, x):
+    members = [Balls(REGIMES[name] * (1.0 + x[4]))]
+    if name == "ball and plane":
+        members.append(Halfspaces(jnp.asarray([[0.0, 0.0, 1.0]]), 0.3 + x[4:5]))
+    return Intersection(tuple(members))
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def minimum_of(name, x):
+    solver = BoundedLevenbergMarquardt(atol=1e-12)
+    return least_squares(curved, solver, jnp.full(3, 0.1), regime(name, x), X0[:4] + x[:4], max_steps=200).value
+
+
+X0 = np.array([0.5, 0.3, 0.6, 0.9, 0.0])
+
+
+@pytest.mark.parametrize(
+    "name", ["ball and plane", *[pytest.param(n, marks=pytest.mark.slow) for n in ("inactive", "ball")]]
+)
+def test_derivatives_of_the_solution_are_those_of_solving_again(name):
+    """Central differences of re-solves in float64; reverse against forward mode."""
+    with jax.enable_x64(True):
+        x, step = jnp.zeros(5), 1e-5
+        minimum = minimum_of(name, x)
+        active = int((regime(name, x).constraints(minimum) > -1e-9).sum())
+        assert active == {"inactive": 0, "ball": 1, "ball and plane": 2}[name]
+        forward = jax.jit(jax.jacfwd(functools.partial(minimum_of, name)))(x)
+        for k in range(5):
+            move = x.at[k].set(step)
+            expected = (minimum_of(name, move) - minimum_of(name, -move)) / (2 * step)
+            np.testing.assert_allclose(forward[:, k], expected, atol=2e-6)
+        backward = jax.jit(jax.jacrev(functools.partial(minimum_of, name)))(x)
+        np.testing.assert_allclose(backward, forward, atol=1e-9)
+        known = jax.jit(jax.jacfwd(lambda x: with_derivatives(minimum, curved, regime(name, x), X0[:4] + x[:4])))(x)
+        np.testing.assert_allclose(known, forward, atol=1e-7)
+
+
+def test_statistics_are_counts():
+    with jax.enable_x64(True):
+        box = Box(*map(jnp.asarray, UNIT))
+        solution = least_squares(rosenbrock, SOLVERS["Gauss-Newton"], jnp.zeros(2), box, 0.5)
+        for field in dataclasses.fields(solution.stats):
+            assert int(getattr(solution.stats, field.name)) > 0

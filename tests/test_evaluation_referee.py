@@ -1,0 +1,156 @@
+"""IPOPT as the referee, on a small analytic cable: it agrees with ours, and its limits are those of the problem."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from cablejax.bounded import BoundedLevenbergMarquardt, SpectralProjectedGradient, certify
+from cablejax.evaluation.planning_problems import (
+    CONFIG,
+    PlanningCase,
+    RecordingSolver,
+    load_cases,
+    other_radii,
+    save_cases,
+)
+from cablejax.evaluation.referee import Limits, RefereeConfig, referee
+from cablejax.evaluation.solver_path import PathFinder
+from cablejax.mpc import Controller
+from mpc_cases import START, at_rest, hermite_shape, poses, problem, random_motion, relaxing_cable
+
+pytest.importorskip("ipyopt")
+STEPS = 3
+NAMES = ("near", "U", "S")
+
+
+def limits(case) -> Limits:
+    feasible = case.feasible
+    values = (float(feasible.radius), float(feasible.min_distance), float(feasible.max_distance))
+    return Limits(np.asarray(feasible.separation, float), *values)
+
+
+@pytest.fixture(scope="module")
+def ours():
+    return PathFinder(
+        lambda motion, case: case.residuals(motion),
+        BoundedLevenbergMarquardt(atol=1e-9),
+        lambda motion, case: case.linearise(motion),
+    )
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_ours_and_the_referees_agree(ours, name):
+    with jax.enable_x64(True):
+        case, start = problem(name), np.zeros((STEPS, 2, 3))
+        bounds = limits(case)
+        path = ours(case, case.feasible, start, 40)
+        assert path.converged and bounds.violation(path.points[-1]) <= 1e-9
+        point = jnp.asarray(path.points[-1])
+        assert float(certify(jax.grad(case.value)(point), case.feasible, point).residual) < 1e-6
+        found = referee(case, bounds, start)
+        assert found.found and found.violation <= 1e-8 and found.evaluations[2] == 0
+        assert path.objectives[-1] <= found.objective * (1 + 1e-6)
+        assert found.objective <= path.objectives[-1] * (1 + 1e-6)
+        assert found.seconds_to(found.objective * (1 + 1e-6)) <= found.seconds
+
+
+@pytest.mark.slow
+def test_the_exact_hessian_leads_to_the_same_plan_in_fewer_iterations():
+    with jax.enable_x64(True):
+        case, start = problem("S"), np.zeros((STEPS, 2, 3))
+        approximate, exact = (referee(case, limits(case), start, RefereeConfig(exact=flag)) for flag in (False, True))
+        assert exact.found and exact.evaluations[2] > 0 and exact.iterations < approximate.iterations
+        assert exact.objective == pytest.approx(approximate.objective, rel=1e-8)
+        np.testing.assert_allclose(exact.motion, approximate.motion, atol=1e-5)
+
+
+def test_the_referee_wants_double_precision_and_stops_in_time():
+    case = problem("U")
+    with pytest.raises(ValueError, match="expected float64"):
+        referee(case, limits(case), np.zeros((STEPS, 2, 3)))
+    with jax.enable_x64(True):
+        case = problem("U")
+        found = referee(case, limits(case), np.zeros((STEPS, 2, 3)), RefereeConfig(max_seconds=0.0))
+        assert not found.found and found.iterations == 1
+        assert found.seconds_to(0.0) == np.inf
+
+
+def test_limits_measure_what_the_feasible_set_measures():
+    """Two independent statements of the same bounds."""
+    with jax.enable_x64(True):
+        case = problem("U")
+        bounds = limits(case)
+        for seed in range(5):
+            motion = random_motion(seed, STEPS, size=0.03)
+            assert bounds.violation(np.asarray(motion)) == pytest.approx(
+                float(case.feasible.violation(motion)), abs=1e-12
+            )
+            inside = case.feasible.project(motion)
+            assert bounds.violation(np.asarray(inside)) <= 1e-9
+
+
+def test_a_path_never_gets_worse_and_ends_where_the_solver_does():
+    """The non-monotone search accepts worse points; what counts is the best so far."""
+    with jax.enable_x64(True):
+        case = problem("S")
+        find = PathFinder(lambda motion, case: case.value(motion), SpectralProjectedGradient(atol=1e-7))
+        path = find(case, case.feasible, np.zeros((STEPS, 2, 3)), 300)
+        assert path.converged and (np.diff(path.objectives) <= 0).all() and (np.diff(path.seconds) > 0).all()
+        assert path.points.shape == (len(path.seconds), STEPS, 2, 3)
+        assert float(case.value(jnp.asarray(path.points[-1]))) == pytest.approx(path.objectives[-1], rel=1e-12)
+        assert path.seconds_to(path.objectives[-1]) <= path.seconds[-1] and path.seconds_to(0.0) == np.inf
+
+
+def case_of(name="one", radius=0.05) -> PlanningCase:
+    history = at_rest(START)
+    n = history.keypoints.shape[1]
+    return PlanningCase(
+        name=name,
+        keypoints=np.asarray(history.keypoints),
+        gripper_pose=np.asarray(history.gripper_pose),
+        gain=np.zeros((6, 2 * n)),
+        bias=np.zeros(2 * n),
+        target=np.asarray(hermite_shape(poses(0.9, 0.15, -0.1), n)),
+        radius=radius,
+        guess=np.asarray(random_motion(0, STEPS)),
+    )
+
+
+def test_cases_survive_their_file(tmp_path):
+    cases = [case_of("one"), case_of("two", radius=0.01)]
+    save_cases(tmp_path / "folder" / "cases.npz", cases)
+    for before, after in zip(cases, load_cases(tmp_path / "folder" / "cases.npz"), strict=True):
+        for field in dataclasses.fields(PlanningCase):
+            np.testing.assert_array_equal(getattr(before, field.name), getattr(after, field.name))
+
+
+def test_other_radii_are_the_controllers():
+    cases = other_radii([case_of(str(i)) for i in range(50)], seed=3)
+    radii = np.array([case.radius for case in cases])
+    assert (radii >= CONFIG.radius_min).all() and (radii <= CONFIG.radius_max).all() and np.ptp(np.log(radii)) > 1
+    assert all(case.name.endswith("another radius") for case in cases)
+    assert cases[0].limits().radius == cases[0].radius
+    assert cases[0].limits().max_distance == pytest.approx(0.99)
+
+
+def test_the_recorder_takes_down_what_the_controller_asks():
+    case = case_of()
+    log = RecordingSolver(CONFIG.solver)
+    config = dataclasses.replace(CONFIG, solver=log, horizon=STEPS - 1)
+    controller = Controller(config, relaxing_cable, jnp.asarray(0.8), case.target)
+    state = controller.init(at_rest(START))
+    seen = []
+    for _ in range(2):
+        keypoints, pose = np.asarray(state.history.keypoints[-1]), np.asarray(state.history.gripper_pose)
+        state, _, info = controller.step(state, keypoints, pose)
+        seen.append((keypoints, pose, float(info.radius)))
+    jax.effects_barrier()
+    assert len(log.met) == 2
+    for met, (keypoints, pose, radius) in zip(log.met, seen, strict=True):
+        np.testing.assert_allclose(met.keypoints[-1], keypoints, atol=1e-7)
+        np.testing.assert_allclose(met.gripper_pose, pose, atol=1e-7)
+        np.testing.assert_allclose(met.target, case.target, atol=1e-7)
+        assert met.guess.shape == (STEPS, 2, 3) and met.radius == pytest.approx(radius)

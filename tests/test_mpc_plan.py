@@ -1,0 +1,144 @@
+"""Single plans: certificates, all bounds, bad input, deadline, sampling, many starts, and derivatives of the plan."""
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from cablejax.mpc import (
+    CrossEntropy,
+    Deadline,
+    Outcome,
+    PathIntegral,
+    TrustRegion,
+    differentiable_plan,
+    feasible_from,
+    multi_start,
+    random_starts,
+)
+from mpc_cases import START, poses, problem
+
+STEPS = 3
+EXACT = TrustRegion(max_iterations=100, tolerance=1e-11, secant=True)
+STILL = np.zeros((STEPS, 2, 3))
+# None of the bounds active; the balls; the balls and the greatest distance.
+REGIMES = {
+    "inactive": {"target": "near", "radius": 1.0},
+    "ball": {"target": "U", "radius": 0.05},
+    "distance": {"target": "S", "start": poses(0.985, 0.4, 0.4), "radius": 0.03},
+}
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def solved(solver, case):
+    plan = solver(case, jnp.asarray(STILL, case.target.dtype))
+    return plan, case.value(plan.motion), case.feasible.violation(plan.motion)
+
+
+certified = jax.jit(lambda plan, case: plan.certificate(case))
+moved = jax.jit(
+    lambda case, x: dataclasses.replace(
+        case,
+        target=case.target + jnp.array([1.0, 0.5]) * x[0],
+        weights=case.weights + x[1],
+        feasible=dataclasses.replace(case.feasible, radius=case.feasible.radius * (1.0 + x[2])),
+    )
+)
+slopes = jax.jit(jax.jacfwd(lambda case, motion, x: differentiable_plan(moved(case, x), motion), argnums=2))
+
+
+@pytest.mark.parametrize("name", REGIMES)
+def test_plan_is_a_minimum_and_its_derivatives_are_those_of_planning_again(name):
+    """KKT residuals, then central differences of re-solves, in float64."""
+    with jax.enable_x64(True):
+        case, step = problem(**REGIMES[name], motion_weight=0.02), 1e-5
+        plan, _, violation = solved(EXACT, case)
+        assert Outcome(int(plan.outcome)) in (Outcome.CONVERGED, Outcome.STALLED) and float(violation) == 0.0
+        certificate = certified(plan, case)
+        assert float(certificate.residual) < 1e-8
+        n_active = int((certificate.multipliers > 1e-6).sum())
+        assert (n_active > 0) == (name != "inactive")
+        half = dataclasses.replace(plan, motion=0.5 * plan.motion)
+        assert float(certified(half, case).residual) > 1e-4
+        forward = slopes(case, plan.motion, jnp.zeros(3))
+        for k in range(3):
+            move = jnp.zeros(3).at[k].set(step)
+            ahead, behind = solved(EXACT, moved(case, move))[0].motion, solved(EXACT, moved(case, -move))[0].motion
+            expected = (ahead - behind) / (2 * step)
+            np.testing.assert_allclose(forward[..., k], expected, atol=3e-6 * max(1.0, float(jnp.abs(expected).max())))
+
+
+def test_a_deadline_plan_is_feasible_and_most_of_the_way():
+    case = problem("U")
+    plan, value, violation = solved(Deadline(), case)
+    best = float(solved(TrustRegion(max_iterations=10), case)[1])
+    start = float(case.value(jnp.asarray(STILL)))
+    assert float(violation) == 0.0 and int(plan.linearisations) == 1
+    assert start - float(value) > 0.9 * (start - best)
+    with pytest.raises(ValueError, match="fractions"):
+        Deadline(fractions=(0.0,))
+
+
+def test_workspace_and_change_of_motion_are_kept():
+    pose, previous = jnp.asarray(START), jnp.full((2, 3), 0.01)
+    bounds = {"workspace": ((-1.0, -0.02), (1.0, 0.03)), "change": 0.015, "previous": previous}
+    case = dataclasses.replace(problem("U"), feasible=feasible_from(pose, 0.05, (0.15, 0.99), **bounds))
+    plan, value, violation = solved(TrustRegion(max_iterations=6), case)
+    motion = np.asarray(plan.motion)
+    assert float(violation) <= 1e-7
+    assert float(value) < float(case.value(jnp.asarray(STILL)))
+    change = np.linalg.norm(np.diff(motion, axis=0, prepend=previous[None]), axis=-1)
+    assert 0.0149 < change.max() <= 0.015 + 1e-7
+    position = np.asarray(pose)[:, :2] + np.cumsum(motion[..., :2], axis=0)
+    assert position[..., 1].min() >= -0.02 - 1e-7 and position[..., 1].max() <= 0.03 + 1e-7
+    assert float(case.feasible.constraints(plan.motion).max()) <= 1e-6
+
+
+def with_bounds(**bounds):
+    case = problem("U")
+    changed = {name: jnp.asarray(value, jnp.float32) for name, value in bounds.items()}
+    return dataclasses.replace(case, feasible=dataclasses.replace(case.feasible, **changed))
+
+
+BAD = {
+    "contradicting distances": (lambda: with_bounds(min_distance=1.2), {Outcome.INFEASIBLE}),
+    "negative radius": (lambda: with_bounds(radius=-0.01), {Outcome.INFEASIBLE}),
+    "unknown radius": (lambda: with_bounds(radius=float("nan")), {Outcome.INFEASIBLE}),
+    "NaN from the model": (lambda: problem("U", rate=float("nan")), {Outcome.NONFINITE}),
+    "zero radius": (lambda: with_bounds(radius=0.0), {Outcome.CONVERGED, Outcome.STALLED, Outcome.STEP_LIMIT}),
+    "singular": (lambda: problem("U", rate=0.0), set(Outcome)),
+}
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_bad_input_gives_a_code(name):
+    make, expected = BAD[name]
+    plan, _, _ = solved(TrustRegion(), make())
+    outcome = Outcome(int(plan.outcome))
+    assert outcome in expected and len(outcome.message) > 20
+    if outcome is not Outcome.INFEASIBLE:
+        assert np.isfinite(plan.motion).all()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("solver", [CrossEntropy(), PathIntegral()])
+def test_sampling_improves_on_the_guess_and_stays_inside(solver):
+    case = problem("U")
+    start, best = float(case.value(jnp.asarray(STILL))), float(solved(TrustRegion(max_iterations=8), case)[1])
+    _, value, violation = solved(solver, case)
+    assert float(violation) == 0.0
+    assert start - float(value) > 0.5 * (start - best)
+    plan, _, _ = solved(solver, problem("U", rate=float("nan")))
+    assert Outcome(int(plan.outcome)) is Outcome.NONFINITE and np.isfinite(plan.motion).all()
+
+
+@pytest.mark.slow
+def test_many_starts_give_the_best_of_them():
+    case = problem("S")
+    starts = random_starts(case, STEPS, 4)
+    best, every, values = jax.jit(lambda case: multi_start(case, TrustRegion(max_iterations=4), starts))(case)
+    assert every.motion.shape == (4, STEPS, 2, 3) and values.shape == (4,)
+    assert float(case.value(best.motion)) == pytest.approx(float(values.min()), rel=1e-5)

@@ -1,0 +1,113 @@
+"""The diagnosis in space on synthetic recordings whose cause is known."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+
+import spatial_cases as cases
+from cablejax.diagnose import verdict_json
+from cablejax.report.diagnosis_page import write_diagnosis_page
+from cablejax.spatial.diagnose import diagnose_space, noise_of
+from cablejax.spatial.fit import Simulator, errors, improve
+from cablejax.spatial.geometry import local_changes
+from cablejax.spatial.identify import layout_of
+from cablejax.spatial.residual import fit_residual
+from cablejax.spatial.rod import Rod
+from cablejax.spatial.search import falls, halves
+from cablejax.spatial.windows import windows_of
+
+
+def test_windows_know_what_the_grippers_hold():
+    windows = windows_of(cases.recording())
+    assert windows.held == (2, 2)
+    assert windows.keypoints.shape == (4, 100, 6, 3)
+    np.testing.assert_allclose(windows.arclength, [*cases.MARKS, cases.LENGTH], atol=1e-9)
+    np.testing.assert_allclose(noise_of(windows), cases.NOISE, rtol=0.2)
+    np.testing.assert_allclose(
+        windows.frames @ np.swapaxes(windows.frames, -1, -2), np.eye(3) * np.ones((4, 100, 2, 1, 1)), atol=1e-6
+    )
+
+
+def test_a_fit_finds_stiffness_and_damping():
+    windows = windows_of(cases.recording())
+    simulator = Simulator(Rod(16, twisting=False), layout_of(windows, cases.NOMINAL, twisting=False))
+    layout = simulator.layout
+    values = np.zeros(layout.size)
+    before = errors(simulator.predict(values, windows), windows).mean()
+    values[layout.slices["damping_time"]] = 0.05
+    effects = ["bending_stiffness", "bending_damping"]
+    fit = improve(simulator, values, effects, windows, iterations=8)
+    after = errors(simulator.predict(fit.values, windows), windows).mean()
+    assert after < 0.1 * before
+    ratio = np.exp(fit.values[layout.slices["log_stiffness"]])
+    np.testing.assert_allclose(ratio, cases.TRUE_RATIO, rtol=0.15)
+    np.testing.assert_allclose(fit.values[layout.slices["damping_time"]], cases.TRUE_DAMPING, rtol=0.2)
+    assert not fit.values[~layout.active(effects)].any()
+
+
+def test_finds_the_file_that_was_gripped_anew():
+    (change,) = local_changes(cases.recording(regripped=2), (2, 2))
+    assert change.pair == (0, 1) and change.gripper == 0 and change.episodes == (2,)
+    assert "gripper 0" in change.sentence and "22.0 mm apart instead of 30.0 mm" in change.sentence
+    assert local_changes(cases.recording(), (2, 2)) == ()
+
+
+def test_the_residual_learns_what_the_clamps_tell():
+    windows = windows_of(cases.recording())
+    generator = np.random.default_rng(1)
+    weights = generator.normal(size=(3, windows.keypoints.shape[2]))
+    off = 0.05 * np.einsum("wtc,cf->wtf", windows.position[:, :, 1] - windows.position[:, :, 0], weights)
+    simulated = windows.keypoints - off[..., None] * np.array([0.0, 0.0, 1.0])
+    residual = fit_residual(simulated, windows)
+    left = errors(residual.correct(simulated, windows), windows).mean()
+    assert left < 0.2 * errors(simulated, windows).mean()
+    np.testing.assert_array_equal(residual.correct(simulated, windows)[:, :2], simulated[:, :2])
+
+
+def test_halves_keep_recordings_together():
+    group = np.array([0, 0, 0, 1, 1, 2, 3, 3])
+    first = halves(group)
+    assert 3 <= first.sum() <= 5
+    for g in range(4):
+        assert len(set(first[group == g])) == 1
+    assert falls(np.full(8, 2.0), np.full(8, 1.0), group)[0]
+    assert not falls(np.full(8, 2.0), np.array([1, 1, 1, 3, 3, 3, 3.0, 3]), group)[0]
+
+
+def test_refuses_what_it_cannot_diagnose():
+    log = cases.recording()
+    with pytest.raises(ValueError, match="expected 3"):
+        windows_of(dataclasses.replace(log, keypoints=log.keypoints[..., :2]))
+    with pytest.raises(ValueError, match="hang free"):
+        windows_of(dataclasses.replace(log, meta={**log.meta, "table": {"friction_coefficient": 0.1}}))
+    time = log.time.copy()
+    time[:, 50:] += 0.3
+    with pytest.raises(ValueError, match="resample"):
+        windows_of(dataclasses.replace(log, time=time))
+    with pytest.raises(ValueError, match="eval"):
+        diagnose_space(dataclasses.replace(log, meta={**log.meta, "split": ["eval"] * 4}))
+
+
+@pytest.mark.slow
+def test_names_the_cause_and_goes_on_where_it_was(tmp_path):
+    log, state, said = cases.recording(6, regripped=3), tmp_path / "state.json", []
+    only = ["bending_stiffness", "bending_damping", "viscous_drag"]
+    result = diagnose_space(log, only=only, state=state, progress=said.append)
+    assert {e.name for e in result.effects} == {"bending_stiffness", "bending_damping"}
+    assert result.verdict in ("named", "named+unknown")
+    assert result.gap.shrinkage is not None and result.gap.shrinkage > 0.9
+    interval = next(e for e in result.effects if e.name == "bending_damping").parameters["time_s"].ci90
+    assert interval is not None
+    assert interval[0] < 1.1 * cases.TRUE_DAMPING and interval[1] > 0.9 * cases.TRUE_DAMPING  # type: ignore[operator]
+    assert "gripper 0" in result.sentence
+    again = diagnose_space(log, only=only, state=state)
+    np.testing.assert_array_equal(again.identified.values, result.identified.values)
+    page = write_diagnosis_page(result, tmp_path / "report").read_text()
+    assert 'id="orbit"' in page and "http://" not in page.replace("http://www.w3.org", "")
+    verdict = json.loads((tmp_path / "report" / "verdict.json").read_text())
+    assert verdict == json.loads(json.dumps(verdict_json(result)))
+    assert len(verdict["where"]["per_episode_mm"]) == 6

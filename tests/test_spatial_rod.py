@@ -1,0 +1,207 @@
+"""The rod in space against MuJoCo's composite, against statics, and its derivatives."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+from cablejax.simulate.compile import compiler_options
+from cablejax.simulate.composite import build_grasped_chain
+from cablejax.simulate.config import CableConfig
+from cablejax.spatial.rod import Rod, RodPhysics
+
+_INTERVAL = 0.01
+
+
+@pytest.fixture(autouse=True)
+def _double():
+    with jax.enable_x64(True):
+        yield
+
+
+def _poses(time, sideways):
+    """Gripper 0 stands still; gripper 1 comes 0.3 m nearer in an arc and tilts, softly. Position and quaternion."""
+    s = 0.5 * (1 - np.cos(np.pi * min(time, 0.8) / 0.8))
+    quaternion = np.array([np.cos(0.3 * s), 0.0, -np.sin(0.3 * s), 0.0])
+    position = np.array([1.0 - 0.3 * s, sideways * s, 0.1 * np.sin(np.pi * s)])
+    return (np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0])), (position, quaternion)
+
+
+def _axes(quaternion):
+    rotation = np.zeros(9)
+    mujoco.mju_quat2Mat(rotation, quaternion)
+    return rotation.reshape(3, 3).T
+
+
+def _inputs(samples, sideways):
+    poses = [_poses(_INTERVAL * k, sideways) for k in range(samples)]
+    position = np.array([[p for p, _ in pair] for pair in poses])
+    frames = np.array([[_axes(q) for _, q in pair] for pair in poses])
+    return position, frames
+
+
+def _mujoco(config, samples, sideways):
+    """Nodes of the composite in C MuJoCo at every sample, shape [T, n, 3]."""
+    model = build_grasped_chain(config)
+    data = mujoco.MjData(model)
+    mocap = [model.body_mocapid[mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, f"gripper_{k}")] for k in range(2)]
+    links = [i for i in range(model.nbody) if model.body(i).name.startswith("cable")]
+    substeps, points = round(_INTERVAL / config.timestep), []
+    for sample in range(samples):
+        for k in range(substeps if sample else 0):
+            pair = _poses(_INTERVAL * (sample - 1) + (k + 1) * config.timestep, sideways)
+            for body, (position, quaternion) in zip(mocap, pair, strict=True):
+                data.mocap_pos[body], data.mocap_quat[body] = position, quaternion
+            mujoco.mj_step(model, data)
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_comPos(model, data)
+        points.append(data.xipos[links].copy())
+    return np.array(points)
+
+
+def _physics(arclength, **changes):
+    n = len(arclength)
+    values = {
+        "length": 1.0, "stiffness": np.full(1, 0.05), "rest_curvature": np.zeros((1, 2)), "damping_time": 0.05,
+        "drag": 0.0, "quadratic_drag": 0.0, "twist_stiffness": 0.05, "stretch": 1e6, "marker_mass": 0.0,
+        "clamp_rotation": np.zeros((2, 2)), "clamp_offset": np.zeros((2, 3)), "roll": 0.0, "arclength": arclength,
+        "offset": np.zeros((n, 2)), "gravity": np.array([0.0, 0.0, -9.81]),
+    }  # fmt: skip
+    return RodPhysics(**{name: jnp.asarray(v, float) for name, v in {**values, **changes}.items()})
+
+
+def _run(rod, physics, position, frames, seen):
+    run = jax.jit(lambda p: rod.rollout(p, position, frames, seen, _INTERVAL), compiler_options=compiler_options())
+    return np.asarray(run(physics))
+
+
+@pytest.mark.parametrize(("sideways", "twisting"), [(0.0, False), (0.15, True)])
+def test_agrees_with_the_mujoco_composite(sideways, twisting):
+    config = CableConfig(
+        dimension=3, n_links=33, timestep=5e-4, friction_coefficient=0.0, bending_stiffness=0.002, damping_time=0.05,
+        linear_density=0.04, diameter=0.006,
+    )  # fmt: skip
+    reference = _mujoco(config, 101, sideways)[:, 1:-1]
+    arclength = np.arange(1, 32) * config.link_length
+    position, frames = _inputs(101, sideways)
+    rod = Rod(n_edges=32, substeps=4, twisting=twisting)
+    found = _run(rod, _physics(arclength), position, frames, jnp.asarray(reference[:2]))
+    distance = np.linalg.norm(found - reference, axis=-1)
+    assert distance.mean() < 1e-3
+    assert np.linalg.norm(reference - reference[0], axis=-1).max() > 0.25
+
+
+def test_second_order_in_the_time_step():
+    arclength = np.linspace(0.1, 0.9, 9)
+    position, frames = _inputs(80, 0.1)
+    seen = jnp.asarray(np.stack([np.stack([arclength, 0 * arclength, 0 * arclength], axis=1)] * 2))
+    physics = _physics(arclength, drag=0.5)
+    runs = {k: _run(Rod(12, k, twisting=False), physics, position, frames, seen) for k in (1, 2, 4, 16)}
+    off = {k: np.abs(run - runs[16]).mean() for k, run in runs.items()}
+    # gravity sets in at once, with which no multistep method starts at its full order
+    assert off[2] < 0.5 * off[1]
+    assert off[4] < 0.5 * off[2]
+    assert off[1] < 1e-3
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+def test_a_cable_clamped_on_its_rest_shape_stays(axis):
+    """A cable with one bend, about the material's second or third axis, which are y and z here."""
+    dense = np.linspace(0.0, 1.0, 2001)
+    curvature = 5.0 * np.exp(-(((dense - 0.3) / 0.1) ** 2))
+    turn = np.concatenate([[0.0], np.cumsum(0.5 * (curvature[1:] + curvature[:-1]) * np.diff(dense))])
+    across = np.array([[0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])[axis]
+    tangent = np.cos(turn)[:, None] * np.eye(3)[0] + np.sin(turn)[:, None] * across
+    points = np.concatenate(
+        [np.zeros((1, 3)), np.cumsum(0.5 * (tangent[1:] + tangent[:-1]) * np.diff(dense)[:, None], 0)]
+    )
+    arclength, samples = np.linspace(0.1, 0.9, 9), 60
+    marks = points[np.round(2000 * arclength).astype(int)]
+    about = np.eye(3)[1 + axis]
+    frames = []
+    for t in tangent[[0, -1]]:
+        frames.append(np.array([t, about, np.cross(t, about)] if axis == 0 else [t, np.cross(about, t), about]))
+    position = np.repeat(points[None, [0, -1]], samples, 0)
+    rest = np.zeros((41, 2))
+    rest[:, axis] = 5.0 * np.exp(-(((np.linspace(0.0, 1.0, 41) - 0.3) / 0.1) ** 2))
+    rod, moved = Rod(24), {}
+    run = jax.jit(
+        lambda p: rod.rollout(
+            p, position, np.repeat(np.array(frames)[None], samples, 0), np.stack([marks] * 2), _INTERVAL
+        ),
+        compiler_options=compiler_options(),
+    )
+    for name, curved in {
+        "its own": rest,
+        "straight": 0 * rest,
+        "turned over": -rest,
+        "uniform": 0 * rest + 2.0,
+    }.items():
+        physics = _physics(arclength, rest_curvature=curved, gravity=np.zeros(3), drag=1.0)
+        moved[name] = np.asarray(run(physics))[-1] - marks
+    size = {name: np.abs(off).max() for name, off in moved.items()}
+    assert size["its own"] < 2e-3
+    assert size["straight"] > 10 * size["its own"]
+    assert size["turned over"] > size["straight"]
+
+
+def test_hangs_as_a_catenary_when_it_hardly_resists_bending():
+    arclength = np.linspace(0.1, 0.9, 9)
+    samples = 400
+    position = np.repeat(np.array([[[0.0, 0, 0], [0.6, 0, 0]]]), samples, 0)
+    # along the catenary at its ends: sinh(d / 2a) = s / 2a
+    a = 0.5
+    for _ in range(100):
+        a = 0.3 / np.arcsinh(0.5 / a)
+    slope = np.array([-0.5 / a, 0.5 / a])
+    along = np.stack([np.ones(2), np.zeros(2), slope], axis=1) / np.hypot(1, slope)[:, None]
+    frames = np.stack([np.stack([t, [0, 1.0, 0], np.cross(t, [0, 1.0, 0])]) for t in along])
+    s = arclength - 0.5
+    x = 0.3 + a * np.arcsinh(s / a)
+    z = np.sqrt(a**2 + s**2) - np.sqrt(a**2 + 0.25)
+    catenary = np.stack([x, 0 * x, z], axis=1)
+    pushed = catenary + 0.03 * np.sin(np.pi * arclength)[:, None] * np.array([0.0, 1.0, 0.0])
+    physics = _physics(arclength, stiffness=np.full(1, 1e-4), drag=3.0)
+    found = _run(
+        Rod(24, twisting=False), physics, position, np.repeat(frames[None], samples, 0), jnp.asarray([pushed, pushed])
+    )
+    assert np.abs(found[-1] - catenary).max() < 2e-3
+
+
+def test_derivatives_are_those_of_finite_differences():
+    arclength = np.linspace(0.1, 0.9, 9)
+    position, frames = _inputs(25, 0.1)
+    seen = np.stack([np.stack([arclength, 0 * arclength, -0.1 * np.sin(np.pi * arclength)], axis=1)] * 2)
+    physics = _physics(
+        1.04 * arclength,
+        length=1.04,
+        rest_curvature=np.array([[0.5, -0.3], [0.2, 0.4]]),
+        clamp_rotation=np.array([[0.05, -0.02], [0.01, 0.03]]),
+        offset=np.full((9, 2), 0.002),
+        drag=0.4,
+        quadratic_drag=0.2,
+        marker_mass=0.01,
+        twist_stiffness=0.03,
+    )
+    keys = jax.random.split(jax.random.key(0), 15)
+    leaves, tree = jax.tree.flatten(physics)
+    sizes = [1e-2 * jnp.maximum(jnp.abs(leaf).max(), 0.05) for leaf in leaves]
+    moved = [size * jax.random.normal(k, leaf.shape) for size, k, leaf in zip(sizes, keys, leaves, strict=True)]
+    direction = jax.tree.unflatten(tree, moved)
+    rod = Rod(12)
+
+    def last(scale):
+        changed = jax.tree.map(lambda leaf, d: leaf + scale * d, physics, direction)
+        return rod.rollout(changed, position, frames, seen, _INTERVAL)[::10]
+
+    run = jax.jit(last, compiler_options=compiler_options())
+    _, derivative = jax.jit(lambda s: jax.jvp(last, (s,), (jnp.ones(()),)), compiler_options=compiler_options())(
+        jnp.zeros(())
+    )
+    step = 1e-4
+    difference = (run(step) - run(-step)) / (2 * step)
+    assert np.abs(difference).max() > 1e-4
+    np.testing.assert_allclose(derivative, difference, atol=2e-3 * float(np.abs(difference).max()))
