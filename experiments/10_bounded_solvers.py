@@ -292,7 +292,8 @@ def page(runs: list[Run], command: str) -> str:
             "sources and what the best known values come from are in `src/cablejax/bounded/problems/`. All solvers are "
             "local. Where a first version of a problem had a second minimum that chance decided on (Rosenbrock of four "
             "and more variables, Wood, HS2, a rod that had to snap through), its box, start or target was changed "
-            "before this table was made; MGH17 and Thurber have second minima still.",
+            "before this table was made, after some of these solvers, ours and scipy's, had failed on it; MGH17 and "
+            "Thurber have second minima still.",
             "",
             "## Successes",
             "",
