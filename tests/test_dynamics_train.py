@@ -46,6 +46,7 @@ def same(a, b) -> None:
     jax.tree.map(np.testing.assert_array_equal, a, b)
 
 
+@pytest.mark.slow
 def test_killed_and_resumed_ends_in_the_same_bits(tmp_path):
     folder = tmp_path / "killed"
     here = pathlib.Path(__file__).parent

@@ -173,6 +173,7 @@ def test_out_of_a_valley_the_grippers_travel_to_where_the_target_is_held():
     assert (run(never, Cable(rate=0.8, sag=0.0), 3)[2].outcome == Outcome.HELD).all()
 
 
+@pytest.mark.slow
 def test_many_cables_in_one_call_are_the_same_as_one_by_one():
     control = controller()
     starts = [jnp.asarray([[0.0, 0.0, a], [d, 0.0, -a]]) for a, d in ((0.0, 0.97), (0.3, 0.9), (-0.4, 0.8))]

@@ -137,12 +137,16 @@ class FeasibleSet(AbstractSet):
 
     def violation(self, y: Float[Array, "T 2 3"]) -> Float[Array, ""]:
         """By how much the worst step of a plan breaks its worst bound [m]; 0 for a feasible plan."""
+        return jnp.maximum(self._worst_excess(y, tight=1.0), 0.0)
+
+    def _worst_excess(self, y: Float[Array, "T 2 3"], tight: float) -> Float[Array, ""]:
+        """The worst excess over a bound [m], radius and distances being tightened by a factor; negative inside."""
         lower, upper = self._distance_bounds(len(y))
         distance = jnp.linalg.norm(self._separations(y), axis=-1)
         excess = [
-            (jnp.linalg.norm(y, axis=-1) - self.radius).max(),
-            (distance - upper).max(),
-            (lower - distance).max(),
+            (jnp.linalg.norm(y, axis=-1) - self.radius * tight).max(),
+            (distance - upper * tight).max(),
+            (lower * (2.0 - tight) - distance).max(),
         ]
         if self.box is not None:
             excess += [(self.box[0] - y).max(), (y - self.box[1]).max()]
@@ -151,7 +155,7 @@ class FeasibleSet(AbstractSet):
             excess += [(low - self._positions(y)).max(), (self._positions(y) - high).max()]
         if self.change is not None:
             excess.append((jnp.linalg.norm(self._changes(y), axis=-1) - self._change_bounds(len(y))).max())
-        return jnp.maximum(jnp.stack(excess).max(), 0.0)
+        return jnp.stack(excess).max()
 
     def empty(self) -> Bool[Array, ""]:
         """Whether bounds contradict themselves or are not numbers; a zero radius leaves rest, which is something."""
@@ -250,8 +254,10 @@ def _nearest_plan(feasible: FeasibleSet, y: Float[Array, "T 2 3"]) -> Float[Arra
         convex = feasible.at(feasible.restore(y))
         return convex.restore(convex.project(y))
 
-    # a plan that is not a number is not broken either
-    return jax.lax.cond(feasible.violation(y) > 0.0, nearest, lambda: y)
+    # Half the margin: what was projected stays, and what only touches a bound does not pass it in other units. A plan that
+    # is not a number is not broken either.
+    tight = 1.0 - 0.5 * _MARGIN_ULP * float(jnp.finfo(y.dtype).eps)
+    return jax.lax.cond(feasible._worst_excess(y, tight) > 0.0, nearest, lambda: y)
 
 
 def _sums(n_steps: int) -> np.ndarray:
