@@ -254,8 +254,8 @@ def _nearest_plan(feasible: FeasibleSet, y: Float[Array, "T 2 3"]) -> Float[Arra
         convex = feasible.at(feasible.restore(y))
         return convex.restore(convex.project(y))
 
-    # Half the margin: what was projected stays, and what only touches a bound does not pass it in other units. A plan that
-    # is not a number is not broken either.
+    # Half the margin: what was projected stays, and what only touches a bound does not pass it in other units. A plan
+    # that is not a number is not broken either.
     tight = 1.0 - 0.5 * _MARGIN_ULP * float(jnp.finfo(y.dtype).eps)
     return jax.lax.cond(feasible._worst_excess(y, tight) > 0.0, nearest, lambda: y)
 
