@@ -10,6 +10,8 @@ from __future__ import annotations
 
 import argparse
 import pathlib
+import shlex
+import sys
 
 from blind.score_page import summary, write_page
 from blind.store import read_labels
@@ -34,7 +36,7 @@ def main() -> None:
     cases = read_verdicts(options.verdicts, labels)
     print(summary(cases))
     if options.report:
-        write_page(cases, options.report)
+        write_page(cases, options.report, shlex.join(["python", *sys.argv]))
         print(f"Written: {options.report}")
 
 

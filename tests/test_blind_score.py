@@ -188,7 +188,7 @@ def test_page_from_locked_labels(tmp_path):
             (verdicts / f"{name}.json").write_text(json.dumps(said))
     assert publish_hashes(labels) == 4
     cases = read_verdicts(verdicts, read_labels(labels))
-    write_page(cases, tmp_path / "page.md")
+    write_page(cases, tmp_path / "page.md", "python score.py")
     page = (tmp_path / "page.md").read_text()
     assert "4 cases: 1 without effect, 2 single effects" in page and "1 without a verdict" in page
     assert "| gravity_tilt | missing 1 |" in page and "| obstacle |  |  | 1/1/1 |  |  |" in page

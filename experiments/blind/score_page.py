@@ -17,8 +17,8 @@ FAMILIES = {
 }
 
 
-def write_page(cases: list[Scored], path: pathlib.Path) -> None:
-    """Markdown at `path`, figures beside it."""
+def write_page(cases: list[Scored], path: pathlib.Path, command: str) -> None:
+    """Markdown at `path`, figures beside it; `command` is what makes it."""
     figure = path.with_name(path.stem + "_confusion.png")
     curve = path.with_name(path.stem + "_reliability.png")
     _confusion_figure(cases, figure)
@@ -27,8 +27,7 @@ def write_page(cases: list[Scored], path: pathlib.Path) -> None:
     kinds = {kind: sum(case.kind == kind for case in cases) for kind in ("none", "single", "pair", "unknown")}
     parts = [
         "# Blind check of the diagnosis",
-        "Made by `python experiments/22_blind_score.py docs/results/blind/verdicts docs/results/blind --report "
-        "docs/results/blind.md`; logs by `20_blind_generate.py`, verdicts by `21_blind_diagnose.py`. What the numbers "
+        f"Made by `{command}`; logs by `20_blind_generate.py`, verdicts by `21_blind_diagnose.py`. What the numbers "
         "mean, and what was seen only afterwards: docs/diagnosis.md.",
         f"{len(cases)} cases: {kinds['none']} without effect, {kinds['single']} single effects, {kinds['pair']} pairs, "
         f"{kinds['unknown']} effects outside the library; {len(missing)} without a verdict, which count as failures. "
