@@ -156,11 +156,9 @@ def _page(scores) -> str:
         lines += [_row(name.replace("_", " "), [f"{a:.1f}", f"{b:.1f}"]) for name, a, b in scores[cable]["stages"]]
         lines.append("")
     lines += [
-        "One procedure with one set of constants for all cables. The ridge residual reads the clamps' history "
-        "of 0.4 s and the "
-        "simulated markers, in a frame that moves with the clamps; its regularisation and number of products "
-        "are chosen "
-        "by leaving out recordings of the train split.",
+        "One procedure with one set of constants for all cables. The ridge residual reads the clamps' history of 0.4 "
+        "s and the simulated markers, in a frame that moves with the clamps; its regularisation and number of "
+        "products are chosen by leaving out recordings of the train split.",
         "",
         "---",
         "",

@@ -143,10 +143,8 @@ def _summary(path: pathlib.Path, log: GapLog, told: Sequence[str]) -> dict[str, 
 def _told(result: dict[str, Any]) -> str:
     lines = [
         f"{result['log']}: {result['episodes']} episodes, {result['samples']} samples of {result['keypoints']} "
-        f"keypoints in "
-        f"{'space' if result['dimension'] == 3 else 'the plane'}, {100 * result['observed']:.4g} % of them observed; "
-        f"the "
-        f"cable is {result['length_m']:.4g} m long.",
+        f"keypoints in {'space' if result['dimension'] == 3 else 'the plane'}, {100 * result['observed']:.4g} % of "
+        f"them observed; the cable is {result['length_m']:.4g} m long.",
         *result["repairs"],
     ]
     return "\n".join(lines if result["repairs"] else [*lines, "Nothing had to be repaired."])

@@ -59,8 +59,7 @@ def _take(path: pathlib.Path, how: Layout) -> Take:
     if len(count) > 1:
         raise ValueError(
             f"{path}: the messages on {keypoints_topic} have {min(count)} to {max(count)} poses, expected the same "
-            f"number "
-            "in each, NaN where a keypoint was not observed."
+            "number in each, NaN where a keypoint was not observed."
         )
     poses = None
     if gripper_topics is not None:

@@ -237,10 +237,8 @@ def import_deform(
     takes, repairs = prepare(takes_of(recordings), Setup(unit=unit, frame=frame, on_grippers="pairs"))
     source = (
         f"{recordings.name} of the DEFORM data set (Chen et al., CoRL 2024, arXiv 2406.05931). The length is measured "
-        f"along "
-        "the markers, which sit off the centreline. Diameter, linear density and bending stiffness are guesses: only "
-        "bending stiffness per linear density shows. Gripper poses are from two markers each, their roll is not "
-        "observed; "
-        "commands are differences of these poses."
+        "along the markers, which sit off the centreline. Diameter, linear density and bending stiffness are guesses: "
+        "only bending stiffness per linear density shows. Gripper poses are from two markers each, their roll is not "
+        "observed; commands are differences of these poses."
     )
     return gap_log_from_takes(takes, nominal, source=source, repairs=repairs), repairs

@@ -98,8 +98,7 @@ def require_hanging(takes: tuple[Take, ...], frame: Frame) -> None:
     found = ("" if told[axis] > 0 else "-") + "xyz"[axis]
     raise ValueError(
         f"The frame was said to have {frame.up} up, but the cable hangs from its ends along the other way of {found}: "
-        f"say "
-        f"that {found} is up, or check the order of the coordinates."
+        f"say that {found} is up, or check the order of the coordinates."
     )
 
 
@@ -137,9 +136,8 @@ def require_rigid(takes: tuple[Take, ...], pairs: tuple[tuple[int, int], ...]) -
         fitting = [name for name, change in _CONVENTIONS.items() if _spread(*change(quaternion, direction)) <= RIGID]
         raise ValueError(
             f"The markers {first} and {second} on gripper {gripper} turn against its orientation by "
-            f"{np.degrees(spread):.0f} degrees (root mean square), expected at most {np.degrees(RIGID):.0f}: "
-            f"positions and "
-            "orientations are not of one frame. "
+            f"{np.degrees(spread):.0f} degrees (root mean square), expected at most {np.degrees(RIGID):.0f}: positions "
+            "and orientations are not of one frame. "
             + (f"They fit if {' or if '.join(fitting)}." if fitting else "Check which gripper and markers these are.")
         )
 

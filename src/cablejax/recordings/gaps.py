@@ -52,8 +52,7 @@ def cut_at_gaps(takes: tuple[Take, ...], held: tuple[int, ...] | None) -> tuple[
         if filled:
             told.append(
                 f"Take {take.name}: {filled} samples without one of the grippers were filled in by straight lines: "
-                f"none "
-                f"of these gaps is longer than {FILLED:g} s."
+                f"none of these gaps is longer than {FILLED:g} s."
             )
         known = _known(take, held)
         breaks, reasons = _breaks(take)
@@ -73,8 +72,7 @@ def cut_at_gaps(takes: tuple[Take, ...], held: tuple[int, ...] | None) -> tuple[
         if lost := sum(b - a for a, b in spans) - sum(b - a for a, b in kept):
             told.append(
                 f"Take {take.name}: {lost} samples in stretches shorter than {SHORTEST:g} s or {SHORTEST_SAMPLES} "
-                f"samples "
-                "were left out."
+                "samples were left out."
             )
         if len(kept) == 1:
             parts.append(take.part(*kept[0], take.name))
@@ -104,8 +102,7 @@ def _require_grippers(takes: tuple[Take, ...], held: tuple[int, ...] | None) -> 
         if not seen:
             raise ValueError(
                 f"Gripper {gripper} {what}. Both ends must be known: name the columns or topic of its pose, or two "
-                f"markers "
-                "that are on it."
+                "markers that are on it."
             )
 
 
@@ -181,9 +178,8 @@ def _breaks(take: Take) -> tuple[list[int], list[str]]:
     for t in np.flatnonzero(late & (interval > FILLED)):
         breaks.append(int(t) + 1)
         told.append(
-            f"Take {take.name}: no samples for {interval[t]:.3g} s after sample {t}, where {usual:.3g} s is usual; "
-            f"the take "
-            "was cut there."
+            f"Take {take.name}: no samples for {interval[t]:.3g} s after sample {t}, where {usual:.3g} s is usual; the "
+            "take was cut there."
         )
     for t in _jumps(median_step(take.keypoints), interval):
         breaks.append(t + 1)

@@ -60,8 +60,7 @@ def prepare(takes: tuple[Take, ...], setup: Setup) -> tuple[tuple[Take, ...], li
     if len(shapes) > 1 or shapes[0][0] < (5 if setup.on_grippers == "pairs" else 3):
         raise ValueError(
             f"The takes have keypoints of the shapes {', '.join(map(str, shapes))}, expected one shape with at least "
-            f"three "
-            "keypoints, or five if the first two and the last two are on the grippers."
+            "three keypoints, or five if the first two and the last two are on the grippers."
         )
     for take in takes:
         if np.isinf(take.keypoints).any():
@@ -70,8 +69,7 @@ def prepare(takes: tuple[Take, ...], setup: Setup) -> tuple[tuple[Take, ...], li
     if not measured and setup.on_grippers == "ends":
         raise ValueError(
             "The grippers' poses are not told, and only one keypoint is on each: name the columns or topics of the "
-            "poses, "
-            "or two keypoints on each gripper."
+            "poses, or two keypoints on each gripper."
         )
     takes, told = _in_metres(takes, setup)
     takes = tuple(into_frame(take, setup.frame) for take in takes)

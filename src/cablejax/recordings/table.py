@@ -133,8 +133,7 @@ def _poses(path: pathlib.Path, columns: dict[str, list[str]], fields: Fields, di
         missing = names.index(None)
         raise ValueError(
             f"{fields.path}: [columns] names gripper_{1 - missing} but not gripper_{missing}: both grippers must be "
-            f"known. "
-            "Leave both out to find them from two markers on each."
+            "known. Leave both out to find them from two markers on each."
         )
     pose = np.stack([_numbers(path, columns, row) for row in names], axis=1)
     if dimension == 2:
@@ -154,7 +153,6 @@ def unit_quaternions(pose: np.ndarray, where: str) -> np.ndarray:
         sample = int(np.argmax(np.nan_to_num(np.abs(norm - 1)).max(axis=(1, 2))))
         raise ValueError(
             f"{where}: sample {sample} has a gripper quaternion of length {float(np.nanmax(norm[sample])):.3g}, "
-            f"expected 1: "
-            "check the columns of qw, qx, qy and qz."
+            "expected 1: check the columns of qw, qx, qy and qz."
         )
     return np.concatenate([pose[..., :3], pose[..., 3:] / norm], axis=-1)

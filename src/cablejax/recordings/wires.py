@@ -121,10 +121,8 @@ def wire_log(wire: HangingWire) -> GapLog:
         cable,
         source=(
             f"{wire.name} wire of qj25/adapteddlo_muj (arXiv 2310.00911), traced in photographs while it hung between "
-            f"two "
-            "clamps. Bending stiffness: mean of the published values; the diameter is a guess. Gripper poses are from "
-            "the "
-            "first and last two points."
+            "two clamps. Bending stiffness: mean of the published values; the diameter is a guess. Gripper poses are "
+            "from the first and last two points."
         ),
         extra={
             "take": [f"{wire.name} {index}" for index in range(repeats)],

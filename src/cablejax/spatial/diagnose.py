@@ -317,9 +317,8 @@ def _where(log, windows, nominal, before, noise, changes) -> Where:
     names = log.meta.get("file", log.meta.get("take", list(range(len(episodes)))))
     sentences = [change.sentence for change in changes]
     sentences += [
-        f"The gap is largest at keypoint {int(along.argmax())}, {arclength[int(along.argmax())]:.2f} m along "
-        f"the cable: "
-        f"{millimetres(along.max())}. A cable held at both ends deviates most in its middle whatever the cause.",
+        f"The gap is largest at keypoint {int(along.argmax())}, {arclength[int(along.argmax())]:.2f} m along the "
+        f"cable: {millimetres(along.max())}. A cable held at both ends deviates most in its middle whatever the cause.",
         f"The worst file is {names[worst]} with {millimetres(episodes[worst])}; the median file has "
         f"{millimetres(np.nanmedian(episodes))}.",
         f"While the grippers move fast the gap is {millimetres(regimes['speed: fast'])}, slowly "
@@ -364,12 +363,10 @@ def _sentence(verdict, gap, effects, changes) -> str:
 
 def _caveats(log, windows, left_out, found) -> tuple[str, ...]:
     result = [
-        "The motion of a hanging cable does not depend on its weight: stiffness, drag and added masses are "
-        "known relative "
-        "to the linear density only, and a wrong density (linear_density) cannot be seen.",
-        "A camera that lags would shift keypoints and grippers alike, for both come from the same marks: "
-        "camera_lag cannot "
-        "be seen.",
+        "The motion of a hanging cable does not depend on its weight: stiffness, drag and added masses are known "
+        "relative to the linear density only, and a wrong density (linear_density) cannot be seen.",
+        "A camera that lags would shift keypoints and grippers alike, for both come from the same marks: camera_lag "
+        "cannot be seen.",
         "Roll of the grippers about the cable is not observed; it is taken as the least turn from their mean "
         "direction.",
     ]

@@ -82,8 +82,7 @@ class Photographs:
         if len(shape) != 3 or shape[0] < 3 or shape[1] < 5 or shape[2] != 2 or not np.isfinite(self.points).all():
             raise ValueError(
                 f"Photographs have points of shape {shape}, expected finite ones of shape [R, N, 2] with at least "
-                f"three "
-                "photographs, so that one can be left out, and five points."
+                "three photographs, so that one can be left out, and five points."
             )
         for name in ("length", "stiffness", "error"):
             if not (np.isfinite(getattr(self, name)) and getattr(self, name) > 0):
@@ -92,8 +91,7 @@ class Photographs:
         if not 0.9 * self.length < longest < 1.02 * self.length:
             raise ValueError(
                 f"Along its traced points the wire measures {longest:.4g} m, expected its length, {self.length:g} m: "
-                f"check "
-                "the scale of the photographs."
+                "check the scale of the photographs."
             )
 
 
