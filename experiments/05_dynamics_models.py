@@ -29,6 +29,7 @@ from cablejax.dynamics.config import ModelConfig
 from cablejax.dynamics.evaluate import evaluation_windows, no_motion, prior_motion, snapping, window_errors
 from cablejax.dynamics.transfer import on_another_cable
 from cablejax.dynamics.weights import load_info, load_weights
+from cablejax.report.markdown import markdown_table
 from cablejax.report.provenance import machine, versions
 from cablejax.simulate import CableConfig, ThreadedEngine
 from cablejax.simulate.equilibrium import angles_of_keypoints
@@ -219,21 +220,21 @@ def main() -> None:
             "",
             "## All windows",
             "",
-            *markdown(rows),
+            *markdown_table(rows),
             "",
             "## Windows without a snap-through",
             "",
-            *markdown(gentle),
+            *markdown_table(gentle),
             "",
             "## 100 steps, windows without a snap-through",
             "",
-            *markdown(far),
+            *markdown_table(far),
             "",
             "## Other cables, 20 steps: median / 90 % in cm per metre of cable",
             "",
             "The first row is the cable that the networks were trained on.",
             "",
-            *markdown(cables),
+            *markdown_table(cables),
             "",
         ]
     )
@@ -241,12 +242,6 @@ def main() -> None:
     if options.out is not None:
         options.out.write_text(page, encoding="utf-8")
         draw(errors, calm, options.out.parent.parent / "images" / "dynamics_models.png")
-
-
-def markdown(rows: list[list[str]]) -> list[str]:
-    """A table, the first row its title."""
-    title, *rest = ["| " + " | ".join(row) + " |" for row in rows]
-    return [title, "|" + " --- |" * len(rows[0]), *rest]
 
 
 if __name__ == "__main__":

@@ -36,6 +36,7 @@ from cablejax.bounded import (
     minimise,
 )
 from cablejax.bounded.problems import BoundedProblem, all_problems
+from cablejax.report.markdown import markdown_table
 from cablejax.report.provenance import machine, versions
 
 TOLERANCE = 1e-10
@@ -218,12 +219,6 @@ def run_all(problems: list[BoundedProblem], path: Path, solvers: tuple[str, ...]
     return runs
 
 
-def markdown(rows: list[list[str]]) -> list[str]:
-    """A table, the first row its title."""
-    title, *rest = ["| " + " | ".join(row) + " |" for row in rows]
-    return [title, "|" + " --- |" * len(rows[0]), *rest]
-
-
 def rates(runs: list[Run]) -> list[list[str]]:
     """Successes over problems that the solver applies to, by family."""
     families = list(dict.fromkeys(run.family for run in runs))
@@ -297,22 +292,22 @@ def page(runs: list[Run], command: str) -> str:
             "",
             "## Successes",
             "",
-            *markdown(rates(runs)),
+            *markdown_table(rates(runs)),
             "",
             "## Ours : scipy's, on the problems that both apply to",
             "",
-            *markdown(duels(runs)),
+            *markdown_table(duels(runs)),
             "",
             "## Failures, one by one",
             "",
-            *markdown(failures(runs)),
+            *markdown_table(failures(runs)),
             "",
             "## Iterations / evaluations of the function",
             "",
             "In brackets where the solver failed. An iteration of the least squares methods takes at most one "
             "Jacobian, one of the others one gradient.",
             "",
-            *markdown(effort(runs)),
+            *markdown_table(effort(runs)),
             "",
         ]
     )

@@ -36,6 +36,7 @@ from cablejax.mpc import (
     ProjectedGradient,
     TrustRegion,
 )
+from cablejax.report.markdown import markdown_table
 from cablejax.report.provenance import machine, versions
 from cablejax.shaping import load_model
 
@@ -165,11 +166,22 @@ def page(trials: list[Trial], table: dict, picture: str | None) -> str:
         lines += ["", f"![Error against milliseconds]({picture})"]
     lines += [
         "",
-        "| solver | horizon | runs | error, mean [cm] | worst [cm] | call p50 [ms] | p95 [ms] |",
-        "| --- | --- | --- | --- | --- | --- | --- |",
-        *(
-            f"| {solver} | {h} | {c['runs']} | {c['error']:.3f} | {c['worst']:.3f} | {c['p50']:.0f} | {c['p95']:.0f} |"
-            for (solver, h), c in table.items()
+        *markdown_table(
+            [
+                ["solver", "horizon", "runs", "error, mean [cm]", "worst [cm]", "call p50 [ms]", "p95 [ms]"],
+                *(
+                    [
+                        solver,
+                        str(h),
+                        str(c["runs"]),
+                        f"{c['error']:.3f}",
+                        f"{c['worst']:.3f}",
+                        f"{c['p50']:.0f}",
+                        f"{c['p95']:.0f}",
+                    ]
+                    for (solver, h), c in table.items()
+                ),
+            ]
         ),
     ]
     pairs = [
@@ -187,13 +199,12 @@ def page(trials: list[Trial], table: dict, picture: str | None) -> str:
     stopped = [t for t in trials if t.stopped]
     lines += ["", "## Runs that ended early", ""]
     lines += [f"- {' '.join(map(str, t.key))}: {t.stopped}" for t in stopped] or ["None."]
-    lines += ["", "## Every run", "", "| solver | horizon | target | seed | error [cm] | settled [s] | p50 [ms] |"]
-    lines += ["| --- | --- | --- | --- | --- | --- | --- |"]
-    lines += [
-        f"| {t.solver} | {t.horizon} | {t.shape} | {t.seed} | {t.terminal_cm:.3f} | {t.settling_s:.0f} | "
-        f"{t.p50_ms:.0f} |"
+    rows = [["solver", "horizon", "target", "seed", "error [cm]", "settled [s]", "p50 [ms]"]]
+    rows += [
+        [*map(str, t.key), f"{t.terminal_cm:.3f}", f"{t.settling_s:.0f}", f"{t.p50_ms:.0f}"]
         for t in sorted(trials, key=lambda t: t.key)
     ]
+    lines += ["", "## Every run", "", *markdown_table(rows)]
     return "\n".join([*lines, ""])
 
 

@@ -26,6 +26,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from cablejax.recordings.wires import HangingWire, read_wires
+from cablejax.report.markdown import markdown_table
 from cablejax.report.provenance import machine, versions
 from cablejax.report.style import LIGHT
 from cablejax.simulate.config import GRAVITY
@@ -77,33 +78,36 @@ def named(diagnosis: WireDiagnosis) -> str:
 
 
 def table(results: dict[str, dict[str, Any]]) -> str:
-    lines = [
-        "| wire | verdict | named (probability) | gap before [mm] | after [mm] | shrinkage | EI [1e-4 N m²] | "
-        "published |",
-        "| --- | --- | --- | --- | --- | --- | --- | --- |",
-    ]
+    title = "wire", "verdict", "named (probability)", "gap before [mm]", "after [mm]", "shrinkage", "EI [1e-4 N m²]"
+    rows = [[*title, "published"]]
     for name, result in results.items():
         d: WireDiagnosis = result["diagnosis"]
         wire: HangingWire = result["wire"]
         unit = 1e4 * float(wire.published_stiffness.mean())
         value, low, high = (unit * number for number in d.stiffness)
         published = 1e4 * wire.published_stiffness
-        lines.append(
-            f"| {name} | {d.verdict} | {named(d)} | {1e3 * d.before:.2f} | {1e3 * d.after:.2f} | {d.shrinkage[0]:.2f} "
-            f"({d.shrinkage[1]:.2f} to {d.shrinkage[2]:.2f}) | {value:.2f} ({low:.2f} to {high:.2f}) | {unit:.2f} "
-            f"({published.min():.2f} to {published.max():.2f}) |"
+        rows.append(
+            [
+                name,
+                d.verdict,
+                named(d),
+                f"{1e3 * d.before:.2f}",
+                f"{1e3 * d.after:.2f}",
+                f"{d.shrinkage[0]:.2f} ({d.shrinkage[1]:.2f} to {d.shrinkage[2]:.2f})",
+                f"{value:.2f} ({low:.2f} to {high:.2f})",
+                f"{unit:.2f} ({published.min():.2f} to {published.max():.2f})",
+            ]
         )
-    return "\n".join(lines)
+    return "\n".join(markdown_table(rows))
 
 
 def ranking(results: dict[str, dict[str, Any]]) -> str:
-    lines = [f"| wire | {' | '.join(f'`{name}`' for name in EFFECTS)} |", "| --- |" + " --- |" * len(EFFECTS)]
+    rows = [["wire", *(f"`{name}`" for name in EFFECTS)]]
     for name, result in results.items():
         d: WireDiagnosis = result["diagnosis"]
         ranked = {entry["name"]: entry["held_out_shrinkage"] for entry in result["verdict"]["ranking"]}
-        cells = [f"{d.inclusion[effect]:.2f}, {ranked[effect]:.2f}" for effect in EFFECTS]
-        lines.append(f"| {name} | {' | '.join(cells)} |")
-    return "\n".join(lines)
+        rows.append([name, *(f"{d.inclusion[effect]:.2f}, {ranked[effect]:.2f}" for effect in EFFECTS)])
+    return "\n".join(markdown_table(rows))
 
 
 def sets(results: dict[str, dict[str, Any]]) -> str:
@@ -123,13 +127,9 @@ def sets(results: dict[str, dict[str, Any]]) -> str:
 
 
 def clamps(results: dict[str, dict[str, Any]]) -> str:
-    lines = [
-        f"| wire | {' | '.join(f'{1e3 * outside:g} mm outside' for outside in OUTSIDE)} |",
-        "| --- |" + " --- |" * len(OUTSIDE),
-    ]
-    for name, result in results.items():
-        lines.append(f"| {name} | {' | '.join(f'{ratio:.2f}' for ratio in result['level'])} |")
-    return "\n".join(lines)
+    rows = [["wire", *(f"{1e3 * outside:g} mm outside" for outside in OUTSIDE)]]
+    rows += [[name, *(f"{ratio:.2f}" for ratio in result["level"])] for name, result in results.items()]
+    return "\n".join(markdown_table(rows))
 
 
 def draw(results: dict[str, dict[str, Any]], path: Path) -> None:

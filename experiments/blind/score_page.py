@@ -6,6 +6,8 @@ import pathlib
 
 import numpy as np
 
+from cablejax.report.markdown import markdown_table
+
 from .measures import Row, baselines, outcome, reliability, severe_singles, table
 from .verdicts import Scored
 
@@ -178,8 +180,7 @@ def _case_list(cases: list[Scored]) -> str:
 
 
 def _markdown(header: list[str], rows) -> str:
-    lines = ["| " + " | ".join(header) + " |", "| " + " | ".join("---" for _ in header) + " |"]
-    return "\n".join(lines + ["| " + " | ".join(row) + " |" for row in rows])
+    return "\n".join(markdown_table([header, *rows]))
 
 
 def summary(cases: list[Scored]) -> str:

@@ -14,7 +14,7 @@ from cablejax.closed_loop import ClosedLoopRun, run_closed_loop
 from cablejax.dynamics.config import ModelConfig
 from cablejax.dynamics.model import apply
 from cablejax.dynamics.weights import load_weights
-from cablejax.mpc import Controller, MPCConfig, ProjectedGradient, TrustRegion
+from cablejax.mpc import SOLVERS, Controller, MPCConfig
 from cablejax.perceive.camera import CameraConfig
 from cablejax.perceive.plant import CloudPlant
 from cablejax.report.record import Method
@@ -25,7 +25,9 @@ from cablejax.simulate.plant import Plant, PlantConfig
 from cablejax.targets import Target, straight_start
 from cablejax.types import History
 
-SolverName = Literal["trust-region", "projected-gradient"]
+SolverName = Literal[
+    "trust-region", "projected-gradient", "dogleg", "gauss-newton", "deadline", "cross-entropy", "path-integral"
+]
 
 METHODS: tuple[Method, ...] = ("residual", "direct")
 """With the online residual, and without."""
@@ -77,7 +79,7 @@ def make_controller(model: Model, target: Target, *, method: Method, solver: Sol
     config = MPCConfig(
         cable_length=model.config.length,
         adaptation=AdaptationConfig() if model.config.conditioned else None,
-        solver=TrustRegion() if solver == "trust-region" else ProjectedGradient(),
+        solver=SOLVERS[solver],
     )
     if method == "direct":
         config = dataclasses.replace(config, residual=None)

@@ -320,21 +320,10 @@ class Bench:
 
 def _controller(model: Model, solver: SolverChoice) -> Controller:
     """The controller with the online residual on the way to an S, with one of the solvers at its defaults."""
-    from cablejax import mpc
     from cablejax.shaping import make_controller
     from cablejax.targets import make_target
 
-    known = {
-        "trust-region": mpc.TrustRegion(),
-        "projected-gradient": mpc.ProjectedGradient(),
-        "dogleg": mpc.Dogleg(),
-        "gauss-newton": mpc.GaussNewton(),
-        "deadline": mpc.Deadline(),
-        "cross-entropy": mpc.CrossEntropy(),
-        "path-integral": mpc.PathIntegral(),
-    }
-    usual = make_controller(model, make_target("S"), method="residual", solver="trust-region")
-    return dataclasses.replace(usual, config=dataclasses.replace(usual.config, solver=known[solver]))
+    return make_controller(model, make_target("S"), method="residual", solver=solver)
 
 
 def _batched_ms(controller: Controller, history: History, size: int, repeats: int) -> float:

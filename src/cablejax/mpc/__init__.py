@@ -6,6 +6,7 @@ from cablejax.mpc.deadline import Deadline
 from cablejax.mpc.feasible import FeasibleSet, feasible_from, project_ball
 from cablejax.mpc.mppi import PathIntegral
 from cablejax.mpc.multi_start import multi_start, random_starts
+from cablejax.mpc.named import SOLVERS
 from cablejax.mpc.plan import Outcome, Plan, Solver
 from cablejax.mpc.problem import ObjectiveConfig, ShapingProblem
 from cablejax.mpc.projected_gradient import ProjectedGradient
@@ -14,6 +15,7 @@ from cablejax.mpc.timing import ControlTiming, time_control
 from cablejax.mpc.trust_region import Dogleg, GaussNewton, TrustRegion
 
 __all__ = [
+    "SOLVERS",
     "ControlInfo",
     "ControlTiming",
     "Controller",

@@ -16,9 +16,9 @@ import dataclasses
 import itertools
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
-from cablejax.spatial.windows import Windows
+from cablejax.spatial.windows import Windows, dealt
 
 _HISTORY = 0.4  # [s]
 _POSITION_LAGS = 10
@@ -72,7 +72,7 @@ def fit_residual(simulated: Float[np.ndarray, "W T F 3"], windows: Windows) -> R
     use[:, :2] = False
     use &= (np.arange(use.shape[1]) % _EVERY == 2)[None]
     target = np.einsum("wtfc,wtkc->wtfk", np.nan_to_num(miss), frame)[use].reshape(use.sum(), -1)
-    features, fold = linear[use], _folds(windows.group)[np.nonzero(use)[0]]
+    features, fold = linear[use], dealt(windows.group, _FOLDS)[np.nonzero(use)[0]]
     centre, scale = features.mean(axis=0), features.std(axis=0) + 1e-6
     scaled = (features - centre) / scale
     _, _, directions = np.linalg.svd(scaled[:: max(1, len(scaled) // 4000)], full_matrices=False)
@@ -94,16 +94,6 @@ def fit_residual(simulated: Float[np.ndarray, "W T F 3"], windows: Windows) -> R
             best = score[r], components, _RIDGES[r], _solve(gram_all, moment_all, _RIDGES[r])
     assert best is not None
     return RidgeResidual(centre, scale, best[1], best[3], best[2], (float(np.abs(target).mean()), float(best[0])))
-
-
-def _folds(group: Int[np.ndarray, "W"]) -> Int[np.ndarray, "W"]:
-    """Recordings dealt out to folds, the largest first to the smallest fold."""
-    names, counts = np.unique(group, return_counts=True)
-    sizes, fold_of = np.zeros(min(_FOLDS, len(names)), int), {}
-    for name, count in sorted(zip(names, counts, strict=True), key=lambda item: (-item[1], item[0])):
-        fold_of[name] = int(sizes.argmin())
-        sizes[fold_of[name]] += count
-    return np.array([fold_of[g] for g in group])
 
 
 def _solve(gram, moment, ridge):

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from cablejax.spatial.fit import Fit, Simulator, errors, improve, moved_by, newton_step
-from cablejax.spatial.windows import Windows
+from cablejax.spatial.windows import Windows, dealt
 
 _STEPS = 3
 _FAILURES = 2
@@ -46,14 +46,7 @@ def halves(group: Int[np.ndarray, "W"]) -> Bool[np.ndarray, "W"]:
     """A split of the recordings into two parts of about as many windows; of windows, where there is one recording."""
     if len(np.unique(group)) < 2:
         return np.arange(len(group)) < (len(group) + 1) // 2
-    names, counts = np.unique(group, return_counts=True)
-    sizes, first = [0, 0], []
-    for name, count in sorted(zip(names, counts, strict=True), key=lambda item: (-item[1], item[0])):
-        smaller = int(sizes[1] < sizes[0])
-        sizes[smaller] += count
-        if smaller == 0:
-            first.append(name)
-    return np.isin(group, first)
+    return dealt(group, 2) == 0
 
 
 def falls(before: Float[np.ndarray, "W"], after: Float[np.ndarray, "W"], group) -> tuple[bool, float]:

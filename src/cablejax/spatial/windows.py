@@ -7,6 +7,7 @@ import dataclasses
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from cablejax.recordings.poses import rotated
 from cablejax.spatial.rod import frames_along
 from cablejax.types import GapLog
 
@@ -87,7 +88,7 @@ def windows_of(log: GapLog, *, length: float = WINDOW) -> Windows:
     points = np.asarray(log.keypoints, float)
     pose = np.asarray(log.gripper_pose, float)
     valid = np.arange(points.shape[1]) < log.episode_length[:, None]
-    tangent = _first_axis(pose[..., 3:])
+    tangent = rotated(pose[..., 3:], np.array([1.0, 0.0, 0.0]))
     held = _held(points, pose[..., :3], tangent, valid)
     s = np.asarray(log.meta["keypoint_arclength_m"], float)
     reach = np.array([s[held[0] - 1] - s[0] if held[0] else 0.0, s[-1] - s[len(s) - held[1]] if held[1] else 0.0])
@@ -143,9 +144,14 @@ def windows_of(log: GapLog, *, length: float = WINDOW) -> Windows:
     )
 
 
-def _first_axis(quaternion):
-    w, x, y, z = np.moveaxis(quaternion, -1, 0)
-    return np.stack([1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)], axis=-1)
+def dealt(group: Int[np.ndarray, "W"], parts: int) -> Int[np.ndarray, "W"]:
+    """The part that each window falls to: recordings are dealt out whole, the largest first to the smallest part."""
+    names, counts = np.unique(group, return_counts=True)
+    sizes, part_of = np.zeros(parts, int), {}
+    for name, count in sorted(zip(names, counts, strict=True), key=lambda item: (-item[1], item[0])):
+        part_of[name] = int(sizes.argmin())
+        sizes[part_of[name]] += count
+    return np.array([part_of[g] for g in group])
 
 
 def _held(points, position, tangent, valid):
