@@ -36,6 +36,7 @@ _WAYPOINTS = {
     "translation": [(0.7, 0.6, -0.5, 0.0), (0.7, 0.6, -0.5, 0.25), (0.7, 0.6, -0.5, 0.05)],
     "ramp_hold": [(0.9, 0.2, -0.3, 0.0), (0.5, 0.2, -0.8, 0.0), (0.5, 0.2, -0.8, 0.0), (0.85, 0.5, -0.3, 0.0)],
 }
+_WAYPOINTS |= {f"back_{name}": way[::-1] for name, way in _WAYPOINTS.items()}
 _REST = 16
 _SETTLING = 6
 
@@ -101,6 +102,7 @@ def evidence_of(
         noise=np.full(points.shape[2], 1e-3 * noise_mm),
         temper=np.ones(len(points)),
         freedom=1e6,
+        motion=np.arange(len(points)),
     )
 
 

@@ -216,3 +216,15 @@ def test_a_file_that_is_no_verdict_is_refused(tmp_path):
     (tmp_path / "00000001.json").write_text(json.dumps({"schema": "cablejax-verdict/1", "verdict": "maybe"}))
     with pytest.raises(ValueError, match="maybe"):
         read_verdicts(tmp_path, {"00000001": label("none")})
+
+
+def test_intervals_of_several_pieces_are_matched_by_index():
+    true = ("keypoint_bias", {"index": [2, 6, 11], "offset_m": [0.01, 0.02, 0.03]})
+    index = {"value": [11, 2], "ci90": None, "unit": ""}
+    said = {"index": index, "offset_m": parameter([0.03, 0.02], [0.029, 0.031], [0.019, 0.021])}
+    case = Scored("a", label("single", true), verdict("named", ("keypoint_bias", 0.9, said)))
+    assert coverages(case) == [("keypoint_bias.offset_m", True), ("keypoint_bias.offset_m", False)]
+    one = {"index": {**index, "value": 2}, "offset_m": parameter(0.01, 0.0, 0.02)}
+    true = ("keypoint_bias", {"index": 2, "offset_m": 0.01})
+    case = Scored("b", label("single", true), verdict("named", ("keypoint_bias", 0.9, one)))
+    assert coverages(case) == [("keypoint_bias.offset_m", True)]

@@ -68,7 +68,7 @@ def test_one_keypoint_that_is_off_is_found_although_no_episode_stands_out():
 
 
 def test_gap_that_comes_with_motion_is_told_from_one_that_stays():
-    motions = MOTIONS * 2
+    motions = (*MOTIONS, *(f"back_{motion}" for motion in MOTIONS))
     pose = np.stack([poses(m) for m in motions])[..., :2]
     velocity = np.gradient(pose, 0.1, axis=1).mean(axis=2)
     moving = localise(*case(0.2 * velocity[:, :, None], motions), np.full(POINTS, NOISE))
@@ -78,6 +78,13 @@ def test_gap_that_comes_with_motion_is_told_from_one_that_stays():
     staying = localise(*case(4e-3, motions), np.full(POINTS, NOISE))
     assert any("not a lag" in sentence for sentence in staying.sentences)
     assert staying.regimes["speed: hold"] == pytest.approx(4.0, rel=0.1)
+
+
+def test_motions_made_twice_prove_nothing_that_made_once_they_do_not():
+    velocity = np.gradient(np.stack([poses(m) for m in MOTIONS])[..., :2], 0.1, axis=1).mean(axis=2)
+    gap = 0.2 * np.concatenate([velocity, velocity])[:, :, None]
+    twice = localise(*case(gap, MOTIONS * 2), np.full(POINTS, NOISE))
+    assert twice.contrasts["speed: hold"][1] > 0.05
 
 
 def test_rest_before_any_motion_does_not_make_a_gap_one_of_motion():
@@ -147,13 +154,13 @@ def test_padding_counts_for_nothing():
 
 def test_chance_of_any_false_contrast_keeps_to_its_level():
     rng = np.random.default_rng(0)
-    false = [contrast_p(rng.normal(size=(6, 9))).min() <= 0.05 for _ in range(600)]
+    false = [contrast_p(rng.normal(size=(6, 9)), np.arange(6)).min() <= 0.05 for _ in range(600)]
     assert np.mean(false) < 0.05 + 3 * np.sqrt(0.05 * 0.95 / 600)
 
 
 def test_fewer_than_six_episodes_prove_no_contrast():
-    assert contrast_p(np.ones((5, 3))).min() > 0.05
-    assert contrast_p(np.ones((6, 3))).min() == pytest.approx(2 / 64)
+    assert contrast_p(np.ones((5, 3)), np.arange(5)).min() > 0.05
+    assert contrast_p(np.ones((6, 3)), np.arange(6)).min() == pytest.approx(2 / 64)
 
 
 def test_correlated_noise_widens_its_sum_of_squares():

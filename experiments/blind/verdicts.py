@@ -167,15 +167,26 @@ def coverages(case: Scored) -> list[tuple[str, bool]]:
             interval = ((said.get("parameters") or {}).get(parameter) or {}).get("ci90")
             if not interval or interval[0] is None or interval[1] is None:
                 continue
-            trues, lows, highs = _as_list(true), _as_list(interval[0]), _as_list(interval[1])
-            for number in range(min(len(trues), len(lows))):
-                value, low, high = trues[number], lows[number], highs[number]
+            trues = _as_list(true)
+            # one interval, or one of each of several pieces
+            pieces = interval if isinstance(interval[0], list | tuple) else [interval]
+            for number, (low, high) in _matched(effect["parameters"], said["parameters"], len(trues), pieces):
+                value = trues[number]
                 if parameter == "direction_rad":  # angles are the same after a turn
                     turn = 2 * math.pi
                     value = low + (value - low) % turn
                     high = low + (high - low) if high - low < turn else low + turn
                 rows.append((f"{effect['name']}.{parameter}", low <= value <= high))
     return rows
+
+
+def _matched(true: dict[str, Any], said: dict[str, Any], count: int, pieces: list[Any]) -> list[tuple[int, Any]]:
+    """Numbers of an effect's true pieces and what is said of each: by `index` where there is one, else in order."""
+    if "index" not in true or "index" not in said:
+        return list(enumerate(pieces))[:count]
+    places = _as_list(said["index"]["value"])
+    numbers = {index: number for number, index in enumerate(_as_list(true["index"]))}
+    return [(numbers[p], piece) for p, piece in zip(places, pieces, strict=True) if p in numbers]
 
 
 def shrinkage_ratio(case: Scored) -> float | None:

@@ -6,7 +6,7 @@ import dataclasses
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from cablejax.diagnose.actuation import Actuation, actuation
 from cablejax.diagnose.belief import Calibration, level
@@ -16,6 +16,7 @@ from cablejax.diagnose.fit import Candidate, Evidence
 from cablejax.diagnose.noise import NoiseFloor, noise_floor
 from cablejax.diagnose.playback import Playback
 from cablejax.diagnose.recording import DiagnosisError, Recording, prepare
+from cablejax.diagnose.repeats import repeated_motions
 from cablejax.simulate.config import CableConfig
 from cablejax.simulate.pose import wrapped
 from cablejax.simulate.replay import config_of_log
@@ -102,10 +103,22 @@ class Case:
         """What the log says, weighed by the noise and by what simulators get wrong without any effect."""
         observed = self.recording.keypoints
         target = observed - self.nominal + self.coarse
-        bare = Evidence(self.playback, target, self.noise.std, temper=np.ones(len(target)), freedom=calibration.freedom)
+        bare = Evidence(
+            self.playback,
+            target,
+            self.noise.std,
+            temper=np.ones(len(target)),
+            freedom=calibration.freedom,
+            motion=self.motion,
+        )
         squares = (bare.residuals(self.coarse) ** 2).sum(axis=1)
         gap = level(bare) * np.sqrt(np.maximum(squares / np.maximum(bare.count, 1) - 1, 0.0))
         return dataclasses.replace(bare, temper=calibration.temper(gap, level(bare)))
+
+    @property
+    def motion(self) -> Int[np.ndarray, "E"]:
+        """Episodes with the same number repeat one another."""
+        return repeated_motions(self.recording.gripper_pose, self.config.length)
 
     def context(self) -> Context:
         """What effects take their first guesses from."""

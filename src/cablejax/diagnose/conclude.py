@@ -7,12 +7,15 @@ from collections.abc import Sequence
 from typing import Any, get_args
 
 import numpy as np
+from jaxtyping import Float
 
 from cablejax.diagnose.actuation import Actuation
 from cablejax.diagnose.belief import Calibration, effect_names, excess, level, probabilities
 from cablejax.diagnose.diagnosis import NamedEffect, ParameterEstimate, Ranked, Verdict
 from cablejax.diagnose.fit import Evidence, Fit
+from cablejax.diagnose.profile import scaled_draws
 from cablejax.diagnose.search import Search
+from cablejax.simulate.config import CableConfig
 from cablejax.simulate.pose import wrapped
 
 _DRAWS = 400
@@ -51,7 +54,10 @@ def conclude(found: Search, evidence: Evidence, calibration: Calibration) -> Con
     smallest = calibration.smallest_gap(level(evidence))
     if gap <= smallest:
         return Conclusion("none", null, (), (), ranking, 0.0)
+    if not best.candidate.terms:
+        return Conclusion("unknown", best, (), (), ranking, explained)
 
+    draws = scaled_draws(evidence, best, calibration.widening, _DRAWS, np.random.default_rng(0))
     effects, equivalent = [], []
     for name in effect_names(best.candidate):
         rest = set(effect_names(best.candidate)) - {name}
@@ -76,9 +82,9 @@ def conclude(found: Search, evidence: Evidence, calibration: Calibration) -> Con
         )
         if len(alike) > 1:
             equivalent.append(tuple(alike))
-        effects.append(_named(name, best, odds[name] / total, evidence, calibration.widening))
+        effects.append(_named(name, best, odds[name] / total, draws, evidence.playback.config))
     complete = calibration.complete(left, gap, level(evidence))
-    if not effects or (explained < calibration.telling and not complete):
+    if explained < calibration.telling and not complete:
         return Conclusion("unknown", best, (), (), ranking, explained)
     if not complete:
         verdict: Verdict = "named+unknown"
@@ -165,13 +171,10 @@ def _ranking(found: Search, evidence: Evidence, calibration: Calibration) -> tup
     return tuple(sorted(result, key=lambda r: -r.probability))
 
 
-def _named(name: str, fit: Fit, probability: float, evidence: Evidence, widening: float) -> NamedEffect:
-    """One effect of a fit, with intervals from Laplace's approximation in the prior's coordinates."""
-    config = evidence.playback.config
-    rng = np.random.default_rng(0)
-    covariance = widening**2 * np.linalg.inv(fit.precision(evidence))
-    draws = rng.multivariate_normal(fit.candidate.z, covariance, size=_DRAWS, method="cholesky")
-    draws = np.clip(draws, *fit.candidate.bounds.T)
+def _named(
+    name: str, fit: Fit, probability: float, draws: Float[np.ndarray, "D P"], config: CableConfig
+) -> NamedEffect:
+    """One effect of a fit, with intervals from draws of the fit's coordinates."""
     parts: list[dict[str, ParameterEstimate]] = []
     location: dict[str, Any] = {"along_cable_m": None, "time_s": None, "table_m": None}
     drawn = [fit.candidate.by_term(draw) for draw in draws]

@@ -12,11 +12,12 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from cablejax.diagnose.effects.base import Effect
 from cablejax.diagnose.physics import Physics
 from cablejax.diagnose.playback import Playback
+from cablejax.diagnose.repeats import share_of_motion
 from cablejax.simulate.config import CableConfig
 
 _FIRST_DAMPING = 1e-2
@@ -113,6 +114,7 @@ class Evidence:
         noise: standard deviation of each observed coordinate [m], shape [N].
         temper: how many correlated samples of each episode count as one independent, see `belief`, shape [E].
         freedom: of Student's distribution over episodes, see `belief`.
+        motion: episodes with the same number repeat one another, see `repeats`, shape [E].
     """
 
     playback: Playback
@@ -120,6 +122,7 @@ class Evidence:
     noise: Float[np.ndarray, "N"]
     temper: Float[np.ndarray, "E"]
     freedom: float
+    motion: Int[np.ndarray, "E"]
 
     def restricted(self, episodes: Sequence[int]) -> Evidence:
         """The evidence of some episodes only."""
@@ -130,7 +133,13 @@ class Evidence:
             angles=self.playback.angles[chosen],
             interval=self.playback.interval[chosen],
         )
-        return dataclasses.replace(self, playback=playback, target=self.target[chosen], temper=self.temper[chosen])
+        return dataclasses.replace(
+            self,
+            playback=playback,
+            target=self.target[chosen],
+            temper=self.temper[chosen],
+            motion=self.motion[chosen],
+        )
 
     def residuals(self, keypoints: Float[np.ndarray, "*P E T N 2"]) -> Float[np.ndarray, "*P E M"]:
         """Whitened differences of simulations from the target, 0 where nothing was observed."""
@@ -140,15 +149,21 @@ class Evidence:
 
     def surprise(self, sse: Float[np.ndarray, "E"]) -> Float[np.ndarray, "E"]:
         """Q of every episode: squared error above the noise, in units of what is to be expected."""
-        return np.maximum(sse - self.count, 0.0) / self.temper
+        return (sse - self.count) / self.temper
 
     def log_likelihood(self, sse: Float[np.ndarray, "E"]) -> float:
-        """Student's log likelihood up to a constant, see `belief`."""
-        return float(-0.5 * (self.freedom + 1) * np.log1p(self.surprise(sse) / self.freedom).sum())
+        """Student's log likelihood up to a constant, see `belief`; below the noise floor, its tangent there.
+
+        The floor is an estimate: a fit may come out below it, and still has a best value.
+        """
+        surprise = self.surprise(sse) / self.freedom
+        each = np.where(surprise > 0, np.log1p(np.maximum(surprise, 0.0)), surprise)
+        return float(-0.5 * (self.freedom + 1) * (share_of_motion(self.motion) * each).sum())
 
     def weight(self, sse: Float[np.ndarray, "E"]) -> Float[np.ndarray, "E"]:
         """Weight of each episode's squared residuals in an equivalent least squares problem."""
-        return (self.freedom + 1) / (self.freedom + self.surprise(sse)) / self.temper
+        share = share_of_motion(self.motion)
+        return share * (self.freedom + 1) / (self.freedom + np.maximum(self.surprise(sse), 0.0)) / self.temper
 
     @property
     def count(self) -> Float[np.ndarray, "E"]:
@@ -181,21 +196,24 @@ class Fit:
         return np.einsum("epq,e->pq", self.curvature, evidence.weight(self.sse)) + np.eye(len(self.candidate.z))
 
     def held_out_sse(self, evidence: Evidence) -> Float[np.ndarray, "E"]:
-        """r'r of every episode if it had been left out of the fit.
+        """r'r of every episode if its motion had been left out of the fit.
 
-        By one Gauss-Newton step without the episode. Where that leads too far to be believed, because this episode
-        alone shows the effect, or because there is no other, the episode pays twice the number of parameters that it
-        decides on instead, as in Akaike's criterion.
+        By one Gauss-Newton step without the episodes of this motion. Where that leads too far to be believed, because
+        this motion alone shows the effect, or because there is no other, its episodes pay twice the number of
+        parameters that it decides on instead, as in Akaike's criterion.
         """
         precision, weight = self.precision(evidence), evidence.weight(self.sse)
         result = np.empty_like(self.sse)
-        for e in range(len(self.sse)):
-            informed = weight[e] * self.curvature[e]
-            step = np.linalg.solve(precision - informed, weight[e] * self.gradient[e])
-            if np.abs(step).max(initial=0.0) <= _LARGEST_HELD_OUT_STEP:
-                result[e] = self.sse[e] + 2 * self.gradient[e] @ step + step @ self.curvature[e] @ step
-            else:
-                result[e] = self.sse[e] + 2.0 * np.trace(np.linalg.solve(precision, informed)) / weight[e]
+        for first in np.unique(evidence.motion):
+            left_out = np.flatnonzero(evidence.motion == first)
+            informed = np.einsum("e,epq->pq", weight[left_out], self.curvature[left_out])
+            step = np.linalg.solve(precision - informed, weight[left_out] @ self.gradient[left_out])
+            for e in left_out:
+                if np.abs(step).max(initial=0.0) <= _LARGEST_HELD_OUT_STEP:
+                    result[e] = self.sse[e] + 2 * self.gradient[e] @ step + step @ self.curvature[e] @ step
+                else:
+                    decided = np.trace(np.linalg.solve(precision, weight[e] * self.curvature[e]))
+                    result[e] = self.sse[e] + 2.0 * decided / weight[e]
         return np.maximum(result, self.sse)
 
 

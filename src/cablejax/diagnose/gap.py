@@ -23,12 +23,14 @@ def held_out_keypoints(
 ) -> tuple[Float[np.ndarray, "E T N 2"], tuple[int, ...]]:
     """Keypoints of every episode from a fit that has not seen it, and which episodes could be held out.
 
-    An effect that the other episodes do not show is left out: nothing would be known of it before this episode.
+    Episodes that repeat one another are held out together. An effect that the other episodes do not show is left out:
+    nothing would be known of it before this episode.
     """
-    n_episodes = len(case.recording.length)
-    if not best.candidate.terms or n_episodes == 1:
-        return case.simulate(best.candidate), tuple(range(n_episodes)) if n_episodes > 1 else ()
-    groups = [list(g) for g in np.array_split(np.arange(n_episodes), min(n_episodes, _FOLDS))]
+    n_episodes, motions = len(evidence.motion), np.unique(evidence.motion)
+    if not best.candidate.terms or len(motions) == 1:
+        return case.simulate(best.candidate), tuple(range(n_episodes)) if len(motions) > 1 else ()
+    folds = np.array_split(motions, min(len(motions), _FOLDS))
+    groups = [np.flatnonzero(np.isin(evidence.motion, fold)).tolist() for fold in folds]
     result = np.empty_like(case.nominal)
     for group in groups:
         rest = evidence.restricted([e for e in range(n_episodes) if e not in group])
@@ -78,9 +80,13 @@ def measure_gap(
         return 1 - max((a - noise)[chosen].sum(), 0.0) / denominator if denominator > 0 else np.nan
 
     interval90 = None
-    if resolvable and len(b) > 1:
-        rng = np.random.default_rng(0)
-        draws = [shrinkage(rng.integers(0, len(b), len(b))) for _ in range(1000)]
+    if resolvable and len(np.unique(case.motion)) > 1:
+        rng, motions = np.random.default_rng(0), np.unique(case.motion)
+        members = [np.flatnonzero(case.motion == first) for first in motions]
+        draws = [
+            shrinkage(np.concatenate([members[i] for i in rng.integers(0, len(members), len(members))]))
+            for _ in range(1000)
+        ]
         low, high = np.nanquantile(draws, (0.05, 0.95))
         interval90 = float(low), float(high)
     total = b.sum()

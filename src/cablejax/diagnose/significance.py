@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from scipy.stats import chi2
 
 from cablejax.types import GapLog
@@ -69,18 +69,20 @@ def smallest_gap(noise: Float[np.ndarray, "N"], freedom: float, level: float) ->
     return 1e3 * float(np.sqrt(max(excess, 0.0) * (noise**2).mean()))
 
 
-def contrast_p(values: Float[np.ndarray, "E C"]) -> Float[np.ndarray, "C"]:
-    """p-values of "no contrast" for several contrasts, each episode's signs flipped together.
+def contrast_p(values: Float[np.ndarray, "E C"], motion: Int[np.ndarray, "E"]) -> Float[np.ndarray, "C"]:
+    """p-values of "no contrast" for several contrasts, the signs of each motion's episodes flipped together.
 
     A contrast's |sum| over the root of its sum of squares is held against the largest of all contrasts under each flip
     (Westfall and Young 1993), which keeps the chance of any false statement below the level.
 
     Args:
         values: of each contrast in each episode, symmetric about 0 if there is none; NaN = not to be had.
+        motion: episodes with the same number repeat one another.
     """
-    filled = np.where(np.isfinite(values), values, 0.0)
+    each = np.where(np.isfinite(values), values, 0.0)
+    filled = np.stack([each[motion == first].sum(axis=0) for first in np.unique(motion)])
     scale = np.sqrt((filled**2).sum(axis=0)) + 1e-12
-    n_episodes = len(values)
+    n_episodes = len(filled)
     if n_episodes <= _MAX_EXACT_FLIPS:
         bits = (np.arange(2**n_episodes)[:, None] >> np.arange(n_episodes)) & 1
     else:

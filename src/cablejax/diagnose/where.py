@@ -19,6 +19,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from cablejax.diagnose.regimes import Regimes, regimes_of
+from cablejax.diagnose.repeats import repeated_motions
 from cablejax.diagnose.significance import (
     NOISE_TOLERANCE,
     contrast_p,
@@ -102,6 +103,8 @@ def localise(log: GapLog, nominal: Float[np.ndarray, "E T N 2"], noise: Float[np
     if not np.isfinite(residual).any():
         raise ValueError("Not one keypoint is both observed and simulated: there is no gap to look at.")
     regimes = regimes_of(log, nominal, valid)
+    pose = np.where(valid[..., None, None], log.gripper_pose, np.nan)
+    motion = repeated_motions(pose, float(log.meta["cable"]["length_m"]))
 
     whitened = residual / noise[:, None]
     squared = (whitened**2).mean(axis=-1)
@@ -120,7 +123,7 @@ def localise(log: GapLog, nominal: Float[np.ndarray, "E T N 2"], noise: Float[np
         horizons_mm=_horizons(log, valid, everywhere, above),
         regimes={name: above(mask[..., None] & everywhere) for name, mask in regimes.masks.items() if mask.any()},
         frames=_frames(residual, noise, nominal, log),
-        contrasts=_contrasts(residual, noise, squared, regimes),
+        contrasts=_contrasts(residual, noise, squared, regimes, motion),
         regime_masks=regimes.masks,
         sentences=(),
     )
@@ -201,7 +204,7 @@ def _frames(residual, noise, nominal, log: GapLog) -> dict[str, float]:
     }
 
 
-def _contrasts(residual, noise, squared, regimes: Regimes) -> dict[str, tuple[float, float]]:
+def _contrasts(residual, noise, squared, regimes: Regimes, motion) -> dict[str, tuple[float, float]]:
     """Ratios of the gap in one part to that in its opposite, with p-values against the largest of all contrasts."""
     everywhere = np.isfinite(squared)
     pairs = {name: (a[..., None] & everywhere, b[..., None] & everywhere) for name, (a, b) in regimes.pairs.items()}
@@ -230,5 +233,5 @@ def _contrasts(residual, noise, squared, regimes: Regimes) -> dict[str, tuple[fl
         ratios.append(max(_above(residual, noise, a), 0.1 * np.sqrt(floor) * 1e3) / low)
     if not names:
         return {}
-    p = contrast_p(np.stack(columns, axis=1))
+    p = contrast_p(np.stack(columns, axis=1), motion)
     return {name: (float(r), float(q)) for name, r, q in zip(names, ratios, p, strict=True)}

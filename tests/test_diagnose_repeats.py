@@ -1,0 +1,65 @@
+"""Episodes that repeat one another are one piece of evidence."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from cablejax.diagnose.fit import candidate, evaluate, improve
+from cablejax.diagnose.profile import QUANTILE, profile_widths
+from cablejax.diagnose.repeats import repeated_motions, share_of_motion
+from diagnose_cases import evidence, parts
+
+
+def test_motions_a_twentieth_of_the_length_apart_are_one():
+    pose = np.zeros((4, 10, 2, 3))
+    pose[1, :, 0, 0] = 0.04
+    pose[2, :, 0, 0] = 0.2
+    # the end of a shorter episode is not compared
+    pose[3, 7:] = np.nan
+    assert repeated_motions(pose, 1.0).tolist() == [0, 0, 2, 0]
+    # seen on a shorter cable they differ
+    assert repeated_motions(pose, 0.5).tolist() == [0, 1, 2, 0]
+    np.testing.assert_allclose(share_of_motion(np.array([0, 0, 2, 0])), [1 / 3, 1 / 3, 1, 1 / 3])
+
+
+def test_an_episode_twice_tells_no_more_than_once():
+    once = evidence(("bending_stiffness", (1.4,)))
+    twice = dataclasses.replace(once.restricted([0, 1, 2, 3, 0]), motion=np.array([0, 1, 2, 3, 0]))
+    trial = candidate(*parts(("bending_stiffness", (1.3,))))
+    one, two = evaluate(once, [trial])[0], evaluate(twice, [trial])[0]
+    assert once.log_likelihood(one.sse) == pytest.approx(twice.log_likelihood(two.sse), rel=1e-6)
+    np.testing.assert_allclose(one.precision(once), two.precision(twice), rtol=1e-4)
+    np.testing.assert_allclose(one.held_out_sse(once), two.held_out_sse(twice)[:4], rtol=1e-4)
+
+
+def test_profiles_of_a_nearly_linear_fit_are_those_of_its_covariance():
+    facts = evidence(("table_friction", (0.45, 0.02)), ("camera_similarity", (1.003, 0.002, 0.002, 0.0)), noise_mm=0.5)
+    start = candidate(*parts(("camera_similarity", (1.003, 0.002, 0.002, 0.0)), ("table_friction", (0.45, 0.02))))
+    fit = improve(facts, evaluate(facts, [start]), max_iterations=8)[0]
+    laplace = QUANTILE * np.sqrt(np.diagonal(np.linalg.inv(fit.precision(facts))))
+    np.testing.assert_allclose(profile_widths(facts, fit)[:4], np.repeat(laplace[:4, None], 2, axis=1), rtol=0.1)
+
+
+def test_a_profile_ends_where_the_refitted_cost_has_risen_by_its_share():
+    """The friction's slip speed is a parameter with curved profiles; the cost is refitted here from scratch."""
+    facts = evidence(("table_friction", (0.45, 0.02)), noise_mm=3.0)
+    start = candidate(*parts(("table_friction", (0.45, 0.02))))
+    fit = improve(facts, evaluate(facts, [start]), max_iterations=12, tolerance=1e-4)[0]
+    widths = profile_widths(facts, fit)
+    z, bounds = fit.candidate.z, fit.candidate.bounds
+    for side, sign in enumerate((-1, 1)):
+        end = z[0] + sign * widths[0, side]
+        if not bounds[0, 0] + 1e-6 < end < bounds[0, 1] - 1e-6:
+            continue
+        costs = []
+        for other in np.linspace(z[1] - 2, z[1] + 2, 41):
+            moved = dataclasses.replace(fit.candidate, z=np.clip([end, other], *bounds.T))
+            costs.append(moved)
+        weight = facts.weight(fit.sse)
+        lowest = min(
+            0.5 * (weight @ trial.sse + trial.candidate.z @ trial.candidate.z) for trial in evaluate(facts, costs)
+        )
+        assert lowest - 0.5 * (weight @ fit.sse + z @ z) == pytest.approx(0.5 * QUANTILE**2, rel=0.35)
