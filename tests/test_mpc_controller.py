@@ -83,6 +83,28 @@ def test_commands_respect_every_bound():
         assert 0.15 <= np.hypot(*(cable.pose[1, :2] - cable.pose[0, :2])) <= 0.99
 
 
+def test_grippers_stay_in_the_workspace_and_brake_in_time():
+    """The target's ends are held outside; the shape is as good as that allows, and the motion changes slowly."""
+    corners = np.array([[-0.5, -0.03], [1.5, 0.03]])
+    config = dataclasses.replace(CONFIG, workspace=((-0.5, -0.03), (1.5, 0.03)), max_change=0.01)
+    cable = Cable(rate=0.8, sag=0.0)
+    control, places = controller(config=config), []
+    state, before = control.init(at_rest(jnp.asarray(cable.pose))), np.zeros((2, 3))
+    errors = []
+    for _ in range(25):
+        state, twist, info = control.step(state, cable.keypoints, cable.pose)
+        cable.step(twist)
+        motion = np.asarray(twist, float) * [1, 1, 0.15]
+        assert np.linalg.norm(motion - before, axis=-1).max() <= 0.01 + 1e-6
+        before = motion
+        places.append(cable.pose[:, :2].copy())
+        errors.append(float(info.shape_error))
+    places = np.array(places)
+    assert (places >= corners[0] - 1e-6).all() and (places <= corners[1] + 1e-6).all()
+    assert errors[-1] < 0.5 * errors[0]
+    assert np.linalg.norm(before) < 5e-3
+
+
 def test_trust_region_shrinks_when_predictions_fail_and_grows_when_they_hold():
     stuck = Cable(rate=0.0, sag=0.0)
     _, _, info = run(controller(config=WITHOUT), stuck, 6)
@@ -224,6 +246,8 @@ def test_times_a_control_call():
         ({"radius": 0.06}, "radius_min"),
         ({"shrink_below": 0.9}, "thresholds"),
         ({"min_reduction": 0.0}, "min_reduction"),
+        ({"workspace": ((0.0, 1.0), (1.0, 0.0))}, "workspace"),
+        ({"max_change": 0.0}, "max_change"),
     ],
 )
 def test_impossible_settings_are_refused(change, message):

@@ -91,6 +91,21 @@ def small_plan(seed: int) -> list[Case]:
     return [Case(index, *row) for index, row in enumerate(rows)]
 
 
+def hard_plan(seed: int) -> list[Case]:
+    """42 cases of families A and B in which more than one thing is wrong, or something that the library does not have.
+
+    24 pairs, 12 effects outside the library, 6 without effect.
+    """
+    rng = np.random.default_rng([seed, 3])
+    rows: list[tuple[str, str, tuple[str, ...], int]] = [("none", family, (), 0) for family in "AAAABB"]
+    for number in range(24):
+        family = "AAB"[number % 3]
+        rows.append(("pair", family, _pair(rng, family), 8 if number % 3 == 2 else 4))
+    for name in rng.choice(UNSPECIFIED, 12, replace=False):
+        rows.append(("unknown", "A", (str(name),), 4))
+    return [Case(index, *rows[row]) for index, row in enumerate(rng.permutation(len(rows)))]
+
+
 def commissioning_plan(seed: int) -> list[Case]:
     """Two cases without any effect of every family, as a user would record on a set-up before it is trusted."""
     del seed
@@ -100,6 +115,7 @@ def commissioning_plan(seed: int) -> list[Case]:
 PLANS = {
     "stored": stored_plan,
     "development": development_plan,
+    "hard": hard_plan,
     "small": small_plan,
     "commissioning": commissioning_plan,
 }

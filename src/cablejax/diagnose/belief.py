@@ -42,9 +42,10 @@ class Calibration:
         noise_share: so much of the noise is added to the baseline error in that comparison, for the noise floor itself
             is an estimate.
         adequate: an explanation that leaves less than this share of the gap, root mean square, is complete.
-        telling: below this share of explained squared gap nothing is named.
+        telling: below this share of explained squared gap nothing is named, unless most motions are explained
+            completely.
         set_odds: an effect belongs to the reported set if its odds against the best are at least these,
-        as_good: or if it leaves at most this many times what the best leaves of the gap, root mean square.
+        as_good: or if it leaves at most this many times what the best leaves, see the function `as_good`.
         widening: of the intervals of parameters, for a law that is not quite the real one shifts them too.
         max_terms: effects in one explanation at most.
     """
@@ -74,6 +75,37 @@ class Calibration:
     def complete(self, left: float, gap: float, noise: float) -> bool:
         """Whether an explanation that leaves so much of the gap, all in metres per coordinate, needs no other."""
         return left <= max(self.adequate * gap, self.smallest_gap(noise))
+
+
+def explains_most_motions(fit: Fit, null: Fit, evidence: Evidence, calibration: Calibration) -> bool:
+    """Whether an explanation is complete for more than half of the motions that have a gap.
+
+    A cause that acts at one place or one time leaves most motions to the other causes.
+    """
+    noise = level(evidence)
+    left, gap = left_by_motion(fit, evidence), left_by_motion(null, evidence)
+    done = [
+        calibration.complete(after, before, noise)
+        for after, before in zip(left, gap, strict=True)
+        if before > calibration.smallest_gap(noise)
+    ]
+    return bool(done) and float(np.mean(done)) > 0.5
+
+
+def as_good(fit: Fit, best: Fit, evidence: Evidence, calibration: Calibration) -> bool:
+    """Whether a fit leaves little more of the gap than the best, over the whole log and in at least half of its
+    motions: one motion that nothing explains makes all explanations look alike."""
+    whole = excess(float(fit.sse.sum()), evidence) <= calibration.as_good * excess(float(best.sse.sum()), evidence)
+    least = np.maximum(left_by_motion(best, evidence), calibration.smallest_gap(level(evidence)))
+    return whole and float(np.mean(left_by_motion(fit, evidence) <= calibration.as_good * least)) >= 0.5
+
+
+def left_by_motion(fit: Fit, evidence: Evidence) -> Float[np.ndarray, "M"]:
+    """What a fit leaves of each motion, root mean square per coordinate above the noise [m]."""
+    counts = evidence.count
+    members = [evidence.motion == first for first in np.unique(evidence.motion)]
+    squares = [max(float((fit.sse - counts)[own].sum()), 0.0) / float(counts[own].sum()) for own in members]
+    return level(evidence) * np.sqrt(squares)
 
 
 def excess(sse: float, evidence: Evidence) -> float:

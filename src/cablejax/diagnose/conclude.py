@@ -10,7 +10,15 @@ import numpy as np
 from jaxtyping import Float
 
 from cablejax.diagnose.actuation import Actuation
-from cablejax.diagnose.belief import Calibration, effect_names, excess, level, probabilities
+from cablejax.diagnose.belief import (
+    Calibration,
+    as_good,
+    effect_names,
+    excess,
+    explains_most_motions,
+    level,
+    probabilities,
+)
 from cablejax.diagnose.diagnosis import NamedEffect, ParameterEstimate, Ranked, Verdict
 from cablejax.diagnose.fit import Evidence, Fit
 from cablejax.diagnose.profile import scaled_draws
@@ -62,29 +70,27 @@ def conclude(found: Search, evidence: Evidence, calibration: Calibration) -> Con
     for name in effect_names(best.candidate):
         rest = set(effect_names(best.candidate)) - {name}
         odds: dict[str, float] = {}
-        leaves: dict[str, float] = {}
+        alike_by_size: set[str] = set()
         for fit, chance in zip(found.fits, chances, strict=True):
             names = set(effect_names(fit.candidate))
             # the same explanation with another effect in this one's place
             if len(names) == len(rest) + 1 and rest <= names:
                 (other,) = names - rest
                 odds[other] = odds.get(other, 0.0) + float(chance)
-                leaves[other] = min(leaves.get(other, np.inf), excess(float(fit.sse.sum()), evidence))
+                if as_good(fit, best, evidence, calibration):
+                    alike_by_size.add(other)
         total = sum(odds.values())
         # In a wide gap a likelihood is sure of differences that are small beside what any law leaves.
         alike = sorted(
-            (
-                n
-                for n in odds
-                if odds[n] >= calibration.set_odds * odds[name] or leaves[n] <= calibration.as_good * left
-            ),
+            (n for n in odds if odds[n] >= calibration.set_odds * odds[name] or n in alike_by_size),
             key=lambda n: -odds[n],
         )
         if len(alike) > 1:
             equivalent.append(tuple(alike))
         effects.append(_named(name, best, odds[name] / total, draws, evidence.playback.config))
     complete = calibration.complete(left, gap, level(evidence))
-    if explained < calibration.telling and not complete:
+    telling = explained >= calibration.telling or explains_most_motions(best, null, evidence, calibration)
+    if not (telling or complete):
         return Conclusion("unknown", best, (), (), ranking, explained)
     if not complete:
         verdict: Verdict = "named+unknown"

@@ -119,7 +119,11 @@ def _grown(evidence: Evidence, base: Candidate, effects: Sequence[Effect], conte
     # a second piece of the same effect makes sense only for marks on the cable
     partners = [e for e in effects if e.name not in base.names or e.name == "keypoint_bias"]
     templates = screen(evidence, base, partners, rest)
+    # An obstacle that is not quite in its place touches in other episodes: what its template takes away says little.
+    fixed = [template for template in templates if template.start.terms[-1].effect.amplitude is None]
     starts = [start for start in shortlist(templates, per_variant=1, per_effect=2) if not _repeats(start)][:_PARTNERS]
+    tried = {start.names[-1] for start in starts}
+    starts += [start for start in shortlist(fixed, per_variant=1, per_effect=1) if start.names[-1] not in tried]
     return improve(evidence, evaluate(evidence, starts), max_iterations=5)
 
 

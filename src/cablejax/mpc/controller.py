@@ -33,6 +33,9 @@ class MPCConfig:
         cable_length: free length of the cable L [m].
         min_distance: least distance of the grippers, relative to L.
         max_distance: greatest distance of the grippers, relative to L: a taut cable cannot be shaped.
+        workspace: lowest and highest corner (x, y) of where the grippers may be [m]; None = anywhere.
+        max_change: greatest norm of the change of a gripper's motion from one step to the next [m]: it bounds the
+            acceleration. Then holding means to brake, which may take steps. None = any.
         radius: initial trust-region size epsilon, the bound on one step's motion of each gripper [m].
         radius_min: it does not shrink below this [m].
         radius_max: nor grow above this [m]: the model has not been trained on faster motions.
@@ -56,6 +59,8 @@ class MPCConfig:
     cable_length: float = 1.0
     min_distance: float = 0.15
     max_distance: float = 0.99
+    workspace: tuple[tuple[float, float], tuple[float, float]] | None = None
+    max_change: float | None = None
     radius: float = 0.05
     radius_min: float = 0.002
     radius_max: float = 0.05
@@ -82,6 +87,15 @@ class MPCConfig:
                 f"MPCConfig distances {self.min_distance} to {self.max_distance}: expected 0 <= min_distance < "
                 "max_distance <= 1, relative to the cable's length."
             )
+        if self.workspace is not None:
+            corners = np.asarray(self.workspace, float)
+            if corners.shape != (2, 2) or not (corners[0] < corners[1]).all():
+                raise ValueError(
+                    f"MPCConfig.workspace is {self.workspace}, expected ((x, y) of the lowest, (x, y) of the highest "
+                    "corner) [m]."
+                )
+        if self.max_change is not None and not self.max_change > 0:
+            raise ValueError(f"MPCConfig.max_change is {self.max_change}, expected a positive length [m] or None.")
         if not 0 < self.radius_min <= self.radius <= self.radius_max:
             raise ValueError(
                 f"MPCConfig radii {self.radius_min}, {self.radius}, {self.radius_max}: expected "
@@ -350,7 +364,14 @@ def _fit_residual(config: MPCConfig, state: ControllerState) -> ResidualModel | 
 
 def _feasible_set(config: MPCConfig, state: ControllerState) -> FeasibleSet:
     limits = config.min_distance * config.cable_length, config.max_distance * config.cable_length
-    return feasible_from(state.history.gripper_pose, state.radius, limits)
+    return feasible_from(
+        state.history.gripper_pose,
+        state.radius,
+        limits,
+        workspace=config.workspace,
+        change=config.max_change,
+        previous=config.objective.to_motion(state.twist),
+    )
 
 
 def _update_radius(
@@ -375,6 +396,8 @@ def _plan_or_hold(
 ) -> tuple[Plan, Float[Array, ""], Float[Array, ""]]:
     """The solver's plan, or holding still where that is as good or nothing can be trusted; and both their values."""
     still = jnp.zeros_like(guess)
+    if config.max_change is not None:
+        still = problem.feasible.project(still)
     plan = config.solver(problem, guess)
     value, value_hold = jax.vmap(problem.value)(jnp.stack([plan.motion, still]))
     improvement = jnp.sqrt(2.0 * value_hold / config.n_commands) - jnp.sqrt(2.0 * value / config.n_commands)

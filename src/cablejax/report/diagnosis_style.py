@@ -2,30 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 from cablejax.diagnose.diagnosis import Diagnosis
 from cablejax.report.effect_words import effect_title
-from cablejax.report.style import LIGHT
+from cablejax.report.style import FIGURE_STYLE
 
-STYLE: dict[Any, Any] = {
-    "font.family": "sans-serif",
-    "font.size": 11.0,
-    "axes.edgecolor": LIGHT.muted,
-    "axes.labelcolor": LIGHT.ink,
-    "axes.titlelocation": "left",
-    "axes.titlesize": 11.0,
-    "axes.titlecolor": LIGHT.ink,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.linewidth": 0.8,
-    "text.color": LIGHT.ink,
-    "xtick.color": LIGHT.muted,
-    "ytick.color": LIGHT.muted,
-    "grid.color": LIGHT.faint,
-    "legend.frameon": False,
-    "svg.fonttype": "none",
-}
+STYLE = FIGURE_STYLE | {"font.size": 11.0, "axes.titlesize": 11.0}
 """Settings for `matplotlib.rc_context`."""
 
 

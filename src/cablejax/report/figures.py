@@ -6,8 +6,6 @@ state, no display needed. Notebooks show it, `page.svg` inlines it, `figure.save
 
 from __future__ import annotations
 
-from typing import Any
-
 import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
@@ -16,6 +14,7 @@ from matplotlib.lines import Line2D
 
 from cablejax.report.record import Method, RunRecord, pair_by_shape
 from cablejax.report.style import (
+    FIGURE_STYLE,
     LIGHT,
     METHOD_LABEL,
     METHOD_ORDER,
@@ -27,26 +26,12 @@ from cablejax.report.style import (
 _REST = 5e-4
 """Grippers that move by less than this in a step [m, rad] rest."""
 
-_STYLE: dict[Any, Any] = {
-    "font.family": "sans-serif",
+_STYLE = FIGURE_STYLE | {
     "font.size": 10.0,
-    "axes.edgecolor": LIGHT.muted,
-    "axes.labelcolor": LIGHT.ink,
-    "axes.titlecolor": LIGHT.ink,
-    "axes.titlelocation": "left",
     "axes.titleweight": "bold",
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.linewidth": 0.8,
-    "text.color": LIGHT.ink,
-    "xtick.color": LIGHT.muted,
-    "ytick.color": LIGHT.muted,
     "xtick.labelcolor": LIGHT.muted,
     "ytick.labelcolor": LIGHT.muted,
-    "grid.color": LIGHT.faint,
     "grid.linewidth": 0.6,
-    "legend.frameon": False,
-    "svg.fonttype": "none",
 }
 
 

@@ -62,6 +62,24 @@ DARK = Colours(
     direct="#ff9d4d",
 )
 
+FIGURE_STYLE: dict[Any, Any] = {
+    "font.family": "sans-serif",
+    "axes.edgecolor": LIGHT.muted,
+    "axes.labelcolor": LIGHT.ink,
+    "axes.titlecolor": LIGHT.ink,
+    "axes.titlelocation": "left",
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.linewidth": 0.8,
+    "text.color": LIGHT.ink,
+    "xtick.color": LIGHT.muted,
+    "ytick.color": LIGHT.muted,
+    "grid.color": LIGHT.faint,
+    "legend.frameon": False,
+    "svg.fonttype": "none",
+}
+"""Settings for `matplotlib.rc_context`, of every figure."""
+
 
 def cable_curve(
     keypoints: Float[np.ndarray, "N 2"], gripper_pose: Float[np.ndarray, "2 3"] | None = None, n_points: int = 61
