@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from cablejax.bounded import BoundedLevenbergMarquardt, SpectralProjectedGradient, certify
+from cablejax.evaluation.against_ipopt import comparable_seconds, kkt_residual, slopes_along
 from cablejax.evaluation.planning_problems import (
     CONFIG,
     PlanningCase,
@@ -15,10 +16,12 @@ from cablejax.evaluation.planning_problems import (
     load_cases,
     other_radii,
     save_cases,
+    smooth_model,
 )
 from cablejax.evaluation.referee import Limits, RefereeConfig, referee
 from cablejax.evaluation.solver_path import PathFinder
 from cablejax.mpc import Controller
+from cablejax.shaping import Model
 from mpc_cases import START, at_rest, hermite_shape, poses, problem, random_motion, relaxing_cable
 
 pytest.importorskip("ipyopt")
@@ -55,6 +58,39 @@ def test_ours_and_the_referees_agree(ours, name):
         assert path.objectives[-1] <= found.objective * (1 + 1e-6)
         assert found.objective <= path.objectives[-1] * (1 + 1e-6)
         assert found.seconds_to(found.objective * (1 + 1e-6)) <= found.seconds
+
+
+def test_slopes_and_residuals_are_those_of_the_objective():
+    with jax.enable_x64(True):
+        case, rng = problem("U"), np.random.default_rng(0)
+        motion = np.asarray(case.feasible.project(random_motion(0, STEPS)))
+        along = slopes_along(case, motion, rng, reach=1e-4, points=3)
+        direction = np.random.default_rng(0).normal(size=motion.shape)
+        direction /= np.linalg.norm(direction)
+        ends = [float(case.value(jnp.asarray(motion + t * direction))) for t in (-1e-4, 1e-4)]
+        assert along[1] == pytest.approx((ends[1] - ends[0]) / 2e-4, rel=1e-4)
+        expected = certify(jax.grad(case.value)(jnp.asarray(motion)), case.feasible, jnp.asarray(motion)).residual
+        assert kkt_residual(case, motion) == pytest.approx(float(expected), rel=1e-9)
+
+
+def test_seconds_are_compared_where_objectives_are_equal():
+    def row(objective, ours, theirs):
+        return {
+            "objective": objective,
+            "limited": {"objective": 1.0, "seconds_to_both": theirs, "ours_seconds_to_both": ours},
+        }
+
+    # equal; another minimum; a start as good as the end; IPOPT without a feasible plan as good
+    rows = [row(1.0 + 1e-8, 2.0, 6.0), row(1.1, 1.0, 1.0), row(1.0, 0.0, 3.0), row(1.0, 1.0, np.inf)]
+    for equal, expected in ((1e-6, ([2.0], [6.0])), (np.inf, ([2.0, 1.0], [6.0, 1.0]))):
+        mine, theirs = comparable_seconds(rows, "limited", equal)
+        assert (mine.tolist(), theirs.tolist()) == expected
+    assert comparable_seconds(rows, "exact")[0].size == 0
+
+
+def test_only_networks_have_corners_to_round():
+    with pytest.raises(ValueError, match="nothing to round"):
+        smooth_model(Model("analytic", None, relaxing_cable, None))  # pyright: ignore[reportArgumentType]
 
 
 @pytest.mark.slow

@@ -18,6 +18,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from cablejax.closed_loop import run_closed_loop
+from cablejax.dynamics.smooth import CORNER, smoothed
 from cablejax.evaluation.cases import PLANT_CABLE, mujoco_plant
 from cablejax.evaluation.protocols import LaidOut, letter_task, random_task
 from cablejax.evaluation.referee import Limits
@@ -25,7 +26,7 @@ from cablejax.mpc import Controller, MPCConfig, Plan, ShapingProblem, Solver
 from cablejax.mpc.feasible import feasible_from
 from cablejax.residual.corrected import corrected
 from cablejax.residual.ridge import ResidualModel, zero_residual
-from cablejax.shaping import Model
+from cablejax.shaping import Model, NetworkDynamics
 from cablejax.targets import Shape
 from cablejax.types import History
 
@@ -102,6 +103,14 @@ class ProblemMaker:
     def _cast(self, leaf) -> Array:
         leaf = jnp.asarray(leaf)
         return leaf.astype(self.precision) if jnp.issubdtype(leaf.dtype, jnp.floating) else leaf
+
+
+def smooth_model(model: Model, corner: float = CORNER) -> Model:
+    """The model with its activations' corners rounded, so that its planning problems have stationary points."""
+    if not isinstance(model.dynamics, NetworkDynamics):
+        raise ValueError(f"Model {model.name!r} is no network as `load_model` gives it: there is nothing to round.")
+    graphdef = smoothed(model.dynamics.graphdef, model.weights, corner)
+    return dataclasses.replace(model, dynamics=NetworkDynamics(graphdef))
 
 
 def closed_loop_cases(

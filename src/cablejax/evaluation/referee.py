@@ -81,7 +81,7 @@ class RefereeResult:
         iterations: of IPOPT.
         evaluations: numbers of objectives, gradients and Hessians asked for.
         seconds: wall time, without compilation if the functions are warm [s].
-        path: (seconds, objective, violation of the constraints) after each iteration, shape [I, 3].
+        path: (seconds, objective, largest excess over a bound [m]) after each iteration, shape [I, 3].
     """
 
     motion: Float[np.ndarray, "T Q 3"]
@@ -135,25 +135,22 @@ def referee(
     shape, n = start.shape, start.size
     bounds = jnp.asarray([*limits.separation, limits.radius, limits.min_distance, limits.max_distance])
     # Objectives range over decades from a run's first step to its last: IPOPT sees them relative to the start's.
-    scale = 1.0 / max(float(_value_and_slope(problem, jnp.asarray(start))[0]), 1e-12)
+    scale = 1.0 / max(float(_value(problem, jnp.asarray(start))), 1e-12)
     counts = [0, 0, 0]
-    seen: list[tuple[bytes, float, np.ndarray]] = []
+    latest = start.ravel().copy()
     path: list[tuple[float, float, float]] = []
     began = time.perf_counter()
 
-    def both(x):
-        if not seen or seen[0][0] != x.tobytes():
-            value, slope = _value_and_slope(problem, jnp.asarray(x.reshape(shape)))
-            seen[:] = [(x.tobytes(), scale * float(value), scale * np.asarray(slope).ravel())]
-        return seen[0]
-
     def objective(x):
         counts[0] += 1
-        return both(x)[1]
+        return scale * float(_value(problem, jnp.asarray(x.reshape(shape))))
 
     def gradient(x, out):
         counts[1] += 1
-        out[()] = both(x)[2]
+        # Objectives are asked for at more points than gradients, in line searches; gradients mostly where the value
+        # is known already.
+        out[()] = scale * np.asarray(_slope(problem, jnp.asarray(x.reshape(shape)))).ravel()
+        latest[()] = x
 
     def constraints(x, out):
         out[()] = np.asarray(_constraints(bounds, jnp.asarray(x.reshape(shape))))
@@ -166,8 +163,11 @@ def referee(
         matrix = _curvature(problem, bounds, jnp.asarray(x.reshape(shape)), multipliers, factor * scale)
         out[()] = np.asarray(matrix)[lower]
 
-    def watch(mode, count, value, inf_pr, *_):
-        path.append((time.perf_counter() - began, value / scale, inf_pr))
+    def watch(mode, count, value, *_):
+        # The iterate is where the last gradient was taken, but for the restoration phase (mode 1), which minimises
+        # something else. IPOPT's own figure of infeasibility is that of its slacks.
+        excess = np.inf if mode == 1 else limits.violation(latest.reshape(shape))
+        path.append((time.perf_counter() - began, value / scale, excess))
         return time.perf_counter() - began < config.max_seconds
 
     n_constraints = int(_constraints(bounds, jnp.asarray(start)).size)
@@ -207,7 +207,7 @@ def referee(
     motion = point.reshape(shape)
     return RefereeResult(
         motion=motion,
-        objective=float(_value_and_slope(problem, jnp.asarray(motion))[0]),
+        objective=float(_value(problem, jnp.asarray(motion))),
         violation=limits.violation(motion),
         status=int(status),
         iterations=len(path),
@@ -218,8 +218,13 @@ def referee(
 
 
 @jax.jit
-def _value_and_slope(problem: ShapingProblem, motion: Float[Array, "T 2 3"]):
-    return jax.value_and_grad(problem.value)(motion)
+def _value(problem: ShapingProblem, motion: Float[Array, "T 2 3"]) -> Float[Array, ""]:
+    return problem.value(motion)
+
+
+@jax.jit
+def _slope(problem: ShapingProblem, motion: Float[Array, "T 2 3"]) -> Float[Array, "T 2 3"]:
+    return jax.grad(problem.value)(motion)
 
 
 @jax.jit

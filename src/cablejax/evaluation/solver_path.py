@@ -60,7 +60,7 @@ class PathFinder:
     ):
         self._fn, self._solver, self._linearise = fn, solver, linearise
         self._begin, self._advance = eqx.filter_jit(self._init), eqx.filter_jit(self._step)
-        self._values = eqx.filter_jit(lambda points, args: jax.lax.map(lambda y: self._objective(y, args), points))
+        self._value = eqx.filter_jit(self._objective)
 
     def __call__(
         self, args: Any, feasible: AbstractSet, start: Float[Array | np.ndarray, "..."], max_steps: int
@@ -74,9 +74,10 @@ class PathFinder:
             y, state, done, converged = jax.block_until_ready(self._advance(y, state, args, feasible))
             points.append(np.asarray(y))
             seconds.append(time.perf_counter() - began)
-        # The same number of points for every path, so that this compiles once.
-        filled = np.stack(points + [points[-1]] * (max_steps + 1 - len(points)))
-        values = np.asarray(self._values(jnp.asarray(filled), args))[: len(points)]
+        # A rejected trial leaves the point where it is.
+        met = {point.tobytes(): point for point in points}
+        value = {key: float(self._value(jnp.asarray(point), args)) for key, point in met.items()}
+        values = np.array([value[point.tobytes()] for point in points])
         best = np.minimum.accumulate(np.where(np.isfinite(values), values, np.inf))
         last = np.maximum.accumulate(np.where(values <= best, np.arange(len(values)), 0))
         return SolverPath(
