@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from cablejax.diagnose.diagnosis import Diagnosis
 from cablejax.report.effect_words import effect_title
 from cablejax.report.style import FIGURE_STYLE
 
-STYLE = FIGURE_STYLE | {"font.size": 11.0, "axes.titlesize": 11.0}
+STYLE: dict[Any, Any] = FIGURE_STYLE | {"font.size": 11.0, "axes.titlesize": 11.0}
 """Settings for `matplotlib.rc_context`."""
 
 

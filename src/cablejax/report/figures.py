@@ -6,6 +6,8 @@ state, no display needed. Notebooks show it, `page.svg` inlines it, `figure.save
 
 from __future__ import annotations
 
+from typing import Any
+
 import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
@@ -26,7 +28,7 @@ from cablejax.report.style import (
 _REST = 5e-4
 """Grippers that move by less than this in a step [m, rad] rest."""
 
-_STYLE = FIGURE_STYLE | {
+_STYLE: dict[Any, Any] = FIGURE_STYLE | {
     "font.size": 10.0,
     "axes.titleweight": "bold",
     "xtick.labelcolor": LIGHT.muted,
