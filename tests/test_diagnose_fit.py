@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from cablejax.diagnose import LIBRARY, Calibration, Effect, Parameter
-from cablejax.diagnose.belief import log_scores
+from cablejax.diagnose.belief import as_good, excess, explains_most_motions, log_scores
 from cablejax.diagnose.chain import LARGEST_STEP
 from cablejax.diagnose.conclude import conclude
 from cablejax.diagnose.effects import BendingStiffness
@@ -16,7 +16,7 @@ from cablejax.diagnose.fit import Candidate, Evidence, Fit, Term, candidate, eva
 from cablejax.diagnose.playback import Playback
 from cablejax.diagnose.screen import residual_of, screen, shortlist
 from cablejax.diagnose.search import Search
-from diagnose_cases import BY_NAME, CABLE, context, evidence, parts
+from diagnose_cases import BY_NAME, CABLE, INTERVAL, context, evidence, parts
 
 LOOK_ALIKES = (("bending_stiffness", (0.3,)), ("table_friction", (0.3, 0.0)))
 OFFSET = ("gripper_rotation_offset", 1, (0.08,))
@@ -80,6 +80,33 @@ def test_a_rival_that_leaves_as_little_is_a_look_alike():
     assert rival == "table_friction"
     strict = conclude(found, facts, Calibration(as_good=1.0))
     assert strict.equivalent == () and strict.effects[0].probability > 0.99
+
+
+def test_a_motion_that_nothing_explains_does_not_hide_the_cause_of_the_others():
+    """Three motions with a turned gripper, one with an error that no effect makes: named beside unknown, not a
+    look-alike of everything."""
+    facts = evidence(("gripper_rotation_offset", 1, (0.08,)), noise_mm=0.5)
+    strange = facts.target.copy()
+    # keypoints that swing against each other: no cable does that
+    swing = np.sin(np.arange(strange.shape[1]) * INTERVAL)[:, None, None]
+    strange[3] += 0.2 * swing * np.where(np.arange(strange.shape[2]) % 2, 1.0, -1.0)[:, None]
+    facts = dataclasses.replace(facts, target=strange)
+    trials = [candidate(), candidate(*parts(OFFSET)), candidate(*parts(("bending_stiffness", (0.5,))))]
+    null, right, wrong = improve(facts, evaluate(facts, trials), max_iterations=10)
+    calibration = Calibration()
+    assert explains_most_motions(right, null, facts, calibration)
+    assert not explains_most_motions(wrong, null, facts, calibration)
+    # over the whole log all leave about the same
+    assert excess(float(wrong.sse.sum()), facts) < calibration.as_good * excess(float(right.sse.sum()), facts)
+    assert not as_good(wrong, right, facts, calibration)
+    assert as_good(right, right, facts, calibration)
+    scores = log_scores([right, wrong, null], facts, calibration)
+    order = np.argsort(-scores)
+    found = Search(tuple([right, wrong, null][i] for i in order), scores[order], {})
+    conclusion = conclude(found, facts, calibration)
+    assert conclusion.verdict == "named+unknown" and conclusion.explained < calibration.telling
+    assert [effect.name for effect in conclusion.effects] == ["gripper_rotation_offset"]
+    assert conclusion.equivalent == ()
 
 
 def test_two_effects_come_back_together():
