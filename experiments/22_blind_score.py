@@ -13,6 +13,7 @@ import pathlib
 import shlex
 import sys
 
+from blind.measures import leftovers
 from blind.score_page import summary, write_page
 from blind.store import read_labels
 from blind.verdicts import read_verdicts
@@ -30,10 +31,18 @@ def main() -> None:
         nargs="+",
         help="files of hashes published before; default: hashes.json of LABELS_DIR",
     )
+    parser.add_argument(
+        "--leftovers",
+        action="store_true",
+        help="print what right explanations of single effects leave, for cablejax.diagnose.conformal, and nothing else",
+    )
     options = parser.parse_args()
     checked = read_labels(options.labels, options.hashes)
     labels = {name: label for name, label in checked.items() if label["family"] in options.family}
     cases = read_verdicts(options.verdicts, labels)
+    if options.leftovers:
+        print(*(f"{score:.2f}" for score in leftovers(cases)))
+        return
     print(summary(cases))
     if options.report:
         write_page(cases, options.report, shlex.join(["python", *sys.argv]))

@@ -66,6 +66,7 @@ def diagnosis(verdict="named", **changes) -> Diagnosis:
         "effects": (CURVED,),
         "equivalent": (),
         "ranking": RANKING,
+        "leftover_p": 0.037,
         "gap": Gap(
             before_rmse_mm=3.2,
             after_rmse_mm=1.1,

@@ -9,6 +9,9 @@ from collections.abc import Callable, Iterable
 import numpy as np
 from scipy.stats import beta
 
+from cablejax.diagnose.belief import Calibration
+from cablejax.diagnose.conformal import leftover_score
+
 from .verdicts import Scored, coverages, place_error, shrinkage_ratio
 
 SEVERE = 4
@@ -207,3 +210,21 @@ def reliability(cases: list[Scored], edges=(0.0, 0.5, 0.7, 0.8, 0.9, 0.97, 1.000
                 (float(np.mean([p for p, _ in inside])), float(np.mean([hit for _, hit in inside])), len(inside))
             )
     return rows
+
+
+def leftovers(cases: list[Scored]) -> list[float]:
+    """Scores of `cablejax.diagnose.conformal`, sorted: of single effects of the library that the reported set has.
+
+    Effects of the arms show in the encoders and are left out.
+    """
+    scores, calibration = [], Calibration()
+    for case in cases:
+        if case.kind != "single" or case.verdict is None or case.truth[0] not in case.reported:
+            continue
+        if case.truth[0].startswith("actuation") or not case.named:
+            continue
+        left = {ranked["name"]: ranked["leftover_mm"] for ranked in case.verdict["ranking"]}
+        # what the nominal cable leaves stands beside every effect that was not fitted
+        lengths = [1e-3 * x for x in (left[case.truth[0]], max(left.values()), case.verdict["gap"]["noise_floor_mm"])]
+        scores.append(leftover_score(*lengths, calibration))
+    return sorted(scores)

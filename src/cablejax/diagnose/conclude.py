@@ -19,6 +19,7 @@ from cablejax.diagnose.belief import (
     level,
     probabilities,
 )
+from cablejax.diagnose.conformal import leftover_p, leftover_score
 from cablejax.diagnose.diagnosis import NamedEffect, ParameterEstimate, Ranked, Verdict
 from cablejax.diagnose.fit import Evidence, Fit
 from cablejax.diagnose.profile import scaled_draws
@@ -40,6 +41,7 @@ class Conclusion:
         equivalent: sets of effects that this log cannot tell apart.
         ranking: of single effects.
         explained: share of the squared gap that the best explanation takes away.
+        leftover_p: of the test whether it leaves more than a right one does, see `conformal`; None without a gap.
     """
 
     verdict: Verdict
@@ -48,6 +50,7 @@ class Conclusion:
     equivalent: tuple[tuple[str, ...], ...]
     ranking: tuple[Ranked, ...]
     explained: float
+    leftover_p: float | None = None
 
 
 def conclude(found: Search, evidence: Evidence, calibration: Calibration) -> Conclusion:
@@ -62,8 +65,9 @@ def conclude(found: Search, evidence: Evidence, calibration: Calibration) -> Con
     smallest = calibration.smallest_gap(level(evidence))
     if gap <= smallest:
         return Conclusion("none", null, (), (), ranking, 0.0)
+    chance = leftover_p(leftover_score(left, gap, level(evidence), calibration))
     if not best.candidate.terms:
-        return Conclusion("unknown", best, (), (), ranking, explained)
+        return Conclusion("unknown", best, (), (), ranking, explained, chance)
 
     draws = scaled_draws(evidence, best, calibration.widening, _DRAWS, np.random.default_rng(0))
     effects, equivalent = [], []
@@ -91,13 +95,14 @@ def conclude(found: Search, evidence: Evidence, calibration: Calibration) -> Con
     complete = calibration.complete(left, gap, level(evidence))
     telling = explained >= calibration.telling or explains_most_motions(best, null, evidence, calibration)
     if not (telling or complete):
-        return Conclusion("unknown", best, (), (), ranking, explained)
+        return Conclusion("unknown", best, (), (), ranking, explained, chance)
     if not complete:
         verdict: Verdict = "named+unknown"
     else:
         verdict = "ambiguous" if equivalent else "named"
     order = np.argsort([-e.probability for e in effects])
-    return Conclusion(verdict, best, tuple(effects[i] for i in order), tuple(equivalent), ranking, explained)
+    named = tuple(effects[i] for i in order)
+    return Conclusion(verdict, best, named, tuple(equivalent), ranking, explained, chance)
 
 
 def with_arms(conclusion: Conclusion, arms: Actuation) -> Conclusion:

@@ -119,6 +119,8 @@ class Diagnosis:
         effects: what is named as the cause; empty for "none" and "unknown".
         equivalent: sets of effects that this log cannot tell apart.
         ranking: every effect tried, most probable first.
+        leftover_p: chance that a right explanation leaves as much as the best one does, see `conformal`; None without a
+            gap, and where no labelled logs are like this one.
         gap: before and after.
         where: along the cable, in time, by regime, by frame.
         next_motion: None if nothing would be gained.
@@ -141,6 +143,7 @@ class Diagnosis:
     effects: tuple[NamedEffect, ...]
     equivalent: tuple[tuple[str, ...], ...]
     ranking: tuple[Ranked, ...]
+    leftover_p: float | None
     gap: Gap
     where: Where
     next_motion: NextMotion | None

@@ -94,6 +94,7 @@ def diagnose(
         effects=conclusion.effects,
         equivalent=conclusion.equivalent,
         ranking=conclusion.ranking,
+        leftover_p=conclusion.leftover_p,
         gap=measured,
         where=localise(repaired, case.to_log(reference), case.noise.std),
         next_motion=following,

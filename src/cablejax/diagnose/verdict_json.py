@@ -21,8 +21,9 @@ _PLACES = ("along_cable_m", "time_s", "table_m")
 def verdict_json(diagnosis: Diagnosis) -> dict[str, Any]:
     """The verdict as a JSON object; what is not a finite number is null.
 
-    Beside the fields of the format it has `sentence`, `caveats` and `seconds`; `gap` has also `horizons`, `split` and
-    `ahead_mm`, `ranking` also `leftover_mm`, and `where` also `sentences`, `per_horizon_mm` and `frames`.
+    Beside the fields of the format it has `sentence`, `leftover_p`, `caveats` and `seconds`; `gap` has also
+    `horizons`, `split` and `ahead_mm`, `ranking` also `leftover_mm`, and `where` also `sentences`, `per_horizon_mm` and
+    `frames`.
     """
     gap, where = diagnosis.gap, diagnosis.where
     return _plain(
@@ -42,6 +43,7 @@ def verdict_json(diagnosis: Diagnosis) -> dict[str, Any]:
                 }
                 for ranked in diagnosis.ranking
             ],
+            "leftover_p": diagnosis.leftover_p,
             "gap": {
                 "horizon_s": _whole_episode(diagnosis),
                 "before_rmse_mm": gap.before_rmse_mm,

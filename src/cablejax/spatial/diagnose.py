@@ -93,6 +93,7 @@ def diagnose_space(
         effects=effects,
         equivalent=_equivalent(found),
         ranking=_ranking(found),
+        leftover_p=None,
         gap=gap,
         where=where,
         next_motion=None,
