@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from cablejax.diagnose import LIBRARY, Calibration, Effect, Parameter
-from cablejax.diagnose.belief import as_good, excess, explains_most_motions, log_scores
+from cablejax.diagnose.belief import as_good, excess, explains_most_motions, level, log_scores
 from cablejax.diagnose.chain import LARGEST_STEP
 from cablejax.diagnose.conclude import conclude
+from cablejax.diagnose.conformal import leftover_p, leftover_score
 from cablejax.diagnose.effects import BendingStiffness
 from cablejax.diagnose.fit import Candidate, Evidence, Fit, Term, candidate, evaluate, improve
 from cablejax.diagnose.playback import Playback
@@ -107,6 +108,8 @@ def test_a_motion_that_nothing_explains_does_not_hide_the_cause_of_the_others():
     assert conclusion.verdict == "named+unknown" and conclusion.explained < calibration.telling
     assert [effect.name for effect in conclusion.effects] == ["gripper_rotation_offset"]
     assert conclusion.equivalent == ()
+    left, gap = (excess(float(fit.sse.sum()), facts) for fit in (right, null))
+    assert conclusion.leftover_p == leftover_p(leftover_score(left, gap, level(facts), calibration)) < 0.05
 
 
 def test_two_effects_come_back_together():

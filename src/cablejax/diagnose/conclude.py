@@ -65,9 +65,9 @@ def conclude(found: Search, evidence: Evidence, calibration: Calibration) -> Con
     smallest = calibration.smallest_gap(level(evidence))
     if gap <= smallest:
         return Conclusion("none", null, (), (), ranking, 0.0)
-    chance = leftover_p(leftover_score(left, gap, level(evidence), calibration))
+    as_much = leftover_p(leftover_score(left, gap, level(evidence), calibration))
     if not best.candidate.terms:
-        return Conclusion("unknown", best, (), (), ranking, explained, chance)
+        return Conclusion("unknown", best, (), (), ranking, explained, as_much)
 
     draws = scaled_draws(evidence, best, calibration.widening, _DRAWS, np.random.default_rng(0))
     effects, equivalent = [], []
@@ -95,14 +95,14 @@ def conclude(found: Search, evidence: Evidence, calibration: Calibration) -> Con
     complete = calibration.complete(left, gap, level(evidence))
     telling = explained >= calibration.telling or explains_most_motions(best, null, evidence, calibration)
     if not (telling or complete):
-        return Conclusion("unknown", best, (), (), ranking, explained, chance)
+        return Conclusion("unknown", best, (), (), ranking, explained, as_much)
     if not complete:
         verdict: Verdict = "named+unknown"
     else:
         verdict = "ambiguous" if equivalent else "named"
     order = np.argsort([-e.probability for e in effects])
     named = tuple(effects[i] for i in order)
-    return Conclusion(verdict, best, named, tuple(equivalent), ranking, explained, chance)
+    return Conclusion(verdict, best, named, tuple(equivalent), ranking, explained, as_much)
 
 
 def with_arms(conclusion: Conclusion, arms: Actuation) -> Conclusion:
