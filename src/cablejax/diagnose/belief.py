@@ -25,6 +25,7 @@ import numpy as np
 from jaxtyping import Float
 
 from cablejax.diagnose.fit import Candidate, Evidence, Fit
+from cablejax.diagnose.repeats import episodes_by_motion
 
 
 @dataclasses.dataclass(frozen=True)
@@ -74,7 +75,11 @@ class Calibration:
 
     def complete(self, left: float, gap: float, noise: float) -> bool:
         """Whether an explanation that leaves so much of the gap, all in metres per coordinate, needs no other."""
-        return left <= max(self.adequate * gap, self.smallest_gap(noise))
+        return left <= self.may_leave(gap, noise)
+
+    def may_leave(self, gap: float, noise: float) -> float:
+        """So much of the gap [m] a complete explanation may leave."""
+        return max(self.adequate * gap, self.smallest_gap(noise))
 
 
 def explains_most_motions(fit: Fit, null: Fit, evidence: Evidence, calibration: Calibration) -> bool:
@@ -103,8 +108,10 @@ def as_good(fit: Fit, best: Fit, evidence: Evidence, calibration: Calibration) -
 def left_by_motion(fit: Fit, evidence: Evidence) -> Float[np.ndarray, "M"]:
     """What a fit leaves of each motion, root mean square per coordinate above the noise [m]."""
     counts = evidence.count
-    members = [evidence.motion == first for first in np.unique(evidence.motion)]
-    squares = [max(float((fit.sse - counts)[own].sum()), 0.0) / float(counts[own].sum()) for own in members]
+    squares = [
+        max(float((fit.sse - counts)[own].sum()), 0.0) / float(counts[own].sum())
+        for own in episodes_by_motion(evidence.motion)
+    ]
     return level(evidence) * np.sqrt(squares)
 
 

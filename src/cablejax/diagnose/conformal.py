@@ -25,7 +25,7 @@ docs/results/blind/20270404/verdicts docs/results/blind/20270404 --leftovers`.""
 
 def leftover_score(left: float, gap: float, noise: float, calibration: Calibration) -> float:
     """What an explanation leaves of the gap, relative to what a complete one may leave; all in metres."""
-    return left / max(calibration.adequate * gap, calibration.smallest_gap(noise))
+    return left / calibration.may_leave(gap, noise)
 
 
 def leftover_p(score: float) -> float:

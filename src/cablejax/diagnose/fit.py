@@ -12,12 +12,12 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from cablejax.diagnose.effects.base import Effect
 from cablejax.diagnose.physics import Physics
 from cablejax.diagnose.playback import Playback
-from cablejax.diagnose.repeats import share_of_motion
+from cablejax.diagnose.repeats import episodes_by_motion, share_of_motion
 from cablejax.simulate.config import CableConfig
 
 _FIRST_DAMPING = 1e-2
@@ -193,7 +193,16 @@ class Fit:
 
     def precision(self, evidence: Evidence) -> Float[np.ndarray, "P P"]:
         """Inverse posterior covariance of the coordinates, by Laplace's approximation with fixed weights."""
-        return np.einsum("epq,e->pq", self.curvature, evidence.weight(self.sse)) + np.eye(len(self.candidate.z))
+        return self.weighted_precision(evidence.weight(self.sse))
+
+    def weighted_precision(self, weight: Float[np.ndarray, "E"]) -> Float[np.ndarray, "P P"]:
+        """The same with weights of another fit."""
+        return np.einsum("epq,e->pq", self.curvature, weight) + np.eye(len(self.candidate.z))
+
+    def free(self, gradient: Float[np.ndarray, "P"]) -> Bool[np.ndarray, "P"]:
+        """Coordinates that a descent of the cost may move; those at a bound that want to leave it stay there."""
+        z, (lower, upper) = self.candidate.z, self.candidate.bounds.T
+        return ~(((z <= lower + 1e-9) & (gradient > 0)) | ((z >= upper - 1e-9) & (gradient < 0)))
 
     def held_out_sse(self, evidence: Evidence) -> Float[np.ndarray, "E"]:
         """r'r of every episode if its motion had been left out of the fit.
@@ -204,8 +213,7 @@ class Fit:
         """
         precision, weight = self.precision(evidence), evidence.weight(self.sse)
         result = np.empty_like(self.sse)
-        for first in np.unique(evidence.motion):
-            left_out = np.flatnonzero(evidence.motion == first)
+        for left_out in episodes_by_motion(evidence.motion):
             informed = np.einsum("e,epq->pq", weight[left_out], self.curvature[left_out])
             step = np.linalg.solve(precision - informed, weight[left_out] @ self.gradient[left_out])
             for e in left_out:
@@ -292,9 +300,7 @@ def improve(evidence: Evidence, fits: Sequence[Fit], *, max_iterations: int, tol
             z, bounds = fit.candidate.z, fit.candidate.bounds
             precision = fit.precision(evidence)
             gradient = fit.gradient.T @ evidence.weight(fit.sse) + z
-            # coordinates at a bound that want to leave it stay there
-            stuck = ((z <= bounds[:, 0] + 1e-9) & (gradient > 0)) | ((z >= bounds[:, 1] - 1e-9) & (gradient < 0))
-            free = ~stuck
+            free = fit.free(gradient)
             step = np.zeros_like(z)
             damped = precision + damping[i] * np.diag(np.diagonal(precision))
             step[free] = -np.linalg.solve(damped[np.ix_(free, free)], gradient[free])

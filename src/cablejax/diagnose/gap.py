@@ -9,6 +9,7 @@ from cablejax.diagnose.case import Case
 from cablejax.diagnose.diagnosis import Gap
 from cablejax.diagnose.fit import Evidence, Fit, evaluate, improve
 from cablejax.diagnose.reference import predicted_ahead
+from cablejax.diagnose.repeats import episodes_by_motion
 from cablejax.diagnose.search import without_one
 
 _HORIZONS = (1.0, 2.0, 5.0, 10.0)
@@ -26,11 +27,11 @@ def held_out_keypoints(
     Episodes that repeat one another are held out together. An effect that the other episodes do not show is left out:
     nothing would be known of it before this episode.
     """
-    n_episodes, motions = len(evidence.motion), np.unique(evidence.motion)
+    n_episodes, motions = len(evidence.motion), episodes_by_motion(evidence.motion)
     if not best.candidate.terms or len(motions) == 1:
         return case.simulate(best.candidate), tuple(range(n_episodes)) if len(motions) > 1 else ()
-    folds = np.array_split(motions, min(len(motions), _FOLDS))
-    groups = [np.flatnonzero(np.isin(evidence.motion, fold)).tolist() for fold in folds]
+    folds = np.array_split(np.arange(len(motions)), min(len(motions), _FOLDS))
+    groups = [sorted(int(e) for i in fold for e in motions[i]) for fold in folds]
     result = np.empty_like(case.nominal)
     for group in groups:
         rest = evidence.restricted([e for e in range(n_episodes) if e not in group])
@@ -79,12 +80,11 @@ def measure_gap(
         denominator = (b - noise)[chosen].sum()
         return 1 - max((a - noise)[chosen].sum(), 0.0) / denominator if denominator > 0 else np.nan
 
-    interval90 = None
-    if resolvable and len(np.unique(case.motion)) > 1:
-        rng, motions = np.random.default_rng(0), np.unique(case.motion)
-        members = [np.flatnonzero(case.motion == first) for first in motions]
+    interval90, motions = None, episodes_by_motion(case.motion)
+    if resolvable and len(motions) > 1:
+        rng = np.random.default_rng(0)
         draws = [
-            shrinkage(np.concatenate([members[i] for i in rng.integers(0, len(members), len(members))]))
+            shrinkage(np.concatenate([motions[i] for i in rng.integers(0, len(motions), len(motions))]))
             for _ in range(1000)
         ]
         low, high = np.nanquantile(draws, (0.05, 0.95))

@@ -72,10 +72,9 @@ def scaled_draws(
 
 def _profiled_cost(trial: Fit, weight: Float[np.ndarray, "E"], fixed: int) -> float:
     """Cost after a Gauss-Newton step of all coordinates but one, as the step's own model has it."""
-    z, bounds = trial.candidate.z, trial.candidate.bounds
+    z = trial.candidate.z
     gradient = trial.gradient.T @ weight + z
-    stuck = ((z <= bounds[:, 0] + 1e-9) & (gradient > 0)) | ((z >= bounds[:, 1] - 1e-9) & (gradient < 0))
-    free = ~stuck & (np.arange(len(z)) != fixed)
-    precision = (np.einsum("epq,e->pq", trial.curvature, weight) + np.eye(len(z)))[np.ix_(free, free)]
+    free = trial.free(gradient) & (np.arange(len(z)) != fixed)
+    precision = trial.weighted_precision(weight)[np.ix_(free, free)]
     gain = 0.5 * float(gradient[free] @ np.linalg.solve(precision, gradient[free]))
     return 0.5 * float(weight @ trial.sse + z @ z) - gain

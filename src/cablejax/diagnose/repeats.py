@@ -34,6 +34,11 @@ def repeated_motions(gripper_pose: Float[np.ndarray, "E T 2 3"], length: float) 
     return first
 
 
+def episodes_by_motion(motion: Int[np.ndarray, "E"]) -> list[Int[np.ndarray, "_"]]:
+    """The episodes of each motion, in the order of their numbers."""
+    return [np.flatnonzero(motion == first) for first in np.unique(motion)]
+
+
 def share_of_motion(motion: Int[np.ndarray, "E"]) -> Float[np.ndarray, "E"]:
     """1 / how many episodes have the motion of each."""
     return 1.0 / (motion[:, None] == motion[None]).sum(axis=1)

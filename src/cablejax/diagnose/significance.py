@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.stats import chi2
 
+from cablejax.diagnose.repeats import episodes_by_motion
 from cablejax.types import GapLog
 
 NOISE_TOLERANCE = 1.15
@@ -80,7 +81,7 @@ def contrast_p(values: Float[np.ndarray, "E C"], motion: Int[np.ndarray, "E"]) -
         motion: episodes with the same number repeat one another.
     """
     each = np.where(np.isfinite(values), values, 0.0)
-    filled = np.stack([each[motion == first].sum(axis=0) for first in np.unique(motion)])
+    filled = np.stack([each[own].sum(axis=0) for own in episodes_by_motion(motion)])
     scale = np.sqrt((filled**2).sum(axis=0)) + 1e-12
     n_episodes = len(filled)
     if n_episodes <= _MAX_EXACT_FLIPS:

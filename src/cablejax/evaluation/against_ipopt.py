@@ -20,7 +20,7 @@ import numpy as np
 
 from cablejax.bounded import BoundedLevenbergMarquardt, certify
 from cablejax.evaluation.planning_problems import PlanningCase, ProblemMaker, smooth_model
-from cablejax.evaluation.referee import RefereeConfig, referee
+from cablejax.evaluation.referee import RefereeConfig, referee, slope_of, value_of
 from cablejax.evaluation.solver_path import PathFinder
 from cablejax.mpc import ShapingProblem
 from cablejax.shaping import Model
@@ -93,9 +93,9 @@ def judge(
     row: dict[str, Any] = {
         "name": case.name,
         "start": scale,
-        "start_slope": float(jnp.abs(_slope(problem, jnp.asarray(start))).max()),
+        "start_slope": float(jnp.abs(slope_of(problem, jnp.asarray(start))).max()),
         "objective": float(path.objectives[-1]),
-        "sharp_objective": float(_value(sharp, jnp.asarray(path.points[-1]))),
+        "sharp_objective": float(value_of(sharp, jnp.asarray(path.points[-1]))),
         "violation": limits.violation(path.points[-1]),
         "kkt": kkt,
         "kkt_scaled": kkt / scale,
@@ -107,7 +107,7 @@ def judge(
     with jax.enable_x64(False):
         single = ours.make_single(case)
         plan = ours.find_single(single, single.feasible, start.astype(np.float32), steps).points[-1]
-    row["single_objective"] = float(_value(problem, jnp.asarray(plan, jnp.float64)))
+    row["single_objective"] = float(value_of(problem, jnp.asarray(plan, jnp.float64)))
     row["single_violation"] = limits.violation(plan)
     for config in referees:
         found = referee(problem, limits, start, config)
@@ -115,7 +115,7 @@ def judge(
         kkt = kkt_residual(problem, found.motion)
         row["exact" if config.exact else "limited"] = {
             "objective": found.objective,
-            "sharp_objective": float(_value(sharp, jnp.asarray(found.motion))),
+            "sharp_objective": float(value_of(sharp, jnp.asarray(found.motion))),
             "violation": found.violation,
             "kkt": kkt,
             "kkt_scaled": kkt / scale,
@@ -133,7 +133,7 @@ def judge(
 def kkt_residual(problem: ShapingProblem, motion) -> float:
     """The worst of stationarity, feasibility and complementarity at a plan [m]."""
     point = jnp.asarray(motion)
-    return float(_certificate(problem, _slope(problem, point), point).residual)
+    return float(_certificate(problem, slope_of(problem, point), point).residual)
 
 
 def excess(row: dict[str, Any], which: str) -> float:
@@ -165,7 +165,7 @@ def slopes_along(
     direction /= np.linalg.norm(direction)
     along = np.linspace(-reach, reach, points)
     return np.array(
-        [np.sum(np.asarray(_slope(problem, jnp.asarray(motion + t * direction))) * direction) for t in along]
+        [np.sum(np.asarray(slope_of(problem, jnp.asarray(motion + t * direction))) * direction) for t in along]
     )
 
 
@@ -188,16 +188,6 @@ def _jacobian(problem: ShapingProblem, motion):
 @jax.jit
 def _rollout(problem: ShapingProblem, motion):
     return problem.rollout(motion)
-
-
-@jax.jit
-def _value(problem: ShapingProblem, motion):
-    return problem.value(motion)
-
-
-@jax.jit
-def _slope(problem: ShapingProblem, motion):
-    return jax.grad(problem.value)(motion)
 
 
 @jax.jit

@@ -135,7 +135,7 @@ def referee(
     shape, n = start.shape, start.size
     bounds = jnp.asarray([*limits.separation, limits.radius, limits.min_distance, limits.max_distance])
     # Objectives range over decades from a run's first step to its last: IPOPT sees them relative to the start's.
-    scale = 1.0 / max(float(_value(problem, jnp.asarray(start))), 1e-12)
+    scale = 1.0 / max(float(value_of(problem, jnp.asarray(start))), 1e-12)
     counts = [0, 0, 0]
     latest = start.ravel().copy()
     path: list[tuple[float, float, float]] = []
@@ -143,13 +143,13 @@ def referee(
 
     def objective(x):
         counts[0] += 1
-        return scale * float(_value(problem, jnp.asarray(x.reshape(shape))))
+        return scale * float(value_of(problem, jnp.asarray(x.reshape(shape))))
 
     def gradient(x, out):
         counts[1] += 1
         # Objectives are asked for at more points than gradients, in line searches; gradients mostly where the value
         # is known already.
-        out[()] = scale * np.asarray(_slope(problem, jnp.asarray(x.reshape(shape)))).ravel()
+        out[()] = scale * np.asarray(slope_of(problem, jnp.asarray(x.reshape(shape)))).ravel()
         latest[()] = x
 
     def constraints(x, out):
@@ -207,7 +207,7 @@ def referee(
     motion = point.reshape(shape)
     return RefereeResult(
         motion=motion,
-        objective=float(_value(problem, jnp.asarray(motion))),
+        objective=float(value_of(problem, jnp.asarray(motion))),
         violation=limits.violation(motion),
         status=int(status),
         iterations=len(path),
@@ -218,12 +218,14 @@ def referee(
 
 
 @jax.jit
-def _value(problem: ShapingProblem, motion: Float[Array, "T 2 3"]) -> Float[Array, ""]:
+def value_of(problem: ShapingProblem, motion: Float[Array, "T 2 3"]) -> Float[Array, ""]:
+    """The objective of a plan [m^2], compiled."""
     return problem.value(motion)
 
 
 @jax.jit
-def _slope(problem: ShapingProblem, motion: Float[Array, "T 2 3"]) -> Float[Array, "T 2 3"]:
+def slope_of(problem: ShapingProblem, motion: Float[Array, "T 2 3"]) -> Float[Array, "T 2 3"]:
+    """Its gradient [m], compiled."""
     return jax.grad(problem.value)(motion)
 
 

@@ -397,6 +397,7 @@ def _plan_or_hold(
     """The solver's plan, or holding still where that is as good or nothing can be trusted; and both their values."""
     still = jnp.zeros_like(guess)
     if config.max_change is not None:
+        # grippers that move brake first, as fast as they may
         still = problem.feasible.project(still)
     plan = config.solver(problem, guess)
     value, value_hold = jax.vmap(problem.value)(jnp.stack([plan.motion, still]))
