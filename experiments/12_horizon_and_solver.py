@@ -25,32 +25,13 @@ from tqdm import tqdm
 from cablejax.closed_loop import run_closed_loop
 from cablejax.evaluation.cases import PLANT_CABLE, mujoco_plant
 from cablejax.evaluation.protocols import LaidOut, letter_task
-from cablejax.mpc import (
-    Controller,
-    CrossEntropy,
-    Deadline,
-    Dogleg,
-    GaussNewton,
-    MPCConfig,
-    PathIntegral,
-    ProjectedGradient,
-    TrustRegion,
-)
+from cablejax.mpc import SOLVERS, Controller, MPCConfig, TrustRegion
 from cablejax.report.markdown import markdown_table
 from cablejax.report.provenance import machine, versions
 from cablejax.shaping import load_model
 
-SOLVERS = {
-    "Levenberg-Marquardt": TrustRegion(),
-    "Levenberg-Marquardt, converged": TrustRegion(max_iterations=12),
-    "dogleg": Dogleg(),
-    "Gauss-Newton": GaussNewton(),
-    "spectral gradient": ProjectedGradient(),
-    "deadline": Deadline(),
-    "CEM": CrossEntropy(),
-    "MPPI": PathIntegral(),
-}
-CONVERGED = "Levenberg-Marquardt, converged"
+CONVERGED = "trust-region, converged"
+PLANNERS = {**SOLVERS, CONVERGED: TrustRegion(max_iterations=12, trials_per_linearisation=1)}
 HORIZONS = (1, 2, 5, 10)
 SHAPES = ("U", "S", "Z")
 STIFFNESS = 2.0
@@ -83,7 +64,7 @@ class Trial:
 def run(model, solver: str, horizon: int, shape: str, seed: int) -> Trial:
     """One of them; what is compiled is kept for the next target."""
     task = letter_task(shape, seed, PLANT_CABLE)
-    config = dataclasses.replace(MPCConfig(), horizon=horizon, solver=SOLVERS[solver])
+    config = dataclasses.replace(MPCConfig(), horizon=horizon, solver=PLANNERS[solver])
     controller = Controller(config, model.dynamics, model.weights, task.target.keypoints)
     plant = LaidOut(mujoco_plant(STIFFNESS), task.start_shape)
     out = run_closed_loop(plant, controller, task.target, STEPS, start=task.start_pose, record_hz=1.0)
@@ -110,7 +91,7 @@ def run_all(path: Path, wanted: list[tuple]) -> None:
 def cells(trials: list[Trial]) -> dict[tuple[str, int], dict[str, float]]:
     """Means over targets and seeds; times are medians of the runs' percentiles."""
     out = {}
-    for solver in SOLVERS:
+    for solver in PLANNERS:
         for horizon in HORIZONS:
             mine = [t for t in trials if (t.solver, t.horizon) == (solver, horizon)]
             if mine:
@@ -127,14 +108,14 @@ def cells(trials: list[Trial]) -> dict[tuple[str, int], dict[str, float]]:
 def draw(table: dict, path: Path) -> None:
     """Terminal error against milliseconds per call; the default is ringed."""
     figure, axis = plt.subplots(figsize=(8.2, 5.0), layout="constrained")
-    for solver, colour in zip(SOLVERS, COLOURS, strict=True):
+    for solver, colour in zip(PLANNERS, COLOURS, strict=True):
         known = [h for h in HORIZONS if (solver, h) in table]
         points = np.array([[table[solver, h]["p50"], table[solver, h]["error"]] for h in known]).reshape(-1, 2)
         axis.plot(*points.T, color=colour, linewidth=1.0, alpha=0.7, label=solver if known else None)
         for horizon, point in zip(known, points, strict=True):
             axis.plot(*point, MARKERS[HORIZONS.index(horizon)], color=colour, markersize=6)
     default = MPCConfig()
-    chosen = next((name for name, solver in SOLVERS.items() if solver == default.solver), None)
+    chosen = next((name for name, solver in PLANNERS.items() if solver == default.solver), None)
     if (chosen, default.horizon) in table:
         cell = table[chosen, default.horizon]
         axis.plot(cell["p50"], cell["error"], "o", markersize=17, fillstyle="none", color="black", markeredgewidth=1.4)
@@ -212,7 +193,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--shapes", nargs="*", choices=SHAPES, default=SHAPES)
     parser.add_argument("--horizons", nargs="*", type=int, choices=HORIZONS, default=(5, 2, 1, 10))
-    parser.add_argument("--solvers", nargs="*", choices=tuple(SOLVERS), default=tuple(SOLVERS))
+    parser.add_argument("--solvers", nargs="*", choices=tuple(PLANNERS), default=tuple(PLANNERS))
     parser.add_argument("--seeds", nargs="*", type=int, default=SEEDS)
     parser.add_argument("--cache", type=Path, default=CACHE, help="finished runs; a run goes on where it stopped")
     parser.add_argument("--report", type=Path, help="run nothing; write the page on what is done to this file")

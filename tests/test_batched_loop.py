@@ -68,7 +68,7 @@ class OneGradientStep:
 
     def __call__(self, problem, guess):
         motion = problem.feasible.project(guess - 0.1 * jax.grad(problem.value)(guess))
-        return Plan(motion, jnp.ones((), jnp.int32), jnp.full((), Outcome.STEP_LIMIT, jnp.int32))
+        return Plan(motion, problem.value(motion), jnp.ones((), jnp.int32), jnp.full((), Outcome.STEP_LIMIT, jnp.int32))
 
 
 def targets(letters: str) -> list[Target]:

@@ -28,6 +28,9 @@ SOLVERS = {
     "Levenberg-Marquardt": BoundedLevenbergMarquardt(atol=1e-9),
     "dogleg": BoundedDogleg(atol=1e-9),
     "Gauss-Newton": BoundedGaussNewton(atol=1e-9),
+    "Levenberg-Marquardt, updated": BoundedLevenbergMarquardt(atol=1e-9, trials_per_linearisation=3),
+    "dogleg, updated": BoundedDogleg(atol=1e-9, trials_per_linearisation=3),
+    "Gauss-Newton, updated": BoundedGaussNewton(atol=1e-9, trials_per_linearisation=3),
     "spectral": SpectralProjectedGradient(atol=1e-9),
 }
 
@@ -198,3 +201,30 @@ def test_statistics_are_counts():
         solution = least_squares(rosenbrock, SOLVERS["Gauss-Newton"], jnp.zeros(2), box, 0.5)
         for field in dataclasses.fields(solution.stats):
             assert int(getattr(solution.stats, field.name)) > 0
+
+
+@pytest.mark.parametrize("trials", [1, 2, 4])
+def test_a_linearisation_lasts_for_as_many_trials_as_asked(trials):
+    with jax.enable_x64(True):
+        box = Box(jnp.full(2, -2.0), jnp.full(2, 2.0))
+        solver = BoundedLevenbergMarquardt(atol=1e-9, trials_per_linearisation=trials)
+        start = jnp.asarray([-1.2, 1.0])
+        solution = least_squares(rosenbrock, solver, start, box, 1.0, max_steps=9, throw=False)
+        assert int(solution.result) == Result.STEP_LIMIT and int(solution.stats.evaluations) == 9
+        # one by one, a rejected trial keeps the linearisation
+        assert int(solution.stats.linearisations) == -(-9 // trials) if trials > 1 else 9
+        value = float(0.5 * jnp.sum(rosenbrock(solution.value, 1.0) ** 2))
+        assert float(solution.objective) == pytest.approx(value, rel=1e-12)
+
+
+def test_updates_between_linearisations_gain_what_a_stale_jacobian_does_not():
+    """Broyden's update against one step from the same linearisation: by the same number of linearisations, one."""
+    with jax.enable_x64(True):
+        box, start = Box(jnp.full(2, -2.0), jnp.full(2, 2.0)), jnp.asarray([-1.2, 1.0])
+        values = {}
+        for trials in (1, 6):
+            solver = BoundedLevenbergMarquardt(atol=1e-12, trials_per_linearisation=6)
+            found = least_squares(rosenbrock, solver, start, box, 1.0, max_steps=trials, throw=False)
+            assert int(found.stats.linearisations) == 1
+            values[trials] = float(found.objective)
+        assert values[6] < 0.5 * values[1]

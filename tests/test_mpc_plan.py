@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from cablejax.mpc import (
+    SOLVERS,
     CrossEntropy,
-    Deadline,
     Outcome,
     PathIntegral,
     TrustRegion,
@@ -22,7 +22,7 @@ from cablejax.mpc import (
 from mpc_cases import START, poses, problem
 
 STEPS = 3
-EXACT = TrustRegion(max_iterations=100, tolerance=1e-11, secant=True)
+EXACT = TrustRegion(max_iterations=100, trials_per_linearisation=1, tolerance=1e-11, secant=True)
 STILL = np.zeros((STEPS, 2, 3))
 # None of the bounds active; the balls; the balls and the greatest distance.
 REGIMES = {
@@ -71,15 +71,14 @@ def test_plan_is_a_minimum_and_its_derivatives_are_those_of_planning_again(name)
             np.testing.assert_allclose(forward[..., k], expected, atol=3e-6 * max(1.0, float(jnp.abs(expected).max())))
 
 
-def test_a_deadline_plan_is_feasible_and_most_of_the_way():
+def test_a_deadline_plan_is_feasible_most_of_the_way_and_one_linearisation():
     case = problem("U")
-    plan, value, violation = solved(Deadline(), case)
-    best = float(solved(TrustRegion(max_iterations=10), case)[1])
+    plan, value, violation = solved(SOLVERS["deadline"], case)
+    best = float(solved(TrustRegion(max_iterations=20), case)[1])
     start = float(case.value(jnp.asarray(STILL)))
     assert float(violation) == 0.0 and int(plan.linearisations) == 1
     assert start - float(value) > 0.9 * (start - best)
-    with pytest.raises(ValueError, match="fractions"):
-        Deadline(fractions=(0.0,))
+    assert float(plan.value) == pytest.approx(float(value), rel=1e-6)
 
 
 def test_workspace_and_change_of_motion_are_kept():

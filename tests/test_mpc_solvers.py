@@ -15,9 +15,9 @@ STEPS = 3
 SOLVERS = {
     "projected gradient": ProjectedGradient(max_evaluations=300, tolerance=1e-5),
     "nonmonotone": ProjectedGradient(max_evaluations=300, tolerance=1e-5, memory=6),
-    "trust region": TrustRegion(max_iterations=12, tolerance=1e-5),
-    "dogleg": Dogleg(max_iterations=12, tolerance=1e-5),
-    "Gauss-Newton": GaussNewton(max_iterations=12, tolerance=1e-5),
+    "trust region": TrustRegion(max_iterations=12, trials_per_linearisation=1, tolerance=1e-5),
+    "dogleg": Dogleg(max_iterations=12, trials_per_linearisation=1, tolerance=1e-5),
+    "Gauss-Newton": GaussNewton(max_iterations=12, trials_per_linearisation=1, tolerance=1e-5),
 }
 CASES = {
     "unbounded": {"target": "near", "radius": 1.0},

@@ -95,15 +95,18 @@ class BoundedDogleg(AbstractBoundedLeastSquares):
     descent: BoundedDoglegDescent
     search: optx.AbstractSearch
     secant: bool = eqx.field(static=True)
+    trials_per_linearisation: int = eqx.field(static=True)
 
-    def __init__(self, rtol: float = 0.0, atol: float = 1e-8, secant: bool = True):
+    def __init__(self, rtol: float = 0.0, atol: float = 1e-8, secant: bool = True, trials_per_linearisation: int = 1):
         """**Arguments:**
 
         - `rtol`: relative tolerance on the projected gradient.
         - `atol`: absolute tolerance on it.
         - `secant`: whether the curvature of the residuals is learned.
+        - `trials_per_linearisation`: trial points per linearisation, the Jacobian being updated in between.
         """
         self.rtol, self.atol, self.norm = rtol, atol, optx.max_norm
         self.descent = BoundedDoglegDescent(secant)
         self.search = GainRatio(largest=1.0)
         self.secant = secant
+        self.trials_per_linearisation = trials_per_linearisation

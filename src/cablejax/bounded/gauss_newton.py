@@ -60,18 +60,21 @@ class BoundedGaussNewton(AbstractBoundedLeastSquares):
     descent: ConstrainedNewton
     search: optx.AbstractSearch
     secant: bool = eqx.field(static=True)
+    trials_per_linearisation: int = eqx.field(static=True)
 
-    def __init__(self, rtol: float = 0.0, atol: float = 1e-8, secant: bool = False):
+    def __init__(self, rtol: float = 0.0, atol: float = 1e-8, secant: bool = False, trials_per_linearisation: int = 1):
         """**Arguments:**
 
         - `rtol`: relative tolerance on the projected gradient.
         - `atol`: absolute tolerance on it.
         - `secant`: whether the curvature of the residuals is learned.
+        - `trials_per_linearisation`: trial points per linearisation, the Jacobian being updated in between.
         """
         self.rtol, self.atol, self.norm = rtol, atol, optx.max_norm
         self.descent = ConstrainedNewton(secant)
         self.search = optx.BacktrackingArmijo(slope=1e-4, decrease_factor=0.3)
         self.secant = secant
+        self.trials_per_linearisation = trials_per_linearisation
 
 
 def regularised(hessian: Float[Array, "P P"]) -> Float[Array, "P P"]:

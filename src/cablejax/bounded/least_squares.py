@@ -14,17 +14,25 @@ from jaxtyping import Array, Bool, Float, Int, PyTree, Scalar
 from cablejax.bounded.secant import secant_update
 
 
+class _Linearisation(eqx.Module):
+    at: Array
+    residual: Float[Array, " M"]
+    jacobian: Float[Array, "M P"]
+
+
 class _State(eqx.Module):
     f_info: Any  # FunctionInfo.EvalGradHessian
     residual: Float[Array, " M"]
-    jacobian: Float[Array, "M P"]
+    jacobian: Float[Array, "M P"]  # that of `last` with Broyden's updates since
     secant: Float[Array, "P P"]
-    linearised_at: Array
+    last: _Linearisation
     descent_state: Any
     search_state: Any
     step_size: Scalar
+    objective: Scalar
     optimality: Scalar
     stale: Bool[Array, ""]
+    updates: Int[Array, ""]
     rounded: Bool[Array, ""]
     terminate: Bool[Array, ""]
     result: optx.RESULTS
@@ -44,6 +52,10 @@ class AbstractBoundedLeastSquares(optx.AbstractLeastSquaresSolver):
     `secant`, S = 0 (Gauss and Newton). With it, S is what the residuals' own curvature contributes, learned from the
     change of the Jacobian, which makes the last steps fast where residuals stay large.
 
+    With `trials_per_linearisation` above 1 the Jacobian follows the trials in between by Broyden's update (Math. Comp.
+    19, 1965): the least change with which the model foretells the residuals of the last trial, accepted or not. It
+    costs nothing, but its gradients are not exact: only a linearisation ends a solve.
+
     Options: `feasible`, the set; `linearise`, a function `(y, args) -> (residuals, Jacobian [M, P])`, if there is a
     cheaper one than `jax.jacfwd`.
     """
@@ -54,6 +66,7 @@ class AbstractBoundedLeastSquares(optx.AbstractLeastSquaresSolver):
     descent: AbstractVar[Any]
     search: AbstractVar[optx.AbstractSearch]
     secant: AbstractVar[bool]
+    trials_per_linearisation: AbstractVar[int]
 
     def init(self, fn, y, args, options, f_struct, aux_struct, tags):
         del fn, args, aux_struct, tags
@@ -64,17 +77,20 @@ class AbstractBoundedLeastSquares(optx.AbstractLeastSquaresSolver):
         info = _info(jnp.zeros((), dtype), jnp.zeros(y.size, dtype), square)
         descent = self.descent.within(options["feasible"].at(y), y)
         zero = jnp.zeros((), jnp.int32)
+        residual, jacobian = jnp.zeros(f_struct.shape, dtype), jnp.zeros((*f_struct.shape, y.size), dtype)
         return _State(
             f_info=info,
-            residual=jnp.zeros(f_struct.shape, dtype),
-            jacobian=jnp.zeros((*f_struct.shape, y.size), dtype),
+            residual=residual,
+            jacobian=jacobian,
             secant=square,
-            linearised_at=y,
+            last=_Linearisation(y, residual, jacobian),
             descent_state=descent.init(y.ravel(), info),
             search_state=self.search.init(y.ravel(), info),
             step_size=jnp.ones((), dtype),
+            objective=jnp.asarray(jnp.inf, dtype),
             optimality=jnp.asarray(jnp.inf, dtype),
             stale=jnp.array(True),
+            updates=zero,
             rounded=jnp.array(False),
             terminate=jnp.array(False),
             result=optx.RESULTS.successful,
@@ -92,20 +108,22 @@ class AbstractBoundedLeastSquares(optx.AbstractLeastSquaresSolver):
             return self._renewed(linearise, feasible, descent, y, args, state)
 
         state = jax.lax.cond(state.stale, renewed, lambda: state)
-        converged = state.optimality <= self.atol + self.rtol * self.norm(y)
+        exact = state.updates == 0
+        converged = exact & (state.optimality <= self.atol + self.rtol * self.norm(y))
         finite = jnp.isfinite(state.f_info.f) & jnp.isfinite(state.f_info.grad).all()
         info = state.f_info
 
         def stay():
-            return y, jnp.full_like(info.f, jnp.inf)
+            return y, jnp.full_like(state.residual, jnp.inf)
 
         def go():
             move, _ = descent.step(state.step_size, state.descent_state)
             move = jnp.where(jnp.isfinite(move).all(), move, 0.0)
             trial = feasible.restore(y + move.reshape(y.shape))
-            return trial, 0.5 * jnp.sum(fn(trial, args)[0] ** 2)
+            return trial, fn(trial, args)[0]
 
-        trial, value = jax.lax.cond(converged | ~finite, stay, go)
+        trial, residual = jax.lax.cond(converged | ~finite, stay, go)
+        value = 0.5 * jnp.sum(residual**2)
         move = (trial - y).ravel()
         step_size, accept, _, search_state = self.search.step(
             jnp.array(False), y.ravel(), trial.ravel(), info, optx.FunctionInfo.Eval(value), state.search_state
@@ -114,22 +132,23 @@ class AbstractBoundedLeastSquares(optx.AbstractLeastSquaresSolver):
         rounding = 4 * jnp.finfo(y.dtype).eps * jnp.abs(info.f)
         rounded = promised <= rounding
         # Gradients are known better than values: two more steps are taken on trust where values cannot tell.
-        accept = (accept | (rounded & (value <= info.f + rounding))) & jnp.isfinite(value)
-        stalled = rounded & state.rounded & ~converged
+        accept = (accept | (exact & rounded & (value <= info.f + rounding))) & jnp.isfinite(value)
+        stalled = exact & rounded & state.rounded & ~converged
         result = optx.RESULTS.where(stalled, optx.RESULTS.stagnation, state.result)  # pyright: ignore[reportArgumentType]
         result = optx.RESULTS.where(finite, result, optx.RESULTS.nonfinite)
         state = eqx.tree_at(
-            lambda s: (
-                *(s.search_state, s.step_size, s.stale, s.rounded, s.terminate, s.result),
-                s.evaluations,
-            ),
+            lambda s: (*(s.search_state, s.step_size, s.stale, s.terminate, s.result), s.evaluations, s.objective),
             state,
             (
-                *(search_state, step_size.astype(y.dtype), accept, rounded, converged | stalled | ~finite, result),
+                *(search_state, step_size.astype(y.dtype), accept, converged | stalled | ~finite, result),
                 state.evaluations + jnp.where(converged | ~finite, 0, 1),
+                jnp.where(accept & finite, value, info.f),
             ),
         )
-        return jnp.where(accept & finite, trial, y), state, None
+        y = jnp.where(accept & finite, trial, y)
+        if self.trials_per_linearisation > 1:
+            state = self._updated(options["feasible"], y, move, residual, accept, state)
+        return y, eqx.tree_at(lambda s: s.rounded, state, jnp.where(exact, rounded, state.rounded)), None
 
     def terminate(self, fn, y, args, options, state, tags):
         del fn, y, args, options, tags
@@ -138,6 +157,7 @@ class AbstractBoundedLeastSquares(optx.AbstractLeastSquaresSolver):
     def postprocess(self, fn, y, aux, args, options, state, tags, result):
         del fn, args, options, tags, result
         stats = {
+            "objective": state.objective,
             "optimality": state.optimality,
             "evaluations": state.evaluations,
             "linearisations": state.linearisations,
@@ -151,11 +171,12 @@ class AbstractBoundedLeastSquares(optx.AbstractLeastSquaresSolver):
         gradient = jacobian.T @ residual
         secant, learned = state.secant, jnp.zeros_like(state.secant)
         if self.secant:
-            moved = (y - state.linearised_at).ravel()
-            bent = gradient - state.jacobian.T @ residual
-            slope = gradient - state.jacobian.T @ state.residual
+            last = state.last
+            moved = (y - last.at).ravel()
+            bent = gradient - last.jacobian.T @ residual
+            slope = gradient - last.jacobian.T @ last.residual
             # Used as long as it has foretold the change of the gradient better than nothing would have.
-            left = slope - state.jacobian.T @ (state.jacobian @ moved)
+            left = slope - last.jacobian.T @ (last.jacobian @ moved)
             telling = jnp.linalg.norm(left - secant @ moved) <= jnp.linalg.norm(left)
             secant = jnp.where(state.linearisations > 0, secant_update(secant, moved, bent, slope), secant)
             learned = jnp.where(telling, secant, 0.0)
@@ -163,14 +184,34 @@ class AbstractBoundedLeastSquares(optx.AbstractLeastSquaresSolver):
         optimality = jnp.abs(feasible.project(y - gradient.reshape(y.shape)) - y).max()
         return eqx.tree_at(
             lambda s: (
-                *(s.f_info, s.residual, s.jacobian, s.secant, s.linearised_at),
-                *(s.descent_state, s.optimality, s.linearisations),
+                *(s.f_info, s.residual, s.jacobian, s.secant, s.last),
+                *(s.descent_state, s.optimality, s.linearisations, s.updates),
             ),
             state,
             (
-                *(info, residual, jacobian, secant, y),
+                *(info, residual, jacobian, secant, _Linearisation(y, residual, jacobian)),
                 *(descent.query(y.ravel(), info, state.descent_state), optimality, state.linearisations + 1),
+                jnp.zeros_like(state.updates),
             ),
+        )
+
+    def _updated(self, feasible, y, move, residual, accept, state: _State) -> _State:
+        """The state with a model that foretells the residuals of the trial that ended at `y`, or was rejected there."""
+        missed = residual - state.residual - state.jacobian @ move
+        square = jnp.sum(move**2)
+        telling = (square > jnp.finfo(move.dtype).tiny) & jnp.isfinite(missed).all()
+        change = jnp.outer(jnp.where(telling, missed, 0.0), move) / jnp.where(telling, square, 1.0)
+        jacobian = state.jacobian + change
+        residual = jnp.where(accept, residual, state.residual)
+        # what the model has learned beyond J'J stays until the next linearisation
+        learned = state.f_info.hessian.as_matrix() - state.jacobian.T @ state.jacobian
+        info = _info(0.5 * jnp.sum(residual**2), jacobian.T @ residual, jacobian.T @ jacobian + learned)
+        descent = self.descent.within(feasible.at(y), y).query(y.ravel(), info, state.descent_state)
+        updates = state.updates + 1
+        return eqx.tree_at(
+            lambda s: (s.f_info, s.residual, s.jacobian, s.descent_state, s.updates, s.stale),
+            state,
+            (info, residual, jacobian, descent, updates, updates >= self.trials_per_linearisation),
         )
 
 

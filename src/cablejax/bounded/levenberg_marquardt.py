@@ -78,6 +78,7 @@ class BoundedLevenbergMarquardt(AbstractBoundedLeastSquares):
     descent: DampedQuadratic
     search: optx.AbstractSearch
     secant: bool = eqx.field(static=True)
+    trials_per_linearisation: int = eqx.field(static=True)
 
     def __init__(
         self,
@@ -85,6 +86,7 @@ class BoundedLevenbergMarquardt(AbstractBoundedLeastSquares):
         atol: float = 1e-8,
         damping: float = 1e-3,
         secant: bool = True,
+        trials_per_linearisation: int = 1,
         search: Any = None,
     ):
         """**Arguments:**
@@ -93,12 +95,14 @@ class BoundedLevenbergMarquardt(AbstractBoundedLeastSquares):
         - `atol`: absolute tolerance on it.
         - `damping`: at the start, relative to the diagonal of the model's Hessian.
         - `secant`: whether the curvature of the residuals is learned.
+        - `trials_per_linearisation`: trial points per linearisation, the Jacobian being updated in between.
         - `search`: how the damping follows the reductions; None = `GainRatio()`.
         """
         self.rtol, self.atol, self.norm = rtol, atol, optx.max_norm
         self.descent = DampedQuadratic(damping, secant)
         self.search = GainRatio() if search is None else search
         self.secant = secant
+        self.trials_per_linearisation = trials_per_linearisation
 
 
 def convex_part(hessian: Float[Array, "P P"]) -> Float[Array, "P P"]:

@@ -47,7 +47,7 @@ def minimise(
     out = optx.minimise(
         fn, solver, start, args, {"feasible": feasible}, max_steps=max_steps, adjoint=FixedPointAdjoint(), throw=False
     )
-    return _finish(out, out.stats["objective"], feasible, start, throw)
+    return _finish(out, feasible, start, throw)
 
 
 def least_squares(
@@ -92,11 +92,10 @@ def least_squares(
     out = optx.least_squares(
         residual_fn, solver, start, args, options, max_steps=max_steps, adjoint=FixedPointAdjoint(), throw=False
     )
-    objective = 0.5 * jnp.sum(residual_fn(out.value, args) ** 2)
-    return _finish(out, objective, feasible, start, throw)
+    return _finish(out, feasible, start, throw)
 
 
-def _finish(out: optx.Solution, objective: Array, feasible: AbstractSet, start: Array, throw: bool) -> Solution:
+def _finish(out: optx.Solution, feasible: AbstractSet, start: Array, throw: bool) -> Solution:
     known = (
         (optx.RESULTS.successful, Result.CONVERGED),
         (optx.RESULTS.nonfinite, Result.NONFINITE),
@@ -110,7 +109,7 @@ def _finish(out: optx.Solution, objective: Array, feasible: AbstractSet, start: 
     code = jnp.where(empty, Result.EMPTY_SET, code).astype(jnp.int32)
     solution = Solution(
         value=out.value,
-        objective=objective,
+        objective=out.stats["objective"],
         result=code,
         stats=Stats(
             iterations=jnp.asarray(out.stats["num_steps"], jnp.int32),
@@ -125,5 +124,5 @@ def _finish(out: optx.Solution, objective: Array, feasible: AbstractSet, start: 
         if result is Result.EMPTY_SET:
             raise ValueError(result.message)
         if result is not Result.CONVERGED:
-            raise RuntimeError(f"{result.message} (objective {float(objective):.6g})")
+            raise RuntimeError(f"{result.message} (objective {float(solution.objective):.6g})")
     return solution

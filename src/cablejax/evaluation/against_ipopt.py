@@ -31,6 +31,8 @@ STATIONARY = 1e-5
 """KKT residual of a minimum [m]."""
 STEPS = 120
 """Trial plans of ours at most."""
+TRIALS = 3
+"""Trial plans per linearisation of ours."""
 TOLERANCE = 1e-8
 """Of ours on the projected gradient in float64 [m]; in float32 1000 times that. Where bounds press, the KKT residual is
 greater than the projected gradient by the ratio of gradient and step bound, some 100 times."""
@@ -61,7 +63,7 @@ def contestant(model: Model) -> Contestant:
     def finder(tolerance: float) -> PathFinder:
         return PathFinder(
             lambda motion, problem: problem.residuals(motion),
-            BoundedLevenbergMarquardt(atol=tolerance),
+            BoundedLevenbergMarquardt(atol=tolerance, trials_per_linearisation=TRIALS),
             lambda motion, problem: problem.linearise(motion),
         )
 

@@ -2,7 +2,6 @@
 
 from cablejax.mpc.cem import CrossEntropy
 from cablejax.mpc.controller import ControlInfo, Controller, ControllerState, MPCConfig, control, initial_state
-from cablejax.mpc.deadline import Deadline
 from cablejax.mpc.feasible import FeasibleSet, feasible_from, project_ball
 from cablejax.mpc.mppi import PathIntegral
 from cablejax.mpc.multi_start import multi_start, random_starts
@@ -21,7 +20,6 @@ __all__ = [
     "Controller",
     "ControllerState",
     "CrossEntropy",
-    "Deadline",
     "Dogleg",
     "FeasibleSet",
     "GaussNewton",

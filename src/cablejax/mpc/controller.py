@@ -260,10 +260,9 @@ def control(
     rho, radius = _update_radius(config, state, error, problem.shape_error(state.predicted))
     problem = dataclasses.replace(problem, feasible=dataclasses.replace(problem.feasible, radius=radius))
     way = _straight_way(config, problem)
-    guess, value_way = _best_guess(problem, state.plan, way)
-    plan, value, value_hold = _plan_or_hold(config, problem, guess)
-    plan, travel = _plan_or_travel(config, state, way, radius, plan)
-    value = jnp.where(travel > 0, value_way, value)
+    start = _starts(config, problem, state.plan, way)
+    plan = _plan_or_hold(config, config.solver(problem, start.guess), start)
+    plan, travel = _plan_or_travel(config, state, way, radius, plan, start.value_way)
 
     twist = config.objective.to_twist(plan.motion[0])
     offline, cable = _displacement(dynamics, weights, state, twist)
@@ -277,8 +276,8 @@ def control(
         predicted_error=problem.shape_error(predicted),
         rho=rho,
         radius=radius,
-        objective=value,
-        objective_hold=value_hold,
+        objective=plan.value,
+        objective_hold=start.value_still,
         evaluations=plan.evaluations,
         outcome=plan.outcome,
         residual_share=jnp.nan_to_num(size_online / jnp.maximum(size_offline + size_online, 1e-12)),
@@ -391,29 +390,30 @@ def _update_radius(
     return rho, jnp.clip(radius, config.radius_min, config.radius_max)
 
 
-def _plan_or_hold(
-    config: MPCConfig, problem: ShapingProblem, guess: Float[Array, "T Q 3"]
-) -> tuple[Plan, Float[Array, ""], Float[Array, ""]]:
-    """The solver's plan, or holding still where that is as good or nothing can be trusted; and both their values."""
-    still = jnp.zeros_like(guess)
-    if config.max_change is not None:
-        # grippers that move brake first, as fast as they may
-        still = problem.feasible.project(still)
-    plan = config.solver(problem, guess)
-    value, value_hold = jax.vmap(problem.value)(jnp.stack([plan.motion, still]))
-    improvement = jnp.sqrt(2.0 * value_hold / config.n_commands) - jnp.sqrt(2.0 * value / config.n_commands)
+def _plan_or_hold(config: MPCConfig, plan: Plan, start: _Starts) -> Plan:
+    """The solver's plan, or holding still where that is as good or nothing can be trusted."""
+    value, hold = plan.value, start.value_still
+    improvement = jnp.sqrt(2.0 * hold / config.n_commands) - jnp.sqrt(2.0 * value / config.n_commands)
     finite = jnp.isfinite(value) & jnp.isfinite(plan.motion).all()
     sound = finite & (plan.outcome != Outcome.NONFINITE) & (plan.outcome != Outcome.INFEASIBLE)
     worthwhile = sound & (improvement >= config.hold_improvement)
     outcome = jnp.where(finite, jnp.where(sound, Outcome.HELD, plan.outcome), Outcome.NONFINITE)
     outcome = jnp.where(worthwhile, plan.outcome, outcome)
-    motion = jnp.where(worthwhile, plan.motion, still)
-    value = jnp.where(worthwhile, value, value_hold)
-    return dataclasses.replace(plan, motion=motion, outcome=outcome.astype(jnp.int32)), value, value_hold
+    return dataclasses.replace(
+        plan,
+        motion=jnp.where(worthwhile, plan.motion, start.still),
+        value=jnp.where(worthwhile, value, hold),
+        outcome=outcome.astype(jnp.int32),
+    )
 
 
 def _plan_or_travel(
-    config: MPCConfig, state: ControllerState, way: _StraightWay, radius: Float[Array, ""], plan: Plan
+    config: MPCConfig,
+    state: ControllerState,
+    way: _StraightWay,
+    radius: Float[Array, ""],
+    plan: Plan,
+    value_way: Float[Array, ""],
 ) -> tuple[Plan, Int[Array, ""]]:
     """The plan, or the next step of a straight way out of a valley; and how many steps of the way are left."""
     stuck = (plan.outcome == Outcome.HELD) & (way.length > config.travel_beyond) & (state.travels < config.max_travels)
@@ -423,8 +423,8 @@ def _plan_or_travel(
     left = jnp.where((way.length > radius) & (plan.outcome != Outcome.NONFINITE), left, 0)
     travelling = left > 0
     outcome = jnp.where(travelling, Outcome.TRAVELLING, plan.outcome).astype(jnp.int32)
-    motion = jnp.where(travelling, way.motion, plan.motion)
-    return dataclasses.replace(plan, motion=motion, outcome=outcome), left
+    motion, value = jnp.where(travelling, way.motion, plan.motion), jnp.where(travelling, value_way, plan.value)
+    return dataclasses.replace(plan, motion=motion, value=value, outcome=outcome), left
 
 
 class _StraightWay(NamedTuple):
@@ -447,15 +447,33 @@ def _straight_way(config: MPCConfig, problem: ShapingProblem) -> _StraightWay:
     return _StraightWay(problem.feasible.project(motion), length)
 
 
-def _best_guess(
-    problem: ShapingProblem, last: Float[Array, "T Q 3"], way: _StraightWay
-) -> tuple[Float[Array, "T Q 3"], Float[Array, ""]]:
-    """The better of two starts: the last plan, shifted by the command that was executed, and the straight way; and the
-    value of the latter."""
+class _Starts(NamedTuple):
+    """What is known before a solver is asked.
+
+    Attributes:
+        guess: the better of two starts: the last plan, shifted by the command that was executed, and the straight way
+            [m], shape [T, Q, 3].
+        value_way: objective of the straight way [m^2], shape [].
+        still: holding, or where motions may not change at once, braking [m], shape [T, Q, 3].
+        value_still: its objective [m^2], shape [].
+    """
+
+    guess: Float[Array, "T Q 3"]
+    value_way: Float[Array, ""]
+    still: Float[Array, "T Q 3"]
+    value_still: Float[Array, ""]
+
+
+def _starts(config: MPCConfig, problem: ShapingProblem, last: Float[Array, "T Q 3"], way: _StraightWay) -> _Starts:
+    still = jnp.zeros_like(last)
+    if config.max_change is not None:
+        # grippers that move brake first, as fast as they may
+        still = problem.feasible.project(still)
     shifted = jnp.roll(last, -1, axis=0).at[-1].set(0.0)
-    guesses = jnp.stack([problem.feasible.project(shifted), way.motion])
-    values = jax.vmap(problem.value)(guesses)
-    return guesses[jnp.argmin(jnp.where(jnp.isfinite(values), values, jnp.inf))], values[1]
+    motions = jnp.stack([problem.feasible.project(shifted), way.motion, still])
+    values = jax.vmap(problem.value)(motions)
+    guesses = jnp.where(jnp.isfinite(values[:2]), values[:2], jnp.inf)
+    return _Starts(motions[jnp.argmin(guesses)], values[1], still, values[2])
 
 
 def _push(window: Array, newest: Array) -> Array:

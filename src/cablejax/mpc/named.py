@@ -6,7 +6,6 @@ from collections.abc import Mapping
 from types import MappingProxyType
 
 from cablejax.mpc.cem import CrossEntropy
-from cablejax.mpc.deadline import Deadline
 from cablejax.mpc.mppi import PathIntegral
 from cablejax.mpc.plan import Solver
 from cablejax.mpc.projected_gradient import ProjectedGradient
@@ -18,7 +17,7 @@ SOLVERS: Mapping[str, Solver] = MappingProxyType(
         "projected-gradient": ProjectedGradient(),
         "dogleg": Dogleg(),
         "gauss-newton": GaussNewton(),
-        "deadline": Deadline(),
+        "deadline": TrustRegion(max_iterations=2, trials_per_linearisation=2),
         "cross-entropy": CrossEntropy(),
         "path-integral": PathIntegral(),
     }

@@ -67,6 +67,7 @@ class Plan:
 
     Attributes:
         motion: feasible motions [m], shape [T, Q, 3].
+        value: their objective [m^2], shape [].
         evaluations: rollouts of the model that were spent on trial plans, shape [].
         outcome: an `Outcome`, shape [].
         linearisations: gradients or Jacobians that were spent, shape []; None = the solver needs none.
@@ -75,6 +76,7 @@ class Plan:
     """
 
     motion: Float[Array, "*batch T Q 3"]
+    value: Float[Array, "*batch"]
     evaluations: Int[Array, "*batch"]
     outcome: Int[Array, "*batch"]
     linearisations: Int[Array, "*batch"] | None = None
@@ -100,6 +102,7 @@ def plan_from(solution: Solution) -> Plan:
         outcome = jnp.where(solution.result == result, ours, outcome)
     return Plan(
         motion=solution.value,
+        value=solution.objective,
         evaluations=solution.stats.evaluations,
         outcome=outcome.astype(jnp.int32),
         linearisations=solution.stats.linearisations,

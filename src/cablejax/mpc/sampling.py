@@ -49,4 +49,4 @@ def better_plan(best: Valued, drawn: Valued, index: Array) -> Valued:
 def sampled_plan(best: Valued, evaluations: int) -> Plan:
     """The best plan as a solver returns it."""
     outcome = jnp.where(jnp.isfinite(best.value), Outcome.STEP_LIMIT, Outcome.NONFINITE)
-    return Plan(best.motion, jnp.asarray(evaluations, jnp.int32), outcome.astype(jnp.int32))
+    return Plan(best.motion, best.value, jnp.asarray(evaluations, jnp.int32), outcome.astype(jnp.int32))

@@ -22,17 +22,21 @@ class _LeastSquaresPlanner(abc.ABC):
     """What these planners share.
 
     Attributes:
-        max_iterations: trial plans at most. One costs a linearisation, as much as about four gradients, and a rollout.
+        max_iterations: trial plans at most. One costs a rollout.
+        trials_per_linearisation: a linearisation costs as much as about ten rollouts. Until the next one the Jacobian
+            follows the trial plans by Broyden's update.
         tolerance: stop once a unit projected gradient step moves no coordinate by more than this [m].
         secant: whether the curvature of the residuals is learned: worth it beyond some five iterations, in float64.
     """
 
-    max_iterations: int = 2
+    max_iterations: int = 5
+    trials_per_linearisation: int = 5
     tolerance: float = 2e-5
     secant: bool = False
 
     def __post_init__(self):
         check_budget(self, "max_iterations")
+        check_budget(self, "trials_per_linearisation")
         check_positive(self, "tolerance")
 
     @abc.abstractmethod
@@ -59,7 +63,7 @@ class TrustRegion(_LeastSquaresPlanner):
     """Solver: damped Gauss-Newton models of the objective, minimised over the feasible set.
 
     Attributes:
-        max_iterations, tolerance, secant: see `_LeastSquaresPlanner`.
+        max_iterations, trials_per_linearisation, tolerance, secant: see `_LeastSquaresPlanner`.
         damping: at the start, relative to the diagonal of J'J.
     """
 
@@ -70,21 +74,28 @@ class TrustRegion(_LeastSquaresPlanner):
         check_positive(self, "damping")
 
     def bounded(self) -> AbstractBoundedLeastSquares:
-        return BoundedLevenbergMarquardt(atol=self.tolerance, damping=self.damping, secant=self.secant)
+        return BoundedLevenbergMarquardt(
+            atol=self.tolerance,
+            damping=self.damping,
+            secant=self.secant,
+            trials_per_linearisation=self.trials_per_linearisation,
+        )
 
 
 class Dogleg(_LeastSquaresPlanner):
     """Solver: a trust region around Gauss-Newton models, its steps along the dogleg inside the feasible set."""
 
     def bounded(self) -> AbstractBoundedLeastSquares:
-        return BoundedDogleg(atol=self.tolerance, secant=self.secant)
+        return BoundedDogleg(
+            atol=self.tolerance, secant=self.secant, trials_per_linearisation=self.trials_per_linearisation
+        )
 
 
 @dataclasses.dataclass(frozen=True)
 class GaussNewton(_LeastSquaresPlanner):
     """Solver: Gauss-Newton models without damping, minimised over the feasible set, and a line search towards that."""
 
-    max_iterations: int = 3
-
     def bounded(self) -> AbstractBoundedLeastSquares:
-        return BoundedGaussNewton(atol=self.tolerance, secant=self.secant)
+        return BoundedGaussNewton(
+            atol=self.tolerance, secant=self.secant, trials_per_linearisation=self.trials_per_linearisation
+        )
