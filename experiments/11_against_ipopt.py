@@ -207,7 +207,7 @@ def page(rows: list[dict], explained: dict[str, dict], kinks: list[dict], n_all:
         f"{len(rows)} of {n_all} problems, in a random order, seed 0; {len(exact)} of them with the exact Hessian too. "
         "Released network gns-reference, the corners of its ReLUs rounded, with the residual fitted online, horizon 5, "
         f"36 unknowns, float64. Ours: `BoundedLevenbergMarquardt(atol={TOLERANCE:g}, "
-        f"trials_per_linearisation={TRIALS})`, at most {STEPS} trial plans. "
+        f"trials_per_linearisation={TRIALS})`, at most {STEPS} linearisations. "
         "IPOPT: tol 1e-9 on the objective divided by its value at the start, constr_viol_tol 1e-9, "
         f"bound_relax_factor 0, adaptive mu, limited memory of 20, at most {ITERATIONS} iterations, or exact Hessian, "
         f"at most {EXACT_ITERATIONS}. "
@@ -270,8 +270,8 @@ def page(rows: list[dict], explained: dict[str, dict], kinks: list[dict], n_all:
         "",
         f"Ours feasible to 1e-8 m: {share([r['violation'] <= 1e-8 for r in rows])}; largest violation "
         f"{max(r['violation'] for r in rows):.1e} m, IPOPT's {max(r['limited']['violation'] for r in limited):.1e} m. "
-        f"Converged by its own test within {STEPS} trial plans: {share([r['converged'] for r in rows])}; trial plans "
-        f"{quantiles([r['steps'] for r in rows], '.0f')}.",
+        f"Converged by its own test within {STEPS} linearisations: {share([r['converged'] for r in rows])}; of these "
+        f"{quantiles([r['linearisations'] for r in rows], '.0f')}.",
         "",
         "In float32 the objective of the plan, evaluated in float64, is above that of the plan found in float64 by "
         f"{quantiles([(r['single_objective'] - r['objective']) / r['objective'] for r in rows])}, relative (median / "

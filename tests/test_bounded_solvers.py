@@ -203,28 +203,27 @@ def test_statistics_are_counts():
             assert int(getattr(solution.stats, field.name)) > 0
 
 
-@pytest.mark.parametrize("trials", [1, 2, 4])
+@pytest.mark.parametrize("trials", [2, 4])
 def test_a_linearisation_lasts_for_as_many_trials_as_asked(trials):
     with jax.enable_x64(True):
         box = Box(jnp.full(2, -2.0), jnp.full(2, 2.0))
         solver = BoundedLevenbergMarquardt(atol=1e-9, trials_per_linearisation=trials)
         start = jnp.asarray([-1.2, 1.0])
-        solution = least_squares(rosenbrock, solver, start, box, 1.0, max_steps=9, throw=False)
-        assert int(solution.result) == Result.STEP_LIMIT and int(solution.stats.evaluations) == 9
-        # one by one, a rejected trial keeps the linearisation
-        assert int(solution.stats.linearisations) == -(-9 // trials) if trials > 1 else 9
+        solution = least_squares(rosenbrock, solver, start, box, 1.0, max_steps=3, throw=False)
+        assert int(solution.result) == Result.STEP_LIMIT
+        assert int(solution.stats.linearisations) == 3 and int(solution.stats.evaluations) == 3 * trials
         value = float(0.5 * jnp.sum(rosenbrock(solution.value, 1.0) ** 2))
         assert float(solution.objective) == pytest.approx(value, rel=1e-12)
 
 
 def test_updates_between_linearisations_gain_what_a_stale_jacobian_does_not():
-    """Broyden's update against one step from the same linearisation: by the same number of linearisations, one."""
+    """Five more trials after the first, all from one linearisation."""
     with jax.enable_x64(True):
         box, start = Box(jnp.full(2, -2.0), jnp.full(2, 2.0)), jnp.asarray([-1.2, 1.0])
         values = {}
         for trials in (1, 6):
-            solver = BoundedLevenbergMarquardt(atol=1e-12, trials_per_linearisation=6)
-            found = least_squares(rosenbrock, solver, start, box, 1.0, max_steps=trials, throw=False)
+            solver = BoundedLevenbergMarquardt(atol=1e-12, trials_per_linearisation=trials)
+            found = least_squares(rosenbrock, solver, start, box, 1.0, max_steps=1, throw=False)
             assert int(found.stats.linearisations) == 1
             values[trials] = float(found.objective)
         assert values[6] < 0.5 * values[1]

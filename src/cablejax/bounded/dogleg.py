@@ -103,7 +103,7 @@ class BoundedDogleg(AbstractBoundedLeastSquares):
         - `rtol`: relative tolerance on the projected gradient.
         - `atol`: absolute tolerance on it.
         - `secant`: whether the curvature of the residuals is learned.
-        - `trials_per_linearisation`: trial points per linearisation, the Jacobian being updated in between.
+        - `trials_per_linearisation`: trial points of one step, the Jacobian being updated in between.
         """
         self.rtol, self.atol, self.norm = rtol, atol, optx.max_norm
         self.descent = BoundedDoglegDescent(secant)

@@ -43,8 +43,8 @@ class _State(eqx.Module):
 class AbstractBoundedLeastSquares(optx.AbstractLeastSquaresSolver):
     """Base of the bounded least squares solvers; `y` is one array, `fn` gives one flat array of residuals.
 
-    One step linearises at y (unless the last trial was rejected: then the linearisation there still holds), proposes
-    one trial point and evaluates the residuals there; `optimistix.AbstractGaussNewton` would linearise at every trial
+    One step linearises at y (unless its only trial was rejected: then the linearisation there still holds), proposes a
+    trial point and evaluates the residuals there; `optimistix.AbstractGaussNewton` would linearise at every trial
     point, used or not. It ends where `|P(y - g) - y|_inf <= atol + rtol |y|_inf`, or where the model promises less than
     rounding can tell (`RESULTS.stagnation`, if the former does not hold).
 
@@ -52,9 +52,9 @@ class AbstractBoundedLeastSquares(optx.AbstractLeastSquaresSolver):
     `secant`, S = 0 (Gauss and Newton). With it, S is what the residuals' own curvature contributes, learned from the
     change of the Jacobian, which makes the last steps fast where residuals stay large.
 
-    With `trials_per_linearisation` above 1 the Jacobian follows the trials in between by Broyden's update (Math. Comp.
-    19, 1965): the least change with which the model foretells the residuals of the last trial, accepted or not. It
-    costs nothing, but its gradients are not exact: only a linearisation ends a solve.
+    With `trials_per_linearisation` above 1 a step goes on to so many trial points, and the Jacobian follows them by
+    Broyden's update (Math. Comp. 19, 1965): the least change with which the model foretells the residuals of the last
+    trial, accepted or not. It costs nothing, but its gradients are not exact: only a linearisation ends a solve.
 
     Options: `feasible`, the set; `linearise`, a function `(y, args) -> (residuals, Jacobian [M, P])`, if there is a
     cheaper one than `jax.jacfwd`.
@@ -100,55 +100,17 @@ class AbstractBoundedLeastSquares(optx.AbstractLeastSquaresSolver):
 
     def step(self, fn, y, args, options, state, tags):
         del tags
-        feasible = options["feasible"].at(y)
         linearise = options.get("linearise", None) or _forward(fn)
-        descent = self.descent.within(feasible, y)
 
         def renewed():
-            return self._renewed(linearise, feasible, descent, y, args, state)
+            return self._renewed(linearise, options["feasible"], y, args, state)
+
+        def one_trial(_, at):
+            return self._trial(fn, args, options["feasible"], *at)
 
         state = jax.lax.cond(state.stale, renewed, lambda: state)
-        exact = state.updates == 0
-        converged = exact & (state.optimality <= self.atol + self.rtol * self.norm(y))
-        finite = jnp.isfinite(state.f_info.f) & jnp.isfinite(state.f_info.grad).all()
-        info = state.f_info
-
-        def stay():
-            return y, jnp.full_like(state.residual, jnp.inf)
-
-        def go():
-            move, _ = descent.step(state.step_size, state.descent_state)
-            move = jnp.where(jnp.isfinite(move).all(), move, 0.0)
-            trial = feasible.restore(y + move.reshape(y.shape))
-            return trial, fn(trial, args)[0]
-
-        trial, residual = jax.lax.cond(converged | ~finite, stay, go)
-        value = 0.5 * jnp.sum(residual**2)
-        move = (trial - y).ravel()
-        step_size, accept, _, search_state = self.search.step(
-            jnp.array(False), y.ravel(), trial.ravel(), info, optx.FunctionInfo.Eval(value), state.search_state
-        )
-        promised = -(jnp.sum(info.grad * move) + 0.5 * move @ info.hessian.as_matrix() @ move)
-        rounding = 4 * jnp.finfo(y.dtype).eps * jnp.abs(info.f)
-        rounded = promised <= rounding
-        # Gradients are known better than values: two more steps are taken on trust where values cannot tell.
-        accept = (accept | (exact & rounded & (value <= info.f + rounding))) & jnp.isfinite(value)
-        stalled = exact & rounded & state.rounded & ~converged
-        result = optx.RESULTS.where(stalled, optx.RESULTS.stagnation, state.result)  # pyright: ignore[reportArgumentType]
-        result = optx.RESULTS.where(finite, result, optx.RESULTS.nonfinite)
-        state = eqx.tree_at(
-            lambda s: (*(s.search_state, s.step_size, s.stale, s.terminate, s.result), s.evaluations, s.objective),
-            state,
-            (
-                *(search_state, step_size.astype(y.dtype), accept, converged | stalled | ~finite, result),
-                state.evaluations + jnp.where(converged | ~finite, 0, 1),
-                jnp.where(accept & finite, value, info.f),
-            ),
-        )
-        y = jnp.where(accept & finite, trial, y)
-        if self.trials_per_linearisation > 1:
-            state = self._updated(options["feasible"], y, move, residual, accept, state)
-        return y, eqx.tree_at(lambda s: s.rounded, state, jnp.where(exact, rounded, state.rounded)), None
+        y, state = jax.lax.fori_loop(0, self.trials_per_linearisation, one_trial, (y, state))
+        return y, state, None
 
     def terminate(self, fn, y, args, options, state, tags):
         del fn, y, args, options, tags
@@ -165,9 +127,56 @@ class AbstractBoundedLeastSquares(optx.AbstractLeastSquaresSolver):
         }
         return y, aux, stats
 
-    def _renewed(self, linearise, feasible, descent, y, args, state: _State) -> _State:
+    def _trial(self, fn, args, feasible, y, state: _State) -> tuple[Array, _State]:
+        """One trial point: where the solve goes on, and the state there."""
+        info, exact = state.f_info, state.updates == 0
+        converged = exact & (state.optimality <= self.atol + self.rtol * self.norm(y))
+        finite = jnp.isfinite(info.f) & jnp.isfinite(info.grad).all()
+        ended = state.terminate | converged | ~finite
+
+        def stay():
+            return y, jnp.full_like(state.residual, jnp.inf)
+
+        def go():
+            at = feasible.at(y)
+            move, _ = self.descent.within(at, y).step(state.step_size, state.descent_state)
+            move = jnp.where(jnp.isfinite(move).all(), move, 0.0)
+            trial = at.restore(y + move.reshape(y.shape))
+            return trial, fn(trial, args)[0]
+
+        trial, residual = jax.lax.cond(ended, stay, go)
+        value = 0.5 * jnp.sum(residual**2)
+        move = (trial - y).ravel()
+        step_size, accept, _, search_state = self.search.step(
+            jnp.array(False), y.ravel(), trial.ravel(), info, optx.FunctionInfo.Eval(value), state.search_state
+        )
+        promised = -(jnp.sum(info.grad * move) + 0.5 * move @ info.hessian.as_matrix() @ move)
+        rounding = 4 * jnp.finfo(y.dtype).eps * jnp.abs(info.f)
+        rounded = promised <= rounding
+        # Gradients are known better than values: two more steps are taken on trust where values cannot tell.
+        accept = (accept | (exact & rounded & (value <= info.f + rounding))) & jnp.isfinite(value) & ~ended
+        stalled = exact & rounded & state.rounded & ~ended
+        result = optx.RESULTS.where(stalled, optx.RESULTS.stagnation, state.result)  # pyright: ignore[reportArgumentType]
+        result = optx.RESULTS.where(finite, result, optx.RESULTS.nonfinite)
+        state = eqx.tree_at(
+            lambda s: (
+                *(s.search_state, s.step_size, s.stale, s.rounded, s.terminate, s.result),
+                *(s.evaluations, s.objective),
+            ),
+            state,
+            (
+                *(search_state, step_size.astype(y.dtype), accept, jnp.where(exact, rounded, state.rounded)),
+                *(ended | stalled, result),
+                *(state.evaluations + jnp.where(ended, 0, 1), jnp.where(accept, value, info.f)),
+            ),
+        )
+        y = jnp.where(accept, trial, y)
+        return y, state if self.trials_per_linearisation == 1 else self._updated(feasible, y, move, residual, state)
+
+    def _renewed(self, linearise, feasible, y, args, state: _State) -> _State:
         """The state with everything that belongs to a new point."""
         residual, jacobian = linearise(y, args)
+        feasible = feasible.at(y)
         gradient = jacobian.T @ residual
         secant, learned = state.secant, jnp.zeros_like(state.secant)
         if self.secant:
@@ -190,28 +199,28 @@ class AbstractBoundedLeastSquares(optx.AbstractLeastSquaresSolver):
             state,
             (
                 *(info, residual, jacobian, secant, _Linearisation(y, residual, jacobian)),
-                *(descent.query(y.ravel(), info, state.descent_state), optimality, state.linearisations + 1),
+                *(self.descent.within(feasible, y).query(y.ravel(), info, state.descent_state), optimality),
+                state.linearisations + 1,
                 jnp.zeros_like(state.updates),
             ),
         )
 
-    def _updated(self, feasible, y, move, residual, accept, state: _State) -> _State:
-        """The state with a model that foretells the residuals of the trial that ended at `y`, or was rejected there."""
+    def _updated(self, feasible, y, move, residual, state: _State) -> _State:
+        """The state with a model that foretells the residuals of the last trial; `y` is where the solve goes on."""
         missed = residual - state.residual - state.jacobian @ move
         square = jnp.sum(move**2)
         telling = (square > jnp.finfo(move.dtype).tiny) & jnp.isfinite(missed).all()
         change = jnp.outer(jnp.where(telling, missed, 0.0), move) / jnp.where(telling, square, 1.0)
         jacobian = state.jacobian + change
-        residual = jnp.where(accept, residual, state.residual)
+        residual = jnp.where(state.stale, residual, state.residual)
         # what the model has learned beyond J'J stays until the next linearisation
         learned = state.f_info.hessian.as_matrix() - state.jacobian.T @ state.jacobian
         info = _info(0.5 * jnp.sum(residual**2), jacobian.T @ residual, jacobian.T @ jacobian + learned)
         descent = self.descent.within(feasible.at(y), y).query(y.ravel(), info, state.descent_state)
-        updates = state.updates + 1
         return eqx.tree_at(
             lambda s: (s.f_info, s.residual, s.jacobian, s.descent_state, s.updates, s.stale),
             state,
-            (info, residual, jacobian, descent, updates, updates >= self.trials_per_linearisation),
+            (info, residual, jacobian, descent, state.updates + 1, jnp.array(True)),
         )
 
 

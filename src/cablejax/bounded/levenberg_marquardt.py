@@ -95,7 +95,7 @@ class BoundedLevenbergMarquardt(AbstractBoundedLeastSquares):
         - `atol`: absolute tolerance on it.
         - `damping`: at the start, relative to the diagonal of the model's Hessian.
         - `secant`: whether the curvature of the residuals is learned.
-        - `trials_per_linearisation`: trial points per linearisation, the Jacobian being updated in between.
+        - `trials_per_linearisation`: trial points of one step, the Jacobian being updated in between.
         - `search`: how the damping follows the reductions; None = `GainRatio()`.
         """
         self.rtol, self.atol, self.norm = rtol, atol, optx.max_norm

@@ -50,7 +50,7 @@ class Stats:
     """What a solve cost; every field has shape [].
 
     Attributes:
-        iterations: trial points.
+        iterations: steps of the solver.
         evaluations: of the function alone.
         linearisations: gradients or Jacobians.
         projections: nearest points and quadratic programs.

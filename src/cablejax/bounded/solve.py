@@ -33,7 +33,7 @@ def minimise(
         y0: where to start; projected onto the set first.
         feasible: the set.
         args: what else the function depends on.
-        max_steps: trial points at most.
+        max_steps: of the solver at most, with one trial point each unless it is told to make more.
         throw: whether to raise outside compiled code; within, the result code is all there is.
 
     Returns:
@@ -71,7 +71,7 @@ def least_squares(
         feasible: the set.
         args: what else the residuals depend on.
         linearise: residuals and Jacobian [M, P], if there is a cheaper way than `jax.jacfwd`.
-        max_steps: trial points at most.
+        max_steps: of the solver at most, with one trial point each unless it is told to make more.
         throw: whether to raise outside compiled code; within, the result code is all there is.
 
     Returns:

@@ -29,10 +29,8 @@ EQUAL = 1e-6
 """Relative difference of objectives that counts as none."""
 STATIONARY = 1e-5
 """KKT residual of a minimum [m]."""
-STEPS = 120
-"""Trial plans of ours at most."""
-TRIALS = 3
-"""Trial plans per linearisation of ours."""
+STEPS, TRIALS = 40, 3
+"""Linearisations of ours at most, and trial plans after each."""
 TOLERANCE = 1e-8
 """Of ours on the projected gradient in float64 [m]; in float32 1000 times that. Where bounds press, the KKT residual is
 greater than the projected gradient by the ratio of gradient and step bound, some 100 times."""
@@ -78,14 +76,14 @@ def contestant(model: Model) -> Contestant:
 def judge(
     ours: Contestant, case: PlanningCase, referees: Sequence[RefereeConfig], steps: int = STEPS
 ) -> dict[str, Any]:
-    """One problem by all, ours with so many trial plans at most; both begin at the same feasible plan.
+    """One problem by all, ours with so many linearisations at most; both begin at the same feasible plan.
 
     Returns:
         A row that JSON can hold: of ours `start` and `objective` [m^2], `start_slope` (largest element of the gradient
-        there) [m], `violation` [m], `kkt` and `kkt_scaled` (see above), `steps`, `converged`, `seconds`, `motion`,
-        `sharp_objective` by the network as it was trained, `single_objective` and `single_violation` of the plan found
-        in float32, evaluated in float64; and for each referee, under `limited` or `exact`, what it found and the
-        seconds in which either first reached the objective that both reach.
+        there) [m], `violation` [m], `kkt` and `kkt_scaled` (see above), `linearisations`, `converged`, `seconds`,
+        `motion`, `sharp_objective` by the network as it was trained, `single_objective` and `single_violation` of the
+        plan found in float32, evaluated in float64; and for each referee, under `limited` or `exact`, what it found and
+        the seconds in which either first reached the objective that both reach.
     """
     problem, sharp, limits = ours.make(case), ours.make_sharp(case), case.limits()
     start = np.asarray(problem.feasible.project(jnp.asarray(case.guess)))
@@ -101,7 +99,7 @@ def judge(
         "violation": limits.violation(path.points[-1]),
         "kkt": kkt,
         "kkt_scaled": kkt / scale,
-        "steps": len(path.seconds) - 1,
+        "linearisations": len(path.seconds) - 1,
         "converged": path.converged,
         "seconds": float(path.seconds[-1]),
         "motion": path.points[-1].tolist(),

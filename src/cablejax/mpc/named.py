@@ -17,7 +17,7 @@ SOLVERS: Mapping[str, Solver] = MappingProxyType(
         "projected-gradient": ProjectedGradient(),
         "dogleg": Dogleg(),
         "gauss-newton": GaussNewton(),
-        "deadline": TrustRegion(max_iterations=2, trials_per_linearisation=2),
+        "deadline": TrustRegion(trials_per_linearisation=2),
         "cross-entropy": CrossEntropy(),
         "path-integral": PathIntegral(),
     }

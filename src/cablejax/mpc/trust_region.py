@@ -22,14 +22,13 @@ class _LeastSquaresPlanner(abc.ABC):
     """What these planners share.
 
     Attributes:
-        max_iterations: trial plans at most. One costs a rollout.
-        trials_per_linearisation: a linearisation costs as much as about ten rollouts. Until the next one the Jacobian
-            follows the trial plans by Broyden's update.
+        max_iterations: linearisations at most; one costs as much as about ten rollouts.
+        trials_per_linearisation: trial plans after each, a rollout each; the Jacobian follows them by Broyden's update.
         tolerance: stop once a unit projected gradient step moves no coordinate by more than this [m].
         secant: whether the curvature of the residuals is learned: worth it beyond some five iterations, in float64.
     """
 
-    max_iterations: int = 5
+    max_iterations: int = 1
     trials_per_linearisation: int = 5
     tolerance: float = 2e-5
     secant: bool = False
