@@ -12,9 +12,10 @@ import spatial_cases as cases
 from cablejax.diagnose import verdict_json
 from cablejax.report.diagnosis_page import write_diagnosis_page
 from cablejax.spatial.diagnose import diagnose_space, noise_of
-from cablejax.spatial.fit import Simulator, errors, improve
+from cablejax.spatial.fit import Simulator, errors
 from cablejax.spatial.geometry import local_changes
 from cablejax.spatial.identify import layout_of
+from cablejax.spatial.newton import improve
 from cablejax.spatial.residual import fit_residual
 from cablejax.spatial.rod import Rod
 from cablejax.spatial.search import falls, halves
@@ -43,10 +44,10 @@ def test_a_fit_finds_stiffness_and_damping():
     fit = improve(simulator, values, effects, windows, iterations=8)
     after = errors(simulator.predict(fit.values, windows), windows).mean()
     assert after < 0.1 * before
-    ratio = np.exp(fit.values[layout.slices["log_stiffness"]])
+    ratio = np.exp(fit.values.shared[layout.slices["log_stiffness"]])
     np.testing.assert_allclose(ratio, cases.TRUE_RATIO, rtol=0.15)
-    np.testing.assert_allclose(fit.values[layout.slices["damping_time"]], cases.TRUE_DAMPING, rtol=0.2)
-    assert not fit.values[~layout.active(effects)].any()
+    np.testing.assert_allclose(fit.values.shared[layout.slices["damping_time"]], cases.TRUE_DAMPING, rtol=0.2)
+    assert not fit.values.shared[~layout.active(effects)].any()
 
 
 def test_finds_the_file_that_was_gripped_anew():
@@ -105,7 +106,7 @@ def test_names_the_cause_and_goes_on_where_it_was(tmp_path):
     assert interval[0] < 1.1 * cases.TRUE_DAMPING and interval[1] > 0.9 * cases.TRUE_DAMPING  # type: ignore[operator]
     assert "gripper 0" in result.sentence
     again = diagnose_space(log, only=only, state=state)
-    np.testing.assert_array_equal(again.identified.values, result.identified.values)
+    np.testing.assert_array_equal(again.identified.values.shared, result.identified.values.shared)
     page = write_diagnosis_page(result, tmp_path / "report").read_text()
     assert 'id="orbit"' in page and "http://" not in page.replace("http://www.w3.org", "")
     verdict = json.loads((tmp_path / "report" / "verdict.json").read_text())

@@ -11,6 +11,7 @@ import pytest
 from cablejax.simulate.compile import compiler_options
 from cablejax.simulate.composite import build_grasped_chain
 from cablejax.simulate.config import CableConfig
+from cablejax.spatial import rod as rod_module
 from cablejax.spatial.rod import Rod, RodPhysics
 
 _INTERVAL = 0.01
@@ -169,6 +170,25 @@ def test_hangs_as_a_catenary_when_it_hardly_resists_bending():
         Rod(24, twisting=False), physics, position, np.repeat(frames[None], samples, 0), jnp.asarray([pushed, pushed])
     )
     assert np.abs(found[-1] - catenary).max() < 2e-3
+
+
+def test_newton_has_converged_where_a_cable_swings_fast_at_a_sharply_turned_clamp(monkeypatch):
+    arclength, time = np.linspace(0.1, 0.9, 9), _INTERVAL * np.arange(200)
+    position = np.zeros((200, 2, 3))
+    position[:, 1, 0] = 0.5 + 0.15 * np.sin(3.0 * np.pi * time)
+    position[:, 1, 1] = 0.15 * np.sin(2.1 * np.pi * time)
+    position[:, 0, 2] = 0.15 * np.sin(3.9 * np.pi * time)
+    down, up = ([[0, 0, -1.0], [0, 1, 0], [1, 0, 0]], [[0, 0, 1.0], [0, 1, 0], [-1, 0, 0]])
+    frames = np.repeat(np.array([[down, up]]), 200, 0)
+    sag = np.stack([0.5 * arclength, 0 * arclength, -0.35 * np.sin(np.pi * arclength)], axis=1)
+    physics = _physics(
+        arclength, stiffness=np.full(1, 0.02), drag=0.1, clamp_rotation=np.array([[1.5, 0.4], [0.4, -0.1]])
+    )
+    found = _run(Rod(20, twisting=False), physics, position, frames, np.stack([sag, sag]))
+    monkeypatch.setattr(rod_module, "_NEWTON", 10)
+    exact = _run(Rod(20, twisting=False), physics, position, frames, np.stack([sag, sag]))
+    assert np.abs(found - exact).max() < 2e-4
+    assert np.ptp(exact, axis=0).max() > 0.2
 
 
 def test_derivatives_are_those_of_finite_differences():

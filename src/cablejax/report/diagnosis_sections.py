@@ -24,6 +24,9 @@ from cablejax.report.effect_words import (
 SEPARABLE = 0.3
 """A motion on which two explanations differ by less than this many noise units does not tell them apart."""
 
+# More episodes than this are counted, not listed.
+_LISTED = 8
+
 _RULES = {
     "lowest_cost": "best fit to the log itself",
     "bic": "best fit with Schwarz's penalty",
@@ -84,8 +87,9 @@ def far_section(diagnosis: Diagnosis, picture: str) -> str:
     else:
         held = [str(e + 1) for e in gap.held_out_episodes]
         word = "episode" if len(held) == 1 else "episodes"
+        named = f"{word} {listed(held)}" if len(held) <= _LISTED else f"{len(held)} {word}"
         seen = (
-            f"on {word} {listed(held)}, each left out of the fit that predicts it"
+            f"on {named}, each left out of the fit that predicts it"
             if held
             else "on the very episode that was fitted: there was no other to check on"
         )

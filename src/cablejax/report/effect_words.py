@@ -121,7 +121,8 @@ def _place(location: dict[str, Any], gripper: Any = None) -> str:
     parts = []
     along, time, table = (location.get(key) for key in ("along_cable_m", "time_s", "table_m"))
     if gripper is not None:
-        parts.append(f"at gripper {gripper}")
+        several = isinstance(gripper, list)
+        parts.append(f"at grippers {listed([str(g) for g in gripper])}" if several else f"at gripper {gripper}")
     elif along is not None:
         low, high = along
         parts.append(

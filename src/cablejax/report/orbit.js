@@ -86,6 +86,7 @@
   function select() {
     current = +choice.value;
     slider.max = (data.windows[current].observed.length - 1) * data.interval;
+    slider.value = data.windows[current].shown * data.interval;
     draw();
   }
   button.onclick = () => {

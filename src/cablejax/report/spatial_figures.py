@@ -17,6 +17,7 @@ from cablejax.report.style import LIGHT
 
 _FRAME = 0.04  # [s] between two pictures of the player
 _SHOWN = 4
+_LOST = 0.5  # [m]
 
 
 def error_per_file(diagnosis: Diagnosis, predicted: np.ndarray) -> np.ndarray:
@@ -136,6 +137,10 @@ def orbit_data(diagnosis: Diagnosis) -> dict[str, Any]:
             "reach": float(np.nanmax(np.ptp(observed.reshape(-1, 3), axis=0))),
             "floor": round(1e3 * float(np.nanmin(observed[..., 2])) - 50),
         }
+        # begins where the simulator is furthest off, but not lost: at the first sample there is nothing to see
+        off = np.linalg.norm(diagnosis.nominal[e, samples] - observed, axis=-1)
+        off = np.nan_to_num(off).max(axis=1)
+        entry["shown"] = int(np.where(off < _LOST, off, 0.0).argmax())
         if diagnosis.explained is not None and diagnosis.effects:
             entry["explained"] = whole(diagnosis.explained[e, samples])
         windows.append(entry)

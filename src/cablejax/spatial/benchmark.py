@@ -9,10 +9,12 @@ from collections.abc import Callable
 
 import numpy as np
 from jaxtyping import Float
+from scipy.stats import t
 
 from cablejax.recordings.deform import NOMINAL, DeformRecordings
 from cablejax.spatial.fit import errors, over_all_markers
 from cablejax.spatial.identify import Identified, identify
+from cablejax.spatial.network import fit_network
 from cablejax.spatial.residual import fit_residual
 from cablejax.spatial.rod import frames_along
 from cablejax.spatial.windows import Windows
@@ -21,6 +23,7 @@ from cablejax.spatial.windows import Windows
 _STRAIGHT = 0.75
 _JUMP = 0.002
 _DRAWS = 5000
+_LEARNED = ("rod", "rod + ridge", "rod + graph network", "rod + graph network + ridge")
 
 
 def protocol_windows(recordings: DeformRecordings) -> Windows:
@@ -62,78 +65,114 @@ class CableScore:
     """Errors of one cable, mean absolute coordinate error over all markers, held ones counted as 0 [mm].
 
     Attributes:
-        stages: (name, on recordings of the train split that the fit has not seen, on the eval split).
-        by_recording: final simulator, and with the residual, from the half of the recordings that a window is not in.
-        spread: 5, 50 and 95 % quantile over random choices of 14 of all windows, final with residual.
-        halves: EI / rho from either half of the recordings [m^4/s^2].
+        stages: of the search (name, on recordings of the train split that the fit has not seen, on the eval split);
+            both are means over the fits to either half of the recordings.
+        learned: (name, split by recording, on the eval split, 5 and 95 % quantile over random choices of as many of all
+            windows as eval has) of the rod with all effects and of what is learned on top of it.
+        without_own: the rod on the eval split, its recordings' own values left at what all recordings share.
+        halves: EI / rho from either half of the recordings with its 90 % interval [m^4/s^2].
         seconds: of one 5 s rollout alone (median), and of a batch of all windows.
         effects: that were found.
+        networks: size and rounds that were chosen for the graph network of all, and of either half.
     """
 
     stages: tuple[tuple[str, float, float], ...]
-    by_recording: tuple[float, float]
-    spread: tuple[float, float, float]
-    halves: tuple[float, float]
+    learned: tuple[tuple[str, float, float, float, float], ...]
+    without_own: float
+    halves: tuple[tuple[float, float, float], ...]
     seconds: tuple[float, float]
     effects: tuple[str, ...]
+    networks: tuple[tuple[int, int], ...]
 
 
-def score_cable(
-    recordings: DeformRecordings, *, state: pathlib.Path | None, progress: Callable[[str], None]
-) -> CableScore:
-    """Identifies a cable on upstream's train split and scores every stage, the eval split only at the very end."""
+def score_cable(recordings: DeformRecordings, *, state: pathlib.Path, progress: Callable[[str], None]) -> CableScore:
+    """Identifies a cable on upstream's train split and scores every stage, the eval split only at the very end.
+
+    Args:
+        recordings: of the cable.
+        state: folder that keeps what is done, so that an interrupted call goes on where it was.
+        progress: called with a line of text.
+    """
     windows = protocol_windows(recordings)
     split = np.array(windows.split)
     train, kept = (windows.chosen(np.flatnonzero(split == name)) for name in ("train", "eval"))
-    found = identify(train, NOMINAL.bending_stiffness / NOMINAL.linear_density, state=state, progress=progress)
+    nominal = NOMINAL.bending_stiffness / NOMINAL.linear_density
+    found = identify(train, nominal, state=state / f"{recordings.name}_search.json", progress=progress)
     simulator = found.simulator
-    fitted, unseen = simulator.predict(found.values, train), found.unseen(train)
-    residual = fit_residual(fitted, train)
-    corrected = np.empty_like(unseen)
-    for half in (found.first, ~found.first):
-        other = np.flatnonzero(~half)
-        learned = fit_residual(unseen[other], train.chosen(other))
-        corrected[half] = learned.correct(unseen[half], train.chosen(np.flatnonzero(half)))
-
-    def metric(predicted, of=None) -> Float[np.ndarray, "W"]:
-        of = train if of is None else of
-        return 1e3 * over_all_markers(errors(predicted, of), of)
-
     # scored as published: every frame, whatever was lost in between
     whole = dataclasses.replace(kept, valid=np.ones_like(kept.valid))
+
+    by_recording = {name: np.zeros_like(train.keypoints) for name in _LEARNED}
+    networks = []
+    for k, (values, half) in enumerate(zip(found.half_values, (found.first, ~found.first), strict=True)):
+        part, other = (train.chosen(np.flatnonzero(use)) for use in (half, ~half))
+        # a recording that is not seen has no values of its own; nor have those that its corrections are learned from
+        fitted, unseen = (simulator.predict(values.shared, w) for w in (part, other))
+        progress(f"learning corrections, half {k + 1}")
+        path = state / f"{recordings.name}_half{k + 1}.npz"
+        corrected, network = _learned(fitted, part, unseen, other, path, progress)
+        networks.append(network)
+        for name, predicted in corrected.items():
+            by_recording[name][~half] = predicted
+    final = simulator.predict(found.values, whole)
+    progress("learning corrections, all of train")
+    path = state / f"{recordings.name}_all.npz"
+    on_eval, network = _learned(simulator.predict(found.values, train), train, final, whole, path, progress)
+
+    def metric(predicted, of) -> Float[np.ndarray, "W"]:
+        return 1e3 * over_all_markers(errors(predicted, of), of)
+
     stages, share = [], train.keypoints.shape[2] / train.n_keypoints
     for step in found.steps:
         if step.accepted:
-            on_eval = metric(simulator.predict(step.values.mean(axis=0), whole), whole).mean()
+            scored = [metric(simulator.predict(values, whole), whole).mean() for values in step.values]
             name = f"+ {step.effect}" if step.effect else "nominal"
-            stages.append((name, 1e3 * share * float(step.error.mean()), float(on_eval)))
-    final = simulator.predict(found.values, whole)
-    stages.append(
-        ("all effects, fitted to all of train", float(metric(unseen).mean()), float(metric(final, whole).mean()))
-    )
-    kept_residual = metric(residual.correct(final, whole), whole)
-    stages.append(("+ ridge residual", float(metric(corrected).mean()), float(kept_residual.mean())))
-
-    everything = np.concatenate([metric(corrected), kept_residual])
-    draws = np.random.default_rng(0)
-    means = [draws.choice(everything, len(kept), replace=False).mean() for _ in range(_DRAWS)]
+            stages.append((name, 1e3 * share * float(step.error.mean()), float(np.mean(scored))))
+    learned, draws = [], np.random.default_rng(0)
+    for name in _LEARNED:
+        unseen, scored = metric(by_recording[name], train), metric(on_eval[name], whole)
+        everything = np.concatenate([unseen, scored])
+        means = [draws.choice(everything, len(kept), replace=False).mean() for _ in range(_DRAWS)]
+        low, high = np.quantile(means, [0.05, 0.95])
+        learned.append((name, float(unseen.mean()), float(scored.mean()), float(low), float(high)))
     return CableScore(
         stages=tuple(stages),
-        by_recording=(float(metric(unseen).mean()), float(metric(corrected).mean())),
-        spread=tuple(float(q) for q in np.quantile(means, [0.05, 0.5, 0.95])),  # pyright: ignore[reportArgumentType]
-        halves=_stiffness(found),
+        learned=tuple(learned),
+        without_own=float(metric(simulator.predict(found.values.shared, whole), whole).mean()),
+        halves=tuple(_stiffness(found, k) for k in range(2)),
         seconds=_seconds(found, windows),
         effects=found.effects,
+        networks=(network, *networks),
     )
 
 
-def _stiffness(found: Identified) -> tuple[float, float]:
-    layout = found.simulator.layout
-    log = found.half_values[:, layout.slices["log_stiffness"]].sum(axis=1)
-    one, other = layout.nominal_stiffness * np.exp(
-        log + found.half_values[:, layout.slices["log_profile"]].mean(axis=1)
-    )
-    return float(one), float(other)
+def _learned(fitted, windows: Windows, simulated, others: Windows, path: pathlib.Path, progress):
+    """Predictions of `others` with what is learned on `windows`, by name, and the network's size and rounds."""
+    if not path.exists():
+        network = fit_network(fitted, windows, progress=progress)
+        on_top = fit_residual(network.left_out, windows)
+        with_network = network.correct(simulated, others)
+        arrays = (
+            simulated,
+            fit_residual(fitted, windows).correct(simulated, others),
+            with_network,
+            on_top.correct(with_network, others),
+        )
+        path.parent.mkdir(parents=True, exist_ok=True)
+        partial = path.with_suffix(".partial.npz")
+        np.savez(partial, network=(network.size, network.rounds), **dict(zip(_LEARNED, arrays, strict=True)))
+        partial.replace(path)
+    with np.load(path) as kept:
+        return {name: kept[name] for name in _LEARNED}, (int(kept["network"][0]), int(kept["network"][1]))
+
+
+def _stiffness(found: Identified, half: int) -> tuple[float, float, float]:
+    """EI / rho from one half of the recordings with its 90 % interval, by leaving out recordings of that half."""
+    layout, moves = found.simulator.layout, found.moves[half]
+    log = layout.log_stiffness(found.half_values[half].shared)
+    error = t.ppf(0.95, len(moves) - 1) * np.sqrt((layout.log_stiffness(moves) ** 2).sum())
+    value, low, high = layout.nominal_stiffness * np.exp([log, log - error, log + error])
+    return float(value), float(low), float(high)
 
 
 def _seconds(found: Identified, windows: Windows) -> tuple[float, float]:

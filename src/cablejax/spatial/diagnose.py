@@ -200,8 +200,9 @@ def _ranking(found: Identified) -> tuple[Ranked, ...]:
 
 def _named(found: Identified, density: float, windows: Windows) -> tuple[NamedEffect, ...]:
     layout = found.simulator.layout
-    spread = np.maximum(found.spread, np.abs(found.half_values[0] - found.half_values[1]) / 2)
-    part = {f: (found.values[s], spread[s]) for f, s in layout.slices.items()}
+    halves = np.stack([values.shared for values in found.half_values])
+    spread = np.maximum(found.spread, np.abs(halves[0] - halves[1]) / 2)
+    part = {f: (found.values.shared[s], spread[s]) for f, s in layout.slices.items()}
     length = layout.arclength[-1]
     profile, wobble = part["log_profile"]
     chance = {step.effect: step.chance for step in found.steps}
@@ -222,14 +223,9 @@ def _named(found: Identified, density: float, windows: Windows) -> tuple[NamedEf
     for name in found.effects:
         location: dict = {"along_cable_m": None, "time_s": None, "table_m": None}
         if name == "bending_stiffness":
-            value, error = (
-                part["log_stiffness"][0][0] + profile.mean(),
-                np.hypot(part["log_stiffness"][1][0], wobble.mean()),
-            )
-            whole = found.half_values[:, layout.slices["log_stiffness"]].sum(axis=1) + found.half_values[
-                :, layout.slices["log_profile"]
-            ].mean(axis=1)
-            error = max(abs(whole[0] - whole[1]) / 2, min(error, 0.5))
+            whole = layout.log_stiffness(halves)
+            error = np.sqrt((layout.log_stiffness(found.moves[2]) ** 2).sum())
+            value, error = layout.log_stiffness(found.values.shared), max(error, abs(whole[0] - whole[1]) / 2)
             parameters = {"ratio": ratio(value, error)}
         elif name == "stiffness_profile":
             knot = int(np.abs(profile - profile.mean()).argmax())
@@ -371,6 +367,13 @@ def _caveats(log, windows, left_out, found) -> tuple[str, ...]:
         "Roll of the grippers about the cable is not observed; it is taken as the least turn from their mean "
         "direction.",
     ]
+    if "gripper_rotation_offset" in found.effects:
+        own = found.values.own[:, found.simulator.layout.slices["clamp_rotation"]]
+        result.append(
+            "How the cable sits in the grippers is fitted for each recording: it differs by "
+            f"{np.sqrt((own**2).mean()):.2f} rad (root mean square) from the mean that is named. Recordings that no "
+            "fit has seen are predicted with the mean."
+        )
     if left_out:
         result.append(f"{left_out} windows are labelled eval; nothing was fitted to or scored on them.")
     groups = len(np.unique(windows.group))

@@ -24,6 +24,9 @@ PROFILE_KNOTS = 5
 CURVATURE_KNOTS = 5
 # Torsional over bending stiffness of a round cord with Poisson's ratio 0.45.
 _TWIST_RATIO = 0.7
+# Two markers that sit 5 mm off the centreline on different sides, 30 mm apart, see a gripper turned by so much [rad].
+# It turns about the cable with the roll, which is not seen, and is another one when the cable is gripped anew.
+_GRIP = 0.3
 # Almost inextensible: 1 m of cable that hangs by its end stretches by 0.2 mm.
 _STRETCH = 5e4
 
@@ -41,6 +44,7 @@ class Block:
         value
             has either sign and is 0 when off.
         templates: values that are tried before a fit begins.
+        spread: prior standard deviation between recordings, for which the value is set up anew; 0 = it stays the same.
     """
 
     effect: str
@@ -49,6 +53,7 @@ class Block:
     scale: float
     start: float | None = None
     templates: tuple[float, ...] = ()
+    spread: float = 0.0
 
 
 def blocks(n_markers: int, *, twisting: bool) -> tuple[Block, ...]:
@@ -59,7 +64,7 @@ def blocks(n_markers: int, *, twisting: bool) -> tuple[Block, ...]:
         Block("viscous_drag", "drag", 1, 1.0, 0.3, (0.2, 0.8)),
         Block("quadratic_drag", "quadratic_drag", 1, 1.0, 0.05, (0.05, 0.3)),
         Block("stiffness_profile", "log_profile", PROFILE_KNOTS, 0.5),
-        Block("gripper_rotation_offset", "clamp_rotation", 4, 0.1),
+        Block("gripper_rotation_offset", "clamp_rotation", 4, _GRIP, spread=_GRIP),
         Block("keypoint_bias", "along", n_markers + 1, 0.005),
         Block("lumped_mass", "marker_mass", 1, 1.0, 0.01, (0.01, 0.04)),
     ]
@@ -110,6 +115,16 @@ class Layout:
     def starts(self) -> Float[np.ndarray, "P"]:
         """Start of positive values, NaN for the others."""
         return np.concatenate([np.full(b.size, np.nan if b.start is None else b.start) for b in self.blocks])
+
+    @property
+    def spreads(self) -> Float[np.ndarray, "P"]:
+        """Prior standard deviation of each value between recordings."""
+        return np.concatenate([np.full(block.size, block.spread) for block in self.blocks])
+
+    def log_stiffness(self, values: Float[np.ndarray, "*B P"]) -> Float[np.ndarray, "*B"]:
+        """Logarithm of EI / rho over the nominal one, mean along the cable. Linear in the values."""
+        where = self.slices
+        return values[..., where["log_stiffness"]].sum(axis=-1) + values[..., where["log_profile"]].mean(axis=-1)
 
     def templates(self, effect: str) -> list[tuple[slice, float]]:
         """Places and values to try for an effect of one number; none for others."""

@@ -15,14 +15,17 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from cablejax.spatial.effects import Layout, blocks
-from cablejax.spatial.fit import Fit, Simulator, errors, improve, newton_step, slopes
+from cablejax.spatial.fit import Simulator, errors
+from cablejax.spatial.newton import improve, jackknife
 from cablejax.spatial.rod import Rod
 from cablejax.spatial.search import Step, accepted_effects, falls, halves, search
+from cablejax.spatial.values import Values, from_json, mean_of, to_json
 from cablejax.spatial.windows import Windows
 
 EDGES = 20
-_SELECTED = 16
+_SELECTED = 24
 _REFITTED = 24
+_FINAL = 12
 _SHORTEST = 0.8
 _MATERIAL = "intrinsic_curvature"
 _RIVAL = "stiffness_profile"
@@ -36,23 +39,29 @@ class Identified:
         simulator: of the rod with all effects.
         effects: that stayed, in the order in which they were found.
         steps: of the search.
-        values: fitted to all windows, shape [P].
-        half_values: fitted to either half of the recordings, shape [2, P].
-        spread: standard error of the values, by leaving out recordings, shape [P].
+        values: fitted to all windows.
+        half_values: fitted to either half of the recordings.
+        moves: scaled changes of the shared values of either half and of all when a recording is left out; the standard
+            error of anything linear in them is the root of its sum of squares over rows, shapes [R, P].
         first: windows of the first half, shape [W].
     """
 
     simulator: Simulator
     effects: tuple[str, ...]
     steps: tuple[Step, ...]
-    values: Float[np.ndarray, "P"]
-    half_values: Float[np.ndarray, "2 P"]
-    spread: Float[np.ndarray, "P"]
+    values: Values
+    half_values: tuple[Values, Values]
+    moves: tuple[Float[np.ndarray, "R P"], ...]
     first: Float[np.ndarray, "W"] | np.ndarray
 
-    def unseen(self, windows: Windows, *, values=None) -> Float[np.ndarray, "W T F 3"]:
+    @property
+    def spread(self) -> Float[np.ndarray, "P"]:
+        """Standard error of the shared values, by leaving out recordings."""
+        return np.sqrt((self.moves[2] ** 2).sum(axis=0))
+
+    def unseen(self, windows: Windows) -> Float[np.ndarray, "W T F 3"]:
         """Predictions of the identified windows, each from the half of the recordings that it is not part of [m]."""
-        one, other = self.half_values if values is None else values
+        one, other = self.half_values
         return np.where(
             self.first[:, None, None, None],
             self.simulator.predict(other, windows),
@@ -124,32 +133,29 @@ def identify(
     if _MATERIAL in effects and any(s.effect == f"{_MATERIAL} for {_RIVAL}" and s.accepted for s in steps):
         effects.remove(_RIVAL)
     last = [step for step in steps if step.accepted][-1]
-    start = last.values[:, : simulator.layout.size]
+    start = [values.of_size(simulator.layout.size) for values in last.values]
 
     first = halves(windows.group)
-    finals = memory.arrays("final")
-    if not finals:
+    finals = memory.finals()
+    if len(finals) < 3:
         use = [first, ~first, np.ones(len(windows), bool)]
         if simulator.rod.twisting:
             # derivatives with the material frame cost four times as much
             use = [part & np.isin(np.arange(len(windows)), selection(windows, _REFITTED)) for part in use]
-        values = []
-        for part, begin, word in zip(
-            use, [*start, start.mean(axis=0)], ("one half", "the other half", "all"), strict=True
-        ):
+        begins, words = (*start, mean_of(*start)), ("one half", "the other half", "all")
+        for part, begin, word in list(zip(use, begins, words, strict=True))[len(finals) :]:
             progress(f"fitting {word}: {int(part.sum())} windows")
-            index = np.flatnonzero(part)
-            fit = improve(simulator, begin, effects, windows.chosen(index), iterations=4, progress=progress)
-            values.append(fit.values)
-        finals = {"values": np.stack(values), "spread": _jackknife(fit, simulator.layout, windows.group[index])}
-        memory.keep_arrays("final", finals)
+            chosen = windows.chosen(np.flatnonzero(part))
+            fit = improve(simulator, begin, effects, chosen, iterations=_FINAL, progress=progress)
+            finals.append((fit.values, jackknife(fit, simulator.layout)))
+            memory.keep_finals(finals)
     return Identified(
         simulator=simulator,
         effects=tuple(effects),
         steps=tuple(steps),
-        values=finals["values"][2],
-        half_values=finals["values"][:2],
-        spread=finals["spread"],
+        values=finals[2][0],
+        half_values=(finals[0][0], finals[1][0]),
+        moves=tuple(moves for _, moves in finals),
         first=first,
     )
 
@@ -168,13 +174,13 @@ def _material(full: Simulator, windows: Windows, steps, progress) -> list[Step]:
         fits = []
         for values, part in zip(start, (first, ~first), strict=True):
             index = np.flatnonzero(part)
-            fits.append(improve(full, np.where(off, 0.0, values), effects, windows.chosen(index), iterations=4).values)
+            fits.append(improve(full, values.without(off), effects, windows.chosen(index), iterations=4).values)
         predicted = [full.predict(values, windows) for values in fits]
         error = np.where(first, errors(predicted[1], windows), errors(predicted[0], windows))
         accepted, chance = falls(base.error, error, windows.group)
         word = "stays" if accepted else "does not help"
         progress(f"{name}: {1e3 * base.error.mean():.2f} -> {1e3 * error.mean():.2f} mm on unseen recordings, {word}")
-        trials.append(Step(name, accepted, np.stack(fits), error, chance))
+        trials.append(Step(name, accepted, (fits[0], fits[1]), error, chance))
     best = min((t for t in trials if t.accepted), key=lambda t: t.error.mean(), default=None)
     # the better one of the two stays, and comes last
     result = [dataclasses.replace(t, accepted=False) for t in trials if t is not best]
@@ -187,19 +193,8 @@ def _material(full: Simulator, windows: Windows, steps, progress) -> list[Step]:
 
 
 def _padded(step: Step, size: int) -> Step:
-    missing = size - step.values.shape[1]
-    return dataclasses.replace(step, values=np.pad(step.values, ((0, 0), (0, missing))))
-
-
-def _jackknife(fit: Fit, layout: Layout, group) -> Float[np.ndarray, "P"]:
-    """Standard error of the values by one Gauss-Newton step without each recording (Miller 1974)."""
-    names = np.unique(group) if len(np.unique(group)) > 1 else np.arange(len(group))
-    label = group if len(np.unique(group)) > 1 else names
-    moved = np.array([newton_step(fit, layout, label != name) for name in names])
-    full = newton_step(fit, layout, np.ones(len(label), bool))
-    steps = (moved - full) * slopes(layout, fit.values)
-    count = len(names)
-    return np.where(fit.active, np.sqrt((count - 1) / count * (steps**2).sum(axis=0)), 0.0)
+    one, other = (values.of_size(size) for values in step.values)
+    return dataclasses.replace(step, values=(one, other))
 
 
 def _fingerprint(windows: Windows, nominal_stiffness: float, names: Sequence[str]) -> str:
@@ -221,21 +216,30 @@ class _Memory:
 
     def steps(self, name: str) -> list[Step]:
         return [
-            Step(s["effect"], s["accepted"], np.array(s["values"]), np.array(s["error"]), s["chance"])
+            Step(
+                s["effect"],
+                s["accepted"],
+                (from_json(s["values"][0]), from_json(s["values"][1])),
+                np.array(s["error"]),
+                s["chance"],
+            )
             for s in self._held.get(name, [])
         ]
 
     def keep(self, name: str, steps: Sequence[Step]) -> None:
         self._write(
             name,
-            [{**dataclasses.asdict(s), "values": s.values.tolist(), "error": s.error.tolist()} for s in steps],
+            [
+                {**dataclasses.asdict(s), "values": [to_json(v) for v in s.values], "error": s.error.tolist()}
+                for s in steps
+            ],
         )
 
-    def arrays(self, name: str) -> dict[str, np.ndarray]:
-        return {k: np.array(v) for k, v in self._held.get(name, {}).items()}
+    def finals(self) -> list[tuple[Values, np.ndarray]]:
+        return [(from_json(kept["values"]), np.array(kept["moves"])) for kept in self._held.get("final", [])]
 
-    def keep_arrays(self, name: str, arrays: dict[str, np.ndarray]) -> None:
-        self._write(name, {k: v.tolist() for k, v in arrays.items()})
+    def keep_finals(self, finals: Sequence[tuple[Values, np.ndarray]]) -> None:
+        self._write("final", [{"values": to_json(v), "moves": moves.tolist()} for v, moves in finals])
 
     def _write(self, name, value):
         self._held[name] = value

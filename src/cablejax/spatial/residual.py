@@ -1,11 +1,10 @@
 """What a diagnosed simulator still gets wrong, learned: a ridge regression on the clamps' history and the simulated
 cable.
 
-The correction of every free marker is a linear function of features, in a frame that moves with the clamps: origin
-midway between them, x along the horizontal chord, z up. So nothing depends on where in the room the cable hangs or
-which way it faces. Features are the clamps' positions and directions over the last 0.4 s, the simulated markers and
-their velocities, and products of the leading principal components of all these. It reads the simulation and the
-grippers, never an observation, so it predicts open loop as far as the simulator does.
+The correction of every free marker is a linear function of `features`, in a frame that moves with the clamps: the
+clamps' positions and directions over the last 0.4 s, the simulated markers and their velocities, and products of the
+leading principal components of all these. It reads the simulation and the grippers, never an observation, so it
+predicts open loop as far as the simulator does.
 
 Number of components and regularisation are chosen by leaving out recordings.
 """
@@ -18,11 +17,9 @@ import itertools
 import numpy as np
 from jaxtyping import Float
 
+from cablejax.spatial.features import clamp_history, earlier, in_frame, moving_frame
 from cablejax.spatial.windows import Windows, dealt
 
-_HISTORY = 0.4  # [s]
-_POSITION_LAGS = 10
-_DIRECTION_LAGS = 4
 _VELOCITY = 0.05  # [s], over which the simulated markers' velocity is taken
 _COMPONENTS = (0, 8, 16, 24)
 _RIDGES = (1e1, 1e2, 1e3, 1e4, 1e5)
@@ -113,24 +110,8 @@ def _expand(scaled, components):
 
 def _linear(simulated, windows):
     """The moving frame, shape [W, T, 3, 3], rows are axes, and the linear features, shape [W, T, K]."""
-    position, direction = windows.position, windows.frames[:, :, :, 0]
-    middle, chord = position.mean(axis=2), position[:, :, 1] - position[:, :, 0]
-    flat = chord * np.array([1.0, 1.0, 0.0])
-    x = flat / np.maximum(np.linalg.norm(flat, axis=-1, keepdims=True), 1e-6)
-    z = np.broadcast_to(np.array([0.0, 0.0, 1.0]), x.shape)
-    frame = np.stack([x, np.cross(z, x), z], axis=-2)
-    samples, last = position.shape[1], round(_HISTORY / windows.interval)
-    time = np.arange(samples)
-
-    def local(vectors):
-        return np.einsum("wtkc,wtmc->wtmk", frame, vectors).reshape(*vectors.shape[:2], -1)
-
-    parts = []
-    for lag in np.linspace(0, last, _POSITION_LAGS).round().astype(int):
-        parts.append(local(position[:, np.maximum(time - lag, 0)] - middle[:, :, None]))
-    for lag in np.linspace(0, last, _DIRECTION_LAGS).round().astype(int):
-        parts.append(local(direction[:, np.maximum(time - lag, 0)]))
-    parts.append(local(simulated - middle[:, :, None]))
+    frame, middle = moving_frame(windows), windows.position.mean(axis=2, keepdims=True)
     back = max(1, round(_VELOCITY / windows.interval))
-    parts.append(local(simulated - simulated[:, np.maximum(time - back, 0)]))
-    return frame, np.concatenate(parts, axis=-1)
+    markers = [in_frame(simulated - middle, frame), in_frame(simulated - earlier(simulated, back), frame)]
+    flat = [part.reshape(*part.shape[:2], -1) for part in markers]
+    return frame, np.concatenate([clamp_history(windows, frame), *flat], axis=-1)

@@ -14,10 +14,12 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from cablejax.spatial.fit import Fit, Simulator, errors, improve, moved_by, newton_step
+from cablejax.spatial.fit import Simulator, errors
+from cablejax.spatial.newton import Fit, improve, moved_by, newton_step
+from cablejax.spatial.values import Values, shared_by_all
 from cablejax.spatial.windows import Windows, dealt
 
-_STEPS = 3
+_STEPS = 5
 _FAILURES = 2
 _LEAST = 0.01
 _CHANCE = 0.84
@@ -30,14 +32,14 @@ class Step:
     Attributes:
         effect: its name; "" for the nominal simulator.
         accepted: whether it stayed.
-        values: of both halves' fits, shape [2, P].
+        values: of both halves' fits.
         error: mean absolute error of each window's free coordinates, from the fit that has not seen it [m], shape [W].
         chance: share of resamples of the recordings in which the error falls.
     """
 
     effect: str
     accepted: bool
-    values: Float[np.ndarray, "2 P"]
+    values: tuple[Values, Values]
     error: Float[np.ndarray, "W"]
     chance: float
 
@@ -92,8 +94,9 @@ def search(
     parts = (first, ~first)
     steps = list(begun)
     if not steps:
-        sums = simulator.sums(np.zeros(layout.size), windows)
-        steps = [Step("", True, np.zeros((2, layout.size)), sums.error, 0.0)]
+        nothing = shared_by_all(np.zeros(layout.size), windows.group)
+        sums = simulator.sums(nothing, windows)
+        steps = [Step("", True, (nothing, nothing), sums.error, 0.0)]
         progress(f"nominal simulator: {1e3 * sums.error.mean():.1f} mm from the free markers")
     fits = _again(simulator, windows, steps)
     while True:
@@ -111,7 +114,7 @@ def search(
         ]
         error, before = _unseen(trial, first), _last(steps).error
         accepted, chance = falls(before, error, windows.group)
-        steps.append(Step(effect, accepted, np.stack([fit.values for fit in trial]), error, chance))
+        steps.append(Step(effect, accepted, (trial[0].values, trial[1].values), error, chance))
         save(steps)
         word = "stays" if accepted else "does not help"
         progress(f"{effect}: {1e3 * before.mean():.2f} -> {1e3 * error.mean():.2f} mm on unseen recordings, {word}")
@@ -130,7 +133,7 @@ def _last(steps):
 
 def _again(simulator, windows, steps) -> list[Fit]:
     active = simulator.layout.active(accepted_effects(steps))
-    return [Fit(v, active, simulator.sums(v, windows)) for v in _last(steps).values]
+    return [Fit(v, active, simulator.sums(v, windows), windows.group) for v in _last(steps).values]
 
 
 def _unseen(fits: Sequence[Fit], first):
@@ -148,12 +151,14 @@ def _starts(simulator: Simulator, fits: Sequence[Fit], windows: Windows, parts, 
     for fit, part in zip(fits, parts, strict=True):
         active = layout.active(effects)
         step = newton_step(fit, layout, part, damping=1e-3, active=active)
-        trials = [moved_by(layout, fit.values, active, scale * step) for scale in (1.0, 0.4)]
+        trials = [moved_by(layout, fit.values, active, step * scale) for scale in (1.0, 0.4)]
         # a positive value that is off cannot go below
-        trials = [np.where(np.isnan(layout.starts), t, np.maximum(t, 0.0)) for t in trials]
+        floor = np.where(np.isnan(layout.starts), -np.inf, 0.0)
+        trials = [dataclasses.replace(t, shared=np.maximum(t.shared, floor)) for t in trials]
         for where, value in layout.templates(effects[-1]):
-            trials.append(fit.values.copy())
-            trials[-1][where] = value
+            shared = fit.values.shared.copy()
+            shared[where] = value
+            trials.append(dataclasses.replace(fit.values, shared=shared))
         own, other = windows.chosen(np.flatnonzero(part)), windows.chosen(np.flatnonzero(~part))
         best = min(trials, key=lambda values: errors(simulator.predict(values, own), own).mean())
         result.append(best)
