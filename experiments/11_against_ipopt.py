@@ -270,8 +270,8 @@ def page(rows: list[dict], explained: dict[str, dict], kinks: list[dict], n_all:
         "",
         f"Ours feasible to 1e-8 m: {share([r['violation'] <= 1e-8 for r in rows])}; largest violation "
         f"{max(r['violation'] for r in rows):.1e} m, IPOPT's {max(r['limited']['violation'] for r in limited):.1e} m. "
-        f"Converged by its own test within {STEPS} linearisations: {share([r['converged'] for r in rows])}; of these "
-        f"{quantiles([r['linearisations'] for r in rows], '.0f')}.",
+        f"Converged by its own test within {STEPS} linearisations: {share([r['converged'] for r in rows])}; "
+        f"{quantiles([r['linearisations'] for r in rows], '.0f')} were used (median / 95 % / largest).",
         "",
         "In float32 the objective of the plan, evaluated in float64, is above that of the plan found in float64 by "
         f"{quantiles([(r['single_objective'] - r['objective']) / r['objective'] for r in rows])}, relative (median / "
