@@ -124,6 +124,9 @@ class BenchMpc(Command):
     solvers: tuple[SolverChoice, ...] = get_args(SolverChoice)
     """How plans are found; the first one is also timed in batches."""
 
+    horizon: int = 5
+    """Steps that a plan looks ahead, beyond the next one."""
+
     repeats: int = 60
     """Calls to time, after the first one, which compiles."""
 
@@ -140,10 +143,12 @@ class BenchMpc(Command):
         from cablejax.shaping import initial_history, load_model
         from cablejax.simulate import CableConfig
 
-        if not self.solvers or self.repeats < 1 or min(self.batches, default=1) < 1 or self.referee < 0:
+        least = min(self.repeats, *self.batches, self.horizon + 1, self.referee + 1)
+        if not self.solvers or least < 1:
             raise UsageError(
-                f"--solvers {self.solvers}, --repeats is {self.repeats}, --batches {self.batches}, --referee is "
-                f"{self.referee}: expected at least one solver, 1 repeat, batches of 1 and 0 problems."
+                f"--solvers {self.solvers}, --horizon {self.horizon}, --repeats {self.repeats}, --batches "
+                f"{self.batches}, --referee {self.referee}: expected at least one solver, a horizon of 0, 1 repeat, "
+                "batches of 1 and 0 problems."
             )
         on_processor = jax.devices()[0].platform == "cpu"
         batches = self.batches or ((1, 16) if on_processor else (1, 64, 1024))
@@ -152,9 +157,9 @@ class BenchMpc(Command):
         solvers = {}
         for name in self.solvers:
             say(f"compiling the control step with {name} ...")
-            timing = time_control(_controller(model, name), history, self.repeats)
+            timing = time_control(_controller(model, name, self.horizon), history, self.repeats)
             solvers[name] = {"p50_ms": timing.p50_ms, "p95_ms": timing.p95_ms, "first_call_s": timing.first_call_s}
-        first = _controller(model, self.solvers[0])
+        first = _controller(model, self.solvers[0], self.horizon)
         batched = {str(size): _batched_ms(first, history, size, self.repeats) for size in batches}
         ipopt, why = _against_ipopt(model, self.referee)
         result = {
@@ -318,12 +323,13 @@ class Bench:
     )
 
 
-def _controller(model: Model, solver: SolverChoice) -> Controller:
+def _controller(model: Model, solver: SolverChoice, horizon: int) -> Controller:
     """The controller with the online residual on the way to an S, with one of the solvers at its defaults."""
     from cablejax.shaping import make_controller
     from cablejax.targets import make_target
 
-    return make_controller(model, make_target("S"), method="residual", solver=solver)
+    controller = make_controller(model, make_target("S"), method="residual", solver=solver)
+    return dataclasses.replace(controller, config=dataclasses.replace(controller.config, horizon=horizon))
 
 
 def _batched_ms(controller: Controller, history: History, size: int, repeats: int) -> float:
