@@ -147,8 +147,8 @@ def page(trials: list[Trial], table: dict, picture: str | None) -> str:
         f"{', '.join(sorted({t.shape for t in trials}))} by {STEPS} commands on the contact plant; seeds "
         f"{', '.join(map(str, sorted({t.seed for t in trials})))}; gns-reference with the online residual. A horizon h "
         "plans h + 1 commands. Milliseconds are those of a control call in the loop, beside whatever else this machine "
-        "did at the time: compare rows, and see [speed](speed.md) for the default alone. Single runs of one setting "
-        "differ by 0.1 to 0.2 cm in S and Z, so that means of three runs tell little apart: plans that are solved "
+        "did at the time: compare rows, and see [speed](speed.md) for the default alone. Means of "
+        "a few runs tell rows apart only roughly: plans that are solved "
         "better do not end nearer to the target here, and short horizons end as near as long ones.",
     ]
     if picture is not None:

@@ -15,8 +15,7 @@ def multi_start(
 ) -> tuple[Plan, Plan, Float[Array, " S"]]:
     """The best plan of several starts; all of them, with a leading axis S; and their values [m^2], inf for NaN."""
     every = jax.vmap(lambda guess: solver(problem, guess))(guesses)
-    values = jax.vmap(problem.value)(every.motion)
-    values = jnp.where(jnp.isfinite(values), values, jnp.inf)
+    values = jnp.where(jnp.isfinite(every.value), every.value, jnp.inf)
     best = jnp.argmin(values)
     return jax.tree.map(lambda leaf: leaf[best], every), every, values
 

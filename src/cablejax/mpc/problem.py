@@ -103,8 +103,8 @@ class ShapingProblem:
 
         The model is linearised at every step of the rollout by itself, in reverse mode: 2N cotangents a step, all steps
         in one batch. The steps' Jacobians are then multiplied along the horizon, which costs next to nothing. Forward
-        mode carries P tangents through T steps, one after the other: a third more time at a horizon of five, and work
-        that grows with the square of the horizon.
+        mode carries P tangents through T steps, one after the other: work that grows with the square of the
+        horizon.
         """
         n_steps = len(motion)
         twist = self.objective.to_twist(motion)

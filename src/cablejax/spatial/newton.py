@@ -150,8 +150,7 @@ def jackknife(fit: Fit, layout: Layout) -> Float[np.ndarray, "R P"]:
 
     Scaled so that the standard error of anything linear in the values is the root of its sum of squares over rows.
     """
-    names = np.unique(fit.group)
-    label = fit.group if len(names) > 1 else np.arange(len(fit.group))
+    label = fit.group if len(np.unique(fit.group)) > 1 else np.arange(len(fit.group))
     names = np.unique(label)
     full = newton_step(fit, layout, np.ones(len(label), bool)).shared
     moved = np.array([newton_step(fit, layout, label != name).shared for name in names])
