@@ -30,6 +30,7 @@ from cablejax.bounded import (
     BoundedDogleg,
     BoundedGaussNewton,
     BoundedLevenbergMarquardt,
+    BoundedQuasiNewton,
     Result,
     SpectralProjectedGradient,
     least_squares,
@@ -49,8 +50,11 @@ OURS = {
     "Levenberg-Marquardt": BoundedLevenbergMarquardt(atol=TOLERANCE),
     "dogleg": BoundedDogleg(atol=TOLERANCE),
     "Gauss-Newton": BoundedGaussNewton(atol=TOLERANCE),
+    "quasi-Newton": BoundedQuasiNewton(atol=TOLERANCE),
     "spectral gradient": SpectralProjectedGradient(atol=TOLERANCE),
 }
+BY_GRADIENTS = ("quasi-Newton", "spectral gradient")
+"""Those for any function, not only for sums of squares."""
 SCIPYS = ("scipy trf", "scipy dogbox", "scipy L-BFGS-B", "scipy SLSQP")
 SOLVERS = (*OURS, *SCIPYS)
 
@@ -75,7 +79,7 @@ class Run:
 def compiled(solver: str, residuals: Callable | None, function: Callable | None) -> Callable:
     """One of our solvers on one function; bounds and start are traced, so that they do not compile anew."""
     if residuals is not None:
-        steps = GRADIENT_STEPS if solver == "spectral gradient" else LEAST_SQUARES_STEPS
+        steps = GRADIENT_STEPS if solver in BY_GRADIENTS else LEAST_SQUARES_STEPS
         solve = functools.partial(least_squares, lambda y, _: residuals(y).ravel(), OURS[solver], max_steps=steps)
     else:
         solve = functools.partial(minimise, lambda y, _: function(y), OURS[solver], max_steps=GRADIENT_STEPS)
@@ -96,7 +100,7 @@ def derivatives(residuals: Callable | None, function: Callable | None, shape: tu
 
 def ours(problem: BoundedProblem, solver: str) -> Run | None:
     """None where the solver does not apply."""
-    if not problem.is_least_squares and solver != "spectral gradient":
+    if not problem.is_least_squares and solver not in BY_GRADIENTS:
         return None
     solve = compiled(solver, problem.residuals, problem.function)
     out = solve(jnp.asarray(problem.start), problem.feasible())

@@ -31,11 +31,9 @@ from tqdm import tqdm
 
 from cablejax.dynamics.smooth import CORNER
 from cablejax.evaluation.against_ipopt import (
+    ACCURATE,
     EQUAL,
     STATIONARY,
-    STEPS,
-    TOLERANCE,
-    TRIALS,
     Contestant,
     comparable_seconds,
     contestant,
@@ -98,7 +96,7 @@ def explain(ours: Contestant, case: PlanningCase, row: dict) -> dict:
         return steep
     sizes = rng.uniform(-1.0, 1.0, (STARTS, *case.guess.shape)) * case.radius / 3**0.5
     starts = [*sizes, np.asarray(theirs["motion"])]
-    paths = [ours.find(problem, problem.feasible, start, STEPS) for start in starts]
+    paths = [ours.find(problem, start, ACCURATE.gradients) for start in starts]
     values, good = [float(path.objectives[-1]) for path in paths], theirs["objective"] * (1 + EQUAL)
     return {
         **steep,
@@ -134,7 +132,9 @@ def run(cases: list[PlanningCase], path: Path, n_exact: int, process: tuple[int,
     ours, began = contestant(load_model("gns-reference")), time.perf_counter()
     for exact in {exact for _, exact in todo}:
         # Compiles, so that no clock below sees that.
-        judge(ours, todo[0][0], [dataclasses.replace(config, max_iterations=2) for config in referees(exact)], steps=2)
+        judge(
+            ours, todo[0][0], [dataclasses.replace(config, max_iterations=2) for config in referees(exact)], gradients=2
+        )
     for case, exact in tqdm(todo, unit="problem", dynamic_ncols=True):
         if time.perf_counter() - began > seconds:
             break
@@ -166,7 +166,7 @@ def measure_kinks(cases: list[PlanningCase], folder: Path, n: int) -> None:
         for kind, make in (("sharp", ours.make_sharp), ("smooth", ours.make)):
             problem, rng = make(case), np.random.default_rng([len(case.name), 13])
             changes = np.abs(np.diff(slopes_along(problem, np.asarray(row["motion"]), rng, REACH, POINTS)))
-            end = ours.find(problem, problem.feasible, case.guess, STEPS).points[-1] if kind == "sharp" else None
+            end = ours.find(problem, case.guess, ACCURATE.gradients).points[-1] if kind == "sharp" else None
             kkt = row["kkt"] if end is None else kkt_residual(problem, end)
             found[kind] = {"jump": float(changes.max()), "usual": float(np.median(changes)), "kkt": kkt}
         found["apart"] = keypoints_apart(ours.make_sharp(case), ours.make(case), np.asarray(row["motion"]))
@@ -206,8 +206,7 @@ def page(rows: list[dict], explained: dict[str, dict], kinks: list[dict], n_all:
         "",
         f"{len(rows)} of {n_all} problems, in a random order, seed 0; {len(exact)} of them with the exact Hessian too. "
         "Released network gns-reference, the corners of its ReLUs rounded, with the residual fitted online, horizon 5, "
-        f"36 unknowns, float64. Ours: `BoundedLevenbergMarquardt(atol={TOLERANCE:g}, "
-        f"trials_per_linearisation={TRIALS})`, at most {STEPS} linearisations. "
+        f"36 unknowns, float64. Ours: `mpc.{ACCURATE}`. "
         "IPOPT: tol 1e-9 on the objective divided by its value at the start, constr_viol_tol 1e-9, "
         f"bound_relax_factor 0, adaptive mu, limited memory of 20, at most {ITERATIONS} iterations, or exact Hessian, "
         f"at most {EXACT_ITERATIONS}. "
@@ -270,8 +269,8 @@ def page(rows: list[dict], explained: dict[str, dict], kinks: list[dict], n_all:
         "",
         f"Ours feasible to 1e-8 m: {share([r['violation'] <= 1e-8 for r in rows])}; largest violation "
         f"{max(r['violation'] for r in rows):.1e} m, IPOPT's {max(r['limited']['violation'] for r in limited):.1e} m. "
-        f"Converged by its own test within {STEPS} linearisations: {share([r['converged'] for r in rows])}; "
-        f"{quantiles([r['linearisations'] for r in rows], '.0f')} were used (median / 95 % / largest).",
+        f"Converged by its own test: {share([r['converged'] for r in rows])}; "
+        f"{quantiles([r['steps'] for r in rows], '.0f')} steps of both parts (median / 95 % / largest).",
         "",
         "In float32 the objective of the plan, evaluated in float64, is above that of the plan found in float64 by "
         f"{quantiles([(r['single_objective'] - r['objective']) / r['objective'] for r in rows])}, relative (median / "

@@ -11,6 +11,7 @@ from cablejax.bounded import (
     BoundedDogleg,
     BoundedGaussNewton,
     BoundedLevenbergMarquardt,
+    BoundedQuasiNewton,
     Result,
     SpectralProjectedGradient,
     least_squares,
@@ -27,6 +28,7 @@ SOLVERS = {
     "Levenberg-Marquardt": BoundedLevenbergMarquardt(atol=1e-9),
     "dogleg": BoundedDogleg(atol=1e-9),
     "Gauss-Newton": BoundedGaussNewton(atol=1e-9),
+    "quasi-Newton": BoundedQuasiNewton(atol=1e-9),
     "spectral gradient": SpectralProjectedGradient(atol=1e-9),
 }
 QUICK = (
@@ -76,9 +78,10 @@ def test_every_solver_finds_the_quick_ones(solver, name):
     check(solver, PROBLEMS[name])
 
 
+@pytest.mark.parametrize("solver", ["quasi-Newton", "spectral gradient"])
 @pytest.mark.parametrize("name", SMOOTH)
-def test_the_spectral_gradient_finds_what_is_no_sum_of_squares(name):
-    check("spectral gradient", PROBLEMS[name])
+def test_solvers_by_gradients_find_what_is_no_sum_of_squares(name, solver):
+    check(solver, PROBLEMS[name])
 
 
 @pytest.mark.slow

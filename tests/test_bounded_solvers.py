@@ -13,6 +13,7 @@ from cablejax.bounded import (
     BoundedDogleg,
     BoundedGaussNewton,
     BoundedLevenbergMarquardt,
+    BoundedQuasiNewton,
     Box,
     Halfspaces,
     Intersection,
@@ -32,6 +33,7 @@ SOLVERS = {
     "dogleg, updated": BoundedDogleg(atol=1e-9, trials_per_linearisation=3),
     "Gauss-Newton, updated": BoundedGaussNewton(atol=1e-9, trials_per_linearisation=3),
     "spectral": SpectralProjectedGradient(atol=1e-9),
+    "quasi-Newton": BoundedQuasiNewton(atol=1e-9),
 }
 
 

@@ -10,6 +10,7 @@ import pytest
 
 from cablejax.mpc import (
     SOLVERS,
+    Accurate,
     CrossEntropy,
     Outcome,
     PathIntegral,
@@ -22,7 +23,7 @@ from cablejax.mpc import (
 from mpc_cases import START, poses, problem
 
 STEPS = 3
-EXACT = TrustRegion(max_iterations=100, trials_per_linearisation=1, tolerance=1e-11, secant=True)
+EXACT = Accurate(tolerance=1e-12)
 STILL = np.zeros((STEPS, 2, 3))
 # None of the bounds active; the balls; the balls and the greatest distance.
 REGIMES = {

@@ -15,6 +15,7 @@ from cablejax.bounded.implicit import FixedPointAdjoint
 from cablejax.bounded.least_squares import AbstractBoundedLeastSquares
 from cablejax.bounded.levenberg_marquardt import BoundedLevenbergMarquardt, DampedQuadratic
 from cablejax.bounded.quadratic import QuadraticMinimum, minimise_quadratic
+from cablejax.bounded.quasi_newton import BoundedQuasiNewton
 from cablejax.bounded.results import Result, Solution, Stats
 from cablejax.bounded.sets import (
     AbstractSet,
@@ -38,6 +39,7 @@ __all__ = [
     "BoundedDoglegDescent",
     "BoundedGaussNewton",
     "BoundedLevenbergMarquardt",
+    "BoundedQuasiNewton",
     "Box",
     "Certificate",
     "ConstrainedNewton",

@@ -11,6 +11,7 @@ import optimistix as optx
 from equinox import AbstractVar
 from jaxtyping import Array, Bool, Float, Int, PyTree, Scalar
 
+from cablejax.bounded.linearise import forward
 from cablejax.bounded.secant import secant_update
 
 
@@ -100,7 +101,7 @@ class AbstractBoundedLeastSquares(optx.AbstractLeastSquaresSolver):
 
     def step(self, fn, y, args, options, state, tags):
         del tags
-        linearise = options.get("linearise", None) or _forward(fn)
+        linearise = options.get("linearise", None) or forward(lambda y, args: fn(y, args)[0])
 
         def renewed():
             return self._renewed(linearise, options["feasible"], y, args, state)
@@ -226,17 +227,3 @@ class AbstractBoundedLeastSquares(optx.AbstractLeastSquaresSolver):
 
 def _info(value: Scalar, gradient: Float[Array, " P"], hessian: Float[Array, "P P"]):
     return optx.FunctionInfo.EvalGradHessian(value, gradient, lx.MatrixLinearOperator(hessian))
-
-
-def _forward(fn):
-    """`fn` and its Jacobian in forward mode."""
-
-    def linearise(y, args):
-        def twice(y):
-            residual = fn(y, args)[0]
-            return residual, residual
-
-        jacobian, residual = jax.jacfwd(twice, has_aux=True)(y)
-        return residual, jacobian.reshape(residual.size, y.size)
-
-    return linearise

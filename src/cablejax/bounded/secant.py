@@ -1,4 +1,4 @@
-"""The curvature that a Gauss-Newton model leaves out, learned along the way."""
+"""Curvature learned along the way: all of it, or what a Gauss-Newton model leaves out."""
 
 from __future__ import annotations
 
@@ -32,3 +32,41 @@ def secant_update(
     correction = (jnp.outer(rest, slope) + jnp.outer(slope, rest)) / safe
     correction = correction - jnp.sum(moved * rest) * jnp.outer(slope, slope) / safe**2
     return jnp.where(telling & jnp.isfinite(correction).all(), sized + correction, secant)
+
+
+def positive_update(
+    hessian: Float[Array, "P P"], moved: Float[Array, " P"], bent: Float[Array, " P"]
+) -> Float[Array, "P P"]:
+    """The formula of Broyden, Fletcher, Goldfarb and Shanno, kept positive semi-definite.
+
+    Where the curvature met is less than a fifth of the model's, the model's is cut to a fifth along the move, and no
+    more is learned: Powell's damping (Lect. Notes Math. 630, 1978) would, of a negative curvature, learn ever greater
+    ones elsewhere. At a curved bound that is the usual case: there the function need not be convex at its minimum.
+
+    Args:
+        hessian: B, positive semi-definite.
+        moved: s, from one point to another.
+        bent: y, by how much the gradient differs there.
+    """
+    expected, curved = hessian @ moved, moved @ bent
+    model = moved @ expected
+    # a direction that the matrix does not see, but for rounding
+    seen = model > 16 * jnp.finfo(moved.dtype).eps * jnp.linalg.norm(moved) * jnp.linalg.norm(expected)
+    model, expected = jnp.where(seen, model, 0.0), jnp.where(seen, expected, 0.0)
+    convex = (curved >= 0.2 * model) & (curved > jnp.finfo(moved.dtype).tiny)
+    learned = jnp.outer(bent, bent) / jnp.where(convex, curved, 1.0)
+    lost = jnp.outer(expected, expected) / jnp.where(seen, model, 1.0)
+    updated = hessian + jnp.where(convex, learned - lost, -0.8 * lost)
+    telling = jnp.isfinite(bent).all() & jnp.isfinite(updated).all()
+    return jnp.where(telling, 0.5 * (updated + updated.T), hessian)
+
+
+def sized(hessian: Float[Array, "P P"], moved: Float[Array, " P"], bent: Float[Array, " P"]) -> Float[Array, "P P"]:
+    """The multiple of the identity with the curvature `y'y / s'y` that was met, or the matrix where there was none.
+
+    Nocedal and Wright, Numerical Optimization, equation 6.20.
+    """
+    curved = moved @ bent
+    telling = curved > 1e-8 * jnp.linalg.norm(moved) * jnp.linalg.norm(bent)
+    size = jnp.sum(bent**2) / jnp.where(telling, curved, 1.0)
+    return jnp.where(telling, size * jnp.eye(len(moved), dtype=moved.dtype), hessian)

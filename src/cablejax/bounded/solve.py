@@ -11,6 +11,7 @@ from jax.core import Tracer
 from jaxtyping import Array
 
 from cablejax.bounded.implicit import FixedPointAdjoint
+from cablejax.bounded.linearise import forward
 from cablejax.bounded.results import Result, Solution, Stats
 from cablejax.bounded.sets import AbstractSet
 
@@ -22,6 +23,7 @@ def minimise(
     feasible: AbstractSet,
     args: Any = None,
     *,
+    hessian: Callable[[Array, Any], Array] | None = None,
     max_steps: int = 1000,
     throw: bool = True,
 ) -> Solution:
@@ -29,10 +31,12 @@ def minimise(
 
     Args:
         fn: the function.
-        solver: `SpectralProjectedGradient(...)`.
+        solver: `BoundedQuasiNewton(...)` or `SpectralProjectedGradient(...)`.
         y0: where to start; projected onto the set first.
         feasible: the set.
         args: what else the function depends on.
+        hessian: at the start a model of the Hessian [P, P], positive semi-definite, if there is one;
+            `BoundedQuasiNewton` begins with it.
         max_steps: of the solver at most, with one trial point each unless it is told to make more.
         throw: whether to raise outside compiled code; within, the result code is all there is.
 
@@ -44,9 +48,8 @@ def minimise(
         RuntimeError: the solve ended in another way than convergence.
     """
     start = feasible.project(jnp.asarray(y0))
-    out = optx.minimise(
-        fn, solver, start, args, {"feasible": feasible}, max_steps=max_steps, adjoint=FixedPointAdjoint(), throw=False
-    )
+    options = {"feasible": feasible, "hessian": hessian}
+    out = optx.minimise(fn, solver, start, args, options, max_steps=max_steps, adjoint=FixedPointAdjoint(), throw=False)
     return _finish(out, feasible, start, throw)
 
 
@@ -66,7 +69,7 @@ def least_squares(
     Args:
         residual_fn: the residuals.
         solver: `BoundedLevenbergMarquardt(...)`, `BoundedDogleg(...)`, `BoundedGaussNewton(...)`, or a solver for
-            `minimise`, which is given half the sum of squares.
+            `minimise`, which is given half the sum of squares and J'J at the start.
         y0: where to start; projected onto the set first.
         feasible: the set.
         args: what else the residuals depend on.
@@ -86,7 +89,11 @@ def least_squares(
         def half_squares(y, args):
             return 0.5 * jnp.sum(residual_fn(y, args) ** 2)
 
-        return minimise(half_squares, solver, y0, feasible, args, max_steps=max_steps, throw=throw)
+        def squared(y, args):
+            jacobian = (linearise or forward(residual_fn))(y, args)[1]
+            return jacobian.T @ jacobian
+
+        return minimise(half_squares, solver, y0, feasible, args, hessian=squared, max_steps=max_steps, throw=throw)
     start = feasible.project(jnp.asarray(y0))
     options = {"feasible": feasible, "linearise": linearise}
     out = optx.least_squares(

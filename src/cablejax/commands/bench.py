@@ -374,7 +374,7 @@ def _against_ipopt(model: Model, problems: int) -> tuple[dict[str, Any] | None, 
     with jax.enable_x64(True):
         ours, cases = contestant(model), random_cases(model, range(problems))
         say("compiling the planning problem in float64 ...")
-        judge(ours, cases[0], [RefereeConfig(max_iterations=2)], steps=2)
+        judge(ours, cases[0], [RefereeConfig(max_iterations=2)], gradients=2)
         rows = []
         for index, case in enumerate(cases):
             rows.append(judge(ours, case, [RefereeConfig(max_iterations=200)]))

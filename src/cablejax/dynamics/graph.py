@@ -137,7 +137,7 @@ def build_graph(history: History, twist: Float[Array, "2 3"], prior: Prior, conf
     along = (topology.receivers - topology.senders) * config.spacing
     chord = now[topology.receivers] - now[topology.senders]
     # 1 nm keeps the derivative finite should two observed keypoints ever coincide.
-    shorter = np.abs(along) - jnp.sqrt(jnp.sum(chord**2, axis=-1) + 1e-18)
+    shorter = jnp.asarray(np.abs(along), now.dtype) - jnp.sqrt(jnp.sum(chord**2, axis=-1) + 1e-18)
     edges = jnp.concatenate(
         [
             chord / config.spacing,

@@ -11,29 +11,29 @@ of the objective divided by its value at the start: the same over `objective(sta
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 
-from cablejax.bounded import BoundedLevenbergMarquardt, certify
+from cablejax.bounded import certify
 from cablejax.evaluation.planning_problems import PlanningCase, ProblemMaker, smooth_model
 from cablejax.evaluation.referee import RefereeConfig, referee, slope_of, value_of
-from cablejax.evaluation.solver_path import PathFinder
-from cablejax.mpc import ShapingProblem
+from cablejax.evaluation.solver_path import PathFinder, SolverPath
+from cablejax.mpc import Accurate, ShapingProblem
 from cablejax.shaping import Model
 
 EQUAL = 1e-6
 """Relative difference of objectives that counts as none."""
 STATIONARY = 1e-5
 """KKT residual of a minimum [m]."""
-STEPS, TRIALS = 40, 3
-"""Linearisations of ours at most, and trial plans after each."""
-TOLERANCE = 1e-8
-"""Of ours on the projected gradient in float64 [m]; in float32 1000 times that. Where bounds press, the KKT residual is
-greater than the projected gradient by the ratio of gradient and step bound, some 100 times."""
+ACCURATE = Accurate(gradients=100)
+"""Ours. In float32 with 1000 times its tolerance on the projected gradient."""
+
+Find = Callable[[ShapingProblem, "Float[Array | np.ndarray, 'T Q 3']", int], SolverPath]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -44,50 +44,59 @@ class Contestant:
         make: problems in float64.
         make_sharp: the same of the network as it was trained.
         make_single: in float32.
-        find: the solver in float64.
+        find: `(problem, start, gradients)` to the path of the solver in float64, with so many gradients at most in its
+            second part.
         find_single: in float32.
     """
 
     make: ProblemMaker
     make_sharp: ProblemMaker
     make_single: ProblemMaker
-    find: PathFinder
-    find_single: PathFinder
+    find: Find
+    find_single: Find
 
 
 def contestant(model: Model) -> Contestant:
-    """`BoundedLevenbergMarquardt` on a model's problems; call it, and all else here, with x64 enabled in JAX."""
+    """`ACCURATE` on a model's problems; call it, and all else here, with x64 enabled in JAX."""
 
-    def finder(tolerance: float) -> PathFinder:
-        return PathFinder(
-            lambda motion, problem: problem.residuals(motion),
-            BoundedLevenbergMarquardt(atol=tolerance, trials_per_linearisation=TRIALS),
-            lambda motion, problem: problem.linearise(motion),
+    def finder(accurate: Accurate) -> Find:
+        first, second = (
+            PathFinder(
+                lambda motion, problem: problem.residuals(motion),
+                solver,
+                lambda motion, problem: problem.linearise(motion),
+            )
+            for solver in accurate.parts()
         )
+
+        def find(problem: ShapingProblem, start: Float[Array | np.ndarray, "T Q 3"], gradients: int) -> SolverPath:
+            near = first(problem, problem.feasible, start, accurate.linearisations)
+            return near.followed_by(second(problem, problem.feasible, near.points[-1], gradients))
+
+        return find
 
     smooth = smooth_model(model)
     with jax.enable_x64(False):
         make_single = ProblemMaker(smooth, np.float32)
-    return Contestant(
-        ProblemMaker(smooth), ProblemMaker(model), make_single, finder(TOLERANCE), finder(1000 * TOLERANCE)
-    )
+    coarse = dataclasses.replace(ACCURATE, tolerance=1000 * ACCURATE.tolerance)
+    return Contestant(ProblemMaker(smooth), ProblemMaker(model), make_single, finder(ACCURATE), finder(coarse))
 
 
 def judge(
-    ours: Contestant, case: PlanningCase, referees: Sequence[RefereeConfig], steps: int = STEPS
+    ours: Contestant, case: PlanningCase, referees: Sequence[RefereeConfig], gradients: int = ACCURATE.gradients
 ) -> dict[str, Any]:
-    """One problem by all, ours with so many linearisations at most; both begin at the same feasible plan.
+    """One problem by all, ours with so many gradients at most; both begin at the same feasible plan.
 
     Returns:
         A row that JSON can hold: of ours `start` and `objective` [m^2], `start_slope` (largest element of the gradient
-        there) [m], `violation` [m], `kkt` and `kkt_scaled` (see above), `linearisations`, `converged`, `seconds`,
+        there) [m], `violation` [m], `kkt` and `kkt_scaled` (see above), `steps`, `converged`, `seconds`,
         `motion`, `sharp_objective` by the network as it was trained, `single_objective` and `single_violation` of the
         plan found in float32, evaluated in float64; and for each referee, under `limited` or `exact`, what it found and
         the seconds in which either first reached the objective that both reach.
     """
     problem, sharp, limits = ours.make(case), ours.make_sharp(case), case.limits()
     start = np.asarray(problem.feasible.project(jnp.asarray(case.guess)))
-    path = ours.find(problem, problem.feasible, start, steps)
+    path = ours.find(problem, start, gradients)
     scale = float(path.objectives[0])
     kkt = kkt_residual(problem, path.points[-1])
     row: dict[str, Any] = {
@@ -99,14 +108,14 @@ def judge(
         "violation": limits.violation(path.points[-1]),
         "kkt": kkt,
         "kkt_scaled": kkt / scale,
-        "linearisations": len(path.seconds) - 1,
+        "steps": len(path.seconds) - 1,
         "converged": path.converged,
         "seconds": float(path.seconds[-1]),
         "motion": path.points[-1].tolist(),
     }
     with jax.enable_x64(False):
         single = ours.make_single(case)
-        plan = ours.find_single(single, single.feasible, start.astype(np.float32), steps).points[-1]
+        plan = ours.find_single(single, start.astype(np.float32), gradients).points[-1]
     row["single_objective"] = float(value_of(problem, jnp.asarray(plan, jnp.float64)))
     row["single_violation"] = limits.violation(plan)
     for config in referees:

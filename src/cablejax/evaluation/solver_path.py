@@ -42,14 +42,24 @@ class SolverPath:
         good = self.objectives <= objective
         return float(self.seconds[good].min()) if good.any() else float("inf")
 
+    def followed_by(self, rest: SolverPath) -> SolverPath:
+        """This path, and one that begins at its end."""
+        return SolverPath(
+            points=np.concatenate([self.points, rest.points[1:]]),
+            seconds=np.concatenate([self.seconds, self.seconds[-1] + rest.seconds[1:]]),
+            objectives=np.concatenate([self.objectives, rest.objectives[1:]]),
+            converged=rest.converged,
+        )
+
 
 class PathFinder:
     """Steps of one solver on one function, compiled once for all `args`, sets and starts of the same shapes.
 
     Args:
-        fn: `(y, args) -> residuals` for a least squares solver, `(y, args) -> objective` for a minimiser.
+        fn: `(y, args) -> residuals`, or `(y, args) -> objective` for a minimiser; given residuals, it minimises half
+            their squares.
         solver: of `cablejax.bounded`.
-        linearise: residuals and Jacobian, if there is a cheaper way than `jax.jacfwd`.
+        linearise: residuals and Jacobian, if there is a cheaper way than `jax.jacfwd`; a minimiser begins with J'J.
     """
 
     def __init__(
@@ -67,9 +77,9 @@ class PathFinder:
     ) -> SolverPath:
         """The path from a start, projected onto the set first, until the solver stops or the steps are used up."""
         y = feasible.project(jnp.asarray(start))
-        state = self._begin(y, args, feasible)
         points, seconds, done, converged = [np.asarray(y)], [0.0], False, False
         began = time.perf_counter()
+        state = jax.block_until_ready(self._begin(y, args, feasible))
         while not done and len(seconds) <= max_steps:
             y, state, done, converged = jax.block_until_ready(self._advance(y, state, args, feasible))
             points.append(np.asarray(y))
@@ -85,17 +95,24 @@ class PathFinder:
         )
 
     def _options(self, feasible):
-        return {"feasible": feasible, "linearise": self._linearise}
+        hessian = None if self._linearise is None else self._squared_jacobian
+        return {"feasible": feasible, "linearise": self._linearise, "hessian": hessian}
+
+    def _squared_jacobian(self, y, args):
+        assert self._linearise is not None
+        jacobian = self._linearise(y, args)[1]
+        return jacobian.T @ jacobian
 
     def _with_aux(self, y, args):
-        return self._fn(y, args), None
+        minimises = isinstance(self._solver, optx.AbstractMinimiser)
+        return (self._objective if minimises else self._fn)(y, args), None
 
     def _objective(self, y, args):
         out = self._fn(y, args)
         return out if out.ndim == 0 else 0.5 * jnp.sum(out**2)
 
     def _init(self, y, args, feasible):
-        struct = jax.eval_shape(self._fn, y, args)
+        struct, _ = jax.eval_shape(self._with_aux, y, args)
         return self._solver.init(self._with_aux, y, args, self._options(feasible), struct, None, frozenset())
 
     def _step(self, y, state, args, feasible):

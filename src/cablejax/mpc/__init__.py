@@ -1,5 +1,6 @@
 """Model predictive control of a cable's shape: feasible motions, the planning problem, its solvers, the controller."""
 
+from cablejax.mpc.accurate import Accurate
 from cablejax.mpc.cem import CrossEntropy
 from cablejax.mpc.controller import ControlInfo, Controller, ControllerState, MPCConfig, control, initial_state
 from cablejax.mpc.feasible import FeasibleSet, feasible_from, project_ball
@@ -15,6 +16,7 @@ from cablejax.mpc.trust_region import Dogleg, GaussNewton, TrustRegion
 
 __all__ = [
     "SOLVERS",
+    "Accurate",
     "ControlInfo",
     "ControlTiming",
     "Controller",

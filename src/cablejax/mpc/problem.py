@@ -43,11 +43,11 @@ class ObjectiveConfig:
 
     def to_twist(self, motion: Float[Array, "*batch 3"]) -> Float[Array, "*batch 3"]:
         """The twist (vx, vy, omega) that makes a motion (metres, see `feasible`) within one interval."""
-        return motion / (self.interval * jnp.asarray([1.0, 1.0, self.rotation_weight]))
+        return motion / (self.interval * jnp.asarray([1.0, 1.0, self.rotation_weight], motion.dtype))
 
     def to_motion(self, twist: Float[Array, "*batch 3"]) -> Float[Array, "*batch 3"]:
         """The motion in metres that a twist makes within one interval; the inverse of `to_twist`."""
-        return twist * (self.interval * jnp.asarray([1.0, 1.0, self.rotation_weight]))
+        return twist * (self.interval * jnp.asarray([1.0, 1.0, self.rotation_weight], twist.dtype))
 
 
 @jax.tree_util.register_dataclass
@@ -158,7 +158,7 @@ class ShapingProblem:
 
     def _weigh(self, shape_error: Float[Array, "T N 2"], motion: Float[Array, "T Q 3"]) -> Float[Array, " M"]:
         n_steps, n_keypoints = shape_error.shape[:2]
-        weight = jnp.ones(n_steps).at[-1].set(self.objective.terminal_weight)
+        weight = jnp.ones(n_steps, motion.dtype).at[-1].set(self.objective.terminal_weight)
         shape = jnp.sqrt(weight / n_keypoints)[:, None, None] * shape_error
         return jnp.concatenate([shape.ravel(), self.objective.motion_weight**0.5 * motion.ravel()])
 

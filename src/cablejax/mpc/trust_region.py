@@ -25,13 +25,11 @@ class _LeastSquaresPlanner(abc.ABC):
         max_iterations: linearisations at most; one costs as much as about ten rollouts.
         trials_per_linearisation: trial plans after each, a rollout each; the Jacobian follows them by Broyden's update.
         tolerance: stop once a unit projected gradient step moves no coordinate by more than this [m].
-        secant: whether the curvature of the residuals is learned: worth it beyond some five iterations, in float64.
     """
 
     max_iterations: int = 1
-    trials_per_linearisation: int = 5
+    trials_per_linearisation: int = 3
     tolerance: float = 2e-5
-    secant: bool = False
 
     def __post_init__(self):
         check_budget(self, "max_iterations")
@@ -62,7 +60,7 @@ class TrustRegion(_LeastSquaresPlanner):
     """Solver: damped Gauss-Newton models of the objective, minimised over the feasible set.
 
     Attributes:
-        max_iterations, trials_per_linearisation, tolerance, secant: see `_LeastSquaresPlanner`.
+        max_iterations, trials_per_linearisation, tolerance: see `_LeastSquaresPlanner`.
         damping: at the start, relative to the diagonal of J'J.
     """
 
@@ -76,7 +74,7 @@ class TrustRegion(_LeastSquaresPlanner):
         return BoundedLevenbergMarquardt(
             atol=self.tolerance,
             damping=self.damping,
-            secant=self.secant,
+            secant=False,
             trials_per_linearisation=self.trials_per_linearisation,
         )
 
@@ -85,9 +83,7 @@ class Dogleg(_LeastSquaresPlanner):
     """Solver: a trust region around Gauss-Newton models, its steps along the dogleg inside the feasible set."""
 
     def bounded(self) -> AbstractBoundedLeastSquares:
-        return BoundedDogleg(
-            atol=self.tolerance, secant=self.secant, trials_per_linearisation=self.trials_per_linearisation
-        )
+        return BoundedDogleg(atol=self.tolerance, secant=False, trials_per_linearisation=self.trials_per_linearisation)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -95,6 +91,4 @@ class GaussNewton(_LeastSquaresPlanner):
     """Solver: Gauss-Newton models without damping, minimised over the feasible set, and a line search towards that."""
 
     def bounded(self) -> AbstractBoundedLeastSquares:
-        return BoundedGaussNewton(
-            atol=self.tolerance, secant=self.secant, trials_per_linearisation=self.trials_per_linearisation
-        )
+        return BoundedGaussNewton(atol=self.tolerance, trials_per_linearisation=self.trials_per_linearisation)

@@ -1,0 +1,25 @@
+"""Residuals and their Jacobian, where the problem has no cheaper way."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+from jaxtyping import Array, Float
+
+
+def forward(
+    residual_fn: Callable[[Array, Any], Array],
+) -> Callable[[Array, Any], tuple[Float[Array, " M"], Float[Array, "M P"]]]:
+    """`residual_fn(y, args)` and its Jacobian with respect to the flattened y, in forward mode."""
+
+    def linearise(y, args):
+        def twice(y):
+            residual = residual_fn(y, args)
+            return residual, residual
+
+        jacobian, residual = jax.jacfwd(twice, has_aux=True)(y)
+        return residual, jacobian.reshape(residual.size, y.size)
+
+    return linearise

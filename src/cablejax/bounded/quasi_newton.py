@@ -1,0 +1,174 @@
+"""Quasi-Newton steps that stay inside a feasible set: gradients only, and fast at the end."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import lineax as lx
+import optimistix as optx
+from jaxtyping import Array, Bool, Float, Int, PyTree, Scalar
+
+from cablejax.bounded.gain_ratio import GainRatio
+from cablejax.bounded.levenberg_marquardt import DampedQuadratic
+from cablejax.bounded.secant import positive_update, sized
+
+
+class _State(eqx.Module):
+    f_info: Any  # FunctionInfo.EvalGradHessian
+    trial: Array
+    descent_state: Any
+    search_state: Any
+    step_size: Scalar
+    optimality: Scalar
+    rounded: Bool[Array, ""]
+    terminate: Bool[Array, ""]
+    result: optx.RESULTS
+    evaluations: Int[Array, ""]
+
+
+class BoundedQuasiNewton(optx.AbstractMinimiser):
+    """Minimiser over a feasible set: a model of the Hessian that learns from gradients, minimised over the set.
+
+    Every step takes the function and its gradient at one trial point. If that is accepted, the change of the gradient
+    updates the model (`positive_update`, after Broyden, Fletcher, Goldfarb and Shanno). The model's minimum over the
+    set, damped as in Levenberg and Marquardt's method, is the next trial point. It ends where
+    `|P(y - g) - y|_inf <= atol + rtol |y|_inf`, or where the model promises less than rounding can tell
+    (`RESULTS.stagnation`, if the former does not hold).
+
+    It keeps a dense P by P matrix. Where bounds couple variables, or are active at the minimum, the model is minimised
+    with them: no active set has to be guessed.
+
+    Options: `feasible`, the set; `hessian`, a function `(y, args) -> [P, P]` that gives the first model, positive
+    semi-definite. Without it the model begins as a multiple of the identity, with which the first step is not longer
+    than 1 nor than the gradient. `least_squares` gives `J'J` at the start.
+    """
+
+    rtol: float
+    atol: float
+    norm: Callable[[PyTree], Scalar]
+    descent: DampedQuadratic
+    search: optx.AbstractSearch
+
+    def __init__(self, rtol: float = 0.0, atol: float = 1e-8, damping: float = 1e-3):
+        """**Arguments:**
+
+        - `rtol`: relative tolerance on the projected gradient.
+        - `atol`: absolute tolerance on it.
+        - `damping`: at the start, relative to the diagonal of the model's Hessian.
+        """
+        self.rtol, self.atol, self.norm = rtol, atol, optx.max_norm
+        # rounding takes a nearly singular model's lowest eigenvalues below zero
+        self.descent = DampedQuadratic(damping, secant=True)
+        # a model that is hardly damped any more gains nothing by less, and takes more trials to come back from it
+        self.search = GainRatio(largest=10.0)
+
+    def init(self, fn, y, args, options, f_struct, aux_struct, tags):
+        del fn, aux_struct, tags
+        dtype, model = f_struct.dtype, options.get("hessian")
+        hessian = jnp.zeros((y.size, y.size), dtype) if model is None else model(y, args)
+        info = _info(jnp.asarray(jnp.inf, dtype), jnp.zeros(y.size, dtype), hessian)
+        descent = self.descent.within(options["feasible"].at(y), y)
+        zero = jnp.zeros((), jnp.int32)
+        return _State(
+            f_info=info,
+            trial=y,
+            descent_state=descent.init(y.ravel(), info),
+            search_state=self.search.init(y.ravel(), info),
+            step_size=jnp.ones((), dtype),
+            optimality=jnp.asarray(jnp.inf, dtype),
+            rounded=jnp.array(False),
+            terminate=jnp.array(False),
+            result=optx.RESULTS.successful,
+            evaluations=zero,
+        )
+
+    def step(self, fn, y, args, options, state: _State, tags):
+        """Takes the gradient at the trial point, decides on it, and finds the next one."""
+        del tags
+        value, gradient = jax.value_and_grad(lambda y: fn(y, args)[0])(state.trial)
+        given = options.get("hessian") is not None
+        y, state = self._decide(y, value, gradient.ravel(), given, state)
+        return y, self._next_trial(options["feasible"], y, state), None
+
+    def _decide(self, y, value, gradient, given: bool, state: _State) -> tuple[Array, _State]:
+        """Where the solve goes on, and the model there; `given` = the first model was."""
+        info, first = state.f_info, state.evaluations == 0
+        move, bent = (state.trial - y).ravel(), gradient - info.grad
+        finite = jnp.isfinite(value) & jnp.isfinite(gradient).all()
+        step_size, accept, _, search_state = self.search.step(
+            first, y.ravel(), state.trial.ravel(), info, optx.FunctionInfo.Eval(value), state.search_state
+        )
+        # Gradients are known better than values: where values cannot tell, a step is taken on trust.
+        rounding = 4 * jnp.finfo(y.dtype).eps * jnp.abs(info.f)
+        accept = (accept | (state.rounded & (value <= info.f + rounding))) & finite
+        # the start is no step, and tells nothing about their size
+        step_size = jnp.where(first, state.step_size, step_size).astype(y.dtype)
+        search_state = jax.tree.map(lambda new, old: jnp.where(first, old, new), search_state, state.search_state)
+
+        model = info.hessian.as_matrix()
+        begun = model
+        if not given:
+            begun = jnp.eye(y.size, dtype=y.dtype) * jnp.maximum(jnp.linalg.norm(gradient), 1.0)
+            # the first step's length was a guess: the curvature along it is better
+            model = jnp.where(state.evaluations == 1, sized(model, move, bent), model)
+        learned = jnp.where(accept, positive_update(model, move, bent), model)
+        info = _info(
+            jnp.where(accept, value, info.f),
+            jnp.where(accept, gradient, info.grad),
+            jnp.where(first, begun, learned),
+        )
+        broken = first & ~finite
+        state = eqx.tree_at(
+            lambda s: (s.f_info, s.search_state, s.step_size, s.evaluations, s.terminate, s.result),
+            state,
+            (
+                *(info, search_state, step_size, state.evaluations + 1, broken),
+                optx.RESULTS.where(broken, optx.RESULTS.nonfinite, state.result),
+            ),
+        )
+        return jnp.where(accept, state.trial, y), state
+
+    def _next_trial(self, feasible, y, state: _State) -> _State:
+        """The state with the next trial point, and with the verdict on this one."""
+        info, feasible = state.f_info, feasible.at(y)
+        descent = self.descent.within(feasible, y)
+        descent_state = descent.query(y.ravel(), info, state.descent_state)
+        move, _ = descent.step(state.step_size, descent_state)
+        trial = feasible.restore(y + jnp.where(jnp.isfinite(move).all(), move, 0.0).reshape(y.shape))
+        move = (trial - y).ravel()
+        promised = -(info.grad @ move + 0.5 * move @ info.hessian.as_matrix() @ move)
+        rounded = promised <= 4 * jnp.finfo(y.dtype).eps * jnp.abs(info.f)
+
+        optimality = jnp.abs(feasible.project(y - info.grad.reshape(y.shape)) - y).max()
+        converged = optimality <= self.atol + self.rtol * self.norm(y)
+        # after a step that was taken on trust
+        stalled = state.rounded & rounded & ~converged & ~state.terminate
+        result = optx.RESULTS.where(stalled, optx.RESULTS.stagnation, state.result)  # pyright: ignore[reportArgumentType]
+        return eqx.tree_at(
+            lambda s: (s.trial, s.descent_state, s.optimality, s.rounded, s.terminate, s.result),
+            state,
+            (trial, descent_state, optimality, rounded, state.terminate | converged | stalled, result),
+        )
+
+    def terminate(self, fn, y, args, options, state: _State, tags):
+        del fn, y, args, options, tags
+        return state.terminate, state.result
+
+    def postprocess(self, fn, y, aux, args, options, state: _State, tags, result):
+        del fn, args, options, tags, result
+        stats = {
+            "objective": state.f_info.f,
+            "optimality": state.optimality,
+            "evaluations": state.evaluations,
+            "linearisations": state.evaluations,
+            "projections": 2 * state.evaluations,
+        }
+        return y, aux, stats
+
+
+def _info(value: Scalar, gradient: Float[Array, " P"], hessian: Float[Array, "P P"]):
+    return optx.FunctionInfo.EvalGradHessian(value, gradient, lx.MatrixLinearOperator(hessian))
