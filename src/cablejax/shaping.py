@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Literal
 
 import numpy as np
 from flax import nnx
@@ -22,12 +21,9 @@ from cablejax.residual import Dynamics
 from cablejax.simulate import CableConfig
 from cablejax.simulate.elastica import elastica
 from cablejax.simulate.plant import Plant, PlantConfig
+from cablejax.solver_names import SolverName
 from cablejax.targets import Target, straight_start
 from cablejax.types import History
-
-SolverName = Literal[
-    "trust-region", "projected-gradient", "dogleg", "gauss-newton", "deadline", "cross-entropy", "path-integral"
-]
 
 METHODS: tuple[Method, ...] = ("residual", "direct")
 """With the online residual, and without."""

@@ -5,11 +5,12 @@ from __future__ import annotations
 import dataclasses
 import time
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
+from typing import TYPE_CHECKING, Annotated, Any, get_args
 
 from tyro.conf import subcommand
 
 from cablejax.commands.options import Command, UsageError, say, text_table
+from cablejax.solver_names import SolverName
 
 if TYPE_CHECKING:
     from cablejax.mpc import Controller
@@ -108,11 +109,6 @@ class BenchSimulate(Command):
         )
 
 
-SolverChoice = Literal[
-    "trust-region", "projected-gradient", "dogleg", "gauss-newton", "deadline", "cross-entropy", "path-integral"
-]
-
-
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class BenchMpc(Command):
     """Time the controller's call (observe, fit the residual, plan, command) with every solver, and in batches; and the
@@ -121,7 +117,7 @@ class BenchMpc(Command):
     weights: str = "gns-reference"
     """Released model by name, or the folder of a training by `cablejax train`."""
 
-    solvers: tuple[SolverChoice, ...] = get_args(SolverChoice)
+    solvers: tuple[SolverName, ...] = get_args(SolverName)
     """How plans are found; the first one is also timed in batches."""
 
     horizon: int = 5
@@ -257,7 +253,7 @@ class BenchLoop(Command):
     weights: str = "gns-reference"
     """Released model by name, or the folder of a training by `cablejax train`."""
 
-    solver: Literal["trust-region", "projected-gradient"] = "trust-region"
+    solver: SolverName = "trust-region"
     """How the plan is found."""
 
     batches: tuple[int, ...] = (1, 8)
@@ -323,7 +319,7 @@ class Bench:
     )
 
 
-def _controller(model: Model, solver: SolverChoice, horizon: int) -> Controller:
+def _controller(model: Model, solver: SolverName, horizon: int) -> Controller:
     """The controller with the online residual on the way to an S, with one of the solvers at its defaults."""
     from cablejax.shaping import make_controller
     from cablejax.targets import make_target

@@ -15,9 +15,10 @@ from cablejax.commands.results import summarise, write_results
 from cablejax.perceive.camera import CameraConfig
 from cablejax.report.record import Method
 from cablejax.report.style import METHOD_LABEL
-from cablejax.shaping import Model, SolverName, shape_once
+from cablejax.shaping import Model, shape_once
 from cablejax.simulate import CableConfig
 from cablejax.simulate.plant import PlantConfig
+from cablejax.solver_names import SolverName
 from cablejax.targets import Target
 
 

@@ -7,6 +7,7 @@ import pathlib
 from typing import ClassVar, Literal
 
 from cablejax.commands.options import Command, text_table
+from cablejax.solver_names import SolverName
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -33,7 +34,7 @@ class Shape(Command):
     weights: str = "gns-reference"
     """Released model by name, or the folder of a training by `cablejax train`."""
 
-    solver: Literal["trust-region", "projected-gradient"] = "trust-region"
+    solver: SolverName = "trust-region"
     """How the controller finds its plan."""
 
     steps: int = 40
