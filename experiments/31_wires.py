@@ -31,7 +31,8 @@ from cablejax.report.provenance import machine, versions
 from cablejax.report.style import LIGHT
 from cablejax.simulate.config import GRAVITY
 from cablejax.spatial.hanging import Wire, hanging_angles, hanging_points
-from cablejax.spatial.hanging_fit import EFFECTS, LINKS_PER_SPACING, Photographs
+from cablejax.spatial.hanging_effects import EFFECTS
+from cablejax.spatial.hanging_fit import LINKS_PER_SPACING, Photographs
 from cablejax.spatial.hanging_verdict import WireDiagnosis, diagnose_wire, rig_error, verdict_of
 
 OUTSIDE = (0.0, 0.005, 0.01, 0.015)

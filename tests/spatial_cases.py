@@ -11,7 +11,9 @@ from cablejax.gaplog import Episode, gap_log_from_episodes
 from cablejax.recordings.poses import twists
 from cablejax.simulate import CableConfig
 from cablejax.simulate.compile import compiler_options
-from cablejax.spatial.rod import Rod, RodPhysics, frames_along
+from cablejax.spatial.clamps import frames_along
+from cablejax.spatial.physics import RodPhysics
+from cablejax.spatial.rod import Rod
 from cablejax.types import GapLog
 
 INTERVAL = 0.02

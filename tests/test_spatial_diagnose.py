@@ -11,14 +11,16 @@ import pytest
 import spatial_cases as cases
 from cablejax.diagnose import verdict_json
 from cablejax.report.diagnosis_page import write_diagnosis_page
-from cablejax.spatial.diagnose import diagnose_space, noise_of
+from cablejax.spatial.diagnose import diagnose_space
 from cablejax.spatial.fit import Simulator, errors
+from cablejax.spatial.gap import noise_of
 from cablejax.spatial.geometry import local_changes
 from cablejax.spatial.identify import layout_of
 from cablejax.spatial.newton import improve
 from cablejax.spatial.residual import fit_residual
 from cablejax.spatial.rod import Rod
 from cablejax.spatial.search import falls, halves
+from cablejax.spatial.values import shared_by_all
 from cablejax.spatial.windows import windows_of
 
 
@@ -37,9 +39,9 @@ def test_a_fit_finds_stiffness_and_damping():
     windows = windows_of(cases.recording())
     simulator = Simulator(Rod(16, twisting=False), layout_of(windows, cases.NOMINAL, twisting=False))
     layout = simulator.layout
-    values = np.zeros(layout.size)
+    values = shared_by_all(np.zeros(layout.size), windows.group)
     before = errors(simulator.predict(values, windows), windows).mean()
-    values[layout.slices["damping_time"]] = 0.05
+    values.shared[layout.slices["damping_time"]] = 0.05
     effects = ["bending_stiffness", "bending_damping"]
     fit = improve(simulator, values, effects, windows, iterations=8)
     after = errors(simulator.predict(fit.values, windows), windows).mean()

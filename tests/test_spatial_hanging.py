@@ -13,7 +13,8 @@ from cablejax.recordings.wires import read_wires
 from cablejax.simulate.config import GRAVITY
 from cablejax.simulate.elastica import elastica
 from cablejax.spatial.hanging import Wire, hanging_angles, hanging_points, imbalance, joint_arclength
-from cablejax.spatial.hanging_fit import EFFECTS, Photographs, fit_wire, wire_shape
+from cablejax.spatial.hanging_effects import EFFECTS, wire_shape
+from cablejax.spatial.hanging_fit import Photographs, fit_wire
 from cablejax.spatial.hanging_verdict import diagnose_wire, rig_error, tracing_noise, verdict_of
 from recording_cases import DATA, needs_wires
 

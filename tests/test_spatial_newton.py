@@ -9,7 +9,7 @@ import numpy as np
 import spatial_cases as cases
 from cablejax.spatial.fit import Simulator, Sums
 from cablejax.spatial.identify import layout_of
-from cablejax.spatial.newton import Fit, coordinates, improve, jackknife, newton_step, slopes
+from cablejax.spatial.newton import Fit, coordinates, improve, jackknife, newton_step, prior_shifts, slopes
 from cablejax.spatial.rod import Rod
 from cablejax.spatial.values import Values, from_json, mean_of, shared_by_all, to_json
 from cablejax.spatial.windows import windows_of
@@ -73,6 +73,11 @@ def test_elimination_solves_the_whole_system():
     np.testing.assert_allclose(step.own[:, m].ravel(), whole[len(a) :], rtol=1e-6, atol=1e-12)
     assert not step.shared[~active].any()
 
+    # the shared part of the whole inverse is what a unit pull on each shared coordinate does
+    shifts = np.zeros((count, count))
+    shifts[np.ix_(a, a)] = np.linalg.inv(matrix[np.ix_(free, free)])[: len(a), : len(a)]
+    np.testing.assert_allclose(prior_shifts(fit, layout), shifts * slope, rtol=1e-6, atol=1e-12)
+
 
 def test_grips_of_every_recording_are_found_and_leave_the_stiffness_alone():
     windows, simulator = _simulator()
@@ -83,8 +88,8 @@ def test_grips_of_every_recording_are_found_and_leave_the_stiffness_alone():
     true.own[:, where["clamp_rotation"]] = 0.25 * generator.normal(size=(4, 4))
     seen = dataclasses.replace(windows, keypoints=simulator.predict(true, windows))
 
-    start = np.zeros(layout.size)
-    start[where["damping_time"]] = 0.06
+    start = shared_by_all(np.zeros(layout.size), windows.group)
+    start.shared[where["damping_time"]] = 0.06
     fits = {own: improve(simulator, start, _EFFECTS[: 2 + own], seen, iterations=10) for own in (False, True)}
     found = fits[True].values
     assert abs(found.shared[where["log_stiffness"]].item() - 0.7) < 0.05

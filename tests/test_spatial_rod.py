@@ -12,7 +12,8 @@ from cablejax.simulate.compile import compiler_options
 from cablejax.simulate.composite import build_grasped_chain
 from cablejax.simulate.config import CableConfig
 from cablejax.spatial import rod as rod_module
-from cablejax.spatial.rod import Rod, RodPhysics
+from cablejax.spatial.physics import RodPhysics
+from cablejax.spatial.rod import Rod
 
 _INTERVAL = 0.01
 

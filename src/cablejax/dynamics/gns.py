@@ -58,20 +58,42 @@ def aggregate(messages: Float[Array, "E latent"], offsets: tuple[int, ...], n: i
     return total  # pyright: ignore[reportReturnType]
 
 
-class GNS(nnx.Module):
-    """Predicts how the cable moves beyond its prior, in the grippers' frame and in units of its scale."""
+class EncodeProcessDecode(nnx.Module):
+    """The network of `topology_of(config)`, from features of any kind to numbers of any kind.
 
-    def __init__(self, config: ModelConfig, rngs: nnx.Rngs):
+    Attributes:
+        config: sizes, and which nodes are connected.
+    """
+
+    def __init__(self, features: tuple[int, int], outputs: int, config: ModelConfig, rngs: nnx.Rngs):
+        """
+        Args:
+            features: numbers of features of a node and of an edge.
+            outputs: numbers predicted per node; all 0 before training.
+            config: sizes, and which nodes are connected.
+            rngs: of the first weights.
+        """
+        node, edge = features
         self.config = config
-        self.node_encoder = MLP((config.node_features,), config.latent, config, normalise=True, rngs=rngs)
-        self.edge_encoder = MLP((config.edge_features,), config.latent, config, normalise=True, rngs=rngs)
+        self.node_encoder = MLP((node,), config.latent, config, normalise=True, rngs=rngs)
+        self.edge_encoder = MLP((edge,), config.latent, config, normalise=True, rngs=rngs)
         self.processor = nnx.List([MessagePassing(config, rngs) for _ in range(config.message_passing)])
-        self.decoder = MLP((config.latent,), 2, config, normalise=False, rngs=rngs)
+        self.decoder = MLP((config.latent,), outputs, config, normalise=False, rngs=rngs)
 
     def __call__(
         self, node_features: Float[Array, "N node_features"], edge_features: Float[Array, "E edge_features"]
-    ) -> Float[Array, "N 2"]:
+    ) -> Float[Array, "N outputs"]:
         nodes, edges = self.node_encoder(node_features), self.edge_encoder(edge_features)
         for step in self.processor:
             nodes, edges = step(nodes, edges)
         return self.decoder(nodes)
+
+
+class GNS(EncodeProcessDecode):
+    """Predicts how the cable moves beyond its prior, in the grippers' frame and in units of its scale, shape [N, 2].
+
+    Reads the features of `cablejax.dynamics.graph`.
+    """
+
+    def __init__(self, config: ModelConfig, rngs: nnx.Rngs):
+        super().__init__((config.node_features, config.edge_features), 2, config, rngs)

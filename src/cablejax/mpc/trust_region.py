@@ -28,7 +28,7 @@ class _LeastSquaresPlanner(abc.ABC):
     """
 
     max_iterations: int = 1
-    trials_per_linearisation: int = 3
+    trials_per_linearisation: int = 5
     tolerance: float = 2e-5
 
     def __post_init__(self):

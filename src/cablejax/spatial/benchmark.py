@@ -9,14 +9,14 @@ from collections.abc import Callable
 
 import numpy as np
 from jaxtyping import Float
-from scipy.stats import t
 
 from cablejax.recordings.deform import NOMINAL, DeformRecordings
+from cablejax.spatial.clamps import frames_along
 from cablejax.spatial.fit import errors, over_all_markers
 from cablejax.spatial.identify import Identified, identify
+from cablejax.spatial.interval import stiffness_interval
 from cablejax.spatial.network import fit_network
 from cablejax.spatial.residual import fit_residual
-from cablejax.spatial.rod import frames_along
 from cablejax.spatial.windows import Windows
 
 # Quantile of a spacing over all samples that is taken for the arc length between two markers: where it is straight.
@@ -70,7 +70,8 @@ class CableScore:
         learned: (name, split by recording, on the eval split, 5 and 95 % quantile over random choices of as many of all
             windows as eval has) of the rod with all effects and of what is learned on top of it.
         without_own: the rod on the eval split, its recordings' own values left at what all recordings share.
-        halves: EI / rho from either half of the recordings with its 90 % interval [m^4/s^2].
+        halves: EI / rho that either half of the recordings is simulated with, and its 90 % interval [m^4/s^2], see
+            `interval`.
         seconds: of one 5 s rollout alone (median), and of a batch of all windows.
         effects: that were found.
         networks: size and rounds that were chosen for the graph network of all, and of either half.
@@ -139,7 +140,13 @@ def score_cable(recordings: DeformRecordings, *, state: pathlib.Path, progress: 
         stages=tuple(stages),
         learned=tuple(learned),
         without_own=float(metric(simulator.predict(found.values.shared, whole), whole).mean()),
-        halves=tuple(_stiffness(found, k) for k in range(2)),
+        halves=tuple(
+            (
+                found.stiffness(values),
+                *stiffness_interval(found, values, train.chosen(np.flatnonzero(half)), progress=progress),
+            )
+            for values, half in zip(found.half_values, (found.first, ~found.first), strict=True)
+        ),
         seconds=_seconds(found, windows),
         effects=found.effects,
         networks=(network, *networks),
@@ -164,15 +171,6 @@ def _learned(fitted, windows: Windows, simulated, others: Windows, path: pathlib
         partial.replace(path)
     with np.load(path) as kept:
         return {name: kept[name] for name in _LEARNED}, (int(kept["network"][0]), int(kept["network"][1]))
-
-
-def _stiffness(found: Identified, half: int) -> tuple[float, float, float]:
-    """EI / rho from one half of the recordings with its 90 % interval, by leaving out recordings of that half."""
-    layout, moves = found.simulator.layout, found.moves[half]
-    log = layout.log_stiffness(found.half_values[half].shared)
-    error = t.ppf(0.95, len(moves) - 1) * np.sqrt((layout.log_stiffness(moves) ** 2).sum())
-    value, low, high = layout.nominal_stiffness * np.exp([log, log - error, log + error])
-    return float(value), float(low), float(high)
 
 
 def _seconds(found: Identified, windows: Windows) -> tuple[float, float]:

@@ -18,12 +18,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from cablejax.spatial.rod import RodPhysics
+from cablejax.spatial.physics import RodPhysics
 
 PROFILE_KNOTS = 5
 CURVATURE_KNOTS = 5
 # Torsional over bending stiffness of a round cord with Poisson's ratio 0.45.
-_TWIST_RATIO = 0.7
+TWIST_RATIO = 0.7
 # Two markers that sit 5 mm off the centreline on different sides, 30 mm apart, see a gripper turned by so much [rad].
 # It turns about the cable with the roll, which is not seen, and is another one when the cable is gripped anew.
 _GRIP = 0.3
@@ -146,7 +146,7 @@ class Layout:
             damping_time=part["damping_time"][0],
             drag=part["drag"][0],
             quadratic_drag=part["quadratic_drag"][0],
-            twist_stiffness=_TWIST_RATIO * self.nominal_stiffness * jnp.exp(part["log_stiffness"][0]) * twist,
+            twist_stiffness=TWIST_RATIO * self.nominal_stiffness * jnp.exp(part["log_stiffness"][0]) * twist,
             stretch=jnp.asarray(_STRETCH),
             marker_mass=part["marker_mass"][0],
             clamp_rotation=part["clamp_rotation"].reshape(2, 2),

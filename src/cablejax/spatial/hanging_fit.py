@@ -11,20 +11,15 @@ error of a law. A photograph's probability is Student's, from a fit to the other
 from __future__ import annotations
 
 import dataclasses
-import functools
 import itertools
 from collections.abc import Callable, Sequence
-from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from cablejax.diagnose.belief import Calibration
-from cablejax.diagnose.effects import BendingStiffness, IntrinsicCurvature, StiffnessProfile
-from cablejax.diagnose.effects.base import Parameter
-from cablejax.spatial.hanging import Wire, hanging_angles, hanging_points, joint_arclength
+from cablejax.spatial.hanging_effects import EFFECTS, PARAMETERS, SLICES, linearised
 
 CALIBRATION = Calibration()
 
@@ -34,29 +29,6 @@ LINKS_PER_SPACING = 2
 CLAMP_ANGLE = np.radians(10.0)
 """Prior standard deviation of a clamp's angle [rad]: a wire leaves a clamp as level as one can hold it."""
 
-PROFILE_SPREAD = 0.3
-"""Prior standard deviation of the logarithm of EI along a wire, which is drawn in one piece: a third."""
-
-LEVEL = 0.014
-"""Prior standard deviation of the angle between a photograph and the plumb line [rad]: the slope that the line between
-the two clamps, which the rig keeps level, has in the published photographs, root mean square."""
-
-EFFECTS: dict[str, tuple[Parameter, ...]] = {
-    "bending_stiffness": BendingStiffness.parameters,
-    "intrinsic_curvature": IntrinsicCurvature.parameters,
-    "stiffness_profile": (
-        *StiffnessProfile.parameters[:2],
-        dataclasses.replace(StiffnessProfile.parameters[2], scale=PROFILE_SPREAD),
-    ),
-    "gravity_tilt": (Parameter("angle_rad", "rad", -0.5, 0.5, 0.0, LEVEL),),
-}
-"""Effects that a hanging wire can show, with the parameters of the planar diagnosis where these exist."""
-
-_PARAMETERS = tuple(parameter for group in EFFECTS.values() for parameter in group)
-_SLICES = {
-    name: slice(sum(map(len, list(EFFECTS.values())[:k])), sum(map(len, list(EFFECTS.values())[: k + 1])))
-    for k, name in enumerate(EFFECTS)
-}
 _CENTRES = (0.2, 0.5, 0.8)
 _MOST_ITERATIONS = 25
 
@@ -121,66 +93,8 @@ class WireFit:
 
     def values(self, name: str) -> tuple[float, ...]:
         """The fitted values of an effect's parameters."""
-        pairs = zip(EFFECTS[name], self.z[_SLICES[name]], strict=True)
+        pairs = zip(EFFECTS[name], self.z[SLICES[name]], strict=True)
         return tuple(float(parameter.value(np.asarray(z))) for parameter, z in pairs)
-
-
-def wire_shape(
-    z: Float[Array, " P"],
-    clamps: Float[Array, " 2"],
-    traced: Float[Array, "N 2"],
-    guess: Float[Array, " M"],
-    stiffness: Any,
-    length: Any,
-) -> Float[Array, "N 2"]:
-    """Points of the wire at rest [m], between the ends of the traced one, shape [N, 2]. Differentiable in z and clamps.
-
-    Args:
-        z: coordinates of the parameters of all effects.
-        clamps: how far the wire's direction at each clamp, first to last, is off the horizontal [rad].
-        traced: points of the photograph [m].
-        guess: angles of the links [rad].
-        stiffness: EI over the weight per length that is believed true [m^3].
-        length: [m].
-    """
-    ratio, centre, width, curvature, other_centre, other_width, other_ratio, tilt = (
-        parameter.value(z[k]) for k, parameter in enumerate(_PARAMETERS)
-    )
-    links = guess.shape[0]
-    s = joint_arclength(links, 1.0)
-    profile = other_ratio ** _section(s, other_centre, other_width)
-    wire = Wire(
-        stiffness=stiffness * ratio * profile,
-        rest_curvature=curvature * _section(s, centre, width),
-        length=jnp.asarray(length),
-    )
-    cosine, sine = jnp.cos(tilt), jnp.sin(tilt)
-    turned = jnp.stack([jnp.stack([cosine, -sine]), jnp.stack([sine, cosine])])
-    ends = traced[jnp.array([0, -1])] @ turned.T
-    # The wire's direction turns by the same whole number of turns as the traced one.
-    turns = 2 * jnp.pi * jnp.round((guess[jnp.array([0, -1])]) / (2 * jnp.pi))
-    placed = jnp.concatenate([ends, (turns + clamps + tilt)[:, None]], axis=1)
-    angles = hanging_angles(wire, placed, guess + tilt)
-    return hanging_points(angles, placed, wire.length, traced.shape[0]) @ turned
-
-
-def _section(s: Array, centre: Any, width: Any) -> Array:
-    """Share of the wire about each joint in a section, all over the length; edges of a hundredth of it."""
-    return jax.nn.sigmoid((s - centre + 0.5 * width) / 0.01) * jax.nn.sigmoid((centre + 0.5 * width - s) / 0.01)
-
-
-@jax.jit
-def _linearised(z, clamps, traced, guess, stiffness, length):
-    """Residuals of each photograph, and their derivatives in z and its clamps' angles."""
-
-    def residual(z, clamps, traced, guess):
-        return (wire_shape(z, clamps, traced, guess, stiffness, length) - traced)[1:-1].ravel()
-
-    def one(clamps, traced, guess):
-        both = functools.partial(residual, traced=traced, guess=guess)
-        return (both(z, clamps), *jax.jacfwd(both, (0, 1))(z, clamps))
-
-    return jax.vmap(one)(clamps, traced, guess)
 
 
 EXPLANATIONS: tuple[tuple[str, ...], ...] = (
@@ -229,7 +143,7 @@ class _Problem:
         self.count = 2 * (photographs.points.shape[1] - 2)
         everyone = np.arange(len(photographs.points))
         self.scale = np.full(len(everyone), np.sqrt(self.count) * photographs.error)
-        _, _, residual, _ = self._fit(np.zeros(len(_PARAMETERS)), (), everyone)
+        _, _, residual, _ = self._fit(np.zeros(len(PARAMETERS)), (), everyone)
         gap = np.sqrt((residual**2).mean(axis=1))
         self.scale = np.sqrt(self.count * (photographs.error**2 + (CALIBRATION.law_error * gap) ** 2))
 
@@ -263,7 +177,7 @@ class _Problem:
         # Always as many photographs, so that one program is compiled.
         places = np.resize(members, len(self.photographs.points))
         rows = np.resize(np.arange(len(members)), len(places))
-        parts = _linearised(
+        parts = linearised(
             z, clamps[rows], self.photographs.points[places], self.guess[places], self.photographs.stiffness,
             self.photographs.length,
         )  # fmt: skip
@@ -276,15 +190,13 @@ class _Problem:
             Coordinates, clamp angles, residuals and posterior standard deviations of the coordinates.
         """
         free = (
-            np.concatenate([np.arange(len(_PARAMETERS))[_SLICES[name]] for name in names])
-            if names
-            else np.zeros(0, int)
+            np.concatenate([np.arange(len(PARAMETERS))[SLICES[name]] for name in names]) if names else np.zeros(0, int)
         )
         z, clamps = start.copy(), np.zeros((len(members), 2)) if clamps is None else clamps
         residual, by_z, by_clamps = self._linearise(z, clamps, members)
         cost, damping = self._cost(z, clamps, residual, members), 1e-3
         size = len(free) + 2 * len(members)
-        low, high = np.array([parameter.z_bounds for parameter in _PARAMETERS]).T
+        low, high = np.array([parameter.z_bounds for parameter in PARAMETERS]).T
         normal = np.eye(size)
         for _ in range(_MOST_ITERATIONS):
             normal, slope = np.zeros((size, size)), np.zeros(size)
@@ -313,14 +225,14 @@ class _Problem:
             z, clamps, (residual, by_z, by_clamps) = tried, turned, there
             if gain < 1e-5 * (1 + cost):
                 break
-        spread = np.zeros(len(_PARAMETERS))
+        spread = np.zeros(len(PARAMETERS))
         spread[free] = np.sqrt(np.diag(np.linalg.inv(normal))[: len(free)])
         return z, clamps, residual, spread
 
 
 def _starts(names: tuple[str, ...]) -> list[np.ndarray]:
     """Where fits begin: local effects at some places, with either sign."""
-    starts = [np.zeros(len(_PARAMETERS))]
+    starts = [np.zeros(len(PARAMETERS))]
     for name in names:
         if name not in ("intrinsic_curvature", "stiffness_profile"):
             continue
@@ -330,7 +242,7 @@ def _starts(names: tuple[str, ...]) -> list[np.ndarray]:
             for centre in _CENTRES:
                 for sign in (-0.5, 0.5):
                     z = start.copy()
-                    z[_SLICES[name]] = group[0].coordinate(centre), group[1].coordinate(0.3), sign
+                    z[SLICES[name]] = group[0].coordinate(centre), group[1].coordinate(0.3), sign
                     spread.append(z)
         starts = spread
     return starts

@@ -16,7 +16,8 @@ from scipy.optimize import brentq
 from scipy.stats import norm, t
 
 from cablejax.diagnose.belief import probabilities
-from cablejax.spatial.hanging_fit import CALIBRATION, EFFECTS, EXPLANATIONS, Photographs, WireFit, fit_wire
+from cablejax.spatial.hanging_effects import EFFECTS
+from cablejax.spatial.hanging_fit import CALIBRATION, EXPLANATIONS, Photographs, WireFit, fit_wire
 
 NAMED = 0.5
 """Least probability of an effect that is named."""

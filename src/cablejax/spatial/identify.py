@@ -3,23 +3,19 @@
 from __future__ import annotations
 
 import dataclasses
-import hashlib
-import json
-import os
 import pathlib
-import tempfile
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from cablejax.spatial.effects import Layout, blocks
 from cablejax.spatial.fit import Simulator, errors
+from cablejax.spatial.memory import Memory, fingerprint
 from cablejax.spatial.newton import improve, jackknife
 from cablejax.spatial.rod import Rod
 from cablejax.spatial.search import Step, accepted_effects, falls, halves, search
-from cablejax.spatial.values import Values, from_json, mean_of, to_json
+from cablejax.spatial.values import Values, mean_of
 from cablejax.spatial.windows import Windows
 
 EDGES = 20
@@ -38,6 +34,7 @@ class Identified:
     Attributes:
         simulator: of the rod with all effects.
         effects: that stayed, in the order in which they were found.
+        tried: all effects that might have stayed.
         steps: of the search.
         values: fitted to all windows.
         half_values: fitted to either half of the recordings.
@@ -48,6 +45,7 @@ class Identified:
 
     simulator: Simulator
     effects: tuple[str, ...]
+    tried: tuple[str, ...]
     steps: tuple[Step, ...]
     values: Values
     half_values: tuple[Values, Values]
@@ -58,6 +56,11 @@ class Identified:
     def spread(self) -> Float[np.ndarray, "P"]:
         """Standard error of the shared values, by leaving out recordings."""
         return np.sqrt((self.moves[2] ** 2).sum(axis=0))
+
+    def stiffness(self, values: Values) -> float:
+        """EI / rho, geometric mean along the cable [m^4/s^2]."""
+        layout = self.simulator.layout
+        return float(layout.nominal_stiffness * np.exp(layout.log_stiffness(values.shared)))
 
     def unseen(self, windows: Windows) -> Float[np.ndarray, "W T F 3"]:
         """Predictions of the identified windows, each from the half of the recordings that it is not part of [m]."""
@@ -86,6 +89,12 @@ def selection(windows: Windows, count: int = _SELECTED) -> Int[np.ndarray, "S"]:
     return whole[np.unique(np.linspace(0, len(whole) - 1, count).astype(int))]
 
 
+def affordable(simulator: Simulator, windows: Windows) -> Bool[np.ndarray, "W"]:
+    """Windows that values are fitted to: all, unless the material frame is followed, at four times the cost."""
+    every = np.arange(len(windows))
+    return np.isin(every, selection(windows, _REFITTED) if simulator.rod.twisting else every)
+
+
 def identify(
     windows: Windows,
     nominal_stiffness: float,
@@ -106,7 +115,7 @@ def identify(
     """
     names = [block.effect for block in blocks(1, twisting=True)]
     names = [name for name in dict.fromkeys(names) if (name != _MATERIAL if only is None else name in only)]
-    memory = _Memory(state, _fingerprint(windows, nominal_stiffness, names))
+    memory = Memory(state, fingerprint(EDGES, windows, nominal_stiffness, names))
     picked = windows.chosen(selection(windows))
     plain = Simulator(Rod(EDGES, twisting=False), layout_of(windows, nominal_stiffness, twisting=False))
     full = Simulator(Rod(EDGES, twisting=True), layout_of(windows, nominal_stiffness, twisting=True))
@@ -139,9 +148,7 @@ def identify(
     finals = memory.finals()
     if len(finals) < 3:
         use = [first, ~first, np.ones(len(windows), bool)]
-        if simulator.rod.twisting:
-            # derivatives with the material frame cost four times as much
-            use = [part & np.isin(np.arange(len(windows)), selection(windows, _REFITTED)) for part in use]
+        use = [part & affordable(simulator, windows) for part in use]
         begins, words = (*start, mean_of(*start)), ("one half", "the other half", "all")
         for part, begin, word in list(zip(use, begins, words, strict=True))[len(finals) :]:
             progress(f"fitting {word}: {int(part.sum())} windows")
@@ -152,6 +159,7 @@ def identify(
     return Identified(
         simulator=simulator,
         effects=tuple(effects),
+        tried=tuple(names),
         steps=tuple(steps),
         values=finals[2][0],
         half_values=(finals[0][0], finals[1][0]),
@@ -195,57 +203,3 @@ def _material(full: Simulator, windows: Windows, steps, progress) -> list[Step]:
 def _padded(step: Step, size: int) -> Step:
     one, other = (values.of_size(size) for values in step.values)
     return dataclasses.replace(step, values=(one, other))
-
-
-def _fingerprint(windows: Windows, nominal_stiffness: float, names: Sequence[str]) -> str:
-    """What a kept state must have been made from to be of use."""
-    digest = hashlib.sha256(repr((EDGES, float(nominal_stiffness), list(names), windows.name)).encode())
-    for array in (windows.keypoints, windows.position, windows.valid, windows.group):
-        digest.update(np.ascontiguousarray(array).tobytes())
-    return digest.hexdigest()
-
-
-class _Memory:
-    """What is done, in one JSON file that is written whole."""
-
-    def __init__(self, path: pathlib.Path | None, fingerprint: str):
-        self._path = path
-        self._held: dict[str, Any] = json.loads(path.read_text()) if path is not None and path.exists() else {}
-        if self._held.get("fingerprint") != fingerprint:
-            self._held = {"fingerprint": fingerprint}
-
-    def steps(self, name: str) -> list[Step]:
-        return [
-            Step(
-                s["effect"],
-                s["accepted"],
-                (from_json(s["values"][0]), from_json(s["values"][1])),
-                np.array(s["error"]),
-                s["chance"],
-            )
-            for s in self._held.get(name, [])
-        ]
-
-    def keep(self, name: str, steps: Sequence[Step]) -> None:
-        self._write(
-            name,
-            [
-                {**dataclasses.asdict(s), "values": [to_json(v) for v in s.values], "error": s.error.tolist()}
-                for s in steps
-            ],
-        )
-
-    def finals(self) -> list[tuple[Values, np.ndarray]]:
-        return [(from_json(kept["values"]), np.array(kept["moves"])) for kept in self._held.get("final", [])]
-
-    def keep_finals(self, finals: Sequence[tuple[Values, np.ndarray]]) -> None:
-        self._write("final", [{"values": to_json(v), "moves": moves.tolist()} for v, moves in finals])
-
-    def _write(self, name, value):
-        self._held[name] = value
-        if self._path is None:
-            return
-        self._path.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.NamedTemporaryFile("w", dir=self._path.parent, delete=False) as file:
-            json.dump(self._held, file)
-        os.replace(file.name, self._path)

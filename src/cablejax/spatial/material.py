@@ -13,7 +13,10 @@ torsional stiffness not at all.
 from __future__ import annotations
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
+
+from cablejax.spatial.physics import RodPhysics
 
 
 def unit(x: Float[Array, "*B 3"]) -> Float[Array, "*B 3"]:
@@ -46,3 +49,14 @@ def joint_frames(tangents: Float[Array, "m 3"], directors: Float[Array, "m 3"]):
     second = directors[:-1] + directors[1:]
     second = unit(second - along * jnp.sum(second * along, axis=1, keepdims=True))
     return second, jnp.cross(along, second)
+
+
+def twist_matrix(
+    physics: RodPhysics, curve: Float[Array, "J 2"], h: Float[Array | np.ndarray, ""], n: int
+) -> Float[Array, "e e"]:
+    """Inverse of the stiffness of the turns against each other and against the rest curvature."""
+    d = np.eye(n - 2, n - 1, 1) - np.eye(n - 2, n - 1)
+    d = jnp.asarray(d[:, 1:-1])
+    # no bend is sharper than this against the rest curvature for long: an upper bound makes the relaxation stable
+    bound = jnp.sqrt(jnp.sum(curve**2, axis=1) + 1e-6) * 10.0 * jnp.mean(physics.stiffness)
+    return jnp.linalg.inv(physics.twist_stiffness / h**2 * d.T @ d + jnp.diag(0.5 * (bound[:-1] + bound[1:])))

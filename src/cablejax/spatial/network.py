@@ -21,12 +21,11 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 from flax import nnx
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from cablejax.dynamics.config import ModelConfig
-from cablejax.dynamics.gns import MessagePassing
+from cablejax.dynamics.gns import EncodeProcessDecode
 from cablejax.dynamics.graph import topology_of
-from cablejax.dynamics.layers import MLP
 from cablejax.simulate.compile import compiler_options
 from cablejax.spatial.features import earlier, in_frame, moving_frame
 from cablejax.spatial.windows import Windows, dealt
@@ -45,23 +44,6 @@ _AVERAGED = 100
 _FOLDS = 3
 _JUDGED = 1024
 _EVERY = 3
-
-
-class CorrectionNetwork(nnx.Module):
-    """Encode, pass messages, decode; the decoder starts at zero."""
-
-    def __init__(self, config: ModelConfig, features: tuple[int, int], rngs: nnx.Rngs):
-        node, edge = features
-        self.node_encoder = MLP((node,), config.latent, config, normalise=True, rngs=rngs)
-        self.edge_encoder = MLP((edge,), config.latent, config, normalise=True, rngs=rngs)
-        self.processor = nnx.List([MessagePassing(config, rngs) for _ in range(config.message_passing)])
-        self.decoder = MLP((config.latent,), 3, config, normalise=False, rngs=rngs)
-
-    def __call__(self, nodes: Float[Array, "N n"], edges: Float[Array, "E e"]) -> Float[Array, "N 3"]:
-        v, e = self.node_encoder(nodes), self.edge_encoder(edges)
-        for step in self.processor:
-            v, e = step(v, e)
-        return self.decoder(v)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -162,10 +144,10 @@ class _Programs(NamedTuple):
 @functools.lru_cache(maxsize=8)
 def _programs(config: ModelConfig, shapes: tuple[int, int]) -> _Programs:
     optimiser = optax.adamw(_RATE, weight_decay=_DECAY)
-    graph = nnx.graphdef(CorrectionNetwork(config, shapes, nnx.Rngs(0)))
+    graph = nnx.graphdef(EncodeProcessDecode(shapes, 3, config, nnx.Rngs(0)))
 
     def first(seed):
-        return nnx.state(CorrectionNetwork(config, shapes, nnx.Rngs(seed)), nnx.Param)
+        return nnx.state(EncodeProcessDecode(shapes, 3, config, nnx.Rngs(seed)), nnx.Param)
 
     def run(weights, nodes, edges):
         return jax.vmap(nnx.merge(graph, weights))(nodes, edges)[:, 1:-1]

@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float
 
 from cablejax.spatial.effects import Layout
 from cablejax.spatial.fit import Simulator, Sums
-from cablejax.spatial.values import Values, shared_by_all
+from cablejax.spatial.values import Values
 from cablejax.spatial.windows import Windows
 
 _LARGEST_STEP = 1.0
@@ -44,7 +44,7 @@ class Fit:
 
 def improve(
     simulator: Simulator,
-    values: Values | Float[np.ndarray, "P"],
+    values: Values,
     effects: Sequence[str],
     windows: Windows,
     *,
@@ -56,7 +56,7 @@ def improve(
 
     Args:
         simulator: of the cable.
-        values: to start from.
+        values: to start from; recordings without values of their own begin at what all share.
         effects: whose values are free.
         windows: of the recordings.
         use: which of them are fitted; the sums are of all. By default all.
@@ -65,7 +65,6 @@ def improve(
     """
     layout = simulator.layout
     active, use = layout.active(effects), np.ones(len(windows), bool) if use is None else use
-    values = values if isinstance(values, Values) else shared_by_all(values, windows.group)
     values = values.covering(windows.group)
     fit, damping = Fit(values, active, simulator.sums(values, windows), windows.group), 1e-3
     best = _objective(fit, layout, use)
@@ -121,27 +120,14 @@ def newton_step(fit: Fit, layout: Layout, use: Bool[np.ndarray, "W"], *, damping
     """Gauss-Newton's step of the active values, from some of the windows."""
     active = fit.active if active is None else active
     a, m = np.flatnonzero(active), np.flatnonzero(active & (layout.spreads > 0))
-    slope, spread = slopes(layout, fit.values.shared), layout.spreads[m]
-    gradient, curvature = coordinates(layout, fit.values.shared), np.eye(len(slope))
-    kept = []
-    for recording, own in zip(fit.values.recordings, fit.values.own, strict=True):
-        part = use & (fit.group == recording)
-        own_gradient, own_curvature = fit.sums.gradient[part].sum(axis=0), fit.sums.curvature[part].sum(axis=0)
-        block = own_curvature[np.ix_(m, m)] + np.diag(1 / spread**2)
-        block = block + damping * np.diag(np.diagonal(block))
-        across = own_curvature[:, m] * slope[:, None]
-        pull = own_gradient[m] + own[m] / spread**2
-        solved = np.linalg.solve(block, np.column_stack([pull, across.T])) if len(m) else np.zeros((0, len(slope) + 1))
-        gradient = gradient + own_gradient * slope - across @ solved[:, 0]
-        curvature = curvature + own_curvature * np.outer(slope, slope) - across @ solved[:, 1:]
-        kept.append(solved)
+    gradient, curvature, kept = _eliminated(fit, layout, use, m, damping)
     matrix = curvature[np.ix_(a, a)]
     matrix = matrix + damping * np.diag(np.diagonal(matrix))
     step, own_step = np.zeros(len(active)), np.zeros_like(fit.values.own)
     step[a] = -np.linalg.solve(matrix, gradient[a])
     for r, solved in enumerate(kept):
         own_step[r, m] = -(solved[:, 0] + solved[:, 1:] @ step)
-    size = max(np.abs(step).max(), np.abs(own_step[:, m] / spread).max(initial=0.0), 1e-12)
+    size = max(np.abs(step).max(), np.abs(own_step[:, m] / layout.spreads[m]).max(initial=0.0), 1e-12)
     return Move(step, own_step) * min(1.0, _LARGEST_STEP / size)
 
 
@@ -156,6 +142,40 @@ def jackknife(fit: Fit, layout: Layout) -> Float[np.ndarray, "R P"]:
     moved = np.array([newton_step(fit, layout, label != name).shared for name in names])
     steps = (moved - full) * slopes(layout, fit.values.shared)
     return np.where(fit.active, np.sqrt((len(names) - 1) / len(names)) * steps, 0.0)
+
+
+def prior_shifts(fit: Fit, layout: Layout) -> Float[np.ndarray, "P P"]:
+    """What moving the prior of each value by its standard deviation does to the shared values, by one step.
+
+    With S the curvature of the cost in prior standard deviations, the fit is off the true values by -S^-1 times these,
+    were there no errors in the data: it is drawn towards the prior. On average over the prior the square of that, for
+    anything linear in the values, is the sum of its squares over rows.
+    """
+    a, m = np.flatnonzero(fit.active), np.flatnonzero(fit.active & (layout.spreads > 0))
+    _, curvature, _ = _eliminated(fit, layout, np.ones(len(fit.group), bool), m, 0.0)
+    shifts = np.zeros_like(curvature)
+    shifts[np.ix_(a, a)] = np.linalg.inv(curvature[np.ix_(a, a)])
+    return shifts * slopes(layout, fit.values.shared)
+
+
+def _eliminated(fit: Fit, layout: Layout, use, m, damping):
+    """Gradient and curvature of the cost by the shared coordinates with the recordings' own values `m` eliminated, and
+    per recording its own values' step, first without a step of the shared ones, then by each of them."""
+    slope, spread = slopes(layout, fit.values.shared), layout.spreads[m]
+    gradient, curvature = coordinates(layout, fit.values.shared), np.eye(len(slope))
+    kept = []
+    for recording, own in zip(fit.values.recordings, fit.values.own, strict=True):
+        part = use & (fit.group == recording)
+        own_gradient, own_curvature = fit.sums.gradient[part].sum(axis=0), fit.sums.curvature[part].sum(axis=0)
+        block = own_curvature[np.ix_(m, m)] + np.diag(1 / spread**2)
+        block = block + damping * np.diag(np.diagonal(block))
+        across = own_curvature[:, m] * slope[:, None]
+        pull = own_gradient[m] + own[m] / spread**2
+        solved = np.linalg.solve(block, np.column_stack([pull, across.T])) if len(m) else np.zeros((0, len(slope) + 1))
+        gradient = gradient + own_gradient * slope - across @ solved[:, 0]
+        curvature = curvature + own_curvature * np.outer(slope, slope) - across @ solved[:, 1:]
+        kept.append(solved)
+    return gradient, curvature, kept
 
 
 def _objective(fit: Fit, layout: Layout, use) -> float:

@@ -25,73 +25,17 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from cablejax.spatial.clamps import held_nodes
 from cablejax.spatial.constrained import Chain, bends_of, constrained, spread_bends, with_held
-from cablejax.spatial.material import joint_frames, transport, turned, twist, unit
+from cablejax.spatial.interpolation import along_joints, between_samples, cubic_weights
+from cablejax.spatial.material import joint_frames, transport, turned, twist, twist_matrix, unit
+from cablejax.spatial.physics import RodPhysics
 
 # With two iterations a step may end off the solution and blow up, where a cable swings fast at a sharply turned clamp.
 _NEWTON = 3
 _NEAR = 4
 # Weight of the observed markers when the first shape is drawn through them [1/s^2].
 _PIN = 3e4
-
-
-@jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True)
-class RodPhysics:
-    """Everything that moves a cable in space, or how it is seen, apart from the grippers' motion.
-
-    Attributes:
-        length: between the two clamps [m], shape [].
-        stiffness: EI / rho along the cable, at J evenly spaced places from clamp to clamp [m^4/s^2], shape [J].
-        rest_curvature: along the cable, about the second and third axis of the material [1/m], shape [K, 2].
-        damping_time: Kelvin-Voigt time constant of bending [s].
-        drag: force per mass and speed [1/s].
-        quadratic_drag: force per mass and squared speed [1/m].
-        twist_stiffness: GJ / rho [m^4/s^2].
-        stretch: EA / rho [m^2/s^2].
-        marker_mass: of each marker, as length of cable of the same mass [m].
-        clamp_rotation: of the cable against either gripper, about its second and third axis [rad], shape [2, 2].
-        clamp_offset: of the cable from either gripper's position, along all three axes [m], shape [2, 3].
-        roll: turn of the second gripper's frame that leaves the cable without twist [rad].
-        arclength: of every free marker from the first clamp [m], shape [N].
-        offset: of every free marker from the centreline along the second and third axis [m], shape [N, 2].
-        gravity: [m/s^2], shape [3].
-    """
-
-    length: Float[Array | np.ndarray, ""]
-    stiffness: Float[Array | np.ndarray, "J"]
-    rest_curvature: Float[Array | np.ndarray, "K 2"]
-    damping_time: Float[Array | np.ndarray, ""]
-    drag: Float[Array | np.ndarray, ""]
-    quadratic_drag: Float[Array | np.ndarray, ""]
-    twist_stiffness: Float[Array | np.ndarray, ""]
-    stretch: Float[Array | np.ndarray, ""]
-    marker_mass: Float[Array | np.ndarray, ""]
-    clamp_rotation: Float[Array | np.ndarray, "2 2"]
-    clamp_offset: Float[Array | np.ndarray, "2 3"]
-    roll: Float[Array | np.ndarray, ""]
-    arclength: Float[Array | np.ndarray, "N"]
-    offset: Float[Array | np.ndarray, "N 2"]
-    gravity: Float[Array | np.ndarray, "3"]
-
-
-def frames_along(tangent: Float[np.ndarray, "*B 3"]) -> Float[np.ndarray, "*B 3 3"]:
-    """Gripper frames whose roll is not observed: the smallest rotation from the mean direction of all tangents.
-
-    Rows are the axes in the world. The grippers of a recording keep their roll about as they were mounted; what they do
-    turn about their own axis is not seen.
-    """
-    mean = tangent.reshape(-1, 3).mean(axis=0)
-    mean = mean / np.linalg.norm(mean)
-    side = np.cross(mean, np.eye(3)[np.argmin(np.abs(mean))])
-    side = np.broadcast_to(side / np.linalg.norm(side), tangent.shape)
-    axis, cosine = np.cross(mean, tangent), (tangent @ mean)[..., None]
-    second = (
-        cosine * side
-        + np.cross(axis, side)
-        + axis * (axis * side).sum(-1, keepdims=True) / np.maximum(1 + cosine, 1e-3)
-    )
-    return np.stack([tangent, second, np.cross(tangent, second)], axis=-2)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -130,11 +74,11 @@ class Rod:
         physics = jax.tree.map(jnp.asarray, physics)
         position, frames, seen = jnp.asarray(position), jnp.asarray(frames), jnp.asarray(seen)
         h = physics.length / self.n_edges
-        held, held_side = self._held(physics, position, frames, h)
-        weights = _interpolation(physics.arclength, h, n)
+        held, held_side = held_nodes(physics, position, frames, h)
+        weights = cubic_weights(physics.arclength, h, n)
 
-        bending = _along(physics.stiffness, n - 2) / h**4
-        curve = jax.vmap(lambda c: _along(c, n - 2), in_axes=1, out_axes=1)(physics.rest_curvature)
+        bending = along_joints(physics.stiffness, n - 2) / h**4
+        curve = jax.vmap(lambda c: along_joints(c, n - 2), in_axes=1, out_axes=1)(physics.rest_curvature)
         mass = 1.0 + physics.marker_mass * weights.sum(axis=0)[2:-2, None] / h
         compliance = h**4 / physics.stretch
         chain = Chain(
@@ -146,7 +90,7 @@ class Rod:
         )
         pins = _PIN**0.5 * weights
         pinned = Chain(jnp.zeros(n - 4), bending, h, compliance, pins[:, 2:-2])
-        turn_matrix = _twist_matrix(physics, curve, h, n)
+        turn_matrix = twist_matrix(physics, curve, h, n)
 
         def forces(nodes, directors, tangents):
             """Of rest curvature and twist at the free nodes."""
@@ -250,7 +194,9 @@ class Rod:
                 state, _ = step(state, jax.tree.map(lambda leaf: leaf[2], window))
             else:
                 state, _ = jax.lax.scan(
-                    lambda s, i: step(s, jax.tree.map(lambda leaf: _between(leaf, (i + 1) / self.substeps), window)),
+                    lambda s, i: step(
+                        s, jax.tree.map(lambda leaf: between_samples(leaf, (i + 1) / self.substeps), window)
+                    ),
                     state,
                     jnp.arange(self.substeps),
                 )
@@ -266,64 +212,3 @@ class Rod:
         _, points = jax.lax.scan(sample, state, (windows(held), windows(held_side)))
         first_points = [weights @ start + offsets, weights @ second_nodes + offsets]
         return jnp.concatenate([jnp.stack(first_points), points])
-
-    def _held(self, physics, position, frames, h):
-        """The four held nodes, shape [T, 4, 3], and the directors of the two held edges, shape [T, 2, 3]."""
-        origin = position + jnp.einsum("qk,tqkc->tqc", physics.clamp_offset, frames)
-        angle = physics.clamp_rotation
-        along = unit(frames[:, :, 0] + angle[:, 1:] * frames[:, :, 1] - angle[:, :1] * frames[:, :, 2])
-        half = 0.5 * h * along
-        held = jnp.stack(
-            [
-                origin[:, 0] - half[:, 0],
-                origin[:, 0] + half[:, 0],
-                origin[:, 1] - half[:, 1],
-                origin[:, 1] + half[:, 1],
-            ],
-            axis=1,
-        )
-        side = jnp.stack(
-            [frames[:, 0, 1], jnp.cos(physics.roll) * frames[:, 1, 1] + jnp.sin(physics.roll) * frames[:, 1, 2]], axis=1
-        )
-        return held, unit(side - along * jnp.sum(side * along, axis=2, keepdims=True))
-
-
-def _between(leaf, w):
-    """Cubic through four samples at `w` between the middle two: a broken line of poses would shake the cable."""
-    weight = jnp.stack(
-        [-w * (1 - w) * (2 - w) / 6, (1 - w * w) * (2 - w) / 2, w * (1 + w) * (2 - w) / 2, -w * (1 - w * w) / 6]
-    )
-    return jnp.tensordot(weight, leaf, axes=1)
-
-
-def _along(values, count):
-    """Linear interpolation of evenly spaced values to the joints."""
-    if values.shape[0] == 1:
-        return jnp.broadcast_to(values, (count,))
-    return jnp.interp(jnp.linspace(0.0, 1.0, count), jnp.linspace(0.0, 1.0, values.shape[0]), values)
-
-
-def _interpolation(s, h, n):
-    """Cubic interpolation from the nodes to arc lengths, shape [N, n]."""
-    begin = jnp.clip(jnp.floor(s / h + 0.5).astype(int) - 1, 0, n - 4)
-    u = s / h + 0.5 - begin
-    weight = jnp.stack(
-        [
-            -(u - 1) * (u - 2) * (u - 3) / 6,
-            u * (u - 2) * (u - 3) / 2,
-            -u * (u - 1) * (u - 3) / 2,
-            u * (u - 1) * (u - 2) / 6,
-        ],
-        axis=1,
-    )
-    rows = jnp.arange(s.shape[0])[:, None]
-    return jnp.zeros((s.shape[0], n)).at[rows, begin[:, None] + jnp.arange(4)].set(weight)
-
-
-def _twist_matrix(physics, curve, h, n):
-    """Inverse of the stiffness of the turns against each other and against the rest curvature."""
-    d = np.eye(n - 2, n - 1, 1) - np.eye(n - 2, n - 1)
-    d = jnp.asarray(d[:, 1:-1])
-    # no bend is sharper than this against the rest curvature for long: an upper bound makes the relaxation stable
-    bound = jnp.sqrt(jnp.sum(curve**2, axis=1) + 1e-6) * 10.0 * jnp.mean(physics.stiffness)
-    return jnp.linalg.inv(physics.twist_stiffness / h**2 * d.T @ d + jnp.diag(0.5 * (bound[:-1] + bound[1:])))

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from cablejax.recordings.poses import rotated
-from cablejax.spatial.rod import frames_along
+from cablejax.spatial.clamps import frames_along
 from cablejax.types import GapLog
 
 WINDOW = 5.0

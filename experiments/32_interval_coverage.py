@@ -1,0 +1,245 @@
+"""Intervals of EI/rho in space: how often they hold the true value, on synthetic recordings where it is known.
+
+    python experiments/32_interval_coverage.py --cables 24      # resumable; each twice, half a minute to two
+    python experiments/32_interval_coverage.py --report docs/results/interval_coverage.md
+
+Every cable is drawn from a seed of its own, simulated by a rod with twice the edges and twice the time steps of the one
+that is fitted, seen through noise, and handed to the protocol of the real recordings: windows, search, fits to both
+halves of the recordings, interval of either half. Once it obeys the law that is fitted, once it has besides what real
+cables have and the search does not try.
+"""
+
+from __future__ import annotations
+
+import argparse
+import collections
+import dataclasses
+import itertools
+import json
+import math
+import os
+import sys
+import time
+from pathlib import Path
+
+os.environ.setdefault("NPROC", "4")
+
+import numpy as np
+from scipy.stats import t
+
+from cablejax.evaluation.statistics import clopper_pearson
+from cablejax.recordings.deform import NOMINAL, SAMPLE_INTERVAL
+from cablejax.report.markdown import markdown_table
+from cablejax.report.provenance import machine, versions
+from cablejax.spatial.benchmark import protocol_windows
+from cablejax.spatial.identify import Identified, identify
+from cablejax.spatial.interval import stiffness_interval
+from cablejax.spatial.synthetic import RECORDINGS, SAMPLES, Law, synthetic_recordings
+
+LAWS: tuple[Law, ...] = ("as fitted", "richer")
+CACHE = Path("docs") / "results" / "trials" / "interval_coverage.jsonl"
+NOMINAL_STIFFNESS = NOMINAL.bending_stiffness / NOMINAL.linear_density
+
+
+@dataclasses.dataclass(frozen=True)
+class Row:
+    """One cable.
+
+    Attributes:
+        seed: that it was drawn from.
+        law: that it obeys.
+        truth: numbers of `SyntheticCable`.
+        halves: EI / rho from either half of the recordings, all effects free, with its 90 % interval [m^4/s^2].
+        everything: the same from all recordings, as a diagnosis tells it.
+        chosen: EI / rho from either half with the effects that stayed alone, and the jackknife's interval for that.
+        effects: that the search named.
+        error_mm: of the nominal simulator and of the last step of the search, on recordings that no fit has seen.
+        seconds: of computing.
+    """
+
+    seed: int
+    law: Law
+    truth: dict[str, float]
+    halves: list[list[float]]
+    everything: list[float]
+    chosen: list[list[float]]
+    effects: list[str]
+    error_mm: list[float]
+    seconds: float
+
+
+def trial(seed: int, law: Law, cache: Path | None) -> Row:
+    """One cable through the protocol of the real recordings."""
+    begun = time.perf_counter()
+    cable, recordings = synthetic_recordings(seed, law)
+    windows = protocol_windows(recordings)
+    found = identify(
+        windows,
+        NOMINAL_STIFFNESS,
+        state=None if cache is None else cache / f"{seed} {law}.json",
+        progress=lambda text: print(f"cable {seed}, {law}: {text}", file=sys.stderr, flush=True),
+    )
+    accepted = [step for step in found.steps if step.accepted]
+    return Row(
+        seed=seed,
+        law=law,
+        truth={k: v for k, v in dataclasses.asdict(cable).items() if isinstance(v, float)},
+        halves=[
+            told(stiffness_interval(found, values, windows.chosen(np.flatnonzero(half))))
+            for values, half in zip(found.half_values, (found.first, ~found.first), strict=True)
+        ],
+        everything=told(stiffness_interval(found, found.values, windows)),
+        chosen=[jackknifed(found, half) for half in range(2)],
+        effects=list(found.effects),
+        error_mm=[1e3 * float(step.error.mean()) for step in (accepted[0], accepted[-1])],
+        seconds=time.perf_counter() - begun,
+    )
+
+
+def told(interval: tuple[float, float]) -> list[float]:
+    """An interval with its middle, which is the estimate."""
+    return [math.sqrt(interval[0] * interval[1]), *interval]
+
+
+def jackknifed(found: Identified, half: int) -> list[float]:
+    """EI / rho of a half with the effects that stayed, and its interval as if these were all there are."""
+    layout, moves = found.simulator.layout, found.moves[half]
+    log = layout.log_stiffness(found.half_values[half].shared)
+    error = t.ppf(0.95, len(moves) - 1) * np.linalg.norm(layout.log_stiffness(moves))
+    return (layout.nominal_stiffness * np.exp([log, log - error, log + error])).tolist()
+
+
+def read(path: Path) -> list[Row]:
+    if not path.is_file():
+        return []
+    return [Row(**json.loads(line)) for line in path.read_text(encoding="utf-8").splitlines()]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--cables", type=int, default=24, help="seeds 0 up to this, without it; each under both laws")
+    parser.add_argument("--trials", type=Path, default=CACHE, help="one line per cable")
+    parser.add_argument("--cache", type=Path, help="folder that keeps searches and fits")
+    parser.add_argument("--report", type=Path, help="only write the page of the cables that are done")
+    options = parser.parse_args()
+    if options.report:
+        options.report.write_text(page(read(options.trials)), encoding="utf-8")
+        print(options.report)
+        return
+    done = {(row.seed, row.law) for row in read(options.trials)}
+    for seed, law in itertools.product(range(options.cables), LAWS):
+        if (seed, law) in done:
+            continue
+        row = trial(seed, law, options.cache)
+        with options.trials.open("a", encoding="utf-8") as file:
+            file.write(json.dumps(dataclasses.asdict(row)) + "\n")
+
+
+def coverage(rows: list[Row], name: str, intervals: list[list[float]]) -> list[str]:
+    """One line of a table; errors and widths are of log EI/rho."""
+    true = np.log([row.truth["stiffness"] for row in rows])
+    value, low, high = np.log(intervals).T
+    held = int(((low <= true) & (true <= high)).sum())
+    bounds = clopper_pearson(held, len(rows))
+    error = value - true
+    return [
+        name,
+        f"{held} of {len(rows)}",
+        f"{100 * held / len(rows):.0f} % ({100 * bounds.low:.0f} to {100 * bounds.high:.0f})",
+        *(f"{100 * x:.0f} %" for x in (np.median(high - low) / 2, np.sqrt(np.mean(error**2)))),
+        f"{100 * error.mean():+.0f} %",
+    ]
+
+
+def apart(pairs: list[list[list[float]]]) -> str:
+    """How far the halves' values are from each other."""
+    off = np.array([abs(math.log(one[0] / other[0])) for one, other in pairs])
+    near = int((off < math.log(1.15)).sum())
+    return f"{100 * np.median(off):.1f} % (median; below 15 % on {near} of {len(off)})"
+
+
+def section(rows: list[Row]) -> list[str]:
+    """The cables that obey one law."""
+    table = [["interval", "holds it", "share, with its 95 % interval", "median half width", "rms error", "mean error"]]
+    for part, of in (("all effects free", lambda row: row.halves), ("the effects that stayed", lambda row: row.chosen)):
+        for k, half in enumerate(("one half", "the other half")):
+            table.append(coverage(rows, f"{half}, {part}", [of(row)[k] for row in rows]))
+    table.insert(3, coverage(rows, "all recordings, all effects free", [row.everything for row in rows]))
+    often = collections.Counter(effect for row in rows for effect in row.effects).most_common()
+    error = np.median([row.error_mm for row in rows], axis=0)
+    return [
+        *markdown_table(table),
+        "",
+        f"The halves differ by {apart([row.halves for row in rows])} with all effects free and by "
+        f"{apart([row.chosen for row in rows])} with the effects that stayed. These were "
+        + ", ".join(f"{name} ({number})" for name, number in often)
+        + f"; they take the median error on unseen recordings from {error[0]:.1f} to {error[1]:.1f} mm.",
+        "",
+    ]
+
+
+def page(rows: list[Row]) -> str:
+    rows = sorted(rows, key=lambda row: (row.law, row.seed))
+    every = [["law", "seed", "true EI/rho", "one half", "the other half", "all recordings"]]
+    for row in rows:
+        cells = ["{:.4f} ({:.4f} to {:.4f})".format(*i) for i in (*row.halves, row.everything)]
+        every.append([row.law, str(row.seed), f"{row.truth['stiffness']:.4f}", *cells])
+    fitted, richer = ([row for row in rows if row.law == law] for law in LAWS)
+    lines = [
+        "# Intervals of EI/rho in space: do they hold the true value?",
+        "",
+        f"Synthetic cables, each with {RECORDINGS} recordings of {SAMPLES * SAMPLE_INTERVAL:g} s at "
+        f"{1 / SAMPLE_INTERVAL:g} Hz, through the protocol of the [real recordings](real_cables.md): windows and "
+        "lengths from the markers, search, fits to both halves of the recordings, the interval of either half. 90 % of "
+        "the intervals should hold the true value. Widths and errors are of log EI/rho. The halves of a cable share "
+        "its true values and the priors, so rows are not independent of each other; within a row cables are.",
+        "",
+        "- **All effects free** is `cablejax.spatial.interval`: every effect that the search tried is fitted, whether "
+        "it stayed or not, and the interval joins the jackknife over recordings with how far the priors draw the fit.",
+        "- **The effects that stayed** is the fit that predictions are made with, and the jackknife of it alone. An "
+        "effect stays only if it helps on recordings that were not fitted, so drag, a profile or the grips are often "
+        "left out. What is left out pulls EI/rho the same way in all recordings, and no resampling shows it. Where the "
+        "stiffness itself did not stay, EI/rho is the believed one but for its profile.",
+        "",
+        "## Where the fitted law is right",
+        "",
+        *section(fitted),
+        "Markers that weigh something all along the cable slow it down as if it were softer. Motion hardly tells the "
+        "two apart, so the prior of the markers' mass makes up much of the width.",
+        "",
+        "## Where the cable has more than is fitted",
+        "",
+        "The same cables, with a rest curvature (0.5 1/m at each of five places), markers off the centreline (2 mm) "
+        "and grippers that roll about the cable (0.15 rad, vibrating), all standard deviations. None of it is tried.",
+        "",
+        *section(richer),
+        "## What was drawn",
+        "",
+        f"EI/rho 0.01 to 0.2 m^4/s^2 (believed: {NOMINAL_STIFFNESS:.3f}), damping time 0.01 to 0.1 s and mass of a "
+        "marker 2 to 40 mm of cable, uniform in the logarithm; linear drag up to 0.8 1/s, quadratic drag up to 0.3 1/m "
+        "and length 0.85 to 1 m, uniform; log EI at five knots along the cable with standard deviation 0.25 about its "
+        "mean; rotation between gripper and cable with standard deviation 0.2 rad for all recordings and 0.2 rad more "
+        "for each. Grippers move by sums of vibrations of 0.3 to 1.5 Hz, 0.6 m/s root mean square. The true cable is a "
+        "rod with twice the edges and twice the time steps of the fitted one. Every marker, held ones too, has an "
+        "error of 0.3 mm with a correlation time of 0.3 s and one of 0.03 to 0.3 mm that is new at every sample (0.03 "
+        "mm is what the real recordings have). Real windows are five times as long.",
+        "",
+        "What is drawn is about as large as the priors say; on a cable beyond them, with far heavier markers for "
+        "instance, intervals hold less. That all effects have to be free was found on seeds 0 to 3 of an earlier draw, "
+        "without markers' mass. How many cables there are was decided by the clock.",
+        "",
+        "## Every cable",
+        "",
+        *markdown_table(every),
+        "",
+        "---",
+        "",
+        "Made by `python experiments/32_interval_coverage.py` and `--report docs/results/interval_coverage.md`. "
+        f"{versions()}; {machine()}.",
+        "",
+    ]
+    return "\n".join(lines)
+
+
+if __name__ == "__main__":
+    main()

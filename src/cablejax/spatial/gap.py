@@ -1,0 +1,74 @@
+"""How far a simulation is off the recorded windows, and how much of that an explanation takes away."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float
+
+from cablejax.diagnose.diagnosis import Gap
+from cablejax.spatial.search import resampled
+from cablejax.spatial.windows import Windows
+
+RESOLVABLE = 3.0
+"""A gap up to so many times the noise is none."""
+
+
+def noise_of(windows: Windows) -> float:
+    """Standard deviation of a coordinate [m], from fourth differences in time, which no motion of a cable has."""
+    fourth = np.diff(windows.keypoints, n=4, axis=1)
+    fourth = fourth[(windows.valid[:, 4:]) & np.isfinite(fourth).all(axis=(2, 3))]
+    return float(1.4826 * np.median(np.abs(fourth)) / np.sqrt(70)) if fourth.size else 0.0
+
+
+def squares(predicted: Float[np.ndarray, "W T F 3"], windows: Windows) -> Float[np.ndarray, "W T F 3"]:
+    """Squared errors of free coordinates, bounded by a metre, NaN where nothing was recorded."""
+    off = np.minimum(np.nan_to_num(np.abs(predicted - windows.keypoints), nan=1.0, posinf=1.0), 1.0) ** 2
+    seen = np.isfinite(windows.keypoints) & windows.valid[:, :, None, None]
+    seen[:, :2] = False
+    return np.where(seen, off, np.nan)
+
+
+def mean_of_finite(values: np.ndarray, axis: tuple[int, ...] | int | None) -> np.ndarray:
+    """Mean of what is finite; NaN where nothing is."""
+    seen = np.isfinite(values)
+    count = seen.sum(axis=axis)
+    return np.where(count > 0, np.where(seen, values, 0.0).sum(axis=axis) / np.maximum(count, 1), np.nan)
+
+
+def gap_of(
+    before: Float[np.ndarray, "W T F 3"], after: Float[np.ndarray, "W T F 3"], windows: Windows, noise: float
+) -> Gap:
+    """How far two predictions of the windows are off, and how much of that goes from one to the other.
+
+    Args:
+        before: of the nominal simulator [m].
+        after: with the effects that were found, each window from a fit that has not seen it [m].
+        windows: as recorded.
+        noise: standard deviation of a coordinate [m].
+    """
+    squared = [squares(part, windows) for part in (before, after)]
+    means = [np.nanmean(s) for s in squared]
+    windowed = [mean_of_finite(s, (1, 2, 3)) for s in squared]
+    resolvable = means[0] > (RESOLVABLE * noise) ** 2
+    shrinkage = float(1 - (means[1] - noise**2) / (means[0] - noise**2)) if resolvable else None
+    interval = None
+    if shrinkage is not None:
+        one, other = (resampled(w, windows.group) for w in windowed)
+        low, high = np.quantile(1 - other / one, [0.05, 0.95])
+        interval = (float(low), float(high))
+    horizons, count = {}, windows.valid.shape[1]
+    for seconds in (1.0, 2.0, 5.0):
+        end = min(round(seconds / windows.interval), count)
+        horizons[seconds] = tuple(1e3 * float(np.sqrt(np.nanmean(s[:, :end]))) for s in squared)
+    floor, left = float(noise**2 / means[0]), float(means[1] / means[0])
+    return Gap(
+        before_rmse_mm=1e3 * float(np.sqrt(means[0])),
+        after_rmse_mm=1e3 * float(np.sqrt(means[1])),
+        noise_floor_mm=1e3 * noise,
+        shrinkage=shrinkage,
+        shrinkage_ci90=interval,
+        ahead_mm=None,
+        horizons_mm=horizons,
+        held_out_episodes=tuple(sorted({int(e) for e in windows.episode})),
+        split={"noise": floor, "named": max(1 - left, 0.0), "learnable": 0.0, "unexplained": max(left - floor, 0.0)},
+    )

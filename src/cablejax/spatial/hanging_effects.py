@@ -1,0 +1,107 @@
+"""What a hanging wire may show: effects with their parameters, and the shape of the wire that they make."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from cablejax.diagnose.effects import BendingStiffness, IntrinsicCurvature, StiffnessProfile
+from cablejax.diagnose.effects.base import Parameter
+from cablejax.spatial.hanging import Wire, hanging_angles, hanging_points, joint_arclength
+
+PROFILE_SPREAD = 0.3
+"""Prior standard deviation of the logarithm of EI along a wire, which is drawn in one piece: a third."""
+
+LEVEL = 0.014
+"""Prior standard deviation of the angle between a photograph and the plumb line [rad]: the slope that the line between
+the two clamps, which the rig keeps level, has in the published photographs, root mean square."""
+
+EFFECTS: dict[str, tuple[Parameter, ...]] = {
+    "bending_stiffness": BendingStiffness.parameters,
+    "intrinsic_curvature": IntrinsicCurvature.parameters,
+    "stiffness_profile": (
+        *StiffnessProfile.parameters[:2],
+        dataclasses.replace(StiffnessProfile.parameters[2], scale=PROFILE_SPREAD),
+    ),
+    "gravity_tilt": (Parameter("angle_rad", "rad", -0.5, 0.5, 0.0, LEVEL),),
+}
+"""Effects that a hanging wire can show, with the parameters of the planar diagnosis where these exist."""
+
+PARAMETERS = tuple(parameter for group in EFFECTS.values() for parameter in group)
+"""Of all effects, one after the other."""
+
+SLICES = {
+    name: slice(sum(map(len, list(EFFECTS.values())[:k])), sum(map(len, list(EFFECTS.values())[: k + 1])))
+    for k, name in enumerate(EFFECTS)
+}
+"""Place of each effect's among all parameters."""
+
+
+def wire_shape(
+    z: Float[Array, " P"],
+    clamps: Float[Array, " 2"],
+    traced: Float[Array, "N 2"],
+    guess: Float[Array, " M"],
+    stiffness: Any,
+    length: Any,
+) -> Float[Array, "N 2"]:
+    """Points of the wire at rest [m], between the ends of the traced one, shape [N, 2]. Differentiable in z and clamps.
+
+    Args:
+        z: coordinates of the parameters of all effects.
+        clamps: how far the wire's direction at each clamp, first to last, is off the horizontal [rad].
+        traced: points of the photograph [m].
+        guess: angles of the links [rad].
+        stiffness: EI over the weight per length that is believed true [m^3].
+        length: [m].
+    """
+    ratio, centre, width, curvature, other_centre, other_width, other_ratio, tilt = (
+        parameter.value(z[k]) for k, parameter in enumerate(PARAMETERS)
+    )
+    links = guess.shape[0]
+    s = joint_arclength(links, 1.0)
+    profile = other_ratio ** _section(s, other_centre, other_width)
+    wire = Wire(
+        stiffness=stiffness * ratio * profile,
+        rest_curvature=curvature * _section(s, centre, width),
+        length=jnp.asarray(length),
+    )
+    cosine, sine = jnp.cos(tilt), jnp.sin(tilt)
+    turned = jnp.stack([jnp.stack([cosine, -sine]), jnp.stack([sine, cosine])])
+    ends = traced[jnp.array([0, -1])] @ turned.T
+    # The wire's direction turns by the same whole number of turns as the traced one.
+    turns = 2 * jnp.pi * jnp.round((guess[jnp.array([0, -1])]) / (2 * jnp.pi))
+    placed = jnp.concatenate([ends, (turns + clamps + tilt)[:, None]], axis=1)
+    angles = hanging_angles(wire, placed, guess + tilt)
+    return hanging_points(angles, placed, wire.length, traced.shape[0]) @ turned
+
+
+def _section(s: Array, centre: Any, width: Any) -> Array:
+    """Share of the wire about each joint in a section, all over the length; edges of a hundredth of it."""
+    return jax.nn.sigmoid((s - centre + 0.5 * width) / 0.01) * jax.nn.sigmoid((centre + 0.5 * width - s) / 0.01)
+
+
+@jax.jit
+def linearised(
+    z: Float[Array, " P"],
+    clamps: Float[Array, "R 2"],
+    traced: Float[Array, "R N 2"],
+    guess: Float[Array, "R M"],
+    stiffness: Any,
+    length: Any,
+) -> tuple[Float[Array, "R C"], Float[Array, "R C P"], Float[Array, "R C 2"]]:
+    """Residuals of each photograph, and their derivatives in z and its clamps' angles."""
+
+    def residual(z, clamps, traced, guess):
+        return (wire_shape(z, clamps, traced, guess, stiffness, length) - traced)[1:-1].ravel()
+
+    def one(clamps, traced, guess):
+        both = functools.partial(residual, traced=traced, guess=guess)
+        return (both(z, clamps), *jax.jacfwd(both, (0, 1))(z, clamps))
+
+    return jax.vmap(one)(clamps, traced, guess)

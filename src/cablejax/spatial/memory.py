@@ -1,0 +1,72 @@
+"""What an identification has done, kept in a file so that an interrupted one goes on where it was."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+import os
+import pathlib
+import tempfile
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from cablejax.spatial.search import Step
+from cablejax.spatial.values import Values, from_json, to_json
+from cablejax.spatial.windows import Windows
+
+
+def fingerprint(edges: int, windows: Windows, nominal_stiffness: float, names: Sequence[str]) -> str:
+    """What a kept state must have been made from to be of use."""
+    digest = hashlib.sha256(repr((edges, float(nominal_stiffness), list(names), windows.name)).encode())
+    for array in (windows.keypoints, windows.position, windows.valid, windows.group):
+        digest.update(np.ascontiguousarray(array).tobytes())
+    return digest.hexdigest()
+
+
+class Memory:
+    """What is done, in one JSON file that is written whole."""
+
+    def __init__(self, path: pathlib.Path | None, fingerprint: str):
+        self._path = path
+        self._held: dict[str, Any] = json.loads(path.read_text()) if path is not None and path.exists() else {}
+        if self._held.get("fingerprint") != fingerprint:
+            self._held = {"fingerprint": fingerprint}
+
+    def steps(self, name: str) -> list[Step]:
+        return [
+            Step(
+                s["effect"],
+                s["accepted"],
+                (from_json(s["values"][0]), from_json(s["values"][1])),
+                np.array(s["error"]),
+                s["chance"],
+            )
+            for s in self._held.get(name, [])
+        ]
+
+    def keep(self, name: str, steps: Sequence[Step]) -> None:
+        self._write(
+            name,
+            [
+                {**dataclasses.asdict(s), "values": [to_json(v) for v in s.values], "error": s.error.tolist()}
+                for s in steps
+            ],
+        )
+
+    def finals(self) -> list[tuple[Values, np.ndarray]]:
+        return [(from_json(kept["values"]), np.array(kept["moves"])) for kept in self._held.get("final", [])]
+
+    def keep_finals(self, finals: Sequence[tuple[Values, np.ndarray]]) -> None:
+        self._write("final", [{"values": to_json(v), "moves": moves.tolist()} for v, moves in finals])
+
+    def _write(self, name, value):
+        self._held[name] = value
+        if self._path is None:
+            return
+        self._path.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.NamedTemporaryFile("w", dir=self._path.parent, delete=False) as file:
+            json.dump(self._held, file)
+        os.replace(file.name, self._path)

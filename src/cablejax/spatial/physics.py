@@ -1,0 +1,49 @@
+"""What there is to know of a cable in space for its motion to follow from that of the grippers."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax
+import numpy as np
+from jaxtyping import Array, Float
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class RodPhysics:
+    """Everything that moves a cable in space, or how it is seen, apart from the grippers' motion.
+
+    Attributes:
+        length: between the two clamps [m], shape [].
+        stiffness: EI / rho along the cable, at J evenly spaced places from clamp to clamp [m^4/s^2], shape [J].
+        rest_curvature: along the cable, about the second and third axis of the material [1/m], shape [K, 2].
+        damping_time: Kelvin-Voigt time constant of bending [s].
+        drag: force per mass and speed [1/s].
+        quadratic_drag: force per mass and squared speed [1/m].
+        twist_stiffness: GJ / rho [m^4/s^2].
+        stretch: EA / rho [m^2/s^2].
+        marker_mass: of each marker, as length of cable of the same mass [m].
+        clamp_rotation: of the cable against either gripper, about its second and third axis [rad], shape [2, 2].
+        clamp_offset: of the cable from either gripper's position, along all three axes [m], shape [2, 3].
+        roll: turn of the second gripper's frame that leaves the cable without twist [rad].
+        arclength: of every free marker from the first clamp [m], shape [N].
+        offset: of every free marker from the centreline along the second and third axis [m], shape [N, 2].
+        gravity: [m/s^2], shape [3].
+    """
+
+    length: Float[Array | np.ndarray, ""]
+    stiffness: Float[Array | np.ndarray, "J"]
+    rest_curvature: Float[Array | np.ndarray, "K 2"]
+    damping_time: Float[Array | np.ndarray, ""]
+    drag: Float[Array | np.ndarray, ""]
+    quadratic_drag: Float[Array | np.ndarray, ""]
+    twist_stiffness: Float[Array | np.ndarray, ""]
+    stretch: Float[Array | np.ndarray, ""]
+    marker_mass: Float[Array | np.ndarray, ""]
+    clamp_rotation: Float[Array | np.ndarray, "2 2"]
+    clamp_offset: Float[Array | np.ndarray, "2 3"]
+    roll: Float[Array | np.ndarray, ""]
+    arclength: Float[Array | np.ndarray, "N"]
+    offset: Float[Array | np.ndarray, "N 2"]
+    gravity: Float[Array | np.ndarray, "3"]
