@@ -183,8 +183,8 @@ def _page(scores) -> str:
         _row("all 70 windows in batches of 8 [s]", pick(lambda s: s["seconds"][1], "{:.2f}")),
         "",
         "What a half is simulated with is not what the cable is: where an effect did not stay in the search, EI/rho "
-        "makes up for it. The estimate with every effect free is the one to read as the cable's: on synthetic recordings "
-        "nine of ten of its intervals hold the true value, and two of ten of those of the other ([coverage]"
+        "makes up for it. The estimate with every effect free is the one to read as the cable's: on synthetic "
+        "recordings nine of ten of its intervals hold the true value, and two of ten of those of the other ([coverage]"
         "(interval_coverage.md)). The halves are different recordings of one cable: if both intervals are right, the "
         f"estimates differ by less than {_NINETY:g} standard errors on nine cables of ten. An error that both halves "
         "share does not show here.",
