@@ -12,8 +12,8 @@ from jaxtyping import Array, Float, PyTree, Scalar
 from cablejax.bounded.gain_ratio import GainRatio
 from cablejax.bounded.gauss_newton import regularised
 from cablejax.bounded.least_squares import AbstractBoundedLeastSquares
-from cablejax.bounded.levenberg_marquardt import convex_part
 from cablejax.bounded.quadratic import minimise_quadratic
+from cablejax.bounded.secant import convex_part
 from cablejax.bounded.sets import ConvexSet
 
 

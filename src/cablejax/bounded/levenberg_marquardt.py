@@ -13,6 +13,7 @@ from jaxtyping import Array, Float, PyTree, Scalar
 from cablejax.bounded.gain_ratio import GainRatio
 from cablejax.bounded.least_squares import AbstractBoundedLeastSquares
 from cablejax.bounded.quadratic import minimise_quadratic
+from cablejax.bounded.secant import convex_part
 from cablejax.bounded.sets import ConvexSet
 
 
@@ -103,13 +104,3 @@ class BoundedLevenbergMarquardt(AbstractBoundedLeastSquares):
         self.search = GainRatio() if search is None else search
         self.secant = secant
         self.trials_per_linearisation = trials_per_linearisation
-
-
-def convex_part(hessian: Float[Array, "P P"]) -> Float[Array, "P P"]:
-    """The matrix without its negative eigenvalues, those of the matrix scaled to a unit diagonal."""
-    diagonal = jnp.abs(jnp.diag(hessian))
-    floor = jnp.finfo(diagonal.dtype).eps * diagonal.max() + jnp.finfo(diagonal.dtype).tiny
-    unit = jnp.sqrt(jnp.maximum(diagonal, floor))
-    eigenvalues, basis = jnp.linalg.eigh(hessian / jnp.outer(unit, unit))
-    root = unit[:, None] * basis
-    return (root * jnp.maximum(eigenvalues, 0.0)) @ root.T

@@ -61,8 +61,7 @@ class BoundedQuasiNewton(optx.AbstractMinimiser):
         - `damping`: at the start, relative to the diagonal of the model's Hessian.
         """
         self.rtol, self.atol, self.norm = rtol, atol, optx.max_norm
-        # rounding takes a nearly singular model's lowest eigenvalues below zero
-        self.descent = DampedQuadratic(damping, secant=True)
+        self.descent = DampedQuadratic(damping, secant=False)
         # a model that is hardly damped any more gains nothing by less, and takes more trials to come back from it
         self.search = GainRatio(largest=10.0)
 

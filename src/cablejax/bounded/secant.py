@@ -58,7 +58,8 @@ def positive_update(
     lost = jnp.outer(expected, expected) / jnp.where(seen, model, 1.0)
     updated = hessian + jnp.where(convex, learned - lost, -0.8 * lost)
     telling = jnp.isfinite(bent).all() & jnp.isfinite(updated).all()
-    return jnp.where(telling, 0.5 * (updated + updated.T), hessian)
+    # rounding takes the lowest eigenvalues of a nearly singular matrix below zero, where they would stay
+    return jnp.where(telling, convex_part(updated), hessian)
 
 
 def sized(hessian: Float[Array, "P P"], moved: Float[Array, " P"], bent: Float[Array, " P"]) -> Float[Array, "P P"]:
@@ -70,3 +71,13 @@ def sized(hessian: Float[Array, "P P"], moved: Float[Array, " P"], bent: Float[A
     telling = curved > 1e-8 * jnp.linalg.norm(moved) * jnp.linalg.norm(bent)
     size = jnp.sum(bent**2) / jnp.where(telling, curved, 1.0)
     return jnp.where(telling, size * jnp.eye(len(moved), dtype=moved.dtype), hessian)
+
+
+def convex_part(hessian: Float[Array, "P P"]) -> Float[Array, "P P"]:
+    """The matrix without its negative eigenvalues, those of the matrix scaled to a unit diagonal."""
+    diagonal = jnp.abs(jnp.diag(hessian))
+    floor = jnp.finfo(diagonal.dtype).eps * diagonal.max() + jnp.finfo(diagonal.dtype).tiny
+    unit = jnp.sqrt(jnp.maximum(diagonal, floor))
+    eigenvalues, basis = jnp.linalg.eigh(hessian / jnp.outer(unit, unit))
+    root = unit[:, None] * basis
+    return (root * jnp.maximum(eigenvalues, 0.0)) @ root.T
