@@ -148,6 +148,15 @@ class Interrupted(ThreadedEngine):
         return super().rollout(params, state, twist, interval)
 
 
+@pytest.fixture
+def listening():
+    """Ctrl-C reaches Python: a shell starts what it runs in the background deaf to it."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.usefixtures("listening")
 def test_ctrl_c_keeps_what_is_done_and_says_how_to_go_on(reference, tmp_path):
     path = tmp_path / "data"
     with pytest.raises(GenerationInterrupted, match=r"Stopped at 4 of 8 .* again to go on"):

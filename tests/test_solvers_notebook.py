@@ -7,7 +7,7 @@ import pytest
 from nbclient import NotebookClient
 
 PATH = pathlib.Path(__file__).parents[1] / "notebooks" / "03_solvers.ipynb"
-SOLVERS = ("Levenberg-Marquardt", "dogleg", "Gauss-Newton", "spectral gradient")
+SOLVERS = ("Levenberg-Marquardt", "dogleg", "Gauss-Newton", "quasi-Newton", "spectral gradient")
 
 
 def printed(notebook) -> str:
