@@ -33,7 +33,7 @@ from cablejax.report.markdown import markdown_table
 from cablejax.report.provenance import machine, versions
 from cablejax.spatial.benchmark import protocol_windows
 from cablejax.spatial.identify import Identified, identify
-from cablejax.spatial.interval import stiffness_interval
+from cablejax.spatial.interval import intervals_of_halves, stiffness_interval
 from cablejax.spatial.synthetic import RECORDINGS, SAMPLES, Law, synthetic_recordings
 
 LAWS: tuple[Law, ...] = ("as fitted", "richer")
@@ -84,10 +84,7 @@ def trial(seed: int, law: Law, cache: Path | None) -> Row:
         seed=seed,
         law=law,
         truth={k: v for k, v in dataclasses.asdict(cable).items() if isinstance(v, float)},
-        halves=[
-            told(stiffness_interval(found, values, windows.chosen(np.flatnonzero(half))))
-            for values, half in zip(found.half_values, (found.first, ~found.first), strict=True)
-        ],
+        halves=[told(interval) for interval in intervals_of_halves(found, windows)],
         everything=told(stiffness_interval(found, found.values, windows)),
         chosen=[jackknifed(found, half) for half in range(2)],
         effects=list(found.effects),

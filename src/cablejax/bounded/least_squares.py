@@ -75,7 +75,7 @@ class AbstractBoundedLeastSquares(optx.AbstractLeastSquaresSolver):
             raise ValueError(f"{type(self).__name__} got residuals of shape {f_struct.shape}, expected a flat array.")
         dtype = f_struct.dtype
         square = jnp.zeros((y.size, y.size), dtype)
-        info = _info(jnp.zeros((), dtype), jnp.zeros(y.size, dtype), square)
+        info = quadratic_info(jnp.zeros((), dtype), jnp.zeros(y.size, dtype), square)
         descent = self.descent.within(options["feasible"].at(y), y)
         zero = jnp.zeros((), jnp.int32)
         residual, jacobian = jnp.zeros(f_struct.shape, dtype), jnp.zeros((*f_struct.shape, y.size), dtype)
@@ -190,7 +190,7 @@ class AbstractBoundedLeastSquares(optx.AbstractLeastSquaresSolver):
             telling = jnp.linalg.norm(left - secant @ moved) <= jnp.linalg.norm(left)
             secant = jnp.where(state.linearisations > 0, secant_update(secant, moved, bent, slope), secant)
             learned = jnp.where(telling, secant, 0.0)
-        info = _info(0.5 * jnp.sum(residual**2), gradient, jacobian.T @ jacobian + learned)
+        info = quadratic_info(0.5 * jnp.sum(residual**2), gradient, jacobian.T @ jacobian + learned)
         optimality = jnp.abs(feasible.project(y - gradient.reshape(y.shape)) - y).max()
         return eqx.tree_at(
             lambda s: (
@@ -216,7 +216,7 @@ class AbstractBoundedLeastSquares(optx.AbstractLeastSquaresSolver):
         residual = jnp.where(state.stale, residual, state.residual)
         # what the model has learned beyond J'J stays until the next linearisation
         learned = state.f_info.hessian.as_matrix() - state.jacobian.T @ state.jacobian
-        info = _info(0.5 * jnp.sum(residual**2), jacobian.T @ residual, jacobian.T @ jacobian + learned)
+        info = quadratic_info(0.5 * jnp.sum(residual**2), jacobian.T @ residual, jacobian.T @ jacobian + learned)
         descent = self.descent.within(feasible.at(y), y).query(y.ravel(), info, state.descent_state)
         return eqx.tree_at(
             lambda s: (s.f_info, s.residual, s.jacobian, s.descent_state, s.updates, s.stale),
@@ -225,5 +225,6 @@ class AbstractBoundedLeastSquares(optx.AbstractLeastSquaresSolver):
         )
 
 
-def _info(value: Scalar, gradient: Float[Array, " P"], hessian: Float[Array, "P P"]):
+def quadratic_info(value: Scalar, gradient: Float[Array, " P"], hessian: Float[Array, "P P"]):
+    """A quadratic model of a function as optimistix's descents and searches take it."""
     return optx.FunctionInfo.EvalGradHessian(value, gradient, lx.MatrixLinearOperator(hessian))

@@ -23,3 +23,15 @@ def forward(
         return residual, jacobian.reshape(residual.size, y.size)
 
     return linearise
+
+
+def squared_jacobian(
+    linearise: Callable[[Array, Any], tuple[Float[Array, " M"], Float[Array, "M P"]]],
+) -> Callable[[Array, Any], Float[Array, "P P"]]:
+    """`J'J` at a point: Gauss and Newton's model of the Hessian of half the sum of squares."""
+
+    def squared(y, args):
+        jacobian = linearise(y, args)[1]
+        return jacobian.T @ jacobian
+
+    return squared

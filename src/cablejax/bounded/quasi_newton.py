@@ -8,11 +8,11 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import lineax as lx
 import optimistix as optx
-from jaxtyping import Array, Bool, Float, Int, PyTree, Scalar
+from jaxtyping import Array, Bool, Int, PyTree, Scalar
 
 from cablejax.bounded.gain_ratio import GainRatio
+from cablejax.bounded.least_squares import quadratic_info
 from cablejax.bounded.levenberg_marquardt import DampedQuadratic
 from cablejax.bounded.secant import positive_update, sized
 
@@ -69,7 +69,7 @@ class BoundedQuasiNewton(optx.AbstractMinimiser):
         del fn, aux_struct, tags
         dtype, model = f_struct.dtype, options.get("hessian")
         hessian = jnp.zeros((y.size, y.size), dtype) if model is None else model(y, args)
-        info = _info(jnp.asarray(jnp.inf, dtype), jnp.zeros(y.size, dtype), hessian)
+        info = quadratic_info(jnp.asarray(jnp.inf, dtype), jnp.zeros(y.size, dtype), hessian)
         descent = self.descent.within(options["feasible"].at(y), y)
         zero = jnp.zeros((), jnp.int32)
         return _State(
@@ -115,7 +115,7 @@ class BoundedQuasiNewton(optx.AbstractMinimiser):
             # the first step's length was a guess: the curvature along it is better
             model = jnp.where(state.evaluations == 1, sized(model, move, bent), model)
         learned = jnp.where(accept, positive_update(model, move, bent), model)
-        info = _info(
+        info = quadratic_info(
             jnp.where(accept, value, info.f),
             jnp.where(accept, gradient, info.grad),
             jnp.where(first, begun, learned),
@@ -167,7 +167,3 @@ class BoundedQuasiNewton(optx.AbstractMinimiser):
             "projections": 2 * state.evaluations,
         }
         return y, aux, stats
-
-
-def _info(value: Scalar, gradient: Float[Array, " P"], hessian: Float[Array, "P P"]):
-    return optx.FunctionInfo.EvalGradHessian(value, gradient, lx.MatrixLinearOperator(hessian))

@@ -11,7 +11,7 @@ from jax.core import Tracer
 from jaxtyping import Array
 
 from cablejax.bounded.implicit import FixedPointAdjoint
-from cablejax.bounded.linearise import forward
+from cablejax.bounded.linearise import forward, squared_jacobian
 from cablejax.bounded.results import Result, Solution, Stats
 from cablejax.bounded.sets import AbstractSet
 
@@ -89,10 +89,7 @@ def least_squares(
         def half_squares(y, args):
             return 0.5 * jnp.sum(residual_fn(y, args) ** 2)
 
-        def squared(y, args):
-            jacobian = (linearise or forward(residual_fn))(y, args)[1]
-            return jacobian.T @ jacobian
-
+        squared = squared_jacobian(linearise or forward(residual_fn))
         return minimise(half_squares, solver, y0, feasible, args, hessian=squared, max_steps=max_steps, throw=throw)
     start = feasible.project(jnp.asarray(y0))
     options = {"feasible": feasible, "linearise": linearise}

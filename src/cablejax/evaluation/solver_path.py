@@ -19,6 +19,7 @@ import optimistix as optx
 from jaxtyping import Array, Float
 
 from cablejax.bounded import AbstractSet
+from cablejax.bounded.linearise import squared_jacobian
 
 
 @dataclasses.dataclass(frozen=True)
@@ -95,13 +96,8 @@ class PathFinder:
         )
 
     def _options(self, feasible):
-        hessian = None if self._linearise is None else self._squared_jacobian
+        hessian = None if self._linearise is None else squared_jacobian(self._linearise)
         return {"feasible": feasible, "linearise": self._linearise, "hessian": hessian}
-
-    def _squared_jacobian(self, y, args):
-        assert self._linearise is not None
-        jacobian = self._linearise(y, args)[1]
-        return jacobian.T @ jacobian
 
     def _with_aux(self, y, args):
         minimises = isinstance(self._solver, optx.AbstractMinimiser)

@@ -8,8 +8,8 @@ from jaxtyping import Array, Float
 
 from cablejax.bounded.levenberg_marquardt import BoundedLevenbergMarquardt
 from cablejax.bounded.quasi_newton import BoundedQuasiNewton
-from cablejax.bounded.solve import least_squares
-from cablejax.mpc.plan import Plan, plan_from
+from cablejax.mpc.bounded_plan import bounded_plan
+from cablejax.mpc.plan import Plan
 from cablejax.mpc.problem import ShapingProblem
 from cablejax.mpc.settings import check_budget, check_positive
 
@@ -34,8 +34,7 @@ class Accurate:
     tolerance: float = 1e-10
 
     def __post_init__(self):
-        for name in ("linearisations", "trials_per_linearisation", "gradients"):
-            check_budget(self, name)
+        check_budget(self, "linearisations", "trials_per_linearisation", "gradients")
         check_positive(self, "tolerance")
 
     def parts(self) -> tuple[BoundedLevenbergMarquardt, BoundedQuasiNewton]:
@@ -46,24 +45,10 @@ class Accurate:
     def __call__(self, problem: ShapingProblem, guess: Float[Array, "T Q 3"]) -> Plan:
         """The plan from a guess; differentiable in the problem where it has converged."""
         first, second = self.parts()
-        near = self._solve(problem, guess, first, self.linearisations)
-        plan = self._solve(problem, near.motion, second, self.gradients)
+        near = bounded_plan(problem, guess, first, self.linearisations)
+        plan = bounded_plan(problem, near.motion, second, self.gradients)
         return dataclasses.replace(
             plan,
             evaluations=near.evaluations + plan.evaluations,
             linearisations=near.linearisations + plan.linearisations,  # pyright: ignore[reportOperatorIssue]
-        )
-
-    def _solve(self, problem: ShapingProblem, guess: Float[Array, "T Q 3"], solver, max_steps: int) -> Plan:
-        return plan_from(
-            least_squares(
-                lambda motion, problem: problem.residuals(motion),
-                solver,
-                guess,
-                problem.feasible,
-                problem,
-                linearise=lambda motion, problem: problem.linearise(motion),
-                max_steps=max_steps,
-                throw=False,
-            )
         )

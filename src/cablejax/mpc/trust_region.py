@@ -11,8 +11,8 @@ from cablejax.bounded.dogleg import BoundedDogleg
 from cablejax.bounded.gauss_newton import BoundedGaussNewton
 from cablejax.bounded.least_squares import AbstractBoundedLeastSquares
 from cablejax.bounded.levenberg_marquardt import BoundedLevenbergMarquardt
-from cablejax.bounded.solve import least_squares
-from cablejax.mpc.plan import Plan, plan_from
+from cablejax.mpc.bounded_plan import bounded_plan
+from cablejax.mpc.plan import Plan
 from cablejax.mpc.problem import ShapingProblem
 from cablejax.mpc.settings import check_budget, check_positive
 
@@ -42,17 +42,7 @@ class _LeastSquaresPlanner(abc.ABC):
 
     def __call__(self, problem: ShapingProblem, guess: Float[Array, "T Q 3"]) -> Plan:
         """The plan from a guess; differentiable in the problem where it has converged."""
-        solution = least_squares(
-            lambda motion, problem: problem.residuals(motion),
-            self.bounded(),
-            guess,
-            problem.feasible,
-            problem,
-            linearise=lambda motion, problem: problem.linearise(motion),
-            max_steps=self.max_iterations,
-            throw=False,
-        )
-        return plan_from(solution)
+        return bounded_plan(problem, guess, self.bounded(), self.max_iterations)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -14,7 +14,7 @@ from cablejax.recordings.deform import NOMINAL, DeformRecordings
 from cablejax.spatial.clamps import frames_along
 from cablejax.spatial.fit import errors, over_all_markers
 from cablejax.spatial.identify import Identified, identify
-from cablejax.spatial.interval import stiffness_interval
+from cablejax.spatial.interval import intervals_of_halves
 from cablejax.spatial.network import fit_network
 from cablejax.spatial.residual import fit_residual
 from cablejax.spatial.windows import Windows
@@ -141,11 +141,10 @@ def score_cable(recordings: DeformRecordings, *, state: pathlib.Path, progress: 
         learned=tuple(learned),
         without_own=float(metric(simulator.predict(found.values.shared, whole), whole).mean()),
         halves=tuple(
-            (
-                found.stiffness(values),
-                *stiffness_interval(found, values, train.chosen(np.flatnonzero(half)), progress=progress),
+            (found.stiffness(values), *interval)
+            for values, interval in zip(
+                found.half_values, intervals_of_halves(found, train, progress=progress), strict=True
             )
-            for values, half in zip(found.half_values, (found.first, ~found.first), strict=True)
         ),
         seconds=_seconds(found, windows),
         effects=found.effects,

@@ -56,3 +56,20 @@ def stiffness_interval(
     )
     low, high = layout.nominal_stiffness * np.exp([log - error, log + error])
     return float(low), float(high)
+
+
+def intervals_of_halves(
+    found: Identified, windows: Windows, *, progress: Callable[[str], None] = lambda text: None
+) -> tuple[tuple[float, float], tuple[float, float]]:
+    """`stiffness_interval` from either half of the recordings, as the search split them [m^4/s^2].
+
+    Args:
+        found: from these windows.
+        windows: of all recordings.
+        progress: called with a line of text.
+    """
+    one, other = (
+        stiffness_interval(found, values, windows.chosen(np.flatnonzero(half)), progress=progress)
+        for values, half in zip(found.half_values, (found.first, ~found.first), strict=True)
+    )
+    return one, other
