@@ -20,6 +20,7 @@ TRIAL = Trial(
     stopped=None,
     mpc_ms_median=100.0,
     wall_s=12.5,
+    errors_cm=(25.0, 3.0, 0.25, 0.25, 0.25),
 )
 
 

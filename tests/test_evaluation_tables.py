@@ -10,6 +10,7 @@ from cablejax.evaluation.tables import (
     comparison_table,
     interval_table,
     paired_table,
+    settling_table,
     stiffness_table,
     success_table,
 )
@@ -60,6 +61,19 @@ def test_stiffness_rows_split_the_comparison():
     assert [row[:3] for row in rows] == [
         ["direct transfer", "0.5", "3"], ["direct transfer", "2", "3"],
         ["GNS + online residual", "0.5", "3"], ["GNS + online residual", "2", "3"],
+    ]  # fmt: skip
+
+
+def test_settling_time_by_the_textbook_is_in_a_table_of_its_own():
+    way = (20.0, 5.0, 1.1, 0.5, 0.25, 0.25, 0.25)  # within 5 % of the way, 0.99 cm, at 2 s, within 2 % at 3 s
+    rows = cells(
+        settling_table(
+            [trial(errors_cm=way), trial(seed=1, errors_cm=(20.0, 9.0, 8.0, 6.0)), trial(seed=2, errors_cm=())], "III"
+        )
+    )
+    assert rows[2] == [
+        "GNS + online residual", "U", "2", "8.00 ± 0.00", "2.00 ± 0.00 (1 of 2 did not settle)",
+        "3.00 ± 0.00 (1 of 2 did not settle)", "12.35 ± 1.09",
     ]  # fmt: skip
 
 

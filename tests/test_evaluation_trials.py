@@ -1,5 +1,6 @@
 """Files of trials survive whatever stops their writer."""
 
+import json
 import math
 
 import numpy as np
@@ -16,6 +17,7 @@ def test_trials_come_back_as_they_were(tmp_path):
     for row in written:
         append_trial(path, row)
     assert read_trials(path) == written
+    assert read_trials(path)[0].errors_cm == TRIAL.errors_cm
     assert finished_keys(written) == {("III", "residual", "U", k, s) for k, s in ((2.0, 0), (2.0, 1), (0.1, 0))}
     append_trial(path, trial(seed=2, terminal_error_cm=math.nan))
     assert math.isnan(read_trials(path)[-1].terminal_error_cm)
@@ -58,6 +60,17 @@ def test_a_line_that_is_no_trial_is_refused(tmp_path, line, message):
         read_trials(path)
 
 
+def test_a_row_without_the_errors_on_the_way_is_still_a_trial(tmp_path):
+    path = tmp_path / "trials.jsonl"
+    append_trial(path, TRIAL)
+    fields = json.loads(path.read_text())
+    path.write_text(json.dumps({name: value for name, value in fields.items() if name != "errors_cm"}) + "\n")
+    assert read_trials(path) == [trial(errors_cm=())]
+    path.write_text(json.dumps(fields | {"speed": 1}) + "\n")
+    with pytest.raises(ValueError, match=r"missing fields \[\], unknown fields \['speed'\]"):
+        read_trials(path)
+
+
 def test_a_value_that_is_no_number_is_refused(tmp_path):
     path = tmp_path / "trials.jsonl"
     append_trial(path, TRIAL)
@@ -75,6 +88,7 @@ def test_a_run_becomes_a_trial():
     row = trial_of(Run(), table="III", method="direct", scenario="Z", stiffness=3, seed=4, wall_s=2)  # pyright: ignore[reportArgumentType]
     assert (row.best_error_cm, row.steps, row.mpc_ms_median) == (0.4, 3, 110.0)
     assert row.key == ("III", "direct", "Z", 3.0, 4)
+    assert row.errors_cm[:2] == (20.0, 0.4) and math.isnan(row.errors_cm[2])
 
 
 def test_a_batch_becomes_trials():

@@ -25,6 +25,7 @@ def test_windows_read_back_length_places_and_motion(fitted):
     assert not cable.rest_curvature.any() and not cable.roll
 
 
+@pytest.mark.slow
 def test_a_seed_gives_one_recording_and_a_richer_law_another_one(fitted):
     cable, recordings = fitted
     again, same = synthetic_recordings(0, "as fitted")

@@ -11,6 +11,7 @@ from typing import cast, get_args
 
 import numpy as np
 
+from cablejax.closed_loop import step_settling_time
 from cablejax.evaluation.paper import LIANG, METHOD_LABEL, PAPER, Measure, PaperTable, best_in_paper
 from cablejax.evaluation.statistics import (
     Interval,
@@ -23,6 +24,9 @@ from cablejax.evaluation.trials import LIANG_TABLE, Trial
 
 SUCCESS_CM = 1.0
 """Liang et al.: a shape is reached below this root mean square error [cm]."""
+
+STEP_BANDS = (0.05, 0.02)
+"""Bands of the settling time of a step response, as fractions of the way that the error went."""
 
 _SHAPES = ("U", "S", "Z")
 _MEASURES: tuple[Measure, ...] = get_args(Measure)
@@ -134,6 +138,40 @@ def interval_table(
         "median", "worst",
     ]  # fmt: skip
     return _markdown(title, rows)
+
+
+def settling_table(
+    trials: Iterable[Trial],
+    table: str,
+    *,
+    methods: Sequence[str] | None = None,
+    labels: Mapping[str, str] = METHOD_LABEL,
+) -> str:
+    """Settling times by the textbook's two bands, beside the stricter one of the other tables and the paper's own.
+
+    Trials whose errors on the way were not kept cannot be judged so and are left out; the column says how many are in.
+
+    Raises:
+        ValueError: there is no trial of this table.
+    """
+    mine = _of_table(trials, table)
+    published = PAPER.get(cast(PaperTable, table), {})
+    rows = []
+    for method in _methods(mine, methods):
+        for scenario in _scenarios(mine):
+            cell = _at([trial for trial in mine if trial.method == method and trial.errors_cm], scenario)
+            if not cell:
+                continue
+            paper = published.get(method, {}).get(scenario)
+            rows.append(
+                [
+                    _label(method, labels), scenario, str(len(cell)), _cell(cell, "settling"),
+                    *(_failing_cell([_within(t, band) for t in cell], "settling") for band in STEP_BANDS),
+                    "" if paper is None else _spread(*paper.settling),
+                ]
+            )  # fmt: skip
+    bands = [f"within {100 * band:g} % of the way [s]" for band in STEP_BANDS]
+    return _markdown(["method", "scenario", "trials", "strict [s]", *bands, "in the paper [s]"], rows)
 
 
 def paired_table(
@@ -264,10 +302,18 @@ def _seed_interval(cell: Sequence[Trial], measure: Measure) -> Interval:
     return bootstrap_interval(means) if means else Interval(np.nan, np.nan)
 
 
+def _within(trial: Trial, fraction: float) -> float:
+    """Settling time [s] of a trial, a command each second, by `step_settling_time`."""
+    return step_settling_time(np.arange(len(trial.errors_cm), dtype=float), np.array(trial.errors_cm), fraction)
+
+
 def _cell(trials: Sequence[Trial], measure: Measure) -> str:
-    if not trials:
-        return ""
-    summary = summarise([_value(trial, measure) for trial in trials])
+    return _failing_cell([_value(trial, measure) for trial in trials], measure) if trials else ""
+
+
+def _failing_cell(values: Sequence[float], measure: Measure) -> str:
+    """Mean ± standard deviation, and how many failed."""
+    summary = summarise(values)
     spread = _spread(summary.mean, summary.std) if summary.failures < summary.count else "none"
     if not summary.failures:
         return spread

@@ -46,6 +46,8 @@ class Trial:
         stopped: why the run ended early, or None.
         mpc_ms_median: median wall time of a control call [ms].
         wall_s: wall time of the whole trial [s].
+        errors_cm: root mean square distance to the target before the first command and after each [cm]; empty in rows
+            of suites that were run before this was kept.
     """
 
     table: str
@@ -61,6 +63,7 @@ class Trial:
     stopped: str | None
     mpc_ms_median: float
     wall_s: float
+    errors_cm: tuple[float, ...] = ()
 
     @property
     def key(self) -> TrialKey:
@@ -87,6 +90,7 @@ def trial_of(
         stopped=run.stopped,
         mpc_ms_median=float(np.median(timed)) if len(timed) else math.nan,
         wall_s=float(wall_s),
+        errors_cm=tuple(map(float, error)),
     )
 
 
@@ -120,6 +124,7 @@ def trials_of_batch(
             stopped=None,
             mpc_ms_median=math.nan,
             wall_s=wall_s / len(error),
+            errors_cm=tuple(map(float, error[i])),
         )
         for i, (scenario, stiffness, seed) in enumerate(zip(scenarios, stiffnesses, seeds, strict=True))
     ]
@@ -188,12 +193,13 @@ def read_lines(path: str | os.PathLike[str]) -> list[tuple[int, dict[str, Any]]]
 
 
 def _parsed(fields: dict[str, Any], where: str) -> Trial:
-    expected = {field.name: field.type for field in dataclasses.fields(Trial)}
-    if set(fields) != set(expected):
-        missing, unknown = sorted(set(expected) - set(fields)), sorted(set(fields) - set(expected))
+    kinds = {field.name: field.type for field in dataclasses.fields(Trial)}
+    needed = {field.name for field in dataclasses.fields(Trial) if field.default is dataclasses.MISSING}
+    if missing_or_unknown := (needed - set(fields)) | (set(fields) - set(kinds)):
+        missing, unknown = sorted(needed & missing_or_unknown), sorted(missing_or_unknown - needed)
         raise ValueError(f"{where} is not a trial: missing fields {missing}, unknown fields {unknown}.")
     try:
-        converted = {name: _CONVERT[kind](fields[name]) for name, kind in expected.items()}
+        converted = {name: _CONVERT[kinds[name]](value) for name, value in fields.items()}
     except (TypeError, ValueError) as error:
         raise ValueError(f"{where} is not a trial: {error}.") from error
     return Trial(**converted)
@@ -204,6 +210,7 @@ _CONVERT: dict[Any, Any] = {
     "float": float,
     "int": int,
     "str | None": lambda value: None if value is None else str(value),
+    "tuple[float, ...]": lambda values: tuple(map(float, values)),
 }
 
 
