@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -9,11 +10,14 @@ from cablejax.evaluation import protocols
 from cablejax.evaluation.protocols import (
     LaidOut,
     ShapeConfig,
+    least_time,
     letter_task,
     random_shape,
     random_straight_start,
     random_task,
 )
+from cablejax.mpc import MPCConfig
+from cablejax.mpc.goal import goal_pose
 from cablejax.simulate.config import CableConfig
 from cablejax.simulate.elastica import solve_elastica
 from cablejax.simulate.equilibrium import angles_of_keypoints, chain_nodes, find_equilibrium
@@ -47,6 +51,16 @@ def test_letters_of_one_seed_start_alike():
     chord = u.start_pose[1, :2] - u.start_pose[0, :2]
     side = np.array([-chord[1], chord[0]]) @ (u.start_shape[50] - u.start_pose[0, :2])
     assert np.sign(side) == np.sign(u.start_pose[0, 2] - np.arctan2(chord[1], chord[0]))
+
+
+def test_least_time_is_that_of_the_gripper_with_the_longer_way():
+    task, config = letter_task("U", 0, CABLE), MPCConfig()
+    there = dataclasses.replace(task, start_pose=np.asarray(goal_pose(jnp.asarray(task.target.keypoints))))
+    there = dataclasses.replace(there, start_shape=task.target.keypoints)
+    assert least_time(there, config) == pytest.approx(0.0, abs=1e-4)
+    offset = np.array([[0.0, 0.03, 0.0], [0.3, 0.0, 4.0 / 3.0]])
+    moved = dataclasses.replace(there, start_pose=there.start_pose + offset)
+    assert least_time(moved, config) == pytest.approx(np.hypot(0.3, 0.2) / 0.05, rel=1e-4)
 
 
 def test_random_tasks_reproduce_and_share_their_target():

@@ -1,6 +1,7 @@
 """Suites of trials: what is run, what is kept, what is not run again."""
 
 import functools
+import re
 
 import jax
 import numpy as np
@@ -55,6 +56,7 @@ def test_a_suite_is_shared_resumed_and_read_whole(tmp_path):
     experiment = Experiment("x", "x.py", "Title", "About.", lambda: cases, (), lambda: cases, (), ("III", "IV"))
     text = page(experiment, trials, "python x.py", picture=None)
     assert "| online visual servo | 2 |" in text and "Table IV" not in text and "Seeds: 0, 1." in text
+    assert re.search(r"takes, on average: U [789]\.\d s\.", text)
 
 
 def test_cases_are_those_of_the_paper():

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from cablejax.mpc import ObjectiveConfig
-from cablejax.mpc.goal import total_turn
+from cablejax.mpc.goal import continued, goal_pose, total_turn
 from cablejax.types import History, advance
 from mpc_cases import START, TARGETS, at_rest, feasible_set, hermite_shape, poses, problem, random_motion
 
@@ -28,7 +28,8 @@ def test_objective_is_the_weighted_sum_of_squares():
     case = problem("S", terminal_weight=4.0, motion_weight=0.02)
     motion = random_motion(1)
     error = np.sum((case.rollout(motion) - case.target) ** 2, axis=(1, 2)) / case.target.shape[0]
-    expected = 0.5 * (np.dot(error, [1, 1, 1, 4]) + 0.02 * np.sum(motion**2))
+    left = np.sum(np.asarray(case.residuals(motion)[-2:]) ** 2)  # a test of its own says what that is
+    expected = 0.5 * (np.dot(error, [1, 1, 1, 4]) + 0.02 * np.sum(motion**2) + left)
     assert float(case.value(motion)) == pytest.approx(float(expected), rel=1e-5)
     shape_error = case.shape_error(case.rollout(motion))
     np.testing.assert_allclose(shape_error**2, error, rtol=1e-5)
@@ -105,14 +106,35 @@ def test_a_wound_up_cable_pays_for_more_than_half_a_turn_and_nothing_else_does()
         )
         motion = random_motion(3)
         turn = 1.7 * np.pi + np.cumsum(np.asarray(motion[:, 1, 2] - motion[:, 0, 2])) / 0.15
-        wound = np.asarray(case.residuals(motion)[-len(motion) :])
+        wound = np.asarray(case.residuals(motion)[-len(motion) - 2 : -2])
         np.testing.assert_allclose(wound, 0.15 * (turn - float(total_turn(case.target)) - np.pi), rtol=1e-9)
         assert wound.min() > 0.05
         residuals, jacobian = case.linearise(motion)
         np.testing.assert_allclose(residuals, case.residuals(motion), atol=1e-12)
         np.testing.assert_allclose(jacobian, jax.jacfwd(case.residuals)(motion).reshape(jacobian.shape), atol=1e-10)
     for name in TARGETS:
-        assert not problem(name).residuals(random_motion(4))[-4:].any()
+        assert not problem(name).residuals(random_motion(4))[-6:-2].any()
+
+
+def test_the_way_left_to_where_the_targets_ends_are_held_costs_what_it_is_longer_than_the_margin():
+    with jax.enable_x64(True):
+        case, motion = problem("U"), random_motion(3)
+        goal = goal_pose(case.target)
+        pose = continued(case.history.gripper_pose, case.history.keypoints[-1])
+        way = np.asarray(goal - pose) * [1.0, 1.0, 0.15] - np.asarray(motion.sum(axis=0))
+        left = np.linalg.norm(way, axis=1) - case.objective.arrival_margin
+        assert left.min() > 0.1
+        np.testing.assert_allclose(case.residuals(motion)[-2:], left, rtol=1e-9)
+        heavy = dataclasses.replace(case, objective=dataclasses.replace(case.objective, arrival_weight=4.0))
+        np.testing.assert_allclose(heavy.residuals(motion)[-2:], 2 * left, rtol=1e-9)
+        residuals, jacobian = case.linearise(motion)
+        np.testing.assert_allclose(residuals, case.residuals(motion), atol=1e-12)
+        np.testing.assert_allclose(jacobian, jax.jacfwd(case.residuals)(motion).reshape(jacobian.shape), atol=1e-10)
+        # on the goal itself nothing is left, and the derivative is finite
+        arrived = dataclasses.replace(case, history=dataclasses.replace(case.history, gripper_pose=goal))
+        still = jnp.zeros_like(motion)
+        assert not arrived.residuals(still)[-2:].any()
+        assert jnp.isfinite(jax.grad(arrived.value)(still)).all()
 
 
 def test_target_shape_has_no_error():

@@ -24,9 +24,12 @@ from __future__ import annotations
 import dataclasses
 from typing import Literal, Protocol
 
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from cablejax.mpc import MPCConfig
+from cablejax.mpc.goal import continued, goal_pose, way_to
 from cablejax.simulate.config import CableConfig
 from cablejax.simulate.elastica import Elastica, ElasticaError, elastica, solve_elastica
 from cablejax.simulate.equilibrium import arch_angles, chain_nodes, find_equilibrium
@@ -92,6 +95,19 @@ class Task:
     start_pose: Float[np.ndarray, "Q 3"]
     start_shape: Float[np.ndarray, "S 2"]
     target: Target
+
+
+def least_time(task: Task, config: MPCConfig) -> float:
+    """Seconds in which the grippers can get to where the target's ends are held, straight and at the motion bound.
+
+    No controller that keeps the bound arrives sooner, whatever it knows of the cable.
+    """
+    keypoints = task.start_shape[
+        np.linspace(0, len(task.start_shape) - 1, len(task.target.keypoints)).round().astype(int)
+    ]
+    pose = continued(jnp.asarray(task.start_pose), jnp.asarray(keypoints))
+    way = way_to(pose, goal_pose(jnp.asarray(task.target.keypoints)), config.objective.rotation_weight)
+    return config.objective.interval * float(jnp.linalg.norm(way, axis=1).max()) / config.radius_max
 
 
 class GuessingCable(Protocol):

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from cablejax.mpc.feasible import FeasibleSet
-from cablejax.mpc.goal import continued, total_turn
+from cablejax.mpc.goal import continued, goal_pose, total_turn, way_to
 from cablejax.residual.corrected import Dynamics
 from cablejax.types import History, advance
 
@@ -26,15 +26,21 @@ class ObjectiveConfig:
             shape the cable equally well: small enough not to be felt, large enough to make the problem well posed.
         rotation_weight: w [m/rad], the length that a rotation of one radian counts as.
         interval: duration of one control step [s].
+        arrival_weight: weight of the squared way that is left, at the end of the plan, to where the target's ends are
+            held. The keypoints say little about how the grippers must turn until the shape is nearly there, and a plan
+            that sees six steps ahead turns them last; so the far way is made shorter from the start.
+        arrival_margin: what is left of that way within this counts nothing, the keypoints alone decide there [m].
     """
 
     terminal_weight: float = 1.0
     motion_weight: float = 1e-3
     rotation_weight: float = 0.15
     interval: float = 1.0
+    arrival_weight: float = 1.0
+    arrival_margin: float = 0.05
 
     def __post_init__(self):
-        for name in ("terminal_weight", "motion_weight"):
+        for name in ("terminal_weight", "motion_weight", "arrival_weight", "arrival_margin"):
             if not getattr(self, name) >= 0:
                 raise ValueError(f"ObjectiveConfig.{name} is {getattr(self, name)}, expected a number >= 0.")
         for name in ("rotation_weight", "interval"):
@@ -56,11 +62,13 @@ class ShapingProblem:
     """Bring the cable to a target shape within a horizon (Wang et al., RA-L 2022, "Model Predictive Control").
 
         min over u in feasible   1/2 sum_t [ w_t / N ||X(t) - X_d||^2 + motion_weight ||u(t - 1)||^2 + l(t)^2 ]
+                                 + 1/2 arrival_weight sum_q max(||way_q(T)|| - arrival_margin, 0)^2
         with X(t + 1) = X(t) + f(X(t - m : t), R(t)),   R = `objective.to_twist(u)`,   t = 1, ..., T
 
-    The last term is zero unless the cable is wound up: `l = rotation_weight max(|turn - turn_d| - pi, 0)`, where turn
-    is the angle from one gripper's theta to the other's along the cable. A loop cannot be shaped away with the
-    grippers' directions as they are, and next to it the keypoint error alone has a minimum.
+    l is zero unless the cable is wound up: `l = rotation_weight max(|turn - turn_d| - pi, 0)`, where turn is the angle
+    from one gripper's theta to the other's along the cable. A loop cannot be shaped away with the grippers' directions
+    as they are, and next to it the keypoint error alone has a minimum. way_q(T) is the motion that takes gripper q from
+    the end of the plan to where the target's ends are held (`goal.way_to`). Both are ours, not the paper's.
 
     It is a nonlinear least squares problem: `value` is half the squared norm of `residuals`. All methods are pure and
     differentiable in `motion`, `history`, `target` and `weights` as far as `dynamics` is.
@@ -91,8 +99,8 @@ class ShapingProblem:
         return jax.lax.scan(one_step, self.history, self.objective.to_twist(motion))[1]
 
     def residuals(self, motion: Float[Array, "T Q 3"]) -> Float[Array, " M"]:
-        """Weighted shape errors of all predicted steps, weighted motions, winding [m]; M = T (2N + 3Q + 1)."""
-        return jnp.concatenate([self._weigh(self.rollout(motion) - self.target, motion), self._winding(motion)])
+        """Shape errors of all predicted steps, motions, winding, way left, weighted [m]; M = T (2N + 3Q + 1) + Q."""
+        return jnp.concatenate([self._weigh(self.rollout(motion) - self.target, motion), self._of_grippers(motion)])
 
     def value(self, motion: Float[Array, "T Q 3"]) -> Float[Array, ""]:
         """The objective, half the sum of squared residuals [m^2]."""
@@ -106,7 +114,6 @@ class ShapingProblem:
         mode carries P tangents through T steps, one after the other: work that grows with the square of the
         horizon.
         """
-        n_steps = len(motion)
         twist = self.objective.to_twist(motion)
 
         def roll(history, command):
@@ -134,9 +141,9 @@ class ShapingProblem:
 
         slope = jnp.swapaxes(jax.lax.scan(one_step, still, (of_steps, unit_twists))[1], 0, 1)
         jacobian = jax.vmap(self._weigh)(slope, unit_motions).T
-        residuals = jnp.concatenate([self._weigh(shapes - self.target, motion), self._winding(motion)])
-        winding = jax.jacfwd(self._winding)(motion).reshape(n_steps, motion.size)
-        return residuals, jnp.concatenate([jacobian, winding])
+        residuals = jnp.concatenate([self._weigh(shapes - self.target, motion), self._of_grippers(motion)])
+        of_grippers = jax.jacfwd(self._of_grippers)(motion).reshape(-1, motion.size)
+        return residuals, jnp.concatenate([jacobian, of_grippers])
 
     def shape_error(self, keypoints: Float[Array, "*batch N 2"]) -> Float[Array, "*batch"]:
         """Root mean square distance of keypoints to the target [m]."""
@@ -162,9 +169,13 @@ class ShapingProblem:
         shape = jnp.sqrt(weight / n_keypoints)[:, None, None] * shape_error
         return jnp.concatenate([shape.ravel(), self.objective.motion_weight**0.5 * motion.ravel()])
 
-    def _winding(self, motion: Float[Array, "T Q 3"]) -> Float[Array, " T"]:
-        """By how much more than half a turn the cable is wound up after every step, as a length [m]."""
-        theta = continued(self.history.gripper_pose, self.history.keypoints[-1])[:, 2]
-        turn = theta[1] - theta[0] + jnp.cumsum(motion[:, 1, 2] - motion[:, 0, 2]) / self.objective.rotation_weight
-        excess = jnp.abs(turn - total_turn(self.target)) - jnp.pi
-        return self.objective.rotation_weight * jnp.maximum(excess, 0.0)
+    def _of_grippers(self, motion: Float[Array, "T Q 3"]) -> Float[Array, " T+Q"]:
+        """What the grippers' poses cost: winding after every step, and the weighted way left after the last one [m]."""
+        pose, weight = continued(self.history.gripper_pose, self.history.keypoints[-1]), self.objective.rotation_weight
+        turn = pose[1, 2] - pose[0, 2] + jnp.cumsum(motion[:, 1, 2] - motion[:, 0, 2]) / weight
+        wound = weight * jnp.maximum(jnp.abs(turn - total_turn(self.target)) - jnp.pi, 0.0)
+        way = way_to(pose, goal_pose(self.target), weight) - motion.sum(axis=0)
+        # the bound keeps the derivative finite where nothing is left
+        length = jnp.sqrt(jnp.maximum(jnp.sum(way**2, axis=1), 1e-12))
+        left = jnp.maximum(length - self.objective.arrival_margin, 0.0)
+        return jnp.concatenate([wound, self.objective.arrival_weight**0.5 * left])
