@@ -20,7 +20,7 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Float, Int
 
 from cablejax.closed_loop import settling_time
-from cablejax.mpc.controller import ControlInfo, ControllerState, MPCConfig, control, initial_state
+from cablejax.mpc import ControlInfo, ControllerState, MPCConfig, control, initial_state
 from cablejax.residual.corrected import Dynamics
 from cablejax.simulate.compile import compiler_options
 from cablejax.simulate.config import CableConfig
@@ -61,11 +61,11 @@ class MpcPolicy:
     dynamics: Dynamics
 
     def begin(self, history: History) -> ControllerState:
-        """See `mpc.controller.initial_state`."""
+        """See `mpc.initial_state`."""
         return initial_state(self.config, history)
 
     def act(self, weights, target, state, keypoints, gripper_pose) -> tuple[ControllerState, Array, ControlInfo]:
-        """See `mpc.controller.control`."""
+        """See `mpc.control`."""
         return control(self.config, self.dynamics, weights, target, state, keypoints, gripper_pose)
 
 

@@ -2,7 +2,9 @@
 
 from cablejax.mpc.accurate import Accurate
 from cablejax.mpc.cem import CrossEntropy
-from cablejax.mpc.controller import ControlInfo, Controller, ControllerState, MPCConfig, control, initial_state
+from cablejax.mpc.config import MPCConfig
+from cablejax.mpc.controller import Controller, control
+from cablejax.mpc.controller_state import ControlInfo, ControllerState, initial_state
 from cablejax.mpc.feasible import FeasibleSet, feasible_from, project_ball
 from cablejax.mpc.mppi import PathIntegral
 from cablejax.mpc.multi_start import multi_start, random_starts

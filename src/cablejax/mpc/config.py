@@ -1,0 +1,107 @@
+"""Settings of the receding-horizon controller."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+
+from cablejax.adaptation.belief import AdaptationConfig
+from cablejax.mpc.plan import Solver
+from cablejax.mpc.problem import ObjectiveConfig
+from cablejax.mpc.trust_region import TrustRegion
+from cablejax.residual.ridge import RidgeConfig
+
+
+@dataclasses.dataclass(frozen=True)
+class MPCConfig:
+    """Settings of the controller. The defaults are those of Wang et al., RA-L 2022, where it gives them.
+
+    Attributes:
+        horizon: h; a plan has h + 1 commands.
+        cable_length: free length of the cable L [m].
+        min_distance: least distance of the grippers, relative to L.
+        max_distance: greatest distance of the grippers, relative to L: a taut cable cannot be shaped.
+        workspace: lowest and highest corner (x, y) of where the grippers may be [m]; None = anywhere.
+        max_change: greatest norm of the change of a gripper's motion from one step to the next [m]: it bounds the
+            acceleration. Then holding means to brake, which may take steps. None = any.
+        radius: initial trust-region size epsilon, the bound on one step's motion of each gripper [m].
+        radius_min: it does not shrink below this [m].
+        radius_max: nor grow above this [m]: the model has not been trained on faster motions.
+        grow_above: eta+; the radius grows if actual over predicted error reduction is at least this.
+        shrink_below: eta-; it shrinks if the ratio is at most this.
+        grow: tau+.
+        shrink: tau-.
+        min_reduction: predicted changes of the error below this say nothing about the model: the radius stays [m].
+        hold_improvement: the grippers hold still if the plan lowers the error over the horizon, as a root mean square
+            distance, by less than this compared with holding still [m].
+        travel_beyond: where no plan is better than holding, and the way to where the target's ends are held is longer
+            than this [m], the grippers travel there by the straight way: the plans are in a valley of the objective.
+        max_travels: how often that may happen; a valley that is fallen into again and again is the model's.
+        objective: weights and units of the planning problem.
+        residual: settings of the online residual; None = trust the offline model.
+        adaptation: settings of the online estimate of the cable, for a conditioned model; None = no estimate.
+        solver: any `Solver`.
+    """
+
+    horizon: int = 5
+    cable_length: float = 1.0
+    min_distance: float = 0.15
+    max_distance: float = 0.99
+    workspace: tuple[tuple[float, float], tuple[float, float]] | None = None
+    max_change: float | None = None
+    radius: float = 0.05
+    radius_min: float = 0.002
+    radius_max: float = 0.05
+    grow_above: float = 0.8
+    shrink_below: float = 0.4
+    grow: float = 1.05
+    shrink: float = 0.95
+    min_reduction: float = 1e-4
+    hold_improvement: float = 2e-5
+    travel_beyond: float = 0.08
+    max_travels: int = 3
+    objective: ObjectiveConfig = ObjectiveConfig()
+    residual: RidgeConfig | None = RidgeConfig(forgetting=0.5, outlier=0.02)
+    adaptation: AdaptationConfig | None = None
+    solver: Solver = TrustRegion()
+
+    def __post_init__(self):
+        if self.horizon < 0:
+            raise ValueError(f"MPCConfig.horizon is {self.horizon}, expected at least 0 (plan one command).")
+        if not (math.isfinite(self.cable_length) and self.cable_length > 0):
+            raise ValueError(f"MPCConfig.cable_length is {self.cable_length}, expected a positive length [m].")
+        if not 0 <= self.min_distance < self.max_distance <= 1:
+            raise ValueError(
+                f"MPCConfig distances {self.min_distance} to {self.max_distance}: expected 0 <= min_distance < "
+                "max_distance <= 1, relative to the cable's length."
+            )
+        if self.workspace is not None:
+            corners = np.asarray(self.workspace, float)
+            if corners.shape != (2, 2) or not (corners[0] < corners[1]).all():
+                raise ValueError(
+                    f"MPCConfig.workspace is {self.workspace}, expected ((x, y) of the lowest, (x, y) of the highest "
+                    "corner) [m]."
+                )
+        if self.max_change is not None and not self.max_change > 0:
+            raise ValueError(f"MPCConfig.max_change is {self.max_change}, expected a positive length [m] or None.")
+        if not 0 < self.radius_min <= self.radius <= self.radius_max:
+            raise ValueError(
+                f"MPCConfig radii {self.radius_min}, {self.radius}, {self.radius_max}: expected "
+                "0 < radius_min <= radius <= radius_max."
+            )
+        if not (self.shrink_below < self.grow_above and 0 < self.shrink <= 1 <= self.grow):
+            raise ValueError(
+                f"MPCConfig trust region: thresholds {self.shrink_below}, {self.grow_above} must increase, and factors "
+                f"{self.shrink}, {self.grow} lie on either side of 1."
+            )
+        if not (self.travel_beyond > 0 and self.max_travels >= 0):
+            raise ValueError("MPCConfig.travel_beyond must be positive [m] and max_travels not negative.")
+        if not (self.min_reduction > 0 and self.hold_improvement >= 0):
+            raise ValueError("MPCConfig.min_reduction must be positive and hold_improvement not negative [m].")
+
+    @property
+    def n_commands(self) -> int:
+        """Commands of a plan, T = h + 1."""
+        return self.horizon + 1
