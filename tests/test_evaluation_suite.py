@@ -1,5 +1,6 @@
 """Suites of trials: what is run, what is kept, what is not run again."""
 
+import dataclasses
 import functools
 import re
 
@@ -56,6 +57,9 @@ def test_a_suite_is_shared_resumed_and_read_whole(tmp_path):
     experiment = Experiment("x", "x.py", "Title", "About.", lambda: cases, (), lambda: cases, (), ("III", "IV"))
     text = page(experiment, trials, "python x.py", picture=None)
     assert "| online visual servo | 2 |" in text and "Table IV" not in text and "Seeds: 0, 1." in text
+    assert "earlier version" not in text
+    old = [dataclasses.replace(trial, errors_cm=()) for trial in trials[:1]]
+    assert "1 of the trials (online visual servo) were run by" in page(experiment, [*old, trials[1]], "", picture=None)
     assert re.search(r"takes, on average: U [789]\.\d s\.", text)
 
 

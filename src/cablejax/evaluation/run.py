@@ -116,6 +116,13 @@ def page(experiment: Experiment, trials: Sequence[Trial], command: str, picture:
             lines += [tables.success_table(mine, labels=LABEL)]
             continue
         lines += [tables.comparison_table(mine, table, labels=LABEL)]
+        if earlier := [trial for trial in mine if not trial.errors_cm]:
+            names = ", ".join(LABEL[name] for name in dict.fromkeys(trial.method for trial in earlier))
+            lines += [
+                "",
+                f"{len(earlier)} of the trials ({names}) were run by an earlier version, with another planner; it did "
+                "not keep the errors on the way.",
+            ]
         if any(trial.errors_cm for trial in mine):
             least = least_times(experiment, {trial.key[:1] + trial.key[2:] for trial in mine})
             lines += ["", "### Settling time by other definitions", "", f"{SETTLING_NOTE} {least}"]

@@ -29,7 +29,8 @@ class ObjectiveConfig:
         arrival_weight: weight of the squared way that is left, at the end of the plan, to where the target's ends are
             held. The keypoints say little about how the grippers must turn until the shape is nearly there, and a plan
             that sees six steps ahead turns them last; so the far way is made shorter from the start.
-        arrival_margin: what is left of that way within this counts nothing, the keypoints alone decide there [m].
+        arrival_margin: what is left of that way within this counts nothing, the keypoints alone decide there [m]: how
+            the ends are held is read off the target's keypoints (`goal.goal_pose`), and is not known to a hair.
     """
 
     terminal_weight: float = 1.0
