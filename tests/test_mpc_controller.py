@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from cablejax.mpc import Controller, MPCConfig, Outcome, ProjectedGradient, TrustRegion, time_control
-from cablejax.mpc.goal import goal_pose
+from cablejax.mpc.goal import straightened
 from cablejax.types import History
 from mpc_cases import START, TARGETS, at_rest, hermite_shape, relaxing_cable
 
@@ -181,18 +181,27 @@ def stubborn_cable(weights, history, twist):
     return away.at[jnp.array([0, -1])].set(twist[:, :2])
 
 
-def test_out_of_a_valley_the_grippers_travel_to_where_the_target_is_held():
+def test_where_no_plan_helps_the_cable_is_straightened():
     control = controller("S", WITHOUT, rate=5.0, dynamics=stubborn_cable)
-    cable = Cable(rate=0.8, sag=0.0)
-    state, twists, info = run(control, cable, 30)
-    travelled = info.outcome == Outcome.TRAVELLING
-    assert info.outcome[0] == Outcome.TRAVELLING and (info.outcome[~travelled] == Outcome.HELD).all()
+    cable = Cable(rate=0.8, sag=0.0, pose=[[0.0, 0.0, 0.6], [0.7, 0.1, -0.6]])
+    state, twists, info = run(control, cable, 20)
+    count = int((info.outcome == Outcome.RESTARTING).sum())
+    assert count > 2 and (info.outcome[:count] == Outcome.RESTARTING).all(), "at once, and in one go"
+    assert (info.outcome[count:] == Outcome.HELD).all() and int(state.restarts) == 1
     assert (np.linalg.norm(twists * [1, 1, 0.15], axis=-1) <= 0.05 * (1 + 1e-5)).all()
-    way = (np.asarray(goal_pose(control.target)) - cable.pose) * [1, 1, 0.15]
-    assert np.linalg.norm(way, axis=1).max() < 0.05, "it ends a step before the goal, where planning takes over"
-    assert int(state.travels) == 1 and int(state.travel) == 0
-    never = dataclasses.replace(control, config=dataclasses.replace(WITHOUT, max_travels=0))
-    assert (run(never, Cable(rate=0.8, sag=0.0), 3)[2].outcome == Outcome.HELD).all()
+    way = (np.asarray(straightened(control.target, 0.99)) - cable.pose) * [1, 1, 0.15]
+    assert np.linalg.norm(way, axis=1).max() < 0.05, "it ends a step before that, where planning takes over"
+    never = dataclasses.replace(control, config=dataclasses.replace(WITHOUT, max_restarts=0))
+    assert (run(never, cable, 3)[2].outcome == Outcome.HELD).all()
+
+
+def test_a_cable_that_comes_no_nearer_is_straightened_as_often_as_allowed():
+    config = dataclasses.replace(WITHOUT, restart_after=3, max_restarts=1)
+    state, twists, info = run(controller("U", config), Cable(rate=0.0, sag=0.0), 45)
+    begun = np.diff(np.asarray(info.outcome == Outcome.RESTARTING).astype(int), prepend=0) == 1
+    assert begun.sum() == 1 == int(state.restarts)
+    assert np.flatnonzero(begun)[0] >= 3 and np.isfinite(info.objective).all()
+    assert (np.linalg.norm(twists * [1, 1, 0.15], axis=-1) <= 0.05 * (1 + 1e-5)).all()
 
 
 @pytest.mark.slow

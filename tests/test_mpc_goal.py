@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from cablejax.mpc.goal import continued, goal_pose, straight_plan, total_turn
+from cablejax.mpc.goal import continued, goal_pose, straight_plan, straightened, total_turn
 from cablejax.targets import make_target
 
 
@@ -50,3 +50,13 @@ def test_turn_is_read_off_the_keypoints_whole_turns_included(turn):
     assert float(continued(pose, keypoints)[1, 2]) == pytest.approx(0.3 + turn, abs=1e-5)
     goal = np.asarray(goal_pose(keypoints))
     np.testing.assert_allclose(goal[:, 2], [0.3, 0.3 + turn], atol=0.03)
+
+
+def test_straightened_is_along_the_chord_around_its_middle():
+    target = jnp.asarray([[0.1, 0.2], [0.3, 0.9], [0.5, 0.6]])
+    pose = np.asarray(straightened(target, 0.9))
+    np.testing.assert_allclose(pose[:, :2].mean(axis=0), [0.3, 0.4], atol=1e-6)
+    np.testing.assert_allclose(pose[1, :2] - pose[0, :2], 0.9 * np.array([1.0, 1.0]) / np.sqrt(2), atol=1e-6)
+    np.testing.assert_allclose(pose[:, 2], np.pi / 4, atol=1e-6)
+    closed = straightened(jnp.zeros((3, 2)), 0.9)
+    assert np.isfinite(closed).all(), "ends that meet have no chord: any direction will do"

@@ -36,9 +36,11 @@ class MPCConfig:
         min_reduction: predicted changes of the error below this say nothing about the model: the radius stays [m].
         hold_improvement: the grippers hold still if the plan lowers the error over the horizon, as a root mean square
             distance, by less than this compared with holding still [m].
-        travel_beyond: where no plan is better than holding, and the way to where the target's ends are held is longer
-            than this [m], the grippers travel there by the straight way: the plans are in a valley of the objective.
-        max_travels: how often that may happen; a valley that is fallen into again and again is the model's.
+        restart_above: where the error stays above this [m], the cable is in another shape than the target's, between
+            the same grippers or others. No plan of a few steps leads out: it is straightened, and begun anew.
+        restart_after: commands without a lower error after which it counts as staying; at once where no plan is better
+            than holding still.
+        max_restarts: how often that may happen; a shape that is fallen into again and again is the model's.
         objective: weights and units of the planning problem.
         residual: settings of the online residual; None = trust the offline model.
         adaptation: settings of the online estimate of the cable, for a conditioned model; None = no estimate.
@@ -60,8 +62,9 @@ class MPCConfig:
     shrink: float = 0.95
     min_reduction: float = 1e-4
     hold_improvement: float = 2e-5
-    travel_beyond: float = 0.08
-    max_travels: int = 3
+    restart_above: float = 0.05
+    restart_after: int = 12
+    max_restarts: int = 3
     objective: ObjectiveConfig = ObjectiveConfig()
     residual: RidgeConfig | None = RidgeConfig(forgetting=0.5, outlier=0.02)
     adaptation: AdaptationConfig | None = None
@@ -96,8 +99,11 @@ class MPCConfig:
                 f"MPCConfig trust region: thresholds {self.shrink_below}, {self.grow_above} must increase, and factors "
                 f"{self.shrink}, {self.grow} lie on either side of 1."
             )
-        if not (self.travel_beyond > 0 and self.max_travels >= 0):
-            raise ValueError("MPCConfig.travel_beyond must be positive [m] and max_travels not negative.")
+        if not (self.restart_above > 0 and self.restart_after >= 1 and self.max_restarts >= 0):
+            raise ValueError(
+                f"MPCConfig restarts: above {self.restart_above} m, after {self.restart_after} commands, at most "
+                f"{self.max_restarts}: expected a positive length, at least 1, and none or more."
+            )
         if not (self.min_reduction > 0 and self.hold_improvement >= 0):
             raise ValueError("MPCConfig.min_reduction must be positive and hold_improvement not negative [m].")
 

@@ -15,8 +15,9 @@ from cablejax.adaptation.belief import CableBelief, update
 from cablejax.mpc.config import MPCConfig
 from cablejax.mpc.controller_state import ControlInfo, ControllerState, initial_state
 from cablejax.mpc.edge import check_observation, check_start, check_target
-from cablejax.mpc.fallback import plan_or_hold, plan_or_travel
+from cablejax.mpc.fallback import plan_or_hold, plan_or_restart
 from cablejax.mpc.feasible import FeasibleSet, feasible_from
+from cablejax.mpc.goal import goal_pose, straightened
 from cablejax.mpc.problem import ShapingProblem
 from cablejax.mpc.start import find_starts, find_straight_way
 from cablejax.residual.corrected import Dynamics, corrected
@@ -60,10 +61,12 @@ def control(
     error = problem.shape_error(state.history.keypoints[-1])
     rho, radius = _update_radius(config, state, error, problem.shape_error(state.predicted))
     problem = dataclasses.replace(problem, feasible=dataclasses.replace(problem.feasible, radius=radius))
-    way = find_straight_way(config, problem)
-    start = find_starts(config, problem, state.plan, way)
+    way = find_straight_way(config, problem, goal_pose(problem.target))
+    apart = straightened(problem.target, config.max_distance * config.cable_length)
+    straight = find_straight_way(config, problem, apart)
+    start = find_starts(config, problem, state.plan, way, straight)
     plan = plan_or_hold(config, config.solver(problem, start.guess), start)
-    plan, travel = plan_or_travel(config, state, way, radius, plan, start.value_way)
+    plan, state = plan_or_restart(config, state, error, straight, radius, plan, start.value_straight)
 
     twist = config.objective.to_twist(plan.motion[0])
     offline, cable = _displacement(dynamics, weights, state, twist)
@@ -89,8 +92,6 @@ def control(
     state = dataclasses.replace(
         state,
         plan=plan.motion,
-        travel=travel,
-        travels=state.travels + ((travel > 0) & (state.travel == 0)),
         cable=cable,
         twist=twist,
         model_displacement=offline,

@@ -30,8 +30,10 @@ class ControllerState:
         observed: keypoints seen at the last step, shape [N].
         shape_error: root mean square distance to the target at the last step [m], shape [].
         radius: trust-region size epsilon [m], shape [].
-        travel: commands left of a way to the target's ends, shape []; 0 = planning.
-        travels: how many such ways were begun, shape [].
+        best_error: lowest shape error since the last restart [m], shape [].
+        since_best: commands since it fell by a hundredth or more, shape [].
+        restarting: commands left for straightening the cable, shape []; 0 = planning.
+        restarts: how often that was begun, shape [].
         cable: what is believed of the cable, and the derivative of `model_displacement` by it [m], shape [N, 2, 2];
             None without adaptation.
         steps: control steps so far, shape [].
@@ -49,8 +51,10 @@ class ControllerState:
     observed: Bool[Array, "*batch N"]
     shape_error: Float[Array, "*batch"]
     radius: Float[Array, "*batch"]
-    travel: Int[Array, "*batch"]
-    travels: Int[Array, "*batch"]
+    best_error: Float[Array, "*batch"]
+    since_best: Int[Array, "*batch"]
+    restarting: Int[Array, "*batch"]
+    restarts: Int[Array, "*batch"]
     cable: tuple[CableBelief, Float[Array, "*batch N 2 2"]] | None
     steps: Int[Array, "*batch"]
     held: Int[Array, "*batch"]
@@ -111,8 +115,10 @@ def initial_state(config: MPCConfig, history: History) -> ControllerState:
         observed=jnp.ones(n_keypoints, bool),
         shape_error=jnp.zeros((), dtype),
         radius=jnp.asarray(config.radius, dtype),
-        travel=jnp.zeros((), jnp.int32),
-        travels=jnp.zeros((), jnp.int32),
+        best_error=jnp.asarray(jnp.inf, dtype),
+        since_best=jnp.zeros((), jnp.int32),
+        restarting=jnp.zeros((), jnp.int32),
+        restarts=jnp.zeros((), jnp.int32),
         cable=cable,
         steps=jnp.zeros((), jnp.int32),
         held=jnp.zeros((), jnp.int32),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 
 from cablejax.mpc.config import MPCConfig
 from cablejax.mpc.controller_state import ControllerState
@@ -30,21 +30,39 @@ def plan_or_hold(config: MPCConfig, plan: Plan, start: Starts) -> Plan:
     )
 
 
-def plan_or_travel(
+def plan_or_restart(
     config: MPCConfig,
     state: ControllerState,
-    way: StraightWay,
+    error: Float[Array, ""],
+    straight: StraightWay,
     radius: Float[Array, ""],
     plan: Plan,
-    value_way: Float[Array, ""],
-) -> tuple[Plan, Int[Array, ""]]:
-    """The plan, or the next step of a straight way out of a valley; and how many steps of the way are left."""
-    stuck = (plan.outcome == Outcome.HELD) & (way.length > config.travel_beyond) & (state.travels < config.max_travels)
+    value_straight: Float[Array, ""],
+) -> tuple[Plan, ControllerState]:
+    """The plan, or the next step of straightening the cable; and the state with what is counted for that.
+
+    A cable has several shapes between the same grippers, and near another one than the target's every plan of a few
+    steps makes the error worse before it makes it better. From the straight cable the target can be reached.
+    """
+    better = error < 0.99 * state.best_error
+    since = jnp.where(better, 0, state.since_best + 1)
+    staying = (plan.outcome == Outcome.HELD) | (since >= config.restart_after)
+    stuck = staying & (error > config.restart_above) & (state.restarts < config.max_restarts)
     # half as many steps again as the way is long: the bounds on the grippers' distance may lead it round
-    needed = jnp.ceil(1.5 * way.length / radius).astype(jnp.int32)
-    left = jnp.where(state.travel > 0, state.travel - 1, jnp.where(stuck, needed, 0))
-    left = jnp.where((way.length > radius) & (plan.outcome != Outcome.NONFINITE), left, 0)
-    travelling = left > 0
-    outcome = jnp.where(travelling, Outcome.TRAVELLING, plan.outcome).astype(jnp.int32)
-    motion, value = jnp.where(travelling, way.motion, plan.motion), jnp.where(travelling, value_way, plan.value)
-    return dataclasses.replace(plan, motion=motion, value=value, outcome=outcome), left
+    needed = jnp.ceil(1.5 * straight.length / radius).astype(jnp.int32)
+    left = jnp.where(state.restarting > 0, state.restarting - 1, jnp.where(stuck, needed, 0))
+    left = jnp.where((straight.length > radius) & (plan.outcome != Outcome.NONFINITE), left, 0)
+    restarting = left > 0
+    state = dataclasses.replace(
+        state,
+        best_error=jnp.where(restarting, jnp.inf, jnp.where(better, error, state.best_error)).astype(error.dtype),
+        since_best=jnp.where(restarting, 0, since),
+        restarting=left,
+        restarts=state.restarts + (restarting & (state.restarting == 0)),
+    )
+    motion, value = (
+        jnp.where(restarting, straight.motion, plan.motion),
+        jnp.where(restarting, value_straight, plan.value),
+    )
+    outcome = jnp.where(restarting, Outcome.RESTARTING, plan.outcome).astype(jnp.int32)
+    return dataclasses.replace(plan, motion=motion, value=value, outcome=outcome), state

@@ -32,6 +32,19 @@ def goal_pose(target: Float[Array, "N 2"]) -> Float[Array, "2 3"]:
     return jnp.concatenate([target[jnp.array([0, -1])], heading[:, None]], axis=1)
 
 
+def straightened(target: Float[Array, "N 2"], distance: float) -> Float[Array, "2 3"]:
+    """(x, y, theta) of the two grippers holding a straight cable along the target's chord, around its middle.
+
+    From there stable shapes lead to every target (Borum and Bretl, ICRA 2015), whatever shape the cable had before.
+    """
+    first, last = target[0], target[-1]
+    chord = last - first
+    heading = jnp.arctan2(chord[1], chord[0])
+    half = 0.5 * distance * jnp.stack([jnp.cos(heading), jnp.sin(heading)])
+    middle = 0.5 * (first + last)
+    return jnp.concatenate([jnp.stack([middle - half, middle + half]), jnp.full((2, 1), heading)], axis=1)
+
+
 def continued(pose: Float[Array, "2 3"], keypoints: Float[Array, "N 2"]) -> Float[Array, "2 3"]:
     """Gripper poses with whole turns added to theta of the second, so that it continues that of the first along the
     cable."""

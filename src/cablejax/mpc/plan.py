@@ -28,7 +28,7 @@ class Outcome(enum.IntEnum):
     """The plan would hardly improve on holding still: the grippers hold."""
     NONFINITE = 3
     """The model or the observation gave NaN or infinity: the grippers hold."""
-    TRAVELLING = 4
+    RESTARTING = 4
     """No plan was better than holding, far from where the target's ends are held: the grippers go there."""
     INFEASIBLE = 5
     """The bounds contradict each other: there is no feasible plan, and the grippers hold."""
@@ -46,7 +46,7 @@ _MESSAGES = {
     Outcome.STEP_LIMIT: "The budget was used up; the plan is feasible and no worse than the guess. Raise the limit.",
     Outcome.HELD: "Holding still is as good as the best plan found.",
     Outcome.NONFINITE: "The model gave NaN or infinity; the grippers hold. Check weights, history and target.",
-    Outcome.TRAVELLING: "The grippers travel to where the target's ends are held.",
+    Outcome.RESTARTING: "The cable is being straightened: it was in another shape than the target's.",
     Outcome.INFEASIBLE: "The bounds contradict each other; the grippers hold. Check distances, radius and workspace.",
     Outcome.STALLED: "No step improves the plan by more than rounding; use float64 for a smaller tolerance.",
 }

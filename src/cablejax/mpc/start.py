@@ -9,12 +9,12 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from cablejax.mpc.config import MPCConfig
-from cablejax.mpc.goal import continued, goal_pose, straight_plan, way_to
+from cablejax.mpc.goal import continued, straight_plan, way_to
 from cablejax.mpc.problem import ShapingProblem
 
 
 class StraightWay(NamedTuple):
-    """The straight way to where the target's ends are held.
+    """The straight way to a pair of gripper poses.
 
     Attributes:
         motion: its first steps, feasible [m], shape [T, Q, 3].
@@ -25,9 +25,9 @@ class StraightWay(NamedTuple):
     length: Float[Array, ""]
 
 
-def find_straight_way(config: MPCConfig, problem: ShapingProblem) -> StraightWay:
-    """The straight way from where the grippers are; a step's length is the problem's radius."""
-    pose, goal = continued(problem.history.gripper_pose, problem.history.keypoints[-1]), goal_pose(problem.target)
+def find_straight_way(config: MPCConfig, problem: ShapingProblem, goal: Float[Array, "2 3"]) -> StraightWay:
+    """The straight way from where the grippers are to a pair of poses; a step's length is the problem's radius."""
+    pose = continued(problem.history.gripper_pose, problem.history.keypoints[-1])
     weight = config.objective.rotation_weight
     motion = straight_plan(pose, goal, problem.feasible.radius, weight, config.n_commands)
     length = jnp.linalg.norm(way_to(pose, goal, weight), axis=1).max()
@@ -40,32 +40,35 @@ class Starts(NamedTuple):
     Attributes:
         guess: the better of two starts: the last plan, shifted by the command that was executed, and the straight way
             [m], shape [T, Q, 3].
-        value_way: objective of the straight way [m^2], shape [].
         still: holding, or where motions may not change at once, braking [m], shape [T, Q, 3].
         value_still: its objective [m^2], shape [].
+        value_straight: that of straightening the cable [m^2], shape [].
     """
 
     guess: Float[Array, "T Q 3"]
-    value_way: Float[Array, ""]
     still: Float[Array, "T Q 3"]
     value_still: Float[Array, ""]
+    value_straight: Float[Array, ""]
 
 
-def find_starts(config: MPCConfig, problem: ShapingProblem, last: Float[Array, "T Q 3"], way: StraightWay) -> Starts:
+def find_starts(
+    config: MPCConfig, problem: ShapingProblem, last: Float[Array, "T Q 3"], way: StraightWay, straight: StraightWay
+) -> Starts:
     """What may be begun from, and what it is worth.
 
     Args:
         config: settings.
         problem: of this step.
         last: the last plan, its first command executed [m].
-        way: the straight way.
+        way: to where the target's ends are held.
+        straight: to a straight cable.
     """
     still = jnp.zeros_like(last)
     if config.max_change is not None:
         # grippers that move brake first, as fast as they may
         still = problem.feasible.project(still)
     shifted = jnp.roll(last, -1, axis=0).at[-1].set(0.0)
-    motions = jnp.stack([problem.feasible.project(shifted), way.motion, still])
+    motions = jnp.stack([problem.feasible.project(shifted), way.motion, still, straight.motion])
     values = jax.vmap(problem.value)(motions)
     guesses = jnp.where(jnp.isfinite(values[:2]), values[:2], jnp.inf)
-    return Starts(motions[jnp.argmin(guesses)], values[1], still, values[2])
+    return Starts(motions[jnp.argmin(guesses)], still, values[2], values[3])
