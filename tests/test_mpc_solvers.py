@@ -54,7 +54,7 @@ def reference(name):
             jac=True,
             method="SLSQP",
             constraints={"type": "ineq", "fun": slack},
-            options={"ftol": 1e-12, "maxiter": 300},
+            options={"ftol": 1e-10, "maxiter": 300},
         )
         assert out.success, out.message
         return out.fun / 1e2
