@@ -102,10 +102,7 @@ def least_time(task: Task, config: MPCConfig) -> float:
 
     No controller that keeps the bound arrives sooner, whatever it knows of the cable.
     """
-    keypoints = task.start_shape[
-        np.linspace(0, len(task.start_shape) - 1, len(task.target.keypoints)).round().astype(int)
-    ]
-    pose = continued(jnp.asarray(task.start_pose), jnp.asarray(keypoints))
+    pose = continued(jnp.asarray(task.start_pose), jnp.asarray(task.start_shape))
     way = way_to(pose, goal_pose(jnp.asarray(task.target.keypoints)), config.objective.rotation_weight)
     return config.objective.interval * float(jnp.linalg.norm(way, axis=1).max()) / config.radius_max
 

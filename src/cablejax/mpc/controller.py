@@ -17,7 +17,7 @@ from cablejax.mpc.controller_state import ControlInfo, ControllerState, initial_
 from cablejax.mpc.edge import check_observation, check_start, check_target
 from cablejax.mpc.fallback import plan_or_hold, plan_or_restart
 from cablejax.mpc.feasible import FeasibleSet, feasible_from
-from cablejax.mpc.goal import goal_pose, straightened
+from cablejax.mpc.goal import goal_pose
 from cablejax.mpc.problem import ShapingProblem
 from cablejax.mpc.start import find_starts, find_straight_way
 from cablejax.residual.corrected import Dynamics, corrected
@@ -62,11 +62,9 @@ def control(
     rho, radius = _update_radius(config, state, error, problem.shape_error(state.predicted))
     problem = dataclasses.replace(problem, feasible=dataclasses.replace(problem.feasible, radius=radius))
     way = find_straight_way(config, problem, goal_pose(problem.target))
-    apart = straightened(problem.target, config.max_distance * config.cable_length)
-    straight = find_straight_way(config, problem, apart)
-    start = find_starts(config, problem, state.plan, way, straight)
+    start = find_starts(config, problem, state.plan, way)
     plan = plan_or_hold(config, config.solver(problem, start.guess), start)
-    plan, state = plan_or_restart(config, state, error, straight, radius, plan, start.value_straight)
+    plan, state = plan_or_restart(config, state, problem, error, plan)
 
     twist = config.objective.to_twist(plan.motion[0])
     offline, cable = _displacement(dynamics, weights, state, twist)

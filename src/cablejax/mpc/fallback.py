@@ -1,16 +1,19 @@
-"""What is done where a solver's plan is no better than holding still."""
+"""What is done where a solver's plan is no better than holding still, or leads nowhere."""
 
 from __future__ import annotations
 
 import dataclasses
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from cablejax.mpc.config import MPCConfig
 from cablejax.mpc.controller_state import ControllerState
+from cablejax.mpc.goal import straightened
 from cablejax.mpc.plan import Outcome, Plan
-from cablejax.mpc.start import Starts, StraightWay
+from cablejax.mpc.problem import ShapingProblem
+from cablejax.mpc.start import Starts, find_straight_way
 
 
 def plan_or_hold(config: MPCConfig, plan: Plan, start: Starts) -> Plan:
@@ -33,17 +36,18 @@ def plan_or_hold(config: MPCConfig, plan: Plan, start: Starts) -> Plan:
 def plan_or_restart(
     config: MPCConfig,
     state: ControllerState,
+    problem: ShapingProblem,
     error: Float[Array, ""],
-    straight: StraightWay,
-    radius: Float[Array, ""],
     plan: Plan,
-    value_straight: Float[Array, ""],
 ) -> tuple[Plan, ControllerState]:
     """The plan, or the next step of straightening the cable; and the state with what is counted for that.
 
     A cable has several shapes between the same grippers, and near another one than the target's every plan of a few
     steps makes the error worse before it makes it better. From the straight cable the target can be reached.
     """
+    radius = problem.feasible.radius
+    apart = straightened(problem.target, config.max_distance * config.cable_length)
+    straight = find_straight_way(config, problem, apart)
     better = error < 0.99 * state.best_error
     since = jnp.where(better, 0, state.since_best + 1)
     staying = (plan.outcome == Outcome.HELD) | (since >= config.restart_after)
@@ -60,9 +64,8 @@ def plan_or_restart(
         restarting=left,
         restarts=state.restarts + (restarting & (state.restarting == 0)),
     )
-    motion, value = (
-        jnp.where(restarting, straight.motion, plan.motion),
-        jnp.where(restarting, value_straight, plan.value),
-    )
+    motion = jnp.where(restarting, straight.motion, plan.motion)
+    # a rollout that is needed in few calls
+    value = jax.lax.cond(restarting, problem.value, lambda motion: plan.value, straight.motion)
     outcome = jnp.where(restarting, Outcome.RESTARTING, plan.outcome).astype(jnp.int32)
     return dataclasses.replace(plan, motion=motion, value=value, outcome=outcome), state

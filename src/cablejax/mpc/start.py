@@ -42,18 +42,14 @@ class Starts(NamedTuple):
             [m], shape [T, Q, 3].
         still: holding, or where motions may not change at once, braking [m], shape [T, Q, 3].
         value_still: its objective [m^2], shape [].
-        value_straight: that of straightening the cable [m^2], shape [].
     """
 
     guess: Float[Array, "T Q 3"]
     still: Float[Array, "T Q 3"]
     value_still: Float[Array, ""]
-    value_straight: Float[Array, ""]
 
 
-def find_starts(
-    config: MPCConfig, problem: ShapingProblem, last: Float[Array, "T Q 3"], way: StraightWay, straight: StraightWay
-) -> Starts:
+def find_starts(config: MPCConfig, problem: ShapingProblem, last: Float[Array, "T Q 3"], way: StraightWay) -> Starts:
     """What may be begun from, and what it is worth.
 
     Args:
@@ -61,14 +57,13 @@ def find_starts(
         problem: of this step.
         last: the last plan, its first command executed [m].
         way: to where the target's ends are held.
-        straight: to a straight cable.
     """
     still = jnp.zeros_like(last)
     if config.max_change is not None:
         # grippers that move brake first, as fast as they may
         still = problem.feasible.project(still)
     shifted = jnp.roll(last, -1, axis=0).at[-1].set(0.0)
-    motions = jnp.stack([problem.feasible.project(shifted), way.motion, still, straight.motion])
+    motions = jnp.stack([problem.feasible.project(shifted), way.motion, still])
     values = jax.vmap(problem.value)(motions)
     guesses = jnp.where(jnp.isfinite(values[:2]), values[:2], jnp.inf)
-    return Starts(motions[jnp.argmin(guesses)], still, values[2], values[3])
+    return Starts(motions[jnp.argmin(guesses)], still, values[2])
