@@ -8,6 +8,7 @@ python experiments/06_stiffness.py --full --report docs/results/stiffness.md    
 
 from __future__ import annotations
 
+import functools
 import os
 
 os.environ.setdefault("NPROC", "4")
@@ -15,7 +16,7 @@ os.environ.setdefault("NPROC", "4")
 from cablejax.evaluation.cases import STIFFNESS_RATIOS, stiffness_cases
 from cablejax.evaluation.methods import ADAPTED_RESIDUAL, METHODS
 from cablejax.evaluation.paper import DIRECT, RESIDUAL
-from cablejax.evaluation.run import Experiment, main
+from cablejax.evaluation.run import Experiment, Extent, main
 from cablejax.evaluation.suite import PATIENCE
 
 if __name__ == "__main__":
@@ -32,10 +33,16 @@ if __name__ == "__main__":
                 "from which on the error stays within a tenth, or 1 mm, of its last value; Wang et al. do not define "
                 "theirs."
             ),
-            small=lambda: stiffness_cases(("U", "S", "Z"), (2.0,), seeds=(0,)),
-            small_methods=(DIRECT, RESIDUAL, ADAPTED_RESIDUAL),
-            full=lambda: stiffness_cases(("U", "S", "Z"), STIFFNESS_RATIOS, seeds=range(5)),
-            full_methods=tuple(METHODS),
+            small=Extent(
+                functools.partial(stiffness_cases, ("U", "S", "Z"), (2.0,)),
+                seeds=range(1),
+                methods=(DIRECT, RESIDUAL, ADAPTED_RESIDUAL),
+            ),
+            full=Extent(
+                functools.partial(stiffness_cases, ("U", "S", "Z"), STIFFNESS_RATIOS),
+                seeds=range(5),
+                methods=tuple(METHODS),
+            ),
             tables=("III",),
         )
     )

@@ -1,5 +1,6 @@
 """Suites of trials: what is run, what is kept, what is not run again."""
 
+import argparse
 import dataclasses
 import functools
 import re
@@ -15,7 +16,7 @@ from cablejax.evaluation.fine_tuning import FineTuneConfig, fine_tune, record
 from cablejax.evaluation.methods import LABEL, METHODS, controller_of
 from cablejax.evaluation.paper import VISUAL_SERVO
 from cablejax.evaluation.protocols import LaidOut, letter_task
-from cablejax.evaluation.run import Experiment, page
+from cablejax.evaluation.run import Experiment, Extent, page, seed_range
 from cablejax.evaluation.suite import Case, key_of, read_suite, run_suite
 from cablejax.mpc import Controller
 from cablejax.servo import VisualServo
@@ -54,7 +55,8 @@ def test_a_suite_is_shared_resumed_and_read_whole(tmp_path):
     before = {path: path.read_bytes() for path in tmp_path.iterdir()}
     run_suite(cases, [SERVO], tmp_path, fine_tuned=no_model, progress=False)
     assert before == {path: path.read_bytes() for path in tmp_path.iterdir()}
-    experiment = Experiment("x", "x.py", "Title", "About.", lambda: cases, (), lambda: cases, (), ("III", "IV"))
+    extent = Extent(lambda seeds: [one for one in cases if one.seed in seeds], range(2), ())
+    experiment = Experiment("x", "x.py", "Title", "About.", extent, extent, ("III", "IV"))
     text = page(experiment, trials, "python x.py", picture=None)
     assert "| online visual servo | 2 |" in text and "Table IV" not in text and "Seeds: 0, 1." in text
     assert "earlier version" not in text
@@ -114,3 +116,11 @@ def test_a_run_ends_when_nothing_happens_any_more():
     assert len(run.times) == 4 and run.stopped is None
     with pytest.raises(ValueError, match="no shape"):
         letter_task("Q", 0, CABLE)
+
+
+def test_seeds_are_named_by_their_range():
+    assert seed_range("100:103") == range(100, 103) and seed_range("7") == range(7, 8)
+    with pytest.raises(argparse.ArgumentTypeError, match="100:150"):
+        seed_range("5:5")
+    with pytest.raises(ValueError, match="invalid literal"):
+        seed_range("many")

@@ -34,6 +34,21 @@ SETTLING_NOTE = (
 
 
 @dataclasses.dataclass(frozen=True)
+class Extent:
+    """How much of an experiment is run.
+
+    Attributes:
+        cases: makes those of some seeds.
+        seeds: unless the command line names others.
+        methods: their names, likewise.
+    """
+
+    cases: Callable[[Sequence[int]], list[Case]]
+    seeds: Sequence[int]
+    methods: tuple[str, ...]
+
+
+@dataclasses.dataclass(frozen=True)
 class Experiment:
     """What one script of `experiments/` measures.
 
@@ -42,10 +57,8 @@ class Experiment:
         script: its file in experiments/.
         title: of its page.
         about: what was done, in a few sentences, for the page.
-        small: cases of the short version.
-        small_methods: names of its methods.
-        full: cases of the whole table.
-        full_methods: names of its methods.
+        small: the short version.
+        full: the whole table.
         tables: tables that the cases belong to, in the page's order.
     """
 
@@ -53,10 +66,8 @@ class Experiment:
     script: str
     title: str
     about: str
-    small: Callable[[], list[Case]]
-    small_methods: tuple[str, ...]
-    full: Callable[[], list[Case]]
-    full_methods: tuple[str, ...]
+    small: Extent
+    full: Extent
     tables: tuple[str, ...]
 
 
@@ -66,32 +77,44 @@ def main(experiment: Experiment, arguments: Sequence[str] | None = None) -> None
     parser.add_argument("--full", action="store_true", help="the whole table instead of the small version")
     parser.add_argument("--out", type=pathlib.Path, help="folder for trials; a run goes on where it stopped")
     parser.add_argument("--methods", nargs="*", choices=tuple(METHODS), help="only these")
-    parser.add_argument("--seeds", nargs="*", type=int, help="only these")
+    parser.add_argument("--seeds", type=seed_range, metavar="FIRST:END", help="these instead of the table's own")
     parser.add_argument(
         "--process", nargs=2, type=int, default=(0, 1), metavar=("INDEX", "COUNT"), help="share of work"
     )
     parser.add_argument("--report", type=pathlib.Path, help="run nothing; write the page on what is done to this file")
     options = parser.parse_args(arguments)
+    extent = experiment.full if options.full else experiment.small
+    seeds = options.seeds or extent.seeds
     folder = options.out or pathlib.Path("runs") / (experiment.name if options.full else f"{experiment.name}-small")
     if options.report is None:
-        cases = (experiment.full if options.full else experiment.small)()
-        names = options.methods or (experiment.full_methods if options.full else experiment.small_methods)
         run_suite(
-            [case for case in cases if options.seeds is None or case.seed in options.seeds],
-            [METHODS[name] for name in names],
+            extent.cases(seeds),
+            [METHODS[name] for name in options.methods or extent.methods],
             folder,
             fine_tuned=functools.partial(fine_tuned_model, folder / "fine-tuned"),
             process=tuple(options.process),
         )
-    trials, snapshots = read_suite(folder)
+    everything, pictures = read_suite(folder)
+    trials = [trial for trial in everything if trial.seed in seeds]
+    shown = {trial.key for trial in trials}
     if options.report is None:
-        print(page(experiment, trials, command(experiment, full=options.full), picture=None))
+        print(page(experiment, trials, command(experiment, options), picture=None))
         return
-    picture = options.report.with_name(f"{experiment.name}_worst.png")
+    picture = options.report.with_name(f"{options.report.stem}_worst.png")
+    snapshots = [snapshot for snapshot in pictures if snapshot.key in shown]
     failure_figure(worst(snapshots, WORST)).savefig(picture, dpi=110, bbox_inches="tight")
-    text = page(experiment, trials, command(experiment, full=options.full, report=options.report), picture=picture.name)
+    text = page(experiment, trials, command(experiment, options), picture=picture.name)
     options.report.write_text(text, encoding="utf-8")
     print(text)
+
+
+def seed_range(text: str) -> range:
+    """`"100:150"` = seeds 100 to 149; `"7"` = seed 7 alone."""
+    first, _, end = text.partition(":")
+    seeds = range(int(first), int(end) if end else int(first) + 1)
+    if not seeds:
+        raise argparse.ArgumentTypeError(f"{text!r} holds no seed; FIRST:END has END above FIRST, such as 100:150")
+    return seeds
 
 
 def fine_tuned_model(folder: pathlib.Path, case: Case) -> Model:
@@ -140,7 +163,7 @@ def page(experiment: Experiment, trials: Sequence[Trial], command: str, picture:
 def least_times(experiment: Experiment, shown: set[tuple[str, str, float, int]]) -> str:
     """How long the grippers' way alone takes, in a sentence. `shown`: (table, scenario, stiffness, seed) of cases."""
     seconds: dict[str, list[float]] = {}
-    for case in experiment.full():
+    for case in experiment.full.cases(sorted({seed for *_, seed in shown})):
         if (case.table, case.scenario, float(case.stiffness), case.seed) in shown:
             seconds.setdefault(case.scenario, []).append(least_time(case.task(), MPCConfig()))
     means = ", ".join(f"{scenario} {np.mean(values):.1f} s" for scenario, values in sorted(seconds.items()))
@@ -150,7 +173,13 @@ def least_times(experiment: Experiment, shown: set[tuple[str, str, float, int]])
     )
 
 
-def command(experiment: Experiment, *, full: bool, report: pathlib.Path | None = None) -> str:
+def command(experiment: Experiment, options: argparse.Namespace) -> str:
     """The call that makes the page."""
-    options = f"{' --full' if full else ''}{'' if report is None else f' --report {report}'}"
-    return f"python experiments/{experiment.script}{options}"
+    parts = ["python", f"experiments/{experiment.script}"]
+    if options.full:
+        parts.append("--full")
+    if options.seeds is not None:
+        parts.append(f"--seeds {options.seeds.start}:{options.seeds.stop}")
+    if options.report is not None:
+        parts.append(f"--report {options.report}")
+    return " ".join(parts)
