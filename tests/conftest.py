@@ -2,13 +2,25 @@
 
 from __future__ import annotations
 
+import atexit
 import gc
 import os
 import pathlib
+import shutil
+import tempfile
 
 # Tests compile far more than they compute: code that LLVM did not optimise is there in two thirds of the time, and
 # differs by rounding only. It has to be said before JAX starts; programs that tests start inherit it.
 os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} --xla_backend_optimization_level=0"
+
+# One program is compiled once for all workers and all that tests start: this file is loaded first by the process that
+# starts the workers, and they inherit what it sets. With a bound on its size JAX locks the folder.
+if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
+    _programs = tempfile.mkdtemp(prefix="cablejax-tests-")
+    atexit.register(shutil.rmtree, _programs, ignore_errors=True)
+    os.environ["JAX_COMPILATION_CACHE_DIR"] = _programs
+    os.environ["JAX_COMPILATION_CACHE_MAX_SIZE"] = str(4 * 1024**3)
+    os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0.3"
 
 import jax
 import pytest

@@ -1,10 +1,20 @@
 """Made-up trials for the evaluation's tests."""
 
 import dataclasses
+import math
 
 import numpy as np
 
 from cablejax.evaluation.trials import Trial
+
+
+def course(terminal_cm: float = 0.25, settled_s: float = 8.0, best_cm: float = math.inf) -> tuple[float, ...]:
+    """Errors [cm] of a run of 40 commands that settles after so many seconds, and was once as low as `best_cm`."""
+    early = 40 if math.isinf(settled_s) else round(settled_s)
+    errors = [25.0, *[5.0] * (early - 1), *[terminal_cm] * (41 - early)]
+    errors[1] = min(errors[1], best_cm)
+    return tuple(errors)
+
 
 TRIAL = Trial(
     table="III",
@@ -12,15 +22,10 @@ TRIAL = Trial(
     scenario="U",
     stiffness=2.0,
     seed=0,
-    initial_error_cm=25.0,
-    terminal_error_cm=0.25,
-    best_error_cm=0.2,
-    settling_time_s=8.0,
-    steps=40,
+    errors_cm=course(),
     stopped=None,
     mpc_ms_median=100.0,
     wall_s=12.5,
-    errors_cm=(25.0, 3.0, 0.25, 0.25, 0.25),
 )
 
 
@@ -37,6 +42,6 @@ def small_table(table: str = "III") -> list[Trial]:
             for seed in range(3):
                 error = 0.3 + 0.2 * rng.random() + 0.1 * stiffness
                 common = {"table": table, "scenario": scenario, "stiffness": stiffness, "seed": seed}
-                rows.append(trial(**common, method="residual", terminal_error_cm=error))
-                rows.append(trial(**common, method="direct", terminal_error_cm=error + 0.1, settling_time_s=9.0))
+                rows.append(trial(**common, method="residual", errors_cm=course(error)))
+                rows.append(trial(**common, method="direct", errors_cm=course(error + 0.1, settled_s=9.0)))
     return rows

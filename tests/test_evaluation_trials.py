@@ -8,18 +8,17 @@ import pytest
 
 from cablejax.batched_loop import BatchRun
 from cablejax.evaluation.trials import append_trial, finished_keys, read_trials, trial_of, trials_of_batch
-from evaluation_cases import TRIAL, trial
+from evaluation_cases import TRIAL, course, trial
 
 
 def test_trials_come_back_as_they_were(tmp_path):
     path = tmp_path / "new" / "trials.jsonl"
-    written = [TRIAL, trial(seed=1, settling_time_s=math.inf, stopped="taut"), trial(stiffness=0.1)]
+    written = [TRIAL, trial(seed=1, errors_cm=course(settled_s=math.inf), stopped="taut"), trial(stiffness=0.1)]
     for row in written:
         append_trial(path, row)
     assert read_trials(path) == written
-    assert read_trials(path)[0].errors_cm == TRIAL.errors_cm
     assert finished_keys(written) == {("III", "residual", "U", k, s) for k, s in ((2.0, 0), (2.0, 1), (0.1, 0))}
-    append_trial(path, trial(seed=2, terminal_error_cm=math.nan))
+    append_trial(path, trial(seed=2, errors_cm=course(math.nan)))
     assert math.isnan(read_trials(path)[-1].terminal_error_cm)
     assert read_trials(tmp_path / "none.jsonl") == []
 
@@ -40,7 +39,7 @@ def test_a_torn_last_line_is_ignored_and_then_cut_off(tmp_path, left):
 
 def test_the_later_of_two_equal_keys_counts(tmp_path):
     path = tmp_path / "trials.jsonl"
-    for row in (TRIAL, trial(seed=1), trial(terminal_error_cm=0.5)):
+    for row in (TRIAL, trial(seed=1), trial(errors_cm=course(0.5))):
         append_trial(path, row)
     assert [row.terminal_error_cm for row in read_trials(path)] == [0.5, 0.25]
 
@@ -60,15 +59,21 @@ def test_a_line_that_is_no_trial_is_refused(tmp_path, line, message):
         read_trials(path)
 
 
-def test_a_row_without_the_errors_on_the_way_is_still_a_trial(tmp_path):
+def test_a_field_that_no_trial_has_is_refused(tmp_path):
     path = tmp_path / "trials.jsonl"
     append_trial(path, TRIAL)
-    fields = json.loads(path.read_text())
-    path.write_text(json.dumps({name: value for name, value in fields.items() if name != "errors_cm"}) + "\n")
-    assert read_trials(path) == [trial(errors_cm=())]
-    path.write_text(json.dumps(fields | {"speed": 1}) + "\n")
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"speed": 1}) + "\n")
     with pytest.raises(ValueError, match=r"missing fields \[\], unknown fields \['speed'\]"):
         read_trials(path)
+
+
+def test_what_a_trial_says_is_read_off_its_errors():
+    assert (TRIAL.terminal_error_cm, TRIAL.best_error_cm, TRIAL.steps, TRIAL.settling_time_s) == (0.25, 0.25, 40, 8.0)
+    assert trial(errors_cm=course(0.9, best_cm=0.5)).best_error_cm == 0.5
+    assert math.isinf(trial(errors_cm=course(settled_s=math.inf)).settling_time_s)
+    lost = trial(errors_cm=course(math.nan))
+    assert math.isnan(lost.terminal_error_cm) and lost.best_error_cm == 5.0 and math.isinf(lost.settling_time_s)
+    assert math.isnan(trial(errors_cm=(math.nan,)).best_error_cm)
 
 
 def test_a_value_that_is_no_number_is_refused(tmp_path):
@@ -83,7 +88,7 @@ def test_a_run_becomes_a_trial():
     class Run:
         error_cm = np.array([20.0, 0.4, np.nan, 0.5])
         mpc_ms = np.array([90.0, 110.0, 130.0, np.nan])
-        initial_error_cm, terminal_error_cm, settling_time_s, stopped = 20.0, 0.5, 1.0, None
+        stopped = None
 
     row = trial_of(Run(), table="III", method="direct", scenario="Z", stiffness=3, seed=4, wall_s=2)  # pyright: ignore[reportArgumentType]
     assert (row.best_error_cm, row.steps, row.mpc_ms_median) == (0.4, 3, 110.0)

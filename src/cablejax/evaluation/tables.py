@@ -11,7 +11,6 @@ from typing import cast, get_args
 
 import numpy as np
 
-from cablejax.closed_loop import step_settling_time
 from cablejax.evaluation.paper import LIANG, METHOD_LABEL, PAPER, Measure, PaperTable, best_in_paper
 from cablejax.evaluation.statistics import (
     Interval,
@@ -149,8 +148,6 @@ def settling_table(
 ) -> str:
     """Settling times by the textbook's two bands, beside the stricter one of the other tables and the paper's own.
 
-    Trials whose errors on the way were not kept cannot be judged so and are left out; the column says how many are in.
-
     Raises:
         ValueError: there is no trial of this table.
     """
@@ -159,14 +156,14 @@ def settling_table(
     rows = []
     for method in _methods(mine, methods):
         for scenario in _scenarios(mine):
-            cell = _at([trial for trial in mine if trial.method == method and trial.errors_cm], scenario)
+            cell = _at([trial for trial in mine if trial.method == method], scenario)
             if not cell:
                 continue
             paper = published.get(method, {}).get(scenario)
             rows.append(
                 [
                     _label(method, labels), scenario, str(len(cell)), _cell(cell, "settling"),
-                    *(_failing_cell([_within(t, band) for t in cell], "settling") for band in STEP_BANDS),
+                    *(_failing_cell([t.step_settling_time_s(band) for t in cell], "settling") for band in STEP_BANDS),
                     "" if paper is None else _spread(*paper.settling),
                 ]
             )  # fmt: skip
@@ -300,11 +297,6 @@ def _seed_interval(cell: Sequence[Trial], measure: Measure) -> Interval:
             by_seed.setdefault(trial.seed, []).append(value)
     means = [float(np.mean(values)) for values in by_seed.values()]
     return bootstrap_interval(means) if means else Interval(np.nan, np.nan)
-
-
-def _within(trial: Trial, fraction: float) -> float:
-    """Settling time [s] of a trial, a command each second, by `step_settling_time`."""
-    return step_settling_time(np.arange(len(trial.errors_cm), dtype=float), np.array(trial.errors_cm), fraction)
 
 
 def _cell(trials: Sequence[Trial], measure: Measure) -> str:

@@ -17,6 +17,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from cablejax.closed_loop import settling_time, step_settling_time
+
 if TYPE_CHECKING:
     from cablejax.batched_loop import BatchRun
     from cablejax.closed_loop import ClosedLoopRun
@@ -30,7 +32,7 @@ LIANG_TABLE = "Liang"
 
 @dataclasses.dataclass(frozen=True)
 class Trial:
-    """One run of one method.
+    """One run of one method, a command every second.
 
     Attributes:
         table: "III", "IV" or "V" for the paper's tables, `LIANG_TABLE`, or any other name.
@@ -38,16 +40,11 @@ class Trial:
         scenario: the target's name, or for Liang's protocol the kind of start.
         stiffness: the plant's bending stiffness over the nominal one.
         seed: of everything random in the trial; methods are compared at equal seeds.
-        initial_error_cm: root mean square distance to the target before the first command [cm].
-        terminal_error_cm: the same at the end [cm]; NaN where the cable was lost.
-        best_error_cm: the lowest on the way [cm].
-        settling_time_s: see `closed_loop.settling_time` [s]; infinite if the run never settled.
-        steps: commands carried out.
+        errors_cm: root mean square distance to the target before the first command and after each [cm]; NaN where the
+            cable was lost.
         stopped: why the run ended early, or None.
         mpc_ms_median: median wall time of a control call [ms].
         wall_s: wall time of the whole trial [s].
-        errors_cm: root mean square distance to the target before the first command and after each [cm]; empty in rows
-            of suites that were run before this was kept.
     """
 
     table: str
@@ -55,42 +52,60 @@ class Trial:
     scenario: str
     stiffness: float
     seed: int
-    initial_error_cm: float
-    terminal_error_cm: float
-    best_error_cm: float
-    settling_time_s: float
-    steps: int
+    errors_cm: tuple[float, ...]
     stopped: str | None
     mpc_ms_median: float
     wall_s: float
-    errors_cm: tuple[float, ...] = ()
 
     @property
     def key(self) -> TrialKey:
         """What makes the trial the one it is."""
         return self.table, self.method, self.scenario, float(self.stiffness), self.seed
 
+    @property
+    def terminal_error_cm(self) -> float:
+        """Error at the end [cm]; NaN where the cable was lost."""
+        return self.errors_cm[-1]
+
+    @property
+    def best_error_cm(self) -> float:
+        """The lowest error on the way [cm]."""
+        return min((error for error in self.errors_cm if math.isfinite(error)), default=math.nan)
+
+    @property
+    def steps(self) -> int:
+        """Commands carried out."""
+        return len(self.errors_cm) - 1
+
+    @property
+    def settling_time_s(self) -> float:
+        """See `closed_loop.settling_time` [s]; infinite if the run never settled."""
+        return settling_time(*self._course)
+
+    def step_settling_time_s(self, fraction: float) -> float:
+        """See `closed_loop.step_settling_time` [s]; likewise."""
+        return step_settling_time(*self._course, fraction)
+
+    @property
+    def _course(self) -> tuple[np.ndarray, np.ndarray]:
+        return np.arange(len(self.errors_cm), dtype=float), np.array(self.errors_cm)
+
 
 def trial_of(
     run: ClosedLoopRun, *, table: str, method: str, scenario: str, stiffness: float, seed: int, wall_s: float
 ) -> Trial:
     """The row of one finished run."""
-    error, timed = run.error_cm, run.mpc_ms[np.isfinite(run.mpc_ms)]
+    timed = run.mpc_ms[np.isfinite(run.mpc_ms)]
     return Trial(
         table=table,
         method=method,
         scenario=scenario,
         stiffness=float(stiffness),
         seed=int(seed),
-        initial_error_cm=run.initial_error_cm,
-        terminal_error_cm=run.terminal_error_cm,
-        best_error_cm=float(np.nanmin(error)) if np.isfinite(error).any() else math.nan,
-        settling_time_s=run.settling_time_s,
-        steps=len(error) - 1,
+        errors_cm=tuple(map(float, run.error_cm)),
         stopped=run.stopped,
         mpc_ms_median=float(np.median(timed)) if len(timed) else math.nan,
         wall_s=float(wall_s),
-        errors_cm=tuple(map(float, error)),
     )
 
 
@@ -103,12 +118,9 @@ def trials_of_batch(
     stiffnesses: Sequence[float],
     seeds: Sequence[int],
     wall_s: float,
-    interval: float = 1.0,
 ) -> list[Trial]:
     """The rows of a batch of runs; each gets its share of the wall time, and there is no time of a control call."""
-    error, settling = np.asarray(run.error_cm, float), run.settling_time_s(interval)
-    lost = ~np.isfinite(error).any(axis=1)
-    best = np.where(lost, np.nan, np.nanmin(np.where(np.isfinite(error), error, np.inf), axis=1))
+    errors = np.asarray(run.error_cm, float)
     return [
         Trial(
             table=table,
@@ -116,17 +128,12 @@ def trials_of_batch(
             scenario=scenario,
             stiffness=float(stiffness),
             seed=int(seed),
-            initial_error_cm=float(error[i, 0]),
-            terminal_error_cm=float(error[i, -1]),
-            best_error_cm=float(best[i]),
-            settling_time_s=float(settling[i]),
-            steps=error.shape[1] - 1,
+            errors_cm=tuple(map(float, error)),
             stopped=None,
             mpc_ms_median=math.nan,
-            wall_s=wall_s / len(error),
-            errors_cm=tuple(map(float, error[i])),
+            wall_s=wall_s / len(errors),
         )
-        for i, (scenario, stiffness, seed) in enumerate(zip(scenarios, stiffnesses, seeds, strict=True))
+        for error, scenario, stiffness, seed in zip(errors, scenarios, stiffnesses, seeds, strict=True)
     ]
 
 
@@ -194,9 +201,8 @@ def read_lines(path: str | os.PathLike[str]) -> list[tuple[int, dict[str, Any]]]
 
 def _parsed(fields: dict[str, Any], where: str) -> Trial:
     kinds = {field.name: field.type for field in dataclasses.fields(Trial)}
-    needed = {field.name for field in dataclasses.fields(Trial) if field.default is dataclasses.MISSING}
-    if missing_or_unknown := (needed - set(fields)) | (set(fields) - set(kinds)):
-        missing, unknown = sorted(needed & missing_or_unknown), sorted(missing_or_unknown - needed)
+    missing, unknown = sorted(set(kinds) - set(fields)), sorted(set(fields) - set(kinds))
+    if missing or unknown:
         raise ValueError(f"{where} is not a trial: missing fields {missing}, unknown fields {unknown}.")
     try:
         converted = {name: _CONVERT[kinds[name]](value) for name, value in fields.items()}
