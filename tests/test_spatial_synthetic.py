@@ -6,12 +6,14 @@ import numpy as np
 import pytest
 
 from cablejax.spatial.benchmark import protocol_windows
-from cablejax.spatial.synthetic import MARKERS, RECORDINGS, SAMPLES, synthetic_recordings
+from cablejax.spatial.synthetic import MARKERS, SAMPLES, synthetic_recordings
+
+RECORDINGS = 2
 
 
 @pytest.fixture(scope="module")
 def fitted():
-    return synthetic_recordings(0, "as fitted")
+    return synthetic_recordings(0, "as fitted", RECORDINGS)
 
 
 def test_windows_read_back_length_places_and_motion(fitted):
@@ -25,18 +27,16 @@ def test_windows_read_back_length_places_and_motion(fitted):
     assert not cable.rest_curvature.any() and not cable.roll
 
 
-@pytest.mark.slow
 def test_a_seed_gives_one_recording_and_a_richer_law_another_one(fitted):
     cable, recordings = fitted
-    again, same = synthetic_recordings(0, "as fitted")
+    again, same = synthetic_recordings(0, "as fitted", RECORDINGS)
     np.testing.assert_array_equal(same.keypoints, recordings.keypoints)
-    assert again.stiffness == cable.stiffness != synthetic_recordings(1, "as fitted")[0].stiffness
+    assert again.stiffness == cable.stiffness != synthetic_recordings(1, "as fitted", RECORDINGS)[0].stiffness
 
 
-@pytest.mark.slow
 def test_a_richer_law_moves_the_same_cable_otherwise(fitted):
     cable, recordings = fitted
-    richer, other = synthetic_recordings(0, "richer")
+    richer, other = synthetic_recordings(0, "richer", RECORDINGS)
     assert richer.stiffness == cable.stiffness and richer.rest_curvature.any() and richer.roll
     off = np.abs(other.keypoints - recordings.keypoints).mean(axis=(0, 1, 3))
     np.testing.assert_array_equal(off[[0, 1, -2, -1]], 0)

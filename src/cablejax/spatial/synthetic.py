@@ -70,14 +70,14 @@ class SyntheticCable:
     roll: float
 
 
-def synthetic_recordings(seed: int, law: Law) -> tuple[SyntheticCable, DeformRecordings]:
-    """A cable and what motion capture saw of it.
+def synthetic_recordings(seed: int, law: Law, recordings: int = RECORDINGS) -> tuple[SyntheticCable, DeformRecordings]:
+    """A cable and what motion capture saw of it, in so many recordings of `SAMPLES` samples.
 
     Raises:
         FloatingPointError: the simulation of this cable broke down.
     """
     generator, more = np.random.default_rng(seed), np.random.default_rng((seed, 1))
-    cable = _drawn(generator)
+    cable = _drawn(generator, recordings)
     if law == "richer":
         cable = dataclasses.replace(
             cable,
@@ -85,8 +85,8 @@ def synthetic_recordings(seed: int, law: Law) -> tuple[SyntheticCable, DeformRec
             offset=0.002 * more.normal(size=(MARKERS, 2)),
             roll=0.15,
         )
-    position, direction = _motion(generator)
-    roll = cable.roll * _vibrations(more, (RECORDINGS, 1, 2))
+    position, direction = _motion(generator, recordings)
+    roll = cable.roll * _vibrations(more, (recordings, 1, 2))
     s = np.linspace(0, cable.length, MARKERS + 2)[1:-1] + 0.003 * generator.normal(size=MARKERS)
     free = _simulated(cable, s, position, _rolled(direction, roll))
     if not np.isfinite(free).all() or np.abs(np.diff(free, axis=1)).max() > _BROKEN:
@@ -96,12 +96,12 @@ def synthetic_recordings(seed: int, law: Law) -> tuple[SyntheticCable, DeformRec
     points = np.concatenate([*ends[:2], free, *ends[2:]], axis=2)
     points = points + _slow_error(generator, points.shape)
     points = points + cable.noise * generator.normal(size=points.shape)
-    names = np.arange(RECORDINGS)
-    split = np.full(RECORDINGS, "train")
+    names = np.arange(recordings)
+    split = np.full(recordings, "train")
     return cable, DeformRecordings(points, SAMPLE_INTERVAL, split, names, names, f"seed {seed}, {law}")
 
 
-def _drawn(generator: np.random.Generator) -> SyntheticCable:
+def _drawn(generator: np.random.Generator, recordings: int) -> SyntheticCable:
     def between(low, high):
         return float(np.exp(generator.uniform(np.log(low), np.log(high))))
 
@@ -114,7 +114,7 @@ def _drawn(generator: np.random.Generator) -> SyntheticCable:
         drag=float(generator.uniform(0.0, 0.8)),
         quadratic_drag=float(generator.uniform(0.0, 0.3)),
         marker_mass=between(0.002, 0.04),
-        grips=0.2 * generator.normal(size=(2, 2)) + 0.2 * generator.normal(size=(RECORDINGS, 2, 2)),
+        grips=0.2 * generator.normal(size=(2, 2)) + 0.2 * generator.normal(size=(recordings, 2, 2)),
         noise=between(3e-5, 3e-4),
         rest_curvature=np.zeros((CURVATURE_KNOTS, 2)),
         offset=np.zeros((MARKERS, 2)),
@@ -122,13 +122,13 @@ def _drawn(generator: np.random.Generator) -> SyntheticCable:
     )
 
 
-def _motion(generator: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+def _motion(generator: np.random.Generator, recordings: int) -> tuple[np.ndarray, np.ndarray]:
     """Fast motion of both grippers: positions [R, T, 2, 3] and directions along the cable [R, T, 2, 3].
 
     Vibrations with 6 cm root mean square make 0.6 m/s. The cable leaves one gripper downwards and comes up to the
     other, both turned by 0.2 rad.
     """
-    shape = (RECORDINGS, 1, 2, 3)
+    shape = (recordings, 1, 2, 3)
     rates = [generator.uniform(low, high, (*shape, 3)) for low, high in [(0.3, 1.5), (0, 2 * np.pi)] * 2]
     position = np.array([[0.0, 0.0, 0.6], [0.5, 0.0, 0.6]]) + 0.06 * _sum_of_waves(*rates[:2])
     direction = np.array([[0.1, 0.0, -1.0], [0.1, 0.0, 1.0]]) + 0.15 * _sum_of_waves(*rates[2:])
@@ -166,7 +166,7 @@ def _simulated(cable: SyntheticCable, s, position, frames) -> Float[np.ndarray, 
     }  # fmt: skip
     physics = RodPhysics(
         clamp_rotation=cable.grips,
-        **{name: np.repeat(np.asarray(value, float)[None], RECORDINGS, 0) for name, value in values.items()},
+        **{name: np.repeat(np.asarray(value, float)[None], len(position), 0) for name, value in values.items()},
     )
     twisting = bool(cable.rest_curvature.any() or cable.offset.any())
     with jax.enable_x64(True):
