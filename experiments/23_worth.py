@@ -3,7 +3,7 @@
 A plant whose cable is a tenth as stiff as believed, on a table with contact. From six logged runs by direct transfer
 the diagnosis names a cause; the released network is then fine-tuned on 2,000 transitions simulated with it, never on
 the plant's own, and the same shaping tasks are run again: direct transfer, online residual, diagnosed, diagnosed with
-residual, and an oracle that was told the truth.
+residual, and an oracle that was told the truth, with and without residual.
 
     python experiments/23_worth.py --report docs/results/worth.md     # resumable, about half an hour on two cores
 """
@@ -46,6 +46,7 @@ ARMS = {
     "diagnosed": MethodSpec("diagnosed", "gns-reference", fine_tuned=True),
     "diagnosed + residual": MethodSpec("diagnosed residual", "gns-reference", residual=True, fine_tuned=True),
     "oracle": MethodSpec("oracle", "gns-reference", fine_tuned=True),
+    "oracle + residual": MethodSpec("oracle residual", "gns-reference", residual=True, fine_tuned=True),
 }
 
 

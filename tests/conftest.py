@@ -10,7 +10,8 @@ import shutil
 import tempfile
 
 # Tests compile far more than they compute: code that LLVM did not optimise is there in two thirds of the time, and
-# differs by rounding only. It has to be said before JAX starts; programs that tests start inherit it.
+# differs by rounding only. It has to be said before JAX starts; programs that tests start inherit it. The diagnosis
+# asks for optimised code all the same (`diagnose.playback`).
 os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} --xla_backend_optimization_level=0"
 
 # One program is compiled once for all workers and all that tests start: this file is loaded first by the process that

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -40,27 +41,35 @@ def directions(params: CableParams, twist: jax.Array) -> dict[str, tuple[CablePa
     return found | {"gripper_motion": (nothing[0], jnp.asarray(gripper))}
 
 
+@pytest.fixture(scope="module")
+def programs():
+    """The last keypoints, their derivative along a direction, and the gradient; compiled once for all starts."""
+    engine = MjxEngine(CONFIG)
+
+    @jax.jit
+    def final(state, params, twist):
+        return engine.unroll(params, state, twist)[1].keypoints[-1]
+
+    @jax.jit
+    def push(state, params, twist, direction):
+        return jax.jvp(functools.partial(final, state), (params, twist), direction)[1]
+
+    @jax.jit
+    def pull(state, params, twist, cotangent):
+        return jax.vjp(functools.partial(final, state), params, twist)[1](cotangent)
+
+    return engine, (final, push, pull)
+
+
 @pytest.fixture(scope="module", params=["moving", "straight at rest"])
-def case(request):
+def case(request, programs):
     with jax.enable_x64(True):
-        engine = MjxEngine(CONFIG)
-        pose, twist = (ARCH, moving()) if request.param == "moving" else (STRAIGHT, np.zeros((1, 2, 3)))
-        state, params, twist = engine.initial_state(pose), CONFIG.params(), jnp.asarray(twist, jnp.float64)
-        state = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float64), state)
-        params = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float64), params)
-
-        @jax.jit
-        def final(params, twist):
-            return engine.unroll(params, state, twist)[1].keypoints[-1]
-
-        @jax.jit
-        def push(params, twist, direction):
-            return jax.jvp(final, (params, twist), direction)[1]
-
-        @jax.jit
-        def pull(params, twist, cotangent):
-            return jax.vjp(final, params, twist)[1](cotangent)
-
+        engine, functions = programs
+        pose, twist = (ARCH, moving()) if request.param == "moving" else (STRAIGHT, np.zeros((2, 2, 3)))
+        state, params, twist = jax.tree.map(
+            lambda leaf: jnp.asarray(leaf, jnp.float64), (engine.initial_state(pose), CONFIG.params(), twist)
+        )
+        final, push, pull = (functools.partial(function, state) for function in functions)
         return request.param, final, push, pull, params, twist
 
 

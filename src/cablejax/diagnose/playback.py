@@ -129,4 +129,6 @@ def _compiled(chain: Chain, n_substeps: int):
         points = chain.rollout(physics, angles, pose, interval, n_substeps=n_substeps)
         return seen_by_camera(physics, points, interval)
 
-    return jax.jit(jax.vmap(one), compiler_options=compiler_options())
+    # runs far longer than it compiles: worth LLVM's optimisations where XLA_FLAGS go without them
+    optimised = {"xla_backend_optimization_level": 3}
+    return jax.jit(jax.vmap(one), compiler_options=compiler_options() | optimised)
