@@ -30,7 +30,7 @@ from typing import Any, get_args
 import numpy as np
 from matplotlib.figure import Figure
 
-from cablejax.evaluation.cases import PLANT_CABLE, stiffness_cases
+from cablejax.evaluation.cases import mujoco_plant, stiffness_cases
 from cablejax.evaluation.methods import ADAPTED_RESIDUAL, METHODS
 from cablejax.evaluation.suite import released, run_case
 from cablejax.perceive import Status, Tracker, TrackerConfig
@@ -41,7 +41,6 @@ from cablejax.report.provenance import machine, versions
 from cablejax.report.style import LIGHT
 from cablejax.simulate import CableConfig, ThreadedEngine
 from cablejax.simulate.motions import random_motion
-from cablejax.simulate.plant import Plant, PlantConfig
 from cablejax.targets import Shape
 
 HZ = 10
@@ -164,14 +163,11 @@ def speed(frames: int = 100) -> dict[str, float]:
 def loop(target_name: Shape, perception: str, seed: int) -> dict[str, Any]:
     """One target on the plant, by our method of the tables, with clouds or with true keypoints."""
     case = stiffness_cases((target_name,), (LOOP_STIFFNESS,), (seed,), steps=LOOP_STEPS)[0]
-    spec, config = METHODS[ADAPTED_RESIDUAL], PlantConfig(cable=PLANT_CABLE, stiffness_ratio=LOOP_STIFFNESS)
-    plant = Plant(config) if perception == "true" else CloudPlant(config, camera=CameraConfig(seed=seed))
+    spec, plant = METHODS[ADAPTED_RESIDUAL], mujoco_plant(LOOP_STIFFNESS)
+    if perception == "cloud":
+        plant = CloudPlant(plant.config, camera=CameraConfig(seed=seed))
     run = run_case(dataclasses.replace(case, plant=lambda: plant), spec, released(str(spec.weights)))
-    return {
-        "terminal_cm": run.terminal_error_cm,
-        "held": plant.held if isinstance(plant, CloudPlant) else 0,
-        "stopped": run.stopped,
-    }
+    return {"terminal_cm": run.terminal_error_cm, "held": getattr(plant, "held", 0)}
 
 
 class Kept:

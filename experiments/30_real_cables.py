@@ -90,24 +90,18 @@ def _row(name: str, values) -> str:
     return f"| {name} | " + " | ".join(values) + " |"
 
 
-def _estimate(half) -> float:
-    """EI/rho with every effect free: the middle of its interval, which is even in the logarithm."""
-    _, low, high = half
-    return math.sqrt(low * high)
-
-
 def _ratio(one: float, other: float) -> float:
     return max(one, other) / min(one, other)
 
 
-def _standard_errors_apart(halves) -> float:
+def _standard_errors_apart(estimated) -> float:
     """Difference of the halves' log EI/rho, every effect free, over its standard error.
 
     Half the width of a 90 % interval counts as 1.645 standard errors. It is in part Student's, with as many degrees of
     freedom as the half has recordings less one, so the standard error comes out a little large.
     """
-    errors = [math.log(high / low) / 2 / _NINETY for _, low, high in halves]
-    return math.log(_ratio(*map(_estimate, halves))) / math.hypot(*errors)
+    errors = [math.log(high / low) / 2 / _NINETY for _, low, high in estimated]
+    return math.log(_ratio(*(value for value, _, _ in estimated))) / math.hypot(*errors)
 
 
 def _page(scores) -> str:
@@ -160,23 +154,20 @@ def _page(scores) -> str:
         ),
         _row(
             "EI/rho that the halves are simulated with [m^4/s^2]",
-            pick(lambda s: s["halves"], "{0[0][0]:.4f}, {0[1][0]:.4f}"),
+            pick(lambda s: s["simulated"], "{0[0]:.4f}, {0[1]:.4f}"),
         ),
-        _row("ratio of the two", pick(lambda s: _ratio(*(h[0] for h in s["halves"])), "{:.2f}")),
+        _row("ratio of the two", pick(lambda s: _ratio(*s["simulated"]), "{:.2f}")),
         *(
             _row(
                 f"EI/rho with every effect free, {half} of the recordings, 90 % interval",
-                pick(
-                    lambda s, k=k: (_estimate(s["halves"][k]), *s["halves"][k][1:]),
-                    "{0[0]:.4f} ({0[1]:.4f} to {0[2]:.4f})",
-                ),
+                pick(lambda s, k=k: s["estimated"][k], "{0[0]:.4f} ({0[1]:.4f} to {0[2]:.4f})"),
             )
             for k, half in enumerate(("one half", "the other half"))
         ),
-        _row("ratio of the two", pick(lambda s: _ratio(*map(_estimate, s["halves"])), "{:.2f}")),
+        _row("ratio of the two", pick(lambda s: _ratio(*(value for value, _, _ in s["estimated"])), "{:.2f}")),
         _row(
             "their difference, in its standard errors from both intervals",
-            pick(lambda s: _standard_errors_apart(s["halves"]), "{:.2f}"),
+            pick(lambda s: _standard_errors_apart(s["estimated"]), "{:.2f}"),
         ),
         _row("graph network: size, rounds", pick(lambda s: s["networks"][0], "{0[0]}, {0[1]}")),
         _row("one rollout of 5 s, median [s]", pick(lambda s: s["seconds"][0], "{:.3f}")),

@@ -1,12 +1,12 @@
-"""Intervals of EI/rho in space: how often they hold the true value, on synthetic recordings where it is known.
+"""Intervals in space: how often they hold the true value, on synthetic recordings where it is known.
 
     python experiments/32_interval_coverage.py --cables 24      # resumable; each twice, half a minute to two
     python experiments/32_interval_coverage.py --report docs/results/interval_coverage.md
 
 Every cable is drawn from a seed of its own, simulated by a rod with twice the edges and twice the time steps of the one
 that is fitted, seen through noise, and handed to the protocol of the real recordings: windows, search, fits to both
-halves of the recordings, interval of either half. Once it obeys the law that is fitted, once it has besides what real
-cables have and the search does not try.
+halves of the recordings, estimates from either half and from all. Once it obeys the law that is fitted, once it has
+besides what real cables have and the search does not try.
 """
 
 from __future__ import annotations
@@ -32,10 +32,20 @@ from cablejax.recordings.deform import NOMINAL, SAMPLE_INTERVAL
 from cablejax.report.markdown import markdown_table
 from cablejax.report.provenance import machine, versions
 from cablejax.spatial.benchmark import protocol_windows
+from cablejax.spatial.estimate import Estimate, Interval, estimate, estimates_of_halves
 from cablejax.spatial.identify import Identified, identify
-from cablejax.spatial.interval import intervals_of_halves, stiffness_interval
-from cablejax.spatial.synthetic import RECORDINGS, SAMPLES, Law, synthetic_recordings
+from cablejax.spatial.named import parameters_of
+from cablejax.spatial.synthetic import RECORDINGS, SAMPLES, Law, SyntheticCable, synthetic_recordings
 
+TOLD = {
+    "bending_damping": "time_s",
+    "viscous_drag": "coefficient_n_s_per_m2",
+    "quadratic_drag": "coefficient_per_m",
+    "lumped_mass": "mass_kg",
+    "stiffness_profile": "ratio",
+    "gripper_rotation_offset": "angle_rad",
+}
+"""Other parameters whose intervals are judged; the true places of the markers (`keypoint_bias`) are not kept."""
 LAWS: tuple[Law, ...] = ("as fitted", "richer")
 CACHE = Path("docs") / "results" / "trials" / "interval_coverage.jsonl"
 NOMINAL_STIFFNESS = NOMINAL.bending_stiffness / NOMINAL.linear_density
@@ -51,6 +61,7 @@ class Row:
         truth: numbers of `SyntheticCable`.
         halves: EI / rho from either half of the recordings, all effects free, with its 90 % interval [m^4/s^2].
         everything: the same from all recordings, as a diagnosis tells it.
+        others: true values, estimates and intervals of other parameters, as a diagnosis tells them but per mass.
         chosen: EI / rho from either half with the effects that stayed alone, and the jackknife's interval for that.
         effects: that the search named.
         error_mm: of the nominal simulator and of the last step of the search, on recordings that no fit has seen.
@@ -62,6 +73,7 @@ class Row:
     truth: dict[str, float]
     halves: list[list[float]]
     everything: list[float]
+    others: dict[str, list[float]]
     chosen: list[list[float]]
     effects: list[str]
     error_mm: list[float]
@@ -79,13 +91,15 @@ def trial(seed: int, law: Law, cache: Path | None) -> Row:
         state=None if cache is None else cache / f"{seed} {law}.json",
         progress=lambda text: print(f"cable {seed}, {law}: {text}", file=sys.stderr, flush=True),
     )
+    everything = estimate(found, found.values, windows)
     accepted = [step for step in found.steps if step.accepted]
     return Row(
         seed=seed,
         law=law,
         truth={k: v for k, v in dataclasses.asdict(cable).items() if isinstance(v, float)},
-        halves=[told(interval) for interval in intervals_of_halves(found, windows)],
-        everything=told(stiffness_interval(found, found.values, windows)),
+        halves=[told(half.stiffness) for half in estimates_of_halves(found, windows)],
+        everything=told(everything.stiffness),
+        others=others(cable, everything),
         chosen=[jackknifed(found, half) for half in range(2)],
         effects=list(found.effects),
         error_mm=[1e3 * float(step.error.mean()) for step in (accepted[0], accepted[-1])],
@@ -93,9 +107,33 @@ def trial(seed: int, law: Law, cache: Path | None) -> Row:
     )
 
 
-def told(interval: tuple[float, float]) -> list[float]:
-    """An interval with its middle, which is the estimate."""
-    return [math.sqrt(interval[0] * interval[1]), *interval]
+def told(interval: Interval) -> list[float]:
+    return list(dataclasses.astuple(interval))
+
+
+def others(cable: SyntheticCable, everything: Estimate) -> dict[str, list[float]]:
+    """What a diagnosis would tell of the other effects, were each of them named; the true value first."""
+    part = {effect: parameters_of(effect, everything, density=1.0)[0] for effect in TOLD}
+    knots = len(cable.profile)
+    knot = round(part["stiffness_profile"]["centre_m"].value / everything.layout.arclength[-1] * (knots - 1))
+    # the mean over these recordings, which is what a diagnosis speaks of
+    angles = np.linalg.norm(cable.grips.mean(axis=0), axis=-1)
+    truths = {
+        "bending_damping": cable.damping_time,
+        "viscous_drag": cable.drag,
+        "quadratic_drag": cable.quadratic_drag,
+        "lumped_mass": cable.marker_mass,
+        "stiffness_profile": float(np.exp(cable.profile[knot] - np.delete(cable.profile, knot).mean())),
+        "gripper_rotation_offset": [float(angle) for angle in angles],
+    }
+    rows = {}
+    for effect, parameter in TOLD.items():
+        one = part[effect][parameter]
+        true, value, ends = np.ravel(truths[effect]), np.ravel(one.value), np.reshape(np.array(one.ci90), (-1, 2))
+        for k in range(len(true)):
+            name = f"{effect}, {parameter}" + (f", gripper {k}" if len(true) > 1 else "")
+            rows[name] = [float(x) for x in (true[k], value[k], *ends[k])]
+    return rows
 
 
 def jackknifed(found: Identified, half: int) -> list[float]:
@@ -132,20 +170,37 @@ def main() -> None:
             file.write(json.dumps(dataclasses.asdict(row)) + "\n")
 
 
-def coverage(rows: list[Row], name: str, intervals: list[list[float]]) -> list[str]:
-    """One line of a table; errors and widths are of log EI/rho."""
-    true = np.log([row.truth["stiffness"] for row in rows])
-    value, low, high = np.log(intervals).T
-    held = int(((low <= true) & (true <= high)).sum())
-    bounds = clopper_pearson(held, len(rows))
-    error = value - true
+def coverage(name: str, true: list[float], intervals: list[list[float]], *, logs: bool = True) -> list[str]:
+    """One line of a table; errors and widths are of logarithms, or in the parameter's unit."""
+    values = np.column_stack([true, intervals])
+    truth, value, low, high = (np.log(values) if logs else values).T
+    held = int(((low <= truth) & (truth <= high)).sum())
+    bounds = clopper_pearson(held, len(true))
+    error = value - truth
+    told = (lambda x, sign="": f"{100 * x:{sign}.0f} %") if logs else (lambda x, sign="": f"{x:{sign}.2f}")
     return [
         name,
-        f"{held} of {len(rows)}",
-        f"{100 * held / len(rows):.0f} % ({100 * bounds.low:.0f} to {100 * bounds.high:.0f})",
-        *(f"{100 * x:.0f} %" for x in (np.median(high - low) / 2, np.sqrt(np.mean(error**2)))),
-        f"{100 * error.mean():+.0f} %",
+        f"{held} of {len(true)}",
+        f"{100 * held / len(true):.0f} % ({100 * bounds.low:.0f} to {100 * bounds.high:.0f})",
+        told(np.median(high - low) / 2),
+        told(np.sqrt(np.mean(error**2))),
+        told(error.mean(), "+"),
     ]
+
+
+HEAD = ["interval", "holds it", "share, with its 95 % interval", "median half width", "rms error", "mean error"]
+
+
+def others_table(rows: list[Row]) -> list[str]:
+    """Everything but EI/rho."""
+    table = [HEAD]
+    for name in rows[0].others:
+        of = [row.others[name] for row in rows]
+        angle = name.startswith("gripper_rotation_offset")
+        table.append(
+            coverage(f"{name} [rad]" if angle else name, [o[0] for o in of], [o[1:] for o in of], logs=not angle)
+        )
+    return markdown_table(table)
 
 
 def apart(pairs: list[list[list[float]]]) -> str:
@@ -157,11 +212,11 @@ def apart(pairs: list[list[list[float]]]) -> str:
 
 def section(rows: list[Row]) -> list[str]:
     """The cables that obey one law."""
-    table = [["interval", "holds it", "share, with its 95 % interval", "median half width", "rms error", "mean error"]]
+    table, true = [HEAD], [row.truth["stiffness"] for row in rows]
     for part, of in (("all effects free", lambda row: row.halves), ("the effects that stayed", lambda row: row.chosen)):
         for k, half in enumerate(("one half", "the other half")):
-            table.append(coverage(rows, f"{half}, {part}", [of(row)[k] for row in rows]))
-    table.insert(3, coverage(rows, "all recordings, all effects free", [row.everything for row in rows]))
+            table.append(coverage(f"{half}, {part}", true, [of(row)[k] for row in rows]))
+    table.insert(3, coverage("all recordings, all effects free", true, [row.everything for row in rows]))
     often = collections.Counter(effect for row in rows for effect in row.effects).most_common()
     error = np.median([row.error_mm for row in rows], axis=0)
     return [
@@ -183,16 +238,18 @@ def page(rows: list[Row]) -> str:
         every.append([row.law, str(row.seed), f"{row.truth['stiffness']:.4f}", *cells])
     fitted, richer = ([row for row in rows if row.law == law] for law in LAWS)
     lines = [
-        "# Intervals of EI/rho in space: do they hold the true value?",
+        "# Intervals in space: do they hold the true value?",
         "",
         f"Synthetic cables, each with {RECORDINGS} recordings of {SAMPLES * SAMPLE_INTERVAL:g} s at "
         f"{1 / SAMPLE_INTERVAL:g} Hz, through the protocol of the [real recordings](real_cables.md): windows and "
-        "lengths from the markers, search, fits to both halves of the recordings, the interval of either half. 90 % of "
-        "the intervals should hold the true value. Widths and errors are of log EI/rho. The halves of a cable share "
-        "its true values and the priors, so rows are not independent of each other; within a row cables are.",
+        "lengths from the markers, search, fits to both halves of the recordings, estimates from either half and from "
+        "all. 90 % of the intervals should hold the true value. First EI/rho; widths and errors are of its logarithm. "
+        "The halves of a cable share its true values and the priors, so rows are not independent of each other; within "
+        "a row cables are.",
         "",
-        "- **All effects free** is `cablejax.spatial.interval`: every effect that the search tried is fitted, whether "
-        "it stayed or not, and the interval joins the jackknife over recordings with how far the priors draw the fit.",
+        "- **All effects free** is `cablejax.spatial.estimate`: every effect that the search tried is fitted, whether "
+        "it stayed or not, and the interval joins the jackknife over recordings with how far the priors draw the fit. "
+        "This is what a diagnosis tells.",
         "- **The effects that stayed** is the fit that predictions are made with, and the jackknife of it alone. An "
         "effect stays only if it helps on recordings that were not fitted, so drag, a profile or the grips are often "
         "left out. What is left out pulls EI/rho the same way in all recordings, and no resampling shows it. Where the "
@@ -210,6 +267,21 @@ def page(rows: list[Row]) -> str:
         "and grippers that roll about the cable (0.15 rad, vibrating), all standard deviations. None of it is tried.",
         "",
         *section(richer),
+        "## The other parameters",
+        "",
+        "What a diagnosis would tell of the other effects, were they named: from all recordings, all effects free. The "
+        "ratio of a stiffness profile is that of the place where it differs most, against the mean of the other four; "
+        "the angle between cable and gripper is the mean over recordings. Angles are in rad, all else is in "
+        "logarithms. Where the markers sit along the cable (`keypoint_bias`) is not judged.",
+        "",
+        "Where the fitted law is right:",
+        "",
+        *others_table(fitted),
+        "",
+        "Where the cable has more than is fitted:",
+        "",
+        *others_table(richer),
+        "",
         "## What was drawn",
         "",
         f"EI/rho 0.01 to 0.2 m^4/s^2 (believed: {NOMINAL_STIFFNESS:.3f}), damping time 0.01 to 0.1 s and mass of a "

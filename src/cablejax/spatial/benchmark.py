@@ -12,9 +12,9 @@ from jaxtyping import Float
 
 from cablejax.recordings.deform import NOMINAL, DeformRecordings
 from cablejax.spatial.clamps import frames_along
+from cablejax.spatial.estimate import estimates_of_halves
 from cablejax.spatial.fit import errors, over_all_markers
 from cablejax.spatial.identify import Identified, identify
-from cablejax.spatial.interval import intervals_of_halves
 from cablejax.spatial.network import fit_network
 from cablejax.spatial.residual import fit_residual
 from cablejax.spatial.windows import Windows
@@ -70,8 +70,8 @@ class CableScore:
         learned: (name, split by recording, on the eval split, 5 and 95 % quantile over random choices of as many of all
             windows as eval has) of the rod with all effects and of what is learned on top of it.
         without_own: the rod on the eval split, its recordings' own values left at what all recordings share.
-        halves: EI / rho that either half of the recordings is simulated with, and its 90 % interval [m^4/s^2], see
-            `interval`.
+        simulated: EI / rho that either half of the recordings is simulated with [m^4/s^2].
+        estimated: EI / rho of either half as `estimate` tells it, with its 90 % interval [m^4/s^2].
         seconds: of one 5 s rollout alone (median), and of a batch of all windows.
         effects: that were found.
         networks: size and rounds that were chosen for the graph network of all, and of either half.
@@ -80,7 +80,8 @@ class CableScore:
     stages: tuple[tuple[str, float, float], ...]
     learned: tuple[tuple[str, float, float, float, float], ...]
     without_own: float
-    halves: tuple[tuple[float, float, float], ...]
+    simulated: tuple[float, ...]
+    estimated: tuple[tuple[float, float, float], ...]
     seconds: tuple[float, float]
     effects: tuple[str, ...]
     networks: tuple[tuple[int, int], ...]
@@ -140,11 +141,9 @@ def score_cable(recordings: DeformRecordings, *, state: pathlib.Path, progress: 
         stages=tuple(stages),
         learned=tuple(learned),
         without_own=float(metric(simulator.predict(found.values.shared, whole), whole).mean()),
-        halves=tuple(
-            (found.stiffness(values), *interval)
-            for values, interval in zip(
-                found.half_values, intervals_of_halves(found, train, progress=progress), strict=True
-            )
+        simulated=tuple(found.stiffness(values) for values in found.half_values),
+        estimated=tuple(
+            dataclasses.astuple(half.stiffness) for half in estimates_of_halves(found, train, progress=progress)
         ),
         seconds=_seconds(found, windows),
         effects=found.effects,

@@ -12,10 +12,10 @@ import numpy as np
 
 from cablejax.diagnose.diagnosis import Diagnosis, Gap, Ranked, Verdict
 from cablejax.report.effect_words import effect_title, listed, millimetres, share
+from cablejax.spatial.estimate import estimate
 from cablejax.spatial.gap import RESOLVABLE, gap_of, noise_of
 from cablejax.spatial.geometry import LocalChange, local_changes
 from cablejax.spatial.identify import EDGES, Identified, identify
-from cablejax.spatial.interval import stiffness_interval
 from cablejax.spatial.named import named_effects
 from cablejax.spatial.where import in_log, where_of
 from cablejax.spatial.windows import WINDOW, Windows, windows_of
@@ -84,8 +84,8 @@ def diagnose_space(
     verdict = _verdict(gap, found)
     effects = ()
     if verdict not in ("none", "unknown"):
-        interval = stiffness_interval(found, found.values, windows, progress=progress)
-        effects = named_effects(found, interval, cable["linear_density_kg_per_m"], windows)
+        told = estimate(found, found.values, windows, progress=progress)
+        effects = named_effects(found, told, cable["linear_density_kg_per_m"], windows)
     nominal, explained = (in_log(log, windows, part) for part in (before, after))
     where = where_of(log, windows, nominal, before, noise, changes)
     return SpatialDiagnosis(
@@ -169,6 +169,8 @@ def _caveats(log, windows, left_out, found) -> tuple[str, ...]:
         "cannot be seen.",
         "Roll of the grippers about the cable is not observed; it is taken as the least turn from their mean "
         "direction.",
+        "Parameters are those of a fit in which everything that was tried is free. Predictions are made with the named "
+        "effects alone, whose values differ from these where something that was not named is there nevertheless.",
     ]
     if "gripper_rotation_offset" in found.effects:
         own = found.values.own[:, found.simulator.layout.slices["clamp_rotation"]]

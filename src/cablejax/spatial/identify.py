@@ -52,11 +52,6 @@ class Identified:
     moves: tuple[Float[np.ndarray, "R P"], ...]
     first: Float[np.ndarray, "W"] | np.ndarray
 
-    @property
-    def spread(self) -> Float[np.ndarray, "P"]:
-        """Standard error of the shared values, by leaving out recordings."""
-        return np.sqrt((self.moves[2] ** 2).sum(axis=0))
-
     def stiffness(self, values: Values) -> float:
         """EI / rho, geometric mean along the cable [m^4/s^2]."""
         layout = self.simulator.layout

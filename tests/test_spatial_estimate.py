@@ -1,0 +1,101 @@
+"""Estimates hold the true values, know what the recordings cannot tell, and say so by the names of the gap log."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+import spatial_cases as cases
+from cablejax.spatial.estimate import estimate
+from cablejax.spatial.fit import Simulator
+from cablejax.spatial.identify import Identified, layout_of
+from cablejax.spatial.named import named_effects, parameters_of
+from cablejax.spatial.newton import improve
+from cablejax.spatial.rod import Rod
+from cablejax.spatial.values import shared_by_all
+from cablejax.spatial.windows import windows_of
+
+_FOUND = ("bending_stiffness", "bending_damping")
+_TRUE_STIFFNESS = cases.TRUE_RATIO * cases.NOMINAL
+
+
+@pytest.fixture(scope="module")
+def found():
+    windows = windows_of(cases.recording())
+    simulator = Simulator(Rod(16, twisting=False), layout_of(windows, cases.NOMINAL, twisting=False))
+    start = shared_by_all(np.zeros(simulator.layout.size), windows.group)
+    start.shared[simulator.layout.slices["damping_time"]] = 0.05
+    values = improve(simulator, start, _FOUND, windows, iterations=8).values
+    first = np.arange(len(windows)) < 2
+    return windows, Identified(simulator, _FOUND, _FOUND, (), values, (values, values), (), first)
+
+
+@pytest.fixture(scope="module")
+def everything(found):
+    """With all that the rod without twist can be taught."""
+    windows, identified = found
+    tried = dataclasses.replace(identified, tried=identified.simulator.layout.effects)
+    return estimate(tried, identified.values, windows)
+
+
+def _width(interval):
+    return np.log(interval.high / interval.low)
+
+
+def test_is_wider_the_more_may_be_true_and_holds_the_true_value(found):
+    windows, identified = found
+    intervals = []
+    for more in ((), ("viscous_drag",), ("viscous_drag", "lumped_mass")):
+        tried = dataclasses.replace(identified, tried=(*_FOUND, *more))
+        intervals.append(estimate(tried, identified.values, windows).stiffness)
+    widths = [_width(interval) for interval in intervals]
+    assert 0 < widths[0] < widths[1] < widths[2] < 0.3
+    # mass that sits all along the cable makes it slower just as a softer cable is
+    assert widths[2] > 1.5 * widths[1]
+    # the others are as narrow as the few per cent by which the coarse rod at 20 ms is off, which no interval tells
+    assert intervals[2].low < _TRUE_STIFFNESS < intervals[2].high
+
+
+def test_says_more_from_more_recordings(found):
+    windows, identified = found
+    every = estimate(identified, identified.values, windows).stiffness
+    two = estimate(identified, identified.values, windows.chosen([0, 1])).stiffness
+    assert _width(every) < 0.7 * _width(two)
+
+
+def test_tells_every_effect_with_its_interval(found, everything):
+    windows, identified = found
+    stiffness, damping = named_effects(identified, everything, 0.05, windows)
+    (ratio,), (time,) = stiffness.parameters.values(), damping.parameters.values()
+    # the priors hold no drag and no mass at all impossible, and some of either is taken for the other two
+    assert ratio.value == pytest.approx(cases.TRUE_RATIO, rel=0.25)
+    assert time.value == pytest.approx(cases.TRUE_DAMPING, rel=0.25)
+    assert ratio.value == pytest.approx(everything.stiffness.value / cases.NOMINAL)
+    for effect in everything.layout.effects:
+        parameters, along = parameters_of(effect, everything, 0.05)
+        assert (along is None) == (effect != "stiffness_profile")
+        for parameter in parameters.values():
+            if parameter.ci90 is not None:
+                low, high = np.reshape(parameter.ci90, (-1, 2)).T
+                assert (low <= np.ravel(parameter.value)).all() and (np.ravel(parameter.value) <= high).all()
+
+
+def test_nothing_that_is_positive_may_be_negative(everything):
+    # there is no drag and no mass of markers: only the priors keep these values from nothing
+    for field in ("drag", "quadratic_drag", "marker_mass"):
+        interval = everything.positive(field)
+        assert 0 < interval.low < interval.value < interval.high
+        assert interval.high / interval.low > 2
+
+
+def test_a_mass_is_told_per_density(everything):
+    one, other = (parameters_of("lumped_mass", everything, density)[0]["mass_kg"] for density in (0.05, 0.1))
+    assert other.value == pytest.approx(2 * one.value)
+    np.testing.assert_allclose(np.array(other.ci90), 2 * np.array(one.ci90))
+
+
+def test_refuses_an_effect_that_it_does_not_know(everything):
+    with pytest.raises(ValueError, match="'axial_stretch', expected one of"):
+        parameters_of("axial_stretch", everything, 0.05)
