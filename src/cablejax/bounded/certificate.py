@@ -6,7 +6,7 @@ import dataclasses
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Scalar
 
 from cablejax.bounded.sets import AbstractSet
 
@@ -41,6 +41,11 @@ class Certificate:
         return jnp.maximum(jnp.maximum(self.stationarity, self.feasibility), self.complementarity)
 
 
+def projected_gradient_size(feasible: AbstractSet, y: Float[Array, "*shape"], gradient: Float[Array, "..."]) -> Scalar:
+    """Largest element of `P(y - g) - y`, which is zero at a minimum and nowhere else, for a gradient of any shape."""
+    return jnp.abs(feasible.project(y - gradient.reshape(y.shape)) - y).max()
+
+
 def certify(
     gradient: Float[Array, "*shape"], feasible: AbstractSet, y: Float[Array, "*shape"], near: float = _NEAR
 ) -> Certificate:
@@ -61,7 +66,7 @@ def certify(
         complementarity=jnp.abs(multipliers * slack).max(),
         smallest_multiplier=jnp.min(jnp.where(active, multipliers, jnp.inf)),
         multipliers=multipliers,
-        projected_gradient=jnp.abs(feasible.at(y).project(y - gradient) - y).max(),
+        projected_gradient=projected_gradient_size(feasible.at(y), y, gradient),
     )
 
 

@@ -7,6 +7,8 @@ import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Scalar
 
+from cablejax.bounded.quadratic_model import promised_decrease
+
 
 class _GainState(eqx.Module):
     step_size: Scalar
@@ -35,10 +37,10 @@ class GainRatio(optx.AbstractSearch):
 
     def step(self, first_step, y, y_eval, f_info, f_eval_info, state):
         move = y_eval - y
-        predicted = jnp.sum(f_info.grad * move) + 0.5 * move @ f_info.hessian.as_matrix() @ move
-        actual = f_eval_info.as_min() - f_info.as_min()
-        promising = predicted < 0
-        ratio = jnp.where(promising, actual / jnp.where(promising, predicted, 1.0), -1.0)
+        promised = promised_decrease(f_info, move)
+        actual = f_info.as_min() - f_eval_info.as_min()
+        promising = promised > 0
+        ratio = jnp.where(promising, actual / jnp.where(promising, promised, 1.0), -1.0)
         # NaN compares as false
         accept = first_step | (ratio > self.accept_above)
         grown = state.step_size / jnp.maximum(0.1, 1.0 - (2.0 * jnp.minimum(ratio, 1.0) - 1.0) ** 3)

@@ -7,11 +7,11 @@ from typing import Any
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import lineax as lx
 import optimistix as optx
 from jaxtyping import Array
 
+from cablejax.bounded.objective import value_of
 from cablejax.bounded.sets import AbstractSet
 
 
@@ -42,8 +42,7 @@ def _fixed_point(y, residual, inputs):
     fn, _, _, args, options, *_ = inputs
 
     def objective(y):
-        out, _ = fn(y, args)
-        return out if out.ndim == 0 else 0.5 * jnp.sum(out**2)
+        return value_of(fn(y, args)[0])
 
     return options["feasible"].at(y).project(y - jax.grad(objective)(y)) - y
 

@@ -6,12 +6,14 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import lineax as lx
 import optimistix as optx
 from equinox import AbstractVar
 from jaxtyping import Array, Bool, Float, Int, PyTree, Scalar
 
+from cablejax.bounded.certificate import projected_gradient_size
 from cablejax.bounded.linearise import forward
+from cablejax.bounded.objective import value_of
+from cablejax.bounded.quadratic_model import promised_decrease, quadratic_info
 from cablejax.bounded.secant import secant_update
 
 
@@ -146,12 +148,12 @@ class AbstractBoundedLeastSquares(optx.AbstractLeastSquaresSolver):
             return trial, fn(trial, args)[0]
 
         trial, residual = jax.lax.cond(ended, stay, go)
-        value = 0.5 * jnp.sum(residual**2)
+        value = value_of(residual)
         move = (trial - y).ravel()
         step_size, accept, _, search_state = self.search.step(
             jnp.array(False), y.ravel(), trial.ravel(), info, optx.FunctionInfo.Eval(value), state.search_state
         )
-        promised = -(jnp.sum(info.grad * move) + 0.5 * move @ info.hessian.as_matrix() @ move)
+        promised = promised_decrease(info, move)
         rounding = 4 * jnp.finfo(y.dtype).eps * jnp.abs(info.f)
         rounded = promised <= rounding
         # Gradients are known better than values: two more steps are taken on trust where values cannot tell.
@@ -190,8 +192,8 @@ class AbstractBoundedLeastSquares(optx.AbstractLeastSquaresSolver):
             telling = jnp.linalg.norm(left - secant @ moved) <= jnp.linalg.norm(left)
             secant = jnp.where(state.linearisations > 0, secant_update(secant, moved, bent, slope), secant)
             learned = jnp.where(telling, secant, 0.0)
-        info = quadratic_info(0.5 * jnp.sum(residual**2), gradient, jacobian.T @ jacobian + learned)
-        optimality = jnp.abs(feasible.project(y - gradient.reshape(y.shape)) - y).max()
+        info = quadratic_info(value_of(residual), gradient, jacobian.T @ jacobian + learned)
+        optimality = projected_gradient_size(feasible, y, gradient)
         return eqx.tree_at(
             lambda s: (
                 *(s.f_info, s.residual, s.jacobian, s.secant, s.last),
@@ -216,15 +218,10 @@ class AbstractBoundedLeastSquares(optx.AbstractLeastSquaresSolver):
         residual = jnp.where(state.stale, residual, state.residual)
         # what the model has learned beyond J'J stays until the next linearisation
         learned = state.f_info.hessian.as_matrix() - state.jacobian.T @ state.jacobian
-        info = quadratic_info(0.5 * jnp.sum(residual**2), jacobian.T @ residual, jacobian.T @ jacobian + learned)
+        info = quadratic_info(value_of(residual), jacobian.T @ residual, jacobian.T @ jacobian + learned)
         descent = self.descent.within(feasible.at(y), y).query(y.ravel(), info, state.descent_state)
         return eqx.tree_at(
             lambda s: (s.f_info, s.residual, s.jacobian, s.descent_state, s.updates, s.stale),
             state,
             (info, residual, jacobian, descent, state.updates + 1, jnp.array(True)),
         )
-
-
-def quadratic_info(value: Scalar, gradient: Float[Array, " P"], hessian: Float[Array, "P P"]):
-    """A quadratic model of a function as optimistix's descents and searches take it."""
-    return optx.FunctionInfo.EvalGradHessian(value, gradient, lx.MatrixLinearOperator(hessian))

@@ -11,9 +11,10 @@ import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Bool, Int, PyTree, Scalar
 
+from cablejax.bounded.certificate import projected_gradient_size
 from cablejax.bounded.gain_ratio import GainRatio
-from cablejax.bounded.least_squares import quadratic_info
 from cablejax.bounded.levenberg_marquardt import DampedQuadratic
+from cablejax.bounded.quadratic_model import promised_decrease, quadratic_info
 from cablejax.bounded.secant import positive_update, sized
 
 
@@ -139,10 +140,10 @@ class BoundedQuasiNewton(optx.AbstractMinimiser):
         move, _ = descent.step(state.step_size, descent_state)
         trial = feasible.restore(y + jnp.where(jnp.isfinite(move).all(), move, 0.0).reshape(y.shape))
         move = (trial - y).ravel()
-        promised = -(info.grad @ move + 0.5 * move @ info.hessian.as_matrix() @ move)
+        promised = promised_decrease(info, move)
         rounded = promised <= 4 * jnp.finfo(y.dtype).eps * jnp.abs(info.f)
 
-        optimality = jnp.abs(feasible.project(y - info.grad.reshape(y.shape)) - y).max()
+        optimality = projected_gradient_size(feasible, y, info.grad)
         converged = optimality <= self.atol + self.rtol * self.norm(y)
         # after a step that was taken on trust
         stalled = state.rounded & rounded & ~converged & ~state.terminate

@@ -8,10 +8,10 @@ from collections.abc import Callable
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from cablejax.bounded.certificate import Certificate, certify
+from cablejax.bounded.objective import value_of
 from cablejax.bounded.sets import AbstractSet
 
 
@@ -85,7 +85,6 @@ class Solution:
         """The first-order conditions at `value`, from the gradient of `fn` there; of residuals, half their squares'."""
 
         def objective(y):
-            out = fn(y, args)
-            return out if out.ndim == 0 else 0.5 * jnp.sum(out**2)
+            return value_of(fn(y, args))
 
         return certify(jax.grad(objective)(self.value), feasible, self.value)

@@ -12,6 +12,7 @@ from jaxtyping import Array
 
 from cablejax.bounded.implicit import FixedPointAdjoint
 from cablejax.bounded.linearise import forward, squared_jacobian
+from cablejax.bounded.objective import value_of
 from cablejax.bounded.results import Result, Solution, Stats
 from cablejax.bounded.sets import AbstractSet
 
@@ -87,7 +88,7 @@ def least_squares(
     if isinstance(solver, optx.AbstractMinimiser):
 
         def half_squares(y, args):
-            return 0.5 * jnp.sum(residual_fn(y, args) ** 2)
+            return value_of(residual_fn(y, args))
 
         squared = squared_jacobian(linearise or forward(residual_fn))
         return minimise(half_squares, solver, y0, feasible, args, hessian=squared, max_steps=max_steps, throw=throw)

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int, PyTree, Scalar
 
+from cablejax.bounded.certificate import projected_gradient_size
 from cablejax.bounded.sets import ConvexSet
 
 
@@ -52,7 +53,7 @@ class ProjectionArc(optx.AbstractDescent):
         length = jnp.clip(jnp.where(curved, spectral, 4.0 * state.length), self.shortest, self.longest)
         length = jnp.where(state.first, state.length, length)
         feasible = _set(self.feasible)
-        optimality = jnp.abs(feasible.project(y - f_info.grad) - y).max()
+        optimality = projected_gradient_size(feasible, y, f_info.grad)
         return _ArcState(feasible, y, f_info.grad, length, jnp.array(False), optimality)
 
     def step(self, step_size, state):

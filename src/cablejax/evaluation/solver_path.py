@@ -20,6 +20,7 @@ from jaxtyping import Array, Float
 
 from cablejax.bounded import AbstractSet
 from cablejax.bounded.linearise import squared_jacobian
+from cablejax.bounded.objective import value_of
 
 
 @dataclasses.dataclass(frozen=True)
@@ -104,8 +105,7 @@ class PathFinder:
         return (self._objective if minimises else self._fn)(y, args), None
 
     def _objective(self, y, args):
-        out = self._fn(y, args)
-        return out if out.ndim == 0 else 0.5 * jnp.sum(out**2)
+        return value_of(self._fn(y, args))
 
     def _init(self, y, args, feasible):
         struct, _ = jax.eval_shape(self._with_aux, y, args)
