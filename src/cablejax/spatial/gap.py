@@ -35,6 +35,11 @@ def mean_of_finite(values: np.ndarray, axis: tuple[int, ...] | int | None) -> np
     return np.where(count > 0, np.where(seen, values, 0.0).sum(axis=axis) / np.maximum(count, 1), np.nan)
 
 
+def errors_ahead(squared: Float[np.ndarray, "W T F 3"], interval: float) -> dict[float, float]:
+    """Root mean square of errors up to some seconds after a window's beginning [mm], from their squares [m^2]."""
+    return {s: 1e3 * float(np.sqrt(np.nanmean(squared[:, : round(s / interval)]))) for s in (1.0, 2.0, 5.0)}
+
+
 def gap_of(
     before: Float[np.ndarray, "W T F 3"], after: Float[np.ndarray, "W T F 3"], windows: Windows, noise: float
 ) -> Gap:
@@ -56,10 +61,7 @@ def gap_of(
         one, other = (resampled(w, windows.group) for w in windowed)
         low, high = np.quantile(1 - other / one, [0.05, 0.95])
         interval = (float(low), float(high))
-    horizons, count = {}, windows.valid.shape[1]
-    for seconds in (1.0, 2.0, 5.0):
-        end = min(round(seconds / windows.interval), count)
-        horizons[seconds] = tuple(1e3 * float(np.sqrt(np.nanmean(s[:, :end]))) for s in squared)
+    ahead = [errors_ahead(s, windows.interval) for s in squared]
     floor, left = float(noise**2 / means[0]), float(means[1] / means[0])
     return Gap(
         before_rmse_mm=1e3 * float(np.sqrt(means[0])),
@@ -68,7 +70,7 @@ def gap_of(
         shrinkage=shrinkage,
         shrinkage_ci90=interval,
         ahead_mm=None,
-        horizons_mm=horizons,
+        horizons_mm={seconds: (ahead[0][seconds], ahead[1][seconds]) for seconds in ahead[0]},
         held_out_episodes=tuple(sorted({int(e) for e in windows.episode})),
         split={"noise": floor, "named": max(1 - left, 0.0), "learnable": 0.0, "unexplained": max(left - floor, 0.0)},
     )

@@ -9,7 +9,7 @@ from jaxtyping import Float
 
 from cablejax.diagnose.where import Where
 from cablejax.report.effect_words import millimetres
-from cablejax.spatial.gap import RESOLVABLE, mean_of_finite, squares
+from cablejax.spatial.gap import RESOLVABLE, errors_ahead, mean_of_finite, squares
 from cablejax.spatial.geometry import LocalChange
 from cablejax.spatial.windows import Windows
 from cablejax.types import GapLog
@@ -69,11 +69,6 @@ def where_of(
         f"While the grippers move fast the gap is {millimetres(regimes['speed: fast'])}, slowly "
         f"{millimetres(regimes['speed: slow'])}.",
     ]
-    count = squared.shape[1]
-    horizons = {
-        s: 1e3 * float(np.sqrt(np.nanmean(squared[:, : min(round(s / windows.interval), count)])))
-        for s in (1.0, 2.0, 5.0)
-    }
     missing = np.ones(len(episodes))
     return Where(
         gap_mm=1e3 * float(np.sqrt(np.nanmean(squared))),
@@ -84,7 +79,7 @@ def where_of(
         episode_p=np.where(episodes > 1e3 * RESOLVABLE * level, 0.0, missing),
         keypoint_p=np.where(along > 1e3 * RESOLVABLE * level, 0.0, 1.0),
         heat=np.sqrt(mean_of_finite(off**2, -1)) / level,
-        horizons_mm=horizons,
+        horizons_mm=errors_ahead(squared, windows.interval),
         regimes=regimes,
         frames={},
         contrasts={},
