@@ -14,6 +14,7 @@ from cablejax.spatial.identify import Identified, layout_of
 from cablejax.spatial.named import named_effects, parameters_of
 from cablejax.spatial.newton import improve
 from cablejax.spatial.rod import Rod
+from cablejax.spatial.time_steps import TimeSteps
 from cablejax.spatial.values import shared_by_all
 from cablejax.spatial.windows import windows_of
 
@@ -29,7 +30,7 @@ def found():
     start.shared[simulator.layout.slices["damping_time"]] = 0.05
     values = improve(simulator, start, _FOUND, windows, iterations=8).values
     first = np.arange(len(windows)) < 2
-    return windows, Identified(simulator, _FOUND, _FOUND, (), values, (values, values), (), first)
+    return windows, Identified(simulator, TimeSteps(1, 0.0), _FOUND, _FOUND, (), values, (values, values), (), first)
 
 
 @pytest.fixture(scope="module")

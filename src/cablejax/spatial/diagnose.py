@@ -181,6 +181,11 @@ def _caveats(log, windows, left_out, found) -> tuple[str, ...]:
         )
     if left_out:
         result.append(f"{left_out} windows are labelled eval; nothing was fitted to or scored on them.")
+    if not found.time_steps.fine_enough:
+        result.append(
+            f"The grippers move too fast for the finest time steps of the simulation: half of them would change it by "
+            f"{millimetres(1e3 * found.time_steps.error)}. Gaps of that size may be its own."
+        )
     groups = len(np.unique(windows.group))
     if groups < 6:
         result.append(f"Only {groups} recordings: intervals over recordings are rough.")

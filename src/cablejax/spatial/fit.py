@@ -25,7 +25,8 @@ from cablejax.spatial.windows import Windows
 
 _CHUNK = 8
 _ROBUST = 0.02  # d [m]
-_ERROR = 0.01  # what is left of a good fit [m]: unit of the residuals
+GOOD_FIT = 0.01
+"""What is left of a good fit [m]: unit of the residuals."""
 _CORRELATION = 0.3  # [s]
 _EVERY = 4
 # A marker further off than this is off by this: a simulation that broke down is one bad window, not infinity [m].
@@ -108,7 +109,7 @@ def _window_sums(predicted, derivative, target, seen, interval):
     ratio = np.sqrt((miss**2).sum(axis=-1)) / _ROBUST
     root = np.sqrt(1 + ratio**2)
     # weight of correlated samples, in units of the error of a good fit
-    unit = _EVERY * interval / _CORRELATION / _ERROR**2 / 3
+    unit = _EVERY * interval / _CORRELATION / GOOD_FIT**2 / 3
     cost = unit * _ROBUST**2 * (np.where(use, root - 1, 0.0).sum() + (seen & lost).sum() * (_LOST / _ROBUST))
     weight = np.where(use, unit / root, 0.0)[..., None]
     flat = np.where(use[..., None, None], derivative, 0.0).reshape(-1, count)

@@ -15,11 +15,13 @@ from cablejax.spatial.memory import Memory, fingerprint
 from cablejax.spatial.newton import improve, jackknife
 from cablejax.spatial.rod import Rod
 from cablejax.spatial.search import Step, accepted_effects, falls, halves, search
+from cablejax.spatial.time_steps import TimeSteps, time_steps_for
 from cablejax.spatial.values import Values, mean_of
 from cablejax.spatial.windows import Windows
 
 EDGES = 20
 _SELECTED = 24
+_TIMED = 8
 _REFITTED = 24
 _FINAL = 12
 _SHORTEST = 0.8
@@ -33,6 +35,7 @@ class Identified:
 
     Attributes:
         simulator: of the rod with all effects.
+        time_steps: that it makes between two samples.
         effects: that stayed, in the order in which they were found.
         tried: all effects that might have stayed.
         steps: of the search.
@@ -44,6 +47,7 @@ class Identified:
     """
 
     simulator: Simulator
+    time_steps: TimeSteps
     effects: tuple[str, ...]
     tried: tuple[str, ...]
     steps: tuple[Step, ...]
@@ -110,10 +114,18 @@ def identify(
     """
     names = [block.effect for block in blocks(1, twisting=True)]
     names = [name for name in dict.fromkeys(names) if (name != _MATERIAL if only is None else name in only)]
-    memory = Memory(state, fingerprint(EDGES, windows, nominal_stiffness, names))
     picked = windows.chosen(selection(windows))
-    plain = Simulator(Rod(EDGES, twisting=False), layout_of(windows, nominal_stiffness, twisting=False))
-    full = Simulator(Rod(EDGES, twisting=True), layout_of(windows, nominal_stiffness, twisting=True))
+    layout = layout_of(windows, nominal_stiffness, twisting=False)
+    time_steps = time_steps_for(windows.chosen(selection(windows, _TIMED)), layout, EDGES)
+    progress(
+        f"time steps of {1e3 * windows.interval / time_steps.substeps:.3g} ms; half of that changes the motion by "
+        f"{1e3 * time_steps.error:.1f} mm"
+    )
+    plain = Simulator(Rod(EDGES, time_steps.substeps, twisting=False), layout)
+    full = Simulator(
+        Rod(EDGES, time_steps.substeps, twisting=True), layout_of(windows, nominal_stiffness, twisting=True)
+    )
+    memory = Memory(state, fingerprint(plain.rod, windows, nominal_stiffness, names))
 
     steps = search(
         plain,
@@ -153,6 +165,7 @@ def identify(
             memory.keep_finals(finals)
     return Identified(
         simulator=simulator,
+        time_steps=time_steps,
         effects=tuple(effects),
         tried=tuple(names),
         steps=tuple(steps),

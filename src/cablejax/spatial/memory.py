@@ -13,14 +13,15 @@ from typing import Any
 
 import numpy as np
 
+from cablejax.spatial.rod import Rod
 from cablejax.spatial.search import Step
 from cablejax.spatial.values import Values, from_json, to_json
 from cablejax.spatial.windows import Windows
 
 
-def fingerprint(edges: int, windows: Windows, nominal_stiffness: float, names: Sequence[str]) -> str:
+def fingerprint(rod: Rod, windows: Windows, nominal_stiffness: float, names: Sequence[str]) -> str:
     """What a kept state must have been made from to be of use."""
-    digest = hashlib.sha256(repr((edges, float(nominal_stiffness), list(names), windows.name)).encode())
+    digest = hashlib.sha256(repr((rod, float(nominal_stiffness), list(names), windows.name)).encode())
     for array in (windows.keypoints, windows.position, windows.valid, windows.group):
         digest.update(np.ascontiguousarray(array).tobytes())
     return digest.hexdigest()
