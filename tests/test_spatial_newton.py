@@ -9,7 +9,17 @@ import numpy as np
 import spatial_cases as cases
 from cablejax.spatial.fit import Simulator, Sums
 from cablejax.spatial.identify import layout_of
-from cablejax.spatial.newton import Fit, coordinates, improve, jackknife, newton_step, prior_shifts, slopes
+from cablejax.spatial.newton import (
+    Fit,
+    Move,
+    coordinates,
+    improve,
+    jackknife,
+    moved_by,
+    newton_step,
+    prior_shifts,
+    slopes,
+)
 from cablejax.spatial.rod import Rod
 from cablejax.spatial.values import Values, from_json, mean_of, shared_by_all, to_json
 from cablejax.spatial.windows import windows_of
@@ -36,6 +46,21 @@ def test_a_recording_that_was_not_fitted_has_what_all_share():
         np.testing.assert_array_equal(getattr(again, field), getattr(values, field))
     other = Values(np.array([3.0, 2.0]), np.array([3, 7]), np.zeros((2, 2)))
     np.testing.assert_array_equal(mean_of(values, other).of(np.array([3])), [[2.5, 2.0]])
+
+
+def test_what_cannot_be_negative_never_becomes_it():
+    layout = _simulator()[1].layout
+    drag, damping = (layout.slices[name].start for name in ("drag", "damping_time"))
+    values = shared_by_all(np.zeros(layout.size), np.array([0]))
+    values.shared[damping] = 0.05
+    active = layout.active(["bending_stiffness", "bending_damping", "viscous_drag"])
+    down = Move(np.full(layout.size, -3.0), np.zeros_like(values.own))
+    less = moved_by(layout, values, active, down).shared
+    assert less[drag] == 0.0 and less[damping] == 0.05 * np.exp(-3.0)
+    assert less[layout.slices["log_stiffness"].start] == -3.0
+    more = moved_by(layout, values, active, down * -1.0).shared
+    assert more[drag] > 0.0 and more[damping] == 0.05 * np.exp(3.0)
+    np.testing.assert_array_equal(less[~active], values.shared[~active])
 
 
 def test_elimination_solves_the_whole_system():

@@ -152,9 +152,6 @@ def _starts(simulator: Simulator, fits: Sequence[Fit], windows: Windows, parts, 
         active = layout.active(effects)
         step = newton_step(fit, layout, part, damping=1e-3, active=active)
         trials = [moved_by(layout, fit.values, active, step * scale) for scale in (1.0, 0.4)]
-        # a positive value that is off cannot go below
-        floor = np.where(np.isnan(layout.starts), -np.inf, 0.0)
-        trials = [dataclasses.replace(t, shared=np.maximum(t.shared, floor)) for t in trials]
         for where, value in layout.templates(effects[-1]):
             shared = fit.values.shared.copy()
             shared[where] = value
