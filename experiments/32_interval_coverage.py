@@ -25,7 +25,6 @@ from pathlib import Path
 os.environ.setdefault("NPROC", "4")
 
 import numpy as np
-from scipy.stats import t
 
 from cablejax.evaluation.statistics import clopper_pearson
 from cablejax.recordings.deform import NOMINAL, SAMPLE_INTERVAL
@@ -35,7 +34,9 @@ from cablejax.spatial.benchmark import protocol_windows
 from cablejax.spatial.estimate import Estimate, Interval, estimate, estimates_of_halves
 from cablejax.spatial.identify import Identified, identify
 from cablejax.spatial.named import parameters_of
+from cablejax.spatial.newton import improve, jackknife
 from cablejax.spatial.synthetic import RECORDINGS, SAMPLES, Law, SyntheticCable, synthetic_recordings
+from cablejax.spatial.windows import Windows
 
 TOLD = {
     "bending_damping": "time_s",
@@ -100,7 +101,7 @@ def trial(seed: int, law: Law, cache: Path | None) -> Row:
         halves=[told(half.stiffness) for half in estimates_of_halves(found, windows)],
         everything=told(everything.stiffness),
         others=others(cable, everything),
-        chosen=[jackknifed(found, half) for half in range(2)],
+        chosen=[jackknifed(found, half, windows) for half in range(2)],
         effects=list(found.effects),
         error_mm=[1e3 * float(step.error.mean()) for step in (accepted[0], accepted[-1])],
         seconds=time.perf_counter() - begun,
@@ -136,12 +137,12 @@ def others(cable: SyntheticCable, everything: Estimate) -> dict[str, list[float]
     return rows
 
 
-def jackknifed(found: Identified, half: int) -> list[float]:
-    """EI / rho of a half with the effects that stayed, and its interval as if these were all there are."""
-    layout, moves = found.simulator.layout, found.moves[half]
-    log = layout.log_stiffness(found.half_values[half].shared)
-    error = t.ppf(0.95, len(moves) - 1) * np.linalg.norm(layout.log_stiffness(moves))
-    return (layout.nominal_stiffness * np.exp([log, log - error, log + error])).tolist()
+def jackknifed(found: Identified, half: int, windows: Windows) -> list[float]:
+    """EI / rho of a half with the effects that stayed, and its interval from the jackknife alone."""
+    layout, values = found.simulator.layout, found.half_values[half]
+    part = windows.chosen(np.flatnonzero((found.first, ~found.first)[half]))
+    fit = improve(found.simulator, values, found.effects, part, iterations=0)
+    return told(Estimate(layout, values.shared, jackknife(fit, layout), np.zeros((layout.size,) * 2)).stiffness)
 
 
 def read(path: Path) -> list[Row]:

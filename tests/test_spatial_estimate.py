@@ -30,7 +30,7 @@ def found():
     start.shared[simulator.layout.slices["damping_time"]] = 0.05
     values = improve(simulator, start, _FOUND, windows, iterations=8).values
     first = np.arange(len(windows)) < 2
-    return windows, Identified(simulator, TimeSteps(1, 0.0), _FOUND, _FOUND, (), values, (values, values), (), first)
+    return windows, Identified(simulator, TimeSteps(1, 0.0), _FOUND, _FOUND, (), values, (values, values), first)
 
 
 @pytest.fixture(scope="module")

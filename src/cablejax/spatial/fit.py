@@ -88,10 +88,14 @@ class Simulator:
         return Sums(*(np.array([row[k] for row in rows]) for k in range(4)))
 
 
+def bounded(off: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape"]:
+    """Sizes of errors [m]; what a simulation has lost, NaN included, is off by `_LOST`."""
+    return np.minimum(np.nan_to_num(np.abs(off), nan=_LOST, posinf=_LOST), _LOST)
+
+
 def errors(predicted: Float[np.ndarray, "W T F 3"], windows: Windows) -> Float[np.ndarray, "W"]:
     """Mean absolute error of a coordinate of the free markers, from the third sample on [m]."""
-    off = np.abs(predicted - windows.keypoints)[:, 2:]
-    off = np.where(np.isfinite(off), np.minimum(off, _LOST), _LOST)
+    off = bounded(predicted - windows.keypoints)[:, 2:]
     seen = np.isfinite(windows.keypoints[:, 2:]) & windows.valid[:, 2:, None, None]
     return (off * seen).sum(axis=(1, 2, 3)) / seen.sum(axis=(1, 2, 3))
 

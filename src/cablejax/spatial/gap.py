@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Float
 
 from cablejax.diagnose.diagnosis import Gap
+from cablejax.spatial.fit import bounded
 from cablejax.spatial.search import resampled
 from cablejax.spatial.windows import Windows
 
@@ -22,7 +23,7 @@ def noise_of(windows: Windows) -> float:
 
 def squares(predicted: Float[np.ndarray, "W T F 3"], windows: Windows) -> Float[np.ndarray, "W T F 3"]:
     """Squared errors of free coordinates, bounded by a metre, NaN where nothing was recorded."""
-    off = np.minimum(np.nan_to_num(np.abs(predicted - windows.keypoints), nan=1.0, posinf=1.0), 1.0) ** 2
+    off = bounded(predicted - windows.keypoints) ** 2
     seen = np.isfinite(windows.keypoints) & windows.valid[:, :, None, None]
     seen[:, :2] = False
     return np.where(seen, off, np.nan)

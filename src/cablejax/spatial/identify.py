@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, Int
 from cablejax.spatial.effects import Layout, blocks
 from cablejax.spatial.fit import Simulator, errors
 from cablejax.spatial.memory import Memory, fingerprint
-from cablejax.spatial.newton import improve, jackknife
+from cablejax.spatial.newton import improve
 from cablejax.spatial.rod import Rod
 from cablejax.spatial.search import Step, accepted_effects, falls, halves, search
 from cablejax.spatial.time_steps import TimeSteps, time_steps_for
@@ -41,8 +41,6 @@ class Identified:
         steps: of the search.
         values: fitted to all windows.
         half_values: fitted to either half of the recordings.
-        moves: scaled changes of the shared values of either half and of all when a recording is left out; the standard
-            error of anything linear in them is the root of its sum of squares over rows, shapes [R, P].
         first: windows of the first half, shape [W].
     """
 
@@ -53,7 +51,6 @@ class Identified:
     steps: tuple[Step, ...]
     values: Values
     half_values: tuple[Values, Values]
-    moves: tuple[Float[np.ndarray, "R P"], ...]
     first: Float[np.ndarray, "W"] | np.ndarray
 
     def stiffness(self, values: Values) -> float:
@@ -161,7 +158,7 @@ def identify(
             progress(f"fitting {word}: {int(part.sum())} windows")
             chosen = windows.chosen(np.flatnonzero(part))
             fit = improve(simulator, begin, effects, chosen, iterations=_FINAL, progress=progress)
-            finals.append((fit.values, jackknife(fit, simulator.layout)))
+            finals.append(fit.values)
             memory.keep_finals(finals)
     return Identified(
         simulator=simulator,
@@ -169,9 +166,8 @@ def identify(
         effects=tuple(effects),
         tried=tuple(names),
         steps=tuple(steps),
-        values=finals[2][0],
-        half_values=(finals[0][0], finals[1][0]),
-        moves=tuple(moves for _, moves in finals),
+        values=finals[2],
+        half_values=(finals[0], finals[1]),
         first=first,
     )
 

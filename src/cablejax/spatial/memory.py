@@ -57,11 +57,11 @@ class Memory:
             ],
         )
 
-    def finals(self) -> list[tuple[Values, np.ndarray]]:
-        return [(from_json(kept["values"]), np.array(kept["moves"])) for kept in self._held.get("final", [])]
+    def finals(self) -> list[Values]:
+        return [from_json(kept) for kept in self._held.get("fitted", [])]
 
-    def keep_finals(self, finals: Sequence[tuple[Values, np.ndarray]]) -> None:
-        self._write("final", [{"values": to_json(v), "moves": moves.tolist()} for v, moves in finals])
+    def keep_finals(self, finals: Sequence[Values]) -> None:
+        self._write("fitted", [to_json(values) for values in finals])
 
     def _write(self, name, value):
         self._held[name] = value

@@ -110,11 +110,11 @@ class Move:
 
 def moved_by(layout: Layout, values: Values, active: Bool[np.ndarray, "P"], step: Move) -> Values:
     """The values after a step. What cannot be negative grows by a factor, or stays off."""
-    positive = ~np.isnan(layout.starts)
-    moved = values.shared + np.where(active, slopes(layout, values.shared) * step.shared, 0.0)
-    grown = values.shared * np.exp(np.where(active & positive, layout.scales * step.shared, 0.0))
-    moved = np.where(positive, np.where(values.shared > 0, grown, np.maximum(moved, 0.0)), moved)
-    return Values(moved, values.recordings, values.own + step.own)
+    old, positive = values.shared, ~np.isnan(layout.starts)
+    moved = old + np.where(active, slopes(layout, old) * step.shared, 0.0)
+    grown = old * np.exp(np.where(active & positive, layout.scales * step.shared, 0.0))
+    shared = np.select([positive & (old > 0), positive], [grown, np.maximum(moved, 0.0)], moved)
+    return Values(shared, values.recordings, values.own + step.own)
 
 
 def newton_step(fit: Fit, layout: Layout, use: Bool[np.ndarray, "W"], *, damping: float = 0.0, active=None) -> Move:

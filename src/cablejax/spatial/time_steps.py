@@ -13,7 +13,7 @@ import dataclasses
 import numpy as np
 
 from cablejax.spatial.effects import Layout
-from cablejax.spatial.fit import GOOD_FIT, Simulator
+from cablejax.spatial.fit import GOOD_FIT, Simulator, bounded
 from cablejax.spatial.rod import Rod
 from cablejax.spatial.windows import Windows
 
@@ -21,7 +21,6 @@ _FINEST = 4
 # Errors of the time steps may be so large a part of what a good fit leaves, on so many of the windows. The others may
 # hold a cable that snaps through, where any error grows.
 _SHARE, _QUANTILE = 0.5, 0.8
-_LOST = 1.0  # [m]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -57,7 +56,7 @@ def time_steps_for(windows: Windows, layout: Layout, edges: int) -> TimeSteps:
     substeps, coarse = 1, predicted(1)
     while True:
         fine = predicted(2 * substeps)
-        off = np.minimum(np.nan_to_num(np.abs(coarse - fine), nan=_LOST, posinf=_LOST), _LOST)
+        off = bounded(coarse - fine)
         each = [part[valid].mean() for part, valid in zip(off, windows.valid, strict=True)]
         found = TimeSteps(substeps, float(np.quantile(each, _QUANTILE)))
         if found.fine_enough or substeps >= _FINEST:
