@@ -1,4 +1,4 @@
-"""The bounded solvers against IPOPT on 1,000 planning problems, in float64, with the released network.
+"""The bounded solvers against IPOPT on 1,000 planning problems, in float64, with the released network or another one.
 
 A quarter of the problems are what the controller asked its solver for on the way to U, S and Z with cables 0.5, 1 and 2
 times as stiff as the one trained on; a quarter are the same states with another step bound; half are random shapes with
@@ -10,6 +10,7 @@ same objective and gradient from JAX, the same start, and on `--exact` of the pr
     python experiments/11_against_ipopt.py --n 1000 --process 1 2 &   # every second one, beside --process 0 2
     python experiments/11_against_ipopt.py --explain              # the exceptions
     python experiments/11_against_ipopt.py --kinks 10             # why the network's corners are rounded
+    python experiments/11_against_ipopt.py --n 60 --exact 0 --weights experiments/weights/gns-rigid   # no snap-through
     python experiments/11_against_ipopt.py --report docs/results/against_ipopt.md     # the page, of what is done
 """
 
@@ -58,6 +59,7 @@ from cablejax.shaping import load_model
 
 FOLDER = Path("docs") / "results" / "trials" / "against_ipopt"
 """Problems and rows, kept with the repository: a thousand problems take longer than one sitting."""
+RELEASED = "gns-reference"
 STARTS = 4
 """Further starts for a problem on which ours is worse than IPOPT's."""
 ITERATIONS, EXACT_ITERATIONS = 200, 60
@@ -70,7 +72,7 @@ REACH, POINTS = 1e-5, 101
 
 def draw(path: Path) -> None:
     """The problems, in an order in which every beginning is a fair sample."""
-    model = load_model("gns-reference")
+    model = load_model(RELEASED)
     loops = closed_loop_cases(model, ("U", "S", "Z"), (0.5, 1.0, 2.0), (0,), 28)[:250]
     cases = loops + other_radii(loops, 0) + random_cases(model, range(500))
     order = np.random.default_rng(0).permutation(len(cases))
@@ -122,14 +124,16 @@ def exceptional(row: dict) -> bool:
     return worse(row) or row["kkt"] >= STATIONARY
 
 
-def run(cases: list[PlanningCase], path: Path, n_exact: int, process: tuple[int, int], seconds: float) -> None:
+def run(
+    ours: Contestant, cases: list[PlanningCase], path: Path, n_exact: int, process: tuple[int, int], seconds: float
+) -> None:
     """Judges what the file does not have yet, until the time is up."""
     done = {row["name"]: "exact" in row for row in read(path.parent)}
     index, count = process
     wanted = [(case, i < n_exact) for i, case in enumerate(cases) if i % count == index]
     # with the exact Hessian again where that was not asked for before
     todo = [(case, exact) for case, exact in wanted if case.name not in done or (exact and not done[case.name])]
-    ours, began = contestant(load_model("gns-reference")), time.perf_counter()
+    began = time.perf_counter()
     for exact in {exact for _, exact in todo}:
         # Compiles, so that no clock below sees that.
         judge(
@@ -143,11 +147,11 @@ def run(cases: list[PlanningCase], path: Path, n_exact: int, process: tuple[int,
             file.write(json.dumps({**row, "machine": machine(), "threads": os.environ["NPROC"]}) + "\n")
 
 
-def explain_all(cases: list[PlanningCase], folder: Path, seconds: float) -> None:
+def explain_all(ours: Contestant, cases: list[PlanningCase], folder: Path, seconds: float) -> None:
     """Explains what is not explained yet, until the time is up."""
     known, by_name = {row["name"] for row in read(folder, "explained")}, {case.name: case for case in cases}
     todo = [row for row in read(folder) if exceptional(row) and row["name"] not in known]
-    ours, began = contestant(load_model("gns-reference")), time.perf_counter()
+    began = time.perf_counter()
     for row in tqdm(todo, unit="problem", dynamic_ncols=True):
         if time.perf_counter() - began > seconds:
             break
@@ -155,10 +159,9 @@ def explain_all(cases: list[PlanningCase], folder: Path, seconds: float) -> None
             file.write(json.dumps(explain(ours, by_name[row["name"]], row)) + "\n")
 
 
-def measure_kinks(cases: list[PlanningCase], folder: Path, n: int) -> None:
+def measure_kinks(ours: Contestant, cases: list[PlanningCase], folder: Path, n: int) -> None:
     """What the corners do to the slope, and to where our solver ends, on the first problems that are judged."""
     done, by_name = {row["name"] for row in read(folder, "kinks")}, {case.name: case for case in cases}
-    ours = contestant(load_model("gns-reference"))
     for row in tqdm(read(folder)[:n], unit="problem", dynamic_ncols=True):
         if row["name"] in done:
             continue
@@ -192,20 +195,21 @@ def quantiles(values, digits: str = ".2g") -> str:
     return " / ".join(f"{v:{digits}}" for v in (np.median(values), np.percentile(values, 95), values.max()))
 
 
-def page(rows: list[dict], explained: dict[str, dict], kinks: list[dict], n_all: int) -> str:
+def page(weights: str, rows: list[dict], explained: dict[str, dict], kinks: list[dict], n_all: int, out: str) -> str:
     """The Markdown page of what is done."""
     limited, exact = ([row for row in rows if which in row] for which in ("limited", "exact"))
     lines = [
         "# Against IPOPT",
         "",
-        "Made by `python experiments/11_against_ipopt.py --report docs/results/against_ipopt.md`, after "
-        f"`--draw`, `--n {len(rows)} --exact {len(exact)}`, `--explain` and `--kinks {len(kinks)}`.",
+        f"Made by `python experiments/11_against_ipopt.py{'' if weights == RELEASED else f' --weights {weights}'} "
+        f"--report {out}`, after `--draw`, `--n {len(rows)} --exact {len(exact)}`, `--explain`"
+        f"{f' and `--kinks {len(kinks)}`' if kinks else ''}.",
         f"{versions()}, ipyopt {_version('ipyopt')}; {', '.join(sorted({row['machine'] for row in rows}))}; "
         f"{platform.machine()}, NPROC={'/'.join(sorted({row['threads'] for row in rows}))}. The machine had other work "
         "to do meanwhile: seconds are long, and say something only beside each other.",
         "",
         f"{len(rows)} of {n_all} problems, in a random order, seed 0; {len(exact)} of them with the exact Hessian too. "
-        "Released network gns-reference, the corners of its ReLUs rounded, with the residual fitted online, horizon 5, "
+        f"Network {weights}, the corners of its ReLUs rounded, with the residual fitted online, horizon 5, "
         f"36 unknowns, float64. Ours: `mpc.{ACCURATE}`. "
         "IPOPT: tol 1e-9 on the objective divided by its value at the start, constr_viol_tol 1e-9, "
         f"bound_relax_factor 0, adaptive mu, limited memory of 20, at most {ITERATIONS} iterations, or exact Hessian, "
@@ -378,7 +382,8 @@ def main() -> None:
     parser.add_argument("--exact", type=int, default=10, help="the first so many with the exact Hessian too")
     parser.add_argument("--seconds", type=float, default=float("inf"), help="begin no other problem after this time")
     parser.add_argument("--process", nargs=2, type=int, default=(0, 1), metavar=("INDEX", "COUNT"))
-    parser.add_argument("--folder", type=Path, default=FOLDER)
+    parser.add_argument("--weights", default=RELEASED, help="released model by name, or the folder of a training")
+    parser.add_argument("--folder", type=Path, default=FOLDER, help="has the problems")
     parser.add_argument("--explain", action="store_true", help="explain the exceptions")
     parser.add_argument("--kinks", type=int, help="measure the kinks of the first so many problems that are judged")
     parser.add_argument("--report", type=Path, help="run nothing; write the page on what is done to this file")
@@ -390,18 +395,23 @@ def main() -> None:
     if not cases_path.is_file():
         parser.error(f"there is no {cases_path}: make the problems first, with --draw")
     jax.config.update("jax_enable_x64", True)
-    cases = load_cases(cases_path)
+    cases, folder = load_cases(cases_path), options.folder
+    if options.weights != RELEASED:
+        folder = folder / Path(options.weights).name
+        folder.mkdir(exist_ok=True)
+    ours = contestant(load_model(options.weights))
     if options.explain:
-        explain_all(cases, options.folder, options.seconds)
+        explain_all(ours, cases, folder, options.seconds)
         return
     if options.kinks:
-        measure_kinks(cases, options.folder, options.kinks)
+        measure_kinks(ours, cases, folder, options.kinks)
         return
     if options.report is None:
-        path = options.folder / f"rows-{options.process[0]}.jsonl"
-        run(cases[: options.n], path, options.exact, tuple(options.process), options.seconds)
-    explained = {row["name"]: row for row in read(options.folder, "explained")}
-    text = page(read(options.folder), explained, read(options.folder, "kinks"), len(cases))
+        path = folder / f"rows-{options.process[0]}.jsonl"
+        run(ours, cases[: options.n], path, options.exact, tuple(options.process), options.seconds)
+    explained = {row["name"]: row for row in read(folder, "explained")}
+    rows, kinks = read(folder), read(folder, "kinks")
+    text = page(options.weights, rows, explained, kinks, len(cases), str(options.report))
     print(text)
     if options.report is not None:
         options.report.write_text(text, encoding="utf-8")

@@ -36,8 +36,11 @@ class Train(Command):
     network: Literal["gns", "mlp", "lstm"] = "gns"
     """gns: the graph network. mlp, lstm: the networks that it is compared with."""
 
-    prior: Literal["static", "rigid"] = "static"
+    prior: Literal["static", "rigid", "none"] = "static"
     """What the network corrects. static: the frictionless resting shape. rigid: the grippers' motion, interpolated."""
+
+    frame: Literal["grippers", "world"] = "grippers"
+    """Axes that the network sees the cable in: the grippers' own, which turn with it, or the world's."""
 
     conditioned: bool = False
     """Tell the network each cable's stiffness and friction; the data should vary in them."""
@@ -126,6 +129,7 @@ class Train(Command):
             config.model,
             network=self.network,
             prior=self.prior,
+            frame=self.frame,
             conditioned=self.conditioned,
             n_keypoints=cable.n_keypoints,
             length=cable.length,

@@ -56,7 +56,8 @@ def write_card(
         "",
         f"{_network(config)} of the dynamics of a cable of {config.length:g} m held at both ends: "
         f"{config.n_keypoints} keypoints, one step of {config.interval:g} s, {config.history} samples of history. It "
-        f"corrects the {config.prior} prior"
+        f"corrects {'no' if config.prior == 'none' else f'the {config.prior}'} prior"
+        + (", sees the cable in the world's frame" if config.frame == "world" else "")
         + (" and is told the cable's stiffness and friction." if config.conditioned else "."),
         "",
         "## Data",

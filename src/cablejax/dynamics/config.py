@@ -57,7 +57,9 @@ class ModelConfig:
         hidden_layers: hidden layers of every network; recurrent layers.
         message_passing: message-passing steps, each with weights of its own.
         prior: movement that the network corrects: "static", towards the frictionless resting shape after the command,
-            see `cablejax.dynamics.statics`, or "rigid", the interpolation of the grippers' motion.
+            see `cablejax.dynamics.statics`; "rigid", the interpolation of the grippers' motion; or "none".
+        frame: axes that features and output are expressed in: "grippers", which turn and shift with the cable, or for
+            comparison "world".
         normalisation: scales of features and output.
     """
 
@@ -72,7 +74,8 @@ class ModelConfig:
     hidden: int = 128
     hidden_layers: int = 2
     message_passing: int = 10
-    prior: Literal["static", "rigid"] = "static"
+    prior: Literal["static", "rigid", "none"] = "static"
+    frame: Literal["grippers", "world"] = "grippers"
     normalisation: Normalisation = Normalisation()
 
     def __post_init__(self):
@@ -90,10 +93,13 @@ class ModelConfig:
             value = getattr(self, name)
             if not (np.isfinite(value) and value > 0):
                 raise ValueError(f"ModelConfig.{name} is {value}, expected a positive finite number in SI units.")
-        if self.network not in ("gns", "mlp", "lstm"):
-            raise ValueError(f'ModelConfig.network is {self.network!r}, expected "gns", "mlp" or "lstm".')
-        if self.prior not in ("static", "rigid"):
-            raise ValueError(f'ModelConfig.prior is {self.prior!r}, expected "static" or "rigid".')
+        for name, known in (
+            ("network", ("gns", "mlp", "lstm")),
+            ("prior", ("static", "rigid", "none")),
+            ("frame", ("grippers", "world")),
+        ):
+            if getattr(self, name) not in known:
+                raise ValueError(f"ModelConfig.{name} is {getattr(self, name)!r}, expected one of {known}.")
         if self.radius < self.spacing:
             raise ValueError(
                 f"ModelConfig.radius is {self.radius} m but keypoints are {self.spacing:.4g} m apart: no two would be "

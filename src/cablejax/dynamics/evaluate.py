@@ -78,7 +78,7 @@ def no_motion(history: History, twist: Float[Array, "2 3"]) -> Float[Array, "N 2
     return jnp.zeros_like(history.keypoints[-1])
 
 
-def prior_motion(config: ModelConfig, prior: Literal["rigid", "static"]) -> Dynamics:
+def prior_motion(config: ModelConfig, prior: Literal["static", "rigid", "none"]) -> Dynamics:
     """The floor that a model's prior is without learning."""
     config = dataclasses.replace(config, prior=prior)
     return lambda history, twist: prior_of(history, twist, config).displacement

@@ -1,6 +1,6 @@
 """The cable as a graph: keypoints are nodes, keypoints near each other along the cable are connected.
 
-Node features, in order, with N keypoints and H history samples (all in the grippers' frame, divided by their scales):
+Node features, in order, with N keypoints and H history samples (all in the model's frame, divided by their scales):
 
     2            position at t
     2 (H - 1)    displacements between the history's samples, oldest first
@@ -15,8 +15,8 @@ Edge features: position of the receiver relative to the sender [2], how much sho
 between them, and the signed arc length from sender to receiver.
 
 The physics of a cable on a level table does not change under translation and rotation, so everything is expressed in
-a frame whose origin is midway between the grippers and whose x axis runs from gripper 0 to gripper 1.
-This is the only file that imports jraph.
+a frame whose origin is midway between the grippers and whose x axis runs from gripper 0 to gripper 1. A model in the
+world's axes is there to measure what that is worth. This is the only file that imports jraph.
 """
 
 from __future__ import annotations
@@ -82,14 +82,25 @@ def topology_of(config: ModelConfig) -> Topology:
     return cable_topology(config.n_keypoints, config.length, config.radius)
 
 
-def gripper_frame(gripper_pose: Float[Array, "2 3"]) -> Float[Array, "2 2"]:
-    """Rows are the x and y axis of the grippers' frame: `frame @ v` expresses v in it, `v @ frame` brings it back.
+class Frame(NamedTuple):
+    """Where a model looks at the cable from: `axes @ v` expresses a vector in the frame, `v @ axes` brings it back.
 
-    Differentiable as long as the grippers are apart.
+    Attributes:
+        origin: in the world [m], shape [2].
+        axes: rows are the x and y axis, shape [2, 2].
     """
+
+    origin: Float[Array, "2"]
+    axes: Float[Array, "2 2"]
+
+
+def frame_of(gripper_pose: Float[Array, "2 3"], config: ModelConfig) -> Frame:
+    """The frame that a model works in. Differentiable as long as the grippers are apart."""
+    if config.frame == "world":
+        return Frame(jnp.zeros(2, gripper_pose.dtype), jnp.eye(2, dtype=gripper_pose.dtype))
     along = gripper_pose[1, :2] - gripper_pose[0, :2]
     x = along / jnp.sqrt(jnp.sum(along**2))
-    return jnp.stack([x, jnp.stack([-x[1], x[0]])])
+    return Frame(gripper_pose[:, :2].mean(axis=0), jnp.stack([x, jnp.stack([-x[1], x[0]])]))
 
 
 def build_graph(history: History, twist: Float[Array, "2 3"], prior: Prior, config: ModelConfig) -> jraph.GraphsTuple:
@@ -103,15 +114,15 @@ def build_graph(history: History, twist: Float[Array, "2 3"], prior: Prior, conf
     """
     topology, scale = topology_of(config), config.normalisation
     pose = history.gripper_pose
-    frame = gripper_frame(pose)
-    past = (history.keypoints - pose[:, :2].mean(axis=0)) @ frame.T
+    origin, axes = frame_of(pose, config)
+    past = (history.keypoints - origin) @ axes.T
     now = past[-1]
 
     s = np.linspace(0.0, 1.0, config.n_keypoints)
     arclength = jnp.asarray(np.stack([s, 4 * s * (1 - s)], axis=-1), now.dtype)
-    heading = jnp.stack([jnp.cos(pose[:, 2]), jnp.sin(pose[:, 2])], axis=-1) @ frame.T
+    heading = jnp.stack([jnp.cos(pose[:, 2]), jnp.sin(pose[:, 2])], axis=-1) @ axes.T
     control = jnp.concatenate(
-        [twist[:, :2] @ frame.T / scale.linear_speed, twist[:, 2:] / scale.angular_speed, heading], axis=-1
+        [twist[:, :2] @ axes.T / scale.linear_speed, twist[:, 2:] / scale.angular_speed, heading], axis=-1
     )
     grasped = jnp.concatenate([control, jnp.eye(2, dtype=now.dtype)], axis=-1)
     free = jnp.zeros((config.n_keypoints - 2, grasped.shape[-1]), now.dtype)
@@ -127,8 +138,8 @@ def build_graph(history: History, twist: Float[Array, "2 3"], prior: Prior, conf
             displacements / scale.displacement,
             arclength,
             jnp.concatenate([grasped[:1], free, grasped[1:]]),
-            prior.displacement @ frame.T / scale.displacement,
-            prior.strain @ frame.T / scale.residual,
+            prior.displacement @ axes.T / scale.displacement,
+            prior.strain @ axes.T / scale.residual,
             *known,
         ],
         axis=-1,
@@ -160,6 +171,9 @@ def build_graph(history: History, twist: Float[Array, "2 3"], prior: Prior, conf
 def prior_of(history: History, twist: Float[Array, "2 3"], config: ModelConfig) -> Prior:
     """What the model's prior expects of a command. Differentiable in `history` and `twist`."""
     now, interval = history.keypoints[-1], config.interval
+    if config.prior == "none":
+        known = jnp.zeros_like(now).at[0].set(interval * twist[0, :2]).at[-1].set(interval * twist[1, :2])
+        return Prior(displacement=known, strain=jnp.zeros_like(now))
     if config.prior == "rigid":
         displacement = rigid_interpolation(
             history.gripper_pose, twist, n_keypoints=config.n_keypoints, length=config.length, interval=interval

@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 from cablejax.dynamics.chain_networks import BiLSTM, FlatMLP
 from cablejax.dynamics.config import ModelConfig
 from cablejax.dynamics.gns import GNS
-from cablejax.dynamics.graph import build_graph, gripper_frame, prior_of
+from cablejax.dynamics.graph import build_graph, frame_of, prior_of
 from cablejax.types import History
 
 Dynamics = Callable[[History, Float[Array, "Q 3"]], Float[Array, "N 2"]]
@@ -31,7 +31,8 @@ def apply(
 ) -> Float[Array, "N 2"]:
     """Displacement X(t + 1) - X(t) [m] of every keypoint; at the two grasped ones it is the grippers', exactly.
 
-    Turns with the cable: rotating and shifting the input rotates the output. Differentiable in weights, history and
+    Turns with the cable, unless it works in the world's frame: rotating and shifting the input rotates the output.
+    Differentiable in weights, history and
     twist (almost everywhere: the activation is ReLU).
 
     Args:
@@ -43,10 +44,10 @@ def apply(
     config = network.config
     prior = prior_of(history, twist, config)
     graph = build_graph(history, twist, prior, config)
-    frame = gripper_frame(history.gripper_pose)
+    axes = frame_of(history.gripper_pose, config).axes
     output = network(graph.nodes, graph.edges)  # pyright: ignore[reportArgumentType]
     beyond = output[1:-1] * config.normalisation.residual
-    return prior.displacement + jnp.pad(beyond @ frame, ((1, 1), (0, 0)))
+    return prior.displacement + jnp.pad(beyond @ axes, ((1, 1), (0, 0)))
 
 
 def bind(graphdef: nnx.GraphDef, weights: nnx.State) -> Dynamics:

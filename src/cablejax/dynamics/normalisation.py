@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from cablejax.dynamics.config import ModelConfig, Normalisation
-from cablejax.dynamics.graph import prior_of
+from cablejax.dynamics.graph import frame_of, prior_of
 from cablejax.types import History, Trajectory
 
 GRASP_TOLERANCE = 2e-2
@@ -69,7 +69,7 @@ def fit_normalisation(data: Trajectory, config: ModelConfig) -> Normalisation:
     beyond = np.mean((moved - np.asarray(expected(*arrays), np.float64))[:, :, 1:-1] ** 2, axis=(2, 3))
     # The few steps in which a cable snaps through would set the scale alone.
     usual = np.sort(beyond.ravel())[: max(1, int(0.95 * beyond.size))]
-    middle = pose[..., :2].mean(axis=2, keepdims=True)
+    origin = np.asarray(jax.vmap(jax.vmap(lambda p: frame_of(p, config).origin))(jnp.asarray(pose)), np.float64)
     shorter = config.spacing - np.linalg.norm(np.diff(x, axis=2), axis=-1)
 
     def rms(values: np.ndarray, least: float) -> float:
@@ -77,7 +77,7 @@ def fit_normalisation(data: Trajectory, config: ModelConfig) -> Normalisation:
         return float(f"{max(np.sqrt(np.mean(values**2)), least):.4g}")
 
     return Normalisation(
-        position=rms(x - middle, 1e-3),
+        position=rms(x - origin[:, :, None], 1e-3),
         displacement=rms(moved, 1e-5),
         linear_speed=rms(twist[..., :2], 1e-5),
         angular_speed=rms(twist[..., 2], 1e-4),
