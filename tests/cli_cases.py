@@ -11,7 +11,7 @@ from cablejax.dynamics.weights import FILE_NAME, save_weights
 
 def small_model(folder: pathlib.Path) -> pathlib.Path:
     """Writes the weights file of a small network into a folder, as `cablejax train` would, and returns the folder."""
-    config = ModelConfig(latent=8, hidden=8, hidden_layers=1, message_passing=1)
+    config = ModelConfig(latent=8, hidden=8, hidden_layers=1, message_passing=1, prior="rigid")
     folder.mkdir(parents=True, exist_ok=True)
     save_weights(folder / FILE_NAME, config, nnx.split(GNS(config, nnx.Rngs(0)))[1], {"source": "test"})
     return folder

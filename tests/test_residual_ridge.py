@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from cablejax.residual import RidgeConfig, apply, corrected, fit, zero_residual
+from cablejax.residual import Corrected, RidgeConfig, apply, fit, zero_residual
 
 W, N, Q = 5, 4, 2
 
@@ -211,5 +211,5 @@ def test_corrected_dynamics_is_the_sum_of_both():
     def offline(weights, history, twist):
         return weights * jnp.ones((N, 2))
 
-    total = corrected(offline)((2.0, model), None, twist[0])
+    total = Corrected(offline)((2.0, model), None, twist[0])
     np.testing.assert_allclose(total, 2.0 + apply(model, twist[0]), rtol=1e-6)

@@ -12,6 +12,7 @@ from cablejax.adaptation.belief import AdaptationConfig
 from cablejax.closed_loop import ClosedLoopRun, run_closed_loop
 from cablejax.dynamics.config import ModelConfig
 from cablejax.dynamics.model import apply
+from cablejax.dynamics.rough import roughened
 from cablejax.dynamics.weights import load_weights
 from cablejax.mpc import SOLVERS, Controller, MPCConfig
 from cablejax.perceive.camera import CameraConfig
@@ -52,12 +53,20 @@ class NetworkDynamics:
 
     Attributes:
         graphdef: the network's structure.
+        rough: whether derivatives in reverse mode may be of lower precision, see `cablejax.dynamics.rough`.
     """
 
     graphdef: nnx.GraphDef
+    rough: bool = False
 
     def __call__(self, weights: nnx.State, history: History, twist: Float[Array, "2 3"]) -> Float[Array, "N 2"]:
-        return apply((self.graphdef, weights), history, twist)
+        network = nnx.merge(self.graphdef, weights)
+        return apply(roughened(network) if self.rough else network, history, twist)
+
+    @property
+    def slopes(self) -> NetworkDynamics:
+        """The same values with derivatives that cost half as much, for `mpc.ShapingProblem.linearise`."""
+        return dataclasses.replace(self, rough=True)
 
 
 def load_model(name: str) -> Model:

@@ -24,7 +24,7 @@ from cablejax.evaluation.protocols import LaidOut, letter_task, random_task
 from cablejax.evaluation.referee import Limits
 from cablejax.mpc import Controller, MPCConfig, ObjectiveConfig, Plan, ShapingProblem, Solver
 from cablejax.mpc.feasible import feasible_from
-from cablejax.residual.corrected import corrected
+from cablejax.residual.corrected import Corrected
 from cablejax.residual.ridge import ResidualModel, zero_residual
 from cablejax.shaping import Model, NetworkDynamics
 from cablejax.targets import Shape
@@ -84,7 +84,7 @@ class ProblemMaker:
     precision: type = np.float64
 
     def __post_init__(self):
-        object.__setattr__(self, "_dynamics", corrected(self.model.dynamics))
+        object.__setattr__(self, "_dynamics", Corrected(self.model.dynamics))
         object.__setattr__(self, "_weights", jax.tree.map(self._cast, self.model.weights))
 
     def __call__(self, case: PlanningCase) -> ShapingProblem:

@@ -20,7 +20,7 @@ from cablejax.mpc.feasible import FeasibleSet, feasible_from
 from cablejax.mpc.goal import goal_pose
 from cablejax.mpc.problem import ShapingProblem
 from cablejax.mpc.start import find_starts, find_straight_way
-from cablejax.residual.corrected import Dynamics, corrected
+from cablejax.residual.corrected import Corrected, Dynamics
 from cablejax.residual.ridge import ResidualModel, apply, fit
 from cablejax.types import History
 
@@ -51,7 +51,7 @@ def control(
     state, n_held = _take_in(config, state, jnp.asarray(keypoints), jnp.asarray(gripper_pose))
     residual = _fit_residual(config, state)
     problem = ShapingProblem(
-        dynamics=dynamics if residual is None else corrected(dynamics),
+        dynamics=dynamics if residual is None else Corrected(dynamics),
         weights=weights if residual is None else (weights, residual),
         history=state.history,
         target=jnp.asarray(target),

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 
 from cablejax.mpc.feasible import FeasibleSet
 from cablejax.mpc.goal import continued, goal_pose, total_turn, way_to
-from cablejax.residual.corrected import Dynamics
+from cablejax.residual.corrected import Dynamics, slopes_of
 from cablejax.types import History, advance
 
 
@@ -110,6 +110,8 @@ class ShapingProblem:
     def linearise(self, motion: Float[Array, "T Q 3"]) -> tuple[Float[Array, " M"], Float[Array, "M P"]]:
         """`residuals` and their Jacobian with respect to the flattened motion, P = 3 T Q.
 
+        The residuals are exact; the Jacobian is as good as the model's `slopes` (`residual.corrected.slopes_of`).
+
         The model is linearised at every step of the rollout by itself, in reverse mode: 2N cotangents a step, all steps
         in one batch. The steps' Jacobians are then multiplied along the horizon, which costs next to nothing. Forward
         mode carries P tangents through T steps, one after the other: work that grows with the square of the
@@ -158,9 +160,11 @@ class ShapingProblem:
     ) -> tuple[Float[Array, "N 2 H N 2"], Float[Array, "N 2 Q 3"], Float[Array, "N 2 Q 3"]]:
         """Derivatives of one step's displacement by keypoints, gripper poses and twist."""
 
+        dynamics = slopes_of(self.dynamics)
+
         def displacement(keypoints, gripper_pose, twist):
             here = dataclasses.replace(history, keypoints=keypoints, gripper_pose=gripper_pose)
-            return self.dynamics(self.weights, here, twist)
+            return dynamics(self.weights, here, twist)
 
         return jax.jacrev(displacement, argnums=(0, 1, 2))(history.keypoints, history.gripper_pose, twist)
 

@@ -1,6 +1,6 @@
 """Online correction of a learned model: ridge regression of its error on the command, and the composition of both."""
 
-from cablejax.residual.corrected import Dynamics, corrected
+from cablejax.residual.corrected import Corrected, Dynamics
 from cablejax.residual.ridge import ResidualModel, RidgeConfig, apply, fit, zero_residual
 
-__all__ = ["Dynamics", "ResidualModel", "RidgeConfig", "apply", "corrected", "fit", "zero_residual"]
+__all__ = ["Corrected", "Dynamics", "ResidualModel", "RidgeConfig", "apply", "fit", "zero_residual"]

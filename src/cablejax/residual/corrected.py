@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any
 
@@ -14,16 +15,31 @@ Dynamics = Callable[[Any, History, Float[Array, "Q 3"]], Float[Array, "N 2"]]
 """A one-step model `(weights, history, twist) -> X(t + 1) - X(t)` [m]; `weights` is any pytree of arrays."""
 
 
-def corrected(dynamics: Dynamics) -> Dynamics:
+def slopes_of(dynamics: Dynamics) -> Dynamics:
+    """What to differentiate in reverse mode where a good approximation of the Jacobian will do: the attribute `slopes`
+    of a dynamics model that has one, of equal values and cheaper derivatives; otherwise the model itself."""
+    return getattr(dynamics, "slopes", dynamics)
+
+
+@dataclasses.dataclass(frozen=True)
+class Corrected:
     """The dynamics `f(X, R) + R J + b` whose weights are the pair (weights of f, `ResidualModel`).
 
-    Differentiable in whatever `dynamics` is differentiable in, and in the residual.
+    Differentiable in whatever `dynamics` is differentiable in, and in the residual. Equal if their models are equal.
+
+    Attributes:
+        dynamics: f.
     """
 
-    def with_residual(
-        weights: tuple[Any, ResidualModel], history: History, twist: Float[Array, "Q 3"]
+    dynamics: Dynamics
+
+    def __call__(
+        self, weights: tuple[Any, ResidualModel], history: History, twist: Float[Array, "Q 3"]
     ) -> Float[Array, "N 2"]:
         offline, residual = weights
-        return dynamics(offline, history, twist) + apply(residual, twist)
+        return self.dynamics(offline, history, twist) + apply(residual, twist)
 
-    return with_residual
+    @property
+    def slopes(self) -> Dynamics:
+        """That of `dynamics`, corrected."""
+        return Corrected(slopes_of(self.dynamics))
