@@ -114,16 +114,21 @@ def all_errors(data: Trajectory, steps: int, stride: int) -> dict[str, np.ndarra
     return errors
 
 
-def of_what_is_given(errors: dict[str, np.ndarray], data: Trajectory, steps: int, stride: int) -> list[list[str]]:
-    """Rows of medians after the first and the last step, by what the networks are given to begin with."""
+def of_what_is_given(
+    errors: dict[str, np.ndarray], data: Trajectory, steps: int, stride: int
+) -> dict[str, dict[str, np.ndarray]]:
+    """Errors [cm] by what the networks are given to begin with, then by network."""
     known = {weights: errors[name] for name, weights in MODELS.items()}
+    new = {weights for networks in GIVEN.values() for weights in networks.values()} - set(known)
+    known |= {weights: network_errors(weights, data, steps, stride) for weights in sorted(new)}
+    return {given: {kind: known[weights] for kind, weights in nets.items()} for given, nets in GIVEN.items()}
+
+
+def medians_by_what_is_given(found: dict[str, dict[str, np.ndarray]], steps: int) -> list[list[str]]:
+    """Rows of medians after the first and the last step."""
     rows = [["given", *(f"{kind}: {k}" for kind in NETWORKS for k in (1, steps)), "MLP / GNS"]]
-    for given, networks in GIVEN.items():
-        medians = {}
-        for kind, weights in networks.items():
-            if weights not in known:
-                known[weights] = network_errors(weights, data, steps, stride)
-            medians[kind] = np.median(known[weights][:, [0, -1]], axis=0)
+    for given, networks in found.items():
+        medians = {kind: np.median(error[:, [0, -1]], axis=0) for kind, error in networks.items()}
         cells = [f"{m:.3f}" for kind in NETWORKS for m in medians.get(kind, (np.nan, np.nan))]
         ratio = medians["MLP"][1] / medians["GNS"][1] if "GNS" in medians else np.nan
         rows.append([given, *("-" if cell == "nan" else cell for cell in cells), f"{ratio:.1f}" if ratio > 0 else "-"])
@@ -151,12 +156,15 @@ def statistics(error: np.ndarray, step: int) -> list[str]:
     return [f"{value:.3f}" for value in (column.mean(), *np.percentile(column, [50, 90]))]
 
 
-def draw(errors: dict[str, np.ndarray], calm: np.ndarray, path: Path) -> None:
-    """Median and the band of the middle 80 % over steps, on a log scale."""
-    figure, axes = plt.subplots(1, 2, figsize=(10.5, 4.2), sharey=True, layout="constrained")
+def draw(errors: dict[str, np.ndarray], bare: dict[str, np.ndarray], calm: np.ndarray, path: Path) -> None:
+    """Median, mean and the band of the middle 80 % over steps, on a log scale; on the right the networks that are given
+    nothing."""
+    figure, axes = plt.subplots(1, 3, figsize=(14, 4.2), sharey=True, layout="constrained")
+    errors = errors | {f"{kind}, nothing given": error for kind, error in bare.items()}
     groups = (
-        ("network corrects the statics of the cable", [*NETWORKS, SIMULATOR, *FLOORS]),
-        ("network corrects the grippers' interpolated motion", [*(f"{n}, no statics" for n in NETWORKS), "no motion"]),
+        ("networks correct the statics of the cable", [*NETWORKS, SIMULATOR, *FLOORS]),
+        ("networks correct the grippers' interpolated motion", [*(f"{n}, no statics" for n in NETWORKS), "no motion"]),
+        ("networks are given nothing, in the world's axes", [*(f"{n}, nothing given" for n in bare), "no motion"]),
     )
     colours = dict(zip((*NETWORKS, SIMULATOR, *FLOORS), COLOURS, strict=True))
     for axis, (title, names) in zip(axes, groups, strict=True):
@@ -167,11 +175,12 @@ def draw(errors: dict[str, np.ndarray], calm: np.ndarray, path: Path) -> None:
             low, middle, high = np.array([np.percentile(c, [10, 50, 90]) for c in columns]).T
             axis.fill_between(x, low, high, color=colours[kind], alpha=0.12, linewidth=0)
             axis.plot(x, middle, color=colours[kind], label=name, linewidth=1.8)
+            axis.plot(x, [c.mean() for c in columns], color=colours[kind], linewidth=0.8, linestyle="--")
         axis.axhline(0.02, color="#999999", linewidth=0.8, linestyle=":")
-        axis.set(yscale="log", xlabel="steps of 1 s", title=title, xlim=(1, 20))
+        axis.set(yscale="log", xlabel="steps of 1 s", title=title, xlim=(1, 20), ylim=(1.5e-3, 60))
         axis.title.set_fontsize(10)
-        axis.legend(fontsize=8, frameon=False, loc="center right", bbox_to_anchor=(1.0, 0.38))
-    axes[0].set_ylabel("keypoint error [cm]: median, 10 to 90 %")
+        axis.legend(fontsize=8, frameon=False, loc="lower right", ncols=2)
+    axes[0].set_ylabel("keypoint error [cm]: median, mean (dashed), 10 to 90 %")
     figure.savefig(path, dpi=140)
 
 
@@ -265,7 +274,7 @@ def main() -> None:
             "and for one step it can nearly do without. Still the ratio stays far below ten. None of these networks is "
             "at its end: with ten times the steps the perceptron passes the graph network, which had no such training.",
             "",
-            *markdown_table(given),
+            *markdown_table(medians_by_what_is_given(given, steps)),
             "",
             "## All windows",
             "",
@@ -290,7 +299,8 @@ def main() -> None:
     print(page)
     if options.out is not None:
         options.out.write_text(page, encoding="utf-8")
-        draw(errors, calm, options.out.parent.parent / "images" / "dynamics_models.png")
+        bare = given["nothing; world's frame"]
+        draw(errors, bare, calm, options.out.parent.parent / "images" / "dynamics_models.png")
 
 
 if __name__ == "__main__":
