@@ -202,8 +202,8 @@ def page(weights: str, rows: list[dict], explained: dict[str, dict], kinks: list
         "# Against IPOPT",
         "",
         f"Made by `python experiments/11_against_ipopt.py{'' if weights == RELEASED else f' --weights {weights}'} "
-        f"--report {out}`, after `--draw`, `--n {len(rows)} --exact {len(exact)}`, `--explain`"
-        f"{f' and `--kinks {len(kinks)}`' if kinks else ''}.",
+        f"--report {out}`, after `--draw`, `--n {len(rows)} --exact {len(exact)}`"
+        f"{', `--explain`' if explained else ''}{f' and `--kinks {len(kinks)}`' if kinks else ''}.",
         f"{versions()}, ipyopt {_version('ipyopt')}; {', '.join(sorted({row['machine'] for row in rows}))}; "
         f"{platform.machine()}, NPROC={'/'.join(sorted({row['threads'] for row in rows}))}. The machine had other work "
         "to do meanwhile: seconds are long, and say something only beside each other.",
