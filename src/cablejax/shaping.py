@@ -65,7 +65,7 @@ class NetworkDynamics:
 
     @property
     def slopes(self) -> NetworkDynamics:
-        """The same values with derivatives that cost half as much, for `mpc.ShapingProblem.linearise`."""
+        """The same values with derivatives that cost less, for `mpc.ShapingProblem.linearise`."""
         return dataclasses.replace(self, rough=True)
 
 

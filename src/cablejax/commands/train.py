@@ -37,7 +37,8 @@ class Train(Command):
     """gns: the graph network. mlp, lstm: the networks that it is compared with."""
 
     prior: Literal["static", "rigid", "none"] = "static"
-    """What the network corrects. static: the frictionless resting shape. rigid: the grippers' motion, interpolated."""
+    """What the network corrects. static: the frictionless resting shape. rigid: the grippers' motion, interpolated.
+    none: nothing."""
 
     frame: Literal["grippers", "world"] = "grippers"
     """Axes that the network sees the cable in: the grippers' own, which turn with it, or the world's."""
