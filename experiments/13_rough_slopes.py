@@ -35,7 +35,7 @@ PLANNERS = ("trust-region", "deadline")
 
 @dataclasses.dataclass(frozen=True)
 class ExactSlopes:
-    """A model as it is without `slopes`."""
+    """A model without a Jacobian of its own: every slope is the network's, in full."""
 
     dynamics: Dynamics
 
@@ -67,7 +67,9 @@ def main() -> None:
     linearise = jax.jit(lambda problem, motion: problem.linearise(motion))
     functions = {"one linearisation": lambda problem, motion: linearise(problem, motion)[1]}
     for name in PLANNERS:
-        functions[f"plan, {name}"] = jax.jit(lambda problem, guess, name=name: SOLVERS[name](problem, guess).value)
+        functions[f"plan, {name}"] = jax.jit(
+            lambda problem, guess, name=name: SOLVERS[name](problem, problem.start(guess)).value
+        )
 
     found = {(name, kind): [] for name in functions for kind in makers}
     spent = {key: [] for key in found}

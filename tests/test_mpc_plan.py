@@ -35,7 +35,7 @@ REGIMES = {
 
 @functools.partial(jax.jit, static_argnums=0)
 def solved(solver, case):
-    plan = solver(case, jnp.asarray(STILL, case.target.dtype))
+    plan = solver(case, case.start(jnp.asarray(STILL, case.target.dtype)))
     return plan, case.value(plan.motion), case.feasible.violation(plan.motion)
 
 

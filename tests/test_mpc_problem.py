@@ -21,17 +21,17 @@ def test_rollout_is_the_model_applied_step_by_step():
     history = case.history
     for step, twist in enumerate(case.objective.to_twist(motion)):
         history = advance(history, case.dynamics(case.weights, history, twist), twist)
-        np.testing.assert_allclose(case.rollout(motion)[step], history.keypoints[-1], atol=1e-6)
+        np.testing.assert_allclose(case.rollout(motion).shapes[step], history.keypoints[-1], atol=1e-6)
 
 
 def test_objective_is_the_weighted_sum_of_squares():
     case = problem("S", terminal_weight=4.0, motion_weight=0.02)
     motion = random_motion(1)
-    error = np.sum((case.rollout(motion) - case.target) ** 2, axis=(1, 2)) / case.target.shape[0]
+    error = np.sum((case.rollout(motion).shapes - case.target) ** 2, axis=(1, 2)) / case.target.shape[0]
     left = np.sum(np.asarray(case.residuals(motion)[-2:]) ** 2)  # a test of its own says what that is
     expected = 0.5 * (np.dot(error, [1, 1, 1, 4]) + 0.02 * np.sum(motion**2) + left)
     assert float(case.value(motion)) == pytest.approx(float(expected), rel=1e-5)
-    shape_error = case.shape_error(case.rollout(motion))
+    shape_error = case.shape_error(case.rollout(motion).shapes)
     np.testing.assert_allclose(shape_error**2, error, rtol=1e-5)
 
 
@@ -49,6 +49,26 @@ def test_structured_jacobian_is_the_jacobian(n_steps):
     np.testing.assert_allclose(residuals, case.residuals(motion), atol=1e-6)
     expected = jax.jacrev(case.residuals)(motion).reshape(residuals.size, motion.size)
     np.testing.assert_allclose(jacobian, expected, atol=2e-6)
+
+
+def test_a_known_rollout_is_used_for_its_own_plan_alone():
+    case, motion = problem("U"), random_motion(3, 2)
+    linearise = jax.jit(lambda c, u, known: c.linearise(u, known=known))
+    own, other = case.rollout(motion), case.rollout(0.5 * motion)
+    for found in (linearise(case, motion, own), linearise(case, motion, other)):
+        for a, b in zip(found, case.linearise(motion), strict=True):
+            np.testing.assert_allclose(a, b, atol=1e-6)
+    # what is known is believed: nothing is rolled out
+    shifted = dataclasses.replace(own, shapes=own.shapes + 1.0)
+    np.testing.assert_array_equal(linearise(case, motion, shifted)[0], case.residuals_of(shifted))
+
+
+def test_a_solver_begins_at_the_plan_that_was_rolled_out():
+    """To the bit, also where bounds are active, or the rollout would be made twice."""
+    for target in TARGETS:
+        case = problem(target, radius=0.05)
+        guess = case.start(random_motion(5, 4, size=0.1))
+        np.testing.assert_array_equal(case.feasible.project(guess.motion), guess.motion)
 
 
 @pytest.mark.parametrize("name", ["generic", "straight cable at rest", "active bound", "active distance"])

@@ -21,7 +21,7 @@ from jaxtyping import Array, Float, Int
 
 from cablejax.closed_loop import settling_time
 from cablejax.mpc import ControlInfo, ControllerState, MPCConfig, control, initial_state
-from cablejax.residual.corrected import Dynamics
+from cablejax.residual.jacobian import Dynamics
 from cablejax.simulate.compile import compiler_options
 from cablejax.simulate.config import CableConfig
 from cablejax.simulate.mjx_engine import MjxEngine

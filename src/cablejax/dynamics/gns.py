@@ -10,6 +10,7 @@ Wang et al., RA-L 2022. Every f is a ReLU network, followed by layer normalisati
 
 from __future__ import annotations
 
+import jax
 import jax.numpy as jnp
 from flax import nnx
 from jaxtyping import Array, Float
@@ -50,12 +51,9 @@ def gather(
 
 def aggregate(messages: Float[Array, "E latent"], offsets: tuple[int, ...], n: int) -> Float[Array, "N latent"]:
     """Sum of the incoming messages of every node, for edges in a `Topology`'s order."""
-    total, start = 0.0, 0
-    for k in offsets:
-        part = messages[start : start + n - abs(k)]
-        total = total + jnp.pad(part, ((max(0, k), max(0, -k)), (0, 0)))
-        start += n - abs(k)
-    return total  # pyright: ignore[reportReturnType]
+    # the derivative of a split is a concatenation; that of slices would be a sum of padded copies
+    parts = jax.lax.split(messages, [n - abs(k) for k in offsets])
+    return sum(jnp.pad(part, ((max(0, k), max(0, -k)), (0, 0))) for k, part in zip(offsets, parts, strict=True))  # pyright: ignore[reportReturnType]
 
 
 class EncodeProcessDecode(nnx.Module):

@@ -196,7 +196,7 @@ def _jacobian(problem: ShapingProblem, motion):
 
 @jax.jit
 def _rollout(problem: ShapingProblem, motion):
-    return problem.rollout(motion)
+    return problem.rollout(motion).shapes
 
 
 @jax.jit

@@ -24,6 +24,7 @@ from cablejax.evaluation.protocols import LaidOut, letter_task, random_task
 from cablejax.evaluation.referee import Limits
 from cablejax.mpc import Controller, MPCConfig, ObjectiveConfig, Plan, ShapingProblem, Solver
 from cablejax.mpc.feasible import feasible_from
+from cablejax.mpc.rollout import Rollout
 from cablejax.residual.corrected import Corrected
 from cablejax.residual.ridge import ResidualModel, zero_residual
 from cablejax.shaping import Model, NetworkDynamics
@@ -201,7 +202,7 @@ class RecordingSolver:
     solver: Solver
     met: list[PlanningCase] = dataclasses.field(default_factory=list)
 
-    def __call__(self, problem: ShapingProblem, guess: Float[Array, "T Q 3"]) -> Plan:
+    def __call__(self, problem: ShapingProblem, guess: Rollout) -> Plan:
         residual = problem.weights[1]
         jax.debug.callback(
             self._take_down,
@@ -211,7 +212,7 @@ class RecordingSolver:
             residual.bias,
             problem.target,
             problem.feasible.radius,
-            guess,
+            guess.motion,
             ordered=True,
         )
         return self.solver(problem, guess)

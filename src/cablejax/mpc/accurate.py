@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 
-from jaxtyping import Array, Float
-
 from cablejax.bounded.levenberg_marquardt import BoundedLevenbergMarquardt
 from cablejax.bounded.quasi_newton import BoundedQuasiNewton
 from cablejax.mpc.bounded_plan import bounded_plan
 from cablejax.mpc.plan import Plan
 from cablejax.mpc.problem import ShapingProblem
+from cablejax.mpc.rollout import Rollout
 from cablejax.mpc.settings import check_budget, check_positive
 
 
@@ -42,11 +41,11 @@ class Accurate:
         first = BoundedLevenbergMarquardt(atol=self.tolerance, trials_per_linearisation=self.trials_per_linearisation)
         return first, BoundedQuasiNewton(atol=self.tolerance)
 
-    def __call__(self, problem: ShapingProblem, guess: Float[Array, "T Q 3"]) -> Plan:
+    def __call__(self, problem: ShapingProblem, guess: Rollout) -> Plan:
         """The plan from a guess; differentiable in the problem where it has converged."""
         first, second = self.parts()
         near = bounded_plan(problem, guess, first, self.linearisations)
-        plan = bounded_plan(problem, near.motion, second, self.gradients)
+        plan = bounded_plan(problem, problem.rollout(near.motion), second, self.gradients)
         return dataclasses.replace(
             plan,
             evaluations=near.evaluations + plan.evaluations,

@@ -6,10 +6,10 @@ import dataclasses
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
 
 from cablejax.mpc.plan import Plan
 from cablejax.mpc.problem import ShapingProblem
+from cablejax.mpc.rollout import Rollout
 from cablejax.mpc.sampling import better_plan, drawn_plans, first_plan, sampled_plan
 from cablejax.mpc.settings import check_budget, check_positive
 
@@ -45,7 +45,7 @@ class CrossEntropy:
                 "and a smoothing in [0, 1)."
             )
 
-    def __call__(self, problem: ShapingProblem, guess: Float[Array, "T Q 3"]) -> Plan:
+    def __call__(self, problem: ShapingProblem, guess: Rollout) -> Plan:
         def iterate(carry, key):
             best, mean, deviation = carry
             drawn = drawn_plans(problem, key, mean, deviation, self.samples)
@@ -56,7 +56,7 @@ class CrossEntropy:
             return (better_plan(best, drawn, order[0]), mean, deviation), None
 
         first = first_plan(problem, guess)
-        deviation = self.spread * problem.feasible.radius * jnp.ones_like(guess)
+        deviation = self.spread * problem.feasible.radius * jnp.ones_like(guess.motion)
         keys = jax.random.split(jax.random.key(self.seed), self.iterations)
         (best, _, _), _ = jax.lax.scan(iterate, (first, first.motion, deviation), keys)
         return sampled_plan(best, 1 + self.samples * self.iterations)

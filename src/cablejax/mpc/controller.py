@@ -20,7 +20,8 @@ from cablejax.mpc.feasible import FeasibleSet, feasible_from
 from cablejax.mpc.goal import goal_pose
 from cablejax.mpc.problem import ShapingProblem
 from cablejax.mpc.start import find_starts, find_straight_way
-from cablejax.residual.corrected import Corrected, Dynamics
+from cablejax.residual.corrected import Corrected
+from cablejax.residual.jacobian import Dynamics
 from cablejax.residual.ridge import ResidualModel, apply, fit
 from cablejax.types import History
 

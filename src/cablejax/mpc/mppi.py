@@ -6,10 +6,10 @@ import dataclasses
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
 
 from cablejax.mpc.plan import Plan
 from cablejax.mpc.problem import ShapingProblem
+from cablejax.mpc.rollout import Rollout
 from cablejax.mpc.sampling import better_plan, drawn_plans, first_plan, sampled_plan
 from cablejax.mpc.settings import check_budget, check_positive
 
@@ -38,15 +38,15 @@ class PathIntegral:
         check_budget(self, "samples", "iterations")
         check_positive(self, "spread", "temperature")
 
-    def __call__(self, problem: ShapingProblem, guess: Float[Array, "T Q 3"]) -> Plan:
-        deviation = self.spread * problem.feasible.radius * jnp.ones_like(guess)
+    def __call__(self, problem: ShapingProblem, guess: Rollout) -> Plan:
+        deviation = self.spread * problem.feasible.radius * jnp.ones_like(guess.motion)
 
         def iterate(carry, key):
             best, mean = carry
             drawn = drawn_plans(problem, key, mean, deviation, self.samples)
             known = jnp.isfinite(drawn.value)
             lowest = drawn.value.min()
-            span = jnp.where(known, drawn.value - lowest, 0.0).max() + jnp.finfo(guess.dtype).tiny
+            span = jnp.where(known, drawn.value - lowest, 0.0).max() + jnp.finfo(guess.motion.dtype).tiny
             weight = jnp.where(known, jnp.exp(-(drawn.value - lowest) / (self.temperature * span)), 0.0)
             weight = weight / jnp.maximum(weight.sum(), 1e-12)
             mean = jnp.where(known.any(), jnp.tensordot(weight, drawn.motion, axes=1), mean)
@@ -55,6 +55,6 @@ class PathIntegral:
         first = first_plan(problem, guess)
         keys = jax.random.split(jax.random.key(self.seed), self.iterations)
         (best, mean), _ = jax.lax.scan(iterate, (first, first.motion), keys)
-        last = first_plan(problem, mean)
+        last = first_plan(problem, problem.start(mean))
         best = jax.tree.map(lambda a, b: jnp.where(last.value < best.value, a, b), last, best)
         return sampled_plan(best, 2 + self.samples * self.iterations)

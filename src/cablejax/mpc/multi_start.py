@@ -14,7 +14,7 @@ def multi_start(
     problem: ShapingProblem, solver: Solver, guesses: Float[Array, "S T Q 3"]
 ) -> tuple[Plan, Plan, Float[Array, " S"]]:
     """The best plan of several starts; all of them, with a leading axis S; and their values [m^2], inf for NaN."""
-    every = jax.vmap(lambda guess: solver(problem, guess))(guesses)
+    every = jax.vmap(lambda guess: solver(problem, problem.start(guess)))(guesses)
     values = jnp.where(jnp.isfinite(every.value), every.value, jnp.inf)
     best = jnp.argmin(values)
     return jax.tree.map(lambda leaf: leaf[best], every), every, values

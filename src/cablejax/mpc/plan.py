@@ -15,6 +15,7 @@ from cablejax.bounded.results import Result, Solution
 
 if TYPE_CHECKING:
     from cablejax.mpc.problem import ShapingProblem
+    from cablejax.mpc.rollout import Rollout
 
 
 class Outcome(enum.IntEnum):
@@ -90,8 +91,8 @@ class Plan:
 class Solver(Protocol):
     """A hashable object, typically a frozen dataclass that is its own configuration, called inside compiled code."""
 
-    def __call__(self, problem: ShapingProblem, guess: Float[Array, "T Q 3"]) -> Plan:
-        """A plan no worse than `problem.feasible.project(guess)`."""
+    def __call__(self, problem: ShapingProblem, guess: Rollout) -> Plan:
+        """A plan no worse than the guess, which is feasible: see `ShapingProblem.start`."""
         ...
 
 

@@ -12,7 +12,8 @@ from jaxtyping import Array, Float
 
 from cablejax.mpc.feasible import FeasibleSet
 from cablejax.mpc.goal import continued, goal_pose, total_turn, way_to
-from cablejax.residual.corrected import Dynamics, slopes_of
+from cablejax.mpc.rollout import Rollout
+from cablejax.residual.jacobian import Dynamics, step_jacobian
 from cablejax.types import History, advance
 
 
@@ -90,41 +91,60 @@ class ShapingProblem:
     feasible: FeasibleSet
     objective: ObjectiveConfig = dataclasses.field(default=ObjectiveConfig(), metadata={"static": True})
 
-    def rollout(self, motion: Float[Array, "T Q 3"]) -> Float[Array, "T N 2"]:
-        """Predicted keypoints X(1), ..., X(T) [m] under a plan."""
+    def start(self, motion: Float[Array, "T Q 3"]) -> Rollout:
+        """Where a solver begins from a plan: the nearest feasible one, rolled out."""
+        return self.rollout(self.feasible.project(motion))
+
+    def rollout(self, motion: Float[Array, "T Q 3"]) -> Rollout:
+        """What the model expects of a plan."""
 
         def one_step(history, twist):
-            history = self._advance(history, twist)
-            return history, history.keypoints[-1]
+            after = self._advance(history, twist)
+            return after, (history, after.keypoints[-1])
 
-        return jax.lax.scan(one_step, self.history, self.objective.to_twist(motion))[1]
+        met, shapes = jax.lax.scan(one_step, self.history, self.objective.to_twist(motion))[1]
+        return Rollout(motion, met, shapes)
 
     def residuals(self, motion: Float[Array, "T Q 3"]) -> Float[Array, " M"]:
         """Shape errors of all predicted steps, motions, winding, way left, weighted [m]; M = T (2N + 3Q + 1) + Q."""
-        return jnp.concatenate([self._weigh(self.rollout(motion) - self.target, motion), self._of_grippers(motion)])
+        return self.residuals_of(self.rollout(motion))
+
+    def residuals_of(self, rollout: Rollout) -> Float[Array, " M"]:
+        """`residuals` of a plan that is rolled out."""
+        shape = self._weigh(rollout.shapes - self.target, rollout.motion)
+        return jnp.concatenate([shape, self._of_grippers(rollout.motion)])
 
     def value(self, motion: Float[Array, "T Q 3"]) -> Float[Array, ""]:
         """The objective, half the sum of squared residuals [m^2]."""
-        return 0.5 * jnp.sum(self.residuals(motion) ** 2)
+        return self.value_of(self.rollout(motion))
 
-    def linearise(self, motion: Float[Array, "T Q 3"]) -> tuple[Float[Array, " M"], Float[Array, "M P"]]:
+    def value_of(self, rollout: Rollout) -> Float[Array, ""]:
+        """The objective of a plan that is rolled out [m^2]."""
+        return 0.5 * jnp.sum(self.residuals_of(rollout) ** 2)
+
+    def linearise(
+        self, motion: Float[Array, "T Q 3"], known: Rollout | None = None
+    ) -> tuple[Float[Array, " M"], Float[Array, "M P"]]:
         """`residuals` and their Jacobian with respect to the flattened motion, P = 3 T Q.
 
-        The residuals are exact; the Jacobian is as good as the model's `slopes` (`residual.corrected.slopes_of`).
+        Args:
+            motion: the plan.
+            known: a rollout of this problem; if it is of the same plan, it is not made again.
 
-        The model is linearised at every step of the rollout by itself, in reverse mode: 2N cotangents a step, all steps
-        in one batch. The steps' Jacobians are then multiplied along the horizon, which costs next to nothing. Forward
-        mode carries P tangents through T steps, one after the other: work that grows with the square of the
+        The residuals are exact; the Jacobian is as good as the model's own (`residual.jacobian.step_jacobian`).
+
+        The model is linearised at every step of the rollout by itself, in reverse mode: up to 2N cotangents a step, all
+        steps in one batch. The steps' Jacobians are then multiplied along the horizon, which costs next to nothing.
+        Forward mode carries P tangents through T steps, one after the other: work that grows with the square of the
         horizon.
         """
+        if known is None:
+            here = self.rollout(motion)
+        else:
+            same = jnp.all(motion == known.motion)
+            here = jax.lax.cond(same, lambda motion: known, self.rollout, motion)
         twist = self.objective.to_twist(motion)
-
-        def roll(history, command):
-            return self._advance(history, command), history
-
-        last, met = jax.lax.scan(roll, self.history, twist)
-        shapes = jnp.concatenate([met.keypoints[1:, -1], last.keypoints[-1:]])
-        of_steps = jax.vmap(self._step_jacobian)(met, twist)
+        of_steps = jax.vmap(functools.partial(step_jacobian, self.dynamics, self.weights))(here.met, twist)
 
         unit_motions = jnp.eye(motion.size, dtype=motion.dtype).reshape(motion.size, *motion.shape)
         unit_twists = self.objective.to_twist(jnp.swapaxes(unit_motions, 0, 1))
@@ -144,9 +164,8 @@ class ShapingProblem:
 
         slope = jnp.swapaxes(jax.lax.scan(one_step, still, (of_steps, unit_twists))[1], 0, 1)
         jacobian = jax.vmap(self._weigh)(slope, unit_motions).T
-        residuals = jnp.concatenate([self._weigh(shapes - self.target, motion), self._of_grippers(motion)])
         of_grippers = jax.jacfwd(self._of_grippers)(motion).reshape(-1, motion.size)
-        return residuals, jnp.concatenate([jacobian, of_grippers])
+        return self.residuals_of(here), jnp.concatenate([jacobian, of_grippers])
 
     def shape_error(self, keypoints: Float[Array, "*batch N 2"]) -> Float[Array, "*batch"]:
         """Root mean square distance of keypoints to the target [m]."""
@@ -154,19 +173,6 @@ class ShapingProblem:
 
     def _advance(self, history: History, twist: Float[Array, "Q 3"]) -> History:
         return advance(history, self.dynamics(self.weights, history, twist), twist, self.objective.interval)
-
-    def _step_jacobian(
-        self, history: History, twist: Float[Array, "Q 3"]
-    ) -> tuple[Float[Array, "N 2 H N 2"], Float[Array, "N 2 Q 3"], Float[Array, "N 2 Q 3"]]:
-        """Derivatives of one step's displacement by keypoints, gripper poses and twist."""
-
-        dynamics = slopes_of(self.dynamics)
-
-        def displacement(keypoints, gripper_pose, twist):
-            here = dataclasses.replace(history, keypoints=keypoints, gripper_pose=gripper_pose)
-            return dynamics(self.weights, here, twist)
-
-        return jax.jacrev(displacement, argnums=(0, 1, 2))(history.keypoints, history.gripper_pose, twist)
 
     def _weigh(self, shape_error: Float[Array, "T N 2"], motion: Float[Array, "T Q 3"]) -> Float[Array, " M"]:
         n_steps, n_keypoints = shape_error.shape[:2]

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import dataclasses
 
-from jaxtyping import Array, Float
-
 from cablejax.bounded.solve import minimise
 from cablejax.bounded.spectral import SpectralProjectedGradient
 from cablejax.mpc.plan import Plan, plan_from
 from cablejax.mpc.problem import ShapingProblem
+from cablejax.mpc.rollout import Rollout
 from cablejax.mpc.settings import check_positive
 
 
@@ -41,14 +40,14 @@ class ProjectedGradient:
             )
         check_positive(self, "tolerance", "initial_step")
 
-    def __call__(self, problem: ShapingProblem, guess: Float[Array, "T Q 3"]) -> Plan:
+    def __call__(self, problem: ShapingProblem, guess: Rollout) -> Plan:
         solver = SpectralProjectedGradient(
             atol=self.tolerance, memory=self.memory, initial_length=self.initial_step, lengths=(1e-3, 1e2)
         )
         solution = minimise(
             lambda motion, problem: problem.value(motion),
             solver,
-            guess,
+            guess.motion,
             problem.feasible,
             problem,
             max_steps=self.max_evaluations,

@@ -10,6 +10,7 @@ from jaxtyping import Array, Float
 
 from cablejax.mpc.plan import Outcome, Plan
 from cablejax.mpc.problem import ShapingProblem
+from cablejax.mpc.rollout import Rollout
 
 
 class Valued(NamedTuple):
@@ -24,11 +25,10 @@ class Valued(NamedTuple):
     value: Float[Array, "*S"]
 
 
-def first_plan(problem: ShapingProblem, motion: Float[Array, "T Q 3"]) -> Valued:
-    """A plan made feasible, and its value."""
-    motion = problem.feasible.project(motion)
-    value = problem.value(motion)
-    return Valued(motion, jnp.where(jnp.isfinite(value), value, jnp.inf))
+def first_plan(problem: ShapingProblem, guess: Rollout) -> Valued:
+    """The guess and its value."""
+    value = problem.value_of(guess)
+    return Valued(guess.motion, jnp.where(jnp.isfinite(value), value, jnp.inf))
 
 
 def drawn_plans(problem: ShapingProblem, key: Array, mean: Array, deviation: Array, samples: int) -> Valued:

@@ -11,6 +11,7 @@ from jaxtyping import Array, Float
 from cablejax.mpc.config import MPCConfig
 from cablejax.mpc.goal import continued, straight_plan, way_to
 from cablejax.mpc.problem import ShapingProblem
+from cablejax.mpc.rollout import Rollout
 
 
 class StraightWay(NamedTuple):
@@ -38,13 +39,12 @@ class Starts(NamedTuple):
     """What is known before a solver is asked.
 
     Attributes:
-        guess: the better of two starts: the last plan, shifted by the command that was executed, and the straight way
-            [m], shape [T, Q, 3].
+        guess: the better of two starts: the last plan, shifted by the command that was executed, and the straight way.
         still: holding, or where motions may not change at once, braking [m], shape [T, Q, 3].
         value_still: its objective [m^2], shape [].
     """
 
-    guess: Float[Array, "T Q 3"]
+    guess: Rollout
     still: Float[Array, "T Q 3"]
     value_still: Float[Array, ""]
 
@@ -64,6 +64,7 @@ def find_starts(config: MPCConfig, problem: ShapingProblem, last: Float[Array, "
         still = problem.feasible.project(still)
     shifted = jnp.roll(last, -1, axis=0).at[-1].set(0.0)
     motions = jnp.stack([problem.feasible.project(shifted), way.motion, still])
-    values = jax.vmap(problem.value)(motions)
-    guesses = jnp.where(jnp.isfinite(values[:2]), values[:2], jnp.inf)
-    return Starts(motions[jnp.argmin(guesses)], still, values[2])
+    rollouts = jax.vmap(problem.rollout)(motions)
+    values = jax.vmap(problem.value_of)(rollouts)
+    best = jnp.argmin(jnp.where(jnp.isfinite(values[:2]), values[:2], jnp.inf))
+    return Starts(jax.tree.map(lambda leaf: leaf[best], rollouts), still, values[2])

@@ -5,8 +5,6 @@ from __future__ import annotations
 import abc
 import dataclasses
 
-from jaxtyping import Array, Float
-
 from cablejax.bounded.dogleg import BoundedDogleg
 from cablejax.bounded.gauss_newton import BoundedGaussNewton
 from cablejax.bounded.least_squares import AbstractBoundedLeastSquares
@@ -14,6 +12,7 @@ from cablejax.bounded.levenberg_marquardt import BoundedLevenbergMarquardt
 from cablejax.mpc.bounded_plan import bounded_plan
 from cablejax.mpc.plan import Plan
 from cablejax.mpc.problem import ShapingProblem
+from cablejax.mpc.rollout import Rollout
 from cablejax.mpc.settings import check_budget, check_positive
 
 
@@ -40,7 +39,7 @@ class _LeastSquaresPlanner(abc.ABC):
     def bounded(self) -> AbstractBoundedLeastSquares:
         """The solver that finds the plan."""
 
-    def __call__(self, problem: ShapingProblem, guess: Float[Array, "T Q 3"]) -> Plan:
+    def __call__(self, problem: ShapingProblem, guess: Rollout) -> Plan:
         """The plan from a guess; differentiable in the problem where it has converged."""
         return bounded_plan(problem, guess, self.bounded(), self.max_iterations)
 

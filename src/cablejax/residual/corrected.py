@@ -3,22 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
 from typing import Any
 
 from jaxtyping import Array, Float
 
+from cablejax.residual.jacobian import Dynamics, StepJacobian, step_jacobian
 from cablejax.residual.ridge import ResidualModel, apply
 from cablejax.types import History
-
-Dynamics = Callable[[Any, History, Float[Array, "Q 3"]], Float[Array, "N 2"]]
-"""A one-step model `(weights, history, twist) -> X(t + 1) - X(t)` [m]; `weights` is any pytree of arrays."""
-
-
-def slopes_of(dynamics: Dynamics) -> Dynamics:
-    """What to differentiate in reverse mode where a good approximation of the Jacobian will do: the attribute `slopes`
-    of a dynamics model that has one, of equal values and cheaper derivatives; otherwise the model itself."""
-    return getattr(dynamics, "slopes", dynamics)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -39,7 +30,10 @@ class Corrected:
         offline, residual = weights
         return self.dynamics(offline, history, twist) + apply(residual, twist)
 
-    @property
-    def slopes(self) -> Dynamics:
-        """That of `dynamics`, corrected."""
-        return Corrected(slopes_of(self.dynamics))
+    def jacobian(
+        self, weights: tuple[Any, ResidualModel], history: History, twist: Float[Array, "Q 3"]
+    ) -> StepJacobian:
+        """f's own, and J."""
+        offline, residual = weights
+        of_f = step_jacobian(self.dynamics, offline, history, twist)
+        return of_f._replace(twist=of_f.twist + residual.gain.T.reshape(of_f.twist.shape))

@@ -1,0 +1,53 @@
+"""How one step of a dynamics model depends on what it starts from: what a planner linearises a rollout with."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+from jaxtyping import Array, Float
+
+from cablejax.types import History
+
+Dynamics = Callable[[Any, History, Float[Array, "Q 3"]], Float[Array, "N 2"]]
+"""A one-step model `(weights, history, twist) -> X(t + 1) - X(t)` [m]; `weights` is any pytree of arrays."""
+
+
+class StepJacobian(NamedTuple):
+    """Derivatives of a step's displacement [m].
+
+    Attributes:
+        keypoints: by the history's keypoints [m], shape [N, 2, H, N, 2].
+        gripper_pose: by the grippers' poses [m, rad], shape [N, 2, Q, 3].
+        twist: by the command [m/s, rad/s], shape [N, 2, Q, 3].
+    """
+
+    keypoints: Float[Array, "N 2 H N 2"]
+    gripper_pose: Float[Array, "N 2 Q 3"]
+    twist: Float[Array, "N 2 Q 3"]
+
+
+def step_jacobian(dynamics: Dynamics, weights: Any, history: History, twist: Float[Array, "Q 3"]) -> StepJacobian:
+    """The derivatives of `dynamics(weights, history, twist)`, in reverse mode.
+
+    A model with a method `jacobian` of the same arguments knows a cheaper way, and how exact that is.
+    """
+    cheaper = getattr(dynamics, "jacobian", None)
+    if cheaper is not None:
+        return cheaper(weights, history, twist)
+    return reverse(lambda history, twist: dynamics(weights, history, twist), history, twist)
+
+
+def reverse(
+    displacement: Callable[[History, Float[Array, "Q 3"]], Float[Array, "n 2"]],
+    history: History,
+    twist: Float[Array, "Q 3"],
+) -> StepJacobian:
+    """The derivatives of any n rows of a displacement, 2n cotangents in one batch."""
+
+    def rows(keypoints, gripper_pose, twist):
+        return displacement(dataclasses.replace(history, keypoints=keypoints, gripper_pose=gripper_pose), twist)
+
+    return StepJacobian(*jax.jacrev(rows, argnums=(0, 1, 2))(history.keypoints, history.gripper_pose, twist))
