@@ -127,16 +127,16 @@ class ShapingProblem:
     ) -> tuple[Float[Array, " M"], Float[Array, "M P"]]:
         """`residuals` and their Jacobian with respect to the flattened motion, P = 3 T Q.
 
-        Args:
-            motion: the plan.
-            known: a rollout of this problem; if it is of the same plan, it is not made again.
-
         The residuals are exact; the Jacobian is as good as the model's own (`residual.jacobian.step_jacobian`).
 
         The model is linearised at every step of the rollout by itself, in reverse mode: up to 2N cotangents a step, all
         steps in one batch. The steps' Jacobians are then multiplied along the horizon, which costs next to nothing.
         Forward mode carries P tangents through T steps, one after the other: work that grows with the square of the
         horizon.
+
+        Args:
+            motion: the plan.
+            known: a rollout of this problem; if it is of the same plan, it is not made again.
         """
         if known is None:
             here = self.rollout(motion)
