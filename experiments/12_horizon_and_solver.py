@@ -18,6 +18,7 @@ from pathlib import Path
 
 os.environ.setdefault("NPROC", "4")
 
+import jax
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.ticker import FixedLocator, NullFormatter
@@ -84,7 +85,12 @@ def run_all(path: Path, wanted: list[tuple]) -> None:
     """Runs what the file does not have yet."""
     model, done = load_model("gns-reference"), {trial.key for trial in read(path)}
     path.parent.mkdir(parents=True, exist_ok=True)
+    compiled = None
     for key in tqdm([key for key in wanted if key not in done], unit="run", dynamic_ncols=True):
+        if key[:2] != compiled:
+            # some twenty compiled controllers are more than LLVM's memory for code holds
+            jax.clear_caches()
+            compiled = key[:2]
         with path.open("a", encoding="utf-8") as file:
             file.write(json.dumps(dataclasses.asdict(run(model, *key))) + "\n")
 

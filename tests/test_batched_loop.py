@@ -67,7 +67,7 @@ class OneGradientStep:
     """A planner that compiles in no time."""
 
     def __call__(self, problem, guess):
-        motion = problem.feasible.project(guess - 0.1 * jax.grad(problem.value)(guess))
+        motion = problem.feasible.project(guess.motion - 0.1 * jax.grad(problem.value)(guess.motion))
         return Plan(motion, problem.value(motion), jnp.ones((), jnp.int32), jnp.full((), Outcome.STEP_LIMIT, jnp.int32))
 
 
