@@ -212,9 +212,9 @@ def main() -> None:
     if options.report is None:
         wanted = [
             (solver, horizon, shape, seed)
-            for seed in options.seeds
             for horizon in options.horizons
             for solver in options.solvers
+            for seed in options.seeds
             for shape in options.shapes
         ]
         run_all(options.cache, wanted)

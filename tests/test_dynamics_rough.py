@@ -68,7 +68,7 @@ def test_slopes_are_exact_in_double_precision():
         twist = jnp.float64(TWIST)
         own, exact = jacobians(dynamics, weights, history, twist)
         for a, b in zip(own, exact, strict=True):
-            np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-14)
+            np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-15)
         move = 1e-6 * np.random.default_rng(0).standard_normal(twist.shape)
         ahead, behind = (jax.jit(dynamics)(weights, history, twist + sign * move) for sign in (1, -1))
         np.testing.assert_allclose(np.tensordot(own.twist, move, 2), (ahead - behind) / 2, atol=1e-13)

@@ -12,6 +12,7 @@ from cablejax.mpc.named import SOLVERS
 from cablejax.mpc.plan import Outcome, Plan, Solver
 from cablejax.mpc.problem import ObjectiveConfig, ShapingProblem
 from cablejax.mpc.projected_gradient import ProjectedGradient
+from cablejax.mpc.rollout import Rollout
 from cablejax.mpc.sensitivity import differentiable_plan
 from cablejax.mpc.timing import ControlTiming, time_control
 from cablejax.mpc.trust_region import Dogleg, GaussNewton, TrustRegion
@@ -33,6 +34,7 @@ __all__ = [
     "PathIntegral",
     "Plan",
     "ProjectedGradient",
+    "Rollout",
     "ShapingProblem",
     "Solver",
     "TrustRegion",
