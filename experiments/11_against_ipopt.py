@@ -10,6 +10,7 @@ same objective and gradient from JAX, the same start, and on `--exact` of the pr
     python experiments/11_against_ipopt.py --n 1000 --process 1 2 &   # every second one, beside --process 0 2
     python experiments/11_against_ipopt.py --explain              # the exceptions
     python experiments/11_against_ipopt.py --kinks 10             # why the network's corners are rounded
+    python experiments/11_against_ipopt.py --calls 60             # a control call, and IPOPT until it is as good
     python experiments/11_against_ipopt.py --n 60 --exact 0 --weights experiments/weights/gns-rigid   # no snap-through
     python experiments/11_against_ipopt.py --report docs/results/against_ipopt.md     # the page, of what is done
 """
@@ -45,8 +46,10 @@ from cablejax.evaluation.against_ipopt import (
     slopes_along,
     steepness,
 )
+from cablejax.evaluation.control_call import race, ratios
 from cablejax.evaluation.planning_problems import (
     PlanningCase,
+    ProblemMaker,
     closed_loop_cases,
     load_cases,
     other_radii,
@@ -54,8 +57,9 @@ from cablejax.evaluation.planning_problems import (
     save_cases,
 )
 from cablejax.evaluation.referee import RefereeConfig
+from cablejax.mpc import SOLVERS
 from cablejax.report.provenance import machine, versions
-from cablejax.shaping import load_model
+from cablejax.shaping import Model, load_model
 
 FOLDER = Path("docs") / "results" / "trials" / "against_ipopt"
 """Problems and rows, kept with the repository: a thousand problems take longer than one sitting."""
@@ -66,6 +70,8 @@ ITERATIONS, EXACT_ITERATIONS = 200, 60
 """Of IPOPT at most, with limited memory and with the exact Hessian, of which one costs as much as ten gradients."""
 STEEP = 50.0
 """Largest singular value of the residuals' Jacobian above which a plan leads through a snap-through."""
+CALLS = {name: SOLVERS[name] for name in ("trust-region", "deadline")}
+"""What a control call solves with."""
 REACH, POINTS = 1e-5, 101
 """How far along a direction the slope is looked at, to either side [m], and at how many points."""
 
@@ -177,6 +183,17 @@ def measure_kinks(ours: Contestant, cases: list[PlanningCase], folder: Path, n: 
             file.write(json.dumps({"name": row["name"], **found}) + "\n")
 
 
+def time_calls(model: Model, cases: list[PlanningCase], folder: Path) -> None:
+    """A control call's solve and IPOPT until it is as good, on the first problems, in single precision."""
+    done = {row["name"] for row in read(folder, "calls")}
+    with jax.enable_x64(False):
+        make = ProblemMaker(model, np.float32)
+        race(make, cases[0], CALLS, RefereeConfig(max_iterations=2))  # compiles, so that no clock below sees that
+        for case in tqdm([case for case in cases if case.name not in done], unit="problem", dynamic_ncols=True):
+            with (folder / "calls-0.jsonl").open("a", encoding="utf-8") as file:
+                file.write(json.dumps({**race(make, case, CALLS), "machine": machine()}) + "\n")
+
+
 def read(folder: Path, kind: str = "rows") -> list[dict]:
     """All finished rows of a kind, "rows" or "explained"."""
     lines = [line for path in sorted(folder.glob(f"{kind}-*.jsonl")) for line in path.read_text().splitlines()]
@@ -195,7 +212,15 @@ def quantiles(values, digits: str = ".2g") -> str:
     return " / ".join(f"{v:{digits}}" for v in (np.median(values), np.percentile(values, 95), values.max()))
 
 
-def page(weights: str, rows: list[dict], explained: dict[str, dict], kinks: list[dict], n_all: int, out: str) -> str:
+def page(
+    weights: str,
+    rows: list[dict],
+    explained: dict[str, dict],
+    kinks: list[dict],
+    calls: list[dict],
+    n_all: int,
+    out: str,
+) -> str:
     """The Markdown page of what is done."""
     limited, exact = ([row for row in rows if which in row] for which in ("limited", "exact"))
     lines = [
@@ -203,7 +228,8 @@ def page(weights: str, rows: list[dict], explained: dict[str, dict], kinks: list
         "",
         f"Made by `python experiments/11_against_ipopt.py{'' if weights == RELEASED else f' --weights {weights}'} "
         f"--report {out}`, after `--draw`, `--n {len(rows)} --exact {len(exact)}`"
-        f"{', `--explain`' if explained else ''}{f' and `--kinks {len(kinks)}`' if kinks else ''}.",
+        f"{', `--explain`' if explained else ''}{f', `--kinks {len(kinks)}`' if kinks else ''}"
+        f"{f', `--calls {len(calls)}`' if calls else ''}.",
         f"{versions()}, ipyopt {_version('ipyopt')}; {', '.join(sorted({row['machine'] for row in rows}))}; "
         f"{platform.machine()}, NPROC={'/'.join(sorted({row['threads'] for row in rows}))}. The machine had other work "
         "to do meanwhile: seconds are long, and say something only beside each other.",
@@ -297,8 +323,37 @@ def page(weights: str, rows: list[dict], explained: dict[str, dict], kinks: list
                     f"| {label}, {where}: {len(mine)} problems | {quantiles(mine)} | {quantiles(theirs)} | "
                     f"{np.median(theirs) / np.median(mine):.1f} | {np.median(theirs / mine):.1f} |"
                 )
-    lines += ["", "## Exceptions, one by one", "", *_exceptions(rows, explained)]
+    lines += [*_calls(calls), "", "## Exceptions, one by one", "", *_exceptions(rows, explained)]
     return "\n".join([*lines, ""])
+
+
+def _calls(calls: list[dict]) -> list[str]:
+    """The section on what a control call reaches."""
+    if not calls:
+        return []
+    lines = [
+        "",
+        "## A control call",
+        "",
+        f"On the first {len(calls)} problems, of the network as it was trained, in float32: the solve of a control "
+        "call, compiled as a whole, and IPOPT (limited memory) with the same compiled objective and gradient, from the "
+        "same start, until its first feasible plan that is as good to 1e-6. Problems whose start a solver does not "
+        f"improve are left out. {', '.join(sorted({row['machine'] for row in calls}))}.",
+        "",
+        "| | ours [ms] median / 95 % / largest | IPOPT [ms], where it came as far | IPOPT never as good | ratio of "
+        "times, median (quarter, three quarters) |",
+        "| --- | --- | --- | --- | --- |",
+    ]
+    for name in CALLS:
+        ratio = ratios(calls, name)
+        theirs = [row[name]["ipopt_seconds"] for row in calls if row[name]["ipopt_seconds"]]
+        low, middle, high = np.quantile(ratio, [0.25, 0.5, 0.75], method="inverted_cdf")
+        lines.append(
+            f"| {name}: {len(ratio)} problems | {quantiles([1e3 * row[name]['seconds'] for row in calls], '.0f')} | "
+            f"{quantiles([1e3 * s for s in theirs], '.0f')} | {int(np.isinf(ratio).sum())} | {middle:.1f} ({low:.1f}, "
+            f"{high:.1f}) |"
+        )
+    return lines
 
 
 def _why_rounded(rows: list[dict], kinks: list[dict]) -> list[str]:
@@ -386,6 +441,7 @@ def main() -> None:
     parser.add_argument("--folder", type=Path, default=FOLDER, help="has the problems")
     parser.add_argument("--explain", action="store_true", help="explain the exceptions")
     parser.add_argument("--kinks", type=int, help="measure the kinks of the first so many problems that are judged")
+    parser.add_argument("--calls", type=int, help="time a control call and IPOPT on the first so many problems")
     parser.add_argument("--report", type=Path, help="run nothing; write the page on what is done to this file")
     options = parser.parse_args()
     cases_path = options.folder / "cases.npz"
@@ -399,7 +455,11 @@ def main() -> None:
     if options.weights != RELEASED:
         folder = folder / Path(options.weights).name
         folder.mkdir(exist_ok=True)
-    ours = contestant(load_model(options.weights))
+    model = load_model(options.weights)
+    if options.calls:
+        time_calls(model, cases[: options.calls], folder)
+        return
+    ours = contestant(model)
     if options.explain:
         explain_all(ours, cases, folder, options.seconds)
         return
@@ -410,8 +470,8 @@ def main() -> None:
         path = folder / f"rows-{options.process[0]}.jsonl"
         run(ours, cases[: options.n], path, options.exact, tuple(options.process), options.seconds)
     explained = {row["name"]: row for row in read(folder, "explained")}
-    rows, kinks = read(folder), read(folder, "kinks")
-    text = page(options.weights, rows, explained, kinks, len(cases), str(options.report))
+    rows, kinks, calls = (read(folder, kind) for kind in ("rows", "kinks", "calls"))
+    text = page(options.weights, rows, explained, kinks, calls, len(cases), str(options.report))
     print(text)
     if options.report is not None:
         options.report.write_text(text, encoding="utf-8")

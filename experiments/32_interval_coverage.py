@@ -59,7 +59,7 @@ class Row:
     Attributes:
         seed: that it was drawn from.
         law: that it obeys.
-        truth: numbers of `SyntheticCable`.
+        truth: numbers of `SyntheticCable`, and `laden`.
         halves: EI / rho from either half of the recordings, all effects free, with its 90 % interval [m^4/s^2].
         everything: the same from all recordings, as a diagnosis tells it.
         others: true values, estimates and intervals of other parameters, as a diagnosis tells them but per mass.
@@ -97,7 +97,7 @@ def trial(seed: int, law: Law, cache: Path | None) -> Row:
     return Row(
         seed=seed,
         law=law,
-        truth={k: v for k, v in dataclasses.asdict(cable).items() if isinstance(v, float)},
+        truth={k: v for k, v in dataclasses.asdict(cable).items() if isinstance(v, float)} | {"laden": cable.laden},
         halves=[told(half.stiffness) for half in estimates_of_halves(found, windows)],
         everything=told(everything.stiffness),
         others=others(cable, everything),
@@ -106,6 +106,11 @@ def trial(seed: int, law: Law, cache: Path | None) -> Row:
         error_mm=[1e3 * float(step.error.mean()) for step in (accepted[0], accepted[-1])],
         seconds=time.perf_counter() - begun,
     )
+
+
+def true_stiffness(row: Row) -> float:
+    """EI / rho, rho with the markers [m^4/s^2]."""
+    return row.truth["stiffness"] / row.truth["laden"]
 
 
 def told(interval: Interval) -> list[float]:
@@ -121,9 +126,9 @@ def others(cable: SyntheticCable, everything: Estimate) -> dict[str, list[float]
     angles = np.linalg.norm(cable.grips.mean(axis=0), axis=-1)
     truths = {
         "bending_damping": cable.damping_time,
-        "viscous_drag": cable.drag,
-        "quadratic_drag": cable.quadratic_drag,
-        "lumped_mass": cable.marker_mass,
+        "viscous_drag": cable.drag / cable.laden,
+        "quadratic_drag": cable.quadratic_drag / cable.laden,
+        "lumped_mass": cable.marker_mass / cable.laden,
         "stiffness_profile": float(np.exp(cable.profile[knot] - np.delete(cable.profile, knot).mean())),
         "gripper_rotation_offset": [float(angle) for angle in angles],
     }
@@ -213,7 +218,7 @@ def apart(pairs: list[list[list[float]]]) -> str:
 
 def section(rows: list[Row]) -> list[str]:
     """The cables that obey one law."""
-    table, true = [HEAD], [row.truth["stiffness"] for row in rows]
+    table, true = [HEAD], [true_stiffness(row) for row in rows]
     for part, of in (("all effects free", lambda row: row.halves), ("the effects that stayed", lambda row: row.chosen)):
         for k, half in enumerate(("one half", "the other half")):
             table.append(coverage(f"{half}, {part}", true, [of(row)[k] for row in rows]))
@@ -236,7 +241,7 @@ def page(rows: list[Row]) -> str:
     every = [["law", "seed", "true EI/rho", "one half", "the other half", "all recordings"]]
     for row in rows:
         cells = ["{:.4f} ({:.4f} to {:.4f})".format(*i) for i in (*row.halves, row.everything)]
-        every.append([row.law, str(row.seed), f"{row.truth['stiffness']:.4f}", *cells])
+        every.append([row.law, str(row.seed), f"{true_stiffness(row):.4f}", *cells])
     fitted, richer = ([row for row in rows if row.law == law] for law in LAWS)
     lines = [
         "# Intervals in space: do they hold the true value?",

@@ -133,6 +133,8 @@ def test_bench_mpc_asks_ipopt(weights, capsys):
     assert ipopt["problems"] == 1 and ipopt["largest_violation_m"] <= 1e-8 and ipopt["largest_kkt"] < 1e-5
     keys = {"as_good", "compared", "ours_s", "ipopt_s", "ratio", "float32_loss"}
     assert keys <= set(ipopt)
+    call = ipopt["control_call"]
+    assert call["solver"] == "trust-region" and call["ms"] > 0 and len(call["ipopt_ms"]) == 1
 
 
 @pytest.mark.parametrize("wrong", [["--repeats", "0"], ["--batches", "0"], ["--referee", "-1"], ["--solvers"]])

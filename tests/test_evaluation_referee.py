@@ -9,9 +9,11 @@ import pytest
 
 from cablejax.bounded import BoundedLevenbergMarquardt, SpectralProjectedGradient, certify
 from cablejax.evaluation.against_ipopt import comparable_seconds, kkt_residual, slopes_along
+from cablejax.evaluation.control_call import race, ratios
 from cablejax.evaluation.planning_problems import (
     CONFIG,
     PlanningCase,
+    ProblemMaker,
     RecordingSolver,
     load_cases,
     other_radii,
@@ -20,7 +22,7 @@ from cablejax.evaluation.planning_problems import (
 )
 from cablejax.evaluation.referee import Limits, RefereeConfig, referee
 from cablejax.evaluation.solver_path import PathFinder
-from cablejax.mpc import Controller
+from cablejax.mpc import SOLVERS, Controller
 from cablejax.shaping import Model
 from mpc_cases import START, at_rest, hermite_shape, poses, problem, random_motion, relaxing_cable
 
@@ -103,15 +105,26 @@ def test_the_exact_hessian_leads_to_the_same_plan_in_fewer_iterations():
         np.testing.assert_allclose(exact.motion, approximate.motion, atol=1e-5)
 
 
-def test_the_referee_wants_double_precision_and_stops_in_time():
-    case = problem("U")
-    with pytest.raises(ValueError, match="expected float64"):
-        referee(case, limits(case), np.zeros((STEPS, 2, 3)))
+def test_the_referee_stops_in_time():
     with jax.enable_x64(True):
         case = problem("U")
         found = referee(case, limits(case), np.zeros((STEPS, 2, 3)), RefereeConfig(max_seconds=0.0))
         assert not found.found and found.iterations == 1
         assert found.seconds_to(0.0) == np.inf
+
+
+def test_a_control_calls_solver_is_timed_beside_the_referee_in_single_precision():
+    case = case_of()
+    make = ProblemMaker(Model("analytic", None, relaxing_cable, jnp.asarray(0.8)), np.float32)  # pyright: ignore[reportArgumentType]
+    one = {"deadline": SOLVERS["deadline"]}
+    row = race(make, case, one)
+    ours, theirs = row["deadline"], row["ipopt"]
+    assert theirs["objective"] < row["start"] and ours["objective"] < 0.9 * row["start"]
+    assert ours["ipopt_seconds"] is None or 0 < ours["ipopt_seconds"] <= theirs["seconds"]
+    row["deadline"] |= {"seconds": 2.0, "ipopt_seconds": 6.0}
+    never = {**row, "deadline": {**ours, "ipopt_seconds": None}}
+    useless = {**row, "deadline": {**ours, "objective": row["start"]}}
+    assert ratios([row, never, useless], "deadline").tolist() == [3.0, np.inf]
 
 
 def test_limits_measure_what_the_feasible_set_measures():

@@ -5,10 +5,21 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from cablejax.mpc import ObjectiveConfig
+from cablejax.mpc import ObjectiveConfig, ShapingProblem
 from cablejax.mpc.goal import continued, goal_pose, total_turn
 from cablejax.types import History, advance
 from mpc_cases import START, TARGETS, at_rest, feasible_set, hermite_shape, poses, problem, random_motion
+
+# One program each: op by op, every line of the problem is compiled by itself.
+rollout = jax.jit(ShapingProblem.rollout)
+residuals_at = jax.jit(ShapingProblem.residuals)
+value_at = jax.jit(ShapingProblem.value)
+linearise = jax.jit(ShapingProblem.linearise)
+
+
+def jacobian_at(case, motion):
+    """By automatic differentiation of the whole rollout."""
+    return jax.jit(jax.jacfwd(ShapingProblem.residuals, argnums=1))(case, motion).reshape(-1, motion.size)
 
 
 def central_difference(f, x, tangent, step=1e-6):
@@ -21,17 +32,18 @@ def test_rollout_is_the_model_applied_step_by_step():
     history = case.history
     for step, twist in enumerate(case.objective.to_twist(motion)):
         history = advance(history, case.dynamics(case.weights, history, twist), twist)
-        np.testing.assert_allclose(case.rollout(motion).shapes[step], history.keypoints[-1], atol=1e-6)
+        np.testing.assert_allclose(rollout(case, motion).shapes[step], history.keypoints[-1], atol=1e-6)
 
 
 def test_objective_is_the_weighted_sum_of_squares():
     case = problem("S", terminal_weight=4.0, motion_weight=0.02)
     motion = random_motion(1)
-    error = np.sum((case.rollout(motion).shapes - case.target) ** 2, axis=(1, 2)) / case.target.shape[0]
-    left = np.sum(np.asarray(case.residuals(motion)[-2:]) ** 2)  # a test of its own says what that is
+    shapes = rollout(case, motion).shapes
+    error = np.sum((shapes - case.target) ** 2, axis=(1, 2)) / case.target.shape[0]
+    left = np.sum(np.asarray(residuals_at(case, motion)[-2:]) ** 2)  # a test of its own says what that is
     expected = 0.5 * (np.dot(error, [1, 1, 1, 4]) + 0.02 * np.sum(motion**2) + left)
-    assert float(case.value(motion)) == pytest.approx(float(expected), rel=1e-5)
-    shape_error = case.shape_error(case.rollout(motion).shapes)
+    assert float(value_at(case, motion)) == pytest.approx(float(expected), rel=1e-5)
+    shape_error = case.shape_error(shapes)
     np.testing.assert_allclose(shape_error**2, error, rtol=1e-5)
 
 
@@ -45,18 +57,16 @@ def test_motion_and_twist_are_inverse_and_a_rotation_counts_by_its_weight():
 @pytest.mark.parametrize("n_steps", [1, 2, 5])
 def test_structured_jacobian_is_the_jacobian(n_steps):
     case, motion = problem("U"), random_motion(3, n_steps)
-    residuals, jacobian = jax.jit(lambda c, u: c.linearise(u))(case, motion)
-    np.testing.assert_allclose(residuals, case.residuals(motion), atol=1e-6)
-    expected = jax.jacrev(case.residuals)(motion).reshape(residuals.size, motion.size)
-    np.testing.assert_allclose(jacobian, expected, atol=2e-6)
+    residuals, jacobian = linearise(case, motion)
+    np.testing.assert_allclose(residuals, residuals_at(case, motion), atol=1e-6)
+    np.testing.assert_allclose(jacobian, jacobian_at(case, motion), atol=2e-6)
 
 
 def test_a_known_rollout_is_used_for_its_own_plan_alone():
     case, motion = problem("U"), random_motion(3, 2)
-    linearise = jax.jit(lambda c, u, known: c.linearise(u, known=known))
-    own, other = case.rollout(motion), case.rollout(0.5 * motion)
+    own, other = rollout(case, motion), rollout(case, 0.5 * motion)
     for found in (linearise(case, motion, own), linearise(case, motion, other)):
-        for a, b in zip(found, case.linearise(motion), strict=True):
+        for a, b in zip(found, linearise(case, motion), strict=True):
             np.testing.assert_allclose(a, b, atol=1e-6)
     # what is known is believed: nothing is rolled out
     shifted = dataclasses.replace(own, shapes=own.shapes + 1.0)
@@ -91,8 +101,8 @@ def test_gradient_of_the_objective(name):
             return case.value(case.feasible.project(motion) if projected else motion)
 
         tangent = random_motion(6, size=1.0)
-        _, forward = jax.jvp(value, (motion,), (tangent,))
-        backward = jnp.vdot(jax.grad(value)(motion), tangent)
+        forward = jax.jit(lambda u, t: jax.jvp(value, (u,), (t,))[1])(motion, tangent)
+        backward = jnp.vdot(jax.jit(jax.grad(value))(motion), tangent)
         assert abs(forward - central_difference(value, motion, tangent)) <= 1e-5 * abs(forward)
         assert abs(forward - backward) <= 1e-8 * abs(forward)
 
@@ -109,9 +119,9 @@ def test_gradient_in_weights_history_and_target():
             return dataclasses.replace(case, history=moved, target=case.target + x[2]).value(motion)
 
         x, tangent = jnp.asarray([0.8, 0.02, -0.01]), jnp.asarray([0.3, -0.5, 0.8])
-        _, forward = jax.jvp(value, (x,), (tangent,))
+        forward = jax.jit(lambda x, t: jax.jvp(value, (x,), (t,))[1])(x, tangent)
         assert abs(forward - central_difference(value, x, tangent)) <= 1e-5 * abs(forward)
-        assert abs(forward - jnp.vdot(jax.grad(value)(x), tangent)) <= 1e-8 * abs(forward)
+        assert abs(forward - jnp.vdot(jax.jit(jax.grad(value))(x), tangent)) <= 1e-8 * abs(forward)
 
 
 def test_a_wound_up_cable_pays_for_more_than_half_a_turn_and_nothing_else_does():
@@ -126,14 +136,14 @@ def test_a_wound_up_cable_pays_for_more_than_half_a_turn_and_nothing_else_does()
         )
         motion = random_motion(3)
         turn = 1.7 * np.pi + np.cumsum(np.asarray(motion[:, 1, 2] - motion[:, 0, 2])) / 0.15
-        wound = np.asarray(case.residuals(motion)[-len(motion) - 2 : -2])
+        wound = np.asarray(residuals_at(case, motion)[-len(motion) - 2 : -2])
         np.testing.assert_allclose(wound, 0.15 * (turn - float(total_turn(case.target)) - np.pi), rtol=1e-9)
         assert wound.min() > 0.05
-        residuals, jacobian = case.linearise(motion)
-        np.testing.assert_allclose(residuals, case.residuals(motion), atol=1e-12)
-        np.testing.assert_allclose(jacobian, jax.jacfwd(case.residuals)(motion).reshape(jacobian.shape), atol=1e-10)
+        residuals, jacobian = linearise(case, motion)
+        np.testing.assert_allclose(residuals, residuals_at(case, motion), atol=1e-12)
+        np.testing.assert_allclose(jacobian, jacobian_at(case, motion), atol=1e-10)
     for name in TARGETS:
-        assert not problem(name).residuals(random_motion(4))[-6:-2].any()
+        assert not residuals_at(problem(name), random_motion(4))[-6:-2].any()
 
 
 def test_the_way_left_to_where_the_targets_ends_are_held_costs_what_it_is_longer_than_the_margin():
@@ -144,17 +154,17 @@ def test_the_way_left_to_where_the_targets_ends_are_held_costs_what_it_is_longer
         way = np.asarray(goal - pose) * [1.0, 1.0, 0.15] - np.asarray(motion.sum(axis=0))
         left = np.linalg.norm(way, axis=1) - case.objective.arrival_margin
         assert left.min() > 0.1
-        np.testing.assert_allclose(case.residuals(motion)[-2:], left, rtol=1e-9)
+        np.testing.assert_allclose(residuals_at(case, motion)[-2:], left, rtol=1e-9)
         heavy = dataclasses.replace(case, objective=dataclasses.replace(case.objective, arrival_weight=4.0))
-        np.testing.assert_allclose(heavy.residuals(motion)[-2:], 2 * left, rtol=1e-9)
-        residuals, jacobian = case.linearise(motion)
-        np.testing.assert_allclose(residuals, case.residuals(motion), atol=1e-12)
-        np.testing.assert_allclose(jacobian, jax.jacfwd(case.residuals)(motion).reshape(jacobian.shape), atol=1e-10)
+        np.testing.assert_allclose(residuals_at(heavy, motion)[-2:], 2 * left, rtol=1e-9)
+        residuals, jacobian = linearise(case, motion)
+        np.testing.assert_allclose(residuals, residuals_at(case, motion), atol=1e-12)
+        np.testing.assert_allclose(jacobian, jacobian_at(case, motion), atol=1e-10)
         # on the goal itself nothing is left, and the derivative is finite
         arrived = dataclasses.replace(case, history=dataclasses.replace(case.history, gripper_pose=goal))
         still = jnp.zeros_like(motion)
-        assert not arrived.residuals(still)[-2:].any()
-        assert jnp.isfinite(jax.grad(arrived.value)(still)).all()
+        assert not residuals_at(arrived, still)[-2:].any()
+        assert jnp.isfinite(jax.jit(jax.grad(ShapingProblem.value, argnums=1))(arrived, still)).all()
 
 
 def test_target_shape_has_no_error():

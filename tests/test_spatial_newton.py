@@ -125,5 +125,5 @@ def test_grips_of_every_recording_are_found_and_leave_the_stiffness_alone():
     assert np.abs(held[0] - held[1]).max() < 0.1
     assert np.abs(held[1]).max() > 0.3
     moves = jackknife(fits[True], layout)
-    error = np.sqrt((layout.log_stiffness(moves) ** 2).sum())
+    error = np.sqrt((moves[:, where["log_stiffness"]] ** 2).sum())
     assert 0 < error < 0.2

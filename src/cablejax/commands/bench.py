@@ -157,7 +157,7 @@ class BenchMpc(Command):
             solvers[name] = {"p50_ms": timing.p50_ms, "p95_ms": timing.p95_ms, "first_call_s": timing.first_call_s}
         first = _controller(model, self.solvers[0], self.horizon)
         batched = {str(size): _batched_ms(first, history, size, self.repeats) for size in batches}
-        ipopt, why = _against_ipopt(model, self.referee)
+        ipopt, why = _against_ipopt(model, self.solvers[0], self.referee)
         result = {
             "solver": self.solvers[0],
             "horizon": first.config.horizon,
@@ -349,8 +349,9 @@ def _batched_ms(controller: Controller, history: History, size: int, repeats: in
     return 1e3 * float(np.median(seconds[1:]))
 
 
-def _against_ipopt(model: Model, problems: int) -> tuple[dict[str, Any] | None, str]:
-    """The accurate setting against IPOPT on random problems, in float64; None and the reason where that cannot be."""
+def _against_ipopt(model: Model, solver: SolverName, problems: int) -> tuple[dict[str, Any] | None, str]:
+    """The accurate setting against IPOPT on random problems, in float64, and a control call's solver until IPOPT is as
+    good, in float32; None and the reason where that cannot be."""
     import importlib.util
 
     if not problems:
@@ -364,9 +365,16 @@ def _against_ipopt(model: Model, problems: int) -> tuple[dict[str, Any] | None, 
     import numpy as np
 
     from cablejax.evaluation.against_ipopt import EQUAL, comparable_seconds, contestant, excess, judge
-    from cablejax.evaluation.planning_problems import random_cases
+    from cablejax.evaluation.control_call import race, ratios
+    from cablejax.evaluation.planning_problems import ProblemMaker, random_cases
     from cablejax.evaluation.referee import RefereeConfig
+    from cablejax.mpc import SOLVERS
 
+    say("compiling the planning problem in float32 ...")
+    make, chosen = ProblemMaker(model, np.float32), {solver: SOLVERS[solver]}
+    race(make, random_cases(model, [0])[0], chosen, RefereeConfig(max_iterations=2))
+    calls = [race(make, case, chosen) for case in random_cases(model, range(problems))]
+    call_ratios = ratios(calls, solver)
     with jax.enable_x64(True):
         ours, cases = contestant(model), random_cases(model, range(problems))
         say("compiling the planning problem in float64 ...")
@@ -388,11 +396,25 @@ def _against_ipopt(model: Model, problems: int) -> tuple[dict[str, Any] | None, 
         "largest_violation_m": max(row["violation"] for row in rows),
         "largest_kkt": max(row["kkt"] for row in rows),
         "float32_loss": float(np.median([row["single_objective"] / row["objective"] - 1 for row in rows])),
+        "control_call": {
+            "solver": solver,
+            "ms": 1e3 * float(np.median([row[solver]["seconds"] for row in calls])),
+            "ipopt_ms": [s and 1e3 * s for s in (row[solver]["ipopt_seconds"] for row in calls)],
+            "ipopt_never_as_good": int(np.isinf(call_ratios).sum()),
+            "ratio": _finite(np.median(call_ratios)) if len(call_ratios) else None,
+        },
     }
     text = f"against IPOPT: as good or better on {as_good} of {problems} problems"
     if ratio is not None:
         text += f"; {result['ipopt_s']:.2f} s by IPOPT, {result['ours_s']:.2f} s by ours: {ratio:.1f} times as fast"
+    text += f"\na control call's plan by {solver}: {result['control_call']['ms']:.0f} ms; IPOPT to one as good: "
+    text += ", ".join("never" if ms is None else f"{ms:.0f} ms" for ms in result["control_call"]["ipopt_ms"])
     return result, text
+
+
+def _finite(number: float) -> float | None:
+    """For JSON, which knows no infinity."""
+    return float(number) if number < float("inf") else None
 
 
 def _median_seconds(contestants: dict[str, Callable[[], Any]], rounds: int) -> dict[str, float]:

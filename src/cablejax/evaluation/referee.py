@@ -5,8 +5,10 @@ the grippers' positions and bounds, and not taken from the solvers' feasible set
 
     (|u|^2 - r^2) / 2 r <= 0,   (|d|^2 - max^2) / 2 max <= 0,   (min^2 - |d|^2) / 2 min <= 0
 
-for every step u of each gripper and every distance d between the grippers. Run it in float64. It needs ipyopt, whose
-wheel carries IPOPT with MUMPS (Waechter and Biegler, Math. Program. 106, 2006).
+for every step u of each gripper and every distance d between the grippers. Functions are evaluated in the problem's
+precision: float64 to judge where it ends. In float32 its tolerances are out of reach, and only how soon it gets
+somewhere says anything. It needs ipyopt, whose wheel carries IPOPT with MUMPS (Waechter and Biegler, Math. Program.
+106, 2006).
 """
 
 from __future__ import annotations
@@ -113,29 +115,28 @@ def referee(
     """Solves a planning problem with IPOPT.
 
     Args:
-        problem: in float64; its feasible set is not looked at.
+        problem: its feasible set is not looked at.
         limits: the bounds.
         start: where IPOPT begins, the same as ours; it may move it off the bounds.
         config: settings.
 
     Raises:
         ImportError: ipyopt is not installed.
-        ValueError: the problem is not in float64.
     """
     try:
         import ipyopt
     except ImportError as error:
         raise ImportError("The referee is IPOPT: install it with `pip install ipyopt`.") from error
-    if problem.history.keypoints.dtype != np.float64:
-        raise ValueError(
-            f"The referee got a problem in {problem.history.keypoints.dtype}, expected float64: enable x64 in JAX and "
-            "convert the problem's arrays."
-        )
+    precision = problem.history.keypoints.dtype
     start = np.asarray(start, float)
     shape, n = start.shape, start.size
-    bounds = jnp.asarray([*limits.separation, limits.radius, limits.min_distance, limits.max_distance])
+    bounds = jnp.asarray([*limits.separation, limits.radius, limits.min_distance, limits.max_distance], precision)
+
+    def plan_of(x):
+        return jnp.asarray(x.reshape(shape), precision)
+
     # Objectives range over decades from a run's first step to its last: IPOPT sees them relative to the start's.
-    scale = 1.0 / max(float(value_of(problem, jnp.asarray(start))), 1e-12)
+    scale = 1.0 / max(float(value_of(problem, plan_of(start))), 1e-12)
     counts = [0, 0, 0]
     latest = start.ravel().copy()
     path: list[tuple[float, float, float]] = []
@@ -143,24 +144,24 @@ def referee(
 
     def objective(x):
         counts[0] += 1
-        return scale * float(value_of(problem, jnp.asarray(x.reshape(shape))))
+        return scale * float(value_of(problem, plan_of(x)))
 
     def gradient(x, out):
         counts[1] += 1
         # Objectives are asked for at more points than gradients, in line searches; gradients mostly where the value
         # is known already.
-        out[()] = scale * np.asarray(slope_of(problem, jnp.asarray(x.reshape(shape)))).ravel()
+        out[()] = scale * np.asarray(slope_of(problem, plan_of(x))).ravel()
         latest[()] = x
 
     def constraints(x, out):
-        out[()] = np.asarray(_constraints(bounds, jnp.asarray(x.reshape(shape))))
+        out[()] = np.asarray(_constraints(bounds, plan_of(x)))
 
     def normals(x, out):
-        out[()] = np.asarray(_normals(bounds, jnp.asarray(x.reshape(shape)))).ravel()
+        out[()] = np.asarray(_normals(bounds, plan_of(x))).ravel()
 
     def curvature(x, multipliers, factor, out):
         counts[2] += 1
-        matrix = _curvature(problem, bounds, jnp.asarray(x.reshape(shape)), multipliers, factor * scale)
+        matrix = _curvature(problem, bounds, plan_of(x), multipliers, factor * scale)
         out[()] = np.asarray(matrix)[lower]
 
     def watch(mode, count, value, *_):
@@ -207,7 +208,7 @@ def referee(
     motion = point.reshape(shape)
     return RefereeResult(
         motion=motion,
-        objective=float(value_of(problem, jnp.asarray(motion))),
+        objective=float(value_of(problem, plan_of(motion))),
         violation=limits.violation(motion),
         status=int(status),
         iterations=len(path),

@@ -5,8 +5,10 @@ off is at its null value there. Names are those of the gap log where one fits. T
 air drag with the square of the speed, and `twist_stiffness` does not appear at all: it is a nuisance of
 `intrinsic_curvature`, without which it is hardly seen.
 
-Weight is no effect here: a cable that hangs free moves the same whatever its density. Only ratios to it are found: EI /
-rho, drag / rho, marker mass / rho.
+Weight is no effect here: a cable that hangs free moves the same whatever its density. Only ratios to it are found. In
+the vector they are ratios to the mass of the bare cable, as the simulator needs them. What is told of a cable is per
+mass of the cable as it was recorded, markers included (`Layout.laden`): markers all along a cable slow it down as if it
+were softer, and motion hardly tells how much of its mass is theirs.
 """
 
 from __future__ import annotations
@@ -121,10 +123,20 @@ class Layout:
         """Prior standard deviation of each value between recordings."""
         return np.concatenate([np.full(block.size, block.spread) for block in self.blocks])
 
-    def log_stiffness(self, values: Float[np.ndarray, "*B P"]) -> Float[np.ndarray, "*B"]:
-        """Logarithm of EI / rho over the nominal one, mean along the cable. Linear in the values."""
-        where = self.slices
-        return values[..., where["log_stiffness"]].sum(axis=-1) + values[..., where["log_profile"]].mean(axis=-1)
+    def laden(self, values: Float[Array, "P"] | np.ndarray) -> Float[Array, ""]:
+        """Mass of the cable with its markers over that of the bare one; differentiable in `values`.
+
+        A marker's mass counts for the cable from halfway to the last to halfway to the next. For modes that do not move
+        at the clamps and are long beside that, it is then no other whether it is there or spread evenly.
+        """
+        spacing = self.arclength[-1] / len(self.arclength)
+        return 1.0 + jnp.asarray(values)[self.slices["marker_mass"].start] / spacing
+
+    def log_stiffness(self, values: Float[Array, "P"] | np.ndarray) -> Float[Array, ""]:
+        """Logarithm of EI / rho over the nominal one, mean along the cable, rho with the markers; differentiable."""
+        where, values = self.slices, jnp.asarray(values)
+        bare = values[where["log_stiffness"]].sum() + values[where["log_profile"]].mean()
+        return bare - jnp.log(self.laden(values))
 
     def templates(self, effect: str) -> list[tuple[slice, float]]:
         """Places and values to try for an effect of one number; none for others."""

@@ -62,6 +62,10 @@ class Simulator:
     rod: Rod
     layout: Layout
 
+    def finer(self, factor: int) -> Simulator:
+        """With so many times as many time steps."""
+        return dataclasses.replace(self, rod=dataclasses.replace(self.rod, substeps=factor * self.rod.substeps))
+
     def predict(self, values: Values | Float[np.ndarray, "P"], windows: Windows) -> Float[np.ndarray, "W T F 3"]:
         """Free markers of every window from its first two samples on [m]."""
         run, values = _compiled(self, windows.interval)[0], _as_values(values)

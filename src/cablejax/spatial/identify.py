@@ -54,7 +54,7 @@ class Identified:
     first: Float[np.ndarray, "W"] | np.ndarray
 
     def stiffness(self, values: Values) -> float:
-        """EI / rho, geometric mean along the cable [m^4/s^2]."""
+        """EI / rho, geometric mean along the cable, rho with the markers [m^4/s^2]."""
         layout = self.simulator.layout
         return float(layout.nominal_stiffness * np.exp(layout.log_stiffness(values.shared)))
 

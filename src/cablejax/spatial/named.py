@@ -55,7 +55,8 @@ def parameters_of(
         """Of two values as a vector; its interval is as wide as that of the less certain one."""
         slots = [where[field].start + first, where[field].start + first + 1]
         value = float(np.linalg.norm(estimate.shared[slots]))
-        error = max(estimate.half_width(lambda values, i=i: values[..., i]) for i in slots)
+        ends = [estimate.of(lambda values, i=i: values[i]) for i in slots]
+        error = max(end.high - end.value for end in ends)
         return Interval(value, max(value - error, 0.0), value + error)
 
     def place(knot, knots):
@@ -73,8 +74,8 @@ def parameters_of(
             rest = [i for i in range(PROFILE_KNOTS) if i != knot]
 
             def against_the_rest(values):
-                profile = values[..., where["log_profile"]]
-                return profile[..., knot] - profile[..., rest].mean(axis=-1)
+                profile = values[where["log_profile"]]
+                return profile[knot] - profile[np.array(rest)].mean()
 
             parameters, along = place(knot, PROFILE_KNOTS)
             parameters["ratio"] = _told(estimate.ratio(against_the_rest), "")
@@ -91,7 +92,7 @@ def parameters_of(
             parameters = {"gripper": _choice([0, 1], ""), "angle_rad": _all_told(angles, "rad")}
         case "keypoint_bias":
             slots = range(where["along"].start, where["along"].stop)
-            each = [estimate.of(lambda values, i=i: values[..., i]) for i in slots]
+            each = [estimate.of(lambda values, i=i: values[i]) for i in slots]
             off = [i for i, e in enumerate(each) if abs(e.value) > _PLACED and not e.low <= 0 <= e.high]
             parameters = {
                 "index": _choice([i + first_marker for i in off], ""),

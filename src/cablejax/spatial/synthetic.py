@@ -1,7 +1,8 @@
 """Synthetic recordings of a cable in space whose parameters are known, for checks of what is found in them.
 
-Cables are drawn at random from wider ranges than the real ones span. The true cable is a rod with twice the edges and
-twice the time steps of the one that is fitted. Markers have a slow error and one that is new at every sample.
+Cables are drawn at random from wider ranges than the real ones span. The true cable is a rod with twice the edges of
+the one that is fitted, and with eight time steps a sample, of which the search makes one where that is fine enough, and
+the estimate four. Markers have a slow error and one that is new at every sample.
 """
 
 from __future__ import annotations
@@ -68,6 +69,11 @@ class SyntheticCable:
     rest_curvature: Float[np.ndarray, "C 2"]
     offset: Float[np.ndarray, "N 2"]
     roll: float
+
+    @property
+    def laden(self) -> float:
+        """Mass of the cable with its markers over that of the bare one, see `effects.Layout.laden`."""
+        return 1.0 + self.marker_mass * (len(self.offset) + 1) / self.length
 
 
 def synthetic_recordings(seed: int, law: Law, recordings: int = RECORDINGS) -> tuple[SyntheticCable, DeformRecordings]:
@@ -175,7 +181,7 @@ def _simulated(cable: SyntheticCable, s, position, frames) -> Float[np.ndarray, 
 
 @functools.cache
 def _program(twisting: bool):
-    rod = Rod(2 * EDGES, 2, twisting=twisting)
+    rod = Rod(2 * EDGES, 8, twisting=twisting)
 
     def one(physics, position, frames, seen):
         return rod.rollout(physics, position, frames, seen, jnp.asarray(SAMPLE_INTERVAL))
