@@ -66,10 +66,8 @@ def test_stiffness_is_per_mass_with_the_markers_since_motion_does_not_tell_their
     where = found_with.layout.slices
     bare = found_with.ratio(lambda values: values[where["log_stiffness"].start])
     assert _width(found_with.stiffness) < 1.2 * _width(without) < 0.4 * _width(bare)
-    laden = float(found_with.layout.laden(found_with.shared))
-    assert (
-        laden == pytest.approx(1 + found_with.shared[where["marker_mass"]].item() / (0.92 / 9), rel=0.1) and laden > 1
-    )
+    laden, spacing = float(found_with.layout.laden(found_with.shared)), cases.LENGTH / (len(cases.MARKS) + 1)
+    assert laden == pytest.approx(1 + found_with.shared[where["marker_mass"]].item() / spacing, rel=1e-3)
     drag, mass = (found_with.positive(field).value for field in ("drag", "marker_mass"))
     assert drag * laden == pytest.approx(found_with.shared[where["drag"]].item())
     assert mass * laden == pytest.approx(found_with.shared[where["marker_mass"]].item())

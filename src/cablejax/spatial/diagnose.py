@@ -164,7 +164,8 @@ def _sentence(verdict, gap, effects, changes) -> str:
 def _caveats(log, windows, left_out, found) -> tuple[str, ...]:
     result = [
         "The motion of a hanging cable does not depend on its weight: stiffness, drag and added masses are known "
-        "relative to the linear density only, and a wrong density (linear_density) cannot be seen.",
+        "relative to the linear density only, that of the cable with its markers, and a wrong density "
+        "(linear_density) cannot be seen.",
         "A camera that lags would shift keypoints and grippers alike, for both come from the same marks: camera_lag "
         "cannot be seen.",
         "Roll of the grippers about the cable is not observed; it is taken as the least turn from their mean "
