@@ -5,9 +5,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from cablejax.residual import Corrected, RidgeConfig, apply, fit, zero_residual
+import cablejax.residual
+from cablejax.residual import Corrected, RidgeConfig, apply, zero_residual
 
 W, N, Q = 5, 4, 2
+# one program for each shape of a window: op by op, every line would be compiled by itself
+fit = jax.jit(cablejax.residual.fit, static_argnums=3)
 
 
 def window(seed=0, motion=0.03, n=W):

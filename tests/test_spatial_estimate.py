@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import spatial_cases as cases
-from cablejax.spatial.estimate import estimate
+from cablejax.spatial.estimate import UNMODELLED, Interval, estimate
 from cablejax.spatial.fit import Simulator
 from cablejax.spatial.identify import Identified, layout_of
 from cablejax.spatial.named import named_effects, parameters_of
@@ -71,6 +71,26 @@ def test_stiffness_is_per_mass_with_the_markers_since_motion_does_not_tell_their
     drag, mass = (found_with.positive(field).value for field in ("drag", "marker_mass"))
     assert drag * laden == pytest.approx(found_with.shared[where["drag"]].item())
     assert mass * laden == pytest.approx(found_with.shared[where["marker_mass"]].item())
+
+
+def test_an_interval_grows_by_an_error_besides_and_no_less_to_its_wide_side():
+    plain = Interval(2.0, 1.0, 4.0)
+    assert plain.wider(0.0) == plain
+    wider = plain.wider(1.0)
+    assert (2.0 - wider.low, wider.high - 2.0) == pytest.approx((np.hypot(1.0, 1.645), np.hypot(2.0, 1.645)), rel=1e-3)
+    factor = plain.wider_by_factor(1.0)
+    assert factor.value == 2.0 and np.log(2.0 / factor.low) == pytest.approx(np.log(factor.high / 2.0))
+    assert np.log(factor.high / 2.0) == pytest.approx(np.hypot(np.log(2.0), 1.645), rel=1e-3)
+
+
+def test_what_is_told_is_wider_by_what_the_law_leaves_out(everything):
+    for effect, more in UNMODELLED.items():
+        told, plain = (parameters_of(effect, everything, 0.05, **kind)[0] for kind in ({}, {"unmodelled": {}}))
+        for name, parameter in plain.items():
+            if parameter.ci90 is not None:
+                wide, narrow = (np.ptp(np.reshape(p.ci90, (-1, 2)), axis=1) for p in (told[name], parameter))
+                assert (wide > narrow).all() and more > 0
+                assert told[name].value == parameter.value
 
 
 def test_says_more_from_more_recordings(found):

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import dataclasses
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from cablejax.diagnose.diagnosis import NamedEffect, ParameterEstimate
 from cablejax.spatial.effects import CURVATURE_KNOTS, PROFILE_KNOTS
-from cablejax.spatial.estimate import Estimate, Interval
+from cablejax.spatial.estimate import UNMODELLED, Estimate, Interval
 from cablejax.spatial.identify import Identified
 from cablejax.spatial.windows import Windows
 
@@ -36,7 +37,12 @@ def named_effects(found: Identified, estimate: Estimate, density: float, windows
 
 
 def parameters_of(
-    effect: str, estimate: Estimate, density: float, *, first_marker: int = 0
+    effect: str,
+    estimate: Estimate,
+    density: float,
+    *,
+    first_marker: int = 0,
+    unmodelled: Mapping[str, float] = UNMODELLED,
 ) -> tuple[dict[str, ParameterEstimate], list[float] | None]:
     """Parameters of an effect by the names of the gap log, and the stretch of cable that they belong to [m].
 
@@ -45,7 +51,9 @@ def parameters_of(
         estimate: in which it is free.
         density: see `named_effects`.
         first_marker: index of the first free marker among all keypoints.
+        unmodelled: error of an effect's parameter besides, see `UNMODELLED`.
     """
+    besides = unmodelled.get(effect, 0.0)
     where, length = estimate.layout.slices, estimate.layout.arclength[-1]
 
     def part(field):
@@ -57,7 +65,11 @@ def parameters_of(
         value = float(np.linalg.norm(estimate.shared[slots]))
         ends = [estimate.of(lambda values, i=i: values[i]) for i in slots]
         error = max(end.high - end.value for end in ends)
-        return Interval(value, max(value - error, 0.0), value + error)
+        told = Interval(value, value - error, value + error).wider(besides)
+        return dataclasses.replace(told, low=max(told.low, 0.0))
+
+    def positive(field):
+        return estimate.positive(field).wider_by_factor(besides)
 
     def place(knot, knots):
         centre, half = knot * length / (knots - 1), 0.5 * length / (knots - 1)
@@ -67,7 +79,7 @@ def parameters_of(
     along = None
     match effect:
         case "bending_stiffness":
-            parameters = {"ratio": _told(estimate.ratio(estimate.layout.log_stiffness), "")}
+            parameters = {"ratio": _told(estimate.ratio(estimate.layout.log_stiffness).wider_by_factor(besides), "")}
         case "stiffness_profile":
             profile = part("log_profile")
             knot = int(np.abs(profile - profile.mean()).argmax())
@@ -78,15 +90,15 @@ def parameters_of(
                 return profile[knot] - profile[np.array(rest)].mean()
 
             parameters, along = place(knot, PROFILE_KNOTS)
-            parameters["ratio"] = _told(estimate.ratio(against_the_rest), "")
+            parameters["ratio"] = _told(estimate.ratio(against_the_rest).wider_by_factor(besides), "")
         case "bending_damping":
-            parameters = {"time_s": _told(estimate.positive("damping_time"), "s")}
+            parameters = {"time_s": _told(positive("damping_time"), "s")}
         case "viscous_drag":
-            parameters = {"coefficient_n_s_per_m2": _told(estimate.positive("drag"), "N s/m²", times=density)}
+            parameters = {"coefficient_n_s_per_m2": _told(positive("drag"), "N s/m²", times=density)}
         case "quadratic_drag":
-            parameters = {"coefficient_per_m": _told(estimate.positive("quadratic_drag"), "1/m")}
+            parameters = {"coefficient_per_m": _told(positive("quadratic_drag"), "1/m")}
         case "lumped_mass":
-            parameters = {"mass_kg": _told(estimate.positive("marker_mass"), "kg", times=density)}
+            parameters = {"mass_kg": _told(positive("marker_mass"), "kg", times=density)}
         case "gripper_rotation_offset":
             angles = [size("clamp_rotation", 2 * gripper) for gripper in range(2)]
             parameters = {"gripper": _choice([0, 1], ""), "angle_rad": _all_told(angles, "rad")}
