@@ -173,12 +173,12 @@ def _page(scores) -> str:
         _row("one rollout of 5 s, median [s]", pick(lambda s: s["seconds"][0], "{:.3f}")),
         _row("all 70 windows in batches of 8 [s]", pick(lambda s: s["seconds"][1], "{:.2f}")),
         "",
-        "What a half is simulated with is not what the cable is: where an effect did not stay in the search, EI/rho "
-        "makes up for it. The estimate with every effect free is the one to read as the cable's: on synthetic "
-        "recordings nine of ten of its intervals hold the true value, and two of ten of those of the other ([coverage]"
-        "(interval_coverage.md)). The halves are different recordings of one cable: if both intervals are right, the "
-        f"estimates differ by less than {_NINETY:g} standard errors on nine cables of ten. An error that both halves "
-        "share does not show here.",
+        "rho is the mass per length of the cable with its markers. What a half is simulated with is not what the cable "
+        "is: where an effect did not stay in the search, EI/rho makes up for it. The estimate with every effect free "
+        "is the one to read as the cable's ([coverage](interval_coverage.md) on synthetic cables, of both). The halves "
+        "are different recordings of one cable: if both intervals are right, the estimates differ by less than "
+        f"{_NINETY:g} standard errors on nine cables of ten. An error that both halves share does not show here; what "
+        "a diagnosis tells is wider by what a cable has beyond the fitted law.",
         "",
         "Windows of the train split beside windows of the eval split in the same recording make upstream's "
         "number easier than the split by recording; how much the choice of 14 files matters is the row of the spread.",

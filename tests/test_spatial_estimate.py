@@ -85,10 +85,11 @@ def test_an_interval_grows_by_an_error_besides_and_no_less_to_its_wide_side():
 
 def test_what_is_told_is_wider_by_what_the_law_leaves_out(everything):
     for effect, more in UNMODELLED.items():
-        told, plain = (parameters_of(effect, everything, 0.05, **kind)[0] for kind in ({}, {"unmodelled": {}}))
+        told = parameters_of(effect, everything, 0.05)[0]
+        plain = parameters_of(effect, everything, 0.05, unmodelled={})[0]
         for name, parameter in plain.items():
             if parameter.ci90 is not None:
-                wide, narrow = (np.ptp(np.reshape(p.ci90, (-1, 2)), axis=1) for p in (told[name], parameter))
+                wide, narrow = (np.ptp(np.reshape(np.array(p.ci90), (-1, 2)), axis=1) for p in (told[name], parameter))
                 assert (wide > narrow).all() and more > 0
                 assert told[name].value == parameter.value
 

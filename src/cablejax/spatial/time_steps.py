@@ -18,9 +18,9 @@ from cablejax.spatial.rod import Rod
 from cablejax.spatial.windows import Windows
 
 _FINEST = 4
-# Errors of the time steps may be so large a part of what a good fit leaves, on so many of the windows. The others may
-# hold a cable that snaps through, where any error grows.
-_SHARE, _QUANTILE = 0.5, 0.8
+# Errors of the time steps may be so large a part of what a good fit leaves, on half of the windows. The others may hold
+# a cable that snaps through, as the believed one often does where the true one is stiffer: there any error grows.
+_SHARE = 0.5
 
 
 @dataclasses.dataclass(frozen=True)
@@ -29,7 +29,8 @@ class TimeSteps:
 
     Attributes:
         substeps: their number.
-        error: by which half the steps would change the motion, as a mean over coordinates and samples [m].
+        error: by which half the steps would change the motion, as a mean over coordinates and samples, median over
+            windows [m].
     """
 
     substeps: int
@@ -58,7 +59,7 @@ def time_steps_for(windows: Windows, layout: Layout, edges: int) -> TimeSteps:
         fine = predicted(2 * substeps)
         off = bounded(coarse - fine)
         each = [part[valid].mean() for part, valid in zip(off, windows.valid, strict=True)]
-        found = TimeSteps(substeps, float(np.quantile(each, _QUANTILE)))
+        found = TimeSteps(substeps, float(np.median(each)))
         if found.fine_enough or substeps >= _FINEST:
             return found
         substeps, coarse = 2 * substeps, fine
