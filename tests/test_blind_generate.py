@@ -55,6 +55,7 @@ def test_a_cable_without_load_has_one_shape_whatever_its_stiffness(commands):
     assert np.abs(steps * 48 - 1).max() < 1e-3
 
 
+@pytest.mark.slow
 def test_mirrored_commands_give_the_mirrored_cable(commands):
     path = commands[0].fine_path(FRAMES)[:400]
     mirrored = path * [1.0, -1.0, -1.0]

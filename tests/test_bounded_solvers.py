@@ -78,12 +78,13 @@ def test_certificate_tells_a_minimum_from_other_points():
         # pulled along (1, 0): the ball and the plane meet at a corner with both multipliers positive
         x = (0.5 + np.sqrt(2 - 0.25)) / 2
         corner = jnp.asarray([x, 0.5 - x])
-        certificate = certify(jnp.asarray([-2.0, 0.0]), feasible, corner)
+        certified = jax.jit(certify)
+        certificate = certified(jnp.asarray([-2.0, 0.0]), feasible, corner)
         assert float(certificate.residual) < 1e-12 and float(certificate.smallest_multiplier) > 0.1
         assert float(certificate.projected_gradient) < 1e-9
-        away = certify(jnp.asarray([0.0, 1.0]), feasible, corner)
+        away = certified(jnp.asarray([0.0, 1.0]), feasible, corner)
         assert float(away.stationarity) > 0.1 and float(away.projected_gradient) > 0.1
-        outside = certify(jnp.asarray([-2.0, 0.0]), feasible, 1.1 * corner)
+        outside = certified(jnp.asarray([-2.0, 0.0]), feasible, 1.1 * corner)
         assert float(outside.feasibility) > 0.01
 
 

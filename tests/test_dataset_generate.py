@@ -218,6 +218,7 @@ def test_faults_are_told_apart(reference):
     assert "stretched" in find_fault(TINY, dataclasses.replace(one, keypoints=middle))
 
 
+@pytest.mark.slow
 def test_two_processes_of_jax_distributed_on_loopback(reference, tmp_path):
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))

@@ -155,6 +155,7 @@ def test_gradients(bias):
         delta, twist, valid = window(3)
         query = twist[0] + 0.01
 
+        @jax.jit
         def predict(delta, twist):
             return apply(fit(delta, twist, valid.at[0].set(False), config), query)
 
