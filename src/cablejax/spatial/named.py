@@ -24,7 +24,7 @@ def named_effects(found: Identified, estimate: Estimate, density: float, windows
     Args:
         found: by `identify`.
         estimate: from the same windows. What is told comes from it, not from the values that predictions are made with.
-        density: mass per length that is believed true [kg/m], for what is known per mass only.
+        density: mass per length, with the markers, that is believed true [kg/m], for what is known per mass only.
         windows: that it was found from.
     """
     chance = {step.effect: step.chance for step in found.steps}
