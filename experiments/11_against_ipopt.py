@@ -46,7 +46,7 @@ from cablejax.evaluation.against_ipopt import (
     slopes_along,
     steepness,
 )
-from cablejax.evaluation.control_call import race, ratios
+from cablejax.evaluation.control_call import improved, race, ratios
 from cablejax.evaluation.planning_problems import (
     PlanningCase,
     ProblemMaker,
@@ -352,11 +352,11 @@ def _calls(calls: list[dict]) -> list[str]:
         "| --- | --- | --- | --- | --- |",
     ]
     for name in CALLS:
-        ratio = ratios(calls, name)
-        theirs = [row[name]["ipopt_seconds"] for row in calls if row[name]["ipopt_seconds"]]
+        ratio, counted = ratios(calls, name), improved(calls, name)
+        theirs = [one["ipopt_seconds"] for one in counted if one["ipopt_seconds"] is not None]
         low, middle, high = np.quantile(ratio, [0.25, 0.5, 0.75], method="inverted_cdf")
         lines.append(
-            f"| {name}: {len(ratio)} problems | {quantiles([1e3 * row[name]['seconds'] for row in calls], '.0f')} | "
+            f"| {name}: {len(ratio)} problems | {quantiles([1e3 * one['seconds'] for one in counted], '.0f')} | "
             f"{quantiles([1e3 * s for s in theirs], '.0f')} | {int(np.isinf(ratio).sum())} | {middle:.1f} ({low:.1f}, "
             f"{high:.1f}) |"
         )

@@ -4,7 +4,7 @@
     python experiments/32_interval_coverage.py --calibrate      # what `spatial.estimate.UNMODELLED` is
     python experiments/32_interval_coverage.py --report docs/results/interval_coverage.md
 
-Every cable is drawn from a seed of its own, simulated by a rod with twice the edges and twice the time steps of the one
+Every cable is drawn from a seed of its own, simulated by a rod with twice the edges and shorter time steps than the one
 that is fitted, seen through noise, and handed to the protocol of the real recordings: windows, search, fits to both
 halves of the recordings, estimates from either half and from all. Once it obeys the law that is fitted, once it has
 besides what real cables have and the search does not try.
@@ -356,7 +356,8 @@ def page(rows: list[Row]) -> str:
         "",
         "---",
         "",
-        "Made by `python experiments/32_interval_coverage.py` and `--report docs/results/interval_coverage.md`. "
+        f"Made by `python experiments/32_interval_coverage.py --cables {1 + max(row.seed for row in rows)}` and "
+        "`--report docs/results/interval_coverage.md`. "
         f"{versions()}; {machine()}.",
         "",
     ]

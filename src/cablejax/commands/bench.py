@@ -365,18 +365,19 @@ def _against_ipopt(model: Model, solver: SolverName, problems: int) -> tuple[dic
     import numpy as np
 
     from cablejax.evaluation.against_ipopt import EQUAL, comparable_seconds, contestant, excess, judge
-    from cablejax.evaluation.control_call import race, ratios
+    from cablejax.evaluation.control_call import finite, race, ratios
     from cablejax.evaluation.planning_problems import ProblemMaker, random_cases
     from cablejax.evaluation.referee import RefereeConfig
     from cablejax.mpc import SOLVERS
 
     say("compiling the planning problem in float32 ...")
     make, chosen = ProblemMaker(model, np.float32), {solver: SOLVERS[solver]}
-    race(make, random_cases(model, [0])[0], chosen, RefereeConfig(max_iterations=2))
-    calls = [race(make, case, chosen) for case in random_cases(model, range(problems))]
+    cases = random_cases(model, range(problems))
+    race(make, cases[0], chosen, RefereeConfig(max_iterations=2))
+    calls = [race(make, case, chosen) for case in cases]
     call_ratios = ratios(calls, solver)
     with jax.enable_x64(True):
-        ours, cases = contestant(model), random_cases(model, range(problems))
+        ours = contestant(model)
         say("compiling the planning problem in float64 ...")
         judge(ours, cases[0], [RefereeConfig(max_iterations=2)], gradients=2)
         rows = []
@@ -401,7 +402,7 @@ def _against_ipopt(model: Model, solver: SolverName, problems: int) -> tuple[dic
             "ms": 1e3 * float(np.median([row[solver]["seconds"] for row in calls])),
             "ipopt_ms": [s and 1e3 * s for s in (row[solver]["ipopt_seconds"] for row in calls)],
             "ipopt_never_as_good": int(np.isinf(call_ratios).sum()),
-            "ratio": _finite(np.median(call_ratios)) if len(call_ratios) else None,
+            "ratio": finite(np.median(call_ratios)) if len(call_ratios) else None,
         },
     }
     text = f"against IPOPT: as good or better on {as_good} of {problems} problems"
@@ -410,11 +411,6 @@ def _against_ipopt(model: Model, solver: SolverName, problems: int) -> tuple[dic
     text += f"\na control call's plan by {solver}: {result['control_call']['ms']:.0f} ms; IPOPT to one as good: "
     text += ", ".join("never" if ms is None else f"{ms:.0f} ms" for ms in result["control_call"]["ipopt_ms"])
     return result, text
-
-
-def _finite(number: float) -> float | None:
-    """For JSON, which knows no infinity."""
-    return float(number) if number < float("inf") else None
 
 
 def _median_seconds(contestants: dict[str, Callable[[], Any]], rounds: int) -> dict[str, float]:

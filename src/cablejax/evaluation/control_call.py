@@ -59,19 +59,25 @@ def race(
         row[name] = {
             "objective": objective,
             "seconds": float(np.median(seconds)),
-            "ipopt_seconds": theirs if np.isfinite(theirs) else None,
+            "ipopt_seconds": finite(theirs),
         }
     return row
 
 
+def improved(rows: Sequence[dict[str, Any]], solver: str) -> list[dict[str, Any]]:
+    """What a solver did where it improved its start; the other problems say nothing about speed."""
+    return [row[solver] for row in rows if row[solver]["objective"] < row["start"] * (1 - EQUAL)]
+
+
 def ratios(rows: Sequence[dict[str, Any]], solver: str) -> Float[np.ndarray, " R"]:
-    """IPOPT's seconds over the solver's; infinite where IPOPT was never as good. Left out are problems that the solver
-    did not improve: they say nothing about speed."""
-    improved = [row for row in rows if row[solver]["objective"] < row["start"] * (1 - EQUAL)]
-    theirs = [row[solver]["ipopt_seconds"] for row in improved]
-    return np.array(
-        [np.inf if s is None else s / row[solver]["seconds"] for s, row in zip(theirs, improved, strict=True)]
-    )
+    """IPOPT's seconds over the solver's, where that improved its start; infinite where IPOPT was never as good."""
+    pairs = [(one["ipopt_seconds"], one["seconds"]) for one in improved(rows, solver)]
+    return np.array([np.inf if theirs is None else theirs / ours for theirs, ours in pairs])
+
+
+def finite(number: float) -> float | None:
+    """For JSON, which knows no infinity."""
+    return float(number) if np.isfinite(number) else None
 
 
 @functools.partial(jax.jit, static_argnums=0)

@@ -28,8 +28,8 @@ from cablejax.spatial.values import Values
 from cablejax.spatial.windows import Windows
 
 _ITERATIONS = 12
-# Predictions may be off by what a time step does; values are not to make up for it. The last steps of the fit are made
-# with so much shorter ones, so few of them: stiffness moves by a tenth at most.
+# Predictions may be off by what a time step does; values are not to make up for it. The last iterations of the fit have
+# time steps that are so much shorter. They are few: they begin near their end.
 _FINER, _MORE = 4, 3
 _TAIL = 0.95
 
