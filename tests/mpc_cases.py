@@ -3,6 +3,7 @@
 import jax.numpy as jnp
 import numpy as np
 
+from cablejax.evaluation.planning_problems import PlanningCase
 from cablejax.mpc.feasible import FeasibleSet
 from cablejax.mpc.problem import ObjectiveConfig, ShapingProblem
 from cablejax.types import History
@@ -73,3 +74,18 @@ def problem(target="near", start=START, radius=0.05, rate=0.8, **objective):
 
 def random_motion(seed, n_steps=4, size=0.02):
     return jnp.asarray(np.random.default_rng(seed).normal(size=(n_steps, 2, 3)) * size)
+
+
+def planning_case(name="one", radius=0.05, steps=3) -> PlanningCase:
+    history = at_rest(START)
+    n = history.keypoints.shape[1]
+    return PlanningCase(
+        name=name,
+        keypoints=np.asarray(history.keypoints),
+        gripper_pose=np.asarray(history.gripper_pose),
+        gain=np.zeros((6, 2 * n)),
+        bias=np.zeros(2 * n),
+        target=np.asarray(hermite_shape(poses(0.9, 0.15, -0.1), n)),
+        radius=radius,
+        guess=np.asarray(random_motion(0, steps)),
+    )

@@ -6,6 +6,7 @@ import functools
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optimistix as optx
 import pytest
 
 from cablejax.bounded import (
@@ -55,6 +56,33 @@ BOXES = {
     "corner": ([1.5, -3.0], [4.0, 1.0], [1.5, 1.0], 0.5 * (12.5**2 + 0.5**2)),
     "fixed": ([0.5, -3.0], [0.5, 3.0], [0.5, 0.25], 0.125),
 }
+
+
+@pytest.mark.parametrize(
+    ("solver", "steps"), [*((name, 500) for name in SOLVERS), ("Levenberg-Marquardt, updated", 3), ("quasi-Newton", 3)]
+)
+def test_what_a_function_gives_beside_its_value_is_that_at_the_solution(solver, steps):
+    """Through optimistix's own entry points, also where trials are rejected on the way and where steps run out."""
+
+    def with_aux(y, args):
+        residuals = rosenbrock(y, args)
+        value = (
+            residuals if isinstance(SOLVERS[solver], optx.AbstractLeastSquaresSolver) else 0.5 * residuals @ residuals
+        )
+        return value, {"point": y, "residuals": residuals}
+
+    @jax.jit
+    def solve_with_aux(start):
+        entry = optx.least_squares if isinstance(SOLVERS[solver], optx.AbstractLeastSquaresSolver) else optx.minimise
+        options = {"feasible": Box(jnp.array([-1.5, -1.5]), jnp.array([0.8, 1.5]))}
+        found = entry(with_aux, SOLVERS[solver], start, 1.0, options, has_aux=True, max_steps=steps, throw=False)
+        return found.value, found.aux, with_aux(found.value, 1.0)[1]
+
+    value, aux, expected = solve_with_aux(jnp.array([-1.2, 1.0]))
+    np.testing.assert_array_equal(aux["point"], value)
+    np.testing.assert_allclose(aux["residuals"], expected["residuals"], rtol=1e-5, atol=1e-6)
+    if steps == 500:
+        np.testing.assert_allclose(value, [0.8, 0.64], atol=2e-6)
 
 
 @pytest.mark.parametrize("solver", SOLVERS)

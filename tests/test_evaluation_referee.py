@@ -24,7 +24,7 @@ from cablejax.evaluation.referee import Limits, RefereeConfig, referee
 from cablejax.evaluation.solver_path import PathFinder
 from cablejax.mpc import SOLVERS, Controller
 from cablejax.shaping import Model
-from mpc_cases import START, at_rest, hermite_shape, poses, problem, random_motion, relaxing_cable
+from mpc_cases import START, at_rest, planning_case, problem, random_motion, relaxing_cable
 
 pytest.importorskip("ipyopt")
 STEPS = 3
@@ -114,7 +114,7 @@ def test_the_referee_stops_in_time():
 
 
 def test_a_control_calls_solver_is_timed_beside_the_referee_in_single_precision():
-    case = case_of()
+    case = planning_case()
     make = ProblemMaker(Model("analytic", None, relaxing_cable, jnp.asarray(0.8)), np.float32)  # pyright: ignore[reportArgumentType]
     one = {"deadline": SOLVERS["deadline"]}
     row = race(make, case, one)
@@ -153,23 +153,8 @@ def test_a_path_never_gets_worse_and_ends_where_the_solver_does():
         assert path.seconds_to(path.objectives[-1]) <= path.seconds[-1] and path.seconds_to(0.0) == np.inf
 
 
-def case_of(name="one", radius=0.05) -> PlanningCase:
-    history = at_rest(START)
-    n = history.keypoints.shape[1]
-    return PlanningCase(
-        name=name,
-        keypoints=np.asarray(history.keypoints),
-        gripper_pose=np.asarray(history.gripper_pose),
-        gain=np.zeros((6, 2 * n)),
-        bias=np.zeros(2 * n),
-        target=np.asarray(hermite_shape(poses(0.9, 0.15, -0.1), n)),
-        radius=radius,
-        guess=np.asarray(random_motion(0, STEPS)),
-    )
-
-
 def test_cases_survive_their_file(tmp_path):
-    cases = [case_of("one"), case_of("two", radius=0.01)]
+    cases = [planning_case("one"), planning_case("two", radius=0.01)]
     save_cases(tmp_path / "folder" / "cases.npz", cases)
     for before, after in zip(cases, load_cases(tmp_path / "folder" / "cases.npz"), strict=True):
         for field in dataclasses.fields(PlanningCase):
@@ -177,7 +162,7 @@ def test_cases_survive_their_file(tmp_path):
 
 
 def test_other_radii_are_the_controllers():
-    cases = other_radii([case_of(str(i)) for i in range(50)], seed=3)
+    cases = other_radii([planning_case(str(i)) for i in range(50)], seed=3)
     radii = np.array([case.radius for case in cases])
     assert (radii >= CONFIG.radius_min).all() and (radii <= CONFIG.radius_max).all() and np.ptp(np.log(radii)) > 1
     assert all(case.name.endswith("another radius") for case in cases)
@@ -186,7 +171,7 @@ def test_other_radii_are_the_controllers():
 
 
 def test_the_recorder_takes_down_what_the_controller_asks():
-    case = case_of()
+    case = planning_case()
     log = RecordingSolver(CONFIG.solver)
     config = dataclasses.replace(CONFIG, solver=log, horizon=STEPS - 1)
     controller = Controller(config, relaxing_cable, jnp.asarray(0.8), case.target)

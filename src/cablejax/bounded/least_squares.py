@@ -10,6 +10,7 @@ import optimistix as optx
 from equinox import AbstractVar
 from jaxtyping import Array, Bool, Float, Int, PyTree, Scalar
 
+from cablejax.bounded.auxiliary import aux_at, chosen
 from cablejax.bounded.certificate import projected_gradient_size
 from cablejax.bounded.linearise import forward
 from cablejax.bounded.objective import value_of
@@ -29,6 +30,7 @@ class _State(eqx.Module):
     jacobian: Float[Array, "M P"]  # that of `last` with Broyden's updates since
     secant: Float[Array, "P P"]
     last: _Linearisation
+    aux: Any  # of `fn` where the solve is
     descent_state: Any
     search_state: Any
     step_size: Scalar
@@ -72,7 +74,7 @@ class AbstractBoundedLeastSquares(optx.AbstractLeastSquaresSolver):
     trials_per_linearisation: AbstractVar[int]
 
     def init(self, fn, y, args, options, f_struct, aux_struct, tags):
-        del fn, args, aux_struct, tags
+        del tags
         if len(f_struct.shape) != 1:
             raise ValueError(f"{type(self).__name__} got residuals of shape {f_struct.shape}, expected a flat array.")
         dtype = f_struct.dtype
@@ -87,6 +89,8 @@ class AbstractBoundedLeastSquares(optx.AbstractLeastSquaresSolver):
             jacobian=jacobian,
             secant=square,
             last=_Linearisation(y, residual, jacobian),
+            # a linearisation that is given tells none
+            aux=aux_at(fn, y, args, aux_struct),
             descent_state=descent.init(y.ravel(), info),
             search_state=self.search.init(y.ravel(), info),
             step_size=jnp.ones((), dtype),
@@ -113,7 +117,7 @@ class AbstractBoundedLeastSquares(optx.AbstractLeastSquaresSolver):
 
         state = jax.lax.cond(state.stale, renewed, lambda: state)
         y, state = jax.lax.fori_loop(0, self.trials_per_linearisation, one_trial, (y, state))
-        return y, state, None
+        return y, state, state.aux
 
     def terminate(self, fn, y, args, options, state, tags):
         del fn, y, args, options, tags
@@ -138,16 +142,16 @@ class AbstractBoundedLeastSquares(optx.AbstractLeastSquaresSolver):
         ended = state.terminate | converged | ~finite
 
         def stay():
-            return y, jnp.full_like(state.residual, jnp.inf)
+            return y, jnp.full_like(state.residual, jnp.inf), state.aux
 
         def go():
             at = feasible.at(y)
             move, _ = self.descent.within(at, y).step(state.step_size, state.descent_state)
             move = jnp.where(jnp.isfinite(move).all(), move, 0.0)
             trial = at.restore(y + move.reshape(y.shape))
-            return trial, fn(trial, args)[0]
+            return trial, *fn(trial, args)
 
-        trial, residual = jax.lax.cond(ended, stay, go)
+        trial, residual, aux = jax.lax.cond(ended, stay, go)
         value = value_of(residual)
         move = (trial - y).ravel()
         step_size, accept, _, search_state = self.search.step(
@@ -164,14 +168,16 @@ class AbstractBoundedLeastSquares(optx.AbstractLeastSquaresSolver):
         state = eqx.tree_at(
             lambda s: (
                 *(s.search_state, s.step_size, s.stale, s.rounded, s.terminate, s.result),
-                *(s.evaluations, s.objective),
+                *(s.evaluations, s.objective, s.aux),
             ),
             state,
             (
                 *(search_state, step_size.astype(y.dtype), accept, jnp.where(exact, rounded, state.rounded)),
                 *(ended | stalled, result),
                 *(state.evaluations + jnp.where(ended, 0, 1), jnp.where(accept, value, info.f)),
+                chosen(accept, aux, state.aux),
             ),
+            is_leaf=lambda x: x is None,
         )
         y = jnp.where(accept, trial, y)
         return y, state if self.trials_per_linearisation == 1 else self._updated(feasible, y, move, residual, state)

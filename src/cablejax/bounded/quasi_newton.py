@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Bool, Int, PyTree, Scalar
 
+from cablejax.bounded.auxiliary import chosen, nothing_yet
 from cablejax.bounded.certificate import projected_gradient_size
 from cablejax.bounded.gain_ratio import GainRatio
 from cablejax.bounded.levenberg_marquardt import DampedQuadratic
@@ -21,6 +22,7 @@ from cablejax.bounded.secant import positive_update, sized
 class _State(eqx.Module):
     f_info: Any  # FunctionInfo.EvalGradHessian
     trial: Array
+    aux: Any  # of `fn` where the solve is
     descent_state: Any
     search_state: Any
     step_size: Scalar
@@ -67,7 +69,7 @@ class BoundedQuasiNewton(optx.AbstractMinimiser):
         self.search = GainRatio(largest=10.0)
 
     def init(self, fn, y, args, options, f_struct, aux_struct, tags):
-        del fn, aux_struct, tags
+        del fn, tags
         dtype, model = f_struct.dtype, options.get("hessian")
         hessian = jnp.zeros((y.size, y.size), dtype) if model is None else model(y, args)
         info = quadratic_info(jnp.asarray(jnp.inf, dtype), jnp.zeros(y.size, dtype), hessian)
@@ -76,6 +78,7 @@ class BoundedQuasiNewton(optx.AbstractMinimiser):
         return _State(
             f_info=info,
             trial=y,
+            aux=nothing_yet(aux_struct),
             descent_state=descent.init(y.ravel(), info),
             search_state=self.search.init(y.ravel(), info),
             step_size=jnp.ones((), dtype),
@@ -89,12 +92,12 @@ class BoundedQuasiNewton(optx.AbstractMinimiser):
     def step(self, fn, y, args, options, state: _State, tags):
         """Takes the gradient at the trial point, decides on it, and finds the next one."""
         del tags
-        value, gradient = jax.value_and_grad(lambda y: fn(y, args)[0])(state.trial)
+        (value, aux), gradient = jax.value_and_grad(fn, has_aux=True)(state.trial, args)
         given = options.get("hessian") is not None
-        y, state = self._decide(y, value, gradient.ravel(), given, state)
-        return y, self._next_trial(options["feasible"], y, state), None
+        y, state = self._decide(y, value, aux, gradient.ravel(), given, state)
+        return y, self._next_trial(options["feasible"], y, state), state.aux
 
-    def _decide(self, y, value, gradient, given: bool, state: _State) -> tuple[Array, _State]:
+    def _decide(self, y, value, aux, gradient, given: bool, state: _State) -> tuple[Array, _State]:
         """Where the solve goes on, and the model there; `given` = the first model was."""
         info, first = state.f_info, state.evaluations == 0
         move, bent = (state.trial - y).ravel(), gradient - info.grad
@@ -123,12 +126,14 @@ class BoundedQuasiNewton(optx.AbstractMinimiser):
         )
         broken = first & ~finite
         state = eqx.tree_at(
-            lambda s: (s.f_info, s.search_state, s.step_size, s.evaluations, s.terminate, s.result),
+            lambda s: (s.f_info, s.search_state, s.step_size, s.evaluations, s.terminate, s.result, s.aux),
             state,
             (
                 *(info, search_state, step_size, state.evaluations + 1, broken),
                 optx.RESULTS.where(broken, optx.RESULTS.nonfinite, state.result),
+                chosen(accept | first, aux, state.aux),
             ),
+            is_leaf=lambda x: x is None,
         )
         return jnp.where(accept, state.trial, y), state
 

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int, PyTree, Scalar
 
+from cablejax.bounded.auxiliary import chosen, nothing_yet
 from cablejax.bounded.certificate import projected_gradient_size
 from cablejax.bounded.sets import ConvexSet
 
@@ -109,6 +110,7 @@ class _SpectralState(eqx.Module):
     inner: Any
     best: Array
     best_value: Scalar
+    best_aux: Any
     linearisations: Int[Array, ""]
     steps: Int[Array, ""]
 
@@ -156,21 +158,23 @@ class SpectralProjectedGradient(optx.AbstractGradientDescent):
         solver = self.within(options["feasible"].at(y))
         inner = super(SpectralProjectedGradient, solver).init(fn, y, args, options, f_struct, aux_struct, tags)
         zero, inf = jnp.zeros((), jnp.int32), jnp.asarray(jnp.inf, f_struct.dtype)
-        return _SpectralState(inner, y, inf, zero, zero)
+        return _SpectralState(inner, y, inf, nothing_yet(aux_struct), zero, zero)
 
     def step(self, fn, y, args, options, state: Any, tags):
         solver = self.within(options["feasible"].at(state.inner.y_eval))
-        y, inner, aux = super(SpectralProjectedGradient, solver).step(fn, y, args, options, state.inner, tags)
+        # the aux that this returns is that of the step before
+        y, inner, _ = super(SpectralProjectedGradient, solver).step(fn, y, args, options, state.inner, tags)
         accepted = inner.search_state.shrunk == 0
         better = inner.f_info.f < state.best_value
         state = _SpectralState(
             inner=inner,
             best=jnp.where(better, y, state.best),
             best_value=jnp.where(better, inner.f_info.f, state.best_value),
+            best_aux=chosen(better, inner.aux, state.best_aux),
             linearisations=state.linearisations + accepted,
             steps=state.steps + 1,
         )
-        return y, state, aux
+        return y, state, state.best_aux
 
     def terminate(self, fn, y, args, options, state: Any, tags) -> tuple[Bool[Array, ""], optx.RESULTS]:
         del fn, args, options, tags
@@ -185,7 +189,7 @@ class SpectralProjectedGradient(optx.AbstractGradientDescent):
         return done | broken | stalled, result
 
     def postprocess(self, fn, y, aux, args, options, state: Any, tags, result) -> tuple[Any, Any, dict[str, Any]]:
-        del fn, y, args, options, tags, result
+        del fn, y, aux, args, options, tags, result
         stats = {
             "optimality": state.inner.descent_state.optimality,
             "objective": state.best_value,
@@ -193,4 +197,4 @@ class SpectralProjectedGradient(optx.AbstractGradientDescent):
             "linearisations": state.linearisations,
             "projections": state.steps + state.linearisations,
         }
-        return state.best, aux, stats
+        return state.best, state.best_aux, stats

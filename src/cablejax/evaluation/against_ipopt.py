@@ -30,6 +30,10 @@ EQUAL = 1e-6
 """Relative difference of objectives that counts as none."""
 STATIONARY = 1e-5
 """KKT residual of a minimum [m]."""
+FEASIBLE = 1e-8
+"""By how much a plan may break a bound [m]."""
+REACH, POINTS = 1e-5, 101
+"""How far along a direction the slope is looked at, to either side [m], and at how many points."""
 ACCURATE = Accurate(gradients=100)
 """Ours. In float32 with 1000 times its tolerance on the projected gradient."""
 
@@ -148,6 +152,61 @@ def kkt_residual(problem: ShapingProblem, motion) -> float:
 def excess(row: dict[str, Any], which: str) -> float:
     """By how much our objective is above the referee's, relative to it."""
     return (row["objective"] - row[which]["objective"]) / row[which]["objective"]
+
+
+def better_referee(row: dict[str, Any]) -> dict[str, Any]:
+    """What the referee with the lower objective found."""
+    return min((row[which] for which in ("limited", "exact") if which in row), key=lambda found: found["objective"])
+
+
+def as_good(found: dict[str, Any], row: dict[str, Any]) -> bool:
+    """Whether a plan of ours, the row's own or one from another start, is as good as every referee's."""
+    return found["objective"] <= better_referee(row)["objective"] * (1 + EQUAL)
+
+
+def meets_all(found: dict[str, Any], row: dict[str, Any]) -> bool:
+    """Whether it is as good, feasible and stationary."""
+    return as_good(found, row) and found["violation"] <= FEASIBLE and found["kkt"] < STATIONARY
+
+
+def explain(ours: Contestant, case: PlanningCase, row: dict[str, Any], starts: int) -> dict[str, Any]:
+    """Why the plan of a row does not have all that is asked: whether a plan has it that is found from elsewhere.
+
+    Args:
+        ours: the solver.
+        case: the problem.
+        row: of `judge`.
+        starts: at random, at most; no other is tried once a plan has all.
+
+    Returns:
+        A row that JSON can hold: `steepness` of the model at the row's plan and `their_steepness` at the referee's;
+        what was found from `starts`, and `from_theirs`, begun at the referee's plan, None where a start has led to all.
+    """
+    problem, limits, rng = ours.make(case), case.limits(), np.random.default_rng([len(case.name), 12])
+    theirs, mine = np.asarray(better_referee(row)["motion"]), np.asarray(row["motion"])
+
+    def find(start) -> dict[str, Any]:
+        path = ours.find(problem, start, ACCURATE.gradients)
+        plan = path.points[-1]
+        return {
+            "objective": float(path.objectives[-1]),
+            "kkt": kkt_residual(problem, plan),
+            "violation": limits.violation(plan),
+            "apart": float(np.linalg.norm(plan - mine, axis=-1).max()),
+        }
+
+    found = []
+    for start in rng.uniform(-1.0, 1.0, (starts, *case.guess.shape)) * case.radius / 3**0.5:
+        found.append(find(start))
+        if meets_all(found[-1], row):
+            break
+    return {
+        "name": case.name,
+        "steepness": steepness(problem, mine),
+        "their_steepness": steepness(problem, theirs),
+        "starts": found,
+        "from_theirs": None if meets_all(found[-1], row) else find(theirs),
+    }
 
 
 def comparable_seconds(
