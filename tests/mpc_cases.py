@@ -11,6 +11,11 @@ from cablejax.types import History
 LENGTH = 1.0
 
 
+def number(value):
+    """In the precision that is set, and strictly so: arrays that are floats by default compile anew."""
+    return jnp.asarray(value, jnp.result_type(float))
+
+
 def hermite_shape(gripper_pose, n_keypoints):
     """Cubic Hermite curve that leaves both grippers along their directions, [N, 2]."""
     gripper_pose = jnp.asarray(gripper_pose)
@@ -54,9 +59,9 @@ def feasible_set(pose, radius=0.05):
     pose = jnp.asarray(pose)
     return FeasibleSet(
         separation=pose[1, :2] - pose[0, :2],
-        radius=jnp.asarray(radius),
-        min_distance=jnp.asarray(0.15 * LENGTH),
-        max_distance=jnp.asarray(0.99 * LENGTH),
+        radius=number(radius),
+        min_distance=number(0.15 * LENGTH),
+        max_distance=number(0.99 * LENGTH),
     )
 
 
@@ -64,7 +69,7 @@ def problem(target="near", start=START, radius=0.05, rate=0.8, **objective):
     history = at_rest(start)
     return ShapingProblem(
         dynamics=relaxing_cable,
-        weights=jnp.asarray(rate),
+        weights=number(rate),
         history=history,
         target=hermite_shape(TARGETS[target], history.keypoints.shape[1]),
         feasible=feasible_set(start, radius),
