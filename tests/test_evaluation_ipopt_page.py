@@ -71,7 +71,7 @@ def test_shares_and_times_are_those_of_the_rows():
             explanation([{**GOOD, "kkt": 1.0}], GOOD),
             "another local minimum; from IPOPT's plan ours",
         ),
-        ({"kkt": 1.0}, explanation([{**GOOD, "kkt": 1.0}], {**GOOD, "kkt": 1.0}, 99.0), "verge of a snap-through"),
+        ({"kkt": 1.0}, explanation([{**GOOD, "kkt": 1.0}], {**GOOD, "kkt": 1.0}, 99.0), "as at a snap-through"),
         (
             {"kkt": 1.0},
             explanation([{**GOOD, "kkt": 1.0}], {**GOOD, "kkt": 1.0}),

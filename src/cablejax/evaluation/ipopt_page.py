@@ -27,7 +27,7 @@ from cablejax.evaluation.control_call import improved, ratios
 from cablejax.report.markdown import markdown_table
 
 STEEP = 50.0
-"""Largest singular value of the residuals' Jacobian above which a plan leads through a snap-through."""
+"""Largest singular value of the residuals' Jacobian above which a model is steep: with statics, at a snap-through."""
 
 _REFEREES = {"limited": "limited memory", "exact": "exact Hessian"}
 
@@ -271,8 +271,9 @@ def _verdict(row: dict, said: dict) -> str:
         )
     if max(said["steepness"], said["their_steepness"]) > STEEP:
         return (
-            f"{'stationary' if stationary else first}, on the verge of a snap-through: the largest singular value of "
-            f"the residuals' Jacobian is {said['steepness']:.0f} at our plan, {said['their_steepness']:.0f} at IPOPT's"
+            f"{'stationary' if stationary else first}, where the model is steep, as at a snap-through: the largest "
+            f"singular value of the residuals' Jacobian is {said['steepness']:.0f} at our plan, "
+            f"{said['their_steepness']:.0f} at IPOPT's"
         )
     first = "stationary" if stationary else first
     return f"{first}, and neither {count} other starts nor IPOPT's plan lead to one that has all three"
