@@ -63,6 +63,7 @@ def test_mirrored_commands_give_the_mirrored_cable(commands):
     assert np.abs(one * [1.0, -1.0] - other).max() < 1e-7
 
 
+@pytest.mark.slow
 def test_the_rod_converges_in_nodes_and_time_step(commands):
     path = commands[0].fine_path(FRAMES)[:400]
     fine = simulate(WORLD, path, FRAME, RodConfig(96, 2e-3, 3)).points[:, ::8]

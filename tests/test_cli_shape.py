@@ -102,6 +102,7 @@ def test_targets_of_another_cable_are_refused(weights, tmp_path, capsys):
         assert message in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_demo_tells_its_story_in_a_table(weights, tmp_path, capsys):
     out = tmp_path / "demo"
     arguments = ["demo", "--weights", str(weights), "--out", str(out), "--steps", "1", "--links", "12", "--shapes", "S"]

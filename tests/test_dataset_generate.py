@@ -237,6 +237,7 @@ def test_two_processes_of_jax_distributed_on_loopback(reference, tmp_path):
     assert tree(tmp_path / "data") == tree(reference)
 
 
+@pytest.mark.slow
 def test_two_devices_make_the_bytes_of_one(tmp_path):
     config = dataclasses.replace(TINY, engine="mjx", n_trajectories=7)
     code = "import jax\nprint(jax.local_device_count(), generate(config, path, progress=False).complete)\n"

@@ -59,7 +59,9 @@ def holed(log: GapLog, share: float) -> GapLog:
 # Less than there should be.
 
 
-@pytest.mark.parametrize("effect", [(OFFSET,), ()], ids=["effect", "none"])
+@pytest.mark.parametrize(
+    "effect", [pytest.param((OFFSET,), marks=pytest.mark.slow, id="effect"), pytest.param((), id="none")]
+)
 def test_one_episode_is_told_to_be_little(effect):
     result = told(episodes(record(*effect), [0]))
     assert caveat(result, "One episode only") and not_misled(result, NAME)

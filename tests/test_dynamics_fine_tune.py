@@ -31,6 +31,7 @@ def trained(tmp_path):
     return tmp_path / "trained.safetensors", (graphdef, weights)
 
 
+@pytest.mark.slow
 def test_a_conditioned_model_starts_as_the_model_it_came_from_and_learns_to_listen(trained, tmp_path):
     path, model = trained
     config, weights = starting_from(path, CONDITIONED)

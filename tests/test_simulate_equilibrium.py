@@ -21,6 +21,7 @@ def error(n_links: int) -> float:
     return float(np.linalg.norm(keypoints - exact, axis=1).max())
 
 
+@pytest.mark.slow
 def test_the_chain_converges_to_the_elastica_with_the_square_of_the_link_length():
     errors = {n: error(n) for n in (13, 24, 25, 49)}
     assert errors[24] <= 1e-3

@@ -57,6 +57,7 @@ def _width(interval):
     return np.log(interval.high / interval.low)
 
 
+@pytest.mark.slow
 def test_is_wider_the_more_may_be_true_and_holds_the_true_value(estimated):
     more = (), ("viscous_drag",), ("viscous_drag", "lumped_mass")
     intervals = [estimated(*names).stiffness for names in more]
