@@ -40,6 +40,7 @@ from cablejax.evaluation.against_ipopt import (
     contestant,
     explain,
     judge,
+    kept_rows,
     keypoints_apart,
     kkt_residual,
     meets_all,
@@ -90,7 +91,7 @@ def run(
     ours: Contestant, cases: list[PlanningCase], path: Path, n_exact: int, process: tuple[int, int], seconds: float
 ) -> None:
     """Judges what the file does not have yet, until the time is up."""
-    done = {row["name"]: "exact" in row for row in read(path.parent)}
+    done = {row["name"]: "exact" in row for row in kept_rows(path.parent)}
     index, count = process
     wanted = [(case, i < n_exact) for i, case in enumerate(cases) if i % count == index]
     # with the exact Hessian again where that was not asked for before
@@ -111,8 +112,8 @@ def run(
 
 def explain_all(ours: Contestant, cases: list[PlanningCase], folder: Path, seconds: float) -> None:
     """Explains what is not explained yet, until the time is up."""
-    known, by_name = {row["name"] for row in read(folder, "explained")}, {case.name: case for case in cases}
-    todo = [row for row in read(folder) if not meets_all(row, row) and row["name"] not in known]
+    known, by_name = {row["name"] for row in kept_rows(folder, "explained")}, {case.name: case for case in cases}
+    todo = [row for row in kept_rows(folder) if not meets_all(row, row) and row["name"] not in known]
     began = time.perf_counter()
     for row in tqdm(todo, unit="problem", dynamic_ncols=True):
         if time.perf_counter() - began > seconds:
@@ -123,8 +124,8 @@ def explain_all(ours: Contestant, cases: list[PlanningCase], folder: Path, secon
 
 def measure_kinks(ours: Contestant, cases: list[PlanningCase], folder: Path, n: int) -> None:
     """What the corners do to the slope, and to where our solver ends, on the first problems that are judged."""
-    done, by_name = {row["name"] for row in read(folder, "kinks")}, {case.name: case for case in cases}
-    for row in tqdm(read(folder)[:n], unit="problem", dynamic_ncols=True):
+    done, by_name = {row["name"] for row in kept_rows(folder, "kinks")}, {case.name: case for case in cases}
+    for row in tqdm(kept_rows(folder)[:n], unit="problem", dynamic_ncols=True):
         if row["name"] in done:
             continue
         case, found = by_name[row["name"]], {}
@@ -141,7 +142,7 @@ def measure_kinks(ours: Contestant, cases: list[PlanningCase], folder: Path, n: 
 
 def time_calls(model: Model, cases: list[PlanningCase], folder: Path) -> None:
     """A control call's solve and IPOPT until it is as good, on the first problems, in single precision."""
-    done = {row["name"] for row in read(folder, "calls")}
+    done = {row["name"] for row in kept_rows(folder, "calls")}
     with jax.enable_x64(False):
         make = ProblemMaker(model, np.float32)
         race(make, cases[0], CALLS, RefereeConfig(max_iterations=2))  # compiles, so that no clock below sees that
@@ -150,16 +151,10 @@ def time_calls(model: Model, cases: list[PlanningCase], folder: Path) -> None:
                 file.write(json.dumps({**race(make, case, CALLS), "machine": machine()}) + "\n")
 
 
-def read(folder: Path, kind: str = "rows") -> list[dict]:
-    """All finished rows of a kind, "rows" or "explained"."""
-    lines = [line for path in sorted(folder.glob(f"{kind}-*.jsonl")) for line in path.read_text().splitlines()]
-    return list({row["name"]: row for row in map(json.loads, lines)}.values())
-
-
 def page(options: argparse.Namespace, folder: Path, n_all: int) -> str:
     """The Markdown page of what is done."""
-    rows, kinks, calls = (read(folder, kind) for kind in ("rows", "kinks", "calls"))
-    explained = {row["name"]: row for row in read(folder, "explained")}
+    rows, kinks, calls = (kept_rows(folder, kind) for kind in ("rows", "kinks", "calls"))
+    explained = {row["name"]: row for row in kept_rows(folder, "explained")}
     n_exact = sum("exact" in row for row in rows)
     done = f"`--draw`, `--n {len(rows)} --exact {n_exact}`"
     for rows_of, option in ((explained, "explain"), (kinks, f"kinks {len(kinks)}"), (calls, f"calls {len(calls)}")):

@@ -64,16 +64,16 @@ BOXES = {
 def test_what_a_function_gives_beside_its_value_is_that_at_the_solution(solver, steps):
     """Through optimistix's own entry points, also where trials are rejected on the way and where steps run out."""
 
+    of_squares = isinstance(SOLVERS[solver], optx.AbstractLeastSquaresSolver)
+
     def with_aux(y, args):
         residuals = rosenbrock(y, args)
-        value = (
-            residuals if isinstance(SOLVERS[solver], optx.AbstractLeastSquaresSolver) else 0.5 * residuals @ residuals
-        )
+        value = residuals if of_squares else 0.5 * residuals @ residuals
         return value, {"point": y, "residuals": residuals}
 
     @jax.jit
     def solve_with_aux(start):
-        entry = optx.least_squares if isinstance(SOLVERS[solver], optx.AbstractLeastSquaresSolver) else optx.minimise
+        entry = optx.least_squares if of_squares else optx.minimise
         options = {"feasible": Box(jnp.array([-1.5, -1.5]), jnp.array([0.8, 1.5]))}
         found = entry(with_aux, SOLVERS[solver], start, 1.0, options, has_aux=True, max_steps=steps, throw=False)
         return found.value, found.aux, with_aux(found.value, 1.0)[1]

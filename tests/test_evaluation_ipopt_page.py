@@ -1,6 +1,5 @@
 """The page on our solver and IPOPT: it says what its rows say, and explains every exception."""
 
-import json
 import pathlib
 
 import jax
@@ -8,7 +7,7 @@ import jax.numpy as jnp
 import pytest
 
 from cablejax.bounded import BoundedQuasiNewton
-from cablejax.evaluation.against_ipopt import Contestant, explain, kkt_residual, meets_all
+from cablejax.evaluation.against_ipopt import Contestant, explain, kept_rows, kkt_residual, meets_all
 from cablejax.evaluation.ipopt_page import ipopt_sections
 from cablejax.evaluation.planning_problems import ProblemMaker
 from cablejax.evaluation.solver_path import PathFinder
@@ -36,13 +35,11 @@ def explanation(starts, from_theirs=None, steepness=1.0):
 def test_the_kept_page_is_what_the_kept_rows_give(page):
     folder = RESULTS / "trials" / "against_ipopt" / PAGES[page]
 
-    def read(kind):
-        lines = [line for path in sorted(folder.glob(f"{kind}-*.jsonl")) for line in path.read_text().splitlines()]
-        return list({row["name"]: row for row in map(json.loads, lines)}.values())
-
-    explained = {row["name"]: row for row in read("explained")}
+    explained = {row["name"]: row for row in kept_rows(folder, "explained")}
     solvers = ("trust-region", "deadline")
-    lines = ipopt_sections(read("rows"), explained, read("kinks"), read("calls"), solvers)
+    lines = ipopt_sections(
+        kept_rows(folder), explained, kept_rows(folder, "kinks"), kept_rows(folder, "calls"), solvers
+    )
     assert "\n".join(lines) in (RESULTS / page).read_text()
 
 
@@ -106,7 +103,7 @@ def test_other_starts_are_tried_until_one_has_all_that_is_asked():
         best |= {"kkt": kkt_residual(problem, path.points[-1]), "violation": case.limits().violation(path.points[-1])}
         worse = {**best, "objective": 2 * best["objective"], "limited": best}
         reached = explain(ours, case, worse, 4)
-        assert meets_all({**best}, worse) and meets_all(reached["starts"][-1], worse)
+        assert meets_all(best, worse) and meets_all(reached["starts"][-1], worse)
         assert reached["from_theirs"] is None and len(reached["starts"]) <= 4
         out_of_reach = {**best, "limited": {**best, "objective": 0.5 * best["objective"]}}
         missed = explain(ours, case, out_of_reach, 2)

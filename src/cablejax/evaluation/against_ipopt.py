@@ -11,6 +11,8 @@ of the objective divided by its value at the start: the same over `objective(sta
 from __future__ import annotations
 
 import dataclasses
+import json
+import pathlib
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -199,14 +201,23 @@ def explain(ours: Contestant, case: PlanningCase, row: dict[str, Any], starts: i
     for start in rng.uniform(-1.0, 1.0, (starts, *case.guess.shape)) * case.radius / 3**0.5:
         found.append(find(start))
         if meets_all(found[-1], row):
+            from_theirs = None
             break
+    else:
+        from_theirs = find(theirs)
     return {
         "name": case.name,
         "steepness": steepness(problem, mine),
         "their_steepness": steepness(problem, theirs),
         "starts": found,
-        "from_theirs": None if meets_all(found[-1], row) else find(theirs),
+        "from_theirs": from_theirs,
     }
+
+
+def kept_rows(folder: pathlib.Path, kind: str = "rows") -> list[dict[str, Any]]:
+    """All finished rows of a kind in a folder: "rows", "explained", "kinks" or "calls"; of one problem the last."""
+    lines = [line for path in sorted(folder.glob(f"{kind}-*.jsonl")) for line in path.read_text().splitlines()]
+    return list({row["name"]: row for row in map(json.loads, lines)}.values())
 
 
 def comparable_seconds(

@@ -24,6 +24,7 @@ from cablejax.evaluation.against_ipopt import (
     meets_all,
 )
 from cablejax.evaluation.control_call import improved, ratios
+from cablejax.evaluation.referee import FOUND
 from cablejax.report.markdown import markdown_table
 
 STEEP = 50.0
@@ -138,7 +139,7 @@ def _objectives(rows: list[dict], explained: dict[str, dict]) -> list[str]:
         return [label, *(share([of(r, which) for r in some]) for which, some in judged.items())]
 
     def ended(found: dict) -> bool:
-        return found["status"] in (0, 1)
+        return found["status"] in FOUND
 
     table = [
         ["", *_REFEREES.values()],
