@@ -131,7 +131,7 @@ def animation_data(records: list[RunRecord]) -> dict[str, Any]:
         return {
             "method": record.method,
             "times": [round(float(t), 3) for t in record.times],
-            "error": np.round(_bridged(record.error_cm), 4).tolist(),
+            "error": np.round(_bridged(record.error_cm), 6).tolist(),
             "pose": np.round(record.gripper_pose.reshape(len(record.times), 6), 5).tolist(),
             "points": [integers(x) for x in record.keypoints],
             "curve": [
