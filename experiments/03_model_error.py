@@ -26,6 +26,7 @@ from cablejax.dataset.windows import concatenate, read_trajectories
 from cablejax.dynamics.error_report import MODEL, error_report
 from cablejax.dynamics.evaluate import SNAP_FACTOR, SNAP_MARGIN
 from cablejax.dynamics.weights import load_info, load_weights
+from cablejax.report.markdown import publish
 from cablejax.report.provenance import machine, versions
 from cablejax.types import Trajectory
 
@@ -97,9 +98,7 @@ def main() -> None:
             "",
         ]
     )
-    print(page)
-    if options.out is not None:
-        options.out.write_text(page, encoding="utf-8")
+    publish(page, options.out)
 
 
 if __name__ == "__main__":

@@ -24,6 +24,7 @@ from cablejax.dynamics.autoencoder import PretrainConfig, pretrain
 from cablejax.dynamics.evaluate import OpenLoopError, open_loop_error, prior_motion
 from cablejax.dynamics.train import train
 from cablejax.dynamics.train_config import PRESETS
+from cablejax.report.markdown import publish
 from cablejax.report.provenance import machine, versions
 from cablejax.simulate.motions import MotionConfig
 
@@ -85,9 +86,7 @@ def main() -> None:
             "",
         ]
     )
-    print(page)
-    if options.out is not None:
-        options.out.write_text(page, encoding="utf-8")
+    publish(page, options.out)
 
 
 if __name__ == "__main__":

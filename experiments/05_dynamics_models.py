@@ -30,7 +30,7 @@ from cablejax.dynamics.config import ModelConfig
 from cablejax.dynamics.evaluate import evaluation_windows, no_motion, prior_motion, snapping, window_errors
 from cablejax.dynamics.transfer import on_another_cable
 from cablejax.dynamics.weights import load_info, load_weights
-from cablejax.report.markdown import markdown_table
+from cablejax.report.markdown import markdown_table, publish
 from cablejax.report.provenance import machine, versions
 from cablejax.simulate import CableConfig, ThreadedEngine
 from cablejax.simulate.equilibrium import angles_of_keypoints
@@ -296,9 +296,8 @@ def main() -> None:
             "",
         ]
     )
-    print(page)
+    publish(page, options.out)
     if options.out is not None:
-        options.out.write_text(page, encoding="utf-8")
         bare = given["nothing; world's frame"]
         draw(errors, bare, calm, options.out.parent.parent / "images" / "dynamics_models.png")
 

@@ -37,6 +37,7 @@ from cablejax.perceive import Status, Tracker, TrackerConfig
 from cablejax.perceive.camera import CameraConfig
 from cablejax.perceive.plant import CloudPlant
 from cablejax.perceive.synthetic import Clutter, scatter
+from cablejax.report.markdown import publish
 from cablejax.report.provenance import machine, versions
 from cablejax.report.style import LIGHT
 from cablejax.simulate import CableConfig, ThreadedEngine
@@ -385,9 +386,7 @@ def main() -> None:
             *table(looped),
             "",
         ]
-    print("\n".join(lines))
-    if options.out is not None:
-        options.out.write_text("\n".join(lines))
+    publish("\n".join(lines), options.out)
     if options.figure is not None:
         draw(options.figure, ours, drifts)
 

@@ -37,7 +37,7 @@ from cablejax.bounded import (
     minimise,
 )
 from cablejax.bounded.problems import BoundedProblem, all_problems
-from cablejax.report.markdown import markdown_table
+from cablejax.report.markdown import markdown_table, publish
 from cablejax.report.provenance import machine, versions
 
 TOLERANCE = 1e-10
@@ -329,9 +329,7 @@ def main() -> None:
     problems = [problem for problem in all_problems() if options.family in (None, problem.family)]
     runs = run_all(problems, options.cache, tuple(options.solver))
     text = page(runs, "python experiments/10_bounded_solvers.py --out docs/results/bounded_solvers.md")
-    print(text)
-    if options.out is not None:
-        options.out.write_text(text, encoding="utf-8")
+    publish(text, options.out)
 
 
 if __name__ == "__main__":

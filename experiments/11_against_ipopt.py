@@ -59,6 +59,7 @@ from cablejax.evaluation.planning_problems import (
 )
 from cablejax.evaluation.referee import RefereeConfig
 from cablejax.mpc import SOLVERS
+from cablejax.report.markdown import publish
 from cablejax.report.provenance import machine, versions
 from cablejax.shaping import Model, load_model
 
@@ -220,9 +221,7 @@ def main() -> None:
         path = folder / f"rows-{options.process[0]}.jsonl"
         run(ours, cases[: options.n], path, options.exact, tuple(options.process), options.seconds)
     text = page(options, folder, len(cases))
-    print(text)
-    if options.report is not None:
-        options.report.write_text(text, encoding="utf-8")
+    publish(text, options.report)
 
 
 if __name__ == "__main__":

@@ -28,7 +28,7 @@ from cablejax.closed_loop import run_closed_loop
 from cablejax.evaluation.cases import PLANT_CABLE, mujoco_plant
 from cablejax.evaluation.protocols import LaidOut, letter_task
 from cablejax.mpc import SOLVERS, Controller, MPCConfig, TrustRegion
-from cablejax.report.markdown import markdown_table
+from cablejax.report.markdown import markdown_table, publish
 from cablejax.report.provenance import machine, versions
 from cablejax.shaping import load_model
 
@@ -226,9 +226,7 @@ def main() -> None:
         draw(table, image)
         picture = f"../images/{image.name}"
     text = page(trials, table, picture)
-    print(text)
-    if options.report is not None:
-        options.report.write_text(text, encoding="utf-8")
+    publish(text, options.report)
 
 
 if __name__ == "__main__":

@@ -24,7 +24,7 @@ import numpy as np
 
 from cablejax.evaluation.planning_problems import ProblemMaker, load_cases
 from cablejax.mpc import SOLVERS
-from cablejax.report.markdown import markdown_table
+from cablejax.report.markdown import markdown_table, publish
 from cablejax.report.provenance import machine, versions
 from cablejax.residual import Dynamics
 from cablejax.shaping import load_model
@@ -111,9 +111,7 @@ def main() -> None:
             "",
         ]
     )
-    print(page)
-    if options.out is not None:
-        options.out.write_text(page, encoding="utf-8")
+    publish(page, options.out)
 
 
 if __name__ == "__main__":

@@ -31,6 +31,7 @@ from cablejax.evaluation.fine_tuning import FineTuneConfig, fine_tune
 from cablejax.evaluation.methods import MethodSpec
 from cablejax.evaluation.suite import Case, read_suite, run_suite
 from cablejax.gaplog import gap_log_from_episodes, read_gap_log, write_gap_log
+from cablejax.report.markdown import publish
 from cablejax.report.provenance import machine, versions
 from cablejax.shaping import Model, load_model, make_controller
 from cablejax.simulate import CableConfig, ThreadedEngine
@@ -63,10 +64,7 @@ def main() -> None:
             trained_with, {"diagnosed": effects, "oracle": truth}.get(kind, ()), options.out / kind
         )
         run_suite(stiffness_cases("USZ", (RATIO,), TASK_SEEDS), [spec], options.out / "trials", fine_tuned=trained)
-    text = page(options.out, verdict)
-    print(text)
-    if options.report:
-        options.report.write_text(text, encoding="utf-8")
+    publish(page(options.out, verdict), options.report)
 
 
 def named(out: pathlib.Path) -> tuple[dict, tuple[NamedEffect, ...]]:

@@ -1,0 +1,19 @@
+"""Pages in Markdown: what is printed is what is written."""
+
+from cablejax.report.markdown import markdown_table, publish
+
+
+def test_table_has_a_title_and_as_many_dashes_as_columns():
+    assert markdown_table([["a", "b"], ["1", "2"]]) == ["| a | b |", "| --- | --- |", "| 1 | 2 |"]
+
+
+def test_page_is_printed_and_written_to_a_folder_that_is_made(tmp_path, capsys):
+    text, out = "# Error in µm\n", tmp_path / "results" / "page.md"
+    publish(text, out)
+    assert out.read_text(encoding="utf-8") == text
+    assert capsys.readouterr().out == text + "\n"
+
+
+def test_page_without_a_file_is_only_printed(capsys):
+    publish("# Title", None)
+    assert capsys.readouterr().out == "# Title\n"
