@@ -79,7 +79,7 @@ def parts(*effects: tuple[str, Any]) -> list[tuple[Effect, int, Sequence[float]]
 def clean(*effects: tuple[Any, ...], n_links: int = FINE_LINKS) -> Float[np.ndarray, "E T N 2"]:
     """Keypoints without noise [m]; `effects` as for `parts`, with tuples throughout."""
     player = playback(n_links)
-    return player.keypoints([candidate(*parts(*effects)).physics(player.nominal(), player.config)])[0]
+    return player.keypoints([candidate(*parts(*effects)).physics(player.believed, player.config)])[0]
 
 
 def noise(shape: Sequence[int], noise_mm: float, seed: int) -> np.ndarray:

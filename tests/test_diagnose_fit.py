@@ -62,7 +62,7 @@ def test_the_time_step_does_not_damp():
 
     def relaxation_time(step: float) -> float:
         player = Playback.of_motion(config, pose, None, np.full(1, 0.1), step)
-        points = player.keypoints([player.nominal()])[0, 0]
+        points = player.keypoints([player.believed])[0, 0]
         distance = np.linalg.norm((points - points[-1]).reshape(len(points), -1), axis=1)
         return 0.3 / np.log(distance[2] / distance[5])
 

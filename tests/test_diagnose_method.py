@@ -107,7 +107,7 @@ def posterior_ranks(terms: tuple[Term, ...], n_draws: int, noise_mm: float = 0.5
     bounds = null.bounds.T
     truths = [np.clip(rng.normal(size=len(null.z)), *bounds) for _ in range(n_draws)]
     everything = [dataclasses.replace(null, z=z) for z in truths]
-    simulated = player.keypoints([c.physics(player.nominal(), player.config) for c in everything])
+    simulated = player.keypoints([c.physics(player.believed, player.config) for c in everything])
     ranks = []
     for seed, (truth, points) in enumerate(zip(truths, simulated, strict=True)):
         facts = evidence_of(points, noise_mm=noise_mm, seed=seed)
@@ -231,7 +231,7 @@ def test_the_chain_is_the_same_from_either_end():
     pose = player.gripper_pose[:, :, ::-1].astype(float)
     pose[..., 2] += np.pi
     reverse = Playback.of_motion(player.config, pose, one[:, 0, ::-1], player.interval)
-    other = reverse.keypoints([reverse.nominal()])[0][:, :, ::-1]
+    other = reverse.keypoints([reverse.believed])[0][:, :, ::-1]
     assert 1e3 * np.abs(one[:, 0] - other[:, 0]).max() < 1e-3, "settled starts are the same"
     assert 1e3 * np.sqrt(((one - other) ** 2).mean(axis=(1, 2, 3))).max() < ASYMMETRY_MM
 

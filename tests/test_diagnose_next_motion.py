@@ -95,7 +95,7 @@ def test_separation_is_the_difference_in_noise_units():
         assert loud.alternatives[name] == pytest.approx(0.5 * value, rel=1e-3)
     poses = safe_motions(CONFIG, log_motion().gripper_pose[0, 0], 300)[quiet.motion]
     motion = Playback.of_motion(CONFIG, poses[None], None, np.full(1, INTERVAL))
-    a, b = motion.keypoints([c.physics(motion.nominal(), CONFIG) for c in (stiff, curved)])
+    a, b = motion.keypoints([c.physics(motion.believed, CONFIG) for c in (stiff, curved)])
     assert quiet.separation == pytest.approx(np.sqrt(np.mean((a - b) ** 2)) / 1e-3, rel=1e-2)
 
 

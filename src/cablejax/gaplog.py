@@ -7,10 +7,12 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import lzma
 import os
 import pathlib
 import tempfile
 import zipfile
+import zlib
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -30,10 +32,17 @@ _DTYPES = {
     "episode_length": np.int32,
     "hold": np.bool_,
 }
-_CABLE_FIELDS = ("length_m", "diameter_m", "linear_density_kg_per_m", "bending_stiffness_n_m2", "bending_damping_s")
+_CABLE_POSITIVE = ("length_m", "diameter_m", "linear_density_kg_per_m", "bending_stiffness_n_m2")
+_CABLE_NOT_NEGATIVE = ("bending_damping_s",)
 _META_FIELDS = (
     "schema", "cable", "table", "gravity_m_per_s2", "keypoint_arclength_m", "grasp", "motion", "source",
 )  # fmt: skip
+# What the decompressors and NumPy raise on a file that is damaged, encrypted, or holds Python objects.
+_UNREADABLE = (
+    ValueError, EOFError, KeyError, RuntimeError, zipfile.BadZipFile, zlib.error, lzma.LZMAError,
+)  # fmt: skip
+# By how much the first and the last mark may miss the cable's ends, relative to its length.
+_ENDS = 0.05
 # Columns of a pose and of a twist, by the dimension of the keypoints.
 _POSE_WIDTH, _TWIST_WIDTH = {2: 3, 3: 7}, {2: 3, 3: 6}
 
@@ -124,7 +133,10 @@ def gap_log_from_episodes(
                 "bending_stiffness_n_m2": cable.bending_stiffness,
                 "bending_damping_s": cable.damping_time,
             },
-            "table": {"friction_coefficient": cable.friction_coefficient} if cable.friction_coefficient > 0 else None,
+            # a cable in the plane lies on a table even where that is perfectly smooth
+            "table": {"friction_coefficient": cable.friction_coefficient}
+            if cable.friction_coefficient > 0 or episodes[0].keypoints.shape[-1] == 2
+            else None,
             "gravity_m_per_s2": [0.0, 0.0, -GRAVITY],
             "keypoint_arclength_m": arclength.tolist(),
             "grasp": list(grasp),
@@ -180,16 +192,20 @@ def read_gap_log(path: str | os.PathLike) -> GapLog:
         GapLogError: the file is no `.npz`, a field is missing, or a field is not what the format says.
         FileNotFoundError: there is no such file.
     """
+    if not zipfile.is_zipfile(path):
+        if not os.path.isfile(path):
+            raise FileNotFoundError(f"There is no file {path}.")
+        raise GapLogError(f"{path} is no .npz archive, expected one with the fields of {SCHEMA}.")
     try:
         with np.load(path, allow_pickle=False) as archive:
-            if not isinstance(archive, np.lib.npyio.NpzFile):
-                raise GapLogError(f"{path} holds a single array, expected an .npz archive with the fields of {SCHEMA}.")
-            fields: dict[str, Any] = {name: archive[name] for name in archive.files}
-    except (ValueError, EOFError, zipfile.BadZipFile) as error:
-        raise GapLogError(f"{path} could not be read as a gap log: {error}") from error
+            # a file may hold more than the format names; that is not looked at
+            fields: dict[str, Any] = {name: archive[name] for name in (*_DTYPES, "meta") if name in archive.files}
+            there = sorted(archive.files)
+    except _UNREADABLE as error:
+        raise GapLogError(f"{path} could not be read as a gap log: {_reason(error)}") from error
     for name in (*_DTYPES, "meta"):
         if name not in fields and name != "hold":
-            raise GapLogError(f"{path} has no field '{name}', only {sorted(fields)}.")
+            raise GapLogError(f"{path} has no field '{name}', only {there}.")
     try:
         meta = json.loads(str(fields["meta"]))
     except json.JSONDecodeError as error:
@@ -208,6 +224,11 @@ def read_gap_log(path: str | os.PathLike) -> GapLog:
     return log
 
 
+def _reason(error: Exception) -> str:
+    """NumPy advises to unpickle what it will not read; nobody should."""
+    return "it holds Python objects, expected plain arrays." if "pickle" in str(error) else str(error)
+
+
 def _validate_arrays(log: GapLog) -> None:
     for name, dtype in _DTYPES.items():
         array = getattr(log, name)
@@ -218,7 +239,12 @@ def _validate_arrays(log: GapLog) -> None:
             raise GapLogError(f"Field '{name}' is {found}, expected an array of {np.dtype(dtype)}.")
     if log.keypoints.ndim != 4 or log.keypoints.shape[3] not in _POSE_WIDTH:
         raise GapLogError(f"Field 'keypoints' has shape {log.keypoints.shape}, expected (E, T, N, 2) or (E, T, N, 3).")
-    episodes, samples, _, dimension = log.keypoints.shape
+    episodes, samples, points, dimension = log.keypoints.shape
+    if episodes < 1 or points < 2:
+        raise GapLogError(
+            f"Field 'keypoints' has shape {log.keypoints.shape}, expected at least one episode and two keypoints: the "
+            "first and the last are at the grippers."
+        )
     grippers = log.gripper_pose.shape[2] if log.gripper_pose.ndim == 4 else 2
     shapes = {
         "time": (episodes, samples),
@@ -237,8 +263,9 @@ def _validate_arrays(log: GapLog) -> None:
         time = log.time[index, :length]
         if not np.isfinite(time).all() or (np.diff(time) <= 0).any():
             raise GapLogError(f"Field 'time' does not increase, or is not finite, in episode {index}.")
-        for name in ("gripper_pose", "gripper_command"):
-            if not np.isfinite(getattr(log, name)[index, :length]).all():
+        # the last command is held for no sample
+        for name, end in (("gripper_pose", length), ("gripper_command", length - 1)):
+            if not np.isfinite(getattr(log, name)[index, :end]).all():
                 raise GapLogError(f"Field '{name}' is not finite in episode {index}; only keypoints may be NaN.")
         if np.isinf(log.keypoints[index, :length]).any():
             raise GapLogError(f"Field 'keypoints' is infinite in episode {index}; a keypoint not observed is NaN.")
@@ -257,16 +284,22 @@ def _validate_meta(log: GapLog) -> None:
     for name in _META_FIELDS:
         if name not in meta:
             raise GapLogError(f"Field 'meta.{name}' is missing.")
-    _check_numbers("cable", meta["cable"], _CABLE_FIELDS)
+    _check_numbers("cable", meta["cable"], _CABLE_POSITIVE, _CABLE_NOT_NEGATIVE)
     if meta["table"] is not None:
-        _check_numbers("table", meta["table"], ("friction_coefficient",))
+        _check_numbers("table", meta["table"], (), ("friction_coefficient",))
     points, grippers = log.keypoints.shape[2], log.gripper_pose.shape[2]
     for name, length in (("gravity_m_per_s2", 3), ("keypoint_arclength_m", points)):
         value = meta[name]
         if not isinstance(value, list) or len(value) != length or not all(_is_number(entry) for entry in value):
             raise GapLogError(f"Field 'meta.{name}' is {value!r}, expected {length} finite numbers.")
-    if (np.diff(meta["keypoint_arclength_m"]) <= 0).any():
+    marks, cable_length = np.asarray(meta["keypoint_arclength_m"], float), float(meta["cable"]["length_m"])
+    if (np.diff(marks) <= 0).any():
         raise GapLogError("Field 'meta.keypoint_arclength_m' does not increase.")
+    if np.abs(marks[[0, -1]] - [0.0, cable_length]).max() > _ENDS * cable_length:
+        raise GapLogError(
+            f"Field 'meta.keypoint_arclength_m' goes from {marks[0]:g} to {marks[-1]:g} m, expected 0 to the cable's "
+            f"length of {cable_length:g} m: the first and the last keypoint are at the grippers."
+        )
     for name, length in (("grasp", grippers), ("motion", len(log.episode_length))):
         value = meta[name]
         if not isinstance(value, list) or len(value) != length or not all(isinstance(entry, str) for entry in value):
@@ -275,15 +308,18 @@ def _validate_meta(log: GapLog) -> None:
         raise GapLogError(f"Field 'meta.source' is {meta['source']!r}, expected text.")
 
 
-def _check_numbers(group: str, value: Any, names: Sequence[str]) -> None:
+def _check_numbers(group: str, value: Any, positive: Sequence[str], not_negative: Sequence[str]) -> None:
+    names = (*positive, *not_negative)
     if not isinstance(value, dict):
         raise GapLogError(f"Field 'meta.{group}' is {value!r}, expected an object with {', '.join(names)}.")
     for name in names:
         if name not in value:
             raise GapLogError(f"Field 'meta.{group}.{name}' is missing.")
-        if not _is_number(value[name]) or value[name] < 0:
-            raise GapLogError(f"Field 'meta.{group}.{name}' is {value[name]!r}, expected a finite number >= 0.")
+        least = "> 0" if name in positive else ">= 0"
+        if not _is_number(value[name]) or value[name] < 0 or (value[name] == 0 and name in positive):
+            raise GapLogError(f"Field 'meta.{group}.{name}' is {value[name]!r}, expected a finite number {least}.")
 
 
 def _is_number(value: Any) -> bool:
-    return isinstance(value, (int, float)) and not isinstance(value, bool) and bool(np.isfinite(value))
+    # an integer may be larger than any float
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) < 1e300

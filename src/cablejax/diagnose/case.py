@@ -14,6 +14,7 @@ from cablejax.diagnose.chain import FINE_STEP, LARGEST_STEP
 from cablejax.diagnose.effects import Context
 from cablejax.diagnose.fit import Candidate, Evidence
 from cablejax.diagnose.noise import NoiseFloor, noise_floor
+from cablejax.diagnose.physics import nominal_physics
 from cablejax.diagnose.playback import Playback
 from cablejax.diagnose.recording import DiagnosisError, Recording, prepare
 from cablejax.diagnose.repeats import repeated_motions
@@ -70,17 +71,19 @@ class Case:
             recording.length,
         )
         config = config_of_log(log, n_links=FIT_LINKS)
-        first = _first_shapes(recording)
+        marks = np.asarray(log.meta["keypoint_arclength_m"], float)
+        first = [_at_uniform_marks(shape, marks) for shape in _first_shapes(recording)]
 
         def replay(n_links, step, pose):
             of_links = dataclasses.replace(config, n_links=n_links)
+            believed = nominal_physics(of_links, gravity=log.meta["gravity_m_per_s2"], arclength=marks)
             try:
-                return Playback.of_motion(of_links, pose, first, recording.interval, step)
+                return Playback.of_motion(of_links, pose, first, recording.interval, step, believed=believed)
             except ValueError as error:
                 raise DiagnosisError(f"The nominal cable has no settled shape at a first pose: {error}") from error
 
         def run(playback):
-            return playback.keypoints([playback.nominal()])[0].astype(np.float64)
+            return playback.keypoints([playback.believed])[0].astype(np.float64)
 
         playback = replay(FIT_LINKS, LARGEST_STEP, recording.gripper_pose)
         nominal = run(replay(FINE_LINKS, FINE_STEP, recording.gripper_pose))
@@ -146,7 +149,7 @@ class Case:
         """
         playback = self.predicted_playback if predicted else self.playback
         chosen = slice(None) if episodes is None else list(episodes)
-        physics = explanation.physics(playback.nominal(), self.config)
+        physics = explanation.physics(playback.believed, self.config)
         return playback.keypoints([physics], episodes)[0] - self.coarse[chosen] + self.nominal[chosen]
 
     def to_log(self, keypoints: Float[np.ndarray, "E T N 2"]) -> Float[np.ndarray, "E T1 N 2"]:
@@ -165,3 +168,13 @@ def _first_shapes(recording: Recording) -> list[np.ndarray | None]:
         mean = np.where(count > 0, np.nansum(still, axis=0) / np.maximum(count, 1), np.nan)
         shapes.append(mean if np.isfinite(mean).all(axis=1).sum() >= 3 else None)
     return shapes
+
+
+def _at_uniform_marks(
+    keypoints: Float[np.ndarray, "N 2"] | None, marks: Float[np.ndarray, "N"]
+) -> Float[np.ndarray, "N 2"] | None:
+    """Where keypoints uniform in arc length would be, roughly: by straight lines between those that are seen."""
+    if keypoints is None:
+        return None
+    uniform, seen = np.linspace(0.0, marks[-1], len(marks)), np.isfinite(keypoints).all(axis=1)
+    return np.stack([np.interp(uniform, marks[seen], column[seen]) for column in keypoints.T], axis=1)

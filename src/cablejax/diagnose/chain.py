@@ -172,7 +172,7 @@ class Chain:
         squared_speed = jnp.sum(velocity**2, axis=1)
         coefficient = coefficient * (1.0 + physics.static_excess * jnp.exp(-squared_speed / _STRIBECK_SPEED**2))
         speed = jnp.sqrt(squared_speed + self.config.friction_speed**2)
-        drag = free * (coefficient * mass * normal_gravity(physics.tilt) / speed + physics.drag * h)
+        drag = free * (coefficient * mass * normal_gravity(physics) / speed + physics.drag * h)
         push, contact = self._contact(physics, where, h * along)
         force = mass[:, None] * physics.tilt + push
 

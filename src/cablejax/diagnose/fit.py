@@ -227,7 +227,7 @@ class Fit:
 
 def evaluate(evidence: Evidence, candidates: Sequence[Candidate]) -> list[Fit]:
     """Replays candidates together with their forward differences."""
-    nominal, config = evidence.playback.nominal(), evidence.playback.config
+    nominal, config = evidence.playback.believed, evidence.playback.config
     physics, steps = [], []
     for c in candidates:
         physics.append(c.physics(nominal, config))

@@ -57,9 +57,10 @@ def next_motion(
         gripper_pose=np.concatenate([m.gripper_pose for m in motions.values()]),
         angles=np.concatenate([m.angles for m in motions.values()]),
         interval=np.concatenate([m.interval for m in motions.values()]),
+        believed=playback.believed,
     )
     if len(candidates) > 1:
-        rivals = [c.physics(playback.nominal(), config) for c in candidates[:2]]
+        rivals = [c.physics(playback.believed, config) for c in candidates[:2]]
         separation = _difference(library, rivals[0], rivals[1:], noise)[0]
         separates = _name(candidates[0]), _name(candidates[1])
     else:
@@ -85,11 +86,10 @@ def _sensitivity(playback, library, candidate: Candidate, noise, temper: float) 
     config, n_parameters = playback.config, len(candidate.z)
     if n_parameters == 0:
         return np.full(len(library.gripper_pose), np.nan)
-    base = candidate.physics(playback.nominal(), config)
+    base = candidate.physics(playback.believed, config)
     steps = candidate.differences
     moved = [
-        candidate.physics(playback.nominal(), config, (candidate.z + step).astype(np.float32))
-        for step in np.diag(steps)
+        candidate.physics(playback.believed, config, (candidate.z + step).astype(np.float32)) for step in np.diag(steps)
     ]
     keypoints = playback.keypoints([base, *moved])
     jacobian = ((keypoints[1:] - keypoints[0]) / noise[:, None]).reshape(n_parameters, -1) / steps[:, None]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
@@ -38,6 +39,7 @@ class Physics:
         patch_radius: [m].
         patch_friction: coefficient inside the patch less the one outside.
         drag: viscous drag per length and speed [N s/m^2].
+        gravity: its magnitude [m/s^2].
         tilt: in-plane part of the gravity [m/s^2], shape [2].
         density: mass per length [kg/m].
         extra_mass: mass added at each node [kg], shape [n].
@@ -47,7 +49,7 @@ class Physics:
         rotation_compliance: of either clamp [rad/(N m)], shape [2].
         obstacle_centre: of a fixed disc [m], shape [2].
         obstacle_radius: to the cable's centreline [m]; 0 = none.
-        bias_along: how far each keypoint sits beyond its nominal arc length [m], shape [N].
+        bias_along: how far each keypoint sits beyond where it would be if all were uniform [m], shape [N].
         bias_across: how far each sits to the left of the centreline [m], shape [N].
         camera_scale: of the keypoints about the world's origin.
         camera_angle: rotation of the keypoints about the world's origin [rad].
@@ -69,6 +71,7 @@ class Physics:
     patch_radius: Float[Array | np.ndarray, "*B"]
     patch_friction: Float[Array | np.ndarray, "*B"]
     drag: Float[Array | np.ndarray, "*B"]
+    gravity: Float[Array | np.ndarray, "*B"]
     tilt: Float[Array | np.ndarray, "*B 2"]
     density: Float[Array | np.ndarray, "*B"]
     extra_mass: Float[Array | np.ndarray, "*B n"]
@@ -86,9 +89,23 @@ class Physics:
     camera_lag: Float[Array | np.ndarray, "*B"]
 
 
-def nominal_physics(config: CableConfig, dtype=jnp.float32) -> Physics:
-    """The cable as it is believed to be: no effect."""
-    joints, links, points = config.n_joints, config.n_links, config.n_keypoints
+def nominal_physics(
+    config: CableConfig,
+    dtype=jnp.float32,
+    *,
+    gravity: Sequence[float] | np.ndarray = (0.0, 0.0, -GRAVITY),
+    arclength: Sequence[float] | np.ndarray | None = None,
+) -> Physics:
+    """The cable as it is believed to be: no effect.
+
+    Args:
+        config: the cable.
+        dtype: of every array.
+        gravity: as it is believed to act, the table's normal being z [m/s^2], shape [3].
+        arclength: where the keypoints are marked on the cable [m], shape [N]; None = uniform over its length.
+    """
+    joints, links = config.n_joints, config.n_links
+    marks = config.keypoint_arclength if arclength is None else np.asarray(arclength, float)
     values = {
         "stiffness": np.full(joints, config.bending_stiffness),
         "rest_curvature": np.zeros(joints),
@@ -104,7 +121,8 @@ def nominal_physics(config: CableConfig, dtype=jnp.float32) -> Physics:
         "patch_radius": 0.1,
         "patch_friction": 0.0,
         "drag": 0.0,
-        "tilt": np.zeros(2),
+        "gravity": float(np.linalg.norm(gravity)),
+        "tilt": np.asarray(gravity, float)[:2],
         "density": config.linear_density,
         "extra_mass": np.zeros(links),
         "slip": np.zeros(2),
@@ -113,8 +131,8 @@ def nominal_physics(config: CableConfig, dtype=jnp.float32) -> Physics:
         "rotation_compliance": np.zeros(2),
         "obstacle_centre": np.full(2, _NEVER),
         "obstacle_radius": 0.0,
-        "bias_along": np.zeros(points),
-        "bias_across": np.zeros(points),
+        "bias_along": marks - config.keypoint_arclength,
+        "bias_across": np.zeros(config.n_keypoints),
         "camera_scale": 1.0,
         "camera_angle": 0.0,
         "camera_offset": np.zeros(2),
@@ -123,6 +141,6 @@ def nominal_physics(config: CableConfig, dtype=jnp.float32) -> Physics:
     return Physics(**{name: np.asarray(value, np.dtype(dtype)) for name, value in values.items()})
 
 
-def normal_gravity(tilt: Float[Array | np.ndarray, "2"]) -> Float[Array, ""]:
-    """Gravity across a tilted table [m/s^2]; the part in the plane is `tilt`."""
-    return jnp.sqrt(jnp.maximum(GRAVITY**2 - jnp.sum(tilt**2), 0.0))
+def normal_gravity(physics: Physics) -> Float[Array, ""]:
+    """Gravity across the table [m/s^2]; the part in its plane is `tilt`."""
+    return jnp.sqrt(jnp.maximum(physics.gravity**2 - jnp.sum(physics.tilt**2), 0.0))

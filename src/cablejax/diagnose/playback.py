@@ -32,6 +32,7 @@ class Playback:
         gripper_pose: measured, theta continuous, the last one held over the padding, shape [E, T, 2, 3].
         angles: of the settled nominal cable at the first pose [rad], shape [E, n].
         interval: between samples [s], shape [E].
+        believed: physics of the cable without any effect.
         largest_step: longest time step [s].
     """
 
@@ -39,6 +40,7 @@ class Playback:
     gripper_pose: Float[np.ndarray, "E T 2 3"]
     angles: Float[np.ndarray, "E n"]
     interval: Float[np.ndarray, "E"]
+    believed: Physics
     largest_step: float = LARGEST_STEP
 
     @classmethod
@@ -49,8 +51,13 @@ class Playback:
         first_keypoints: Sequence[Float[np.ndarray, "N 2"] | None] | None,
         interval: Float[np.ndarray, "E"],
         largest_step: float = LARGEST_STEP,
+        *,
+        believed: Physics | None = None,
     ) -> Playback:
-        """Finds the settled start of every episode near its first keypoints, or a gentle arch where there are none."""
+        """Finds the settled start of every episode near its first keypoints, or a gentle arch where there are none.
+
+        Without `believed` the cable is that of `config` on a level table, keypoints uniform along it.
+        """
         angles = [
             np.asarray(
                 equilibrium_state(config, pose[0], guess=None if first_keypoints is None else first_keypoints[e]).qpos
@@ -62,12 +69,9 @@ class Playback:
             gripper_pose=np.asarray(gripper_pose, np.float32),
             angles=np.asarray(angles, np.float32),
             interval=np.asarray(interval, np.float32),
+            believed=nominal_physics(config) if believed is None else believed,
             largest_step=largest_step,
         )
-
-    def nominal(self) -> Physics:
-        """The cable without any effect."""
-        return nominal_physics(self.config)
 
     def keypoints(
         self, physics: Sequence[Physics], episodes: Sequence[int] | None = None

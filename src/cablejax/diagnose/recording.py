@@ -8,14 +8,19 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from cablejax.diagnose.clock import Samples, furthest_off, is_even, on_even_clock, usual_interval
 from cablejax.gaplog import validate
 from cablejax.types import GapLog
 
 # Samples are padded to a multiple of this, so that logs of nearly equal length share one compiled program.
 _PADDING = 50
-_UNEVEN = 0.2
+_SHORTEST = 20
+# Of an episode of one sample.
+_ANY_INTERVAL = 0.1
 _FAR = 0.1
 _WRONG_LENGTH = 0.12
+# Share of gravity in the plane of the table beyond which it is none.
+_STEEP = 0.9
 
 
 class DiagnosisError(ValueError):
@@ -81,43 +86,46 @@ def prepare(log: GapLog) -> Recording:
     caveats: list[str] = []
     if n_episodes == 1:
         caveats.append(
-            "One episode only: nothing can be held out, so the shrinkage is that of the fit itself and every "
-            "probability is less certain than it looks."
+            "One episode only: nothing can be held out, so there is no shrinkage to tell, and every probability is "
+            "less certain than it looks."
         )
+    short = [e for e in range(n_episodes) if log.episode_length[e] < _SHORTEST]
+    if len(short) == n_episodes:
+        raise DiagnosisError(
+            f"The longest episode has {log.episode_length.max()} samples, expected one of at least {_SHORTEST}."
+        )
+    if short:
+        caveats.append(f"Left out for having fewer than {_SHORTEST} samples: episode {', '.join(map(str, short))}.")
     episodes, intervals = [], []
     for e in range(n_episodes):
-        n = int(log.episode_length[e])
-        if n < 20:
-            raise DiagnosisError(f"Episode {e} has {n} samples, expected at least 20.")
-        step = np.diff(log.time[e, :n])
-        interval = float(np.round(np.median(step), 6))
-        even = np.abs(step - interval) <= _UNEVEN * interval
-        if not even.all():
+        time, samples = _samples(log, e, observed=e not in short)
+        interval = usual_interval(time) if len(time) > 1 else _ANY_INTERVAL
+        if not is_even(time, interval):
             caveats.append(
-                f"The clock of episode {e} jumps {int((~even).sum())} times: put on an even clock of {interval:g} s."
+                f"The clock of episode {e} is up to {1e3 * furthest_off(time, interval):.0f} ms off an even one: "
+                f"sampled again every {interval:g} s."
             )
-        episodes.append(_even(log, e, n, interval) if not even.all() else _plain(log, e, n))
+            samples = on_even_clock(time, samples, interval)
+        episodes.append(samples)
         intervals.append(interval)
     if max(intervals) > 1.0:
         raise DiagnosisError(f"The samples are {max(intervals):g} s apart, expected at most 1 s.")
-    longest = max(len(x[0]) for x in episodes)
-    total = -(-longest // _PADDING) * _PADDING
+    lengths = [len(samples.hold) for samples in episodes]
+    total = -(-max(lengths) // _PADDING) * _PADDING
     shape = (n_episodes, total)
     points = np.full((*shape, log.keypoints.shape[2], 2), np.nan)
     pose, command = np.zeros((*shape, 2, 3)), np.zeros((*shape, 2, 3))
     hold = np.zeros(shape, bool)
-    for e, (p, g, c, h) in enumerate(episodes):
-        n = len(p)
-        points[e, :n], pose[e, :n], command[e, : n - 1], hold[e, :n] = p, g, c[: n - 1], h
-        pose[e, n:] = g[-1]
-    pose[..., 2] = np.unwrap(pose[..., 2], axis=1)
+    for e, (samples, n) in enumerate(zip(episodes, lengths, strict=True)):
+        points[e, :n], pose[e, :n], hold[e, :n] = samples.keypoints, samples.gripper_pose, samples.hold
+        pose[e, n:], command[e, : n - 1] = samples.gripper_pose[-1], samples.gripper_command[: n - 1]
     recording = Recording(
         keypoints=points,
         gripper_pose=pose,
         gripper_command=command,
         hold=None if log.hold is None else hold,
         interval=np.array(intervals),
-        length=np.array([len(x[0]) for x in episodes]),
+        length=np.array(lengths),
         caveats=(),
     )
     caveats += _plausible(log, recording)
@@ -128,28 +136,36 @@ def prepare(log: GapLog) -> Recording:
     return dataclasses.replace(recording, caveats=tuple(caveats))
 
 
-def _plain(log, e, n):
-    hold = np.zeros(n, bool) if log.hold is None else log.hold[e, :n]
-    return log.keypoints[e, :n], log.gripper_pose[e, :n], log.gripper_command[e, :n], hold
-
-
-def _even(log, e, n, interval):
-    """The samples at even times; keypoints only where there is one near in time."""
-    time = log.time[e, :n] - log.time[e, 0]
-    grid = np.arange(int(np.floor(time[-1] / interval + 1e-6)) + 1) * interval
-    pose = np.stack([np.interp(grid, time, column) for column in _continuous(log.gripper_pose[e, :n])], axis=1)
-    nearest = np.abs(time[None] - grid[:, None]).argmin(axis=1)
-    close = np.abs(time[nearest] - grid) <= 0.25 * interval
-    points = np.where(close[:, None, None], log.keypoints[e, nearest], np.nan)
-    before = np.clip(np.searchsorted(time, grid + 1e-9, side="right") - 1, 0, n - 1)
-    hold = np.zeros(len(grid), bool) if log.hold is None else log.hold[e, before] & close
-    return points, pose.reshape(-1, 2, 3), log.gripper_command[e, before], hold
-
-
-def _continuous(pose):
-    pose = pose.astype(float).copy()
+def _samples(log: GapLog, e: int, *, observed: bool) -> tuple[Float[np.ndarray, "T"], Samples]:
+    """Times and samples of one episode as recorded, angles continuous in time and along the cable."""
+    n = int(log.episode_length[e])
+    points, pose = log.keypoints[e, :n].astype(float), log.gripper_pose[e, :n].astype(float)
     pose[..., 2] = np.unwrap(pose[..., 2], axis=0)
-    return pose.reshape(len(pose), -1).T
+    pose[:, 1, 2] += _whole_turns(points, pose)
+    return log.time[e, :n], Samples(
+        keypoints=points if observed else np.full_like(points, np.nan),
+        gripper_pose=pose,
+        gripper_command=np.nan_to_num(log.gripper_command[e, :n].astype(float)),
+        hold=np.zeros(n, bool) if log.hold is None else log.hold[e, :n],
+    )
+
+
+def _whole_turns(points: Float[np.ndarray, "T N 2"], pose: Float[np.ndarray, "T 2 3"]) -> float:
+    """What to add to the second gripper's angle so that it continues the first one's along the cable [rad].
+
+    An angle is known up to whole turns, a cable is not: between the same directions it may lie straight or with a loop
+    in it. The keypoints tell, in the samples that show most of them.
+    """
+    seen = np.isfinite(points).all(axis=-1)
+    best = seen & (seen.sum(axis=1) == seen.sum(axis=1).max())[:, None]
+    turns = []
+    for points_, pose_, seen_ in zip(points, pose, best, strict=True):
+        if seen_.sum() < 3:
+            continue
+        chord = np.diff(points_[seen_], axis=0)
+        along = np.unwrap(np.arctan2(chord[:, 1], chord[:, 0]))
+        turns.append(np.round((pose_[0, 2] + along[-1] - along[0] - pose_[1, 2]) / (2 * np.pi)))
+    return 2 * np.pi * float(np.median(turns)) if turns else 0.0
 
 
 def _plausible(log: GapLog, recording: Recording) -> list[str]:
@@ -177,18 +193,22 @@ def _plausible(log: GapLog, recording: Recording) -> list[str]:
             f"The grippers are up to {span[valid].max():.3f} m apart, more than the cable's length of {length} m: "
             "correct meta.cable.length_m."
         )
+    if points.shape[2] < 3:
+        raise DiagnosisError("The log has no keypoint between the grippers: nothing to diagnose.")
+    # chords are shorter than the cable between them, the more so the fewer there are
     nominal = np.diff(log.meta["keypoint_arclength_m"])
     chord = np.linalg.norm(np.diff(points, axis=2), axis=-1)
     ratio = float(np.nanmedian(chord / nominal)) if np.isfinite(chord).any() else 1.0
-    if abs(ratio - 1) > _WRONG_LENGTH:
+    bent = (2 * np.pi / (points.shape[2] - 1)) ** 2 / 24  # a cable bent into a ring
+    if not 1 - _WRONG_LENGTH - bent <= ratio <= 1 + _WRONG_LENGTH:
         raise DiagnosisError(
             f"The keypoints lie {ratio:.2f} times as far apart as meta.keypoint_arclength_m says: correct the length, "
             "the unit, or the marks."
         )
-    uneven = np.abs(np.asarray(log.meta["keypoint_arclength_m"]) - np.linspace(0, length, points.shape[2])).max()
-    if uneven > 1e-3 * length:
+    gravity = np.asarray(log.meta["gravity_m_per_s2"], float)
+    if np.linalg.norm(gravity[:2]) > _STEEP * np.linalg.norm(gravity):
         raise DiagnosisError(
-            "The keypoints are not uniform in arc length from 0 to the cable's length, as meta.keypoint_arclength_m "
-            "says; the simulator places them so. Resample them first."
+            f"Gravity is {gravity.tolist()} m/s^2, mostly in the plane of the keypoints: the cable hangs, and is "
+            "expected to lie on a table. Write the log with keypoints in space (D = 3)."
         )
     return caveats

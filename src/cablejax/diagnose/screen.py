@@ -41,7 +41,7 @@ def screen(
     the null value has no derivative there.
     """
     playback = evidence.playback
-    nominal, config = playback.nominal(), playback.config
+    nominal, config = playback.believed, playback.config
     begin = _parts(base)
     starts = [
         candidate(*begin, (effect, variant, values)) for effect in effects for variant, values in effect.starts(context)
@@ -108,5 +108,5 @@ def shortlist(templates: Sequence[Template], per_variant: int = 3, per_effect: i
 def residual_of(evidence: Evidence, fitted: Candidate) -> Float[np.ndarray, "E T N 2"]:
     """Observed less simulated keypoints under a candidate [m]."""
     playback = evidence.playback
-    simulated = playback.keypoints([fitted.physics(playback.nominal(), playback.config)])[0]
+    simulated = playback.keypoints([fitted.physics(playback.believed, playback.config)])[0]
     return evidence.target - simulated

@@ -17,9 +17,8 @@ from cablejax.mpc.controller_state import ControlInfo, ControllerState, initial_
 from cablejax.mpc.edge import check_observation, check_start, check_target
 from cablejax.mpc.fallback import plan_or_hold, plan_or_restart
 from cablejax.mpc.feasible import FeasibleSet, feasible_from
-from cablejax.mpc.goal import goal_pose
 from cablejax.mpc.problem import ShapingProblem
-from cablejax.mpc.start import find_starts, find_straight_way
+from cablejax.mpc.start import find_starts
 from cablejax.residual.corrected import Corrected
 from cablejax.residual.jacobian import Dynamics
 from cablejax.residual.ridge import ResidualModel, apply, fit
@@ -62,10 +61,9 @@ def control(
     error = problem.shape_error(state.history.keypoints[-1])
     rho, radius = _update_radius(config, state, error, problem.shape_error(state.predicted))
     problem = dataclasses.replace(problem, feasible=dataclasses.replace(problem.feasible, radius=radius))
-    way = find_straight_way(config, problem, goal_pose(problem.target))
-    start = find_starts(config, problem, state.plan, way)
+    start = find_starts(config, problem, state.plan)
     plan = plan_or_hold(config, config.solver(problem, start.guess), start)
-    plan, state = plan_or_restart(config, state, problem, error, plan)
+    plan, state = plan_or_restart(config, state, problem, error, plan, start.straightening)
 
     twist = config.objective.to_twist(plan.motion[0])
     offline, cable = _displacement(dynamics, weights, state, twist)

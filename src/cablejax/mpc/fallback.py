@@ -10,10 +10,9 @@ from jaxtyping import Array, Float
 
 from cablejax.mpc.config import MPCConfig
 from cablejax.mpc.controller_state import ControllerState
-from cablejax.mpc.goal import straightened
 from cablejax.mpc.plan import Outcome, Plan
 from cablejax.mpc.problem import ShapingProblem
-from cablejax.mpc.start import Starts, find_straight_way
+from cablejax.mpc.start import Starts, StraightWay
 
 
 def plan_or_hold(config: MPCConfig, plan: Plan, start: Starts) -> Plan:
@@ -39,6 +38,7 @@ def plan_or_restart(
     problem: ShapingProblem,
     error: Float[Array, ""],
     plan: Plan,
+    straight: StraightWay,
 ) -> tuple[Plan, ControllerState]:
     """The plan, or the next step of straightening the cable; and the state with what is counted for that.
 
@@ -46,8 +46,6 @@ def plan_or_restart(
     steps makes the error worse before it makes it better. From the straight cable the target can be reached.
     """
     radius = problem.feasible.radius
-    apart = straightened(problem.target, config.max_distance * config.cable_length)
-    straight = find_straight_way(config, problem, apart)
     better = error < 0.99 * state.best_error
     since = jnp.where(better, 0, state.since_best + 1)
     staying = (plan.outcome == Outcome.HELD) | (since >= config.restart_after)

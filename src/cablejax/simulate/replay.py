@@ -11,6 +11,8 @@ from cablejax.simulate.config import CableConfig
 from cablejax.simulate.engine import Engine
 from cablejax.types import GapLog
 
+_SLENDER = 0.01
+
 
 @dataclasses.dataclass(frozen=True)
 class Replay:
@@ -26,17 +28,20 @@ class Replay:
 
 
 def config_of_log(log: GapLog, *, n_links: int | None = None, timestep: float | None = None) -> CableConfig:
-    """The simulator of the cable that a log states, at the default resolution unless told otherwise."""
+    """The simulator of the cable that a log states, at the default resolution unless told otherwise.
+
+    In the plane the diameter hardly matters to the motion, and a cable thicker than a link is long gets a smaller one.
+    """
     cable, table = log.meta["cable"], log.meta["table"]
-    chosen = {"n_links": n_links, "timestep": timestep}
+    dimension, chosen = log.keypoints.shape[-1], {"n_links": n_links, "timestep": timestep}
     return CableConfig(
         length=cable["length_m"],
-        diameter=cable["diameter_m"],
+        diameter=cable["diameter_m"] if dimension == 3 else min(cable["diameter_m"], _SLENDER * cable["length_m"]),
         linear_density=cable["linear_density_kg_per_m"],
         bending_stiffness=cable["bending_stiffness_n_m2"],
         damping_time=cable["bending_damping_s"],
         friction_coefficient=0.0 if table is None else table["friction_coefficient"],
-        dimension=log.keypoints.shape[-1],
+        dimension=dimension,
         n_keypoints=log.keypoints.shape[-2],
         **{name: value for name, value in chosen.items() if value is not None},
     )

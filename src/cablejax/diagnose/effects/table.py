@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from cablejax.diagnose.effects.base import Context, Effect, Parameter
-from cablejax.simulate.config import GRAVITY, CableConfig
+from cablejax.simulate.config import CableConfig
 
 
 def _believed(config: CableConfig) -> float:
@@ -101,7 +101,7 @@ class ViscousDrag(Effect):
 
 
 class GravityTilt(Effect):
-    """The table is tilted: gravity has a part in its plane. Fitted as that part's x and y over g."""
+    """The table is tilted against what is believed. Fitted as what gravity's part in its plane is more, over g."""
 
     name = "gravity_tilt"
     parameters = (
@@ -112,7 +112,7 @@ class GravityTilt(Effect):
 
     def apply(self, physics, values, variant, config):
         xp = values[0].__array_namespace__()
-        return replace(physics, tilt=physics.tilt + GRAVITY * xp.stack([values[0], values[1]]))
+        return replace(physics, tilt=physics.tilt + physics.gravity * xp.stack([values[0], values[1]]))
 
     def starts(self, context):
         angle = np.arange(8) * np.pi / 4

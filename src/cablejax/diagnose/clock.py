@@ -1,0 +1,116 @@
+"""Samples of one episode on an even clock.
+
+The simulator and everything that looks at correlation in time want samples a fixed interval apart. Clocks of real
+recordings jitter, drift and drop samples. Between two samples the grippers move with the twist that was held, so their
+poses, measured and commanded, are linear there; keypoints are smooth, and a cubic through four of them is good to a few
+hundredths of a millimetre where a straight line, or the nearest sample, would be off by as much as a small gap.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+# A clock whose samples are all within this share of the interval from an even one is even.
+_EVEN = 0.01
+# Samples farther apart than this many intervals have a gap between them, which is not bridged.
+_GAP = 1.5
+# A sample within this share of the interval from the clock is taken as it is beside a gap.
+_CLOSE = 0.05
+
+
+class Samples(NamedTuple):
+    """One episode.
+
+    Attributes:
+        keypoints: [m], NaN = not observed, shape [T, N, 2].
+        gripper_pose: theta continuous, shape [T, 2, 3].
+        gripper_command: mean twist from each sample to the next, shape [T, 2, 3].
+        hold: shape [T].
+    """
+
+    keypoints: Float[np.ndarray, "T N 2"]
+    gripper_pose: Float[np.ndarray, "T 2 3"]
+    gripper_command: Float[np.ndarray, "T 2 3"]
+    hold: Bool[np.ndarray, "T"]
+
+
+def usual_interval(time: Float[np.ndarray, "T"]) -> float:
+    """Of an episode of at least two samples [s]: the mean, or the median where some are lost."""
+    step = np.diff(time)
+    mean, median = float(step.mean()), float(np.median(step))
+    return float(np.round(mean if step.max() <= _GAP * median else median, 6))
+
+
+def furthest_off(time: Float[np.ndarray, "T"], interval: float) -> float:
+    """How far a sample is from an even clock, at most [s]."""
+    return float(np.abs(time - time[0] - interval * np.arange(len(time))).max())
+
+
+def is_even(time: Float[np.ndarray, "T"], interval: float) -> bool:
+    """Whether samples may be taken as they are."""
+    return furthest_off(time, interval) <= _EVEN * interval
+
+
+def on_even_clock(time: Float[np.ndarray, "T"], samples: Samples, interval: float) -> Samples:
+    """The samples at even times.
+
+    What was commanded is integrated over the times at which it was held, so that exact arms stay exact. Keypoints are
+    not observed in a gap between samples.
+
+    Args:
+        time: of the samples, increasing [s].
+        samples: as recorded.
+        interval: of the new clock [s].
+    """
+    time = time - time[0]
+    grid = np.arange(int(np.floor(time[-1] / interval + 1e-6)) + 1) * interval
+    held = np.diff(time)[:, None, None]
+    path = np.concatenate([np.zeros((1, 2, 3)), np.cumsum(samples.gripper_command[:-1] * held, axis=0)])
+    commanded = np.diff(_linear(grid, time, path), axis=0) / interval
+    before = np.clip(np.searchsorted(time, grid + 1e-9, side="right") - 1, 0, len(time) - 1)
+    after = np.minimum(before + 1, len(time) - 1)
+    return Samples(
+        keypoints=_keypoints_at(grid, time, samples.keypoints, interval),
+        gripper_pose=_linear(grid, time, samples.gripper_pose),
+        gripper_command=np.concatenate([commanded, np.zeros((1, 2, 3))]),
+        hold=samples.hold[before] & samples.hold[after],
+    )
+
+
+def _linear(grid, time, values: Float[np.ndarray, "T Q 3"]) -> Float[np.ndarray, "G Q 3"]:
+    columns = [np.interp(grid, time, column) for column in values.reshape(len(values), -1).T]
+    return np.stack(columns, axis=1).reshape(len(grid), *values.shape[1:])
+
+
+def _keypoints_at(grid, time, points: Float[np.ndarray, "T N 2"], interval: float) -> Float[np.ndarray, "G N 2"]:
+    """Cubic where the two samples before and after are observed, else linear between two, else none."""
+    n = len(time)
+    left = np.clip(np.searchsorted(time, grid, side="right") - 1, 0, n - 2)
+    share = (grid - time[left]) / (time[left + 1] - time[left])
+    whole = time[left + 1] - time[left] <= _GAP * interval
+    line = (1 - share)[:, None, None] * points[left] + share[:, None, None] * points[left + 1]
+    nodes = left[:, None] + np.arange(-1, 3)
+    inside = (nodes[:, 0] >= 0) & (nodes[:, 3] < n)
+    nodes = np.clip(nodes, 0, n - 1)
+    inside &= (np.diff(time[nodes], axis=1) <= _GAP * interval).all(axis=1)
+    weights = _lagrange(grid, time[np.where(inside[:, None], nodes, np.arange(4))]) if n >= 4 else None
+    curve = np.full_like(line, np.nan)
+    if weights is not None:
+        curve = np.where(inside[:, None, None], np.einsum("gk,gknd->gnd", weights, points[nodes]), np.nan)
+    between = np.where(np.isfinite(curve), curve, line)
+    nearest = np.where(share < 0.5, left, left + 1)
+    close = (np.abs(time[nearest] - grid) <= _CLOSE * interval)[:, None, None]
+    alone = np.where(close, points[nearest], np.nan)
+    return np.where(whole[:, None, None] & np.isfinite(between), between, alone)
+
+
+def _lagrange(at: Float[np.ndarray, "G"], nodes: Float[np.ndarray, "G 4"]) -> Float[np.ndarray, "G 4"]:
+    """Weights of four nodes in the value of the cubic through them."""
+    columns = []
+    for i in range(4):
+        others = [j for j in range(4) if j != i]
+        columns.append(np.prod([(at - nodes[:, j]) / (nodes[:, i] - nodes[:, j]) for j in others], axis=0))
+    return np.stack(columns, axis=1)
