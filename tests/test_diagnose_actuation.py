@@ -52,7 +52,8 @@ def arms(*, gain: float = 1.0, delay: float = 0.0, slow: float = 0.0, backlash: 
 
 def told(**faults):
     measured = arms(**faults)
-    return actuation(measured, commands(), np.full(len(MOTIONS), INTERVAL), np.full(len(MOTIONS), measured.shape[1]))
+    n = len(MOTIONS)
+    return actuation(measured, commands(), np.full(n, INTERVAL), np.full(n, measured.shape[1]), np.arange(n))
 
 
 def test_exact_arms_do_not_deviate():
@@ -104,7 +105,7 @@ def test_padding_does_not_count():
     length = np.array([measured.shape[1]] * len(MOTIONS))
     padded = np.concatenate([measured, np.full((*measured.shape[:1], 30, 2, 3), 9.0)], axis=1)
     more = np.concatenate([twist, np.zeros((*twist.shape[:1], 30, 2, 3))], axis=1)
-    plain = actuation(measured, twist, np.full(4, INTERVAL), length)
-    result = actuation(padded, more, np.full(4, INTERVAL), length)
+    plain = actuation(measured, twist, np.full(4, INTERVAL), length, np.arange(4))
+    result = actuation(padded, more, np.full(4, INTERVAL), length, np.arange(4))
     assert result.effects["actuation_gain"][0] == pytest.approx(plain.effects["actuation_gain"][0], abs=1e-6)
     assert result.deviation == pytest.approx(plain.deviation)

@@ -68,6 +68,7 @@ def diagnosis(verdict="named", **changes) -> Diagnosis:
         "ranking": RANKING,
         "leftover_p": 0.037,
         "gap": Gap(
+            horizon_s=9.9,
             before_rmse_mm=3.2,
             after_rmse_mm=1.1,
             noise_floor_mm=1.0,
@@ -96,6 +97,7 @@ def diagnosis(verdict="named", **changes) -> Diagnosis:
 
 
 NO_GAP = Gap(
+    horizon_s=1.0,
     before_rmse_mm=1.0,
     after_rmse_mm=1.0,
     noise_floor_mm=1.0,
@@ -198,8 +200,10 @@ def test_verdict_beside_the_page_is_strict_json_of_the_format(written):
     assert {"effects", "equivalent", "ranking", "gap", "where", "next_motion"} <= set(verdict)
     assert [e["name"] for e in verdict["effects"]] == [e.name for e in result.effects]
     assert len(verdict["where"]["along_cable_mm"]) == POINTS and len(verdict["where"]["per_episode_mm"]) == 2
-    assert verdict["gap"]["shrinkage"] == result.gap.shrinkage
-    assert verdict["gap"]["horizon_s"] == pytest.approx(9.9)
+    # what nothing was named for has not shrunk
+    assert verdict["gap"]["shrinkage"] == (0.0 if result.verdict == "unknown" else result.gap.shrinkage)
+    assert verdict["gap"]["best_shrinkage"] == result.gap.shrinkage
+    assert verdict["gap"]["horizon_s"] == result.gap.horizon_s
 
 
 def _refuse(constant):

@@ -1,5 +1,6 @@
 """The gap log format: what is written comes back, and what does not follow the format is named."""
 
+import contextlib
 import dataclasses
 import json
 import os
@@ -13,6 +14,13 @@ from cablejax.simulate.config import CableConfig
 from cablejax.types import GapLog
 
 CABLE = CableConfig(n_keypoints=5)
+CABLE_META = {
+    "length_m": 1.0,
+    "diameter_m": 0.01,
+    "linear_density_kg_per_m": 0.08,
+    "bending_stiffness_n_m2": 0.02,
+    "bending_damping_s": 0.1,
+}
 
 
 def episode(samples: int, motion: str = "approach", seed: int = 0) -> Episode:
@@ -38,19 +46,13 @@ def test_assembly_pads_short_episodes(log):
     np.testing.assert_array_equal(log.gripper_command[1, 5:], 0.0)
     np.testing.assert_array_equal(log.gripper_pose[1, 5:], np.repeat(log.gripper_pose[1, 4:5], 3, axis=0))
     assert log.meta["motion"] == ["approach", "mirror"]
-    assert log.meta["cable"] == {
-        "length_m": 1.0,
-        "diameter_m": 0.01,
-        "linear_density_kg_per_m": 0.08,
-        "bending_stiffness_n_m2": 0.02,
-        "bending_damping_s": 0.1,
-    }
+    assert log.meta["cable"] == CABLE_META
     assert log.meta["keypoint_arclength_m"] == [0.0, 0.25, 0.5, 0.75, 1.0]
 
 
-def test_frictionless_cable_has_no_table():
+def test_a_smooth_table_is_a_table():
     log = gap_log_from_episodes([episode(4)], CableConfig(n_keypoints=5, friction_coefficient=0.0), source="test")
-    assert log.meta["table"] is None
+    assert log.meta["table"] == {"friction_coefficient": 0.0}
 
 
 def test_round_trip(tmp_path, log):
@@ -115,6 +117,9 @@ def test_a_missing_meta_field_is_named(log, name):
     [
         ({"schema": "cablejax-gap-log/2"}, r"meta\.schema"),
         ({"cable": {"length_m": 1.0}}, r"meta\.cable\.diameter_m"),
+        ({"cable": CABLE_META | {"bending_stiffness_n_m2": 0}}, r"bending_stiffness_n_m2' is 0, expected .* > 0"),
+        ({"cable": CABLE_META | {"length_m": 10**400}}, r"meta\.cable\.length_m"),
+        ({"cable": CABLE_META | {"length_m": 0.5}}, r"goes from 0 to 1 m, expected 0 to the cable's length of 0.5 m"),
         ({"table": {}}, r"meta\.table\.friction_coefficient"),
         ({"table": {"friction_coefficient": -0.1}}, r"meta\.table\.friction_coefficient"),
         ({"gravity_m_per_s2": [0.0, -9.81]}, r"meta\.gravity_m_per_s2"),
@@ -141,6 +146,7 @@ def test_wrong_arrays_are_named(log):
     refuses("'gripper_command' has shape", gripper_command=log.gripper_command[:, :-1])
     refuses("'episode_length' is 9", episode_length=np.array([9, 5], np.int32))
     refuses("'gripper_pose' is not finite", gripper_pose=np.full_like(log.gripper_pose, np.nan))
+    refuses("at least one episode and two keypoints", keypoints=log.keypoints[:, :, :1])
     refuses("'keypoints' is infinite", keypoints=np.full_like(log.keypoints, np.inf))
     with pytest.raises(GapLogError, match="at least one episode"):
         gap_log_from_episodes([], CABLE, source="test")
@@ -152,9 +158,41 @@ def test_nothing_is_unpickled(tmp_path, log):
     np.savez(tmp_path / "run.npz", time=np.array([{}], dtype=object), meta="{}")
     with pytest.raises(GapLogError, match="could not be read"):
         read_gap_log(tmp_path / "run.npz")
+    with pytest.raises(GapLogError, match="holds Python objects"):
+        read_gap_log(tmp_path / "run.npz")
+
+
+def test_what_a_file_holds_beside_the_format_is_left_alone(tmp_path, log):
+    path = write_gap_log(tmp_path / "run.npz", log)
+    with np.load(path) as archive:
+        fields = dict(archive)
+    np.savez(tmp_path / "more.npz", **fields, notes=np.array([{}], dtype=object))
+    assert read_gap_log(tmp_path / "more.npz").meta == log.meta
+
+
+def test_a_file_that_is_no_archive_or_damaged_is_refused(tmp_path, log):
     (tmp_path / "text.npz").write_text("not an archive")
-    with pytest.raises(GapLogError, match="could not be read"):
-        read_gap_log(tmp_path / "text.npz")
+    np.save(tmp_path / "array.npy", np.zeros(3))
+    for name in ("text.npz", "array.npy"):
+        with pytest.raises(GapLogError, match=r"no \.npz archive"):
+            read_gap_log(tmp_path / name)
+    with pytest.raises(FileNotFoundError, match="There is no file"):
+        read_gap_log(tmp_path / "absent.npz")
+    path = write_gap_log(tmp_path / "run.npz", log)
+    whole, rng = path.read_bytes(), np.random.default_rng(0)
+    for _ in range(60):
+        broken = bytearray(whole)
+        for place in rng.integers(0, len(whole), 3):
+            broken[place] ^= int(rng.integers(1, 256))
+        path.write_bytes(bytes(broken))
+        with contextlib.suppress(GapLogError):
+            read_gap_log(path)
+
+
+def test_a_command_that_is_never_held_may_be_anything(log):
+    command = log.gripper_command.copy()
+    command[0, log.episode_length[0] - 1] = np.nan
+    validate(dataclasses.replace(log, gripper_command=command))
 
 
 def test_logs_of_another_program():

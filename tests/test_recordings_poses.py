@@ -161,3 +161,13 @@ def test_a_take_of_wrong_shape_is_refused():
         Take("a", np.arange(3.0), np.zeros((3, 5)))
     with pytest.raises(ValueError, match=r"gripper_pose has shape \(3, 2, 3\), expected \(3, 2, 7\)"):
         Take("a", np.arange(3.0), np.zeros((3, 5, 3)), np.zeros((3, 2, 3)))
+
+
+def test_twists_of_angles_that_are_wrapped():
+    time = 0.1 * np.arange(60)
+    angle = 3.0 + 0.2 * time
+    pose = np.zeros((60, 2, 3))
+    pose[:, 1, 2] = (angle + np.pi) % (2 * np.pi) - np.pi
+    twist = twists(time, pose)
+    np.testing.assert_allclose(twist[:-1, 1, 2], 0.2, atol=1e-9)
+    np.testing.assert_array_equal(twist[-1], 0.0)

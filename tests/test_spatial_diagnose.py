@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import json
 
@@ -11,6 +12,7 @@ import pytest
 import spatial_cases as cases
 from cablejax.diagnose import verdict_json
 from cablejax.report.diagnosis_page import write_diagnosis_page
+from cablejax.spatial.clock import on_one_clock
 from cablejax.spatial.diagnose import diagnose_space
 from cablejax.spatial.fit import Simulator, errors
 from cablejax.spatial.gap import noise_of
@@ -83,7 +85,7 @@ def test_halves_keep_recordings_together():
 
 def test_refuses_what_it_cannot_diagnose():
     log = cases.recording()
-    with pytest.raises(ValueError, match="expected 3"):
+    with pytest.raises(ValueError, match="expected a cable in space"):
         windows_of(dataclasses.replace(log, keypoints=log.keypoints[..., :2]))
     with pytest.raises(ValueError, match="hang free"):
         windows_of(dataclasses.replace(log, meta={**log.meta, "table": {"friction_coefficient": 0.1}}))
@@ -93,6 +95,59 @@ def test_refuses_what_it_cannot_diagnose():
         windows_of(dataclasses.replace(log, time=time))
     with pytest.raises(ValueError, match="eval"):
         diagnose_space(dataclasses.replace(log, meta={**log.meta, "split": ["eval"] * 4}))
+
+
+def test_labels_are_one_for_each_episode_or_none():
+    log = cases.recording()
+    for odd in (7, "2024-01-01 lab.bag", ["a"], [None] * 4):
+        told = windows_of(dataclasses.replace(log, meta={**log.meta, "recording": odd, "file": odd, "split": odd}))
+        assert len(np.unique(told.group)) == 4 and set(told.split) == {""}
+        assert set(told.name) == {"0", "1", "2", "3"}
+    told = windows_of(dataclasses.replace(log, meta={**log.meta, "recording": [1, 1, 2, 2], "take": list("abcd")}))
+    assert len(np.unique(told.group)) == 2 and set(told.name) == set("abcd")
+
+
+def test_gravity_is_the_one_that_the_log_states():
+    log = cases.recording()
+    gravity = [0.0, -9.81, 0.0]
+    windows = windows_of(dataclasses.replace(log, meta={**log.meta, "gravity_m_per_s2": gravity}))
+    layout = layout_of(windows, 0.02, twisting=False)
+    np.testing.assert_allclose(layout.physics(np.zeros(layout.size)).gravity, gravity, rtol=1e-6)
+
+
+def test_a_keypoint_that_is_never_seen_is_named():
+    log = cases.recording()
+    keypoints = log.keypoints.copy()
+    keypoints[:, :, 4] = np.nan
+    with pytest.raises(ValueError, match="Keypoint 4 is never observed"):
+        windows_of(dataclasses.replace(log, keypoints=keypoints))
+
+
+def test_clocks_that_differ_are_made_one():
+    """Two episodes at half the rate, one whose samples jitter: the others are as they were."""
+    log, rng = cases.recording(), np.random.default_rng(0)
+    same, nothing = on_one_clock(log)
+    assert same is log and nothing == ()
+    uneven, interval = copy.deepcopy(log), cases.INTERVAL
+    half = (cases.SAMPLES + 1) // 2
+    for e in (1, 2):
+        for name in ("time", "keypoints", "gripper_pose", "gripper_command"):
+            array = getattr(uneven, name)
+            array[e, :half] = getattr(log, name)[e, ::2]
+        uneven.episode_length[e] = half
+    late = interval * rng.uniform(-0.2, 0.2, cases.SAMPLES)
+    uneven.time[3] += late
+    uneven.keypoints[3, :-1] += (late[:-1, None, None] / interval) * np.diff(log.keypoints[3], axis=0)
+    even, told = on_one_clock(uneven)
+    assert len(told) == 1 and "every 20 ms" in told[0]
+    for e in range(4):
+        n = int(even.episode_length[e])
+        assert n >= cases.SAMPLES - 2
+        np.testing.assert_allclose(np.diff(even.time[e, :n]), interval, rtol=1e-9)
+        off = np.abs(even.keypoints[e, :n] - log.keypoints[e, :n])[3:-3]
+        assert np.nanmedian(off) < (1e-9 if e == 0 else 3e-4)
+        np.testing.assert_allclose(np.linalg.norm(even.gripper_pose[e, :n, :, 3:], axis=-1), 1.0, atol=1e-6)
+    assert len(windows_of(even)) == len(windows_of(log))
 
 
 @pytest.mark.slow

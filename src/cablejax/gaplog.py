@@ -197,7 +197,7 @@ def read_gap_log(path: str | os.PathLike) -> GapLog:
             raise FileNotFoundError(f"There is no file {path}.")
         raise GapLogError(f"{path} is no .npz archive, expected one with the fields of {SCHEMA}.")
     try:
-        with np.load(path, allow_pickle=False) as archive:
+        with open(path, "rb") as stream, np.load(stream, allow_pickle=False) as archive:
             # a file may hold more than the format names; that is not looked at
             fields: dict[str, Any] = {name: archive[name] for name in (*_DTYPES, "meta") if name in archive.files}
             there = sorted(archive.files)

@@ -12,7 +12,9 @@ from typing import Any
 
 import numpy as np
 import scipy.optimize
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
+
+from cablejax.diagnose.repeats import episodes_by_motion
 
 # Poses are believed to this [m]; radians count for 0.15 m.
 _ENCODER_NOISE = 5e-5
@@ -21,6 +23,9 @@ _ROTATION_WEIGHT = 0.15
 _NEGLIGIBLE = 2e-4
 # An effect explains the arms' deviation if it leaves no more than this share of it, root mean square.
 _EXPLAINED = 0.25
+# An effect that leaves more of it than this is not named.
+_TELLING = 0.7
+_GAIN, _LAG = "actuation_gain", "actuation_lag"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -29,14 +34,17 @@ class Actuation:
 
     Attributes:
         effects: names and parameters (value, 90 % interval, unit) of what explains the deviation, at most both.
+        alone: what every effect that was tried leaves by itself, of poses that it was fitted to and of others [m].
         deviation: root mean square of measured less commanded poses [m].
         leftover: the same after the effects.
         commanded: poses that exact arms would have had, shape [E, T, 2, 3].
-        predicted: poses with the effects, shape [E, T, 2, 3].
+        predicted: poses with the effects, each motion from a fit without it where there are several, shape
+            [E, T, 2, 3].
         deviates: whether measured and commanded poses differ at all.
     """
 
     effects: dict[str, tuple[float, tuple[float, float], str]]
+    alone: dict[str, tuple[float, float]]
     deviation: float
     leftover: float
     commanded: Float[np.ndarray, "E T 2 3"]
@@ -49,11 +57,70 @@ class Actuation:
         return not self.deviates or self.leftover <= max(_EXPLAINED * self.deviation, _NEGLIGIBLE)
 
 
+@dataclasses.dataclass(frozen=True)
+class _Arms:
+    """What was measured and what was commanded; fits what lies between.
+
+    Attributes:
+        pose: measured, shape [E, T, 2, 3].
+        commanded: poses of exact arms, shape [E, T, 2, 3].
+        interval: between samples [s], shape [E].
+        valid: samples that are no padding, shape [E, T].
+    """
+
+    pose: Float[np.ndarray, "E T 2 3"]
+    commanded: Float[np.ndarray, "E T 2 3"]
+    interval: Float[np.ndarray, "E"]
+    valid: Bool[np.ndarray, "E T"]
+
+    def chosen(self, episodes) -> _Arms:
+        return _Arms(self.pose[episodes], self.commanded[episodes], self.interval[episodes], self.valid[episodes])
+
+    def predicted(self, effects: tuple[str, ...], theta) -> Float[np.ndarray, "E T 2 3"]:
+        """Poses with the effects: of a gain its value, of a lag the pure delay and the time constant [s]."""
+        theta, start = list(theta), self.pose[:, :1]
+        gain = theta.pop(0) if "actuation_gain" in effects else 1.0
+        delay, slow = theta if "actuation_lag" in effects else (0.0, 0.0)
+        return _lagged(start + gain * (self.commanded - start), self.interval, max(delay, 0.0), max(slow, 0.0))
+
+    def off(self, poses: Float[np.ndarray, "E T 2 3"]) -> Float[np.ndarray, "E T 2 3"]:
+        """What measured poses are off [m]; 0 in the padding."""
+        return np.array([1.0, 1.0, _ROTATION_WEIGHT]) * self.valid[:, :, None, None] * (self.pose - poses)
+
+    def rms(self, poses: Float[np.ndarray, "E T 2 3"]) -> float:
+        """Root mean square of that over coordinates [m]."""
+        return float(np.sqrt(np.sum(self.off(poses) ** 2) / (self.valid.sum() * 6)))
+
+    def fit(self, effects: tuple[str, ...], starts) -> Any:
+        """The best of scipy's least squares results."""
+        bounds = [(0.1, 3.0)] * ("actuation_gain" in effects) + [(0.0, 5.0)] * (2 * ("actuation_lag" in effects))
+        results = [
+            scipy.optimize.least_squares(
+                lambda theta: self.off(self.predicted(effects, theta)).ravel() / _ENCODER_NOISE,
+                start,
+                bounds=tuple(zip(*bounds, strict=True)),
+                diff_step=1e-4,
+            )
+            for start in starts
+        ]
+        return min(results, key=lambda result: result.cost)
+
+    def unseen(self, effects: tuple[str, ...], theta, motion: Int[np.ndarray, "E"]) -> Float[np.ndarray, "E T 2 3"]:
+        """Poses of each motion from a fit without it, begun at the fit of all; from that where there is one motion."""
+        result, groups = self.predicted(effects, theta), episodes_by_motion(motion)
+        for group in groups if len(groups) > 1 else ():
+            rest = self.chosen(np.setdiff1d(np.arange(len(motion)), group))
+            inside = np.clip(theta, [1e-3] * len(theta), [2.9] * len(theta))
+            result[group] = self.chosen(group).predicted(effects, rest.fit(effects, [inside]).x)
+        return result
+
+
 def actuation(
     pose: Float[np.ndarray, "E T 2 3"],
     command: Float[np.ndarray, "E T 2 3"] | None,
     interval: Float[np.ndarray, "E"],
-    length: Float[np.ndarray, "E"],
+    length: Int[np.ndarray, "E"],
+    motion: Int[np.ndarray, "E"],
 ) -> Actuation:
     """Compares measured gripper poses with their commands and fits gain and lag.
 
@@ -64,61 +131,47 @@ def actuation(
         command: twists held from one sample to the next; None = not logged, nothing can be told.
         interval: between samples [s].
         length: valid samples of each episode.
+        motion: episodes with the same number repeat one another.
     """
     if command is None:
-        return Actuation({}, 0.0, 0.0, pose, pose, deviates=False)
+        return Actuation({}, {}, 0.0, 0.0, pose, pose, deviates=False)
     valid = np.arange(pose.shape[1])[None] < np.asarray(length)[:, None]
-    weight = np.array([1.0, 1.0, _ROTATION_WEIGHT]) * valid[:, :, None, None]
-    wanted = _integrated(pose[:, 0], command, interval)
-
-    def rms(predicted):
-        return float(np.sqrt(np.sum((weight * (pose - predicted)) ** 2) / (valid.sum() * 6)))
-
-    def model(theta, gain_free, lag_free):
-        theta = list(theta)
-        gain = theta.pop(0) if gain_free else 1.0
-        delay, slow = theta if lag_free else (0.0, 0.0)
-        moved = pose[:, :1] + gain * (wanted - pose[:, :1])
-        return _lagged(moved, interval, max(delay, 0.0), max(slow, 0.0))
-
-    deviation = rms(wanted)
+    arms = _Arms(pose, _integrated(pose[:, 0], command, interval), np.asarray(interval), valid)
+    deviation = arms.rms(arms.commanded)
     if deviation < _NEGLIGIBLE:
-        return Actuation({}, deviation, deviation, wanted, wanted, deviates=False)
+        return Actuation({}, {}, deviation, deviation, arms.commanded, arms.commanded, deviates=False)
 
-    best: tuple[float, Any, bool, bool] | None = None
-    for gain_free, lag_free in ((True, False), (False, True), (True, True)):
-        starts = [[0.1, 0.05], [0.02, 0.2], [0.4, 0.2]] if lag_free else [[]]
-        for start in starts:
-            first = ([1.0] if gain_free else []) + start
-            low = ([0.1] if gain_free else []) + [0.0] * len(start)
-            high = ([3.0] if gain_free else []) + [5.0] * len(start)
-            result = scipy.optimize.least_squares(
-                lambda t, g=gain_free, f=lag_free: (weight * (pose - model(t, g, f))).ravel() / _ENCODER_NOISE,
-                first,
-                bounds=(low, high),
-                diff_step=1e-4,
-            )
-            left = rms(model(result.x, gain_free, lag_free))
-            # a second effect must take away much of what the first one leaves
-            threshold = 0.5 if gain_free and lag_free else 0.999
-            if best is None or left < threshold * best[0]:
-                best = left, result, gain_free, lag_free
-    assert best is not None  # there are always starts
-    left, result, gain_free, lag_free = best
-    scale = max(left / _ENCODER_NOISE, 1.0)
+    lags = [[0.1, 0.05], [0.02, 0.2], [0.4, 0.2]]
+    found: dict[tuple[str, ...], Any] = {
+        (_GAIN,): arms.fit((_GAIN,), [[1.0]]),
+        (_LAG,): arms.fit((_LAG,), lags),
+        (_GAIN, _LAG): arms.fit((_GAIN, _LAG), [[1.0, *lag] for lag in lags]),
+    }
+    left = {effects: arms.rms(arms.predicted(effects, result.x)) for effects, result in found.items()}
+    unseen = {effects: arms.unseen(effects, result.x, motion) for effects, result in found.items()}
+    best = min((_GAIN,), (_LAG,), key=lambda effects: left[effects])
+    # a second effect must take away much of what the first one leaves
+    best = (_GAIN, _LAG) if left[_GAIN, _LAG] < 0.5 * left[best] else best
+    alone = {effects[0]: (left[effects], arms.rms(unseen[effects])) for effects in ((_GAIN,), (_LAG,))}
+    if left[best] >= _TELLING * deviation:
+        return Actuation({}, alone, deviation, deviation, arms.commanded, arms.commanded, deviates=True)
+    told = _told(best, found[best], max(left[best] / _ENCODER_NOISE, 1.0))
+    return Actuation(told, alone, deviation, left[best], arms.commanded, unseen[best], deviates=True)
+
+
+def _told(effects: tuple[str, ...], result: Any, scale: float) -> dict[str, tuple[float, tuple[float, float], str]]:
+    """Value, 90 % interval and unit of every effect of a fit."""
     # residuals of one motion are far from independent: a hundred samples count as one
     covariance = 100.0 * scale**2 * np.linalg.pinv(result.jac.T @ result.jac)
-    effects = {}
-    if left < 0.7 * deviation:
-        if gain_free:
-            half = 1.645 * float(np.sqrt(covariance[0, 0]))
-            effects["actuation_gain"] = (float(result.x[0]), (result.x[0] - half, result.x[0] + half), "")
-        if lag_free:
-            total = float(result.x[-2:].sum())
-            half = 1.645 * float(np.sqrt(covariance[-2:, -2:].sum())) + 0.01 * total
-            effects["actuation_lag"] = (total, (max(total - half, 0.0), total + half), "s")
-    predicted = model(result.x, gain_free, lag_free) if effects else wanted
-    return Actuation(effects, deviation, left if effects else deviation, wanted, predicted, deviates=True)
+    told = {}
+    if _GAIN in effects:
+        half = 1.645 * float(np.sqrt(covariance[0, 0]))
+        told[_GAIN] = (float(result.x[0]), (result.x[0] - half, result.x[0] + half), "")
+    if _LAG in effects:
+        total = float(result.x[-2:].sum())
+        half = 1.645 * float(np.sqrt(covariance[-2:, -2:].sum())) + 0.01 * total
+        told[_LAG] = (total, (max(total - half, 0.0), total + half), "s")
+    return told
 
 
 def _integrated(first, command, interval):

@@ -69,6 +69,7 @@ class Case:
             recording.gripper_command if recording.has_commands else None,
             recording.interval,
             recording.length,
+            repeated_motions(recording.gripper_pose, log.meta["cable"]["length_m"]),
         )
         config = config_of_log(log, n_links=FIT_LINKS)
         marks = np.asarray(log.meta["keypoint_arclength_m"], float)

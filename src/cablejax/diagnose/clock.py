@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float
 # A clock whose samples are all within this share of the interval from an even one is even.
 _EVEN = 0.01
 # Samples farther apart than this many intervals have a gap between them, which is not bridged.
-_GAP = 1.5
+_GAP = 1.7
 # A sample within this share of the interval from the clock is taken as it is beside a gap.
 _CLOSE = 0.05
 
@@ -73,7 +73,7 @@ def on_even_clock(time: Float[np.ndarray, "T"], samples: Samples, interval: floa
     before = np.clip(np.searchsorted(time, grid + 1e-9, side="right") - 1, 0, len(time) - 1)
     after = np.minimum(before + 1, len(time) - 1)
     return Samples(
-        keypoints=_keypoints_at(grid, time, samples.keypoints, interval),
+        keypoints=keypoints_at(grid, time, samples.keypoints, interval),
         gripper_pose=_linear(grid, time, samples.gripper_pose),
         gripper_command=np.concatenate([commanded, np.zeros((1, 2, 3))]),
         hold=samples.hold[before] & samples.hold[after],
@@ -85,7 +85,9 @@ def _linear(grid, time, values: Float[np.ndarray, "T Q 3"]) -> Float[np.ndarray,
     return np.stack(columns, axis=1).reshape(len(grid), *values.shape[1:])
 
 
-def _keypoints_at(grid, time, points: Float[np.ndarray, "T N 2"], interval: float) -> Float[np.ndarray, "G N 2"]:
+def keypoints_at(
+    grid: Float[np.ndarray, "G"], time: Float[np.ndarray, "T"], points: Float[np.ndarray, "T N D"], interval: float
+) -> Float[np.ndarray, "G N D"]:
     """Cubic where the two samples before and after are observed, else linear between two, else none."""
     n = len(time)
     left = np.clip(np.searchsorted(time, grid, side="right") - 1, 0, n - 2)

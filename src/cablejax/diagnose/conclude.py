@@ -119,7 +119,11 @@ def with_arms(conclusion: Conclusion, arms: Actuation) -> Conclusion:
         for name, (value, ci, unit) in arms.effects.items()
         for key in ("gain" if name == "actuation_gain" else "time_s",)
     )
-    ranked = tuple(Ranked(e.name, e.probability, 1 - (arms.leftover / arms.deviation) ** 2, 0.0) for e in named)
+    believed = {e.name: e.probability for e in named}
+    ranked = [
+        Ranked(name, believed.get(name, 0.0), float(np.clip(1 - (unseen / arms.deviation) ** 2, -1.0, 1.0)), 1e3 * left)
+        for name, (left, unseen) in arms.alone.items()
+    ]
     changed: dict[Verdict, Verdict] = {}
     if named and arms.explained:
         changed = {"none": "named", "unknown": "named+unknown"}
@@ -132,7 +136,7 @@ def with_arms(conclusion: Conclusion, arms: Actuation) -> Conclusion:
         conclusion,
         verdict=changed.get(conclusion.verdict, conclusion.verdict),
         effects=(*named, *conclusion.effects),
-        ranking=(*ranked, *conclusion.ranking),
+        ranking=tuple(sorted([*ranked, *conclusion.ranking], key=lambda r: -r.probability)),
         explained=share if conclusion.verdict == "none" else conclusion.explained,
     )
 
@@ -199,8 +203,15 @@ def _named(
             column = [sample[key][0] for sample in sampled]
             parameters[key] = ParameterEstimate(value, _interval(value, column, unit), unit)
         parts.append(parameters)
-        location.update(term.effect.location(fitted, term.variant, config))
+        location = _spanning(location, term.effect.location(fitted, term.variant, config))
     return NamedEffect(name, probability, _merged(parts), location)
+
+
+def _spanning(location: dict[str, Any], other: dict[str, Any]) -> dict[str, Any]:
+    """Stretches of cable from the first to the last of both; places of another kind are those of the later piece."""
+    one, two = location["along_cable_m"], other.get("along_cable_m")
+    both = {"along_cable_m": [min(one[0], two[0]), max(one[1], two[1])]} if one and two else {}
+    return location | other | both
 
 
 def _interval(value, column: Sequence[Any], unit: str):

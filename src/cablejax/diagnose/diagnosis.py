@@ -68,9 +68,11 @@ class Gap:
     """How large the gap is before and after, on episodes that no fit has seen. Root mean squares per coordinate [mm].
 
     Attributes:
+        horizon_s: over which the simulations run freely that are compared: the longest episode, or a window in space.
         before_rmse_mm, after_rmse_mm: nominal simulator, and with the named effects; noise included.
         noise_floor_mm: of the recording.
-        shrinkage: `1 - (after^2 - floor^2) / (before^2 - floor^2)`; None where the gap is not resolvable.
+        shrinkage: `1 - (after^2 - floor^2) / (before^2 - floor^2)`; None where the gap is not
+            resolvable, or nothing could be held out.
         shrinkage_ci90: by resampling episodes.
         ahead_mm: errors of predictions five seconds ahead of the last observation, by "nominal", "ridge" (the nominal
             simulator with the controller's online residual, which knows no cause) and "named" (the simulator with the
@@ -80,6 +82,7 @@ class Gap:
         split: shares of the squared error before: "noise", "named", "learnable", "unexplained"; they sum to 1.
     """
 
+    horizon_s: float
     before_rmse_mm: float
     after_rmse_mm: float
     noise_floor_mm: float

@@ -59,7 +59,7 @@ def measure_gap(
         before: the nominal simulator's keypoints [m].
         after: with the named effects, every episode from a fit that has not seen it.
         held_out: episodes for which that is so.
-        resolvable: whether there is a gap at all.
+        resolvable: whether there is a gap at all; without one, or with nothing held out, no shrinkage is told.
     """
     observed, interval = case.recording.keypoints, case.recording.interval
     floor = float(np.sqrt(np.mean(case.noise.std**2)))
@@ -98,17 +98,16 @@ def measure_gap(
     ahead, learnable = _ahead(case, before, after)
     share["learnable"] = learnable * left
     share["unexplained"] = left - share["learnable"]
+    whole = float(np.round((interval * (case.recording.length - 1)).max(), 3))
     return Gap(
+        horizon_s=whole,
         before_rmse_mm=1e3 * rmse(before),
         after_rmse_mm=1e3 * rmse(after),
         noise_floor_mm=1e3 * floor,
-        shrinkage=float(shrinkage(np.arange(len(b)))) if resolvable else None,
+        shrinkage=float(shrinkage(np.arange(len(b)))) if resolvable and held_out else None,
         shrinkage_ci90=interval90,
         ahead_mm=ahead,
-        horizons_mm={
-            h: (1e3 * rmse(before, h), 1e3 * rmse(after, h))
-            for h in (*_HORIZONS, float(np.round((interval * (case.recording.length - 1)).max(), 3)))
-        },
+        horizons_mm={h: (1e3 * rmse(before, h), 1e3 * rmse(after, h)) for h in (*_HORIZONS, whole)},
         held_out_episodes=held_out,
         split=share,
     )

@@ -19,13 +19,21 @@ _PLACES = ("along_cable_m", "time_s", "table_m")
 
 
 def verdict_json(diagnosis: Diagnosis) -> dict[str, Any]:
-    """The verdict as a JSON object; what is not a finite number is null.
+    """The verdict as a JSON object; what is not a finite number, or was never observed, is null.
 
-    Beside the fields of the format it has `sentence`, `leftover_p`, `caveats` and `seconds`; `gap` has also
-    `horizons`, `split` and `ahead_mm`, `ranking` also `leftover_mm`, and `where` also `sentences`, `per_horizon_mm` and
-    `frames`.
+    Where the verdict is "unknown" nothing was added, and nothing shrinks; `gap.best_shrinkage` is that of the best
+    explanation all the same. `ci90` is null for a choice, such as a gripper, and a list where the value is one.
+
+    Beside the fields of the format it has `sentence`, `baselines`, `leftover_p`, `caveats` and `seconds`; `gap` has
+    also `horizons`, `split`, `ahead_mm` and `best_shrinkage`, `ranking` also `leftover_mm`, and `where` also
+    `sentences`, `per_horizon_mm` and `frames`.
     """
     gap, where = diagnosis.gap, diagnosis.where
+    # what no effect was named for has not shrunk, however much an explanation that was not believed takes away
+    blamed = diagnosis.verdict != "unknown"
+    log = diagnosis.log
+    valid = np.arange(log.keypoints.shape[1]) < log.episode_length[:, None]
+    seen = np.isfinite(log.keypoints).all(axis=-1) & valid[..., None]
     return _plain(
         {
             "schema": SCHEMA,
@@ -45,12 +53,13 @@ def verdict_json(diagnosis: Diagnosis) -> dict[str, Any]:
             ],
             "leftover_p": diagnosis.leftover_p,
             "gap": {
-                "horizon_s": _whole_episode(diagnosis),
+                "horizon_s": gap.horizon_s,
                 "before_rmse_mm": gap.before_rmse_mm,
                 "noise_floor_mm": gap.noise_floor_mm,
-                "after_rmse_mm": gap.after_rmse_mm,
-                "shrinkage": gap.shrinkage,
-                "shrinkage_ci90": gap.shrinkage_ci90,
+                "after_rmse_mm": gap.after_rmse_mm if blamed else gap.before_rmse_mm,
+                "shrinkage": gap.shrinkage if blamed or gap.shrinkage is None else 0.0,
+                "shrinkage_ci90": gap.shrinkage_ci90 if blamed else None,
+                "best_shrinkage": gap.shrinkage,
                 "held_out_episodes": gap.held_out_episodes,
                 "ahead_mm": gap.ahead_mm,
                 "horizons": [
@@ -60,8 +69,8 @@ def verdict_json(diagnosis: Diagnosis) -> dict[str, Any]:
                 "split": gap.split,
             },
             "where": {
-                "along_cable_mm": where.along_cable_mm,
-                "per_episode_mm": where.per_episode_mm,
+                "along_cable_mm": np.where(seen.any(axis=(0, 1)), where.along_cable_mm, np.nan),
+                "per_episode_mm": np.where(seen.any(axis=(1, 2)), where.per_episode_mm, np.nan),
                 "regimes": where.regimes,
                 "per_horizon_mm": [
                     {"horizon_s": seconds, "gap_mm": size} for seconds, size in sorted(where.horizons_mm.items())
@@ -90,12 +99,6 @@ def write_verdict(path: str | os.PathLike[str], diagnosis: Diagnosis) -> pathlib
     finally:
         pathlib.Path(temporary).unlink(missing_ok=True)
     return path
-
-
-def _whole_episode(diagnosis: Diagnosis) -> float:
-    """The gap is scored open loop over whole episodes: the longest one's duration [s]."""
-    log = diagnosis.log
-    return max(float(time[length - 1] - time[0]) for time, length in zip(log.time, log.episode_length, strict=True))
 
 
 def _effect(effect: NamedEffect) -> dict[str, Any]:

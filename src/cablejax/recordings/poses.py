@@ -12,6 +12,8 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float
 
+from cablejax.simulate.pose import wrapped
+
 _X = np.array([1.0, 0.0, 0.0])
 
 
@@ -87,6 +89,7 @@ def twists(time: Float[np.ndarray, " T"], pose: Float[np.ndarray, "T Q P"]) -> F
     interval = np.diff(time)[:, None, None]
     if pose.shape[-1] == 3:
         change = np.diff(pose, axis=0)
+        change[..., 2] = wrapped(change[..., 2])
     else:
         start = pose[:-1, :, 3:] * np.array([1.0, -1.0, -1.0, -1.0])
         turn = product(pose[1:, :, 3:], start)

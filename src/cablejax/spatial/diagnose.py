@@ -12,6 +12,7 @@ import numpy as np
 
 from cablejax.diagnose.diagnosis import Diagnosis, Gap, Ranked, Verdict
 from cablejax.report.effect_words import effect_title, listed, millimetres, share
+from cablejax.spatial.clock import on_one_clock
 from cablejax.spatial.estimate import estimate
 from cablejax.spatial.gap import RESOLVABLE, gap_of, noise_of
 from cablejax.spatial.geometry import LocalChange, local_changes
@@ -63,6 +64,7 @@ def diagnose_space(
         ValueError: a log that cannot be diagnosed, with the reason.
     """
     begun = time.perf_counter()
+    log, repairs = on_one_clock(log)
     windows = windows_of(log)
     left_out = sum(split == "eval" for split in windows.split)
     if left_out == len(windows):
@@ -99,7 +101,7 @@ def diagnose_space(
         where=where,
         next_motion=None,
         baselines={},
-        caveats=_caveats(log, windows, left_out, found),
+        caveats=(*repairs, *_caveats(log, windows, left_out, found)),
         log=log,
         nominal=nominal,
         explained=explained,

@@ -20,6 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from cablejax.simulate.config import GRAVITY
 from cablejax.spatial.physics import RodPhysics
 
 PROFILE_KNOTS = 5
@@ -86,11 +87,13 @@ class Layout:
         blocks: in order.
         nominal_stiffness: EI / rho believed true [m^4/s^2].
         arclength: of the free markers and of the second clamp, from the first [m], shape [N + 1].
+        gravity: [m/s^2].
     """
 
     blocks: tuple[Block, ...]
     nominal_stiffness: float
     arclength: tuple[float, ...]
+    gravity: tuple[float, ...] = (0.0, 0.0, -GRAVITY)
 
     @property
     def size(self) -> int:
@@ -166,5 +169,5 @@ class Layout:
             roll=jnp.zeros(()),
             arclength=arclength[:-1],
             offset=jnp.zeros((points, 2)),
-            gravity=jnp.array([0.0, 0.0, -9.81]),
+            gravity=jnp.array(self.gravity),
         )

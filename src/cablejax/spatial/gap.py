@@ -65,6 +65,7 @@ def gap_of(
     ahead = [errors_ahead(s, windows.interval) for s in squared]
     floor, left = float(noise**2 / means[0]), float(means[1] / means[0])
     return Gap(
+        horizon_s=float((windows.valid.sum(axis=1).max() - 1) * windows.interval),
         before_rmse_mm=1e3 * float(np.sqrt(means[0])),
         after_rmse_mm=1e3 * float(np.sqrt(means[1])),
         noise_floor_mm=1e3 * noise,

@@ -13,6 +13,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 
+from cablejax.spatial.windows import labels
 from cablejax.types import GapLog
 
 _SCATTERS = 6.0
@@ -60,7 +61,7 @@ def local_changes(log: GapLog, held: tuple[int, int]) -> tuple[LocalChange, ...]
     grippers = [0 if k + 1 < held[0] else 1 if k >= points - held[1] else None for k in range(points - 1)]
     spacing = pair_distances(log, [gripper is not None for gripper in grippers])
     arclength = np.asarray(log.meta["keypoint_arclength_m"], float)
-    names = log.meta.get("file", log.meta.get("take", list(range(len(spacing)))))
+    names = labels(log, "file", "take")
     found = []
     for k in range(points - 1):
         gripper = grippers[k]

@@ -74,6 +74,7 @@ def layout_of(windows: Windows, nominal_stiffness: float, *, twisting: bool) -> 
         blocks(windows.keypoints.shape[2], twisting=twisting),
         float(nominal_stiffness),
         tuple(float(s) for s in windows.arclength),
+        tuple(float(g) for g in windows.gravity),
     )
 
 

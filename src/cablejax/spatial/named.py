@@ -94,11 +94,14 @@ def parameters_of(
         case "bending_damping":
             parameters = {"time_s": _told(positive("damping_time"), "s")}
         case "viscous_drag":
-            parameters = {"coefficient_n_s_per_m2": _told(positive("drag"), "N s/m²", times=density)}
+            parameters = {"coefficient_n_s_per_m2": _told(positive("drag"), "N s/m^2", times=density)}
         case "quadratic_drag":
             parameters = {"coefficient_per_m": _told(positive("quadratic_drag"), "1/m")}
         case "lumped_mass":
-            parameters = {"mass_kg": _told(positive("marker_mass"), "kg", times=density)}
+            parameters = {
+                "centre_m": _choice([float(s) for s in estimate.layout.arclength[:-1]], "m"),
+                "mass_kg": _told(positive("marker_mass"), "kg", times=density),
+            }
         case "gripper_rotation_offset":
             angles = [size("clamp_rotation", 2 * gripper) for gripper in range(2)]
             parameters = {"gripper": _choice([0, 1], ""), "angle_rad": _all_told(angles, "rad")}

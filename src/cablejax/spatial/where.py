@@ -11,7 +11,7 @@ from cablejax.diagnose.where import Where
 from cablejax.report.effect_words import millimetres
 from cablejax.spatial.gap import RESOLVABLE, errors_ahead, mean_of_finite, squares
 from cablejax.spatial.geometry import LocalChange
-from cablejax.spatial.windows import Windows
+from cablejax.spatial.windows import Windows, labels
 from cablejax.types import GapLog
 
 
@@ -59,7 +59,7 @@ def where_of(
         "speed: slow": 1e3 * float(np.sqrt(squared[~fast & np.isfinite(squared)].mean())),
     }
     worst = int(np.nanargmax(episodes))
-    names = log.meta.get("file", log.meta.get("take", list(range(len(episodes)))))
+    names = labels(log, "file", "take")
     sentences = [change.sentence for change in changes]
     sentences += [
         f"The gap is largest at keypoint {int(along.argmax())}, {arclength[int(along.argmax())]:.2f} m along the "

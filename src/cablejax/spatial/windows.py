@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from cablejax.recordings.poses import rotated
+from cablejax.simulate.config import GRAVITY
 from cablejax.spatial.clamps import frames_along
 from cablejax.types import GapLog
 
@@ -36,6 +37,7 @@ class Windows:
         held: number of keypoints held at either end.
         arclength: of the free markers and the second clamp, from the first clamp [m], shape [F + 1].
         n_keypoints: N.
+        gravity: as the log states it [m/s^2].
     """
 
     keypoints: Float[np.ndarray, "W T F 3"]
@@ -51,6 +53,7 @@ class Windows:
     held: tuple[int, int]
     arclength: Float[np.ndarray, "F1"]
     n_keypoints: int
+    gravity: tuple[float, ...] = (0.0, 0.0, -GRAVITY)
 
     def __len__(self) -> int:
         return len(self.keypoints)
@@ -74,8 +77,11 @@ def windows_of(log: GapLog, *, length: float = WINDOW) -> Windows:
     Raises:
         ValueError: a log in the plane, of unequal sample intervals, or one that has no window of a second.
     """
-    if log.keypoints.shape[-1] != 3:
-        raise ValueError(f"The log has keypoints in {log.keypoints.shape[-1]} dimensions, expected 3.")
+    if log.keypoints.shape[-1] != 3 or log.gripper_pose.shape[2] != 2:
+        raise ValueError(
+            f"The log has keypoints in {log.keypoints.shape[-1]} dimensions and {log.gripper_pose.shape[2]} grippers, "
+            "expected a cable in space (3) between two grippers."
+        )
     if log.meta["table"] is not None:
         raise ValueError("The log has a table; a cable in space is expected to hang free (`table` null).")
     intervals = np.concatenate([np.diff(t[:n]) for t, n in zip(log.time, log.episode_length, strict=True)])
@@ -106,10 +112,15 @@ def windows_of(log: GapLog, *, length: float = WINDOW) -> Windows:
     for q in range(2):
         frames[valid, q] = frames_along(flat[:, q])
 
-    meta = log.meta
-    recording = meta.get("recording", list(range(len(points))))
+    recording = labels(log, "recording")
     groups = {r: i for i, r in enumerate(dict.fromkeys(recording))}
-    files = meta.get("file", meta.get("take", [str(e) for e in range(len(points))]))
+    files, splits = labels(log, "file", "take"), labels(log, "split", default="")
+    unseen = [k for k in range(held[0], len(s) - held[1]) if not np.isfinite(points[valid][:, k]).any()]
+    if unseen:
+        raise ValueError(
+            f"Keypoint {', '.join(map(str, unseen))} is never observed: leave it out of keypoints and of "
+            "meta.keypoint_arclength_m."
+        )
     pieces = []
     for e, count in enumerate(log.episode_length):
         for begin in range(0, int(count), samples):
@@ -136,12 +147,27 @@ def windows_of(log: GapLog, *, length: float = WINDOW) -> Windows:
         episode=np.array([e for e, _, _ in pieces]),
         begin=np.array([begin for _, begin, _ in pieces]),
         group=np.array([groups[recording[e]] for e, _, _ in pieces]),
-        split=tuple(str(meta.get("split", [""] * len(points))[e]) for e, _, _ in pieces),
-        name=tuple(str(files[e]) for e, _, _ in pieces),
+        split=tuple(splits[e] for e, _, _ in pieces),
+        name=tuple(files[e] for e, _, _ in pieces),
         held=held,
         arclength=np.append(s[free], last) - first,
         n_keypoints=len(s),
+        gravity=tuple(log.meta["gravity_m_per_s2"]),
     )
+
+
+def labels(log: GapLog, *names: str, default: str | None = None) -> list[str]:
+    """What a log says of each episode under the first of these names, which the format does not know; else its number.
+
+    Only lists of one text or number for each episode are labels; what another program means by these names is left
+    alone.
+    """
+    for name in names:
+        value = log.meta.get(name)
+        each = isinstance(value, list) and len(value) == len(log.keypoints)
+        if each and all(isinstance(entry, (str, int, float)) for entry in value):
+            return [str(entry) for entry in value]
+    return [str(e) if default is None else default for e in range(len(log.keypoints))]
 
 
 def dealt(group: Int[np.ndarray, "W"], parts: int) -> Int[np.ndarray, "W"]:

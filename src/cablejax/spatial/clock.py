@@ -1,0 +1,68 @@
+"""A log in space with all its samples one interval apart."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+from jaxtyping import Float
+
+from cablejax.diagnose.clock import keypoints_at
+from cablejax.types import GapLog
+
+# Clocks whose intervals are all within this share of the usual one are taken as they are.
+_EVEN = 0.05
+
+
+def on_one_clock(log: GapLog) -> tuple[GapLog, tuple[str, ...]]:
+    """The log, sampled again where its clocks are uneven or differ between episodes, and a sentence if it was.
+
+    Positions and tangents of the grippers are linear between samples, as under the twists that were held; keypoints are
+    those of `diagnose.clock.keypoints_at`.
+    """
+    steps = np.concatenate([np.diff(time[:n]) for time, n in zip(log.time, log.episode_length, strict=True)])
+    interval = float(np.median(steps)) if len(steps) else 0.0
+    if not len(steps) or np.abs(steps - interval).max() <= _EVEN * interval:
+        return log, ()
+    length = [
+        int(np.floor((time[n - 1] - time[0]) / interval + 1e-6)) + 1
+        for time, n in zip(log.time, log.episode_length, strict=True)
+    ]
+    whole: dict[str, np.ndarray] = {"time": np.zeros((len(length), max(length)))}
+    for name in ("keypoints", "gripper_pose", "gripper_command", "hold"):
+        array = getattr(log, name)
+        if array is not None:
+            empty = np.nan if name == "keypoints" else 0
+            whole[name] = np.full((len(length), max(length), *array.shape[2:]), empty, array.dtype)
+    for e, (samples, n) in enumerate(zip(length, log.episode_length, strict=True)):
+        time = log.time[e, :n] - log.time[e, 0]
+        grid = interval * np.arange(samples)
+        before = np.clip(np.searchsorted(time, grid + 1e-9, side="right") - 1, 0, n - 1)
+        whole["time"][e] = interval * np.arange(max(length))
+        whole["keypoints"][e, :samples] = _points(grid, time, log.keypoints[e, :n].astype(float), interval)
+        whole["gripper_pose"][e] = _poses(interval * np.arange(max(length)), time, log.gripper_pose[e, :n])
+        whole["gripper_command"][e, :samples] = log.gripper_command[e, before]
+        if log.hold is not None:
+            whole["hold"][e, :samples] = log.hold[e, before] & log.hold[e, np.minimum(before + 1, n - 1)]
+    told = (
+        f"Samples are {1e3 * steps.min():.3g} to {1e3 * steps.max():.3g} ms apart: sampled again every "
+        f"{1e3 * interval:.3g} ms."
+    )
+    return dataclasses.replace(log, episode_length=np.array(length, np.int32), **whole), (told,)
+
+
+def _points(grid, time, points: Float[np.ndarray, "T N 3"], interval: float) -> Float[np.ndarray, "G N 3"]:
+    # an episode may be slower than the clock: a gap is one in its own clock
+    own = max(interval, float(np.median(np.diff(time)))) if len(time) > 1 else interval
+    return keypoints_at(grid, time, points, own) if len(time) > 1 else points
+
+
+def _poses(grid, time, pose: Float[np.ndarray, "T Q 7"]) -> Float[np.ndarray, "G Q 7"]:
+    """Linear, quaternions made continuous before and of unit length after; the last one is held."""
+    pose = pose.astype(float)
+    same = np.sign((pose[1:, :, 3:] * pose[:-1, :, 3:]).sum(axis=-1, keepdims=True))
+    pose[1:, :, 3:] *= np.cumprod(np.where(same == 0, 1.0, same), axis=0)
+    columns = [np.interp(grid, time, column) for column in pose.reshape(len(pose), -1).T]
+    pose = np.stack(columns, axis=1).reshape(len(grid), *pose.shape[1:])
+    pose[..., 3:] /= np.linalg.norm(pose[..., 3:], axis=-1, keepdims=True)
+    return pose

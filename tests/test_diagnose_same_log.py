@@ -1,0 +1,126 @@
+"""One log written in other words is the same log: turned, wound, numbered from the other end, on another clock."""
+
+import copy
+import dataclasses
+
+import numpy as np
+import pytest
+
+from cablejax.diagnose import DiagnosisError
+from cablejax.diagnose.case import Case
+from cablejax.types import GapLog
+from diagnose_cases import INTERVAL, SAMPLES, clean, log_of, record
+
+TILT = ("gravity_tilt", 0, (0.12, -0.05))
+
+
+def gap_mm(log: GapLog) -> float:
+    """Root mean square of what the nominal simulator is off."""
+    case = Case.of(log)
+    return 1e3 * float(np.sqrt(np.nanmean((case.recording.keypoints - case.nominal) ** 2)))
+
+
+def with_meta(log: GapLog, **changes) -> GapLog:
+    return dataclasses.replace(log, meta=copy.deepcopy(log.meta) | changes)
+
+
+def turned(log: GapLog, angle: float) -> GapLog:
+    """The world turned, angles wrapped."""
+    matrix = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    pose, command = log.gripper_pose.astype(float), log.gripper_command.astype(float)
+    pose[..., :2], command[..., :2] = pose[..., :2] @ matrix.T, command[..., :2] @ matrix.T
+    pose[..., 2] = (pose[..., 2] + angle + np.pi) % (2 * np.pi) - np.pi
+    keypoints = log.keypoints.astype(float) @ matrix.T
+    arrays = {"keypoints": keypoints, "gripper_pose": pose, "gripper_command": command}
+    return dataclasses.replace(log, **{name: array.astype(np.float32) for name, array in arrays.items()})
+
+
+def from_the_other_end(log: GapLog) -> GapLog:
+    pose = log.gripper_pose[:, :, ::-1].copy()
+    pose[..., 2] = (pose[..., 2] + 2 * np.pi) % (2 * np.pi) - np.pi
+    return dataclasses.replace(
+        log,
+        keypoints=log.keypoints[:, :, ::-1].copy(),
+        gripper_pose=pose,
+        gripper_command=log.gripper_command[:, :, ::-1].copy(),
+    )
+
+
+def wound(log: GapLog) -> GapLog:
+    """A whole turn more at gripper 1, and angles from 0 on."""
+    pose = log.gripper_pose.copy()
+    pose[:, :, 0, 2] %= 2 * np.pi
+    pose[:, :, 1, 2] += 2 * np.pi
+    return dataclasses.replace(log, gripper_pose=pose)
+
+
+def at_some_marks(log: GapLog) -> GapLog:
+    kept = [0, 1, 2, 4, 7, 8, 9, 12]
+    marks = [log.meta["keypoint_arclength_m"][i] for i in kept]
+    return with_meta(dataclasses.replace(log, keypoints=log.keypoints[:, :, kept]), keypoint_arclength_m=marks)
+
+
+def thick(log: GapLog) -> GapLog:
+    return with_meta(log, cable=log.meta["cable"] | {"diameter_m": 0.03})
+
+
+CHANGES = {
+    "turned": lambda log: turned(log, 3.0),
+    "wound": wound,
+    "from the other end": from_the_other_end,
+    "at some marks": at_some_marks,
+    "thick": thick,
+}
+
+
+@pytest.mark.parametrize("name", CHANGES)
+def test_the_gap_is_the_same(name):
+    log = record()
+    changed = CHANGES[name](log)
+    assert gap_mm(changed) == pytest.approx(gap_mm(log), rel=0.03)
+
+
+def test_exact_arms_are_exact_on_any_clock():
+    log, rng = log_of(clean()), np.random.default_rng(0)
+    even = INTERVAL * np.arange(SAMPLES)
+    time = np.stack([even + INTERVAL * rng.uniform(-0.1, 0.1, SAMPLES) for _ in log.time])
+    pose = np.stack([_at(t, even, p) for t, p in zip(time, log.gripper_pose, strict=True)])
+    command = np.zeros_like(pose)
+    command[:, :-1] = np.diff(pose, axis=1) / np.diff(time, axis=1)[..., None, None]
+    points = np.stack([_at(t, even, k) for t, k in zip(time, log.keypoints, strict=True)])
+    arrays = {"keypoints": points, "gripper_pose": pose, "gripper_command": command}
+    jittered = dataclasses.replace(log, time=time, **{n: a.astype(np.float32) for n, a in arrays.items()})
+    case = Case.of(jittered)
+    assert not case.arms.deviates and case.arms.deviation < 1e-5
+    assert any("off an even one" in caveat for caveat in case.recording.caveats)
+    assert gap_mm(jittered) < 0.1
+
+
+def test_a_tilt_that_the_log_states_is_no_gap():
+    log = record(TILT)
+    x, y = 9.81 * np.array(TILT[2])
+    stated = with_meta(log, gravity_m_per_s2=[x, y, -float(np.sqrt(9.81**2 - x**2 - y**2))])
+    assert gap_mm(stated) == pytest.approx(gap_mm(record()), rel=0.03)
+    assert gap_mm(log) > 2 * gap_mm(stated)
+
+
+def test_gravity_in_the_plane_of_the_keypoints_is_refused():
+    with pytest.raises(DiagnosisError, match="the cable hangs"):
+        Case.of(with_meta(record(), gravity_m_per_s2=[0.0, -9.81, 0.0]))
+
+
+def test_an_episode_of_a_few_samples_is_left_out():
+    log = record()
+    length = log.episode_length.copy()
+    length[1] = 7
+    case = Case.of(dataclasses.replace(log, episode_length=length))
+    assert np.isnan(case.recording.keypoints[1]).all() and np.isfinite(case.recording.keypoints[0]).any()
+    assert any("fewer than 20 samples: episode 1." in caveat for caveat in case.recording.caveats)
+    with pytest.raises(DiagnosisError, match="longest episode has 7 samples"):
+        Case.of(dataclasses.replace(log, episode_length=np.full_like(length, 7)))
+
+
+def _at(time, even, values):
+    """Linear between samples, as twists that are held make poses."""
+    columns = [np.interp(time, even, column) for column in values.reshape(len(values), -1).T]
+    return np.stack(columns, axis=1).reshape(len(time), *values.shape[1:])
