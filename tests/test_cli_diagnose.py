@@ -105,7 +105,7 @@ def test_other_file_is_refused(tmp_path, capsys):
     assert "has no field 'time'" in refused([other, "--out", tmp_path / "report"], capsys)
     text = tmp_path / "notes.txt"
     text.write_text("not a log")
-    assert "could not be read as a gap log" in refused([text, "--out", tmp_path / "report"], capsys)
+    assert "is no .npz archive" in refused([text, "--out", tmp_path / "report"], capsys)
     assert not (tmp_path / "report").exists()
 
 

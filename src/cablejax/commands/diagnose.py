@@ -40,10 +40,13 @@ class Diagnose(Command):
 
     def execute(self):
         from cablejax.diagnose import LIBRARY, verdict_json
+        from cablejax.diagnose.actuation import ARMS
         from cablejax.gaplog import read_gap_log
 
         known = {effect.name: effect for effect in LIBRARY}
         for name in self.only:
+            if name in ARMS:
+                raise UsageError(f"--only names {name!r}, which is looked for in any case: leave it out.")
             if name not in known:
                 raise UsageError(f"--only names the effect {name!r}, expected some of {', '.join(known)}.")
         log = read_gap_log(self.log)

@@ -25,7 +25,7 @@ _NEGLIGIBLE = 2e-4
 _EXPLAINED = 0.25
 # An effect that leaves more of it than this is not named.
 _TELLING = 0.7
-_GAIN, _LAG = "actuation_gain", "actuation_lag"
+_GAIN, _LAG = ARMS = "actuation_gain", "actuation_lag"
 
 
 @dataclasses.dataclass(frozen=True)

@@ -57,8 +57,8 @@ def is_even(time: Float[np.ndarray, "T"], interval: float) -> bool:
 def on_even_clock(time: Float[np.ndarray, "T"], samples: Samples, interval: float) -> Samples:
     """The samples at even times.
 
-    What was commanded is integrated over the times at which it was held, so that exact arms stay exact. Keypoints are
-    not observed in a gap between samples.
+    What was commanded is integrated over the times at which it was held, so that exact arms stay exact. In a gap
+    between samples keypoints are not observed, and what was commanded is taken to be what was done.
 
     Args:
         time: of the samples, increasing [s].
@@ -68,7 +68,9 @@ def on_even_clock(time: Float[np.ndarray, "T"], samples: Samples, interval: floa
     time = time - time[0]
     grid = np.arange(int(np.floor(time[-1] / interval + 1e-6)) + 1) * interval
     held = np.diff(time)[:, None, None]
-    path = np.concatenate([np.zeros((1, 2, 3)), np.cumsum(samples.gripper_command[:-1] * held, axis=0)])
+    done = np.diff(samples.gripper_pose, axis=0)
+    steps = np.where(held <= _GAP * interval, samples.gripper_command[:-1] * held, done)
+    path = np.concatenate([np.zeros((1, 2, 3)), np.cumsum(steps, axis=0)])
     commanded = np.diff(_linear(grid, time, path), axis=0) / interval
     before = np.clip(np.searchsorted(time, grid + 1e-9, side="right") - 1, 0, len(time) - 1)
     after = np.minimum(before + 1, len(time) - 1)

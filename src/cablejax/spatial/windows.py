@@ -164,8 +164,9 @@ def labels(log: GapLog, *names: str, default: str | None = None) -> list[str]:
     """
     for name in names:
         value = log.meta.get(name)
-        each = isinstance(value, list) and len(value) == len(log.keypoints)
-        if each and all(isinstance(entry, (str, int, float)) for entry in value):
+        if not isinstance(value, list) or len(value) != len(log.keypoints):
+            continue
+        if all(isinstance(entry, (str, int, float)) for entry in value):
             return [str(entry) for entry in value]
     return [str(e) if default is None else default for e in range(len(log.keypoints))]
 
