@@ -138,6 +138,7 @@ def test_trials_have_their_own_noise_gaps_and_models():
     assert np.isfinite(run.error_cm).all()
 
 
+@pytest.mark.slow
 def test_the_controller_in_a_batch_equals_the_controller_alone():
     """With a graph network, the online residual and a plan of two steps."""
     graphdef, weights = network(SMALL)

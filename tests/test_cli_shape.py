@@ -26,7 +26,8 @@ def weights(tmp_path_factory):
 
 
 def shape_arguments(weights, out) -> list[str]:
-    return ["shape", "--weights", str(weights), "--out", str(out), "--steps", "2", "--links", "12", "--target", "U"]
+    small = ["--steps", "2", "--links", "12", "--target", "U"]
+    return ["shape", "--weights", str(weights), "--out", str(out), *small]
 
 
 def test_shape_is_resumed_where_it_was_interrupted_and_writes_everything(weights, tmp_path, capsys, monkeypatch):

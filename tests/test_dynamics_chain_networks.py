@@ -68,7 +68,8 @@ def test_the_recurrence_runs_both_ways_along_the_cable():
         assert set(np.flatnonzero(change > 0)) == set(reached)
 
 
-@pytest.mark.parametrize("kind", [pytest.param("lstm", marks=pytest.mark.slow), "mlp"])
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", KINDS)
 def test_it_trains_and_is_saved_like_the_graph_network(kind, tmp_path):
     config = resized(TINY_TRAINING, network=kind)
     result = train(config, trajectories(), tmp_path / "run", progress=False)

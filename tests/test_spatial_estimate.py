@@ -67,6 +67,7 @@ def test_is_wider_the_more_may_be_true_and_holds_the_true_value(estimated):
         assert interval.low < _TRUE_STIFFNESS < interval.high
 
 
+@pytest.mark.slow
 def test_stiffness_is_per_mass_with_the_markers_since_motion_does_not_tell_theirs_from_the_cables(estimated):
     without, found_with = estimated("viscous_drag").stiffness, estimated("viscous_drag", "lumped_mass")
     where = found_with.layout.slices

@@ -25,6 +25,7 @@ def load(script: str):
     return module
 
 
+@pytest.mark.slow
 def test_experiment_shapes_a_cable(weights, tmp_path, capsys):
     arguments = ["--steps", "1", "--links", "12", "--weights", str(weights), "--out", str(tmp_path)]
     load("01_shape_a_cable.py").main(arguments)
