@@ -87,6 +87,12 @@ def test_the_gap_is_the_same(name, usual_mm):
     assert gap_mm(CHANGES[name](record())) == pytest.approx(usual_mm, rel=0.03)
 
 
+def test_episodes_that_repeat_are_known_whatever_their_angles():
+    pose = prepare(turned(log_of(clean()), 3.0)).gripper_pose
+    assert np.ptp(pose[:, 0, 0, 2]) < np.pi
+    np.testing.assert_allclose(np.diff(pose[..., 2], axis=2), np.diff(log_of(clean()).gripper_pose[..., 2]), atol=1e-5)
+
+
 def test_exact_arms_are_exact_on_any_clock():
     log, rng = log_of(clean()), np.random.default_rng(0)
     even = INTERVAL * np.arange(SAMPLES)

@@ -119,6 +119,8 @@ def prepare(log: GapLog) -> Recording:
     for e, (samples, n) in enumerate(zip(episodes, lengths, strict=True)):
         points[e, :n], pose[e, :n], hold[e, :n] = samples.keypoints, samples.gripper_pose, samples.hold
         pose[e, n:], command[e, : n - 1] = samples.gripper_pose[-1], samples.gripper_command[: n - 1]
+        # both grippers by the same whole turns, so that an episode which repeats another one is known by its angles
+        pose[e, ..., 2] += 2 * np.pi * np.round((pose[0, 0, 0, 2] - pose[e, 0, 0, 2]) / (2 * np.pi))
     recording = Recording(
         keypoints=points,
         gripper_pose=pose,
