@@ -170,6 +170,27 @@ def random_model(rng, rank=SIZE):
 _minimise = jax.jit(lambda h, g, s, y: minimise_quadratic(h, g, s, y))
 
 
+@jax.jit
+@jax.vmap
+def nearest_twice(matrix, offset, point):
+    """The violation of the nearest point, and how far that of a point a thousandth of the way back is from it."""
+    feasible = AffineBalls(matrix, offset, jnp.asarray([0.3, 0.25]))
+    nearest = feasible.project(point)
+    again = feasible.project(nearest + 1e-3 * (point - nearest))
+    return feasible.violation(nearest), jnp.abs(again - nearest).max()
+
+
+@pytest.mark.parametrize(("size", "apart"), [(10.0, 1e-7), (100.0, 1e-4)])
+def test_from_far_away_the_nearest_point_is_still_found(size, apart):
+    """Forty to four hundred times as far as the balls are wide, which meet at any angle."""
+    with jax.enable_x64(True):
+        rng = np.random.default_rng(0)
+        maps = rng.normal(size=(60, 2, 2, 6)), 0.1 * rng.normal(size=(60, 2, 2)), size * rng.normal(size=(60, 6))
+        violation, between = nearest_twice(*maps)
+        assert float(violation.max()) <= 1e-6
+        assert float(between.max()) <= apart
+
+
 @pytest.mark.parametrize("name", SETS)
 def test_minimum_of_a_quadratic_meets_its_conditions(name):
     """The conditions are those of any minimum, whoever found it: of a regular Hessian and of a singular one."""

@@ -135,8 +135,56 @@ def test_a_function_that_is_not_a_number_ends_the_solve_with_a_feasible_point(so
         np.testing.assert_array_equal(value, [0.5, 0.5])
         # NaN on the way only: beyond y = 0.2, short of the minimum at 0
         result, value = ended(lambda y, _: jnp.where(y < 0.2, jnp.nan, y), solver)
-        assert result is not Result.CONVERGED
+        assert result in (Result.NONFINITE, Result.STEP_LIMIT)
         assert np.isfinite(value).all() and (value >= 0.2).all() and (value < 0.5).all()
+        assert ended(lambda y, _: y, solver, start=(np.nan, 0.5))[0] is Result.NONFINITE
+
+
+def test_where_there_is_a_value_but_no_gradient_is_no_place_to_go_on_from():
+    """The slope of `0 sqrt(max(y - 0.4, 0))` is NaN below 0.4, on the way to the minimum at 0.3."""
+
+    def half_known(y, _):
+        return 0.5 * jnp.sum((y - 0.3) ** 2) + 0.0 * jnp.sum(jnp.sqrt(jnp.maximum(y - 0.4, 0.0)))
+
+    with jax.enable_x64(True):
+        box, start = Box(jnp.full(2, -2.0), jnp.full(2, 2.0)), jnp.asarray([1.5, 1.8])
+        found = minimise(half_known, SOLVERS["quasi-Newton"], start, box, throw=False)
+        assert Result(int(found.result)) is Result.NONFINITE and int(found.stats.iterations) < 500
+        assert (found.value >= 0.4).all() and float(found.objective) < 0.02
+
+
+def test_the_spectral_gradient_returns_the_point_that_it_says_is_a_minimum():
+    """Not one with a value lower by rounding, met before, whose projected gradient is far above the tolerance."""
+    solver = SpectralProjectedGradient(atol=1e-8, memory=1)
+
+    def bowl(y, args):
+        matrix, centre = args
+        return 1e4 + 0.5 * (y - centre) @ matrix @ (y - centre)
+
+    @jax.jit
+    @jax.vmap
+    def solve_all(matrix, centre):
+        box = Box(jnp.full(8, -2.0), jnp.full(8, 2.0))
+        found = minimise(bowl, solver, jnp.ones(8), box, (matrix, centre), throw=False)
+        size = found.certificate(bowl, box, (matrix, centre)).projected_gradient
+        return found.result, size, found.objective - bowl(found.value, (matrix, centre))
+
+    with jax.enable_x64(True):
+        rng = np.random.default_rng(0)
+        turns = np.linalg.qr(rng.normal(size=(20, 8, 8)))[0]
+        matrices = turns @ np.diag(np.logspace(0, 3, 8)) @ turns.swapaxes(1, 2)
+        result, size, missed = solve_all(matrices, rng.normal(size=(20, 8)))
+        assert (result == Result.CONVERGED).sum() >= 15
+        assert float(jnp.where(result == Result.CONVERGED, size, 0.0).max()) <= 1e-8
+        np.testing.assert_allclose(missed, 0.0, atol=1e-10)
+
+
+def test_bounds_that_a_point_keeps_by_rounding_are_active():
+    """A kilometre from zero, float32 has steps of 0.06 mm: a certificate has to allow for them."""
+    start, plane = jnp.asarray([1e3, 0.0]), Halfspaces(jnp.asarray([[1.0, 0.0]]), jnp.asarray([1e3 * (1 + 1e-6)]))
+    slope = jnp.asarray([-1.0, 0.0])
+    assert float(certify(slope, plane, start).stationarity) < 1e-6
+    assert float(certify(slope, plane, start, near=1e-6).stationarity) == 1.0
 
 
 @pytest.mark.parametrize("solver", [s if s == "dogleg" else pytest.param(s, marks=pytest.mark.slow) for s in SOLVERS])
@@ -198,8 +246,10 @@ def regime(name, x):
 
 @functools.partial(jax.jit, static_argnums=0)
 def minimum_of(name, x):
+    """Where it is, and the objective there."""
     solver = BoundedLevenbergMarquardt(atol=1e-12)
-    return least_squares(curved, solver, jnp.full(3, 0.1), regime(name, x), X0[:4] + x[:4], max_steps=200).value
+    found = least_squares(curved, solver, jnp.full(3, 0.1), regime(name, x), X0[:4] + x[:4], max_steps=200)
+    return jnp.append(found.value, found.objective)
 
 
 X0 = np.array([0.5, 0.3, 0.6, 0.9, 0.0])
@@ -212,7 +262,7 @@ def test_derivatives_of_the_solution_are_those_of_solving_again(name):
     """Central differences of re-solves in float64; reverse against forward mode."""
     with jax.enable_x64(True):
         x, step = jnp.zeros(5), 1e-5
-        minimum = minimum_of(name, x)
+        minimum = minimum_of(name, x)[:3]
         active = int((regime(name, x).constraints(minimum) > -1e-9).sum())
         assert active == {"inactive": 0, "ball": 1, "ball and plane": 2}[name]
         forward = jax.jit(jax.jacfwd(functools.partial(minimum_of, name)))(x)
@@ -223,7 +273,21 @@ def test_derivatives_of_the_solution_are_those_of_solving_again(name):
         backward = jax.jit(jax.jacrev(functools.partial(minimum_of, name)))(x)
         np.testing.assert_allclose(backward, forward, atol=1e-9)
         known = jax.jit(jax.jacfwd(lambda x: with_derivatives(minimum, curved, regime(name, x), X0[:4] + x[:4])))(x)
-        np.testing.assert_allclose(known, forward, atol=1e-7)
+        np.testing.assert_allclose(known, forward[:3], atol=1e-7)
+        assert np.abs(forward[3]).max() > 0.1
+
+
+def test_functions_may_close_over_what_is_differentiated():
+    def nearest(target):
+        found = least_squares(
+            *(lambda y, _: y - target, SOLVERS["Levenberg-Marquardt"], jnp.zeros(2), Box(*map(jnp.asarray, UNIT))),
+            linearise=lambda y, _: (y - target, jnp.eye(2)),
+        )
+        return found.value
+
+    with jax.enable_x64(True):
+        slope = jax.jit(jax.jacrev(nearest))(jnp.asarray([0.3, 2.0]))
+        np.testing.assert_allclose(slope, [[1.0, 0.0], [0.0, 0.0]], atol=1e-9)
 
 
 def test_statistics_are_counts():

@@ -169,6 +169,27 @@ def test_a_model_that_yields_nan_makes_the_grippers_hold_still_and_says_so():
     assert np.linalg.norm(twist) > 0.01 and int(info.outcome) != Outcome.NONFINITE
 
 
+def test_where_bounds_contradict_each_other_the_grippers_hold_still():
+    """Too far apart and outside the workspace, which cannot both be mended as fast as is asked: no straightening."""
+    config = dataclasses.replace(WITHOUT, workspace=((-3.0, -1.0), (-1.0, 3.0)), restart_after=1)
+    cable = Cable(pose=[[0.0, 0.0, 1.57], [0.0, 1.5, 1.57]])
+    state, twists, info = run(controller(config=config), cable, 3)
+    assert (info.outcome == Outcome.INFEASIBLE).all()
+    assert (twists == 0).all() and int(state.restarts) == 0
+
+
+def test_data_in_float32_stay_so_where_float64_is_on():
+    def single(weights, history, twist):
+        return relaxing_cable(weights, history, twist).astype(history.keypoints.dtype)
+
+    with jax.enable_x64(True):
+        control, cable = controller(rate=np.float32(0.8), dynamics=single), Cable()
+        history = jax.tree.map(lambda x: x.astype(jnp.float32), at_rest(START))
+        control = dataclasses.replace(control, target=np.asarray(control.target, float))
+        state, twist, _ = control.step(control.init(history), cable.keypoints, cable.pose)
+        assert {leaf.dtype.name for leaf in (twist, state.plan, state.predicted, state.radius)} == {"float32"}
+
+
 def test_at_the_target_the_grippers_rest():
     pose = TARGETS["U"]
     _, twists, info = run(controller(), Cable(rate=0.8, sag=0.0, pose=pose), 4)
@@ -251,6 +272,7 @@ def test_times_a_control_call():
     ("change", "message"),
     [
         ({"horizon": -1}, "horizon"),
+        ({"horizon": 2.5}, "horizon"),
         ({"cable_length": -1.0}, "cable_length"),
         ({"min_distance": 0.995}, "min_distance"),
         ({"radius": 0.06}, "radius_min"),
@@ -268,6 +290,10 @@ def test_impossible_settings_are_refused(change, message):
 def test_impossible_inputs_are_refused():
     with pytest.raises(ValueError, match="non-finite"):
         Controller(CONFIG, relaxing_cable, jnp.ones(()), hermite_shape(START, N).at[2].set(jnp.nan))
+    with pytest.raises(ValueError, match="three or more"):
+        Controller(CONFIG, relaxing_cable, jnp.ones(()), hermite_shape(START, 2))
+    with pytest.raises(ValueError, match="whole numbers"):
+        TrustRegion(max_iterations=1.5)
     control = controller()
     with pytest.raises(ValueError, match=r"\(7, 2\) as the target"):
         control.init(at_rest(START, n_keypoints=9))

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from cablejax.mpc import project_ball
+from cablejax.mpc import feasible_from, project_ball
 from mpc_cases import feasible_set
 
 T = 4
@@ -113,6 +113,19 @@ def test_a_start_outside_is_led_back_inside(distance, sign):
     assert float(sign * (projected[0, 1, 0] - projected[0, 0, 0])) > 0.02
     relative = feasible.separation + jnp.sum(projected[:, 1, :2] - projected[:, 0, :2], axis=0)
     assert LOWER <= float(jnp.linalg.norm(relative)) <= UPPER
+
+
+def test_after_a_motion_faster_than_is_allowed_now_there_is_room():
+    """The bound on a step has shrunk since the last one, and a bound on the change is kept from there."""
+    with jax.enable_x64(True):
+        pose, last = jnp.asarray([[0.0, 0.0, 0.0], [0.6, 0.0, 0.0]]), jnp.asarray([[0.05, 0.0, 0.0], [0.0, 0.05, 0.0]])
+        feasible = feasible_from(pose, 0.0475, (LOWER, UPPER), change=0.001, previous=last)
+        plans = jnp.asarray(np.random.default_rng(0).normal(size=(20, T, 2, 3)) * 0.03)
+        projected = jax.jit(jax.vmap(feasible.project))(plans)
+        assert float(jax.vmap(feasible.violation)(projected).max()) <= 1e-11
+        # a plan inside, by more than rounding
+        slower = jnp.tile(last * (0.0475 / 0.05 - 0.005), (T, 1, 1))
+        assert float(feasible.constraints(slower).max()) < -1e-5
 
 
 def test_projection_has_finite_gradients_at_the_centre_and_on_the_bound():

@@ -148,6 +148,21 @@ def test_sampling_improves_on_the_guess_and_stays_inside(solver):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("solver", [CrossEntropy(samples=16, iterations=3), PathIntegral(samples=16, iterations=3)])
+def test_sampling_knows_the_way_back_from_outside(solver):
+    """Grippers beyond the workspace: every bound closes in on them, and no plan may break it."""
+    workspace = {"workspace": ((0.1, 0.2), (0.8, 1.0))}
+    case = dataclasses.replace(
+        problem("U"), feasible=feasible_from(jnp.asarray(START), 0.05, (0.15, 0.99), **workspace)
+    )
+    plan, value, violation = solved(solver, case)
+    assert float(violation) <= 1e-7 and Outcome(int(plan.outcome)) is Outcome.STEP_LIMIT
+    assert float(value) <= float(value_at(case, case.start(jnp.asarray(STILL)).motion))
+    plan, _, _ = solved(solver, with_bounds(min_distance=1.2))
+    assert Outcome(int(plan.outcome)) is Outcome.INFEASIBLE
+
+
+@pytest.mark.slow
 def test_many_starts_give_the_best_of_them():
     case = problem("S")
     starts = random_starts(case, STEPS, 4)

@@ -191,7 +191,8 @@ def test_batches_over_cables():
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"window": 0}, "at least one sample"),
+        ({"window": 0}, "at least 1"),
+        ({"window": 2.5}, "whole number"),
         ({"regularisation": 0.0}, "regularisation"),
         ({"motion_scale": float("nan")}, "motion_scale"),
         ({"forgetting": 0.0}, "forgetting"),

@@ -10,7 +10,8 @@ from jaxtyping import Array, Float, Scalar
 
 from cablejax.bounded.sets import AbstractSet
 
-_NEAR = 1e-6
+# What counts as active by default: within this of the bound, or within so many units of rounding of the point.
+_NEAR, _NEAR_ULP = 1e-6, 64
 
 
 @jax.tree_util.register_dataclass
@@ -47,17 +48,24 @@ def projected_gradient_size(feasible: AbstractSet, y: Float[Array, "*shape"], gr
 
 
 def certify(
-    gradient: Float[Array, "*shape"], feasible: AbstractSet, y: Float[Array, "*shape"], near: float = _NEAR
+    gradient: Float[Array, "*shape"], feasible: AbstractSet, y: Float[Array, "*shape"], near: float | None = None
 ) -> Certificate:
     """The first-order conditions of a minimum over `feasible` at `y`, where the function has this gradient.
 
     The multipliers are the non-negative ones with the least `|g + N' lambda|` over the bounds within `near` of being
     active. No solver is involved but that of this least squares problem.
+
+    Args:
+        gradient: of the function at `y`, in any shape.
+        feasible: the set.
+        y: the point.
+        near: in the units of y; None = 1e-6, or what rounding leaves of a `y` far from 0 or in float32.
     """
     flat, slope = y.ravel(), gradient.ravel()
     values, pull = jax.vjp(lambda flat: feasible.constraints(flat.reshape(y.shape)), flat)
     normals = jax.vmap(lambda e: pull(e)[0])(jnp.eye(values.size, dtype=values.dtype))
-    active = values > -near
+    rounding = _NEAR_ULP * jnp.finfo(y.dtype).eps * jnp.maximum(jnp.abs(y).max(), 1.0)
+    active = values > -(jnp.maximum(_NEAR, rounding) if near is None else near)
     multipliers = _nonnegative_least_squares(jnp.where(active[:, None], normals, 0.0), slope, active)
     slack = jnp.where(active, values, 0.0)
     return Certificate(

@@ -39,6 +39,7 @@ class _State(eqx.Module):
     stale: Bool[Array, ""]
     updates: Int[Array, ""]
     rounded: Bool[Array, ""]
+    finite: Bool[Array, ""]  # whether all trials since the last real step had a value
     terminate: Bool[Array, ""]
     result: optx.RESULTS
     linearisations: Int[Array, ""]
@@ -99,6 +100,7 @@ class AbstractBoundedLeastSquares(optx.AbstractLeastSquaresSolver):
             stale=jnp.array(True),
             updates=zero,
             rounded=jnp.array(False),
+            finite=jnp.array(True),
             terminate=jnp.array(False),
             result=optx.RESULTS.successful,
             linearisations=zero,
@@ -164,15 +166,17 @@ class AbstractBoundedLeastSquares(optx.AbstractLeastSquaresSolver):
         accept = (accept | (exact & rounded & (value <= info.f + rounding))) & jnp.isfinite(value) & ~ended
         stalled = exact & rounded & state.rounded & ~ended
         result = optx.RESULTS.where(stalled, optx.RESULTS.stagnation, state.result)  # pyright: ignore[reportArgumentType]
-        result = optx.RESULTS.where(finite, result, optx.RESULTS.nonfinite)
+        met = jnp.isfinite(value) & ((accept & ~rounded) | state.finite)
+        broken = ~finite | (stalled & ~met)
+        result = optx.RESULTS.where(broken, optx.RESULTS.nonfinite, result)  # pyright: ignore[reportArgumentType]
         state = eqx.tree_at(
             lambda s: (
-                *(s.search_state, s.step_size, s.stale, s.rounded, s.terminate, s.result),
+                *(s.search_state, s.step_size, s.stale, s.rounded, s.finite, s.terminate, s.result),
                 *(s.evaluations, s.objective, s.aux),
             ),
             state,
             (
-                *(search_state, step_size.astype(y.dtype), accept, jnp.where(exact, rounded, state.rounded)),
+                *(search_state, step_size.astype(y.dtype), accept, jnp.where(exact, rounded, state.rounded), met),
                 *(ended | stalled, result),
                 *(state.evaluations + jnp.where(ended, 0, 1), jnp.where(accept, value, info.f)),
                 chosen(accept, aux, state.aux),

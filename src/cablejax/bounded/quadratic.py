@@ -14,7 +14,8 @@ from cablejax.bounded.quadrics import Quadrics
 if TYPE_CHECKING:
     from cablejax.bounded.sets.base import ConvexSet
 
-_ITERATIONS = 30
+# Ten to fifteen is usual; from far away, with bounds that meet at a sharp angle, up to sixty.
+_ITERATIONS = 100
 # Share of the way to the nearest bound that a step may take.
 _TO_BOUND = 0.995
 
@@ -168,7 +169,9 @@ def _interior_point(quadrics: Quadrics, hessian, linear, centre):
     linear = linear / unit
 
     start = scaled.of_lift(scaled.offset)
-    outside = jnp.maximum(jnp.max(jnp.where(present, start, 0.0)), 0.0)
+    # Newton's step to each bound tells how far outside; the value itself grows with the square of the distance.
+    steepness = jnp.linalg.norm(scaled.jacobian(scaled.offset), axis=1) + jnp.finfo(dtype).tiny
+    outside = jnp.max(jnp.where(present, jnp.maximum(start, 0.0) / steepness, 0.0))
     force = jnp.linalg.norm(linear) + outside + jnp.finfo(dtype).tiny
     # The step is about as long as the force, as far as there is room; a curved bound leaves its radius.
     curved = scaled.groups @ scaled.curvature > 0
@@ -194,12 +197,13 @@ def _interior_point(quadrics: Quadrics, hessian, linear, centre):
         jacobian, dual, primal, gap, _ = residuals(x, slack, multipliers)
         weight = multipliers / slack
         matrix = hessian + scaled.bend(multipliers) + (jacobian.T * weight) @ jacobian
-        matrix = matrix + jnp.diag(4 * eps * (1.0 + jnp.diag(matrix)))
-        factor = jax.scipy.linalg.cho_factor(matrix)
+        factor = jax.scipy.linalg.cho_factor(matrix + jnp.diag(4 * eps * (1.0 + jnp.diag(matrix))))
 
         def direction(dual, primal, complement):
             right = dual + (weight * primal - complement / slack) @ jacobian
             along = -jax.scipy.linalg.cho_solve(factor, right)
+            # refined once: the factor is that of a matrix a little larger, and loses digits where weights differ much
+            along = along - jax.scipy.linalg.cho_solve(factor, right + matrix @ along)
             opening = jnp.where(present, -primal - jacobian @ along, 0.0)
             pressing = jnp.where(present, -(complement + multipliers * opening) / slack, 0.0)
             return along, opening, pressing

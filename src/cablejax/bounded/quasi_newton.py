@@ -28,6 +28,7 @@ class _State(eqx.Module):
     step_size: Scalar
     optimality: Scalar
     rounded: Bool[Array, ""]
+    finite: Bool[Array, ""]  # whether all trials since the last real step had a value and a gradient
     terminate: Bool[Array, ""]
     result: optx.RESULTS
     evaluations: Int[Array, ""]
@@ -84,6 +85,7 @@ class BoundedQuasiNewton(optx.AbstractMinimiser):
             step_size=jnp.ones((), dtype),
             optimality=jnp.asarray(jnp.inf, dtype),
             rounded=jnp.array(False),
+            finite=jnp.array(True),
             terminate=jnp.array(False),
             result=optx.RESULTS.successful,
             evaluations=zero,
@@ -103,7 +105,9 @@ class BoundedQuasiNewton(optx.AbstractMinimiser):
         move, bent = (state.trial - y).ravel(), gradient - info.grad
         finite = jnp.isfinite(value) & jnp.isfinite(gradient).all()
         step_size, accept, _, search_state = self.search.step(
-            first, y.ravel(), state.trial.ravel(), info, optx.FunctionInfo.Eval(value), state.search_state
+            *(first, y.ravel(), state.trial.ravel(), info),
+            # a point without a gradient is no place to go on from, whatever its value
+            *(optx.FunctionInfo.Eval(jnp.where(finite, value, jnp.nan)), state.search_state),
         )
         # Gradients are known better than values: where values cannot tell, a step is taken on trust.
         rounding = 4 * jnp.finfo(y.dtype).eps * jnp.abs(info.f)
@@ -112,6 +116,7 @@ class BoundedQuasiNewton(optx.AbstractMinimiser):
         step_size = jnp.where(first, state.step_size, step_size).astype(y.dtype)
         search_state = jax.tree.map(lambda new, old: jnp.where(first, old, new), search_state, state.search_state)
 
+        met = finite & ((accept & ~state.rounded) | state.finite)
         model = info.hessian.as_matrix()
         begun = model
         if not given:
@@ -126,10 +131,10 @@ class BoundedQuasiNewton(optx.AbstractMinimiser):
         )
         broken = first & ~finite
         state = eqx.tree_at(
-            lambda s: (s.f_info, s.search_state, s.step_size, s.evaluations, s.terminate, s.result, s.aux),
+            lambda s: (s.f_info, s.search_state, s.step_size, s.evaluations, s.finite, s.terminate, s.result, s.aux),
             state,
             (
-                *(info, search_state, step_size, state.evaluations + 1, broken),
+                *(info, search_state, step_size, state.evaluations + 1, met, broken),
                 optx.RESULTS.where(broken, optx.RESULTS.nonfinite, state.result),
                 chosen(accept | first, aux, state.aux),
             ),
@@ -153,6 +158,7 @@ class BoundedQuasiNewton(optx.AbstractMinimiser):
         # after a step that was taken on trust
         stalled = state.rounded & rounded & ~converged & ~state.terminate
         result = optx.RESULTS.where(stalled, optx.RESULTS.stagnation, state.result)  # pyright: ignore[reportArgumentType]
+        result = optx.RESULTS.where(stalled & ~state.finite, optx.RESULTS.nonfinite, result)  # pyright: ignore[reportArgumentType]
         return eqx.tree_at(
             lambda s: (s.trial, s.descent_state, s.optimality, s.rounded, s.terminate, s.result),
             state,

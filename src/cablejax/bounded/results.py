@@ -38,7 +38,8 @@ class Result(enum.IntEnum):
 _MESSAGES = {
     Result.CONVERGED: "Converged: the projected gradient is within the tolerance.",
     Result.STEP_LIMIT: "The steps were used up, the projected gradient is still above the tolerance: raise max_steps.",
-    Result.NONFINITE: "The function or its derivatives are NaN or infinite: check it at `solution.value`.",
+    Result.NONFINITE: "The start, the function or its derivatives are NaN or infinite: check them at and near "
+    "`solution.value`.",
     Result.EMPTY_SET: "The bounds contradict each other: there is no feasible point.",
     Result.STALLED: "No step improves the function by more than rounding: use float64, or a greater tolerance.",
 }
@@ -69,7 +70,7 @@ class Solution:
 
     Attributes:
         value: the best feasible point found.
-        objective: the function there, for least squares half the sum of squares, shape [].
+        objective: the function there (half the sum of squares), differentiable where `value` is, shape [].
         result: a `Result`, shape [].
         stats: what it cost.
         optimality: largest element of `P(y - g) - y` at the last point whose gradient was taken, shape [].
@@ -81,10 +82,15 @@ class Solution:
     stats: Stats
     optimality: Float[Array, "*batch"]
 
-    def certificate(self, fn: Callable[[Array, Any], Array], feasible: AbstractSet, args: Any = None) -> Certificate:
-        """The first-order conditions at `value`, from the gradient of `fn` there; of residuals, half their squares'."""
+    def certificate(
+        self, fn: Callable[[Array, Any], Array], feasible: AbstractSet, args: Any = None, near: float | None = None
+    ) -> Certificate:
+        """The first-order conditions at `value`, from the gradient of `fn` there; of residuals, half their squares'.
+
+        `near` tells how far from a bound counts as held by it, see `certify`.
+        """
 
         def objective(y):
             return value_of(fn(y, args))
 
-        return certify(jax.grad(objective)(self.value), feasible, self.value)
+        return certify(jax.grad(objective)(self.value), feasible, self.value, near)

@@ -5,10 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+import equinox as eqx
+import jax
 import jax.numpy as jnp
 import optimistix as optx
 from jax.core import Tracer
-from jaxtyping import Array
+from jaxtyping import Array, Bool
 
 from cablejax.bounded.implicit import FixedPointAdjoint
 from cablejax.bounded.linearise import forward, squared_jacobian
@@ -48,10 +50,12 @@ def minimise(
         ValueError: the set is empty.
         RuntimeError: the solve ended in another way than convergence.
     """
-    start = feasible.project(jnp.asarray(y0))
+    y0 = jnp.asarray(y0)
+    start = feasible.project(y0)
+    fn, hessian = _explicit(start, args, fn, hessian)
     options = {"feasible": feasible, "hessian": hessian}
     out = optx.minimise(fn, solver, start, args, options, max_steps=max_steps, adjoint=FixedPointAdjoint(), throw=False)
-    return _finish(out, feasible, start, throw)
+    return _finish(out, fn, args, feasible, start, jnp.isnan(y0).any(), throw)
 
 
 def least_squares(
@@ -92,15 +96,48 @@ def least_squares(
 
         squared = squared_jacobian(linearise or forward(residual_fn))
         return minimise(half_squares, solver, y0, feasible, args, hessian=squared, max_steps=max_steps, throw=throw)
-    start = feasible.project(jnp.asarray(y0))
+    y0 = jnp.asarray(y0)
+    start = feasible.project(y0)
+    residual_fn, linearise = _explicit(start, args, residual_fn, linearise)
     options = {"feasible": feasible, "linearise": linearise}
     out = optx.least_squares(
         residual_fn, solver, start, args, options, max_steps=max_steps, adjoint=FixedPointAdjoint(), throw=False
     )
-    return _finish(out, feasible, start, throw)
+    return _finish(out, residual_fn, args, feasible, start, jnp.isnan(y0).any(), throw)
 
 
-def _finish(out: optx.Solution, feasible: AbstractSet, start: Array, throw: bool) -> Solution:
+def _explicit(start: Array, args: Any, fn: Callable, beside: Callable | None) -> tuple[Callable, Callable | None]:
+    """Both functions with what they close over as arguments, so that it may be traced."""
+    convert = eqx.filter_closure_convert
+    return convert(fn, start, args), None if beside is None else convert(beside, start, args)
+
+
+@eqx.filter_custom_jvp
+def _value_at(fn, y, args, known):
+    """`known`, which is `value_of(fn(y, args))`, with its derivatives; only for these the function is called."""
+    del fn, y, args
+    return known
+
+
+@_value_at.def_jvp
+def _value_at_jvp(primals, tangents):
+    *inputs, known = primals
+    of_inputs = tuple(tangents[:-1])
+    # The tangents are those of arrays; what has none stays as it is.
+    moving = jax.tree.map(lambda t: t is not None, of_inputs, is_leaf=lambda t: t is None)
+    varying, fixed = eqx.partition(tuple(inputs), moving)
+
+    def value(varying):
+        fn, y, args = eqx.combine(varying, fixed)
+        return value_of(fn(y, args))
+
+    return known, jax.jvp(value, (varying,), (of_inputs,))[1]
+
+
+def _finish(
+    out: optx.Solution, fn, args, feasible: AbstractSet, start: Array, unknown: Bool[Array, ""], throw: bool
+) -> Solution:
+    """The solution as ours; `unknown` = the start was not a number."""
     known = (
         (optx.RESULTS.successful, Result.CONVERGED),
         (optx.RESULTS.nonfinite, Result.NONFINITE),
@@ -111,10 +148,11 @@ def _finish(out: optx.Solution, feasible: AbstractSet, start: Array, throw: bool
         code = jnp.where(out.result == theirs, ours, code)
     rounding = jnp.finfo(start.dtype).eps ** 0.5 * (1.0 + jnp.abs(start).max())
     empty = feasible.empty() | ~(feasible.violation(start) <= rounding)
-    code = jnp.where(empty, Result.EMPTY_SET, code).astype(jnp.int32)
+    code = jnp.where(empty, Result.EMPTY_SET, code)
+    code = jnp.where(unknown, Result.NONFINITE, code).astype(jnp.int32)
     solution = Solution(
         value=out.value,
-        objective=out.stats["objective"],
+        objective=_value_at(fn, out.value, args, out.stats["objective"]),
         result=code,
         stats=Stats(
             iterations=jnp.asarray(out.stats["num_steps"], jnp.int32),

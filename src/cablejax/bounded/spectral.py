@@ -72,6 +72,7 @@ class _MemoryState(eqx.Module):
     step_size: Scalar
     values: Float[Array, " M"]
     shrunk: Int[Array, ""]
+    finite: Bool[Array, ""]  # whether all trials since the last accepted one had a value
 
 
 class NonmonotoneArmijo(optx.AbstractSearch):
@@ -91,7 +92,7 @@ class NonmonotoneArmijo(optx.AbstractSearch):
 
     def init(self, y, f_info_struct):
         values = jnp.full(self.memory, -jnp.inf, f_info_struct.f.dtype)
-        return _MemoryState(jnp.ones((), y.dtype), values, jnp.zeros((), jnp.int32))
+        return _MemoryState(jnp.ones((), y.dtype), values, jnp.zeros((), jnp.int32), jnp.array(True))
 
     def step(self, first_step, y, y_eval, f_info, f_eval_info, state):
         predicted = f_info.compute_grad_dot(y_eval - y)
@@ -103,7 +104,9 @@ class NonmonotoneArmijo(optx.AbstractSearch):
         values = jnp.where(accept, jnp.roll(state.values, 1).at[0].set(value), state.values)
         step_size = jnp.where(accept, 1.0, self.shrink * state.step_size).astype(state.step_size.dtype)
         shrunk = jnp.where(accept, 0, state.shrunk + 1)
-        return step_size, accept, optx.RESULTS.successful, _MemoryState(step_size, values, shrunk)
+        finite = jnp.isfinite(value) & (accept | state.finite)
+        state = _MemoryState(step_size, values, shrunk, finite)
+        return step_size, accept, optx.RESULTS.successful, state
 
 
 class _SpectralState(eqx.Module):
@@ -118,8 +121,9 @@ class _SpectralState(eqx.Module):
 class SpectralProjectedGradient(optx.AbstractGradientDescent):
     """Minimiser over a feasible set: gradient steps of Barzilai-Borwein length along the projection arc.
 
-    It ends where `|P(y - g) - y|_inf <= atol + rtol |y|_inf`. Every trial point costs one evaluation of the function,
-    every accepted one its gradient. All points are feasible if the first is; the best one is returned.
+    It ends where `|P(y - g) - y|_inf <= atol + rtol |y|_inf`, and returns the point where that holds; if it ends in
+    another way, the best point that it has seen. Every trial point costs one evaluation of the function, every accepted
+    one its gradient. All points are feasible if the first is.
 
     Options: `feasible`, the set.
     """
@@ -180,21 +184,29 @@ class SpectralProjectedGradient(optx.AbstractGradientDescent):
         del fn, args, options, tags
         inner = state.inner
         started = ~inner.first_step
-        optimality = inner.descent_state.optimality
-        broken = started & ~(jnp.isfinite(inner.f_info.f) & jnp.isfinite(optimality))
-        done = started & (optimality <= self.atol + self.rtol * self.norm(inner.descent_state.y))
-        stalled = inner.search_state.step_size < jnp.finfo(y.dtype).eps
-        result = optx.RESULTS.where(broken, optx.RESULTS.nonfinite, inner.result)
-        result = optx.RESULTS.where(stalled & ~done, optx.RESULTS.stagnation, result)  # pyright: ignore[reportArgumentType]
+        done = started & self._converged(inner)
+        stalled = ~done & (inner.search_state.step_size < jnp.finfo(y.dtype).eps)
+        broken = started & ~(jnp.isfinite(inner.f_info.f) & jnp.isfinite(inner.descent_state.optimality))
+        broken = broken | (stalled & ~inner.search_state.finite)
+        result = optx.RESULTS.where(stalled, optx.RESULTS.stagnation, inner.result)  # pyright: ignore[reportArgumentType]
+        result = optx.RESULTS.where(broken, optx.RESULTS.nonfinite, result)
         return done | broken | stalled, result
 
     def postprocess(self, fn, y, aux, args, options, state: Any, tags, result) -> tuple[Any, Any, dict[str, Any]]:
         del fn, y, aux, args, options, tags, result
+        inner = state.inner
+        # A lower value that was seen on the way does not meet the conditions of a minimum.
+        done = self._converged(inner)
         stats = {
-            "optimality": state.inner.descent_state.optimality,
-            "objective": state.best_value,
+            "optimality": inner.descent_state.optimality,
+            "objective": jnp.where(done, inner.f_info.f, state.best_value),
             "evaluations": state.steps,
             "linearisations": state.linearisations,
             "projections": state.steps + state.linearisations,
         }
-        return state.best, state.best_aux, stats
+        value = jnp.where(done, inner.descent_state.y, state.best)
+        return value, chosen(done, inner.aux, state.best_aux), stats
+
+    def _converged(self, inner) -> Bool[Array, ""]:
+        descent = inner.descent_state
+        return descent.optimality <= self.atol + self.rtol * self.norm(descent.y)

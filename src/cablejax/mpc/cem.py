@@ -59,4 +59,4 @@ class CrossEntropy:
         deviation = self.spread * problem.feasible.radius * jnp.ones_like(guess.motion)
         keys = jax.random.split(jax.random.key(self.seed), self.iterations)
         (best, _, _), _ = jax.lax.scan(iterate, (first, first.motion, deviation), keys)
-        return sampled_plan(best, 1 + self.samples * self.iterations)
+        return sampled_plan(problem, best, 1 + self.samples * self.iterations)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import numbers
 
 import numpy as np
 
@@ -71,8 +72,8 @@ class MPCConfig:
     solver: Solver = TrustRegion()
 
     def __post_init__(self):
-        if self.horizon < 0:
-            raise ValueError(f"MPCConfig.horizon is {self.horizon}, expected at least 0 (plan one command).")
+        if not (isinstance(self.horizon, numbers.Integral) and self.horizon >= 0):
+            raise ValueError(f"MPCConfig.horizon is {self.horizon}, expected a whole number, at least 0 (one command).")
         if not (math.isfinite(self.cable_length) and self.cable_length > 0):
             raise ValueError(f"MPCConfig.cable_length is {self.cable_length}, expected a positive length [m].")
         if not 0 <= self.min_distance < self.max_distance <= 1:

@@ -54,7 +54,7 @@ def control(
         dynamics=dynamics if residual is None else Corrected(dynamics),
         weights=weights if residual is None else (weights, residual),
         history=state.history,
-        target=jnp.asarray(target),
+        target=jnp.asarray(target, state.predicted.dtype),
         feasible=_feasible_set(config, state),
         objective=config.objective,
     )

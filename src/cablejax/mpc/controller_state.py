@@ -72,7 +72,7 @@ class ControlInfo:
         radius: trust-region size that the command was planned with [m].
         objective: value of the plan [m^2].
         objective_hold: value of holding still [m^2].
-        evaluations: iterations of the solver.
+        evaluations: rollouts that the solver spent on trial plans.
         outcome: an `Outcome`.
         residual_share: |residual's displacement| / (|model's| + |residual's|) of the command, in [0, 1].
         condition: condition number of the ridge system.

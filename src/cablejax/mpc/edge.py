@@ -9,12 +9,12 @@ from cablejax.types import History
 
 
 def check_target(target: Float[Array | np.ndarray, "N 2"]) -> None:
-    """Raises ValueError unless the target is an array of finite keypoints [N, 2]."""
+    """Raises ValueError unless the target is an array of finite keypoints [N, 2], N at least 3: fewer have no shape."""
     target = np.asarray(target)
-    if target.ndim != 2 or target.shape[1] != 2 or not np.isfinite(target).all():
+    if target.ndim != 2 or target.shape[0] < 3 or target.shape[1] != 2 or not np.isfinite(target).all():
         raise ValueError(
             f"The target has shape {target.shape}{'' if np.isfinite(target).all() else ' with non-finite values'}, "
-            "expected finite keypoints [N, 2] in metres."
+            "expected finite keypoints [N, 2] in metres, three or more."
         )
 
 

@@ -53,7 +53,8 @@ def plan_or_restart(
     # half as many steps again as the way is long: the bounds on the grippers' distance may lead it round
     needed = jnp.ceil(1.5 * straight.length / radius).astype(jnp.int32)
     left = jnp.where(state.restarting > 0, state.restarting - 1, jnp.where(stuck, needed, 0))
-    left = jnp.where((straight.length > radius) & (plan.outcome != Outcome.NONFINITE), left, 0)
+    sound = (plan.outcome != Outcome.NONFINITE) & (plan.outcome != Outcome.INFEASIBLE)
+    left = jnp.where((straight.length > radius) & sound, left, 0)
     restarting = left > 0
     state = dataclasses.replace(
         state,

@@ -31,15 +31,18 @@ __all__ = ["FeasibleSet", "feasible_from", "project_ball"]
 _MARGIN_ULP = 16
 # Grippers that start outside come back at this share of the fastest way, so that there is room for other aims.
 _RETURN_SPEED = 0.9
+# Room, relative to the bound on a step, for the first motion after one that was faster than is allowed now.
+_CHANGE_ROOM = 0.02
 
 
 class FeasibleSet(AbstractSet):
     """Motions of two grippers within all their bounds. Those that are None are not there, and cost nothing.
 
     The set is convex but for the least distance, whose bound leaves out a disc: `at` has a half-plane of relative
-    positions instead, which touches the disc on the side where the grippers are. It is never empty for distances and a
-    workspace in order: grippers that start outside have a bound that closes in on them as they can follow. A bound on
-    the change may contradict the others (it takes a way to stop), which `violation` of a projected plan tells.
+    positions instead, which touches the disc on the side where the grippers are. Grippers that start outside have a
+    bound that closes in on them as they can follow, so that distances or a workspace alone never leave the set empty.
+    Together, outside both, they may contradict each other, and so may a bound on the change (it takes a way to stop):
+    `violation` of a projected plan tells.
 
     Attributes:
         separation: position of gripper 1 relative to gripper 0 at the plan's start [m], shape [2].
@@ -100,7 +103,10 @@ class FeasibleSet(AbstractSet):
         return _nearest_plan(self, y)
 
     def restore(self, y: Float[Array, "T 2 3"]) -> Float[Array, "T 2 3"]:
-        """A plan that keeps every bound but that on the change, cheaply: see `keep_each_step`."""
+        """A plan that keeps every bound but that on the change, cheaply, where the grippers start inside them.
+
+        From outside it comes near the bounds that close in, no more: see `keep_each_step`.
+        """
         tight = 1.0 - _MARGIN_ULP * jnp.finfo(y.dtype).eps
         corners = None
         if self.workspace is not None:
@@ -203,7 +209,8 @@ class FeasibleSet(AbstractSet):
     def _change_bounds(self, n_steps: int) -> Float[Array, "T 2"]:
         """Bound on each change; the first is wider where the last command was faster than is allowed now."""
         excess = jnp.linalg.norm(self.previous, axis=-1) - self.radius  # pyright: ignore[reportArgumentType]
-        return jnp.broadcast_to(self.change, (n_steps, 2)).at[0].max(excess)  # pyright: ignore[reportArgumentType]
+        wider = excess + _CHANGE_ROOM * self.radius
+        return jnp.broadcast_to(self.change, (n_steps, 2)).at[0].max(wider)  # pyright: ignore[reportArgumentType]
 
     def _change_balls(self, n_steps: int, dtype) -> AffineBalls:
         difference = np.kron(np.eye(n_steps) - np.eye(n_steps, k=-1), np.eye(6)).reshape(2 * n_steps, 3, 6 * n_steps)

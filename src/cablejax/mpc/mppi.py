@@ -57,4 +57,4 @@ class PathIntegral:
         (best, mean), _ = jax.lax.scan(iterate, (first, first.motion), keys)
         last = first_plan(problem, problem.start(mean))
         best = jax.tree.map(lambda a, b: jnp.where(last.value < best.value, a, b), last, best)
-        return sampled_plan(best, 2 + self.samples * self.iterations)
+        return sampled_plan(problem, best, 2 + self.samples * self.iterations)

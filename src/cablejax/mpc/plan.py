@@ -30,7 +30,7 @@ class Outcome(enum.IntEnum):
     NONFINITE = 3
     """The model or the observation gave NaN or infinity: the grippers hold."""
     RESTARTING = 4
-    """No plan was better than holding, far from where the target's ends are held: the grippers go there."""
+    """The error stayed where it is, as in another shape between the same grippers: the cable is straightened first."""
     INFEASIBLE = 5
     """The bounds contradict each other: there is no feasible plan, and the grippers hold."""
     STALLED = 6

@@ -24,7 +24,7 @@ class ProjectedGradient:
         initial_step: a before the first curvature is known. The objective's Hessian is near 1 per step of the horizon
             that a motion is felt in, and up to about 17 for the six-step sum, hence 0.1.
         memory: a trial is compared with the worst of this many last accepted values (Grippo, Lampariello, Lucidi
-            1986); 1 makes every accepted step a descent. The best plan is returned in any case.
+            1986); 1 makes every accepted step a descent.
     """
 
     max_evaluations: int = 12

@@ -6,10 +6,11 @@ import math
 
 
 def check_budget(settings: object, *names: str) -> None:
-    """Raises ValueError unless these settings of a solver are at least one."""
-    if any(getattr(settings, name) < 1 for name in names):
-        given = ", ".join(f"{name}={getattr(settings, name)}" for name in names)
-        raise ValueError(f"{type(settings).__name__}({given}): expected at least one of each.")
+    """Raises ValueError unless these settings of a solver are whole numbers, at least one."""
+    values = [getattr(settings, name) for name in names]
+    if not all(isinstance(value, int) and value >= 1 for value in values):
+        given = ", ".join(f"{name}={value}" for name, value in zip(names, values, strict=True))
+        raise ValueError(f"{type(settings).__name__}({given}): expected whole numbers, at least one of each.")
 
 
 def check_positive(settings: object, *names: str) -> None:

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import numbers
 
 import jax
 import jax.numpy as jnp
@@ -51,8 +52,8 @@ class RidgeConfig:
     outlier: float = math.inf
 
     def __post_init__(self):
-        if self.window < 1:
-            raise ValueError(f"RidgeConfig.window is {self.window}, expected at least one sample.")
+        if not (isinstance(self.window, numbers.Integral) and self.window >= 1):
+            raise ValueError(f"RidgeConfig.window is {self.window}, expected a whole number of samples, at least 1.")
         for name in ("regularisation", "motion_scale", "rotation_weight", "bias_scale"):
             value = getattr(self, name)
             if not (math.isfinite(value) and value > 0):
@@ -98,7 +99,7 @@ def fit(
     (by age and by size, 0 where a sample is not valid). The minimiser is `C = (A' S^2 A + lambda I)^-1 A' S^2 dX`. (The
     paper prints it with regressors and targets swapped.) It is computed in its dual form,
     `C = (S A)' (S A A' S + lambda I)^-1 S dX`: the same C, from a W x W system (5 x 5) instead of one of 7 x 7, whose
-    smallest eigenvalue is never below that of the primal, so that it is never worse conditioned. All columns of one
+    smallest eigenvalue, with no more samples than inputs, is never below that of the primal. All columns of one
     keypoint share a system; keypoints have their own because each may have been unobserved at other instants.
 
     Differentiable in `delta` and `twist` (the reported condition number is not).
@@ -123,7 +124,7 @@ def fit(
     delta = jnp.where(valid[..., None], delta, 0.0)
     twist = jnp.where(valid.any(axis=1)[:, None, None], twist, 0.0)
 
-    units = _units(twist.shape[1], config)
+    units = _units(twist.shape[1], config).astype(twist.dtype)
     regressors = twist.reshape(window, -1) / units
     if config.bias:
         regressors = jnp.concatenate([regressors, jnp.full((window, 1), config.bias_scale, regressors.dtype)], axis=1)
@@ -131,7 +132,7 @@ def fit(
     size = jnp.sum(delta**2, axis=(1, 2)) / jnp.maximum(jnp.sum(valid, axis=1), 1)
     # the root of Geman and McClure's weight
     belief = 1.0 / (1.0 + size / config.outlier**2)
-    root_weight = valid * (belief * jnp.sqrt(config.forgetting**age))[:, None]
+    root_weight = valid * (belief * jnp.sqrt(config.forgetting**age))[:, None].astype(delta.dtype)
 
     coefficients = jax.vmap(_dual_ridge, in_axes=(None, 1, 1, None), out_axes=1)(
         regressors, delta, root_weight, config.regularisation
@@ -166,13 +167,13 @@ def _dual_ridge(
 ) -> Float[Array, "R 2"]:
     """Weighted ridge coefficients by the W x W dual system."""
     weighted = root_weight[:, None] * regressors
-    gram = weighted @ weighted.T + regularisation * jnp.eye(regressors.shape[0])
+    gram = weighted @ weighted.T + regularisation * jnp.eye(regressors.shape[0], dtype=regressors.dtype)
     factor = jax.scipy.linalg.cho_factor(gram)
     return weighted.T @ jax.scipy.linalg.cho_solve(factor, root_weight[:, None] * target)
 
 
 def _condition(weighted: Float[Array, "W R"], regularisation: float) -> Float[Array, ""]:
     """Condition number of the regularised dual Gram matrix."""
-    gram = weighted @ weighted.T + regularisation * jnp.eye(weighted.shape[0])
+    gram = weighted @ weighted.T + regularisation * jnp.eye(weighted.shape[0], dtype=weighted.dtype)
     eigenvalues = jnp.linalg.eigvalsh(gram)
     return eigenvalues[-1] / eigenvalues[0]
