@@ -66,9 +66,14 @@ def test_pretraining_repeats_to_the_bit_and_training_goes_on_from_it(pretrained,
 def test_features_are_those_of_the_graphs_row_by_row():
     config = dataclasses.replace(SMALL, normalisation=fit_normalisation(DATA, SMALL))
     windows = draw_windows(jax.random.key(0), DATA, batch=3, history=3, steps=1)
-    nodes, edges = features(windows, config)
     last = jax.tree.map(lambda x: x[2], windows)
-    graph = build_graph(last.history, last.twist[0], prior_of(last.history, last.twist[0], config), config)
+
+    @jax.jit
+    def of_both(windows, last):
+        graph = build_graph(last.history, last.twist[0], prior_of(last.history, last.twist[0], config), config)
+        return features(windows, config), graph
+
+    (nodes, edges), graph = of_both(windows, last)
     np.testing.assert_allclose(nodes[-config.n_keypoints :], graph.nodes, rtol=1e-4, atol=1e-4)
     np.testing.assert_allclose(edges[-len(graph.senders) :], graph.edges, rtol=1e-4, atol=1e-4)
     pair = AutoEncoders(GNS(config, nnx.Rngs(0)), nnx.Rngs(1))

@@ -1,5 +1,6 @@
 """What the bounded least squares solvers share: one linearisation, one model, one trial point after the other."""
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any
 
@@ -169,19 +170,18 @@ class AbstractBoundedLeastSquares(optx.AbstractLeastSquaresSolver):
         met = jnp.isfinite(value) & ((accept & ~rounded) | state.finite)
         broken = ~finite | (stalled & ~met)
         result = optx.RESULTS.where(broken, optx.RESULTS.nonfinite, result)  # pyright: ignore[reportArgumentType]
-        state = eqx.tree_at(
-            lambda s: (
-                *(s.search_state, s.step_size, s.stale, s.rounded, s.finite, s.terminate, s.result),
-                *(s.evaluations, s.objective, s.aux),
-            ),
+        state = dataclasses.replace(
             state,
-            (
-                *(search_state, step_size.astype(y.dtype), accept, jnp.where(exact, rounded, state.rounded), met),
-                *(ended | stalled, result),
-                *(state.evaluations + jnp.where(ended, 0, 1), jnp.where(accept, value, info.f)),
-                chosen(accept, aux, state.aux),
-            ),
-            is_leaf=lambda x: x is None,
+            search_state=search_state,
+            step_size=step_size.astype(y.dtype),
+            stale=accept,
+            rounded=jnp.where(exact, rounded, state.rounded),
+            finite=met,
+            terminate=ended | stalled,
+            result=result,
+            evaluations=state.evaluations + jnp.where(ended, 0, 1),
+            objective=jnp.where(accept, value, info.f),
+            aux=chosen(accept, aux, state.aux),
         )
         y = jnp.where(accept, trial, y)
         return y, state if self.trials_per_linearisation == 1 else self._updated(feasible, y, move, residual, state)
@@ -203,19 +203,17 @@ class AbstractBoundedLeastSquares(optx.AbstractLeastSquaresSolver):
             secant = jnp.where(state.linearisations > 0, secant_update(secant, moved, bent, slope), secant)
             learned = jnp.where(telling, secant, 0.0)
         info = quadratic_info(value_of(residual), gradient, jacobian.T @ jacobian + learned)
-        optimality = projected_gradient_size(feasible, y, gradient)
-        return eqx.tree_at(
-            lambda s: (
-                *(s.f_info, s.residual, s.jacobian, s.secant, s.last),
-                *(s.descent_state, s.optimality, s.linearisations, s.updates),
-            ),
+        return dataclasses.replace(
             state,
-            (
-                *(info, residual, jacobian, secant, _Linearisation(y, residual, jacobian)),
-                *(self.descent.within(feasible, y).query(y.ravel(), info, state.descent_state), optimality),
-                state.linearisations + 1,
-                jnp.zeros_like(state.updates),
-            ),
+            f_info=info,
+            residual=residual,
+            jacobian=jacobian,
+            secant=secant,
+            last=_Linearisation(y, residual, jacobian),
+            descent_state=self.descent.within(feasible, y).query(y.ravel(), info, state.descent_state),
+            optimality=projected_gradient_size(feasible, y, gradient),
+            linearisations=state.linearisations + 1,
+            updates=jnp.zeros_like(state.updates),
         )
 
     def _updated(self, feasible, y, move, residual, state: _State) -> _State:
@@ -230,8 +228,12 @@ class AbstractBoundedLeastSquares(optx.AbstractLeastSquaresSolver):
         learned = state.f_info.hessian.as_matrix() - state.jacobian.T @ state.jacobian
         info = quadratic_info(value_of(residual), jacobian.T @ residual, jacobian.T @ jacobian + learned)
         descent = self.descent.within(feasible.at(y), y).query(y.ravel(), info, state.descent_state)
-        return eqx.tree_at(
-            lambda s: (s.f_info, s.residual, s.jacobian, s.descent_state, s.updates, s.stale),
+        return dataclasses.replace(
             state,
-            (info, residual, jacobian, descent, state.updates + 1, jnp.array(True)),
+            f_info=info,
+            residual=residual,
+            jacobian=jacobian,
+            descent_state=descent,
+            updates=state.updates + 1,
+            stale=jnp.array(True),
         )

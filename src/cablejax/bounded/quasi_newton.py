@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any
 
@@ -130,15 +131,16 @@ class BoundedQuasiNewton(optx.AbstractMinimiser):
             jnp.where(first, begun, learned),
         )
         broken = first & ~finite
-        state = eqx.tree_at(
-            lambda s: (s.f_info, s.search_state, s.step_size, s.evaluations, s.finite, s.terminate, s.result, s.aux),
+        state = dataclasses.replace(
             state,
-            (
-                *(info, search_state, step_size, state.evaluations + 1, met, broken),
-                optx.RESULTS.where(broken, optx.RESULTS.nonfinite, state.result),
-                chosen(accept | first, aux, state.aux),
-            ),
-            is_leaf=lambda x: x is None,
+            f_info=info,
+            aux=chosen(accept | first, aux, state.aux),
+            search_state=search_state,
+            step_size=step_size,
+            finite=met,
+            terminate=broken,
+            result=optx.RESULTS.where(broken, optx.RESULTS.nonfinite, state.result),
+            evaluations=state.evaluations + 1,
         )
         return jnp.where(accept, state.trial, y), state
 
@@ -159,10 +161,14 @@ class BoundedQuasiNewton(optx.AbstractMinimiser):
         stalled = state.rounded & rounded & ~converged & ~state.terminate
         result = optx.RESULTS.where(stalled, optx.RESULTS.stagnation, state.result)  # pyright: ignore[reportArgumentType]
         result = optx.RESULTS.where(stalled & ~state.finite, optx.RESULTS.nonfinite, result)  # pyright: ignore[reportArgumentType]
-        return eqx.tree_at(
-            lambda s: (s.trial, s.descent_state, s.optimality, s.rounded, s.terminate, s.result),
+        return dataclasses.replace(
             state,
-            (trial, descent_state, optimality, rounded, state.terminate | converged | stalled, result),
+            trial=trial,
+            descent_state=descent_state,
+            optimality=optimality,
+            rounded=rounded,
+            terminate=state.terminate | converged | stalled,
+            result=result,
         )
 
     def terminate(self, fn, y, args, options, state: _State, tags):
