@@ -220,6 +220,8 @@ def run_all(problems: list[BoundedProblem], path: Path, solvers: tuple[str, ...]
                 runs.append(Run(**done[key]))
         failed = [run.solver for run in runs if run.problem == problem.name and not run.solved]
         print(f"{index} of {len(problems)} {problem.name}: {', '.join(failed) or 'all'}", file=sys.stderr, flush=True)
+        # no problem shares a program with another one, and all of them are more than LLVM's memory for code holds
+        jax.clear_caches()
     return runs
 
 
