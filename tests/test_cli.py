@@ -2,7 +2,6 @@
 
 import json
 import os
-import pathlib
 import signal
 import subprocess
 import sys
@@ -136,12 +135,3 @@ def test_bench_simulate_relates_the_engines(capsys):
 def test_text_table_lines_up():
     text = options.text_table(["shape", "error"], [["U", "0.5"], ["long name", "12.25"]])
     assert text.splitlines()[1:] == ["---------  -----", "U            0.5", "long name  12.25"]
-
-
-def test_json_is_written_whole(tmp_path: pathlib.Path):
-    options.write_json(tmp_path / "a.json", {"x": 1.5})
-    assert json.loads((tmp_path / "a.json").read_text()) == {"x": 1.5}
-    assert [path.name for path in tmp_path.iterdir()] == ["a.json"]
-    with pytest.raises(ValueError, match="JSON"):
-        options.write_json(tmp_path / "b.json", {"x": float("nan")})
-    assert not (tmp_path / "b.json").exists()

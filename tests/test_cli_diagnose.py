@@ -102,7 +102,7 @@ def test_missing_file_is_refused(tmp_path, capsys):
 def test_other_file_is_refused(tmp_path, capsys):
     other = tmp_path / "other.npz"
     np.savez(other, something=np.zeros(3))
-    assert "has no field 'time'" in refused([other, "--out", tmp_path / "report"], capsys)
+    assert "lacks time" in refused([other, "--out", tmp_path / "report"], capsys)
     text = tmp_path / "notes.txt"
     text.write_text("not a log")
     assert "is no .npz archive" in refused([text, "--out", tmp_path / "report"], capsys)

@@ -9,9 +9,10 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from cablejax.closed_loop import ClosedLoopRun
-from cablejax.commands.options import UsageError, output_folder, say, write_json
+from cablejax.commands.options import UsageError, output_folder, say
 from cablejax.commands.parts import Parts
 from cablejax.commands.results import summarise, write_results
+from cablejax.json_file import write_json
 from cablejax.perceive.camera import CameraConfig
 from cablejax.report.record import Method
 from cablejax.report.style import METHOD_LABEL

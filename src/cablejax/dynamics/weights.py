@@ -145,7 +145,7 @@ def _open(source: str | os.PathLike[str]) -> tuple[Path, dict[str, Any]]:
         with safe_open(path, framework="numpy") as file:
             metadata = file.metadata() or {}
         content = json.loads(metadata.get(_KEY, "null"))
-    except (SafetensorError, OSError, ValueError) as error:
+    except (SafetensorError, OSError, ValueError, RecursionError) as error:
         raise WeightsError(f"{path} is no safetensors file, or a damaged one ({error}).") from error
     schema = content.get("schema") if isinstance(content, dict) else None
     if not isinstance(content, dict) or schema != SCHEMA or not {"config", "info"} <= content.keys():

@@ -9,12 +9,12 @@ from __future__ import annotations
 import dataclasses
 import os
 import pathlib
-import zipfile
 
 import numpy as np
 from jaxtyping import Float
 
 from cablejax.gaplog import Episode, gap_log_from_episodes
+from cablejax.npz import read_npz
 from cablejax.recordings.poses import poses_from_markers
 from cablejax.recordings.units import require_metres
 from cablejax.simulate.config import CableConfig
@@ -51,13 +51,7 @@ def read_wires(path: str | os.PathLike[str]) -> tuple[HangingWire, ...]:
         ValueError: there is no such file, or something in it is missing, not finite or does not fit together.
     """
     path = pathlib.Path(path)
-    try:
-        with np.load(path, allow_pickle=False) as archive:
-            arrays = {name: archive[name] for name in archive.files}
-    except (OSError, ValueError, AttributeError, zipfile.BadZipFile) as error:
-        raise ValueError(f"{path} is not an .npz file of plain arrays: {error}") from None
-    if missing := set(_FIELDS) - set(arrays):
-        raise ValueError(f"{path} lacks {', '.join(sorted(missing))}; it has {', '.join(sorted(arrays))}.")
+    arrays = read_npz(path, _FIELDS)
     points = arrays["keypoints"]
     count = points.shape[:2]
     shapes = {"wire": count[:1], "length_m": (), "mass_per_length_kg_m": count[:1], "EI_published_Nm2": count}
