@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from cablejax.cli import main
+from cablejax.commands import diagnose
 from cablejax.gaplog import write_gap_log
 from diagnose_cases import record
 
@@ -79,6 +80,23 @@ def test_script_gets_json_and_replaces_a_report_when_told(log, tmp_path, capsys)
     assert summary["verdict"] == "named" and pathlib.Path(summary["report"]).is_file()
     assert json.loads((tmp_path / "verdict.json").read_text())["verdict"] == "named"
     assert "screening 3 effects" in told.err, "progress goes to stderr"
+
+
+def test_goes_on_after_ctrl_c_with_half_a_report(log, tmp_path, capsys, monkeypatch):
+    def half_written(log, folder, *, state, **_):
+        (folder / "verdict.json").write_text("{}")
+        state.write_text("{}")
+        raise KeyboardInterrupt
+
+    arguments = ["diagnose", str(log), "--out", str(tmp_path), *ONLY]
+    with monkeypatch.context() as patch:
+        patch.setattr(diagnose, "diagnose_and_report", half_written)
+        assert main(arguments) == 130
+        assert "Run the same command again" in capsys.readouterr().err
+        assert main(arguments) == 130, "it begins anew"
+        assert main([*arguments[:-1]]) == 2, "another diagnosis is not mixed with it"
+    assert "is not empty" in capsys.readouterr().err
+    assert (tmp_path / "parts" / "state.json").exists()
 
 
 def refused(arguments, capsys) -> str:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 import pathlib
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from cablejax.commands.options import Command, UsageError, output_folder, say
+from cablejax.commands.options import Command, UsageError, say
 
 if TYPE_CHECKING:
     from cablejax.diagnose import Diagnosis, Effect
@@ -39,6 +40,7 @@ class Diagnose(Command):
     """Replace a report that is there."""
 
     def execute(self):
+        from cablejax.commands.parts import unfinished
         from cablejax.diagnose import LIBRARY, verdict_json
         from cablejax.diagnose.actuation import ARMS
         from cablejax.gaplog import read_gap_log
@@ -51,9 +53,15 @@ class Diagnose(Command):
                 raise UsageError(f"--only names the effect {name!r}, expected some of {', '.join(known)}.")
         log = read_gap_log(self.log)
         commissioning = [read_gap_log(path) for path in self.commissioning]
-        folder = output_folder(self.out, overwrite=self.overwrite)
         effects = [known[name] for name in self.only] or LIBRARY
-        result, page = diagnose_and_report(log, folder, effects=effects, commissioning=commissioning)
+        settings = {
+            "diagnosis": [hashlib.sha256(path.read_bytes()).hexdigest() for path in (self.log, *self.commissioning)],
+            "only": self.only,
+        }
+        with unfinished(self.out, settings, overwrite=self.overwrite) as parts:
+            result, page = diagnose_and_report(
+                log, self.out, effects=effects, commissioning=commissioning, state=parts.state
+            )
         return {**verdict_json(result), "report": str(page)}, f"{result.verdict}: {result.sentence}\n{page}"
 
 
@@ -63,8 +71,16 @@ def diagnose_and_report(
     *,
     effects: Sequence[Effect] | None = None,
     commissioning: Sequence[GapLog] = (),
+    state: pathlib.Path | None = None,
 ) -> tuple[Diagnosis, pathlib.Path]:
     """Diagnoses a log, tells how it goes, and writes verdict.json, report.html and the figures into an existing folder.
+
+    Args:
+        log: in the plane or in space.
+        folder: that exists.
+        effects: to look for; by default all.
+        commissioning: logs known to have no effect.
+        state: file from which an interrupted diagnosis in space goes on.
 
     Returns:
         The diagnosis and its page.
@@ -78,12 +94,8 @@ def diagnose_and_report(
         names = None
         if effects is not None and len(effects) < len(LIBRARY):
             names = [effect.name for effect in effects]
-        # beside the folder, which must be empty to begin with
-        state = folder.parent / f".{folder.name}.json"
         spatial = diagnose_space(log, only=names, state=state, progress=say)
-        page = write_diagnosis_page(spatial, folder)
-        state.unlink(missing_ok=True)
-        return spatial, page
+        return spatial, write_diagnosis_page(spatial, folder)
     result = diagnose(
         log,
         effects=LIBRARY if effects is None else effects,

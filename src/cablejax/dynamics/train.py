@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import hashlib
 import json
 import signal
 import threading
@@ -30,6 +29,7 @@ from cablejax.dataset.windows import Window, draw_windows
 from cablejax.dynamics.checkpoint import Checkpoints
 from cablejax.dynamics.config import ModelConfig
 from cablejax.dynamics.evaluate import HORIZONS, evaluation_windows, make_errors
+from cablejax.dynamics.fingerprint import fingerprint
 from cablejax.dynamics.loss import random_walk_noise, rollout_loss
 from cablejax.dynamics.metrics import MetricsLog
 from cablejax.dynamics.model import bind, make_network
@@ -113,7 +113,7 @@ def train(
     config = dataclasses.replace(config, model=model_config)
     out_dir = Path(out_dir)
     claim_folder(
-        out_dir, {"config": dataclasses.asdict(config), "data": fingerprint(data, initial and initial[1])}, resume
+        out_dir, {"config": dataclasses.asdict(config), "data": fingerprint((data, initial and initial[1]))}, resume
     )
 
     graphdef, weights = nnx.split(make_network(model_config, nnx.Rngs(config.seed)))
@@ -222,16 +222,6 @@ class Validation:
     def __call__(self, weights: nnx.State) -> dict[int, float]:
         error = np.asarray(self.errors((weights,), self.windows), np.float64)
         return {h: float(100 * np.median(error[:, h - 1])) for h in self.horizons}
-
-
-def fingerprint(data: Trajectory, initial: nnx.State | None) -> str:
-    """Hash of the arrays that a training starts from."""
-    digest = hashlib.blake2b(digest_size=16)
-    for leaf in jax.tree.leaves((data, initial)):
-        array = np.ascontiguousarray(leaf)
-        digest.update(f"{array.dtype}{array.shape}".encode())
-        digest.update(array.data)
-    return digest.hexdigest()
 
 
 def claim_folder(out_dir: Path, run: dict[str, Any], resume: bool) -> None:
