@@ -6,6 +6,7 @@ import pathlib
 import numpy as np
 import pytest
 
+import spatial_cases
 from cablejax.cli import main
 from cablejax.commands import diagnose
 from cablejax.gaplog import write_gap_log
@@ -110,6 +111,36 @@ def test_unknown_effect_is_refused_with_the_known_ones(log, tmp_path, capsys):
     said = refused([log, "--out", tmp_path / "report", "--only", "gremlins"], capsys)
     assert "'gremlins'" in said and "bending_stiffness" in said
     assert not (tmp_path / "report").exists()
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--only", "obstacle"], "'obstacle'"),
+        (["--only", "viscous_drag", "actuation_lag"], "'actuation_lag'"),
+        (["--commissioning", "LOG"], "leave it out"),
+    ],
+    ids=["effect", "arms", "commissioning"],
+)
+def test_a_log_in_space_is_not_asked_for_what_only_the_plane_has(options, message, tmp_path, capsys):
+    path = write_gap_log(tmp_path / "space.npz", spatial_cases.recording())
+    options = [path if option == "LOG" else option for option in options]
+    said = refused([path, "--out", tmp_path / "report", *options], capsys)
+    assert message in said and "in space" in said
+    assert not (tmp_path / "report").exists()
+
+
+def test_a_log_in_space_is_searched_for_the_effects_of_space(tmp_path, monkeypatch):
+    path, asked = write_gap_log(tmp_path / "space.npz", spatial_cases.recording()), []
+
+    def stopped(log, *, only, **_):
+        asked.append(only)
+        raise ValueError("enough")
+
+    monkeypatch.setattr("cablejax.spatial.diagnose.diagnose_space", stopped)
+    assert main(["diagnose", str(path), "--out", str(tmp_path / "a"), "--only", "quadratic_drag"]) == 2
+    assert main(["diagnose", str(path), "--out", str(tmp_path / "b")]) == 2
+    assert asked == [("quadratic_drag",), None]
 
 
 def test_missing_file_is_refused(tmp_path, capsys):

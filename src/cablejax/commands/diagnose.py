@@ -13,7 +13,7 @@ import tyro
 from cablejax.commands.options import Command, UsageError, say
 
 if TYPE_CHECKING:
-    from cablejax.diagnose import Diagnosis, Effect
+    from cablejax.diagnose import Diagnosis
     from cablejax.types import GapLog
 
 
@@ -31,45 +31,71 @@ class Diagnose(Command):
     """Folder of the report."""
 
     commissioning: tuple[pathlib.Path, ...] = ()
-    """Logs known to have no effect, of the same set-up: they tell the simulator's own error from the gap."""
+    """Logs known to have no effect, of the same set-up: they tell the simulator's own error from the gap. For logs in
+    the plane."""
 
     only: tuple[str, ...] = ()
-    """Names of the effects to look for; by default all."""
+    """Names of the effects to look for; by default all; in space all but intrinsic_curvature, which takes four times as
+    long as the others together."""
 
     overwrite: bool = False
     """Replace a report that is there."""
 
     def execute(self):
         from cablejax.commands.parts import unfinished
-        from cablejax.diagnose import LIBRARY, verdict_json
-        from cablejax.diagnose.actuation import ARMS
+        from cablejax.diagnose import verdict_json
         from cablejax.gaplog import read_gap_log
 
-        known = {effect.name: effect for effect in LIBRARY}
-        for name in self.only:
-            if name in ARMS:
-                raise UsageError(f"--only names {name!r}, which is looked for in any case: leave it out.")
-            if name not in known:
-                raise UsageError(f"--only names the effect {name!r}, expected some of {', '.join(known)}.")
         log = read_gap_log(self.log)
+        if _in_space(log):
+            self._check_space()
+        else:
+            self._check_plane()
         commissioning = [read_gap_log(path) for path in self.commissioning]
-        effects = [known[name] for name in self.only] or LIBRARY
         settings = {
             "diagnosis": [hashlib.sha256(path.read_bytes()).hexdigest() for path in (self.log, *self.commissioning)],
             "only": self.only,
         }
         with unfinished(self.out, settings, overwrite=self.overwrite) as parts:
             result, page = diagnose_and_report(
-                log, self.out, effects=effects, commissioning=commissioning, state=parts.state
+                log, self.out, only=self.only, commissioning=commissioning, state=parts.state
             )
         return {**verdict_json(result), "report": str(page)}, f"{result.verdict}: {result.sentence}\n{page}"
+
+    def _check_plane(self) -> None:
+        """Refuses names of effects that the plane has none of."""
+        from cablejax.diagnose import LIBRARY
+        from cablejax.diagnose.actuation import ARMS
+
+        known = [effect.name for effect in LIBRARY]
+        for name in self.only:
+            if name in ARMS:
+                raise UsageError(f"--only names {name!r}, which is looked for in any case: leave it out.")
+            if name not in known:
+                raise UsageError(f"--only names the effect {name!r}, expected some of {', '.join(known)}.")
+
+    def _check_space(self) -> None:
+        """Refuses what a log in space cannot be diagnosed with."""
+        from cablejax.spatial.effects import effect_names
+
+        for name in self.only:
+            if name not in effect_names():
+                raise UsageError(
+                    f"--only names the effect {name!r}, but {self.log} is a log in space, which is searched for "
+                    f"{', '.join(effect_names())}: name some of these."
+                )
+        if self.commissioning:
+            raise UsageError(
+                f"--commissioning is given, but {self.log} is a log in space, where the gap is judged by recordings "
+                "that no fit has seen and commissioning logs are not used: leave it out."
+            )
 
 
 def diagnose_and_report(
     log: GapLog,
     folder: pathlib.Path,
     *,
-    effects: Sequence[Effect] | None = None,
+    only: Sequence[str] = (),
     commissioning: Sequence[GapLog] = (),
     state: pathlib.Path | None = None,
 ) -> tuple[Diagnosis, pathlib.Path]:
@@ -78,8 +104,8 @@ def diagnose_and_report(
     Args:
         log: in the plane or in space.
         folder: that exists.
-        effects: to look for; by default all.
-        commissioning: logs known to have no effect.
+        only: names of the effects to look for; by default all.
+        commissioning: logs known to have no effect; none for a log in space.
         state: file from which an interrupted diagnosis in space goes on.
 
     Returns:
@@ -88,19 +114,20 @@ def diagnose_and_report(
     from cablejax.diagnose import LIBRARY, diagnose, write_verdict
     from cablejax.report.diagnosis_page import write_diagnosis_page
 
-    if log.keypoints.shape[-1] == 3:
+    if _in_space(log):
         from cablejax.spatial.diagnose import diagnose_space
 
-        names = None
-        if effects is not None and len(effects) < len(LIBRARY):
-            names = [effect.name for effect in effects]
-        spatial = diagnose_space(log, only=names, state=state, progress=say)
+        spatial = diagnose_space(log, only=only or None, state=state, progress=say)
         return spatial, write_diagnosis_page(spatial, folder)
     result = diagnose(
         log,
-        effects=LIBRARY if effects is None else effects,
+        effects=[effect for effect in LIBRARY if effect.name in only] or LIBRARY,
         commissioning=commissioning,
         progress=lambda text: say(f"{text} ..."),
     )
     write_verdict(folder / "verdict.json", result)
     return result, write_diagnosis_page(result, folder)
+
+
+def _in_space(log: GapLog) -> bool:
+    return log.keypoints.shape[-1] == 3
