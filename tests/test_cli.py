@@ -52,6 +52,13 @@ def test_help_is_fast_because_it_loads_neither_jax_nor_mujoco():
     [
         (["simulate", "--trajectories", "0"], "n_trajectories is 0"),
         (["simulate", "--links", "1"], "n_links is 1"),
+        (["simulate", "--links", "3"], "n_links 3, expected at least 5"),
+        (["simulate", "--links", "4"], "n_links 4, expected at least 5"),
+        (["simulate", "--max-amplification", "0"], "max_amplification is 0"),
+        (["simulate", "--max-amplification", "-1"], "max_amplification is -1"),
+        (["simulate", "--max-amplification", "nan"], "max_amplification is nan"),
+        (["train", "--steps", "0"], "--steps is 0"),
+        (["train", "--steps", "-1"], "--steps is -1"),
         (["simulate", "--stiffness", "-1"], "bending_stiffness is -1"),
         (["simulate", "--seed", "-1"], "--seed is -1"),
         (["train", "--data", "nowhere.zarr"], "holds no data set"),
