@@ -87,6 +87,7 @@ def read_deform(path: str | os.PathLike[str]) -> DeformRecordings:
 
     Raises:
         ValueError: there is nothing of the kind, a pickle holds anything but arrays of numbers, or shapes do not fit.
+        FileNotFoundError: there is no such file.
     """
     path = pathlib.Path(path)
     if path.is_dir():
