@@ -1,5 +1,6 @@
 """The command line as a person or a script meets it."""
 
+import importlib.metadata
 import json
 import os
 import signal
@@ -26,6 +27,11 @@ def test_help_names_every_command(capsys):
     text = help_of([], capsys)
     for command in ("demo", "simulate", "train", "shape", "bench"):
         assert command in text
+
+
+def test_version_is_that_of_the_package(capsys):
+    assert main(["--version"]) == 0
+    assert capsys.readouterr().out == f"cablejax {importlib.metadata.version('cablejax')}\n"
 
 
 @pytest.mark.parametrize("command", [c for c in SUBCOMMANDS if c != ["bench"]], ids=" ".join)

@@ -130,10 +130,12 @@ def test_shape_goes_on_after_ctrl_c_between_its_results(made, weights, tmp_path,
     with monkeypatch.context() as patch:
         patch.setattr("cablejax.commands.results.write_page", interrupted)
         assert main(arguments) == 130
-    assert "Run the same command again" in capsys.readouterr().err
+    told = capsys.readouterr().err
+    assert told.startswith("compiling the control step ...\n") and "Run the same command again" in told
     assert (tmp_path / "log.npz").exists() and not (tmp_path / "summary.json").exists()
     assert main(arguments) == 0
     assert made == ["residual", "direct"], "no run was repeated"
+    assert "compiling" not in capsys.readouterr().err
     assert {file.name for file in tmp_path.iterdir()} == {"demo.gif", "log.npz", "report.html", "summary.json"}
     assert main(arguments) == 2, "the command has ended"
 

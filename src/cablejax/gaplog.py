@@ -9,7 +9,6 @@ import dataclasses
 import json
 import os
 import pathlib
-import tempfile
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -20,6 +19,7 @@ from cablejax.json_file import parse_json
 from cablejax.npz import NpzError, read_npz
 from cablejax.simulate.config import GRAVITY, CableConfig
 from cablejax.types import GapLog
+from cablejax.whole_file import whole_file
 
 SCHEMA = "cablejax-gap-log/1"
 
@@ -169,14 +169,8 @@ def write_gap_log(path: str | os.PathLike, log: GapLog, *, overwrite: bool = Fal
         raise FileExistsError(f"{path} exists: choose another name, or pass overwrite=True to replace it.")
     arrays = {name: getattr(log, name) for name in _DTYPES if getattr(log, name) is not None}
     path.parent.mkdir(parents=True, exist_ok=True)
-    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.stem}-", suffix=".npz")
-    try:
-        with os.fdopen(handle, "wb") as stream:
-            np.savez_compressed(stream, allow_pickle=False, meta=np.array(json.dumps(log.meta)), **arrays)
-        os.chmod(temporary, 0o644)
-        os.replace(temporary, path)
-    finally:
-        pathlib.Path(temporary).unlink(missing_ok=True)
+    with whole_file(path) as stream:
+        np.savez_compressed(stream, allow_pickle=False, meta=np.array(json.dumps(log.meta)), **arrays)
     return path
 
 

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import json
-import os
 import pathlib
 from collections.abc import Mapping
 from typing import Any
+
+from cablejax.whole_file import whole_file
 
 
 def write_json(path: pathlib.Path, value: Mapping[str, Any]) -> None:
@@ -15,9 +16,8 @@ def write_json(path: pathlib.Path, value: Mapping[str, Any]) -> None:
     Raises:
         ValueError: a number is not finite, for which JSON has no word.
     """
-    scratch = path.with_name(path.name + ".part")
-    scratch.write_text(json.dumps(value, indent=2, allow_nan=False) + "\n", encoding="utf-8")
-    os.replace(scratch, path)
+    with whole_file(path) as stream:
+        stream.write((json.dumps(value, indent=2, allow_nan=False) + "\n").encode())
 
 
 def read_json(path: pathlib.Path) -> Any:

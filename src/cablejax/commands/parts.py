@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import json
-import os
 import pathlib
 from collections.abc import Iterator, Mapping
 from typing import Any
@@ -18,12 +17,13 @@ from cablejax.gaplog import Episode
 from cablejax.json_file import parse_json, read_json, write_json
 from cablejax.npz import read_npz
 from cablejax.targets import Target
+from cablejax.whole_file import whole_file
 
 SCHEMA = "cablejax-parts/1"
 """Tells the folder from one of that name that somebody else made."""
 
 _NESTED = {"target": Target, "episode": Episode}
-_SETTINGS, _STATE, _RUN, _DRAFT = "settings.json", "state.json", ".run.npz", ".part"
+_SETTINGS, _STATE, _RUN = "settings.json", "state.json", ".run.npz"
 
 
 class Parts:
@@ -71,10 +71,8 @@ class Parts:
         fields = _flatten(run)
         text = {key: value for key, value in fields.items() if isinstance(value, (str, int)) or value is None}
         arrays = {key: value for key, value in fields.items() if key not in text}
-        draft = self.folder / f"{name}{_RUN}{_DRAFT}"
-        with draft.open("wb") as stream:
+        with whole_file(self.folder / f"{name}{_RUN}") as stream:
             np.savez_compressed(stream, text=np.array(json.dumps(text)), **arrays)
-        os.replace(draft, self.folder / f"{name}{_RUN}")
 
     def load(self, name: str) -> ClosedLoopRun | None:
         """A run that was kept; None where there is none, or a damaged one, which has to be made again."""
@@ -100,7 +98,7 @@ class Parts:
     def remove(self) -> None:
         """Deletes what the command kept, and the folder unless it holds something else."""
         # the settings last: until then the same command goes on
-        for pattern in (f"*{_RUN}", f"*{_DRAFT}", _STATE, _SETTINGS):
+        for pattern in (f"*{_RUN}", "*.part", _STATE, _SETTINGS):
             for file in self.folder.glob(pattern):
                 file.unlink()
         with contextlib.suppress(OSError):

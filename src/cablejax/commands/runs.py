@@ -81,11 +81,13 @@ def shape_and_report(
         ValueError: model and plant do not fit.
     """
     begin = time.perf_counter()
+    kept = {(t.name, method): parts.load(f"{t.name}-{method}") for t in job.targets for method in job.methods}
+    if any(run is None for run in kept.values()):
+        say("compiling the control step ...")
     runs: dict[tuple[str, Method], ClosedLoopRun] = {}
     for target in job.targets:
         for method in job.methods:
-            name = f"{target.name}-{method}"
-            run = parts.load(name)
+            run = kept[target.name, method]
             if run is None:
                 run = shape_once(
                     job.plant,
@@ -96,7 +98,7 @@ def shape_and_report(
                     steps=job.steps,
                     camera=job.camera,
                 )
-                parts.save(name, run)
+                parts.save(f"{target.name}-{method}", run)
             runs[target.name, method] = run
             say(f"{time.perf_counter() - begin:5.0f} s  {METHOD_LABEL[method]:22s}{run.verdict()}")
     summary = summarise(runs, total_s=0.0)

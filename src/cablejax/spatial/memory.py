@@ -6,7 +6,6 @@ import contextlib
 import dataclasses
 import hashlib
 import json
-import os
 import pathlib
 from collections.abc import Sequence
 from typing import Any
@@ -18,6 +17,7 @@ from cablejax.spatial.rod import Rod
 from cablejax.spatial.search import Step
 from cablejax.spatial.values import Values, from_json, to_json
 from cablejax.spatial.windows import Windows
+from cablejax.whole_file import whole_file
 
 
 def fingerprint(rod: Rod, windows: Windows, nominal_stiffness: float, names: Sequence[str]) -> str:
@@ -73,6 +73,5 @@ class Memory:
         if self._path is None:
             return
         self._path.parent.mkdir(parents=True, exist_ok=True)
-        draft = self._path.with_name(f"{self._path.name}.part")
-        draft.write_text(json.dumps(self._held), encoding="utf-8")
-        os.replace(draft, self._path)
+        with whole_file(self._path) as stream:
+            stream.write(json.dumps(self._held).encode())
