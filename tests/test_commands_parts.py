@@ -119,10 +119,21 @@ def test_a_folder_of_that_name_that_is_a_users_own_stays(name, made, weights, tm
 def test_files_that_a_user_put_between_the_parts_stay(tmp_path):
     parts = Parts(tmp_path / "parts", SETTINGS)
     parts.begin()
-    (parts.folder / "notes.txt").write_text("mine")
+    mine = {"notes.txt", "film.part"}
+    for name in mine:
+        (parts.folder / name).write_text("mine")
+    (parts.folder / "U.run.npz.part").write_text("killed here")
     Parts(tmp_path / "parts", {"steps": 3}).begin()
     parts.remove()
-    assert [file.name for file in parts.folder.iterdir()] == ["notes.txt"]
+    assert {file.name for file in parts.folder.iterdir()} == mine
+
+
+def test_a_kill_before_the_settings_are_whole_is_no_foreign_folder(tmp_path):
+    (tmp_path / "parts").mkdir()
+    (tmp_path / "parts" / "settings.json.part").write_text("{")
+    with unfinished(tmp_path, SETTINGS, overwrite=True) as parts:
+        assert parts.match()
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_shape_goes_on_after_ctrl_c_between_its_results(made, weights, tmp_path, capsys, monkeypatch):

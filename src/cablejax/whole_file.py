@@ -8,15 +8,18 @@ import pathlib
 from collections.abc import Iterator
 from typing import BinaryIO
 
+DRAFT = ".part"
+"""What the name of a file ends in until it is whole."""
+
 
 @contextlib.contextmanager
 def whole_file(path: pathlib.Path) -> Iterator[BinaryIO]:
     """A stream into a file that takes its place, over what was there, when the block has ended.
 
-    Until then it is called `NAME.part`; a block that is left early leaves nothing, and a kill no more than that. Its
+    Until then it is called `NAME.part` (`DRAFT`); a block that is left early leaves nothing, and a kill no more than that. Its
     mode is the umask's.
     """
-    draft = path.with_name(f"{path.name}.part")
+    draft = path.with_name(f"{path.name}{DRAFT}")
     try:
         with draft.open("wb") as stream:
             yield stream

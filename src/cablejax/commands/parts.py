@@ -17,7 +17,7 @@ from cablejax.gaplog import Episode
 from cablejax.json_file import parse_json, read_json, write_json
 from cablejax.npz import read_npz
 from cablejax.targets import Target
-from cablejax.whole_file import whole_file
+from cablejax.whole_file import DRAFT, whole_file
 
 SCHEMA = "cablejax-parts/1"
 """Tells the folder from one of that name that somebody else made."""
@@ -45,7 +45,8 @@ class Parts:
         Raises:
             UsageError: the folder is not one that a command made, or its settings cannot be read.
         """
-        if not self.folder.exists() or (self.folder.is_dir() and not any(self.folder.iterdir())):
+        # a kill may leave settings that were never finished
+        if not self.folder.exists() or (self.folder.is_dir() and self._names() <= {f"{_SETTINGS}{DRAFT}"}):
             return False
         try:
             found = read_json(self.folder / _SETTINGS)
@@ -93,13 +94,16 @@ class Parts:
     @property
     def empty(self) -> bool:
         """Whether nothing but the settings was kept."""
-        return [file.name for file in self.folder.iterdir()] == [_SETTINGS]
+        return self._names() == {_SETTINGS}
+
+    def _names(self) -> set[str]:
+        return {file.name for file in self.folder.iterdir()}
 
     def remove(self) -> None:
         """Deletes what the command kept, and the folder unless it holds something else."""
         # the settings last: until then the same command goes on
-        for pattern in (f"*{_RUN}", "*.part", _STATE, _SETTINGS):
-            for file in self.folder.glob(pattern):
+        for pattern in (f"*{_RUN}", _STATE, _SETTINGS):
+            for file in (*self.folder.glob(f"{pattern}{DRAFT}"), *self.folder.glob(pattern)):
                 file.unlink()
         with contextlib.suppress(OSError):
             self.folder.rmdir()
