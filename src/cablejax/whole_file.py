@@ -16,7 +16,7 @@ DRAFT = ".part"
 def whole_file(path: pathlib.Path) -> Iterator[BinaryIO]:
     """A stream into a file that takes its place, over what was there, when the block has ended.
 
-    Until then it is called `NAME.part` (`DRAFT`); a block that is left early leaves nothing, and a kill no more than that. Its
+    Until then its name ends in `DRAFT`; a block that is left early leaves nothing, and a kill no more than that. Its
     mode is the umask's.
     """
     draft = path.with_name(f"{path.name}{DRAFT}")
