@@ -1,17 +1,56 @@
-"""A network small enough for tests of the command line. Untrained, it does what its prior does."""
+"""A network small enough for tests of the command line, and a run that nobody has to wait for.
+
+Untrained, the network does what its prior does."""
 
 import pathlib
 
+import numpy as np
 from flax import nnx
 
+from cablejax.closed_loop import ClosedLoopRun, shape_error_cm
 from cablejax.dynamics.config import ModelConfig
 from cablejax.dynamics.gns import GNS
 from cablejax.dynamics.weights import FILE_NAME, save_weights
+from cablejax.gaplog import Episode
+from cablejax.targets import Target
 
 
-def small_model(folder: pathlib.Path) -> pathlib.Path:
+def small_model(folder: pathlib.Path, seed: int = 0) -> pathlib.Path:
     """Writes the weights file of a small network into a folder, as `cablejax train` would, and returns the folder."""
     config = ModelConfig(latent=8, hidden=8, hidden_layers=1, message_passing=1, prior="rigid")
     folder.mkdir(parents=True, exist_ok=True)
-    save_weights(folder / FILE_NAME, config, nnx.split(GNS(config, nnx.Rngs(0)))[1], {"source": "test"})
+    save_weights(folder / FILE_NAME, config, nnx.split(GNS(config, nnx.Rngs(seed)))[1], {"source": "test"})
     return folder
+
+
+def made_up_run(target: Target, commands: int = 2) -> ClosedLoopRun:
+    """A run whose cable goes nine tenths of the way to its target."""
+    samples = commands + 1
+    way = np.linspace(0.0, 0.9, samples)[:, None, None]
+    line = np.stack([np.linspace(-0.5, 0.5, len(target.keypoints)), np.zeros(len(target.keypoints))], axis=1)
+    keypoints = (1 - way) * line + way * target.keypoints
+    pose = np.repeat(target.gripper_pose[None], samples, axis=0)
+    last = np.arange(samples) == commands
+    error = shape_error_cm(keypoints, target.keypoints)
+    return ClosedLoopRun(
+        target=target,
+        times=np.arange(samples, dtype=float),
+        keypoints=keypoints,
+        gripper_pose=pose,
+        twist=np.where(last[:, None, None], np.nan, 0.0) * pose,
+        error_cm=error,
+        residual_share=np.where(last, np.nan, 0.5),
+        radius=np.where(last, np.nan, 0.05),
+        mpc_ms=np.where(last, np.nan, 100.0),
+        held=0,
+        stopped=None,
+        observed_error_cm=error,
+        episode=Episode(
+            motion=f"approach_{target.name.lower()}",
+            time=np.arange(samples, dtype=float),
+            keypoints=keypoints,
+            gripper_pose=pose,
+            gripper_command=np.zeros_like(pose),
+            hold=np.zeros(samples, bool),
+        ),
+    )

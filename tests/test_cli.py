@@ -1,8 +1,8 @@
 """The command line as a person or a script meets it."""
 
+import importlib.metadata
 import json
 import os
-import pathlib
 import signal
 import subprocess
 import sys
@@ -29,6 +29,11 @@ def test_help_names_every_command(capsys):
         assert command in text
 
 
+def test_version_is_that_of_the_package(capsys):
+    assert main(["--version"]) == 0
+    assert capsys.readouterr().out == f"cablejax {importlib.metadata.version('cablejax')}\n"
+
+
 @pytest.mark.parametrize("command", [c for c in SUBCOMMANDS if c != ["bench"]], ids=" ".join)
 def test_help_explains_every_option(command, capsys):
     text = help_of(command, capsys)
@@ -53,6 +58,13 @@ def test_help_is_fast_because_it_loads_neither_jax_nor_mujoco():
     [
         (["simulate", "--trajectories", "0"], "n_trajectories is 0"),
         (["simulate", "--links", "1"], "n_links is 1"),
+        (["simulate", "--links", "3"], "n_links 3, expected at least 5"),
+        (["simulate", "--links", "4"], "n_links 4, expected at least 5"),
+        (["simulate", "--max-amplification", "0"], "max_amplification is 0"),
+        (["simulate", "--max-amplification", "-1"], "max_amplification is -1"),
+        (["simulate", "--max-amplification", "nan"], "max_amplification is nan"),
+        (["train", "--steps", "0"], "--steps is 0"),
+        (["train", "--steps", "-1"], "--steps is -1"),
         (["simulate", "--stiffness", "-1"], "bending_stiffness is -1"),
         (["simulate", "--seed", "-1"], "--seed is -1"),
         (["train", "--data", "nowhere.zarr"], "holds no data set"),
@@ -136,12 +148,3 @@ def test_bench_simulate_relates_the_engines(capsys):
 def test_text_table_lines_up():
     text = options.text_table(["shape", "error"], [["U", "0.5"], ["long name", "12.25"]])
     assert text.splitlines()[1:] == ["---------  -----", "U            0.5", "long name  12.25"]
-
-
-def test_json_is_written_whole(tmp_path: pathlib.Path):
-    options.write_json(tmp_path / "a.json", {"x": 1.5})
-    assert json.loads((tmp_path / "a.json").read_text()) == {"x": 1.5}
-    assert [path.name for path in tmp_path.iterdir()] == ["a.json"]
-    with pytest.raises(ValueError, match="JSON"):
-        options.write_json(tmp_path / "b.json", {"x": float("nan")})
-    assert not (tmp_path / "b.json").exists()

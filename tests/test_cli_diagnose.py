@@ -6,7 +6,9 @@ import pathlib
 import numpy as np
 import pytest
 
+import spatial_cases
 from cablejax.cli import main
+from cablejax.commands import diagnose
 from cablejax.gaplog import write_gap_log
 from diagnose_cases import record
 
@@ -81,6 +83,23 @@ def test_script_gets_json_and_replaces_a_report_when_told(log, tmp_path, capsys)
     assert "screening 3 effects" in told.err, "progress goes to stderr"
 
 
+def test_goes_on_after_ctrl_c_with_half_a_report(log, tmp_path, capsys, monkeypatch):
+    def half_written(log, folder, *, state, **_):
+        (folder / "verdict.json").write_text("{}")
+        state.write_text("{}")
+        raise KeyboardInterrupt
+
+    arguments = ["diagnose", str(log), "--out", str(tmp_path), *ONLY]
+    with monkeypatch.context() as patch:
+        patch.setattr(diagnose, "diagnose_and_report", half_written)
+        assert main(arguments) == 130
+        assert "Run the same command again" in capsys.readouterr().err
+        assert main(arguments) == 130, "it begins anew"
+        assert main([*arguments[:-1]]) == 2, "another diagnosis is not mixed with it"
+    assert "is not empty" in capsys.readouterr().err
+    assert (tmp_path / "parts" / "state.json").exists()
+
+
 def refused(arguments, capsys) -> str:
     assert main(["diagnose", *map(str, arguments)]) == 2
     told = capsys.readouterr()
@@ -94,6 +113,36 @@ def test_unknown_effect_is_refused_with_the_known_ones(log, tmp_path, capsys):
     assert not (tmp_path / "report").exists()
 
 
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--only", "obstacle"], "'obstacle'"),
+        (["--only", "viscous_drag", "actuation_lag"], "'actuation_lag'"),
+        (["--commissioning", "LOG"], "leave it out"),
+    ],
+    ids=["effect", "arms", "commissioning"],
+)
+def test_a_log_in_space_is_not_asked_for_what_only_the_plane_has(options, message, tmp_path, capsys):
+    path = write_gap_log(tmp_path / "space.npz", spatial_cases.recording())
+    options = [path if option == "LOG" else option for option in options]
+    said = refused([path, "--out", tmp_path / "report", *options], capsys)
+    assert message in said and "in space" in said
+    assert not (tmp_path / "report").exists()
+
+
+def test_a_log_in_space_is_searched_for_the_effects_of_space(tmp_path, monkeypatch):
+    path, asked = write_gap_log(tmp_path / "space.npz", spatial_cases.recording()), []
+
+    def stopped(log, *, only, **_):
+        asked.append(only)
+        raise ValueError("enough")
+
+    monkeypatch.setattr("cablejax.spatial.diagnose.diagnose_space", stopped)
+    assert main(["diagnose", str(path), "--out", str(tmp_path / "a"), "--only", "quadratic_drag"]) == 2
+    assert main(["diagnose", str(path), "--out", str(tmp_path / "b")]) == 2
+    assert asked == [("quadratic_drag",), None]
+
+
 def test_missing_file_is_refused(tmp_path, capsys):
     assert "nowhere.npz" in refused([tmp_path / "nowhere.npz", "--out", tmp_path / "report"], capsys)
     assert not (tmp_path / "report").exists()
@@ -102,7 +151,7 @@ def test_missing_file_is_refused(tmp_path, capsys):
 def test_other_file_is_refused(tmp_path, capsys):
     other = tmp_path / "other.npz"
     np.savez(other, something=np.zeros(3))
-    assert "has no field 'time'" in refused([other, "--out", tmp_path / "report"], capsys)
+    assert "lacks time" in refused([other, "--out", tmp_path / "report"], capsys)
     text = tmp_path / "notes.txt"
     text.write_text("not a log")
     assert "is no .npz archive" in refused([text, "--out", tmp_path / "report"], capsys)

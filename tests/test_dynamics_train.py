@@ -2,6 +2,7 @@
 
 import csv
 import dataclasses
+import json
 import os
 import pathlib
 import signal
@@ -22,7 +23,8 @@ from cablejax.dynamics.loss import random_walk_noise, rollout_loss
 from cablejax.dynamics.metrics import MetricsLog
 from cablejax.dynamics.model import bind
 from cablejax.dynamics.normalisation import fit_normalisation
-from cablejax.dynamics.train import train
+from cablejax.dynamics.run_folder import claim_folder
+from cablejax.dynamics.train import DivergedError, train
 from cablejax.dynamics.train_config import PRESETS, Phase, TrainConfig
 from dynamics_cases import SMALL, TINY_TRAINING, network, resized, trajectories
 
@@ -101,6 +103,75 @@ def test_a_folder_with_another_training_is_left_alone(tmp_path):
         train(TINY_TRAINING, trajectories(seed=3), tmp_path, progress=False)
     with pytest.raises(ValueError, match="holds a training already"):
         run(TINY_TRAINING, tmp_path, resume=False)
+
+
+def test_a_training_is_overwritten_when_told_and_nothing_else(tmp_path):
+    first = {"config": {"seed": 0}, "data": "a"}
+    claim_folder(tmp_path, first, resume=True, overwrite=False)
+    kept = [tmp_path / "checkpoints" / "20" / "a", tmp_path / "weights.safetensors", tmp_path / "metrics.csv"]
+    mine = [tmp_path / "notes.txt", tmp_path / "checkpoints" / "mine.txt"]
+    for file in (*kept, *mine):
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_text("")
+    claim_folder(tmp_path, first, resume=True, overwrite=True)
+    assert all(file.exists() for file in kept), "the same training is resumed"
+    second = {"config": {"seed": 1}, "data": "a"}
+    with pytest.raises(ValueError, match=r"differs in config.seed \(0, now 1\)"):
+        claim_folder(tmp_path, second, resume=True, overwrite=False)
+    claim_folder(tmp_path, second, resume=True, overwrite=True)
+    assert not any(file.exists() for file in kept) and all(file.exists() for file in mine)
+    assert json.loads((tmp_path / "run.json").read_text()) == second
+
+
+@pytest.mark.parametrize(
+    ("file", "text", "overwrite", "message"),
+    [
+        ("notes.txt", "", False, "is not empty, and holds no training"),
+        ("checkpoints/7", "", True, "checkpoints was not made by a training"),
+        ("tensorboard/7", "", True, "tensorboard was not made by a training"),
+        ("run.json", "", True, "run.json is no JSON.*delete this one"),
+        ("run.json", "[" * 100_000, False, "nested too deep"),
+        ("run.json", '{"distance_km": 7}', True, "was not made by a training"),
+    ],
+)
+def test_a_folder_that_is_a_users_own_is_left_alone(file, text, overwrite, message, tmp_path):
+    mine = tmp_path / file
+    mine.parent.mkdir(exist_ok=True)
+    mine.write_text(text)
+    with pytest.raises(ValueError, match=message):
+        run(TINY_TRAINING, tmp_path, overwrite=overwrite)
+    assert mine.read_text() == text and len(list(tmp_path.rglob("*"))) <= 2
+
+
+def test_a_damaged_checkpoint_is_told_and_the_one_before_it_used(tmp_path):
+    state, told = {"a": jnp.arange(3000.0)}, []
+
+    def damage(step):
+        for file in (tmp_path / str(step)).rglob("*"):
+            if file.is_file():
+                file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
+
+    with Checkpoints(tmp_path) as checkpoints:
+        checkpoints.save(10, state)
+        checkpoints.save(20, {"a": jnp.zeros(3000)})
+    damage(20)
+    with Checkpoints(tmp_path) as checkpoints:
+        same(checkpoints.restore(state, tell=told.append), state)
+        assert told == ["The checkpoint of step 20 is damaged; going on from the one of step 10."]
+        checkpoints.save(20, state)
+    damage(10), damage(20)
+    with Checkpoints(tmp_path) as checkpoints, pytest.raises(ValueError, match=r"No checkpoint .* Delete this folder"):
+        checkpoints.restore(state)
+
+
+def test_a_training_that_diverges_says_what_to_change(tmp_path, monkeypatch):
+    def diverging(config, phase, graphdef, steps):
+        lost = {"loss": np.full(steps, np.nan), "gradient_norm": np.full(steps, np.nan)}
+        return lambda state, data: (dataclasses.replace(state, step=state.step + steps), lost)
+
+    monkeypatch.setattr("cablejax.dynamics.train.chunk_update", diverging)
+    with pytest.raises(DivergedError, match=r"its loss is nan after step 2, .* \(--lr, now 0.001\) .*--overwrite"):
+        run(TINY_TRAINING, tmp_path)
 
 
 @pytest.mark.parametrize(

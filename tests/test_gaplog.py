@@ -99,7 +99,7 @@ def test_a_missing_field_is_named(tmp_path, log, name):
     }
     del fields[name]
     np.savez(tmp_path / "run.npz", **fields)
-    with pytest.raises(GapLogError, match=f"no field '{name}'"):
+    with pytest.raises(GapLogError, match=f"lacks {name}"):
         read_gap_log(tmp_path / "run.npz")
 
 

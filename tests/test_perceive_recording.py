@@ -112,9 +112,9 @@ def broken(path, what):
     [
         ("no file", "does not exist"),
         ("empty folder", "0 PCD files"),
-        ("pickle", "not an .npz"),
-        ("objects", "not an .npz"),
-        ("text", "not an .npz"),
+        ("pickle", "no .npz archive"),
+        ("objects", "holds Python objects"),
+        ("text", "no .npz archive"),
         ("lacks", "lacks gripper_pose"),
         ("shape", "points has shape"),
         ("count", "sums up to 6"),

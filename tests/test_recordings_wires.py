@@ -54,7 +54,7 @@ def test_wrong_archives_are_refused(tmp_path, change, message):
 
 def test_a_file_that_is_no_archive_is_refused(tmp_path):
     (tmp_path / "wires.npz").write_bytes(b"nothing")
-    with pytest.raises(ValueError, match=r"is not an \.npz file"):
+    with pytest.raises(ValueError, match=r"is no \.npz archive"):
         read_wires(tmp_path / "wires.npz")
 
 

@@ -95,6 +95,8 @@ def test_refuses_what_it_cannot_diagnose():
         windows_of(dataclasses.replace(log, time=time))
     with pytest.raises(ValueError, match="eval"):
         diagnose_space(dataclasses.replace(log, meta={**log.meta, "split": ["eval"] * 4}))
+    with pytest.raises(ValueError, match="no effect 'obstacle' in space"):
+        diagnose_space(log, only=["obstacle"])
 
 
 def test_labels_are_one_for_each_episode_or_none():

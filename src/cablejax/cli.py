@@ -9,6 +9,7 @@ from typing import Annotated, Any
 import tyro
 from tyro.conf import subcommand
 
+from cablejax import __version__
 from cablejax.commands.bench import Bench
 from cablejax.commands.demo import Demo
 from cablejax.commands.diagnose import Diagnose
@@ -37,7 +38,7 @@ _DESCRIPTION = """Two robot grippers bring a cable to a shape.
 
 Start with `cablejax demo`: it needs nothing else and writes a page to look at. To make your own model: `simulate` a
 data set, `train` on it, `shape` a cable with the result, and `diagnose` what the simulator lacks. A recording of a
-real cable is `import`ed first. `cablejax COMMAND --help` explains each one."""
+real cable is `import`ed first. `cablejax COMMAND --help` explains each one, `cablejax --version` says which this is."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -46,11 +47,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Args:
         arguments: what follows `cablejax` on the command line; by default that of this process.
     """
+    given = sys.argv[1:] if arguments is None else list(arguments)
+    if given == ["--version"]:
+        print(f"cablejax {__version__}")
+        return 0
     command: Command | Bench | Import = tyro.cli(
         _COMMANDS,
         prog="cablejax",
         description=_DESCRIPTION,
-        args=arguments,
+        args=given,
         config=(tyro.conf.OmitArgPrefixes, tyro.conf.OmitSubcommandPrefixes, tyro.conf.FlagCreatePairsOff),
     )
     command = command.what if isinstance(command, (Bench, Import)) else command

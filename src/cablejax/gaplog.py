@@ -7,20 +7,19 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import lzma
 import os
 import pathlib
-import tempfile
-import zipfile
-import zlib
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
+from cablejax.json_file import parse_json
+from cablejax.npz import NpzError, read_npz
 from cablejax.simulate.config import GRAVITY, CableConfig
 from cablejax.types import GapLog
+from cablejax.whole_file import whole_file
 
 SCHEMA = "cablejax-gap-log/1"
 
@@ -36,10 +35,6 @@ _CABLE_POSITIVE = ("length_m", "diameter_m", "linear_density_kg_per_m", "bending
 _CABLE_NOT_NEGATIVE = ("bending_damping_s",)
 _META_FIELDS = (
     "schema", "cable", "table", "gravity_m_per_s2", "keypoint_arclength_m", "grasp", "motion", "source",
-)  # fmt: skip
-# What the decompressors and NumPy raise on a file that is damaged, encrypted, or holds Python objects.
-_UNREADABLE = (
-    ValueError, EOFError, KeyError, RuntimeError, zipfile.BadZipFile, zlib.error, lzma.LZMAError,
 )  # fmt: skip
 # By how much the first and the last mark may miss the cable's ends, relative to its length.
 _ENDS = 0.05
@@ -174,14 +169,8 @@ def write_gap_log(path: str | os.PathLike, log: GapLog, *, overwrite: bool = Fal
         raise FileExistsError(f"{path} exists: choose another name, or pass overwrite=True to replace it.")
     arrays = {name: getattr(log, name) for name in _DTYPES if getattr(log, name) is not None}
     path.parent.mkdir(parents=True, exist_ok=True)
-    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.stem}-", suffix=".npz")
-    try:
-        with os.fdopen(handle, "wb") as stream:
-            np.savez_compressed(stream, allow_pickle=False, meta=np.array(json.dumps(log.meta)), **arrays)
-        os.chmod(temporary, 0o644)
-        os.replace(temporary, path)
-    finally:
-        pathlib.Path(temporary).unlink(missing_ok=True)
+    with whole_file(path) as stream:
+        np.savez_compressed(stream, allow_pickle=False, meta=np.array(json.dumps(log.meta)), **arrays)
     return path
 
 
@@ -192,24 +181,14 @@ def read_gap_log(path: str | os.PathLike) -> GapLog:
         GapLogError: the file is no `.npz`, a field is missing, or a field is not what the format says.
         FileNotFoundError: there is no such file.
     """
-    if not zipfile.is_zipfile(path):
-        if not os.path.isfile(path):
-            raise FileNotFoundError(f"There is no file {path}.")
-        raise GapLogError(f"{path} is no .npz archive, expected one with the fields of {SCHEMA}.")
     try:
-        with open(path, "rb") as stream, np.load(stream, allow_pickle=False) as archive:
-            # a file may hold more than the format names; that is not looked at
-            fields: dict[str, Any] = {name: archive[name] for name in (*_DTYPES, "meta") if name in archive.files}
-            there = sorted(archive.files)
-    except _UNREADABLE as error:
-        raise GapLogError(f"{path} could not be read as a gap log: {_reason(error)}") from error
-    for name in (*_DTYPES, "meta"):
-        if name not in fields and name != "hold":
-            raise GapLogError(f"{path} has no field '{name}', only {there}.")
+        fields = read_npz(path, [*(name for name in _DTYPES if name != "hold"), "meta"], ["hold"])
+    except NpzError as error:
+        raise GapLogError(f"{error} Expected a gap log ({SCHEMA}).") from error
     try:
-        meta = json.loads(str(fields["meta"]))
-    except json.JSONDecodeError as error:
-        raise GapLogError(f"{path}: field 'meta' is not JSON: {error}") from error
+        meta = parse_json(str(fields["meta"]))
+    except ValueError as error:
+        raise GapLogError(f"{path}: field 'meta' {error}") from error
     arrays = {}
     for name, dtype in _DTYPES.items():
         if name in fields:
@@ -222,11 +201,6 @@ def read_gap_log(path: str | os.PathLike) -> GapLog:
     except GapLogError as error:
         raise GapLogError(f"{path}: {error}") from error
     return log
-
-
-def _reason(error: Exception) -> str:
-    """NumPy advises to unpickle what it will not read; nobody should."""
-    return "it holds Python objects, expected plain arrays." if "pickle" in str(error) else str(error)
 
 
 def _validate_arrays(log: GapLog) -> None:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 import pathlib
 from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
 
+from cablejax.json_file import read_json
+from cablejax.npz import read_npz
 from cablejax.simulate.config import CableConfig
 from cablejax.simulate.elastica import elastica
 
@@ -149,23 +150,20 @@ def load_target(path: str | pathlib.Path, config: CableConfig = CableConfig()) -
         raise ValueError(f"{path} is none of {', '.join(_READERS)}: save the target's keypoints in one of these.")
     try:
         fields = _READERS[path.suffix](path)
-    except (ValueError, KeyError, TypeError, OSError, EOFError) as error:
-        if isinstance(error, FileNotFoundError):
-            raise
+    except FileNotFoundError:
+        raise
+    except (ValueError, TypeError, OSError) as error:
         raise ValueError(f"{path} could not be read as a target: {error}") from error
-    if "keypoints" not in fields:
-        raise ValueError(f"{path} has no field 'keypoints', only {sorted(fields)}.")
     return target_from_keypoints(path.stem, fields["keypoints"], config, fields.get("gripper_pose"))
 
 
 def _read_npz(path: pathlib.Path) -> dict[str, np.ndarray]:
-    with np.load(path, allow_pickle=False) as archive:
-        return {name: archive[name] for name in archive.files}
+    return read_npz(path, ["keypoints"], ["gripper_pose"])
 
 
 def _read_json(path: pathlib.Path) -> dict[str, np.ndarray]:
-    content = json.loads(path.read_text())
-    if not isinstance(content, dict):
+    content = read_json(path)
+    if not isinstance(content, dict) or "keypoints" not in content:
         raise ValueError('expected an object with the field "keypoints"')
     return {name: np.asarray(content[name], float) for name in ("keypoints", "gripper_pose") if name in content}
 

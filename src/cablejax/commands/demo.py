@@ -44,36 +44,37 @@ class Demo(Command):
     """How the controller finds its plan."""
 
     def execute(self):
+        from cablejax.commands.parts import unfinished
         from cablejax.commands.results import table_of
-        from cablejax.commands.runs import shape_and_report
+        from cablejax.commands.runs import Job, shape_and_report
         from cablejax.shaping import METHODS, load_model
         from cablejax.simulate.plant import PlantConfig
         from cablejax.targets import make_target
 
         plant = PlantConfig(stiffness_ratio=STIFFNESS_RATIO, seed=self.seed)
         plant = dataclasses.replace(plant, cable=dataclasses.replace(plant.cable, n_links=self.links))
-        summary = shape_and_report(
-            self.out,
-            overwrite=self.overwrite,
+        job = Job(
             plant=plant,
             model=load_model(self.weights),
-            targets=[make_target(shape, plant.cable) for shape in dict.fromkeys(self.shapes)],
+            targets=tuple(make_target(shape, plant.cable) for shape in dict.fromkeys(self.shapes)),
             methods=METHODS,
             solver=self.solver,
             steps=self.steps,
-            about=(
-                "The cable is twice as stiff as the one that the model was trained on. It touches the table with "
-                "contact and friction cones, where the training simulator has a smoothed friction law."
-            ),
-            facts={
-                "command": f"cablejax demo --seed {self.seed} --steps {self.steps} --links {self.links}",
-                "model": self.weights,
-                "solver": self.solver,
-            },
         )
+        about = (
+            "The cable is twice as stiff as the one that the model was trained on. It touches the table with contact "
+            "and friction cones, where the training simulator has a smoothed friction law."
+        )
+        facts = {
+            "command": f"cablejax demo --seed {self.seed} --steps {self.steps} --links {self.links}",
+            "model": self.weights,
+            "solver": self.solver,
+        }
+        with unfinished(self.out, job.settings(), overwrite=self.overwrite) as parts:
+            summary = shape_and_report(job, self.out, parts, about=about, facts=facts)
+            gap = self._diagnosed()
         table = text_table(*table_of(summary))
         text = f"{table}\n\n{summary['total_s']:.0f} s. Look at {self.out / 'report.html'}"
-        gap = self._diagnosed()
         return {
             **summary,
             "diagnosis": gap,

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 import pathlib
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from cablejax.commands.options import Command, UsageError, output_folder, say
+from cablejax.commands.options import Command, UsageError, say
 
 if TYPE_CHECKING:
-    from cablejax.diagnose import Diagnosis, Effect
+    from cablejax.diagnose import Diagnosis
     from cablejax.types import GapLog
 
 
@@ -30,41 +31,82 @@ class Diagnose(Command):
     """Folder of the report."""
 
     commissioning: tuple[pathlib.Path, ...] = ()
-    """Logs known to have no effect, of the same set-up: they tell the simulator's own error from the gap."""
+    """Logs known to have no effect, of the same set-up: they tell the simulator's own error from the gap. For logs in
+    the plane."""
 
     only: tuple[str, ...] = ()
-    """Names of the effects to look for; by default all."""
+    """Names of the effects to look for; by default all; in space all but intrinsic_curvature, which takes four times as
+    long as the others together."""
 
     overwrite: bool = False
     """Replace a report that is there."""
 
     def execute(self):
-        from cablejax.diagnose import LIBRARY, verdict_json
-        from cablejax.diagnose.actuation import ARMS
+        from cablejax.commands.parts import unfinished
+        from cablejax.diagnose import verdict_json
         from cablejax.gaplog import read_gap_log
 
-        known = {effect.name: effect for effect in LIBRARY}
+        log = read_gap_log(self.log)
+        if _in_space(log):
+            self._check_space()
+        else:
+            self._check_plane()
+        commissioning = [read_gap_log(path) for path in self.commissioning]
+        settings = {
+            "diagnosis": [hashlib.sha256(path.read_bytes()).hexdigest() for path in (self.log, *self.commissioning)],
+            "only": self.only,
+        }
+        with unfinished(self.out, settings, overwrite=self.overwrite) as parts:
+            result, page = diagnose_and_report(
+                log, self.out, only=self.only, commissioning=commissioning, state=parts.state
+            )
+        return {**verdict_json(result), "report": str(page)}, f"{result.verdict}: {result.sentence}\n{page}"
+
+    def _check_plane(self) -> None:
+        """Refuses names of effects that the plane has none of."""
+        from cablejax.diagnose import LIBRARY
+        from cablejax.diagnose.actuation import ARMS
+
+        known = [effect.name for effect in LIBRARY]
         for name in self.only:
             if name in ARMS:
                 raise UsageError(f"--only names {name!r}, which is looked for in any case: leave it out.")
             if name not in known:
                 raise UsageError(f"--only names the effect {name!r}, expected some of {', '.join(known)}.")
-        log = read_gap_log(self.log)
-        commissioning = [read_gap_log(path) for path in self.commissioning]
-        folder = output_folder(self.out, overwrite=self.overwrite)
-        effects = [known[name] for name in self.only] or LIBRARY
-        result, page = diagnose_and_report(log, folder, effects=effects, commissioning=commissioning)
-        return {**verdict_json(result), "report": str(page)}, f"{result.verdict}: {result.sentence}\n{page}"
+
+    def _check_space(self) -> None:
+        """Refuses what a log in space cannot be diagnosed with."""
+        from cablejax.spatial.effects import effect_names
+
+        for name in self.only:
+            if name not in effect_names():
+                raise UsageError(
+                    f"--only names the effect {name!r}, but {self.log} is a log in space, which is searched for "
+                    f"{', '.join(effect_names())}: name some of these."
+                )
+        if self.commissioning:
+            raise UsageError(
+                f"--commissioning is given, but {self.log} is a log in space, where the gap is judged by recordings "
+                "that no fit has seen and commissioning logs are not used: leave it out."
+            )
 
 
 def diagnose_and_report(
     log: GapLog,
     folder: pathlib.Path,
     *,
-    effects: Sequence[Effect] | None = None,
+    only: Sequence[str] = (),
     commissioning: Sequence[GapLog] = (),
+    state: pathlib.Path | None = None,
 ) -> tuple[Diagnosis, pathlib.Path]:
     """Diagnoses a log, tells how it goes, and writes verdict.json, report.html and the figures into an existing folder.
+
+    Args:
+        log: in the plane or in space.
+        folder: that exists.
+        only: names of the effects to look for; by default all.
+        commissioning: logs known to have no effect; none for a log in space.
+        state: file from which an interrupted diagnosis in space goes on.
 
     Returns:
         The diagnosis and its page.
@@ -72,23 +114,20 @@ def diagnose_and_report(
     from cablejax.diagnose import LIBRARY, diagnose, write_verdict
     from cablejax.report.diagnosis_page import write_diagnosis_page
 
-    if log.keypoints.shape[-1] == 3:
+    if _in_space(log):
         from cablejax.spatial.diagnose import diagnose_space
 
-        names = None
-        if effects is not None and len(effects) < len(LIBRARY):
-            names = [effect.name for effect in effects]
-        # beside the folder, which must be empty to begin with
-        state = folder.parent / f".{folder.name}.json"
-        spatial = diagnose_space(log, only=names, state=state, progress=say)
-        page = write_diagnosis_page(spatial, folder)
-        state.unlink(missing_ok=True)
-        return spatial, page
+        spatial = diagnose_space(log, only=only or None, state=state, progress=say)
+        return spatial, write_diagnosis_page(spatial, folder)
     result = diagnose(
         log,
-        effects=LIBRARY if effects is None else effects,
+        effects=[effect for effect in LIBRARY if effect.name in only] or LIBRARY,
         commissioning=commissioning,
         progress=lambda text: say(f"{text} ..."),
     )
     write_verdict(folder / "verdict.json", result)
     return result, write_diagnosis_page(result, folder)
+
+
+def _in_space(log: GapLog) -> bool:
+    return log.keypoints.shape[-1] == 3

@@ -8,7 +8,6 @@ import dataclasses
 import importlib
 import io
 import json as json_format
-import os
 import pathlib
 import sys
 from collections.abc import Mapping
@@ -88,13 +87,6 @@ def output_folder(path: pathlib.Path, *, overwrite: bool) -> pathlib.Path:
         raise UsageError(f"{path} exists and is not empty. Give another folder with --out, or add --overwrite.")
     path.mkdir(parents=True, exist_ok=True)
     return path
-
-
-def write_json(path: pathlib.Path, value: Mapping[str, Any]) -> None:
-    """Writes a JSON file whole or not at all."""
-    scratch = path.with_name(path.name + ".part")
-    scratch.write_text(json_format.dumps(value, indent=2, allow_nan=False) + "\n", encoding="utf-8")
-    os.replace(scratch, path)
 
 
 def say(message: str) -> None:

@@ -1,69 +1,149 @@
-"""Finished runs of an unfinished command, kept so that an interrupted demo goes on where it stopped."""
+"""What an unfinished command keeps, so that the same command goes on where it was interrupted."""
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import json
-import os
 import pathlib
-import shutil
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
 
 from cablejax.closed_loop import ClosedLoopRun
+from cablejax.commands.options import UsageError, output_folder, say
 from cablejax.gaplog import Episode
+from cablejax.json_file import parse_json, read_json, write_json
+from cablejax.npz import read_npz
 from cablejax.targets import Target
+from cablejax.whole_file import DRAFT, whole_file
+
+SCHEMA = "cablejax-parts/1"
+"""Tells the folder from one of that name that somebody else made."""
 
 _NESTED = {"target": Target, "episode": Episode}
+_SETTINGS, _STATE, _RUN = "settings.json", "state.json", ".run.npz"
 
 
 class Parts:
-    """A folder of runs made under the same settings, one `.npz` each."""
+    """A folder that is there while a command is unfinished. It holds the settings that tell this command from another,
+    and finished runs, one `.run.npz` each."""
 
     def __init__(self, folder: pathlib.Path, settings: Mapping[str, Any]):
         self.folder = folder
-        self._settings = json.loads(json.dumps(settings))
+        self._settings = {"schema": SCHEMA, **json.loads(json.dumps(settings))}
+
+    @property
+    def state(self) -> pathlib.Path:
+        """A file for what else there is to go on from."""
+        return self.folder / _STATE
 
     def match(self) -> bool:
-        """Whether the folder holds runs made under these settings."""
-        file = self.folder / "settings.json"
-        return file.is_file() and json.loads(file.read_text(encoding="utf-8")) == self._settings
+        """Whether a command of these settings began here and did not end.
+
+        Raises:
+            UsageError: the folder is not one that a command made, or its settings cannot be read.
+        """
+        # a kill may leave settings that were never finished
+        if not self.folder.exists() or (self.folder.is_dir() and self._names() <= {f"{_SETTINGS}{DRAFT}"}):
+            return False
+        try:
+            found = read_json(self.folder / _SETTINGS)
+        except (FileNotFoundError, NotADirectoryError):
+            found = None
+        except ValueError as error:
+            raise UsageError(f"{error} Delete {self.folder} to begin anew.") from error
+        if not isinstance(found, dict) or found.get("schema") != SCHEMA:
+            raise UsageError(
+                f"{self.folder} was not made by this command, which needs a folder of that name for what is "
+                "unfinished. Move it elsewhere, or give another folder with --out."
+            )
+        return found == self._settings
 
     def begin(self) -> None:
-        """Makes the folder ready: runs under these settings stay, others are removed."""
-        if not self.match():
-            self.remove()
-            self.folder.mkdir(parents=True)
-            (self.folder / "settings.json").write_text(json.dumps(self._settings), encoding="utf-8")
+        """Makes the folder ready; of a command of other settings, what it kept is deleted."""
+        self.remove()
+        self.folder.mkdir(parents=True, exist_ok=True)
+        write_json(self.folder / _SETTINGS, self._settings)
 
     def save(self, name: str, run: ClosedLoopRun) -> None:
         """Keeps a run, whole or not at all."""
         fields = _flatten(run)
         text = {key: value for key, value in fields.items() if isinstance(value, (str, int)) or value is None}
         arrays = {key: value for key, value in fields.items() if key not in text}
-        draft = self.folder / f"{name}.draft.npz"
-        np.savez_compressed(draft, text=np.array(json.dumps(text)), **arrays)
-        os.replace(draft, self.folder / f"{name}.npz")
+        with whole_file(self.folder / f"{name}{_RUN}") as stream:
+            np.savez_compressed(stream, text=np.array(json.dumps(text)), **arrays)
 
     def load(self, name: str) -> ClosedLoopRun | None:
-        """A run that was kept, or None."""
-        file = self.folder / f"{name}.npz"
-        if not file.is_file():
+        """A run that was kept; None where there is none, or a damaged one, which has to be made again."""
+        try:
+            arrays = read_npz(self.folder / f"{name}{_RUN}", ["text"], _FIELDS)
+            fields: dict[str, Any] = {**parse_json(str(arrays.pop("text"))), **arrays}
+            nested = {
+                group: cls(**{f.name: fields.pop(f"{group}.{f.name}") for f in dataclasses.fields(cls)})
+                for group, cls in _NESTED.items()
+            }
+            return ClosedLoopRun(**fields, **nested)
+        except FileNotFoundError:
             return None
-        with np.load(file, allow_pickle=False) as archive:
-            fields = {key: archive[key] for key in archive.files if key != "text"}
-            fields |= json.loads(str(archive["text"]))
-        nested = {
-            name: cls(**{f.name: fields.pop(f"{name}.{f.name}") for f in dataclasses.fields(cls)})
-            for name, cls in _NESTED.items()
-        }
-        return ClosedLoopRun(**fields, **nested)
+        except (ValueError, TypeError, KeyError) as error:
+            say(f"The run {name} was kept, but is damaged and made again: {error}")
+            return None
+
+    @property
+    def empty(self) -> bool:
+        """Whether nothing but the settings was kept."""
+        return self._names() == {_SETTINGS}
+
+    def _names(self) -> set[str]:
+        return {file.name for file in self.folder.iterdir()}
 
     def remove(self) -> None:
-        """Deletes the folder."""
-        shutil.rmtree(self.folder, ignore_errors=True)
+        """Deletes what the command kept, and the folder unless it holds something else."""
+        # the settings last: until then the same command goes on
+        for pattern in (f"*{_RUN}", _STATE, _SETTINGS):
+            for file in (*self.folder.glob(f"{pattern}{DRAFT}"), *self.folder.glob(pattern)):
+                file.unlink()
+        with contextlib.suppress(OSError):
+            self.folder.rmdir()
+
+
+@contextlib.contextmanager
+def unfinished(out: pathlib.Path, settings: Mapping[str, Any], *, overwrite: bool) -> Iterator[Parts]:
+    """A folder for results that is marked as unfinished until the block has ended.
+
+    However the block was left, the same command goes on in the folder; another one is refused as it would be by any
+    folder that is not empty.
+
+    Args:
+        out: the folder.
+        settings: what tells this command from another, as for JSON.
+        overwrite: whether results that are there may be replaced.
+
+    Raises:
+        UsageError: the folder holds other results and `overwrite` is false, or is a file.
+    """
+    parts = Parts(out / "parts", settings)
+    if not parts.match():
+        output_folder(out, overwrite=overwrite)
+        parts.begin()
+    try:
+        yield parts
+    except ValueError:
+        # input that is refused before anything was made of it leaves the folder free for other input
+        if parts.empty and list(out.iterdir()) == [parts.folder]:
+            parts.remove()
+        raise
+    parts.remove()
+
+
+def _names() -> list[str]:
+    fields = [field.name for field in dataclasses.fields(ClosedLoopRun) if field.name not in _NESTED]
+    return fields + [f"{group}.{field.name}" for group, cls in _NESTED.items() for field in dataclasses.fields(cls)]
+
+
+_FIELDS = _names()
 
 
 def _flatten(run: ClosedLoopRun) -> dict[str, Any]:

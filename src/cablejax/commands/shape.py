@@ -58,8 +58,9 @@ class Shape(Command):
     """Links of the plant's cable."""
 
     def execute(self):
+        from cablejax.commands.parts import unfinished
         from cablejax.commands.results import table_of
-        from cablejax.commands.runs import shape_and_report
+        from cablejax.commands.runs import Job, shape_and_report
         from cablejax.perceive.camera import CameraConfig
         from cablejax.shaping import METHODS, load_model
         from cablejax.simulate.plant import PlantConfig
@@ -78,26 +79,25 @@ class Shape(Command):
         )
         seen = "The cable is seen by a depth camera" if cloud else "The keypoints are seen"
         target = make_target(self.target, cable) if self.target in ("U", "S", "Z") else load_target(self.target, cable)
-        summary = shape_and_report(
-            self.out,
-            overwrite=self.overwrite,
+        job = Job(
             plant=plant,
             model=load_model(self.weights),
-            targets=[target],
+            targets=(target,),
             methods=METHODS if self.method == "both" else (self.method,),
             solver=self.solver,
             steps=self.steps,
             camera=CameraConfig(range_noise=1e-3 * noise_mm, seed=self.seed) if cloud else None,
-            about=(
-                f"The plant's cable is {self.stiffness_ratio:g} times as stiff as the one that the model was trained "
-                f"on; the table's friction coefficient is {self.friction:g}. {seen} "
-                f"with {noise_mm:g} mm of noise."
-            ),
-            facts={
-                field.name.replace("_", " "): str(getattr(self, field.name))
-                for field in dataclasses.fields(self)
-                if field.name not in ("json", "out", "overwrite", "device")
-            },
         )
+        about = (
+            f"The plant's cable is {self.stiffness_ratio:g} times as stiff as the one that the model was trained on; "
+            f"the table's friction coefficient is {self.friction:g}. {seen} with {noise_mm:g} mm of noise."
+        )
+        facts = {
+            field.name.replace("_", " "): str(getattr(self, field.name))
+            for field in dataclasses.fields(self)
+            if field.name not in ("json", "out", "overwrite", "device")
+        }
+        with unfinished(self.out, job.settings(), overwrite=self.overwrite) as parts:
+            summary = shape_and_report(job, self.out, parts, about=about, facts=facts)
         table = text_table(*table_of(summary))
         return summary, f"{table}\n\nLook at {self.out / 'report.html'}"

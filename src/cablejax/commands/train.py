@@ -7,7 +7,8 @@ import json
 import pathlib
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
-from cablejax.commands.options import Command, UsageError, say, text_table, write_json
+from cablejax.commands.options import Command, UsageError, say, text_table
+from cablejax.json_file import write_json
 
 if TYPE_CHECKING:
     from cablejax.dataset.store import Store
@@ -29,6 +30,9 @@ class Train(Command):
 
     out: pathlib.Path = pathlib.Path("runs/train")
     """Folder for what the training writes; one that holds the same training is resumed."""
+
+    overwrite: bool = False
+    """Delete another training that is in the folder, or write among what else is there."""
 
     preset: Literal["released", "small", "smoke"] = "released"
     """released: as the released model was trained. small: to compare variants, some minutes. smoke: a few steps."""
@@ -83,6 +87,8 @@ class Train(Command):
             raise UsageError("--start-from and --pretrain both say where to start: give one of them.")
         if self.pretrain < 0:
             raise UsageError(f"--pretrain is {self.pretrain}, expected 0 or a number of steps.")
+        if self.steps is not None and self.steps < 1:
+            raise UsageError(f"--steps is {self.steps}, expected at least 1; leave it out for those of the preset.")
         stores = [open_store(path) for path in self.data]
         if not stores:
             raise UsageError("--data names no data set, expected at least one.")
@@ -96,7 +102,9 @@ class Train(Command):
             initial = pretrained.model, pretrained.weights
         if self.start_from is not None:
             initial = starting_from(self.start_from, config.model)
-        result = train(config, training, self.out, validation=concatenate(held_out), initial=initial)
+        result = train(
+            config, training, self.out, validation=concatenate(held_out), initial=initial, overwrite=self.overwrite
+        )
         if not result.completed:
             raise KeyboardInterrupt(
                 f"Stopped after step {result.steps} of {config.total_steps}; the checkpoint is in {self.out}. "

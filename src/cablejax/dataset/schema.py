@@ -13,6 +13,7 @@ from typing import Any, Literal
 import numpy as np
 
 from cablejax.simulate.config import CableConfig
+from cablejax.simulate.equilibrium import FEWEST_LINKS
 from cablejax.simulate.motions import MotionConfig
 
 SCHEMA = "cablejax-dataset/1"
@@ -80,6 +81,11 @@ class DatasetConfig:
             raise ValueError(f"DatasetConfig.engine is {self.engine!r}, expected 'threaded' or 'mjx'.")
         if self.cable.dimension != 2:
             raise ValueError("DatasetConfig.cable has dimension 3; data sets hold cables on a table: use dimension=2.")
+        if self.cable.n_links < FEWEST_LINKS:
+            raise ValueError(
+                f"DatasetConfig.cable has n_links {self.cable.n_links}, expected at least {FEWEST_LINKS}: with fewer "
+                "the grippers' poses leave it no freedom."
+            )
 
     @property
     def n_shards(self) -> int:

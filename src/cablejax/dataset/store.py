@@ -15,7 +15,6 @@ import contextlib
 import dataclasses
 import hashlib
 import importlib.metadata
-import json
 import os
 import shutil
 from collections.abc import Sequence
@@ -36,6 +35,7 @@ from cablejax.dataset.schema import (
     differences,
     digest_of_config,
 )
+from cablejax.json_file import read_json
 
 PACKAGES = ("jax", "jaxlib", "mujoco", "mujoco-mjx", "numpy")
 """Packages whose versions decide the content, beside cablejax itself: those that begin a store must complete it."""
@@ -219,9 +219,9 @@ def open_store(path: str | os.PathLike[str], *, mode: Literal["r", "r+"] = "r") 
     if not (path / "zarr.json").is_file():
         raise ValueError(f"{path} holds no data set (no zarr.json). Generate one there, or give another folder.")
     try:
-        attributes: dict[str, Any] = json.loads((path / "zarr.json").read_text()).get("attributes", {})
+        attributes: dict[str, Any] = read_json(path / "zarr.json").get("attributes", {})
     except (ValueError, AttributeError) as error:
-        raise ValueError(f"{path}/zarr.json is damaged ({error}). Generate the data set again elsewhere.") from error
+        raise ValueError(f"The data set is damaged: {error} Generate it again elsewhere.") from error
     if attributes.get("schema") != SCHEMA:
         raise ValueError(
             f"{path} has schema {attributes.get('schema')!r}, expected {SCHEMA!r}. "

@@ -6,13 +6,13 @@ import json
 import math
 import os
 import pathlib
-import tempfile
 from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
 from cablejax.diagnose.diagnosis import Diagnosis, NamedEffect
+from cablejax.whole_file import whole_file
 
 SCHEMA = "cablejax-verdict/1"
 _PLACES = ("along_cable_m", "time_s", "table_m")
@@ -90,14 +90,8 @@ def write_verdict(path: str | os.PathLike[str], diagnosis: Diagnosis) -> pathlib
     path = pathlib.Path(path)
     text = json.dumps(verdict_json(diagnosis), indent=1, allow_nan=False) + "\n"
     path.parent.mkdir(parents=True, exist_ok=True)
-    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.stem}-", suffix=".json")
-    try:
-        with os.fdopen(handle, "w", encoding="utf-8") as stream:
-            stream.write(text)
-        os.chmod(temporary, 0o644)
-        os.replace(temporary, path)
-    finally:
-        pathlib.Path(temporary).unlink(missing_ok=True)
+    with whole_file(path) as stream:
+        stream.write(text.encode())
     return path
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ class Checkpoints:
     """
 
     def __init__(self, folder: Path, keep: int = 2):
+        self._folder = folder
         options = ocp.CheckpointManagerOptions(max_to_keep=keep, create=True, enable_async_checkpointing=False)
         self._manager = ocp.CheckpointManager(folder.absolute(), options=options)
 
@@ -34,7 +36,30 @@ class Checkpoints:
         if step != self.latest():
             self._manager.save(step, args=ocp.args.StandardSave(state))
 
-    def restore(self, like: Any) -> Any:
-        """The newest state, as a pytree like `like` (shapes, dtypes and structure are checked against it)."""
+    def restore(self, like: Any, *, tell: Callable[[str], None] = lambda text: None) -> Any:
+        """The newest state that can be read; newer ones, which are damaged, are deleted.
+
+        Args:
+            like: a pytree that shapes, dtypes and structure are checked against.
+            tell: called with a line of text on each state that cannot be read.
+
+        Raises:
+            ValueError: none can be read.
+        """
         abstract = jax.tree.map(ocp.utils.to_shape_dtype_struct, like)
-        return self._manager.restore(self.latest(), args=ocp.args.StandardRestore(abstract))
+        damaged: list[int] = []
+        reason = "there is none"
+        for step in sorted(self._manager.all_steps(), reverse=True):
+            try:
+                state = self._manager.restore(step, args=ocp.args.StandardRestore(abstract))
+            except Exception as error:  # Orbax raises what its parts raise, and plain exceptions itself
+                damaged.append(step)
+                reason = next(iter(str(error).splitlines()), repr(error))
+                continue
+            for newer in damaged:
+                tell(f"The checkpoint of step {newer} is damaged; going on from the one of step {step}.")
+                self._manager.delete(newer)
+            return state
+        raise ValueError(
+            f"No checkpoint in {self._folder} can be read ({reason}). Delete this folder to begin the training anew."
+        )

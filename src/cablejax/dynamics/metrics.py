@@ -7,6 +7,8 @@ from pathlib import Path
 
 from tensorboardX import SummaryWriter
 
+from cablejax.dynamics.run_folder import BOARD, METRICS
+
 
 class MetricsLog:
     """Appends rows of numbers, keyed by optimiser step.
@@ -17,7 +19,7 @@ class MetricsLog:
 
     def __init__(self, folder: Path, columns: tuple[str, ...], resume_step: int):
         self._columns = columns
-        path = folder / "metrics.csv"
+        path = folder / METRICS
         kept: list[list[str]] = []
         if path.exists():
             with path.open(newline="") as file:
@@ -28,7 +30,7 @@ class MetricsLog:
         self._csv.writerow(["step", *columns])
         self._csv.writerows(kept)
         self._file.flush()
-        self._board = SummaryWriter(str(folder / "tensorboard"), purge_step=resume_step + 1, write_to_disk=True)
+        self._board = SummaryWriter(str(folder / BOARD), purge_step=resume_step + 1, write_to_disk=True)
 
     def __enter__(self) -> MetricsLog:
         return self

@@ -8,9 +8,8 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import hashlib
-import json
 import signal
+import sys
 import threading
 import time
 from collections.abc import Iterator
@@ -30,12 +29,18 @@ from cablejax.dataset.windows import Window, draw_windows
 from cablejax.dynamics.checkpoint import Checkpoints
 from cablejax.dynamics.config import ModelConfig
 from cablejax.dynamics.evaluate import HORIZONS, evaluation_windows, make_errors
+from cablejax.dynamics.fingerprint import fingerprint
 from cablejax.dynamics.loss import random_walk_noise, rollout_loss
 from cablejax.dynamics.metrics import MetricsLog
 from cablejax.dynamics.model import bind, make_network
 from cablejax.dynamics.normalisation import check_trajectories, fit_normalisation
+from cablejax.dynamics.run_folder import CHECKPOINTS, claim_folder
 from cablejax.dynamics.train_config import Phase, TrainConfig
 from cablejax.types import Trajectory
+
+
+class DivergedError(ValueError):
+    """A training whose loss is no longer finite: says what to change."""
 
 
 @jax.tree_util.register_dataclass
@@ -85,6 +90,7 @@ def train(
     validation: Trajectory | None = None,
     initial: tuple[ModelConfig, nnx.State] | None = None,
     resume: bool = True,
+    overwrite: bool = False,
     progress: bool = True,
 ) -> TrainResult:
     """Trains from scratch, or goes on from the last checkpoint in `out_dir`.
@@ -96,11 +102,13 @@ def train(
         validation: held-out trajectories, evaluated open loop every `config.evaluate_every` chunks.
         initial: a model to start from instead of random weights. Its scales stay, since its weights mean nothing
             without them.
-        resume: false refuses a folder that holds a run already.
+        resume: false refuses a folder that holds this run already.
+        overwrite: another run in the folder is deleted, and other files there may be replaced.
         progress: show a progress bar with remaining time.
 
     Raises:
-        ValueError: bad data, or `out_dir` holds a run of another configuration or data.
+        ValueError: bad data, or `out_dir` holds a run of another configuration or data, or something else.
+        DivergedError: the loss is no longer finite.
     """
     check_trajectories(data, config.model, steps=config.longest_rollout, what="training data")
     scales = fit_normalisation(data, config.model) if initial is None else initial[0].normalisation
@@ -112,9 +120,8 @@ def train(
         )
     config = dataclasses.replace(config, model=model_config)
     out_dir = Path(out_dir)
-    claim_folder(
-        out_dir, {"config": dataclasses.asdict(config), "data": fingerprint(data, initial and initial[1])}, resume
-    )
+    run = {"config": dataclasses.asdict(config), "data": fingerprint((data, initial and initial[1]))}
+    claim_folder(out_dir, run, resume=resume, overwrite=overwrite)
 
     graphdef, weights = nnx.split(make_network(model_config, nnx.Rngs(config.seed)))
     if initial is not None:
@@ -126,9 +133,9 @@ def train(
     columns = ("phase", "learning_rate", "loss", "gradient_norm", *(f"open_loop_{h}_cm" for h in HORIZONS), "seconds")
 
     scores: dict[int, float] = {}
-    with Checkpoints(out_dir / "checkpoints") as checkpoints, interrupt_flag() as interrupted:
+    with Checkpoints(out_dir / CHECKPOINTS) as checkpoints, interrupt_flag() as interrupted:
         if checkpoints.latest() is not None:
-            state = checkpoints.restore(state)
+            state = checkpoints.restore(state, tell=functools.partial(tqdm.write, file=sys.stderr))
         step, total = int(state.step), config.total_steps
         bar = tqdm(total=total, initial=step, unit="step", disable=not progress, dynamic_ncols=True)
         with MetricsLog(out_dir, columns, step) as log, bar:
@@ -142,9 +149,11 @@ def train(
                 row = {"phase": index, "learning_rate": rate, "seconds": seconds}
                 row |= {name: float(np.mean(values)) for name, values in losses.items()}
                 if not np.isfinite(row["loss"]):
-                    raise FloatingPointError(
-                        f"training loss is {row['loss']} after step {step}; the last good checkpoint is in "
-                        f"{out_dir / 'checkpoints'}. Lower the learning rate or the gradient clip."
+                    raise DivergedError(
+                        f"The training diverged: its loss is {row['loss']} after step {step}, at a learning rate of "
+                        f"{rate:.3g}. Train with a lower one (--lr, now {config.phases[0].lr_start:g}) or larger "
+                        f"batches, in another folder or with overwriting (--overwrite); {out_dir} keeps the last good "
+                        "checkpoint."
                     )
                 chunks = -(-step // config.chunk)
                 if evaluate is not None and (chunks % config.evaluate_every == 0 or step == total):
@@ -222,42 +231,6 @@ class Validation:
     def __call__(self, weights: nnx.State) -> dict[int, float]:
         error = np.asarray(self.errors((weights,), self.windows), np.float64)
         return {h: float(100 * np.median(error[:, h - 1])) for h in self.horizons}
-
-
-def fingerprint(data: Trajectory, initial: nnx.State | None) -> str:
-    """Hash of the arrays that a training starts from."""
-    digest = hashlib.blake2b(digest_size=16)
-    for leaf in jax.tree.leaves((data, initial)):
-        array = np.ascontiguousarray(leaf)
-        digest.update(f"{array.dtype}{array.shape}".encode())
-        digest.update(array.data)
-    return digest.hexdigest()
-
-
-def claim_folder(out_dir: Path, run: dict[str, Any], resume: bool) -> None:
-    """Writes `run.json` into a fresh folder; refuses one that holds another run, or any run unless `resume`."""
-    path = out_dir / "run.json"
-    run = json.loads(json.dumps(run))
-    if path.exists():
-        found = json.loads(path.read_text())
-        if not resume:
-            raise ValueError(f"{out_dir} holds a training already. Choose another folder, or resume it.")
-        if found != run:
-            raise ValueError(
-                f"{out_dir} holds a training that differs in {', '.join(differences(found, run))}. "
-                "Choose another folder, or repeat it with the same configuration and data."
-            )
-        return
-    out_dir.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps(run, indent=1) + "\n")
-
-
-def differences(old: Any, new: Any, name: str = "") -> list[str]:
-    """Where two JSON trees differ, as `path (old, now new)`."""
-    if isinstance(old, dict) and isinstance(new, dict):
-        keys = sorted(old.keys() | new.keys())
-        return [d for k in keys for d in differences(old.get(k), new.get(k), f"{name}.{k}" if name else k)]
-    return [] if old == new else [f"{name} ({old}, now {new})"]
 
 
 @contextmanager

@@ -23,10 +23,11 @@ import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 from safetensors import SafetensorError, safe_open
-from safetensors.numpy import save_file
+from safetensors.numpy import save
 
 from cablejax.dynamics.config import ModelConfig, Normalisation
 from cablejax.dynamics.transfer import structure_of
+from cablejax.whole_file import whole_file
 
 SCHEMA = "cablejax-weights/1"
 """Name and version of the file's layout. A reader refuses any other."""
@@ -61,9 +62,9 @@ def save_weights(
     tensors = {name: np.asarray(leaf) for name, leaf in _named(weights).items()}
     _check_tensors(tensors, _named(structure_of(model_config)[1]), f"The weights to be saved in {path}")
     content = {"schema": SCHEMA, "config": dataclasses.asdict(model_config), "info": dict(info)}
-    part = path.with_name(path.name + ".part")
-    save_file(tensors, part, metadata={_KEY: json.dumps(content, allow_nan=False)})
-    os.replace(part, path)
+    data = save(tensors, metadata={_KEY: json.dumps(content, allow_nan=False)})
+    with whole_file(path) as stream:
+        stream.write(data)
 
 
 def load_weights(
@@ -145,7 +146,7 @@ def _open(source: str | os.PathLike[str]) -> tuple[Path, dict[str, Any]]:
         with safe_open(path, framework="numpy") as file:
             metadata = file.metadata() or {}
         content = json.loads(metadata.get(_KEY, "null"))
-    except (SafetensorError, OSError, ValueError) as error:
+    except (SafetensorError, OSError, ValueError, RecursionError) as error:
         raise WeightsError(f"{path} is no safetensors file, or a damaged one ({error}).") from error
     schema = content.get("schema") if isinstance(content, dict) else None
     if not isinstance(content, dict) or schema != SCHEMA or not {"config", "info"} <= content.keys():

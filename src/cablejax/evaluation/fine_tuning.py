@@ -13,6 +13,7 @@ from cablejax.dynamics.train import train
 from cablejax.dynamics.train_config import Phase, TrainConfig
 from cablejax.dynamics.weights import FILE_NAME, save_weights
 from cablejax.evaluation.protocols import GuessingCable
+from cablejax.npz import read_npz
 from cablejax.shaping import Model, load_model
 from cablejax.simulate.config import CableConfig
 from cablejax.simulate.motions import MotionConfig, random_motion
@@ -55,8 +56,8 @@ def record(
         cache: file to keep the recording in, and to take it from if it is there.
     """
     if cache is not None and cache.is_file():
-        with np.load(cache, allow_pickle=False) as arrays:
-            return Trajectory(arrays["keypoints"], arrays["gripper_pose"], arrays["gripper_twist"])  # pyright: ignore[reportArgumentType]
+        arrays = read_npz(cache, ["keypoints", "gripper_pose", "gripper_twist"])
+        return Trajectory(arrays["keypoints"], arrays["gripper_pose"], arrays["gripper_twist"])  # pyright: ignore[reportArgumentType]
     motion = MotionConfig(start="straight")
     keypoints, poses, twists, attempt = [], [], [], 0
     while len(twists) < config.trajectories:

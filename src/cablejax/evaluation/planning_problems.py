@@ -25,6 +25,7 @@ from cablejax.evaluation.referee import Limits
 from cablejax.mpc import Controller, MPCConfig, ObjectiveConfig, Plan, ShapingProblem, Solver
 from cablejax.mpc.feasible import feasible_from
 from cablejax.mpc.rollout import Rollout
+from cablejax.npz import read_npz
 from cablejax.residual.corrected import Corrected
 from cablejax.residual.ridge import ResidualModel, zero_residual
 from cablejax.shaping import Model, NetworkDynamics
@@ -183,8 +184,7 @@ def save_cases(path: pathlib.Path, cases: Sequence[PlanningCase]) -> None:
 
 def load_cases(path: pathlib.Path) -> list[PlanningCase]:
     """Reads what `save_cases` wrote."""
-    with np.load(path, allow_pickle=False) as file:
-        columns = {name: file[name] for name in file.files}
+    columns = read_npz(path, [field.name for field in dataclasses.fields(PlanningCase)])
     rows = zip(*columns.values(), strict=True)
     cases = [dict(zip(columns, row, strict=True)) for row in rows]
     return [PlanningCase(**(case | {"name": str(case["name"]), "radius": float(case["radius"])})) for case in cases]

@@ -5,11 +5,11 @@ from __future__ import annotations
 import dataclasses
 import os
 import pathlib
-import zipfile
 
 import numpy as np
 from jaxtyping import Float
 
+from cablejax.npz import read_npz
 from cablejax.perceive.pcd import read_pcd
 
 POSES_FILE = "poses.csv"
@@ -69,16 +69,10 @@ def read_clouds(path: str | os.PathLike[str]) -> CloudSequence:
         return _read_folder(path)
     if not path.is_file():
         raise ValueError(f"{path} does not exist, expected an .npz file or a folder of PCD files.")
-    try:
-        with np.load(path, allow_pickle=False) as archive:
-            arrays = {name: archive[name] for name in archive.files}
-    except (OSError, ValueError, AttributeError, zipfile.BadZipFile) as error:
-        raise ValueError(f"{path} is not an .npz file of plain arrays: {error}") from None
-    if missing := {"time", "gripper_pose", "points"} - set(arrays):
-        raise ValueError(
-            f"{path} lacks {', '.join(sorted(missing))}: expected time [T], gripper_pose [T, 2, 3] and points."
-        )
+    arrays = read_npz(path, ["time", "gripper_pose", "points"], ["count"])
     points = arrays["points"]
+    if not np.issubdtype(points.dtype, np.floating):
+        raise ValueError(f"{path}: points are {points.dtype}, expected floating point numbers.")
     if "count" in arrays:
         count = arrays["count"]
         if points.ndim != 2 or not np.issubdtype(count.dtype, np.integer) or count.sum() != len(points):

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.interpolate import CubicSpline
 
+from cablejax.cable_length import require_long_enough
 from cablejax.gaplog import Episode, gap_log_from_episodes
 from cablejax.recordings.poses import twists
 from cablejax.recordings.take import Take, typical_spacing
@@ -54,7 +55,7 @@ def gap_log_from_takes(takes: Sequence[Take], nominal: Nominal, *, source: str, 
         repairs: what was changed; told in the log's source.
 
     Raises:
-        ValueError: takes or values that make no gap log.
+        ValueError: takes or values that make no gap log, or a cable shorter than its keypoints are apart.
     """
     points = takes[0].keypoints.shape[1]
     arclength = measured_arclength(takes) if nominal.arclength is None else np.asarray(nominal.arclength, float)
@@ -62,6 +63,7 @@ def gap_log_from_takes(takes: Sequence[Take], nominal: Nominal, *, source: str, 
         raise ValueError(
             f"The arc lengths of the keypoints are {arclength.tolist()}, expected {points} increasing numbers from 0."
         )
+    require_long_enough([take.keypoints for take in takes], arclength, "keypoint_arclength_m")
     cable = CableConfig(
         length=float(arclength[-1]),
         diameter=nominal.diameter,

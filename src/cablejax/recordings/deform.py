@@ -12,12 +12,12 @@ import dataclasses
 import itertools
 import os
 import pathlib
-import zipfile
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
+from cablejax.npz import read_npz
 from cablejax.recordings.assemble import Nominal, gap_log_from_takes
 from cablejax.recordings.frames import Frame
 from cablejax.recordings.pickles import read_pickle
@@ -87,6 +87,7 @@ def read_deform(path: str | os.PathLike[str]) -> DeformRecordings:
 
     Raises:
         ValueError: there is nothing of the kind, a pickle holds anything but arrays of numbers, or shapes do not fit.
+        FileNotFoundError: there is no such file.
     """
     path = pathlib.Path(path)
     if path.is_dir():
@@ -99,13 +100,7 @@ def read_deform(path: str | os.PathLike[str]) -> DeformRecordings:
 
 
 def _read_npz(path: pathlib.Path) -> DeformRecordings:
-    try:
-        with np.load(path, allow_pickle=False) as archive:
-            arrays = {name: archive[name] for name in archive.files}
-    except (OSError, ValueError, AttributeError, zipfile.BadZipFile) as error:
-        raise ValueError(f"{path} is not an .npz file of plain arrays: {error}") from None
-    if missing := {"keypoints", "dt", "split", "source_id", "recording_guess"} - set(arrays):
-        raise ValueError(f"{path} lacks {', '.join(sorted(missing))}; it has {', '.join(sorted(arrays))}.")
+    arrays = read_npz(path, ["keypoints", "dt", "split", "source_id", "recording_guess"])
     if not np.issubdtype(arrays["keypoints"].dtype, np.floating):
         raise ValueError(f"{path}: keypoints is {arrays['keypoints'].dtype}, expected floating point numbers.")
     if arrays["dt"].size != 1:

@@ -111,7 +111,7 @@ def read_layout(path: str | os.PathLike[str], place: str) -> Layout:
         raise ValueError(
             f"The layout {path} could not be read: {error.strerror}. docs/recordings.md has one."
         ) from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
         raise ValueError(f"The layout {path} is no TOML: {error}") from None
     if unknown := set(values) - {"cable", "table", "frame", "source", place}:
         raise ValueError(

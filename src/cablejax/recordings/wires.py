@@ -9,12 +9,13 @@ from __future__ import annotations
 import dataclasses
 import os
 import pathlib
-import zipfile
 
 import numpy as np
 from jaxtyping import Float
 
+from cablejax.cable_length import require_long_enough
 from cablejax.gaplog import Episode, gap_log_from_episodes
+from cablejax.npz import read_npz
 from cablejax.recordings.poses import poses_from_markers
 from cablejax.recordings.units import require_metres
 from cablejax.simulate.config import CableConfig
@@ -48,16 +49,11 @@ def read_wires(path: str | os.PathLike[str]) -> tuple[HangingWire, ...]:
     `EI_published_Nm2` [W, R].
 
     Raises:
-        ValueError: there is no such file, or something in it is missing, not finite or does not fit together.
+        ValueError: something in the file is missing, not finite or does not fit together, or it is no such file.
+        FileNotFoundError: there is none.
     """
     path = pathlib.Path(path)
-    try:
-        with np.load(path, allow_pickle=False) as archive:
-            arrays = {name: archive[name] for name in archive.files}
-    except (OSError, ValueError, AttributeError, zipfile.BadZipFile) as error:
-        raise ValueError(f"{path} is not an .npz file of plain arrays: {error}") from None
-    if missing := set(_FIELDS) - set(arrays):
-        raise ValueError(f"{path} lacks {', '.join(sorted(missing))}; it has {', '.join(sorted(arrays))}.")
+    arrays = read_npz(path, _FIELDS)
     points = arrays["keypoints"]
     count = points.shape[:2]
     shapes = {"wire": count[:1], "length_m": (), "mass_per_length_kg_m": count[:1], "EI_published_Nm2": count}
@@ -88,8 +84,14 @@ def wire_log(wire: HangingWire) -> GapLog:
 
     The mean of the published stiffnesses is what is believed true; the diameter is a guess. Gripper poses are the first
     and last point with the direction to the point beside it, since the photographs do not show the clamps.
+
+    Raises:
+        ValueError: the wire is shorter than its points are apart.
     """
     repeats, count, _ = wire.keypoints.shape
+    require_long_enough(
+        [points[None] for points in wire.keypoints], np.linspace(0.0, wire.length, count), f"length_m, for {wire.name},"
+    )
     cable = CableConfig(
         length=wire.length,
         diameter=_DIAMETER,

@@ -18,6 +18,9 @@ from cablejax.simulate.config import CableConfig
 from cablejax.simulate.pose import wrapped
 from cablejax.types import CableState
 
+FEWEST_LINKS = 5
+"""Links of a chain that both grippers' poses leave a joint to move: four joints against three conditions."""
+
 _MAX_ITERATIONS = 200
 _MAX_TURN = 0.2  # largest change of a joint angle in one iteration [rad]
 _MAX_STRETCH = 0.2  # largest correction of the far end in one iteration, relative to the length
@@ -44,7 +47,8 @@ def find_equilibrium(
     """The settled cable between two planar gripper poses, near the joint angles `guess` [rad].
 
     Raises:
-        ValueError: the poses are out of reach of the cable, or the iteration does not settle.
+        ValueError: the chain has fewer links than `FEWEST_LINKS`, the poses are out of reach of the cable, or the
+            iteration does not settle.
     """
     pose = np.asarray(gripper_pose, np.float64)
     if not np.all(np.isfinite(pose)):
@@ -60,6 +64,10 @@ def find_equilibrium(
     h, lengths, joints = config.link_length, link_lengths(config), np.arange(config.n_joints)
     later = np.maximum.outer(joints, joints)
     angles = np.array(guess, np.float64)
+    if config.n_links < FEWEST_LINKS:
+        raise ValueError(
+            f"A chain of {config.n_links} links has no freedom between two grippers, expected at least {FEWEST_LINKS}."
+        )
     error = np.full(3, np.inf)
     for _ in range(_MAX_ITERATIONS):
         theta = pose[0, 2] + np.concatenate([[0.0], np.cumsum(angles)])

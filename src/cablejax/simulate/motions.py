@@ -51,6 +51,13 @@ class MotionConfig:
     max_curvature: float = 12.0
     max_amplification: float = 1.5
 
+    def __post_init__(self):
+        if not self.max_amplification > 0:
+            raise ValueError(
+                f"MotionConfig.max_amplification is {self.max_amplification}, expected > 0: 1.5 keeps the cable from "
+                "snapping through, 1000 lets it snap."
+            )
+
 
 def random_motion(
     rng: np.random.Generator,

@@ -10,6 +10,7 @@ from collections.abc import Callable
 import numpy as np
 from jaxtyping import Float
 
+from cablejax.npz import read_npz
 from cablejax.recordings.deform import NOMINAL, DeformRecordings
 from cablejax.spatial.clamps import frames_along
 from cablejax.spatial.estimate import estimates_of_halves
@@ -167,8 +168,8 @@ def _learned(fitted, windows: Windows, simulated, others: Windows, path: pathlib
         partial = path.with_suffix(".partial.npz")
         np.savez(partial, network=(network.size, network.rounds), **dict(zip(_LEARNED, arrays, strict=True)))
         partial.replace(path)
-    with np.load(path) as kept:
-        return {name: kept[name] for name in _LEARNED}, (int(kept["network"][0]), int(kept["network"][1]))
+    kept = read_npz(path, ["network", *_LEARNED])
+    return {name: kept[name] for name in _LEARNED}, (int(kept["network"][0]), int(kept["network"][1]))
 
 
 def _seconds(found: Identified, windows: Windows) -> tuple[float, float]:

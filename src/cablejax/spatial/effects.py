@@ -79,6 +79,11 @@ def blocks(n_markers: int, *, twisting: bool) -> tuple[Block, ...]:
     return tuple(result)
 
 
+def effect_names() -> tuple[str, ...]:
+    """Names of all effects that a log in space is searched for."""
+    return tuple(dict.fromkeys(block.effect for block in blocks(1, twisting=True)))
+
+
 @dataclasses.dataclass(frozen=True)
 class Layout:
     """Where each block sits in the vector.

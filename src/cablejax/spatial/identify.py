@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from cablejax.spatial.effects import Layout, blocks
+from cablejax.spatial.effects import Layout, blocks, effect_names
 from cablejax.spatial.fit import Simulator, errors
 from cablejax.spatial.memory import Memory, fingerprint
 from cablejax.spatial.newton import improve
@@ -109,9 +109,13 @@ def identify(
             material frame and take four times as long as all others together.
         state: file that keeps what is done, so that an interrupted call goes on where it was.
         progress: called with a line of text.
+
+    Raises:
+        ValueError: `only` names another effect.
     """
-    names = [block.effect for block in blocks(1, twisting=True)]
-    names = [name for name in dict.fromkeys(names) if (name != _MATERIAL if only is None else name in only)]
+    if unknown := [name for name in only or () if name not in effect_names()]:
+        raise ValueError(f"There is no effect {unknown[0]!r} in space, expected some of {', '.join(effect_names())}.")
+    names = [name for name in effect_names() if (name != _MATERIAL if only is None else name in only)]
     picked = windows.chosen(selection(windows))
     layout = layout_of(windows, nominal_stiffness, twisting=False)
     time_steps = time_steps_for(windows.chosen(selection(windows, _TIMED)), layout, EDGES)

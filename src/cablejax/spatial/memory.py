@@ -2,21 +2,22 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import hashlib
 import json
-import os
 import pathlib
-import tempfile
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
+from cablejax.json_file import read_json
 from cablejax.spatial.rod import Rod
 from cablejax.spatial.search import Step
 from cablejax.spatial.values import Values, from_json, to_json
 from cablejax.spatial.windows import Windows
+from cablejax.whole_file import whole_file
 
 
 def fingerprint(rod: Rod, windows: Windows, nominal_stiffness: float, names: Sequence[str]) -> str:
@@ -32,9 +33,13 @@ class Memory:
 
     def __init__(self, path: pathlib.Path | None, fingerprint: str):
         self._path = path
-        self._held: dict[str, Any] = json.loads(path.read_text()) if path is not None and path.exists() else {}
-        if self._held.get("fingerprint") != fingerprint:
-            self._held = {"fingerprint": fingerprint}
+        self._held: dict[str, Any] = {"fingerprint": fingerprint}
+        if path is not None and path.exists():
+            # what cannot be read is found again
+            with contextlib.suppress(ValueError):
+                found = read_json(path)
+                if isinstance(found, dict) and found.get("fingerprint") == fingerprint:
+                    self._held = found
 
     def steps(self, name: str) -> list[Step]:
         return [
@@ -68,6 +73,5 @@ class Memory:
         if self._path is None:
             return
         self._path.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.NamedTemporaryFile("w", dir=self._path.parent, delete=False) as file:
-            json.dump(self._held, file)
-        os.replace(file.name, self._path)
+        with whole_file(self._path) as stream:
+            stream.write(json.dumps(self._held).encode())

@@ -7,6 +7,7 @@ import dataclasses
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from cablejax.cable_length import require_long_enough
 from cablejax.recordings.poses import rotated
 from cablejax.simulate.config import GRAVITY
 from cablejax.spatial.clamps import frames_along
@@ -75,7 +76,8 @@ def windows_of(log: GapLog, *, length: float = WINDOW) -> Windows:
     """Cuts every episode into windows.
 
     Raises:
-        ValueError: a log in the plane, of unequal sample intervals, or one that has no window of a second.
+        ValueError: a log in the plane, of unequal sample intervals, of a cable shorter than its keypoints are apart, or
+            one that has no window of a second.
     """
     if log.keypoints.shape[-1] != 3 or log.gripper_pose.shape[2] != 2:
         raise ValueError(
@@ -90,6 +92,11 @@ def windows_of(log: GapLog, *, length: float = WINDOW) -> Windows:
         raise ValueError(
             f"Samples are {intervals.min():.4g} to {intervals.max():.4g} s apart, expected one interval: resample."
         )
+    require_long_enough(
+        [np.asarray(p[:n], float) for p, n in zip(log.keypoints, log.episode_length, strict=True)],
+        np.asarray(log.meta["keypoint_arclength_m"], float),
+        "meta.keypoint_arclength_m",
+    )
     samples = min(round(length / interval), int(log.episode_length.max()))
     points = np.asarray(log.keypoints, float)
     pose = np.asarray(log.gripper_pose, float)

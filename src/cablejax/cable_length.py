@@ -1,0 +1,52 @@
+"""A cable is no shorter than its keypoints are apart: arc lengths that say so are refused."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float
+
+TOLERANCE = 0.03
+"""By how much keypoints may lie further apart than their arc lengths say, relative to the cable's length: markers sit
+off the centreline, and real cables stretch a little."""
+
+
+def require_long_enough(
+    episodes: Sequence[Float[np.ndarray, "T N D"]], arclength: Float[np.ndarray, " N"], name: str
+) -> None:
+    """Refuses arc lengths that are shorter than the polyline of the keypoints, over any stretch of the cable.
+
+    Args:
+        episodes: keypoints [m], NaN = not observed.
+        arclength: of each keypoint [m].
+        name: what the arc lengths are called where they come from.
+
+    Raises:
+        ValueError: they are shorter by more than noise and `TOLERANCE`.
+    """
+    chords = np.concatenate([np.linalg.norm(np.diff(points, axis=1), axis=-1) for points in episodes])
+    stated = np.diff(arclength)
+    seen = np.isfinite(chords).any(axis=0)
+    usual = stated.copy()
+    usual[seen] = np.nanmedian(chords[:, seen], axis=0)
+    # noise across a chord lengthens it
+    noise = _noise(episodes)
+    across = (episodes[0].shape[-1] - 1) * noise**2 / np.maximum(stated, 1e-9)
+    excess = np.concatenate([[0.0], np.cumsum(usual - stated - across)])
+    low = np.minimum.accumulate(excess)
+    end = int((excess - low).argmax())
+    begin = int(excess[: end + 1].argmin())
+    if excess[end] - excess[begin] > TOLERANCE * arclength[-1]:
+        raise ValueError(
+            f"From keypoint {begin} to {end} it usually is {usual[begin:end].sum():.4g} m from one to the next, but "
+            f"{name} gives them {stated[begin:end].sum():.4g} m of cable, and a cable does not stretch so far (noise "
+            f"of {1e3 * noise:.2g} mm is allowed for): correct {name}, or the unit of length."
+        )
+
+
+def _noise(episodes: Sequence[Float[np.ndarray, "T N D"]]) -> float:
+    """Standard deviation of a coordinate [m], from third differences in time; 0 where there are too few samples."""
+    third = np.concatenate([np.diff(points, n=3, axis=0).ravel() for points in episodes])
+    third = np.abs(third[np.isfinite(third)])
+    return float(1.4826 * np.median(third) / np.sqrt(20)) if len(third) else 0.0

@@ -1,0 +1,92 @@
+"""The folder of a training: whose it is, and what may be replaced in it."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+from cablejax.json_file import read_json, write_json
+
+RUN, CHECKPOINTS, METRICS, BOARD = "run.json", "checkpoints", "metrics.csv", "tensorboard"
+
+# What `cablejax train` adds in the end.
+_RESULTS = ("weights.safetensors", "card.md", "summary.json")
+
+
+def claim_folder(out_dir: Path, run: dict[str, Any], *, resume: bool, overwrite: bool) -> None:
+    """Writes `run.json` into a fresh folder, or into one that is taken over.
+
+    Args:
+        out_dir: the folder.
+        run: what decides the outcome of the training, as for JSON: "config" and "data".
+        resume: whether the folder may hold this very training.
+        overwrite: whether another training, or files of something else, may be there. The training is deleted; of the
+            other files those are replaced that have the names of its own.
+
+    Raises:
+        ValueError: the folder holds another run, any run without `resume`, or something else without `overwrite`.
+    """
+    if out_dir.exists() and not out_dir.is_dir():
+        raise ValueError(f"{out_dir} is a file, expected a folder for the training. Name another one.")
+    path = out_dir / RUN
+    run = json.loads(json.dumps(run))
+    if path.exists():
+        found = _read(path)
+        if found == run:
+            if not resume:
+                raise ValueError(f"{out_dir} holds a training already. Choose another folder, or resume it.")
+            return
+        if not overwrite:
+            raise ValueError(
+                f"{out_dir} holds a training that differs in {', '.join(differences(found, run))}. Choose another "
+                "folder, repeat it with the same configuration and data, or overwrite it (--overwrite)."
+            )
+        _discard(out_dir)
+    elif out_dir.is_dir() and any(out_dir.iterdir()):
+        if not overwrite:
+            raise ValueError(
+                f"{out_dir} exists and is not empty, and holds no training. Choose another folder, or write among what "
+                "is there (--overwrite)."
+            )
+        for name in (CHECKPOINTS, BOARD):
+            if (out_dir / name).exists():
+                raise ValueError(
+                    f"{out_dir / name} was not made by a training, which needs a folder of that name. Move it "
+                    "elsewhere, or choose another folder."
+                )
+        _discard(out_dir)
+    out_dir.mkdir(parents=True, exist_ok=True)
+    write_json(path, run)
+
+
+def differences(old: Any, new: Any, name: str = "") -> list[str]:
+    """Where two JSON trees differ, as `path (old, now new)`."""
+    if isinstance(old, dict) and isinstance(new, dict):
+        keys = sorted(old.keys() | new.keys())
+        return [d for k in keys for d in differences(old.get(k), new.get(k), f"{name}.{k}" if name else k)]
+    return [] if old == new else [f"{name} ({old}, now {new})"]
+
+
+def _read(path: Path) -> dict[str, Any]:
+    try:
+        found = read_json(path)
+    except ValueError as error:
+        raise ValueError(
+            f"{error} Which training {path.parent} holds cannot be told: choose another folder, or delete this one."
+        ) from error
+    if not isinstance(found, dict) or not {"config", "data"} <= found.keys():
+        raise ValueError(f"{path} was not made by a training: choose another folder.")
+    return found
+
+
+def _discard(out_dir: Path) -> None:
+    """Deletes what a training wrote, its name last: until then it can be deleted again."""
+    checkpoints, board = out_dir / CHECKPOINTS, out_dir / BOARD
+    for step in checkpoints.glob("[0-9]*"):
+        shutil.rmtree(step)
+    for events in board.glob("events.*"):
+        events.unlink()
+    for name in (METRICS, *_RESULTS, RUN):
+        (out_dir / name).unlink(missing_ok=True)

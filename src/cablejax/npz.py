@@ -1,0 +1,62 @@
+"""Reading `.npz` files of plain arrays: nothing is ever unpickled, and a damaged file is told by a message."""
+
+from __future__ import annotations
+
+import lzma
+import os
+import pathlib
+import struct
+import tokenize
+import zipfile
+import zlib
+from collections.abc import Sequence
+
+import numpy as np
+
+# What the decompressors and NumPy raise on a file that is damaged, encrypted, or holds Python objects. A damaged header
+# may ask for more memory than there is.
+_UNREADABLE = (
+    ValueError, TypeError, KeyError, OSError, EOFError, RuntimeError, MemoryError, OverflowError, SyntaxError,
+    struct.error, tokenize.TokenError, zipfile.BadZipFile, zlib.error, lzma.LZMAError,
+)  # fmt: skip
+
+
+class NpzError(ValueError):
+    """An `.npz` file that is damaged, none at all, or lacks an array."""
+
+
+def read_npz(
+    path: str | os.PathLike[str], required: Sequence[str], optional: Sequence[str] = ()
+) -> dict[str, np.ndarray]:
+    """The named arrays of an `.npz` file. What else it holds is not looked at.
+
+    Args:
+        path: the file.
+        required: names of arrays that must be there.
+        optional: names of arrays that are read where they are there.
+
+    Raises:
+        NpzError: the file is no `.npz`, cannot be read, lacks a required array, or holds Python objects under one of
+            these names.
+        FileNotFoundError: there is no such file.
+    """
+    path = pathlib.Path(path)
+    if not path.is_file():
+        raise FileNotFoundError(f"There is no file {path}.")
+    if not zipfile.is_zipfile(path):
+        raise NpzError(f"{path} is no .npz archive, or one that is cut off: make it again.")
+    try:
+        # NumPy leaves a file open that it opened itself and could not read
+        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as archive:
+            there = sorted(archive.files)
+            arrays = {name: archive[name] for name in (*required, *optional) if name in archive.files}
+    except _UNREADABLE as error:
+        raise NpzError(f"{path} could not be read: {_reason(error)}") from error
+    if missing := [name for name in required if name not in arrays]:
+        raise NpzError(f"{path} lacks {', '.join(missing)}, it has {', '.join(there) or 'nothing'}.")
+    return arrays
+
+
+def _reason(error: Exception) -> str:
+    """NumPy advises to unpickle what it will not read; nobody should."""
+    return "it holds Python objects, expected plain arrays." if "pickle" in str(error) else f"{error}."

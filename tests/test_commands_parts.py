@@ -1,0 +1,193 @@
+"""Commands that did not end: the same one goes on, whatever was written, and files of the user's own stay."""
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+
+from cablejax.cli import main
+from cablejax.commands import diagnose, runs
+from cablejax.commands.options import UsageError
+from cablejax.commands.parts import Parts, unfinished
+from cablejax.commands.runs import Job
+from cablejax.shaping import load_model
+from cablejax.simulate.plant import PlantConfig
+from cablejax.targets import make_target
+from cli_cases import made_up_run, small_model
+
+TARGET = make_target("U")
+SETTINGS = {"steps": 2}
+
+
+@pytest.fixture(scope="module")
+def weights(tmp_path_factory):
+    return small_model(tmp_path_factory.mktemp("model"))
+
+
+@pytest.fixture
+def made(monkeypatch):
+    """Runs cost nothing here; this is what was made."""
+    made = []
+
+    def quick(plant, model, target, *, method, **_):
+        made.append(method)
+        return made_up_run(target)
+
+    monkeypatch.setattr(runs, "shape_once", quick)
+    return made
+
+
+def interrupted(*args, **kwargs):
+    raise KeyboardInterrupt
+
+
+def assert_same(run, other):
+    for field in dataclasses.fields(run):
+        one, two = getattr(run, field.name), getattr(other, field.name)
+        assert_same(one, two) if dataclasses.is_dataclass(one) else np.testing.assert_array_equal(one, two)
+
+
+def test_a_run_comes_back_as_it_was_kept(tmp_path):
+    parts, run = Parts(tmp_path / "parts", SETTINGS), made_up_run(TARGET)
+    parts.begin()
+    assert parts.match() and parts.load("U") is None
+    parts.save("U", run)
+    kept = parts.load("U")
+    assert kept is not None
+    assert_same(kept, run)
+    parts.remove()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_damaged_run_is_made_again(tmp_path, capsys):
+    parts = Parts(tmp_path / "parts", SETTINGS)
+    parts.begin()
+    parts.save("U", made_up_run(TARGET))
+    (file,) = parts.folder.glob("*.npz")
+    whole = file.read_bytes()
+    for damaged in (b"", whole[:-30], whole[: len(whole) // 2], whole[:200] + bytes(100) + whole[300:]):
+        file.write_bytes(damaged)
+        assert parts.load("U") is None
+        assert "is damaged and made again" in capsys.readouterr().err
+
+
+def test_settings_that_cannot_be_read_are_told(tmp_path):
+    parts = Parts(tmp_path / "parts", SETTINGS)
+    parts.begin()
+    for text in ("", '{"schema": ', "[" * 100_000):
+        (parts.folder / "settings.json").write_text(text)
+        with pytest.raises(UsageError, match=r"settings\.json is .* Delete .*parts to begin anew"):
+            parts.match()
+
+
+def test_parts_of_other_settings_are_refused_or_replaced(tmp_path):
+    with pytest.raises(KeyboardInterrupt), unfinished(tmp_path, SETTINGS, overwrite=False) as parts:
+        parts.save("U", made_up_run(TARGET))
+        raise KeyboardInterrupt
+    with unfinished(tmp_path, SETTINGS, overwrite=False) as parts:
+        assert parts.load("U") is not None
+        parts.save("S", made_up_run(TARGET))
+    assert list(tmp_path.iterdir()) == []
+    with pytest.raises(KeyboardInterrupt), unfinished(tmp_path, SETTINGS, overwrite=False) as parts:
+        parts.save("U", made_up_run(TARGET))
+        raise KeyboardInterrupt
+    with pytest.raises(UsageError, match="not empty"), unfinished(tmp_path, {"steps": 3}, overwrite=False):
+        pass
+    with unfinished(tmp_path, {"steps": 3}, overwrite=True) as parts:
+        assert parts.load("U") is None
+
+
+def test_input_that_is_refused_leaves_the_folder_free(tmp_path):
+    with pytest.raises(ValueError, match="no good"), unfinished(tmp_path, SETTINGS, overwrite=False):
+        raise ValueError("no good")
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("name", ["photos.txt", "settings.json", "U-residual.npz"])
+def test_a_folder_of_that_name_that_is_a_users_own_stays(name, made, weights, tmp_path, capsys):
+    mine = tmp_path / "parts" / name
+    mine.parent.mkdir()
+    mine.write_text('{"mine": 1}')
+    arguments = ["shape", "--weights", str(weights), "--out", str(tmp_path), "--target", "U", "--steps", "2"]
+    for more in ([], ["--overwrite"]):
+        assert main([*arguments, *more]) == 2
+        assert "parts was not made by this command" in capsys.readouterr().err
+        assert mine.read_text() == '{"mine": 1}' and not made
+
+
+def test_files_that_a_user_put_between_the_parts_stay(tmp_path):
+    parts = Parts(tmp_path / "parts", SETTINGS)
+    parts.begin()
+    mine = {"notes.txt", "film.part"}
+    for name in mine:
+        (parts.folder / name).write_text("mine")
+    (parts.folder / "U.run.npz.part").write_text("killed here")
+    Parts(tmp_path / "parts", {"steps": 3}).begin()
+    parts.remove()
+    assert {file.name for file in parts.folder.iterdir()} == mine
+
+
+def test_a_kill_before_the_settings_are_whole_is_no_foreign_folder(tmp_path):
+    (tmp_path / "parts").mkdir()
+    (tmp_path / "parts" / "settings.json.part").write_text("{")
+    with unfinished(tmp_path, SETTINGS, overwrite=True) as parts:
+        assert parts.match()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_shape_goes_on_after_ctrl_c_between_its_results(made, weights, tmp_path, capsys, monkeypatch):
+    arguments = ["shape", "--weights", str(weights), "--out", str(tmp_path), "--target", "U", "--steps", "2"]
+    with monkeypatch.context() as patch:
+        patch.setattr("cablejax.commands.results.write_page", interrupted)
+        assert main(arguments) == 130
+    told = capsys.readouterr().err
+    assert told.startswith("compiling the control step ...\n") and "Run the same command again" in told
+    assert (tmp_path / "log.npz").exists() and not (tmp_path / "summary.json").exists()
+    assert main(arguments) == 0
+    assert made == ["residual", "direct"], "no run was repeated"
+    assert "compiling" not in capsys.readouterr().err
+    assert {file.name for file in tmp_path.iterdir()} == {"demo.gif", "log.npz", "report.html", "summary.json"}
+    assert main(arguments) == 2, "the command has ended"
+
+
+def test_demo_goes_on_after_ctrl_c_in_its_diagnosis(made, weights, tmp_path, capsys, monkeypatch):
+    arguments = ["demo", "--weights", str(weights), "--out", str(tmp_path), "--shapes", "U", "--steps", "2"]
+
+    def half_written(log, folder, **_):
+        (folder / "verdict.json").write_text("{}")
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(diagnose, "diagnose_and_report", half_written)
+        assert main(arguments) == 130
+    assert "Run the same command again" in capsys.readouterr().err
+    again = []
+
+    def refused(log, folder, **_):
+        from cablejax.diagnose import DiagnosisError
+
+        again.append(folder)
+        raise DiagnosisError("too short")
+
+    monkeypatch.setattr(diagnose, "diagnose_and_report", refused)
+    assert main(arguments) == 0
+    assert made == ["residual", "direct"] and again == [tmp_path / "diagnosis"]
+    assert not (tmp_path / "parts").exists()
+
+
+def test_parts_are_of_these_weights_and_no_others(tmp_path):
+    first, same, other = (small_model(tmp_path / str(k), seed) for k, seed in enumerate((0, 0, 1)))
+
+    def settings(folder):
+        job = Job(
+            plant=PlantConfig(),
+            model=load_model(str(folder)),
+            targets=(TARGET,),
+            methods=("direct",),
+            solver="trust-region",
+            steps=2,
+        )
+        return json.dumps(job.settings())
+
+    assert settings(first) == settings(same) != settings(other)

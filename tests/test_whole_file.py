@@ -1,0 +1,32 @@
+"""Files are there whole or not at all, with the mode that the user's other files have."""
+
+import os
+
+import pytest
+from flax import nnx
+
+from cablejax.dynamics.gns import GNS
+from cablejax.dynamics.weights import save_weights
+from cablejax.whole_file import whole_file
+from dynamics_cases import SMALL
+
+
+def test_a_block_that_is_left_early_changes_nothing(tmp_path):
+    path = tmp_path / "a.txt"
+    with whole_file(path) as stream:
+        stream.write(b"one")
+    with pytest.raises(KeyboardInterrupt), whole_file(path) as stream:
+        stream.write(b"two")
+        raise KeyboardInterrupt
+    assert path.read_bytes() == b"one" and list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.parametrize("umask", [0o022, 0o077])
+def test_weights_have_the_mode_of_other_files(umask, tmp_path):
+    path = tmp_path / "weights.safetensors"
+    before = os.umask(umask)
+    try:
+        save_weights(path, SMALL, nnx.split(GNS(SMALL, nnx.Rngs(0)))[1], {})
+    finally:
+        os.umask(before)
+    assert path.stat().st_mode & 0o777 == 0o666 & ~umask
