@@ -53,6 +53,7 @@ def test_verdict_follows_the_format(report):
     assert set(gap) >= GAP and gap["held_out_episodes"] == [0, 1, 2, 3]
     assert gap["before_rmse_mm"] > gap["after_rmse_mm"] >= 0.9 * gap["noise_floor_mm"] > 0
     assert 0.9 < gap["shrinkage"] <= 1
+    assert f"explains {100 * gap['shrinkage']:.0f} % of it" in verdict["sentence"], "of motions that no fit has seen"
     where = verdict["where"]
     assert len(where["along_cable_mm"]) == 13 and len(where["per_episode_mm"]) == 4 and where["regimes"]
 

@@ -40,7 +40,7 @@ class Conclusion:
         effects: named; empty for "none" and "unknown".
         equivalent: sets of effects that this log cannot tell apart.
         ranking: of single effects.
-        explained: share of the squared gap that the best explanation takes away.
+        explained: share of the squared gap that the best explanation takes away, on the episodes of the fit.
         leftover_p: of the test whether it leaves more than a right one does, see `conformal`; None without a gap.
     """
 
@@ -237,9 +237,14 @@ def _merged(parts: list[dict[str, ParameterEstimate]]) -> dict[str, ParameterEst
     return merged
 
 
-def sentence(conclusion: Conclusion) -> str:
-    """The verdict in words."""
-    share = f"{100 * conclusion.explained:.0f} %"
+def sentence(conclusion: Conclusion, shrinkage: float | None) -> str:
+    """The verdict in words, with the share of the squared gap that goes away.
+
+    Args:
+        conclusion: the verdict.
+        shrinkage: on episodes left out of the fit; None where nothing could be, which leaves that of the fit.
+    """
+    share = f"{100 * max(conclusion.explained if shrinkage is None else shrinkage, 0.0):.0f} %"
     names = " and ".join(e.name.replace("_", " ") for e in conclusion.effects)
     alike = "; ".join(" or ".join(n.replace("_", " ") for n in group) for group in conclusion.equivalent)
     rivals = f" (this log cannot tell apart: {alike})" if alike else ""

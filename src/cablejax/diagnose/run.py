@@ -90,7 +90,7 @@ def diagnose(
     repaired = recording.as_log(log.meta)
     return Diagnosis(
         verdict=conclusion.verdict,
-        sentence=sentence(conclusion),
+        sentence=sentence(conclusion, measured.shrinkage),
         effects=conclusion.effects,
         equivalent=conclusion.equivalent,
         ranking=conclusion.ranking,

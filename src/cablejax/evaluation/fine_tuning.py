@@ -91,7 +91,7 @@ def fine_tune(data: Trajectory, config: FineTuneConfig, folder: pathlib.Path) ->
         training = TrainConfig(
             model=source.config, phases=config.phases, seed=config.seed, warmup=20, ema=0.99, clip=1.0
         )
-        result = train(training, data, folder, initial=initial)
+        result = train(training, data, folder / "training", initial=initial)
         if not result.completed:
             raise KeyboardInterrupt(f"Stopped while fine-tuning; run the same command again to go on in {folder}.")
         info = {"started_from": config.weights, "transitions": int(np.prod(np.shape(data.gripper_twist)[:2]))}
