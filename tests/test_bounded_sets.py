@@ -127,7 +127,9 @@ def test_constraints_are_negative_inside_and_about_the_distance_outside(name):
         assert float(feasible.violation(near)) == pytest.approx(float(feasible.constraints(near).max()), rel=1e-3)
 
 
-@pytest.mark.parametrize("name", SETS)
+@pytest.mark.parametrize(
+    "name", [pytest.param(n, marks=pytest.mark.slow) if n in ("affine balls", "half-spaces") else n for n in SETS]
+)
 def test_derivatives_of_the_projection(name):
     """In the point, in float64: central differences of forward mode, and reverse against forward."""
     with jax.enable_x64(True):

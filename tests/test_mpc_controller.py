@@ -52,7 +52,7 @@ def run(control, cable, steps, hide=None, **changed):
     return state, np.stack(twists), jax.tree.map(lambda *leaves: np.stack(leaves), *infos)
 
 
-@pytest.mark.parametrize("solver", [TrustRegion(), ProjectedGradient()])
+@pytest.mark.parametrize("solver", [TrustRegion(), pytest.param(ProjectedGradient(), marks=pytest.mark.slow)])
 def test_brings_the_cable_to_the_target_and_holds_it_there(solver):
     config = dataclasses.replace(CONFIG, solver=solver)
     _, twists, info = run(controller(config=config), Cable(rate=0.8, sag=0.0), 25)
@@ -178,6 +178,7 @@ def test_where_bounds_contradict_each_other_the_grippers_hold_still():
     assert (twists == 0).all() and int(state.restarts) == 0
 
 
+@pytest.mark.slow
 def test_data_in_float32_stay_so_where_float64_is_on():
     def single(weights, history, twist):
         return relaxing_cable(weights, history, twist).astype(history.keypoints.dtype)

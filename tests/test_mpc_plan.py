@@ -81,6 +81,7 @@ def test_plan_is_a_minimum_and_its_derivatives_are_those_of_planning_again(name)
             np.testing.assert_allclose(forward[..., k], expected, atol=3e-6 * max(1.0, float(jnp.abs(expected).max())))
 
 
+@pytest.mark.slow
 def test_a_deadline_plan_is_feasible_most_of_the_way_and_one_linearisation():
     case = problem("U")
     plan, value, violation = solved(SOLVERS["deadline"], case)
