@@ -118,6 +118,7 @@ def test_shares_of_two_processes_make_the_same_store(reference, tmp_path):
         generate(TINY, tmp_path / "data", process_index=2, process_count=2)
 
 
+@pytest.mark.slow
 def test_sigkill_and_resume_bit_for_bit(tmp_path):
     config = dataclasses.replace(TINY, n_trajectories=60, n_steps=20)
     whole = generate(config, tmp_path / "whole", progress=False)

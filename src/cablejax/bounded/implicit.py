@@ -22,7 +22,8 @@ class FixedPointAdjoint(optx.AbstractAdjoint):
     projection's derivative takes away the directions that the bounds forbid, and the solution moves along those only as
     the bounds do. The set comes from `options["feasible"]`; its arrays are differentiated in as `args` are. Takes one
     Hessian-vector product for every element of y. Where a bound is touched without holding (its multiplier is 0) the
-    solution has a kink, and no derivative.
+    solution has a kink, and no derivative. Where the minimum is not isolated, or the function there is not a number,
+    lineax raises as the derivative is taken, under `vmap` for the whole batch.
 
     Attributes:
         linear_solver: of the system `d(P(y - grad f) - y) / dy`.
