@@ -95,6 +95,7 @@ def test_a_deadline_plan_is_feasible_most_of_the_way_and_one_linearisation():
     assert float(plan.value) == pytest.approx(float(value), rel=1e-6)
 
 
+@pytest.mark.slow
 def test_workspace_and_change_of_motion_are_kept():
     pose, previous = jnp.asarray(START), jnp.full((2, 3), 0.01)
     bounds = {"workspace": ((-1.0, -0.02), (1.0, 0.03)), "change": 0.015, "previous": previous}
