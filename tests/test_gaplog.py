@@ -12,6 +12,7 @@ import pytest
 from cablejax.gaplog import Episode, GapLogError, gap_log_from_episodes, read_gap_log, validate, write_gap_log
 from cablejax.simulate.config import CableConfig
 from cablejax.types import GapLog
+from file_cases import with_other_bytes
 
 CABLE = CableConfig(n_keypoints=5)
 CABLE_META = {
@@ -179,12 +180,8 @@ def test_a_file_that_is_no_archive_or_damaged_is_refused(tmp_path, log):
     with pytest.raises(FileNotFoundError, match="There is no file"):
         read_gap_log(tmp_path / "absent.npz")
     path = write_gap_log(tmp_path / "run.npz", log)
-    whole, rng = path.read_bytes(), np.random.default_rng(0)
-    for _ in range(60):
-        broken = bytearray(whole)
-        for place in rng.integers(0, len(whole), 3):
-            broken[place] ^= int(rng.integers(1, 256))
-        path.write_bytes(bytes(broken))
+    for broken in with_other_bytes(path.read_bytes(), 60):
+        path.write_bytes(broken)
         with contextlib.suppress(GapLogError):
             read_gap_log(path)
 

@@ -13,6 +13,7 @@ from cablejax.perceive.recording import read_clouds
 from cablejax.recordings.deform import read_deform
 from cablejax.recordings.wires import read_wires
 from cablejax.targets import load_target
+from file_cases import with_other_bytes
 
 DEEP = "[" * 100_000
 
@@ -45,12 +46,8 @@ def test_a_file_cut_off_anywhere_is_refused(archive):
 
 
 def test_a_file_with_other_bytes_is_read_or_refused(archive):
-    whole, rng = archive.read_bytes(), np.random.default_rng(0)
-    for _ in range(400):
-        broken = bytearray(whole)
-        for place in rng.integers(0, len(whole), 3):
-            broken[place] ^= int(rng.integers(1, 256))
-        archive.write_bytes(bytes(broken))
+    for broken in with_other_bytes(archive.read_bytes(), 400):
+        archive.write_bytes(broken)
         with contextlib.suppress(NpzError):
             read_npz(archive, ["a", "b", "text"])
 

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from cablejax.bounded.quadrics import Quadrics
+from cablejax.bounded.tangents import derivative_along
 
 if TYPE_CHECKING:
     from cablejax.bounded.sets.base import ConvexSet
@@ -105,17 +106,12 @@ def _solve_jvp(primals, tangents):
     active = multipliers > -quadrics.of_lift(z) * jnp.abs(multipliers).max() / _typical_length(quadrics, step)
     held = jnp.where(active, multipliers, 0.0)
 
-    # The tangents are those of arrays; what has none stays as it is.
-    perturbed = jax.tree.map(lambda t: t is not None, tangents, is_leaf=lambda t: t is None)
-    varying, fixed = eqx.partition(primals, perturbed)
-
-    def conditions(varying):
-        quadrics, hessian, linear, centre = eqx.combine(varying, fixed)
+    def conditions(quadrics, hessian, linear, centre):
         z = quadrics.lift(centre + step)
         pull = hessian @ step + linear + held @ quadrics.jacobian(z)
         return jnp.concatenate([pull, jnp.where(active, quadrics.of_lift(z), 0.0)])
 
-    _, change = jax.jvp(conditions, (varying,), (tangents,))
+    change = derivative_along(conditions, primals, tangents)
     normals = jnp.where(active[:, None], quadrics.jacobian(z), 0.0)
     # a little below zero where active, so that normals which depend on each other do no harm
     shift = 8 * jnp.finfo(step.dtype).eps / (1.0 + jnp.abs(hessian).max())

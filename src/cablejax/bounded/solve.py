@@ -6,7 +6,6 @@ from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import optimistix as optx
 from jax.core import Tracer
@@ -17,6 +16,7 @@ from cablejax.bounded.linearise import forward, squared_jacobian
 from cablejax.bounded.objective import value_of
 from cablejax.bounded.results import Result, Solution, Stats
 from cablejax.bounded.sets import AbstractSet
+from cablejax.bounded.tangents import derivative_along
 
 
 def minimise(
@@ -50,12 +50,7 @@ def minimise(
         ValueError: the set is empty.
         RuntimeError: the solve ended in another way than convergence.
     """
-    y0 = jnp.asarray(y0)
-    start = feasible.project(y0)
-    fn, hessian = _explicit(start, args, fn, hessian)
-    options = {"feasible": feasible, "hessian": hessian}
-    out = optx.minimise(fn, solver, start, args, options, max_steps=max_steps, adjoint=FixedPointAdjoint(), throw=False)
-    return _finish(out, fn, args, feasible, start, jnp.isnan(y0).any(), throw)
+    return _solve(optx.minimise, fn, solver, y0, feasible, args, "hessian", hessian, max_steps, throw)
 
 
 def least_squares(
@@ -96,20 +91,19 @@ def least_squares(
 
         squared = squared_jacobian(linearise or forward(residual_fn))
         return minimise(half_squares, solver, y0, feasible, args, hessian=squared, max_steps=max_steps, throw=throw)
+    return _solve(optx.least_squares, residual_fn, solver, y0, feasible, args, "linearise", linearise, max_steps, throw)
+
+
+def _solve(entry, fn, solver, y0, feasible: AbstractSet, args, option: str, given, max_steps: int, throw: bool):
+    """By one of optimistix's entry points; `given` is the function that the solver takes as an option, or None."""
     y0 = jnp.asarray(y0)
     start = feasible.project(y0)
-    residual_fn, linearise = _explicit(start, args, residual_fn, linearise)
-    options = {"feasible": feasible, "linearise": linearise}
-    out = optx.least_squares(
-        residual_fn, solver, start, args, options, max_steps=max_steps, adjoint=FixedPointAdjoint(), throw=False
-    )
-    return _finish(out, residual_fn, args, feasible, start, jnp.isnan(y0).any(), throw)
-
-
-def _explicit(start: Array, args: Any, fn: Callable, beside: Callable | None) -> tuple[Callable, Callable | None]:
-    """Both functions with what they close over as arguments, so that it may be traced."""
-    convert = eqx.filter_closure_convert
-    return convert(fn, start, args), None if beside is None else convert(beside, start, args)
+    # with what they close over as arguments, so that it may be traced
+    fn = eqx.filter_closure_convert(fn, start, args)
+    given = None if given is None else eqx.filter_closure_convert(given, start, args)
+    options = {"feasible": feasible, option: given}
+    out = entry(fn, solver, start, args, options, max_steps=max_steps, adjoint=FixedPointAdjoint(), throw=False)
+    return _finish(out, fn, args, feasible, start, jnp.isnan(y0).any(), throw)
 
 
 @eqx.filter_custom_jvp
@@ -122,16 +116,7 @@ def _value_at(fn, y, args, known):
 @_value_at.def_jvp
 def _value_at_jvp(primals, tangents):
     *inputs, known = primals
-    of_inputs = tuple(tangents[:-1])
-    # The tangents are those of arrays; what has none stays as it is.
-    moving = jax.tree.map(lambda t: t is not None, of_inputs, is_leaf=lambda t: t is None)
-    varying, fixed = eqx.partition(tuple(inputs), moving)
-
-    def value(varying):
-        fn, y, args = eqx.combine(varying, fixed)
-        return value_of(fn(y, args))
-
-    return known, jax.jvp(value, (varying,), (of_inputs,))[1]
+    return known, derivative_along(lambda fn, y, args: value_of(fn(y, args)), tuple(inputs), tuple(tangents[:-1]))
 
 
 def _finish(

@@ -46,7 +46,7 @@ class Parts:
             UsageError: the folder is not one that a command made, or its settings cannot be read.
         """
         # a kill may leave settings that were never finished
-        if not self.folder.exists() or (self.folder.is_dir() and self._names() <= {f"{_SETTINGS}{DRAFT}"}):
+        if not self.folder.exists() or (self.folder.is_dir() and self._files() <= {f"{_SETTINGS}{DRAFT}"}):
             return False
         try:
             found = read_json(self.folder / _SETTINGS)
@@ -94,9 +94,9 @@ class Parts:
     @property
     def empty(self) -> bool:
         """Whether nothing but the settings was kept."""
-        return self._names() == {_SETTINGS}
+        return self._files() == {_SETTINGS}
 
-    def _names(self) -> set[str]:
+    def _files(self) -> set[str]:
         return {file.name for file in self.folder.iterdir()}
 
     def remove(self) -> None:

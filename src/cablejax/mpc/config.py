@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import numbers
 
 import numpy as np
 
@@ -13,6 +12,7 @@ from cablejax.mpc.plan import Solver
 from cablejax.mpc.problem import ObjectiveConfig
 from cablejax.mpc.trust_region import TrustRegion
 from cablejax.residual.ridge import RidgeConfig
+from cablejax.whole_number import is_whole
 
 
 @dataclasses.dataclass(frozen=True)
@@ -72,7 +72,7 @@ class MPCConfig:
     solver: Solver = TrustRegion()
 
     def __post_init__(self):
-        if not (isinstance(self.horizon, numbers.Integral) and self.horizon >= 0):
+        if not is_whole(self.horizon, least=0):
             raise ValueError(f"MPCConfig.horizon is {self.horizon}, expected a whole number, at least 0 (one command).")
         if not (math.isfinite(self.cable_length) and self.cable_length > 0):
             raise ValueError(f"MPCConfig.cable_length is {self.cable_length}, expected a positive length [m].")

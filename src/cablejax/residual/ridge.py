@@ -14,11 +14,12 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import numbers
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
+
+from cablejax.whole_number import is_whole
 
 
 @dataclasses.dataclass(frozen=True)
@@ -52,7 +53,7 @@ class RidgeConfig:
     outlier: float = math.inf
 
     def __post_init__(self):
-        if not (isinstance(self.window, numbers.Integral) and self.window >= 1):
+        if not is_whole(self.window, least=1):
             raise ValueError(f"RidgeConfig.window is {self.window}, expected a whole number of samples, at least 1.")
         for name in ("regularisation", "motion_scale", "rotation_weight", "bias_scale"):
             value = getattr(self, name)
