@@ -29,7 +29,7 @@ def main(arguments: list[str] | None = None) -> None:
     options = parser.parse_args(arguments)
 
     plant = PlantConfig(stiffness_ratio=2.0)
-    plant = dataclasses.replace(plant, cable=dataclasses.replace(plant.cable, n_links=options.links))
+    plant = dataclasses.replace(plant, discretisation=dataclasses.replace(plant.discretisation, n_links=options.links))
     model = load_model(options.weights)
     target = make_target(options.shape, plant.cable)
 

@@ -22,8 +22,10 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
+from cablejax.cable import Discretisation
+from cablejax.effects.physics import nominal_physics
 from cablejax.gaplog import read_gap_log
-from cablejax.simulate import CableConfig, ThreadedEngine
+from cablejax.simulate import ThreadedEngine
 from cablejax.simulate.elastica import elastica
 from cablejax.simulate.equilibrium import equilibrium_state
 from cablejax.simulate.replay import config_of_log, replay_episode
@@ -38,13 +40,15 @@ SHAPES = (
 
 def elastica_error(n_links: int) -> float:
     """Largest keypoint distance [mm] between the resting chain and the boundary-value solution."""
-    config, worst = CableConfig(n_links=n_links), 0.0
+    config, worst = Discretisation(n_links=n_links), 0.0
     engine = ThreadedEngine(config, n_threads=1)
     for pose in SHAPES:
         state = equilibrium_state(config, pose)
         twist = np.zeros((1, 2, 3))
-        resting = np.asarray(engine.rollout(config.params(), state, twist, config.timestep)[1].keypoints[0], np.float64)
-        exact = elastica(pose, config.length, config.keypoint_arclength, guess=resting)
+        resting = np.asarray(
+            engine.rollout(nominal_physics(config), state, twist, config.timestep)[1].keypoints[0], np.float64
+        )
+        exact = elastica(pose, config.cable.length, config.cable.keypoint_arclength, guess=resting)
         worst = max(worst, float(np.linalg.norm(resting - exact, axis=1).max()))
     return 1e3 * worst
 
@@ -65,12 +69,12 @@ def replay_ratios(n_links: int, timestep: float, folder: Path) -> tuple[float, f
 
 def microseconds_per_step(n_links: int, timestep: float) -> float:
     """Cost of one time step of C MuJoCo on one core."""
-    config = CableConfig(n_links=n_links, timestep=timestep)
+    config = Discretisation(n_links=n_links, timestep=timestep)
     engine = ThreadedEngine(config, n_threads=1)
     state, twist = engine.initial_state(SHAPES[0]), np.zeros((100, 2, 3))
-    engine.rollout(config.params(), state, twist[:1])
+    engine.rollout(nominal_physics(config), state, twist[:1])
     began = time.process_time()
-    engine.rollout(config.params(), state, twist)
+    engine.rollout(nominal_physics(config), state, twist)
     return (time.process_time() - began) / (len(twist) / timestep) * 1e6
 
 
@@ -93,7 +97,7 @@ def main() -> None:
             f"| {microseconds_per_step(n_links, timestep):.1f} |"
         )
         print(lines[-1], flush=True)
-    default = CableConfig()
+    default = Discretisation()
     page = "\n".join(
         [
             "# Resolution and time step of the simulator",

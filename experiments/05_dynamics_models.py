@@ -23,6 +23,7 @@ import jax
 import matplotlib.pyplot as plt
 import numpy as np
 
+from cablejax.cable import Cable, Discretisation
 from cablejax.dataset.generate import make_engine, simulate
 from cablejax.dataset.schema import DatasetConfig, config_from_json
 from cablejax.dataset.windows import Window, concatenate
@@ -30,9 +31,10 @@ from cablejax.dynamics.config import ModelConfig
 from cablejax.dynamics.evaluate import evaluation_windows, no_motion, prior_motion, snapping, window_errors
 from cablejax.dynamics.transfer import on_another_cable
 from cablejax.dynamics.weights import load_info, load_weights
+from cablejax.effects.physics import nominal_physics
 from cablejax.report.markdown import markdown_table, publish
 from cablejax.report.provenance import machine, versions
-from cablejax.simulate import CableConfig, ThreadedEngine
+from cablejax.simulate import ThreadedEngine
 from cablejax.simulate.equilibrium import angles_of_keypoints
 from cablejax.types import CableState, Trajectory
 
@@ -82,14 +84,14 @@ def simulated(config: DatasetConfig, count: int) -> Trajectory:
     return concatenate(parts)
 
 
-def simulator_errors(windows: Window, cable: CableConfig) -> np.ndarray:
+def simulator_errors(windows: Window, cable: Discretisation) -> np.ndarray:
     """Error [m] of the training simulator, its state taken from the keypoints, at rest."""
     engine, history = ThreadedEngine(cable), windows.history
     pose = np.asarray(history.gripper_pose, float)
     now = np.asarray(history.keypoints[:, -1], float)
     qpos = [np.concatenate([p[0], angles_of_keypoints(cable, p, x)]) for p, x in zip(pose, now, strict=True)]
     state = CableState(np.stack(qpos), np.zeros((len(pose), cable.n_joints + 3)), pose)  # pyright: ignore[reportArgumentType]
-    params = jax.tree.map(lambda leaf: np.broadcast_to(leaf, (len(pose), *leaf.shape)), cable.params())
+    params = jax.tree.map(lambda leaf: np.broadcast_to(leaf, (len(pose), *leaf.shape)), nominal_physics(cable))
     seen = engine.rollout(params, state, np.asarray(windows.twist, float))[1].keypoints[:, 1:]
     return np.sqrt(np.mean(np.sum((np.asarray(seen) - windows.future) ** 2, axis=-1), axis=-1))
 
@@ -108,7 +110,7 @@ def all_errors(data: Trajectory, steps: int, stride: int) -> dict[str, np.ndarra
     errors = {name: network_errors(weights, data, steps, stride) for name, weights in MODELS.items()}
     config = ModelConfig()
     windows = evaluation_windows(data, config, steps=steps, stride=stride)
-    errors[SIMULATOR] = 100 * np.asarray(simulator_errors(windows, CableConfig()))
+    errors[SIMULATOR] = 100 * np.asarray(simulator_errors(windows, Discretisation()))
     errors["statics alone"] = 100 * window_errors(prior_motion(config, "static"), windows, config)
     errors["no motion"] = 100 * window_errors(no_motion, windows, config)
     return errors
@@ -137,8 +139,8 @@ def medians_by_what_is_given(found: dict[str, dict[str, np.ndarray]], steps: int
 
 def other_cable(length: float, n_keypoints: int, trajectories: int) -> Trajectory:
     """Random motions of a cable that no network was trained on; all lengths scaled alike."""
-    cable = CableConfig(length=length, n_keypoints=n_keypoints)
-    config = DatasetConfig(n_trajectories=trajectories, n_steps=60, seed=7, cable=cable, shard_size=1)
+    cable = Discretisation(Cable(length=length, n_keypoints=n_keypoints))
+    config = DatasetConfig(n_trajectories=trajectories, n_steps=60, seed=7, discretisation=cable, shard_size=1)
     return simulated(config, trajectories)
 
 

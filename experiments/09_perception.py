@@ -30,6 +30,8 @@ from typing import Any, get_args
 import numpy as np
 from matplotlib.figure import Figure
 
+from cablejax.cable import Cable, Discretisation
+from cablejax.effects.physics import nominal_physics
 from cablejax.evaluation.cases import mujoco_plant, stiffness_cases
 from cablejax.evaluation.methods import ADAPTED_RESIDUAL, METHODS
 from cablejax.evaluation.suite import released, run_case
@@ -40,14 +42,14 @@ from cablejax.perceive.synthetic import Clutter, scatter
 from cablejax.report.markdown import publish
 from cablejax.report.provenance import machine, versions
 from cablejax.report.style import LIGHT
-from cablejax.simulate import CableConfig, ThreadedEngine
+from cablejax.simulate import ThreadedEngine
 from cablejax.simulate.motions import random_motion
 from cablejax.targets import Shape
 
 HZ = 10
 FINE = 20
 """Points of the true curve between two keypoints."""
-CABLE = CableConfig(n_keypoints=12 * FINE + 1)
+CABLE = Discretisation(Cable(n_keypoints=12 * FINE + 1))
 CONDITIONS = {
     "30 % hidden, 10 % outliers": Clutter(hidden=0.3, outliers=0.1),
     "2 mm noise": Clutter(),
@@ -72,7 +74,7 @@ def moving_cable(seed: int, seconds: int) -> tuple[np.ndarray, np.ndarray]:
     pose, twist = random_motion(np.random.default_rng(seed), CABLE, seconds)
     engine = ThreadedEngine(CABLE, n_threads=1)
     commands = np.repeat(twist, HZ, axis=0)
-    _, motion = engine.rollout(CABLE.params(), engine.initial_state(pose), commands, 1.0 / HZ)
+    _, motion = engine.rollout(nominal_physics(CABLE), engine.initial_state(pose), commands, 1.0 / HZ)
     return np.asarray(motion.keypoints, float), np.asarray(motion.gripper_pose, float)
 
 

@@ -25,7 +25,7 @@ from matplotlib.ticker import FixedLocator, NullFormatter
 from tqdm import tqdm
 
 from cablejax.closed_loop import run_closed_loop
-from cablejax.evaluation.cases import PLANT_CABLE, mujoco_plant
+from cablejax.evaluation.cases import PLANT_CHAIN, mujoco_plant
 from cablejax.evaluation.protocols import LaidOut, letter_task
 from cablejax.mpc import SOLVERS, Controller, MPCConfig, TrustRegion
 from cablejax.report.markdown import markdown_table, publish
@@ -65,7 +65,7 @@ class Trial:
 
 def run(model, solver: str, horizon: int, shape: str, seed: int) -> Trial:
     """One of them; what is compiled is kept for the next target."""
-    task = letter_task(shape, seed, PLANT_CABLE)
+    task = letter_task(shape, seed, PLANT_CHAIN)
     config = dataclasses.replace(MPCConfig(), horizon=horizon, solver=PLANNERS[solver])
     controller = Controller(config, model.dynamics, model.weights, task.target.keypoints)
     plant = LaidOut(mujoco_plant(STIFFNESS), task.start_shape)

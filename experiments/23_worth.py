@@ -22,10 +22,12 @@ os.environ.setdefault("NPROC", "4")
 import jax
 import numpy as np
 
+from cablejax.cable import Cable, Discretisation
 from cablejax.closed_loop import run_closed_loop
 from cablejax.diagnose import diagnose, write_verdict
 from cablejax.diagnose.diagnosis import NamedEffect, ParameterEstimate
 from cablejax.diagnose.into_simulator import params_with
+from cablejax.effects.physics import Physics
 from cablejax.evaluation.cases import mujoco_plant, stiffness_cases
 from cablejax.evaluation.fine_tuning import FineTuneConfig, fine_tune
 from cablejax.evaluation.methods import MethodSpec
@@ -34,9 +36,9 @@ from cablejax.gaplog import gap_log_from_episodes, read_gap_log, write_gap_log
 from cablejax.report.markdown import publish
 from cablejax.report.provenance import machine, versions
 from cablejax.shaping import Model, load_model, make_controller
-from cablejax.simulate import CableConfig, ThreadedEngine
+from cablejax.simulate import ThreadedEngine
 from cablejax.simulate.motions import MotionConfig, random_motion
-from cablejax.types import CableParams, Trajectory
+from cablejax.types import Trajectory
 
 RATIO = 0.1
 LOG_SEEDS, TASK_SEEDS = (100, 101), (0, 1, 2)
@@ -92,7 +94,7 @@ def trained_with(effects: tuple[NamedEffect, ...], home: pathlib.Path, case: Cas
     """The released network after training on the simulator with these effects."""
     del case
     config = FineTuneConfig()
-    return fine_tune(transitions(params_with(effects, CableConfig()), config), config, home)
+    return fine_tune(transitions(params_with(effects, Discretisation()), config), config, home)
 
 
 def recorded():
@@ -105,12 +107,12 @@ def recorded():
         rng = np.random.default_rng((case.seed, len(episodes)))
         noisy = run.episode.keypoints + rng.normal(0.0, NOISE, run.episode.keypoints.shape)
         episodes.append(dataclasses.replace(run.episode, keypoints=noisy))
-    return gap_log_from_episodes(episodes, CableConfig(), source="direct transfer on a plant with contact")
+    return gap_log_from_episodes(episodes, Cable(), source="direct transfer on a plant with contact")
 
 
-def transitions(params: CableParams, config: FineTuneConfig) -> Trajectory:
+def transitions(params: Physics, config: FineTuneConfig) -> Trajectory:
     """Random motions of the simulated cable with these parameters, as many as `FineTuneConfig` says."""
-    cable, rng = CableConfig(), np.random.default_rng(config.seed)
+    cable, rng = Discretisation(), np.random.default_rng(config.seed)
     engine = ThreadedEngine(cable)
     drawn = [
         random_motion(rng, cable, config.commands, MotionConfig(start="straight")) for _ in range(config.trajectories)

@@ -25,11 +25,11 @@ import jax.numpy as jnp
 import numpy as np
 from matplotlib.figure import Figure
 
+from cablejax.cable import GRAVITY
 from cablejax.recordings.wires import HangingWire, read_wires
 from cablejax.report.markdown import markdown_table
 from cablejax.report.provenance import machine, versions
 from cablejax.report.style import LIGHT
-from cablejax.simulate.config import GRAVITY
 from cablejax.spatial.hanging import Wire, hanging_angles, hanging_points
 from cablejax.spatial.hanging_effects import EFFECTS
 from cablejax.spatial.hanging_fit import LINKS_PER_SPACING, Photographs

@@ -5,7 +5,6 @@ Four episodes of ten seconds, each a motion that tells other causes apart, with 
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 from collections.abc import Sequence
 from typing import Any
@@ -13,17 +12,17 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from cablejax.cable import Cable, Discretisation
 from cablejax.diagnose import LIBRARY, Context, Effect
 from cablejax.diagnose.case import FINE_LINKS
-from cablejax.diagnose.chain import FINE_STEP, LARGEST_STEP
 from cablejax.diagnose.fit import Evidence, candidate
 from cablejax.diagnose.playback import Playback
 from cablejax.diagnose.screen import residual_of
 from cablejax.gaplog import Episode, gap_log_from_episodes
-from cablejax.simulate import CableConfig
+from cablejax.simulate.chain.step import FINE_STEP, LARGEST_STEP
 from cablejax.types import GapLog
 
-CABLE = CableConfig()
+CABLE = Cable()
 INTERVAL = 0.1
 SAMPLES = 100
 MOTIONS = ("approach", "mirror", "translation", "ramp_hold")
@@ -64,7 +63,7 @@ def holds(samples: int = SAMPLES) -> np.ndarray:
 @functools.cache
 def playback(n_links: int) -> Playback:
     """The four motions at a resolution; where it is that of the nominal cable, in time too."""
-    config = dataclasses.replace(CABLE, n_links=n_links)
+    config = Discretisation(CABLE, n_links=n_links)
     step = FINE_STEP if n_links == FINE_LINKS else LARGEST_STEP
     motions = np.stack([poses(m) for m in MOTIONS])
     return Playback.of_motion(config, motions, None, np.full(len(MOTIONS), INTERVAL), step)

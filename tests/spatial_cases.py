@@ -7,9 +7,9 @@ import functools
 import jax
 import numpy as np
 
+from cablejax.cable import Cable
 from cablejax.gaplog import Episode, gap_log_from_episodes
 from cablejax.recordings.poses import twists
-from cablejax.simulate import CableConfig
 from cablejax.simulate.compile import compiler_options
 from cablejax.spatial.clamps import frames_along
 from cablejax.spatial.physics import RodPhysics
@@ -100,7 +100,7 @@ def recording(episodes: int = 4, regripped: int | None = None) -> GapLog:
                 hold=np.zeros(SAMPLES, bool),
             )
         )
-    cable = CableConfig(
+    cable = Cable(
         length=LENGTH + 2 * REACH, n_keypoints=len(MARKS) + 4, bending_stiffness=NOMINAL * _DENSITY, diameter=0.006,
         linear_density=_DENSITY, damping_time=0.0, friction_coefficient=0.0,
     )  # fmt: skip

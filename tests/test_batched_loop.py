@@ -12,19 +12,21 @@ import numpy as np
 import pytest
 
 from cablejax.batched_loop import LoopConfig, MpcPolicy, shape_batch, varied_params
+from cablejax.cable import Cable, Discretisation
 from cablejax.closed_loop import run_closed_loop
+from cablejax.effects.physics import Physics
 from cablejax.mpc import Controller, MPCConfig, Outcome, Plan
 from cablejax.mpc.goal import goal_pose
 from cablejax.shaping import NetworkDynamics, load_model, make_controller
-from cablejax.simulate import CableConfig, MjxEngine
+from cablejax.simulate import MjxEngine
 from cablejax.simulate.engine_plant import EnginePlant
 from cablejax.simulate.plant import Plant, PlantConfig
 from cablejax.simulate.table_plant import PlantError
 from cablejax.targets import Target, make_target, straight_start
-from cablejax.types import CableParams, History
+from cablejax.types import History
 from dynamics_cases import SMALL, network
 
-CABLE = CableConfig(n_links=9, n_keypoints=5)
+CABLE = Discretisation(Cable(n_keypoints=5), n_links=9)
 ENGINE = MjxEngine(CABLE)
 RATIOS = np.array([0.5, 2.0, 1.0])
 
@@ -77,11 +79,11 @@ def targets(letters: str) -> list[Target]:
 
 def arguments(letters="USU", ratios=RATIOS):
     """Plant, cables, and where they start; the policy, weights, targets and config follow."""
-    starts = np.stack([straight_start(CABLE)] * len(letters))
+    starts = np.stack([straight_start(CABLE.cable)] * len(letters))
     return ENGINE, varied_params(CABLE, ratios), ENGINE.initial_state(starts)
 
 
-def member(params: CableParams, index: int) -> CableParams:
+def member(params: Physics, index: int) -> Physics:
     return jax.tree.map(lambda leaf: leaf[index], params)
 
 
@@ -89,10 +91,10 @@ def shapes(letters: str) -> np.ndarray:
     return np.stack([target.keypoints for target in targets(letters)])
 
 
-def alone(controller, params: CableParams, target: Target, steps: int, history_length: int = 6):
+def alone(controller, params: Physics, target: Target, steps: int, history_length: int = 6):
     return run_closed_loop(
         EnginePlant(ENGINE, params), controller, target, steps,
-        start=straight_start(CABLE), record_hz=1.0, history_length=history_length,
+        start=straight_start(CABLE.cable), record_hz=1.0, history_length=history_length,
     )  # fmt: skip
 
 
@@ -189,19 +191,19 @@ def test_the_batch_ends_where_the_contact_plant_ends():
     Not for very soft cables: at a tenth of the stiffness the two end a millimetre apart (0.056 and 0.156 cm from the
     target), since contacts hold the cable where it lies, while the simulator's friction is viscous at a creep.
     """
-    cable, ratios, steps = CableConfig(), np.array([1.0, 3.0]), 20
-    engine, model, target = MjxEngine(cable), load_model("gns-reference"), make_target("U", cable)
+    cable, ratios, steps = Discretisation(), np.array([1.0, 3.0]), 20
+    engine, model, target = MjxEngine(cable), load_model("gns-reference"), make_target("U", cable.cable)
     controller = make_controller(model, target, method="residual", solver="trust-region")
-    state = engine.initial_state(np.stack([straight_start(cable)] * 2))
+    state = engine.initial_state(np.stack([straight_start(cable.cable)] * 2))
     policy = MpcPolicy(controller.config, model.dynamics)
     goals = np.stack([target.keypoints] * 2)
     run = shape_batch(
         engine, varied_params(cable, ratios), state, policy, model.weights, goals, LoopConfig(steps=steps)
     )  # fmt: skip
-    fine = CableConfig(n_links=24, dimension=3, timestep=0.005)
+    fine = Discretisation(n_links=24, dimension=3, timestep=0.005)
     for i, ratio in enumerate(ratios):
-        plant = Plant(PlantConfig(cable=fine, stiffness_ratio=float(ratio)))
-        one = run_closed_loop(plant, controller, target, steps, start=straight_start(cable), record_hz=1.0)
+        plant = Plant(PlantConfig(discretisation=fine, stiffness_ratio=float(ratio)))
+        one = run_closed_loop(plant, controller, target, steps, start=straight_start(cable.cable), record_hz=1.0)
         assert np.abs(one.keypoints[:10] - run.keypoints[i, :10]).max() < 1.5e-3
         assert abs(one.terminal_error_cm - run.terminal_error_cm[i]) < 0.1
 
@@ -224,8 +226,8 @@ def test_the_adapter_refuses_what_a_plant_refuses():
     plant = EnginePlant(ENGINE)
     with pytest.raises(ValueError, match="call reset"):
         plant.record(np.zeros((2, 3)), 1.0, samples=1)
-    first = plant.reset(straight_start(CABLE))
-    np.testing.assert_allclose(first.keypoints[[0, -1]], straight_start(CABLE)[:, :2], atol=1e-6)
+    first = plant.reset(straight_start(CABLE.cable))
+    np.testing.assert_allclose(first.keypoints[[0, -1]], straight_start(CABLE.cable)[:, :2], atol=1e-6)
     with pytest.raises(ValueError, match="not finite"):
         plant.record(np.full((2, 3), np.nan), 1.0, samples=1)
     with pytest.raises(ValueError, match="samples is 0"):
@@ -235,4 +237,4 @@ def test_the_adapter_refuses_what_a_plant_refuses():
     with pytest.raises(ValueError, match="call reset"):
         plant.record(np.zeros((2, 3)), 1.0, samples=1)
     with pytest.raises(ValueError, match="dimension is 3"):
-        EnginePlant(MjxEngine(CableConfig(n_links=9, dimension=3)))
+        EnginePlant(MjxEngine(Discretisation(n_links=9, dimension=3)))

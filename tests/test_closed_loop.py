@@ -5,14 +5,14 @@ import dataclasses
 import numpy as np
 import pytest
 
+from cablejax.cable import Discretisation
 from cablejax.closed_loop import run_closed_loop, settling_time, shape_error_cm, step_settling_time
 from cablejax.gaplog import gap_log_from_episodes, read_gap_log, write_gap_log
-from cablejax.simulate.config import CableConfig
 from cablejax.simulate.plant import Plant, PlantConfig
 from cablejax.targets import Target, make_target, straight_start
 
-CABLE = CableConfig(n_links=12, dimension=3, timestep=0.005)
-CONFIG = PlantConfig(cable=CABLE, settle_time=0.2)
+CABLE = Discretisation(n_links=12, dimension=3, timestep=0.005)
+CONFIG = PlantConfig(discretisation=CABLE, settle_time=0.2)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -48,9 +48,9 @@ class Failing(GoToPose):
 
 
 def test_a_reachable_shape_is_reached_and_recorded(tmp_path):
-    target = make_target("U", CABLE)
+    target = make_target("U", CABLE.cable)
     run = run_closed_loop(
-        Plant(CONFIG), GoToPose(target.gripper_pose), target, 14, start=straight_start(CABLE), record_hz=5.0
+        Plant(CONFIG), GoToPose(target.gripper_pose), target, 14, start=straight_start(CABLE.cable), record_hz=5.0
     )
     assert run.times.tolist() == list(range(15))
     assert run.initial_error_cm > 20
@@ -75,22 +75,24 @@ def test_a_reachable_shape_is_reached_and_recorded(tmp_path):
     np.testing.assert_array_equal(episode.keypoints[5::5], run.keypoints)
     assert np.abs(episode.keypoints[episode.hold] - episode.keypoints[0]).max() < 1e-4
 
-    path = write_gap_log(tmp_path / "log.npz", gap_log_from_episodes([episode], CABLE, source="test"))
+    path = write_gap_log(tmp_path / "log.npz", gap_log_from_episodes([episode], CABLE.cable, source="test"))
     np.testing.assert_array_equal(read_gap_log(path).keypoints[0], episode.keypoints.astype(np.float32))
 
 
 def test_an_unreachable_target_says_how_far_it_got():
-    shape = make_target("U", CABLE)
+    shape = make_target("U", CABLE.cable)
     far = Target("far", shape.keypoints + np.array([0.0, 2.0]), shape.gripper_pose + np.array([0.0, 2.0, 0.0]))
-    run = run_closed_loop(Plant(CONFIG), GoToPose(far.gripper_pose), far, 3, start=straight_start(CABLE), record_hz=1.0)
+    run = run_closed_loop(
+        Plant(CONFIG), GoToPose(far.gripper_pose), far, 3, start=straight_start(CABLE.cable), record_hz=1.0
+    )
     assert run.settling_time_s == float("inf")
     assert f"from {run.initial_error_cm:.2f} to {run.terminal_error_cm:.2f} cm" in run.verdict()
     assert "not reached within 1.00 cm" in run.verdict()
 
 
 def test_a_failing_controller_loses_nothing():
-    target = make_target("S", CABLE)
-    run = run_closed_loop(Plant(CONFIG), Failing(target.gripper_pose), target, 9, start=straight_start(CABLE))
+    target = make_target("S", CABLE.cable)
+    run = run_closed_loop(Plant(CONFIG), Failing(target.gripper_pose), target, 9, start=straight_start(CABLE.cable))
     assert run.stopped is not None and "not finite" in run.stopped
     assert len(run.times) == 3 and np.isfinite(run.error_cm).all()
     assert len(run.episode.time) == 3 * 10 + 1
@@ -98,22 +100,24 @@ def test_a_failing_controller_loses_nothing():
 
 
 def test_a_taut_pull_stops_the_run():
-    start = straight_start(CABLE)
+    start = straight_start(CABLE.cable)
     apart = start + np.array([[-0.3, 0, 0], [0.3, 0, 0]])
-    run = run_closed_loop(Plant(CONFIG), GoToPose(apart), make_target("U", CABLE), 5, start=start)
+    run = run_closed_loop(Plant(CONFIG), GoToPose(apart), make_target("U", CABLE.cable), 5, start=start)
     assert run.stopped is not None and "taut" in run.stopped and len(run.times) == 1
 
 
 def test_missing_keypoints_are_counted_and_do_not_spread():
     plant = Plant(dataclasses.replace(CONFIG, keypoint_dropout=0.3))
-    target = make_target("U", CABLE)
-    run = run_closed_loop(plant, GoToPose(target.gripper_pose), target, 2, start=straight_start(CABLE), record_hz=1.0)
+    target = make_target("U", CABLE.cable)
+    run = run_closed_loop(
+        plant, GoToPose(target.gripper_pose), target, 2, start=straight_start(CABLE.cable), record_hz=1.0
+    )
     assert run.held == np.isnan(run.keypoints[..., 0]).sum() > 0
     assert np.isfinite(run.error_cm).all()
 
 
 def test_wrong_requests_are_refused():
-    target, start = make_target("U", CABLE), straight_start(CABLE)
+    target, start = make_target("U", CABLE.cable), straight_start(CABLE.cable)
     plant, controller = Plant(CONFIG), GoToPose(target.gripper_pose)
     with pytest.raises(ValueError, match="at least one step"):
         run_closed_loop(plant, controller, target, 0, start=start)

@@ -7,11 +7,11 @@ import shlex
 import pytest
 import tyro
 
+from cablejax.cable import Cable, Discretisation
 from cablejax.commands.reproduce import command_line, simulate_command
 from cablejax.commands.simulate import Simulate
 from cablejax.commands.train import Train
 from cablejax.dataset.schema import DatasetConfig, Randomisation
-from cablejax.simulate import CableConfig
 from cablejax.simulate.motions import MotionConfig
 
 
@@ -21,8 +21,13 @@ from cablejax.simulate.motions import MotionConfig
         DatasetConfig(),
         DatasetConfig(n_trajectories=896, seed=1, motion=MotionConfig(start="random")),
         DatasetConfig(n_trajectories=320, seed=2, motion=MotionConfig(max_amplification=1e3)),
-        DatasetConfig(n_steps=7, engine="mjx", cable=CableConfig(n_links=17, friction_coefficient=0.0)),
-        DatasetConfig(randomisation=Randomisation(stiffness=(0.1, 3.0)), cable=CableConfig(bending_stiffness=0.05)),
+        DatasetConfig(
+            n_steps=7, engine="mjx", discretisation=Discretisation(Cable(friction_coefficient=0.0), n_links=17)
+        ),
+        DatasetConfig(
+            randomisation=Randomisation(stiffness=(0.1, 3.0)),
+            discretisation=Discretisation(Cable(bending_stiffness=0.05)),
+        ),
     ],
     ids=["default", "random", "free", "mjx", "stiffness"],
 )
@@ -35,7 +40,7 @@ def test_the_command_of_a_data_set_asks_for_that_data_set(config):
 
 
 def test_a_data_set_beyond_the_options_says_so():
-    config = DatasetConfig(cable=CableConfig(damping_time=0.3))
+    config = DatasetConfig(discretisation=Discretisation(Cable(damping_time=0.3)))
     assert simulate_command(config, "name.zarr").startswith("# name.zarr: ")
 
 

@@ -12,10 +12,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from cablejax.cable import Cable, Discretisation
 from cablejax.dataset.generate import MAX_ATTEMPTS, GenerationInterrupted, draw, find_fault, generate, simulate
 from cablejax.dataset.schema import DatasetConfig, Randomisation
 from cablejax.dataset.store import open_store
-from cablejax.simulate import CableConfig, ThreadedEngine
+from cablejax.simulate import ThreadedEngine
 from cablejax.simulate.motions import MotionConfig
 
 TINY = DatasetConfig(
@@ -25,7 +26,7 @@ TINY = DatasetConfig(
     seed=5,
     # so few links can only take gentle motion
     motion=MotionConfig(max_step=0.03, min_distance=0.6, max_angle=0.6, max_curvature=3.0),
-    cable=CableConfig(n_links=7, n_keypoints=4, timestep=0.02),
+    discretisation=Discretisation(Cable(n_keypoints=4), n_links=7, timestep=0.02),
     randomisation=Randomisation(stiffness=(0.1, 3.0), friction=(0.5, 2.0)),
 )
 
@@ -34,7 +35,7 @@ CHILD = """
 import sys
 from cablejax.dataset.generate import generate
 from cablejax.dataset.schema import *
-from cablejax.simulate import CableConfig
+from cablejax.cable import Cable, Discretisation
 from cablejax.simulate.motions import MotionConfig
 config, path = eval(sys.argv[1]), sys.argv[2]
 """
@@ -100,7 +101,7 @@ def test_parameters_reach_the_simulator():
         dataclasses.replace(TINY, randomisation=Randomisation(stiffness=(ratio, ratio)), n_trajectories=1)
         for ratio in (0.1, 10.0)
     )
-    shapes = [simulate(config, ThreadedEngine(config.cable), [0])[0].keypoints for config in (stiff, soft)]
+    shapes = [simulate(config, ThreadedEngine(config.discretisation), [0])[0].keypoints for config in (stiff, soft)]
     assert np.abs(shapes[0] - shapes[1]).max() > 1e-3
 
 
@@ -161,11 +162,11 @@ def listening():
 def test_ctrl_c_keeps_what_is_done_and_says_how_to_go_on(reference, tmp_path):
     path = tmp_path / "data"
     with pytest.raises(GenerationInterrupted, match=r"Stopped at 4 of 8 .* again to go on"):
-        generate(TINY, path, progress=False, engine=Interrupted(TINY.cable))
+        generate(TINY, path, progress=False, engine=Interrupted(TINY.discretisation))
     assert open_store(path).info().n_complete == 4
     with pytest.raises(ValueError, match="exists and holds trajectories"):
         generate(TINY, path, progress=False, resume=False)
-    engine = Interrupted(TINY.cable)
+    engine = Interrupted(TINY.discretisation)
     assert generate(TINY, path, progress=False, engine=engine).complete
     assert engine.calls == [2, 2]  # the two shards that were left, and nothing twice
     assert tree(path) == tree(reference)
@@ -186,7 +187,7 @@ class Diverging(ThreadedEngine):
 
 def test_a_failed_trajectory_is_drawn_again_and_counted(reference, tmp_path):
     lost = [draw(TINY, 3), draw(TINY, 6), draw(TINY, 6, attempt=1)]
-    engine = Diverging(TINY.cable, speeds=tuple(one.gripper_twist[0, 0, 0] for one in lost))
+    engine = Diverging(TINY.discretisation, speeds=tuple(one.gripper_twist[0, 0, 0] for one in lost))
     info = generate(TINY, tmp_path / "data", progress=False, engine=engine)
     store = open_store(tmp_path / "data")
     block, usual = store.read(), open_store(reference).read()
@@ -200,7 +201,7 @@ def test_a_failed_trajectory_is_drawn_again_and_counted(reference, tmp_path):
 def test_a_trajectory_that_never_works_is_an_error_not_data(tmp_path):
     speeds = tuple(draw(TINY, 5, attempt).gripper_twist[0, 0, 0] for attempt in range(MAX_ATTEMPTS))
     with pytest.raises(ValueError, match=rf"failed {MAX_ATTEMPTS} times in a row; number 5: .*not finite.*timestep"):
-        generate(TINY, tmp_path / "data", progress=False, engine=Diverging(TINY.cable, speeds=speeds))
+        generate(TINY, tmp_path / "data", progress=False, engine=Diverging(TINY.discretisation, speeds=speeds))
     assert open_store(tmp_path / "data").info().n_complete == 4  # shards 0 and 1
 
 
@@ -249,6 +250,6 @@ def test_two_devices_make_the_bytes_of_one(tmp_path):
     assert tree(tmp_path / "1") == tree(tmp_path / "2")
     # and they are the trajectories of the other engine
     here = open_store(tmp_path / "1").read()
-    block = simulate(config, ThreadedEngine(config.cable), range(config.n_shards))
+    block = simulate(config, ThreadedEngine(config.discretisation), range(config.n_shards))
     other = np.concatenate([part.keypoints for part in block])
     np.testing.assert_allclose(here.keypoints, other, atol=1e-3)

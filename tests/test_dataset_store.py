@@ -12,12 +12,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from cablejax.cable import Cable, Discretisation
 from cablejax.dataset.schema import Block, DatasetConfig, Randomisation, digest_of_config
 from cablejax.dataset.store import Store, open_or_create, open_store
-from cablejax.simulate import CableConfig
 from cablejax.simulate.motions import MotionConfig
 
-SMALL = DatasetConfig(n_trajectories=7, n_steps=2, shard_size=3, cable=CableConfig(n_links=5, n_keypoints=4))
+SMALL = DatasetConfig(
+    n_trajectories=7, n_steps=2, shard_size=3, discretisation=Discretisation(Cable(n_keypoints=4), n_links=5)
+)
 
 
 def block(config: DatasetConfig, shard: int) -> Block:
@@ -157,7 +159,7 @@ def test_another_configuration_is_refused_with_the_difference(tmp_path):
     path = tmp_path / "data"
     complete(open_or_create(path, SMALL))
     whole = tree(path)
-    other = dataclasses.replace(SMALL, seed=1, cable=dataclasses.replace(SMALL.cable, n_links=6))
+    other = dataclasses.replace(SMALL, seed=1, discretisation=dataclasses.replace(SMALL.discretisation, n_links=6))
     with pytest.raises(ValueError, match=r"cable.n_links is 5 in the store and 6 here; seed is 0 in the store and 1"):
         open_or_create(path, other)
     assert tree(path) == whole

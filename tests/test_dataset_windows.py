@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from cablejax.cable import Cable, Discretisation
 from cablejax.dataset.schema import Block, DatasetConfig
 from cablejax.dataset.store import open_or_create
 from cablejax.dataset.windows import (
@@ -20,7 +21,6 @@ from cablejax.dataset.windows import (
     split,
     window_at,
 )
-from cablejax.simulate import CableConfig
 from cablejax.types import Trajectory, advance
 
 M, T, N = 4, 9, 3
@@ -131,7 +131,9 @@ def filled(path, config: DatasetConfig, shards: int | None = None):
     return store
 
 
-CONFIG = DatasetConfig(n_trajectories=4, n_steps=2, shard_size=2, cable=CableConfig(n_links=5, n_keypoints=4))
+CONFIG = DatasetConfig(
+    n_trajectories=4, n_steps=2, shard_size=2, discretisation=Discretisation(Cable(n_keypoints=4), n_links=5)
+)
 
 
 def test_several_stores_are_split_each_and_trained_on_one_after_the_other(tmp_path):

@@ -9,11 +9,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from cablejax.cable import Discretisation
 from cablejax.diagnose import LIBRARY, Effect, Parameter
-from cablejax.diagnose.chain import Chain
 from cablejax.diagnose.check import check_effect
-from cablejax.diagnose.physics import nominal_physics
-from cablejax.simulate import CableConfig, MjxEngine, compiler_options
+from cablejax.effects.physics import nominal_physics
+from cablejax.simulate import MjxEngine, compiler_options
+from cablejax.simulate.chain.step import Chain
 
 NAMES = {
     "bending_stiffness", "stiffness_profile", "intrinsic_curvature", "plasticity", "bending_hysteresis",
@@ -76,7 +77,7 @@ def test_check_refuses_a_hidden_derivative():
 
 
 def test_chain_moves_like_the_mjx_engine():
-    config = CableConfig(n_links=13, timestep=0.002)
+    config = Discretisation(n_links=13, timestep=0.002)
     engine = MjxEngine(config)
     pose = np.array([[0.0, 0.0, 0.5], [0.8, 0.0, -0.4]])
     twist = np.zeros((10, 2, 3))
@@ -84,7 +85,7 @@ def test_chain_moves_like_the_mjx_engine():
     twist[:, 1] = [-0.02, 0.01, -0.2]
     with jax.enable_x64(True):
         state = engine.initial_state(pose)
-        _, trajectory = engine.rollout(config.params(), state, twist, 0.1)
+        _, trajectory = engine.rollout(nominal_physics(config), state, twist, 0.1)
         poses = np.concatenate([pose[None], pose + np.cumsum(twist, axis=0) * 0.1])
         rollout = jax.jit(
             lambda *args: Chain(config).rollout(*args, n_substeps=50), compiler_options=compiler_options()

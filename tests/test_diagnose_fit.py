@@ -7,17 +7,18 @@ import dataclasses
 import numpy as np
 import pytest
 
+from cablejax.cable import Cable, Discretisation
 from cablejax.diagnose import LIBRARY, Calibration, Effect, Parameter
 from cablejax.diagnose.belief import as_good, excess, explains_most_motions, level, log_scores
-from cablejax.diagnose.chain import LARGEST_STEP
 from cablejax.diagnose.conclude import conclude, sentence
 from cablejax.diagnose.conformal import leftover_p, leftover_score
-from cablejax.diagnose.effects import BendingStiffness
 from cablejax.diagnose.fit import Candidate, Evidence, Fit, Term, candidate, evaluate, improve
 from cablejax.diagnose.playback import Playback
 from cablejax.diagnose.screen import residual_of, screen, shortlist
 from cablejax.diagnose.search import Search
-from diagnose_cases import BY_NAME, CABLE, INTERVAL, context, evidence, parts
+from cablejax.effects import BendingStiffness
+from cablejax.simulate.chain.step import LARGEST_STEP
+from diagnose_cases import BY_NAME, INTERVAL, context, evidence, parts
 
 LOOK_ALIKES = (("bending_stiffness", (0.3,)), ("table_friction", (0.3, 0.0)))
 OFFSET = ("gripper_rotation_offset", 1, (0.08,))
@@ -58,7 +59,7 @@ def test_the_time_step_does_not_damp():
     """A light cable without friction creeps to rest after a turn of a gripper at a rate of its damping alone."""
     pose = np.tile(np.array([[0.0, 0.0, 0.6], [0.7, 0.0, -0.6]]), (1, 16, 1, 1))
     pose[0, 1:, 0, 2] += 0.2
-    config = dataclasses.replace(CABLE, n_links=17, friction_coefficient=0.0, linear_density=1e-3)
+    config = Discretisation(Cable(friction_coefficient=0.0, linear_density=1e-3), n_links=17)
 
     def relaxation_time(step: float) -> float:
         player = Playback.of_motion(config, pose, None, np.full(1, 0.1), step)

@@ -15,12 +15,12 @@ from scipy.signal import lfilter
 from scipy.stats import binom, kstest
 
 from cablejax.diagnose import LIBRARY, Calibration, Diagnosis, diagnose
-from cablejax.diagnose.effects import Effect
 from cablejax.diagnose.fit import Candidate, Term, candidate, evaluate, improve
 from cablejax.diagnose.playback import Playback
 from cablejax.diagnose.search import search
 from cablejax.diagnose.significance import NOISE_TOLERANCE, contrast_p, exceedance_p, variance_inflation
 from cablejax.diagnose.where import LEVEL, localise
+from cablejax.effects import Effect
 from cablejax.types import GapLog
 from diagnose_cases import BY_NAME, clean, context, evidence, evidence_of, log_of, noise, parts, playback, record
 

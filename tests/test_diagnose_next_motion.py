@@ -7,18 +7,18 @@ import functools
 import numpy as np
 import pytest
 
+from cablejax.cable import Cable, Discretisation
 from cablejax.diagnose import LIBRARY
 from cablejax.diagnose.fit import candidate
 from cablejax.diagnose.next_motion import next_motion
 from cablejax.diagnose.playback import Playback
 from cablejax.diagnose.safe_motions import INTERVAL, safe_motions, starting_pose
-from cablejax.simulate import CableConfig
 
-CONFIG = CableConfig(n_links=9)
+CONFIG = Discretisation(n_links=9)
 EFFECTS = {effect.name: effect for effect in LIBRARY}
 ARCH = np.array([[0.0, 0.0, 0.4], [0.85, 0.0, -0.4]])
 NAMES = {"mirror", "translation", "ramp_hold", "overload_return", "taut", "shifted_repeat"}
-NOISE = np.full(CONFIG.n_keypoints, 1e-3)
+NOISE = np.full(CONFIG.cable.n_keypoints, 1e-3)
 
 
 @functools.cache
@@ -46,7 +46,7 @@ def one(name, *values, variant=0):
 )
 @pytest.mark.parametrize("length", [1.0, 0.6])
 def test_motions_keep_to_their_limits(first, length):
-    config = CableConfig(n_links=9, length=length)
+    config = Discretisation(Cable(length=length), n_links=9)
     first = first * [length, length, 1.0]
     motions = safe_motions(config, first)
     assert {"translation", "ramp_hold", "overload_return"} <= set(motions) <= NAMES

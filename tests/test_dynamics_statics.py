@@ -5,17 +5,17 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from cablejax.cable import Discretisation
 from cablejax.dynamics.config import ModelConfig
 from cablejax.dynamics.graph import prior_of
 from cablejax.dynamics.statics import resting_shapes
-from cablejax.simulate import CableConfig
 from cablejax.simulate.composite import link_lengths, node_offsets
 from cablejax.simulate.equilibrium import arch_angles, find_equilibrium
 from cablejax.simulate.keypoints import hermite_weights
 from dynamics_cases import arched_history, check_derivatives, moved_rigidly, straight_history
 
 CONFIG = ModelConfig()
-CABLE = CableConfig(n_links=49)
+CABLE = Discretisation(n_links=49)
 POSES = {
     "arch": np.array([[-0.3, 0.05, 1.2], [0.35, -0.02, -0.7]]),
     "deep": np.array([[-0.2, 0.0, -1.4], [0.2, 0.0, 1.4]]),

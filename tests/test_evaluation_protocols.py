@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from cablejax.cable import Discretisation
 from cablejax.evaluation import protocols
 from cablejax.evaluation.protocols import (
     LaidOut,
@@ -18,14 +19,14 @@ from cablejax.evaluation.protocols import (
 )
 from cablejax.mpc import MPCConfig
 from cablejax.mpc.goal import goal_pose
-from cablejax.simulate.config import CableConfig
 from cablejax.simulate.elastica import solve_elastica
 from cablejax.simulate.equilibrium import angles_of_keypoints, chain_nodes, find_equilibrium
 from cablejax.simulate.motions import admissible
 from cablejax.simulate.plant import Plant, PlantConfig
 from cablejax.targets import make_target
 
-CABLE = CableConfig()
+CHAIN = Discretisation()
+CABLE = CHAIN.cable
 
 
 def test_straight_starts_vary_within_their_limits():
@@ -54,7 +55,7 @@ def test_letters_of_one_seed_start_alike():
 
 
 def test_least_time_is_that_of_the_gripper_with_the_longer_way():
-    task, config = letter_task("U", 0, CABLE), MPCConfig()
+    task, config = letter_task("U", 0, CHAIN), MPCConfig()
     there = dataclasses.replace(task, start_pose=np.asarray(goal_pose(jnp.asarray(task.target.keypoints))))
     there = dataclasses.replace(there, start_shape=task.target.keypoints)
     assert least_time(there, config) == pytest.approx(0.0, abs=1e-4)
@@ -78,16 +79,16 @@ def test_random_targets_are_shapes_in_which_the_cable_rests(seed):
     target = random_task("straight", seed).target
     pose, points = target.gripper_pose, target.keypoints
     np.testing.assert_allclose(points[[0, -1]], pose[:, :2], atol=1e-6)
-    assert admissible(CABLE, ShapeConfig().motion, pose)
+    assert admissible(CHAIN, ShapeConfig().motion, pose)
     assert 0.15 <= np.linalg.norm(pose[1, :2] - pose[0, :2]) <= 0.98
     assert np.abs(pose[:, :2].mean(axis=0)).max() <= 0.2
     chords = np.linalg.norm(np.diff(points, axis=0), axis=1)
     assert chords.max() <= 1 / 12 + 1e-6 and chords.sum() > 0.93
     # The chain, which shares nothing with the boundary-value solution, rests there too.
-    rest = find_equilibrium(CABLE, pose, angles_of_keypoints(CABLE, pose, points))
+    rest = find_equilibrium(CHAIN, pose, angles_of_keypoints(CHAIN, pose, points))
     assert rest.stability > 0
-    nodes = chain_nodes(CABLE, pose, rest.angles)
-    s = (np.arange(CABLE.n_joints) + 0.5) * CABLE.link_length
+    nodes = chain_nodes(CHAIN, pose, rest.angles)
+    s = (np.arange(CHAIN.n_joints) + 0.5) * CHAIN.link_length
     middle = [np.interp(CABLE.keypoint_arclength[1:-1], s, nodes[:, i]) for i in range(2)]
     assert np.abs(np.stack(middle, axis=1) - points[1:-1]).max() < 0.004
 
@@ -95,7 +96,7 @@ def test_random_targets_are_shapes_in_which_the_cable_rests(seed):
 @pytest.mark.parametrize("seed", range(3))
 def test_a_way_of_stable_shapes_leads_from_straight_to_the_target(seed):
     """The first part of the target's curve, enlarged to the cable's length, is a cable at rest, for every part."""
-    _, rest = random_shape(np.random.default_rng(seed), "way", CABLE)
+    _, rest = random_shape(np.random.default_rng(seed), "way", CHAIN)
     previous = None
     for fraction in np.linspace(0.1, 1.0, 10):
         s = fraction * np.linspace(0.0, 1.0, 101)
@@ -118,11 +119,13 @@ def test_crossed_shapes_are_found():
 
 
 def test_a_plant_is_laid_out_in_the_start_shape():
-    cable = CableConfig(n_links=12, dimension=3, timestep=0.005)
-    plant = Plant(PlantConfig(cable=cable, settle_time=0.2))
+    cable = Discretisation(n_links=12, dimension=3, timestep=0.005)
+    plant = Plant(PlantConfig(discretisation=cable, settle_time=0.2))
     task = random_task("diverse", 1)
     seen = LaidOut(plant, task.start_shape).reset(task.start_pose)
-    start = np.stack([np.interp(cable.keypoint_arclength, np.linspace(0, 1, 241), x) for x in task.start_shape.T], 1)
+    start = np.stack(
+        [np.interp(cable.cable.keypoint_arclength, np.linspace(0, 1, 241), x) for x in task.start_shape.T], 1
+    )
     assert np.abs(seen.keypoints - start).max() < 0.02
     observed = LaidOut(plant, task.start_shape).record(np.zeros((2, 3)), 0.1, samples=2)
     assert len(observed) == 2

@@ -8,6 +8,7 @@ import jax
 import numpy as np
 import pytest
 
+from cablejax.cable import Discretisation
 from cablejax.closed_loop import run_closed_loop
 from cablejax.dynamics.train_config import Phase
 from cablejax.evaluation.cases import mujoco_plant, random_cases, stiffness_cases
@@ -20,18 +21,17 @@ from cablejax.evaluation.suite import Case, key_of, read_suite, run_suite
 from cablejax.mpc import Controller
 from cablejax.servo import VisualServo
 from cablejax.shaping import load_model
-from cablejax.simulate.config import CableConfig
 from cablejax.simulate.plant import Plant, PlantConfig
 from cablejax.targets import make_target
 from cli_cases import small_model
 
-CABLE = CableConfig(n_links=12, dimension=3, timestep=0.005)
+CABLE = Discretisation(n_links=12, dimension=3, timestep=0.005)
 SERVO = METHODS[VISUAL_SERVO]
 
 
 @functools.lru_cache
 def small_plant():
-    return Plant(PlantConfig(cable=CABLE, settle_time=0.1))
+    return Plant(PlantConfig(discretisation=CABLE, settle_time=0.1))
 
 
 def case(seed, scenario="U"):

@@ -9,12 +9,12 @@ import pathlib
 import numpy as np
 import pytest
 
+from cablejax.cable import Cable
 from cablejax.gaplog import Episode, GapLogError, gap_log_from_episodes, read_gap_log, validate, write_gap_log
-from cablejax.simulate.config import CableConfig
 from cablejax.types import GapLog
 from file_cases import with_other_bytes
 
-CABLE = CableConfig(n_keypoints=5)
+CABLE = Cable(n_keypoints=5)
 CABLE_META = {
     "length_m": 1.0,
     "diameter_m": 0.01,
@@ -52,7 +52,7 @@ def test_assembly_pads_short_episodes(log):
 
 
 def test_a_smooth_table_is_a_table():
-    log = gap_log_from_episodes([episode(4)], CableConfig(n_keypoints=5, friction_coefficient=0.0), source="test")
+    log = gap_log_from_episodes([episode(4)], Cable(n_keypoints=5, friction_coefficient=0.0), source="test")
     assert log.meta["table"] == {"friction_coefficient": 0.0}
 
 

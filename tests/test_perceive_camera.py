@@ -5,25 +5,25 @@ import dataclasses
 import numpy as np
 import pytest
 
+from cablejax.cable import Cable, Discretisation
 from cablejax.closed_loop import run_closed_loop, shape_error_cm
 from cablejax.perceive.camera import CameraConfig, DepthCamera
 from cablejax.perceive.plant import CloudPlant
-from cablejax.simulate.config import CableConfig
 from cablejax.simulate.elastica import solve_elastica
 from cablejax.simulate.plant import PlantConfig
 from cablejax.targets import make_target, straight_start
 from perceive_cases import TRACKER
 
-CABLE = CableConfig(n_links=40, dimension=3, timestep=0.005)
+CABLE = Discretisation(n_links=40, dimension=3, timestep=0.005)
 CAMERA = CameraConfig(resolution=(480, 360), distance=1.5)
-TARGET = make_target("U", CABLE)
-SMALL_PLANT = PlantConfig(cable=dataclasses.replace(CABLE, n_links=12), settle_time=0.1)
+TARGET = make_target("U", CABLE.cable)
+SMALL_PLANT = PlantConfig(discretisation=dataclasses.replace(CABLE, n_links=12), settle_time=0.1)
 
 
 def lying(pose):
     """Nodes and directions of the links of a cable that rests on the table."""
-    solution = solve_elastica(pose, CABLE.length, n_samples=CABLE.n_links)
-    height = np.full((CABLE.n_links, 1), CABLE.diameter / 2)
+    solution = solve_elastica(pose, CABLE.cable.length, n_samples=CABLE.n_links)
+    height = np.full((CABLE.n_links, 1), CABLE.cable.diameter / 2)
     directions = np.stack([np.cos(solution.angle), np.sin(solution.angle), np.zeros(CABLE.n_links)], axis=1)
     return np.concatenate([solution.position, height], axis=1), directions, pose
 
@@ -34,7 +34,7 @@ def look(config: CameraConfig, pose=TARGET.gripper_pose) -> np.ndarray:
 
 def offsets(points: np.ndarray) -> np.ndarray:
     """Signed distance of every point across the cable [m], shape [S]."""
-    curve = solve_elastica(TARGET.gripper_pose, CABLE.length, n_samples=2001)
+    curve = solve_elastica(TARGET.gripper_pose, CABLE.cable.length, n_samples=2001)
     nearest = np.linalg.norm(points[:, None, :2] - curve.position[::4], axis=-1).argmin(axis=1) * 4
     normal = np.stack([-np.sin(curve.angle), np.cos(curve.angle)], axis=1)[nearest]
     return np.sum((points[:, :2] - curve.position[nearest]) * normal, axis=1)
@@ -134,6 +134,8 @@ def test_a_hidden_cable_is_reported_as_not_observed():
 
 
 def test_tracker_and_plant_must_be_about_the_same_cable():
-    other = dataclasses.replace(SMALL_PLANT, cable=dataclasses.replace(SMALL_PLANT.cable, n_keypoints=9))
+    other = dataclasses.replace(
+        SMALL_PLANT, discretisation=dataclasses.replace(CABLE, cable=Cable(n_keypoints=9), n_links=12)
+    )
     with pytest.raises(ValueError, match="13 keypoints"):
         CloudPlant(other, camera=CAMERA, tracker=TRACKER)

@@ -10,11 +10,13 @@ import mujoco
 import numpy as np
 import pytest
 
-from cablejax.simulate import CableConfig, MjxEngine, ThreadedEngine
+from cablejax.cable import Cable, Discretisation
+from cablejax.effects.physics import nominal_physics
+from cablejax.simulate import MjxEngine, ThreadedEngine
 from cablejax.simulate.composite import refuse_plugins
 
-PLANAR = CableConfig(n_links=25)
-SPATIAL = CableConfig(n_links=13, dimension=3, timestep=0.01, bending_stiffness=0.05)
+PLANAR = Discretisation(n_links=25)
+SPATIAL = Discretisation(Cable(bending_stiffness=0.05), n_links=13, dimension=3, timestep=0.01)
 
 
 def planar_pose() -> np.ndarray:
@@ -51,7 +53,7 @@ def spatial_twist() -> np.ndarray:
 )
 def test_mjx_follows_c_mujoco_within_a_hundredth_of_a_millimetre(config, pose, twist):
     threaded, mjx = ThreadedEngine(config, n_threads=1), MjxEngine(config)
-    state, params = mjx.initial_state(pose), config.params()
+    state, params = mjx.initial_state(pose), nominal_physics(config)
     _, reference = threaded.rollout(params, state, twist)
     _, trajectory = mjx.rollout(params, state, twist)
     moved = np.abs(np.asarray(reference.keypoints[-1] - reference.keypoints[0])).max()
@@ -111,20 +113,20 @@ def test_a_model_with_a_plugin_is_refused():
 
 @pytest.mark.parametrize("engine", [ThreadedEngine, MjxEngine])
 def test_ends_stay_at_the_grippers_while_they_move(engine):
-    config = CableConfig(n_links=13)
+    config = Discretisation(n_links=13)
     simulator = engine(config)
-    _, trajectory = simulator.rollout(config.params(), simulator.initial_state(planar_pose()), planar_twist())
+    _, trajectory = simulator.rollout(nominal_physics(config), simulator.initial_state(planar_pose()), planar_twist())
     ends = np.asarray(trajectory.keypoints)[:, [0, -1]]
     np.testing.assert_allclose(ends, np.asarray(trajectory.gripper_pose)[..., :2], atol=5e-6)
 
 
 @pytest.mark.parametrize("engine", [ThreadedEngine, MjxEngine])
 def test_a_batch_equals_its_members(engine):
-    config = CableConfig(n_links=9)
+    config = Discretisation(n_links=9)
     simulator = engine(config)
     poses = np.stack([planar_pose(), planar_pose() * [1, 1, -1]])
     twists = np.stack([planar_twist(), 0.5 * planar_twist()])
-    params = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), config.params())
+    params = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), nominal_physics(config))
     params = dataclasses.replace(params, friction_coefficient=jnp.array([0.1, 0.4]))
     states = simulator.initial_state(poses)
     _, batch = simulator.rollout(params, states, twists)
@@ -136,9 +138,9 @@ def test_a_batch_equals_its_members(engine):
 
 def test_friction_holds_a_cable_that_was_shifted():
     """After a shift, friction leaves the cable behind its frictionless shape, and it stays so while it is held."""
-    config = CableConfig(n_links=17, friction_coefficient=1.0)
+    config = Discretisation(Cable(friction_coefficient=1.0), n_links=17)
     engine = ThreadedEngine(config)
-    state, params = engine.initial_state(planar_pose()), config.params()
+    state, params = engine.initial_state(planar_pose()), nominal_physics(config)
     shift = np.zeros((1, 2, 3))
     shift[..., 0] = 0.05
     state, moved = engine.rollout(params, state, shift)
@@ -150,16 +152,16 @@ def test_friction_holds_a_cable_that_was_shifted():
 
 
 def test_bad_input_is_refused_with_what_came_and_what_was_expected():
-    engine = MjxEngine(CableConfig(n_links=5))
-    state, params = engine.initial_state(planar_pose()), engine.config.params()
+    engine = MjxEngine(Discretisation(n_links=5))
+    state, params = engine.initial_state(planar_pose()), nominal_physics(engine.config)
     with pytest.raises(ValueError, match=r"\(3, 2, 2\).*expected"):
         engine.rollout(params, state, np.zeros((3, 2, 2)))
     with pytest.raises(ValueError, match="multiple of the time step"):
         engine.rollout(params, state, np.zeros((3, 2, 3)), 0.033)
     with pytest.raises(ValueError, match="length is -1"):
-        CableConfig(length=-1)
+        Discretisation(Cable(length=-1))
     with pytest.raises(ValueError, match="n_links is 1"):
-        CableConfig(n_links=1)
+        Discretisation(n_links=1)
     with pytest.raises(ValueError, match="more than the cable's length"):
         engine.initial_state(np.array([[-0.6, 0.0, 0.0], [0.6, 0.0, 0.0]]))
     with pytest.raises(ValueError, match="NaN"):

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from cablejax.simulate import CableConfig, MjxEngine
+from cablejax.cable import Discretisation
+from cablejax.simulate import MjxEngine
 from cablejax.simulate.elastica import elastica
 from cablejax.simulate.equilibrium import arch_angles, find_equilibrium
 
@@ -14,10 +15,10 @@ POSE = np.array([[-0.3, 0.05, 1.2], [0.35, -0.02, -0.7]])
 
 def error(n_links: int) -> float:
     """Largest distance of a keypoint from the elastica [m]."""
-    config = CableConfig(n_links=n_links)
+    config = Discretisation(n_links=n_links)
     engine = MjxEngine(config)
     keypoints = np.asarray(engine.keypoints(engine.initial_state(POSE)))
-    exact = elastica(POSE, config.length, config.keypoint_arclength, guess=keypoints)
+    exact = elastica(POSE, config.cable.length, config.cable.keypoint_arclength, guess=keypoints)
     return float(np.linalg.norm(keypoints - exact, axis=1).max())
 
 
@@ -30,7 +31,7 @@ def test_the_chain_converges_to_the_elastica_with_the_square_of_the_link_length(
 
 
 def test_equilibrium_is_a_minimum_and_stability_falls_towards_snap_through():
-    config = CableConfig(n_links=13)
+    config = Discretisation(n_links=13)
     stabilities = []
     angles = None
     for lean in (0.6, 0.3, 0.0, -0.15):
@@ -43,6 +44,6 @@ def test_equilibrium_is_a_minimum_and_stability_falls_towards_snap_through():
 
 
 def test_a_pose_out_of_reach_is_refused():
-    config = CableConfig(n_links=13)
+    config = Discretisation(n_links=13)
     with pytest.raises(ValueError, match=r"1\.2000 m apart"):
         find_equilibrium(config, np.array([[-0.6, 0, 0], [0.6, 0, 0.0]]), np.zeros(12))

@@ -10,10 +10,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from cablejax.simulate import CableConfig, MjxEngine
-from cablejax.types import CableParams
+from cablejax.cable import Discretisation
+from cablejax.effects.physics import Physics, nominal_physics
+from cablejax.simulate import MjxEngine
 
-CONFIG = CableConfig(n_links=7, timestep=0.02)
+CONFIG = Discretisation(n_links=7, timestep=0.02)
 STRAIGHT = np.array([[-0.5, 0.0, 0.0], [0.5, 0.0, 0.0]])
 ARCH = np.array([[-0.42, 0.0, 0.6], [0.42, 0.0, -0.4]])
 
@@ -25,15 +26,15 @@ def moving() -> np.ndarray:
     return twist
 
 
-def directions(params: CableParams, twist: jax.Array) -> dict[str, tuple[CableParams, jax.Array]]:
+def directions(params: Physics, twist: jax.Array) -> dict[str, tuple[Physics, jax.Array]]:
     """One direction for each input, relative where the input has a size."""
     nothing = (jax.tree.map(jnp.zeros_like, params), jnp.zeros_like(twist))
     slope = jnp.linspace(-1.0, 1.5, CONFIG.n_joints)
     changes = {
-        "bending_stiffness": params.bending_stiffness * (1.0 + 0.3 * slope),
+        "bending_stiffness": params.stiffness * (1.0 + 0.3 * slope),
         "damping_time": params.damping_time,
-        "friction_coefficient": params.friction_coefficient,
-        "linear_density": params.linear_density,
+        "friction_coefficient": params.friction,
+        "linear_density": params.density,
         "rest_curvature": slope,
     }
     found = {name: (dataclasses.replace(nothing[0], **{name: d}), nothing[1]) for name, d in changes.items()}
@@ -67,7 +68,7 @@ def case(request, programs):
         engine, functions = programs
         pose, twist = (ARCH, moving()) if request.param == "moving" else (STRAIGHT, np.zeros((2, 2, 3)))
         state, params, twist = jax.tree.map(
-            lambda leaf: jnp.asarray(leaf, jnp.float64), (engine.initial_state(pose), CONFIG.params(), twist)
+            lambda leaf: jnp.asarray(leaf, jnp.float64), (engine.initial_state(pose), nominal_physics(CONFIG), twist)
         )
         final, push, pull = (functools.partial(function, state) for function in functions)
         return request.param, final, push, pull, params, twist

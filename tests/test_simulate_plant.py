@@ -6,12 +6,12 @@ import mujoco
 import numpy as np
 import pytest
 
-from cablejax.simulate.config import GRAVITY, CableConfig
+from cablejax.cable import GRAVITY, Discretisation
 from cablejax.simulate.elastica import elastica
 from cablejax.simulate.plant import Plant, PlantConfig, plant_model
 
-CABLE = CableConfig(n_links=14, dimension=3, timestep=0.005)
-CONFIG = PlantConfig(cable=CABLE, settle_time=0.3)
+CABLE = Discretisation(n_links=14, dimension=3, timestep=0.005)
+CONFIG = PlantConfig(discretisation=CABLE, settle_time=0.3)
 ARCH = np.array([[-0.45, 0.0, 0.0], [0.45, 0.0, 0.0]])
 STILL = np.zeros((2, 3))
 
@@ -38,14 +38,14 @@ def test_cable_at_rest_stays_at_rest(plant):
     after = plant.step(STILL, 10.0)
     assert np.abs(after.keypoints - before.keypoints).max() / 10.0 < 1e-4  # [m/s]
     heights = plant.nodes()[0][:, 2]
-    assert (np.abs(heights - CABLE.diameter / 2) < 5e-4).all()
+    assert (np.abs(heights - CABLE.cable.diameter / 2) < 5e-4).all()
 
 
 @pytest.mark.parametrize("ratio", [0.5, 3.0])
 def test_a_new_cable_has_the_shape_of_the_elastica_whatever_its_stiffness(ratio):
     plant = Plant(dataclasses.replace(CONFIG, stiffness_ratio=ratio))
     pose = np.array([[-0.3, 0.1, -1.2], [0.3, 0.0, 1.0]])
-    expected = elastica(pose, CABLE.length, CABLE.keypoint_arclength)
+    expected = elastica(pose, CABLE.cable.length, CABLE.cable.keypoint_arclength)
     np.testing.assert_allclose(plant.reset(pose).keypoints, expected, atol=3e-3)
 
 
@@ -56,7 +56,7 @@ def test_friction_of_a_sliding_cable_is_coulombs():
     plant.reset(ARCH)
     plant.step(np.array([[0.05, 0.0, 0.0]] * 2))
     force = contact_force(plant)
-    weight = cable.linear_density * (cable.length - cable.link_length) * GRAVITY
+    weight = cable.cable.linear_density * (cable.cable.length - cable.link_length) * GRAVITY
     assert force[0] == pytest.approx(-0.1 * force[2], rel=0.01)
     # Friction rolls the cable a little, so the grippers bear down on it.
     assert force[2] == pytest.approx(weight, rel=0.25)
@@ -74,7 +74,7 @@ def contact_force(plant) -> np.ndarray:
 
 def test_the_table_carries_the_weight_steadily(plant):
     plant.reset(ARCH)
-    weight = CABLE.linear_density * (CABLE.length - CABLE.link_length) * GRAVITY
+    weight = CABLE.cable.linear_density * (CABLE.cable.length - CABLE.link_length) * GRAVITY
     assert contact_force(plant)[2] == pytest.approx(weight, rel=0.1)
     loads = []
     for _ in range(40):
@@ -92,7 +92,7 @@ def test_friction_keeps_a_cable_where_a_frictionless_one_springs_back():
         plant.reset(ARCH)
         plant.step(twist)
         shapes.append(plant.step(STILL, 2.0).keypoints)
-    rest = elastica(ARCH + twist, CABLE.length, CABLE.keypoint_arclength)
+    rest = elastica(ARCH + twist, CABLE.cable.length, CABLE.cable.keypoint_arclength)
     off = [np.abs(shape - rest).max() for shape in shapes]
     assert off[1] < 4e-3
     assert off[0] > 3 * off[1]
@@ -100,7 +100,7 @@ def test_friction_keeps_a_cable_where_a_frictionless_one_springs_back():
 
 def test_bad_set_ups_are_refused():
     with pytest.raises(ValueError, match="dimension is 2"):
-        PlantConfig(cable=CableConfig())
+        PlantConfig(discretisation=Discretisation())
     with pytest.raises(ValueError, match="stiffness_ratio"):
         PlantConfig(stiffness_ratio=0.0)
     with pytest.raises(ValueError, match="keypoint_dropout"):
@@ -110,5 +110,5 @@ def test_bad_set_ups_are_refused():
 def test_weight_and_plugins():
     model = plant_model(CONFIG)
     free = model.body_mass[[i for i in range(model.nbody) if model.body(i).name.startswith("cable")]][1:-1]
-    np.testing.assert_allclose(free, CABLE.linear_density * CABLE.link_length)
+    np.testing.assert_allclose(free, CABLE.cable.linear_density * CABLE.link_length)
     assert model.nplugin == 0

@@ -9,8 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from cablejax.cable import Discretisation
 from cablejax.gaplog import read_gap_log
-from cablejax.simulate import CableConfig, MjxEngine, ThreadedEngine
+from cablejax.simulate import MjxEngine, ThreadedEngine
 from cablejax.simulate.replay import config_of_log, replay_episode
 
 FOLDER = Path(os.environ.get("CABLEJAX_DATA", "absent")).parent / "gap-dev"
@@ -68,6 +69,6 @@ def test_configuration_comes_from_the_log(tmp_path):
         meta=meta,
     )
     config = config_of_log(log)
-    assert (config.length, config.n_keypoints, config.friction_coefficient) == (0.8, 9, 0.3)
-    assert (config.bending_stiffness, config.damping_time, config.linear_density) == (0.01, 0.2, 0.05)
-    assert isinstance(config, CableConfig)
+    assert (config.cable.length, config.cable.n_keypoints, config.cable.friction_coefficient) == (0.8, 9, 0.3)
+    assert (config.cable.bending_stiffness, config.cable.damping_time, config.cable.linear_density) == (0.01, 0.2, 0.05)
+    assert isinstance(config, Discretisation)

@@ -8,15 +8,15 @@ import pytest
 
 pytest.importorskip("elastica", reason="PyElastica is not installed: pip install pyelastica==1.0.0")
 
+from cablejax.cable import GRAVITY, Cable, Discretisation
 from cablejax.closed_loop import run_closed_loop
 from cablejax.simulate import rod_plant
-from cablejax.simulate.config import GRAVITY, CableConfig
 from cablejax.simulate.elastica import elastica
 from cablejax.simulate.rod_plant import ETHERNET, USB, RodPlant, RodPlantConfig
 from cablejax.targets import make_target, straight_start
 
-CABLE = CableConfig(n_links=15, timestep=4e-4)
-CONFIG = RodPlantConfig(cable=CABLE)
+CABLE = Discretisation(n_links=15, timestep=4e-4)
+CONFIG = RodPlantConfig(discretisation=CABLE)
 ARCH = np.array([[-0.45, 0.0, 0.0], [0.45, 0.0, 0.0]])
 STILL = np.zeros((2, 3))
 
@@ -27,13 +27,13 @@ def plant() -> RodPlant:
 
 
 def rubbing(friction, **changes) -> RodPlant:
-    cable = dataclasses.replace(CABLE, friction_coefficient=friction)
-    return RodPlant(dataclasses.replace(CONFIG, cable=cable, **changes))
+    cable = dataclasses.replace(CABLE, cable=Cable(friction_coefficient=friction))
+    return RodPlant(dataclasses.replace(CONFIG, discretisation=cable, **changes))
 
 
 @pytest.mark.parametrize("letter", ["U", "S", "Z"])
 def test_a_new_cable_has_the_shape_of_the_elastica(letter):
-    plant = RodPlant(RodPlantConfig(cable=CableConfig(n_links=27, timestep=2e-4)))
+    plant = RodPlant(RodPlantConfig(discretisation=Discretisation(n_links=27, timestep=2e-4)))
     target = make_target(letter, plant.config.cable)
     np.testing.assert_allclose(plant.reset(target.gripper_pose).keypoints, target.keypoints, atol=2e-3)
     assert plant.stretch() < 1e-3
@@ -78,7 +78,7 @@ def test_friction_of_a_sliding_cable_is_stribecks(speed):
 
 def test_friction_keeps_a_cable_where_a_frictionless_one_springs_back():
     twist = np.array([[0.0, 0.0, 0.4], [0.0, 0.0, -0.2]])
-    rest = elastica(ARCH + twist, CABLE.length, CABLE.keypoint_arclength)
+    rest = elastica(ARCH + twist, CABLE.cable.length, CABLE.cable.keypoint_arclength)
     off = []
     for friction in (1.0, 0.0):
         plant = rubbing(friction)
@@ -100,8 +100,8 @@ def test_a_uniform_rest_curvature_does_not_show_between_two_clamps():
 
 def test_bad_set_ups_are_refused():
     for changes, message in [
-        ({"cable": CableConfig(dimension=3, timestep=1e-4)}, "dimension is 3"),
-        ({"cable": CableConfig(n_links=27, timestep=1e-3)}, "stable only up to"),
+        ({"cable": Discretisation(dimension=3, timestep=1e-4)}, "dimension is 3"),
+        ({"cable": Discretisation(n_links=27, timestep=1e-3)}, "stable only up to"),
         ({"static_ratio": 0.9}, "static_ratio"),
         ({"axial_ratio": 0.0}, "axial_ratio"),
         ({"rest_curvature": np.nan}, "rest_curvature"),
@@ -134,14 +134,16 @@ def test_the_closed_loop_takes_it_for_a_plant():
         def step(self, state, keypoints, gripper_pose):
             return None, STILL, None
 
-    run = run_closed_loop(RodPlant(CONFIG), Still(), make_target("U", CABLE), 2, start=straight_start(CABLE))
+    run = run_closed_loop(
+        RodPlant(CONFIG), Still(), make_target("U", CABLE.cable), 2, start=straight_start(CABLE.cable)
+    )
     assert run.stopped is None and len(run.episode.time) == 3 * 10 + 1
     assert np.abs(run.keypoints[-1] - run.keypoints[0]).max() < 1e-6
 
 
 def test_the_named_cables_differ_from_the_reference_in_opposite_directions():
-    nominal = CableConfig()
-    assert USB.cable.bending_stiffness < nominal.bending_stiffness < ETHERNET.cable.bending_stiffness
+    nominal = Discretisation()
+    assert USB.cable.bending_stiffness < nominal.cable.bending_stiffness < ETHERNET.cable.bending_stiffness
     for config in (ETHERNET, USB):
         assert config.cable.n_keypoints == 13 and config.cable.length == 1.0
         assert config.rest_curvature == 0.0

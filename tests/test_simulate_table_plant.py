@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from cablejax.simulate import CableConfig
+from cablejax.cable import Discretisation
 from cablejax.simulate.plant import Plant, PlantConfig
 from cablejax.simulate.rod_plant import RodPlant, RodPlantConfig
 from cablejax.simulate.table_plant import PlantError
@@ -13,8 +13,8 @@ from cablejax.simulate.table_plant import PlantError
 ARCH = np.array([[-0.45, 0.0, 0.0], [0.45, 0.0, 0.0]])
 STILL = np.zeros((2, 3))
 CONFIGS = {
-    "mujoco": PlantConfig(cable=CableConfig(n_links=14, dimension=3, timestep=0.005), settle_time=0.3),
-    "rod": RodPlantConfig(cable=CableConfig(n_links=15, timestep=4e-4)),
+    "mujoco": PlantConfig(discretisation=Discretisation(n_links=14, dimension=3, timestep=0.005), settle_time=0.3),
+    "rod": RodPlantConfig(discretisation=Discretisation(n_links=15, timestep=4e-4)),
 }
 SAME_MOTION = {"mujoco": 1e-9, "rod": 1e-6}
 """How much sampling may change a motion [m]."""

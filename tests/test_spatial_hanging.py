@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_bvp
 
+from cablejax.cable import GRAVITY
 from cablejax.recordings.wires import read_wires
-from cablejax.simulate.config import GRAVITY
 from cablejax.simulate.elastica import elastica
 from cablejax.spatial.hanging import Wire, hanging_angles, hanging_points, imbalance, joint_arclength
 from cablejax.spatial.hanging_effects import EFFECTS, wire_shape

@@ -8,9 +8,9 @@ import mujoco
 import numpy as np
 import pytest
 
+from cablejax.cable import Cable, Discretisation
 from cablejax.simulate.compile import compiler_options
 from cablejax.simulate.composite import build_grasped_chain
-from cablejax.simulate.config import CableConfig
 from cablejax.spatial import rod as rod_module
 from cablejax.spatial.physics import RodPhysics
 from cablejax.spatial.rod import Rod
@@ -82,10 +82,18 @@ def _run(rod, physics, position, frames, seen):
 
 @pytest.mark.parametrize(("sideways", "twisting"), [(0.0, False), (0.15, True)])
 def test_agrees_with_the_mujoco_composite(sideways, twisting):
-    config = CableConfig(
-        dimension=3, n_links=33, timestep=5e-4, friction_coefficient=0.0, bending_stiffness=0.002, damping_time=0.05,
-        linear_density=0.04, diameter=0.006,
-    )  # fmt: skip
+    config = Discretisation(
+        Cable(
+            friction_coefficient=0.0,
+            bending_stiffness=0.002,
+            damping_time=0.05,
+            linear_density=0.04,
+            diameter=0.006,
+        ),
+        dimension=3,
+        n_links=33,
+        timestep=5e-4,
+    )
     reference = _mujoco(config, 101, sideways)[:, 1:-1]
     arclength = np.arange(1, 32) * config.link_length
     position, frames = _inputs(101, sideways)

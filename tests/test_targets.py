@@ -5,11 +5,11 @@ import json
 import numpy as np
 import pytest
 
-from cablejax.simulate.config import CableConfig
+from cablejax.cable import Cable
 from cablejax.simulate.elastica import solve_elastica
 from cablejax.targets import load_target, make_target, straight_start, target_from_keypoints
 
-CABLE = CableConfig()
+CABLE = Cable()
 
 
 @pytest.mark.parametrize("shape", ["U", "S", "Z"])
@@ -38,7 +38,7 @@ def test_letters_look_like_letters():
 
 
 def test_letters_scale_with_the_cable():
-    large = make_target("S", CableConfig(length=2.0))
+    large = make_target("S", Cable(length=2.0))
     np.testing.assert_allclose(large.keypoints, 2 * make_target("S", CABLE).keypoints, atol=1e-5)
 
 

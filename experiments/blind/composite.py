@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from cablejax.simulate.config import CableConfig
+from cablejax.cable import Cable, Discretisation
 from cablejax.simulate.plant import Plant, PlantConfig
 from cablejax.simulate.table_plant import PlantError
 
@@ -31,12 +31,20 @@ def simulate(world: World, pose: np.ndarray, frame: float) -> Motion:
     unknown = world.unlike_nominal() - UNDERSTOOD
     if unknown:
         raise ValueError(f"Family C has no law for {sorted(unknown)}.")
-    cable = CableConfig(
-        length=world.length, diameter=world.diameter, n_links=LINKS, dimension=3, timestep=0.005,
-        bending_stiffness=world.stiffness, damping_time=world.damping_time, linear_density=world.linear_density,
-        friction_coefficient=world.friction,
-    )  # fmt: skip
-    plant = Plant(PlantConfig(cable=cable))
+    cable = Discretisation(
+        Cable(
+            length=world.length,
+            diameter=world.diameter,
+            bending_stiffness=world.stiffness,
+            damping_time=world.damping_time,
+            linear_density=world.linear_density,
+            friction_coefficient=world.friction,
+        ),
+        n_links=LINKS,
+        dimension=3,
+        timestep=0.005,
+    )
+    plant = Plant(PlantConfig(discretisation=cable))
     plant.model.opt.gravity[:] = GRAVITY * np.array([
         np.sin(world.tilt) * np.cos(world.tilt_direction), np.sin(world.tilt) * np.sin(world.tilt_direction),
         -np.cos(world.tilt),

@@ -19,14 +19,15 @@ import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Float, Int
 
+from cablejax.cable import Discretisation
 from cablejax.closed_loop import settling_time
+from cablejax.effects.physics import Physics, nominal_physics
 from cablejax.mpc import ControlInfo, ControllerState, MPCConfig, control, initial_state
 from cablejax.residual.jacobian import Dynamics
 from cablejax.simulate.compile import compiler_options
-from cablejax.simulate.config import CableConfig
 from cablejax.simulate.mjx_engine import MjxEngine
 from cablejax.simulate.table_plant import check_camera
-from cablejax.types import CableParams, CableState, History
+from cablejax.types import CableState, History
 
 
 class Policy(Protocol):
@@ -132,7 +133,7 @@ class BatchRun:
 
 def shape_batch(
     engine: MjxEngine,
-    params: CableParams,
+    params: Physics,
     state: CableState,
     policy: Policy,
     weights: Any,
@@ -161,10 +162,10 @@ def shape_batch(
         ValueError: the batch axes differ, the cable is not planar, or a target has another number of keypoints.
     """
     size, cable = len(targets), engine.config
-    if cable.dimension != 2 or np.shape(targets) != (size, cable.n_keypoints, 2):
+    if cable.dimension != 2 or np.shape(targets) != (size, cable.cable.n_keypoints, 2):
         raise ValueError(
-            f"Targets of shape {np.shape(targets)} for a cable with {cable.n_keypoints} keypoints in {cable.dimension} "
-            f"dimensions, expected (B, {cable.n_keypoints}, 2) on a planar cable."
+            f"Targets of shape {np.shape(targets)} for a cable with {cable.cable.n_keypoints} keypoints in {cable.dimension} "
+            f"dimensions, expected (B, {cable.cable.n_keypoints}, 2) on a planar cable."
         )
     engine.substeps(config.interval)
     seeds = np.arange(size) if seeds is None else np.asarray(seeds)
@@ -181,9 +182,10 @@ def shape_batch(
     return run if devices is None else jax.tree.map(lambda leaf: leaf[:size], run)
 
 
-def varied_params(config: CableConfig, stiffness_ratio: Float[np.ndarray, " B"]) -> CableParams:
+def varied_params(config: Discretisation, stiffness_ratio: Float[np.ndarray, " B"]) -> Physics:
     """The nominal parameters B times, with bending stiffnesses of given ratios to the nominal one."""
-    one = [config.params(stiffness_ratio=float(ratio)) for ratio in stiffness_ratio]
+    nominal = nominal_physics(config)
+    one = [dataclasses.replace(nominal, stiffness=nominal.stiffness * np.float32(r)) for r in stiffness_ratio]
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *one)
 
 
@@ -212,7 +214,7 @@ def _one_trial(
     policy: Policy,
     config: LoopConfig,
     weights: Any,
-    params: CableParams,
+    params: Physics,
     cable: CableState,
     target: Float[Array, "N 2"],
     seed: Int[Array, ""],

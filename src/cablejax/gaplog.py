@@ -15,9 +15,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from cablejax.cable import GRAVITY, Cable
 from cablejax.json_file import parse_json
 from cablejax.npz import NpzError, read_npz
-from cablejax.simulate.config import GRAVITY, CableConfig
 from cablejax.types import GapLog
 from cablejax.whole_file import whole_file
 
@@ -69,7 +69,7 @@ class Episode:
 
 def gap_log_from_episodes(
     episodes: Sequence[Episode],
-    cable: CableConfig,
+    cable: Cable,
     *,
     source: str,
     grasp: Sequence[str] = ("clamped", "clamped"),

@@ -10,6 +10,7 @@ from flax import nnx
 from jaxtyping import Array, Float
 
 from cablejax.adaptation.belief import AdaptationConfig
+from cablejax.cable import Cable
 from cablejax.closed_loop import ClosedLoopRun, run_closed_loop
 from cablejax.dynamics.config import ModelConfig
 from cablejax.dynamics.model import apply
@@ -21,7 +22,6 @@ from cablejax.perceive.plant import CloudPlant
 from cablejax.report.record import Method
 from cablejax.residual import Dynamics
 from cablejax.residual.jacobian import StepJacobian, reverse
-from cablejax.simulate import CableConfig
 from cablejax.simulate.elastica import elastica
 from cablejax.simulate.plant import Plant, PlantConfig
 from cablejax.solver_names import SolverName
@@ -96,7 +96,7 @@ def make_controller(model: Model, target: Target, *, method: Method, solver: Sol
     return Controller(config, model.dynamics, model.weights, target.keypoints)
 
 
-def initial_history(cable: CableConfig, config: ModelConfig) -> History:
+def initial_history(cable: Cable, config: ModelConfig) -> History:
     """A straight cable at rest, as the controller meets it before its first command."""
     pose = straight_start(cable)
     keypoints = elastica(pose, cable.length, cable.keypoint_arclength)

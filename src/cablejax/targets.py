@@ -9,9 +9,9 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float
 
+from cablejax.cable import Cable
 from cablejax.json_file import read_json
 from cablejax.npz import read_npz
-from cablejax.simulate.config import CableConfig
 from cablejax.simulate.elastica import elastica
 
 Shape = Literal["U", "S", "Z"]
@@ -56,7 +56,7 @@ _LETTERS: dict[str, _Letter] = {
 }
 
 
-def make_target(shape: Shape, config: CableConfig = CableConfig()) -> Target:
+def make_target(shape: Shape, config: Cable = Cable()) -> Target:
     """The letter U, S or Z as the elastica between two grippers, its chord's middle at the origin.
 
     It is a stable equilibrium of a uniform cable without friction, whatever its stiffness.
@@ -77,7 +77,7 @@ def make_target(shape: Shape, config: CableConfig = CableConfig()) -> Target:
     return Target(shape, elastica(pose, config.length, config.keypoint_arclength), pose)
 
 
-def straight_start(config: CableConfig = CableConfig()) -> Float[np.ndarray, "2 3"]:
+def straight_start(config: Cable = Cable()) -> Float[np.ndarray, "2 3"]:
     """Gripper poses (x, y, theta) of an almost straight cable along +x, centred at the origin, its slack towards -y."""
     half = 0.5 * START_DISTANCE * config.length
     return np.array([[-half, 0.0, -START_LEAN], [half, 0.0, START_LEAN]])
@@ -86,7 +86,7 @@ def straight_start(config: CableConfig = CableConfig()) -> Float[np.ndarray, "2 
 def target_from_keypoints(
     name: str,
     keypoints: Float[np.ndarray, "N 2"],
-    config: CableConfig = CableConfig(),
+    config: Cable = Cable(),
     gripper_pose: Float[np.ndarray, "2 3"] | None = None,
 ) -> Target:
     """A target from points along the cable, checked against the cable it is meant for.
@@ -137,7 +137,7 @@ def target_from_keypoints(
     return Target(name, points, pose)
 
 
-def load_target(path: str | pathlib.Path, config: CableConfig = CableConfig()) -> Target:
+def load_target(path: str | pathlib.Path, config: Cable = Cable()) -> Target:
     """A target from a file: `.npz` or `.json` with "keypoints" (and "gripper_pose"), or `.csv` with rows `x,y`.
 
     Raises:

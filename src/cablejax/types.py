@@ -25,26 +25,6 @@ PLANAR_DOF = 3
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
-class CableParams:
-    """Physical parameters of one cable on one table: everything that a gradient may be taken in.
-
-    Attributes:
-        bending_stiffness: EI at each bending joint [N m^2], shape [J].
-        damping_time: Kelvin-Voigt time constant tau [s] in `M = EI (kappa - kappa_0 + tau dkappa/dt)`, shape [].
-        rest_curvature: kappa_0 at each bending joint [1/m], shape [J] in the plane, [J, 3] in space.
-        linear_density: mass per length [kg/m], shape [].
-        friction_coefficient: Coulomb coefficient mu of the table, kinetic, shape [].
-    """
-
-    bending_stiffness: Float[Array, "*batch J"]
-    damping_time: Float[Array, "*batch"]
-    rest_curvature: Float[Array, "*batch J"] | Float[Array, "*batch J 3"]
-    linear_density: Float[Array, "*batch"]
-    friction_coefficient: Float[Array, "*batch"]
-
-
-@jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True)
 class CableState:
     """Full state of a simulated cable.
 

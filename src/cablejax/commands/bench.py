@@ -46,12 +46,14 @@ class BenchSimulate(Command):
         import jax.numpy as jnp
         import numpy as np
 
-        from cablejax.simulate import CableConfig, MjxEngine, ThreadedEngine, compiler_options
+        from cablejax.cable import Discretisation
+        from cablejax.effects.physics import nominal_physics
+        from cablejax.simulate import MjxEngine, ThreadedEngine, compiler_options
 
         for name in ("batch", "seconds", "rounds", "threads"):
             if getattr(self, name) < 1:
                 raise UsageError(f"--{name} is {getattr(self, name)}, expected at least 1.")
-        config = CableConfig() if self.links is None else CableConfig(n_links=self.links)
+        config = Discretisation() if self.links is None else Discretisation(n_links=self.links)
         mjx, one, many = MjxEngine(config), ThreadedEngine(config, 1), ThreadedEngine(config, self.threads)
 
         # An arch, moved slowly: contact with the table, bending and grasps are all at work.
@@ -59,7 +61,8 @@ class BenchSimulate(Command):
         rng = np.random.default_rng(self.seed)
         twist = jnp.asarray(rng.uniform(-0.01, 0.01, (self.batch, self.seconds, 2, 3)))
         params, states = jax.tree.map(
-            lambda leaf: jnp.broadcast_to(jnp.asarray(leaf), (self.batch, *jnp.shape(leaf))), (config.params(), state)
+            lambda leaf: jnp.broadcast_to(jnp.asarray(leaf), (self.batch, *jnp.shape(leaf))),
+            (nominal_physics(config), state),
         )
 
         say(f"compiling the MJX engine for {self.batch} cables of {config.n_links} links ...")
@@ -135,9 +138,9 @@ class BenchMpc(Command):
     def execute(self):
         import jax
 
+        from cablejax.cable import Cable
         from cablejax.mpc import time_control
         from cablejax.shaping import initial_history, load_model
-        from cablejax.simulate import CableConfig
 
         least = min(self.repeats, *self.batches, self.horizon + 1, self.referee + 1)
         if not self.solvers or least < 1:
@@ -148,7 +151,7 @@ class BenchMpc(Command):
             )
         on_processor = jax.devices()[0].platform == "cpu"
         batches = self.batches or ((1, 16) if on_processor else (1, 64, 1024))
-        model, cable = load_model(self.weights), CableConfig()
+        model, cable = load_model(self.weights), Cable()
         history = initial_history(cable, model.config)
         solvers = {}
         for name in self.solvers:
@@ -272,23 +275,24 @@ class BenchLoop(Command):
         import numpy as np
 
         from cablejax.batched_loop import LoopConfig, MpcPolicy, shape_batch, varied_params
+        from cablejax.cable import Discretisation
         from cablejax.shaping import load_model, make_controller
-        from cablejax.simulate import CableConfig, MjxEngine
+        from cablejax.simulate import MjxEngine
         from cablejax.targets import make_target, straight_start
 
         if not self.batches or min(*self.batches, self.steps, self.rounds) < 1:
             raise UsageError(
                 f"--batches {self.batches}, --steps {self.steps} and --rounds {self.rounds}: expected at least 1 each."
             )
-        model, cable = load_model(self.weights), CableConfig()
-        target = make_target("S", cable)
+        model, chain = load_model(self.weights), Discretisation()
+        target = make_target("S", chain.cable)
         controller = make_controller(model, target, method="residual", solver=self.solver)
         config = LoopConfig(self.steps, interval=model.config.interval, history_length=model.config.history)
-        policy, engine = MpcPolicy(controller.config, model.dynamics), MjxEngine(cable)
+        policy, engine = MpcPolicy(controller.config, model.dynamics), MjxEngine(chain)
 
         def run(size: int):
-            state = engine.initial_state(np.stack([straight_start(cable)] * size))
-            params = varied_params(cable, np.linspace(0.5, 2.0, size))
+            state = engine.initial_state(np.stack([straight_start(chain.cable)] * size))
+            params = varied_params(chain, np.linspace(0.5, 2.0, size))
             goals = np.stack([target.keypoints] * size)
             return jax.block_until_ready(shape_batch(engine, params, state, policy, model.weights, goals, config))
 

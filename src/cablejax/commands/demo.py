@@ -52,7 +52,7 @@ class Demo(Command):
         from cablejax.targets import make_target
 
         plant = PlantConfig(stiffness_ratio=STIFFNESS_RATIO, seed=self.seed)
-        plant = dataclasses.replace(plant, cable=dataclasses.replace(plant.cable, n_links=self.links))
+        plant = dataclasses.replace(plant, discretisation=dataclasses.replace(plant.discretisation, n_links=self.links))
         job = Job(
             plant=plant,
             model=load_model(self.weights),

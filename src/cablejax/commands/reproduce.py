@@ -32,7 +32,7 @@ def simulate_command(config: DatasetConfig, out: str) -> str:
         start=config.motion.start,
         max_amplification=config.motion.max_amplification,
         engine=config.engine,
-        links=config.cable.n_links,
+        links=config.discretisation.n_links,
         stiffness=config.cable.bending_stiffness,
         friction=config.cable.friction_coefficient,
         stiffness_range=config.randomisation.stiffness,
@@ -41,7 +41,7 @@ def simulate_command(config: DatasetConfig, out: str) -> str:
     )
     if command.dataset_config() != dataclasses.replace(config, shard_size=DatasetConfig.shard_size):
         return f"# {out}: cablejax.dataset.generate.generate with the configuration recorded in the weights file"
-    if command.links == DatasetConfig().cable.n_links:
+    if command.links == DatasetConfig().discretisation.n_links:
         command = dataclasses.replace(command, links=None)
     return command_line(command, "simulate")
 

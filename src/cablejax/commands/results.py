@@ -9,13 +9,13 @@ from typing import Any
 
 import numpy as np
 
+from cablejax.cable import Cable
 from cablejax.closed_loop import ClosedLoopRun
 from cablejax.gaplog import gap_log_from_episodes, write_gap_log
 from cablejax.report.animation import write_gif
 from cablejax.report.page import write_page
 from cablejax.report.provenance import machine, versions
 from cablejax.report.record import Method, record_of
-from cablejax.simulate import CableConfig
 
 Runs = Mapping[tuple[str, Method], ClosedLoopRun]
 """Runs by target's name and method."""
@@ -66,7 +66,7 @@ def write_results(
     runs: Runs,
     summary: Mapping[str, Any],
     *,
-    believed: CableConfig,
+    believed: Cable,
     about: str,
     facts: Mapping[str, str],
 ) -> None:

@@ -8,6 +8,7 @@ import time
 from collections.abc import Mapping
 from typing import Any
 
+from cablejax.cable import Cable
 from cablejax.closed_loop import ClosedLoopRun
 from cablejax.commands.options import UsageError, say
 from cablejax.commands.parts import Parts
@@ -18,7 +19,6 @@ from cablejax.perceive.camera import CameraConfig
 from cablejax.report.record import Method
 from cablejax.report.style import METHOD_LABEL
 from cablejax.shaping import Model, shape_once
-from cablejax.simulate import CableConfig
 from cablejax.simulate.plant import PlantConfig
 from cablejax.solver_names import SolverName
 from cablejax.targets import Target
@@ -103,7 +103,7 @@ def shape_and_report(
             say(f"{time.perf_counter() - begin:5.0f} s  {METHOD_LABEL[method]:22s}{run.verdict()}")
     summary = summarise(runs, total_s=0.0)
     cable = job.plant.cable
-    believed = CableConfig(length=cable.length, n_keypoints=cable.n_keypoints)
+    believed = Cable(length=cable.length, n_keypoints=cable.n_keypoints)
     write_results(out, runs, summary, believed=believed, about=about, facts=facts)
     summary["total_s"] = round(time.perf_counter() - begin, 3)
     write_json(out / "summary.json", summary)

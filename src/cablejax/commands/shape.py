@@ -69,10 +69,10 @@ class Shape(Command):
         cloud = self.perception == "cloud"
         noise_mm = (2.0 if cloud else 0.0) if self.noise_mm is None else self.noise_mm
         default = PlantConfig()
-        cable = dataclasses.replace(default.cable, n_links=self.links, friction_coefficient=self.friction)
+        cable = dataclasses.replace(default.cable, friction_coefficient=self.friction)
         plant = dataclasses.replace(
             default,
-            cable=cable,
+            discretisation=dataclasses.replace(default.discretisation, cable=cable, n_links=self.links),
             stiffness_ratio=self.stiffness_ratio,
             keypoint_noise=0.0 if cloud else 1e-3 * noise_mm,
             seed=self.seed,

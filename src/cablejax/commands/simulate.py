@@ -99,19 +99,19 @@ class Simulate(Command):
         Raises:
             ValueError: an option is out of its range.
         """
+        from cablejax.cable import Cable, Discretisation
         from cablejax.dataset.schema import DatasetConfig, Randomisation
-        from cablejax.simulate import CableConfig
         from cablejax.simulate.motions import MotionConfig
 
-        cable = CableConfig(bending_stiffness=self.stiffness, friction_coefficient=self.friction)
+        chain = Discretisation(Cable(bending_stiffness=self.stiffness, friction_coefficient=self.friction))
         if self.links is not None:
-            cable = dataclasses.replace(cable, n_links=self.links)
+            chain = dataclasses.replace(chain, n_links=self.links)
         return DatasetConfig(
             n_trajectories=self.trajectories,
             n_steps=self.steps,
             seed=self.seed,
             motion=MotionConfig(start=self.start, max_amplification=self.max_amplification),
-            cable=cable,
+            discretisation=chain,
             randomisation=Randomisation(
                 stiffness=self.stiffness_range, damping=self.damping_range, friction=self.friction_range
             ),

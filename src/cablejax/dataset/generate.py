@@ -18,9 +18,10 @@ from tqdm import tqdm
 from cablejax.dataset.parallel import DeviceParallel
 from cablejax.dataset.schema import Block, DatasetConfig
 from cablejax.dataset.store import DatasetInfo, open_or_create
+from cablejax.effects.physics import Physics, nominal_physics
 from cablejax.simulate import Engine, MjxEngine, ThreadedEngine
 from cablejax.simulate.motions import random_motion
-from cablejax.types import CableParams, Trajectory
+from cablejax.types import Trajectory
 
 MAX_ATTEMPTS = 10
 """Motions drawn for one trajectory before generation gives up."""
@@ -60,7 +61,7 @@ def draw(config: DatasetConfig, index: int, attempt: int = 0) -> Draw:
         for limits in (ranges.stiffness, ranges.friction, ranges.damping)
     )
     cable = config.cable
-    pose, twist = random_motion(rng, cable, config.n_steps, config.motion, config.interval)
+    pose, twist = random_motion(rng, config.discretisation, config.n_steps, config.motion, config.interval)
     return Draw(
         gripper_pose=np.asarray(pose, np.float32),
         gripper_twist=np.asarray(twist, np.float32),
@@ -68,11 +69,16 @@ def draw(config: DatasetConfig, index: int, attempt: int = 0) -> Draw:
     )
 
 
-def cable_params(config: DatasetConfig, parameters: np.ndarray) -> CableParams:
+def cable_params(config: DatasetConfig, parameters: np.ndarray) -> Physics:
     """The simulator's parameters of one trajectory, from its row of the store's `parameters`."""
     stiffness, friction, damping = parameters
-    nominal = config.cable.params(stiffness_ratio=float(stiffness))
-    return dataclasses.replace(nominal, friction_coefficient=jnp.float32(friction), damping_time=jnp.float32(damping))
+    nominal = nominal_physics(config.discretisation)
+    return dataclasses.replace(
+        nominal,
+        stiffness=nominal.stiffness * np.float32(stiffness),
+        friction=np.float32(friction),
+        damping_time=np.float32(damping),
+    )
 
 
 def generate(
@@ -194,8 +200,8 @@ def find_fault(config: DatasetConfig, one: Block) -> str | None:
 def make_engine(config: DatasetConfig) -> Engine:
     """The simulator that the configuration names, spread over this process' devices."""
     if config.engine == "threaded":
-        return ThreadedEngine(config.cable)
-    return DeviceParallel(MjxEngine(config.cable), config.shard_size, tuple(jax.local_devices()))
+        return ThreadedEngine(config.discretisation)
+    return DeviceParallel(MjxEngine(config.discretisation), config.shard_size, tuple(jax.local_devices()))
 
 
 def _rollout(config: DatasetConfig, engine: Engine, draws: Sequence[Draw]) -> Trajectory:

@@ -8,7 +8,7 @@ import jax
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
-from cablejax.simulate.config import CableConfig
+from cablejax.cable import Discretisation
 from cablejax.simulate.engine import Engine
 from cablejax.types import CableState
 
@@ -31,7 +31,7 @@ class DeviceParallel(Engine):
     devices: tuple[jax.Device, ...]  # pyright: ignore[reportInvalidTypeForm]
 
     @property
-    def config(self) -> CableConfig:
+    def config(self) -> Discretisation:
         """The simulated cable."""
         return self.engine.config
 

@@ -12,11 +12,11 @@ from typing import Any, Literal
 
 import numpy as np
 
-from cablejax.simulate.config import CableConfig
+from cablejax.cable import Cable, Discretisation
 from cablejax.simulate.equilibrium import FEWEST_LINKS
 from cablejax.simulate.motions import MotionConfig
 
-SCHEMA = "cablejax-dataset/1"
+SCHEMA = "cablejax-dataset/2"
 """Name and version of the store's layout. A reader refuses any other."""
 
 PARAMETERS = ("stiffness_ratio", "friction_coefficient", "damping_time")
@@ -53,7 +53,7 @@ class DatasetConfig:
         interval: time each command is held [s].
         seed: trajectory i depends on (seed, i) only, never on who makes it or when.
         motion: where the grippers start and how they move.
-        cable: the simulated cable.
+        discretisation: the simulated cable, its links and time step.
         randomisation: ranges of the physical parameters.
         engine: "threaded", MuJoCo in threads on the CPU, or "mjx", batched on the accelerator.
         shard_size: trajectories per shard: the unit that one process writes and that a kill can cost.
@@ -64,7 +64,7 @@ class DatasetConfig:
     interval: float = 1.0
     seed: int = 0
     motion: MotionConfig = dataclasses.field(default_factory=MotionConfig)
-    cable: CableConfig = dataclasses.field(default_factory=CableConfig)
+    discretisation: Discretisation = Discretisation()
     randomisation: Randomisation = dataclasses.field(default_factory=Randomisation)
     engine: Literal["threaded", "mjx"] = "threaded"
     shard_size: int = 32
@@ -79,13 +79,20 @@ class DatasetConfig:
             raise ValueError(f"DatasetConfig.seed is {self.seed}, expected an integer >= 0.")
         if self.engine not in ("threaded", "mjx"):
             raise ValueError(f"DatasetConfig.engine is {self.engine!r}, expected 'threaded' or 'mjx'.")
-        if self.cable.dimension != 2:
-            raise ValueError("DatasetConfig.cable has dimension 3; data sets hold cables on a table: use dimension=2.")
-        if self.cable.n_links < FEWEST_LINKS:
+        if self.discretisation.dimension != 2:
             raise ValueError(
-                f"DatasetConfig.cable has n_links {self.cable.n_links}, expected at least {FEWEST_LINKS}: with fewer "
-                "the grippers' poses leave it no freedom."
+                "DatasetConfig.discretisation has dimension 3; data sets hold cables on a table: use dimension=2."
             )
+        if self.discretisation.n_links < FEWEST_LINKS:
+            raise ValueError(
+                f"DatasetConfig.discretisation has n_links {self.discretisation.n_links}, expected at least "
+                f"{FEWEST_LINKS}: with fewer the grippers' poses leave it no freedom."
+            )
+
+    @property
+    def cable(self) -> Cable:
+        """What is simulated."""
+        return self.discretisation.cable
 
     @property
     def n_shards(self) -> int:

@@ -16,8 +16,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
+from cablejax.cable import GRAVITY
 from cablejax.dataset.store import Store, open_store
-from cablejax.simulate.config import GRAVITY
 from cablejax.types import History, Trajectory, cable_descriptor
 
 

@@ -2,10 +2,10 @@
 
 from cablejax.diagnose.belief import Calibration
 from cablejax.diagnose.diagnosis import Diagnosis
-from cablejax.diagnose.effects import LIBRARY, Context, Effect, Parameter
 from cablejax.diagnose.recording import DiagnosisError
 from cablejax.diagnose.run import diagnose
 from cablejax.diagnose.verdict_json import verdict_json, write_verdict
+from cablejax.effects import LIBRARY, Context, Effect, Parameter
 
 __all__ = [
     "LIBRARY",

@@ -8,17 +8,17 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float, Int
 
+from cablejax.cable import Discretisation
 from cablejax.diagnose.actuation import Actuation, actuation
 from cablejax.diagnose.belief import Calibration, level
-from cablejax.diagnose.chain import FINE_STEP, LARGEST_STEP
-from cablejax.diagnose.effects import Context
 from cablejax.diagnose.fit import Candidate, Evidence
 from cablejax.diagnose.noise import NoiseFloor, noise_floor
-from cablejax.diagnose.physics import nominal_physics
 from cablejax.diagnose.playback import Playback
 from cablejax.diagnose.recording import DiagnosisError, Recording, prepare
 from cablejax.diagnose.repeats import repeated_motions
-from cablejax.simulate.config import CableConfig
+from cablejax.effects import Context
+from cablejax.effects.physics import nominal_physics
+from cablejax.simulate.chain.step import FINE_STEP, LARGEST_STEP
 from cablejax.simulate.pose import wrapped
 from cablejax.simulate.replay import config_of_log
 from cablejax.types import GapLog
@@ -46,7 +46,7 @@ class Case:
     """
 
     recording: Recording
-    config: CableConfig
+    config: Discretisation
     arms: Actuation
     noise: NoiseFloor
     playback: Playback
@@ -122,14 +122,14 @@ class Case:
     @property
     def motion(self) -> Int[np.ndarray, "E"]:
         """Episodes with the same number repeat one another."""
-        return repeated_motions(self.recording.gripper_pose, self.config.length)
+        return repeated_motions(self.recording.gripper_pose, self.config.cable.length)
 
     def context(self) -> Context:
         """What effects take their first guesses from."""
         chord = np.diff(self.nominal, axis=2)
         turn = np.diff(np.arctan2(chord[..., 1], chord[..., 0]), axis=-1)
         turn = np.abs(wrapped(turn))
-        spacing = self.config.length / (self.config.n_keypoints - 1)
+        spacing = self.config.cable.length / (self.config.cable.n_keypoints - 1)
         return Context(
             config=self.config,
             keypoints=self.nominal,

@@ -8,15 +8,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from cablejax.diagnose.chain import Chain, seen_by_camera
-from cablejax.diagnose.effects.base import Context, Effect
+from cablejax.cable import Discretisation
 from cablejax.diagnose.fit import Candidate, candidate
-from cablejax.diagnose.physics import nominal_physics
+from cablejax.effects.base import Context, Effect
+from cablejax.effects.physics import nominal_physics
+from cablejax.simulate.chain.step import Chain, seen_by_camera
 from cablejax.simulate.compile import compiler_options
-from cablejax.simulate.config import CableConfig
 from cablejax.simulate.equilibrium import equilibrium_state
 
-_CONFIG = CableConfig(n_links=13)
+_CONFIG = Discretisation(n_links=13)
 _SAMPLES, _INTERVAL = 60, 0.1
 # Of central differences, in prior standard deviations: so small that no contact, yield or slip begins within it.
 _STEP = 1e-6

@@ -9,6 +9,7 @@ from typing import Any, get_args
 import numpy as np
 from jaxtyping import Float
 
+from cablejax.cable import Discretisation
 from cablejax.diagnose.actuation import Actuation
 from cablejax.diagnose.belief import (
     Calibration,
@@ -24,7 +25,6 @@ from cablejax.diagnose.diagnosis import NamedEffect, ParameterEstimate, Ranked, 
 from cablejax.diagnose.fit import Evidence, Fit
 from cablejax.diagnose.profile import scaled_draws
 from cablejax.diagnose.search import Search
-from cablejax.simulate.config import CableConfig
 from cablejax.simulate.pose import wrapped
 
 _DRAWS = 400
@@ -187,7 +187,7 @@ def _ranking(found: Search, evidence: Evidence, calibration: Calibration) -> tup
 
 
 def _named(
-    name: str, fit: Fit, probability: float, draws: Float[np.ndarray, "D P"], config: CableConfig
+    name: str, fit: Fit, probability: float, draws: Float[np.ndarray, "D P"], config: Discretisation
 ) -> NamedEffect:
     """One effect of a fit, with intervals from draws of the fit's coordinates."""
     parts: list[dict[str, ParameterEstimate]] = []

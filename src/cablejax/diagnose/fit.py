@@ -14,11 +14,11 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from cablejax.diagnose.effects.base import Effect
-from cablejax.diagnose.physics import Physics
+from cablejax.cable import Discretisation
 from cablejax.diagnose.playback import Playback
 from cablejax.diagnose.repeats import episodes_by_motion, share_of_motion
-from cablejax.simulate.config import CableConfig
+from cablejax.effects.base import Effect
+from cablejax.effects.physics import Physics
 
 _FIRST_DAMPING = 1e-2
 # Largest change of one coordinate in one step, in prior standard deviations.
@@ -70,7 +70,7 @@ class Candidate:
         """Parameter values of every term."""
         return [np.array(term.values(z)) for term, z in self.by_term()]
 
-    def physics(self, nominal: Physics, config: CableConfig, z: Any = None) -> Physics:
+    def physics(self, nominal: Physics, config: Discretisation, z: Any = None) -> Physics:
         """The nominal physics with all terms applied. Differentiable in `z`, if that is a JAX array."""
         for term, part in self.by_term(np.asarray(self.z, np.float32) if z is None else z):
             values = [p.value(x) for p, x in zip(term.effect.parameters, part, strict=True)]

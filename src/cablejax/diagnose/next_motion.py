@@ -9,9 +9,9 @@ from jaxtyping import Float
 
 from cablejax.diagnose.diagnosis import NextMotion
 from cablejax.diagnose.fit import Candidate
-from cablejax.diagnose.physics import Physics
 from cablejax.diagnose.playback import Playback
 from cablejax.diagnose.safe_motions import INTERVAL, safe_motions, starting_pose
+from cablejax.effects.physics import Physics
 
 # Motions as long as the log's share its compiled program, if they are neither cut short nor mostly rest.
 _SAMPLES = (250, 400)

@@ -13,10 +13,10 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from cablejax.diagnose.chain import LARGEST_STEP, Chain, seen_by_camera
-from cablejax.diagnose.physics import Physics, nominal_physics
+from cablejax.cable import Cable, Discretisation
+from cablejax.effects.physics import Physics, nominal_physics
+from cablejax.simulate.chain.step import LARGEST_STEP, Chain, seen_by_camera
 from cablejax.simulate.compile import compiler_options
-from cablejax.simulate.config import CableConfig
 from cablejax.simulate.equilibrium import equilibrium_state
 
 # Cables that one compiled call replays at once.
@@ -36,7 +36,7 @@ class Playback:
         largest_step: longest time step [s].
     """
 
-    config: CableConfig
+    config: Discretisation
     gripper_pose: Float[np.ndarray, "E T 2 3"]
     angles: Float[np.ndarray, "E n"]
     interval: Float[np.ndarray, "E"]
@@ -46,7 +46,7 @@ class Playback:
     @classmethod
     def of_motion(
         cls,
-        config: CableConfig,
+        config: Discretisation,
         gripper_pose: Float[np.ndarray, "E T 2 3"],
         first_keypoints: Sequence[Float[np.ndarray, "N 2"] | None] | None,
         interval: Float[np.ndarray, "E"],
@@ -91,14 +91,16 @@ class Playback:
             }
         )
         substeps = max(1, math.ceil(float(self.interval.max()) / self.largest_step - 1e-6))
-        geometry = CableConfig(
-            length=self.config.length,
-            diameter=self.config.diameter,
+        geometry = Discretisation(
+            Cable(
+                length=self.config.cable.length,
+                diameter=self.config.cable.diameter,
+                n_keypoints=self.config.cable.n_keypoints,
+            ),
             n_links=self.config.n_links,
-            n_keypoints=self.config.n_keypoints,
             friction_speed=self.config.friction_speed,
         )
-        points = np.empty((n_physics, len(chosen), n_samples, self.config.n_keypoints, 2), np.float32)
+        points = np.empty((n_physics, len(chosen), n_samples, self.config.cable.n_keypoints, 2), np.float32)
 
         def one_chunk(rows: np.ndarray, with_contact: bool) -> None:
             full = np.concatenate([rows, np.broadcast_to(rows[:1], (_ROWS - len(rows), 2))])

@@ -14,13 +14,13 @@ from cablejax.diagnose.belief import Calibration, excess, level
 from cablejax.diagnose.case import FINE_LINKS, FIT_LINKS, Case
 from cablejax.diagnose.conclude import baselines, conclude, sentence, with_arms
 from cablejax.diagnose.diagnosis import Diagnosis
-from cablejax.diagnose.effects import LIBRARY, Effect
 from cablejax.diagnose.fit import candidate, evaluate
 from cablejax.diagnose.gap import held_out_keypoints, measure_gap
 from cablejax.diagnose.next_motion import next_motion
 from cablejax.diagnose.noise import SMALLEST
 from cablejax.diagnose.search import Search, search
 from cablejax.diagnose.where import localise
+from cablejax.effects import LIBRARY, Effect
 from cablejax.types import GapLog
 
 

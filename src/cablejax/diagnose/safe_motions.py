@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.special import j0
 
-from cablejax.simulate.config import CableConfig
+from cablejax.cable import Discretisation
 from cablejax.simulate.motions import MotionConfig, admissible
 from cablejax.simulate.pose import wrapped
 
@@ -58,7 +58,7 @@ def starting_pose(gripper_pose: Float[np.ndarray, "E T 2 3"]) -> Float[np.ndarra
 
 
 def safe_motions(
-    config: CableConfig, first: Float[np.ndarray, "2 3"], n_samples: int = 300
+    config: Discretisation, first: Float[np.ndarray, "2 3"], n_samples: int = 300
 ) -> dict[str, Float[np.ndarray, "T 2 3"]]:
     """Motions by name, as gripper poses (x, y, theta) every 0.1 s; the last pose is held to the end.
 
@@ -84,7 +84,7 @@ def safe_motions(
     first = np.asarray(first, np.float64)
     if first.shape != (2, 3) or not np.isfinite(first).all():
         raise ValueError(f"first has shape {first.shape}, expected two finite poses (x, y, theta).")
-    length = config.length
+    length = config.cable.length
     given = _Pair.of(first)
     low, high = LIMITS.min_distance, 1.0 - LIMITS.straight_slack
     start = dataclasses.replace(given, distance=float(np.clip(given.distance, low * length, high * length)))

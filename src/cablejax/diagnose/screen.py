@@ -8,8 +8,8 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 
-from cablejax.diagnose.effects.base import Context, Effect
 from cablejax.diagnose.fit import Candidate, Evidence, candidate
+from cablejax.effects.base import Context, Effect
 
 # How far a template is stretched, at most, to meet the gap.
 _LARGEST_AMPLITUDE = 3.0

@@ -10,9 +10,9 @@ import numpy as np
 from jaxtyping import Float
 
 from cablejax.diagnose.belief import Calibration, best_by_effects, effect_names, excess, level, log_scores
-from cablejax.diagnose.effects.base import Context, Effect
 from cablejax.diagnose.fit import Candidate, Evidence, Fit, evaluate, improve
 from cablejax.diagnose.screen import residual_of, screen, shortlist
+from cablejax.effects.base import Context, Effect
 
 _FIRST_STEPS = 3
 _LAST_STEPS = 8

@@ -18,8 +18,8 @@ import numpy as np
 from jaxtyping import Array, Float
 from scipy.interpolate import CubicSpline
 
+from cablejax.cable import Cable, Discretisation
 from cablejax.simulate.composite import link_lengths, node_offsets
-from cablejax.simulate.config import CableConfig
 from cablejax.simulate.keypoints import hermite_weights
 
 LINKS = 25
@@ -56,11 +56,11 @@ class Chain(NamedTuple):
 @functools.lru_cache(maxsize=32)
 def chain(n_keypoints: int, length: float) -> Chain:
     """The matrices for a cable of given keypoints and length [m]. Not to be modified: cached."""
-    config = CableConfig(length=length, n_links=LINKS, n_keypoints=n_keypoints, diameter=1e-3 * length)
+    config = Discretisation(Cable(length=length, n_keypoints=n_keypoints, diameter=1e-3 * length), n_links=LINKS)
     nodes = np.linspace(0.0, length, LINKS)
 
     def derivative(values: np.ndarray, first: float, last: float) -> np.ndarray:
-        return CubicSpline(config.keypoint_arclength, values, bc_type=((1, first), (1, last)))(nodes, 1)  # pyright: ignore[reportArgumentType]
+        return CubicSpline(config.cable.keypoint_arclength, values, bc_type=((1, first), (1, last)))(nodes, 1)  # pyright: ignore[reportArgumentType]
 
     of_keypoints = np.stack([derivative(unit, 0.0, 0.0) for unit in np.eye(n_keypoints)], axis=1)
     zero = np.zeros(n_keypoints)

@@ -6,10 +6,10 @@ import functools
 from collections.abc import Sequence
 from typing import get_args
 
+from cablejax.cable import Discretisation
 from cablejax.evaluation.protocols import StartKind, letter_task, random_task
 from cablejax.evaluation.suite import Case
 from cablejax.evaluation.trials import LIANG_TABLE
-from cablejax.simulate.config import CableConfig
 from cablejax.simulate.plant import Plant, PlantConfig
 from cablejax.targets import Shape
 
@@ -17,7 +17,7 @@ STIFFNESS_RATIOS = (0.1, 0.5, 1.0, 2.0, 3.0)
 """Wang et al., RA-L 2022: the cable's stiffness over the trained one's."""
 RANDOM_TASK_STIFFNESS = 2.0
 """The same in the tasks of Liang et al., who do not vary it."""
-PLANT_CABLE = CableConfig(n_links=24, dimension=3, timestep=0.005)
+PLANT_CHAIN = Discretisation(n_links=24, dimension=3, timestep=0.005)
 """The plant's cable in every table that has the MuJoCo plant."""
 
 
@@ -31,7 +31,7 @@ def stiffness_cases(
             scenario=shape,
             stiffness=ratio,
             seed=seed,
-            task=functools.partial(letter_task, shape, seed, PLANT_CABLE),
+            task=functools.partial(letter_task, shape, seed, PLANT_CHAIN),
             plant=functools.partial(mujoco_plant, ratio),
             cable=f"stiffness-{ratio:g}",
             steps=steps,
@@ -58,7 +58,7 @@ def real_cable_cases(
             scenario=shape,
             stiffness=1.0,
             seed=seed,
-            task=functools.partial(letter_task, shape, seed, config.cable),
+            task=functools.partial(letter_task, shape, seed, config.discretisation),
             plant=functools.partial(RodPlant, config),
             cable=name,
             steps=steps,
@@ -78,7 +78,7 @@ def random_cases(seeds: Sequence[int], steps: int = 250) -> list[Case]:
             scenario=kind,
             stiffness=RANDOM_TASK_STIFFNESS,
             seed=seed,
-            task=functools.partial(random_task, kind, seed, PLANT_CABLE),
+            task=functools.partial(random_task, kind, seed, PLANT_CHAIN),
             plant=functools.partial(mujoco_plant, RANDOM_TASK_STIFFNESS),
             cable=f"stiffness-{RANDOM_TASK_STIFFNESS:g}",
             steps=steps,
@@ -91,4 +91,4 @@ def random_cases(seeds: Sequence[int], steps: int = 250) -> list[Case]:
 @functools.lru_cache(maxsize=8)
 def mujoco_plant(stiffness_ratio: float) -> Plant:
     """The plant with a cable of another stiffness; `reset` makes it new."""
-    return Plant(PlantConfig(cable=PLANT_CABLE, stiffness_ratio=stiffness_ratio))
+    return Plant(PlantConfig(discretisation=PLANT_CHAIN, stiffness_ratio=stiffness_ratio))

@@ -8,6 +8,7 @@ import sys
 
 import numpy as np
 
+from cablejax.cable import Discretisation
 from cablejax.dynamics.fine_tune import starting_from
 from cablejax.dynamics.train import train
 from cablejax.dynamics.train_config import Phase, TrainConfig
@@ -15,7 +16,6 @@ from cablejax.dynamics.weights import FILE_NAME, save_weights
 from cablejax.evaluation.protocols import GuessingCable
 from cablejax.npz import read_npz
 from cablejax.shaping import Model, load_model
-from cablejax.simulate.config import CableConfig
 from cablejax.simulate.motions import MotionConfig, random_motion
 from cablejax.simulate.table_plant import PlantError
 from cablejax.types import Trajectory
@@ -44,7 +44,7 @@ class FineTuneConfig:
 
 
 def record(
-    plant: GuessingCable, cable: CableConfig, config: FineTuneConfig, cache: pathlib.Path | None = None
+    plant: GuessingCable, cable: Discretisation, config: FineTuneConfig, cache: pathlib.Path | None = None
 ) -> Trajectory:
     """Random motions of a plant's cable, arrays [M, T + 1, N, 2] and so on. A motion that the plant cannot bear is
     drawn again.

@@ -19,7 +19,7 @@ from jaxtyping import Array, Float
 
 from cablejax.closed_loop import run_closed_loop
 from cablejax.dynamics.smooth import CORNER, smoothed
-from cablejax.evaluation.cases import PLANT_CABLE, mujoco_plant
+from cablejax.evaluation.cases import PLANT_CHAIN, mujoco_plant
 from cablejax.evaluation.protocols import LaidOut, letter_task, random_task
 from cablejax.evaluation.referee import Limits
 from cablejax.mpc import Controller, MPCConfig, ObjectiveConfig, Plan, ShapingProblem, Solver
@@ -124,7 +124,7 @@ def closed_loop_cases(
     config = dataclasses.replace(CONFIG, solver=log)
     for seed in seeds:
         for shape in shapes:
-            task = letter_task(shape, seed, PLANT_CABLE)
+            task = letter_task(shape, seed, PLANT_CHAIN)
             for ratio in ratios:
                 log.met.clear()
                 controller = Controller(config, model.dynamics, model.weights, task.target.keypoints)
@@ -142,7 +142,7 @@ def random_cases(model: Model, seeds: Sequence[int]) -> list[PlanningCase]:
     """A cable at rest in a random shape, a random target, a random radius, and a random guess or none."""
     cases = []
     for seed in seeds:
-        task = random_task("diverse", seed, PLANT_CABLE)
+        task = random_task("diverse", seed, PLANT_CHAIN)
         rng = np.random.default_rng([seed, 10])
         index = np.linspace(0.0, len(task.start_shape) - 1.0, model.config.n_keypoints)
         rest = [np.interp(index, np.arange(len(task.start_shape)), task.start_shape[:, i]) for i in range(2)]

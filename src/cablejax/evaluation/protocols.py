@@ -28,9 +28,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from cablejax.cable import Discretisation
 from cablejax.mpc import MPCConfig
 from cablejax.mpc.goal import continued, goal_pose, way_to
-from cablejax.simulate.config import CableConfig
 from cablejax.simulate.elastica import Elastica, ElasticaError, elastica, solve_elastica
 from cablejax.simulate.equilibrium import arch_angles, chain_nodes, find_equilibrium
 from cablejax.simulate.motions import MotionConfig, admissible
@@ -139,20 +139,20 @@ class LaidOut:
 
 
 def letter_task(
-    shape: Shape, seed: int, config: CableConfig = CableConfig(), start: StartConfig = StartConfig()
+    shape: Shape, seed: int, config: Discretisation = Discretisation(), start: StartConfig = StartConfig()
 ) -> Task:
     """A letter from a straight start that depends on the seed.
 
     Raises:
         ValueError: another letter.
     """
-    return _straight_task(f"{shape} {seed}", make_target(shape, config), seed, config, start)
+    return _straight_task(f"{shape} {seed}", make_target(shape, config.cable), seed, config, start)
 
 
 def random_task(
     kind: StartKind,
     seed: int,
-    config: CableConfig = CableConfig(),
+    config: Discretisation = Discretisation(),
     start: StartConfig = StartConfig(),
     shapes: ShapeConfig = ShapeConfig(),
 ) -> Task:
@@ -172,19 +172,19 @@ def random_task(
 
 
 def random_straight_start(
-    seed: int, config: CableConfig = CableConfig(), start: StartConfig = StartConfig()
+    seed: int, config: Discretisation = Discretisation(), start: StartConfig = StartConfig()
 ) -> Float[np.ndarray, "2 3"]:
     """Gripper poses (x, y, theta) [m, rad] of an almost straight cable; see `StartConfig`."""
     rng = _stream(seed, _STRAIGHT)
     heading = rng.uniform(-start.heading, start.heading)
     middle = rng.uniform(-start.position, start.position, 2)
-    half = 0.5 * config.length * (1.0 - rng.uniform(*start.slack)) * np.array([np.cos(heading), np.sin(heading)])
+    half = 0.5 * config.cable.length * (1.0 - rng.uniform(*start.slack)) * np.array([np.cos(heading), np.sin(heading)])
     lean = START_LEAN * rng.choice([-1.0, 1.0])
     return np.array([[*(middle - half), heading + lean], [*(middle + half), heading - lean]])
 
 
 def random_shape(
-    rng: np.random.Generator, name: str, config: CableConfig = CableConfig(), shapes: ShapeConfig = ShapeConfig()
+    rng: np.random.Generator, name: str, config: Discretisation = Discretisation(), shapes: ShapeConfig = ShapeConfig()
 ) -> tuple[Target, Elastica]:
     """A random shape in which the cable rests stably, as a target and as a curve.
 
@@ -194,21 +194,21 @@ def random_shape(
     for _ in range(MAX_DRAWS):
         pose = _random_pose(rng, config, shapes)
         if (rest := _resting_shape(config, pose, shapes.min_stability)) is not None:
-            points = [np.interp(config.keypoint_arclength, rest.arclength, rest.position[:, i]) for i in range(2)]
+            points = [np.interp(config.cable.keypoint_arclength, rest.arclength, rest.position[:, i]) for i in range(2)]
             return Target(name, np.stack(points, axis=1), pose), rest
     raise ValueError(f"None of {MAX_DRAWS} random shapes met {shapes}: widen the limits.")
 
 
-def _straight_task(name: str, target: Target, seed: int, config: CableConfig, start: StartConfig) -> Task:
+def _straight_task(name: str, target: Target, seed: int, config: Discretisation, start: StartConfig) -> Task:
     pose = random_straight_start(seed, config, start)
-    return Task(name, pose, elastica(pose, config.length, np.linspace(0.0, config.length, 101)), target)
+    return Task(name, pose, elastica(pose, config.cable.length, np.linspace(0.0, config.cable.length, 101)), target)
 
 
-def _random_pose(rng: np.random.Generator, config: CableConfig, shapes: ShapeConfig) -> Float[np.ndarray, "2 3"]:
+def _random_pose(rng: np.random.Generator, config: Discretisation, shapes: ShapeConfig) -> Float[np.ndarray, "2 3"]:
     """Two grippers at a random distance, angles and place."""
     limits = shapes.motion
     while True:
-        half = 0.5 * config.length * rng.uniform(limits.min_distance, 1.0)
+        half = 0.5 * config.cable.length * rng.uniform(limits.min_distance, 1.0)
         heading = rng.uniform(-np.pi, np.pi)
         offset = half * np.array([np.cos(heading), np.sin(heading)])
         angles = heading + rng.uniform(-limits.max_angle, limits.max_angle, 2)
@@ -218,20 +218,20 @@ def _random_pose(rng: np.random.Generator, config: CableConfig, shapes: ShapeCon
             return pose
 
 
-def _resting_shape(config: CableConfig, pose: Float[np.ndarray, "2 3"], min_stability: float) -> Elastica | None:
+def _resting_shape(config: Discretisation, pose: Float[np.ndarray, "2 3"], min_stability: float) -> Elastica | None:
     """The elastica near the chain's equilibrium that grows out of one gentle arch, if it is stable and uncrossed."""
     try:
         angles = find_equilibrium(config, pose, arch_angles(config, pose)).angles
         nodes = np.concatenate([pose[:1, :2], chain_nodes(config, pose, angles), pose[1:, :2]])
         # The held links are half as long as the others.
-        s = np.concatenate([[0.0], (np.arange(config.n_joints) + 0.5) * config.link_length, [config.length]])
-        even = np.linspace(0.0, config.length, 101)
+        s = np.concatenate([[0.0], (np.arange(config.n_joints) + 0.5) * config.link_length, [config.cable.length]])
+        even = np.linspace(0.0, config.cable.length, 101)
         guess = np.stack([np.interp(even, s, nodes[:, i]) for i in range(2)], axis=1)
-        rest = solve_elastica(pose, config.length, guess=guess)
+        rest = solve_elastica(pose, config.cable.length, guess=guess)
     except (ElasticaError, ValueError):
         return None
-    same = np.abs(np.interp(even, rest.arclength, rest.position[:, 1]) - guess[:, 1]).max() < 0.02 * config.length
-    stable = rest.stability(_NODES) * config.length**2 >= min_stability
+    same = np.abs(np.interp(even, rest.arclength, rest.position[:, 1]) - guess[:, 1]).max() < 0.02 * config.cable.length
+    stable = rest.stability(_NODES) * config.cable.length**2 >= min_stability
     return rest if same and stable and not _crosses_itself(rest.position[::4]) else None
 
 

@@ -9,8 +9,8 @@ import numpy as np
 from jaxtyping import Float
 from scipy.ndimage import convolve
 
+from cablejax.cable import Discretisation
 from cablejax.simulate.composite import link_lengths, node_offsets
-from cablejax.simulate.config import CableConfig
 
 CENTRE_DEPTH = np.pi / 4
 """How far behind its visible surface the axis of a cylinder lies on average, seen from the side, in radii."""
@@ -87,15 +87,15 @@ class DepthCamera:
     The scene is a model of its own with nothing but what can be seen, so that any simulated cable may be put into it.
     """
 
-    def __init__(self, config: CameraConfig, cable: CableConfig):
-        self.config, self.cable = config, cable
+    def __init__(self, config: CameraConfig, chain: Discretisation):
+        self.config, self.chain = config, chain
         self.position, self._rays = _pixels(config)
-        self.model = _scene(config, cable)
+        self.model = _scene(config, chain)
         self._data = mujoco.MjData(self.model)
         bodies = [self.model.body(i).name for i in range(self.model.nbody)]
         self._links = np.array([i for i, name in enumerate(bodies) if name.startswith("link")])
         self._on_cable = np.isin(self.model.geom_bodyid, self._links)
-        self._to_middle = (0.5 * link_lengths(cable) - node_offsets(cable))[:, None]
+        self._to_middle = (0.5 * link_lengths(chain) - node_offsets(chain))[:, None]
         self.reset()
 
     def reset(self) -> None:
@@ -121,9 +121,9 @@ class DepthCamera:
         """
         config, random = self.config, self._random
         self._place(nodes, directions, gripper_pose)
-        radius = 0.5 * self.cable.diameter
+        radius = 0.5 * self.chain.cable.diameter
         low = radius if config.min_height is None else config.min_height
-        high = self.cable.diameter + 3.0 * radius if config.max_height is None else config.max_height
+        high = self.chain.cable.diameter + 3.0 * radius if config.max_height is None else config.max_height
         # Where there is only table the range has a formula; noise and outliers make cable out of few of its pixels.
         rays = self._rays
         to_table = -self.position[2] / rays[:, 2]
@@ -172,8 +172,8 @@ class DepthCamera:
         depth = offset @ sight
         column = np.round(focal * (offset @ right) / depth + 0.5 * (across - 1)).astype(int)
         row = np.round(focal * (offset @ below) / depth + 0.5 * (down - 1)).astype(int)
-        spacing = self.cable.link_length / 8.0
-        reach = int(np.ceil(focal * (0.5 * self.cable.diameter + MARGIN + spacing) / depth.min()))
+        spacing = self.chain.link_length / 8.0
+        reach = int(np.ceil(focal * (0.5 * self.chain.cable.diameter + MARGIN + spacing) / depth.min()))
         near = np.zeros((down, across), bool)
         for i, j in zip(row, column, strict=True):
             near[max(i - reach, 0) : max(i + reach + 1, 0), max(j - reach, 0) : max(j + reach + 1, 0)] = True
@@ -227,14 +227,14 @@ def _pixels(config: CameraConfig) -> tuple[np.ndarray, np.ndarray]:
     return np.array([*config.centre, 0.0]) - config.distance * sight, rays
 
 
-def _scene(config: CameraConfig, cable: CableConfig) -> mujoco.MjModel:
+def _scene(config: CameraConfig, chain: Discretisation) -> mujoco.MjModel:
     """Table, one capsule per link, a box per gripper, and occluders; bodies that move are mocap bodies."""
     spec = mujoco.MjSpec()
     box = mujoco.mjtGeom.mjGEOM_BOX
     spec.worldbody.add_geom(name="table", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[5, 5, 0.1])
-    for index, length in enumerate(link_lengths(cable)):
+    for index, length in enumerate(link_lengths(chain)):
         body = spec.worldbody.add_body(name=f"link_{index}", mocap=True)
-        body.add_geom(type=mujoco.mjtGeom.mjGEOM_CAPSULE, size=[cable.diameter / 2, length / 2, 0])
+        body.add_geom(type=mujoco.mjtGeom.mjGEOM_CAPSULE, size=[chain.cable.diameter / 2, length / 2, 0])
     for index in range(2):
         body = spec.worldbody.add_body(name=f"gripper_{index}", mocap=True)
         body.add_geom(type=box, size=[0.5 * side for side in config.gripper_size])

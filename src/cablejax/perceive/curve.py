@@ -14,8 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from cablejax.cable import Cable, Discretisation
 from cablejax.simulate.composite import link_lengths, node_offsets
-from cablejax.simulate.config import CableConfig
 from cablejax.simulate.keypoints import hermite_weights
 
 KERNEL_FLOOR = 1e-3
@@ -55,7 +55,7 @@ class Curve(NamedTuple):
 @functools.lru_cache(maxsize=32)
 def curve_matrices(n_links: int, n_keypoints: int, length: float, kernel_width: float) -> CurveMatrices:
     """The matrices of a cable of given length [m]; `kernel_width` is that of the motion kernel, in lengths."""
-    config = CableConfig(length=length, n_links=n_links, n_keypoints=n_keypoints, diameter=1e-3 * length)
+    config = Discretisation(Cable(length=length, n_keypoints=n_keypoints, diameter=1e-3 * length), n_links=n_links)
     lengths = link_lengths(config)
     arclength = (np.cumsum(lengths) - lengths / 2) / length
     kernel = np.exp(-0.5 * ((arclength[:, None] - arclength) / kernel_width) ** 2)

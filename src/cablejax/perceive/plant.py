@@ -7,10 +7,10 @@ import dataclasses
 import numpy as np
 from jaxtyping import Float
 
+from cablejax.cable import Cable
 from cablejax.perceive.camera import CameraConfig, DepthCamera
 from cablejax.perceive.registration import RegistrationConfig
 from cablejax.perceive.tracker import Status, Track, Tracker, TrackerConfig, TrackState
-from cablejax.simulate.config import CableConfig
 from cablejax.simulate.plant import Plant, PlantConfig
 from cablejax.simulate.table_plant import Observation
 
@@ -38,7 +38,7 @@ class CloudPlant(Plant):
     ):
         super().__init__(config)
         cable = self.config.cable
-        self.camera = DepthCamera(CameraConfig() if camera is None else camera, cable)
+        self.camera = DepthCamera(CameraConfig() if camera is None else camera, self.config.discretisation)
         self.tracker = Tracker(tracker_for(cable) if tracker is None else tracker)
         wanted = self.tracker.config.registration
         if wanted.n_keypoints != cable.n_keypoints or abs(wanted.length - cable.length) > 1e-9:
@@ -79,6 +79,6 @@ class CloudPlant(Plant):
         return dataclasses.replace(truth, keypoints=keypoints)
 
 
-def tracker_for(cable: CableConfig) -> TrackerConfig:
+def tracker_for(cable: Cable) -> TrackerConfig:
     """A tracker's settings for a cable, the default ones but for its length and keypoints."""
     return TrackerConfig(registration=RegistrationConfig(length=cable.length, n_keypoints=cable.n_keypoints))

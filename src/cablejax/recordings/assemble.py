@@ -10,11 +10,11 @@ import numpy as np
 from jaxtyping import Float
 from scipy.interpolate import CubicSpline
 
+from cablejax.cable import Cable
 from cablejax.cable_length import require_long_enough
 from cablejax.gaplog import Episode, gap_log_from_episodes
 from cablejax.recordings.poses import twists
 from cablejax.recordings.take import Take, typical_spacing
-from cablejax.simulate.config import CableConfig
 from cablejax.types import GapLog
 
 _MOST_SAMPLES = 1000
@@ -64,10 +64,9 @@ def gap_log_from_takes(takes: Sequence[Take], nominal: Nominal, *, source: str, 
             f"The arc lengths of the keypoints are {arclength.tolist()}, expected {points} increasing numbers from 0."
         )
     require_long_enough([take.keypoints for take in takes], arclength, "keypoint_arclength_m")
-    cable = CableConfig(
+    cable = Cable(
         length=float(arclength[-1]),
         diameter=nominal.diameter,
-        n_links=3,  # how finely the cable is simulated is no matter of the log
         n_keypoints=points,
         bending_stiffness=nominal.bending_stiffness,
         damping_time=nominal.damping_time,

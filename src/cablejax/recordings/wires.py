@@ -13,12 +13,12 @@ import pathlib
 import numpy as np
 from jaxtyping import Float
 
+from cablejax.cable import Cable
 from cablejax.cable_length import require_long_enough
 from cablejax.gaplog import Episode, gap_log_from_episodes
 from cablejax.npz import read_npz
 from cablejax.recordings.poses import poses_from_markers
 from cablejax.recordings.units import require_metres
-from cablejax.simulate.config import CableConfig
 from cablejax.types import GapLog
 
 _FIELDS = ("wire", "keypoints", "length_m", "mass_per_length_kg_m", "EI_published_Nm2")
@@ -92,10 +92,9 @@ def wire_log(wire: HangingWire) -> GapLog:
     require_long_enough(
         [points[None] for points in wire.keypoints], np.linspace(0.0, wire.length, count), f"length_m, for {wire.name},"
     )
-    cable = CableConfig(
+    cable = Cable(
         length=wire.length,
         diameter=_DIAMETER,
-        n_links=3,
         n_keypoints=count,
         bending_stiffness=float(wire.published_stiffness.mean()),
         damping_time=0.0,

@@ -13,12 +13,12 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from cablejax.cable import Discretisation
 from cablejax.diagnose.diagnosis import Diagnosis
 from cablejax.diagnose.safe_motions import INTERVAL, safe_motions, starting_pose
 from cablejax.report.diagnosis_style import STYLE, explained_label
 from cablejax.report.effect_words import effect_title
 from cablejax.report.style import LIGHT, gripper_outline
-from cablejax.simulate.config import CableConfig
 from cablejax.simulate.equilibrium import arch_angles, chain_nodes, find_equilibrium
 from cablejax.simulate.replay import config_of_log
 
@@ -164,7 +164,7 @@ def _split_bar(ax: Axes, split: dict[str, float]) -> None:
         ax.legend(loc="upper left", bbox_to_anchor=(0.0, 0.05), ncols=4, fontsize=9.5, handlelength=1.0, borderpad=0.0)
 
 
-def _film(figure: Any, config: CableConfig, poses: np.ndarray) -> None:
+def _film(figure: Any, config: Discretisation, poses: np.ndarray) -> None:
     """The motion as a few frames: where it begins, and where the grippers turn or stop."""
     speed = np.diff(poses, axis=0).reshape(len(poses) - 1, -1)
     turns = 1 + np.flatnonzero(np.abs(np.diff(speed, axis=0)).max(axis=1) > 1e-3)

@@ -14,7 +14,7 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 
-from cablejax.simulate.config import GRAVITY, CableConfig
+from cablejax.cable import GRAVITY, Discretisation
 
 # A weld is as soft as the lighter body is light. The held links are held anyway, so C MuJoCo gets them heavy.
 _HELD_MASS = 10.0  # [kg]
@@ -23,12 +23,12 @@ _HELD_INERTIA = 0.04  # [kg m^2], a sphere of 10 cm
 _RIGID = (0.9999, 0.9999, 0.001, 0.5, 2.0)
 
 
-def build_chain(config: CableConfig) -> mujoco.MjModel:
+def build_chain(config: Discretisation) -> mujoco.MjModel:
     """The free chain: root link free in the plane (x, y, theta) or in space, `n_links - 1` bending joints."""
     return _chain_spec(config).compile()
 
 
-def build_grasped_chain(config: CableConfig) -> mujoco.MjModel:
+def build_grasped_chain(config: Discretisation) -> mujoco.MjModel:
     """The chain welded at both ends to mocap bodies `gripper_0`, `gripper_1`, with friction actuators in the plane.
 
     The welds are deadbeat: with `k = 1/dt^2` and `b = 1/dt` the held end reaches the mocap pose within the very step,
@@ -91,14 +91,14 @@ def link_bodies(spec: mujoco.MjSpec) -> list[mujoco.MjsBody]:
     return [body for body in spec.bodies if body.name.startswith("cable")]
 
 
-def link_lengths(config: CableConfig) -> np.ndarray:
+def link_lengths(config: Discretisation) -> np.ndarray:
     """Length of each link [m], shape [n_links]: half-length links at the held ends."""
     lengths = np.full(config.n_links, config.link_length)
     lengths[[0, -1]] /= 2
     return lengths
 
 
-def node_offsets(config: CableConfig) -> np.ndarray:
+def node_offsets(config: Discretisation) -> np.ndarray:
     """Offset of each link's node along the link from the link's origin [m], shape [n_links].
 
     Node j sits at arc length `j * link_length`: the middle of a free link, the outer end of a held one.
@@ -108,7 +108,7 @@ def node_offsets(config: CableConfig) -> np.ndarray:
     return offsets
 
 
-def _chain_spec(config: CableConfig) -> mujoco.MjSpec:
+def _chain_spec(config: Discretisation) -> mujoco.MjSpec:
     lengths, offsets = link_lengths(config), node_offsets(config)
     vertices = np.concatenate([[0.0], np.cumsum(lengths)])
     gravity = 0.0 if config.dimension == 2 else -GRAVITY
@@ -118,27 +118,29 @@ def _chain_spec(config: CableConfig) -> mujoco.MjSpec:
       <worldbody>
         <composite type="cable" prefix="cable" initial="free" vertex="{" ".join(f"{v:.9g} 0 0" for v in vertices)}">
           <joint kind="main"/>
-          <geom type="capsule" size="{config.diameter / 2:.9g}" contype="0" conaffinity="0"/>
+          <geom type="capsule" size="{config.cable.diameter / 2:.9g}" contype="0" conaffinity="0"/>
         </composite>
       </worldbody>
     </mujoco>""")
-    stiffness = config.bending_stiffness / config.link_length
+    stiffness = config.cable.bending_stiffness / config.link_length
     origins = np.concatenate([[0.0], vertices[1:-1] - vertices[:-2]])
     for k, (link, length, offset, origin) in enumerate(zip(link_bodies(spec), lengths, offsets, origins, strict=True)):
         link.pos = [origin, 0.0, 0.0]  # the composite keeps vertices in single precision
         link.explicitinertial = True
-        link.mass = config.linear_density * length
+        link.mass = config.cable.linear_density * length
         link.ipos = [offset, 0.0, 0.0]
-        # thin rod; the roll inertia of a solid cylinder
+        # A thin rod, with the roll inertia of a solid cylinder. No body has more than its two other moments together,
+        # which links shorter than they are thick would.
         transverse = link.mass * length**2 / 12
-        link.inertia = [link.mass * config.diameter**2 / 8, transverse, transverse]
+        roll = min(link.mass * config.cable.diameter**2 / 8, 1.999 * transverse)
+        link.inertia = [roll, transverse, transverse]
         if config.dimension == 2:
             _make_planar(spec, link, k)
         for joint in link.joints:
             if k > 0:
                 # linear terms of polynomial laws
                 joint.stiffness = [stiffness, 0.0, 0.0]
-                joint.damping = [config.damping_time * stiffness, 0.0, 0.0]
+                joint.damping = [config.cable.damping_time * stiffness, 0.0, 0.0]
     return spec
 
 

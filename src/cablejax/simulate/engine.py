@@ -6,8 +6,9 @@ import abc
 
 from jaxtyping import ArrayLike, Float
 
-from cablejax.simulate.config import CableConfig
-from cablejax.types import CableParams, CableState, Trajectory
+from cablejax.cable import Discretisation
+from cablejax.effects.physics import Physics
+from cablejax.types import CableState, Trajectory
 
 
 class Engine(abc.ABC):
@@ -17,7 +18,7 @@ class Engine(abc.ABC):
     the same meaning of `qpos` and `qvel`.
     """
 
-    config: CableConfig
+    config: Discretisation
 
     @abc.abstractmethod
     def initial_state(
@@ -32,14 +33,14 @@ class Engine(abc.ABC):
 
     @abc.abstractmethod
     def rollout(
-        self, params: CableParams, state: CableState, twist: Float[ArrayLike, "*B T Q V"], interval: float = 1.0
+        self, physics: Physics, state: CableState, twist: Float[ArrayLike, "*B T Q V"], interval: float = 1.0
     ) -> tuple[CableState, Trajectory]:
         """Moves the grippers by T twists, each held for `interval` seconds.
 
         All arguments carry the same leading batch axis, or none of them does.
 
         Args:
-            params: physical parameters.
+            physics: physical parameters.
             state: where the cable starts.
             twist: (vx, vy, omega) of each gripper in the world's frame [m/s, rad/s], shape [T, Q, 3]; in space
                 (linear, angular), shape [T, Q, 6].

@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float
 
+from cablejax.effects.physics import Physics, nominal_physics
 from cablejax.simulate.engine import Engine
 from cablejax.simulate.table_plant import Observation, PlantError, checked
-from cablejax.types import CableParams, CableState, Trajectory
+from cablejax.types import CableState, Trajectory
 
 
 class EnginePlant:
@@ -17,17 +18,17 @@ class EnginePlant:
 
     Args:
         engine: planar.
-        params: of this cable; by default the nominal ones.
+        physics: of this cable; by default the nominal ones.
 
     Raises:
         ValueError: the engine simulates a cable in space.
     """
 
-    def __init__(self, engine: Engine, params: CableParams | None = None):
+    def __init__(self, engine: Engine, physics: Physics | None = None):
         if engine.config.dimension != 2:
             raise ValueError(f"The engine's dimension is {engine.config.dimension}, expected 2, a cable on a table.")
         self.engine = engine
-        self.params = engine.config.params() if params is None else params
+        self.physics = nominal_physics(engine.config) if physics is None else physics
         self._state: CableState | None = None
         self._time = 0.0
 
@@ -45,7 +46,7 @@ class EnginePlant:
         """
         self._state, self._time = self.engine.initial_state(gripper_pose, guess=guess), 0.0
         # A rollout begins by showing where it starts; an engine that compiles has this one at hand for `record`.
-        _, shown = self.engine.rollout(self.params, self._state, np.zeros((1, 2, 3)))
+        _, shown = self.engine.rollout(self.physics, self._state, np.zeros((1, 2, 3)))
         return self._sample(shown, 0)
 
     def record(self, twist: Float[np.ndarray, "Q 3"], interval: float = 1.0, *, samples: int) -> list[Observation]:
@@ -62,7 +63,7 @@ class EnginePlant:
             raise ValueError(f"samples is {samples}, expected at least 1.")
         observations = []
         for _ in range(samples):
-            self._state, shown = self.engine.rollout(self.params, self._state, twist[None], interval / samples)
+            self._state, shown = self.engine.rollout(self.physics, self._state, twist[None], interval / samples)
             self._time += interval / samples
             observations.append(self._sample(shown, -1))
         if not np.isfinite(observations[-1].keypoints).all():

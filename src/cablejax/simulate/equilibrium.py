@@ -13,8 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from cablejax.cable import Discretisation
 from cablejax.simulate.composite import link_lengths
-from cablejax.simulate.config import CableConfig
 from cablejax.simulate.pose import wrapped
 from cablejax.types import CableState
 
@@ -42,7 +42,7 @@ class Equilibrium:
 
 
 def find_equilibrium(
-    config: CableConfig, gripper_pose: Float[np.ndarray, "2 3"], guess: Float[np.ndarray, "J"]
+    config: Discretisation, gripper_pose: Float[np.ndarray, "2 3"], guess: Float[np.ndarray, "J"]
 ) -> Equilibrium:
     """The settled cable between two planar gripper poses, near the joint angles `guess` [rad].
 
@@ -54,12 +54,12 @@ def find_equilibrium(
     if not np.all(np.isfinite(pose)):
         raise ValueError(f"The gripper poses contain NaN or infinity: {pose.tolist()}.")
     span = np.linalg.norm(pose[1, :2] - pose[0, :2])
-    if span > config.length * (1 + 1e-9):
+    if span > config.cable.length * (1 + 1e-9):
         raise ValueError(
-            f"The grippers are {span:.4f} m apart, more than the cable's length of {config.length} m: bring them "
+            f"The grippers are {span:.4f} m apart, more than the cable's length of {config.cable.length} m: bring them "
             "closer."
         )
-    if span > config.length * (1 - 1e-9):
+    if span > config.cable.length * (1 - 1e-9):
         return _taut(config, pose)
     h, lengths, joints = config.link_length, link_lengths(config), np.arange(config.n_joints)
     later = np.maximum.outer(joints, joints)
@@ -83,7 +83,7 @@ def find_equilibrium(
         multiplier = left @ (inverse * (right[:3] @ gradient))
         # second derivative of the tip with respect to angles i, j: minus what lies beyond the later one
         hessian = np.eye(len(angles)) / h + multiplier[0] * beyond[later, 0] + multiplier[1] * beyond[later, 1]
-        shrink = min(1.0, _MAX_STRETCH * config.length / max(np.abs(error).max(), 1e-300))
+        shrink = min(1.0, _MAX_STRETCH * config.cable.length / max(np.abs(error).max(), 1e-300))
         correction = right[:3].T @ (inverse * (left.T @ (shrink * error)))
         null = right[3:].T
         values, vectors = np.linalg.eigh(null.T @ hessian @ null)
@@ -92,7 +92,7 @@ def find_equilibrium(
         step *= min(1.0, _MAX_TURN / max(np.abs(step).max(), 1e-300))
         angles += step
         if np.abs(step).max() < _TOLERANCE and np.abs(error).max() < 1e-8:
-            return Equilibrium(angles=angles, stability=float(values[0] * config.length))
+            return Equilibrium(angles=angles, stability=float(values[0] * config.cable.length))
     raise ValueError(
         f"No equilibrium found between gripper poses {pose.tolist()} in {_MAX_ITERATIONS} iterations: the remaining "
         f"error of the far end is {np.abs(error).max():.2e}. Give a `guess` nearer to the shape, or poses further from "
@@ -100,7 +100,7 @@ def find_equilibrium(
     )
 
 
-def _taut(config: CableConfig, pose: Float[np.ndarray, "2 3"]) -> Equilibrium:
+def _taut(config: Discretisation, pose: Float[np.ndarray, "2 3"]) -> Equilibrium:
     """The only shape of a cable as long as the grippers are apart: straight."""
     chord = pose[1, :2] - pose[0, :2]
     off = np.abs(wrapped(pose[:, 2] - np.arctan2(chord[1], chord[0]))).max()
@@ -113,7 +113,7 @@ def _taut(config: CableConfig, pose: Float[np.ndarray, "2 3"]) -> Equilibrium:
 
 
 def chain_nodes(
-    config: CableConfig, gripper_pose: Float[np.ndarray, "2 3"], angles: Float[np.ndarray, "J"]
+    config: Discretisation, gripper_pose: Float[np.ndarray, "2 3"], angles: Float[np.ndarray, "J"]
 ) -> Float[np.ndarray, "J 2"]:
     """Positions of the bending joints [m] of the chain that leaves gripper 0."""
     theta = gripper_pose[0, 2] + np.concatenate([[0.0], np.cumsum(angles)])
@@ -121,10 +121,10 @@ def chain_nodes(
     return gripper_pose[0, :2] + np.cumsum(steps, axis=0)[:-1]
 
 
-def arch_angles(config: CableConfig, gripper_pose: Float[np.ndarray, "2 3"]) -> Float[np.ndarray, "J"]:
+def arch_angles(config: Discretisation, gripper_pose: Float[np.ndarray, "2 3"]) -> Float[np.ndarray, "J"]:
     """A first guess for `find_equilibrium`: the tangent turns linearly between the ends, plus one gentle arch."""
     pose = np.asarray(gripper_pose, np.float64)
-    span = np.linalg.norm(pose[1, :2] - pose[0, :2]) / config.length
+    span = np.linalg.norm(pose[1, :2] - pose[0, :2]) / config.cable.length
     fraction = np.linspace(0.0, 1.0, config.n_links)
     chord = np.arctan2(pose[1, 1] - pose[0, 1], pose[1, 0] - pose[0, 0])
     # An arch theta = a sin(2 pi s) shortens the span by a^2 / 4. The side is that to which the ends already lean.
@@ -137,7 +137,7 @@ def arch_angles(config: CableConfig, gripper_pose: Float[np.ndarray, "2 3"]) -> 
 
 
 def angles_of_keypoints(
-    config: CableConfig, gripper_pose: Float[np.ndarray, "2 3"], keypoints: Float[np.ndarray, "N 2"]
+    config: Discretisation, gripper_pose: Float[np.ndarray, "2 3"], keypoints: Float[np.ndarray, "N 2"]
 ) -> Float[np.ndarray, "J"]:
     """Joint angles of the chain through given keypoints; missing ones (NaN) are bridged."""
     pose = np.asarray(gripper_pose, np.float64)
@@ -145,16 +145,16 @@ def angles_of_keypoints(
     seen = np.all(np.isfinite(points), axis=1)
     if seen.sum() < 3:
         raise ValueError(f"Only {seen.sum()} of {len(points)} keypoints are finite, expected at least 3 as a guess.")
-    arclength = np.linspace(0.0, config.length, len(points))[seen]
+    arclength = np.linspace(0.0, config.cable.length, len(points))[seen]
     tangents = np.unwrap(np.arctan2(*np.diff(points[seen], axis=0).T[::-1]))
     tangents += 2 * np.pi * np.round((pose[0, 2] - tangents[0]) / (2 * np.pi))
-    s = np.concatenate([[0.0], (arclength[1:] + arclength[:-1]) / 2, [config.length]])
+    s = np.concatenate([[0.0], (arclength[1:] + arclength[:-1]) / 2, [config.cable.length]])
     theta = np.concatenate([[pose[0, 2]], tangents, [pose[1, 2]]])
     nodes = np.arange(config.n_links) * config.link_length
     return np.diff(np.interp(nodes, s, theta))
 
 
-def equilibrium_state(config: CableConfig, gripper_pose, *, guess=None) -> CableState:
+def equilibrium_state(config: Discretisation, gripper_pose, *, guess=None) -> CableState:
     """The settled cable as a `CableState`, for one pair of grippers or a batch `[*B, Q, P]`.
 
     Raises:

@@ -12,12 +12,12 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 from mujoco import mjx
 
+from cablejax.cable import Discretisation
 from cablejax.simulate.composite import link_lengths, node_offsets
-from cablejax.simulate.config import CableConfig
 from cablejax.simulate.pose import quaternion_product
 
 
-def chain_kinematics(config: CableConfig, data: mjx.Data) -> mjx.Data:
+def chain_kinematics(config: Discretisation, data: mjx.Data) -> mjx.Data:
     """Fills the same fields of `data` as `mjx.kinematics` does, for the chain of `composite.build_chain`.
 
     Differentiable in `data.qpos`.

@@ -12,9 +12,10 @@ import numpy as np
 from jaxtyping import Array, Float
 from mujoco import mjx
 
+from cablejax.cable import GRAVITY, Discretisation
+from cablejax.effects.physics import Physics
 from cablejax.simulate.compile import compiler_options
 from cablejax.simulate.composite import build_chain, refuse_plugins
-from cablejax.simulate.config import GRAVITY, CableConfig
 from cablejax.simulate.engine import Engine
 from cablejax.simulate.equilibrium import equilibrium_state
 from cablejax.simulate.friction import drag_coefficient, implicit_drag
@@ -22,7 +23,7 @@ from cablejax.simulate.grasp import constrained_acceleration
 from cablejax.simulate.keypoints import hermite_weights
 from cablejax.simulate.kinematics import chain_kinematics
 from cablejax.simulate.pose import integrate_pose, pose_velocity, quaternion_of, quaternion_product
-from cablejax.types import CableParams, CableState, Trajectory
+from cablejax.types import CableState, Trajectory
 
 
 @dataclasses.dataclass(frozen=True)
@@ -37,7 +38,7 @@ class MjxEngine(Engine):
         config: the cable, its resolution and time step.
     """
 
-    config: CableConfig = CableConfig()
+    config: Discretisation = Discretisation()
 
     @functools.cached_property
     def mj_model(self) -> mujoco.MjModel:
@@ -55,18 +56,18 @@ class MjxEngine(Engine):
         data = chain_kinematics(self.config, mjx.make_data(model).replace(qpos=state.qpos))
         return self._observe(data)
 
-    def rollout(self, params, state, twist, interval=1.0):
+    def rollout(self, physics, state, twist, interval=1.0):
         twist = jnp.asarray(twist)
         self.check_twist(twist)
         self.substeps(interval)
-        return _compiled_rollout(self, twist.ndim - 3, float(interval))(params, state, twist)
+        return _compiled_rollout(self, twist.ndim - 3, float(interval))(physics, state, twist)
 
     def unroll(
-        self, params: CableParams, state: CableState, twist: Float[Array, "T Q V"], interval: float = 1.0
+        self, physics: Physics, state: CableState, twist: Float[Array, "T Q V"], interval: float = 1.0
     ) -> tuple[CableState, Trajectory]:
-        """`rollout` of one cable, uncompiled. Differentiable in `params`, `state` and `twist`."""
+        """`rollout` of one cable, uncompiled. Differentiable in `physics`, `state` and `twist`."""
         count = self.substeps(interval)
-        model = self._with_params(mjx.put_model(self.mj_model), params)
+        model = self._with_physics(mjx.put_model(self.mj_model), physics)
         template = mjx.make_data(model)
 
         def interval_step(state: CableState, twist):
@@ -75,7 +76,7 @@ class MjxEngine(Engine):
             def substep(carry, i):
                 qpos, qvel = carry
                 target = integrate_pose(start, twist, (i + 1) * self.config.timestep)
-                return self._step(model, template, params, qpos, qvel, target), None
+                return self._step(model, template, physics, qpos, qvel, target), None
 
             # Remember the start of each interval only: reverse mode recomputes the inside.
             (qpos, qvel), _ = jax.lax.scan(substep, (state.qpos, state.qvel), jnp.arange(count))
@@ -91,19 +92,19 @@ class MjxEngine(Engine):
         )
         return final, trajectory
 
-    def _with_params(self, model: mjx.Model, params: CableParams) -> mjx.Model:
+    def _with_physics(self, model: mjx.Model, physics: Physics) -> mjx.Model:
         """The model with every differentiable parameter put in."""
         h = self.config.link_length
-        stiffness = params.bending_stiffness / h
-        damping = params.damping_time * stiffness
-        density_ratio = params.linear_density / self.config.linear_density
+        stiffness = physics.stiffness / h
+        damping = physics.damping_time * stiffness
+        density_ratio = physics.density / self.config.cable.linear_density
         if self.config.dimension == 2:
             zeros = jnp.zeros(3, stiffness.dtype)
-            springref = jnp.concatenate([zeros, params.rest_curvature * h])
+            springref = jnp.concatenate([zeros, physics.rest_curvature * h])
             jnt_stiffness = jnp.concatenate([zeros, stiffness])
             dof_damping = jnp.concatenate([zeros, damping])
         else:
-            rest = quaternion_of(params.rest_curvature * h)
+            rest = quaternion_of(jnp.asarray(physics.rest_curvature * h))
             springref = jnp.concatenate([model.qpos_spring[:7], rest.reshape(-1)])
             jnt_stiffness = jnp.concatenate([jnp.zeros(1, stiffness.dtype), stiffness])
             dof_damping = jnp.concatenate([jnp.zeros(6, damping.dtype), jnp.repeat(damping, 3)])
@@ -115,7 +116,7 @@ class MjxEngine(Engine):
             body_inertia=model.body_inertia * density_ratio,
         )
 
-    def _step(self, model, template, params, qpos, qvel, target):
+    def _step(self, model, template, physics, qpos, qvel, target):
         """One linearly implicit Euler step that ends with the grippers at `target`."""
         dt = self.config.timestep
         planar = self.config.dimension == 2
@@ -129,8 +130,8 @@ class MjxEngine(Engine):
         if planar:
             free = jacobian[1:-1, :, :2]
             velocity = jnp.einsum("kid,i->kd", free, qvel)
-            load = params.linear_density * self.config.link_length * GRAVITY * jnp.ones(free.shape[0], qvel.dtype)
-            drag = drag_coefficient(velocity, load, params.friction_coefficient, self.config.friction_speed)
+            load = physics.density * self.config.link_length * GRAVITY * jnp.ones(free.shape[0], qvel.dtype)
+            drag = drag_coefficient(velocity, load, physics.friction, self.config.friction_speed)
             damping, drag_force = implicit_drag(free, drag, velocity)
             inertia, force = inertia + dt * damping, force + drag_force
 

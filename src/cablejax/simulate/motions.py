@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float
 
-from cablejax.simulate.config import CableConfig
+from cablejax.cable import Discretisation
 from cablejax.simulate.equilibrium import arch_angles, chain_nodes, find_equilibrium
 from cablejax.simulate.pose import wrapped
 
@@ -61,7 +61,7 @@ class MotionConfig:
 
 def random_motion(
     rng: np.random.Generator,
-    config: CableConfig,
+    config: Discretisation,
     n_steps: int,
     motion: MotionConfig = MotionConfig(),
     interval: float = 1.0,
@@ -112,12 +112,12 @@ def random_motion(
 class _Shape:
     """The frictionless equilibrium, on a coarse chain, that a motion carries along."""
 
-    config: CableConfig
+    config: Discretisation
     angles: np.ndarray
     nodes: np.ndarray
 
     @classmethod
-    def settled(cls, config: CableConfig, pose: np.ndarray) -> _Shape:
+    def settled(cls, config: Discretisation, pose: np.ndarray) -> _Shape:
         coarse = dataclasses.replace(config, n_links=min(config.n_links, _COARSE_LINKS))
         angles = find_equilibrium(coarse, pose, arch_angles(coarse, pose)).angles
         return cls(coarse, angles, chain_nodes(coarse, pose, angles))
@@ -144,7 +144,7 @@ def bound_twist(twist: Float[np.ndarray, "Q 3"], bound: float, rotation_weight: 
     return twist * np.minimum(1.0, bound / np.maximum(twist_size(twist, rotation_weight), 1e-12))[..., None]
 
 
-def admissible(config: CableConfig, motion: MotionConfig, pose: Float[np.ndarray, "Q 3"]) -> bool:
+def admissible(config: Discretisation, motion: MotionConfig, pose: Float[np.ndarray, "Q 3"]) -> bool:
     """Whether the cable can take these poses without being pulled taut or bent beyond `max_curvature` at a grip.
 
     An end that leaves the line through both grippers at angle a must bend there and back. On arcs of radius
@@ -155,15 +155,15 @@ def admissible(config: CableConfig, motion: MotionConfig, pose: Float[np.ndarray
     angles = np.abs(wrapped(pose[:, 2] - np.arctan2(chord[1], chord[0])))
     detour = 2.0 / motion.max_curvature * np.sum(angles - np.sin(angles))
     return bool(
-        distance >= motion.min_distance * config.length
-        and distance <= config.length * (1.0 - motion.straight_slack) - detour
+        distance >= motion.min_distance * config.cable.length
+        and distance <= config.cable.length * (1.0 - motion.straight_slack) - detour
         and angles.max() <= motion.max_angle
     )
 
 
 def _straight_start(rng, config, motion):
     """Aligned grippers along a random direction; the slack lets the cable lean to a random side."""
-    half = 0.5 * config.length * (1.0 - 1.5 * motion.straight_slack)
+    half = 0.5 * config.cable.length * (1.0 - 1.5 * motion.straight_slack)
     lean = rng.choice([-1.0, 1.0]) * 0.01
     heading = rng.uniform(-np.pi, np.pi)
     offset = half * np.array([np.cos(heading), np.sin(heading)])
@@ -172,7 +172,7 @@ def _straight_start(rng, config, motion):
 
 def _random_start(rng, config, motion):
     while True:
-        half = 0.5 * config.length * rng.uniform(motion.min_distance, 1.0)
+        half = 0.5 * config.cable.length * rng.uniform(motion.min_distance, 1.0)
         heading = rng.uniform(-np.pi, np.pi)
         offset = half * np.array([np.cos(heading), np.sin(heading)])
         angles = heading + rng.uniform(-motion.max_angle, motion.max_angle, 2)

@@ -18,8 +18,8 @@ import mujoco
 import numpy as np
 from jaxtyping import Float
 
+from cablejax.cable import GRAVITY, Cable, Discretisation
 from cablejax.simulate.composite import link_bodies, link_lengths, node_offsets
-from cablejax.simulate.config import GRAVITY, CableConfig
 from cablejax.simulate.elastica import solve_elastica
 from cablejax.simulate.table_plant import Observation, TablePlant, check_camera
 
@@ -39,8 +39,8 @@ class PlantConfig:
     """What the plant is made of; the defaults are the reference cable, finer than the trained one.
 
     Attributes:
-        cable: geometry, links, time step and nominal physics. `friction_speed` has no meaning here and `dimension`
-            must be 3.
+        discretisation: the cable, its links and time step. `friction_speed` has no meaning here and
+            `dimension` must be 3.
         stiffness_ratio: the plant's EI over the nominal one, a factor on `cable.bending_stiffness`.
         cone_ratio: MuJoCo's `impratio`: how much harder the friction cone's tangent is than its normal direction; it
             sets how slowly a cable at rest creeps.
@@ -53,7 +53,7 @@ class PlantConfig:
         seed: of noise and gaps.
     """
 
-    cable: CableConfig = CableConfig(n_links=40, dimension=3, timestep=0.005)
+    discretisation: Discretisation = Discretisation(n_links=40, dimension=3, timestep=0.005)
     stiffness_ratio: float = 1.0
     cone_ratio: float = 100.0
     contact_time: float = 0.01
@@ -62,9 +62,16 @@ class PlantConfig:
     settle_time: float = 0.5
     seed: int = 0
 
+    @property
+    def cable(self) -> Cable:
+        """What is simulated."""
+        return self.discretisation.cable
+
     def __post_init__(self):
-        if self.cable.dimension != 3:
-            raise ValueError(f"PlantConfig.cable.dimension is {self.cable.dimension}, expected 3, the plant's.")
+        if self.discretisation.dimension != 3:
+            raise ValueError(
+                f"PlantConfig.discretisation.dimension is {self.discretisation.dimension}, expected 3, the plant's."
+            )
         for name in ("stiffness_ratio", "cone_ratio", "contact_time", "settle_time"):
             value = getattr(self, name)
             if not (np.isfinite(value) and value > 0):
@@ -75,9 +82,9 @@ class PlantConfig:
 def plant_model(config: PlantConfig) -> mujoco.MjModel:
     """The MuJoCo model of the plant: table, composite cable, and one mocap body welded to each held link."""
     cable = config.cable
-    h, dt = cable.link_length, cable.timestep
+    h, dt = config.discretisation.link_length, config.discretisation.timestep
     stiffness = config.stiffness_ratio * cable.bending_stiffness / h
-    vertices = np.concatenate([[0.0], np.cumsum(link_lengths(cable))])
+    vertices = np.concatenate([[0.0], np.cumsum(link_lengths(config.discretisation))])
     spec = mujoco.MjSpec.from_string(f"""
         <mujoco>
           <option timestep="{dt}" integrator="discrete" cone="elliptic" impratio="{config.cone_ratio}"
@@ -92,7 +99,7 @@ def plant_model(config: PlantConfig) -> mujoco.MjModel:
           </worldbody>
         </mujoco>""")
     links = link_bodies(spec)
-    for link, length in zip(links, link_lengths(cable), strict=True):
+    for link, length in zip(links, link_lengths(config.discretisation), strict=True):
         link.geoms[0].mass = cable.linear_density * length
     for gripper, (link, offset) in enumerate(((links[0], 0.0), (links[-1], h / 2))):
         link.geoms[0].conaffinity = 0  # the gripper carries its link: it neither rubs on the table nor weighs on it
@@ -125,7 +132,7 @@ class Plant(TablePlant):
         self._data = mujoco.MjData(self.model)
         names = (self.model.body(i).name for i in range(self.model.nbody))
         self._links = np.array([i for i, name in enumerate(names) if name.startswith("cable")])
-        self._offsets = node_offsets(self.config.cable)[:, None]
+        self._offsets = node_offsets(self.config.discretisation)[:, None]
         self._height = np.nan
 
     def reset(
@@ -135,7 +142,7 @@ class Plant(TablePlant):
         pose = self._checked_start(gripper_pose)
         cable, data = self.config.cable, self._data
         # A chain's links follow the elastica's chords; only the held ones have the exact direction of the grippers.
-        shape = solve_elastica(pose, cable.length, guess=guess, n_samples=2 * cable.n_joints + 1)
+        shape = solve_elastica(pose, cable.length, guess=guess, n_samples=2 * self.config.discretisation.n_joints + 1)
         vertices = np.concatenate([shape.position[:1], shape.position[1:-1:2], shape.position[-1:]])
         chords = np.diff(vertices, axis=0)
         angles = np.unwrap(np.arctan2(chords[:, 1], chords[:, 0]))
@@ -165,7 +172,7 @@ class Plant(TablePlant):
 
     def _advance(self, twist: np.ndarray, steps: int) -> None:
         """`steps` time steps under one twist; the mocap bodies lead to the pose at the end of each."""
-        model, data, dt = self.model, self._data, self.config.cable.timestep
+        model, data, dt = self.model, self._data, self.config.discretisation.timestep
         start = self._pose
         for step in range(1, steps + 1):
             self._place_grippers(start + (step * dt) * twist)
@@ -176,10 +183,10 @@ class Plant(TablePlant):
 
     def _place_grippers(self, pose: np.ndarray) -> None:
         """Mocap bodies coincide with the frames of the held links, whose origins are their starts."""
-        data, cable = self._data, self.config.cable
+        data = self._data
         heading = np.array([np.cos(pose[1, 2]), np.sin(pose[1, 2])])
         data.mocap_pos[:, :2] = pose[:, :2]
-        data.mocap_pos[1, :2] -= 0.5 * cable.link_length * heading
+        data.mocap_pos[1, :2] -= 0.5 * self.config.discretisation.link_length * heading
         data.mocap_pos[:, 2] = self._height
         data.mocap_quat[:] = _quaternions(pose[:, 2])
 

@@ -7,7 +7,8 @@ import dataclasses
 import numpy as np
 from jaxtyping import Float
 
-from cablejax.simulate.config import CableConfig
+from cablejax.cable import Cable, Discretisation
+from cablejax.effects.physics import nominal_physics
 from cablejax.simulate.engine import Engine
 from cablejax.types import GapLog
 
@@ -27,23 +28,24 @@ class Replay:
     rmse: float
 
 
-def config_of_log(log: GapLog, *, n_links: int | None = None, timestep: float | None = None) -> CableConfig:
+def config_of_log(log: GapLog, *, n_links: int | None = None, timestep: float | None = None) -> Discretisation:
     """The simulator of the cable that a log states, at the default resolution unless told otherwise.
 
     In the plane the diameter hardly matters to the motion, and a cable thicker than a link is long gets a smaller one.
     """
     cable, table = log.meta["cable"], log.meta["table"]
     dimension, chosen = log.keypoints.shape[-1], {"n_links": n_links, "timestep": timestep}
-    return CableConfig(
+    described = Cable(
         length=cable["length_m"],
         diameter=cable["diameter_m"] if dimension == 3 else min(cable["diameter_m"], _SLENDER * cable["length_m"]),
         linear_density=cable["linear_density_kg_per_m"],
         bending_stiffness=cable["bending_stiffness_n_m2"],
         damping_time=cable["bending_damping_s"],
         friction_coefficient=0.0 if table is None else table["friction_coefficient"],
-        dimension=dimension,
         n_keypoints=log.keypoints.shape[-2],
-        **{name: value for name, value in chosen.items() if value is not None},
+    )
+    return Discretisation(
+        described, dimension=dimension, **{name: value for name, value in chosen.items() if value is not None}
     )
 
 
@@ -61,6 +63,6 @@ def replay_episode(engine: Engine, log: GapLog, episode: int) -> Replay:
     interval = float(np.round(np.diff(log.time[episode, :length]).mean(), 9))
     state = engine.initial_state(pose[0], guess=seen[0])
     twist = np.diff(pose, axis=0) / interval
-    _, trajectory = engine.rollout(engine.config.params(), state, twist, interval)
+    _, trajectory = engine.rollout(nominal_physics(engine.config), state, twist, interval)
     keypoints = np.asarray(trajectory.keypoints, np.float64)
     return Replay(keypoints=keypoints, rmse=float(np.sqrt(np.nanmean((keypoints - seen) ** 2))))

@@ -20,7 +20,7 @@ What makes it fast enough for a closed loop:
 - The loop over time steps is compiled and calls PyElastica's compiled kernels, without Python in between.
 
 The rod lies in the table's plane. Its end elements are held rigidly and are half as long as the others, as in
-`CableConfig`, so that the middles of the elements have the arc lengths of the chain's nodes.
+`Discretisation`, so that the middles of the elements have the arc lengths of the chain's nodes.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ import dataclasses
 import numpy as np
 from jaxtyping import Float
 
+from cablejax.cable import GRAVITY, Cable, Discretisation
 from cablejax.simulate.composite import link_lengths
-from cablejax.simulate.config import GRAVITY, CableConfig
 from cablejax.simulate.elastica import solve_elastica
 from cablejax.simulate.table_plant import Observation, TablePlant, check_camera
 
@@ -46,8 +46,8 @@ class RodPlantConfig:
     """What the rod is made of; the defaults are the reference cable.
 
     Attributes:
-        cable: geometry, elements (`n_links`), time step and physics. `friction_coefficient` is the kinetic one mu_k,
-            `friction_speed` has no meaning here, and `dimension` must be 2.
+        discretisation: the cable, its elements (`n_links`) and time step. `friction_coefficient` is the kinetic one
+            mu_k, `friction_speed` has no meaning here, and `dimension` must be 2.
         static_ratio: mu_s / mu_k >= 1.
         stribeck_speed: v_s [m/s], the speed at which sliding has taken away most of the difference.
         axial_ratio: EA / EI [1/m^2]; `4 / r^2` for a solid rod of radius r. The stretch is the internal force over EI,
@@ -59,7 +59,7 @@ class RodPlantConfig:
         seed: of noise and gaps.
     """
 
-    cable: CableConfig = CableConfig(n_links=27, timestep=2e-4)
+    discretisation: Discretisation = Discretisation(n_links=27, timestep=2e-4)
     static_ratio: float = 1.3
     stribeck_speed: float = 0.005
     axial_ratio: float = 1e5
@@ -69,10 +69,16 @@ class RodPlantConfig:
     settle_time: float = 1.0
     seed: int = 0
 
+    @property
+    def cable(self) -> Cable:
+        """What is simulated."""
+        return self.discretisation.cable
+
     def __post_init__(self):
-        if self.cable.dimension != 2:
+        if self.discretisation.dimension != 2:
             raise ValueError(
-                f"RodPlantConfig.cable.dimension is {self.cable.dimension}, expected 2: the rod lies in a plane."
+                f"RodPlantConfig.discretisation.dimension is {self.discretisation.dimension}, expected 2: the rod lies "
+                "in a plane."
             )
         for name in ("stribeck_speed", "axial_ratio", "settle_time"):
             value = getattr(self, name)
@@ -83,41 +89,35 @@ class RodPlantConfig:
         if not np.isfinite(self.rest_curvature):
             raise ValueError(f"RodPlantConfig.rest_curvature is {self.rest_curvature}, expected a finite number [1/m].")
         check_camera(self)
-        if self.cable.timestep > self.longest_timestep:
+        if self.discretisation.timestep > self.longest_timestep:
             raise ValueError(
-                f"RodPlantConfig.cable.timestep is {self.cable.timestep} s, but this rod is stable only up to "
-                f"{self.longest_timestep:.2g} s: use a shorter time step, fewer links or a lower axial_ratio."
+                f"RodPlantConfig.discretisation.timestep is {self.discretisation.timestep} s, but this rod is stable "
+                f"only up to {self.longest_timestep:.2g} s: use a shorter time step, fewer links or a lower axial_ratio."
             )
 
     @property
     def longest_timestep(self) -> float:
         """Longest stable time step [s]: an axial wave crosses an element in it, and a tenth less for safety."""
         speed = np.sqrt(self.axial_ratio * self.cable.bending_stiffness / self.cable.linear_density)
-        return 0.9 * self.cable.link_length / speed
+        return 0.9 * self.discretisation.link_length / speed
 
 
 ETHERNET = RodPlantConfig(
-    cable=CableConfig(
+    discretisation=Discretisation(
+        Cable(diameter=0.008, bending_stiffness=0.044, damping_time=0.1, linear_density=0.06, friction_coefficient=0.2),
         n_links=27,
         timestep=1e-4,
-        diameter=0.008,
-        bending_stiffness=0.044,
-        damping_time=0.1,
-        linear_density=0.06,
-        friction_coefficient=0.2,
     ),
 )
 """A shielded installation cable (Cat 7 S/FTP), stiffer than the reference: see docs/simulator.md for the values."""
 
 USB = RodPlantConfig(
-    cable=CableConfig(
+    discretisation=Discretisation(
+        Cable(
+            diameter=0.0045, bending_stiffness=0.008, damping_time=0.3, linear_density=0.035, friction_coefficient=0.15
+        ),
         n_links=27,
         timestep=2e-4,
-        diameter=0.0045,
-        bending_stiffness=0.008,
-        damping_time=0.3,
-        linear_density=0.035,
-        friction_coefficient=0.15,
     ),
 )
 """A USB 2.0 cable, softer and lighter than the reference: see docs/simulator.md for the values."""
@@ -146,7 +146,7 @@ class RodPlant(TablePlant):
         """See `TablePlant.reset`."""
         pose = self._checked_start(gripper_pose)
         shape = solve_elastica(
-            pose, self.config.cable.length, guess=guess, n_samples=2 * self.config.cable.n_joints + 1
+            pose, self.config.cable.length, guess=guess, n_samples=2 * self.config.discretisation.n_joints + 1
         )
         rod = _straight_rod(self.config)
         rod.position_collection[:2] = np.concatenate(
@@ -174,7 +174,7 @@ class RodPlant(TablePlant):
     def _advance(self, twist: np.ndarray, steps: int, *, settling: bool = False) -> None:
         """`steps` time steps under one twist; settling is without friction and with all motion damped."""
         config, rod = self.config, self._rod
-        cable, h = config.cable, config.cable.link_length
+        cable, h = config.cable, config.discretisation.link_length
         friction = 0.0 if settling else cable.friction_coefficient
         self._loop(
             rod.position_collection,
@@ -195,7 +195,7 @@ class RodPlant(TablePlant):
             self._pose,
             twist,
             steps,
-            cable.timestep,
+            config.discretisation.timestep,
             cable.bending_stiffness * cable.damping_time / h,
             GRAVITY * friction,
             config.static_ratio,
@@ -212,13 +212,13 @@ def _straight_rod(config: RodPlantConfig):
     Directors are the table's normal, the in-plane normal and the tangent; bending in the plane is about the first.
     """
     rod_class = _import_rod_class()
-    cable, h = config.cable, config.cable.link_length
-    lengths = link_lengths(cable)
-    position = np.zeros((3, cable.n_links + 1))
+    cable, h = config.cable, config.discretisation.link_length
+    lengths = link_lengths(config.discretisation)
+    position = np.zeros((3, config.discretisation.n_links + 1))
     position[0, 1:] = np.cumsum(lengths)
     area = np.pi * cable.diameter**2 / 4
     rod = rod_class.straight_rod(
-        cable.n_links,
+        config.discretisation.n_links,
         np.zeros(3),
         np.array([1.0, 0.0, 0.0]),
         np.array([0.0, 0.0, 1.0]),

@@ -13,7 +13,7 @@ from typing import Protocol
 import numpy as np
 from jaxtyping import Float
 
-from cablejax.simulate.config import CableConfig
+from cablejax.cable import Cable, Discretisation
 from cablejax.simulate.keypoints import hermite_weights
 
 TAUT = 0.999
@@ -45,7 +45,10 @@ class ObservedConfig(Protocol):
     """What the configuration of a plant says of its cable and of how that is seen; see `PlantConfig`."""
 
     @property
-    def cable(self) -> CableConfig: ...
+    def cable(self) -> Cable: ...
+
+    @property
+    def discretisation(self) -> Discretisation: ...
 
     @property
     def keypoint_noise(self) -> float: ...
@@ -65,7 +68,8 @@ class TablePlant(abc.ABC):
 
     def __init__(self, config: ObservedConfig):
         self.config = config
-        self._weights = hermite_weights(config.cable)
+        self._timestep = config.discretisation.timestep
+        self._weights = hermite_weights(config.discretisation)
         self._pose = np.full((2, 3), np.nan)
         self._random = np.random.default_rng(config.seed)
         self._steps_done: int | None = None
@@ -115,7 +119,7 @@ class TablePlant(abc.ABC):
         steps = self._steps(interval)
         if samples < 1 or steps % samples:
             raise ValueError(
-                f"{samples} samples in {interval} s do not fall on time steps of {self.config.cable.timestep} s: "
+                f"{samples} samples in {interval} s do not fall on time steps of {self._timestep} s: "
                 f"choose a divisor of {steps}."
             )
         self._check_distance(self._pose + interval * twist)
@@ -128,7 +132,7 @@ class TablePlant(abc.ABC):
     @property
     def time(self) -> float:
         """Simulated seconds since the last reset."""
-        return (self._steps_done or 0) * self.config.cable.timestep
+        return (self._steps_done or 0) * self._timestep
 
     def observe(self) -> Observation:
         """Keypoints and gripper poses now, with the configured noise and gaps (drawn anew by every call)."""
@@ -155,7 +159,7 @@ class TablePlant(abc.ABC):
 
     def _moved(self, twist: np.ndarray, steps: int, *, stable: bool) -> None:
         """Takes note of a motion that the physics has made."""
-        dt = self.config.cable.timestep
+        dt = self._timestep
         self._pose = self._pose + (steps * dt) * twist
         self._steps_done = (self._steps_done or 0) + steps
         if not stable:
@@ -166,9 +170,9 @@ class TablePlant(abc.ABC):
             )
 
     def _steps(self, interval: float) -> int:
-        steps = round(interval / self.config.cable.timestep)
-        if steps < 1 or abs(steps * self.config.cable.timestep - interval) > 1e-9:
-            raise ValueError(f"{interval} s is not a whole number of time steps of {self.config.cable.timestep} s.")
+        steps = round(interval / self._timestep)
+        if steps < 1 or abs(steps * self._timestep - interval) > 1e-9:
+            raise ValueError(f"{interval} s is not a whole number of time steps of {self._timestep} s.")
         return steps
 
     def _check_distance(self, pose: np.ndarray) -> None:

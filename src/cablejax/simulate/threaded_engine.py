@@ -16,12 +16,13 @@ import mujoco
 import numba
 import numpy as np
 
+from cablejax.cable import GRAVITY, Discretisation
+from cablejax.effects.physics import Physics
 from cablejax.simulate.composite import build_grasped_chain
-from cablejax.simulate.config import GRAVITY, CableConfig
 from cablejax.simulate.engine import Engine
 from cablejax.simulate.equilibrium import equilibrium_state
 from cablejax.simulate.keypoints import hermite_weights
-from cablejax.types import CableParams, CableState, Trajectory
+from cablejax.types import CableState, Trajectory
 
 
 @dataclasses.dataclass(frozen=True)
@@ -36,7 +37,7 @@ class ThreadedEngine(Engine):
         n_threads: threads to use; None = one per core.
     """
 
-    config: CableConfig = CableConfig()
+    config: Discretisation = Discretisation()
     n_threads: int | None = None
 
     @functools.cached_property
@@ -47,7 +48,7 @@ class ThreadedEngine(Engine):
     def initial_state(self, gripper_pose, *, guess=None) -> CableState:
         return equilibrium_state(self.config, gripper_pose, guess=guess)
 
-    def rollout(self, params, state, twist, interval=1.0):
+    def rollout(self, physics, state, twist, interval=1.0):
         twist = np.asarray(twist, np.float64)
         self.check_twist(twist)
         count = self.substeps(interval)
@@ -60,9 +61,9 @@ class ThreadedEngine(Engine):
         def restore(leaf):
             return jnp.asarray(leaf.reshape(*batch, *leaf.shape[1:]), float)
 
-        params, state, commands = jax.tree.map(flatten, (params, state, twist))
+        physics, state, commands = jax.tree.map(flatten, (physics, state, twist))
         samples = twist.shape[-3] + 1
-        keypoints = np.empty((size, samples, self.config.n_keypoints, self.config.dimension))
+        keypoints = np.empty((size, samples, self.config.cable.n_keypoints, self.config.dimension))
         poses = np.empty((size, samples, *state.gripper_pose.shape[1:]))
         qpos, qvel = np.empty_like(state.qpos), np.empty_like(state.qvel)
         workers = max(min(self.n_threads or os.cpu_count() or 1, size), 1)
@@ -70,7 +71,7 @@ class ThreadedEngine(Engine):
         def run(worker: int) -> None:
             simulation = _Simulation(self.config, self.mj_model)
             for i in range(worker, size, workers):
-                one, start = jax.tree.map(lambda leaf: leaf[i], (params, state))  # noqa: B023, used at once
+                one, start = jax.tree.map(lambda leaf: leaf[i], (physics, state))  # noqa: B023, used at once
                 simulation.run(one, start, commands[i], count, keypoints[i], poses[i])
                 qpos[i], qvel[i] = simulation.data.qpos, simulation.data.qvel
 
@@ -86,7 +87,7 @@ class ThreadedEngine(Engine):
 class _Simulation:
     """One thread's own model and data: parameters are written into the model."""
 
-    def __init__(self, config: CableConfig, model: mujoco.MjModel):
+    def __init__(self, config: Discretisation, model: mujoco.MjModel):
         self.config = config
         self.model = copy.copy(model)
         self.data = mujoco.MjData(self.model)
@@ -95,13 +96,13 @@ class _Simulation:
         self.nominal_inertia = self.model.body_inertia.copy()
         self.links = np.array([i for i in range(self.model.nbody) if self.model.body(i).name.startswith("cable")])
 
-    def run(self, params: CableParams, state: CableState, twist, count: int, keypoints, poses) -> None:
+    def run(self, physics: Physics, state: CableState, twist, count: int, keypoints, poses) -> None:
         """Simulates in place; writes samples into `keypoints` [T + 1, N, D] and `poses` [T + 1, Q, P]."""
         config, model, data = self.config, self.model, self.data
-        self._write(params)
+        self._write(physics)
         mujoco.mj_resetData(model, data)
         data.qpos[:], data.qvel[:] = state.qpos, state.qvel
-        load = float(params.linear_density) * config.link_length * GRAVITY * float(params.friction_coefficient)
+        load = float(physics.density) * config.link_length * GRAVITY * float(physics.friction)
         addresses = np.array([model._address, data._address], np.uint64)
         nodes = np.empty((len(twist) + 1, len(self.links), 3))
         tangents = np.empty_like(nodes)
@@ -127,12 +128,12 @@ class _Simulation:
         positions_w, tangents_w = self.weights
         keypoints[:] = (positions_w @ nodes + tangents_w @ tangents)[..., : config.dimension]
 
-    def _write(self, params: CableParams) -> None:
+    def _write(self, physics: Physics) -> None:
         """Puts the parameters into the model."""
         model, h = self.model, self.config.link_length
-        stiffness = np.asarray(params.bending_stiffness) / h
-        damping = float(params.damping_time) * stiffness
-        rest = np.asarray(params.rest_curvature) * h
+        stiffness = np.asarray(physics.stiffness) / h
+        damping = float(physics.damping_time) * stiffness
+        rest = np.asarray(physics.rest_curvature) * h
         if self.config.dimension == 2:
             model.jnt_stiffness[3:] = stiffness
             model.dof_damping[3:] = damping
@@ -145,7 +146,7 @@ class _Simulation:
                 angle = np.linalg.norm(rotation)
                 mujoco.mju_axisAngle2Quat(quaternion[i], rotation / angle if angle > 0 else np.eye(3)[0], angle)
         free = self.links[1:-1]
-        ratio = float(params.linear_density) / self.config.linear_density
+        ratio = float(physics.density) / self.config.cable.linear_density
         model.body_mass[free] = self.nominal_mass[free] * ratio
         model.body_inertia[free] = self.nominal_inertia[free] * ratio
 

@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from cablejax.simulate.config import GRAVITY
+from cablejax.cable import GRAVITY
 from cablejax.spatial.physics import RodPhysics
 
 PROFILE_KNOTS = 5

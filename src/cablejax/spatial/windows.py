@@ -7,9 +7,9 @@ import dataclasses
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from cablejax.cable import GRAVITY
 from cablejax.cable_length import require_long_enough
 from cablejax.recordings.poses import rotated
-from cablejax.simulate.config import GRAVITY
 from cablejax.spatial.clamps import frames_along
 from cablejax.types import GapLog
 

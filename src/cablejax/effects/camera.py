@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from cablejax.diagnose.effects.base import Effect, Parameter
+from cablejax.effects.base import Effect, Parameter
 
 
 class CameraSimilarity(Effect):
@@ -73,7 +73,7 @@ class KeypointBias(Effect):
     def apply(self, physics, values, variant, config):
         index, across = divmod(variant, 2)
         xp = values[0].__array_namespace__()
-        one = (np.arange(config.n_keypoints) == index).astype(np.float32)
+        one = (np.arange(config.cable.n_keypoints) == index).astype(np.float32)
         field = "bias_across" if across else "bias_along"
         return replace(physics, **{field: getattr(physics, field) + values[0] * xp.asarray(one)})
 
@@ -83,7 +83,7 @@ class KeypointBias(Effect):
         tangent = tangent / np.linalg.norm(tangent, axis=-1, keepdims=True)
         normal = np.stack([-tangent[..., 1], tangent[..., 0]], axis=-1)
         gains = []
-        for index in range(1, context.config.n_keypoints - 1):
+        for index in range(1, context.config.cable.n_keypoints - 1):
             for across, direction in ((0, tangent), (1, normal)):
                 projected = np.sum(context.residual[:, :, index] * direction[:, :, index], axis=-1)
                 if not np.isfinite(projected).any():
@@ -96,5 +96,5 @@ class KeypointBias(Effect):
         return {"index": (variant // 2, ""), "offset_m": (float(values[0]), "m")}
 
     def location(self, values, variant, config):
-        s = float(config.keypoint_arclength[variant // 2])
+        s = float(config.cable.keypoint_arclength[variant // 2])
         return {"along_cable_m": [s, s]}

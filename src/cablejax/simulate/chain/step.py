@@ -25,9 +25,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from cablejax.diagnose.physics import Physics, normal_gravity
+from cablejax.cable import Discretisation
+from cablejax.effects.physics import Physics, normal_gravity
 from cablejax.simulate.composite import link_lengths, node_offsets
-from cablejax.simulate.config import CableConfig
 from cablejax.simulate.grasp import solve_positive
 
 LARGEST_STEP = 0.05
@@ -79,7 +79,7 @@ class Chain:
         with_contact: whether the obstacle can be touched. Looking for contacts is a quarter of a step's work.
     """
 
-    config: CableConfig
+    config: Discretisation
     with_contact: bool = True
 
     def rollout(
@@ -246,7 +246,7 @@ class Chain:
                     after[0, 2] + physics.rotation_offset[0] - theta[0],
                     *(after[1, :2] - after[0, :2] - nodes[-1]),
                     after[1, 2] + physics.rotation_offset[1] - theta[-1],
-                    slipped / self.config.length - state.stretch,
+                    slipped / self.config.cable.length - state.stretch,
                 ]
             )
             / dt
@@ -257,7 +257,7 @@ class Chain:
                 jnp.zeros((), dtype),
                 jnp.zeros((), dtype),
                 physics.rotation_compliance[1],
-                physics.axial_compliance / self.config.length,
+                physics.axial_compliance / self.config.cable.length,
             ]
         )
         solved = _solve_lower(matrix, jnp.concatenate([rhs[:, None], rows.T], axis=1))
@@ -332,11 +332,11 @@ class Chain:
         nodes = root + _chained(lengths[:, None] * along) + offsets[:, None] * along
         # Keypoints are marks on the cable: where it slips through a gripper, they move away from that gripper.
         slipped = physics.slip * jax.nn.sigmoid((time - physics.slip_time) / _SLIP_DURATION)
-        marks = jnp.asarray(config.keypoint_arclength, dtype) + physics.bias_along
-        inner = (marks + slipped[0]) / (config.length + jnp.sum(slipped))
-        ends = np.zeros(config.n_keypoints, bool)
+        marks = jnp.asarray(config.cable.keypoint_arclength, dtype) + physics.bias_along
+        inner = (marks + slipped[0]) / (config.cable.length + jnp.sum(slipped))
+        ends = np.zeros(config.cable.n_keypoints, bool)
         ends[[0, -1]] = True
-        nominal = marks / config.length
+        nominal = marks / config.cable.length
         s = jnp.clip(jnp.where(ends, nominal, inner), 0.0, 1.0) * (config.n_links - 1)
         segment = jnp.clip(jnp.floor(jax.lax.stop_gradient(s) + 1e-4).astype(int), 0, config.n_links - 2)
         t = (s - segment)[:, None]

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from cablejax.diagnose.effects.base import Effect, Parameter, hat, section
+from cablejax.effects.base import Effect, Parameter, hat, section
 
 # Where along the cable fits of local effects begin; a section of another sign is reached from the same place.
 _CENTRES = (0.08, 0.2, 0.32, 0.44, 0.56, 0.68, 0.8, 0.92)
@@ -18,14 +18,14 @@ class _Section(Effect):
     def reported(self, values, variant, config):
         last = self.parameters[2]
         return {
-            "centre_m": (float(values[0]) * config.length, "m"),
-            "width_m": (float(values[1]) * config.length, "m"),
+            "centre_m": (float(values[0]) * config.cable.length, "m"),
+            "width_m": (float(values[1]) * config.cable.length, "m"),
             last.name: (float(values[2]), last.unit),
         }
 
     def location(self, values, variant, config):
-        centre, width = float(values[0]) * config.length, float(values[1]) * config.length
-        return {"along_cable_m": [max(centre - width / 2, 0.0), min(centre + width / 2, config.length)]}
+        centre, width = float(values[0]) * config.cable.length, float(values[1]) * config.cable.length
+        return {"along_cable_m": [max(centre - width / 2, 0.0), min(centre + width / 2, config.cable.length)]}
 
 
 class BendingStiffness(Effect):
@@ -56,7 +56,7 @@ class StiffnessProfile(_Section):
     amplitude, reversible = 2, True
 
     def apply(self, physics, values, variant, config):
-        part = section(values[0] * config.length, values[1] * config.length, config)
+        part = section(values[0] * config.cable.length, values[1] * config.cable.length, config)
         return replace(physics, stiffness=physics.stiffness * values[2] ** part)
 
     def starts(self, context):
@@ -76,7 +76,7 @@ class IntrinsicCurvature(_Section):
     amplitude, reversible = 2, True
 
     def apply(self, physics, values, variant, config):
-        part = section(values[0] * config.length, values[1] * config.length, config)
+        part = section(values[0] * config.cable.length, values[1] * config.cable.length, config)
         return replace(physics, rest_curvature=physics.rest_curvature + values[2] * part)
 
     def starts(self, context):
@@ -123,7 +123,7 @@ class BendingHysteresis(Effect):
         return replace(physics, hysteresis_moment=still + values[0], hysteresis_curvature=still + values[1])
 
     def starts(self, context):
-        stiffness = context.config.bending_stiffness
+        stiffness = context.config.cable.bending_stiffness
         return [(0, (m * stiffness, k)) for m in (0.15, 0.6) for k in (0.15, 1.0)]
 
 
@@ -136,14 +136,14 @@ class BendingDamping(Effect):
 
     def apply(self, physics, values, variant, config):
         # a cable believed to be undamped gets one millisecond to be a multiple of
-        nominal = physics.damping_time + (0.001 if config.damping_time == 0 else 0.0)
+        nominal = physics.damping_time + (0.001 if config.cable.damping_time == 0 else 0.0)
         return replace(physics, damping_time=nominal * values[0])
 
     def starts(self, context):
         return [(0, (0.2,)), (0, (4.0,)), (0, (20.0,))]
 
     def reported(self, values, variant, config):
-        return {"time_s": (float(values[0]) * (config.damping_time or 0.001), "s")}
+        return {"time_s": (float(values[0]) * (config.cable.damping_time or 0.001), "s")}
 
 
 class AxialStretch(Effect):
@@ -188,14 +188,16 @@ class LumpedMass(Effect):
     amplitude = 1
 
     def apply(self, physics, values, variant, config):
-        return replace(physics, extra_mass=physics.extra_mass + values[1] * hat(values[0] * config.length, config))
+        return replace(
+            physics, extra_mass=physics.extra_mass + values[1] * hat(values[0] * config.cable.length, config)
+        )
 
     def starts(self, context):
         return [(0, (c, 0.03)) for c in _CENTRES]
 
     def reported(self, values, variant, config):
-        return {"centre_m": (float(values[0]) * config.length, "m"), "mass_kg": (float(values[1]), "kg")}
+        return {"centre_m": (float(values[0]) * config.cable.length, "m"), "mass_kg": (float(values[1]), "kg")}
 
     def location(self, values, variant, config):
-        s = float(values[0]) * config.length
+        s = float(values[0]) * config.cable.length
         return {"along_cable_m": [s, s]}

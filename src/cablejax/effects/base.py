@@ -10,8 +10,8 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 from jaxtyping import Float
 
-from cablejax.diagnose.physics import Physics
-from cablejax.simulate.config import CableConfig
+from cablejax.cable import Discretisation
+from cablejax.effects.physics import Physics
 
 
 @dataclasses.dataclass(frozen=True)
@@ -77,7 +77,7 @@ class Context:
         max_curvature: largest curvature of the nominal cable in each episode [1/m], shape [E].
     """
 
-    config: CableConfig
+    config: Discretisation
     keypoints: Float[np.ndarray, "E T N 2"]
     residual: Float[np.ndarray, "E T N 2"]
     duration: float
@@ -107,7 +107,7 @@ class Effect(abc.ABC):
     """What a variant is called in the verdict; None = there is only one."""
 
     @abc.abstractmethod
-    def apply(self, physics: Physics, values: Sequence[Any], variant: int, config: CableConfig) -> Physics:
+    def apply(self, physics: Physics, values: Sequence[Any], variant: int, config: Discretisation) -> Physics:
         """The physics with this effect. NumPy in, NumPy out; JAX in, JAX out, differentiable in `values`.
 
         Args:
@@ -121,18 +121,18 @@ class Effect(abc.ABC):
     def starts(self, context: Context) -> Sequence[tuple[int, Sequence[float]]]:
         """Pairs (variant, values) from which fits begin; enough of them that one is within reach of the truth."""
 
-    def reported(self, values: Sequence[float], variant: int, config: CableConfig) -> dict[str, tuple[Any, str]]:
+    def reported(self, values: Sequence[float], variant: int, config: Discretisation) -> dict[str, tuple[Any, str]]:
         """Parameters by the names of the verdict, as (value, unit). Choices are integers."""
         named = {p.name: (float(v), p.unit) for p, v in zip(self.parameters, values, strict=True)}
         return named if self.variant_name is None else {self.variant_name: (variant, ""), **named}
 
-    def location(self, values: Sequence[float], variant: int, config: CableConfig) -> dict[str, Any]:
+    def location(self, values: Sequence[float], variant: int, config: Discretisation) -> dict[str, Any]:
         """Where the effect sits: keys "along_cable_m", "time_s", "table_m" of the verdict, where they apply."""
         del values, variant, config
         return {}
 
 
-def section(centre: Any, width: Any, config: CableConfig) -> Any:
+def section(centre: Any, width: Any, config: Discretisation) -> Any:
     """Share of each joint's stretch of cable within `[centre - width/2, centre + width/2]`, shape [J].
 
     Smooth in both: the edges are as wide as half a link.
@@ -146,7 +146,7 @@ def section(centre: Any, width: Any, config: CableConfig) -> Any:
     return 1.0 / ((1.0 + xp.exp(begin)) * (1.0 + xp.exp(end)))
 
 
-def hat(centre: Any, config: CableConfig) -> Any:
+def hat(centre: Any, config: Discretisation) -> Any:
     """Weights that split a point at arc length `centre` between its two neighbouring nodes, shape [n]."""
     xp = centre.__array_namespace__()
     nodes = np.arange(config.n_links).astype(np.float32)

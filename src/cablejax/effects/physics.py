@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from cablejax.simulate.config import GRAVITY, CableConfig
+from cablejax.cable import GRAVITY, Discretisation
 
 # Far enough to be out of the game, near enough for single precision.
 _NEVER = 1e3
@@ -26,7 +26,7 @@ class Physics:
 
     Attributes:
         stiffness: EI at each joint [N m^2], shape [J].
-        rest_curvature: kappa_0 at each joint [1/m], shape [J].
+        rest_curvature: kappa_0 at each joint [1/m], shape [J]; in space [J, 3].
         damping_time: Kelvin-Voigt time constant [s].
         yield_curvature: elastic curvature beyond which a bend stays [1/m].
         hardening: h, kinematic: beyond yielding the moment grows with slope `EI h / (1 + h)`; 0 = perfectly plastic.
@@ -58,7 +58,7 @@ class Physics:
     """
 
     stiffness: Float[Array | np.ndarray, "*B J"]
-    rest_curvature: Float[Array | np.ndarray, "*B J"]
+    rest_curvature: Float[Array | np.ndarray, "*B J"] | Float[Array | np.ndarray, "*B J 3"]
     damping_time: Float[Array | np.ndarray, "*B"]
     yield_curvature: Float[Array | np.ndarray, "*B"]
     hardening: Float[Array | np.ndarray, "*B"]
@@ -90,7 +90,7 @@ class Physics:
 
 
 def nominal_physics(
-    config: CableConfig,
+    config: Discretisation,
     dtype=jnp.float32,
     *,
     gravity: Sequence[float] | np.ndarray = (0.0, 0.0, -GRAVITY),
@@ -105,17 +105,17 @@ def nominal_physics(
         arclength: where the keypoints are marked on the cable [m], shape [N]; None = uniform over its length.
     """
     joints, links = config.n_joints, config.n_links
-    marks = config.keypoint_arclength if arclength is None else np.asarray(arclength, float)
+    marks = config.cable.keypoint_arclength if arclength is None else np.asarray(arclength, float)
     values = {
-        "stiffness": np.full(joints, config.bending_stiffness),
-        "rest_curvature": np.zeros(joints),
-        "damping_time": config.damping_time,
+        "stiffness": np.full(joints, config.cable.bending_stiffness),
+        "rest_curvature": np.full(joints if config.dimension == 2 else (joints, 3), config.cable.rest_curvature),
+        "damping_time": config.cable.damping_time,
         "yield_curvature": _NEVER,
         "hardening": 0.0,
         "hysteresis_moment": 0.0,
         "hysteresis_curvature": 1.0,
         "axial_compliance": 0.0,
-        "friction": config.friction_coefficient,
+        "friction": config.cable.friction_coefficient,
         "static_excess": 0.0,
         "patch_centre": np.zeros(2),
         "patch_radius": 0.1,
@@ -123,7 +123,7 @@ def nominal_physics(
         "drag": 0.0,
         "gravity": float(np.linalg.norm(gravity)),
         "tilt": np.asarray(gravity, float)[:2],
-        "density": config.linear_density,
+        "density": config.cable.linear_density,
         "extra_mass": np.zeros(links),
         "slip": np.zeros(2),
         "slip_time": 0.0,
@@ -131,8 +131,8 @@ def nominal_physics(
         "rotation_compliance": np.zeros(2),
         "obstacle_centre": np.full(2, _NEVER),
         "obstacle_radius": 0.0,
-        "bias_along": marks - config.keypoint_arclength,
-        "bias_across": np.zeros(config.n_keypoints),
+        "bias_along": marks - config.cable.keypoint_arclength,
+        "bias_across": np.zeros(config.cable.n_keypoints),
         "camera_scale": 1.0,
         "camera_angle": 0.0,
         "camera_offset": np.zeros(2),

@@ -1,9 +1,9 @@
 """The effects that a diagnosis knows, by the names of the gap log's format."""
 
-from cablejax.diagnose.effects.base import Context, Effect, Parameter
-from cablejax.diagnose.effects.camera import CameraLag, CameraSimilarity, KeypointBias
-from cablejax.diagnose.effects.grasp import GripperCompliance, GripperRotationOffset, GripperSlip
-from cablejax.diagnose.effects.material import (
+from cablejax.effects.base import Context, Effect, Parameter
+from cablejax.effects.camera import CameraLag, CameraSimilarity, KeypointBias
+from cablejax.effects.grasp import GripperCompliance, GripperRotationOffset, GripperSlip
+from cablejax.effects.material import (
     AxialStretch,
     BendingDamping,
     BendingHysteresis,
@@ -14,7 +14,7 @@ from cablejax.diagnose.effects.material import (
     Plasticity,
     StiffnessProfile,
 )
-from cablejax.diagnose.effects.table import FrictionPatch, GravityTilt, Obstacle, TableFriction, ViscousDrag
+from cablejax.effects.table import FrictionPatch, GravityTilt, Obstacle, TableFriction, ViscousDrag
 
 LIBRARY: tuple[Effect, ...] = (
     BendingStiffness(),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from cablejax.diagnose.effects.base import Effect, Parameter
+from cablejax.effects.base import Effect, Parameter
 
 
 def _at(gripper: int, value):
@@ -14,7 +14,7 @@ def _at(gripper: int, value):
 
 
 def _end(gripper: int, config):
-    s = 0.0 if gripper == 0 else config.length
+    s = 0.0 if gripper == 0 else config.cable.length
     return {"along_cable_m": [s, s]}
 
 

@@ -6,13 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from cablejax.diagnose.effects.base import Context, Effect, Parameter
-from cablejax.simulate.config import CableConfig
+from cablejax.cable import Discretisation
+from cablejax.effects.base import Context, Effect, Parameter
 
 
-def _believed(config: CableConfig) -> float:
+def _believed(config: Discretisation) -> float:
     """The nominal coefficient; a table believed to be smooth gets a small one to be a multiple of."""
-    return config.friction_coefficient or 0.01
+    return config.cable.friction_coefficient or 0.01
 
 
 class TableFriction(Effect):
@@ -28,7 +28,7 @@ class TableFriction(Effect):
     amplitude, reversible = 0, True
 
     def apply(self, physics, values, variant, config):
-        nominal = physics.friction + (_believed(config) if config.friction_coefficient == 0 else 0.0)
+        nominal = physics.friction + (_believed(config) if config.cable.friction_coefficient == 0 else 0.0)
         return replace(physics, friction=nominal * values[0], static_excess=physics.static_excess + variant * values[1])
 
     def starts(self, context):

@@ -1,0 +1,155 @@
+"""The cable and its discretisation: what every stage of the pipeline agrees on.
+
+A `Cable` is the physical object on its table. A `Discretisation` is that cable cut into links for a simulator. The same
+two objects go into simulators, data sets, trained weights and logs, so that any two stages can be compared.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any, Literal
+
+import numpy as np
+
+GRAVITY = 9.81
+"""Magnitude of gravity [m/s^2]."""
+
+BOUNDS = {
+    "length": (1e-2, 1e2),
+    "diameter": (1e-6, 1.0),
+    "linear_density": (1e-6, 1e3),
+    "bending_stiffness": (1e-9, 1e6),
+    "damping_time": (0.0, 1e3),
+    "rest_curvature": (-1e3, 1e3),
+    "friction_coefficient": (0.0, 1e2),
+}
+"""Smallest and largest accepted value of each number of a cable, SI units. What lies outside is a mistake in units."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Cable:
+    """A uniform cable held at both ends, and the table it lies on. The defaults are the reference cable.
+
+    Attributes:
+        length: free length between the grippers [m].
+        diameter: [m].
+        linear_density: mass per length [kg/m].
+        bending_stiffness: EI [N m^2].
+        damping_time: Kelvin-Voigt time constant tau [s] in `M = EI (kappa - kappa_0 + tau dkappa/dt)`.
+        rest_curvature: kappa_0, the curvature without load [1/m].
+        friction_coefficient: kinetic Coulomb coefficient of the table; 0 = a smooth table.
+        n_keypoints: observed keypoints N, both ends included.
+        marks: arc length of each keypoint from gripper 0 [m], N increasing numbers from 0 to `length`; None = uniform.
+        grasp: how grippers 0 and 1 hold the cable. Simulators know "clamped": position and direction are held.
+
+    Raises:
+        ValueError: a number is not finite or outside of `BOUNDS`, or the marks do not fit.
+    """
+
+    length: float = 1.0
+    diameter: float = 0.01
+    linear_density: float = 0.08
+    bending_stiffness: float = 0.02
+    damping_time: float = 0.1
+    rest_curvature: float = 0.0
+    friction_coefficient: float = 0.1
+    n_keypoints: int = 13
+    marks: tuple[float, ...] | None = None
+    grasp: tuple[str, str] = ("clamped", "clamped")
+
+    def __post_init__(self):
+        for name, (low, high) in BOUNDS.items():
+            value = getattr(self, name)
+            if isinstance(value, bool) or not (np.isfinite(value) and low <= value <= high):
+                raise ValueError(f"Cable.{name} is {value}, expected {low:g} to {high:g} in SI units.")
+        if self.diameter >= self.length:
+            raise ValueError(
+                f"Cable.diameter is {self.diameter} m and its length {self.length} m: expected a cable that is longer "
+                "than it is thick."
+            )
+        if self.n_keypoints < 2:
+            raise ValueError(f"Cable.n_keypoints is {self.n_keypoints}, expected at least 2: both ends.")
+        if tuple(self.grasp) != ("clamped", "clamped"):
+            raise ValueError(f'Cable.grasp is {self.grasp}, expected ("clamped", "clamped"), the only grasp simulated.')
+        self._check_marks()
+
+    def _check_marks(self) -> None:
+        if self.marks is None:
+            return
+        marks = np.asarray(self.marks, float)
+        if marks.shape != (self.n_keypoints,) or not (np.diff(marks) > 0).all():
+            raise ValueError(
+                f"Cable.marks holds {marks.size} arc lengths, expected {self.n_keypoints}, increasing, one per "
+                "keypoint."
+            )
+        if np.abs(marks[[0, -1]] - [0.0, self.length]).max() > 1e-6 * self.length:
+            raise ValueError(
+                f"Cable.marks goes from {marks[0]:g} to {marks[-1]:g} m, expected 0 to the cable's length of "
+                f"{self.length:g} m: the first and the last keypoint are at the grippers."
+            )
+
+    @property
+    def keypoint_arclength(self) -> np.ndarray:
+        """Arc length of each keypoint from gripper 0 [m], shape [N]."""
+        if self.marks is not None:
+            return np.asarray(self.marks, float)
+        return np.linspace(0.0, self.length, self.n_keypoints)
+
+
+@dataclasses.dataclass(frozen=True)
+class Discretisation:
+    """A cable cut into rigid links, and the time step of its simulation.
+
+    `n_links` links have `n_links - 1` bending joints between them, spaced `length / (n_links - 1)` apart: the two links
+    held by the grippers have half that length, so that clamping them takes no bending length away.
+
+    Attributes:
+        cable: what is simulated.
+        n_links: number of rigid links, at least 3.
+        timestep: integration step [s].
+        dimension: 2 for a cable on a table (z-hinges), 3 for a cable in space (ball joints).
+        friction_speed: speed v0 [m/s] below which Coulomb friction turns viscous:
+            `f = -mu w v / sqrt(|v|^2 + v0^2)`.
+
+    Raises:
+        ValueError: a number is out of range; the message names it.
+    """
+
+    cable: Cable = Cable()
+    n_links: int = 33
+    timestep: float = 0.02
+    dimension: Literal[2, 3] = 2
+    friction_speed: float = 2e-4
+
+    def __post_init__(self):
+        for name in ("timestep", "friction_speed"):
+            value = getattr(self, name)
+            if not (np.isfinite(value) and value > 0):
+                raise ValueError(f"Discretisation.{name} is {value}, expected a positive finite number in SI units.")
+        if self.n_links < 3:
+            raise ValueError(
+                f"Discretisation.n_links is {self.n_links}, expected at least 3: two held links and one free."
+            )
+        if self.dimension not in (2, 3):
+            raise ValueError(f"Discretisation.dimension is {self.dimension}, expected 2 (table plane) or 3 (space).")
+
+    @property
+    def link_length(self) -> float:
+        """Spacing h of the bending joints, and length of every link but the two half-length ones at the ends [m]."""
+        return self.cable.length / (self.n_links - 1)
+
+    @property
+    def n_joints(self) -> int:
+        """Number of bending joints J."""
+        return self.n_links - 1
+
+
+def differing(one: Cable, other: Cable, tolerance: float = 1e-9) -> dict[str, tuple[Any, Any]]:
+    """The fields in which two cables differ by more than a relative tolerance, with both values."""
+    found = {}
+    for field in dataclasses.fields(Cable):
+        a, b = getattr(one, field.name), getattr(other, field.name)
+        same = abs(a - b) <= tolerance * max(abs(a), abs(b)) if isinstance(a, (int, float)) else a == b
+        if not same:
+            found[field.name] = (a, b)
+    return found
