@@ -160,7 +160,9 @@ def test_another_configuration_is_refused_with_the_difference(tmp_path):
     complete(open_or_create(path, SMALL))
     whole = tree(path)
     other = dataclasses.replace(SMALL, seed=1, discretisation=dataclasses.replace(SMALL.discretisation, n_links=6))
-    with pytest.raises(ValueError, match=r"cable.n_links is 5 in the store and 6 here; seed is 0 in the store and 1"):
+    with pytest.raises(
+        ValueError, match=r"discretisation.n_links is 5 in the store and 6 here; seed is 0 in the store and 1"
+    ):
         open_or_create(path, other)
     assert tree(path) == whole
 

@@ -161,11 +161,11 @@ def shape_batch(
     Raises:
         ValueError: the batch axes differ, the cable is not planar, or a target has another number of keypoints.
     """
-    size, cable = len(targets), engine.config
-    if cable.dimension != 2 or np.shape(targets) != (size, cable.cable.n_keypoints, 2):
+    size, chain = len(targets), engine.config
+    if chain.dimension != 2 or np.shape(targets) != (size, chain.cable.n_keypoints, 2):
         raise ValueError(
-            f"Targets of shape {np.shape(targets)} for a cable with {cable.cable.n_keypoints} keypoints in {cable.dimension} "
-            f"dimensions, expected (B, {cable.cable.n_keypoints}, 2) on a planar cable."
+            f"Targets of shape {np.shape(targets)} for a cable with {chain.cable.n_keypoints} keypoints in "
+            f"{chain.dimension} dimensions, expected (B, {chain.cable.n_keypoints}, 2) on a planar cable."
         )
     engine.substeps(config.interval)
     seeds = np.arange(size) if seeds is None else np.asarray(seeds)
