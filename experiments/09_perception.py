@@ -30,6 +30,7 @@ from typing import Any, get_args
 import numpy as np
 from matplotlib.figure import Figure
 
+from cablejax.control.targets import Shape
 from cablejax.evaluation.cases import mujoco_plant, stiffness_cases
 from cablejax.evaluation.methods import ADAPTED_RESIDUAL, METHODS
 from cablejax.evaluation.suite import released, run_case
@@ -42,7 +43,6 @@ from cablejax.report.provenance import machine, versions
 from cablejax.report.style import LIGHT
 from cablejax.simulate import CableConfig, ThreadedEngine
 from cablejax.simulate.motions import random_motion
-from cablejax.targets import Shape
 
 HZ = 10
 FINE = 20

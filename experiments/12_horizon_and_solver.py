@@ -24,13 +24,13 @@ import numpy as np
 from matplotlib.ticker import FixedLocator, NullFormatter
 from tqdm import tqdm
 
-from cablejax.closed_loop import run_closed_loop
+from cablejax.control.loop import run_closed_loop
+from cablejax.control.shaping import load_model
 from cablejax.evaluation.cases import PLANT_CABLE, mujoco_plant
 from cablejax.evaluation.protocols import LaidOut, letter_task
 from cablejax.mpc import SOLVERS, Controller, MPCConfig, TrustRegion
 from cablejax.report.markdown import markdown_table, publish
 from cablejax.report.provenance import machine, versions
-from cablejax.shaping import load_model
 
 CONVERGED = "trust-region, converged"
 PLANNERS = {**SOLVERS, CONVERGED: TrustRegion(max_iterations=12, trials_per_linearisation=1)}

@@ -22,7 +22,8 @@ os.environ.setdefault("NPROC", "4")
 import jax
 import numpy as np
 
-from cablejax.closed_loop import run_closed_loop
+from cablejax.control.loop import run_closed_loop
+from cablejax.control.shaping import Model, load_model, make_controller
 from cablejax.diagnose import diagnose, write_verdict
 from cablejax.diagnose.diagnosis import NamedEffect, ParameterEstimate
 from cablejax.diagnose.into_simulator import params_with
@@ -33,7 +34,6 @@ from cablejax.evaluation.suite import Case, read_suite, run_suite
 from cablejax.gaplog import gap_log_from_episodes, read_gap_log, write_gap_log
 from cablejax.report.markdown import publish
 from cablejax.report.provenance import machine, versions
-from cablejax.shaping import Model, load_model, make_controller
 from cablejax.simulate import CableConfig, ThreadedEngine
 from cablejax.simulate.motions import MotionConfig, random_motion
 from cablejax.types import CableParams, Trajectory

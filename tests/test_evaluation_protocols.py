@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from cablejax.control.targets import make_target
 from cablejax.evaluation import protocols
 from cablejax.evaluation.protocols import (
     LaidOut,
@@ -23,7 +24,6 @@ from cablejax.simulate.elastica import solve_elastica
 from cablejax.simulate.equilibrium import angles_of_keypoints, chain_nodes, find_equilibrium
 from cablejax.simulate.motions import admissible
 from cablejax.simulate.plant import Plant, PlantConfig
-from cablejax.targets import make_target
 
 CABLE = CableConfig()
 

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from cablejax.bounded import BoundedLevenbergMarquardt, SpectralProjectedGradient, certify
+from cablejax.control.shaping import Model
 from cablejax.evaluation.against_ipopt import comparable_seconds, kkt_residual, slopes_along
 from cablejax.evaluation.control_call import race, ratios
 from cablejax.evaluation.planning_problems import (
@@ -23,7 +24,6 @@ from cablejax.evaluation.planning_problems import (
 from cablejax.evaluation.referee import Limits, RefereeConfig, referee
 from cablejax.evaluation.solver_path import PathFinder
 from cablejax.mpc import SOLVERS, Controller
-from cablejax.shaping import Model
 from mpc_cases import START, at_rest, planning_case, problem, random_motion, relaxing_cable
 
 pytest.importorskip("ipyopt")

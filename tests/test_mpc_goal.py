@@ -6,8 +6,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from cablejax.control.targets import make_target
 from cablejax.mpc.goal import continued, goal_pose, straight_plan, straightened, total_turn
-from cablejax.targets import make_target
 
 
 @pytest.mark.parametrize("shape", ["U", "S", "Z"])

@@ -5,13 +5,13 @@ import dataclasses
 import numpy as np
 import pytest
 
-from cablejax.closed_loop import run_closed_loop, shape_error_cm
+from cablejax.control.loop import run_closed_loop, shape_error_cm
+from cablejax.control.targets import make_target, straight_start
 from cablejax.perceive.camera import CameraConfig, DepthCamera
 from cablejax.perceive.plant import CloudPlant
 from cablejax.simulate.config import CableConfig
 from cablejax.simulate.elastica import solve_elastica
 from cablejax.simulate.plant import PlantConfig
-from cablejax.targets import make_target, straight_start
 from perceive_cases import TRACKER
 
 CABLE = CableConfig(n_links=40, dimension=3, timestep=0.005)

@@ -8,12 +8,12 @@ import pytest
 
 pytest.importorskip("elastica", reason="PyElastica is not installed: pip install pyelastica==1.0.0")
 
-from cablejax.closed_loop import run_closed_loop
+from cablejax.control.loop import run_closed_loop
+from cablejax.control.targets import make_target, straight_start
 from cablejax.simulate import rod_plant
 from cablejax.simulate.config import GRAVITY, CableConfig
 from cablejax.simulate.elastica import elastica
 from cablejax.simulate.rod_plant import ETHERNET, USB, RodPlant, RodPlantConfig
-from cablejax.targets import make_target, straight_start
 
 CABLE = CableConfig(n_links=15, timestep=4e-4)
 CONFIG = RodPlantConfig(cable=CABLE)

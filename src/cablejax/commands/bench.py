@@ -13,8 +13,8 @@ from cablejax.commands.options import Command, UsageError, say, text_table
 from cablejax.solver_names import SolverName
 
 if TYPE_CHECKING:
+    from cablejax.control.shaping import Model
     from cablejax.mpc import Controller
-    from cablejax.shaping import Model
     from cablejax.types import History
 
 
@@ -135,8 +135,8 @@ class BenchMpc(Command):
     def execute(self):
         import jax
 
+        from cablejax.control.shaping import initial_history, load_model
         from cablejax.mpc import time_control
-        from cablejax.shaping import initial_history, load_model
         from cablejax.simulate import CableConfig
 
         least = min(self.repeats, *self.batches, self.horizon + 1, self.referee + 1)
@@ -271,10 +271,10 @@ class BenchLoop(Command):
         import jax
         import numpy as np
 
-        from cablejax.batched_loop import LoopConfig, MpcPolicy, shape_batch, varied_params
-        from cablejax.shaping import load_model, make_controller
+        from cablejax.control.batched import LoopConfig, MpcPolicy, shape_batch, varied_params
+        from cablejax.control.shaping import load_model, make_controller
+        from cablejax.control.targets import make_target, straight_start
         from cablejax.simulate import CableConfig, MjxEngine
-        from cablejax.targets import make_target, straight_start
 
         if not self.batches or min(*self.batches, self.steps, self.rounds) < 1:
             raise UsageError(
@@ -321,8 +321,8 @@ class Bench:
 
 def _controller(model: Model, solver: SolverName, horizon: int) -> Controller:
     """The controller with the online residual on the way to an S, with one of the solvers at its defaults."""
-    from cablejax.shaping import make_controller
-    from cablejax.targets import make_target
+    from cablejax.control.shaping import make_controller
+    from cablejax.control.targets import make_target
 
     controller = make_controller(model, make_target("S"), method="residual", solver=solver)
     return dataclasses.replace(controller, config=dataclasses.replace(controller.config, horizon=horizon))

@@ -17,7 +17,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from cablejax.closed_loop import run_closed_loop
+from cablejax.control.loop import run_closed_loop
+from cablejax.control.shaping import Model, NetworkDynamics
+from cablejax.control.targets import Shape
 from cablejax.dynamics.smooth import CORNER, smoothed
 from cablejax.evaluation.cases import PLANT_CABLE, mujoco_plant
 from cablejax.evaluation.protocols import LaidOut, letter_task, random_task
@@ -28,8 +30,6 @@ from cablejax.mpc.rollout import Rollout
 from cablejax.npz import read_npz
 from cablejax.residual.corrected import Corrected
 from cablejax.residual.ridge import ResidualModel, zero_residual
-from cablejax.shaping import Model, NetworkDynamics
-from cablejax.targets import Shape
 from cablejax.types import History
 
 CONFIG = MPCConfig(objective=ObjectiveConfig(arrival_weight=0.0))

@@ -28,6 +28,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from cablejax.control.targets import START_LEAN, Shape, Target, make_target
 from cablejax.mpc import MPCConfig
 from cablejax.mpc.goal import continued, goal_pose, way_to
 from cablejax.simulate.config import CableConfig
@@ -35,7 +36,6 @@ from cablejax.simulate.elastica import Elastica, ElasticaError, elastica, solve_
 from cablejax.simulate.equilibrium import arch_angles, chain_nodes, find_equilibrium
 from cablejax.simulate.motions import MotionConfig, admissible
 from cablejax.simulate.table_plant import Observation
-from cablejax.targets import START_LEAN, Shape, Target, make_target
 
 StartKind = Literal["straight", "diverse"]
 
@@ -119,7 +119,7 @@ class GuessingCable(Protocol):
 
 @dataclasses.dataclass(frozen=True)
 class LaidOut:
-    """A plant that lays its cable out in a task's start shape; for `closed_loop.run_closed_loop`.
+    """A plant that lays its cable out in a task's start shape; for `control.loop.run_closed_loop`.
 
     Attributes:
         plant: what is laid out and shaped.

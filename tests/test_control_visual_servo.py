@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from cablejax.servo import ServoConfig, VisualServo, initial_state, servo
+from cablejax.control.visual_servo import ServoConfig, VisualServo, initial_state, servo
 from cablejax.types import History
 from mpc_cases import START, TARGETS, at_rest, hermite_shape, relaxing_cable
 

@@ -5,9 +5,9 @@ import json
 import numpy as np
 import pytest
 
+from cablejax.control.targets import load_target, make_target, straight_start, target_from_keypoints
 from cablejax.simulate.config import CableConfig
 from cablejax.simulate.elastica import solve_elastica
-from cablejax.targets import load_target, make_target, straight_start, target_from_keypoints
 
 CABLE = CableConfig()
 

@@ -9,9 +9,9 @@ from typing import Any, Protocol
 import numpy as np
 from jaxtyping import Float
 
+from cablejax.control.targets import Target
 from cablejax.gaplog import Episode
 from cablejax.simulate.table_plant import Observation, PlantError
-from cablejax.targets import Target
 from cablejax.types import History
 
 SETTLING_FRACTION = 0.1

@@ -5,11 +5,11 @@ import dataclasses
 import numpy as np
 import pytest
 
-from cablejax.closed_loop import run_closed_loop, settling_time, shape_error_cm, step_settling_time
+from cablejax.control.loop import run_closed_loop, settling_time, shape_error_cm, step_settling_time
+from cablejax.control.targets import Target, make_target, straight_start
 from cablejax.gaplog import gap_log_from_episodes, read_gap_log, write_gap_log
 from cablejax.simulate.config import CableConfig
 from cablejax.simulate.plant import Plant, PlantConfig
-from cablejax.targets import Target, make_target, straight_start
 
 CABLE = CableConfig(n_links=12, dimension=3, timestep=0.005)
 CONFIG = PlantConfig(cable=CABLE, settle_time=0.2)

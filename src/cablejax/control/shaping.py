@@ -10,7 +10,8 @@ from flax import nnx
 from jaxtyping import Array, Float
 
 from cablejax.adaptation.belief import AdaptationConfig
-from cablejax.closed_loop import ClosedLoopRun, run_closed_loop
+from cablejax.control.loop import ClosedLoopRun, run_closed_loop
+from cablejax.control.targets import Target, straight_start
 from cablejax.dynamics.config import ModelConfig
 from cablejax.dynamics.model import apply
 from cablejax.dynamics.rough import roughened
@@ -25,7 +26,6 @@ from cablejax.simulate import CableConfig
 from cablejax.simulate.elastica import elastica
 from cablejax.simulate.plant import Plant, PlantConfig
 from cablejax.solver_names import SolverName
-from cablejax.targets import Target, straight_start
 from cablejax.types import History
 
 METHODS: tuple[Method, ...] = ("residual", "direct")

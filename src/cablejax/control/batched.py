@@ -1,7 +1,7 @@
 """The whole closed loop as one compiled call: many cables, each with its own target, shaped side by side.
 
 Plant (the MJX engine), camera, model, residual and controller are pure functions, so one trial is a `lax.scan` over
-its control steps and a table of trials is its `vmap`. What `closed_loop.run_closed_loop` does with one cable in Python,
+its control steps and a table of trials is its `vmap`. What `control.loop.run_closed_loop` does with one cable in Python,
 this does with a batch on an accelerator. The plant is the planar simulator here; the contact plant in C MuJoCo, which
 the model has never seen, stays the reference.
 """
@@ -19,7 +19,7 @@ import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Float, Int
 
-from cablejax.closed_loop import settling_time
+from cablejax.control.loop import settling_time
 from cablejax.mpc import ControlInfo, ControllerState, MPCConfig, control, initial_state
 from cablejax.residual.jacobian import Dynamics
 from cablejax.simulate.compile import compiler_options
@@ -124,7 +124,7 @@ class BatchRun:
         return np.asarray(self.error_cm[:, -1])
 
     def settling_time_s(self, interval: float = 1.0) -> Float[np.ndarray, " B"]:
-        """See `closed_loop.settling_time` [s]; infinite for a trial that never settled."""
+        """See `control.loop.settling_time` [s]; infinite for a trial that never settled."""
         errors = np.asarray(self.error_cm, float)
         times = interval * np.arange(errors.shape[1])
         return np.array([settling_time(times, error) for error in errors])
@@ -262,6 +262,6 @@ def _observed(config: LoopConfig, key: Array, keypoints: Float[Array, "N 2"]) ->
 
 
 def _shape_error_cm(keypoints: Float[Array, "T N 2"], target: Float[Array, "N 2"]) -> Float[Array, " T"]:
-    """`closed_loop.shape_error_cm`; the held ends are always seen unless the simulation diverged."""
+    """`control.loop.shape_error_cm`; the held ends are always seen unless the simulation diverged."""
     squared = ((keypoints - target) ** 2).sum(axis=-1)
     return 100.0 * jnp.sqrt(jnp.nanmean(squared, axis=-1))

@@ -11,16 +11,16 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from cablejax.batched_loop import LoopConfig, MpcPolicy, shape_batch, varied_params
-from cablejax.closed_loop import run_closed_loop
+from cablejax.control.batched import LoopConfig, MpcPolicy, shape_batch, varied_params
+from cablejax.control.loop import run_closed_loop
+from cablejax.control.shaping import NetworkDynamics, load_model, make_controller
+from cablejax.control.targets import Target, make_target, straight_start
 from cablejax.mpc import Controller, MPCConfig, Outcome, Plan
 from cablejax.mpc.goal import goal_pose
-from cablejax.shaping import NetworkDynamics, load_model, make_controller
 from cablejax.simulate import CableConfig, MjxEngine
 from cablejax.simulate.engine_plant import EnginePlant
 from cablejax.simulate.plant import Plant, PlantConfig
 from cablejax.simulate.table_plant import PlantError
-from cablejax.targets import Target, make_target, straight_start
 from cablejax.types import CableParams, History
 from dynamics_cases import SMALL, network
 
@@ -163,7 +163,7 @@ def test_two_devices_shape_as_one(tmp_path):
     code = """
 import sys; sys.path.insert(0, {folder!r})
 import jax, numpy as np
-from test_batched_loop import *
+from test_control_batched import *
 run = shape_batch(*arguments("USU"), GoToTarget(), 0.05, shapes("USU"), LoopConfig(steps=3), devices=jax.devices())
 print(jax.device_count()); np.save({path!r}, run.keypoints)
 """
