@@ -20,7 +20,7 @@ from cablejax.evaluation.paper import VISUAL_SERVO
 from cablejax.evaluation.protocols import LaidOut, letter_task
 from cablejax.evaluation.run import Experiment, Extent, page, seed_range
 from cablejax.evaluation.suite import Case, key_of, read_suite, run_suite
-from cablejax.mpc import Controller
+from cablejax.mpc import MPC
 from cablejax.simulate.config import CableConfig
 from cablejax.simulate.plant import Plant, PlantConfig
 from cli_cases import small_model
@@ -78,7 +78,7 @@ def test_every_method_has_its_controller(tmp_path):
     for spec in METHODS.values():
         if spec.weights is not None:
             controller = controller_of(spec, model, target)
-            assert isinstance(controller, Controller)
+            assert isinstance(controller, MPC)
             assert (controller.config.residual is not None) == spec.residual
 
 

@@ -113,7 +113,7 @@ class Still:
     def init(self, history):
         return 0
 
-    def step(self, state, keypoints, gripper_pose):
+    def step(self, state, measurement):
         return state, np.zeros((2, 3)), None
 
 

@@ -131,7 +131,7 @@ def test_the_closed_loop_takes_it_for_a_plant():
         def init(self, history):
             return None
 
-        def step(self, state, keypoints, gripper_pose):
+        def step(self, state, measurement):
             return None, STILL, None
 
     run = run_closed_loop(RodPlant(CONFIG), Still(), make_target("U", CABLE), 2, start=straight_start(CABLE))
