@@ -31,6 +31,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from cablejax.cable import Cable, Discretisation
+from cablejax.control.targets import Shape
 from cablejax.effects.physics import nominal_physics
 from cablejax.evaluation.cases import mujoco_plant, stiffness_cases
 from cablejax.evaluation.methods import ADAPTED_RESIDUAL, METHODS
@@ -44,7 +45,6 @@ from cablejax.report.provenance import machine, versions
 from cablejax.report.style import LIGHT
 from cablejax.simulate import ThreadedEngine
 from cablejax.simulate.motions import random_motion
-from cablejax.targets import Shape
 
 HZ = 10
 FINE = 20

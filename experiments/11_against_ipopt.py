@@ -32,6 +32,7 @@ import jax
 import numpy as np
 from tqdm import tqdm
 
+from cablejax.control.shaping import Model, load_model
 from cablejax.evaluation.against_ipopt import (
     ACCURATE,
     POINTS,
@@ -61,7 +62,6 @@ from cablejax.evaluation.referee import RefereeConfig
 from cablejax.mpc import SOLVERS
 from cablejax.report.markdown import publish
 from cablejax.report.provenance import machine, versions
-from cablejax.shaping import Model, load_model
 
 FOLDER = Path("docs") / "results" / "trials" / "against_ipopt"
 """Problems and rows, kept with the repository: a thousand problems take longer than one sitting."""

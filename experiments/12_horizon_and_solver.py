@@ -24,13 +24,13 @@ import numpy as np
 from matplotlib.ticker import FixedLocator, NullFormatter
 from tqdm import tqdm
 
-from cablejax.closed_loop import run_closed_loop
+from cablejax.control.loop import run_closed_loop
+from cablejax.control.shaping import load_model
 from cablejax.evaluation.cases import PLANT_CHAIN, mujoco_plant
 from cablejax.evaluation.protocols import LaidOut, letter_task
-from cablejax.mpc import SOLVERS, Controller, MPCConfig, TrustRegion
+from cablejax.mpc import MPC, SOLVERS, MPCConfig, TrustRegion
 from cablejax.report.markdown import markdown_table, publish
 from cablejax.report.provenance import machine, versions
-from cablejax.shaping import load_model
 
 CONVERGED = "trust-region, converged"
 PLANNERS = {**SOLVERS, CONVERGED: TrustRegion(max_iterations=12, trials_per_linearisation=1)}
@@ -67,7 +67,7 @@ def run(model, solver: str, horizon: int, shape: str, seed: int) -> Trial:
     """One of them; what is compiled is kept for the next target."""
     task = letter_task(shape, seed, PLANT_CHAIN)
     config = dataclasses.replace(MPCConfig(), horizon=horizon, solver=PLANNERS[solver])
-    controller = Controller(config, model.dynamics, model.weights, task.target.keypoints)
+    controller = MPC(config, model.dynamics, model.weights, task.target.keypoints)
     plant = LaidOut(mujoco_plant(STIFFNESS), task.start_shape)
     out = run_closed_loop(plant, controller, task.target, STEPS, start=task.start_pose, record_hz=1.0)
     p50, p95 = np.nanpercentile(out.mpc_ms, [50, 95])

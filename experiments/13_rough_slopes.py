@@ -22,12 +22,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from cablejax.control.shaping import load_model
 from cablejax.evaluation.planning_problems import ProblemMaker, load_cases
 from cablejax.mpc import SOLVERS
 from cablejax.report.markdown import markdown_table, publish
 from cablejax.report.provenance import machine, versions
 from cablejax.residual import Dynamics
-from cablejax.shaping import load_model
 
 CASES = Path("docs") / "results" / "trials" / "against_ipopt" / "cases.npz"
 PLANNERS = ("trust-region", "deadline")

@@ -23,7 +23,8 @@ import jax
 import numpy as np
 
 from cablejax.cable import Cable, Discretisation
-from cablejax.closed_loop import run_closed_loop
+from cablejax.control.loop import run_closed_loop
+from cablejax.control.shaping import Model, load_model, make_controller
 from cablejax.diagnose import diagnose, write_verdict
 from cablejax.diagnose.diagnosis import NamedEffect, ParameterEstimate
 from cablejax.diagnose.into_simulator import params_with
@@ -35,7 +36,6 @@ from cablejax.evaluation.suite import Case, read_suite, run_suite
 from cablejax.gaplog import gap_log_from_episodes, read_gap_log, write_gap_log
 from cablejax.report.markdown import publish
 from cablejax.report.provenance import machine, versions
-from cablejax.shaping import Model, load_model, make_controller
 from cablejax.simulate import ThreadedEngine
 from cablejax.simulate.motions import MotionConfig, random_motion
 from cablejax.types import Trajectory

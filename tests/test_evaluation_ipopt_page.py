@@ -7,11 +7,11 @@ import jax.numpy as jnp
 import pytest
 
 from cablejax.bounded import BoundedQuasiNewton
+from cablejax.control.shaping import Model
 from cablejax.evaluation.against_ipopt import Contestant, explain, kept_rows, kkt_residual, meets_all
 from cablejax.evaluation.ipopt_page import ipopt_sections
 from cablejax.evaluation.planning_problems import ProblemMaker
 from cablejax.evaluation.solver_path import PathFinder
-from cablejax.shaping import Model
 from mpc_cases import planning_case, relaxing_cable
 
 RESULTS = pathlib.Path(__file__).parents[1] / "docs" / "results"

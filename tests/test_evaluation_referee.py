@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from cablejax.bounded import BoundedLevenbergMarquardt, SpectralProjectedGradient, certify
+from cablejax.control.shaping import Model
 from cablejax.evaluation.against_ipopt import comparable_seconds, kkt_residual, slopes_along
 from cablejax.evaluation.control_call import race, ratios
 from cablejax.evaluation.planning_problems import (
@@ -22,8 +23,8 @@ from cablejax.evaluation.planning_problems import (
 )
 from cablejax.evaluation.referee import Limits, RefereeConfig, referee
 from cablejax.evaluation.solver_path import PathFinder
-from cablejax.mpc import SOLVERS, Controller
-from cablejax.shaping import Model
+from cablejax.mpc import MPC, SOLVERS
+from cablejax.types import Measurement
 from mpc_cases import START, at_rest, planning_case, problem, random_motion, relaxing_cable
 
 pytest.importorskip("ipyopt")
@@ -174,12 +175,12 @@ def test_the_recorder_takes_down_what_the_controller_asks():
     case = planning_case()
     log = RecordingSolver(CONFIG.solver)
     config = dataclasses.replace(CONFIG, solver=log, horizon=STEPS - 1)
-    controller = Controller(config, relaxing_cable, jnp.asarray(0.8), case.target)
+    controller = MPC(config, relaxing_cable, jnp.asarray(0.8), case.target)
     state = controller.init(at_rest(START))
     seen = []
     for _ in range(2):
         keypoints, pose = np.asarray(state.history.keypoints[-1]), np.asarray(state.history.gripper_pose)
-        state, _, info = controller.step(state, keypoints, pose)
+        state, _, info = controller.step(state, Measurement(keypoints, pose))
         seen.append((keypoints, pose, float(info.radius)))
     jax.effects_barrier()
     assert len(log.met) == 2

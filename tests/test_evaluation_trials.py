@@ -6,7 +6,7 @@ import math
 import numpy as np
 import pytest
 
-from cablejax.batched_loop import BatchRun
+from cablejax.control.batched import BatchRun
 from cablejax.evaluation.trials import append_trial, finished_keys, read_trials, trial_of, trials_of_batch
 from evaluation_cases import TRIAL, course, trial
 

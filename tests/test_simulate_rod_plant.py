@@ -9,11 +9,11 @@ import pytest
 pytest.importorskip("elastica", reason="PyElastica is not installed: pip install pyelastica==1.0.0")
 
 from cablejax.cable import GRAVITY, Cable, Discretisation
-from cablejax.closed_loop import run_closed_loop
+from cablejax.control.loop import run_closed_loop
+from cablejax.control.targets import make_target, straight_start
 from cablejax.simulate import rod_plant
 from cablejax.simulate.elastica import elastica
 from cablejax.simulate.rod_plant import ETHERNET, USB, RodPlant, RodPlantConfig
-from cablejax.targets import make_target, straight_start
 
 CABLE = Discretisation(n_links=15, timestep=4e-4)
 CONFIG = RodPlantConfig(discretisation=CABLE)
@@ -131,7 +131,7 @@ def test_the_closed_loop_takes_it_for_a_plant():
         def init(self, history):
             return None
 
-        def step(self, state, keypoints, gripper_pose):
+        def step(self, state, measurement):
             return None, STILL, None
 
     run = run_closed_loop(

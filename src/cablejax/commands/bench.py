@@ -13,8 +13,8 @@ from cablejax.commands.options import Command, UsageError, say, text_table
 from cablejax.solver_names import SolverName
 
 if TYPE_CHECKING:
-    from cablejax.mpc import Controller
-    from cablejax.shaping import Model
+    from cablejax.control.shaping import Model
+    from cablejax.mpc import MPC
     from cablejax.types import History
 
 
@@ -139,8 +139,8 @@ class BenchMpc(Command):
         import jax
 
         from cablejax.cable import Cable
+        from cablejax.control.shaping import initial_history, load_model
         from cablejax.mpc import time_control
-        from cablejax.shaping import initial_history, load_model
 
         least = min(self.repeats, *self.batches, self.horizon + 1, self.referee + 1)
         if not self.solvers or least < 1:
@@ -274,11 +274,11 @@ class BenchLoop(Command):
         import jax
         import numpy as np
 
-        from cablejax.batched_loop import LoopConfig, MpcPolicy, shape_batch, varied_params
         from cablejax.cable import Discretisation
-        from cablejax.shaping import load_model, make_controller
+        from cablejax.control.batched import LoopConfig, shape_batch, varied_params
+        from cablejax.control.shaping import load_model, make_controller
+        from cablejax.control.targets import make_target, straight_start
         from cablejax.simulate import MjxEngine
-        from cablejax.targets import make_target, straight_start
 
         if not self.batches or min(*self.batches, self.steps, self.rounds) < 1:
             raise UsageError(
@@ -288,13 +288,13 @@ class BenchLoop(Command):
         target = make_target("S", chain.cable)
         controller = make_controller(model, target, method="residual", solver=self.solver)
         config = LoopConfig(self.steps, interval=model.config.interval, history_length=model.config.history)
-        policy, engine = MpcPolicy(controller.config, model.dynamics), MjxEngine(chain)
+        engine = MjxEngine(chain)
 
         def run(size: int):
             state = engine.initial_state(np.stack([straight_start(chain.cable)] * size))
             params = varied_params(chain, np.linspace(0.5, 2.0, size))
             goals = np.stack([target.keypoints] * size)
-            return jax.block_until_ready(shape_batch(engine, params, state, policy, model.weights, goals, config))
+            return jax.block_until_ready(shape_batch(engine, params, state, controller, goals, config))
 
         say(f"compiling the closed loop for batches of {', '.join(map(str, self.batches))} ...")
         contestants = {str(size): functools.partial(run, size) for size in self.batches}
@@ -323,33 +323,36 @@ class Bench:
     )
 
 
-def _controller(model: Model, solver: SolverName, horizon: int) -> Controller:
+def _controller(model: Model, solver: SolverName, horizon: int) -> MPC:
     """The controller with the online residual on the way to an S, with one of the solvers at its defaults."""
-    from cablejax.shaping import make_controller
-    from cablejax.targets import make_target
+    from cablejax.control.shaping import make_controller
+    from cablejax.control.targets import make_target
 
     controller = make_controller(model, make_target("S"), method="residual", solver=solver)
     return dataclasses.replace(controller, config=dataclasses.replace(controller.config, horizon=horizon))
 
 
-def _batched_ms(controller: Controller, history: History, size: int, repeats: int) -> float:
+def _batched_ms(controller: MPC, history: History, size: int, repeats: int) -> float:
     """Median wall time [ms] of one call that controls so many cables, after the one that compiles."""
     import jax
     import jax.numpy as jnp
     import numpy as np
 
+    from cablejax.types import Measurement
+
     say(f"compiling the control step for {size} cables ...")
-    step = controller.vectorised()
-    state, keypoints, pose = jax.tree.map(
+    step = jax.jit(jax.vmap(controller.step))
+    state, measurement = jax.tree.map(
         lambda leaf: jnp.broadcast_to(jnp.asarray(leaf), (size, *jnp.shape(leaf))),
-        (controller.init(history), history.keypoints[-1], history.gripper_pose),
+        (controller.init(history), Measurement(history.keypoints[-1], history.gripper_pose)),
     )
     seconds = []
     for _ in range(min(repeats, 10) + 1):
         begin = time.perf_counter()
-        state, twist, _ = jax.block_until_ready(step(state, keypoints, pose))
+        state, twist, _ = jax.block_until_ready(step(state, measurement))
         seconds.append(time.perf_counter() - begin)
-        keypoints, pose = state.predicted, pose + controller.config.objective.interval * twist
+        pose = measurement.gripper_pose + controller.config.objective.interval * twist
+        measurement = Measurement(state.last.predicted, pose)
     return 1e3 * float(np.median(seconds[1:]))
 
 

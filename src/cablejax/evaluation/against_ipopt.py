@@ -22,11 +22,11 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from cablejax.bounded import certify
+from cablejax.control.shaping import Model
 from cablejax.evaluation.planning_problems import PlanningCase, ProblemMaker, smooth_model
 from cablejax.evaluation.referee import RefereeConfig, referee, slope_of, value_of
 from cablejax.evaluation.solver_path import PathFinder, SolverPath
 from cablejax.mpc import Accurate, ShapingProblem
-from cablejax.shaping import Model
 
 EQUAL = 1e-6
 """Relative difference of objectives that counts as none."""

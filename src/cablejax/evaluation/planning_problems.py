@@ -17,19 +17,19 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from cablejax.closed_loop import run_closed_loop
+from cablejax.control.loop import run_closed_loop
+from cablejax.control.shaping import Model, NetworkDynamics
+from cablejax.control.targets import Shape
 from cablejax.dynamics.smooth import CORNER, smoothed
 from cablejax.evaluation.cases import PLANT_CHAIN, mujoco_plant
 from cablejax.evaluation.protocols import LaidOut, letter_task, random_task
 from cablejax.evaluation.referee import Limits
-from cablejax.mpc import Controller, MPCConfig, ObjectiveConfig, Plan, ShapingProblem, Solver
+from cablejax.mpc import MPC, MPCConfig, ObjectiveConfig, Plan, ShapingProblem, Solver
 from cablejax.mpc.feasible import feasible_from
-from cablejax.mpc.rollout import Rollout
+from cablejax.mpc.problem import Rollout
 from cablejax.npz import read_npz
 from cablejax.residual.corrected import Corrected
 from cablejax.residual.ridge import ResidualModel, zero_residual
-from cablejax.shaping import Model, NetworkDynamics
-from cablejax.targets import Shape
 from cablejax.types import History
 
 CONFIG = MPCConfig(objective=ObjectiveConfig(arrival_weight=0.0))
@@ -127,7 +127,7 @@ def closed_loop_cases(
             task = letter_task(shape, seed, PLANT_CHAIN)
             for ratio in ratios:
                 log.met.clear()
-                controller = Controller(config, model.dynamics, model.weights, task.target.keypoints)
+                controller = MPC(config, model.dynamics, model.weights, task.target.keypoints)
                 plant = LaidOut(mujoco_plant(ratio), task.start_shape)
                 run_closed_loop(plant, controller, task.target, steps, start=task.start_pose, record_hz=1.0)
                 jax.effects_barrier()

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from cablejax.control.shaping import Model
 from cablejax.dynamics.weights import FILE_NAME
 from cablejax.evaluation import tables
 from cablejax.evaluation.failures import failure_figure, worst
@@ -21,7 +22,6 @@ from cablejax.evaluation.suite import Case, read_suite, released, run_suite
 from cablejax.evaluation.trials import LIANG_TABLE, Trial
 from cablejax.mpc import MPCConfig
 from cablejax.report.provenance import machine, versions
-from cablejax.shaping import Model
 
 WORST = 10
 """Runs shown as pictures: the ones that ended farthest off."""

@@ -10,12 +10,12 @@ from collections.abc import Callable, Sequence
 
 from tqdm import tqdm
 
-from cablejax.closed_loop import ClosedLoopRun, run_closed_loop
+from cablejax.control.loop import ClosedLoopRun, run_closed_loop
+from cablejax.control.shaping import Model, load_model
 from cablejax.evaluation.failures import Snapshot, append_snapshot, read_snapshots, snapshot_of
 from cablejax.evaluation.methods import MethodSpec, controller_of
 from cablejax.evaluation.protocols import GuessingCable, LaidOut, Task
 from cablejax.evaluation.trials import Trial, TrialKey, append_trial, read_trials, trial_of
-from cablejax.shaping import Model, load_model
 
 PATIENCE = 12
 """Commands without any change of the error after which a trial ends: nothing more happens."""

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from cablejax.cable import Discretisation
-from cablejax.closed_loop import run_closed_loop, settling_time, shape_error_cm, step_settling_time
+from cablejax.control.loop import run_closed_loop, settling_time, shape_error_cm, step_settling_time
+from cablejax.control.targets import Target, make_target, straight_start
 from cablejax.gaplog import gap_log_from_episodes, read_gap_log, write_gap_log
 from cablejax.simulate.plant import Plant, PlantConfig
-from cablejax.targets import Target, make_target, straight_start
 
 CABLE = Discretisation(n_links=12, dimension=3, timestep=0.005)
 CONFIG = PlantConfig(discretisation=CABLE, settle_time=0.2)
@@ -32,8 +32,8 @@ class GoToPose:
         assert history.keypoints.shape == (6, 13, 2) and np.isfinite(history.keypoints).all()
         return 0
 
-    def step(self, state, keypoints, gripper_pose):
-        twist = self.pose - gripper_pose
+    def step(self, state, measurement):
+        twist = self.pose - measurement.gripper_pose
         size = np.linalg.norm(twist * [1.0, 1.0, 0.15], axis=1).max()
         return state + 1, twist * min(1.0, self.bound / max(size, 1e-12)), Info(state / 100, self.bound)
 
@@ -42,8 +42,8 @@ class GoToPose:
 class Failing(GoToPose):
     """Commands nonsense from the third step on."""
 
-    def step(self, state, keypoints, gripper_pose):
-        state, twist, info = super().step(state, keypoints, gripper_pose)
+    def step(self, state, measurement):
+        state, twist, info = super().step(state, measurement)
         return state, twist * (np.nan if state > 2 else 1.0), info
 
 
@@ -57,7 +57,7 @@ def test_a_reachable_shape_is_reached_and_recorded(tmp_path):
     assert run.terminal_error_cm < 1.0
     assert 4 < run.settling_time_s < 12
     assert run.verdict().startswith("U: reached")
-    assert run.stopped is None and run.held == 0
+    assert run.stopped is None and run.unobserved == 0
     # Commands lead from each row to the next; none was computed at the last.
     np.testing.assert_allclose(np.diff(run.gripper_pose, axis=0), run.twist[:-1], atol=1e-12)
     for rows in (run.twist.sum(axis=(1, 2)), run.residual_share, run.radius, run.mpc_ms):
@@ -112,7 +112,7 @@ def test_missing_keypoints_are_counted_and_do_not_spread():
     run = run_closed_loop(
         plant, GoToPose(target.gripper_pose), target, 2, start=straight_start(CABLE.cable), record_hz=1.0
     )
-    assert run.held == np.isnan(run.keypoints[..., 0]).sum() > 0
+    assert run.unobserved == np.isnan(run.keypoints[..., 0]).sum() > 0
     assert np.isfinite(run.error_cm).all()
 
 

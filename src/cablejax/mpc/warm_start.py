@@ -1,4 +1,4 @@
-"""Where a solver may begin: the last plan, the straight way to where the target's ends are held, and holding still."""
+"""Warm start of a solver: the last plan, the straight way to the target poses of the grippers, and holding still."""
 
 from __future__ import annotations
 
@@ -9,9 +9,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from cablejax.mpc.config import MPCConfig
-from cablejax.mpc.goal import continued, goal_pose, straight_plan, straightened, way_to
-from cablejax.mpc.problem import ShapingProblem
-from cablejax.mpc.rollout import Rollout
+from cablejax.mpc.problem import Rollout, ShapingProblem
+from cablejax.mpc.target_pose import continued, straight_plan, straightened, target_pose, way_to
 
 
 class StraightWay(NamedTuple):
@@ -50,7 +49,7 @@ def find_starts(config: MPCConfig, problem: ShapingProblem, last: Float[Array, "
         problem: of this step.
         last: the last plan, its first command executed [m].
     """
-    to_target = _straight_way(config, problem, goal_pose(problem.target))
+    to_target = _straight_way(config, problem, target_pose(problem.target))
     apart = straightened(problem.target, config.max_distance * config.cable_length)
     to_straight = _straight_way(config, problem, apart)
     still = jnp.zeros_like(last)
@@ -68,9 +67,9 @@ def find_starts(config: MPCConfig, problem: ShapingProblem, last: Float[Array, "
     return Starts(guess, still, values[2], to_straight._replace(motion=allowed[2]))
 
 
-def _straight_way(config: MPCConfig, problem: ShapingProblem, goal: Float[Array, "2 3"]) -> StraightWay:
+def _straight_way(config: MPCConfig, problem: ShapingProblem, to: Float[Array, "2 3"]) -> StraightWay:
     """From where the grippers are to a pair of poses, within the bound on a step and no other."""
     pose = continued(problem.history.gripper_pose, problem.history.keypoints[-1])
     weight = config.objective.rotation_weight
-    motion = straight_plan(pose, goal, problem.feasible.radius, weight, config.n_commands)
-    return StraightWay(motion, jnp.linalg.norm(way_to(pose, goal, weight), axis=1).max())
+    motion = straight_plan(pose, to, problem.feasible.radius, weight, config.n_commands)
+    return StraightWay(motion, jnp.linalg.norm(way_to(pose, to, weight), axis=1).max())

@@ -1,4 +1,4 @@
-"""A plan without a model: both grippers on straight lines to where the target's ends are held.
+"""Target pose of the grippers, and a plan without a model: both grippers on straight lines to it.
 
 A local solver started from the last plan can stay in a valley: between an arch and an S, say, the shape error hardly
 falls for several steps. This plan crosses such ridges, and is a guess for the solver, not a command.
@@ -24,7 +24,7 @@ def total_turn(keypoints: Float[Array, "N 2"]) -> Float[Array, ""]:
     return jnp.sum(turns) + 0.5 * (turns[0] + turns[-1])
 
 
-def goal_pose(target: Float[Array, "N 2"]) -> Float[Array, "2 3"]:
+def target_pose(target: Float[Array, "N 2"]) -> Float[Array, "2 3"]:
     """(x, y, theta) of the two grippers in a target shape; theta of the second continues that of the first."""
     chord = target[1] - target[0]
     first = jnp.arctan2(chord[1], chord[0]) - 0.5 * _turns(target)[0]
@@ -52,27 +52,27 @@ def continued(pose: Float[Array, "2 3"], keypoints: Float[Array, "N 2"]) -> Floa
     return pose.at[1, 2].add(2 * jnp.pi * jnp.round((total_turn(keypoints) - turn) / (2 * jnp.pi)))
 
 
-def way_to(pose: Float[Array, "2 3"], goal: Float[Array, "2 3"], rotation_weight: float) -> Float[Array, "2 3"]:
+def way_to(pose: Float[Array, "2 3"], target: Float[Array, "2 3"], rotation_weight: float) -> Float[Array, "2 3"]:
     """The motion [m] from one pair of poses to another, both `continued` along their cable. Of the ways, which differ
     by whole turns of both grippers together, the shortest."""
-    way = goal - pose
+    way = target - pose
     whole_turns = 2 * jnp.pi * jnp.round(jnp.mean(way[:, 2]) / (2 * jnp.pi))
     return jnp.concatenate([way[:, :2], rotation_weight * (way[:, 2:] - whole_turns)], axis=1)
 
 
 def straight_plan(
-    pose: Float[Array, "2 3"], goal: Float[Array, "2 3"], radius: Float[Array, ""], rotation_weight: float, steps: int
+    pose: Float[Array, "2 3"], target: Float[Array, "2 3"], radius: Float[Array, ""], rotation_weight: float, steps: int
 ) -> Float[Array, "T 2 3"]:
-    """Motions [m] (see `feasible`) that bring both grippers to `goal` together, as fast as the step bound allows.
+    """Motions [m] (see `feasible`) that bring both grippers to `target` together, as fast as the step bound allows.
 
     Args:
         pose: where the grippers are, (x, y, theta), the second's theta `continued` from the first.
-        goal: where they shall be, likewise, see `way_to`.
+        target: where they shall be, likewise, see `way_to`.
         radius: bound on the norm of each gripper's motion in each step [m].
         rotation_weight: w [m/rad].
         steps: T; the rest of the way lies beyond the plan, and steps after the arrival are 0.
     """
-    way = way_to(pose, goal, rotation_weight)
+    way = way_to(pose, target, rotation_weight)
     longest = jnp.maximum(jnp.linalg.norm(way, axis=1).max(), 1e-9)
     fraction = jnp.minimum(radius / longest, 1.0)
     done = jnp.minimum(fraction * jnp.arange(steps + 1), 1.0)

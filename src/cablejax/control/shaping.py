@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import Literal, get_args
 
 import jax.numpy as jnp
 import numpy as np
@@ -11,25 +12,26 @@ from jaxtyping import Array, Float
 
 from cablejax.adaptation.belief import AdaptationConfig
 from cablejax.cable import Cable
-from cablejax.closed_loop import ClosedLoopRun, run_closed_loop
+from cablejax.control.loop import ClosedLoopRun, run_closed_loop
+from cablejax.control.targets import Target, straight_start
 from cablejax.dynamics.config import ModelConfig
 from cablejax.dynamics.model import apply
 from cablejax.dynamics.rough import roughened
 from cablejax.dynamics.weights import load_weights
-from cablejax.mpc import SOLVERS, Controller, MPCConfig
+from cablejax.mpc import MPC, SOLVERS, MPCConfig
 from cablejax.perceive.camera import CameraConfig
 from cablejax.perceive.plant import CloudPlant
-from cablejax.report.record import Method
 from cablejax.residual import Dynamics
 from cablejax.residual.jacobian import StepJacobian, reverse
 from cablejax.simulate.elastica import elastica
 from cablejax.simulate.plant import Plant, PlantConfig
 from cablejax.solver_names import SolverName
-from cablejax.targets import Target, straight_start
 from cablejax.types import History
 
-METHODS: tuple[Method, ...] = ("residual", "direct")
-"""With the online residual, and without."""
+Method = Literal["residual", "direct"]
+"""The learned model with the online residual, or as it was trained."""
+
+METHODS: tuple[Method, ...] = get_args(Method)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -84,7 +86,7 @@ def load_model(name: str) -> Model:
     return Model(name, config, NetworkDynamics(graphdef), weights)
 
 
-def make_controller(model: Model, target: Target, *, method: Method, solver: SolverName) -> Controller:
+def make_controller(model: Model, target: Target, *, method: Method, solver: SolverName) -> MPC:
     """The controller for one target, with or without the online residual; a conditioned model adapts in any case."""
     config = MPCConfig(
         cable_length=model.config.length,
@@ -93,7 +95,7 @@ def make_controller(model: Model, target: Target, *, method: Method, solver: Sol
     )
     if method == "direct":
         config = dataclasses.replace(config, residual=None)
-    return Controller(config, model.dynamics, model.weights, target.keypoints)
+    return MPC(config, model.dynamics, model.weights, target.keypoints)
 
 
 def initial_history(cable: Cable, config: ModelConfig) -> History:
@@ -125,7 +127,7 @@ def shape_once(
         method: with the online residual, or without.
         solver: how plans are found.
         steps: commands.
-        camera: what the cable is seen with; None = its keypoints are told.
+        camera: what the cable is seen with; None = the controller observes the simulated keypoints directly.
 
     Raises:
         ValueError: the plant's cable is not the one that the model was made for.

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from cablejax.cable import Cable
+from cablejax.control.targets import load_target, make_target, straight_start, target_from_keypoints
 from cablejax.simulate.elastica import solve_elastica
-from cablejax.targets import load_target, make_target, straight_start, target_from_keypoints
 
 CABLE = Cable()
 

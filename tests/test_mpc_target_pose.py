@@ -6,14 +6,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from cablejax.mpc.goal import continued, goal_pose, straight_plan, straightened, total_turn
-from cablejax.targets import make_target
+from cablejax.control.targets import make_target
+from cablejax.mpc.target_pose import continued, straight_plan, straightened, target_pose, total_turn
 
 
 @pytest.mark.parametrize("shape", ["U", "S", "Z"])
 def test_goal_is_where_the_target_is_held(shape):
     target = make_target(shape)
-    goal = np.asarray(goal_pose(jnp.asarray(target.keypoints)))
+    goal = np.asarray(target_pose(jnp.asarray(target.keypoints)))
     np.testing.assert_allclose(goal[:, :2], target.gripper_pose[:, :2], atol=1e-6)
     turn = (goal[:, 2] - target.gripper_pose[:, 2] + np.pi) % (2 * np.pi) - np.pi
     assert np.abs(turn).max() < 0.15, "the tangent is extrapolated from chords of 8 cm"
@@ -48,7 +48,7 @@ def test_turn_is_read_off_the_keypoints_whole_turns_included(turn):
     assert float(total_turn(keypoints)) == pytest.approx(turn, abs=0.03)
     pose = jnp.array([[0.0, 0.0, 0.3], [0.5, 0.0, 0.3 + turn - 4 * np.pi]])
     assert float(continued(pose, keypoints)[1, 2]) == pytest.approx(0.3 + turn, abs=1e-5)
-    goal = np.asarray(goal_pose(keypoints))
+    goal = np.asarray(target_pose(keypoints))
     np.testing.assert_allclose(goal[:, 2], [0.3, 0.3 + turn], atol=0.03)
 
 

@@ -1,9 +1,9 @@
 """The whole closed loop as one compiled call: many cables, each with its own target, shaped side by side.
 
 Plant (the MJX engine), camera, model, residual and controller are pure functions, so one trial is a `lax.scan` over
-its control steps and a table of trials is its `vmap`. What `closed_loop.run_closed_loop` does with one cable in Python,
-this does with a batch on an accelerator. The plant is the planar simulator here; the contact plant in C MuJoCo, which
-the model has never seen, stays the reference.
+its control steps and a table of trials is its `vmap`. It runs the same controllers as `control.loop.run_closed_loop`,
+but a batch of cables on an accelerator instead of one cable in Python. The plant is the planar simulator here; the
+contact plant in C MuJoCo, which the model has never seen, stays the reference.
 """
 
 from __future__ import annotations
@@ -11,8 +11,9 @@ from __future__ import annotations
 import dataclasses
 import functools
 from collections.abc import Sequence
-from typing import Any, Protocol
+from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -20,54 +21,12 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Float, Int
 
 from cablejax.cable import Discretisation
-from cablejax.closed_loop import settling_time
+from cablejax.control.loop import Controller, settling_time
 from cablejax.effects.physics import Physics, nominal_physics
-from cablejax.mpc import ControlInfo, ControllerState, MPCConfig, control, initial_state
-from cablejax.residual.jacobian import Dynamics
 from cablejax.simulate.compile import compiler_options
 from cablejax.simulate.mjx_engine import MjxEngine
 from cablejax.simulate.table_plant import check_camera
-from cablejax.types import CableState, History
-
-
-class Policy(Protocol):
-    """A controller as two pure functions; hashable, since what it is is compiled in."""
-
-    def begin(self, history: History) -> Any:
-        """Its state before the first step."""
-        ...
-
-    def act(
-        self,
-        weights: Any,
-        target: Float[Array, "N 2"],
-        state: Any,
-        keypoints: Float[Array, "N 2"],
-        gripper_pose: Float[Array, "Q 3"],
-    ) -> tuple[Any, Float[Array, "Q 3"], Any]:
-        """Its next state, the twist to hold and a report, of which `residual_share` and `radius` are recorded."""
-        ...
-
-
-@dataclasses.dataclass(frozen=True)
-class MpcPolicy:
-    """The model predictive controller.
-
-    Attributes:
-        config: its settings.
-        dynamics: the offline model `(weights, history, twist) -> displacement`.
-    """
-
-    config: MPCConfig
-    dynamics: Dynamics
-
-    def begin(self, history: History) -> ControllerState:
-        """See `mpc.initial_state`."""
-        return initial_state(self.config, history)
-
-    def act(self, weights, target, state, keypoints, gripper_pose) -> tuple[ControllerState, Array, ControlInfo]:
-        """See `mpc.control`."""
-        return control(self.config, self.dynamics, weights, target, state, keypoints, gripper_pose)
+from cablejax.types import CableState, History, Measurement
 
 
 @dataclasses.dataclass(frozen=True)
@@ -125,7 +84,7 @@ class BatchRun:
         return np.asarray(self.error_cm[:, -1])
 
     def settling_time_s(self, interval: float = 1.0) -> Float[np.ndarray, " B"]:
-        """See `closed_loop.settling_time` [s]; infinite for a trial that never settled."""
+        """See `control.loop.settling_time` [s]; infinite for a trial that never settled."""
         errors = np.asarray(self.error_cm, float)
         times = interval * np.arange(errors.shape[1])
         return np.array([settling_time(times, error) for error in errors])
@@ -135,27 +94,25 @@ def shape_batch(
     engine: MjxEngine,
     params: Physics,
     state: CableState,
-    policy: Policy,
-    weights: Any,
+    controller: Controller,
     targets: Float[Array | np.ndarray, "B N 2"],
     config: LoopConfig,
     *,
     seeds: Int[np.ndarray, " B"] | None = None,
-    stacked_weights: bool = False,
+    stacked: bool = False,
     devices: Sequence[jax.Device] | None = None,  # pyright: ignore[reportInvalidTypeForm]
 ) -> BatchRun:
-    """Shapes B cables side by side, in one compiled call; it compiles anew for another batch size or configuration.
+    """Shapes B cables side by side, in one compiled call; another batch size or configuration compiles again.
 
     Args:
         engine: the plant, planar.
         params: of each cable, every leaf with a leading axis B; see `varied_params`.
         state: where each cable starts, likewise: `engine.initial_state` of stacked gripper poses.
-        policy: the controller, the same for all.
-        weights: its arrays, shared by all trials.
+        controller: a pytree with a leaf `target`, which is replaced by each trial's own; its other leaves are shared.
         targets: desired keypoints [m], shape [B, N, 2].
         config: length, timing and camera of the trials.
         seeds: of each trial's noise and gaps; by default 0, 1, ...
-        stacked_weights: the weights' leaves have a leading axis B too: every trial has a model of its own.
+        stacked: the controller's other leaves have a leading axis B too: every trial has weights of its own.
         devices: to spread the batch over; by default the one on which the arguments are.
 
     Raises:
@@ -169,17 +126,22 @@ def shape_batch(
         )
     engine.substeps(config.interval)
     seeds = np.arange(size) if seeds is None else np.asarray(seeds)
-    batch = (params, state, jnp.asarray(targets, float), seeds)
-    if stacked_weights:
-        batch = (*batch, weights)
+    controllers = _with_target(controller, jnp.asarray(targets, float))
+    batched = _with_target(jax.tree.map(lambda _: stacked, controller), True)
+    own, shared = eqx.partition(controllers, batched)
+    batch = (params, state, own, seeds)
     lengths = {np.shape(leaf)[:1] for leaf in jax.tree.leaves(batch)}
     if lengths != {(size,)}:
         raise ValueError(f"The leading axes are {sorted(lengths)}, expected {size}, the number of targets, everywhere.")
     if devices is not None:
-        batch, weights = _spread(batch, weights, size, devices)
-    shared = None if stacked_weights else weights
-    run = _compiled_batch(engine, policy, config, stacked_weights)(shared, *batch)
+        batch, shared = _spread(batch, shared, size, devices)
+    run = _compiled_batch(engine, config)(shared, *batch)
     return run if devices is None else jax.tree.map(lambda leaf: leaf[:size], run)
+
+
+def _with_target(controller: Any, target: Any) -> Any:
+    """The same pytree with another leaf for its target."""
+    return eqx.tree_at(lambda controller: controller.target, controller, target)
 
 
 def varied_params(config: Discretisation, stiffness_ratio: Float[np.ndarray, " B"]) -> Physics:
@@ -189,35 +151,26 @@ def varied_params(config: Discretisation, stiffness_ratio: Float[np.ndarray, " B
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *one)
 
 
-def _spread(batch, weights, size: int, devices: Sequence[jax.Device]):  # pyright: ignore[reportInvalidTypeForm]
-    """The batch in equal shares on all devices, padded by copies of its last trial, and the weights on each."""
+def _spread(batch, shared, size: int, devices: Sequence[jax.Device]):  # pyright: ignore[reportInvalidTypeForm]
+    """The batch in equal shares on all devices, padded by copies of its last trial, and what is shared on each."""
     width = -(-size // len(devices)) * len(devices)
     rows = np.minimum(np.arange(width), size - 1)
     mesh = Mesh(np.array(devices), ("trial",))
     split, whole = NamedSharding(mesh, PartitionSpec("trial")), NamedSharding(mesh, PartitionSpec())
     batch = jax.tree.map(lambda leaf: jax.device_put(np.asarray(leaf)[rows], split), batch)
-    return batch, jax.tree.map(lambda leaf: jax.device_put(leaf, whole), weights)
+    return batch, jax.tree.map(lambda leaf: jax.device_put(leaf, whole), shared)
 
 
 @functools.lru_cache(maxsize=16)
-def _compiled_batch(engine: MjxEngine, policy: Policy, config: LoopConfig, stacked_weights: bool):
-    def one(shared, params, state, target, seed, own=None):
-        weights = own if stacked_weights else shared
-        return _one_trial(engine, policy, config, weights, params, state, target, seed)
+def _compiled_batch(engine: MjxEngine, config: LoopConfig):
+    def one(shared, params, state, own, seed):
+        return _one_trial(engine, config, eqx.combine(own, shared), params, state, seed)
 
-    axes = (None, 0, 0, 0, 0) + (0,) * stacked_weights
-    return jax.jit(jax.vmap(one, in_axes=axes), compiler_options=compiler_options())
+    return jax.jit(jax.vmap(one, in_axes=(None, 0, 0, 0, 0)), compiler_options=compiler_options())
 
 
 def _one_trial(
-    engine: MjxEngine,
-    policy: Policy,
-    config: LoopConfig,
-    weights: Any,
-    params: Physics,
-    cable: CableState,
-    target: Float[Array, "N 2"],
-    seed: Int[Array, ""],
+    engine: MjxEngine, config: LoopConfig, controller: Any, params: Physics, cable: CableState, seed: Int[Array, ""]
 ) -> BatchRun:
     key = jax.random.key(seed)
     still = jnp.zeros((config.rest, *cable.gripper_pose.shape), cable.qpos.dtype)
@@ -227,20 +180,20 @@ def _one_trial(
 
     def step(carry, index):
         cable, state, keypoints = carry
-        state, twist, info = policy.act(weights, target, state, keypoints, cable.gripper_pose)
+        state, twist, info = controller.step(state, Measurement(keypoints, cable.gripper_pose))
         cable, shown = engine.unroll(params, cable, twist[None], config.interval)
         keypoints = _observed(config, jax.random.fold_in(key, index), shown.keypoints[-1])
         report = [jnp.asarray(getattr(info, name, jnp.nan), keypoints.dtype) for name in ("residual_share", "radius")]
         return (cable, state, keypoints), (keypoints, cable.gripper_pose, twist, *report)
 
-    carry = (cable, policy.begin(history), first)
+    carry = (cable, controller.init(history), first)
     _, (keypoints, pose, twist, share, radius) = jax.lax.scan(step, carry, jnp.arange(config.steps))
     keypoints = jnp.concatenate([first[None], keypoints])
     return BatchRun(
         keypoints=keypoints,
         gripper_pose=jnp.concatenate([cable.gripper_pose[None], pose]),
         twist=twist,
-        error_cm=_shape_error_cm(keypoints, target),
+        error_cm=_shape_error_cm(keypoints, controller.target),
         residual_share=share,
         radius=radius,
     )
@@ -264,6 +217,6 @@ def _observed(config: LoopConfig, key: Array, keypoints: Float[Array, "N 2"]) ->
 
 
 def _shape_error_cm(keypoints: Float[Array, "T N 2"], target: Float[Array, "N 2"]) -> Float[Array, " T"]:
-    """`closed_loop.shape_error_cm`; the held ends are always seen unless the simulation diverged."""
+    """`control.loop.shape_error_cm`; the held ends are always seen unless the simulation diverged."""
     squared = ((keypoints - target) ** 2).sum(axis=-1)
     return 100.0 * jnp.sqrt(jnp.nanmean(squared, axis=-1))

@@ -11,18 +11,19 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from cablejax.batched_loop import LoopConfig, MpcPolicy, shape_batch, varied_params
+from cablejax.bounded import Result
 from cablejax.cable import Cable, Discretisation
-from cablejax.closed_loop import run_closed_loop
+from cablejax.control.batched import LoopConfig, shape_batch, varied_params
+from cablejax.control.loop import run_closed_loop
+from cablejax.control.shaping import NetworkDynamics, load_model, make_controller
+from cablejax.control.targets import Target, make_target, straight_start
 from cablejax.effects.physics import Physics
-from cablejax.mpc import Controller, MPCConfig, Outcome, Plan
-from cablejax.mpc.goal import goal_pose
-from cablejax.shaping import NetworkDynamics, load_model, make_controller
+from cablejax.mpc import MPC, MPCConfig, Plan
+from cablejax.mpc.target_pose import target_pose
 from cablejax.simulate import MjxEngine
 from cablejax.simulate.engine_plant import EnginePlant
 from cablejax.simulate.plant import Plant, PlantConfig
 from cablejax.simulate.table_plant import PlantError
-from cablejax.targets import Target, make_target, straight_start
 from cablejax.types import History
 from dynamics_cases import SMALL, network
 
@@ -36,32 +37,21 @@ class Info:
     radius: jax.Array
 
 
+@jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class GoToTarget:
-    """Moves the grippers straight to the target's; its state counts the commands, its weight is the speed."""
+    """Moves the grippers straight to the target's; its state counts the commands."""
 
-    def begin(self, history: History):
+    target: jax.Array
+    speed: jax.Array | float
+
+    def init(self, history: History):
         return jnp.zeros((), jnp.int32)
 
-    def act(self, weights, target, state, keypoints, gripper_pose):
-        way = goal_pose(target) - gripper_pose
+    def step(self, state, measurement):
+        way = target_pose(jnp.asarray(self.target)) - measurement.gripper_pose
         size = jnp.linalg.norm(way * jnp.array([1.0, 1.0, 0.15]), axis=1).max()
-        return state + 1, way * jnp.minimum(1.0, weights / jnp.maximum(size, 1e-9)), Info(0.01 * state)
-
-
-@dataclasses.dataclass(frozen=True)
-class Alone:
-    """A policy as `run_closed_loop` takes it."""
-
-    policy: GoToTarget
-    weights: float
-    target: np.ndarray
-
-    def init(self, history):
-        return self.policy.begin(history)
-
-    def step(self, state, keypoints, gripper_pose):
-        return self.policy.act(self.weights, self.target, state, keypoints, gripper_pose)
+        return state + 1, way * jnp.minimum(1.0, self.speed / jnp.maximum(size, 1e-9)), Info(0.01 * state)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -70,7 +60,7 @@ class OneGradientStep:
 
     def __call__(self, problem, guess):
         motion = problem.feasible.project(guess.motion - 0.1 * jax.grad(problem.value)(guess.motion))
-        return Plan(motion, problem.value(motion), jnp.ones((), jnp.int32), jnp.full((), Outcome.STEP_LIMIT, jnp.int32))
+        return Plan(motion, problem.value(motion), jnp.ones((), jnp.int32), jnp.full((), Result.STEP_LIMIT, jnp.int32))
 
 
 def targets(letters: str) -> list[Target]:
@@ -78,7 +68,7 @@ def targets(letters: str) -> list[Target]:
 
 
 def arguments(letters="USU", ratios=RATIOS):
-    """Plant, cables, and where they start; the policy, weights, targets and config follow."""
+    """Plant, cables, and where they start; controller, targets and config follow."""
     starts = np.stack([straight_start(CABLE.cable)] * len(letters))
     return ENGINE, varied_params(CABLE, ratios), ENGINE.initial_state(starts)
 
@@ -99,12 +89,13 @@ def alone(controller, params: Physics, target: Target, steps: int, history_lengt
 
 
 def test_a_batch_of_loops_equals_each_loop_alone():
-    policy, config, letters = GoToTarget(), LoopConfig(steps=6), "USU"
+    config, letters = LoopConfig(steps=6), "USU"
+    controller = GoToTarget(shapes("U")[0], 0.05)
     engine, params, state = arguments(letters)
-    run = shape_batch(engine, params, state, policy, 0.05, shapes(letters), config)
+    run = shape_batch(engine, params, state, controller, shapes(letters), config)
     assert run.keypoints.shape == (3, 7, 5, 2) and run.twist.shape == (3, 6, 2, 3)
     for i, target in enumerate(targets(letters)):
-        one = alone(Alone(policy, 0.05, target.keypoints), member(params, i), target, 6)
+        one = alone(GoToTarget(target.keypoints, 0.05), member(params, i), target, 6)
         np.testing.assert_allclose(run.keypoints[i], one.keypoints, atol=1e-6)
         np.testing.assert_allclose(run.gripper_pose[i], one.gripper_pose, atol=1e-6)
         np.testing.assert_allclose(run.twist[i], one.twist[:-1], atol=1e-6)
@@ -112,7 +103,7 @@ def test_a_batch_of_loops_equals_each_loop_alone():
         assert run.settling_time_s()[i] == one.settling_time_s
     assert (run.error_cm[:, -1] < 0.7 * run.error_cm[:, 0]).all()
     np.testing.assert_allclose(run.radius, np.tile(0.01 * np.arange(6), (3, 1)), atol=1e-6)
-    assert np.isnan(run.residual_share).all()  # this policy reports none
+    assert np.isnan(run.residual_share).all()  # this controller reports none
     # The stiffness is in the plant: two cables with the same target part by more than rounding.
     assert np.abs(run.keypoints[0] - run.keypoints[2]).max() > 1e-4
 
@@ -121,10 +112,10 @@ def test_trials_have_their_own_noise_gaps_and_models():
     letters = "UUU"
     config = LoopConfig(steps=4, keypoint_noise=0.002, keypoint_dropout=0.4)
     engine, params, state = arguments(letters, np.ones(3))
-    speeds = jnp.array([0.0, 0.0, 0.02])  # as weights
+    speeds = jnp.array([0.0, 0.0, 0.02])
     run = shape_batch(
-        engine, params, state, GoToTarget(), speeds, shapes(letters), config,
-        seeds=np.array([4, 4, 5]), stacked_weights=True,
+        engine, params, state, GoToTarget(shapes(letters), speeds), shapes(letters), config,
+        seeds=np.array([4, 4, 5]), stacked=True,
     )  # fmt: skip
     size = jnp.linalg.norm(run.twist * jnp.array([1.0, 1.0, 0.15]), axis=-1).max(axis=(1, 2))
     np.testing.assert_allclose(size, speeds, rtol=1e-5)
@@ -147,11 +138,10 @@ def test_the_controller_in_a_batch_equals_the_controller_alone():
     config, dynamics = MPCConfig(horizon=1, solver=OneGradientStep()), NetworkDynamics(graphdef)
     engine, params, state = arguments("SU", np.array([2.0, 0.5]))
     loop = LoopConfig(steps=5, history_length=SMALL.history)
-    run = shape_batch(engine, params, state, MpcPolicy(config, dynamics), weights, shapes("SU"), loop)
     target = targets("SU")[1]
-    one = alone(
-        Controller(config, dynamics, weights, target.keypoints), member(params, 1), target, 5, SMALL.history
-    )  # fmt: skip
+    controller = MPC(config, dynamics, weights, target.keypoints)
+    run = shape_batch(engine, params, state, controller, shapes("SU"), loop)
+    one = alone(controller, member(params, 1), target, 5, SMALL.history)
     np.testing.assert_allclose(run.keypoints[1], one.keypoints, atol=3e-6)
     np.testing.assert_allclose(run.twist[1], one.twist[:-1], atol=3e-6)
     np.testing.assert_allclose(run.radius[1], one.radius[:-1], atol=1e-6)
@@ -165,8 +155,9 @@ def test_two_devices_shape_as_one(tmp_path):
     code = """
 import sys; sys.path.insert(0, {folder!r})
 import jax, numpy as np
-from test_batched_loop import *
-run = shape_batch(*arguments("USU"), GoToTarget(), 0.05, shapes("USU"), LoopConfig(steps=3), devices=jax.devices())
+from test_control_batched import *
+controller = GoToTarget(shapes("U")[0], 0.05)
+run = shape_batch(*arguments("USU"), controller, shapes("USU"), LoopConfig(steps=3), devices=jax.devices())
 print(jax.device_count()); np.save({path!r}, run.keypoints)
 """
     results = []
@@ -195,10 +186,9 @@ def test_the_batch_ends_where_the_contact_plant_ends():
     engine, model, target = MjxEngine(cable), load_model("gns-reference"), make_target("U", cable.cable)
     controller = make_controller(model, target, method="residual", solver="trust-region")
     state = engine.initial_state(np.stack([straight_start(cable.cable)] * 2))
-    policy = MpcPolicy(controller.config, model.dynamics)
     goals = np.stack([target.keypoints] * 2)
     run = shape_batch(
-        engine, varied_params(cable, ratios), state, policy, model.weights, goals, LoopConfig(steps=steps)
+        engine, varied_params(cable, ratios), state, controller, goals, LoopConfig(steps=steps)
     )  # fmt: skip
     fine = Discretisation(n_links=24, dimension=3, timestep=0.005)
     for i, ratio in enumerate(ratios):
@@ -210,13 +200,13 @@ def test_the_batch_ends_where_the_contact_plant_ends():
 
 def test_wrong_requests_are_refused():
     engine, params, state = arguments("UU", np.ones(2))
-    rest = (GoToTarget(), 0.05)
+    controller = GoToTarget(shapes("U")[0], 0.05)
     with pytest.raises(ValueError, match=r"Targets of shape \(2, 5\)"):
-        shape_batch(engine, params, state, *rest, shapes("UU")[:, :, 0], LoopConfig(steps=1))
+        shape_batch(engine, params, state, controller, shapes("UU")[:, :, 0], LoopConfig(steps=1))
     with pytest.raises(ValueError, match="expected 1, the number of targets"):
-        shape_batch(engine, params, state, *rest, shapes("U"), LoopConfig(steps=1))
+        shape_batch(engine, params, state, controller, shapes("U"), LoopConfig(steps=1))
     with pytest.raises(ValueError, match="multiple of the time step"):
-        shape_batch(engine, params, state, *rest, shapes("UU"), LoopConfig(steps=1, interval=0.015))
+        shape_batch(engine, params, state, controller, shapes("UU"), LoopConfig(steps=1, interval=0.015))
     for wrong in ({"steps": 0}, {"steps": 1, "keypoint_dropout": 1.0}, {"steps": 1, "keypoint_noise": -1.0}):
         with pytest.raises(ValueError, match="LoopConfig"):
             LoopConfig(**wrong)

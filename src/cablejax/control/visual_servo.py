@@ -21,17 +21,17 @@ is shortened as a whole to the largest allowed motion and projected onto the set
 from __future__ import annotations
 
 import dataclasses
-import math
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from cablejax.mpc.edge import check_observation, check_start, check_target
 from cablejax.mpc.feasible import feasible_from
 from cablejax.mpc.problem import ObjectiveConfig
-from cablejax.types import History
+from cablejax.mpc.validation import check_history, check_measurement, check_positive, check_target
+from cablejax.types import History, Measurement
 
 
 @dataclasses.dataclass(frozen=True)
@@ -73,13 +73,8 @@ class ServoConfig:
     interval: float = 1.0
 
     def __post_init__(self):
-        for name in (
-            *("cable_length", "radius", "damping", "regularisation", "outlier", "probe"),
-            *("rotation_weight", "interval"),
-        ):
-            value = getattr(self, name)
-            if not (math.isfinite(value) and value > 0):
-                raise ValueError(f"ServoConfig.{name} is {value}, expected a positive finite number.")
+        check_positive(self, "cable_length", "radius", "damping", "regularisation", "outlier", "probe")
+        check_positive(self, "rotation_weight", "interval")
         for name in ("gain", "forgetting"):
             if not 0 < getattr(self, name) <= 1:
                 raise ValueError(f"ServoConfig.{name} is {getattr(self, name)}, expected a number in (0, 1].")
@@ -112,7 +107,7 @@ class ServoState:
         gripper_pose: last measured pose, shape [Q, 3].
         motion: the last command [m], shape [Q, 3].
         steps: control steps so far, shape [].
-        held: keypoint observations missing so far, shape [].
+        unobserved: keypoint observations missing so far, shape [].
     """
 
     jacobian: Float[Array, "*batch N 2 R"]
@@ -124,7 +119,7 @@ class ServoState:
     gripper_pose: Float[Array, "*batch Q 3"]
     motion: Float[Array, "*batch Q 3"]
     steps: Int[Array, "*batch"]
-    held: Int[Array, "*batch"]
+    unobserved: Int[Array, "*batch"]
 
 
 @jax.tree_util.register_dataclass
@@ -138,7 +133,7 @@ class ServoInfo:
         fit_error: root mean square distance of the keypoints from what J expected of the last command [m].
         probing: whether the command belongs to the motions of the beginning.
         radius: bound on one step's motion [m].
-        held: keypoints not observed now, replaced by their prediction.
+        unobserved: keypoints not observed now, replaced by their prediction.
     """
 
     shape_error: Float[Array, "*batch"]
@@ -146,11 +141,10 @@ class ServoInfo:
     fit_error: Float[Array, "*batch"]
     probing: Bool[Array, "*batch"]
     radius: Float[Array, "*batch"]
-    held: Int[Array, "*batch"]
+    unobserved: Int[Array, "*batch"]
 
 
-def initial_state(config: ServoConfig, history: History) -> ServoState:
-    """State before the first step, with a Jacobian of zeros: nothing is known about the cable. Pure, vmappable."""
+def _initial_state(config: ServoConfig, history: History) -> ServoState:
     keypoints = history.keypoints[-1]
     n_keypoints, dtype = keypoints.shape[0], keypoints.dtype
     return ServoState(
@@ -163,32 +157,59 @@ def initial_state(config: ServoConfig, history: History) -> ServoState:
         gripper_pose=history.gripper_pose,
         motion=jnp.zeros_like(history.gripper_pose),
         steps=jnp.zeros((), jnp.int32),
-        held=jnp.zeros((), jnp.int32),
+        unobserved=jnp.zeros((), jnp.int32),
     )
 
 
-def servo(
-    config: ServoConfig,
-    target: Float[Array | np.ndarray, "N 2"],
-    state: ServoState,
-    keypoints: Float[Array | np.ndarray, "N 2"],
-    gripper_pose: Float[Array | np.ndarray, "Q 3"],
-) -> tuple[ServoState, Float[Array, "Q 3"], ServoInfo]:
-    """One step of the visual servo as a pure function; vmap it over everything but `config` for many cables.
+class VisualServo(eqx.Module):
+    """Controller without a model: `init` once, then `step` at every control interval.
 
-    Args:
-        config: settings; static.
+    Both are pure and may be called inside compiled code. The object is a pytree: vmap over the states for many cables,
+    over `target` as well for one target each.
+
+    Attributes:
+        config: see `ServoConfig`; static.
         target: desired keypoints [m], shape [N, 2].
-        state: from the last step.
-        keypoints: observed now [m]; a keypoint with a NaN counts as not observed, shape [N, 2].
-        gripper_pose: measured now; NaN = not measured, shape [Q, 3].
 
-    Returns:
-        The state for the next step, the twist to hold until then (finite and within all bounds) and the report.
+    Raises:
+        ValueError: if the target is not an array of finite keypoints.
     """
+
+    config: ServoConfig = eqx.field(static=True)
+    target: Float[Array | np.ndarray, "*batch N 2"]
+
+    def __check_init__(self):
+        check_target(self.target)
+
+    def init(self, history: History) -> ServoState:
+        """State for a cable seen at rest, with a Jacobian of zeros; only the newest sample of the history is used.
+
+        Raises:
+            ValueError: if the history is empty, not finite or not of floating-point numbers, or has another number of
+                keypoints than the target.
+        """
+        check_history(self.target, history)
+        return _initial_state(self.config, jax.tree.map(jnp.asarray, history))
+
+    def step(self, state: ServoState, measurement: Measurement) -> tuple[ServoState, Float[Array, "Q 3"], ServoInfo]:
+        """One control step, compiled at its first call: the next state, the twist to hold until then, the report.
+
+        Raises:
+            ValueError: if the measurement has another shape than the target's keypoints and two grippers.
+        """
+        check_measurement(self.target, measurement)
+        return _step(self, state, measurement)
+
+
+@jax.jit
+def _step(
+    servo: VisualServo, state: ServoState, measurement: Measurement
+) -> tuple[ServoState, Float[Array, "Q 3"], ServoInfo]:
+    """See `VisualServo.step`."""
+    config = servo.config
     units = ObjectiveConfig(rotation_weight=config.rotation_weight, interval=config.interval)
-    target = jnp.asarray(target)
-    state, fit_error, n_held = _take_in(config, units, state, jnp.asarray(keypoints), jnp.asarray(gripper_pose))
+    target = jnp.asarray(servo.target)
+    state, fit_error, unobserved = _observe(config, units, state, *map(jnp.asarray, measurement))
     state = dataclasses.replace(state, jacobian=_fit_jacobian(config, state))
     error = state.keypoints - target
 
@@ -203,13 +224,13 @@ def servo(
         fit_error=fit_error,
         probing=probing,
         radius=jnp.full_like(fit_error, config.radius),
-        held=n_held,
+        unobserved=unobserved,
     )
-    state = dataclasses.replace(state, motion=motion, steps=state.steps + 1, held=state.held + n_held)
+    state = dataclasses.replace(state, motion=motion, steps=state.steps + 1, unobserved=state.unobserved + unobserved)
     return state, units.to_twist(motion), info
 
 
-def _take_in(
+def _observe(
     config: ServoConfig,
     units: ObjectiveConfig,
     state: ServoState,
@@ -285,48 +306,3 @@ def _root_mean_square(error: Float[Array, "N 2"]) -> Float[Array, ""]:
 
 def _push(window: Array, newest: Array) -> Array:
     return jnp.concatenate([window, newest[None]])[1:]
-
-
-_compiled_servo = jax.jit(servo, static_argnums=0)
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class VisualServo:
-    """Steers a cable towards a target shape without a model: `init` once, then `step` at every control interval.
-
-    Attributes:
-        config: see `ServoConfig`.
-        target: desired keypoints [m], shape [N, 2].
-
-    Raises:
-        ValueError: if the target is not an array of finite keypoints.
-    """
-
-    config: ServoConfig
-    target: Float[Array | np.ndarray, "N 2"]
-
-    def __post_init__(self):
-        check_target(self.target)
-
-    def init(self, history: History) -> ServoState:
-        """State for a cable seen at rest; only the newest sample of the history is used.
-
-        Raises:
-            ValueError: if the history is not finite or has another number of keypoints than the target.
-        """
-        check_start(self.target, history)
-        return initial_state(self.config, jax.tree.map(jnp.asarray, history))
-
-    def step(
-        self,
-        state: ServoState,
-        keypoints: Float[Array | np.ndarray, "N 2"],
-        gripper_pose: Float[Array | np.ndarray, "Q 3"],
-    ) -> tuple[ServoState, Float[Array, "Q 3"], ServoInfo]:
-        """One control step, compiled at its first call: see `servo`.
-
-        Raises:
-            ValueError: if the observation has another shape than the target's keypoints and two grippers.
-        """
-        check_observation(self.target, keypoints, gripper_pose)
-        return _compiled_servo(self.config, self.target, state, keypoints, gripper_pose)

@@ -7,12 +7,12 @@ import time
 from typing import Any, Protocol
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
+from cablejax.control.targets import Target
 from cablejax.gaplog import Episode
 from cablejax.simulate.table_plant import Observation, PlantError
-from cablejax.targets import Target
-from cablejax.types import History
+from cablejax.types import History, Measurement
 
 SETTLING_FRACTION = 0.1
 """Half-width of the band around the terminal error in which a run counts as settled, relative to that error or, where
@@ -25,7 +25,7 @@ SETTLING_DWELL = 3
 """Samples at the end that must lie in the band, or the run has not settled."""
 
 
-class Cable(Protocol):
+class ObservedCable(Protocol):
     """What is shaped: the plant, or a robot behind the same two calls; see `Plant` for their meaning."""
 
     def reset(self, gripper_pose: Float[np.ndarray, "Q 3"]) -> Observation: ...
@@ -33,12 +33,22 @@ class Cable(Protocol):
     def record(self, twist: Float[np.ndarray, "Q 3"], interval: float, *, samples: int) -> list[Observation]: ...
 
 
-class ShapeController(Protocol):
-    """What shapes it. `info` may have the fields `residual_share` and `radius`, which are recorded."""
+class Controller(Protocol):
+    """What shapes it: an object with two pure functions. Those of the package are `mpc.MPC` and `VisualServo`.
 
-    def init(self, history: History) -> Any: ...
+    For `control.batched` it is a pytree with a leaf `target` as well, the keypoints [N, 2] that it steers towards.
+    """
 
-    def step(self, state: Any, keypoints: Float[np.ndarray, "N 2"], gripper_pose: Float[np.ndarray, "Q 3"]) -> Any: ...
+    def init(self, history: History) -> Any:
+        """The state before the first step, a pytree, from the last observations of the cable."""
+        ...
+
+    def step(self, state: Any, measurement: Measurement) -> tuple[Any, Float[Array | np.ndarray, "Q 3"], Any]:
+        """The next state, the twist to hold until then [m/s, rad/s], and a report.
+
+        Of the report the fields `residual_share` and `radius` are recorded, where it has them.
+        """
+        ...
 
 
 @dataclasses.dataclass(frozen=True)
@@ -54,11 +64,11 @@ class ClosedLoopRun:
         gripper_pose: (x, y, theta) [m, rad], shape [T, Q, 3].
         twist: commands [m/s, rad/s], shape [T, Q, 3].
         error_cm: root mean square distance to the target [cm], shape [T]: of the true keypoints where the cable is a
-            simulated one and tells them, otherwise of the observed ones.
+            simulated one, which knows them, otherwise of the observed ones.
         residual_share: the controller's report, NaN where it makes none, shape [T].
         radius: the controller's bound on one step's motion [m], NaN where it reports none, shape [T].
         mpc_ms: wall time of each control call [ms], compilation excluded, shape [T].
-        held: keypoints that were not observed, over the whole run.
+        unobserved: keypoint observations that are missing, over the whole run.
         stopped: why the run ended early, or None.
         observed_error_cm: the same error of the observed keypoints, which is all that the controller knows, shape [T].
         episode: the run for the gap log, resting time before the first command included.
@@ -73,7 +83,7 @@ class ClosedLoopRun:
     residual_share: Float[np.ndarray, " T"]
     radius: Float[np.ndarray, " T"]
     mpc_ms: Float[np.ndarray, " T"]
-    held: int
+    unobserved: int
     stopped: str | None
     observed_error_cm: Float[np.ndarray, " T"]
     episode: Episode
@@ -151,8 +161,8 @@ def _time_in_band(times: Float[np.ndarray, " T"], error: Float[np.ndarray, " T"]
 
 
 def run_closed_loop(
-    plant: Cable,
-    controller: ShapeController,
+    plant: ObservedCable,
+    controller: Controller,
     target: Target,
     steps: int,
     *,
@@ -207,14 +217,14 @@ def run_closed_loop(
         gripper_pose=observation.gripper_pose,  # pyright: ignore[reportArgumentType]
     )
     state = controller.init(history)
-    controller.step(state, observation.keypoints, observation.gripper_pose)  # compiles; the result is not used
+    controller.step(state, _measurement(observation))  # compiles; the result is not used
 
     rows, stopped = [_Row(observation)], None
     for _ in range(steps):
         row = rows[-1]
         began = time.perf_counter()
         try:
-            state, twist, info = controller.step(state, row.observation.keypoints, row.observation.gripper_pose)
+            state, twist, info = controller.step(state, _measurement(row.observation))
             row.twist = np.asarray(twist, float)  # waits for the result
             row.mpc_ms = 1e3 * (time.perf_counter() - began)
             row.residual_share = float(getattr(info, "residual_share", np.nan))
@@ -241,7 +251,7 @@ def run_closed_loop(
         residual_share=np.array([row.residual_share for row in rows]),
         radius=np.array([row.radius for row in rows]),
         mpc_ms=np.array([row.mpc_ms for row in rows]),
-        held=int(np.isnan(keypoints).any(axis=-1).sum()),
+        unobserved=int(np.isnan(keypoints).any(axis=-1).sum()),
         stopped=stopped,
         observed_error_cm=shape_error_cm(keypoints, target.keypoints),
         episode=log.episode(f"approach_{target.name.lower()}", resting),
@@ -286,6 +296,10 @@ class _Log:
             gripper_command=np.stack(commands),
             hold=np.arange(len(commands)) < resting,
         )
+
+
+def _measurement(observation: Observation) -> Measurement:
+    return Measurement(observation.keypoints, observation.gripper_pose)
 
 
 def _at_rest(last: list[_Row], patience: int, target: Target) -> bool:

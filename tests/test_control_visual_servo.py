@@ -1,15 +1,14 @@
 """The visual servo: what it learns of the Jacobian, that it shapes a cable, its bounds, and gaps in what it sees."""
 
 import dataclasses
-import functools
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from cablejax.servo import ServoConfig, VisualServo, initial_state, servo
-from cablejax.types import History
+from cablejax.control.visual_servo import ServoConfig, VisualServo
+from cablejax.types import History, Measurement
 from mpc_cases import START, TARGETS, at_rest, hermite_shape, relaxing_cable
 
 N = 7
@@ -47,7 +46,7 @@ def run(controller, cable, steps, observe=lambda step, keypoints: keypoints):
     history = History(keypoints=jnp.asarray(cable.keypoints)[None], gripper_pose=jnp.asarray(cable.pose))
     state, infos, twists = controller.init(history), [], []
     for step in range(steps):
-        state, twist, info = controller.step(state, observe(step, cable.keypoints.copy()), cable.pose)
+        state, twist, info = controller.step(state, Measurement(observe(step, cable.keypoints.copy()), cable.pose))
         cable.step(twist)
         infos.append(info)
         twists.append(np.asarray(twist))
@@ -77,7 +76,7 @@ def test_the_estimate_follows_a_jacobian_that_changes_and_keeps_what_was_not_mov
         # A robot that moves only gripper 1 along y, whatever it is told, while the cable has become another one.
         motion = np.array([[0.0, 0.0, 0.0], [0.0, 0.02, 0.0]])
         keypoints, pose = keypoints + other @ motion.ravel(), pose + motion
-        state, _, _ = controller.step(state, keypoints, pose)
+        state, _, _ = controller.step(state, Measurement(keypoints, pose))
     np.testing.assert_allclose(state.jacobian[..., 4], other[..., 4], atol=0.02)
     np.testing.assert_allclose(state.jacobian[..., 0], before[..., 0], atol=0.1)
 
@@ -97,7 +96,7 @@ def test_commands_respect_every_bound():
     controller = VisualServo(CONFIG, far)
     state = controller.init(at_rest(jnp.asarray(cable.pose)))
     for _ in range(20):
-        state, twist, _ = controller.step(state, cable.keypoints, cable.pose)
+        state, twist, _ = controller.step(state, Measurement(cable.keypoints, cable.pose))
         assert (np.linalg.norm(np.asarray(twist, float) * UNITS, axis=-1) <= 0.05).all()
         cable.step(twist)
         assert 0.15 <= np.hypot(*(cable.pose[1, :2] - cable.pose[0, :2])) <= 0.99
@@ -113,8 +112,8 @@ def test_missing_keypoints_are_held_and_counted_and_not_learned_from():
         return keypoints
 
     state, twists, info = run(controller, cable, 12, hide)
-    assert info.held.tolist() == [0, 0, 0, 2, 2, 0, 0, 0, 0, 2, 0, 0]
-    assert int(state.held) == 6
+    assert info.unobserved.tolist() == [0, 0, 0, 2, 2, 0, 0, 0, 0, 2, 0, 0]
+    assert int(state.unobserved) == 6
     assert np.isfinite(twists).all() and np.isfinite(info.shape_error).all()
     # The steps that end at 9, and the one that starts there, say nothing about the two keypoints.
     valid = np.asarray(state.valid)
@@ -132,9 +131,9 @@ def test_nothing_seen_at_all_gives_finite_commands_and_recovers():
     state, twists, info = run(controller, HermiteCable(), 45, blind)
     assert np.isfinite(twists).all()
     assert info.shape_error[-1] < 5e-3
-    _, twist, _ = controller.step(state, np.full((N, 2), np.nan), np.full((2, 3), np.nan))
+    _, twist, _ = controller.step(state, Measurement(np.full((N, 2), np.nan), np.full((2, 3), np.nan)))
     assert np.isfinite(np.asarray(twist)).all()
-    _, twist, _ = controller.step(state, np.full((N, 2), 1e30), np.full((2, 3), 1e30))
+    _, twist, _ = controller.step(state, Measurement(np.full((N, 2), 1e30), np.full((2, 3), 1e30)))
     assert np.isfinite(np.asarray(twist)).all()
 
 
@@ -155,20 +154,20 @@ def test_an_outlier_counts_for_less_than_in_least_squares():
 def test_many_cables_at_once_are_the_same_as_one_by_one():
     history = at_rest(jnp.asarray(START), n_keypoints=N)
     targets = jnp.stack([hermite_shape(TARGETS[name], N) for name in ("U", "S")])
-    state = initial_state(CONFIG, history)
-    batch = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), state)
+    many = VisualServo(CONFIG, targets)
+    batch = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), VisualServo(CONFIG, targets[0]).init(history))
     pose = jnp.stack([history.gripper_pose] * 2)
     keypoints = jnp.stack([history.keypoints[-1]] * 2)
-    step = jax.jit(jax.vmap(functools.partial(servo, CONFIG)))
+    step = jax.jit(jax.vmap(VisualServo.step))
     for _ in range(8):
         # A cable that moves with its grippers' mean.
-        batch, twist, _ = step(targets, batch, keypoints, pose)
+        batch, twist, _ = step(many, batch, Measurement(keypoints, pose))
         keypoints = keypoints + twist[:, :, :2].mean(axis=1)[:, None]
         pose = pose + twist
     one = VisualServo(CONFIG, targets[1])
     single, keypoints, pose = one.init(history), history.keypoints[-1], history.gripper_pose
     for _ in range(8):
-        single, twist, _ = one.step(single, keypoints, pose)
+        single, twist, _ = one.step(single, Measurement(keypoints, pose))
         keypoints, pose = keypoints + twist[:, :2].mean(axis=0), pose + twist
     np.testing.assert_allclose(single.gripper_pose, batch.gripper_pose[1], atol=1e-5)
     np.testing.assert_allclose(single.jacobian, batch.jacobian[1], atol=1e-3)
@@ -187,4 +186,4 @@ def test_bad_settings_and_shapes_are_refused():
     with pytest.raises(ValueError, match="non-finite"):
         controller.init(dataclasses.replace(history, keypoints=history.keypoints.at[0, 0, 0].set(jnp.nan)))
     with pytest.raises(ValueError, match=r"\(2, 2\)"):
-        controller.step(controller.init(history), np.zeros((N, 2)), np.zeros((2, 2)))
+        controller.step(controller.init(history), Measurement(np.zeros((N, 2)), np.zeros((2, 2))))

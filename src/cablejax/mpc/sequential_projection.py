@@ -1,4 +1,4 @@
-"""Motions made feasible one step after the other: not the nearest ones, but near, and cheap."""
+"""Sequential projection: plans made feasible one step after the other, near the given plan and cheap."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from cablejax.bounded.sets import project_ball
 _ROUNDS = 4
 
 
-def keep_each_step(
+def project_sequentially(
     motion: Float[Array, "T 2 3"],
     *,
     separation: Float[Array, " 2"],
