@@ -36,9 +36,9 @@ from cablejax.bounded import (
     least_squares,
     minimise,
 )
-from cablejax.bounded.problems import BoundedProblem, all_problems
 from cablejax.report.markdown import markdown_table, publish
 from cablejax.report.provenance import machine, versions
+from standard_problems import BoundedProblem, all_problems
 
 TOLERANCE = 1e-10
 """Of ours: largest element of the projected gradient."""
@@ -290,7 +290,7 @@ def page(runs: list[Run], command: str) -> str:
             f"Ours stop at a projected gradient of {TOLERANCE:g}; scipy's tests on gradient, objective and step are "
             f"set to {TOLERANCE:g}, {TIGHT:g} and {TIGHT:g}, and `least_squares` scales by the Jacobian. At most "
             f"{LEAST_SQUARES_STEPS} steps, {GRADIENT_STEPS} for methods that use gradients only. The families, their "
-            "sources and what the best known values come from are in `src/cablejax/bounded/problems/`. All solvers are "
+            "sources and what the best known values come from are in `experiments/standard_problems/`. All solvers are "
             "local. Where a first version of a problem had a second minimum that chance decided on (Rosenbrock of four "
             "and more variables, Wood, HS2, a rod that had to snap through), its box, start or target was changed "
             "before this table was made, after some of these solvers, ours and scipy's, had failed on it; MGH17 and "

@@ -32,7 +32,8 @@ import jax
 import numpy as np
 from tqdm import tqdm
 
-from cablejax.evaluation.against_ipopt import (
+from against_ipopt.control_call import race
+from against_ipopt.judge import (
     ACCURATE,
     POINTS,
     REACH,
@@ -46,9 +47,8 @@ from cablejax.evaluation.against_ipopt import (
     meets_all,
     slopes_along,
 )
-from cablejax.evaluation.control_call import race
-from cablejax.evaluation.ipopt_page import ipopt_sections
-from cablejax.evaluation.planning_problems import (
+from against_ipopt.page import ipopt_sections
+from against_ipopt.planning_problems import (
     PlanningCase,
     ProblemMaker,
     closed_loop_cases,
@@ -57,7 +57,7 @@ from cablejax.evaluation.planning_problems import (
     random_cases,
     save_cases,
 )
-from cablejax.evaluation.referee import RefereeConfig
+from against_ipopt.referee import RefereeConfig
 from cablejax.mpc import SOLVERS
 from cablejax.report.markdown import publish
 from cablejax.report.provenance import machine, versions

@@ -22,7 +22,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from cablejax.evaluation.planning_problems import ProblemMaker, load_cases
+from against_ipopt.planning_problems import ProblemMaker, load_cases
 from cablejax.mpc import SOLVERS
 from cablejax.report.markdown import markdown_table, publish
 from cablejax.report.provenance import machine, versions

@@ -20,7 +20,7 @@ import matplotlib
 
 from cablejax.recordings.deform import read_deform
 from cablejax.report.provenance import machine, versions
-from cablejax.spatial.benchmark import score_cable
+from real_cables.benchmark import score_cable
 
 CABLES = ("DLO1", "DLO2", "DLO3")
 _NINETY = 1.645

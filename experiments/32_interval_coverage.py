@@ -32,13 +32,13 @@ from cablejax.evaluation.statistics import clopper_pearson
 from cablejax.recordings.deform import NOMINAL, SAMPLE_INTERVAL
 from cablejax.report.markdown import markdown_table
 from cablejax.report.provenance import machine, versions
-from cablejax.spatial.benchmark import protocol_windows
 from cablejax.spatial.estimate import UNMODELLED, Estimate, Interval, estimate, estimates_of_halves
 from cablejax.spatial.identify import Identified, identify
 from cablejax.spatial.named import parameters_of
 from cablejax.spatial.newton import improve, jackknife
-from cablejax.spatial.synthetic import RECORDINGS, SAMPLES, Law, SyntheticCable, synthetic_recordings
 from cablejax.spatial.windows import Windows
+from real_cables.benchmark import protocol_windows
+from real_cables.synthetic import RECORDINGS, SAMPLES, Law, SyntheticCable, synthetic_recordings
 
 TOLD = {
     "bending_damping": "time_s",

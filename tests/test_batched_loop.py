@@ -17,12 +17,11 @@ from cablejax.mpc import Controller, MPCConfig, Outcome, Plan
 from cablejax.mpc.goal import goal_pose
 from cablejax.shaping import NetworkDynamics, load_model, make_controller
 from cablejax.simulate import CableConfig, MjxEngine
-from cablejax.simulate.engine_plant import EnginePlant
 from cablejax.simulate.plant import Plant, PlantConfig
-from cablejax.simulate.table_plant import PlantError
 from cablejax.targets import Target, make_target, straight_start
 from cablejax.types import CableParams, History
 from dynamics_cases import SMALL, network
+from engine_plant import EnginePlant
 
 CABLE = CableConfig(n_links=9, n_keypoints=5)
 ENGINE = MjxEngine(CABLE)
@@ -218,21 +217,3 @@ def test_wrong_requests_are_refused():
     for wrong in ({"steps": 0}, {"steps": 1, "keypoint_dropout": 1.0}, {"steps": 1, "keypoint_noise": -1.0}):
         with pytest.raises(ValueError, match="LoopConfig"):
             LoopConfig(**wrong)
-
-
-def test_the_adapter_refuses_what_a_plant_refuses():
-    plant = EnginePlant(ENGINE)
-    with pytest.raises(ValueError, match="call reset"):
-        plant.record(np.zeros((2, 3)), 1.0, samples=1)
-    first = plant.reset(straight_start(CABLE))
-    np.testing.assert_allclose(first.keypoints[[0, -1]], straight_start(CABLE)[:, :2], atol=1e-6)
-    with pytest.raises(ValueError, match="not finite"):
-        plant.record(np.full((2, 3), np.nan), 1.0, samples=1)
-    with pytest.raises(ValueError, match="samples is 0"):
-        plant.record(np.zeros((2, 3)), 1.0, samples=0)
-    with pytest.raises(PlantError, match="diverged"):
-        plant.record(np.full((2, 3), 1e30), 1.0, samples=1)
-    with pytest.raises(ValueError, match="call reset"):
-        plant.record(np.zeros((2, 3)), 1.0, samples=1)
-    with pytest.raises(ValueError, match="dimension is 3"):
-        EnginePlant(MjxEngine(CableConfig(n_links=9, dimension=3)))

@@ -3,13 +3,9 @@
 import collections
 import dataclasses
 import json
-import pathlib
-import sys
 
 import numpy as np
 import pytest
-
-sys.path.insert(0, str(pathlib.Path(__file__).parents[1] / "experiments"))
 
 from blind.cases import make_case
 from blind.effects import EFFECTS, SPECIFIED, Setup
@@ -22,7 +18,6 @@ from blind.severity import search
 from blind.store import is_done, publish_hashes, read_labels, write_case
 from blind.unknown import UNSPECIFIED
 from blind.world import World
-
 from cablejax.gaplog import read_gap_log
 
 WORLD = World(stiffness=0.01, friction=0.3)

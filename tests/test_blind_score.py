@@ -1,12 +1,8 @@
 """The scorer of the blind check on verdicts made by hand."""
 
 import json
-import pathlib
-import sys
 
 import pytest
-
-sys.path.insert(0, str(pathlib.Path(__file__).parents[1] / "experiments"))
 
 from blind.measures import baselines, clopper_pearson, reliability, table
 from blind.score_page import write_page

@@ -3,17 +3,13 @@
 from __future__ import annotations
 
 import pathlib
-import sys
 
 import numpy as np
 import pytest
 
-sys.path.insert(0, str(pathlib.Path(__file__).parents[1] / "experiments"))
-
 from blind.measures import leftovers
 from blind.store import read_labels
 from blind.verdicts import read_verdicts
-
 from cablejax.diagnose import Calibration
 from cablejax.diagnose.conformal import SCORES, leftover_p, leftover_score
 

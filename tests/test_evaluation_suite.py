@@ -15,7 +15,6 @@ from cablejax.evaluation.fine_tuning import FineTuneConfig, fine_tune, record
 from cablejax.evaluation.methods import LABEL, METHODS, controller_of
 from cablejax.evaluation.paper import VISUAL_SERVO
 from cablejax.evaluation.protocols import LaidOut, letter_task
-from cablejax.evaluation.run import Experiment, Extent, page, seed_range
 from cablejax.evaluation.suite import Case, key_of, read_suite, run_suite
 from cablejax.mpc import Controller
 from cablejax.servo import VisualServo
@@ -24,6 +23,7 @@ from cablejax.simulate.config import CableConfig
 from cablejax.simulate.plant import Plant, PlantConfig
 from cablejax.targets import make_target
 from cli_cases import small_model
+from closed_loops import Experiment, Extent, page, seed_range
 
 CABLE = CableConfig(n_links=12, dimension=3, timestep=0.005)
 SERVO = METHODS[VISUAL_SERVO]

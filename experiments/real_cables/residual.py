@@ -17,8 +17,8 @@ import itertools
 import numpy as np
 from jaxtyping import Float
 
-from cablejax.spatial.features import clamp_history, earlier, in_frame, moving_frame
 from cablejax.spatial.windows import Windows, dealt
+from real_cables.features import clamp_history, earlier, in_frame, moving_frame
 
 _VELOCITY = 0.05  # [s], over which the simulated markers' velocity is taken
 _COMPONENTS = (0, 8, 16, 24)

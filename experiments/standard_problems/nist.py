@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from cablejax.bounded.problems.base import BoundedProblem
+from standard_problems.base import BoundedProblem
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -17,11 +17,11 @@ from cablejax.bounded import (
     least_squares,
     minimise,
 )
-from cablejax.bounded.problems import BoundedProblem, all_problems
-from cablejax.bounded.problems import more_garbow_hillstrom as mgh
-from cablejax.bounded.problems.elastica_shaping import ROTATION, ElasticaShaping
-from cablejax.bounded.problems.nist import DATA_SETS
 from cablejax.simulate.elastica import elastica, solve_elastica
+from standard_problems import BoundedProblem, all_problems
+from standard_problems import more_garbow_hillstrom as mgh
+from standard_problems.elastica_shaping import ROTATION, ElasticaShaping
+from standard_problems.nist import DATA_SETS
 
 PROBLEMS = {problem.name: problem for problem in all_problems()}
 SOLVERS = {

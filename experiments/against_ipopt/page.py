@@ -10,8 +10,8 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from cablejax.dynamics.smooth import CORNER
-from cablejax.evaluation.against_ipopt import (
+from against_ipopt.control_call import improved, ratios
+from against_ipopt.judge import (
     EQUAL,
     FEASIBLE,
     POINTS,
@@ -23,8 +23,8 @@ from cablejax.evaluation.against_ipopt import (
     excess,
     meets_all,
 )
-from cablejax.evaluation.control_call import improved, ratios
-from cablejax.evaluation.referee import FOUND
+from against_ipopt.referee import FOUND
+from cablejax.dynamics.smooth import CORNER
 from cablejax.report.markdown import markdown_table
 
 STEEP = 50.0

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from cablejax.bounded.problems.base import BoundedProblem
+from standard_problems.base import BoundedProblem
 
 
 def more_garbow_hillstrom_problems() -> list[BoundedProblem]:

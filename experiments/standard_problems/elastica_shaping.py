@@ -19,8 +19,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from cablejax.bounded.problems.base import BoundedProblem
 from cablejax.simulate.elastica import solve_elastica
+from standard_problems.base import BoundedProblem
 
 STEPS = 4
 """Motions of a plan; each moves both ends, (dx, dy, ROTATION dtheta) in metres."""

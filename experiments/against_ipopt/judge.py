@@ -21,10 +21,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from against_ipopt.planning_problems import PlanningCase, ProblemMaker, smooth_model
+from against_ipopt.referee import RefereeConfig, referee, slope_of, value_of
+from against_ipopt.solver_path import PathFinder, SolverPath
 from cablejax.bounded import certify
-from cablejax.evaluation.planning_problems import PlanningCase, ProblemMaker, smooth_model
-from cablejax.evaluation.referee import RefereeConfig, referee, slope_of, value_of
-from cablejax.evaluation.solver_path import PathFinder, SolverPath
 from cablejax.mpc import Accurate, ShapingProblem
 from cablejax.shaping import Model
 

@@ -16,9 +16,9 @@ from cablejax.spatial.clamps import frames_along
 from cablejax.spatial.estimate import estimates_of_halves
 from cablejax.spatial.fit import errors, over_all_markers
 from cablejax.spatial.identify import Identified, identify
-from cablejax.spatial.network import fit_network
-from cablejax.spatial.residual import fit_residual
 from cablejax.spatial.windows import Windows
+from real_cables.network import fit_network
+from real_cables.residual import fit_residual
 
 # Quantile of a spacing over all samples that is taken for the arc length between two markers: where it is straight.
 _STRAIGHT = 0.75

@@ -1,4 +1,4 @@
-"""The graph network on top of the rod learns what clamps tell, and does not care where the cable hangs."""
+"""Corrections learned on top of the rod: the graph network, wherever the cable hangs, and the ridge residual."""
 
 from __future__ import annotations
 
@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 import spatial_cases as cases
-from cablejax.spatial import network
 from cablejax.spatial.fit import errors
 from cablejax.spatial.windows import windows_of
+from real_cables import network
+from real_cables.residual import fit_residual
 
 
 @pytest.fixture(scope="module")
@@ -55,3 +56,15 @@ def test_no_rounds_correct_nothing(learned):
     windows, simulated, fitted = learned
     untrained = dataclasses.replace(fitted, rounds=0, weights=None)
     np.testing.assert_array_equal(untrained.correct(simulated, windows), simulated)
+
+
+def test_the_residual_learns_what_the_clamps_tell():
+    windows = windows_of(cases.recording())
+    generator = np.random.default_rng(1)
+    weights = generator.normal(size=(3, windows.keypoints.shape[2]))
+    off = 0.05 * np.einsum("wtc,cf->wtf", windows.position[:, :, 1] - windows.position[:, :, 0], weights)
+    simulated = windows.keypoints - off[..., None] * np.array([0.0, 0.0, 1.0])
+    residual = fit_residual(simulated, windows)
+    left = errors(residual.correct(simulated, windows), windows).mean()
+    assert left < 0.2 * errors(simulated, windows).mean()
+    np.testing.assert_array_equal(residual.correct(simulated, windows)[:, :2], simulated[:, :2])

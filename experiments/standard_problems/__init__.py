@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from cablejax.bounded.problems.base import BoundedProblem
-from cablejax.bounded.problems.elastica_shaping import elastica_problems
-from cablejax.bounded.problems.hock_schittkowski import hock_schittkowski_problems
-from cablejax.bounded.problems.more_garbow_hillstrom import more_garbow_hillstrom_problems
-from cablejax.bounded.problems.nist import nist_problems
-from cablejax.bounded.problems.rosenbrock import rosenbrock_problems
+from standard_problems.base import BoundedProblem
+from standard_problems.elastica_shaping import elastica_problems
+from standard_problems.hock_schittkowski import hock_schittkowski_problems
+from standard_problems.more_garbow_hillstrom import more_garbow_hillstrom_problems
+from standard_problems.nist import nist_problems
+from standard_problems.rosenbrock import rosenbrock_problems
 
 __all__ = [
     "BoundedProblem",

@@ -7,10 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from cablejax.bounded import BoundedLevenbergMarquardt, SpectralProjectedGradient, certify
-from cablejax.evaluation.against_ipopt import comparable_seconds, kkt_residual, slopes_along
-from cablejax.evaluation.control_call import race, ratios
-from cablejax.evaluation.planning_problems import (
+from against_ipopt.control_call import race, ratios
+from against_ipopt.judge import comparable_seconds, kkt_residual, slopes_along
+from against_ipopt.planning_problems import (
     CONFIG,
     PlanningCase,
     ProblemMaker,
@@ -20,8 +19,9 @@ from cablejax.evaluation.planning_problems import (
     save_cases,
     smooth_model,
 )
-from cablejax.evaluation.referee import Limits, RefereeConfig, referee
-from cablejax.evaluation.solver_path import PathFinder
+from against_ipopt.referee import Limits, RefereeConfig, referee
+from against_ipopt.solver_path import PathFinder
+from cablejax.bounded import BoundedLevenbergMarquardt, SpectralProjectedGradient, certify
 from cablejax.mpc import SOLVERS, Controller
 from cablejax.shaping import Model
 from mpc_cases import START, at_rest, planning_case, problem, random_motion, relaxing_cable

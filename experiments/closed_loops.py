@@ -1,4 +1,4 @@
-"""The command line that the experiments on closed loops share: run what is missing, then write the page."""
+"""The command line of the experiments on closed loops: runs missing trials, then writes the page."""
 
 from __future__ import annotations
 

@@ -6,11 +6,11 @@ import jax
 import jax.numpy as jnp
 import pytest
 
+from against_ipopt.judge import Contestant, explain, kept_rows, kkt_residual, meets_all
+from against_ipopt.page import ipopt_sections
+from against_ipopt.planning_problems import ProblemMaker
+from against_ipopt.solver_path import PathFinder
 from cablejax.bounded import BoundedQuasiNewton
-from cablejax.evaluation.against_ipopt import Contestant, explain, kept_rows, kkt_residual, meets_all
-from cablejax.evaluation.ipopt_page import ipopt_sections
-from cablejax.evaluation.planning_problems import ProblemMaker
-from cablejax.evaluation.solver_path import PathFinder
 from cablejax.shaping import Model
 from mpc_cases import planning_case, relaxing_cable
 

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from cablejax.bounded.problems.base import BoundedProblem
+from standard_problems.base import BoundedProblem
 
 SIZES = (2, 10, 50)
 CUT = 0.5

@@ -17,11 +17,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from against_ipopt.referee import Limits
 from cablejax.closed_loop import run_closed_loop
 from cablejax.dynamics.smooth import CORNER, smoothed
 from cablejax.evaluation.cases import PLANT_CABLE, mujoco_plant
 from cablejax.evaluation.protocols import LaidOut, letter_task, random_task
-from cablejax.evaluation.referee import Limits
 from cablejax.mpc import Controller, MPCConfig, ObjectiveConfig, Plan, ShapingProblem, Solver
 from cablejax.mpc.feasible import feasible_from
 from cablejax.mpc.rollout import Rollout

@@ -17,9 +17,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from cablejax.evaluation.against_ipopt import EQUAL
-from cablejax.evaluation.planning_problems import PlanningCase, ProblemMaker
-from cablejax.evaluation.referee import RefereeConfig, referee, value_of
+from against_ipopt.judge import EQUAL
+from against_ipopt.planning_problems import PlanningCase, ProblemMaker
+from against_ipopt.referee import RefereeConfig, referee, value_of
 from cablejax.mpc import Solver
 
 REFEREE = RefereeConfig(max_iterations=200, max_seconds=60.0)

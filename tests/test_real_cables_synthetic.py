@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from cablejax.spatial.benchmark import protocol_windows
-from cablejax.spatial.synthetic import MARKERS, SAMPLES, synthetic_recordings
+from real_cables.benchmark import protocol_windows
+from real_cables.synthetic import MARKERS, SAMPLES, synthetic_recordings
 
 RECORDINGS = 1
 
