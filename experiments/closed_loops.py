@@ -20,8 +20,8 @@ from cablejax.evaluation.protocols import least_time
 from cablejax.evaluation.suite import Case, read_suite, released, run_suite
 from cablejax.evaluation.trials import LIANG_TABLE, Trial
 from cablejax.mpc import MPCConfig
-from cablejax.report.provenance import machine, versions
 from cablejax.shaping import Model
+from pages import page_of_results, publish
 
 WORST = 10
 """Runs shown as pictures: the ones that ended farthest off."""
@@ -97,15 +97,14 @@ def main(experiment: Experiment, arguments: Sequence[str] | None = None) -> None
     everything, pictures = read_suite(folder)
     trials = [trial for trial in everything if trial.seed in seeds]
     shown = {trial.key for trial in trials}
-    if options.report is None:
-        print(page(experiment, trials, command(experiment, options), picture=None))
-        return
-    picture = options.report.with_name(f"{options.report.stem}_worst.png")
-    snapshots = [snapshot for snapshot in pictures if snapshot.key in shown]
-    failure_figure(worst(snapshots, WORST)).savefig(picture, dpi=110, bbox_inches="tight")
-    text = page(experiment, trials, command(experiment, options), picture=picture.name)
-    options.report.write_text(text, encoding="utf-8")
-    print(text)
+    picture = None
+    if options.report is not None:
+        picture = options.report.with_name(f"{options.report.stem}_worst.png")
+        # trials that are kept without their snapshots leave the figure as it is
+        if snapshots := [snapshot for snapshot in pictures if snapshot.key in shown]:
+            failure_figure(worst(snapshots, WORST)).savefig(picture, dpi=110, bbox_inches="tight")
+    name = picture.name if picture is not None and picture.exists() else None
+    publish(page(experiment, trials, command(experiment, options), picture=name), options.report)
 
 
 def seed_range(text: str) -> range:
@@ -128,7 +127,7 @@ def fine_tuned_model(folder: pathlib.Path, case: Case) -> Model:
 
 def page(experiment: Experiment, trials: Sequence[Trial], command: str, picture: str | None) -> str:
     """The Markdown page of an experiment's trials."""
-    lines = [f"# {experiment.title}", "", f"Made by `{command}`.", f"{versions()}; {machine()}.", "", experiment.about]
+    lines = [experiment.about]
     for table in experiment.tables:
         mine = [trial for trial in trials if trial.table == table]
         if not mine:
@@ -149,7 +148,7 @@ def page(experiment: Experiment, trials: Sequence[Trial], command: str, picture:
             lines += ["", "### In pairs", "", tables.paired_table(mine, table, ADAPTED_RESIDUAL, labels=LABEL)]
     if picture is not None:
         lines += ["", "## The runs that ended farthest off", "", f"![start, end and target of each]({picture})"]
-    return "\n".join([*lines, ""])
+    return page_of_results(experiment.title, f"`{command}`", lines)
 
 
 def least_times(experiment: Experiment, shown: set[tuple[str, str, float, int]]) -> str:

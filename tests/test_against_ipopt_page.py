@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import pytest
 
-from against_ipopt.judge import Contestant, explain, kept_rows, kkt_residual, meets_all
+from against_ipopt.judge import Contestant, explain, kkt_residual, meets_all, rows_of
 from against_ipopt.page import ipopt_sections
 from against_ipopt.planning_problems import ProblemMaker
 from against_ipopt.solver_path import PathFinder
@@ -35,11 +35,8 @@ def explanation(starts, from_theirs=None, steepness=1.0):
 def test_the_kept_page_is_what_the_kept_rows_give(page):
     folder = RESULTS / "trials" / "against_ipopt" / PAGES[page]
 
-    explained = {row["name"]: row for row in kept_rows(folder, "explained")}
-    solvers = ("trust-region", "deadline")
-    lines = ipopt_sections(
-        kept_rows(folder), explained, kept_rows(folder, "kinks"), kept_rows(folder, "calls"), solvers
-    )
+    rows, explained, kinks, calls = (rows_of(folder, kind).read() for kind in ("rows", "explained", "kinks", "calls"))
+    lines = ipopt_sections(rows, {row["name"]: row for row in explained}, kinks, calls, ("trust-region", "deadline"))
     assert "\n".join(lines) in (RESULTS / page).read_text()
 
 

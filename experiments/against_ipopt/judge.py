@@ -11,7 +11,6 @@ of the objective divided by its value at the start: the same over `objective(sta
 from __future__ import annotations
 
 import dataclasses
-import json
 import pathlib
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -25,6 +24,7 @@ from against_ipopt.planning_problems import PlanningCase, ProblemMaker, smooth_m
 from against_ipopt.referee import RefereeConfig, referee, slope_of, value_of
 from against_ipopt.solver_path import PathFinder, SolverPath
 from cablejax.bounded import certify
+from cablejax.evaluation.rows import Rows
 from cablejax.mpc import Accurate, ShapingProblem
 from cablejax.shaping import Model
 
@@ -214,10 +214,9 @@ def explain(ours: Contestant, case: PlanningCase, row: dict[str, Any], starts: i
     }
 
 
-def kept_rows(folder: pathlib.Path, kind: str = "rows") -> list[dict[str, Any]]:
-    """All finished rows of a kind in a folder: "rows", "explained", "kinks" or "calls"; of one problem the last."""
-    lines = [line for path in sorted(folder.glob(f"{kind}-*.jsonl")) for line in path.read_text().splitlines()]
-    return list({row["name"]: row for row in map(json.loads, lines)}.values())
+def rows_of(folder: pathlib.Path, kind: str = "rows") -> Rows:
+    """Rows of a kind in a folder, one for each problem: "rows", "explained", "kinks" or "calls"."""
+    return Rows(folder / f"{kind}.jsonl", ("name",))
 
 
 def comparable_seconds(

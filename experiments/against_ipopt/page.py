@@ -25,7 +25,7 @@ from against_ipopt.judge import (
 )
 from against_ipopt.referee import FOUND
 from cablejax.dynamics.smooth import CORNER
-from cablejax.report.markdown import markdown_table
+from pages import markdown_table
 
 STEEP = 50.0
 """Largest singular value of the residuals' Jacobian above which a model is steep: with statics, at a snap-through."""
