@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
 from typing import Literal, get_args
 
 import jax.numpy as jnp
@@ -32,6 +33,9 @@ Method = Literal["residual", "direct"]
 """The learned model with the online residual, or as it was trained."""
 
 METHODS: tuple[Method, ...] = get_args(Method)
+
+Runs = Mapping[tuple[str, Method], ClosedLoopRun]
+"""Runs by name of the target and method."""
 
 
 @dataclasses.dataclass(frozen=True)
