@@ -35,7 +35,7 @@ def main(arguments: list[str] | None = None) -> None:
 
     runs = {}
     for method in METHODS:
-        run = shape_once(plant, model, target, method=method, solver="trust-region", steps=options.steps)
+        run = shape_once(plant, model, target, method=method, solver="levenberg-marquardt", steps=options.steps)
         print(f"{method:10s} {run.verdict()}")
         runs[target.name, method] = run
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from cablejax.control.loop import ClosedLoopRun
+from cablejax.control.run import ClosedLoopRun
 from cablejax.control.shaping import Method
 from cablejax.control.targets import Target
 from cablejax.gaplog import Episode

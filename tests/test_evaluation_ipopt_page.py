@@ -36,7 +36,7 @@ def test_the_kept_page_is_what_the_kept_rows_give(page):
     folder = RESULTS / "trials" / "against_ipopt" / PAGES[page]
 
     explained = {row["name"]: row for row in kept_rows(folder, "explained")}
-    solvers = ("trust-region", "deadline")
+    solvers = ("levenberg-marquardt", "two-trials")
     lines = ipopt_sections(
         kept_rows(folder), explained, kept_rows(folder, "kinks"), kept_rows(folder, "calls"), solvers
     )

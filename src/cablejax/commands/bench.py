@@ -164,7 +164,6 @@ class BenchMpc(Command):
             "repeats": self.repeats,
             **solvers[self.solvers[0]],
             "solvers": solvers,
-            "deadline": solvers.get("deadline"),
             "batched": {k: {"ms": v, "plans_per_second": 1e3 * int(k) / v} for k, v in batched.items()},
             "ipopt": ipopt,
             **_machine(),
@@ -253,7 +252,7 @@ class BenchLoop(Command):
     weights: str = "gns-reference"
     """Released model by name, or the folder of a training by `cablejax train`."""
 
-    solver: SolverName = "trust-region"
+    solver: SolverName = "levenberg-marquardt"
     """How the plan is found."""
 
     batches: tuple[int, ...] = (1, 8)

@@ -11,7 +11,7 @@ from typing import Any
 from cablejax.commands.options import UsageError, say
 from cablejax.commands.parts import Parts
 from cablejax.commands.results import summarise, write_results
-from cablejax.control.loop import ClosedLoopRun
+from cablejax.control.run import ClosedLoopRun
 from cablejax.control.shaping import Method, Model, shape_once
 from cablejax.control.targets import Target
 from cablejax.dynamics.fingerprint import fingerprint

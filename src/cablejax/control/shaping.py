@@ -12,7 +12,8 @@ from flax import nnx
 from jaxtyping import Array, Float
 
 from cablejax.adaptation.belief import AdaptationConfig
-from cablejax.control.loop import ClosedLoopRun, run_closed_loop
+from cablejax.control.loop import run_closed_loop
+from cablejax.control.run import ClosedLoopRun
 from cablejax.control.targets import Target, straight_start
 from cablejax.dynamics.config import ModelConfig
 from cablejax.dynamics.model import apply

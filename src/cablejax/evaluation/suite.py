@@ -10,7 +10,8 @@ from collections.abc import Callable, Sequence
 
 from tqdm import tqdm
 
-from cablejax.control.loop import ClosedLoopRun, run_closed_loop
+from cablejax.control.loop import run_closed_loop
+from cablejax.control.run import ClosedLoopRun
 from cablejax.control.shaping import Model, load_model
 from cablejax.evaluation.failures import Snapshot, append_snapshot, read_snapshots, snapshot_of
 from cablejax.evaluation.methods import MethodSpec, controller_of

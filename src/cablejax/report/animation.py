@@ -25,7 +25,7 @@ from cablejax.report.style import (
 )
 
 if TYPE_CHECKING:
-    from cablejax.control.loop import ClosedLoopRun
+    from cablejax.control.run import ClosedLoopRun
     from cablejax.control.shaping import Method, Runs
 
 _OVERSAMPLING = 3

@@ -27,7 +27,7 @@ from cablejax.report.style import (
 )
 
 if TYPE_CHECKING:
-    from cablejax.control.loop import ClosedLoopRun
+    from cablejax.control.run import ClosedLoopRun
     from cablejax.control.shaping import Method, Runs
 
 _REST = 5e-4

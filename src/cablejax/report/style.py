@@ -13,7 +13,7 @@ from jaxtyping import Float
 from scipy.interpolate import CubicSpline
 
 if TYPE_CHECKING:
-    from cablejax.control.loop import ClosedLoopRun
+    from cablejax.control.run import ClosedLoopRun
     from cablejax.control.shaping import Method, Runs
 
 METHOD_ORDER: tuple[Method, ...] = ("direct", "residual")
