@@ -77,8 +77,8 @@ class NetworkDynamics:
         network = roughened(nnx.merge(self.graphdef, weights))
         between = reverse(lambda history, twist: apply(network, history, twist)[1:-1], history, twist)
         padded = StepJacobian(*(jnp.pad(part, [(1, 1)] + [(0, 0)] * (part.ndim - 1)) for part in between))
-        held = network.config.interval * jnp.eye(2, 3, dtype=twist.dtype)
-        return padded._replace(twist=padded.twist.at[0, :, 0].set(held).at[-1, :, 1].set(held))
+        grasped = network.config.interval * jnp.eye(2, 3, dtype=twist.dtype)
+        return padded._replace(twist=padded.twist.at[0, :, 0].set(grasped).at[-1, :, 1].set(grasped))
 
 
 def load_model(name: str) -> Model:
