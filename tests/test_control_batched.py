@@ -183,7 +183,7 @@ def test_the_batch_ends_where_the_contact_plant_ends():
     """
     cable, ratios, steps = Discretisation(), np.array([1.0, 3.0]), 20
     engine, model, target = MjxEngine(cable), load_model("gns-reference"), make_target("U", cable.cable)
-    controller = make_controller(model, target, method="residual", solver="trust-region")
+    controller = make_controller(model, target, method="residual", solver="levenberg-marquardt")
     state = engine.initial_state(np.stack([straight_start(cable.cable)] * 2))
     goals = np.stack([target.keypoints] * 2)
     run = shape_batch(

@@ -161,7 +161,6 @@ class BenchMpc(Command):
             "repeats": self.repeats,
             **solvers[self.solvers[0]],
             "solvers": solvers,
-            "deadline": solvers.get("deadline"),
             "batched": {k: {"ms": v, "plans_per_second": 1e3 * int(k) / v} for k, v in batched.items()},
             **_machine(),
         }
@@ -248,7 +247,7 @@ class BenchLoop(Command):
     weights: str = "gns-reference"
     """Released model by name, or the folder of a training by `cablejax train`."""
 
-    solver: SolverName = "trust-region"
+    solver: SolverName = "levenberg-marquardt"
     """How the plan is found."""
 
     batches: tuple[int, ...] = (1, 8)
