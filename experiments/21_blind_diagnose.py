@@ -22,7 +22,7 @@ os.environ.setdefault("NPROC", "4")
 import jax
 
 from cablejax.diagnose import Calibration, DiagnosisError, diagnose, write_verdict
-from cablejax.diagnose.run import baseline_error
+from cablejax.diagnose.planar_run import baseline_error
 from cablejax.gaplog import read_gap_log
 
 

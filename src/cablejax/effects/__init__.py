@@ -1,7 +1,8 @@
 """The effects that a diagnosis knows, by the names of the gap log's format."""
 
-from cablejax.effects.base import Context, Effect, Parameter
+from cablejax.effects.base import CableEffect, Context
 from cablejax.effects.camera import CameraLag, CameraSimilarity, KeypointBias
+from cablejax.effects.effect import Effect, Parameter
 from cablejax.effects.grasp import GripperCompliance, GripperRotationOffset, GripperSlip
 from cablejax.effects.material import (
     AxialStretch,
@@ -16,7 +17,7 @@ from cablejax.effects.material import (
 )
 from cablejax.effects.table import FrictionPatch, GravityTilt, Obstacle, TableFriction, ViscousDrag
 
-LIBRARY: tuple[Effect, ...] = (
+LIBRARY: tuple[CableEffect, ...] = (
     BendingStiffness(),
     StiffnessProfile(),
     IntrinsicCurvature(),
@@ -40,4 +41,4 @@ LIBRARY: tuple[Effect, ...] = (
 )
 """Every effect of the cable and the camera. Those of the arms are found from the encoders, see `actuation`."""
 
-__all__ = ["LIBRARY", "Context", "Effect", "Parameter"]
+__all__ = ["LIBRARY", "CableEffect", "Context", "Effect", "Parameter"]

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from cablejax.effects import BendingStiffness, IntrinsicCurvature, StiffnessProfile
-from cablejax.effects.base import Parameter
+from cablejax.effects.effect import Parameter
 from cablejax.spatial.hanging import Wire, hanging_angles, hanging_points, joint_arclength
 
 PROFILE_SPREAD = 0.3
