@@ -12,11 +12,11 @@ import argparse
 import dataclasses
 import pathlib
 
+from cablejax.control.shaping import METHODS, load_model, shape_once
+from cablejax.control.targets import make_target
 from cablejax.report import figures, record_of
 from cablejax.report.animation import write_gif
-from cablejax.shaping import METHODS, load_model, shape_once
 from cablejax.simulate.plant import PlantConfig
-from cablejax.targets import make_target
 
 
 def main(arguments: list[str] | None = None) -> None:

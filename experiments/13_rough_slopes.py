@@ -22,12 +22,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from cablejax.evaluation.planning_problems import ProblemMaker, load_cases
+from against_ipopt.planning_problems import ProblemMaker, load_cases
+from cablejax.control.shaping import load_model
 from cablejax.mpc import SOLVERS
-from cablejax.report.markdown import markdown_table, publish
-from cablejax.report.provenance import machine, versions
 from cablejax.residual import Dynamics
-from cablejax.shaping import load_model
+from pages import markdown_table, page_of_results, publish
 
 CASES = Path("docs") / "results" / "trials" / "against_ipopt" / "cases.npz"
 PLANNERS = ("trust-region", "deadline")
@@ -94,13 +93,10 @@ def main() -> None:
         else:
             change = value_r / value_e - 1
             rows.append([name, *cells, quantiles(change), f"{(change < 0).sum()} / {(change > 0).sum()}"])
-    page = "\n".join(
+    page = page_of_results(
+        "Slopes in bfloat16",
+        f"`python experiments/13_rough_slopes.py --n {options.n} --weights {options.weights}`",
         [
-            "# Slopes in bfloat16",
-            "",
-            f"Made by `python experiments/13_rough_slopes.py --n {options.n} --weights {options.weights}`.",
-            f"{versions()}; {machine()}.",
-            "",
             f"{options.n} planning problems, {model.name} with the residual fitted online, horizon 5, float32. Both "
             "kinds take turns, so what else the machine does hits both. Exact is `jax.jacrev` of the whole model, "
             "which has cotangents of the held keypoints besides. The difference is that of the Jacobian, "
@@ -108,8 +104,7 @@ def main() -> None:
             "the plan with rough slopes is better.",
             "",
             *markdown_table(rows),
-            "",
-        ]
+        ],
     )
     publish(page, options.out)
 

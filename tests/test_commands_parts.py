@@ -11,9 +11,9 @@ from cablejax.commands import diagnose, runs
 from cablejax.commands.options import UsageError
 from cablejax.commands.parts import Parts, unfinished
 from cablejax.commands.runs import Job
-from cablejax.shaping import load_model
+from cablejax.control.shaping import load_model
+from cablejax.control.targets import make_target
 from cablejax.simulate.plant import PlantConfig
-from cablejax.targets import make_target
 from cli_cases import made_up_run, small_model
 
 TARGET = make_target("U")

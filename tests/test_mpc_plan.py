@@ -8,11 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from cablejax.bounded import Result
 from cablejax.mpc import (
     SOLVERS,
     Accurate,
     CrossEntropy,
-    Outcome,
     PathIntegral,
     ShapingProblem,
     TrustRegion,
@@ -66,7 +66,7 @@ def test_plan_is_a_minimum_and_its_derivatives_are_those_of_planning_again(name)
     with jax.enable_x64(True):
         case, step = problem(**REGIMES[name], motion_weight=0.02), 5e-5
         plan, _, violation = solved(EXACT, case)
-        assert Outcome(int(plan.outcome)) in (Outcome.CONVERGED, Outcome.STALLED) and float(violation) == 0.0
+        assert Result(int(plan.result)) in (Result.CONVERGED, Result.STALLED) and float(violation) == 0.0
         certificate = certified(plan, case)
         assert float(certificate.residual) < 1e-8
         n_active = int((certificate.multipliers > 1e-6).sum())
@@ -118,12 +118,12 @@ def with_bounds(**bounds):
 
 
 BAD = {
-    "contradicting distances": (lambda: with_bounds(min_distance=1.2), {Outcome.INFEASIBLE}),
-    "negative radius": (lambda: with_bounds(radius=-0.01), {Outcome.INFEASIBLE}),
-    "unknown radius": (lambda: with_bounds(radius=float("nan")), {Outcome.INFEASIBLE}),
-    "NaN from the model": (lambda: problem("U", rate=float("nan")), {Outcome.NONFINITE}),
-    "zero radius": (lambda: with_bounds(radius=0.0), {Outcome.CONVERGED, Outcome.STALLED, Outcome.STEP_LIMIT}),
-    "singular": (lambda: problem("U", rate=0.0), set(Outcome)),
+    "contradicting distances": (lambda: with_bounds(min_distance=1.2), {Result.EMPTY_SET}),
+    "negative radius": (lambda: with_bounds(radius=-0.01), {Result.EMPTY_SET}),
+    "unknown radius": (lambda: with_bounds(radius=float("nan")), {Result.EMPTY_SET}),
+    "NaN from the model": (lambda: problem("U", rate=float("nan")), {Result.NONFINITE}),
+    "zero radius": (lambda: with_bounds(radius=0.0), {Result.CONVERGED, Result.STALLED, Result.STEP_LIMIT}),
+    "singular": (lambda: problem("U", rate=0.0), set(Result)),
 }
 
 
@@ -131,9 +131,9 @@ BAD = {
 def test_bad_input_gives_a_code(name):
     make, expected = BAD[name]
     plan, _, _ = solved(TrustRegion(), make())
-    outcome = Outcome(int(plan.outcome))
-    assert outcome in expected and len(outcome.message) > 20
-    if outcome is not Outcome.INFEASIBLE:
+    result = Result(int(plan.result))
+    assert result in expected and len(result.message) > 20
+    if result is not Result.EMPTY_SET:
         assert np.isfinite(plan.motion).all()
 
 
@@ -146,7 +146,7 @@ def test_sampling_improves_on_the_guess_and_stays_inside(solver):
     assert float(violation) == 0.0
     assert start - float(value) > 0.5 * (start - best)
     plan, _, _ = solved(solver, problem("U", rate=float("nan")))
-    assert Outcome(int(plan.outcome)) is Outcome.NONFINITE and np.isfinite(plan.motion).all()
+    assert Result(int(plan.result)) is Result.NONFINITE and np.isfinite(plan.motion).all()
 
 
 @pytest.mark.slow
@@ -158,10 +158,10 @@ def test_sampling_knows_the_way_back_from_outside(solver):
         problem("U"), feasible=feasible_from(jnp.asarray(START), 0.05, (0.15, 0.99), **workspace)
     )
     plan, value, violation = solved(solver, case)
-    assert float(violation) <= 1e-7 and Outcome(int(plan.outcome)) is Outcome.STEP_LIMIT
+    assert float(violation) <= 1e-7 and Result(int(plan.result)) is Result.STEP_LIMIT
     assert float(value) <= float(value_at(case, case.start(jnp.asarray(STILL)).motion))
     plan, _, _ = solved(solver, with_bounds(min_distance=1.2))
-    assert Outcome(int(plan.outcome)) is Outcome.INFEASIBLE
+    assert Result(int(plan.result)) is Result.EMPTY_SET
 
 
 @pytest.mark.slow

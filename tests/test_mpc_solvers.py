@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 import scipy.optimize
 
-from cablejax.mpc import Dogleg, GaussNewton, Outcome, ProjectedGradient, TrustRegion
+from cablejax.bounded import Result
+from cablejax.mpc import Dogleg, GaussNewton, ProjectedGradient, TrustRegion
 from mpc_cases import TARGETS, problem, random_motion
 
 STEPS = 3
@@ -99,7 +100,7 @@ def test_says_when_it_has_converged(solver):
     case = problem("U")
     plan, value, _ = solve(solver, case, jnp.zeros((STEPS, 2, 3)))
     again, same, _ = solve(solver, case, plan.motion)
-    assert Outcome(int(again.outcome)) is Outcome.CONVERGED
+    assert Result(int(again.result)) is Result.CONVERGED
     assert int(again.evaluations) <= 10
     assert same == pytest.approx(value, rel=1e-4)
 
@@ -114,7 +115,7 @@ def test_stops_at_its_budget_with_an_improvement(solver):
         return plan, case.value(plan.motion), case.value(guess)
 
     plan, value, before = planned(case)
-    assert Outcome(int(plan.outcome)) is Outcome.STEP_LIMIT
+    assert Result(int(plan.result)) is Result.STEP_LIMIT
     assert int(plan.evaluations) == getattr(solver, "max_evaluations", None) or getattr(solver, "max_iterations", None)
     assert float(value) < 0.8 * float(before)
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from cablejax.cable import Cable
-from cablejax.closed_loop import ClosedLoopRun
+from cablejax.control.loop import ClosedLoopRun
 from cablejax.gaplog import gap_log_from_episodes, write_gap_log
 from cablejax.report.animation import write_gif
 from cablejax.report.page import write_page

@@ -7,7 +7,6 @@ wrong is told from commands and poses alone. It neither hides an effect of the c
 from __future__ import annotations
 
 import dataclasses
-import itertools
 from typing import Any, get_args
 
 import numpy as np
@@ -19,6 +18,7 @@ from cablejax.diagnose.conclude import Conclusion
 from cablejax.diagnose.diagnosis import PLACES, NamedEffect, ParameterEstimate, Ranked, Verdict
 from cablejax.diagnose.evidence import student_log_likelihood
 from cablejax.diagnose.repeats import episodes_by_motion
+from cablejax.effects.arms import lagged
 
 # Poses are believed to this [m]; radians count for 0.15 m.
 _ENCODER_NOISE = 5e-5
@@ -92,7 +92,10 @@ class _Arms:
         theta, start = list(theta), self.pose[:, :1]
         gain = theta.pop(0) if "actuation_gain" in effects else 1.0
         delay, slow = theta if "actuation_lag" in effects else (0.0, 0.0)
-        return _lagged(start + gain * (self.commanded - start), self.interval, max(delay, 0.0), max(slow, 0.0))
+        moved = start + gain * (self.commanded - start)
+        return np.stack(
+            [lagged(p, dt, max(delay, 0.0), max(slow, 0.0)) for p, dt in zip(moved, self.interval, strict=True)]
+        )
 
     def off(self, poses: Float[np.ndarray, "E T 2 3"]) -> Float[np.ndarray, "E T 2 3"]:
         """What measured poses are off [m]; 0 in the padding."""
@@ -266,25 +269,3 @@ def _named(effects: tuple[str, ...], result: Any, scale: float) -> dict[str, tup
 def _integrated(first, command, interval):
     steps = command * np.asarray(interval)[:, None, None, None]
     return first[:, None] + np.concatenate([np.zeros_like(steps[:, :1]), np.cumsum(steps, axis=1)[:, :-1]], axis=1)
-
-
-def _lagged(poses, interval, delay, slow):
-    """A pure delay [s], then a first-order lag of time constant `slow` [s], exact for piecewise linear input."""
-    result = np.empty_like(poses)
-    for e, (pose, dt) in enumerate(zip(poses, np.asarray(interval), strict=True)):
-        n = len(pose)
-        back = np.clip(np.arange(n) - delay / dt, 0.0, n - 1.0)
-        before = np.minimum(back.astype(int), n - 2)
-        t = (back - before)[:, None, None]
-        late = (1 - t) * pose[before] + t * pose[before + 1]
-        if slow > 1e-6:
-            decay = np.exp(-dt / slow)
-            state, out = late[0].copy(), [late[0]]
-            for a, b in itertools.pairwise(late):
-                slope = (b - a) / dt
-                # exact response of slow * y' + y = u on a ramp u = a + slope t
-                state = (state - a + slope * slow) * decay + b - slope * slow
-                out.append(state)
-            late = np.stack(out)
-        result[e] = late
-    return result

@@ -22,7 +22,7 @@ SCORES = (
 )
 # fmt: on
 """Of 80 logs of the blind check of seed 20270404, printed by `python experiments/22_blind_score.py
-docs/results/blind/20270404/verdicts docs/results/blind/20270404 --leftovers`."""
+docs/results/blind/20270404/cases.jsonl --leftovers`."""
 
 
 def leftover_score(left: float, gap: float, noise: float, calibration: Calibration) -> float:

@@ -13,9 +13,8 @@ import numpy as np
 
 from cablejax.diagnose.diagnosis import PLACES, Diagnosis, Gap, NamedEffect, Ranked
 from cablejax.diagnose.where import Where
+from cablejax.effects.given import VERDICT_SCHEMA
 from cablejax.whole_file import whole_file
-
-SCHEMA = "cablejax-verdict/1"
 
 
 def verdict_json(diagnosis: Diagnosis) -> dict[str, Any]:
@@ -32,7 +31,7 @@ def verdict_json(diagnosis: Diagnosis) -> dict[str, Any]:
     gap = diagnosis.gap
     return _plain(
         {
-            "schema": SCHEMA,
+            "schema": VERDICT_SCHEMA,
             "verdict": diagnosis.verdict,
             "sentence": diagnosis.sentence,
             "effects": [_effect(effect) for effect in diagnosis.effects],

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import abc
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar, Literal
 
 import numpy as np
@@ -34,6 +34,12 @@ class Context:
     max_curvature: Float[np.ndarray, "E"]
 
 
+Hook = Literal["bending", "extension", "memory", "table", "mass", "grasp", "input", "observation", "obstacle"]
+"""Where an effect acts on a simulation: the bending law along the cable, the change of its length, bends that the cable
+remembers, the forces of the table, mass, how the grippers hold the cable, how the arms follow their commands, how the
+cable is observed, and what it touches. Every simulator states the hooks that it honours."""
+
+
 class CableEffect(Effect, abc.ABC):
     """Something that a real cable does and the nominal simulator does not.
 
@@ -41,6 +47,8 @@ class CableEffect(Effect, abc.ABC):
     `check_effect` says whether it behaves. Effects are stateless: the attributes of `Effect` are those of the class.
     """
 
+    hook: ClassVar[Hook]
+    """The hook through which the effect acts."""
     side: ClassVar[Literal["dynamics", "observation"]] = "dynamics"
     """Whether the cable moves differently, or is only seen differently."""
 
@@ -66,6 +74,21 @@ class CableEffect(Effect, abc.ABC):
         """Parameters by the names of the verdict, as (value, unit). Choices are integers."""
         named = {p.name: (float(v), p.unit) for p, v in zip(self.parameters, values, strict=True)}
         return named if self.variant_name is None else {self.variant_name: (variant, ""), **named}
+
+    def given(self, parameters: Mapping[str, float], config: Discretisation) -> tuple[tuple[float, ...], int]:
+        """Inverse of `reported`: `values` and `variant` of parameters by the names of the verdict.
+
+        A parameter that is not given takes its prior median; so what a verdict leaves out does no harm.
+        """
+        named = {p.name: p.centre for p in self.parameters}
+        own = self._from_reported(dict(parameters), config)
+        variant = int(own.get("variant", own.get(self.variant_name or "", self.variants[0])))
+        return tuple(float(own.get(name, centre)) for name, centre in named.items()), variant
+
+    def _from_reported(self, parameters: dict[str, float], config: Discretisation) -> dict[str, float]:
+        """`parameters` by the names and in the units of `self.parameters`; the variant as "variant" or its own name."""
+        del config
+        return parameters
 
     def location(self, values: Sequence[float], variant: int, config: Discretisation) -> dict[str, Any]:
         """Where the effect sits: keys "along_cable_m", "time_s", "table_m" of the verdict, where they apply."""

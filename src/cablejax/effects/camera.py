@@ -14,6 +14,7 @@ class CameraSimilarity(CableEffect):
     """Scale, rotation and offset of the keypoints' frame."""
 
     name = "camera_similarity"
+    hook = "observation"
     parameters = (
         Parameter("scale", "", 0.5, 2.0, 1.0, 0.02),
         Parameter("angle_rad", "rad", -1.0, 1.0, 0.0, 0.02),
@@ -46,6 +47,7 @@ class CameraLag(CableEffect):
     """Keypoints are stamped late."""
 
     name = "camera_lag"
+    hook = "observation"
     parameters = (Parameter("time_s", "s", 0.0, 5.0, 0.2, 0.2),)
     null = (0.0,)
     side = "observation"
@@ -64,6 +66,7 @@ class KeypointBias(CableEffect):
     """
 
     name = "keypoint_bias"
+    hook = "observation"
     parameters = (Parameter("offset_m", "m", -0.1, 0.1, 0.0, 0.01),)
     null = (0.0,)
     amplitude, reversible = 0, True
@@ -95,7 +98,10 @@ class KeypointBias(CableEffect):
         return [(variant, (mean,)) for _, variant, mean in sorted(gains, reverse=True)[:3]]
 
     def reported(self, values, variant, config):
-        return {"index": (variant // 2, ""), "offset_m": (float(values[0]), "m")}
+        return {"index": (variant // 2, ""), "across": (variant % 2, ""), "offset_m": (float(values[0]), "m")}
+
+    def _from_reported(self, parameters, config):
+        return parameters | {"variant": 2 * parameters["index"] + parameters.get("across", 0)}
 
     def location(self, values, variant, config):
         s = float(config.cable.keypoint_arclength[variant // 2])

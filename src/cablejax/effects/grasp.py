@@ -23,6 +23,7 @@ class GripperSlip(CableEffect):
     """The cable slides through a gripper, once in every episode."""
 
     name = "gripper_slip"
+    hook = "extension"
     parameters = (
         Parameter("time_s", "s", 0.0, 300.0, 10.0, 8.0, difference=0.01),
         Parameter("distance_m", "m", -0.2, 0.2, 0.0, 0.02),
@@ -49,6 +50,7 @@ class GripperRotationOffset(CableEffect):
     """The grasp angle is off."""
 
     name = "gripper_rotation_offset"
+    hook = "grasp"
     parameters = (Parameter("angle_rad", "rad", -1.0, 1.0, 0.0, 0.15),)
     null = (0.0,)
     amplitude, reversible = 0, True
@@ -69,6 +71,7 @@ class GripperCompliance(CableEffect):
     """The grasp yields in rotation."""
 
     name = "gripper_compliance"
+    hook = "grasp"
     parameters = (Parameter("stiffness_n_m_per_rad", "N m/rad", 1e-3, 1e4, 0.3, 1.2, log=True),)
     null = (float("inf"),)
     amplitude = 0

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 if TYPE_CHECKING:
-    from cablejax.closed_loop import ClosedLoopRun
+    from cablejax.control.loop import ClosedLoopRun
 
 Method = Literal["residual", "direct"]
 """`residual`: the learned model corrected online; `direct`: the learned model as it was trained."""
