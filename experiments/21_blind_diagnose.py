@@ -21,7 +21,7 @@ os.environ.setdefault("NPROC", "4")
 import jax
 
 from cablejax.diagnose import Calibration, DiagnosisError, diagnose, verdict_json
-from cablejax.diagnose.run import baseline_error
+from cablejax.diagnose.planar_run import baseline_error
 from cablejax.evaluation.rows import Rows
 from cablejax.gaplog import read_gap_log
 

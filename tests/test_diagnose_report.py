@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from cablejax.diagnose.diagnosis import Diagnosis, Gap, NamedEffect, NextMotion, ParameterEstimate, Ranked
+from cablejax.diagnose.diagnosis import CableDiagnosis, Gap, NamedEffect, NextMotion, ParameterEstimate, Ranked
 from cablejax.diagnose.verdict_json import verdict_json, write_verdict
 from cablejax.diagnose.where import localise
 from cablejax.report.diagnosis_page import write_diagnosis_page
@@ -51,7 +51,7 @@ RANKING = (
 )
 
 
-def diagnosis(verdict="named", **changes) -> Diagnosis:
+def diagnosis(verdict="named", **changes) -> CableDiagnosis:
     """A made-up diagnosis of two episodes whose gap is 3 mm in the middle of the cable."""
     s = np.linspace(0.0, 1.0, POINTS)
     pose = np.stack([poses(m) for m in MOTIONS])[..., :2]
@@ -93,7 +93,7 @@ def diagnosis(verdict="named", **changes) -> Diagnosis:
         "seconds": 12.3,
         "settings": {"jax": "0", "links": {"fit": 33}},
     }
-    return Diagnosis(**{**values, **changes})
+    return CableDiagnosis(**{**values, **changes})
 
 
 NO_GAP = Gap(

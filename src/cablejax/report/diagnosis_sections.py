@@ -7,7 +7,7 @@ import itertools
 import json
 from collections.abc import Sequence
 
-from cablejax.diagnose.diagnosis import Diagnosis
+from cablejax.diagnose.diagnosis import CableDiagnosis
 from cablejax.report.effect_words import (
     EFFECTS,
     MOTIONS,
@@ -34,7 +34,7 @@ _RULES = {
 }
 
 
-def which_section(diagnosis: Diagnosis, ranking: str) -> str:
+def which_section(diagnosis: CableDiagnosis, ranking: str) -> str:
     parts = []
     if diagnosis.verdict == "none":
         parts.append("<p>There is no gap to explain, so no effect is named.</p>")
@@ -72,12 +72,12 @@ def which_section(diagnosis: Diagnosis, ranking: str) -> str:
     return "\n".join(parts)
 
 
-def _left(diagnosis: Diagnosis) -> float:
+def _left(diagnosis: CableDiagnosis) -> float:
     gap = diagnosis.gap
     return max(gap.after_rmse_mm**2 - gap.noise_floor_mm**2, 0.0) ** 0.5
 
 
-def far_section(diagnosis: Diagnosis, picture: str) -> str:
+def far_section(diagnosis: CableDiagnosis, picture: str) -> str:
     gap = diagnosis.gap
     added = listed([effect_title(e.name) for e in diagnosis.effects]) or "the best explanation"
     if diagnosis.verdict == "none":
@@ -114,7 +114,7 @@ def far_section(diagnosis: Diagnosis, picture: str) -> str:
     return f"<p>{html.escape(text)}</p>\n<figure>{picture}<figcaption>{caption}</figcaption></figure>"
 
 
-def next_section(diagnosis: Diagnosis, picture: str) -> str:
+def next_section(diagnosis: CableDiagnosis, picture: str) -> str:
     following = diagnosis.next_motion
     if following is None:
         settled = diagnosis.verdict in ("none", "named")
@@ -143,14 +143,14 @@ def _explanation(names: str) -> str:
     return listed([effect_title(name) for name in names.split(" + ")])
 
 
-def limits_section(diagnosis: Diagnosis) -> str:
+def limits_section(diagnosis: CableDiagnosis) -> str:
     if not diagnosis.caveats:
         return ""
     rows = "".join(f"<li>{html.escape(caveat)}</li>" for caveat in diagnosis.caveats)
     return f'<h2>What limits this verdict</h2>\n<ul class="limits">{rows}</ul>'
 
 
-def details_section(diagnosis: Diagnosis) -> str:
+def details_section(diagnosis: CableDiagnosis) -> str:
     where = diagnosis.where
     tried = _table(
         ("effect", "what it is", "probability", "share taken away", "left"),

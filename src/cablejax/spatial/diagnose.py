@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 import jax
 import numpy as np
 
-from cablejax.diagnose.diagnosis import Diagnosis, Gap, Ranked, Verdict
+from cablejax.diagnose.diagnosis import CableDiagnosis, Gap, Ranked, Verdict
 from cablejax.report.effect_words import effect_title, listed, millimetres, share
 from cablejax.spatial.clock import on_one_clock
 from cablejax.spatial.estimate import estimate
@@ -28,7 +28,7 @@ _TELLING = 0.2
 
 
 @dataclasses.dataclass(frozen=True)
-class SpatialDiagnosis(Diagnosis):
+class SpatialDiagnosis(CableDiagnosis):
     """A diagnosis in space. Arrays of keypoints have three coordinates; held keypoints are as observed.
 
     Attributes:

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from cablejax.effects.base import Parameter
+from cablejax.effects.effect import Parameter
 from cablejax.effects.material import BendingStiffness, IntrinsicCurvature, StiffnessProfile
 from cablejax.spatial.hanging import Wire, hanging_angles, hanging_points, joint_arclength
 
