@@ -30,7 +30,7 @@ from cablejax.recordings.wires import HangingWire, read_wires
 from cablejax.report.markdown import markdown_table
 from cablejax.report.provenance import machine, versions
 from cablejax.report.style import LIGHT
-from cablejax.spatial.hanging import Wire, hanging_angles, hanging_points
+from cablejax.simulate.hanging import Wire, hanging_angles, hanging_points
 from cablejax.spatial.hanging_effects import EFFECTS
 from cablejax.spatial.hanging_fit import LINKS_PER_SPACING, Photographs
 from cablejax.spatial.hanging_verdict import WireDiagnosis, diagnose_wire, rig_error, verdict_of

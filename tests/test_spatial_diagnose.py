@@ -12,6 +12,7 @@ import pytest
 import spatial_cases as cases
 from cablejax.diagnose import verdict_json
 from cablejax.report.diagnosis_page import write_diagnosis_page
+from cablejax.simulate.rod import Rod
 from cablejax.spatial.clock import on_one_clock
 from cablejax.spatial.diagnose import diagnose_space
 from cablejax.spatial.fit import Simulator, errors
@@ -20,7 +21,6 @@ from cablejax.spatial.geometry import local_changes
 from cablejax.spatial.identify import layout_of
 from cablejax.spatial.newton import improve
 from cablejax.spatial.residual import fit_residual
-from cablejax.spatial.rod import Rod
 from cablejax.spatial.search import falls, halves
 from cablejax.spatial.values import shared_by_all
 from cablejax.spatial.windows import windows_of

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 import spatial_cases as cases
+from cablejax.simulate.rod import Rod
 from cablejax.spatial.estimate import UNMODELLED, Interval, estimate
 from cablejax.spatial.fit import Simulator
 from cablejax.spatial.identify import Identified, layout_of
 from cablejax.spatial.named import named_effects, parameters_of
 from cablejax.spatial.newton import improve
-from cablejax.spatial.rod import Rod
 from cablejax.spatial.time_steps import TimeSteps
 from cablejax.spatial.values import shared_by_all
 from cablejax.spatial.windows import windows_of

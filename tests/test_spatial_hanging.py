@@ -12,7 +12,7 @@ from scipy.integrate import solve_bvp
 from cablejax.cable import GRAVITY
 from cablejax.recordings.wires import read_wires
 from cablejax.simulate.elastica import elastica
-from cablejax.spatial.hanging import Wire, hanging_angles, hanging_points, imbalance, joint_arclength
+from cablejax.simulate.hanging import Wire, hanging_angles, hanging_points, imbalance, joint_arclength
 from cablejax.spatial.hanging_effects import EFFECTS, wire_shape
 from cablejax.spatial.hanging_fit import Photographs, fit_wire
 from cablejax.spatial.hanging_verdict import diagnose_wire, rig_error, tracing_noise, verdict_of

@@ -7,6 +7,7 @@ import dataclasses
 import numpy as np
 
 import spatial_cases as cases
+from cablejax.simulate.rod import Rod
 from cablejax.spatial.fit import Simulator, Sums
 from cablejax.spatial.identify import layout_of
 from cablejax.spatial.newton import (
@@ -20,7 +21,6 @@ from cablejax.spatial.newton import (
     prior_shifts,
     slopes,
 )
-from cablejax.spatial.rod import Rod
 from cablejax.spatial.values import Values, from_json, mean_of, shared_by_all, to_json
 from cablejax.spatial.windows import windows_of
 

@@ -9,11 +9,11 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from cablejax.simulate.rod import Rod
 from cablejax.spatial.effects import Layout, blocks, effect_names
 from cablejax.spatial.fit import Simulator, errors
 from cablejax.spatial.memory import Memory, fingerprint
 from cablejax.spatial.newton import improve
-from cablejax.spatial.rod import Rod
 from cablejax.spatial.search import Step, accepted_effects, falls, halves, search
 from cablejax.spatial.time_steps import TimeSteps, time_steps_for
 from cablejax.spatial.values import Values, mean_of

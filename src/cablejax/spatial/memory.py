@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from cablejax.json_file import read_json
-from cablejax.spatial.rod import Rod
+from cablejax.simulate.rod import Rod
 from cablejax.spatial.search import Step
 from cablejax.spatial.values import Values, from_json, to_json
 from cablejax.spatial.windows import Windows
