@@ -111,7 +111,9 @@ def test_says_more_from_more_recordings(found, estimated):
 def test_tells_every_effect_with_its_interval(found, everything):
     windows, identified = found
     stiffness, damping = named_effects(identified, everything, 0.05, windows)
-    (ratio,), (time,) = stiffness.parameters.values(), damping.parameters.values()
+    assert stiffness.probability is None and damping.probability is None
+    (ratio, absolute), (time,) = stiffness.parameters.values(), damping.parameters.values()
+    assert absolute.unit == "m^4/s^2" and absolute.value == pytest.approx(ratio.value * cases.NOMINAL)
     # the priors hold no drag at all impossible, and some is taken for damping
     assert ratio.value == pytest.approx(cases.TRUE_RATIO, rel=0.05)
     assert time.value == pytest.approx(cases.TRUE_DAMPING, rel=0.25)

@@ -35,30 +35,32 @@ class NamedEffect:
 
     Attributes:
         name: from the gap log's list of names.
-        probability: that this effect is a cause.
+        probability: that this effect is a cause; None where no posterior over explanations was computed.
         parameters: by the names of the format.
         location: keys "along_cable_m", "time_s", "table_m"; None where an effect has no such place.
     """
 
     name: str
-    probability: float
+    probability: float | None
     parameters: dict[str, ParameterEstimate]
     location: dict[str, Any]
 
 
 @dataclasses.dataclass(frozen=True)
 class Ranked:
-    """One effect that was tried alone.
+    """One effect that was tried: alone, or in a forward search on top of those kept before it.
 
     Attributes:
         name: of the effect.
-        probability: posterior among all single effects.
-        held_out_shrinkage: share of the squared gap that goes away on episodes left out of the fit.
-        leftover_mm: gap above the noise that is left on the episodes fitted, root mean square per coordinate [mm].
+        probability: posterior among all single effects; None in a forward search, which computes none.
+        held_out_shrinkage: share of the squared gap that goes away on episodes left out of the fit; negative where the
+            effect makes these worse.
+        leftover_mm: gap above the noise that is left, root mean square per coordinate [mm], on the episodes fitted; of
+            a forward search, on those left out.
     """
 
     name: str
-    probability: float
+    probability: float | None
     held_out_shrinkage: float
     leftover_mm: float
 
@@ -79,7 +81,8 @@ class Gap:
             named effects, without a residual); None if no episode is long enough.
         horizons_mm: {seconds since the episode's start: (before, after)}.
         held_out_episodes: those scored; all of them where every episode was held out once.
-        split: shares of the squared error before: "noise", "named", "learnable", "unexplained"; they sum to 1.
+        split: shares of the squared error before: "noise", "named", "learnable", "unexplained"; they sum to 1. None for
+            a share that was not evaluated, which is then part of "unexplained".
     """
 
     horizon_s: float
@@ -91,7 +94,7 @@ class Gap:
     ahead_mm: dict[str, float] | None
     horizons_mm: dict[float, tuple[float, float]]
     held_out_episodes: tuple[int, ...]
-    split: dict[str, float]
+    split: dict[str, float | None]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -112,33 +115,26 @@ class NextMotion:
     alternatives: dict[str, float]
 
 
-@dataclasses.dataclass(frozen=True)
-class Diagnosis:
-    """Where a simulator is wrong, which effect causes it, how far the gap shrinks with it.
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Findings:
+    """What any diagnosis says, in the plane, in space or of a hanging wire: the content of `verdict.json`.
 
     Attributes:
         verdict: see the format.
         sentence: the verdict in words.
         effects: what is named as the cause; empty for "none" and "unknown".
         equivalent: sets of effects that this log cannot tell apart.
-        ranking: every effect tried, most probable first.
+        ranking: every effect tried, most probable first; without probabilities, the largest shrinkage first.
         leftover_p: chance that a right explanation leaves as much as the best one does, see `conformal`; None without a
             gap, and where no labelled logs are like this one.
         gap: before and after.
         where: along the cable, in time, by regime, by frame.
-        next_motion: None if nothing would be gained.
+        next_motion: None if nothing would be gained, or if no motion was evaluated.
         baselines: the single effect that simpler rules would have named: "lowest_cost" (best fit in sample), "bic" (the
             same with Schwarz's penalty, all samples taken to be independent) and "sparse_regression" (the best template
-            without any fit); empty for the verdict "none".
+            without any fit); empty for the verdict "none", and where these rules were not evaluated.
         caveats: what the log did not allow, in words.
-        log: what was diagnosed.
-        nominal: keypoints of the nominal simulator [m], NaN beyond an episode's end, shape [E, T, N, 2].
-        explained: keypoints of the simulator with the named (or best) effects, each episode from a fit that left it
-            out [m], shape [E, T, N, 2]; None for the verdict "none".
-        noise_mm: standard deviation of each keypoint's coordinates [mm], shape [N].
-        noise_correlation: autocorrelation of the noise at lags 1, 2, ... samples.
         seconds: run time.
-        settings: versions and options, for the record.
     """
 
     verdict: Verdict
@@ -152,10 +148,26 @@ class Diagnosis:
     next_motion: NextMotion | None
     baselines: dict[str, str]
     caveats: tuple[str, ...]
+    seconds: float
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Diagnosis(Findings):
+    """Where a simulator is wrong, which effect causes it, how far the gap shrinks with it.
+
+    Attributes:
+        log: what was diagnosed.
+        nominal: keypoints of the nominal simulator [m], NaN beyond an episode's end, shape [E, T, N, 2].
+        explained: keypoints of the simulator with the named (or best) effects, each episode from a fit that left it
+            out [m], shape [E, T, N, 2]; None for the verdict "none".
+        noise_mm: standard deviation of each keypoint's coordinates [mm], shape [N].
+        noise_correlation: autocorrelation of the noise at lags 1, 2, ... samples.
+        settings: versions and options, for the record.
+    """
+
     log: GapLog
     nominal: Float[np.ndarray, "E T N 2"]
     explained: Float[np.ndarray, "E T N 2"] | None
     noise_mm: Float[np.ndarray, "N"]
     noise_correlation: Float[np.ndarray, "K"]
-    seconds: float
     settings: dict[str, Any]

@@ -12,10 +12,11 @@ import numpy as np
 
 from cablejax.diagnose.belief import Calibration, excess, level
 from cablejax.diagnose.case import FINE_LINKS, FIT_LINKS, Case
-from cablejax.diagnose.conclude import baselines, conclude, sentence, with_arms
+from cablejax.diagnose.conclude import baselines, conclude, with_arms
 from cablejax.diagnose.diagnosis import Diagnosis
 from cablejax.diagnose.fit import candidate, evaluate
 from cablejax.diagnose.gap import held_out_keypoints, measure_gap
+from cablejax.diagnose.judgement import sentence
 from cablejax.diagnose.next_motion import next_motion
 from cablejax.diagnose.noise import SMALLEST
 from cablejax.diagnose.search import Search, search
@@ -90,7 +91,12 @@ def diagnose(
     repaired = recording.as_log(log.meta)
     return Diagnosis(
         verdict=conclusion.verdict,
-        sentence=sentence(conclusion, measured.shrinkage),
+        sentence=sentence(
+            conclusion.verdict,
+            conclusion.effects,
+            conclusion.equivalent,
+            conclusion.explained if measured.shrinkage is None else measured.shrinkage,
+        ),
         effects=conclusion.effects,
         equivalent=conclusion.equivalent,
         ranking=conclusion.ranking,

@@ -11,15 +11,15 @@ from typing import Any
 
 import numpy as np
 
-from cablejax.diagnose.diagnosis import Diagnosis, NamedEffect
+from cablejax.diagnose.diagnosis import Findings, NamedEffect
 from cablejax.whole_file import whole_file
 
 SCHEMA = "cablejax-verdict/1"
 _PLACES = ("along_cable_m", "time_s", "table_m")
 
 
-def verdict_json(diagnosis: Diagnosis) -> dict[str, Any]:
-    """The verdict as a JSON object; what is not a finite number, or was never observed, is null.
+def verdict_json(findings: Findings) -> dict[str, Any]:
+    """The verdict as a JSON object; what is not a finite number, was never observed, or was not computed, is null.
 
     Where the verdict is "unknown" nothing was added, and nothing shrinks; `gap.best_shrinkage` is that of the best
     explanation all the same. `ci90` is null for a choice, such as a gripper, and a list where the value is one.
@@ -28,20 +28,18 @@ def verdict_json(diagnosis: Diagnosis) -> dict[str, Any]:
     also `horizons`, `split`, `ahead_mm` and `best_shrinkage`, `ranking` also `leftover_mm`, and `where` also
     `sentences`, `per_horizon_mm` and `frames`.
     """
-    gap, where = diagnosis.gap, diagnosis.where
+    gap, where = findings.gap, findings.where
     # what no effect was named for has not shrunk, however much an explanation that was not believed takes away
-    blamed = diagnosis.verdict != "unknown"
-    log = diagnosis.log
-    valid = np.arange(log.keypoints.shape[1]) < log.episode_length[:, None]
-    seen = np.isfinite(log.keypoints).all(axis=-1) & valid[..., None]
+    blamed = findings.verdict != "unknown"
+    seen = np.isfinite(where.heat)
     return _plain(
         {
             "schema": SCHEMA,
-            "verdict": diagnosis.verdict,
-            "sentence": diagnosis.sentence,
-            "effects": [_effect(effect) for effect in diagnosis.effects],
-            "equivalent": diagnosis.equivalent,
-            "baselines": diagnosis.baselines,
+            "verdict": findings.verdict,
+            "sentence": findings.sentence,
+            "effects": [_effect(effect) for effect in findings.effects],
+            "equivalent": findings.equivalent,
+            "baselines": findings.baselines,
             "ranking": [
                 {
                     "name": ranked.name,
@@ -49,9 +47,9 @@ def verdict_json(diagnosis: Diagnosis) -> dict[str, Any]:
                     "held_out_shrinkage": ranked.held_out_shrinkage,
                     "leftover_mm": ranked.leftover_mm,
                 }
-                for ranked in diagnosis.ranking
+                for ranked in findings.ranking
             ],
-            "leftover_p": diagnosis.leftover_p,
+            "leftover_p": findings.leftover_p,
             "gap": {
                 "horizon_s": gap.horizon_s,
                 "before_rmse_mm": gap.before_rmse_mm,
@@ -78,17 +76,17 @@ def verdict_json(diagnosis: Diagnosis) -> dict[str, Any]:
                 "frames": where.frames,
                 "sentences": where.sentences,
             },
-            "next_motion": None if diagnosis.next_motion is None else diagnosis.next_motion.motion,
-            "caveats": diagnosis.caveats,
-            "seconds": diagnosis.seconds,
+            "next_motion": None if findings.next_motion is None else findings.next_motion.motion,
+            "caveats": findings.caveats,
+            "seconds": findings.seconds,
         }
     )
 
 
-def write_verdict(path: str | os.PathLike[str], diagnosis: Diagnosis) -> pathlib.Path:
+def write_verdict(path: str | os.PathLike[str], findings: Findings) -> pathlib.Path:
     """Writes the verdict, whole or not at all, over what was there, and returns its path."""
     path = pathlib.Path(path)
-    text = json.dumps(verdict_json(diagnosis), indent=1, allow_nan=False) + "\n"
+    text = json.dumps(verdict_json(findings), indent=1, allow_nan=False) + "\n"
     path.parent.mkdir(parents=True, exist_ok=True)
     with whole_file(path) as stream:
         stream.write(text.encode())
