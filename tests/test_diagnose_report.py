@@ -16,6 +16,7 @@ import spatial_cases
 from cablejax.diagnose.diagnosis import Diagnosis, Gap, NamedEffect, NextMotion, ParameterEstimate, Ranked
 from cablejax.diagnose.verdict_json import verdict_json, write_verdict
 from cablejax.diagnose.where import localise
+from cablejax.report.diagnosis_charts import ranking_figure
 from cablejax.report.diagnosis_page import write_diagnosis_page
 from cablejax.report.effect_words import effect_place, quantity, share
 from cablejax.spatial.gap import gap_of, noise_of
@@ -281,13 +282,16 @@ def test_in_space_what_was_not_computed_is_null_and_not_on_the_page(space):
 
 
 def test_in_space_the_page_describes_the_search_the_noise_and_the_units(space):
-    _, page, verdict = space
+    result, page, verdict = space
+    figure = ranking_figure(result)
+    assert figure is not None and len(figure.axes) == 1
+    assert [text.get_text() for text in figure.axes[0].texts] == ["90", "-319"]
     assert "forward search" in page and "Every effect alone" not in page and "tried alone" not in page
-    assert ">-319<" in page and "-319 %" in page
+    assert "-319 %" in page
     assert "without the markers' constant offsets" in html_module.unescape(page)
     assert "0.060 m^4/s^2 (0.050 to 0.070)" in page
     # sizes without a test: no statement on which files deviate
-    assert "It is largest in file" in page and "only." not in page
+    assert "It is largest in file" in page and "of 4 only" not in page
     assert verdict["where"]["along_cable_mm"][4] == pytest.approx(30, rel=0.1)
     assert [row["horizon_s"] for row in verdict["where"]["per_horizon_mm"]] == [1.0, 2.0]
 

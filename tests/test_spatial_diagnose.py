@@ -45,7 +45,7 @@ def test_a_fit_finds_stiffness_and_damping():
     before = errors(simulator.predict(values, windows), windows).mean()
     values.shared[layout.slices["damping_time"]] = 0.05
     effects = ["bending_stiffness", "bending_damping"]
-    fit = improve(simulator, values, effects, windows, iterations=8)
+    fit = improve(simulator, values, effects, windows)
     after = errors(simulator.predict(fit.values, windows), windows).mean()
     assert after < 0.1 * before
     ratio = np.exp(fit.values.shared[layout.slices["log_stiffness"]])

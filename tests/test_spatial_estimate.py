@@ -29,7 +29,7 @@ def found():
     simulator = Simulator(Rod(16, twisting=False), layout_of(windows, cases.NOMINAL, twisting=False))
     start = shared_by_all(np.zeros(simulator.layout.size), windows.group)
     start.shared[simulator.layout.slices["damping_time"]] = 0.05
-    values = improve(simulator, start, _FOUND, windows, iterations=8).values
+    values = improve(simulator, start, _FOUND, windows).values
     first = np.arange(len(windows)) < 2
     return windows, Identified(simulator, TimeSteps(1, 0.0), _FOUND, _FOUND, (), values, (values, values), first)
 

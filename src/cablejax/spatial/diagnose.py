@@ -10,6 +10,7 @@ from collections.abc import Callable, Sequence
 import jax
 import numpy as np
 
+from cablejax.bounded import Result
 from cablejax.diagnose.belief import Calibration
 from cablejax.diagnose.diagnosis import Diagnosis, Gap, Ranked, Verdict
 from cablejax.diagnose.judgement import judged, sentence
@@ -179,6 +180,12 @@ def _caveats(log, windows, left_out, found) -> tuple[str, ...]:
             f"The grippers move too fast for the finest time steps of the simulation: half of them would change it by "
             f"{1e3 * found.time_steps.error:.1f} mm. Gaps of that size may be its own."
         )
+    parts = ("one half of the recordings", "the other half", "all recordings")
+    for part, ended in zip(parts, found.results, strict=False):
+        if ended not in (Result.CONVERGED, Result.STALLED):
+            result.append(
+                f"The fit to {part} had not converged when it ended ({ended.name.lower().replace('_', ' ')})."
+            )
     groups = len(np.unique(windows.group))
     if groups < 6:
         result.append(f"Only {groups} recordings: intervals over recordings are rough.")
