@@ -17,6 +17,7 @@ from cablejax.diagnose.diagnosis import CableDiagnosis, Gap
 from cablejax.diagnose.evidence import Evidence
 from cablejax.diagnose.fit import evaluate
 from cablejax.diagnose.gap import held_out_predictions, measure_gap
+from cablejax.diagnose.judgement import sentence
 from cablejax.diagnose.next_motion import next_motion
 from cablejax.diagnose.noise import SMALLEST
 from cablejax.diagnose.protocol import explanation
