@@ -26,6 +26,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from cablejax.diagnose.physics import Physics, normal_gravity
+from cablejax.simulate.compile import full_precision
 from cablejax.simulate.composite import link_lengths, node_offsets
 from cablejax.simulate.config import CableConfig
 from cablejax.simulate.grasp import solve_positive
@@ -82,6 +83,7 @@ class Chain:
     config: CableConfig
     with_contact: bool = True
 
+    @full_precision
     def rollout(
         self,
         physics: Physics,

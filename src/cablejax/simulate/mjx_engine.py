@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from mujoco import mjx
 
-from cablejax.simulate.compile import compiler_options
+from cablejax.simulate.compile import compiler_options, full_precision
 from cablejax.simulate.composite import build_chain, refuse_plugins
 from cablejax.simulate.config import GRAVITY, CableConfig
 from cablejax.simulate.engine import Engine
@@ -49,6 +49,7 @@ class MjxEngine(Engine):
     def initial_state(self, gripper_pose, *, guess=None) -> CableState:
         return equilibrium_state(self.config, gripper_pose, guess=guess)
 
+    @full_precision
     def keypoints(self, state: CableState) -> Float[Array, "N D"]:
         """Keypoints of one cable [m]. Differentiable in `state.qpos`."""
         model = mjx.put_model(self.mj_model)
@@ -61,6 +62,7 @@ class MjxEngine(Engine):
         self.substeps(interval)
         return _compiled_rollout(self, twist.ndim - 3, float(interval))(params, state, twist)
 
+    @full_precision
     def unroll(
         self, params: CableParams, state: CableState, twist: Float[Array, "T Q V"], interval: float = 1.0
     ) -> tuple[CableState, Trajectory]:
