@@ -40,6 +40,8 @@ HORIZONS = (1.0, 2.0, 5.0, 10.0, 20.0, 30.0)
 class Where:
     """Sizes and places of the gap. All `_mm` are root mean squares per coordinate above the noise [mm].
 
+    What was not computed is None, or empty where it is a collection.
+
     Attributes:
         gap_mm: over the whole log.
         smallest_mm: the least gap over the whole log that would have been told from noise.
@@ -64,10 +66,10 @@ class Where:
     gap_mm: float
     smallest_mm: float
     along_cable_mm: Float[np.ndarray, "N"]
-    bend_per_m: Float[np.ndarray, "N2"]
+    bend_per_m: Float[np.ndarray, "N2"] | None
     per_episode_mm: Float[np.ndarray, "E"]
-    episode_p: Float[np.ndarray, "E"]
-    keypoint_p: Float[np.ndarray, "N"]
+    episode_p: Float[np.ndarray, "E"] | None
+    keypoint_p: Float[np.ndarray, "N"] | None
     heat: Float[np.ndarray, "E T N"]
     horizons_mm: dict[float, float]
     regimes: dict[str, float]
@@ -79,7 +81,16 @@ class Where:
     @property
     def episodes(self) -> tuple[int, ...]:
         """Those whose gap stands out from the noise."""
-        return tuple(int(e) for e in np.flatnonzero(self.episode_p < LEVEL))
+        return _below(self.episode_p)
+
+    @property
+    def keypoints(self) -> tuple[int, ...]:
+        """Those whose gap stands out from the noise."""
+        return _below(self.keypoint_p)
+
+
+def _below(p: Float[np.ndarray, "K"] | None) -> tuple[int, ...]:
+    return () if p is None else tuple(int(i) for i in np.flatnonzero(p < LEVEL))
 
 
 def localise(log: GapLog, nominal: Float[np.ndarray, "E T N 2"], noise: Float[np.ndarray, "N"]) -> Where:

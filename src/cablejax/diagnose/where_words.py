@@ -26,9 +26,8 @@ def describe(where: Where, arclength: np.ndarray, noise: np.ndarray, level: floa
         level: below which a p-value counts.
     """
     floor = 1e3 * float(np.sqrt((noise**2).mean()))
-    shown = [e for e in range(len(where.episode_p)) if where.episode_p[e] < level]
-    points = [i for i in range(len(where.keypoint_p)) if where.keypoint_p[i] < level]
-    if not shown and not points:
+    shown = where.episodes
+    if not shown and not where.keypoints:
         return (
             f"No episode deviates from the simulator by more than its noise of {_mm(floor)}.",
             f"A gap of {_mm(max(where.smallest_mm, 0.01))} or more over the whole log would have shown.",
@@ -41,7 +40,7 @@ def describe(where: Where, arclength: np.ndarray, noise: np.ndarray, level: floa
     return (*sentences[:4], few)
 
 
-def _size(where: Where, shown: list[int], floor: float) -> str:
+def _size(where: Where, shown: tuple[int, ...], floor: float) -> str:
     total = len(where.per_episode_mm)
     size = f"The gap is {_mm(where.gap_mm)} above the noise of {_mm(floor)}"
     if not shown:
@@ -75,7 +74,7 @@ def _along(where: Where, arclength: np.ndarray) -> list[str]:
     place = f"between {low:.2f} and {high:.2f} m" if high > low else f"at {low:.2f} m"
     sentence = f"Along the cable it is largest {place}, {profile[peak]:.1f} mm at {arclength[peak]:.2f} m{rest}."
     bend = where.bend_per_m
-    if bend.max() > 0:
+    if bend is not None and bend.max() > 0:
         strong = np.flatnonzero(bend >= 0.7 * bend.max())
         at = arclength[1:-1][strong]
         together = strong[-1] - strong[0] == len(strong) - 1
