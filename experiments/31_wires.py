@@ -27,13 +27,13 @@ from matplotlib.figure import Figure
 
 from cablejax.cable import GRAVITY
 from cablejax.recordings.wires import HangingWire, read_wires
-from cablejax.report.markdown import markdown_table
 from cablejax.report.provenance import machine, versions
 from cablejax.report.style import LIGHT
 from cablejax.simulate.hanging import Wire, hanging_angles, hanging_points
 from cablejax.spatial.hanging_effects import EFFECTS
 from cablejax.spatial.hanging_fit import LINKS_PER_SPACING, Photographs
 from cablejax.spatial.hanging_verdict import WireDiagnosis, diagnose_wire, rig_error, wire_verdict_json
+from pages import markdown_table, publish
 
 OUTSIDE = (0.0, 0.005, 0.01, 0.015)
 """How far outside of the first and last traced point the clamps may be [m]: nothing, to half a spacing."""
@@ -240,9 +240,7 @@ def main() -> None:
                 json.dumps(result["verdict"], indent=1, allow_nan=False) + "\n"
             )
     draw(results, options.figure)
-    options.out.parent.mkdir(parents=True, exist_ok=True)
-    options.out.write_text(page(results, error, sys.argv[1:], time.perf_counter() - began))
-    print(options.out.read_text())
+    publish(page(results, error, sys.argv[1:], time.perf_counter() - began), options.out)
 
 
 if __name__ == "__main__":

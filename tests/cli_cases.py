@@ -7,12 +7,12 @@ import pathlib
 import numpy as np
 from flax import nnx
 
-from cablejax.closed_loop import ClosedLoopRun, shape_error_cm
+from cablejax.control.run import ClosedLoopRun, shape_error_cm
+from cablejax.control.targets import Target
 from cablejax.dynamics.config import ModelConfig
 from cablejax.dynamics.gns import GNS
 from cablejax.dynamics.weights import FILE_NAME, save_weights
 from cablejax.gaplog import Episode
-from cablejax.targets import Target
 
 
 def small_model(folder: pathlib.Path, seed: int = 0) -> pathlib.Path:
@@ -42,7 +42,7 @@ def made_up_run(target: Target, commands: int = 2) -> ClosedLoopRun:
         residual_share=np.where(last, np.nan, 0.5),
         radius=np.where(last, np.nan, 0.05),
         mpc_ms=np.where(last, np.nan, 100.0),
-        held=0,
+        unobserved=0,
         stopped=None,
         observed_error_cm=error,
         episode=Episode(

@@ -11,9 +11,9 @@ from cablejax.commands import diagnose, runs
 from cablejax.commands.options import UsageError
 from cablejax.commands.parts import Parts, unfinished
 from cablejax.commands.runs import Job
-from cablejax.shaping import load_model
+from cablejax.control.shaping import load_model
+from cablejax.control.targets import make_target
 from cablejax.simulate.plant import PlantConfig
-from cablejax.targets import make_target
 from cli_cases import made_up_run, small_model
 
 TARGET = make_target("U")
@@ -185,7 +185,7 @@ def test_parts_are_of_these_weights_and_no_others(tmp_path):
             model=load_model(str(folder)),
             targets=(TARGET,),
             methods=("direct",),
-            solver="trust-region",
+            solver="levenberg-marquardt",
             steps=2,
         )
         return json.dumps(job.settings())

@@ -13,7 +13,7 @@ import pytest
 from PIL import Image
 
 import spatial_cases
-from cablejax.diagnose.diagnosis import Diagnosis, Gap, NamedEffect, NextMotion, ParameterEstimate, Ranked
+from cablejax.diagnose.diagnosis import CableDiagnosis, Gap, NamedEffect, NextMotion, ParameterEstimate, Ranked
 from cablejax.diagnose.verdict_json import verdict_json, write_verdict
 from cablejax.diagnose.where import localise
 from cablejax.report.diagnosis_charts import ranking_figure
@@ -57,7 +57,7 @@ RANKING = (
 )
 
 
-def diagnosis(verdict="named", **changes) -> Diagnosis:
+def diagnosis(verdict="named", **changes) -> CableDiagnosis:
     """A made-up diagnosis of two episodes whose gap is 3 mm in the middle of the cable."""
     s = np.linspace(0.0, 1.0, POINTS)
     pose = np.stack([poses(m) for m in MOTIONS])[..., :2]
@@ -99,7 +99,7 @@ def diagnosis(verdict="named", **changes) -> Diagnosis:
         "seconds": 12.3,
         "settings": {"jax": "0", "links": {"fit": 33}},
     }
-    return Diagnosis(**{**values, **changes})
+    return CableDiagnosis(**{**values, **changes})
 
 
 NO_GAP = Gap(
@@ -240,7 +240,7 @@ def space(tmp_path_factory):
     before, after = (np.nan_to_num(windows.keypoints) + size * along for size in (0.03, 0.004))
     nominal, explained = (in_log(log, windows, part) for part in (before, after))
     stiffness = ParameterEstimate(0.06, (0.05, 0.07), "m^4/s^2")
-    result = Diagnosis(
+    result = CableDiagnosis(
         verdict="named",
         sentence="A sentence.",
         effects=(

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 
+from cablejax.control.shaping import NetworkDynamics
 from cablejax.dynamics.config import ModelConfig
 from cablejax.dynamics.model import apply
 from cablejax.dynamics.rough import product, roughened
@@ -15,7 +16,6 @@ from cablejax.mpc.feasible import feasible_from
 from cablejax.mpc.problem import ShapingProblem
 from cablejax.residual import Corrected, zero_residual
 from cablejax.residual.jacobian import step_jacobian
-from cablejax.shaping import NetworkDynamics
 from dynamics_cases import SMALL, arched_history, as_float64, network
 
 TWIST = jnp.array([[0.01, -0.02, 0.1], [-0.03, 0.005, -0.2]])

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from cablejax.cable import Discretisation
+from cablejax.control.targets import make_target
 from cablejax.evaluation import protocols
 from cablejax.evaluation.protocols import (
     LaidOut,
@@ -18,12 +19,11 @@ from cablejax.evaluation.protocols import (
     random_task,
 )
 from cablejax.mpc import MPCConfig
-from cablejax.mpc.goal import goal_pose
+from cablejax.mpc.target_pose import target_pose
 from cablejax.simulate.elastica import solve_elastica
 from cablejax.simulate.equilibrium import angles_of_keypoints, chain_nodes, find_equilibrium
 from cablejax.simulate.motions import admissible
 from cablejax.simulate.plant import Plant, PlantConfig
-from cablejax.targets import make_target
 
 CHAIN = Discretisation()
 CABLE = CHAIN.cable
@@ -56,7 +56,7 @@ def test_letters_of_one_seed_start_alike():
 
 def test_least_time_is_that_of_the_gripper_with_the_longer_way():
     task, config = letter_task("U", 0, CHAIN), MPCConfig()
-    there = dataclasses.replace(task, start_pose=np.asarray(goal_pose(jnp.asarray(task.target.keypoints))))
+    there = dataclasses.replace(task, start_pose=np.asarray(target_pose(jnp.asarray(task.target.keypoints))))
     there = dataclasses.replace(there, start_shape=task.target.keypoints)
     assert least_time(there, config) == pytest.approx(0.0, abs=1e-4)
     offset = np.array([[0.0, 0.03, 0.0], [0.3, 0.0, 4.0 / 3.0]])

@@ -9,21 +9,21 @@ import numpy as np
 import pytest
 
 from cablejax.cable import Discretisation
-from cablejax.closed_loop import run_closed_loop
+from cablejax.control.loop import run_closed_loop
+from cablejax.control.shaping import load_model
+from cablejax.control.targets import make_target
+from cablejax.control.visual_servo import VisualServo
 from cablejax.dynamics.train_config import Phase
 from cablejax.evaluation.cases import mujoco_plant, random_cases, stiffness_cases
 from cablejax.evaluation.fine_tuning import FineTuneConfig, fine_tune, record
 from cablejax.evaluation.methods import LABEL, METHODS, controller_of
 from cablejax.evaluation.paper import VISUAL_SERVO
 from cablejax.evaluation.protocols import LaidOut, letter_task
-from cablejax.evaluation.run import Experiment, Extent, page, seed_range
 from cablejax.evaluation.suite import Case, key_of, read_suite, run_suite
-from cablejax.mpc import Controller
-from cablejax.servo import VisualServo
-from cablejax.shaping import load_model
+from cablejax.mpc import MPC
 from cablejax.simulate.plant import Plant, PlantConfig
-from cablejax.targets import make_target
 from cli_cases import small_model
+from closed_loops import Experiment, Extent, page, seed_range
 
 CABLE = Discretisation(n_links=12, dimension=3, timestep=0.005)
 SERVO = METHODS[VISUAL_SERVO]
@@ -78,7 +78,7 @@ def test_every_method_has_its_controller(tmp_path):
     for spec in METHODS.values():
         if spec.weights is not None:
             controller = controller_of(spec, model, target)
-            assert isinstance(controller, Controller)
+            assert isinstance(controller, MPC)
             assert (controller.config.residual is not None) == spec.residual
 
 

@@ -5,9 +5,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from cablejax.mpc import Controller, MPCConfig, Outcome, ProjectedGradient, TrustRegion, time_control
-from cablejax.mpc.goal import straightened
-from cablejax.types import History
+from cablejax.bounded import Result
+from cablejax.mpc import MPC, Action, LevenbergMarquardt, MPCConfig, ProjectedGradient, time_control
+from cablejax.mpc.target_pose import straightened
+from cablejax.types import History, Measurement
 from mpc_cases import START, TARGETS, at_rest, hermite_shape, relaxing_cable
 
 N = 7
@@ -32,27 +33,28 @@ class Cable:
 
 
 def controller(target="U", config=CONFIG, rate=0.8, dynamics=relaxing_cable):
-    return Controller(config, dynamics, jnp.asarray(rate), hermite_shape(TARGETS[target], N))
+    return MPC(config, dynamics, jnp.asarray(rate), hermite_shape(TARGETS[target], N))
 
 
-def run(control, cable, steps, hide=None, **changed):
-    """The last state, commands and reports; `changed` are fields of the first state."""
+def run(control, cable, steps, hide=None, radius=CONFIG.radius, restarts=0):
+    """The last state, commands and reports; `radius` and `restarts` are those of the first state."""
     state = control.init(at_rest(jnp.asarray(cable.pose)))
-    # of the same type, strictly: another would compile anew
-    state = dataclasses.replace(state, **{k: jnp.asarray(v, getattr(state, k).dtype) for k, v in changed.items()})
+    # of the same type, strictly: another would compile again
+    progress = state.progress._replace(restarts=jnp.asarray(restarts, jnp.int32))
+    state = dataclasses.replace(state, radius=jnp.asarray(radius, state.radius.dtype), progress=progress)
     infos, twists = [], []
     for step in range(steps):
         keypoints = cable.keypoints.copy()
         if hide is not None:
             keypoints[hide(step)] = np.nan
-        state, twist, info = control.step(state, keypoints, cable.pose)
+        state, twist, info = control.step(state, Measurement(keypoints, cable.pose))
         cable.step(twist)
         infos.append(info)
         twists.append(np.asarray(twist))
     return state, np.stack(twists), jax.tree.map(lambda *leaves: np.stack(leaves), *infos)
 
 
-@pytest.mark.parametrize("solver", [TrustRegion(), pytest.param(ProjectedGradient(), marks=pytest.mark.slow)])
+@pytest.mark.parametrize("solver", [LevenbergMarquardt(), pytest.param(ProjectedGradient(), marks=pytest.mark.slow)])
 def test_brings_the_cable_to_the_target_and_holds_it_there(solver):
     config = dataclasses.replace(CONFIG, solver=solver)
     _, twists, info = run(controller(config=config), Cable(rate=0.8, sag=0.0), 25)
@@ -79,7 +81,7 @@ def test_commands_respect_every_bound():
     control = controller()
     state = control.init(at_rest(jnp.asarray(cable.pose)))
     for _ in range(20):
-        state, twist, _ = control.step(state, cable.keypoints, cable.pose)
+        state, twist, _ = control.step(state, Measurement(cable.keypoints, cable.pose))
         size = np.linalg.norm(np.asarray(twist, float) * [1, 1, 0.15], axis=-1)
         assert (size <= 0.05).all()
         cable.step(twist)
@@ -95,7 +97,7 @@ def test_grippers_stay_in_the_workspace_and_brake_in_time():
     state, before = control.init(at_rest(jnp.asarray(cable.pose))), np.zeros((2, 3))
     errors = []
     for _ in range(25):
-        state, twist, info = control.step(state, cable.keypoints, cable.pose)
+        state, twist, info = control.step(state, Measurement(cable.keypoints, cable.pose))
         cable.step(twist)
         motion = np.asarray(twist, float) * [1, 1, 0.15]
         assert np.linalg.norm(motion - before, axis=-1).max() <= 0.01 + 1e-6
@@ -131,11 +133,11 @@ def test_missing_keypoints_are_held_and_counted_and_not_learned_from():
         return [2, 3] if step in (4, 5) else []
 
     state, twists, info = run(controller(), Cable(), 8, hide)
-    assert info.held.tolist() == [0, 0, 0, 0, 2, 2, 0, 0]
-    assert int(state.held) == 4
+    assert info.unobserved.tolist() == [0, 0, 0, 0, 2, 2, 0, 0]
+    assert int(state.unobserved) == 4
     assert np.isfinite(twists).all() and np.isfinite(info.shape_error).all()
     # Steps that end at 4 and 5, and the one that starts from 5, say nothing about the two keypoints.
-    valid = np.asarray(state.valid)
+    valid = np.asarray(state.window.valid)
     assert valid[:, [0, 1, 4, 5, 6]].all()
     assert valid[:, 2].tolist() == [True, False, False, False, True]
     _, _, clear = run(controller(), Cable(), 25)
@@ -147,26 +149,28 @@ def test_nothing_observed_at_all_keeps_going_on_predictions():
     control, cable = controller(), Cable(rate=0.8, sag=0.0)
     state = control.init(at_rest(START))
     for blind in (False, True, True):
-        nothing = np.full((N, 2), np.nan), np.full((2, 3), np.nan)
-        state, twist, _ = control.step(state, *(nothing if blind else (cable.keypoints, cable.pose)))
+        nothing = Measurement(np.full((N, 2), np.nan), np.full((2, 3), np.nan))
+        state, twist, _ = control.step(state, nothing if blind else Measurement(cable.keypoints, cable.pose))
         assert np.linalg.norm(twist) > 0.01
         # The model is right here, so that what it expects is where the cable is.
         np.testing.assert_allclose(state.history.keypoints[-1], cable.keypoints, atol=1e-5)
         np.testing.assert_allclose(state.history.gripper_pose, cable.pose, atol=1e-5)
         cable.step(twist)
-    assert int(state.held) == 2 * N
-    assert not state.valid.any()
+    assert int(state.unobserved) == 2 * N
+    assert not state.window.valid.any()
 
 
 def test_a_model_that_yields_nan_makes_the_grippers_hold_still_and_says_so():
     control, cable = controller(rate=float("nan")), Cable()
     state, twists, info = run(control, cable, 4)
     assert (twists == 0).all()
-    assert (info.outcome == Outcome.NONFINITE).all()
-    assert np.isfinite(info.shape_error).all() and np.isfinite(np.asarray(state.predicted)).all()
+    assert (info.result == Result.NONFINITE).all()
+    assert np.isfinite(info.shape_error).all() and np.isfinite(np.asarray(state.last.predicted)).all()
     # It recovers as soon as the model does.
-    _, twist, info = dataclasses.replace(control, weights=jnp.asarray(0.8)).step(state, cable.keypoints, cable.pose)
-    assert np.linalg.norm(twist) > 0.01 and int(info.outcome) != Outcome.NONFINITE
+    _, twist, info = dataclasses.replace(control, weights=jnp.asarray(0.8)).step(
+        state, Measurement(cable.keypoints, cable.pose)
+    )
+    assert np.linalg.norm(twist) > 0.01 and int(info.result) != Result.NONFINITE
 
 
 def test_where_bounds_contradict_each_other_the_grippers_hold_still():
@@ -174,8 +178,8 @@ def test_where_bounds_contradict_each_other_the_grippers_hold_still():
     config = dataclasses.replace(WITHOUT, workspace=((-3.0, -1.0), (-1.0, 3.0)), restart_after=1)
     cable = Cable(pose=[[0.0, 0.0, 1.57], [0.0, 1.5, 1.57]])
     state, twists, info = run(controller(config=config), cable, 3)
-    assert (info.outcome == Outcome.INFEASIBLE).all()
-    assert (twists == 0).all() and int(state.restarts) == 0
+    assert (info.result == Result.EMPTY_SET).all()
+    assert (twists == 0).all() and int(state.progress.restarts) == 0
 
 
 @pytest.mark.slow
@@ -187,15 +191,15 @@ def test_data_in_float32_stay_so_where_float64_is_on():
         control, cable = controller(rate=np.float32(0.8), dynamics=single), Cable()
         history = jax.tree.map(lambda x: x.astype(jnp.float32), at_rest(START))
         control = dataclasses.replace(control, target=np.asarray(control.target, float))
-        state, twist, _ = control.step(control.init(history), cable.keypoints, cable.pose)
-        assert {leaf.dtype.name for leaf in (twist, state.plan, state.predicted, state.radius)} == {"float32"}
+        state, twist, _ = control.step(control.init(history), Measurement(cable.keypoints, cable.pose))
+        assert {leaf.dtype.name for leaf in (twist, state.last.plan, state.last.predicted, state.radius)} == {"float32"}
 
 
 def test_at_the_target_the_grippers_rest():
     pose = TARGETS["U"]
     _, twists, info = run(controller(), Cable(rate=0.8, sag=0.0, pose=pose), 4)
     assert (twists == 0).all()
-    assert (info.outcome == Outcome.HELD).all()
+    assert (info.action == Action.HOLD).all()
 
 
 def stubborn_cable(weights, history, twist):
@@ -209,20 +213,20 @@ def test_where_no_plan_helps_the_cable_is_straightened():
     control = controller("S", WITHOUT, rate=5.0, dynamics=stubborn_cable)
     cable = Cable(rate=0.8, sag=0.0, pose=[[0.0, 0.0, 0.6], [0.7, 0.1, -0.6]])
     state, twists, info = run(control, cable, 20)
-    count = int((info.outcome == Outcome.RESTARTING).sum())
-    assert count > 2 and (info.outcome[:count] == Outcome.RESTARTING).all(), "at once, and in one go"
-    assert (info.outcome[count:] == Outcome.HELD).all() and int(state.restarts) == 1
+    count = int((info.action == Action.STRAIGHTEN).sum())
+    assert count > 2 and (info.action[:count] == Action.STRAIGHTEN).all(), "at once, and in one go"
+    assert (info.action[count:] == Action.HOLD).all() and int(state.progress.restarts) == 1
     assert (np.linalg.norm(twists * [1, 1, 0.15], axis=-1) <= 0.05 * (1 + 1e-5)).all()
     way = (np.asarray(straightened(control.target, 0.99)) - cable.pose) * [1, 1, 0.15]
     assert np.linalg.norm(way, axis=1).max() < 0.05, "it ends a step before that, where planning takes over"
-    assert (run(control, cable, 3, restarts=WITHOUT.max_restarts)[2].outcome == Outcome.HELD).all()
+    assert (run(control, cable, 3, restarts=WITHOUT.max_restarts)[2].action == Action.HOLD).all()
 
 
 def test_a_cable_that_comes_no_nearer_is_straightened_as_often_as_allowed():
     stuck, last = Cable(rate=0.0, sag=0.0), WITHOUT.max_restarts - 1
     state, twists, info = run(controller("U", WITHOUT), stuck, 60, restarts=last)
-    begun = np.diff(np.asarray(info.outcome == Outcome.RESTARTING).astype(int), prepend=0) == 1
-    assert begun.sum() == 1 and int(state.restarts) == WITHOUT.max_restarts
+    begun = np.diff(np.asarray(info.action == Action.STRAIGHTEN).astype(int), prepend=0) == 1
+    assert begun.sum() == 1 and int(state.progress.restarts) == WITHOUT.max_restarts
     assert np.flatnonzero(begun)[0] >= WITHOUT.restart_after and np.isfinite(info.objective).all()
     assert (np.linalg.norm(twists * [1, 1, 0.15], axis=-1) <= 0.05 * (1 + 1e-5)).all()
 
@@ -234,12 +238,12 @@ def test_many_cables_in_one_call_are_the_same_as_one_by_one():
     states = [control.init(at_rest(pose)) for pose in starts]
     batch = jax.tree.map(lambda *leaves: jnp.stack(leaves), *states)
     keypoints = jnp.stack([hermite_shape(pose, N) for pose in starts])
-    step = control.vectorised()
-    batch, twists, _ = step(batch, keypoints, jnp.stack(starts))
-    batch, twists, info = step(batch, batch.predicted, jnp.stack(starts) + twists)
+    step = jax.jit(jax.vmap(control.step))
+    batch, twists, _ = step(batch, Measurement(keypoints, jnp.stack(starts)))
+    batch, twists, info = step(batch, Measurement(batch.last.predicted, jnp.stack(starts) + twists))
     for i, (state, pose) in enumerate(zip(states, starts, strict=True)):
-        state, twist, _ = control.step(state, keypoints[i], pose)
-        state, twist, alone = control.step(state, state.predicted, pose + twist)
+        state, twist, _ = control.step(state, Measurement(keypoints[i], pose))
+        state, twist, alone = control.step(state, Measurement(state.last.predicted, pose + twist))
         np.testing.assert_allclose(twists[i], twist, atol=1e-4)
         assert float(info.objective[i]) == pytest.approx(float(alone.objective), rel=1e-3)
 
@@ -253,10 +257,10 @@ def test_new_weights_and_targets_do_not_compile_anew():
 
     control, cable = controller(dynamics=counting), Cable()
     state = control.init(at_rest(START))
-    control.step(state, cable.keypoints, cable.pose)
+    control.step(state, Measurement(cable.keypoints, cable.pose))
     before = len(traces)
     other = dataclasses.replace(control, weights=jnp.asarray(0.7), target=control.target + 0.01)
-    other.step(state, cable.keypoints, cable.pose)
+    other.step(state, Measurement(cable.keypoints, cable.pose))
     assert len(traces) == before > 0
 
 
@@ -281,6 +285,13 @@ def test_times_a_control_call():
         ({"min_reduction": 0.0}, "min_reduction"),
         ({"workspace": ((0.0, 1.0), (1.0, 0.0))}, "workspace"),
         ({"max_change": 0.0}, "max_change"),
+        ({"max_restarts": 1.5}, "max_restarts"),
+        ({"restart_after": 2.5}, "restart_after"),
+        ({"solver": "levenberg-marquardt"}, r"solver is 'levenberg-marquardt', expected a solver such as"),
+        ({"solver": LevenbergMarquardt}, "expected a solver such as"),
+        ({"objective": None}, "objective is None, expected a ObjectiveConfig"),
+        ({"residual": True}, "residual is True, expected a RidgeConfig or None"),
+        ({"adaptation": 1.0}, "adaptation is 1.0, expected a AdaptationConfig or None"),
     ],
 )
 def test_impossible_settings_are_refused(change, message):
@@ -290,16 +301,31 @@ def test_impossible_settings_are_refused(change, message):
 
 def test_impossible_inputs_are_refused():
     with pytest.raises(ValueError, match="non-finite"):
-        Controller(CONFIG, relaxing_cable, jnp.ones(()), hermite_shape(START, N).at[2].set(jnp.nan))
+        MPC(CONFIG, relaxing_cable, jnp.ones(()), hermite_shape(START, N).at[2].set(jnp.nan))
     with pytest.raises(ValueError, match="three or more"):
-        Controller(CONFIG, relaxing_cable, jnp.ones(()), hermite_shape(START, 2))
+        MPC(CONFIG, relaxing_cable, jnp.ones(()), hermite_shape(START, 2))
     with pytest.raises(ValueError, match="whole numbers"):
-        TrustRegion(max_iterations=1.5)
+        LevenbergMarquardt(max_iterations=1.5)
     control = controller()
     with pytest.raises(ValueError, match=r"\(7, 2\) as the target"):
         control.init(at_rest(START, n_keypoints=9))
     with pytest.raises(ValueError, match="complete observation"):
         control.init(jax.tree.map(lambda x: x.at[-1].set(jnp.nan), at_rest(START)))
     state = control.init(History(np.tile(hermite_shape(START, N), (3, 1, 1)), np.asarray(START)))
+    full = at_rest(START)
+    for wrong, message in [
+        (dataclasses.replace(full, keypoints=full.keypoints[:0]), "at least one sample"),
+        (dataclasses.replace(full, keypoints=full.keypoints[-1]), "at least one sample"),
+        (dataclasses.replace(full, keypoints=np.asarray(full.keypoints).tolist()), "keypoints are list"),
+        (
+            dataclasses.replace(full, keypoints=np.zeros((3, N, 2), int)),
+            "array of int64, expected an array of float",
+        ),
+        (dataclasses.replace(full, gripper_pose=np.zeros((2, 3), complex)), "gripper poses are an array of complex128"),
+    ]:
+        with pytest.raises(ValueError, match=message):
+            control.init(wrong)
+    with pytest.raises(ValueError, match="Measured keypoints are list"):
+        control.step(state, Measurement([[0.0, 0.0]] * N, np.zeros((2, 3))))
     with pytest.raises(ValueError, match="gripper poses"):
-        control.step(state, np.zeros((N, 2)), np.zeros((3, 3)))
+        control.step(state, Measurement(np.zeros((N, 2)), np.zeros((3, 3))))

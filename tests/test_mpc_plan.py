@@ -1,4 +1,4 @@
-"""Single plans: certificates, all bounds, bad input, deadline, sampling, many starts, and derivatives of the plan."""
+"""Single plans: certificates, all bounds, bad input, two trials, sampling, many starts, and derivatives of the plan."""
 
 import dataclasses
 import functools
@@ -8,14 +8,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from cablejax.bounded import Result
 from cablejax.mpc import (
     SOLVERS,
     Accurate,
     CrossEntropy,
-    Outcome,
+    LevenbergMarquardt,
     PathIntegral,
     ShapingProblem,
-    TrustRegion,
     differentiable_plan,
     feasible_from,
     multi_start,
@@ -66,7 +66,7 @@ def test_plan_is_a_minimum_and_its_derivatives_are_those_of_planning_again(name)
     with jax.enable_x64(True):
         case, step = problem(**REGIMES[name], motion_weight=0.02), 5e-5
         plan, _, violation = solved(EXACT, case)
-        assert Outcome(int(plan.outcome)) in (Outcome.CONVERGED, Outcome.STALLED) and float(violation) == 0.0
+        assert Result(int(plan.result)) in (Result.CONVERGED, Result.STALLED) and float(violation) == 0.0
         certificate = certified(plan, case)
         assert float(certificate.residual) < 1e-8
         n_active = int((certificate.multipliers > 1e-6).sum())
@@ -82,12 +82,12 @@ def test_plan_is_a_minimum_and_its_derivatives_are_those_of_planning_again(name)
 
 
 @pytest.mark.slow
-def test_a_deadline_plan_is_feasible_most_of_the_way_and_one_linearisation():
+def test_a_plan_of_two_trials_is_feasible_most_of_the_way_and_one_linearisation():
     case = problem("U")
-    plan, value, violation = solved(SOLVERS["deadline"], case)
+    plan, value, violation = solved(SOLVERS["two-trials"], case)
     better = STILL
     for _ in range(4):
-        better = solved(TrustRegion(), case, better)[0].motion
+        better = solved(LevenbergMarquardt(), case, better)[0].motion
     best = float(value_at(case, better))
     start = float(value_at(case, jnp.asarray(STILL)))
     assert float(violation) == 0.0 and int(plan.linearisations) == 1
@@ -100,7 +100,7 @@ def test_workspace_and_change_of_motion_are_kept():
     pose, previous = jnp.asarray(START), jnp.full((2, 3), 0.01)
     bounds = {"workspace": ((-1.0, -0.02), (1.0, 0.03)), "change": 0.015, "previous": previous}
     case = dataclasses.replace(problem("U"), feasible=feasible_from(pose, 0.05, (0.15, 0.99), **bounds))
-    plan, value, violation = solved(TrustRegion(max_iterations=2), case)
+    plan, value, violation = solved(LevenbergMarquardt(max_iterations=2), case)
     motion = np.asarray(plan.motion)
     assert float(violation) <= 1e-7
     assert float(value) < float(value_at(case, jnp.asarray(STILL)))
@@ -118,22 +118,22 @@ def with_bounds(**bounds):
 
 
 BAD = {
-    "contradicting distances": (lambda: with_bounds(min_distance=1.2), {Outcome.INFEASIBLE}),
-    "negative radius": (lambda: with_bounds(radius=-0.01), {Outcome.INFEASIBLE}),
-    "unknown radius": (lambda: with_bounds(radius=float("nan")), {Outcome.INFEASIBLE}),
-    "NaN from the model": (lambda: problem("U", rate=float("nan")), {Outcome.NONFINITE}),
-    "zero radius": (lambda: with_bounds(radius=0.0), {Outcome.CONVERGED, Outcome.STALLED, Outcome.STEP_LIMIT}),
-    "singular": (lambda: problem("U", rate=0.0), set(Outcome)),
+    "contradicting distances": (lambda: with_bounds(min_distance=1.2), {Result.EMPTY_SET}),
+    "negative radius": (lambda: with_bounds(radius=-0.01), {Result.EMPTY_SET}),
+    "unknown radius": (lambda: with_bounds(radius=float("nan")), {Result.EMPTY_SET}),
+    "NaN from the model": (lambda: problem("U", rate=float("nan")), {Result.NONFINITE}),
+    "zero radius": (lambda: with_bounds(radius=0.0), {Result.CONVERGED, Result.STALLED, Result.STEP_LIMIT}),
+    "singular": (lambda: problem("U", rate=0.0), set(Result)),
 }
 
 
 @pytest.mark.parametrize("name", BAD)
 def test_bad_input_gives_a_code(name):
     make, expected = BAD[name]
-    plan, _, _ = solved(TrustRegion(), make())
-    outcome = Outcome(int(plan.outcome))
-    assert outcome in expected and len(outcome.message) > 20
-    if outcome is not Outcome.INFEASIBLE:
+    plan, _, _ = solved(LevenbergMarquardt(), make())
+    result = Result(int(plan.result))
+    assert result in expected and len(result.message) > 20
+    if result is not Result.EMPTY_SET:
         assert np.isfinite(plan.motion).all()
 
 
@@ -141,12 +141,12 @@ def test_bad_input_gives_a_code(name):
 @pytest.mark.parametrize("solver", [CrossEntropy(), PathIntegral()])
 def test_sampling_improves_on_the_guess_and_stays_inside(solver):
     case = problem("U")
-    start, best = float(case.value(jnp.asarray(STILL))), float(solved(TrustRegion(max_iterations=2), case)[1])
+    start, best = float(case.value(jnp.asarray(STILL))), float(solved(LevenbergMarquardt(max_iterations=2), case)[1])
     _, value, violation = solved(solver, case)
     assert float(violation) == 0.0
     assert start - float(value) > 0.5 * (start - best)
     plan, _, _ = solved(solver, problem("U", rate=float("nan")))
-    assert Outcome(int(plan.outcome)) is Outcome.NONFINITE and np.isfinite(plan.motion).all()
+    assert Result(int(plan.result)) is Result.NONFINITE and np.isfinite(plan.motion).all()
 
 
 @pytest.mark.slow
@@ -158,16 +158,16 @@ def test_sampling_knows_the_way_back_from_outside(solver):
         problem("U"), feasible=feasible_from(jnp.asarray(START), 0.05, (0.15, 0.99), **workspace)
     )
     plan, value, violation = solved(solver, case)
-    assert float(violation) <= 1e-7 and Outcome(int(plan.outcome)) is Outcome.STEP_LIMIT
+    assert float(violation) <= 1e-7 and Result(int(plan.result)) is Result.STEP_LIMIT
     assert float(value) <= float(value_at(case, case.start(jnp.asarray(STILL)).motion))
     plan, _, _ = solved(solver, with_bounds(min_distance=1.2))
-    assert Outcome(int(plan.outcome)) is Outcome.INFEASIBLE
+    assert Result(int(plan.result)) is Result.EMPTY_SET
 
 
 @pytest.mark.slow
 def test_many_starts_give_the_best_of_them():
     case = problem("S")
     starts = random_starts(case, STEPS, 4)
-    best, every, values = jax.jit(lambda case: multi_start(case, TrustRegion(), starts))(case)
+    best, every, values = jax.jit(lambda case: multi_start(case, LevenbergMarquardt(), starts))(case)
     assert every.motion.shape == (4, STEPS, 2, 3) and values.shape == (4,)
     assert float(case.value(best.motion)) == pytest.approx(float(values.min()), rel=1e-5)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from cablejax.mpc import ObjectiveConfig, ShapingProblem
-from cablejax.mpc.goal import continued, goal_pose, total_turn
+from cablejax.mpc.target_pose import continued, target_pose, total_turn
 from cablejax.types import History, advance
 from mpc_cases import START, TARGETS, at_rest, feasible_set, hermite_shape, poses, problem, random_motion
 
@@ -149,7 +149,7 @@ def test_a_wound_up_cable_pays_for_more_than_half_a_turn_and_nothing_else_does()
 def test_the_way_left_to_where_the_targets_ends_are_held_costs_what_it_is_longer_than_the_margin():
     with jax.enable_x64(True):
         case, motion = problem("U"), random_motion(3)
-        goal = goal_pose(case.target)
+        goal = target_pose(case.target)
         pose = continued(case.history.gripper_pose, case.history.keypoints[-1])
         way = np.asarray(goal - pose) * [1.0, 1.0, 0.15] - np.asarray(motion.sum(axis=0))
         left = np.linalg.norm(way, axis=1) - case.objective.arrival_margin

@@ -6,12 +6,13 @@ import numpy as np
 import pytest
 
 from cablejax.cable import Cable, Discretisation
-from cablejax.closed_loop import run_closed_loop, shape_error_cm
+from cablejax.control.loop import run_closed_loop
+from cablejax.control.run import shape_error_cm
+from cablejax.control.targets import make_target, straight_start
 from cablejax.perceive.camera import CameraConfig, DepthCamera
 from cablejax.perceive.plant import CloudPlant
 from cablejax.simulate.elastica import solve_elastica
 from cablejax.simulate.plant import PlantConfig
-from cablejax.targets import make_target, straight_start
 from perceive_cases import TRACKER
 
 CABLE = Discretisation(n_links=40, dimension=3, timestep=0.005)
@@ -113,7 +114,7 @@ class Still:
     def init(self, history):
         return 0
 
-    def step(self, state, keypoints, gripper_pose):
+    def step(self, state, measurement):
         return state, np.zeros((2, 3)), None
 
 

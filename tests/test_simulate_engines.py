@@ -127,7 +127,7 @@ def test_a_batch_equals_its_members(engine):
     poses = np.stack([planar_pose(), planar_pose() * [1, 1, -1]])
     twists = np.stack([planar_twist(), 0.5 * planar_twist()])
     params = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), nominal_physics(config))
-    params = dataclasses.replace(params, friction_coefficient=jnp.array([0.1, 0.4]))
+    params = dataclasses.replace(params, friction=jnp.array([0.1, 0.4]))
     states = simulator.initial_state(poses)
     _, batch = simulator.rollout(params, states, twists)
     for i in range(2):

@@ -31,10 +31,10 @@ def directions(params: Physics, twist: jax.Array) -> dict[str, tuple[Physics, ja
     nothing = (jax.tree.map(jnp.zeros_like, params), jnp.zeros_like(twist))
     slope = jnp.linspace(-1.0, 1.5, CONFIG.n_joints)
     changes = {
-        "bending_stiffness": params.stiffness * (1.0 + 0.3 * slope),
+        "stiffness": params.stiffness * (1.0 + 0.3 * slope),
         "damping_time": params.damping_time,
-        "friction_coefficient": params.friction,
-        "linear_density": params.density,
+        "friction": params.friction,
+        "density": params.density,
         "rest_curvature": slope,
     }
     found = {name: (dataclasses.replace(nothing[0], **{name: d}), nothing[1]) for name, d in changes.items()}
@@ -76,7 +76,7 @@ def case(request, programs):
 
 @pytest.mark.parametrize(
     "name",
-    ["bending_stiffness", "damping_time", "friction_coefficient", "linear_density", "rest_curvature", "gripper_motion"],
+    ["stiffness", "damping_time", "friction", "density", "rest_curvature", "gripper_motion"],
 )
 def test_derivatives_of_a_rollout(case, name):
     which, final, push, pull, params, twist = case

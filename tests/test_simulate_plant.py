@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from cablejax.cable import GRAVITY, Discretisation
+from cablejax.cable import GRAVITY, Cable, Discretisation
 from cablejax.simulate.elastica import elastica
 from cablejax.simulate.plant import Plant, PlantConfig, plant_model
 
@@ -14,6 +14,11 @@ CABLE = Discretisation(n_links=14, dimension=3, timestep=0.005)
 CONFIG = PlantConfig(discretisation=CABLE, settle_time=0.3)
 ARCH = np.array([[-0.45, 0.0, 0.0], [0.45, 0.0, 0.0]])
 STILL = np.zeros((2, 3))
+
+
+def rubbing(friction: float) -> Plant:
+    chain = dataclasses.replace(CABLE, cable=Cable(friction_coefficient=friction))
+    return Plant(dataclasses.replace(CONFIG, discretisation=chain))
 
 
 @pytest.fixture(scope="module")
@@ -51,12 +56,11 @@ def test_a_new_cable_has_the_shape_of_the_elastica_whatever_its_stiffness(ratio)
 
 def test_friction_of_a_sliding_cable_is_coulombs():
     # Dragged along, all of the free cable slides: every contact pushes back with mu times its load.
-    cable = dataclasses.replace(CABLE, friction_coefficient=0.1)
-    plant = Plant(dataclasses.replace(CONFIG, cable=cable))
+    plant = rubbing(0.1)
     plant.reset(ARCH)
     plant.step(np.array([[0.05, 0.0, 0.0]] * 2))
     force = contact_force(plant)
-    weight = cable.cable.linear_density * (cable.cable.length - cable.link_length) * GRAVITY
+    weight = CABLE.cable.linear_density * (CABLE.cable.length - CABLE.link_length) * GRAVITY
     assert force[0] == pytest.approx(-0.1 * force[2], rel=0.01)
     # Friction rolls the cable a little, so the grippers bear down on it.
     assert force[2] == pytest.approx(weight, rel=0.25)
@@ -85,10 +89,8 @@ def test_the_table_carries_the_weight_steadily(plant):
 
 def test_friction_keeps_a_cable_where_a_frictionless_one_springs_back():
     twist = np.array([[0.0, 0.0, 0.4], [0.0, 0.0, -0.2]])
-    rubbing = Plant(dataclasses.replace(CONFIG, cable=dataclasses.replace(CABLE, friction_coefficient=1.0)))
-    gliding = Plant(dataclasses.replace(CONFIG, cable=dataclasses.replace(CABLE, friction_coefficient=0.0)))
     shapes = []
-    for plant in (rubbing, gliding):
+    for plant in (rubbing(1.0), rubbing(0.0)):
         plant.reset(ARCH)
         plant.step(twist)
         shapes.append(plant.step(STILL, 2.0).keypoints)

@@ -9,11 +9,11 @@ import pytest
 pytest.importorskip("elastica", reason="PyElastica is not installed: pip install pyelastica==1.0.0")
 
 from cablejax.cable import GRAVITY, Cable, Discretisation
-from cablejax.closed_loop import run_closed_loop
+from cablejax.control.loop import run_closed_loop
+from cablejax.control.targets import make_target, straight_start
 from cablejax.simulate import rod_plant
 from cablejax.simulate.elastica import elastica
 from cablejax.simulate.rod_plant import ETHERNET, USB, RodPlant, RodPlantConfig
-from cablejax.targets import make_target, straight_start
 
 CABLE = Discretisation(n_links=15, timestep=4e-4)
 CONFIG = RodPlantConfig(discretisation=CABLE)
@@ -100,8 +100,8 @@ def test_a_uniform_rest_curvature_does_not_show_between_two_clamps():
 
 def test_bad_set_ups_are_refused():
     for changes, message in [
-        ({"cable": Discretisation(dimension=3, timestep=1e-4)}, "dimension is 3"),
-        ({"cable": Discretisation(n_links=27, timestep=1e-3)}, "stable only up to"),
+        ({"discretisation": Discretisation(dimension=3, timestep=1e-4)}, "dimension is 3"),
+        ({"discretisation": Discretisation(n_links=27, timestep=1e-3)}, "stable only up to"),
         ({"static_ratio": 0.9}, "static_ratio"),
         ({"axial_ratio": 0.0}, "axial_ratio"),
         ({"rest_curvature": np.nan}, "rest_curvature"),
@@ -131,7 +131,7 @@ def test_the_closed_loop_takes_it_for_a_plant():
         def init(self, history):
             return None
 
-        def step(self, state, keypoints, gripper_pose):
+        def step(self, state, measurement):
             return None, STILL, None
 
     run = run_closed_loop(

@@ -12,7 +12,7 @@ SI units, radians, right-handed frames. Arrays may carry leading batch axes wher
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -71,6 +71,18 @@ class History:
     keypoints: Float[Array, "*batch H N 2"]
     gripper_pose: Float[Array, "*batch Q 3"]
     cable: Float[Array, "*batch 2"] | None = None
+
+
+class Measurement(NamedTuple):
+    """What a controller is given at each of its steps.
+
+    Attributes:
+        keypoints: observed now [m], NaN = not observed, shape [N, 2].
+        gripper_pose: (x, y, theta) of both grippers [m, rad], NaN = not measured, shape [Q, 3].
+    """
+
+    keypoints: Float[Array | np.ndarray, "*batch N 2"]
+    gripper_pose: Float[Array | np.ndarray, "*batch Q 3"]
 
 
 REFERENCE_STIFFNESS = 0.02

@@ -8,6 +8,8 @@ from collections.abc import Callable
 from typing import Any
 
 import jax
+import jax.numpy as jnp
+import optimistix as optx
 from jaxtyping import Array, Float, Int
 
 from cablejax.bounded.certificate import Certificate, certify
@@ -16,7 +18,7 @@ from cablejax.bounded.sets import AbstractSet
 
 
 class Result(enum.IntEnum):
-    """How a solve ended. Inside compiled code it is an int32."""
+    """How a solve ended, from the solvers to the controller's report. Inside compiled code it is an int32."""
 
     CONVERGED = 0
     """The projected gradient is within the tolerance."""
@@ -43,6 +45,20 @@ _MESSAGES = {
     Result.EMPTY_SET: "The bounds contradict each other: there is no feasible point.",
     Result.STALLED: "No step improves the function by more than rounding: use float64, or a greater tolerance.",
 }
+
+_OF_OPTIMISTIX = (
+    (optx.RESULTS.successful, Result.CONVERGED),
+    (optx.RESULTS.nonfinite, Result.NONFINITE),
+    (optx.RESULTS.stagnation, Result.STALLED),
+)
+
+
+def result_of(theirs: optx.RESULTS) -> Int[Array, ""]:
+    """The `Result` of a solve by optimistix; `STEP_LIMIT` for all codes that these solvers do not set."""
+    code = jnp.asarray(Result.STEP_LIMIT, jnp.int32)
+    for result, ours in _OF_OPTIMISTIX:
+        code = jnp.where(theirs == result, ours, code)
+    return code
 
 
 @jax.tree_util.register_dataclass

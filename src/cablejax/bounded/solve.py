@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool
 from cablejax.bounded.implicit import FixedPointAdjoint
 from cablejax.bounded.linearise import forward, squared_jacobian
 from cablejax.bounded.objective import value_of
-from cablejax.bounded.results import Result, Solution, Stats
+from cablejax.bounded.results import Result, Solution, Stats, result_of
 from cablejax.bounded.sets import AbstractSet
 from cablejax.bounded.tangents import derivative_along
 
@@ -123,17 +123,9 @@ def _finish(
     out: optx.Solution, fn, args, feasible: AbstractSet, start: Array, unknown: Bool[Array, ""], throw: bool
 ) -> Solution:
     """The solution as ours; `unknown` = the start was not a number."""
-    known = (
-        (optx.RESULTS.successful, Result.CONVERGED),
-        (optx.RESULTS.nonfinite, Result.NONFINITE),
-        (optx.RESULTS.stagnation, Result.STALLED),
-    )
-    code = jnp.asarray(Result.STEP_LIMIT, jnp.int32)
-    for theirs, ours in known:
-        code = jnp.where(out.result == theirs, ours, code)
     rounding = jnp.finfo(start.dtype).eps ** 0.5 * (1.0 + jnp.abs(start).max())
     empty = feasible.empty() | ~(feasible.violation(start) <= rounding)
-    code = jnp.where(empty, Result.EMPTY_SET, code)
+    code = jnp.where(empty, Result.EMPTY_SET, result_of(out.result))
     code = jnp.where(unknown, Result.NONFINITE, code).astype(jnp.int32)
     solution = Solution(
         value=out.value,

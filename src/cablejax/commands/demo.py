@@ -40,16 +40,16 @@ class Demo(Command):
     links: int = 24
     """Links of the plant's cable."""
 
-    solver: Literal["trust-region", "projected-gradient"] = "trust-region"
+    solver: Literal["levenberg-marquardt", "projected-gradient"] = "levenberg-marquardt"
     """How the controller finds its plan."""
 
     def execute(self):
         from cablejax.commands.parts import unfinished
         from cablejax.commands.results import table_of
         from cablejax.commands.runs import Job, shape_and_report
-        from cablejax.shaping import METHODS, load_model
+        from cablejax.control.shaping import METHODS, load_model
+        from cablejax.control.targets import make_target
         from cablejax.simulate.plant import PlantConfig
-        from cablejax.targets import make_target
 
         plant = PlantConfig(stiffness_ratio=STIFFNESS_RATIO, seed=self.seed)
         plant = dataclasses.replace(plant, discretisation=dataclasses.replace(plant.discretisation, n_links=self.links))

@@ -13,7 +13,7 @@ import tyro
 from cablejax.commands.options import Command, UsageError, say
 
 if TYPE_CHECKING:
-    from cablejax.diagnose import Diagnosis
+    from cablejax.diagnose import CableDiagnosis
     from cablejax.types import GapLog
 
 
@@ -99,7 +99,7 @@ def diagnose_and_report(
     only: Sequence[str] = (),
     commissioning: Sequence[GapLog] = (),
     state: pathlib.Path | None = None,
-) -> tuple[Diagnosis, pathlib.Path]:
+) -> tuple[CableDiagnosis, pathlib.Path]:
     """Diagnoses a log, tells how it goes, and writes verdict.json, report.html and the figures into an existing folder.
 
     Args:

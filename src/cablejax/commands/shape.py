@@ -34,7 +34,7 @@ class Shape(Command):
     weights: str = "gns-reference"
     """Released model by name, or the folder of a training by `cablejax train`."""
 
-    solver: SolverName = "trust-region"
+    solver: SolverName = "levenberg-marquardt"
     """How the controller finds its plan."""
 
     steps: int = 40
@@ -61,10 +61,10 @@ class Shape(Command):
         from cablejax.commands.parts import unfinished
         from cablejax.commands.results import table_of
         from cablejax.commands.runs import Job, shape_and_report
+        from cablejax.control.shaping import METHODS, load_model
+        from cablejax.control.targets import load_target, make_target
         from cablejax.perceive.camera import CameraConfig
-        from cablejax.shaping import METHODS, load_model
         from cablejax.simulate.plant import PlantConfig
-        from cablejax.targets import load_target, make_target
 
         cloud = self.perception == "cloud"
         noise_mm = (2.0 if cloud else 0.0) if self.noise_mm is None else self.noise_mm

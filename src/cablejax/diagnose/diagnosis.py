@@ -13,6 +13,9 @@ from cablejax.types import GapLog
 
 Verdict = Literal["none", "named", "ambiguous", "named+unknown", "unknown"]
 
+PLACES = ("along_cable_m", "time_s", "table_m")
+"""Where an effect may sit, by the keys of the verdict."""
+
 
 @dataclasses.dataclass(frozen=True)
 class ParameterEstimate:
@@ -35,9 +38,10 @@ class NamedEffect:
 
     Attributes:
         name: from the gap log's list of names.
-        probability: that this effect is a cause; None where no posterior over explanations was computed.
+        probability: posterior that this effect is a cause, among all explanations with it or with another effect in its
+            place, were the cause one of those that were tried; None where nothing of the kind was computed.
         parameters: by the names of the format.
-        location: keys "along_cable_m", "time_s", "table_m"; None where an effect has no such place.
+        location: keys `PLACES`; None where an effect has no such place.
     """
 
     name: str
@@ -52,11 +56,12 @@ class Ranked:
 
     Attributes:
         name: of the effect.
-        probability: posterior among all single effects; None in a forward search, which computes none.
+        probability: posterior among all single effects, were the cause one of them; None where it was not computed, as
+            in a forward search.
         held_out_shrinkage: share of the squared gap that goes away on episodes left out of the fit; negative where the
             effect makes these worse.
-        leftover_mm: gap above the noise that is left, root mean square per coordinate [mm], on the episodes fitted; of
-            a forward search, on those left out.
+        leftover_mm: gap above the noise that is left, root mean square per coordinate [mm, or thousandths of
+            `Gap.unit`], on the episodes fitted; of a forward search, on those left out.
     """
 
     name: str
@@ -68,6 +73,8 @@ class Ranked:
 @dataclasses.dataclass(frozen=True)
 class Gap:
     """How large the gap is before and after, on episodes that no fit has seen. Root mean squares per coordinate [mm].
+
+    Where `unit` is not the metre, whatever is called `_mm` is in thousandths of it.
 
     Attributes:
         horizon_s: over which the simulations run freely that are compared: the longest episode, or a window in space.
@@ -81,8 +88,10 @@ class Gap:
             named effects, without a residual); None if no episode is long enough.
         horizons_mm: {seconds since the episode's start: (before, after)}.
         held_out_episodes: those scored; all of them where every episode was held out once.
-        split: shares of the squared error before: "noise", "named", "learnable", "unexplained"; they sum to 1. None for
-            a share that was not evaluated, which is then part of "unexplained".
+        split: shares of the squared error before: "noise", "named", "learnable", "unexplained"; they sum to 1.
+            "learnable" is what the online residual would take away of what is left; None where that was not computed,
+            and then it is part of "unexplained".
+        unit: of the observations.
     """
 
     horizon_s: float
@@ -95,6 +104,7 @@ class Gap:
     horizons_mm: dict[float, tuple[float, float]]
     held_out_episodes: tuple[int, ...]
     split: dict[str, float | None]
+    unit: str = "m"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -116,8 +126,10 @@ class NextMotion:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Findings:
-    """What any diagnosis says, in the plane, in space or of a hanging wire: the content of `verdict.json`.
+class Diagnosis:
+    """Which effect makes a simulator wrong on a recording, and how far the gap shrinks with it. Any simulator's.
+
+    What a simulator does not compute is None.
 
     Attributes:
         verdict: see the format.
@@ -128,13 +140,14 @@ class Findings:
         leftover_p: chance that a right explanation leaves as much as the best one does, see `conformal`; None without a
             gap, and where no labelled logs are like this one.
         gap: before and after.
-        where: along the cable, in time, by regime, by frame.
-        next_motion: None if nothing would be gained, or if no motion was evaluated.
+        where: along the cable, in time, by regime, by frame; None where no adapter localises.
+        next_motion: None if nothing would be gained, or no motion was evaluated.
         baselines: the single effect that simpler rules would have named: "lowest_cost" (best fit in sample), "bic" (the
             same with Schwarz's penalty, all samples taken to be independent) and "sparse_regression" (the best template
-            without any fit); empty for the verdict "none", and where these rules were not evaluated.
+            without any fit); empty for the verdict "none".
         caveats: what the log did not allow, in words.
         seconds: run time.
+        settings: versions and options, for the record.
     """
 
     verdict: Verdict
@@ -144,30 +157,31 @@ class Findings:
     ranking: tuple[Ranked, ...]
     leftover_p: float | None
     gap: Gap
-    where: Where
+    where: Where | None
     next_motion: NextMotion | None
     baselines: dict[str, str]
     caveats: tuple[str, ...]
     seconds: float
+    settings: dict[str, Any]
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Diagnosis(Findings):
-    """Where a simulator is wrong, which effect causes it, how far the gap shrinks with it.
+class CableDiagnosis(Diagnosis):
+    """The diagnosis of a cable between two grippers, with what its page shows.
 
     Attributes:
+        where: along the cable, in time, by regime, by frame.
         log: what was diagnosed.
-        nominal: keypoints of the nominal simulator [m], NaN beyond an episode's end, shape [E, T, N, 2].
+        nominal: keypoints of the nominal simulator [m], NaN beyond an episode's end, shape [E, T, N, D].
         explained: keypoints of the simulator with the named (or best) effects, each episode from a fit that left it
-            out [m], shape [E, T, N, 2]; None for the verdict "none".
+            out [m], shape [E, T, N, D]; None for the verdict "none".
         noise_mm: standard deviation of each keypoint's coordinates [mm], shape [N].
         noise_correlation: autocorrelation of the noise at lags 1, 2, ... samples.
-        settings: versions and options, for the record.
     """
 
+    where: Where
     log: GapLog
-    nominal: Float[np.ndarray, "E T N 2"]
-    explained: Float[np.ndarray, "E T N 2"] | None
+    nominal: Float[np.ndarray, "E T N D"]
+    explained: Float[np.ndarray, "E T N D"] | None
     noise_mm: Float[np.ndarray, "N"]
     noise_correlation: Float[np.ndarray, "K"]
-    settings: dict[str, Any]

@@ -27,7 +27,7 @@ def judged(*, resolvable: bool, telling: bool, complete: bool, alike: bool) -> V
     return "ambiguous" if alike else "named"
 
 
-def sentence(
+def verdict_sentence(
     verdict: Verdict, effects: Sequence[NamedEffect], equivalent: Sequence[Sequence[str]], explained: float
 ) -> str:
     """The verdict in words.

@@ -1,7 +1,9 @@
-"""The effects that a diagnosis knows, by the names of the gap log's format."""
+"""What a simulator may lack: the library of effects, by the names of the gap log's format."""
 
-from cablejax.effects.base import Context, Effect, Parameter
+from cablejax.effects.arms import ActuationGain, ActuationLag
+from cablejax.effects.base import CableEffect, Context, Hook
 from cablejax.effects.camera import CameraLag, CameraSimilarity, KeypointBias
+from cablejax.effects.effect import Effect, Parameter
 from cablejax.effects.grasp import GripperCompliance, GripperRotationOffset, GripperSlip
 from cablejax.effects.material import (
     AxialStretch,
@@ -16,7 +18,7 @@ from cablejax.effects.material import (
 )
 from cablejax.effects.table import FrictionPatch, GravityTilt, Obstacle, TableFriction, ViscousDrag
 
-LIBRARY: tuple[Effect, ...] = (
+LIBRARY: tuple[CableEffect, ...] = (
     BendingStiffness(),
     StiffnessProfile(),
     IntrinsicCurvature(),
@@ -38,6 +40,9 @@ LIBRARY: tuple[Effect, ...] = (
     CameraLag(),
     Obstacle(),
 )
-"""Every effect of the cable and the camera. Those of the arms are found from the encoders, see `actuation`."""
+"""Every effect of the cable and the camera."""
 
-__all__ = ["LIBRARY", "Context", "Effect", "Parameter"]
+ARMS: tuple[CableEffect, ...] = (ActuationGain(), ActuationLag())
+"""Effects of the arms. A diagnosis finds them from commands and encoders, see `cablejax.diagnose.actuation`."""
+
+__all__ = ["ARMS", "LIBRARY", "CableEffect", "Context", "Effect", "Hook", "Parameter"]

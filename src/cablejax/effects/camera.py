@@ -6,13 +6,15 @@ from dataclasses import replace
 
 import numpy as np
 
-from cablejax.effects.base import Effect, Parameter
+from cablejax.effects.base import CableEffect
+from cablejax.effects.effect import Parameter
 
 
-class CameraSimilarity(Effect):
+class CameraSimilarity(CableEffect):
     """Scale, rotation and offset of the keypoints' frame."""
 
     name = "camera_similarity"
+    hook = "observation"
     parameters = (
         Parameter("scale", "", 0.5, 2.0, 1.0, 0.02),
         Parameter("angle_rad", "rad", -1.0, 1.0, 0.0, 0.02),
@@ -41,10 +43,11 @@ class CameraSimilarity(Effect):
         return [(0, (np.hypot(1 + a, b), np.arctan2(b, 1 + a), dx, dy))]
 
 
-class CameraLag(Effect):
+class CameraLag(CableEffect):
     """Keypoints are stamped late."""
 
     name = "camera_lag"
+    hook = "observation"
     parameters = (Parameter("time_s", "s", 0.0, 5.0, 0.2, 0.2),)
     null = (0.0,)
     side = "observation"
@@ -56,19 +59,21 @@ class CameraLag(Effect):
         return [(0, (0.15,)), (0, (0.6,))]
 
 
-class KeypointBias(Effect):
+class KeypointBias(CableEffect):
     """One keypoint sits off its nominal arc length or off the centreline; several are found one after the other.
 
     The variant is twice the keypoint's index, plus one for an offset across the cable.
     """
 
     name = "keypoint_bias"
+    hook = "observation"
     parameters = (Parameter("offset_m", "m", -0.1, 0.1, 0.0, 0.01),)
     null = (0.0,)
     amplitude, reversible = 0, True
     side = "observation"
     variants = tuple(range(128))
     variant_name = "index"
+    repeatable = True
 
     def apply(self, physics, values, variant, config):
         index, across = divmod(variant, 2)
@@ -93,7 +98,10 @@ class KeypointBias(Effect):
         return [(variant, (mean,)) for _, variant, mean in sorted(gains, reverse=True)[:3]]
 
     def reported(self, values, variant, config):
-        return {"index": (variant // 2, ""), "offset_m": (float(values[0]), "m")}
+        return {"index": (variant // 2, ""), "across": (variant % 2, ""), "offset_m": (float(values[0]), "m")}
+
+    def _from_reported(self, parameters, config):
+        return parameters | {"variant": 2 * parameters["index"] + parameters.get("across", 0)}
 
     def location(self, values, variant, config):
         s = float(config.cable.keypoint_arclength[variant // 2])

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from cablejax.effects.base import Effect, Parameter
+from cablejax.effects.base import CableEffect
+from cablejax.effects.effect import Parameter
 
 
 def _at(gripper: int, value):
@@ -18,10 +19,11 @@ def _end(gripper: int, config):
     return {"along_cable_m": [s, s]}
 
 
-class GripperSlip(Effect):
+class GripperSlip(CableEffect):
     """The cable slides through a gripper, once in every episode."""
 
     name = "gripper_slip"
+    hook = "extension"
     parameters = (
         Parameter("time_s", "s", 0.0, 300.0, 10.0, 8.0, difference=0.01),
         Parameter("distance_m", "m", -0.2, 0.2, 0.0, 0.02),
@@ -44,10 +46,11 @@ class GripperSlip(Effect):
         return {**_end(variant, config), "time_s": float(values[0])}
 
 
-class GripperRotationOffset(Effect):
+class GripperRotationOffset(CableEffect):
     """The grasp angle is off."""
 
     name = "gripper_rotation_offset"
+    hook = "grasp"
     parameters = (Parameter("angle_rad", "rad", -1.0, 1.0, 0.0, 0.15),)
     null = (0.0,)
     amplitude, reversible = 0, True
@@ -64,10 +67,11 @@ class GripperRotationOffset(Effect):
         return _end(variant, config)
 
 
-class GripperCompliance(Effect):
+class GripperCompliance(CableEffect):
     """The grasp yields in rotation."""
 
     name = "gripper_compliance"
+    hook = "grasp"
     parameters = (Parameter("stiffness_n_m_per_rad", "N m/rad", 1e-3, 1e4, 0.3, 1.2, log=True),)
     null = (float("inf"),)
     amplitude = 0

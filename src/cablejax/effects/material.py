@@ -6,13 +6,14 @@ from dataclasses import replace
 
 import numpy as np
 
-from cablejax.effects.base import Effect, Parameter, hat, section
+from cablejax.effects.base import CableEffect, hat, section
+from cablejax.effects.effect import Parameter
 
 # Where along the cable fits of local effects begin; a section of another sign is reached from the same place.
 _CENTRES = (0.08, 0.2, 0.32, 0.44, 0.56, 0.68, 0.8, 0.92)
 
 
-class _Section(Effect):
+class _Section(CableEffect):
     """An effect on a section of the cable; its first two parameters are centre and width over the cable's length."""
 
     def reported(self, values, variant, config):
@@ -23,15 +24,21 @@ class _Section(Effect):
             last.name: (float(values[2]), last.unit),
         }
 
+    def _from_reported(self, parameters, config):
+        length = config.cable.length
+        shares = {name.removesuffix("_m"): value / length for name, value in parameters.items()}
+        return parameters | {name: shares[name] for name in ("centre", "width") if name in shares}
+
     def location(self, values, variant, config):
         centre, width = float(values[0]) * config.cable.length, float(values[1]) * config.cable.length
         return {"along_cable_m": [max(centre - width / 2, 0.0), min(centre + width / 2, config.cable.length)]}
 
 
-class BendingStiffness(Effect):
+class BendingStiffness(CableEffect):
     """EI differs everywhere by one factor."""
 
     name = "bending_stiffness"
+    hook = "bending"
     parameters = (Parameter("ratio", "", 0.02, 50.0, 1.0, 1.0, log=True),)
     null = (1.0,)
     amplitude, reversible = 0, True
@@ -47,6 +54,7 @@ class StiffnessProfile(_Section):
     """EI differs over part of the cable."""
 
     name = "stiffness_profile"
+    hook = "bending"
     parameters = (
         Parameter("centre", "", 0.0, 1.0, 0.5, 0.3),
         Parameter("width", "", 0.03, 1.0, 0.25, 0.7, log=True),
@@ -67,6 +75,7 @@ class IntrinsicCurvature(_Section):
     """The rest shape is curved, over part of the cable or all of it."""
 
     name = "intrinsic_curvature"
+    hook = "bending"
     parameters = (
         Parameter("centre", "", 0.0, 1.0, 0.5, 0.3),
         Parameter("width", "", 0.03, 1.0, 0.25, 0.7, log=True),
@@ -83,10 +92,11 @@ class IntrinsicCurvature(_Section):
         return [(0, (c, 0.15, 1.0)) for c in _CENTRES]
 
 
-class Plasticity(Effect):
+class Plasticity(CableEffect):
     """Bends beyond a yield curvature stay; what a bend beyond it costs more, the hardening, is fitted beside it."""
 
     name = "plasticity"
+    hook = "memory"
     parameters = (
         Parameter("yield_curvature_per_m", "1/m", 0.2, 100.0, 5.0, 0.8, log=True),
         Parameter("hardening", "", 1e-3, 30.0, 0.3, 1.5, log=True),
@@ -103,14 +113,12 @@ class Plasticity(Effect):
             (0, (float(np.clip(f * sharpest, 0.3, 90.0)), h)) for f in (0.9, 0.75, 0.6, 0.45, 0.3) for h in (0.05, 1.0)
         ]
 
-    def reported(self, values, variant, config):
-        return {"yield_curvature_per_m": (float(values[0]), "1/m")}
 
-
-class BendingHysteresis(Effect):
+class BendingHysteresis(CableEffect):
     """Rate-independent internal friction in bending, by Dahl's law."""
 
     name = "bending_hysteresis"
+    hook = "memory"
     parameters = (
         Parameter("moment_n_m", "N m", 1e-5, 1.0, 0.01, 1.2, log=True),
         Parameter("transition_curvature_per_m", "1/m", 0.02, 20.0, 0.5, 0.8, log=True),
@@ -127,10 +135,11 @@ class BendingHysteresis(Effect):
         return [(0, (m * stiffness, k)) for m in (0.15, 0.6) for k in (0.15, 1.0)]
 
 
-class BendingDamping(Effect):
+class BendingDamping(CableEffect):
     """Internal viscous damping differs."""
 
     name = "bending_damping"
+    hook = "bending"
     parameters = (Parameter("ratio", "", 0.01, 1000.0, 1.0, 1.5, log=True),)
     null = (1.0,)
 
@@ -145,11 +154,15 @@ class BendingDamping(Effect):
     def reported(self, values, variant, config):
         return {"time_s": (float(values[0]) * (config.cable.damping_time or 0.001), "s")}
 
+    def _from_reported(self, parameters, config):
+        return {"ratio": parameters["time_s"] / (config.cable.damping_time or 0.001)}
 
-class AxialStretch(Effect):
+
+class AxialStretch(CableEffect):
     """The cable is extensible."""
 
     name = "axial_stretch"
+    hook = "extension"
     parameters = (Parameter("stiffness_n", "N", 0.05, 1e6, 20.0, 1.5, log=True),)
     null = (np.inf,)
     amplitude = 0
@@ -161,10 +174,11 @@ class AxialStretch(Effect):
         return [(0, (2.0,)), (0, (15.0,)), (0, (150.0,))]
 
 
-class LinearDensity(Effect):
+class LinearDensity(CableEffect):
     """Mass per length differs: weight, and with it friction, and inertia."""
 
     name = "linear_density"
+    hook = "mass"
     parameters = (Parameter("ratio", "", 0.05, 20.0, 1.0, 0.7, log=True),)
     null = (1.0,)
     amplitude, reversible = 0, True
@@ -176,10 +190,11 @@ class LinearDensity(Effect):
         return [(0, (0.5,)), (0, (2.0,))]
 
 
-class LumpedMass(Effect):
+class LumpedMass(CableEffect):
     """A connector or clip."""
 
     name = "lumped_mass"
+    hook = "mass"
     parameters = (
         Parameter("centre", "", 0.0, 1.0, 0.5, 0.3),
         Parameter("mass_kg", "kg", 1e-4, 1.0, 0.03, 1.0, log=True),
@@ -197,6 +212,9 @@ class LumpedMass(Effect):
 
     def reported(self, values, variant, config):
         return {"centre_m": (float(values[0]) * config.cable.length, "m"), "mass_kg": (float(values[1]), "kg")}
+
+    def _from_reported(self, parameters, config):
+        return {"centre": parameters["centre_m"] / config.cable.length, "mass_kg": parameters["mass_kg"]}
 
     def location(self, values, variant, config):
         s = float(values[0]) * config.cable.length

@@ -55,6 +55,9 @@ class Physics:
         camera_angle: rotation of the keypoints about the world's origin [rad].
         camera_offset: added after scale and rotation [m], shape [2].
         camera_lag: by which the keypoints' stamps are late [s].
+        actuation_gain: motion of the grippers over the commanded one, from the first pose on.
+        actuation_delay: pure delay between command and motion [s].
+        actuation_time: time constant of a first-order lag after that [s].
     """
 
     stiffness: Float[Array | np.ndarray, "*B J"]
@@ -87,6 +90,9 @@ class Physics:
     camera_angle: Float[Array | np.ndarray, "*B"]
     camera_offset: Float[Array | np.ndarray, "*B 2"]
     camera_lag: Float[Array | np.ndarray, "*B"]
+    actuation_gain: Float[Array | np.ndarray, "*B"]
+    actuation_delay: Float[Array | np.ndarray, "*B"]
+    actuation_time: Float[Array | np.ndarray, "*B"]
 
 
 def nominal_physics(
@@ -137,6 +143,9 @@ def nominal_physics(
         "camera_angle": 0.0,
         "camera_offset": np.zeros(2),
         "camera_lag": 0.0,
+        "actuation_gain": 1.0,
+        "actuation_delay": 0.0,
+        "actuation_time": 0.0,
     }
     return Physics(**{name: np.asarray(value, np.dtype(dtype)) for name, value in values.items()})
 

@@ -7,7 +7,8 @@ from dataclasses import replace
 import numpy as np
 
 from cablejax.cable import Discretisation
-from cablejax.effects.base import Context, Effect, Parameter
+from cablejax.effects.base import CableEffect, Context
+from cablejax.effects.effect import Parameter
 
 
 def _believed(config: Discretisation) -> float:
@@ -15,10 +16,11 @@ def _believed(config: Discretisation) -> float:
     return config.cable.friction_coefficient or 0.01
 
 
-class TableFriction(Effect):
+class TableFriction(CableEffect):
     """The Coulomb coefficient differs everywhere. Variant 1 also sticks harder than it slides, by a fitted excess."""
 
     name = "table_friction"
+    hook = "table"
     parameters = (
         Parameter("ratio", "", 0.01, 50.0, 1.0, 1.0, log=True),
         Parameter("static_excess", "", 0.0, 1.5, 0.0, 0.2),
@@ -35,7 +37,12 @@ class TableFriction(Effect):
         return [(0, (0.4, 0.0)), (0, (2.5, 0.0)), (1, (0.4, 0.2)), (1, (2.5, 0.2))]
 
     def reported(self, values, variant, config):
-        return {"coefficient": (float(values[0]) * _believed(config), "")}
+        coefficient = {"coefficient": (float(values[0]) * _believed(config), "")}
+        return {**coefficient, "static_excess": (float(values[1]), "")} if variant else coefficient
+
+    def _from_reported(self, parameters, config):
+        ratio = parameters["coefficient"] / _believed(config)
+        return {"static_excess": 0.0, **parameters, "ratio": ratio, "variant": float("static_excess" in parameters)}
 
 
 def _swept(context: Context, spacing: float) -> np.ndarray:
@@ -46,10 +53,11 @@ def _swept(context: Context, spacing: float) -> np.ndarray:
     return squares[np.argsort(-visits)] * spacing
 
 
-class FrictionPatch(Effect):
+class FrictionPatch(CableEffect):
     """Another coefficient inside a round region of the table."""
 
     name = "friction_patch"
+    hook = "table"
     parameters = (
         Parameter("x_m", "m", -3.0, 3.0, 0.4, 0.4, difference=0.01),
         Parameter("y_m", "m", -3.0, 3.0, 0.1, 0.4, difference=0.01),
@@ -81,14 +89,18 @@ class FrictionPatch(Effect):
             "coefficient": (ratio * _believed(config), ""),
         }
 
+    def _from_reported(self, parameters, config):
+        return {**parameters, "ratio": parameters["coefficient"] / _believed(config)}
+
     def location(self, values, variant, config):
         return {"table_m": [float(values[0]), float(values[1])]}
 
 
-class ViscousDrag(Effect):
+class ViscousDrag(CableEffect):
     """Drag per length proportional to velocity."""
 
     name = "viscous_drag"
+    hook = "table"
     parameters = (Parameter("coefficient_n_s_per_m2", "N s/m^2", 1e-3, 1e3, 1.0, 1.2, log=True),)
     null = (0.0,)
     amplitude = 0
@@ -100,10 +112,11 @@ class ViscousDrag(Effect):
         return [(0, (1.0,)), (0, (8.0,))]
 
 
-class GravityTilt(Effect):
+class GravityTilt(CableEffect):
     """The table is tilted against what is believed. Fitted as what gravity's part in its plane is more, over g."""
 
     name = "gravity_tilt"
+    hook = "table"
     parameters = (
         Parameter("sine_x", "", -0.9, 0.9, 0.0, 0.15),
         Parameter("sine_y", "", -0.9, 0.9, 0.0, 0.15),
@@ -123,11 +136,16 @@ class GravityTilt(Effect):
         sine = float(np.clip(np.hypot(x, y), 0.0, 1.0))
         return {"angle_rad": (float(np.arcsin(sine)), "rad"), "direction_rad": (float(np.arctan2(y, x)), "rad")}
 
+    def _from_reported(self, parameters, config):
+        sine, direction = np.sin(parameters["angle_rad"]), parameters["direction_rad"]
+        return {"sine_x": sine * np.cos(direction), "sine_y": sine * np.sin(direction)}
 
-class Obstacle(Effect):
+
+class Obstacle(CableEffect):
     """An unmodelled fixed disc touches the cable."""
 
     name = "obstacle"
+    hook = "obstacle"
     parameters = (
         Parameter("x_m", "m", -3.0, 3.0, 0.4, 0.4, difference=0.003),
         Parameter("y_m", "m", -3.0, 3.0, 0.1, 0.4, difference=0.003),

@@ -7,11 +7,11 @@ from collections.abc import Sequence
 from typing import get_args
 
 from cablejax.cable import Discretisation
+from cablejax.control.targets import Shape
 from cablejax.evaluation.protocols import StartKind, letter_task, random_task
 from cablejax.evaluation.suite import Case
 from cablejax.evaluation.trials import LIANG_TABLE
 from cablejax.simulate.plant import Plant, PlantConfig
-from cablejax.targets import Shape
 
 STIFFNESS_RATIOS = (0.1, 0.5, 1.0, 2.0, 3.0)
 """Wang et al., RA-L 2022: the cable's stiffness over the trained one's."""

@@ -9,13 +9,13 @@ import sys
 import numpy as np
 
 from cablejax.cable import Discretisation
+from cablejax.control.shaping import Model, load_model
 from cablejax.dynamics.fine_tune import starting_from
 from cablejax.dynamics.train import train
 from cablejax.dynamics.train_config import Phase, TrainConfig
 from cablejax.dynamics.weights import FILE_NAME, save_weights
 from cablejax.evaluation.protocols import GuessingCable
 from cablejax.npz import read_npz
-from cablejax.shaping import Model, load_model
 from cablejax.simulate.motions import MotionConfig, random_motion
 from cablejax.simulate.table_plant import PlantError
 from cablejax.types import Trajectory

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import dataclasses
 
-from cablejax.closed_loop import ShapeController
+from cablejax.control.loop import Controller
+from cablejax.control.shaping import Model, make_controller
+from cablejax.control.targets import Target
+from cablejax.control.visual_servo import ServoConfig, VisualServo
 from cablejax.evaluation.paper import DIRECT, FINE_TUNED, METHOD_LABEL, RANDOMISED, RESIDUAL, VISUAL_SERVO
-from cablejax.servo import ServoConfig, VisualServo
-from cablejax.shaping import Model, make_controller
-from cablejax.targets import Target
 
 ADAPTED = "adapted"
 ADAPTED_RESIDUAL = "adapted residual"
@@ -52,7 +52,7 @@ METHODS: dict[str, MethodSpec] = {
 """The paper's methods in its order, then two beyond it. A conditioned model estimates its cable in any case."""
 
 
-def controller_of(spec: MethodSpec, model: Model | None, target: Target) -> ShapeController:
+def controller_of(spec: MethodSpec, model: Model | None, target: Target) -> Controller:
     """What shapes the cable.
 
     Args:
@@ -62,4 +62,6 @@ def controller_of(spec: MethodSpec, model: Model | None, target: Target) -> Shap
     """
     if model is None:
         return VisualServo(ServoConfig(), target.keypoints)
-    return make_controller(model, target, method="residual" if spec.residual else "direct", solver="trust-region")
+    return make_controller(
+        model, target, method="residual" if spec.residual else "direct", solver="levenberg-marquardt"
+    )

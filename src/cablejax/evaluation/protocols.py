@@ -29,13 +29,13 @@ import numpy as np
 from jaxtyping import Float
 
 from cablejax.cable import Discretisation
+from cablejax.control.targets import START_LEAN, Shape, Target, make_target
 from cablejax.mpc import MPCConfig
-from cablejax.mpc.goal import continued, goal_pose, way_to
+from cablejax.mpc.target_pose import continued, target_pose, way_to
 from cablejax.simulate.elastica import Elastica, ElasticaError, elastica, solve_elastica
 from cablejax.simulate.equilibrium import arch_angles, chain_nodes, find_equilibrium
 from cablejax.simulate.motions import MotionConfig, admissible
 from cablejax.simulate.table_plant import Observation
-from cablejax.targets import START_LEAN, Shape, Target, make_target
 
 StartKind = Literal["straight", "diverse"]
 
@@ -103,7 +103,7 @@ def least_time(task: Task, config: MPCConfig) -> float:
     No controller that keeps the bound arrives sooner, whatever it knows of the cable.
     """
     pose = continued(jnp.asarray(task.start_pose), jnp.asarray(task.start_shape))
-    way = way_to(pose, goal_pose(jnp.asarray(task.target.keypoints)), config.objective.rotation_weight)
+    way = way_to(pose, target_pose(jnp.asarray(task.target.keypoints)), config.objective.rotation_weight)
     return config.objective.interval * float(jnp.linalg.norm(way, axis=1).max()) / config.radius_max
 
 
@@ -119,7 +119,7 @@ class GuessingCable(Protocol):
 
 @dataclasses.dataclass(frozen=True)
 class LaidOut:
-    """A plant that lays its cable out in a task's start shape; for `closed_loop.run_closed_loop`.
+    """A plant that lays its cable out in a task's start shape; for `control.loop.run_closed_loop`.
 
     Attributes:
         plant: what is laid out and shaped.

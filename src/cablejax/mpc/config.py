@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Hashable
 
 import numpy as np
 
 from cablejax.adaptation.belief import AdaptationConfig
 from cablejax.mpc.plan import Solver
+from cablejax.mpc.planners import LevenbergMarquardt
 from cablejax.mpc.problem import ObjectiveConfig
-from cablejax.mpc.trust_region import TrustRegion
 from cablejax.residual.ridge import RidgeConfig
 from cablejax.whole_number import is_whole
 
@@ -27,7 +28,7 @@ class MPCConfig:
         workspace: lowest and highest corner (x, y) of where the grippers may be [m]; None = anywhere.
         max_change: greatest norm of the change of a gripper's motion from one step to the next [m]: it bounds the
             acceleration. Then holding means to brake, which may take steps. None = any.
-        radius: initial trust-region size epsilon, the bound on one step's motion of each gripper [m].
+        radius: initial bound epsilon on one step's motion of each gripper [m]; adapted as a trust region is.
         radius_min: it does not shrink below this [m].
         radius_max: nor grow above this [m]: the model has not been trained on faster motions.
         grow_above: eta+; the radius grows if actual over predicted error reduction is at least this.
@@ -38,7 +39,7 @@ class MPCConfig:
         hold_improvement: the grippers hold still if the plan lowers the error over the horizon, as a root mean square
             distance, by less than this compared with holding still [m].
         restart_above: where the error stays above this [m], the cable is in another shape than the target's, between
-            the same grippers or others. No plan of a few steps leads out: it is straightened, and begun anew.
+            the same grippers or others. No plan of a few steps leads out: it is straightened, and shaped from there.
         restart_after: commands without a lower error after which it counts as staying; at once where no plan is better
             than holding still.
         max_restarts: how often that may happen; a shape that is fallen into again and again is the model's.
@@ -69,7 +70,7 @@ class MPCConfig:
     objective: ObjectiveConfig = ObjectiveConfig()
     residual: RidgeConfig | None = RidgeConfig(forgetting=0.5, outlier=0.02)
     adaptation: AdaptationConfig | None = None
-    solver: Solver = TrustRegion()
+    solver: Solver = LevenbergMarquardt()
 
     def __post_init__(self):
         if not is_whole(self.horizon, least=0):
@@ -97,16 +98,37 @@ class MPCConfig:
             )
         if not (self.shrink_below < self.grow_above and 0 < self.shrink <= 1 <= self.grow):
             raise ValueError(
-                f"MPCConfig trust region: thresholds {self.shrink_below}, {self.grow_above} must increase, and factors "
+                f"MPCConfig radius: thresholds {self.shrink_below}, {self.grow_above} must increase, and factors "
                 f"{self.shrink}, {self.grow} lie on either side of 1."
             )
-        if not (self.restart_above > 0 and self.restart_after >= 1 and self.max_restarts >= 0):
+        whole = is_whole(self.restart_after, least=1) and is_whole(self.max_restarts, least=0)
+        if not (self.restart_above > 0 and whole):
             raise ValueError(
-                f"MPCConfig restarts: above {self.restart_above} m, after {self.restart_after} commands, at most "
-                f"{self.max_restarts}: expected a positive length, at least 1, and none or more."
+                f"MPCConfig restarts: restart_above {self.restart_above} m, restart_after {self.restart_after}, "
+                f"max_restarts {self.max_restarts}: expected a positive length, a whole number of at least 1, and one "
+                "of at least 0."
             )
         if not (self.min_reduction > 0 and self.hold_improvement >= 0):
             raise ValueError("MPCConfig.min_reduction must be positive and hold_improvement not negative [m].")
+        self._check_parts()
+
+    def _check_parts(self) -> None:
+        """Raises ValueError unless every part of the settings is of its kind."""
+        for name, kind, optional in (
+            ("objective", ObjectiveConfig, False),
+            ("residual", RidgeConfig, True),
+            ("adaptation", AdaptationConfig, True),
+        ):
+            value = getattr(self, name)
+            if not (isinstance(value, kind) or (optional and value is None)):
+                raise ValueError(
+                    f"MPCConfig.{name} is {value!r}, expected a {kind.__name__}{' or None' if optional else ''}."
+                )
+        if not (callable(self.solver) and isinstance(self.solver, Hashable)) or isinstance(self.solver, type):
+            raise ValueError(
+                f"MPCConfig.solver is {self.solver!r}, expected a solver such as LevenbergMarquardt(); `SOLVERS` has "
+                "them by name."
+            )
 
     @property
     def n_commands(self) -> int:

@@ -3,68 +3,84 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float, Int
 
+from cablejax.bounded.results import Result
 from cablejax.mpc.config import MPCConfig
-from cablejax.mpc.controller_state import ControllerState
-from cablejax.mpc.plan import Outcome, Plan
+from cablejax.mpc.plan import Plan
 from cablejax.mpc.problem import ShapingProblem
-from cablejax.mpc.start import Starts, StraightWay
+from cablejax.mpc.state import Action, Progress
+from cablejax.mpc.warm_start import Starts, StraightWay
 
 
-def plan_or_hold(config: MPCConfig, plan: Plan, start: Starts) -> Plan:
+class Decision(NamedTuple):
+    """What is done.
+
+    Attributes:
+        plan: to carry out the first command of; its `result` is the solver's.
+        action: an `Action`, shape [].
+    """
+
+    plan: Plan
+    action: Int[Array, ""]
+
+
+def plan_or_hold(config: MPCConfig, plan: Plan, start: Starts) -> Decision:
     """The solver's plan, or holding still where that is as good or nothing can be trusted."""
     value, hold = plan.value, start.value_still
     improvement = jnp.sqrt(2.0 * hold / config.n_commands) - jnp.sqrt(2.0 * value / config.n_commands)
     finite = jnp.isfinite(value) & jnp.isfinite(plan.motion).all()
-    sound = finite & (plan.outcome != Outcome.NONFINITE) & (plan.outcome != Outcome.INFEASIBLE)
-    worthwhile = sound & (improvement >= config.hold_improvement)
-    outcome = jnp.where(finite, jnp.where(sound, Outcome.HELD, plan.outcome), Outcome.NONFINITE)
-    outcome = jnp.where(worthwhile, plan.outcome, outcome)
-    return dataclasses.replace(
+    result = jnp.where(finite, plan.result, Result.NONFINITE).astype(jnp.int32)
+    worthwhile = _sound(result) & (improvement >= config.hold_improvement)
+    plan = dataclasses.replace(
         plan,
         motion=jnp.where(worthwhile, plan.motion, start.still),
         value=jnp.where(worthwhile, value, hold),
-        outcome=outcome.astype(jnp.int32),
+        result=result,
     )
+    return Decision(plan, jnp.where(worthwhile, Action.FOLLOW, Action.HOLD).astype(jnp.int32))
 
 
 def plan_or_restart(
     config: MPCConfig,
-    state: ControllerState,
+    progress: Progress,
     problem: ShapingProblem,
     error: Float[Array, ""],
-    plan: Plan,
+    decision: Decision,
     straight: StraightWay,
-) -> tuple[Plan, ControllerState]:
-    """The plan, or the next step of straightening the cable; and the state with what is counted for that.
+) -> tuple[Decision, Progress]:
+    """The decision, or the next step of straightening the cable; and the progress with what is counted for that.
 
     A cable has several shapes between the same grippers, and near another one than the target's every plan of a few
     steps makes the error worse before it makes it better. From the straight cable the target can be reached.
     """
-    radius = problem.feasible.radius
-    better = error < 0.99 * state.best_error
-    since = jnp.where(better, 0, state.since_best + 1)
-    staying = (plan.outcome == Outcome.HELD) | (since >= config.restart_after)
-    stuck = staying & (error > config.restart_above) & (state.restarts < config.max_restarts)
+    plan, radius, sound = decision.plan, problem.feasible.radius, _sound(decision.plan.result)
+    better = error < 0.99 * progress.best_error
+    since = jnp.where(better, 0, progress.since_best + 1)
+    staying = (sound & (decision.action == Action.HOLD)) | (since >= config.restart_after)
+    stuck = staying & (error > config.restart_above) & (progress.restarts < config.max_restarts)
     # half as many steps again as the way is long: the bounds on the grippers' distance may lead it round
     needed = jnp.ceil(1.5 * straight.length / radius).astype(jnp.int32)
-    left = jnp.where(state.restarting > 0, state.restarting - 1, jnp.where(stuck, needed, 0))
-    sound = (plan.outcome != Outcome.NONFINITE) & (plan.outcome != Outcome.INFEASIBLE)
+    left = jnp.where(progress.straightening > 0, progress.straightening - 1, jnp.where(stuck, needed, 0))
     left = jnp.where((straight.length > radius) & sound, left, 0)
     restarting = left > 0
-    state = dataclasses.replace(
-        state,
-        best_error=jnp.where(restarting, jnp.inf, jnp.where(better, error, state.best_error)).astype(error.dtype),
+    progress = Progress(
+        best_error=jnp.where(restarting, jnp.inf, jnp.where(better, error, progress.best_error)).astype(error.dtype),
         since_best=jnp.where(restarting, 0, since),
-        restarting=left,
-        restarts=state.restarts + (restarting & (state.restarting == 0)),
+        straightening=left,
+        restarts=progress.restarts + (restarting & (progress.straightening == 0)),
     )
     motion = jnp.where(restarting, straight.motion, plan.motion)
     # a rollout that is needed in few calls
     value = jax.lax.cond(restarting, problem.value, lambda motion: plan.value, straight.motion)
-    outcome = jnp.where(restarting, Outcome.RESTARTING, plan.outcome).astype(jnp.int32)
-    return dataclasses.replace(plan, motion=motion, value=value, outcome=outcome), state
+    action = jnp.where(restarting, Action.STRAIGHTEN, decision.action).astype(jnp.int32)
+    return Decision(dataclasses.replace(plan, motion=motion, value=value), action), progress
+
+
+def _sound(result: Int[Array, ""]) -> Bool[Array, ""]:
+    """Whether a plan of this result may be carried out."""
+    return (result != Result.NONFINITE) & (result != Result.EMPTY_SET)

@@ -23,7 +23,7 @@ from cablejax.bounded.sets import (
     Intersection,
     project_ball,
 )
-from cablejax.mpc.step_by_step import keep_each_step
+from cablejax.mpc.sequential_projection import project_sequentially
 
 __all__ = ["FeasibleSet", "feasible_from", "project_ball"]
 
@@ -105,14 +105,14 @@ class FeasibleSet(AbstractSet):
     def restore(self, y: Float[Array, "T 2 3"]) -> Float[Array, "T 2 3"]:
         """A plan that keeps every bound but that on the change, cheaply, where the grippers start inside them.
 
-        From outside it comes near the bounds that close in, no more: see `keep_each_step`.
+        From outside it comes near the bounds that close in, no more: see `project_sequentially`.
         """
         tight = 1.0 - _MARGIN_ULP * jnp.finfo(y.dtype).eps
         corners = None
         if self.workspace is not None:
             corners = jnp.stack(self._workspace_bounds(len(y)), axis=1).astype(y.dtype)
         lower, upper = self._distance_bounds(len(y))
-        return keep_each_step(
+        return project_sequentially(
             y,
             separation=self.separation.astype(y.dtype),
             radius=self.radius * tight,

@@ -1,64 +1,18 @@
-"""What a solver of the planning problem takes and returns, and how a solve ended."""
+"""Plans: what a planner takes and returns, the best of several starts, derivatives with respect to the problem."""
 
 from __future__ import annotations
 
 import dataclasses
-import enum
-from typing import TYPE_CHECKING, Protocol
+from typing import Protocol
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from cablejax.bounded.certificate import Certificate, certify
-from cablejax.bounded.results import Result, Solution
-
-if TYPE_CHECKING:
-    from cablejax.mpc.problem import ShapingProblem
-    from cablejax.mpc.rollout import Rollout
-
-
-class Outcome(enum.IntEnum):
-    """How a solve ended. Inside compiled code it is an int32."""
-
-    CONVERGED = 0
-    """No feasible direction improves the plan by more than the tolerance."""
-    STEP_LIMIT = 1
-    """The evaluation budget was used up; the plan is feasible and no worse than the guess."""
-    HELD = 2
-    """The plan would hardly improve on holding still: the grippers hold."""
-    NONFINITE = 3
-    """The model or the observation gave NaN or infinity: the grippers hold."""
-    RESTARTING = 4
-    """The error stayed where it is, as in another shape between the same grippers: the cable is straightened first."""
-    INFEASIBLE = 5
-    """The bounds contradict each other: there is no feasible plan, and the grippers hold."""
-    STALLED = 6
-    """No step improves the plan by more than rounding can tell; it is feasible and no worse than the guess."""
-
-    @property
-    def message(self) -> str:
-        """The outcome as one sentence, for people."""
-        return _MESSAGES[self]
-
-
-_MESSAGES = {
-    Outcome.CONVERGED: "Converged: no feasible change improves the plan by more than the tolerance.",
-    Outcome.STEP_LIMIT: "The budget was used up; the plan is feasible and no worse than the guess. Raise the limit.",
-    Outcome.HELD: "Holding still is as good as the best plan found.",
-    Outcome.NONFINITE: "The model gave NaN or infinity; the grippers hold. Check weights, history and target.",
-    Outcome.RESTARTING: "The cable is being straightened: it was in another shape than the target's.",
-    Outcome.INFEASIBLE: "The bounds contradict each other; the grippers hold. Check distances, radius and workspace.",
-    Outcome.STALLED: "No step improves the plan by more than rounding; use float64 for a smaller tolerance.",
-}
-
-_OUTCOMES = {
-    Result.CONVERGED: Outcome.CONVERGED,
-    Result.STEP_LIMIT: Outcome.STEP_LIMIT,
-    Result.NONFINITE: Outcome.NONFINITE,
-    Result.EMPTY_SET: Outcome.INFEASIBLE,
-    Result.STALLED: Outcome.STALLED,
-}
+from cablejax.bounded.implicit import with_derivatives
+from cablejax.bounded.results import Solution
+from cablejax.mpc.problem import Rollout, ShapingProblem
 
 
 @jax.tree_util.register_dataclass
@@ -70,7 +24,7 @@ class Plan:
         motion: feasible motions [m], shape [T, Q, 3].
         value: their objective [m^2], shape [].
         evaluations: rollouts of the model that were spent on trial plans, shape [].
-        outcome: an `Outcome`, shape [].
+        result: a `bounded.Result`: how the solve ended, shape [].
         linearisations: gradients or Jacobians that were spent, shape []; None = the solver needs none.
         optimality: largest element of a unit projected gradient step [m] at the last plan whose gradient was taken,
             shape []; None = the solver takes none.
@@ -79,7 +33,7 @@ class Plan:
     motion: Float[Array, "*batch T Q 3"]
     value: Float[Array, "*batch"]
     evaluations: Int[Array, "*batch"]
-    outcome: Int[Array, "*batch"]
+    result: Int[Array, "*batch"]
     linearisations: Int[Array, "*batch"] | None = None
     optimality: Float[Array, "*batch"] | None = None
 
@@ -98,14 +52,45 @@ class Solver(Protocol):
 
 def plan_from(solution: Solution) -> Plan:
     """The plan that a bounded solve found."""
-    outcome = jnp.asarray(Outcome.STEP_LIMIT, jnp.int32)
-    for result, ours in _OUTCOMES.items():
-        outcome = jnp.where(solution.result == result, ours, outcome)
     return Plan(
         motion=solution.value,
         value=solution.objective,
         evaluations=solution.stats.evaluations,
-        outcome=outcome.astype(jnp.int32),
+        result=solution.result,
         linearisations=solution.stats.linearisations,
         optimality=solution.optimality,
+    )
+
+
+def multi_start(
+    problem: ShapingProblem, solver: Solver, guesses: Float[Array, "S T Q 3"]
+) -> tuple[Plan, Plan, Float[Array, " S"]]:
+    """The best plan of several starts; all of them, with a leading axis S; and their values [m^2], inf for NaN."""
+    every = jax.vmap(lambda guess: solver(problem, problem.start(guess)))(guesses)
+    values = jnp.where(jnp.isfinite(every.value), every.value, jnp.inf)
+    best = jnp.argmin(values)
+    return jax.tree.map(lambda leaf: leaf[best], every), every, values
+
+
+def random_starts(problem: ShapingProblem, n_commands: int, count: int, seed: int = 0) -> Float[Array, "S T Q 3"]:
+    """Feasible plans at random: each gripper goes about straight on, at random speed."""
+    heading, noise = jax.random.split(jax.random.key(seed))
+    dtype = problem.target.dtype
+    way = jax.random.normal(heading, (count, 1, 2, 3), dtype)
+    motion = problem.feasible.radius * (way + 0.3 * jax.random.normal(noise, (count, n_commands, 2, 3), dtype)) / 2.0
+    return jax.vmap(problem.feasible.project)(motion)
+
+
+def differentiable_plan(problem: ShapingProblem, motion: Float[Array, "T Q 3"]) -> Float[Array, "T Q 3"]:
+    """`motion` itself, with the derivatives that the minimum of the problem has in all arrays of `problem`.
+
+    In forward and reverse mode, as the fixed point `u = P(u - grad J(u))`: also right where bounds are active. The
+    motion must be a converged plan, from any solver. Takes one Hessian-vector product for each of its numbers.
+
+    Args:
+        problem: where its arrays are traced, they are differentiated in.
+        motion: a minimum of it [m].
+    """
+    return with_derivatives(
+        jax.lax.stop_gradient(motion), lambda motion, problem: problem.value(motion), problem.feasible, problem
     )

@@ -11,8 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from cablejax.mpc.feasible import FeasibleSet
-from cablejax.mpc.goal import continued, goal_pose, total_turn, way_to
-from cablejax.mpc.rollout import Rollout
+from cablejax.mpc.target_pose import continued, target_pose, total_turn, way_to
 from cablejax.residual.jacobian import Dynamics, step_jacobian
 from cablejax.types import History, advance
 
@@ -31,7 +30,7 @@ class ObjectiveConfig:
             held. The keypoints say little about how the grippers must turn until the shape is nearly there, and a plan
             that sees six steps ahead turns them last; so the far way is made shorter from the start.
         arrival_margin: what is left of that way within this counts nothing, the keypoints alone decide there [m]: how
-            the ends are held is read off the target's keypoints (`goal.goal_pose`), and is not known to a hair.
+            the ends are held is read off the target's keypoints (`target_pose`), and is not known to a hair.
     """
 
     terminal_weight: float = 1.0
@@ -60,6 +59,22 @@ class ObjectiveConfig:
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
+class Rollout:
+    """What `ShapingProblem.rollout` gives.
+
+    Attributes:
+        motion: the plan [m], shape [T, Q, 3].
+        met: the histories that its steps start from, with a leading axis T.
+        shapes: predicted keypoints X(1), ..., X(T) [m], shape [T, N, 2].
+    """
+
+    motion: Float[Array, "*batch T Q 3"]
+    met: History
+    shapes: Float[Array, "*batch T N 2"]
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
 class ShapingProblem:
     """Bring the cable to a target shape within a horizon (Wang et al., RA-L 2022, "Model Predictive Control").
 
@@ -70,7 +85,7 @@ class ShapingProblem:
     l is zero unless the cable is wound up: `l = rotation_weight max(|turn - turn_d| - pi, 0)`, where turn is the angle
     from one gripper's theta to the other's along the cable. A loop cannot be shaped away with the grippers' directions
     as they are, and next to it the keypoint error alone has a minimum. way_q(T) is the motion that takes gripper q from
-    the end of the plan to where the target's ends are held (`goal.way_to`). Both are ours, not the paper's.
+    the end of the plan to where the target's ends are held (`target_pose.way_to`). Both are ours, not the paper's.
 
     It is a nonlinear least squares problem: `value` is half the squared norm of `residuals`. All methods are pure and
     differentiable in `motion`, `history`, `target` and `weights` as far as `dynamics` is.
@@ -185,7 +200,7 @@ class ShapingProblem:
         pose, weight = continued(self.history.gripper_pose, self.history.keypoints[-1]), self.objective.rotation_weight
         turn = pose[1, 2] - pose[0, 2] + jnp.cumsum(motion[:, 1, 2] - motion[:, 0, 2]) / weight
         wound = weight * jnp.maximum(jnp.abs(turn - total_turn(self.target)) - jnp.pi, 0.0)
-        way = way_to(pose, goal_pose(self.target), weight) - motion.sum(axis=0)
+        way = way_to(pose, target_pose(self.target), weight) - motion.sum(axis=0)
         # the bound keeps the derivative finite where nothing is left
         length = jnp.sqrt(jnp.maximum(jnp.sum(way**2, axis=1), 1e-12))
         left = jnp.maximum(length - self.objective.arrival_margin, 0.0)

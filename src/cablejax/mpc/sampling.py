@@ -1,16 +1,112 @@
-"""What planning by sampling needs: plans drawn, made feasible and valued."""
+"""Planners by sampling: the cross-entropy method and path integrals. No derivatives, many rollouts; baselines."""
 
 from __future__ import annotations
 
+import dataclasses
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from cablejax.mpc.plan import Outcome, Plan
-from cablejax.mpc.problem import ShapingProblem
-from cablejax.mpc.rollout import Rollout
+from cablejax.bounded.results import Result
+from cablejax.mpc.plan import Plan
+from cablejax.mpc.problem import Rollout, ShapingProblem
+from cablejax.mpc.validation import check_budget, check_positive
+
+
+@dataclasses.dataclass(frozen=True)
+class CrossEntropy:
+    """Solver: the cross-entropy method (de Boer et al., Ann. Oper. Res. 134, 2005).
+
+    Plans are drawn from a normal distribution and projected; the best of them say the next mean and spread.
+
+    Attributes:
+        samples: plans per iteration.
+        elites: best of them.
+        iterations: how often.
+        spread: initial standard deviation, relative to the bound on one step's motion.
+        smoothing: share of the old mean and spread that stays.
+        seed: of the samples; the same in every call.
+    """
+
+    samples: int = 64
+    elites: int = 8
+    iterations: int = 5
+    spread: float = 0.5
+    smoothing: float = 0.1
+    seed: int = 0
+
+    def __post_init__(self):
+        check_budget(self, "samples", "elites", "iterations")
+        check_positive(self, "spread")
+        if self.elites > self.samples or not 0 <= self.smoothing < 1:
+            raise ValueError(
+                f"CrossEntropy(elites={self.elites}, smoothing={self.smoothing}): expected no more elites than samples "
+                "and a smoothing in [0, 1)."
+            )
+
+    def __call__(self, problem: ShapingProblem, guess: Rollout) -> Plan:
+        def iterate(carry, key):
+            best, mean, deviation = carry
+            drawn = drawn_plans(problem, key, mean, deviation, self.samples)
+            order = jnp.argsort(drawn.value)[: self.elites]
+            elite = drawn.motion[order]
+            mean = self.smoothing * mean + (1 - self.smoothing) * elite.mean(axis=0)
+            deviation = self.smoothing * deviation + (1 - self.smoothing) * elite.std(axis=0)
+            return (better_plan(best, drawn, order[0]), mean, deviation), None
+
+        first = first_plan(problem, guess)
+        deviation = self.spread * problem.feasible.radius * jnp.ones_like(guess.motion)
+        keys = jax.random.split(jax.random.key(self.seed), self.iterations)
+        (best, _, _), _ = jax.lax.scan(iterate, (first, first.motion, deviation), keys)
+        return sampled_plan(problem, best, 1 + self.samples * self.iterations)
+
+
+@dataclasses.dataclass(frozen=True)
+class PathIntegral:
+    """Solver: model predictive path integral control (Williams et al., ICRA 2017).
+
+    Plans around the mean are weighted by `exp(-value / temperature)`; their weighted mean is the next one.
+
+    Attributes:
+        samples: plans per iteration.
+        iterations: how often.
+        spread: standard deviation of the samples, relative to the bound on one step's motion.
+        temperature: relative to the spread of the samples' values.
+        seed: of the samples; the same in every call.
+    """
+
+    samples: int = 64
+    iterations: int = 5
+    spread: float = 0.3
+    temperature: float = 0.1
+    seed: int = 0
+
+    def __post_init__(self):
+        check_budget(self, "samples", "iterations")
+        check_positive(self, "spread", "temperature")
+
+    def __call__(self, problem: ShapingProblem, guess: Rollout) -> Plan:
+        deviation = self.spread * problem.feasible.radius * jnp.ones_like(guess.motion)
+
+        def iterate(carry, key):
+            best, mean = carry
+            drawn = drawn_plans(problem, key, mean, deviation, self.samples)
+            known = jnp.isfinite(drawn.value)
+            lowest = drawn.value.min()
+            span = jnp.where(known, drawn.value - lowest, 0.0).max() + jnp.finfo(guess.motion.dtype).tiny
+            weight = jnp.where(known, jnp.exp(-(drawn.value - lowest) / (self.temperature * span)), 0.0)
+            weight = weight / jnp.maximum(weight.sum(), 1e-12)
+            mean = jnp.where(known.any(), jnp.tensordot(weight, drawn.motion, axes=1), mean)
+            return (better_plan(best, drawn, jnp.argmin(drawn.value)), mean), None
+
+        first = first_plan(problem, guess)
+        keys = jax.random.split(jax.random.key(self.seed), self.iterations)
+        (best, mean), _ = jax.lax.scan(iterate, (first, first.motion), keys)
+        last = first_plan(problem, problem.start(mean))
+        best = jax.tree.map(lambda a, b: jnp.where(last.value < best.value, a, b), last, best)
+        return sampled_plan(problem, best, 2 + self.samples * self.iterations)
 
 
 class Valued(NamedTuple):
@@ -50,8 +146,8 @@ def better_plan(best: Valued, drawn: Valued, index: Array) -> Valued:
 
 def sampled_plan(problem: ShapingProblem, best: Valued, evaluations: int) -> Plan:
     """The best plan as a solver returns it."""
-    outcome = jnp.where(jnp.isfinite(best.value), Outcome.STEP_LIMIT, Outcome.NONFINITE)
+    result = jnp.where(jnp.isfinite(best.value), Result.STEP_LIMIT, Result.NONFINITE)
     rounding = jnp.finfo(best.motion.dtype).eps ** 0.5
     broken = problem.feasible.empty() | ~(problem.feasible.violation(best.motion) <= rounding)
-    outcome = jnp.where(broken, Outcome.INFEASIBLE, outcome)
-    return Plan(best.motion, best.value, jnp.asarray(evaluations, jnp.int32), outcome.astype(jnp.int32))
+    result = jnp.where(broken, Result.EMPTY_SET, result)
+    return Plan(best.motion, best.value, jnp.asarray(evaluations, jnp.int32), result.astype(jnp.int32))

@@ -9,8 +9,8 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from cablejax.mpc.controller import Controller
-from cablejax.types import History
+from cablejax.mpc.controller import MPC
+from cablejax.types import History, Measurement
 
 
 @dataclasses.dataclass(frozen=True)
@@ -36,7 +36,7 @@ class ControlTiming:
         return float(np.percentile(self.call_ms, 95))
 
 
-def time_control(controller: Controller, history: History, repeats: int = 30) -> ControlTiming:
+def time_control(controller: MPC, history: History, repeats: int = 30) -> ControlTiming:
     """Times `controller.step`, from the observation to the command on the host.
 
     The loop is closed through the controller's own prediction, so that its window fills, its plans are warm and the
@@ -48,11 +48,12 @@ def time_control(controller: Controller, history: History, repeats: int = 30) ->
     if repeats < 1:
         raise ValueError(f"time_control got repeats={repeats}, expected at least 1.")
     state = controller.init(history)
-    keypoints, pose = np.asarray(history.keypoints[-1]), np.asarray(history.gripper_pose)
+    measurement = Measurement(np.asarray(history.keypoints[-1]), np.asarray(history.gripper_pose))
     seconds = []
     for _ in range(repeats + 1):
         start = time.perf_counter()
-        state, twist, _ = jax.block_until_ready(controller.step(state, keypoints, pose))
+        state, twist, _ = jax.block_until_ready(controller.step(state, measurement))
         seconds.append(time.perf_counter() - start)
-        keypoints, pose = np.asarray(state.predicted), pose + controller.config.objective.interval * np.asarray(twist)
+        pose = measurement.gripper_pose + controller.config.objective.interval * np.asarray(twist)
+        measurement = Measurement(np.asarray(state.last.predicted), pose)
     return ControlTiming(first_call_s=seconds[0], call_ms=1e3 * np.asarray(seconds[1:]))

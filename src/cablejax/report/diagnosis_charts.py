@@ -1,7 +1,7 @@
 """Charts of a diagnosis: which effect causes the gap, how far it shrinks, and what to record next.
 
-Each takes a `Diagnosis` and gives a `matplotlib.figure.Figure` that belongs to nobody else, or None if there is nothing
-to draw.
+Each takes a `CableDiagnosis` and gives a `matplotlib.figure.Figure` that belongs to nobody else, or None if there is
+nothing to draw.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from cablejax.cable import Discretisation
-from cablejax.diagnose.diagnosis import Diagnosis
+from cablejax.diagnose.diagnosis import CableDiagnosis
 from cablejax.diagnose.safe_motions import INTERVAL, safe_motions, starting_pose
 from cablejax.report.diagnosis_style import STYLE, explained_label
 from cablejax.report.effect_words import effect_title
@@ -33,7 +33,7 @@ _SPLIT = (
 )
 
 
-def ranking_figure(diagnosis: Diagnosis) -> Figure | None:
+def ranking_figure(diagnosis: CableDiagnosis) -> Figure | None:
     """Effects that were tried: how probable each is, where that was computed, and how much of the gap it takes away.
 
     None where none was tried.
@@ -70,7 +70,7 @@ def ranking_figure(diagnosis: Diagnosis) -> Figure | None:
     return figure
 
 
-def shrinkage_figure(diagnosis: Diagnosis) -> Figure:
+def shrinkage_figure(diagnosis: CableDiagnosis) -> Figure:
     """Error before and after by horizon over the noise floor, five seconds ahead beside a correction that knows no
     cause, and what the error before consists of."""
     gap = diagnosis.gap
@@ -103,7 +103,7 @@ def shrinkage_figure(diagnosis: Diagnosis) -> Figure:
     return figure
 
 
-def motion_figure(diagnosis: Diagnosis) -> Figure | None:
+def motion_figure(diagnosis: CableDiagnosis) -> Figure | None:
     """The motion to record next, and how well each motion of the library tells the explanations apart."""
     following = diagnosis.next_motion
     if following is None:

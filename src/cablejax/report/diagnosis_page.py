@@ -11,7 +11,7 @@ import string
 import numpy as np
 
 from cablejax.diagnose.belief import Calibration
-from cablejax.diagnose.diagnosis import Diagnosis, NamedEffect, Verdict
+from cablejax.diagnose.diagnosis import CableDiagnosis, NamedEffect, Verdict
 from cablejax.diagnose.verdict_json import write_verdict
 from cablejax.report.diagnosis_charts import motion_figure, ranking_figure, shrinkage_figure
 from cablejax.report.diagnosis_figures import cable_figure, where_figure
@@ -56,7 +56,7 @@ _FILES_CAPTION = (
 )
 
 
-def write_diagnosis_page(diagnosis: Diagnosis, out: str | os.PathLike[str]) -> pathlib.Path:
+def write_diagnosis_page(diagnosis: CableDiagnosis, out: str | os.PathLike[str]) -> pathlib.Path:
     """Writes `report.html`, `verdict.json` and the figures as PNG into a folder, and returns the page's path.
 
     The figures are `cable.png`, `where.png`, `shrinkage.png`, and, where effects were tried, `ranking.png`.
@@ -85,7 +85,7 @@ def write_diagnosis_page(diagnosis: Diagnosis, out: str | os.PathLike[str]) -> p
     here = importlib.resources.files("cablejax.report")
     css = "\n".join((here / name).read_text(encoding="utf-8") for name in ("page.css", "diagnosis.css"))
     page = string.Template((here / "diagnosis.html").read_text(encoding="utf-8")).substitute(
-        title=html.escape(f"Diagnosis: {badge}"),
+        title=html.escape(f"CableDiagnosis: {badge}"),
         css=css,
         kind=kind,
         badge=badge,
@@ -113,7 +113,7 @@ def write_diagnosis_page(diagnosis: Diagnosis, out: str | os.PathLike[str]) -> p
     return path
 
 
-def _lead(diagnosis: Diagnosis) -> str:
+def _lead(diagnosis: CableDiagnosis) -> str:
     """What was looked at, and the gap in one line."""
     log, gap = diagnosis.log, diagnosis.gap
     seconds = sum(float(t[n - 1] - t[0]) for t, n in zip(log.time, log.episode_length, strict=True))
@@ -126,7 +126,7 @@ def _lead(diagnosis: Diagnosis) -> str:
     return html.escape(text)
 
 
-def _cards(diagnosis: Diagnosis):
+def _cards(diagnosis: CableDiagnosis):
     gap = diagnosis.gap
     if diagnosis.effects:
         names = listed([listed(_alike(diagnosis, e), "or") for e in diagnosis.effects])
@@ -154,13 +154,13 @@ def _cards(diagnosis: Diagnosis):
         yield _card("Error", millimetres(gap.before_rmse_mm), _noise(diagnosis))
 
 
-def _noise(diagnosis: Diagnosis) -> str:
+def _noise(diagnosis: CableDiagnosis) -> str:
     """The noise, and what it leaves out: in space it is only what changes between samples."""
     besides = ", without the markers' constant offsets" if in_space(diagnosis) else ""
     return f"noise {millimetres(diagnosis.gap.noise_floor_mm)}{besides}"
 
 
-def _chance(diagnosis: Diagnosis) -> str:
+def _chance(diagnosis: CableDiagnosis) -> str:
     """How probable the named effects are, as far as that was computed, and how strong the first one is."""
     chances = [e.probability for e in diagnosis.effects if e.probability is not None]
     strength = _most_telling(diagnosis.effects[0])
@@ -171,7 +171,7 @@ def _chance(diagnosis: Diagnosis) -> str:
     return "; ".join(part for part in (f"probability {share(min(chances))}", strength) if part)
 
 
-def _least(diagnosis: Diagnosis) -> float:
+def _least(diagnosis: CableDiagnosis) -> float:
     """The gap [mm] from which on the verdict would not have been "none"."""
     if in_space(diagnosis):
         return diagnosis.where.smallest_mm
@@ -180,13 +180,13 @@ def _least(diagnosis: Diagnosis) -> float:
     return max(diagnosis.where.smallest_mm, 1e3 * calibration.smallest_gap(1e-3 * noise))
 
 
-def _peak(diagnosis: Diagnosis) -> str:
+def _peak(diagnosis: CableDiagnosis) -> str:
     profile = diagnosis.where.along_cable_mm
     peak = int(profile.argmax())
     return f"the gap peaks at {diagnosis.log.meta['keypoint_arclength_m'][peak]:.2f} m, {millimetres(profile[peak])}"
 
 
-def _alike(diagnosis: Diagnosis, effect: NamedEffect) -> list[str]:
+def _alike(diagnosis: CableDiagnosis, effect: NamedEffect) -> list[str]:
     """The effect and those that cannot be told from it, in words."""
     group = next((g for g in diagnosis.equivalent if effect.name in g), ())
     return [effect_title(effect.name), *(effect_title(name) for name in group if name != effect.name)]
@@ -206,7 +206,7 @@ def _most_telling(effect: NamedEffect) -> str:
     return ""
 
 
-def _cable_caption(diagnosis: Diagnosis) -> str:
+def _cable_caption(diagnosis: CableDiagnosis) -> str:
     parts = ["The moment at which observation and simulator are furthest apart, seen from above."]
     if any(e.location.get("along_cable_m") or e.location.get("table_m") for e in diagnosis.effects):
         parts.append("Shaded blue: where the named effect sits.")

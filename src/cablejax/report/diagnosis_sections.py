@@ -7,7 +7,7 @@ import itertools
 import json
 from collections.abc import Sequence
 
-from cablejax.diagnose.diagnosis import Diagnosis, NamedEffect
+from cablejax.diagnose.diagnosis import CableDiagnosis, NamedEffect
 from cablejax.report.effect_words import (
     EFFECTS,
     MOTIONS,
@@ -34,7 +34,7 @@ _RULES = {
 }
 
 
-def which_section(diagnosis: Diagnosis, ranking: str) -> str:
+def which_section(diagnosis: CableDiagnosis, ranking: str) -> str:
     parts = []
     if diagnosis.verdict == "none":
         parts.append("<p>There is no gap to explain, so no effect is named.</p>")
@@ -69,7 +69,7 @@ def which_section(diagnosis: Diagnosis, ranking: str) -> str:
     return "\n".join(parts)
 
 
-def in_space(diagnosis: Diagnosis) -> bool:
+def in_space(diagnosis: CableDiagnosis) -> bool:
     """Whether the cable hangs in space, rather than lying on a table."""
     return diagnosis.log.keypoints.shape[-1] == 3
 
@@ -78,7 +78,7 @@ def _probability(effect: NamedEffect) -> str:
     return "" if effect.probability is None else f" Probability {share(effect.probability)}."
 
 
-def _ranking_note(diagnosis: Diagnosis) -> str:
+def _ranking_note(diagnosis: CableDiagnosis) -> str:
     if any(ranked.probability is None for ranked in diagnosis.ranking):
         return (
             "Every effect tried in the forward search: what it takes away on unseen recordings when it joins those "
@@ -90,12 +90,12 @@ def _ranking_note(diagnosis: Diagnosis) -> str:
     return note
 
 
-def _left(diagnosis: Diagnosis) -> float:
+def _left(diagnosis: CableDiagnosis) -> float:
     gap = diagnosis.gap
     return max(gap.after_rmse_mm**2 - gap.noise_floor_mm**2, 0.0) ** 0.5
 
 
-def far_section(diagnosis: Diagnosis, picture: str) -> str:
+def far_section(diagnosis: CableDiagnosis, picture: str) -> str:
     gap = diagnosis.gap
     added = listed([effect_title(e.name) for e in diagnosis.effects]) or "the best explanation"
     if diagnosis.verdict == "none":
@@ -133,7 +133,7 @@ def far_section(diagnosis: Diagnosis, picture: str) -> str:
     return f"<p>{html.escape(text)}</p>\n<figure>{picture}<figcaption>{caption}</figcaption></figure>"
 
 
-def next_section(diagnosis: Diagnosis, picture: str) -> str:
+def next_section(diagnosis: CableDiagnosis, picture: str) -> str:
     following = diagnosis.next_motion
     if following is None:
         if in_space(diagnosis):
@@ -164,14 +164,14 @@ def _explanation(names: str) -> str:
     return listed([effect_title(name) for name in names.split(" + ")])
 
 
-def limits_section(diagnosis: Diagnosis) -> str:
+def limits_section(diagnosis: CableDiagnosis) -> str:
     if not diagnosis.caveats:
         return ""
     rows = "".join(f"<li>{html.escape(caveat)}</li>" for caveat in diagnosis.caveats)
     return f'<h2>What limits this verdict</h2>\n<ul class="limits">{rows}</ul>'
 
 
-def details_section(diagnosis: Diagnosis) -> str:
+def details_section(diagnosis: CableDiagnosis) -> str:
     where = diagnosis.where
     alone = all(r.probability is not None for r in diagnosis.ranking)
     tried = _table(

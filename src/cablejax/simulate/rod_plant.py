@@ -91,8 +91,9 @@ class RodPlantConfig:
         check_camera(self)
         if self.discretisation.timestep > self.longest_timestep:
             raise ValueError(
-                f"RodPlantConfig.discretisation.timestep is {self.discretisation.timestep} s, but this rod is stable "
-                f"only up to {self.longest_timestep:.2g} s: use a shorter time step, fewer links or a lower axial_ratio."
+                f"RodPlantConfig.discretisation.timestep is {self.discretisation.timestep} s, but this rod is "
+                f"stable only up to {self.longest_timestep:.2g} s: use a shorter time step, fewer links or a lower "
+                "axial_ratio."
             )
 
     @property

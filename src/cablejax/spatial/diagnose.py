@@ -12,8 +12,8 @@ import numpy as np
 
 from cablejax.bounded import Result
 from cablejax.diagnose.belief import Calibration
-from cablejax.diagnose.diagnosis import Diagnosis, Gap, Ranked, Verdict
-from cablejax.diagnose.judgement import judged, sentence
+from cablejax.diagnose.diagnosis import CableDiagnosis, Gap, Ranked, Verdict
+from cablejax.diagnose.judgement import judged, verdict_sentence
 from cablejax.spatial.clock import on_one_clock
 from cablejax.spatial.estimate import estimate
 from cablejax.spatial.gap import RESOLVABLE, gap_of, noise_of
@@ -28,7 +28,7 @@ _CALIBRATION = Calibration()
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class SpatialDiagnosis(Diagnosis):
+class SpatialDiagnosis(CableDiagnosis):
     """A diagnosis in space. Arrays of keypoints have three coordinates; held keypoints are as observed.
 
     Attributes:
@@ -93,7 +93,7 @@ def diagnose_space(
     where = where_of(log, windows, nominal, before, noise, changes)
     return SpatialDiagnosis(
         verdict=verdict,
-        sentence=" ".join([sentence(verdict, effects, equivalent, gap.shrinkage or 0.0), *first]),
+        sentence=" ".join([verdict_sentence(verdict, effects, equivalent, gap.shrinkage or 0.0), *first]),
         effects=effects,
         equivalent=equivalent,
         ranking=_ranking(found),

@@ -17,8 +17,8 @@ from scipy.optimize import brentq
 from scipy.stats import norm, t
 
 from cablejax.diagnose.belief import probabilities
-from cablejax.diagnose.diagnosis import Findings, Gap, NamedEffect, ParameterEstimate, Ranked
-from cablejax.diagnose.judgement import judged, sentence
+from cablejax.diagnose.diagnosis import Diagnosis, Gap, NamedEffect, ParameterEstimate, Ranked
+from cablejax.diagnose.judgement import judged, verdict_sentence
 from cablejax.diagnose.verdict_json import verdict_json
 from cablejax.diagnose.where import LEVEL, Where
 from cablejax.diagnose.where_words import describe
@@ -33,7 +33,7 @@ _INTERVAL = 0.9
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class WireDiagnosis(Findings):
+class WireDiagnosis(Diagnosis):
     """The findings on one wire. Its episodes are the photographs.
 
     Attributes:
@@ -103,7 +103,7 @@ def diagnose_wire(photographs: Photographs, progress: Callable[[str], None] = la
     ]
     return WireDiagnosis(
         verdict=verdict,
-        sentence=sentence(verdict, effects, equivalent, gap.shrinkage or 0.0),
+        sentence=verdict_sentence(verdict, effects, equivalent, gap.shrinkage or 0.0),
         effects=effects,
         equivalent=equivalent,
         ranking=tuple(ranking),
@@ -114,6 +114,7 @@ def diagnose_wire(photographs: Photographs, progress: Callable[[str], None] = la
         baselines={},
         caveats=(),
         seconds=time.perf_counter() - begun,
+        settings={"calibration": dataclasses.asdict(CALIBRATION)},
         fits=tuple(fits),
         chances=chances,
         inclusion=inclusion,

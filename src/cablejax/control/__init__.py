@@ -1,0 +1,1 @@
+"""Closed-loop shaping of a cable: controllers, the loop and its batched form, targets."""

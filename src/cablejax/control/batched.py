@@ -1,0 +1,223 @@
+"""The whole closed loop as one compiled call: many cables, each with its own target, shaped side by side.
+
+Plant (the MJX engine), camera, model, residual and controller are pure functions, so one trial is a `lax.scan` over
+its control steps and a table of trials is its `vmap`. It runs the same controllers as `control.loop.run_closed_loop`,
+but a batch of cables on an accelerator instead of one cable in Python. The plant is the planar simulator here; the
+contact plant in C MuJoCo, which the model has never seen, stays the reference.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+from jaxtyping import Array, Float, Int
+
+from cablejax.cable import Discretisation
+from cablejax.control.loop import Controller
+from cablejax.control.run import settling_time
+from cablejax.effects.physics import Physics, nominal_physics
+from cablejax.simulate.compile import compiler_options
+from cablejax.simulate.mjx_engine import MjxEngine
+from cablejax.simulate.table_plant import check_camera
+from cablejax.types import CableState, History, Measurement
+
+
+@dataclasses.dataclass(frozen=True)
+class LoopConfig:
+    """How a batch of trials is run.
+
+    Attributes:
+        steps: commands of each trial, T.
+        interval: time that each command is held [s].
+        history_length: samples H of the history that a controller starts from, all of them the cable at rest.
+        rest: intervals without motion before the first command.
+        keypoint_noise: standard deviation of the observed keypoints [m] per coordinate.
+        keypoint_dropout: probability with which a keypoint is not observed (NaN), except the first and last, which the
+            grippers hold, and except before the first command.
+    """
+
+    steps: int
+    interval: float = 1.0
+    history_length: int = 6
+    rest: int = 1
+    keypoint_noise: float = 0.0
+    keypoint_dropout: float = 0.0
+
+    def __post_init__(self):
+        for name, least in (("steps", 1), ("history_length", 1), ("rest", 0)):
+            if getattr(self, name) < least:
+                raise ValueError(f"LoopConfig.{name} is {getattr(self, name)}, expected an integer >= {least}.")
+        check_camera(self)
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class BatchRun:
+    """B trials of T commands; sample 0 is before the first command. A cable whose simulation diverged is NaN from then.
+
+    Attributes:
+        keypoints: observed cables [m], NaN = not observed, shape [B, T + 1, N, 2].
+        gripper_pose: (x, y, theta) [m, rad], shape [B, T + 1, Q, 3].
+        twist: commands [m/s, rad/s], shape [B, T, Q, 3].
+        error_cm: root mean square distance of the observed keypoints to the target [cm], shape [B, T + 1].
+        residual_share: the controller's report, NaN where it makes none, shape [B, T].
+        radius: the controller's bound on one step's motion [m], NaN where it reports none, shape [B, T].
+    """
+
+    keypoints: Float[Array, "B T1 N 2"]
+    gripper_pose: Float[Array, "B T1 Q 3"]
+    twist: Float[Array, "B T Q 3"]
+    error_cm: Float[Array, "B T1"]
+    residual_share: Float[Array, "B T"]
+    radius: Float[Array, "B T"]
+
+    @property
+    def terminal_error_cm(self) -> Float[np.ndarray, " B"]:
+        """Errors at the end [cm]."""
+        return np.asarray(self.error_cm[:, -1])
+
+    def settling_time_s(self, interval: float = 1.0) -> Float[np.ndarray, " B"]:
+        """See `control.run.settling_time` [s]; infinite for a trial that never settled."""
+        errors = np.asarray(self.error_cm, float)
+        times = interval * np.arange(errors.shape[1])
+        return np.array([settling_time(times, error) for error in errors])
+
+
+def shape_batch(
+    engine: MjxEngine,
+    params: Physics,
+    state: CableState,
+    controller: Controller,
+    targets: Float[Array | np.ndarray, "B N 2"],
+    config: LoopConfig,
+    *,
+    seeds: Int[np.ndarray, " B"] | None = None,
+    stacked: bool = False,
+    devices: Sequence[jax.Device] | None = None,  # pyright: ignore[reportInvalidTypeForm]
+) -> BatchRun:
+    """Shapes B cables side by side, in one compiled call; another batch size or configuration compiles again.
+
+    Args:
+        engine: the plant, planar.
+        params: of each cable, every leaf with a leading axis B; see `varied_params`.
+        state: where each cable starts, likewise: `engine.initial_state` of stacked gripper poses.
+        controller: a pytree with a leaf `target`, which is replaced by each trial's own; its other leaves are shared.
+        targets: desired keypoints [m], shape [B, N, 2].
+        config: length, timing and camera of the trials.
+        seeds: of each trial's noise and gaps; by default 0, 1, ...
+        stacked: the controller's other leaves have a leading axis B too: every trial has weights of its own.
+        devices: to spread the batch over; by default the one on which the arguments are.
+
+    Raises:
+        ValueError: the batch axes differ, the cable is not planar, or a target has another number of keypoints.
+    """
+    size, chain = len(targets), engine.config
+    if chain.dimension != 2 or np.shape(targets) != (size, chain.cable.n_keypoints, 2):
+        raise ValueError(
+            f"Targets of shape {np.shape(targets)} for a cable with {chain.cable.n_keypoints} keypoints in "
+            f"{chain.dimension} dimensions, expected (B, {chain.cable.n_keypoints}, 2) on a planar cable."
+        )
+    engine.substeps(config.interval)
+    seeds = np.arange(size) if seeds is None else np.asarray(seeds)
+    controllers = _with_target(controller, jnp.asarray(targets, float))
+    batched = _with_target(jax.tree.map(lambda _: stacked, controller), True)
+    own, shared = eqx.partition(controllers, batched)
+    batch = (params, state, own, seeds)
+    lengths = {np.shape(leaf)[:1] for leaf in jax.tree.leaves(batch)}
+    if lengths != {(size,)}:
+        raise ValueError(f"The leading axes are {sorted(lengths)}, expected {size}, the number of targets, everywhere.")
+    if devices is not None:
+        batch, shared = _spread(batch, shared, size, devices)
+    run = _compiled_batch(engine, config)(shared, *batch)
+    return run if devices is None else jax.tree.map(lambda leaf: leaf[:size], run)
+
+
+def _with_target(controller: Any, target: Any) -> Any:
+    """The same pytree with another leaf for its target."""
+    return eqx.tree_at(lambda controller: controller.target, controller, target)
+
+
+def varied_params(config: Discretisation, stiffness_ratio: Float[np.ndarray, " B"]) -> Physics:
+    """The nominal parameters B times, with bending stiffnesses of given ratios to the nominal one."""
+    nominal = nominal_physics(config)
+    one = [dataclasses.replace(nominal, stiffness=nominal.stiffness * np.float32(r)) for r in stiffness_ratio]
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *one)
+
+
+def _spread(batch, shared, size: int, devices: Sequence[jax.Device]):  # pyright: ignore[reportInvalidTypeForm]
+    """The batch in equal shares on all devices, padded by copies of its last trial, and what is shared on each."""
+    width = -(-size // len(devices)) * len(devices)
+    rows = np.minimum(np.arange(width), size - 1)
+    mesh = Mesh(np.array(devices), ("trial",))
+    split, whole = NamedSharding(mesh, PartitionSpec("trial")), NamedSharding(mesh, PartitionSpec())
+    batch = jax.tree.map(lambda leaf: jax.device_put(np.asarray(leaf)[rows], split), batch)
+    return batch, jax.tree.map(lambda leaf: jax.device_put(leaf, whole), shared)
+
+
+@functools.lru_cache(maxsize=16)
+def _compiled_batch(engine: MjxEngine, config: LoopConfig):
+    def one(shared, params, state, own, seed):
+        return _one_trial(engine, config, eqx.combine(own, shared), params, state, seed)
+
+    return jax.jit(jax.vmap(one, in_axes=(None, 0, 0, 0, 0)), compiler_options=compiler_options())
+
+
+def _one_trial(
+    engine: MjxEngine, config: LoopConfig, controller: Any, params: Physics, cable: CableState, seed: Int[Array, ""]
+) -> BatchRun:
+    key = jax.random.key(seed)
+    still = jnp.zeros((config.rest, *cable.gripper_pose.shape), cable.qpos.dtype)
+    cable, shown = engine.unroll(params, cable, still, config.interval)
+    first = _noisy(config, jax.random.fold_in(key, config.steps), shown.keypoints[-1])
+    history = History(keypoints=jnp.repeat(first[None], config.history_length, axis=0), gripper_pose=cable.gripper_pose)
+
+    def step(carry, index):
+        cable, state, keypoints = carry
+        state, twist, info = controller.step(state, Measurement(keypoints, cable.gripper_pose))
+        cable, shown = engine.unroll(params, cable, twist[None], config.interval)
+        keypoints = _observed(config, jax.random.fold_in(key, index), shown.keypoints[-1])
+        report = [jnp.asarray(getattr(info, name, jnp.nan), keypoints.dtype) for name in ("residual_share", "radius")]
+        return (cable, state, keypoints), (keypoints, cable.gripper_pose, twist, *report)
+
+    carry = (cable, controller.init(history), first)
+    _, (keypoints, pose, twist, share, radius) = jax.lax.scan(step, carry, jnp.arange(config.steps))
+    keypoints = jnp.concatenate([first[None], keypoints])
+    return BatchRun(
+        keypoints=keypoints,
+        gripper_pose=jnp.concatenate([cable.gripper_pose[None], pose]),
+        twist=twist,
+        error_cm=_shape_error_cm(keypoints, controller.target),
+        residual_share=share,
+        radius=radius,
+    )
+
+
+def _noisy(config: LoopConfig, key: Array, keypoints: Float[Array, "N 2"]) -> Float[Array, "N 2"]:
+    if not config.keypoint_noise:
+        return keypoints
+    return keypoints + config.keypoint_noise * jax.random.normal(key, keypoints.shape, keypoints.dtype)
+
+
+def _observed(config: LoopConfig, key: Array, keypoints: Float[Array, "N 2"]) -> Float[Array, "N 2"]:
+    """What the camera reports of the true keypoints."""
+    noise, gaps = jax.random.split(key)
+    keypoints = _noisy(config, noise, keypoints)
+    if not config.keypoint_dropout:
+        return keypoints
+    missing = jax.random.bernoulli(gaps, config.keypoint_dropout, keypoints.shape[:1])
+    missing = missing.at[jnp.array([0, -1])].set(False)
+    return jnp.where(missing[:, None], jnp.nan, keypoints)
+
+
+def _shape_error_cm(keypoints: Float[Array, "T N 2"], target: Float[Array, "N 2"]) -> Float[Array, " T"]:
+    """`control.run.shape_error_cm`; the held ends are always seen unless the simulation diverged."""
+    squared = ((keypoints - target) ** 2).sum(axis=-1)
+    return 100.0 * jnp.sqrt(jnp.nanmean(squared, axis=-1))

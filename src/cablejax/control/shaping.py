@@ -1,0 +1,154 @@
+"""A trained model, the controller around it, and one run of both on the plant."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Literal, get_args
+
+import jax.numpy as jnp
+import numpy as np
+from flax import nnx
+from jaxtyping import Array, Float
+
+from cablejax.adaptation.belief import AdaptationConfig
+from cablejax.cable import Cable
+from cablejax.control.loop import run_closed_loop
+from cablejax.control.run import ClosedLoopRun
+from cablejax.control.targets import Target, straight_start
+from cablejax.dynamics.config import ModelConfig
+from cablejax.dynamics.model import apply
+from cablejax.dynamics.rough import roughened
+from cablejax.dynamics.weights import load_weights
+from cablejax.mpc import MPC, SOLVERS, MPCConfig
+from cablejax.perceive.camera import CameraConfig
+from cablejax.perceive.plant import CloudPlant
+from cablejax.residual import Dynamics
+from cablejax.residual.jacobian import StepJacobian, reverse
+from cablejax.simulate.elastica import elastica
+from cablejax.simulate.plant import Plant, PlantConfig
+from cablejax.solver_names import SolverName
+from cablejax.types import History
+
+Method = Literal["residual", "direct"]
+"""The learned model with the online residual, or as it was trained."""
+
+METHODS: tuple[Method, ...] = get_args(Method)
+
+Runs = Mapping[tuple[str, Method], ClosedLoopRun]
+"""Runs by name of the target and method."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Model:
+    """A trained model as the controller takes it.
+
+    Attributes:
+        name: where it came from.
+        config: its graph and sizes.
+        dynamics: `(weights, history, twist) -> displacement`.
+        weights: its arrays.
+    """
+
+    name: str
+    config: ModelConfig
+    dynamics: Dynamics
+    weights: nnx.State
+
+
+@dataclasses.dataclass(frozen=True)
+class NetworkDynamics:
+    """A network as a function of its weights. Equal structures are equal, so that the controller compiles once for all.
+
+    Attributes:
+        graphdef: the network's structure.
+    """
+
+    graphdef: nnx.GraphDef
+
+    def __call__(self, weights: nnx.State, history: History, twist: Float[Array, "2 3"]) -> Float[Array, "N 2"]:
+        return apply((self.graphdef, weights), history, twist)
+
+    def jacobian(self, weights: nnx.State, history: History, twist: Float[Array, "2 3"]) -> StepJacobian:
+        """Derivatives of a step. Exact in float64; in float32 good to about a thousandth, see `dynamics.rough`.
+
+        The grasped keypoints move as their grippers do, so that only the others' cotangents go through the network.
+        """
+        network = roughened(nnx.merge(self.graphdef, weights))
+        between = reverse(lambda history, twist: apply(network, history, twist)[1:-1], history, twist)
+        padded = StepJacobian(*(jnp.pad(part, [(1, 1)] + [(0, 0)] * (part.ndim - 1)) for part in between))
+        grasped = network.config.interval * jnp.eye(2, 3, dtype=twist.dtype)
+        return padded._replace(twist=padded.twist.at[0, :, 0].set(grasped).at[-1, :, 1].set(grasped))
+
+
+def load_model(name: str) -> Model:
+    """A released model by name, or the one in a training's folder.
+
+    Raises:
+        ValueError: there is no such model, or its file does not fit this version of the network.
+    """
+    config, graphdef, weights = load_weights(name)
+    return Model(name, config, NetworkDynamics(graphdef), weights)
+
+
+def make_controller(model: Model, target: Target, *, method: Method, solver: SolverName) -> MPC:
+    """The controller for one target, with or without the online residual; a conditioned model adapts in any case."""
+    config = MPCConfig(
+        cable_length=model.config.length,
+        adaptation=AdaptationConfig() if model.config.conditioned else None,
+        solver=SOLVERS[solver],
+    )
+    if method == "direct":
+        config = dataclasses.replace(config, residual=None)
+    return MPC(config, model.dynamics, model.weights, target.keypoints)
+
+
+def initial_history(cable: Cable, config: ModelConfig) -> History:
+    """A straight cable at rest, as the controller meets it before its first command."""
+    pose = straight_start(cable)
+    keypoints = elastica(pose, cable.length, cable.keypoint_arclength)
+    return History(
+        keypoints=np.repeat(keypoints[None], config.history, axis=0),  # pyright: ignore[reportArgumentType]
+        gripper_pose=pose,  # pyright: ignore[reportArgumentType]
+    )
+
+
+def shape_once(
+    plant: PlantConfig,
+    model: Model,
+    target: Target,
+    *,
+    method: Method,
+    solver: SolverName,
+    steps: int,
+    camera: CameraConfig | None = None,
+) -> ClosedLoopRun:
+    """One straight cable brought to one target on a plant of its own.
+
+    Args:
+        plant: what the cable and its table really are.
+        model: what the controller believes.
+        target: the wanted shape.
+        method: with the online residual, or without.
+        solver: how plans are found.
+        steps: commands.
+        camera: what the cable is seen with; None = the controller observes the simulated keypoints directly.
+
+    Raises:
+        ValueError: the plant's cable is not the one that the model was made for.
+    """
+    cable, config = plant.cable, model.config
+    if cable.n_keypoints != config.n_keypoints or abs(cable.length - config.length) > 1e-9:
+        raise ValueError(
+            f"The model {model.name} is for {config.n_keypoints} keypoints on {config.length} m of cable, but the "
+            f"plant has {cable.n_keypoints} on {cable.length} m: train one for this cable, or change the plant."
+        )
+    return run_closed_loop(
+        Plant(plant) if camera is None else CloudPlant(plant, camera=camera),
+        make_controller(model, target, method=method, solver=solver),
+        target,
+        steps,
+        start=straight_start(cable),
+        interval=config.interval,
+        history_length=config.history,
+    )

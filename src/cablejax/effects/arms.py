@@ -1,0 +1,94 @@
+"""Effects of the arms: how they follow their commands. The cable is driven by where the grippers really are."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from cablejax.effects.base import CableEffect
+from cablejax.effects.effect import Parameter
+from cablejax.effects.physics import Physics
+
+
+class ActuationGain(CableEffect):
+    """The arms move more or less than commanded, seen from where they started."""
+
+    name = "actuation_gain"
+    hook = "input"
+    parameters = (Parameter("gain", "", 0.1, 3.0, 1.0, 0.1),)
+    null = (1.0,)
+    amplitude, reversible = 0, True
+
+    def apply(self, physics, values, variant, config):
+        return replace(physics, actuation_gain=physics.actuation_gain * values[0])
+
+    def starts(self, context):
+        return []
+
+
+class ActuationLag(CableEffect):
+    """The arms move later than commanded: by a pure delay, and by a first-order lag for the rest of the time."""
+
+    name = "actuation_lag"
+    hook = "input"
+    parameters = (
+        Parameter("time_s", "s", 0.0, 10.0, 0.2, 0.2),
+        Parameter("delay_s", "s", 0.0, 5.0, 0.0, 0.2),
+    )
+    null = (0.0, 0.0)
+    amplitude = 0
+
+    def apply(self, physics, values, variant, config):
+        total, delay = values
+        return replace(
+            physics,
+            actuation_delay=physics.actuation_delay + delay,
+            actuation_time=physics.actuation_time + (total - delay),
+        )
+
+    def starts(self, context):
+        return []
+
+
+def executed(physics: Physics, commanded: Any, interval: Any) -> Any:
+    """Gripper poses of arms with gain, delay and lag. Differentiable in all arguments.
+
+    The lag is exact for commands that are piecewise linear in time.
+
+    Args:
+        physics: of these arms; `actuation_gain`, `actuation_delay` and `actuation_time` are used.
+        commanded: poses of exact arms at even times, shape [T, Q, P]. NumPy in, NumPy out; JAX in, JAX out.
+        interval: between two of them [s].
+
+    Returns:
+        Poses of the same shape.
+    """
+    amplified = commanded[:1] + physics.actuation_gain * (commanded - commanded[:1])
+    return lagged(amplified, interval, physics.actuation_delay, physics.actuation_time)
+
+
+def lagged(poses: Any, interval: Any, delay: Any, slow: Any) -> Any:
+    """Poses after a pure delay [s], then a first-order lag of time constant `slow` [s]; shape [T, ...] as `poses`.
+
+    Exact for piecewise linear input: over one interval dt, `slow y' + y = u` gives
+    `y_1 = d y_0 + (r - d - d r) u_0 + (1 - r + d r) u_1` with `d = exp(-dt / slow)` and `r = slow / dt`.
+    """
+    xp = poses.__array_namespace__()
+    n = len(poses)
+    back = xp.clip(np.arange(n) - delay / interval, 0.0, n - 1.0)
+    before = (
+        np.minimum(xp.floor(back).astype(int), n - 2) if xp is np else xp.minimum(xp.floor(back).astype(int), n - 2)
+    )
+    t = (back - before).reshape(-1, *(1,) * (poses.ndim - 1))
+    late = (1 - t) * poses[before] + t * poses[before + 1]
+    ratio = xp.maximum(xp.asarray(slow, dtype=poses.dtype), 1e-6) / interval
+    decay = xp.exp(-1.0 / ratio)
+    driven = (ratio - decay - decay * ratio) * late[:-1] + (1 - ratio + decay * ratio) * late[1:]
+    # the recursion as one product with the powers of the decay, bounded against overflow
+    steps = np.subtract.outer(np.arange(n - 1), np.arange(n - 1))
+    powers = xp.where(steps >= 0, xp.exp(-np.maximum(steps, 0) / ratio), 0.0)
+    first = xp.exp(-np.arange(1, n) / ratio).reshape(-1, *(1,) * (poses.ndim - 1)) * late[0]
+    rest = first + xp.tensordot(powers, driven, axes=1)
+    return xp.concatenate([late[:1], rest.astype(poses.dtype)])

@@ -1,0 +1,178 @@
+"""Effects with their parameters: staged in a plant, added to a simulator, read from a verdict or a command line."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+import os
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from cablejax.cable import Discretisation
+from cablejax.effects import ARMS, LIBRARY
+from cablejax.effects.base import CableEffect, Hook
+from cablejax.effects.physics import Physics
+
+EFFECTS: Mapping[str, CableEffect] = {effect.name: effect for effect in (*LIBRARY, *ARMS)}
+"""Every effect by its name in the gap log's format."""
+
+VERDICT_SCHEMA = "cablejax-verdict/1"
+
+
+@dataclasses.dataclass(frozen=True)
+class GivenEffect:
+    """One effect and the values of its parameters, by the names of the verdict's format.
+
+    Attributes:
+        name: of the effect.
+        parameters: pairs of name and value, SI units.
+
+    Raises:
+        ValueError: there is no such effect or parameter, a parameter is missing, or a value is out of its bounds.
+    """
+
+    name: str
+    parameters: tuple[tuple[str, float], ...]
+
+    def __post_init__(self):
+        if self.name not in EFFECTS:
+            raise ValueError(f"There is no effect {self.name!r}. Expected one of: {', '.join(sorted(EFFECTS))}.")
+        object.__setattr__(self, "parameters", tuple((str(n), v) for n, v in self.parameters))
+        known, required = _parameter_names(self.effect)
+        named = dict(self.parameters)
+        example = f"{self.name}:{','.join(f'{name}=...' for name in required)}"
+        for name, value in named.items():
+            if name not in known:
+                raise ValueError(f"{self.name} has no parameter {name!r}, expected {', '.join(known)}: {example}.")
+            if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+                raise ValueError(f"{self.name}: {name} is {value!r}, expected a finite number.")
+        missing = [name for name in required if name not in named]
+        if missing:
+            raise ValueError(f"{self.name} lacks {', '.join(missing)}. Expected {example}.")
+
+    @property
+    def effect(self) -> CableEffect:
+        """Its entry of the library."""
+        return EFFECTS[self.name]
+
+    def applied(self, physics: Physics, chain: Discretisation) -> Physics:
+        """The physics with this effect.
+
+        Raises:
+            ValueError: a parameter is out of its bounds.
+        """
+        values, variant = self.effect.given(dict(self.parameters), chain)
+        if variant not in self.effect.variants:
+            raise ValueError(f"{self.name}: {self.effect.variant_name} {variant} does not exist.")
+        for parameter, value in zip(self.effect.parameters, values, strict=True):
+            if not parameter.low * (1 - 1e-9) <= value <= parameter.high:
+                raise ValueError(
+                    f"{self.name}: {parameter.name} is {value:g}, expected {parameter.low:g} to {parameter.high:g} "
+                    f"{parameter.unit}".rstrip()
+                    + "."
+                )
+        return self.effect.apply(physics, [np.float32(v) for v in values], variant, chain)
+
+    def __str__(self) -> str:
+        return f"{self.name}:{','.join(f'{name}={value:g}' for name, value in self.parameters)}"
+
+
+def with_effects(physics: Physics, effects: Iterable[GivenEffect], chain: Discretisation) -> Physics:
+    """The physics with every effect, applied in order. An effect may be given more than once, at several places."""
+    for effect in effects:
+        physics = effect.applied(physics, chain)
+    return physics
+
+
+def parse_effect(text: str) -> GivenEffect:
+    """An effect as written on a command line: `name:parameter=value,parameter=value`, SI units.
+
+    Raises:
+        ValueError: the text is not of this form, or see `GivenEffect`.
+    """
+    name, _, rest = text.partition(":")
+    parameters = []
+    for item in filter(None, (part.strip() for part in rest.split(","))):
+        key, equals, number = item.partition("=")
+        try:
+            value = float(number) if equals else math.nan
+        except ValueError:
+            value = math.nan
+        if not math.isfinite(value):
+            raise ValueError(f"Effect {text!r}: {item!r} is not of the form parameter=number.")
+        parameters.append((key.strip(), value))
+    return GivenEffect(name.strip(), tuple(parameters))
+
+
+def effects_of_verdict(path: str | os.PathLike[str]) -> tuple[GivenEffect, ...]:
+    """The effects that a verdict names, with their estimated parameters. Several pieces become several effects.
+
+    Raises:
+        ValueError: the file is no verdict, or it names no effect ("none" and "unknown").
+    """
+    try:
+        verdict = json.loads(Path(path).read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError) as error:
+        raise ValueError(f"{path} is no readable verdict ({error}). Expected a verdict.json of `diagnose`.") from error
+    if not isinstance(verdict, dict) or verdict.get("schema") != VERDICT_SCHEMA:
+        came = verdict.get("schema") if isinstance(verdict, dict) else None
+        raise ValueError(f"{path} has schema {came!r}, expected {VERDICT_SCHEMA!r}: a verdict.json of `diagnose`.")
+    named = verdict.get("effects") or []
+    if not named:
+        raise ValueError(
+            f"{path} names no effect (its verdict is {verdict.get('verdict')!r}), so there is nothing to add. "
+            "Leave --with out, or give an effect with --effect."
+        )
+    return tuple(piece for effect in named for piece in _pieces(effect, path))
+
+
+def check_hooks(
+    effects: Sequence[GivenEffect], hooks: frozenset[Hook], simulator: str, able: Mapping[str, Any]
+) -> None:
+    """Raises `ValueError` if an effect acts through a hook that a simulator does not honour.
+
+    Args:
+        effects: to be simulated.
+        hooks: of the simulator.
+        simulator: its name, for the message.
+        able: other simulators by name with their hooks, for the message.
+    """
+    for effect in effects:
+        if effect.effect.hook not in hooks:
+            others = ", ".join(name for name, theirs in able.items() if effect.effect.hook in theirs) or "none"
+            raise ValueError(
+                f"The simulator {simulator} cannot simulate {effect.name}: it has no hook for {effect.effect.hook}. "
+                f"Simulators that have: {others}."
+            )
+
+
+def _pieces(effect: Any, path: Any) -> list[GivenEffect]:
+    try:
+        values = {name: entry["value"] for name, entry in effect["parameters"].items()}
+        count = max((len(value) for value in values.values() if isinstance(value, list)), default=1)
+        rows = [
+            tuple((name, value[i] if isinstance(value, list) else value) for name, value in values.items())
+            for i in range(count)
+        ]
+        return [GivenEffect(effect["name"], row) for row in rows]
+    except (KeyError, TypeError, AttributeError, IndexError) as error:
+        raise ValueError(f"{path}: an effect is not of the verdict's format ({error}).") from error
+
+
+def _parameter_names(effect: CableEffect) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Names of the verdict that an effect takes, and those of them that it needs."""
+    chain = Discretisation()
+    values = [p.centre for p in effect.parameters]
+    every: dict[str, None] = {}
+    for variant in effect.variants[:2]:
+        every |= dict.fromkeys(effect.reported(values, variant, chain))
+    known = tuple(every)
+    return known, tuple(name for name in known if name not in OPTIONAL)
+
+
+OPTIONAL = frozenset({"hardening", "static_excess", "across", "delay_s"})
+"""Parameters beyond the format's, which need not be given; see `CableEffect.given`."""

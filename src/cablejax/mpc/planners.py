@@ -1,0 +1,206 @@
+"""Planners on the bounded solvers, and every planner by its name."""
+
+from __future__ import annotations
+
+import abc
+import dataclasses
+from collections.abc import Mapping
+from types import MappingProxyType
+
+import optimistix as optx
+
+from cablejax.bounded.dogleg import BoundedDogleg
+from cablejax.bounded.gauss_newton import BoundedGaussNewton
+from cablejax.bounded.least_squares import AbstractBoundedLeastSquares
+from cablejax.bounded.levenberg_marquardt import BoundedLevenbergMarquardt
+from cablejax.bounded.quasi_newton import BoundedQuasiNewton
+from cablejax.bounded.solve import least_squares, minimise
+from cablejax.bounded.spectral import SpectralProjectedGradient
+from cablejax.mpc.plan import Plan, Solver, plan_from
+from cablejax.mpc.problem import Rollout, ShapingProblem
+from cablejax.mpc.sampling import CrossEntropy, PathIntegral
+from cablejax.mpc.validation import check_budget, check_positive
+
+
+def bounded_plan(
+    problem: ShapingProblem,
+    guess: Rollout,
+    solver: optx.AbstractLeastSquaresSolver | optx.AbstractMinimiser,
+    max_steps: int,
+) -> Plan:
+    """The plan that a bounded solver finds from a guess; differentiable in the problem where it has converged."""
+    solution = least_squares(
+        lambda motion, given: given[0].residuals(motion),
+        solver,
+        guess.motion,
+        problem.feasible,
+        (problem, guess),
+        linearise=lambda motion, given: given[0].linearise(motion, known=given[1]),
+        max_steps=max_steps,
+        throw=False,
+    )
+    return plan_from(solution)
+
+
+@dataclasses.dataclass(frozen=True)
+class _LeastSquaresPlanner(abc.ABC):
+    """What these planners share.
+
+    Attributes:
+        max_iterations: linearisations at most; one costs as much as about ten rollouts.
+        trials_per_linearisation: trial plans after each, a rollout each; the Jacobian follows them by Broyden's update.
+        tolerance: stop once a unit projected gradient step moves no coordinate by more than this [m].
+    """
+
+    max_iterations: int = 1
+    trials_per_linearisation: int = 5
+    tolerance: float = 2e-5
+
+    def __post_init__(self):
+        check_budget(self, "max_iterations")
+        check_budget(self, "trials_per_linearisation")
+        check_positive(self, "tolerance")
+
+    @abc.abstractmethod
+    def bounded(self) -> AbstractBoundedLeastSquares:
+        """The solver that finds the plan."""
+
+    def __call__(self, problem: ShapingProblem, guess: Rollout) -> Plan:
+        """The plan from a guess; differentiable in the problem where it has converged."""
+        return bounded_plan(problem, guess, self.bounded(), self.max_iterations)
+
+
+@dataclasses.dataclass(frozen=True)
+class LevenbergMarquardt(_LeastSquaresPlanner):
+    """Solver: damped Gauss-Newton models of the objective, minimised over the feasible set.
+
+    Attributes:
+        max_iterations, trials_per_linearisation, tolerance: see `_LeastSquaresPlanner`.
+        damping: at the start, relative to the diagonal of J'J.
+    """
+
+    damping: float = dataclasses.field(default=1e-3, kw_only=True)
+
+    def __post_init__(self):
+        super().__post_init__()
+        check_positive(self, "damping")
+
+    def bounded(self) -> AbstractBoundedLeastSquares:
+        return BoundedLevenbergMarquardt(
+            atol=self.tolerance,
+            damping=self.damping,
+            secant=False,
+            trials_per_linearisation=self.trials_per_linearisation,
+        )
+
+
+class Dogleg(_LeastSquaresPlanner):
+    """Solver: a trust region around Gauss-Newton models, its steps along the dogleg inside the feasible set."""
+
+    def bounded(self) -> AbstractBoundedLeastSquares:
+        return BoundedDogleg(atol=self.tolerance, secant=False, trials_per_linearisation=self.trials_per_linearisation)
+
+
+@dataclasses.dataclass(frozen=True)
+class GaussNewton(_LeastSquaresPlanner):
+    """Solver: Gauss-Newton models without damping, minimised over the feasible set, and a line search towards that."""
+
+    def bounded(self) -> AbstractBoundedLeastSquares:
+        return BoundedGaussNewton(atol=self.tolerance, trials_per_linearisation=self.trials_per_linearisation)
+
+
+@dataclasses.dataclass(frozen=True)
+class Accurate:
+    """Solver: a few linearisations, which get near a good minimum, then quasi-Newton steps of one gradient each.
+
+    For float64 and a network with rounded corners (`dynamics.smooth`): another has no point to end at.
+
+    Attributes:
+        linearisations: of the first part, at most.
+        trials_per_linearisation: trial plans after each.
+        gradients: of the second part, at most.
+        tolerance: stop once a unit projected gradient step moves no coordinate by more than this [m]. Where bounds
+            press, the KKT residual is greater by the ratio of gradient and step bound, some 100 times.
+    """
+
+    linearisations: int = 2
+    trials_per_linearisation: int = 3
+    gradients: int = 200
+    tolerance: float = 1e-10
+
+    def __post_init__(self):
+        check_budget(self, "linearisations", "trials_per_linearisation", "gradients")
+        check_positive(self, "tolerance")
+
+    def parts(self) -> tuple[BoundedLevenbergMarquardt, BoundedQuasiNewton]:
+        """The solver that begins, and the one that goes on from there."""
+        first = BoundedLevenbergMarquardt(atol=self.tolerance, trials_per_linearisation=self.trials_per_linearisation)
+        return first, BoundedQuasiNewton(atol=self.tolerance)
+
+    def __call__(self, problem: ShapingProblem, guess: Rollout) -> Plan:
+        """The plan from a guess; differentiable in the problem where it has converged."""
+        first, second = self.parts()
+        near = bounded_plan(problem, guess, first, self.linearisations)
+        plan = bounded_plan(problem, problem.rollout(near.motion), second, self.gradients)
+        return dataclasses.replace(
+            plan,
+            evaluations=near.evaluations + plan.evaluations,
+            linearisations=near.linearisations + plan.linearisations,  # pyright: ignore[reportOperatorIssue]
+        )
+
+
+@dataclasses.dataclass(frozen=True)
+class ProjectedGradient:
+    """Solver: gradient steps of Barzilai-Borwein length along the projection arc `P(u - s a g)`.
+
+    Every evaluation costs one rollout, and an accepted one its gradient in reverse mode.
+
+    Attributes:
+        max_evaluations: trial plans, the guess included.
+        tolerance: stop once a unit gradient step, projected, would move no coordinate by more than this [m].
+        initial_step: a before the first curvature is known. The objective's Hessian is near 1 per step of the horizon
+            that a motion is felt in, and up to about 17 for the six-step sum, hence 0.1.
+        memory: a trial is compared with the worst of this many last accepted values (Grippo, Lampariello, Lucidi
+            1986); 1 makes every accepted step a descent.
+    """
+
+    max_evaluations: int = 12
+    tolerance: float = 2e-5
+    initial_step: float = 0.1
+    memory: int = 1
+
+    def __post_init__(self):
+        if self.max_evaluations < 2 or self.memory < 1:
+            raise ValueError(
+                f"ProjectedGradient(max_evaluations={self.max_evaluations}, memory={self.memory}): expected at least "
+                "2 evaluations (the guess and one step) and a memory of at least 1."
+            )
+        check_positive(self, "tolerance", "initial_step")
+
+    def __call__(self, problem: ShapingProblem, guess: Rollout) -> Plan:
+        solver = SpectralProjectedGradient(
+            atol=self.tolerance, memory=self.memory, initial_length=self.initial_step, lengths=(1e-3, 1e2)
+        )
+        solution = minimise(
+            lambda motion, problem: problem.value(motion),
+            solver,
+            guess.motion,
+            problem.feasible,
+            problem,
+            max_steps=self.max_evaluations,
+            throw=False,
+        )
+        return plan_from(solution)
+
+
+SOLVERS: Mapping[str, Solver] = MappingProxyType(
+    {
+        "levenberg-marquardt": LevenbergMarquardt(),
+        "projected-gradient": ProjectedGradient(),
+        "dogleg": Dogleg(),
+        "gauss-newton": GaussNewton(),
+        "two-trials": LevenbergMarquardt(trials_per_linearisation=2),
+        "cross-entropy": CrossEntropy(),
+        "path-integral": PathIntegral(),
+    }
+)

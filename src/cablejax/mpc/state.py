@@ -1,0 +1,182 @@
+"""State of the controller between steps, and its report of each step."""
+
+from __future__ import annotations
+
+import dataclasses
+import enum
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from cablejax.adaptation.belief import CableBelief, prior_belief
+from cablejax.mpc.config import MPCConfig
+from cablejax.types import History
+
+
+class Action(enum.IntEnum):
+    """What a command does. Inside compiled code it is an int32."""
+
+    FOLLOW = 0
+    """It is the first one of the solver's plan."""
+    HOLD = 1
+    """The grippers hold, or brake as fast as they may: no plan is better, or none can be trusted (see the result)."""
+    STRAIGHTEN = 2
+    """The error stayed where it is, as in another shape between the same grippers: the cable is straightened first."""
+
+
+class ErrorWindow(NamedTuple):
+    """The last W steps, oldest first; every step adds one.
+
+    Attributes:
+        error: observed displacement minus the offline model's [m], shape [W, N, 2].
+        twist: commands, shape [W, Q, 3].
+        valid: keypoints whose error was observed, shape [W, N].
+    """
+
+    error: Float[Array, "*batch W N 2"]
+    twist: Float[Array, "*batch W Q 3"]
+    valid: Bool[Array, "*batch W N"]
+
+
+class LastCommand(NamedTuple):
+    """The last command and what was expected of it; replaced at the end of every step.
+
+    Attributes:
+        plan: the plan whose first command it is [m], shape [T, Q, 3].
+        twist: the command, shape [Q, 3].
+        displacement: the offline model's, of this command [m], shape [N, 2].
+        predicted: keypoints that model and residual expect after it [m], shape [N, 2].
+        shape_error: root mean square distance to the target before it [m], shape [].
+    """
+
+    plan: Float[Array, "*batch T Q 3"]
+    twist: Float[Array, "*batch Q 3"]
+    displacement: Float[Array, "*batch N 2"]
+    predicted: Float[Array, "*batch N 2"]
+    shape_error: Float[Array, "*batch"]
+
+
+class Progress(NamedTuple):
+    """Counts that decide when the cable is straightened to begin again; every field has shape [].
+
+    Attributes:
+        best_error: lowest shape error since the last restart [m].
+        since_best: commands since it fell by a hundredth or more.
+        straightening: commands left for straightening the cable; 0 = planning.
+        restarts: how often that was begun.
+    """
+
+    best_error: Float[Array, "*batch"]
+    since_best: Int[Array, "*batch"]
+    straightening: Int[Array, "*batch"]
+    restarts: Int[Array, "*batch"]
+
+
+class CableEstimate(NamedTuple):
+    """The online estimate of the cable.
+
+    Attributes:
+        belief: after the observations so far.
+        sensitivity: derivative of `LastCommand.displacement` with respect to its mean [m], shape [N, 2, 2].
+    """
+
+    belief: CableBelief
+    sensitivity: Float[Array, "*batch N 2 2"]
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class MPCState:
+    """State of the controller between two steps, its arrays grouped by when they change.
+
+    Attributes:
+        history: what the model sees; gaps are filled.
+        observed: keypoints that were observed at the last step, shape [N].
+        window: the offline model's errors, which the residual is fitted to.
+        last: the last command.
+        progress: counts for restarts.
+        estimate: the cable; None without adaptation.
+        radius: bound on one step's motion of each gripper [m], shape [].
+        steps: control steps so far, shape [].
+        unobserved: keypoint observations missing so far, shape [].
+    """
+
+    history: History
+    observed: Bool[Array, "*batch N"]
+    window: ErrorWindow
+    last: LastCommand
+    progress: Progress
+    estimate: CableEstimate | None
+    radius: Float[Array, "*batch"]
+    steps: Int[Array, "*batch"]
+    unobserved: Int[Array, "*batch"]
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class MPCInfo:
+    """Report of one control step; every field but the last has shape [].
+
+    Attributes:
+        shape_error: root mean square distance to the target now [m].
+        predicted_error: the same, expected after the command [m].
+        rho: actual over predicted reduction of the error by the last command; 1 where it is not known.
+        radius: bound on one step's motion that the command was planned with [m].
+        objective: value of the plan that the command belongs to [m^2].
+        objective_hold: value of holding still [m^2].
+        evaluations: rollouts that the solver spent on trial plans.
+        result: a `bounded.Result`: how the solve ended; `NONFINITE` also where its plan is not finite.
+        action: an `Action`.
+        residual_share: |residual's displacement| / (|model's| + |residual's|) of the command, in [0, 1].
+        condition: condition number of the ridge system.
+        unobserved: keypoints not observed now, replaced by their prediction.
+        belief: what is believed of the cable now, None without adaptation.
+    """
+
+    shape_error: Float[Array, "*batch"]
+    predicted_error: Float[Array, "*batch"]
+    rho: Float[Array, "*batch"]
+    radius: Float[Array, "*batch"]
+    objective: Float[Array, "*batch"]
+    objective_hold: Float[Array, "*batch"]
+    evaluations: Int[Array, "*batch"]
+    result: Int[Array, "*batch"]
+    action: Int[Array, "*batch"]
+    residual_share: Float[Array, "*batch"]
+    condition: Float[Array, "*batch"]
+    unobserved: Int[Array, "*batch"]
+    belief: CableBelief | None
+
+
+def initial_state(config: MPCConfig, history: History) -> MPCState:
+    """The controller's state before its first step; pure, vmappable."""
+    n_keypoints, n_grippers = history.keypoints.shape[1], history.gripper_pose.shape[0]
+    window = 0 if config.residual is None else config.residual.window
+    dtype, zero = history.keypoints.dtype, jnp.zeros((), jnp.int32)
+    estimate = None
+    if config.adaptation is not None:
+        estimate = CableEstimate(prior_belief(config.adaptation), jnp.zeros((n_keypoints, 2, 2), dtype))
+        history = dataclasses.replace(history, cable=estimate.belief.mean)
+    return MPCState(
+        history=history,
+        observed=jnp.ones(n_keypoints, bool),
+        window=ErrorWindow(
+            error=jnp.zeros((window, n_keypoints, 2), dtype),
+            twist=jnp.zeros((window, n_grippers, 3), dtype),
+            valid=jnp.zeros((window, n_keypoints), bool),
+        ),
+        last=LastCommand(
+            plan=jnp.zeros((config.n_commands, n_grippers, 3), dtype),
+            twist=jnp.zeros((n_grippers, 3), dtype),
+            displacement=jnp.zeros((n_keypoints, 2), dtype),
+            predicted=history.keypoints[-1],
+            shape_error=jnp.zeros((), dtype),
+        ),
+        progress=Progress(best_error=jnp.asarray(jnp.inf, dtype), since_best=zero, straightening=zero, restarts=zero),
+        estimate=estimate,
+        radius=jnp.asarray(config.radius, dtype),
+        steps=zero,
+        unobserved=zero,
+    )

@@ -1,0 +1,76 @@
+"""Validation of what users give: settings of planners, targets, histories, measurements."""
+
+from __future__ import annotations
+
+import math
+
+import jax
+import numpy as np
+from jax.core import Tracer
+from jaxtyping import Array, Float
+
+from cablejax.types import History, Measurement
+from cablejax.whole_number import is_whole
+
+
+def check_budget(settings: object, *names: str) -> None:
+    """Raises ValueError unless these settings of a solver are whole numbers, at least one."""
+    values = [getattr(settings, name) for name in names]
+    if not all(is_whole(value, least=1) for value in values):
+        given = ", ".join(f"{name}={value}" for name, value in zip(names, values, strict=True))
+        raise ValueError(f"{type(settings).__name__}({given}): expected whole numbers, at least one of each.")
+
+
+def check_positive(settings: object, *names: str) -> None:
+    """Raises ValueError unless these settings of a solver are positive and finite."""
+    for name in names:
+        value = getattr(settings, name)
+        if not (math.isfinite(value) and value > 0):
+            raise ValueError(f"{type(settings).__name__}.{name} is {value}, expected a positive finite number.")
+
+
+def check_target(target: Float[Array | np.ndarray, "*batch N 2"]) -> None:
+    """Raises ValueError unless the target is an array of finite keypoints [N, 2], N at least 3: fewer have no shape."""
+    shape = np.shape(target)
+    finite = isinstance(target, Tracer) or bool(np.isfinite(target).all())
+    if len(shape) < 2 or shape[-2] < 3 or shape[-1] != 2 or not finite:
+        raise ValueError(
+            f"The target has shape {shape}{'' if finite else ' with non-finite values'}, "
+            "expected finite keypoints [N, 2] in metres, three or more."
+        )
+
+
+def check_history(target: Float[Array | np.ndarray, "N 2"], history: History) -> None:
+    """Raises ValueError unless the history has a sample, fits the target's number of keypoints, and is finite."""
+    _check_floating("The history's keypoints", history.keypoints)
+    _check_floating("The history's gripper poses", history.gripper_pose)
+    if np.ndim(history.keypoints) != 3 or len(history.keypoints) < 1:
+        raise ValueError(
+            f"The history has keypoints of shape {np.shape(history.keypoints)}, expected [H, N, 2] with at least one "
+            "sample: repeat the first observation H times for a cable at rest."
+        )
+    check_measurement(target, Measurement(history.keypoints[-1], history.gripper_pose))
+    given = [leaf for leaf in (history.keypoints, history.gripper_pose) if not isinstance(leaf, Tracer)]
+    if not all(np.isfinite(leaf).all() for leaf in given):
+        raise ValueError("The initial history has non-finite values: start from a complete observation.")
+
+
+def check_measurement(target: Float[Array | np.ndarray, "N 2"], measurement: Measurement) -> None:
+    """Raises ValueError unless a measurement has the shape of the target's keypoints and of two grippers' poses."""
+    keypoints, gripper_pose = measurement
+    _check_floating("Measured keypoints", keypoints)
+    _check_floating("Measured gripper poses", gripper_pose)
+    if keypoints.shape != np.shape(target) or gripper_pose.shape != (2, 3):
+        raise ValueError(
+            f"Measurement with keypoints {keypoints.shape} and gripper poses {gripper_pose.shape}, "
+            f"expected {np.shape(target)} as the target and (2, 3)."
+        )
+
+
+def _check_floating(what: str, value: object) -> None:
+    kind = f"an array of {value.dtype}" if isinstance(value, (np.ndarray, jax.Array)) else type(value).__name__
+    if not (isinstance(value, (np.ndarray, jax.Array)) and np.issubdtype(value.dtype, np.floating)):
+        raise ValueError(
+            f"{what} are {kind}, expected an array of floating-point numbers: convert them with "
+            "`numpy.asarray(values, float)`."
+        )

@@ -1,0 +1,75 @@
+"""Warm start of a solver: the last plan, the straight way to the target poses of the grippers, and holding still."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from cablejax.mpc.config import MPCConfig
+from cablejax.mpc.problem import Rollout, ShapingProblem
+from cablejax.mpc.target_pose import continued, straight_plan, straightened, target_pose, way_to
+
+
+class StraightWay(NamedTuple):
+    """The straight way to a pair of gripper poses.
+
+    Attributes:
+        motion: its first steps [m], shape [T, Q, 3].
+        length: of the gripper that has farther to go, all the way [m], shape [].
+    """
+
+    motion: Float[Array, "T Q 3"]
+    length: Float[Array, ""]
+
+
+class Starts(NamedTuple):
+    """What is known before a solver is asked.
+
+    Attributes:
+        guess: the better of two starts: the last plan, shifted by the command that was executed, and the straight way.
+        still: holding, or where motions may not change at once, braking [m], shape [T, Q, 3].
+        value_still: its objective [m^2], shape [].
+        straightening: the way to where the cable is straight, feasible.
+    """
+
+    guess: Rollout
+    still: Float[Array, "T Q 3"]
+    value_still: Float[Array, ""]
+    straightening: StraightWay
+
+
+def find_starts(config: MPCConfig, problem: ShapingProblem, last: Float[Array, "T Q 3"]) -> Starts:
+    """What may be begun from, and what it is worth.
+
+    Args:
+        config: settings.
+        problem: of this step.
+        last: the last plan, its first command executed [m].
+    """
+    to_target = _straight_way(config, problem, target_pose(problem.target))
+    apart = straightened(problem.target, config.max_distance * config.cable_length)
+    to_straight = _straight_way(config, problem, apart)
+    still = jnp.zeros_like(last)
+    shifted = jnp.roll(last, -1, axis=0).at[-1].set(0.0)
+    wanted = jnp.stack([shifted, to_target.motion, to_straight.motion, still])
+    # one after the other: vmap would run the interior-point method for all, and several calls would compile it for each
+    allowed = jax.lax.map(problem.feasible.project, wanted if config.max_change is not None else wanted[:3])
+    if config.max_change is not None:
+        # grippers that move brake first, as fast as they may
+        still = allowed[3]
+    rollouts = jax.vmap(problem.rollout)(jnp.stack([allowed[0], allowed[1], still]))
+    values = jax.vmap(problem.value_of)(rollouts)
+    best = jnp.argmin(jnp.where(jnp.isfinite(values[:2]), values[:2], jnp.inf))
+    guess = jax.tree.map(lambda leaf: leaf[best], rollouts)
+    return Starts(guess, still, values[2], to_straight._replace(motion=allowed[2]))
+
+
+def _straight_way(config: MPCConfig, problem: ShapingProblem, to: Float[Array, "2 3"]) -> StraightWay:
+    """From where the grippers are to a pair of poses, within the bound on a step and no other."""
+    pose = continued(problem.history.gripper_pose, problem.history.keypoints[-1])
+    weight = config.objective.rotation_weight
+    motion = straight_plan(pose, to, problem.feasible.radius, weight, config.n_commands)
+    return StraightWay(motion, jnp.linalg.norm(way_to(pose, to, weight), axis=1).max())
