@@ -19,7 +19,7 @@ from cablejax.diagnose.fit import Evidence, candidate
 from cablejax.diagnose.playback import Playback
 from cablejax.diagnose.screen import residual_of
 from cablejax.gaplog import Episode, gap_log_from_episodes
-from cablejax.simulate.chain.step import FINE_STEP, LARGEST_STEP
+from cablejax.simulate.chain.replay import FINE_STEP, LARGEST_STEP
 from cablejax.types import GapLog
 
 CABLE = Cable()

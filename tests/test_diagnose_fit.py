@@ -17,7 +17,7 @@ from cablejax.diagnose.playback import Playback
 from cablejax.diagnose.screen import residual_of, screen, shortlist
 from cablejax.diagnose.search import Search
 from cablejax.effects import BendingStiffness
-from cablejax.simulate.chain.step import LARGEST_STEP
+from cablejax.simulate.chain.replay import LARGEST_STEP
 from diagnose_cases import BY_NAME, INTERVAL, context, evidence, parts
 
 LOOK_ALIKES = (("bending_stiffness", (0.3,)), ("table_friction", (0.3, 0.0)))

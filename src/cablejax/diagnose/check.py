@@ -11,8 +11,9 @@ import numpy as np
 from cablejax.cable import Discretisation
 from cablejax.diagnose.fit import Candidate, candidate
 from cablejax.effects.base import Context, Effect
+from cablejax.effects.camera import seen_by_camera
 from cablejax.effects.physics import nominal_physics
-from cablejax.simulate.chain.step import Chain, seen_by_camera
+from cablejax.simulate.chain.replay import Chain
 from cablejax.simulate.compile import compiler_options
 from cablejax.simulate.equilibrium import equilibrium_state
 

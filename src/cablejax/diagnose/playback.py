@@ -14,8 +14,9 @@ import numpy as np
 from jaxtyping import Float
 
 from cablejax.cable import Cable, Discretisation
+from cablejax.effects.camera import seen_by_camera
 from cablejax.effects.physics import Physics, nominal_physics
-from cablejax.simulate.chain.step import LARGEST_STEP, Chain, seen_by_camera
+from cablejax.simulate.chain.replay import LARGEST_STEP, Chain
 from cablejax.simulate.compile import compiler_options
 from cablejax.simulate.equilibrium import equilibrium_state
 

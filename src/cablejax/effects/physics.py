@@ -153,3 +153,17 @@ def nominal_physics(
 def normal_gravity(physics: Physics) -> Float[Array, ""]:
     """Gravity across the table [m/s^2]; the part in its plane is `tilt`."""
     return jnp.sqrt(jnp.maximum(physics.gravity**2 - jnp.sum(physics.tilt**2), 0.0))
+
+
+def may_touch(physics: Physics) -> bool:
+    """Whether a cable of this physics can touch an obstacle: false only where the radius is known to be zero.
+
+    Inside `jit` the radius is known if it is a constant, see `without_obstacle`.
+    """
+    radius = physics.obstacle_radius
+    return isinstance(radius, jax.core.Tracer) or bool(np.any(np.asarray(radius) > 0))
+
+
+def without_obstacle(physics: Physics) -> Physics:
+    """The physics with an obstacle that is known to be absent, even inside `jit`: no time is spent on contacts."""
+    return dataclasses.replace(physics, obstacle_radius=np.zeros(np.shape(physics.obstacle_radius), np.float32))

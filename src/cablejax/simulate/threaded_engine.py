@@ -9,6 +9,7 @@ import dataclasses
 import functools
 import os
 import pathlib
+from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -16,12 +17,16 @@ import mujoco
 import numba
 import numpy as np
 
-from cablejax.cable import GRAVITY, Discretisation
+from cablejax.cable import Discretisation
+from cablejax.effects.arms import executed_twist
+from cablejax.effects.base import Hook
+from cablejax.effects.camera import seen_by_camera
 from cablejax.effects.physics import Physics
 from cablejax.simulate.composite import build_grasped_chain
-from cablejax.simulate.engine import Engine
+from cablejax.simulate.engine import Engine, finely_sampled
 from cablejax.simulate.equilibrium import equilibrium_state
-from cablejax.simulate.keypoints import hermite_weights
+from cablejax.simulate.friction import PATCH_EDGE, STRIBECK_SPEED
+from cablejax.simulate.keypoints import hermite_weights, marked_keypoints
 from cablejax.types import CableState, Trajectory
 
 
@@ -40,6 +45,11 @@ class ThreadedEngine(Engine):
     config: Discretisation = Discretisation()
     n_threads: int | None = None
 
+    name: ClassVar[str] = "threaded"
+    hooks: ClassVar[frozenset[Hook]] = frozenset(
+        ("bending", "table", "mass", "grasp", "input", "observation", "obstacle")
+    )
+
     @functools.cached_property
     def mj_model(self) -> mujoco.MjModel:
         """The MuJoCo model: the chain welded to two mocap bodies."""
@@ -51,6 +61,9 @@ class ThreadedEngine(Engine):
     def rollout(self, physics, state, twist, interval=1.0):
         twist = np.asarray(twist, np.float64)
         self.check_twist(twist)
+        return finely_sampled(self._run, self, physics, state, twist, interval)
+
+    def _run(self, physics, state, twist, interval):
         count = self.substeps(interval)
         batch = twist.shape[:-3]
         size = int(np.prod(batch))
@@ -61,6 +74,7 @@ class ThreadedEngine(Engine):
         def restore(leaf):
             return jnp.asarray(leaf.reshape(*batch, *leaf.shape[1:]), float)
 
+        state = CableState(state.qpos, state.qvel, state.gripper_pose)
         physics, state, commands = jax.tree.map(flatten, (physics, state, twist))
         samples = twist.shape[-3] + 1
         keypoints = np.empty((size, samples, self.config.cable.n_keypoints, self.config.dimension))
@@ -72,7 +86,7 @@ class ThreadedEngine(Engine):
             simulation = _Simulation(self.config, self.mj_model)
             for i in range(worker, size, workers):
                 one, start = jax.tree.map(lambda leaf: leaf[i], (physics, state))  # noqa: B023, used at once
-                simulation.run(one, start, commands[i], count, keypoints[i], poses[i])
+                simulation.run(one, start, commands[i], count, interval, keypoints[i], poses[i])
                 qpos[i], qvel[i] = simulation.data.qpos, simulation.data.qvel
 
         if workers == 1:
@@ -89,20 +103,22 @@ class _Simulation:
 
     def __init__(self, config: Discretisation, model: mujoco.MjModel):
         self.config = config
-        self.model = copy.copy(model)
+        self.bare = self.model = copy.copy(model)
         self.data = mujoco.MjData(self.model)
-        self.weights = hermite_weights(config)
         self.nominal_mass = self.model.body_mass.copy()
         self.nominal_inertia = self.model.body_inertia.copy()
         self.links = np.array([i for i in range(self.model.nbody) if self.model.body(i).name.startswith("cable")])
 
-    def run(self, physics: Physics, state: CableState, twist, count: int, keypoints, poses) -> None:
+    def run(self, physics: Physics, state: CableState, twist, count: int, interval: float, keypoints, poses) -> None:
         """Simulates in place; writes samples into `keypoints` [T + 1, N, D] and `poses` [T + 1, Q, P]."""
-        config, model, data = self.config, self.model, self.data
+        config, planar = self.config, self.config.dimension == 2
+        if planar:
+            self._place_obstacle(physics)
+            twist = executed_twist(physics, state.gripper_pose, twist, interval)
+        model, data = self.model, self.data
         self._write(physics)
         mujoco.mj_resetData(model, data)
         data.qpos[:], data.qvel[:] = state.qpos, state.qvel
-        load = float(physics.density) * config.link_length * GRAVITY * float(physics.friction)
         addresses = np.array([model._address, data._address], np.uint64)
         nodes = np.empty((len(twist) + 1, len(self.links), 3))
         tangents = np.empty_like(nodes)
@@ -116,17 +132,40 @@ class _Simulation:
             data.xmat,
             self.links,
             np.array(state.gripper_pose),
+            np.asarray(physics.rotation_offset),
             twist,
             count,
             config.timestep,
-            load,
+            self._table(physics),
             config.friction_speed,
             nodes,
             tangents,
             poses,
         )
-        positions_w, tangents_w = self.weights
-        keypoints[:] = (positions_w @ nodes + tangents_w @ tangents)[..., : config.dimension]
+        if planar:
+            points = marked_keypoints(config, physics, nodes[..., :2], tangents[..., :2])
+            keypoints[:] = seen_by_camera(physics, points, interval)
+        else:
+            positions_w, tangents_w = hermite_weights(config)
+            keypoints[:] = positions_w @ nodes + tangents_w @ tangents
+
+    def _place_obstacle(self, physics: Physics) -> None:
+        """Takes the model with this obstacle, which C MuJoCo must know when it builds its collision trees."""
+        radius = float(physics.obstacle_radius)
+        model = self.bare if radius == 0 else _model_with(self.config, (*map(float, physics.obstacle_centre), radius))
+        if (radius > 0) == (self.model is self.bare) or radius > 0:
+            self.model = model if radius == 0 else copy.copy(model)
+            self.data = mujoco.MjData(self.model)
+
+    def _table(self, physics: Physics) -> np.ndarray:
+        """Arguments of `_drag`: seven values for the whole table, then the weight of each free node [N], shape [7 + n]."""
+        h = self.config.link_length
+        if self.config.dimension == 3:
+            return np.zeros(7)
+        normal = np.sqrt(max(float(physics.gravity) ** 2 - float(np.sum(physics.tilt**2)), 0.0))
+        weight = (float(physics.density) * h + np.asarray(physics.extra_mass)[1:-1]) * normal
+        whole = (physics.friction, physics.static_excess, *physics.patch_centre, physics.patch_radius)
+        return np.array([*map(float, whole), float(physics.patch_friction), float(physics.drag) * h, *weight])
 
     def _write(self, physics: Physics) -> None:
         """Puts the parameters into the model."""
@@ -149,6 +188,15 @@ class _Simulation:
         ratio = float(physics.density) / self.config.cable.linear_density
         model.body_mass[free] = self.nominal_mass[free] * ratio
         model.body_inertia[free] = self.nominal_inertia[free] * ratio
+        if self.config.dimension == 2:
+            model.body_mass[free] += physics.extra_mass[1:-1]
+            normal = np.sqrt(max(float(physics.gravity) ** 2 - float(np.sum(physics.tilt**2)), 0.0))
+            model.opt.gravity[:] = [*physics.tilt, -normal]
+
+
+@functools.lru_cache(maxsize=64)
+def _model_with(config: Discretisation, obstacle: tuple[float, float, float]) -> mujoco.MjModel:
+    return build_grasped_chain(config, obstacle)
 
 
 def _c_function(name: str):
@@ -174,10 +222,11 @@ def _advance(
     xmat,
     links,
     pose,
+    rotation_offset,
     twist,
     count,
     dt,
-    load,
+    table,
     friction_speed,
     nodes,
     tangents,
@@ -192,16 +241,29 @@ def _advance(
         start = pose.copy()
         for i in range(count):
             _integrate(start, twist[t], (i + 1) * dt, pose)
-            _set_mocap(pose, mocap_pos, mocap_quat)
+            _set_mocap(pose, rotation_offset, mocap_pos, mocap_quat)
             _step1(model, data)
             for k in range(n_free):
                 vx, vy = actuator_velocity[2 * k], actuator_velocity[2 * k + 1]
-                drag = load / np.sqrt(vx * vx + vy * vy + friction_speed * friction_speed)
+                node = xipos[links[k + 1]]
+                drag = _drag(table, table[7 + k], node[0], node[1], vx * vx + vy * vy, friction_speed)
                 actuator_biasprm[2 * k, 2] = -drag
                 actuator_biasprm[2 * k + 1, 2] = -drag
             _step2(model, data)
         _sample(model, data, xipos, xmat, links, nodes[t + 1], tangents[t + 1])
         poses[t + 1] = pose
+
+
+@numba.njit(nogil=True, cache=False)
+def _drag(table, weight, x, y, squared_speed, friction_speed):
+    """`friction.drag_coefficient` of one node."""
+    coefficient = table[0]
+    if table[5] != 0.0:
+        distance = np.sqrt((x - table[2]) ** 2 + (y - table[3]) ** 2)
+        coefficient += table[5] / (1.0 + np.exp(-(table[4] - distance) / PATCH_EDGE))
+    if table[1] != 0.0:
+        coefficient *= 1.0 + table[1] * np.exp(-squared_speed / STRIBECK_SPEED**2)
+    return coefficient * weight / np.sqrt(squared_speed + friction_speed * friction_speed) + table[6]
 
 
 @numba.njit(nogil=True, cache=False)
@@ -233,12 +295,13 @@ def _integrate(start, twist, duration, pose):
 
 
 @numba.njit(nogil=True, cache=False)
-def _set_mocap(pose, mocap_pos, mocap_quat):
+def _set_mocap(pose, rotation_offset, mocap_pos, mocap_quat):
     for q in range(pose.shape[0]):
         if pose.shape[1] == 3:
+            half = (pose[q, 2] + rotation_offset[q]) / 2
             mocap_pos[q, 0], mocap_pos[q, 1], mocap_pos[q, 2] = pose[q, 0], pose[q, 1], 0.0
-            mocap_quat[q, 0], mocap_quat[q, 1] = np.cos(pose[q, 2] / 2), 0.0
-            mocap_quat[q, 2], mocap_quat[q, 3] = 0.0, np.sin(pose[q, 2] / 2)
+            mocap_quat[q, 0], mocap_quat[q, 1] = np.cos(half), 0.0
+            mocap_quat[q, 2], mocap_quat[q, 3] = 0.0, np.sin(half)
         else:
             mocap_pos[q] = pose[q, :3]
             mocap_quat[q] = pose[q, 3:]
