@@ -11,6 +11,8 @@ Two variants of the same chain are built:
 
 from __future__ import annotations
 
+from typing import Any
+
 import mujoco
 import numpy as np
 
@@ -114,6 +116,15 @@ def refuse_plugins(model: mujoco.MjModel) -> None:
             f"The MuJoCo model has {model.nplugin} plugin instance(s). MJX ignores plugins, so the cable would have no "
             "bending stiffness. Build it with `cablejax.simulate.composite`, which uses joint springs instead."
         )
+
+
+def stable_damping_time(damping_time: Any, timestep: float) -> Any:
+    """The Kelvin-Voigt time [s] that MuJoCo's step can integrate: at least half a time step.
+
+    The step takes elastic moments where it starts and damping where it ends. Bending waves of short cables of links are
+    much faster than a step, and with less damping than this they grow without bound.
+    """
+    return damping_time.__array_namespace__().maximum(damping_time, 0.5 * timestep)
 
 
 def link_bodies(spec: mujoco.MjSpec) -> list[mujoco.MjsBody]:

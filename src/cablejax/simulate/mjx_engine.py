@@ -18,7 +18,7 @@ from cablejax.effects.arms import executed_twist
 from cablejax.effects.base import Hook
 from cablejax.effects.camera import seen_by_camera
 from cablejax.effects.physics import Physics, may_touch, nominal_physics, normal_gravity
-from cablejax.simulate.composite import build_chain, refuse_plugins
+from cablejax.simulate.composite import build_chain, refuse_plugins, stable_damping_time
 from cablejax.simulate.contact import obstacle_contact
 from cablejax.simulate.engine import Engine, compiled_rollout, finely_sampled
 from cablejax.simulate.equilibrium import equilibrium_state
@@ -113,7 +113,7 @@ class MjxEngine(Engine):
         """The model with every differentiable parameter put in."""
         h = self.config.link_length
         stiffness = physics.stiffness / h
-        damping = physics.damping_time * stiffness
+        damping = stable_damping_time(jnp.asarray(physics.damping_time), self.config.timestep) * stiffness
         density_ratio = physics.density / self.config.cable.linear_density
         mass, gravity = model.body_mass * density_ratio, model.opt.gravity
         if self.config.dimension == 2:
@@ -180,7 +180,7 @@ class MjxEngine(Engine):
         return implicit_drag(jacobian, drag, velocity)
 
     def _obstacle(self, data, physics, jacobian, qvel):
-        """Generalised stiffness of the obstacle's contacts, and their force at the end of the step at the present velocity."""
+        """Generalised stiffness of the obstacle's contacts, and their force after a step at the present velocity."""
         force, k = obstacle_contact(physics, data.xipos[1:, :2], self.config.link_length * data.xmat[1:, :2, 0])
         tensor = jnp.stack([jnp.stack([k[:, 0], k[:, 1]], axis=1), jnp.stack([k[:, 1], k[:, 2]], axis=1)], axis=1)
         stiffness = jnp.einsum("kid,kde,kje->ij", jacobian, tensor, jacobian)

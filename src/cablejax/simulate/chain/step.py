@@ -177,8 +177,10 @@ def _load(config: Discretisation, physics: Physics, frame: Frame, root, with_con
 
 
 def _joints(config: Discretisation, physics: Physics, state: ChainState, dt) -> tuple[Array, Array]:
-    """Moments of the joints [N m], and what they add to the matrix: elastic, viscous, and internal friction (Dahl 1968),
-    which saturates at its moment."""
+    """Moments of the joints [N m], and what they add to the matrix.
+
+    Elastic, viscous, and internal friction (Dahl 1968), which saturates at its moment.
+    """
     h = config.link_length
     elastic = state.angles[1:] / h - physics.rest_curvature - state.set_curvature
     # Elastic moments as they are in the middle of the step: at its end, as implicit Euler has them, they would add
