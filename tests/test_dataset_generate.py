@@ -65,7 +65,6 @@ VALUES = {
         ("camera_similarity", "scale angle_rad x_m y_m", (1.02, 0.05, 0.01, 0.0)),
         ("keypoint_bias", "index offset_m", (2, 0.01)),
         ("camera_lag", "time_s", (0.3,)),
-        ("obstacle", "x_m y_m radius_m", (0.0, 0.0, 0.2)),
         ("actuation_gain", "gain", (0.8,)),
         ("actuation_lag", "time_s", (0.4,)),
     )
@@ -153,10 +152,18 @@ def by_chain() -> dict[str, np.ndarray]:
     return {"keypoints": block.keypoints, "pose": block.gripper_pose, "twist": block.gripper_twist}
 
 
+def in_the_way(keypoints: np.ndarray) -> tuple[tuple[str, float], ...]:
+    """A disc of 3 cm into which `keypoints` [T + 1, N, 2] end up 5 mm deep."""
+    along = keypoints[-1, -1] - keypoints[-1, 0]
+    across = np.array([-along[1], along[0]]) / np.hypot(*along)
+    moved = keypoints[-1, 2] - keypoints[0, 2]
+    x, y = keypoints[-1, 2] + np.sign(moved @ across) * 0.025 * across
+    return (("x_m", float(x)), ("y_m", float(y)), ("radius_m", 0.03))
+
+
 @pytest.mark.parametrize("effect", EFFECTS.values(), ids=lambda effect: effect.name)
 def test_every_effect_reaches_the_data(effect, by_chain):
-    """Two trajectories of one effect's prior median, or of a start of its fit where that does nothing."""
-    one = GivenEffect(effect.name, VALUES[effect.name])
+    one = GivenEffect(effect.name, VALUES.get(effect.name) or in_the_way(by_chain["keypoints"][0]))
     config = dataclasses.replace(STAGED, effects=(one,))
     (block,) = simulate(config, make_engine(config), [0])
     assert block.attempts.max() == 0

@@ -21,6 +21,7 @@ from cablejax.types import CableState, Trajectory
 
 _FINE_SAMPLE = 0.1
 """Interval of the samples between which arms and camera with a lag move linearly [s]."""
+_LAGS = ("actuation_time", "actuation_delay", "camera_lag")
 
 
 class Engine(abc.ABC):
@@ -113,10 +114,21 @@ def finely_sampled(
     return final, dataclasses.replace(fine, keypoints=keypoints, gripper_pose=pose, gripper_twist=jnp.asarray(twist))
 
 
+def refuse_lags(physics: Physics) -> None:
+    """Raises `ValueError` if arms or camera lag: in a closed loop every rollout would forget what went before."""
+    lags = {name: getattr(physics, name) for name in _LAGS}
+    late = [f"{name} {np.max(np.asarray(lag)):g} s" for name, lag in lags.items() if np.any(np.asarray(lag) > 0)]
+    if late:
+        raise ValueError(
+            f"The physics has {', '.join(late)}. An engine's rollouts begin with arms and camera at rest, so it cannot "
+            "simulate a lag command by command: leave the effect out, or use a plant that has it."
+        )
+
+
 def _parts(engine: Engine, physics: Physics, interval: float) -> int:
     """Into how many parts a command is split: whole numbers of time steps, each about `_FINE_SAMPLE` long."""
     count = engine.substeps(interval)
-    lags = (physics.actuation_time, physics.actuation_delay, physics.camera_lag)
+    lags = [getattr(physics, name) for name in _LAGS]
     if not any(isinstance(lag, jax.core.Tracer) or np.any(np.asarray(lag) > 0) for lag in lags):
         return 1
     wanted = min(max(round(interval / _FINE_SAMPLE), 1), count)
