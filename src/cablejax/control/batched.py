@@ -118,7 +118,8 @@ def shape_batch(
         devices: to spread the batch over; by default the one on which the arguments are.
 
     Raises:
-        ValueError: the batch axes differ, the cable is not planar, arms or camera lag, or a target has another number of keypoints.
+        ValueError: the batch axes differ, the cable is not planar, arms or camera lag, or a target has another number
+            of keypoints.
     """
     size, chain = len(targets), engine.config
     if chain.dimension != 2 or np.shape(targets) != (size, chain.cable.n_keypoints, 2):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import abc
 import dataclasses
 import functools
+import warnings
 from collections.abc import Callable
 from typing import Any, ClassVar
 
@@ -57,6 +58,8 @@ class Engine(abc.ABC):
     ) -> tuple[CableState, Trajectory]:
         """Moves the grippers by T twists, each held for `interval` seconds.
 
+        A taut cable has no derivative along its chord: pulled, it does not move; pushed, it buckles.
+
         All arguments carry the same leading batch axis, or none of them does. Arms that lag and a camera that lags
         begin at rest, whatever was before `state`.
 
@@ -106,12 +109,31 @@ def finely_sampled(
     and its twists as they were commanded.
     """
     parts = _parts(engine, physics, interval)
+    _warn_if_taut(engine, physics, state, twist, interval)
     if parts == 1:
         return run(physics, state, twist, float(interval))
     xp = twist.__array_namespace__()
     final, fine = run(physics, state, xp.repeat(twist, parts, axis=-3), float(interval) / parts)
     keypoints, pose = fine.keypoints[..., ::parts, :, :], fine.gripper_pose[..., ::parts, :, :]
     return final, dataclasses.replace(fine, keypoints=keypoints, gripper_pose=pose, gripper_twist=jnp.asarray(twist))
+
+
+def _warn_if_taut(engine: Engine, physics: Physics, state: CableState, twist: Any, interval: float) -> None:
+    """Warns where the grippers are commanded further apart than the cable is long, unless it can stretch or slip."""
+    inputs = (state.gripper_pose, twist, physics.axial_compliance, physics.slip)
+    if any(isinstance(x, jax.core.Tracer) for x in inputs) or any(np.any(np.asarray(x) != 0) for x in inputs[2:]):
+        return
+    pose, moved = np.asarray(state.gripper_pose)[..., :3], np.asarray(twist)[..., :3]
+    chord = (pose[..., 1, :] - pose[..., 0, :])[..., None, :] + interval * np.cumsum(
+        moved[..., 1, :] - moved[..., 0, :], axis=-2
+    )
+    reach = np.linalg.norm(chord[..., : engine.config.dimension], axis=-1).max()
+    if reach > engine.config.cable.length * (1 + 1e-4):
+        warnings.warn(
+            f"The grippers are commanded {reach:.4f} m apart and the cable is {engine.config.cable.length:g} m long: "
+            "its ends will leave the grippers, and derivatives mean nothing there. Bring the grippers closer.",
+            stacklevel=4,
+        )
 
 
 def refuse_lags(physics: Physics) -> None:
