@@ -19,7 +19,7 @@ from cablejax.diagnose.protocol import Term
 from cablejax.diagnose.screen import screen, shortlist
 from cablejax.diagnose.search import Search
 from cablejax.effects import BendingStiffness
-from cablejax.simulate.chain.step import LARGEST_STEP
+from cablejax.simulate.chain.replay import LARGEST_STEP
 from diagnose_cases import BY_NAME, INTERVAL, evidence, parts
 
 LOOK_ALIKES = (("bending_stiffness", (0.3,)), ("table_friction", (0.3, 0.0)))

@@ -17,12 +17,12 @@ if TYPE_CHECKING:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class BenchSimulate(Command):
-    """Time the simulators: MJX in a batch, C MuJoCo on one core and on several.
+    """Time the simulators: the closed-form chain and MJX in a batch, C MuJoCo on one core and on several.
 
     An environment-step is one time step of one cable. The engines take turns, and the median of the rounds counts."""
 
     batch: int = 256
-    """Cables that MJX simulates at once; C simulates as many, one after the other."""
+    """Cables that chain and MJX simulate at once; C simulates as many, one after the other."""
 
     seconds: int = 1
     """Simulated seconds per round."""
@@ -37,30 +37,30 @@ class BenchSimulate(Command):
     """Links of the cable; by default the package's."""
 
     def execute(self):
-        import functools
-
         import jax
         import numpy as np
 
         from cablejax.cable import Discretisation
         from cablejax.commands.workloads import moving_arches, program_bytes, seconds_in_turns, setting
-        from cablejax.simulate import MjxEngine, ThreadedEngine, compiler_options
+        from cablejax.simulate import ChainEngine, MjxEngine, ThreadedEngine
+        from cablejax.simulate.engine import compiled_rollout
 
         for name in ("batch", "seconds", "rounds", "threads"):
             if getattr(self, name) < 1:
                 raise UsageError(f"--{name} is {getattr(self, name)}, expected at least 1.")
         config = Discretisation() if self.links is None else Discretisation(n_links=self.links)
         mjx, one, many = MjxEngine(config), ThreadedEngine(config, 1), ThreadedEngine(config, self.threads)
+        chain = ChainEngine(config)
 
         params, states, twist = moving_arches(config, self.batch, self.seconds, self.seed)
         say(f"compiling the MJX engine for {self.batch} cables of {config.n_links} links ...")
         begin = time.perf_counter()
-        unroll = jax.vmap(functools.partial(mjx.unroll, interval=1.0))
-        compiled = jax.jit(unroll, compiler_options=compiler_options()).lower(params, states, twist).compile()
+        compiled = compiled_rollout(mjx, params, 1, 1.0).lower(params, states, twist).compile()
         compile_s = time.perf_counter() - begin
         memory_bytes = program_bytes(compiled)
 
         contestants = {
+            "chain": lambda: jax.block_until_ready(chain.rollout(params, states, twist, 1.0)),
             "mjx": lambda: jax.block_until_ready(compiled(params, states, twist)),
             "c_one": lambda: one.rollout(params, states, twist, 1.0),
             "c_many": lambda: many.rollout(params, states, twist, 1.0),
@@ -73,9 +73,11 @@ class BenchSimulate(Command):
             "timestep_s": config.timestep,
             "batch": self.batch,
             "threads": self.threads,
+            "chain_us_per_env_step": micros["chain"],
             "mjx_us_per_env_step": micros["mjx"],
             "c_us_per_env_step": micros["c_one"],
             "c_threads_us_per_env_step": micros["c_many"],
+            "chain_over_c": micros["chain"] / micros["c_one"],
             "mjx_over_c": micros["mjx"] / micros["c_one"],
             "threads_speedup": micros["c_one"] / micros["c_many"],
             "mjx_memory_per_env_bytes": memory_bytes / self.batch,
@@ -85,6 +87,7 @@ class BenchSimulate(Command):
         text = text_table(
             ["engine", "us per environment-step", "relative to C on one core"],
             [
+                [f"chain, batch {self.batch}", f"{micros['chain']:.2f}", f"{result['chain_over_c']:.2f}"],
                 [f"MJX, batch {self.batch}", f"{micros['mjx']:.2f}", f"{result['mjx_over_c']:.2f}"],
                 ["C MuJoCo, one core", f"{micros['c_one']:.2f}", "1.00"],
                 [

@@ -38,7 +38,7 @@ class Simulate(Command):
     """Largest movement of any point of the frictionless cable, relative to what the grippers move together. It keeps
     the cable from snapping through; 1000 lets it snap."""
 
-    engine: Literal["threaded", "mjx"] = "threaded"
+    engine: Literal["threaded", "mjx", "chain"] = "threaded"
     """threaded: C MuJoCo on all CPU cores. mjx: batched in JAX, for an accelerator."""
 
     links: int | None = None

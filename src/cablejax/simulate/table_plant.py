@@ -133,7 +133,7 @@ class TablePlant(abc.ABC):
                 f"choose a divisor of {steps}."
             )
         self._check_distance(self._arms.target(twist, interval))
-        late = self.config.physics.camera_lag > 0
+        late = bool(self.config.physics.camera_lag > 0)
         observations = []
         for _ in range(samples):
             for executed, count in self._arms.follow(twist, steps // samples, self._timestep, pieces=late):

@@ -177,6 +177,7 @@ def _final_fits(simulator: Simulator, windows: Windows, effects, start, memory: 
     for part, begin, word in list(zip(use, begins, words, strict=True))[len(finals) :]:
         progress(f"fitting {word}: {int(part.sum())} windows")
         fit = improve(simulator, begin, effects, windows.chosen(np.flatnonzero(part)), progress=progress)
+        assert fit.result is not None  # it was improved
         finals.append((fit.values, fit.result))
         memory.keep_finals(finals)
     return finals
