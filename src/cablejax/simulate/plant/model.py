@@ -145,6 +145,9 @@ def _set_bending(model: mujoco.MjModel, config: PlantConfig) -> None:
         model.jnt_stiffness[joint] = own
         model.dof_damping[first : first + 3] = own * physics.damping_time
         model.qpos_spring[position : position + 4] = shape
+    # MuJoCo's composite has a spring at its root too, which is of no account where a grasp holds the root rigidly
+    if physics.rotation_compliance[0] > 0:
+        model.jnt_stiffness[model.jnt_type == mujoco.mjtJoint.mjJNT_FREE] = 0.0
 
 
 def _set_drag(model: mujoco.MjModel, link: int, coefficient: float) -> None:
