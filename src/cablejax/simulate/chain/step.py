@@ -27,6 +27,7 @@ from jaxtyping import Array, Float
 
 from cablejax.cable import Discretisation
 from cablejax.effects.physics import Physics, normal_gravity
+from cablejax.simulate.compile import full_precision
 from cablejax.simulate.composite import link_lengths, node_offsets
 from cablejax.simulate.grasp import solve_positive
 
@@ -84,6 +85,7 @@ class Chain:
     config: Discretisation
     with_contact: bool = True
 
+    @full_precision
     def rollout(
         self,
         physics: Physics,
