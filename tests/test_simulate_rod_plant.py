@@ -177,4 +177,4 @@ def test_the_named_cables_differ_from_the_reference_in_opposite_directions():
     assert USB.cable.bending_stiffness < nominal.cable.bending_stiffness < ETHERNET.cable.bending_stiffness
     for config in (ETHERNET, USB):
         assert config.cable.n_keypoints == 13 and config.cable.length == 1.0
-        assert config.rest_curvature == 0.0
+        assert config.cable.rest_curvature == 0.0

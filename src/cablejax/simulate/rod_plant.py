@@ -214,7 +214,7 @@ class RodPlant(TablePlant):
             twist,
             steps,
             config.discretisation.timestep,
-            np.asarray(physics.stiffness) * (physics.damping_time / h),
+            np.asarray(physics.stiffness * physics.damping_time) / h,
             GRAVITY * friction,
             config.static_ratio,
             config.stribeck_speed,
