@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import pytest
 
 from cablejax.bounded import BoundedQuasiNewton
+from cablejax.cable import Cable
 from cablejax.control.shaping import Model
 from cablejax.evaluation.against_ipopt import Contestant, explain, kept_rows, kkt_residual, meets_all
 from cablejax.evaluation.ipopt_page import ipopt_sections
@@ -87,7 +88,7 @@ def test_every_exception_is_explained(of_row, said, words):
 def test_other_starts_are_tried_until_one_has_all_that_is_asked():
     with jax.enable_x64(True):
         case = planning_case()
-        make = ProblemMaker(Model("analytic", None, relaxing_cable, jnp.asarray(0.8)))  # pyright: ignore[reportArgumentType]
+        make = ProblemMaker(Model("analytic", None, relaxing_cable, jnp.asarray(0.8), Cable()))  # pyright: ignore[reportArgumentType]
         finder = PathFinder(
             lambda motion, problem: problem.residuals(motion),
             BoundedQuasiNewton(atol=1e-10),

@@ -138,7 +138,6 @@ class BenchMpc(Command):
     def execute(self):
         import jax
 
-        from cablejax.cable import Cable
         from cablejax.control.shaping import initial_history, load_model
         from cablejax.mpc import time_control
 
@@ -151,8 +150,8 @@ class BenchMpc(Command):
             )
         on_processor = jax.devices()[0].platform == "cpu"
         batches = self.batches or ((1, 16) if on_processor else (1, 64, 1024))
-        model, cable = load_model(self.weights), Cable()
-        history = initial_history(cable, model.config)
+        model = load_model(self.weights)
+        history = initial_history(model.cable, model.config)
         solvers = {}
         for name in self.solvers:
             say(f"compiling the control step with {name} ...")
@@ -284,7 +283,8 @@ class BenchLoop(Command):
             raise UsageError(
                 f"--batches {self.batches}, --steps {self.steps} and --rounds {self.rounds}: expected at least 1 each."
             )
-        model, chain = load_model(self.weights), Discretisation()
+        model = load_model(self.weights)
+        chain = Discretisation(model.cable)
         target = make_target("S", chain.cable)
         controller = make_controller(model, target, method="residual", solver=self.solver)
         config = LoopConfig(self.steps, interval=model.config.interval, history_length=model.config.history)
@@ -328,7 +328,7 @@ def _controller(model: Model, solver: SolverName, horizon: int) -> MPC:
     from cablejax.control.shaping import make_controller
     from cablejax.control.targets import make_target
 
-    controller = make_controller(model, make_target("S"), method="residual", solver=solver)
+    controller = make_controller(model, make_target("S", model.cable), method="residual", solver=solver)
     return dataclasses.replace(controller, config=dataclasses.replace(controller.config, horizon=horizon))
 
 
@@ -361,12 +361,17 @@ def _against_ipopt(model: Model, solver: SolverName, problems: int) -> tuple[dic
     good, in float32; None and the reason where that cannot be."""
     import importlib.util
 
+    from cablejax.cable import Cable
+
     if not problems:
         return None, "IPOPT was not asked."
     if importlib.util.find_spec("ipyopt") is None:
         return None, "IPOPT was not asked: install ipyopt for that."
     if model.config.conditioned:
         return None, "IPOPT was not asked: its problems are for a model that is not told its cable."
+
+    if model.cable.length != Cable.length:
+        return None, f"IPOPT was not asked: its problems are for a cable of {Cable.length:g} m."
 
     import jax
     import numpy as np

@@ -13,6 +13,7 @@ from typing import Any, Literal
 import numpy as np
 
 from cablejax.cable import Cable, Discretisation
+from cablejax.effects.given import GivenEffect
 from cablejax.simulate.equilibrium import FEWEST_LINKS
 from cablejax.simulate.motions import MotionConfig
 
@@ -68,6 +69,7 @@ class DatasetConfig:
     randomisation: Randomisation = dataclasses.field(default_factory=Randomisation)
     engine: Literal["threaded", "mjx"] = "threaded"
     shard_size: int = 32
+    effects: tuple[GivenEffect, ...] = ()
 
     def __post_init__(self):
         for name in ("n_trajectories", "n_steps", "shard_size"):
