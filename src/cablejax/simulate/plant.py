@@ -19,7 +19,6 @@ import numpy as np
 from jaxtyping import Float
 
 from cablejax.cable import GRAVITY, Cable, Discretisation
-from cablejax.effects.given import GivenEffect
 from cablejax.simulate.composite import link_bodies, link_lengths, node_offsets
 from cablejax.simulate.elastica import solve_elastica
 from cablejax.simulate.table_plant import Observation, TablePlant, check_camera
@@ -56,7 +55,6 @@ class PlantConfig:
 
     discretisation: Discretisation = Discretisation(n_links=40, dimension=3, timestep=0.005)
     stiffness_ratio: float = 1.0
-    effects: tuple[GivenEffect, ...] = ()
     cone_ratio: float = 100.0
     contact_time: float = 0.01
     keypoint_noise: float = 0.0
