@@ -131,7 +131,10 @@ def cable_from_fields(fields: Mapping[str, Any], where: str) -> Cable:
     try:
         return Cable(**values)
     except ValueError as error:
-        raise ValueError(f"{where}: {error}") from None
+        text = str(error)
+        for name, key in KEYS.items():
+            text = text.replace(f"Cable.{name} ", f"{key} ")
+        raise ValueError(f"{where}: {text}") from None
 
 
 def _keypoints(fields: Mapping[str, Any], where: str) -> dict[str, Any]:
@@ -159,7 +162,8 @@ def _unknown(key: str) -> str:
     if bare := [known for known in (*NUMBERS, *OTHERS) if known.startswith(f"{key}_")]:
         unit = NUMBERS.get(bare[0], ("", "m", ""))[1]
         return f"{key} without its unit: write {bare[0]}, in {unit}."
-    near = difflib.get_close_matches(key, (*NUMBERS, *OTHERS), 1, 0.5)
+    near = [known for known in NUMBERS if key and key in known]
+    near = near or difflib.get_close_matches(key, (*NUMBERS, *OTHERS), 1, 0.5)
     known = f"Did you mean {near[0]}?" if near else f"Expected {', '.join((*NUMBERS, *OTHERS))}."
     return f"the unknown key {_shown(key)}. {known}"
 

@@ -8,10 +8,10 @@ from jaxtyping import Float
 from cablejax.types import GapLog
 
 REACH = 5.0
-"""Largest distance of a keypoint from the nearer gripper, in lengths of the cable. A metre is added, by which the frames
+"""Largest distance of a keypoint from the nearer gripper, in lengths of the cable. A metre is added, by which the
 of camera and arms may differ."""
 INWARDS = np.radians(120.0)
-"""Median angle between a gripper's tangent and the cable beside it, from which on the tangent points the wrong way."""
+"""Median angle between a gripper's tangent and the cable beside it, at which the tangent points the wrong way."""
 _FEWEST = 5
 _DEGREES_OFF = 0.5
 _DEGREES_BETTER = 3.0

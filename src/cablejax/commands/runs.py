@@ -18,7 +18,7 @@ from cablejax.control.loop import ClosedLoopRun
 from cablejax.control.shaping import Model, shape_once
 from cablejax.control.targets import Target
 from cablejax.dynamics.fingerprint import fingerprint
-from cablejax.effects.given import GivenEffect, with_effects
+from cablejax.effects.given import GivenEffect
 from cablejax.effects.physics import nominal_physics
 from cablejax.json_file import write_json
 from cablejax.perceive.camera import CameraConfig
@@ -177,8 +177,7 @@ _QUANTITIES = {
 
 def _changes(believed: Cable, plant: PlantConfig) -> list[str]:
     """The values that the plant's cable has everywhere and the believed one has not, with their ratio."""
-    chain = Discretisation(plant.cable)
-    ours, theirs = nominal_physics(Discretisation(believed)), with_effects(nominal_physics(chain), plant.effects, chain)
+    ours, theirs = nominal_physics(Discretisation(believed)), plant.physics
     pairs = [(*_QUANTITIES[name], getattr(ours, name), getattr(theirs, name)) for name in _QUANTITIES]
     pairs.append(("diameter", " m", believed.diameter, plant.cable.diameter))
     found = []

@@ -67,7 +67,7 @@ class DatasetConfig:
     motion: MotionConfig = dataclasses.field(default_factory=MotionConfig)
     discretisation: Discretisation = Discretisation()
     randomisation: Randomisation = dataclasses.field(default_factory=Randomisation)
-    engine: Literal["threaded", "mjx"] = "threaded"
+    engine: Literal["threaded", "mjx", "chain"] = "threaded"
     shard_size: int = 32
     effects: tuple[GivenEffect, ...] = ()
 
@@ -79,7 +79,7 @@ class DatasetConfig:
             raise ValueError(f"DatasetConfig.interval is {self.interval}, expected a positive number of seconds.")
         if self.seed < 0:
             raise ValueError(f"DatasetConfig.seed is {self.seed}, expected an integer >= 0.")
-        if self.engine not in ("threaded", "mjx"):
+        if self.engine not in ("threaded", "mjx", "chain"):
             raise ValueError(f"DatasetConfig.engine is {self.engine!r}, expected 'threaded' or 'mjx'.")
         if self.discretisation.dimension != 2:
             raise ValueError(

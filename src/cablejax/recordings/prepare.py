@@ -14,7 +14,6 @@ from cablejax.recordings.poses import poses_from_markers
 from cablejax.recordings.take import Take, typical_spacing
 from cablejax.recordings.units import METRES, metres_per, recognised_unit, require_metres
 
-
 _OUTLIER = 1.5
 """Distance of a keypoint from the median of its sample, in lengths of the cable, from which on it cannot be on it."""
 
