@@ -150,9 +150,12 @@ def about(job: Job) -> str:
     if job.model.effects:
         sentences.append(f"Its training data hold {listed(job.model.effects)}.")
     changes = _changes(believed, plant)
-    sentences.append(f"The plant has {listed(changes) if changes else 'the same values everywhere'}.")
-    for effect in plant.effects:
-        sentences.append(f"Staged in the plant: {EFFECTS[effect.name]} ({effect}).")
+    if changes:
+        sentences.append(f"The plant has {listed(changes)}.")
+    if plant.effects:
+        sentences.append(f"Staged in the plant: {listed([f'{EFFECTS[e.name]} ({e})' for e in plant.effects])}.")
+    if not changes and not plant.effects:
+        sentences.append("The plant has the same cable.")
     sentences.append(
         "The plant touches its table with contact and friction cones, where the training simulator has a smoothed "
         "friction law."
