@@ -29,6 +29,7 @@ from cablejax.simulate import ThreadedEngine
 from cablejax.simulate.elastica import elastica
 from cablejax.simulate.equilibrium import equilibrium_state
 from cablejax.simulate.replay import config_of_log, replay_episode
+from pages import page_of_results, publish
 
 RESOLUTIONS = ((13, 0.02), (17, 0.02), (25, 0.02), (33, 0.02), (49, 0.02), (33, 0.005), (33, 0.01), (33, 0.05))
 SHAPES = (
@@ -98,24 +99,20 @@ def main() -> None:
         )
         print(lines[-1], flush=True)
     default = Discretisation()
-    page = "\n".join(
+    page = page_of_results(
+        "Resolution and time step of the simulator",
+        "`python experiments/02_resolution.py --out docs/results/resolution.md`",
         [
-            "# Resolution and time step of the simulator",
-            "",
-            "Made by `python experiments/02_resolution.py --out docs/results/resolution.md`.",
-            f"MuJoCo {mujoco.__version__}, Python {platform.python_version()}, {platform.machine()}, one core.",
-            "",
             *lines,
             "",
             f"Default: **{default.n_links} links, {1e3 * default.timestep:g} ms**. The error falls with the square of",
             "the link length; at 33 links it is within 1 mm of the exact shape, and replays stay within 1.15 times the",
             "noise. The time step hardly matters up to 50 ms, since friction and damping are implicit; 20 ms keeps a",
             "held end within a few micrometres of its gripper while the cable moves.",
-            "",
-        ]
+        ],
+        made_on=f"MuJoCo {mujoco.__version__}, Python {platform.python_version()}, {platform.machine()}, one core.",
     )
-    if out is not None:
-        out.write_text(page)
+    publish(page, out)
 
 
 if __name__ == "__main__":

@@ -26,9 +26,8 @@ from cablejax.dataset.windows import concatenate, read_trajectories
 from cablejax.dynamics.error_report import MODEL, error_report
 from cablejax.dynamics.evaluate import SNAP_FACTOR, SNAP_MARGIN
 from cablejax.dynamics.weights import load_info, load_weights
-from cablejax.report.markdown import publish
-from cablejax.report.provenance import machine, versions
 from cablejax.types import Trajectory
+from pages import page_of_results, publish
 
 TOGETHER = 8
 
@@ -75,13 +74,10 @@ def main() -> None:
     horizons = report.errors["all windows"][MODEL].horizons
     snaps = ", ".join(f"{100 * f:.1f} % ({h})" for h, f in zip(horizons, report.snapping_fraction(), strict=True))
     sizes = ", ".join(f"{len(part.gripper_twist)} {name}" for name, part in held_out.items())
-    page = "\n".join(
+    page = page_of_results(
+        "Open-loop error of the learned model",
+        "`python experiments/03_model_error.py --out docs/results/model_error.md`",
         [
-            "# Open-loop error of the learned model",
-            "",
-            "Made by `python experiments/03_model_error.py --out docs/results/model_error.md`.",
-            f"{versions()}; {machine()}.",
-            "",
             f"Held-out trajectories: {sizes}; a window starts at every {options.stride}. sample. The model sees "
             f"{config.history} samples and then only the commands. The error of a shape is the root mean square "
             "distance of its keypoints from the simulated ones; the columns are its root mean square, median and "
@@ -95,8 +91,7 @@ def main() -> None:
             f"{100 * SNAP_MARGIN:g} cm. Windows with one, after so many steps: {snaps}.",
             "",
             *report.markdown(),
-            "",
-        ]
+        ],
     )
     publish(page, options.out)
 

@@ -24,9 +24,8 @@ from cablejax.dynamics.autoencoder import PretrainConfig, pretrain
 from cablejax.dynamics.evaluate import OpenLoopError, open_loop_error, prior_motion
 from cablejax.dynamics.train import train
 from cablejax.dynamics.train_config import PRESETS
-from cablejax.report.markdown import publish
-from cablejax.report.provenance import machine, versions
 from cablejax.simulate.motions import MotionConfig
+from pages import page_of_results, publish
 
 TRAIN, HELD_OUT = 100, 10
 
@@ -68,13 +67,10 @@ def main() -> None:
             missed = f"{pretrained.node_error:.2%} of node and {pretrained.edge_error:.2%} of edge features"
         lines.append(row("static prior", open_loop_error(prior_motion(result.model, "static"), held_out, result.model)))
     model = preset.model
-    page = "\n".join(
+    page = page_of_results(
+        "Pretraining of the encoders",
+        "`python experiments/04_pretraining.py --out docs/results/pretraining.md`",
         [
-            "# Pretraining of the encoders",
-            "",
-            "Made by `python experiments/04_pretraining.py --out docs/results/pretraining.md`.",
-            f"{versions()}; {machine()}.",
-            "",
             f"{model.message_passing} message-passing steps of {model.latent}, {options.steps} optimiser steps of "
             f"batch {phases[0].batch} on {TRAIN} trajectories; median (95th percentile) of the open-loop error on "
             f"{HELD_OUT} others [cm]. Pretraining: as many steps before that ({seconds:.0f} s), after which the "
@@ -83,8 +79,7 @@ def main() -> None:
             "| | " + " | ".join(f"after {h}" for h in error.horizons) + " |",
             "| --- |" + " ---: |" * len(error.horizons),
             *lines,
-            "",
-        ]
+        ],
     )
     publish(page, options.out)
 

@@ -32,11 +32,10 @@ from cablejax.dynamics.evaluate import evaluation_windows, no_motion, prior_moti
 from cablejax.dynamics.transfer import on_another_cable
 from cablejax.dynamics.weights import load_info, load_weights
 from cablejax.effects.physics import nominal_physics
-from cablejax.report.markdown import markdown_table, publish
-from cablejax.report.provenance import machine, versions
 from cablejax.simulate import ThreadedEngine
 from cablejax.simulate.equilibrium import angles_of_keypoints
 from cablejax.types import CableState, Trajectory
+from pages import markdown_table, page_of_results, publish
 
 MODELS = {
     "GNS": "gns-reference",
@@ -240,13 +239,10 @@ def main() -> None:
 
     given = of_what_is_given(errors, data, steps, stride)
     worse = {name: np.median(errors[name][:, -1]) / np.median(errors["GNS"][:, -1]) for name in errors}
-    page = "\n".join(
+    page = page_of_results(
+        "Which model of the cable?",
+        f"`python experiments/05_dynamics_models.py{' --full' if options.full else ''}`",
         [
-            "# Which model of the cable?",
-            "",
-            f"Made by `python experiments/05_dynamics_models.py{' --full' if options.full else ''}`.",
-            f"{versions()}; {machine()}.",
-            "",
             f"{len(data.gripper_twist)} held-out trajectories of the released model's data, a window every {stride} "
             "samples. All errors are root mean square keypoint distances in cm; a cell has mean, median and 90th "
             "percentile over windows. The mean is decided by windows in which the cable snaps through or takes the "
@@ -295,8 +291,7 @@ def main() -> None:
             "The first row is the cable that the networks were trained on.",
             "",
             *markdown_table(cables),
-            "",
-        ]
+        ],
     )
     publish(page, options.out)
     if options.out is not None:

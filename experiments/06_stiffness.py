@@ -16,8 +16,8 @@ os.environ.setdefault("NPROC", "4")
 from cablejax.evaluation.cases import STIFFNESS_RATIOS, stiffness_cases
 from cablejax.evaluation.methods import ADAPTED_RESIDUAL, METHODS
 from cablejax.evaluation.paper import DIRECT, RESIDUAL
-from cablejax.evaluation.run import Experiment, Extent, main
 from cablejax.evaluation.suite import PATIENCE
+from closed_loops import Experiment, Extent, main
 
 if __name__ == "__main__":
     main(

@@ -15,7 +15,7 @@ os.environ.setdefault("NPROC", "4")
 from cablejax.evaluation.cases import real_cable_cases
 from cablejax.evaluation.methods import ADAPTED_RESIDUAL, METHODS
 from cablejax.evaluation.paper import DIRECT
-from cablejax.evaluation.run import Experiment, Extent, main
+from closed_loops import Experiment, Extent, main
 
 if __name__ == "__main__":
     main(

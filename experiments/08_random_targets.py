@@ -15,8 +15,8 @@ os.environ.setdefault("NPROC", "4")
 from cablejax.evaluation.cases import random_cases
 from cablejax.evaluation.methods import ADAPTED_RESIDUAL
 from cablejax.evaluation.paper import DIRECT, RESIDUAL
-from cablejax.evaluation.run import Experiment, Extent, main
 from cablejax.evaluation.trials import LIANG_TABLE
+from closed_loops import Experiment, Extent, main
 
 if __name__ == "__main__":
     main(

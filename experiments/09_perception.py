@@ -20,8 +20,6 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-import json
-import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -35,16 +33,16 @@ from cablejax.control.targets import Shape
 from cablejax.effects.physics import nominal_physics
 from cablejax.evaluation.cases import mujoco_plant, stiffness_cases
 from cablejax.evaluation.methods import ADAPTED_RESIDUAL, METHODS
+from cablejax.evaluation.rows import Rows
 from cablejax.evaluation.suite import released, run_case
 from cablejax.perceive import Status, Tracker, TrackerConfig
 from cablejax.perceive.camera import CameraConfig
 from cablejax.perceive.plant import CloudPlant
 from cablejax.perceive.synthetic import Clutter, scatter
-from cablejax.report.markdown import publish
-from cablejax.report.provenance import machine, versions
 from cablejax.report.style import LIGHT
 from cablejax.simulate import ThreadedEngine
 from cablejax.simulate.motions import random_motion
+from pages import markdown_table, page_of_results, publish
 
 HZ = 10
 FINE = 20
@@ -174,27 +172,14 @@ def loop(target_name: Shape, perception: str, seed: int) -> dict[str, Any]:
 
 
 class Kept:
-    """Results of parts that are finished, one JSON file each."""
+    """Results of finished parts, a row each; what is missing is made."""
 
-    def __init__(self, folder: Path):
-        self.folder = folder
-        folder.mkdir(parents=True, exist_ok=True)
+    def __init__(self, path: Path):
+        self.rows = Rows(path, ("part",))
 
     def __call__(self, name: str, make: Callable[[], dict[str, Any]]) -> dict[str, Any]:
-        file = self.folder / f"{name}.json"
-        if not file.exists():
-            began = time.perf_counter()
-            result = make()
-            scratch = file.with_suffix(".part")
-            scratch.write_text(json.dumps(result))
-            scratch.rename(file)
-            print(f"{time.perf_counter() - began:6.1f} s  {name}", file=sys.stderr, flush=True)
-        return json.loads(file.read_text())
-
-
-def table(rows: list[list[str]]) -> list[str]:
-    """Rows of a Markdown table, the first one its header."""
-    return ["| " + " | ".join(row) + " |" for row in [rows[0], ["---"] * len(rows[0]), *rows[1:]]]
+        self.rows.run(self.rows.missing([(name,)]), lambda _: make(), progress=False)
+        return next(row for row in self.rows.read() if row["part"] == name)
 
 
 def accuracy_rows(ours: dict[str, list[dict]], drifts: dict[str, list[dict]]) -> list[list[str]]:
@@ -319,7 +304,7 @@ def main() -> None:
     options = parser.parse_args()
     seeds, seconds = options.seeds or (100 if options.full else 3), 60 if options.full else 10
     drift_seeds, drift_seconds = (min(seeds, 10), 10) if options.full else (1, 6)
-    kept = Kept(options.work)
+    kept = Kept(options.work / "parts.jsonl")
     fast = kept("speed", speed)
     looped = loop_rows(kept) if options.full else []
     ours = {
@@ -339,19 +324,13 @@ def main() -> None:
     cpd_ms = float(np.median([p["frame_cpu_ms"] for parts in drifts.values() for p in parts]))
     settings = TrackerConfig()
     lines = [
-        "# Perception: keypoints from point clouds",
-        "",
-        f"Made by `python experiments/09_perception.py --out docs/results/perception.md --figure "
-        f"docs/images/perception.png{' --full' if options.full else ''}`.",
-        f"{versions()}; {machine()}.",
-        "",
         f"{seeds} cables move at random for {seconds} s each (seeds {FIRST_SEED} to {FIRST_SEED + seeds - 1}), seen at "
         f"{HZ} Hz as {Clutter().points} points with 2 mm of noise in every coordinate unless stated. The hidden "
         "stretch wanders along the cable. Errors are mean distances of the 13 keypoints to the true ones, over frames "
         f"that were not held; a cable is lost if it is off by more than {LOST_MM:.0f} mm in a frame that was not "
         "reported as held, or if it is not seen in the last half second.",
         "",
-        *table(accuracy_rows(ours, drifts)),
+        *markdown_table(accuracy_rows(ours, drifts)),
         "",
         f"CPD: coherent point drift of pycpd 2.0.0, 61 points along the cable, on {drift_seeds} of the cables for "
         f"{drift_seconds} s. It is told the first frame, and its ends are put into the grippers; a cable counts as "
@@ -361,7 +340,7 @@ def main() -> None:
         "",
         "## Speed",
         "",
-        *table(
+        *markdown_table(
             [
                 ["what", "ms", "frames per second"],
                 ["one frame, median", f"{fast['median_ms']:.1f}", f"{1e3 / fast['median_ms']:.0f}"],
@@ -373,10 +352,10 @@ def main() -> None:
         "",
         f"{settings.capacity} points, {settings.registration.n_keypoints} keypoints, {settings.iterations} "
         f"iterations on {settings.registration.n_links} links.",
-        "",
     ]
     if options.full:
         lines += [
+            "",
             "## In the loop",
             "",
             f"Terminal error of the true keypoints after at most {LOOP_STEPS} commands, conditioned network with "
@@ -385,10 +364,11 @@ def main() -> None:
             "Clouds come from the depth camera with its default settings: 20 degrees of tilt, 2 mm of noise, 5 % "
             "dropout, 0.1 % random ranges, both grippers in view.",
             "",
-            *table(looped),
-            "",
+            *markdown_table(looped),
         ]
-    publish("\n".join(lines), options.out)
+    command = "python experiments/09_perception.py --out docs/results/perception.md --figure docs/images/perception.png"
+    made_by = f"`{command}{' --full' if options.full else ''}`"
+    publish(page_of_results("Perception: keypoints from point clouds", made_by, lines), options.out)
     if options.figure is not None:
         draw(options.figure, ours, drifts)
 

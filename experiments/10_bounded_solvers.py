@@ -12,7 +12,6 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import functools
-import json
 import os
 import sys
 import warnings
@@ -36,9 +35,10 @@ from cablejax.bounded import (
     least_squares,
     minimise,
 )
-from cablejax.bounded.problems import BoundedProblem, all_problems
-from cablejax.report.markdown import markdown_table, publish
+from cablejax.evaluation.rows import Rows
 from cablejax.report.provenance import machine, versions
+from pages import markdown_table, page_of_results, publish
+from standard_problems import BoundedProblem, all_problems
 
 TOLERANCE = 1e-10
 """Of ours: largest element of the projected gradient."""
@@ -98,10 +98,17 @@ def derivatives(residuals: Callable | None, function: Callable | None, shape: tu
     return jax.jit(jax.value_and_grad(lambda y: 0.5 * jnp.sum(flat(y) ** 2))), jax.jit(flat), jax.jit(jax.jacfwd(flat))
 
 
-def ours(problem: BoundedProblem, solver: str) -> Run | None:
-    """None where the solver does not apply."""
-    if not problem.is_least_squares and solver not in BY_GRADIENTS:
-        return None
+def applies(solver: str, problem: BoundedProblem) -> bool:
+    """Whether a solver is made for such a problem."""
+    if solver in OURS:
+        return problem.is_least_squares or solver in BY_GRADIENTS
+    if solver in ("scipy trf", "scipy dogbox"):
+        return problem.is_least_squares and problem.is_box
+    return problem.is_box or solver != "scipy L-BFGS-B"
+
+
+def ours(problem: BoundedProblem, solver: str) -> Run:
+    """One of our solvers on a problem that it applies to."""
     solve = compiled(solver, problem.residuals, problem.function)
     out = solve(jnp.asarray(problem.start), problem.feasible())
     said = Result(int(out.result)).name
@@ -109,13 +116,9 @@ def ours(problem: BoundedProblem, solver: str) -> Run | None:
     return verdict(problem, solver, np.asarray(out.value), int(stats.iterations), int(stats.evaluations), said)
 
 
-def scipys(problem: BoundedProblem, solver: str) -> Run | None:
-    """None where the solver does not apply."""
+def scipys(problem: BoundedProblem, solver: str) -> Run:
+    """One of scipy's solvers on a problem that it applies to."""
     method = solver.split()[1]
-    if (method in ("trf", "dogbox") and not (problem.is_least_squares and problem.is_box)) or (
-        method == "L-BFGS-B" and not problem.is_box
-    ):
-        return None
     shape = problem.start.shape
     both, residuals, jacobian = derivatives(problem.residuals, problem.function, shape)
     lower, upper = -np.inf, np.inf
@@ -202,27 +205,21 @@ def verdict(problem: BoundedProblem, solver: str, point: np.ndarray, iterations:
 
 def run_all(problems: list[BoundedProblem], path: Path, solvers: tuple[str, ...]) -> list[Run]:
     """Runs what the file does not have yet."""
-    done = {}
-    if path.is_file():
-        rows = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
-        done = {(row["problem"], row["solver"]): row for row in rows}
-    path.parent.mkdir(parents=True, exist_ok=True)
-    runs = []
+    rows, wanted = Rows(path, ("problem", "solver")), []
     for index, problem in enumerate(problems, 1):
-        for solver in solvers:
-            key = (problem.name, solver)
-            if key not in done:
-                run = (ours if solver in OURS else scipys)(problem, solver)
-                done[key] = {"problem": problem.name, "solver": solver} if run is None else dataclasses.asdict(run)
-                with path.open("a", encoding="utf-8") as file:
-                    file.write(json.dumps(done[key]) + "\n")
-            if "family" in done[key]:
-                runs.append(Run(**done[key]))
-        failed = [run.solver for run in runs if run.problem == problem.name and not run.solved]
+        keys = [(problem.name, solver) for solver in solvers if applies(solver, problem)]
+
+        def run(name: str, solver: str, problem: BoundedProblem = problem):
+            return dataclasses.asdict((ours if solver in OURS else scipys)(problem, solver))
+
+        rows.run(rows.missing(keys), run, progress=False)
+        wanted += keys
+        failed = [row["solver"] for row in rows.read() if row["problem"] == problem.name and not row["solved"]]
         print(f"{index} of {len(problems)} {problem.name}: {', '.join(failed) or 'all'}", file=sys.stderr, flush=True)
         # no problem shares a program with another one, and all of them are more than LLVM's memory for code holds
         jax.clear_caches()
-    return runs
+    by_key = {(row["problem"], row["solver"]): Run(**row) for row in rows.read()}
+    return [by_key[key] for key in wanted]
 
 
 def rates(runs: list[Run]) -> list[list[str]]:
@@ -278,19 +275,16 @@ def failures(runs: list[Run]) -> list[list[str]]:
 
 def page(runs: list[Run], command: str) -> str:
     """The Markdown page."""
-    return "\n".join(
+    return page_of_results(
+        "Bounded solvers on standard problems",
+        f"`{command}`",
         [
-            "# Bounded solvers on standard problems",
-            "",
-            f"Made by `{command}`.",
-            f"{versions()}, scipy {scipy.__version__}; {machine()}.",
-            "",
             f"{len({run.problem for run in runs})} problems in float64, derivatives by JAX, one start each. Success: "
             "feasible to 1e-8 and an objective within 1e-6 of the best known, relative to it (1e-10 where that is 0). "
             f"Ours stop at a projected gradient of {TOLERANCE:g}; scipy's tests on gradient, objective and step are "
             f"set to {TOLERANCE:g}, {TIGHT:g} and {TIGHT:g}, and `least_squares` scales by the Jacobian. At most "
             f"{LEAST_SQUARES_STEPS} steps, {GRADIENT_STEPS} for methods that use gradients only. The families, their "
-            "sources and what the best known values come from are in `src/cablejax/bounded/problems/`. All solvers are "
+            "sources and what the best known values come from are in `experiments/standard_problems/`. All solvers are "
             "local. Where a first version of a problem had a second minimum that chance decided on (Rosenbrock of four "
             "and more variables, Wood, HS2, a rod that had to snap through), its box, start or target was changed "
             "before this table was made, after some of these solvers, ours and scipy's, had failed on it; MGH17 and "
@@ -314,8 +308,8 @@ def page(runs: list[Run], command: str) -> str:
             "Jacobian, one of the others one gradient.",
             "",
             *markdown_table(effort(runs)),
-            "",
-        ]
+        ],
+        made_on=f"{versions()}, scipy {scipy.__version__}; {machine()}.",
     )
 
 

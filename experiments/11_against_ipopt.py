@@ -19,21 +19,19 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-import json
 import os
 import platform
-import time
 from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
 os.environ.setdefault("NPROC", "4")
 
 import jax
 import numpy as np
-from tqdm import tqdm
 
-from cablejax.control.shaping import Model, load_model
-from cablejax.evaluation.against_ipopt import (
+from against_ipopt.control_call import race
+from against_ipopt.judge import (
     ACCURATE,
     POINTS,
     REACH,
@@ -41,15 +39,14 @@ from cablejax.evaluation.against_ipopt import (
     contestant,
     explain,
     judge,
-    kept_rows,
     keypoints_apart,
     kkt_residual,
     meets_all,
+    rows_of,
     slopes_along,
 )
-from cablejax.evaluation.control_call import race
-from cablejax.evaluation.ipopt_page import ipopt_sections
-from cablejax.evaluation.planning_problems import (
+from against_ipopt.page import ipopt_sections
+from against_ipopt.planning_problems import (
     PlanningCase,
     ProblemMaker,
     closed_loop_cases,
@@ -58,10 +55,11 @@ from cablejax.evaluation.planning_problems import (
     random_cases,
     save_cases,
 )
-from cablejax.evaluation.referee import RefereeConfig
+from against_ipopt.referee import RefereeConfig
+from cablejax.control.shaping import Model, load_model
 from cablejax.mpc import SOLVERS
-from cablejax.report.markdown import publish
 from cablejax.report.provenance import machine, versions
+from pages import page_of_results, publish
 
 FOLDER = Path("docs") / "results" / "trials" / "against_ipopt"
 """Problems and rows, kept with the repository: a thousand problems take longer than one sitting."""
@@ -70,7 +68,7 @@ STARTS = 6
 """Further starts, at most, for a problem on which the first does not meet all that is asked."""
 ITERATIONS, EXACT_ITERATIONS = 200, 60
 """Of IPOPT at most, with limited memory and with the exact Hessian, of which one costs as much as ten gradients."""
-CALLS = {name: SOLVERS[name] for name in ("trust-region", "deadline")}
+CALLS = {name: SOLVERS[name] for name in ("levenberg-marquardt", "two-trials")}
 """What a control call solves with."""
 
 
@@ -89,86 +87,76 @@ def referees(exact: bool) -> list[RefereeConfig]:
 
 
 def run(
-    ours: Contestant, cases: list[PlanningCase], path: Path, n_exact: int, process: tuple[int, int], seconds: float
+    ours: Contestant, cases: list[PlanningCase], folder: Path, n_exact: int, process: tuple[int, int], seconds: float
 ) -> None:
-    """Judges what the file does not have yet, until the time is up."""
-    done = {row["name"]: "exact" in row for row in kept_rows(path.parent)}
-    index, count = process
-    wanted = [(case, i < n_exact) for i, case in enumerate(cases) if i % count == index]
+    """Judges what has no row yet, until the time is up."""
+    rows, by_name = rows_of(folder), {case.name: case for case in cases}
+    exact = {case.name for case in cases[:n_exact]}
     # with the exact Hessian again where that was not asked for before
-    todo = [(case, exact) for case, exact in wanted if case.name not in done or (exact and not done[case.name])]
-    began = time.perf_counter()
-    for exact in {exact for _, exact in todo}:
+    short = {row["name"] for row in rows.read() if "exact" not in row} & exact
+    wanted = [(case.name,) for case in cases]
+    missing = set(rows.missing(wanted)) | {(name,) for name in short}
+    todo = [key for key in wanted[process[0] :: process[1]] if key in missing]
+    for flag in {name in exact for (name,) in todo}:
         # Compiles, so that no clock below sees that.
-        judge(
-            ours, todo[0][0], [dataclasses.replace(config, max_iterations=2) for config in referees(exact)], gradients=2
-        )
-    for case, exact in tqdm(todo, unit="problem", dynamic_ncols=True):
-        if time.perf_counter() - began > seconds:
-            break
-        with path.open("a", encoding="utf-8") as file:
-            row = judge(ours, case, referees(exact))
-            file.write(json.dumps({**row, "machine": machine(), "threads": os.environ["NPROC"]}) + "\n")
+        few = [dataclasses.replace(config, max_iterations=2) for config in referees(flag)]
+        judge(ours, by_name[todo[0][0]], few, gradients=2)
+
+    def judged(name: str) -> dict[str, Any]:
+        row = judge(ours, by_name[name], referees(name in exact))
+        return {**row, "machine": machine(), "threads": os.environ["NPROC"]}
+
+    rows.run(todo, judged, seconds=seconds)
 
 
 def explain_all(ours: Contestant, cases: list[PlanningCase], folder: Path, seconds: float) -> None:
     """Explains what is not explained yet, until the time is up."""
-    known, by_name = {row["name"] for row in kept_rows(folder, "explained")}, {case.name: case for case in cases}
-    todo = [row for row in kept_rows(folder) if not meets_all(row, row) and row["name"] not in known]
-    began = time.perf_counter()
-    for row in tqdm(todo, unit="problem", dynamic_ncols=True):
-        if time.perf_counter() - began > seconds:
-            break
-        with (folder / "explained-0.jsonl").open("a", encoding="utf-8") as file:
-            file.write(json.dumps(explain(ours, by_name[row["name"]], row, STARTS)) + "\n")
+    explained, by_name = rows_of(folder, "explained"), {case.name: case for case in cases}
+    short = {row["name"]: row for row in rows_of(folder).read() if not meets_all(row, row)}
+    todo = explained.missing((name,) for name in short)
+    explained.run(todo, lambda name: explain(ours, by_name[name], short[name], STARTS), seconds=seconds)
 
 
 def measure_kinks(ours: Contestant, cases: list[PlanningCase], folder: Path, n: int) -> None:
     """What the corners do to the slope, and to where our solver ends, on the first problems that are judged."""
-    done, by_name = {row["name"] for row in kept_rows(folder, "kinks")}, {case.name: case for case in cases}
-    for row in tqdm(kept_rows(folder)[:n], unit="problem", dynamic_ncols=True):
-        if row["name"] in done:
-            continue
-        case, found = by_name[row["name"]], {}
+    kinks, by_name = rows_of(folder, "kinks"), {case.name: case for case in cases}
+    judged = {row["name"]: row for row in rows_of(folder).read()[:n]}
+
+    def measured(name: str) -> dict[str, Any]:
+        case, row, found = by_name[name], judged[name], {}
         for kind, make in (("sharp", ours.make_sharp), ("smooth", ours.make)):
-            problem, rng = make(case), np.random.default_rng([len(case.name), 13])
+            problem, rng = make(case), np.random.default_rng([len(name), 13])
             changes = np.abs(np.diff(slopes_along(problem, np.asarray(row["motion"]), rng, REACH, POINTS)))
             end = ours.find(problem, case.guess, ACCURATE.gradients).points[-1] if kind == "sharp" else None
             kkt = row["kkt"] if end is None else kkt_residual(problem, end)
             found[kind] = {"jump": float(changes.max()), "usual": float(np.median(changes)), "kkt": kkt}
-        found["apart"] = keypoints_apart(ours.make_sharp(case), ours.make(case), np.asarray(row["motion"]))
-        with (folder / "kinks-0.jsonl").open("a", encoding="utf-8") as file:
-            file.write(json.dumps({"name": row["name"], **found}) + "\n")
+        apart = keypoints_apart(ours.make_sharp(case), ours.make(case), np.asarray(row["motion"]))
+        return {**found, "apart": apart}
+
+    kinks.run(kinks.missing((name,) for name in judged), measured)
 
 
 def time_calls(model: Model, cases: list[PlanningCase], folder: Path) -> None:
     """A control call's solve and IPOPT until it is as good, on the first problems, in single precision."""
-    done = {row["name"] for row in kept_rows(folder, "calls")}
+    calls, by_name = rows_of(folder, "calls"), {case.name: case for case in cases}
     with jax.enable_x64(False):
         make = ProblemMaker(model, np.float32)
         race(make, cases[0], CALLS, RefereeConfig(max_iterations=2))  # compiles, so that no clock below sees that
-        for case in tqdm([case for case in cases if case.name not in done], unit="problem", dynamic_ncols=True):
-            with (folder / "calls-0.jsonl").open("a", encoding="utf-8") as file:
-                file.write(json.dumps({**race(make, case, CALLS), "machine": machine()}) + "\n")
+        todo = calls.missing((name,) for name in by_name)
+        calls.run(todo, lambda name: {**race(make, by_name[name], CALLS), "machine": machine()})
 
 
 def page(options: argparse.Namespace, folder: Path, n_all: int) -> str:
     """The Markdown page of what is done."""
-    rows, kinks, calls = (kept_rows(folder, kind) for kind in ("rows", "kinks", "calls"))
-    explained = {row["name"]: row for row in kept_rows(folder, "explained")}
+    rows, kinks, calls, explanations = (rows_of(folder, k).read() for k in ("rows", "kinks", "calls", "explained"))
+    explained = {row["name"]: row for row in explanations}
     n_exact = sum("exact" in row for row in rows)
     done = f"`--draw`, `--n {len(rows)} --exact {n_exact}`"
-    for rows_of, option in ((explained, "explain"), (kinks, f"kinks {len(kinks)}"), (calls, f"calls {len(calls)}")):
-        done += f", `--{option}`" if rows_of else ""
+    for finished, option in ((explained, "explain"), (kinks, f"kinks {len(kinks)}"), (calls, f"calls {len(calls)}")):
+        done += f", `--{option}`" if finished else ""
     weights = "" if options.weights == RELEASED else f" --weights {options.weights}"
+    machines = ", ".join(sorted({row["machine"] for row in rows}))
     lines = [
-        "# Against IPOPT",
-        "",
-        f"Made by `python experiments/11_against_ipopt.py{weights} --report {options.report}`, after {done}.",
-        f"{versions()}, ipyopt {version('ipyopt')}; {', '.join(sorted({row['machine'] for row in rows}))}; "
-        f"{platform.machine()}, NPROC={'/'.join(sorted({row['threads'] for row in rows}))}. The machine had other work "
-        "to do meanwhile: seconds are long, and say something only beside each other.",
-        "",
         f"{len(rows)} of {n_all} problems, in a random order, seed 0; {n_exact} of them with the exact Hessian too. "
         f"Network {options.weights}, the corners of its ReLUs rounded, with the residual fitted online, horizon 5, "
         f"36 unknowns, float64. Ours: `mpc.{ACCURATE}`. "
@@ -178,7 +166,14 @@ def page(options: argparse.Namespace, folder: Path, n_all: int) -> str:
         "",
         *ipopt_sections(rows, explained, kinks, calls, tuple(CALLS)),
     ]
-    return "\n".join(lines)
+    return page_of_results(
+        "Against IPOPT",
+        f"`python experiments/11_against_ipopt.py{weights} --report {options.report}`, after {done}",
+        lines,
+        made_on=f"{versions()}, ipyopt {version('ipyopt')}; {machines}; {platform.machine()}, "
+        f"NPROC={'/'.join(sorted({row['threads'] for row in rows}))}. The machine had other work to do meanwhile: "
+        "seconds are long, and say something only beside each other.",
+    )
 
 
 def main() -> None:
@@ -218,8 +213,7 @@ def main() -> None:
         measure_kinks(ours, cases, folder, options.kinks)
         return
     if options.report is None:
-        path = folder / f"rows-{options.process[0]}.jsonl"
-        run(ours, cases[: options.n], path, options.exact, tuple(options.process), options.seconds)
+        run(ours, cases[: options.n], folder, options.exact, tuple(options.process), options.seconds)
     text = page(options, folder, len(cases))
     publish(text, options.report)
 

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-import json
 import os
 from pathlib import Path
 
@@ -22,18 +21,17 @@ import jax
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.ticker import FixedLocator, NullFormatter
-from tqdm import tqdm
 
 from cablejax.control.loop import run_closed_loop
 from cablejax.control.shaping import load_model
 from cablejax.evaluation.cases import PLANT_CHAIN, mujoco_plant
 from cablejax.evaluation.protocols import LaidOut, letter_task
-from cablejax.mpc import MPC, SOLVERS, MPCConfig, TrustRegion
-from cablejax.report.markdown import markdown_table, publish
-from cablejax.report.provenance import machine, versions
+from cablejax.evaluation.rows import Rows
+from cablejax.mpc import MPC, SOLVERS, LevenbergMarquardt, MPCConfig
+from pages import markdown_table, page_of_results, publish
 
-CONVERGED = "trust-region, converged"
-PLANNERS = {**SOLVERS, CONVERGED: TrustRegion(max_iterations=12, trials_per_linearisation=1)}
+CONVERGED = "levenberg-marquardt, converged"
+PLANNERS = {**SOLVERS, CONVERGED: LevenbergMarquardt(max_iterations=12, trials_per_linearisation=1)}
 HORIZONS = (1, 2, 5, 10)
 SHAPES = ("U", "S", "Z")
 STIFFNESS = 2.0
@@ -63,6 +61,9 @@ class Trial:
         return self.solver, self.horizon, self.shape, self.seed
 
 
+KEY = ("solver", "horizon", "shape", "seed")
+
+
 def run(model, solver: str, horizon: int, shape: str, seed: int) -> Trial:
     """One of them; what is compiled is kept for the next target."""
     task = letter_task(shape, seed, PLANT_CHAIN)
@@ -75,24 +76,14 @@ def run(model, solver: str, horizon: int, shape: str, seed: int) -> Trial:
     return Trial(solver, horizon, shape, seed, *values)
 
 
-def read(path: Path) -> list[Trial]:
-    if not path.is_file():
-        return []
-    return [Trial(**json.loads(line)) for line in path.read_text(encoding="utf-8").splitlines()]
-
-
 def run_all(path: Path, wanted: list[tuple]) -> None:
     """Runs what the file does not have yet."""
-    model, done = load_model("gns-reference"), {trial.key for trial in read(path)}
-    path.parent.mkdir(parents=True, exist_ok=True)
-    compiled = None
-    for key in tqdm([key for key in wanted if key not in done], unit="run", dynamic_ncols=True):
-        if key[:2] != compiled:
-            # some twenty compiled controllers are more than LLVM's memory for code holds
-            jax.clear_caches()
-            compiled = key[:2]
-        with path.open("a", encoding="utf-8") as file:
-            file.write(json.dumps(dataclasses.asdict(run(model, *key))) + "\n")
+    model, rows = load_model("gns-reference"), Rows(path, KEY)
+    todo = rows.missing(wanted)
+    for pair in dict.fromkeys(key[:2] for key in todo):
+        # some twenty compiled controllers are more than LLVM's memory for code holds
+        jax.clear_caches()
+        rows.run([key for key in todo if key[:2] == pair], lambda *key: dataclasses.asdict(run(model, *key)))
 
 
 def cells(trials: list[Trial]) -> dict[tuple[str, int], dict[str, float]]:
@@ -144,11 +135,6 @@ def draw(table: dict, path: Path) -> None:
 def page(trials: list[Trial], table: dict, picture: str | None) -> str:
     """The Markdown page."""
     lines = [
-        "# Horizon and solver",
-        "",
-        "Made by `python experiments/12_horizon_and_solver.py --report docs/results/horizon_and_solver.md`.",
-        f"{versions()}; {machine()}.",
-        "",
         f"{len(trials)} closed loops: a straight cable, {STIFFNESS:g} times as stiff as the trained one, brought to "
         f"{', '.join(sorted({t.shape for t in trials}))} by {STEPS} commands on the contact plant; seeds "
         f"{', '.join(map(str, sorted({t.seed for t in trials})))}; gns-reference with the online residual. A horizon h "
@@ -180,9 +166,9 @@ def page(trials: list[Trial], table: dict, picture: str | None) -> str:
         ),
     ]
     slow = table.get((CONVERGED, MPCConfig().horizon))
-    fast = [(h, table["deadline", h]) for h in HORIZONS if ("deadline", h) in table]
+    fast = [(h, table["two-trials", h]) for h in HORIZONS if ("two-trials", h) in table]
     if slow and fast:
-        lines += ["", "## Deadline mode against converged", ""]
+        lines += ["", "## Two trials against converged", ""]
         lines += [
             f"- horizon {h}: {cell['error']:.3f} cm in {cell['p50']:.0f} ms, p95 {cell['p95']:.0f} ms, against "
             f"{slow['error']:.3f} cm in {slow['p50']:.0f} ms ({100 * (cell['error'] / slow['error'] - 1):+.0f} %)"
@@ -197,7 +183,8 @@ def page(trials: list[Trial], table: dict, picture: str | None) -> str:
         for t in sorted(trials, key=lambda t: t.key)
     ]
     lines += ["", "## Every run", "", *markdown_table(rows)]
-    return "\n".join([*lines, ""])
+    command = "python experiments/12_horizon_and_solver.py --report docs/results/horizon_and_solver.md"
+    return page_of_results("Horizon and solver", f"`{command}`", lines)
 
 
 def main() -> None:
@@ -218,7 +205,7 @@ def main() -> None:
             for shape in options.shapes
         ]
         run_all(options.cache, wanted)
-    trials = read(options.cache)
+    trials = [Trial(**row) for row in Rows(options.cache, KEY).read()]
     table = cells(trials)
     picture = None
     if options.report is not None:

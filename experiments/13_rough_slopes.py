@@ -1,7 +1,8 @@
 """Are slopes in bfloat16 harmless? The same plans with exact and with rough slopes: objective, Jacobian, time.
 
 The planning problems are those of experiments/11_against_ipopt.py: what the controller asked its solver for on the way
-to U, S and Z, the same with other step bounds, and random shapes. Float32, the default solver and the deadline one.
+to U, S and Z, the same with other step bounds, and random shapes. Float32, the default solver, and the same with two
+trials.
 
     python experiments/13_rough_slopes.py                                  # the first 100 problems: some minutes
     python experiments/13_rough_slopes.py --out docs/results/rough_slopes.md
@@ -22,15 +23,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from against_ipopt.planning_problems import ProblemMaker, load_cases
 from cablejax.control.shaping import load_model
-from cablejax.evaluation.planning_problems import ProblemMaker, load_cases
 from cablejax.mpc import SOLVERS
-from cablejax.report.markdown import markdown_table, publish
-from cablejax.report.provenance import machine, versions
 from cablejax.residual import Dynamics
+from pages import markdown_table, page_of_results, publish
 
 CASES = Path("docs") / "results" / "trials" / "against_ipopt" / "cases.npz"
-PLANNERS = ("trust-region", "deadline")
+PLANNERS = ("levenberg-marquardt", "two-trials")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -94,13 +94,10 @@ def main() -> None:
         else:
             change = value_r / value_e - 1
             rows.append([name, *cells, quantiles(change), f"{(change < 0).sum()} / {(change > 0).sum()}"])
-    page = "\n".join(
+    page = page_of_results(
+        "Slopes in bfloat16",
+        f"`python experiments/13_rough_slopes.py --n {options.n} --weights {options.weights}`",
         [
-            "# Slopes in bfloat16",
-            "",
-            f"Made by `python experiments/13_rough_slopes.py --n {options.n} --weights {options.weights}`.",
-            f"{versions()}; {machine()}.",
-            "",
             f"{options.n} planning problems, {model.name} with the residual fitted online, horizon 5, float32. Both "
             "kinds take turns, so what else the machine does hits both. Exact is `jax.jacrev` of the whole model, "
             "which has cotangents of the held keypoints besides. The difference is that of the Jacobian, "
@@ -108,8 +105,7 @@ def main() -> None:
             "the plan with rough slopes is better.",
             "",
             *markdown_table(rows),
-            "",
-        ]
+        ],
     )
     publish(page, options.out)
 

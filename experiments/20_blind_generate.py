@@ -1,10 +1,10 @@
 """Makes cable logs whose cause is withheld, and locks what is true of them.
 
-python experiments/20_blind_generate.py --plan small --out DIR --labels DIR       # five cases, a quarter of a minute
-python experiments/20_blind_generate.py --plan stored --out DIR --labels DIR      # 155 cases, resumable, half an hour
-python experiments/20_blind_generate.py ... --family A --process 0 2              # shares the work
+python experiments/20_blind_generate.py --plan small --out DIR --labels LABELS.jsonl --hashes SET.jsonl    # five cases
+python experiments/20_blind_generate.py --plan stored ...                      # 155 cases, resumable, half an hour
+python experiments/20_blind_generate.py ... --family A --process 0 2           # shares the work
 
-Writes `<8 hex>.npz` to --out, `locked/<8 hex>.json` and `hashes.json` to --labels. The hashes are published before any
+Writes `<8 hex>.npz` to --out, a row per case to --labels, and its hash to --hashes. The hashes are published before any
 diagnosis runs, the labels after it. Same seed, same logs.
 """
 
@@ -21,7 +21,7 @@ from blind.cases import make_case
 from blind.families import FAMILIES
 from blind.plan import PLANS
 from blind.record import Unreachable
-from blind.store import is_done, publish_hashes, read_labels, write_case, write_open_labels
+from blind.store import checked_labels, is_done, publish_hashes, read_cases, write_case, write_open_labels
 
 
 def main() -> None:
@@ -29,7 +29,8 @@ def main() -> None:
     parser.add_argument("--plan", choices=PLANS, default="small")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--out", type=pathlib.Path, required=True, help="folder of the logs")
-    parser.add_argument("--labels", type=pathlib.Path, required=True, help="folder of the locked labels and the hashes")
+    parser.add_argument("--labels", type=pathlib.Path, required=True, help="file of the labels, not to be shown")
+    parser.add_argument("--hashes", type=pathlib.Path, required=True, help="file of the set, which gets the hashes")
     parser.add_argument("--family", default="ABC", help="letters of the families to make now")
     parser.add_argument(
         "--process", type=int, nargs=2, metavar=("I", "N"), default=(0, 1), help="this is process I of N"
@@ -52,7 +53,7 @@ def main() -> None:
                     options.out,
                     options.labels,
                 )
-                publish_hashes(options.labels)
+                publish_hashes(options.labels, options.hashes)
                 made += 1
             except Unreachable as error:
                 failed.append(case.index)
@@ -62,9 +63,9 @@ def main() -> None:
         line = f"{number}/{len(mine)} of families {options.family}, {seconds:.0f} s, {len(failed)} not possible"
         print(line, flush=True)
         (options.out / "STATUS.txt").write_text(line + "\n")
-    total = publish_hashes(options.labels)
+    total = publish_hashes(options.labels, options.hashes)
     if options.open_labels:
-        write_open_labels(options.out, read_labels(options.labels))
+        write_open_labels(options.out, checked_labels(read_cases([options.labels, options.hashes])))
     print(f"{made} cases made, {total} in {options.labels}; not possible: {failed}")
 
 

@@ -34,11 +34,10 @@ from cablejax.evaluation.fine_tuning import FineTuneConfig, fine_tune
 from cablejax.evaluation.methods import MethodSpec
 from cablejax.evaluation.suite import Case, read_suite, run_suite
 from cablejax.gaplog import gap_log_from_episodes, read_gap_log, write_gap_log
-from cablejax.report.markdown import publish
-from cablejax.report.provenance import machine, versions
 from cablejax.simulate import ThreadedEngine
 from cablejax.simulate.motions import MotionConfig, random_motion
 from cablejax.types import Trajectory
+from pages import page_of_results, publish
 
 RATIO = 0.1
 LOG_SEEDS, TASK_SEEDS = (100, 101), (0, 1, 2)
@@ -102,7 +101,7 @@ def recorded():
     model, episodes = load_model("gns-reference"), []
     for case in stiffness_cases("USZ", (RATIO,), LOG_SEEDS):
         task, plant = case.task(), mujoco_plant(RATIO)
-        controller = make_controller(model, task.target, method="direct", solver="trust-region")
+        controller = make_controller(model, task.target, method="direct", solver="levenberg-marquardt")
         run = run_closed_loop(plant, controller, task.target, 30, start=task.start_pose, record_hz=10.0)
         rng = np.random.default_rng((case.seed, len(episodes)))
         noisy = run.episode.keypoints + rng.normal(0.0, NOISE, run.episode.keypoints.shape)
@@ -130,11 +129,6 @@ def page(out: pathlib.Path, verdict: dict) -> str:
         for e in verdict["effects"]
     )
     lines = [
-        "# What a diagnosis is worth",
-        "",
-        "Made by `python experiments/23_worth.py --report docs/results/worth.md`.",
-        f"{versions()}; {machine()}.",
-        "",
         f"The plant's cable has {RATIO:g} times the believed stiffness. Verdict on six logged runs by direct transfer "
         f"(seeds {LOG_SEEDS}, 1 mm noise): **{verdict['verdict']}**, {effects or 'nothing'}; cannot be told apart: "
         f"{verdict['equivalent']}. The network was fine-tuned on 2,000 transitions of the simulator with that effect "
@@ -150,7 +144,8 @@ def page(out: pathlib.Path, verdict: dict) -> str:
             errors = [t.terminal_error_cm for t in trials if t.method == spec.name and t.scenario == shape]
             cells.append(f"{np.mean(errors):.2f} ± {np.std(errors):.2f} ({len(errors)})" if errors else "")
         lines.append(f"| {label} | {' | '.join(cells)} |")
-    return "\n".join([*lines, ""])
+    command = "python experiments/23_worth.py --report docs/results/worth.md"
+    return page_of_results("What a diagnosis is worth", f"`{command}`", lines)
 
 
 if __name__ == "__main__":

@@ -11,16 +11,17 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-import json
 import math
 import pathlib
 import sys
 
 import matplotlib
 
+from cablejax.evaluation.rows import Rows
 from cablejax.recordings.deform import read_deform
 from cablejax.report.provenance import machine, versions
-from cablejax.spatial.benchmark import score_cable
+from pages import publish
+from real_cables.benchmark import score_cable
 
 CABLES = ("DLO1", "DLO2", "DLO3")
 _NINETY = 1.645
@@ -41,24 +42,23 @@ def main() -> None:
     parser.add_argument("--cache", type=pathlib.Path, default=pathlib.Path("runs/real_cables"))
     parser.add_argument("--out", type=pathlib.Path, default=pathlib.Path("docs/results/real_cables.md"))
     arguments = parser.parse_args()
-    arguments.cache.mkdir(parents=True, exist_ok=True)
-    scores = {}
-    for cable in CABLES:
-        kept = arguments.cache / f"{cable}.json"
-        if not kept.exists():
-            score = score_cable(
-                read_deform(arguments.data / f"{cable}.npz"),
-                state=arguments.cache,
-                progress=lambda text, cable=cable: print(f"{cable}: {text}", file=sys.stderr, flush=True),
-            )
-            kept.write_text(json.dumps(dataclasses.asdict(score), indent=1))
-        scores[cable] = json.loads(kept.read_text())
-    arguments.out.parent.mkdir(parents=True, exist_ok=True)
+
+    def scored(cable: str):
+        recordings = read_deform(arguments.data / f"{cable}.npz")
+        score = score_cable(
+            recordings,
+            state=arguments.cache,
+            progress=lambda text: print(f"{cable}: {text}", file=sys.stderr, flush=True),
+        )
+        return dataclasses.asdict(score)
+
+    rows = Rows(arguments.cache / "scores.jsonl", ("cable",))
+    rows.run(rows.missing([(cable,) for cable in CABLES]), scored)
+    scores = {row["cable"]: row for row in rows.read()}
     picture = arguments.out.parent.parent / "images" / "real_cables.png"
     picture.parent.mkdir(parents=True, exist_ok=True)
     _figure(scores, picture)
-    arguments.out.write_text(_page(scores))
-    print(arguments.out)
+    publish(_page(scores), arguments.out)
 
 
 def _figure(scores, path: pathlib.Path) -> None:

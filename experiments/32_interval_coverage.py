@@ -16,7 +16,6 @@ import argparse
 import collections
 import dataclasses
 import itertools
-import json
 import math
 import os
 import sys
@@ -28,17 +27,18 @@ os.environ.setdefault("NPROC", "4")
 import numpy as np
 from scipy.stats import norm
 
+from cablejax.evaluation.rows import Rows
 from cablejax.evaluation.statistics import clopper_pearson
 from cablejax.recordings.deform import NOMINAL, SAMPLE_INTERVAL
-from cablejax.report.markdown import markdown_table
 from cablejax.report.provenance import machine, versions
-from cablejax.spatial.benchmark import protocol_windows
 from cablejax.spatial.estimate import UNMODELLED, Estimate, Interval, estimate, estimates_of_halves
 from cablejax.spatial.identify import Identified, identify
 from cablejax.spatial.named import parameters_of
-from cablejax.spatial.newton import improve, jackknife
-from cablejax.spatial.synthetic import RECORDINGS, SAMPLES, Law, SyntheticCable, synthetic_recordings
+from cablejax.spatial.newton import fit_at, jackknife
 from cablejax.spatial.windows import Windows
+from pages import markdown_table, publish
+from real_cables.benchmark import protocol_windows
+from real_cables.synthetic import RECORDINGS, SAMPLES, Law, SyntheticCable, synthetic_recordings
 
 TOLD = {
     "bending_damping": "time_s",
@@ -150,14 +150,8 @@ def jackknifed(found: Identified, half: int, windows: Windows) -> list[float]:
     """EI / rho of a half with the effects that stayed, and its interval from the jackknife alone."""
     layout, values = found.simulator.layout, found.half_values[half]
     part = windows.chosen(np.flatnonzero((found.first, ~found.first)[half]))
-    fit = improve(found.simulator, values, found.effects, part, iterations=0)
+    fit = fit_at(found.simulator, values, found.effects, part)
     return told(Estimate(layout, values.shared, jackknife(fit, layout), np.zeros((layout.size,) * 2)).stiffness)
-
-
-def read(path: Path) -> list[Row]:
-    if not path.is_file():
-        return []
-    return [Row(**json.loads(line)) for line in path.read_text(encoding="utf-8").splitlines()]
 
 
 def main() -> None:
@@ -168,22 +162,18 @@ def main() -> None:
     parser.add_argument("--calibrate", action="store_true", help="print what the cables that are done make UNMODELLED")
     parser.add_argument("--report", type=Path, help="only write the page of the cables that are done")
     options = parser.parse_args()
+    rows = Rows(options.trials, ("seed", "law"))
+    done = [Row(**row) for row in rows.read()]
     if options.report:
-        options.report.write_text(page(read(options.trials)), encoding="utf-8")
-        print(options.report)
+        publish(page(done), options.report)
         return
     if options.calibrate:
-        rows = [row for row in read(options.trials) if calibrates(row) and row.law == "richer"]
+        rows = [row for row in done if calibrates(row) and row.law == "richer"]
         for name in (STIFFNESS, *rows[0].others):
             print(f"{name}: {besides([with_truth(row, name) for row in rows], angle=is_angle(name)):.3f}")
         return
-    done = {(row.seed, row.law) for row in read(options.trials)}
-    for seed, law in itertools.product(range(options.cables), LAWS):
-        if (seed, law) in done:
-            continue
-        row = trial(seed, law, options.cache)
-        with options.trials.open("a", encoding="utf-8") as file:
-            file.write(json.dumps(dataclasses.asdict(row)) + "\n")
+    wanted = itertools.product(range(options.cables), LAWS)
+    rows.run(rows.missing(wanted), lambda seed, law: dataclasses.asdict(trial(seed, law, options.cache)))
 
 
 def calibrates(row: Row) -> bool:

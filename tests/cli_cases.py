@@ -9,7 +9,7 @@ from flax import nnx
 
 from cablejax.cable import Cable
 from cablejax.cable_file import cable_to_fields
-from cablejax.control.loop import ClosedLoopRun, shape_error_cm
+from cablejax.control.run import ClosedLoopRun, shape_error_cm
 from cablejax.control.targets import Target
 from cablejax.dynamics.config import ModelConfig
 from cablejax.dynamics.gns import GNS

@@ -13,11 +13,11 @@ import numpy as np
 from jaxtyping import Float
 
 from cablejax.cable import Cable, Discretisation
-from cablejax.diagnose import LIBRARY, Context, Effect
+from cablejax.diagnose import LIBRARY, CableEffect, explanation
 from cablejax.diagnose.case import FINE_LINKS
-from cablejax.diagnose.fit import Evidence, candidate
+from cablejax.diagnose.evidence import Evidence
+from cablejax.diagnose.planar import PlanarCable, physics_of
 from cablejax.diagnose.playback import Playback
-from cablejax.diagnose.screen import residual_of
 from cablejax.gaplog import Episode, gap_log_from_episodes
 from cablejax.simulate.chain.step import FINE_STEP, LARGEST_STEP
 from cablejax.types import GapLog
@@ -69,8 +69,8 @@ def playback(n_links: int) -> Playback:
     return Playback.of_motion(config, motions, None, np.full(len(MOTIONS), INTERVAL), step)
 
 
-def parts(*effects: tuple[str, Any]) -> list[tuple[Effect, int, Sequence[float]]]:
-    """(name, values) or (name, variant, values) as `candidate` takes them."""
+def parts(*effects: tuple[str, Any]) -> list[tuple[CableEffect, int, Sequence[float]]]:
+    """(name, values) or (name, variant, values) as `explanation` takes them."""
     return [(BY_NAME[e[0]], e[1] if len(e) == 3 else 0, e[-1]) for e in effects]
 
 
@@ -78,7 +78,18 @@ def parts(*effects: tuple[str, Any]) -> list[tuple[Effect, int, Sequence[float]]
 def clean(*effects: tuple[Any, ...], n_links: int = FINE_LINKS) -> Float[np.ndarray, "E T N 2"]:
     """Keypoints without noise [m]; `effects` as for `parts`, with tuples throughout."""
     player = playback(n_links)
-    return player.keypoints([candidate(*parts(*effects)).physics(player.believed, player.config)])[0]
+    return player.keypoints([physics_of(explanation(*parts(*effects)), player.believed, player.config)])[0]
+
+
+def simulator(n_links: int, effects: Sequence[CableEffect] = LIBRARY) -> PlanarCable:
+    """The cable of the four motions, exact at its resolution."""
+    return PlanarCable(
+        effects=effects,
+        playback=playback(n_links),
+        correction=np.zeros((len(MOTIONS), 1, 1, 1)),
+        duration=INTERVAL * SAMPLES,
+        max_curvature=np.full(len(MOTIONS), 6.0),
+    )
 
 
 def noise(shape: Sequence[int], noise_mm: float, seed: int) -> np.ndarray:
@@ -96,24 +107,14 @@ def evidence_of(
 ) -> Evidence:
     """The same for keypoints without noise [m] that the simulator gave at this resolution."""
     return Evidence(
-        playback=playback(n_links),
-        target=points + noise(points.shape, noise_mm, seed),
-        noise=np.full(points.shape[2], 1e-3 * noise_mm),
+        simulator=simulator(n_links),
+        episodes=np.arange(len(points)),
+        observed=points + noise(points.shape, noise_mm, seed),
+        nominal=clean(n_links=n_links).astype(float),
+        noise=np.full((points.shape[2], 1), 1e-3 * noise_mm),
         temper=np.ones(len(points)),
         freedom=1e6,
         motion=np.arange(len(points)),
-    )
-
-
-def context(facts: Evidence) -> Context:
-    """What is known before any fit: the nominal cable and how the log differs from it."""
-    residual = residual_of(facts, candidate())
-    return Context(
-        config=facts.playback.config,
-        keypoints=facts.target - residual,
-        residual=residual,
-        duration=INTERVAL * SAMPLES,
-        max_curvature=np.full(len(facts.target), 6.0),
     )
 
 

@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 import numpy as np
 
-from cablejax.evaluation.planning_problems import PlanningCase
+from against_ipopt.planning_problems import PlanningCase
 from cablejax.mpc.feasible import FeasibleSet
 from cablejax.mpc.problem import ObjectiveConfig, ShapingProblem
 from cablejax.types import History

@@ -3,13 +3,9 @@
 import collections
 import dataclasses
 import json
-import pathlib
-import sys
 
 import numpy as np
 import pytest
-
-sys.path.insert(0, str(pathlib.Path(__file__).parents[1] / "experiments"))
 
 from blind.cases import make_case
 from blind.effects import EFFECTS, SPECIFIED, Setup
@@ -19,10 +15,10 @@ from blind.plan import B_EFFECTS, C_EFFECTS, Case, development_plan, stored_plan
 from blind.record import FRAME, FRAMES, context_of, family_a, gap, quick, record
 from blind.rod import Motion, RodConfig, simulate
 from blind.severity import search
-from blind.store import is_done, publish_hashes, read_labels, write_case
+from blind.store import checked_labels, is_done, publish_hashes, read_cases, write_case
 from blind.unknown import UNSPECIFIED
 from blind.world import World
-
+from cablejax.evaluation.rows import read_rows
 from cablejax.gaplog import read_gap_log
 
 WORLD = World(stiffness=0.01, friction=0.3)
@@ -153,14 +149,14 @@ def test_the_stored_plan_is_what_was_asked_for():
 
 def test_a_case_is_the_same_again_and_its_label_is_locked(tmp_path):
     case = Case(3, "single", "A", ("gripper_rotation_offset",), 4)
-    out, labels = tmp_path / "out", tmp_path / "labels"
+    out, labels, published = tmp_path / "out", tmp_path / "labels.jsonl", tmp_path / "cases.jsonl"
     out.mkdir()
     name = case.name(11)
     assert not is_done(name, out, labels)
     draft = make_case(case, 11, family_a)
     write_case(case, draft, 11, out, labels)
-    assert is_done(name, out, labels) and publish_hashes(labels) == 1
-    label = read_labels(labels)[name]
+    assert is_done(name, out, labels) and publish_hashes(labels, published) == 1
+    label = checked_labels(read_cases([published, labels]))[name]
     log = read_gap_log(out / f"{name}.npz")
     assert label["severity"] == 4 and not label["traceless"]
     assert label["gap_over_noise"] == pytest.approx(4, rel=0.1)
@@ -185,11 +181,12 @@ def test_a_case_is_the_same_again_and_its_label_is_locked(tmp_path):
     again = record(Setup(world), [commands], family_a).keypoints[0]
     left = np.sqrt(np.nanmean((again - log.keypoints[0, :length]) ** 2))
     assert 1e3 * left == pytest.approx(label["noise_mm"], rel=0.06)
-    # Again: the same log, another salt.
-    write_case(case, draft, 11, tmp_path, tmp_path)
+    # Again: the same log and label; elsewhere with another salt.
+    write_case(case, draft, 11, tmp_path, labels)
     np.testing.assert_array_equal(read_gap_log(tmp_path / f"{name}.npz").keypoints, log.keypoints)
-    locked = [json.loads((folder / "locked" / f"{name}.json").read_text()) for folder in (labels, tmp_path)]
-    assert locked[0]["label"] == locked[1]["label"] and locked[0]["salt"] != locked[1]["salt"]
+    write_case(case, draft, 11, tmp_path, tmp_path / "other.jsonl")
+    (locked,), (other,) = read_rows(labels), read_rows(tmp_path / "other.jsonl")
+    assert locked["label"] == other["label"] and locked["salt"] != other["salt"]
 
 
 @pytest.mark.slow

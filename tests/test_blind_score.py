@@ -1,19 +1,17 @@
 """The scorer of the blind check on verdicts made by hand."""
 
-import json
 import pathlib
-import sys
 
 import pytest
 
-sys.path.insert(0, str(pathlib.Path(__file__).parents[1] / "experiments"))
-
 from blind.measures import baselines, clopper_pearson, reliability, table
 from blind.score_page import write_page
-from blind.store import digest, publish_hashes, read_labels
-from blind.verdicts import Scored, coverages, place_error, read_verdicts, shrinkage_ratio
+from blind.store import checked_labels, digest, publish_hashes, read_cases, write_cases
+from blind.verdicts import Scored, coverages, place_error, scored, shrinkage_ratio
+from cablejax.evaluation.rows import append_row
 
 NOISE = 1.0
+BLIND = pathlib.Path(__file__).parents[1] / "docs" / "results" / "blind"
 
 
 def label(kind, *effects, gap=4.0, family="A", traceless=False, twins=None):
@@ -173,9 +171,7 @@ def test_reliability_bins_the_first_names():
 
 
 def test_page_from_locked_labels(tmp_path):
-    labels, verdicts = tmp_path / "labels", tmp_path / "verdicts"
-    (labels / "locked").mkdir(parents=True)
-    verdicts.mkdir()
+    labels, verdicts, cases = (tmp_path / f"{name}.jsonl" for name in ("labels", "verdicts", "cases"))
     made = {
         "00000001": (label("none"), verdict("none")),
         "00000002": (label("single", OBSTACLE), verdict("named", ("obstacle", 0.9, {}), ranking=[("obstacle", 0.9)])),
@@ -183,12 +179,14 @@ def test_page_from_locked_labels(tmp_path):
         "00000004": (label("single", TILT, family="C"), None),
     }
     for name, (true, said) in made.items():
-        (labels / "locked" / f"{name}.json").write_text(json.dumps({"salt": "ab" + name, "label": true}))
-        if said:
-            (verdicts / f"{name}.json").write_text(json.dumps(said))
-    assert publish_hashes(labels) == 4
-    cases = read_verdicts(verdicts, read_labels(labels))
-    write_page(cases, tmp_path / "page.md", "python score.py")
+        append_row(labels, {"name": name, "salt": "ab" + name, "label": true})
+        append_row(verdicts, {"name": name, **({"verdict": said} if said else {"refused": "too short"})})
+    assert publish_hashes(labels, cases) == 4
+    assert all(set(row) == {"name", "hash"} for row in read_cases([cases]).values())
+    write_cases(cases, read_cases([cases, labels, verdicts]))
+    assert publish_hashes(labels, cases) == 4, "a set that is complete stays"
+    rows = read_cases([cases])
+    write_page(scored(rows, checked_labels(rows)), tmp_path / "page.md", "python score.py")
     page = (tmp_path / "page.md").read_text()
     assert "4 cases: 1 without effect, 2 single effects" in page and "1 without a verdict" in page
     assert "| gravity_tilt | missing 1 |" in page and "| obstacle |  |  | 1/1/1 |  |  |" in page
@@ -197,25 +195,35 @@ def test_page_from_locked_labels(tmp_path):
 
 
 def test_a_changed_label_is_found(tmp_path):
-    (tmp_path / "locked").mkdir()
-    path = tmp_path / "locked" / "00000001.json"
-    locked = {"salt": "abcd", "label": label("none")}
-    path.write_text(json.dumps(locked))
-    publish_hashes(tmp_path)
-    assert read_labels(tmp_path) == {"00000001": locked["label"]}
-    path.write_text(json.dumps({**locked, "label": label("single", OBSTACLE)}))
-    with pytest.raises(ValueError, match="changed afterwards"):
-        read_labels(tmp_path)
-    path.unlink()
+    labels, cases = tmp_path / "labels.jsonl", tmp_path / "cases.jsonl"
+    locked = {"name": "00000001", "salt": "abcd", "label": label("none")}
+    append_row(labels, locked)
+    publish_hashes(labels, cases)
+    assert checked_labels(read_cases([cases, labels])) == {"00000001": locked["label"]}
     with pytest.raises(ValueError, match="no label"):
-        read_labels(tmp_path)
+        checked_labels(read_cases([cases]))
+    append_row(labels, {"name": "00000002", "salt": "abcd", "label": label("none")})
+    assert list(checked_labels(read_cases([cases, labels]))) == ["00000001"], "a label without a hash is left out"
+    append_row(labels, {**locked, "label": label("single", OBSTACLE)})
+    with pytest.raises(ValueError, match="changed afterwards"):
+        checked_labels(read_cases([cases, labels]))
+    with pytest.raises(ValueError, match=r"say different things of case 00000001: \['hash'\]"):
+        publish_hashes(labels, cases)
     assert digest(locked) != digest({**locked, "salt": "abce"})
 
 
-def test_a_file_that_is_no_verdict_is_refused(tmp_path):
-    (tmp_path / "00000001.json").write_text(json.dumps({"schema": "cablejax-verdict/1", "verdict": "maybe"}))
+def test_a_row_that_has_no_verdict_of_this_format_is_refused():
+    row = {"verdict": {"schema": "cablejax-verdict/1", "verdict": "maybe"}}
     with pytest.raises(ValueError, match="maybe"):
-        read_verdicts(tmp_path, {"00000001": label("none")})
+        scored({"00000001": row}, {"00000001": label("none")})
+
+
+@pytest.mark.parametrize("cases", sorted(BLIND.glob("*/cases.jsonl")), ids=lambda path: path.parent.name)
+def test_the_kept_page_is_what_the_kept_rows_give(cases, tmp_path):
+    rows, page = read_cases([cases]), cases.with_name("score.md").read_text()
+    command = page.split("`")[1]
+    write_page(scored(rows, checked_labels(rows)), tmp_path / "score.md", command)
+    assert (tmp_path / "score.md").read_text() == page
 
 
 def test_intervals_of_several_pieces_are_matched_by_index():

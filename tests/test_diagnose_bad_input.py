@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from cablejax.diagnose import Diagnosis, DiagnosisError, diagnose
+from cablejax.diagnose import CableDiagnosis, DiagnosisError, diagnose
 from cablejax.diagnose.recording import prepare
 from cablejax.types import GapLog
 from diagnose_cases import BY_NAME, SAMPLES, clean, log_of, noise, record
@@ -17,16 +17,16 @@ NAME = "gripper_rotation_offset"
 OFFSET = (NAME, 0, (0.08,))
 
 
-def told(log: GapLog) -> Diagnosis:
+def told(log: GapLog) -> CableDiagnosis:
     return diagnose(log, effects=FEW)
 
 
-def not_misled(result: Diagnosis, *true: str) -> bool:
+def not_misled(result: CableDiagnosis, *true: str) -> bool:
     """No name but the true ones is given without a doubt."""
     return result.verdict != "named" or {e.name for e in result.effects} <= set(true)
 
 
-def caveat(result: Diagnosis, words: str) -> bool:
+def caveat(result: CableDiagnosis, words: str) -> bool:
     return any(words in text for text in result.caveats)
 
 

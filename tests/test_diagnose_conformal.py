@@ -3,25 +3,22 @@
 from __future__ import annotations
 
 import pathlib
-import sys
 
 import numpy as np
 import pytest
 
-sys.path.insert(0, str(pathlib.Path(__file__).parents[1] / "experiments"))
-
 from blind.measures import leftovers
-from blind.store import read_labels
-from blind.verdicts import read_verdicts
-
+from blind.store import checked_labels, read_cases
+from blind.verdicts import scored
 from cablejax.diagnose import Calibration
 from cablejax.diagnose.conformal import SCORES, leftover_p, leftover_score
 
-SET = pathlib.Path(__file__).parents[1] / "docs" / "results" / "blind" / "20270404"
+SET = pathlib.Path(__file__).parents[1] / "docs" / "results" / "blind" / "20270404" / "cases.jsonl"
 
 
 def test_scores_are_those_of_the_stored_blind_check():
-    cases = read_verdicts(SET / "verdicts", read_labels(SET, None))
+    rows = read_cases([SET])
+    cases = scored(rows, checked_labels(rows))
     np.testing.assert_allclose(leftovers(cases), SCORES, atol=0.0051)
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from cablejax.cable import Discretisation
-from cablejax.diagnose import LIBRARY, Effect, Parameter
+from cablejax.diagnose import LIBRARY, CableEffect, Parameter
 from cablejax.diagnose.check import check_effect
 from cablejax.effects.physics import nominal_physics
 from cablejax.simulate import MjxEngine, compiler_options
@@ -33,7 +33,7 @@ def test_effect_passes_its_check(effect):
     check_effect(effect)
 
 
-class _Shift(Effect):
+class _Shift(CableEffect):
     """Moves all keypoints aside, even at its null value if told so."""
 
     name = "shift"

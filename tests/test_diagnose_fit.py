@@ -8,25 +8,29 @@ import numpy as np
 import pytest
 
 from cablejax.cable import Cable, Discretisation
-from cablejax.diagnose import LIBRARY, Calibration, Effect, Parameter
+from cablejax.diagnose import LIBRARY, CableEffect, Calibration, Explanation, Parameter, explanation
 from cablejax.diagnose.belief import as_good, excess, explains_most_motions, level, log_scores
-from cablejax.diagnose.conclude import conclude, sentence
+from cablejax.diagnose.conclude import conclude
 from cablejax.diagnose.conformal import leftover_p, leftover_score
-from cablejax.diagnose.fit import Candidate, Evidence, Fit, Term, candidate, evaluate, improve
+from cablejax.diagnose.evidence import Evidence
+from cablejax.diagnose.fit import Fit, evaluate, improve
+from cablejax.diagnose.judgement import sentence
 from cablejax.diagnose.playback import Playback
-from cablejax.diagnose.screen import residual_of, screen, shortlist
+from cablejax.diagnose.protocol import Term
+from cablejax.diagnose.screen import screen, shortlist
 from cablejax.diagnose.search import Search
 from cablejax.effects import BendingStiffness
 from cablejax.simulate.chain.step import LARGEST_STEP
-from diagnose_cases import BY_NAME, INTERVAL, context, evidence, parts
+from diagnose_cases import BY_NAME, INTERVAL, evidence, parts
 
 LOOK_ALIKES = (("bending_stiffness", (0.3,)), ("table_friction", (0.3, 0.0)))
+NOTHING = explanation()
 OFFSET = ("gripper_rotation_offset", 1, (0.08,))
 
 
-def fitted(facts: Evidence, effect: Effect, base: Candidate | None = None) -> Fit:
+def fitted(facts: Evidence, effect: CableEffect, base: Explanation = NOTHING) -> Fit:
     """The best of an effect's starts after fitting."""
-    starts = shortlist(screen(facts, base or candidate(), [effect], context(facts)))
+    starts = shortlist(screen(facts, base, [effect], facts.predict([base])[0]))
     return min(improve(facts, evaluate(facts, starts), max_iterations=15), key=lambda fit: fit.cost(facts))
 
 
@@ -45,11 +49,11 @@ def test_known_parameters_come_back(name):
     variant, truth = RECOVERED[name]
     facts = evidence((name, variant, truth))
     fit = fitted(facts, BY_NAME[name])
-    assert fit.candidate.terms == (Term(BY_NAME[name], variant),)
-    true_z = candidate(*parts((name, variant, truth))).z
+    assert fit.explanation.terms == (Term(BY_NAME[name], variant),)
+    true_z = explanation(*parts((name, variant, truth))).z
     deviation = np.sqrt(np.diagonal(np.linalg.inv(fit.precision(facts))))
     assert deviation.max() < 0.1, "the log tells the parameters well"
-    np.testing.assert_array_less(np.abs(fit.candidate.z - true_z), 4.5 * deviation)
+    np.testing.assert_array_less(np.abs(fit.explanation.z - true_z), 4.5 * deviation)
     # what is left is the noise: a chi-square of as many degrees of freedom
     left = facts.count.sum() - len(true_z)
     assert abs(fit.sse.sum() - left) < 4.5 * np.sqrt(2 * left)
@@ -73,8 +77,8 @@ def test_the_time_step_does_not_damp():
 def test_a_rival_that_leaves_as_little_is_a_look_alike():
     """However sure the likelihood is: in a wide gap it tells small differences between two laws from each other."""
     facts = evidence(("bending_stiffness", (0.25,)), ("viscous_drag", (0.3,)), noise_mm=0.02)
-    fits = improve(facts, evaluate(facts, [candidate(*parts((n, v))) for n, v in LOOK_ALIKES]), max_iterations=15)
-    null = evaluate(facts, [candidate()])[0]
+    fits = improve(facts, evaluate(facts, [explanation(*parts((n, v))) for n, v in LOOK_ALIKES]), max_iterations=15)
+    null = evaluate(facts, [explanation()])[0]
     scores = log_scores([*fits, null], facts, Calibration())
     order = np.argsort(-scores)
     found = Search(tuple([*fits, null][i] for i in order), scores[order], {})
@@ -88,12 +92,12 @@ def test_a_motion_that_nothing_explains_does_not_hide_the_cause_of_the_others():
     """Three motions with a turned gripper, one with an error that no effect makes: named beside unknown, not a
     look-alike of everything."""
     facts = evidence(("gripper_rotation_offset", 1, (0.08,)), noise_mm=0.5)
-    strange = facts.target.copy()
+    strange = facts.observed.copy()
     # keypoints that swing against each other: no cable does that
     swing = np.sin(np.arange(strange.shape[1]) * INTERVAL)[:, None, None]
     strange[3] += 0.2 * swing * np.where(np.arange(strange.shape[2]) % 2, 1.0, -1.0)[:, None]
-    facts = dataclasses.replace(facts, target=strange)
-    trials = [candidate(), candidate(*parts(OFFSET)), candidate(*parts(("bending_stiffness", (0.5,))))]
+    facts = dataclasses.replace(facts, observed=strange)
+    trials = [explanation(), explanation(*parts(OFFSET)), explanation(*parts(("bending_stiffness", (0.5,))))]
     null, right, wrong = improve(facts, evaluate(facts, trials), max_iterations=10)
     calibration = Calibration()
     assert explains_most_motions(right, null, facts, calibration)
@@ -111,16 +115,16 @@ def test_a_motion_that_nothing_explains_does_not_hide_the_cause_of_the_others():
     assert conclusion.equivalent == ()
     left, gap = (excess(float(fit.sse.sum()), facts) for fit in (right, null))
     assert conclusion.leftover_p == leftover_p(leftover_score(left, gap, level(facts), calibration)) < 0.05
-    assert ", 70 %, is" in sentence(conclusion, 0.7) and ", 0 %, is" in sentence(conclusion, -0.2)
-    assert f", {100 * conclusion.explained:.0f} %, is" in sentence(conclusion, None)
+    for explained, words in ((0.7, ", 70 %, is"), (-0.2, ", 0 %, is")):
+        assert words in sentence(conclusion.verdict, conclusion.effects, conclusion.equivalent, explained)
 
 
 def test_two_effects_come_back_together():
     stiff = ("bending_stiffness", (0.5,))
     facts = evidence(stiff, OFFSET)
     one = fitted(facts, BY_NAME["gripper_rotation_offset"])
-    both = fitted(facts, BY_NAME["bending_stiffness"], one.candidate)
-    (angle,), (ratio,) = both.candidate.values()
+    both = fitted(facts, BY_NAME["bending_stiffness"], one.explanation)
+    (angle,), (ratio,) = both.explanation.values()
     assert angle == pytest.approx(0.08, abs=0.002) and ratio == pytest.approx(0.5, rel=0.05)
     assert both.sse.sum() < 0.5 * one.sse.sum()
 
@@ -128,7 +132,7 @@ def test_two_effects_come_back_together():
 def test_the_true_effect_explains_most_at_first_sight():
     facts = evidence(OFFSET)
     effects = [BY_NAME[n] for n in ("bending_stiffness", "gripper_rotation_offset", "keypoint_bias", "viscous_drag")]
-    templates = screen(facts, candidate(), effects, context(facts))
+    templates = screen(facts, explanation(), effects, facts.nominal)
     best = max(templates, key=lambda t: t.explained)
     assert best.start.terms[0] == Term(BY_NAME["gripper_rotation_offset"], 1)
     assert 0.97 < best.explained < 1.03
@@ -137,7 +141,7 @@ def test_the_true_effect_explains_most_at_first_sight():
 
 def test_what_an_effect_leaves_is_the_noise():
     facts = evidence(OFFSET)
-    left = residual_of(facts, candidate(*parts(OFFSET)))
+    left = facts.observed - facts.predict([explanation(*parts(OFFSET))])[0]
     assert left.std() == pytest.approx(5e-4, rel=0.03)
 
 
@@ -153,17 +157,17 @@ class _Bounded(BendingStiffness):
 def test_bounds_are_respected(truth, bound):
     facts = evidence(("bending_stiffness", (truth,)))
     fit = fitted(facts, _Bounded())
-    assert fit.candidate.values()[0][0] == pytest.approx(bound, rel=1e-6)
-    low, high = fit.candidate.bounds.T
-    assert (fit.candidate.z >= low).all() and (fit.candidate.z <= high).all()
+    assert fit.explanation.values()[0][0] == pytest.approx(bound, rel=1e-6)
+    low, high = fit.explanation.bounds.T
+    assert (fit.explanation.z >= low).all() and (fit.explanation.z <= high).all()
 
 
 def test_a_start_beyond_the_bounds_is_brought_back():
-    (term_bounds,) = candidate((_Bounded(), 0, (5.0,))).bounds
-    assert candidate((_Bounded(), 0, (5.0,))).z[0] == term_bounds[1]
+    (term_bounds,) = explanation((_Bounded(), 0, (5.0,))).bounds
+    assert explanation((_Bounded(), 0, (5.0,))).z[0] == term_bounds[1]
 
 
-class _Broken(Effect):
+class _Broken(CableEffect):
     """Breaks the simulation down once its parameter exceeds a limit, and explains nothing."""
 
     name = "broken"
@@ -181,13 +185,13 @@ class _Broken(Effect):
 
 def test_a_broken_simulation_never_wins():
     facts = evidence(OFFSET)
-    broken = candidate((_Broken(), 0, (1.0,)))
-    null, dead, good = evaluate(facts, [candidate(), broken, candidate(*parts(OFFSET))])
+    broken = explanation((_Broken(), 0, (1.0,)))
+    null, dead, good = evaluate(facts, [explanation(), broken, explanation(*parts(OFFSET))])
     assert (dead.sse > 1e9).all() and not dead.gradient.any() and not dead.curvature.any()
     assert np.isfinite(dead.cost(facts)) and dead.cost(facts) > null.cost(facts) > good.cost(facts)
     scores = log_scores([null, dead, good], facts, Calibration())
     assert np.isfinite(scores).all() and scores.argmin() == 1 and scores.argmax() == 2
-    assert screen(facts, candidate(), [_Broken()], context(facts)) == [], "no template of a breakdown"
+    assert screen(facts, explanation(), [_Broken()], facts.nominal) == [], "no template of a breakdown"
 
 
 def test_a_fit_does_not_step_into_a_breakdown():
@@ -199,16 +203,16 @@ def test_a_fit_does_not_step_into_a_breakdown():
             return dataclasses.replace(physics, stiffness=physics.stiffness * values[0] * bad)
 
     facts = evidence(("bending_stiffness", (0.4,)))
-    start = evaluate(facts, [candidate((Edge(), 0, (0.9,)))])[0]
+    start = evaluate(facts, [explanation((Edge(), 0, (0.9,)))])[0]
     fit = improve(facts, [start], max_iterations=15)[0]
-    assert np.isfinite(fit.candidate.z).all() and (fit.sse < 1e9).all()
-    assert 0.55 <= fit.candidate.values()[0][0] < 0.7 and fit.cost(facts) < start.cost(facts)
+    assert np.isfinite(fit.explanation.z).all() and (fit.sse < 1e9).all()
+    assert 0.55 <= fit.explanation.values()[0][0] < 0.7 and fit.cost(facts) < start.cost(facts)
 
 
 def test_iterations_never_make_a_fit_worse():
     facts = evidence(("bending_stiffness", (0.5,)), OFFSET)
     starts = shortlist(
-        screen(facts, candidate(), [BY_NAME["bending_stiffness"], BY_NAME["viscous_drag"]], context(facts))
+        screen(facts, explanation(), [BY_NAME["bending_stiffness"], BY_NAME["viscous_drag"]], facts.nominal)
     )
     before = evaluate(facts, starts)
     after = improve(facts, before, max_iterations=3)
@@ -218,7 +222,7 @@ def test_iterations_never_make_a_fit_worse():
 def test_candidates_do_not_disturb_each_other():
     """Many candidates share a batch; each must come out as it does alone."""
     facts = evidence(OFFSET)
-    several = [candidate(*parts(OFFSET)), candidate(), candidate(*parts(("bending_stiffness", (0.5,)), OFFSET))]
+    several = [explanation(*parts(OFFSET)), explanation(), explanation(*parts(("bending_stiffness", (0.5,)), OFFSET))]
     for together, one in zip(evaluate(facts, several), several, strict=True):
         (alone,) = evaluate(facts, [one])
         np.testing.assert_allclose(together.sse, alone.sse, rtol=1e-5)
@@ -227,31 +231,31 @@ def test_candidates_do_not_disturb_each_other():
 
 def test_missing_keypoints_do_not_count():
     facts = evidence(OFFSET)
-    target = facts.target.copy()
+    target = facts.observed.copy()
     target[0, 10:20, 3] = np.nan
-    some = dataclasses.replace(facts, target=target)
+    some = dataclasses.replace(facts, observed=target)
     np.testing.assert_array_equal(facts.count - some.count, [20, 0, 0, 0])
-    (fit,) = evaluate(some, [candidate(*parts(OFFSET))])
+    (fit,) = evaluate(some, [explanation(*parts(OFFSET))])
     assert np.isfinite(fit.sse).all() and np.isfinite(fit.gradient).all()
 
 
 def test_restricted_evidence_is_that_of_the_episodes():
     facts = evidence(OFFSET)
-    whole, part = (evaluate(f, [candidate(*parts(OFFSET))])[0] for f in (facts, facts.restricted([2, 0])))
+    whole, part = (evaluate(f, [explanation(*parts(OFFSET))])[0] for f in (facts, facts.restricted([2, 0])))
     np.testing.assert_allclose(part.sse, whole.sse[[2, 0]], rtol=1e-5)
 
 
 def test_held_out_errors_are_those_of_a_fit_without_the_episode():
     effects = (("bending_stiffness", (0.5,)), OFFSET)
     facts = evidence(*effects, noise_mm=2.0)
-    (fit,) = improve(facts, evaluate(facts, [candidate(*parts(*effects))]), max_iterations=10)
+    (fit,) = improve(facts, evaluate(facts, [explanation(*parts(*effects))]), max_iterations=10)
     short = fit.held_out_sse(facts)
     assert (short >= fit.sse).all() and (short - fit.sse).max() > 0.1
     without = []
     for episode in range(len(short)):
         rest = fit.precision(facts) - fit.curvature[episode]
         step = np.linalg.solve(rest, fit.gradient[episode])
-        without.append(dataclasses.replace(fit.candidate, z=fit.candidate.z + step))
+        without.append(fit.explanation.moved(fit.explanation.z + step))
     for episode, seen in enumerate(evaluate(facts, without)):
         expected = max(seen.sse[episode], fit.sse[episode])
         assert short[episode] == pytest.approx(expected, abs=0.3 + 0.1 * abs(expected - fit.sse[episode]))
@@ -260,7 +264,7 @@ def test_held_out_errors_are_those_of_a_fit_without_the_episode():
 def test_every_start_of_the_library_lies_within_its_bounds():
     facts = evidence(OFFSET)
     for effect in LIBRARY:
-        for variant, values in effect.starts(context(facts)):
+        for variant, values in facts.simulator.starts(effect, facts.nominal, facts.observed - facts.nominal):
             assert variant in effect.variants
             for parameter, value in zip(effect.parameters, values, strict=True):
                 assert parameter.low <= value <= parameter.high, (effect.name, parameter.name, value)

@@ -14,15 +14,17 @@ import pytest
 from scipy.signal import lfilter
 from scipy.stats import binom, kstest
 
-from cablejax.diagnose import LIBRARY, Calibration, Diagnosis, diagnose
-from cablejax.diagnose.fit import Candidate, Term, candidate, evaluate, improve
+from cablejax.diagnose import LIBRARY, CableDiagnosis, Calibration, Explanation, diagnose, explanation
+from cablejax.diagnose.fit import evaluate, improve
+from cablejax.diagnose.planar import physics_of
 from cablejax.diagnose.playback import Playback
+from cablejax.diagnose.protocol import Term
 from cablejax.diagnose.search import search
 from cablejax.diagnose.significance import NOISE_TOLERANCE, contrast_p, exceedance_p, variance_inflation
 from cablejax.diagnose.where import LEVEL, localise
-from cablejax.effects import Effect
+from cablejax.effects import CableEffect
 from cablejax.types import GapLog
-from diagnose_cases import BY_NAME, clean, context, evidence, evidence_of, log_of, noise, parts, playback, record
+from diagnose_cases import BY_NAME, clean, evidence, evidence_of, log_of, noise, parts, playback, record, simulator
 
 FEW = tuple(BY_NAME[n] for n in ("gripper_rotation_offset", "bending_stiffness", "keypoint_bias", "viscous_drag"))
 OFFSET = ("gripper_rotation_offset", 0, (0.08,))
@@ -79,10 +81,10 @@ def test_noise_is_not_explained_by_an_effect():
     """The search forced upon pure noise: each effect may win by chance, but seldom."""
     won = 0
     for seed in range(12):
-        facts = evidence(seed=seed)
-        null = evaluate(facts, [candidate()])[0]
-        found = search(facts, null, FEW, context(facts), EXACT, deadline=math.inf, progress=lambda _: None)
-        won += bool(found.fits[0].candidate.terms)
+        facts = dataclasses.replace(evidence(seed=seed), simulator=simulator(17, FEW))
+        null = evaluate(facts, [explanation()])[0]
+        found = search(facts, null, EXACT, deadline=math.inf, progress=lambda _: None)
+        won += bool(found.fits[0].explanation.terms)
     assert won <= 2, f"an effect was preferred to none in {won} of 12 logs of pure noise"
 
 
@@ -103,16 +105,16 @@ def posterior_ranks(terms: tuple[Term, ...], n_draws: int, noise_mm: float = 0.5
     """
     rng = np.random.default_rng(1)
     player = playback(17)
-    null = Candidate(terms, np.zeros(sum(term.size for term in terms)))
+    null = Explanation(terms, np.zeros(sum(term.size for term in terms)))
     bounds = null.bounds.T
     truths = [np.clip(rng.normal(size=len(null.z)), *bounds) for _ in range(n_draws)]
-    everything = [dataclasses.replace(null, z=z) for z in truths]
-    simulated = player.keypoints([c.physics(player.believed, player.config) for c in everything])
+    everything = [null.moved(z) for z in truths]
+    simulated = player.keypoints([physics_of(c, player.believed, player.config) for c in everything])
     ranks = []
     for seed, (truth, points) in enumerate(zip(truths, simulated, strict=True)):
         facts = evidence_of(points, noise_mm=noise_mm, seed=seed)
         (fit,) = improve(facts, evaluate(facts, [null]), max_iterations=15)
-        drawn = rng.multivariate_normal(fit.candidate.z, np.linalg.inv(fit.precision(facts)), size=199)
+        drawn = rng.multivariate_normal(fit.explanation.z, np.linalg.inv(fit.precision(facts)), size=199)
         ranks.append(((drawn < truth).sum(axis=0) + 0.5) / 200)
     return np.array(ranks)
 
@@ -147,13 +149,13 @@ def test_twice_the_noise_makes_fits_half_as_sharp(effect):
     sharpness = []
     for noise_mm in (0.5, 1.0):
         facts = evidence(effect, noise_mm=noise_mm)
-        (fit,) = improve(facts, evaluate(facts, [candidate(*parts(effect))]), max_iterations=10)
+        (fit,) = improve(facts, evaluate(facts, [explanation(*parts(effect))]), max_iterations=10)
         # less the prior's part
         sharpness.append(np.diagonal(fit.precision(facts)) - 1.0)
     np.testing.assert_allclose(sharpness[0] / sharpness[1], 4.0, rtol=0.1)
 
 
-def width(result: Diagnosis) -> float:
+def width(result: CableDiagnosis) -> float:
     (effect,) = result.effects
     low, high = effect.parameters["angle_rad"].ci90
     return high - low
@@ -193,11 +195,11 @@ def turned(log: GapLog, angle: float = 2.4) -> GapLog:
 
 
 @functools.cache
-def plain(effect: tuple, effects: tuple[Effect, ...]) -> Diagnosis:
+def plain(effect: tuple, effects: tuple[CableEffect, ...]) -> CableDiagnosis:
     return diagnose(record(effect), effects=effects)
 
 
-def assert_same(result: Diagnosis, other: Diagnosis, *, error_mm: float = 0.003, **changed):
+def assert_same(result: CableDiagnosis, other: CableDiagnosis, *, error_mm: float = 0.003, **changed):
     """The same verdict, names, numbers and gap; `changed` gives parameters that must come out otherwise."""
     assert result.verdict == other.verdict
     assert [e.name for e in result.effects] == [e.name for e in other.effects]

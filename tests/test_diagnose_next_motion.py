@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from cablejax.cable import Cable, Discretisation
-from cablejax.diagnose import LIBRARY
-from cablejax.diagnose.fit import candidate
+from cablejax.diagnose import LIBRARY, explanation
 from cablejax.diagnose.next_motion import next_motion
+from cablejax.diagnose.planar import physics_of
 from cablejax.diagnose.playback import Playback
 from cablejax.diagnose.safe_motions import INTERVAL, safe_motions, starting_pose
 
@@ -30,7 +30,7 @@ def log_motion() -> Playback:
 
 
 def one(name, *values, variant=0):
-    return candidate((EFFECTS[name], variant, values))
+    return explanation((EFFECTS[name], variant, values))
 
 
 @pytest.mark.parametrize(
@@ -73,7 +73,7 @@ def test_order_of_the_episodes_does_not_choose_the_start():
 
 
 def test_yield_shows_where_the_cable_is_bent_most():
-    following = next_motion(log_motion(), [one("plasticity", 7.0, 0.3), candidate()], NOISE)
+    following = next_motion(log_motion(), [one("plasticity", 7.0, 0.3), explanation()], NOISE)
     assert following.motion == "overload_return"
     assert following.separates == ("plasticity", "nominal")
     assert following.separation == max(following.alternatives.values()) > 1.0
@@ -81,7 +81,7 @@ def test_yield_shows_where_the_cable_is_bent_most():
 
 def test_obstacle_shows_where_the_cable_has_not_been():
     beyond = one("obstacle", 0.42, 0.49, 0.03)
-    following = next_motion(log_motion(), [candidate(), beyond], NOISE)
+    following = next_motion(log_motion(), [explanation(), beyond], NOISE)
     assert following.motion in ("shifted_repeat", "translation")
     still = [size for name, size in following.alternatives.items() if name in ("mirror", "taut")]
     assert max(still) < 0.1 * following.separation
@@ -95,7 +95,7 @@ def test_separation_is_the_difference_in_noise_units():
         assert loud.alternatives[name] == pytest.approx(0.5 * value, rel=1e-3)
     poses = safe_motions(CONFIG, log_motion().gripper_pose[0, 0], 300)[quiet.motion]
     motion = Playback.of_motion(CONFIG, poses[None], None, np.full(1, INTERVAL))
-    a, b = motion.keypoints([c.physics(motion.believed, CONFIG) for c in (stiff, curved)])
+    a, b = motion.keypoints([physics_of(c, motion.believed, CONFIG) for c in (stiff, curved)])
     assert quiet.separation == pytest.approx(np.sqrt(np.mean((a - b) ** 2)) / 1e-3, rel=1e-2)
 
 

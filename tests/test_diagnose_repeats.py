@@ -7,7 +7,8 @@ import dataclasses
 import numpy as np
 import pytest
 
-from cablejax.diagnose.fit import candidate, evaluate, improve
+from cablejax.diagnose import explanation
+from cablejax.diagnose.fit import evaluate, improve
 from cablejax.diagnose.profile import QUANTILE, profile_widths
 from cablejax.diagnose.repeats import repeated_motions, share_of_motion
 from diagnose_cases import evidence, parts
@@ -28,7 +29,7 @@ def test_motions_a_twentieth_of_the_length_apart_are_one():
 def test_an_episode_twice_tells_no_more_than_once():
     once = evidence(("bending_stiffness", (1.4,)))
     twice = dataclasses.replace(once.restricted([0, 1, 2, 3, 0]), motion=np.array([0, 1, 2, 3, 0]))
-    trial = candidate(*parts(("bending_stiffness", (1.3,))))
+    trial = explanation(*parts(("bending_stiffness", (1.3,))))
     one, two = evaluate(once, [trial])[0], evaluate(twice, [trial])[0]
     assert once.log_likelihood(one.sse) == pytest.approx(twice.log_likelihood(two.sse), rel=1e-6)
     np.testing.assert_allclose(one.precision(once), two.precision(twice), rtol=1e-4)
@@ -37,7 +38,7 @@ def test_an_episode_twice_tells_no_more_than_once():
 
 def test_profiles_of_a_nearly_linear_fit_are_those_of_its_covariance():
     facts = evidence(("table_friction", (0.45, 0.02)), ("camera_similarity", (1.003, 0.002, 0.002, 0.0)), noise_mm=0.5)
-    start = candidate(*parts(("camera_similarity", (1.003, 0.002, 0.002, 0.0)), ("table_friction", (0.45, 0.02))))
+    start = explanation(*parts(("camera_similarity", (1.003, 0.002, 0.002, 0.0)), ("table_friction", (0.45, 0.02))))
     fit = improve(facts, evaluate(facts, [start]), max_iterations=8)[0]
     laplace = QUANTILE * np.sqrt(np.diagonal(np.linalg.inv(fit.precision(facts))))
     np.testing.assert_allclose(profile_widths(facts, fit)[:4], np.repeat(laplace[:4, None], 2, axis=1), rtol=0.1)
@@ -46,10 +47,10 @@ def test_profiles_of_a_nearly_linear_fit_are_those_of_its_covariance():
 def test_a_profile_ends_where_the_refitted_cost_has_risen_by_its_share():
     """The ratio of friction is known in its order of magnitude; the cost is minimised here over its static excess."""
     facts = evidence(("table_friction", (0.45, 0.02)), noise_mm=3.0)
-    start = candidate(*parts(("table_friction", (0.45, 0.02))))
+    start = explanation(*parts(("table_friction", (0.45, 0.02))))
     fit = improve(facts, evaluate(facts, [start]), max_iterations=12, tolerance=1e-4)[0]
     widths = profile_widths(facts, fit)
-    z, bounds = fit.candidate.z, fit.candidate.bounds
+    z, bounds = fit.explanation.z, fit.explanation.bounds
     seen = 0
     for side, sign in enumerate((-1, 1)):
         end = z[0] + sign * widths[0, side]
@@ -58,11 +59,11 @@ def test_a_profile_ends_where_the_refitted_cost_has_risen_by_its_share():
         seen += 1
         costs = []
         for other in np.linspace(z[1] - 2, z[1] + 2, 41):
-            moved = dataclasses.replace(fit.candidate, z=np.clip([end, other], *bounds.T))
+            moved = fit.explanation.moved(np.clip([end, other], *bounds.T))
             costs.append(moved)
         weight = facts.weight(fit.sse)
         lowest = min(
-            0.5 * (weight @ trial.sse + trial.candidate.z @ trial.candidate.z) for trial in evaluate(facts, costs)
+            0.5 * (weight @ trial.sse + trial.explanation.z @ trial.explanation.z) for trial in evaluate(facts, costs)
         )
         assert lowest - 0.5 * (weight @ fit.sse + z @ z) == pytest.approx(0.5 * QUANTILE**2, rel=0.35)
     assert seen == 2

@@ -20,11 +20,11 @@ from cablejax.evaluation.fine_tuning import FineTuneConfig, fine_tune, record
 from cablejax.evaluation.methods import LABEL, METHODS, controller_of
 from cablejax.evaluation.paper import VISUAL_SERVO
 from cablejax.evaluation.protocols import LaidOut, letter_task
-from cablejax.evaluation.run import Experiment, Extent, page, seed_range
 from cablejax.evaluation.suite import Case, key_of, read_suite, run_suite
 from cablejax.mpc import MPC
 from cablejax.simulate.plant import Plant, PlantConfig
 from cli_cases import small_model
+from closed_loops import Experiment, Extent, page, seed_range
 
 CABLE = Discretisation(n_links=12, dimension=3, timestep=0.005)
 SERVO = METHODS[VISUAL_SERVO]

@@ -17,6 +17,11 @@ ARCH = np.array([[-0.45, 0.0, 0.0], [0.45, 0.0, 0.0]])
 STILL = np.zeros((2, 3))
 
 
+def rubbing(friction: float) -> Plant:
+    chain = dataclasses.replace(CABLE, cable=Cable(friction_coefficient=friction))
+    return Plant(dataclasses.replace(CONFIG, discretisation=chain))
+
+
 @pytest.fixture(scope="module")
 def plant() -> Plant:
     return Plant(CONFIG)
@@ -53,7 +58,7 @@ def test_a_new_cable_has_the_shape_of_the_elastica_whatever_its_stiffness(ratio)
 
 def test_friction_of_a_sliding_cable_is_coulombs():
     # Dragged along, all of the free cable slides: every contact pushes back with mu times its load.
-    plant = Plant(CONFIG)
+    plant = rubbing(0.1)
     plant.reset(ARCH)
     plant.step(np.array([[0.05, 0.0, 0.0]] * 2))
     force = contact_force(plant)
@@ -86,12 +91,8 @@ def test_the_table_carries_the_weight_steadily(plant):
 
 def test_friction_keeps_a_cable_where_a_frictionless_one_springs_back():
     twist = np.array([[0.0, 0.0, 0.4], [0.0, 0.0, -0.2]])
-    rubbing, gliding = (
-        Plant(dataclasses.replace(CONFIG, discretisation=dataclasses.replace(CABLE, cable=cable)))
-        for cable in (Cable(friction_coefficient=1.0), Cable(friction_coefficient=0.0))
-    )
     shapes = []
-    for plant in (rubbing, gliding):
+    for plant in (rubbing(1.0), rubbing(0.0)):
         plant.reset(ARCH)
         plant.step(twist)
         shapes.append(plant.step(STILL, 2.0).keypoints)

@@ -100,8 +100,8 @@ def test_a_uniform_rest_curvature_does_not_show_between_two_clamps():
 
 def test_bad_set_ups_are_refused():
     for changes, message in [
-        ({"cable": Discretisation(dimension=3, timestep=1e-4)}, "dimension is 3"),
-        ({"cable": Discretisation(n_links=27, timestep=1e-3)}, "stable only up to"),
+        ({"discretisation": Discretisation(dimension=3, timestep=1e-4)}, "dimension is 3"),
+        ({"discretisation": Discretisation(n_links=27, timestep=1e-3)}, "stable only up to"),
         ({"static_ratio": 0.9}, "static_ratio"),
         ({"axial_ratio": 0.0}, "axial_ratio"),
         ({"rest_curvature": np.nan}, "rest_curvature"),

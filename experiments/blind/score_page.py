@@ -6,7 +6,7 @@ import pathlib
 
 import numpy as np
 
-from cablejax.report.markdown import markdown_table
+from pages import markdown_table
 
 from .measures import Row, baselines, outcome, reliability, severe_singles, table
 from .verdicts import Scored

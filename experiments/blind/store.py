@@ -1,21 +1,26 @@
-"""Writes cases and locks their labels.
+"""Writes cases and locks their labels; everything about a case is a row with its `name` in files of JSON lines.
 
-A label is published only as the SHA-256 of a random salt and the label's JSON; the salt is in the label's file, so that
-anybody can check afterwards that no label was changed, and nobody can guess one before.
+A label is published only as `hash`, the SHA-256 of a random salt and the label's JSON. `salt` and `label` stay in a
+private file until the diagnosis has run, and are published then: everybody can check that no label was changed, and
+nobody can guess one before. A finished set is one file, whose rows have `name`, `hash`, `salt`, `label` and verdicts.
 """
 
 from __future__ import annotations
 
+import fcntl
 import hashlib
 import json
-import os
 import pathlib
 import secrets
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
 
+from cablejax.evaluation.rows import Rows, append_row
 from cablejax.gaplog import SCHEMA, GapLog, write_gap_log
+from cablejax.json_file import write_json
+from cablejax.whole_file import whole_file
 
 from .cases import Draft, label_of
 from .motions import INTERVAL
@@ -30,12 +35,15 @@ MISSING_LOGS, MISSING = 0.15, 0.01
 
 
 def write_case(case: Case, draft: Draft, seed: int, out: pathlib.Path, labels: pathlib.Path) -> None:
-    """`out/<name>.npz` and `labels/locked/<name>.json`; the label last, as it marks the case as done."""
+    """`out/<name>.npz` and a row of the file `labels`; the label last, as it marks the case as done.
+
+    A log that was lost is made again; its label stays, and with it the hash that may be published.
+    """
     log, label = noisy_log(case, draft, seed)
     name = case.name(seed)
     write_gap_log(out / f"{name}.npz", log, overwrite=True)
-    locked = {"salt": secrets.token_hex(16), "label": label}
-    _write_whole(labels / "locked" / f"{name}.json", json.dumps(locked, indent=1))
+    if name not in read_cases([labels]):
+        append_row(labels, {"name": name, "salt": secrets.token_hex(16), "label": label})
 
 
 def noisy_log(case: Case, draft: Draft, seed: int) -> tuple[GapLog, dict[str, Any]]:
@@ -86,7 +94,7 @@ def noisy_log(case: Case, draft: Draft, seed: int) -> tuple[GapLog, dict[str, An
 
 def is_done(name: str, out: pathlib.Path, labels: pathlib.Path) -> bool:
     """Whether a case need not be made again."""
-    return (out / f"{name}.npz").exists() and (labels / "locked" / f"{name}.json").exists()
+    return (out / f"{name}.npz").exists() and name in read_cases([labels])
 
 
 def digest(locked: dict[str, Any]) -> str:
@@ -95,44 +103,64 @@ def digest(locked: dict[str, Any]) -> str:
     return hashlib.sha256(text.encode()).hexdigest()
 
 
-def publish_hashes(labels: pathlib.Path) -> int:
-    """Writes `labels/hashes.json` from every label there is, and returns their number."""
-    hashes = {
-        path.stem: digest(json.loads(path.read_text())) for path in sorted((labels / "locked").glob("????????.json"))
-    }
-    _write_whole(labels / "hashes.json", json.dumps(hashes, indent=0, sort_keys=True) + "\n")
-    return len(hashes)
+def publish_hashes(labels: pathlib.Path, published: pathlib.Path) -> int:
+    """Adds the hashes of all labels to the rows of the file `published`, and returns the number of labels.
+
+    The rows are sorted by name, since the order of making says what a case is.
+
+    Raises:
+        ValueError: another hash of a case is published already.
+    """
+    with open(labels, "a+b") as turn:  # one process at a time
+        fcntl.flock(turn, fcntl.LOCK_EX)
+        locked = read_cases([labels])
+        hashes = {name: {"name": name, "hash": digest(row)} for name, row in locked.items()}
+        write_cases(published, _merged([read_cases([published]), hashes]))
+    return len(locked)
 
 
-def read_labels(labels: pathlib.Path, published: list[pathlib.Path] | None = None) -> dict[str, dict[str, Any]]:
+def read_cases(paths: Iterable[pathlib.Path]) -> dict[str, dict[str, Any]]:
+    """The rows of some files by the cases' names, sorted; what several files say of a case is put together.
+
+    Raises:
+        ValueError: two files say different things.
+    """
+    return _merged([{row["name"]: row for row in Rows(path, ("name",)).read()} for path in paths])
+
+
+def write_cases(path: pathlib.Path, cases: dict[str, dict[str, Any]]) -> None:
+    """Writes a file of rows, whole, over what was there."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with whole_file(path) as stream:
+        stream.write("".join(json.dumps(row, allow_nan=False) + "\n" for row in cases.values()).encode())
+
+
+def checked_labels(cases: dict[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
     """All labels whose hashes were published, each checked against its hash; others are left out.
-
-    Args:
-        labels: folder of `locked/`, and of `hashes.json` where nothing else was published.
-        published: files of hashes that were published before; together they hold every case.
 
     Raises:
         ValueError: a label was changed or lost since the hashes were published.
     """
-    hashes: dict[str, str] = {}
-    for path in published or [labels / "hashes.json"]:
-        hashes |= json.loads(path.read_text())
-    found = {path.stem: json.loads(path.read_text()) for path in (labels / "locked").glob("????????.json")}
-    if lost := sorted(set(hashes) - set(found)):
+    published = {name: row for name, row in cases.items() if "hash" in row}
+    if lost := [name for name, row in published.items() if "label" not in row]:
         raise ValueError(f"{len(lost)} cases have a published hash but no label: {lost[:5]} ...")
-    for name, published_hash in hashes.items():
-        if digest(found[name]) != published_hash:
+    for name, row in published.items():
+        if digest(row) != row["hash"]:
             raise ValueError(f"The label of {name} does not fit its published hash: it was changed afterwards.")
-    return {name: found[name]["label"] for name in sorted(hashes)}
+    return {name: row["label"] for name, row in published.items()}
 
 
-def _write_whole(path: pathlib.Path, text: str) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}")
-    temporary.write_text(text)
-    os.replace(temporary, path)
+def _merged(parts: Iterable[dict[str, dict[str, Any]]]) -> dict[str, dict[str, Any]]:
+    merged: dict[str, dict[str, Any]] = {}
+    for part in parts:
+        for name, row in part.items():
+            known = merged.setdefault(name, {})
+            if differing := [field for field in row if known.get(field, row[field]) != row[field]]:
+                raise ValueError(f"Files say different things of case {name}: {differing}. Give the right one only.")
+            known |= row
+    return dict(sorted(merged.items()))
 
 
 def write_open_labels(out: pathlib.Path, labels: dict[str, dict[str, Any]]) -> None:
     """`labels.json` beside the logs, for a development set that is not blind."""
-    _write_whole(out / "labels.json", json.dumps(labels, indent=1) + "\n")
+    write_json(out / "labels.json", labels)

@@ -7,9 +7,7 @@ verdict stays in every count as a failure.
 from __future__ import annotations
 
 import dataclasses
-import json
 import math
-import pathlib
 from typing import Any
 
 SCHEMA = "cablejax-verdict/1"
@@ -24,7 +22,7 @@ class Scored:
     """One case.
 
     Attributes:
-        name: of its file.
+        name: of its log and its row.
         label: what is true.
         verdict: what was said; None where there is none.
     """
@@ -103,23 +101,25 @@ class Scored:
         return None
 
 
-def read_verdicts(folder: pathlib.Path, labels: dict[str, dict[str, Any]]) -> list[Scored]:
+def scored(cases: dict[str, dict[str, Any]], labels: dict[str, dict[str, Any]], field: str = "verdict") -> list[Scored]:
     """Every labelled case with its verdict.
 
+    Args:
+        cases: rows by name, see `store.read_cases`.
+        labels: by name.
+        field: of the rows that has the verdict; a case without it has none.
+
     Raises:
-        ValueError: a file that is no verdict.
+        ValueError: a field that is no verdict.
     """
-    cases = []
-    for name, label in labels.items():
-        path = folder / f"{name}.json"
-        verdict = json.loads(path.read_text()) if path.exists() else None
+    for name in labels:
+        verdict = cases[name].get(field)
         if verdict is not None and (verdict.get("schema") != SCHEMA or verdict.get("verdict") not in VERDICTS):
             raise ValueError(
-                f"{path} has schema {verdict.get('schema')!r} and verdict {verdict.get('verdict')!r}, expected "
-                f"{SCHEMA!r} and one of {VERDICTS}."
+                f"Case {name} has schema {verdict.get('schema')!r} and verdict {verdict.get('verdict')!r} in "
+                f"{field!r}, expected {SCHEMA!r} and one of {VERDICTS}."
             )
-        cases.append(Scored(name, label, verdict))
-    return cases
+    return [Scored(name, label, cases[name].get(field)) for name, label in labels.items()]
 
 
 def place_error(case: Scored, effect: dict[str, Any], length: float = 1.0) -> float | None:

@@ -7,6 +7,7 @@ travels in their options:
     solution.value, solution.certificate(residuals, Box(lower, upper))
 """
 
+from cablejax.bounded.batched_gauss_newton import BatchedGaussNewton, Linearised, Minimised, solve_arrow
 from cablejax.bounded.certificate import Certificate, certify
 from cablejax.bounded.dogleg import BoundedDogleg, BoundedDoglegDescent
 from cablejax.bounded.gain_ratio import GainRatio
@@ -35,6 +36,7 @@ __all__ = [
     "AbstractSet",
     "AffineBalls",
     "Balls",
+    "BatchedGaussNewton",
     "BoundedDogleg",
     "BoundedDoglegDescent",
     "BoundedGaussNewton",
@@ -49,6 +51,8 @@ __all__ = [
     "GainRatio",
     "Halfspaces",
     "Intersection",
+    "Linearised",
+    "Minimised",
     "NonmonotoneArmijo",
     "ProjectionArc",
     "QuadraticMinimum",
@@ -61,4 +65,5 @@ __all__ = [
     "minimise",
     "minimise_quadratic",
     "project_ball",
+    "solve_arrow",
 ]

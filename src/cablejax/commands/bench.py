@@ -114,8 +114,7 @@ class BenchSimulate(Command):
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class BenchMpc(Command):
-    """Time the controller's call (observe, fit the residual, plan, command) with every solver, and in batches; and the
-    default solver against IPOPT on the same planning problems."""
+    """Time the controller's call (observe, fit the residual, plan, command) with every solver, and in batches."""
 
     weights: str = "gns-reference"
     """Released model by name, or the folder of a training by `cablejax train`."""
@@ -132,21 +131,17 @@ class BenchMpc(Command):
     batches: tuple[int, ...] = ()
     """Cables to control at once; by default 1 and 16 on a processor, and 1, 64 and 1024 on an accelerator."""
 
-    referee: int = 3
-    """Planning problems to solve with IPOPT too, in float64; 0 = none. It needs ipyopt."""
-
     def execute(self):
         import jax
 
         from cablejax.control.shaping import initial_history, load_model
         from cablejax.mpc import time_control
 
-        least = min(self.repeats, *self.batches, self.horizon + 1, self.referee + 1)
+        least = min(self.repeats, *self.batches, self.horizon + 1)
         if not self.solvers or least < 1:
             raise UsageError(
                 f"--solvers {self.solvers}, --horizon {self.horizon}, --repeats {self.repeats}, --batches "
-                f"{self.batches}, --referee {self.referee}: expected at least one solver, a horizon of 0, 1 repeat, "
-                "batches of 1 and 0 problems."
+                f"{self.batches}: expected at least one solver, a horizon of 0, 1 repeat and batches of 1."
             )
         on_processor = jax.devices()[0].platform == "cpu"
         batches = self.batches or ((1, 16) if on_processor else (1, 64, 1024))
@@ -159,16 +154,13 @@ class BenchMpc(Command):
             solvers[name] = {"p50_ms": timing.p50_ms, "p95_ms": timing.p95_ms, "first_call_s": timing.first_call_s}
         first = _controller(model, self.solvers[0], self.horizon)
         batched = {str(size): _batched_ms(first, history, size, self.repeats) for size in batches}
-        ipopt, why = _against_ipopt(model, self.solvers[0], self.referee)
         result = {
             "solver": self.solvers[0],
             "horizon": first.config.horizon,
             "repeats": self.repeats,
             **solvers[self.solvers[0]],
             "solvers": solvers,
-            "deadline": solvers.get("deadline"),
             "batched": {k: {"ms": v, "plans_per_second": 1e3 * int(k) / v} for k, v in batched.items()},
-            "ipopt": ipopt,
             **_machine(),
         }
         rows = [
@@ -182,7 +174,6 @@ class BenchMpc(Command):
                 [f"cables at once, {self.solvers[0]}", "ms", "plans per second"],
                 [[k, f"{v:.1f}", f"{1e3 * int(k) / v:.1f}"] for k, v in batched.items()],
             ),
-            why,
         ]
         return result, "\n\n".join(text)
 
@@ -255,7 +246,7 @@ class BenchLoop(Command):
     weights: str = "gns-reference"
     """Released model by name, or the folder of a training by `cablejax train`."""
 
-    solver: SolverName = "trust-region"
+    solver: SolverName = "levenberg-marquardt"
     """How the plan is found."""
 
     batches: tuple[int, ...] = (1, 8)
@@ -354,75 +345,6 @@ def _batched_ms(controller: MPC, history: History, size: int, repeats: int) -> f
         pose = measurement.gripper_pose + controller.config.objective.interval * twist
         measurement = Measurement(state.last.predicted, pose)
     return 1e3 * float(np.median(seconds[1:]))
-
-
-def _against_ipopt(model: Model, solver: SolverName, problems: int) -> tuple[dict[str, Any] | None, str]:
-    """The accurate setting against IPOPT on random problems, in float64, and a control call's solver until IPOPT is as
-    good, in float32; None and the reason where that cannot be."""
-    import importlib.util
-
-    from cablejax.cable import Cable
-
-    if not problems:
-        return None, "IPOPT was not asked."
-    if importlib.util.find_spec("ipyopt") is None:
-        return None, "IPOPT was not asked: install ipyopt for that."
-    if model.config.conditioned:
-        return None, "IPOPT was not asked: its problems are for a model that is not told its cable."
-
-    if model.cable.length != Cable.length:
-        return None, f"IPOPT was not asked: its problems are for a cable of {Cable.length:g} m."
-
-    import jax
-    import numpy as np
-
-    from cablejax.evaluation.against_ipopt import EQUAL, comparable_seconds, contestant, excess, judge
-    from cablejax.evaluation.control_call import finite, race, ratios
-    from cablejax.evaluation.planning_problems import ProblemMaker, random_cases
-    from cablejax.evaluation.referee import RefereeConfig
-    from cablejax.mpc import SOLVERS
-
-    say("compiling the planning problem in float32 ...")
-    make, chosen = ProblemMaker(model, np.float32), {solver: SOLVERS[solver]}
-    cases = random_cases(model, range(problems))
-    race(make, cases[0], chosen, RefereeConfig(max_iterations=2))
-    calls = [race(make, case, chosen) for case in cases]
-    call_ratios = ratios(calls, solver)
-    with jax.enable_x64(True):
-        ours = contestant(model)
-        say("compiling the planning problem in float64 ...")
-        judge(ours, cases[0], [RefereeConfig(max_iterations=2)], gradients=2)
-        rows = []
-        for index, case in enumerate(cases):
-            rows.append(judge(ours, case, [RefereeConfig(max_iterations=200)]))
-            say(f"IPOPT: {index + 1} of {problems}")
-    mine, theirs = comparable_seconds(rows, "limited")
-    as_good = sum(excess(row, "limited") <= EQUAL for row in rows)
-    ratio = float(np.median(theirs) / np.median(mine)) if len(mine) else None
-    result = {
-        "problems": problems,
-        "as_good": as_good,
-        "compared": len(mine),
-        "ours_s": float(np.median(mine)) if len(mine) else None,
-        "ipopt_s": float(np.median(theirs)) if len(mine) else None,
-        "ratio": ratio,
-        "largest_violation_m": max(row["violation"] for row in rows),
-        "largest_kkt": max(row["kkt"] for row in rows),
-        "float32_loss": float(np.median([row["single_objective"] / row["objective"] - 1 for row in rows])),
-        "control_call": {
-            "solver": solver,
-            "ms": 1e3 * float(np.median([row[solver]["seconds"] for row in calls])),
-            "ipopt_ms": [s and 1e3 * s for s in (row[solver]["ipopt_seconds"] for row in calls)],
-            "ipopt_never_as_good": int(np.isinf(call_ratios).sum()),
-            "ratio": finite(np.median(call_ratios)) if len(call_ratios) else None,
-        },
-    }
-    text = f"against IPOPT: as good or better on {as_good} of {problems} problems"
-    if ratio is not None:
-        text += f"; {result['ipopt_s']:.2f} s by IPOPT, {result['ours_s']:.2f} s by ours: {ratio:.1f} times as fast"
-    text += f"\na control call's plan by {solver}: {result['control_call']['ms']:.0f} ms; IPOPT to one as good: "
-    text += ", ".join("never" if ms is None else f"{ms:.0f} ms" for ms in result["control_call"]["ipopt_ms"])
-    return result, text
 
 
 def _median_seconds(contestants: dict[str, Callable[[], Any]], rounds: int) -> dict[str, float]:

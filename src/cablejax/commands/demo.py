@@ -37,7 +37,7 @@ class Demo(Command):
     links: int = 24
     """Links of the plant's cable."""
 
-    solver: Literal["trust-region", "projected-gradient"] = "trust-region"
+    solver: Literal["levenberg-marquardt", "projected-gradient"] = "levenberg-marquardt"
     """How the controller finds its plan."""
 
     def execute(self):

@@ -14,8 +14,8 @@ from cablejax.cable import Cable, Discretisation
 from cablejax.commands.options import UsageError, say
 from cablejax.commands.parts import Parts
 from cablejax.commands.results import summarise, write_results
-from cablejax.control.loop import ClosedLoopRun
-from cablejax.control.shaping import Model, shape_once
+from cablejax.control.run import ClosedLoopRun
+from cablejax.control.shaping import Method, Model, shape_once
 from cablejax.control.targets import Target
 from cablejax.dynamics.fingerprint import fingerprint
 from cablejax.effects.given import GivenEffect
@@ -23,7 +23,6 @@ from cablejax.effects.physics import nominal_physics
 from cablejax.json_file import write_json
 from cablejax.perceive.camera import CameraConfig
 from cablejax.report.effect_words import EFFECTS, listed
-from cablejax.report.record import Method
 from cablejax.report.style import METHOD_LABEL
 from cablejax.simulate.plant import PlantConfig
 from cablejax.solver_names import SolverName
@@ -40,7 +39,7 @@ class Job:
         methods: with the online residual, without, or both.
         solver: how plans are found.
         steps: commands per run.
-        camera: what the cable is seen with; None = its keypoints are told.
+        camera: what the cable is seen with; None = the controller observes the simulated keypoints directly.
     """
 
     plant: PlantConfig

@@ -39,7 +39,7 @@ class Shape(Command):
     weights: str = "gns-reference"
     """Released model by name, or the folder of a training by `cablejax train`."""
 
-    solver: SolverName = "trust-region"
+    solver: SolverName = "levenberg-marquardt"
     """How the controller finds its plan."""
 
     steps: int = 40

@@ -7,12 +7,16 @@ wrong is told from commands and poses alone. It neither hides an effect of the c
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import scipy.optimize
 from jaxtyping import Bool, Float, Int
 
+from cablejax.diagnose.belief import Calibration, probabilities
+from cablejax.diagnose.conclude import Conclusion
+from cablejax.diagnose.diagnosis import PLACES, NamedEffect, ParameterEstimate, Ranked, Verdict
+from cablejax.diagnose.evidence import student_log_likelihood
 from cablejax.diagnose.repeats import episodes_by_motion
 from cablejax.effects.arms import lagged
 
@@ -35,6 +39,10 @@ class Actuation:
     Attributes:
         effects: names and parameters (value, 90 % interval, unit) of what explains the deviation, at most both.
         alone: what every effect that was tried leaves by itself, of poses that it was fitted to and of others [m].
+        unseen: root mean square error of each episode [m] by set of effects: of poses as commanded for no effect, else
+            from fits to the other motions, shape [E] each.
+        count: coordinates of each episode, shape [E].
+        motion: episodes with the same number repeat one another, shape [E].
         deviation: root mean square of measured less commanded poses [m].
         leftover: the same after the effects.
         commanded: poses that exact arms would have had, shape [E, T, 2, 3].
@@ -45,6 +53,9 @@ class Actuation:
 
     effects: dict[str, tuple[float, tuple[float, float], str]]
     alone: dict[str, tuple[float, float]]
+    unseen: dict[tuple[str, ...], Float[np.ndarray, "E"]]
+    count: Int[np.ndarray, "E"]
+    motion: Int[np.ndarray, "E"]
     deviation: float
     leftover: float
     commanded: Float[np.ndarray, "E T 2 3"]
@@ -90,6 +101,10 @@ class _Arms:
         """What measured poses are off [m]; 0 in the padding."""
         return np.array([1.0, 1.0, _ROTATION_WEIGHT]) * self.valid[:, :, None, None] * (self.pose - poses)
 
+    def each(self, poses: Float[np.ndarray, "E T 2 3"]) -> Float[np.ndarray, "E"]:
+        """Root mean square of that in each episode [m]."""
+        return np.sqrt(np.sum(self.off(poses) ** 2, axis=(1, 2, 3)) / (6 * np.maximum(self.valid.sum(axis=1), 1)))
+
     def rms(self, poses: Float[np.ndarray, "E T 2 3"]) -> float:
         """Root mean square of that over coordinates [m]."""
         return float(np.sqrt(np.sum(self.off(poses) ** 2) / (self.valid.sum() * 6)))
@@ -131,18 +146,30 @@ def actuation(
 
     Args:
         pose: measured, theta continuous.
-        command: twists held from one sample to the next; None = not logged, nothing can be told.
+        command: twists held from one sample to the next; None = not logged, nothing is compared.
         interval: between samples [s].
         length: valid samples of each episode.
         motion: episodes with the same number repeat one another.
     """
     if command is None:
-        return Actuation({}, {}, 0.0, 0.0, pose, pose, deviates=False)
+        return Actuation({}, {}, {}, np.zeros(len(pose), int), motion, 0.0, 0.0, pose, pose, deviates=False)
     valid = np.arange(pose.shape[1])[None] < np.asarray(length)[:, None]
     arms = _Arms(pose, _integrated(pose[:, 0], command, interval), np.asarray(interval), valid)
     deviation = arms.rms(arms.commanded)
+    nothing = Actuation(
+        effects={},
+        alone={},
+        unseen={},
+        count=6 * valid.sum(axis=1),
+        motion=motion,
+        deviation=deviation,
+        leftover=deviation,
+        commanded=arms.commanded,
+        predicted=arms.commanded,
+        deviates=False,
+    )
     if deviation < _NEGLIGIBLE:
-        return Actuation({}, {}, deviation, deviation, arms.commanded, arms.commanded, deviates=False)
+        return nothing
 
     lags = [[0.1, 0.05], [0.02, 0.2], [0.4, 0.2]]
     found: dict[tuple[str, ...], Any] = {
@@ -155,26 +182,88 @@ def actuation(
     best = min((_GAIN,), (_LAG,), key=lambda effects: left[effects])
     # a second effect must take away much of what the first one leaves
     best = (_GAIN, _LAG) if left[_GAIN, _LAG] < 0.5 * left[best] else best
-    alone = {effects[0]: (left[effects], arms.rms(unseen[effects])) for effects in ((_GAIN,), (_LAG,))}
+    tried = dataclasses.replace(
+        nothing,
+        alone={effects[0]: (left[effects], arms.rms(unseen[effects])) for effects in ((_GAIN,), (_LAG,))},
+        unseen={(): arms.each(arms.commanded)} | {effects: arms.each(poses) for effects, poses in unseen.items()},
+        deviates=True,
+    )
     if left[best] >= _TELLING * deviation:
-        return Actuation({}, alone, deviation, deviation, arms.commanded, arms.commanded, deviates=True)
-    told = _told(best, found[best], max(left[best] / _ENCODER_NOISE, 1.0))
-    return Actuation(told, alone, deviation, left[best], arms.commanded, unseen[best], deviates=True)
+        return tried
+    named = _named(best, found[best], max(left[best] / _ENCODER_NOISE, 1.0))
+    return dataclasses.replace(tried, effects=named, leftover=left[best], predicted=unseen[best])
 
 
-def _told(effects: tuple[str, ...], result: Any, scale: float) -> dict[str, tuple[float, tuple[float, float], str]]:
+def with_arms(conclusion: Conclusion, arms: Actuation, calibration: Calibration) -> Conclusion:
+    """Adds what the encoders show to what the keypoints show."""
+    if not arms.deviates:
+        return conclusion
+    of_set = _chances(arms, calibration)
+    named = tuple(
+        NamedEffect(
+            name=name,
+            probability=sum(chance for effects, chance in of_set.items() if name in effects),
+            parameters={key: ParameterEstimate(value, (float(ci[0]), float(ci[1])), unit)},
+            location=dict.fromkeys(PLACES),
+        )
+        for name, (value, ci, unit) in arms.effects.items()
+        for key in ("gain" if name == _GAIN else "time_s",)
+    )
+    among_singles = sum(of_set[name,] for name in arms.alone)
+    ranked = [
+        Ranked(
+            name,
+            of_set[name,] / among_singles,
+            float(np.clip(1 - (unseen / arms.deviation) ** 2, -1.0, 1.0)),
+            1e3 * left,
+        )
+        for name, (left, unseen) in arms.alone.items()
+    ]
+    changed: dict[Verdict, Verdict] = {}
+    if named and arms.explained:
+        changed = {"none": "named", "unknown": "named+unknown"}
+    elif named:
+        changed = dict.fromkeys(get_args(Verdict), "named+unknown")
+    else:
+        changed = {"none": "unknown", "named": "named+unknown", "ambiguous": "named+unknown"}
+    share = 1 - (arms.leftover / arms.deviation) ** 2
+    return dataclasses.replace(
+        conclusion,
+        verdict=changed.get(conclusion.verdict, conclusion.verdict),
+        effects=(*named, *conclusion.effects),
+        ranking=tuple(sorted([*ranked, *conclusion.ranking], key=lambda r: -(r.probability or 0.0))),
+        explained=share if conclusion.verdict == "none" else conclusion.explained,
+    )
+
+
+def _chances(arms: Actuation, calibration: Calibration) -> dict[tuple[str, ...], float]:
+    """Probability of every set of effects of the arms, by the rule of `belief`: errors of motions that a fit has not
+    seen, tempered for what laws of arms get wrong, and a cost for every effect."""
+    calibration = dataclasses.replace(calibration, baseline=_NEGLIGIBLE)
+    temper = calibration.temper(arms.unseen[()], _ENCODER_NOISE)
+    scores = [
+        student_log_likelihood(
+            arms.count * ((error / _ENCODER_NOISE) ** 2 - 1.0) / temper, calibration.freedom, arms.motion
+        )
+        - calibration.term_cost * len(effects)
+        for effects, error in arms.unseen.items()
+    ]
+    return dict(zip(arms.unseen, probabilities(np.array(scores)).tolist(), strict=True))
+
+
+def _named(effects: tuple[str, ...], result: Any, scale: float) -> dict[str, tuple[float, tuple[float, float], str]]:
     """Value, 90 % interval and unit of every effect of a fit."""
     # residuals of one motion are far from independent: a hundred samples count as one
     covariance = 100.0 * scale**2 * np.linalg.pinv(result.jac.T @ result.jac)
-    told = {}
+    named = {}
     if _GAIN in effects:
         half = 1.645 * float(np.sqrt(covariance[0, 0]))
-        told[_GAIN] = (float(result.x[0]), (result.x[0] - half, result.x[0] + half), "")
+        named[_GAIN] = (float(result.x[0]), (result.x[0] - half, result.x[0] + half), "")
     if _LAG in effects:
         total = float(result.x[-2:].sum())
         half = 1.645 * float(np.sqrt(covariance[-2:, -2:].sum())) + 0.01 * total
-        told[_LAG] = (total, (max(total - half, 0.0), total + half), "s")
-    return told
+        named[_LAG] = (total, (max(total - half, 0.0), total + half), "s")
+    return named
 
 
 def _integrated(first, command, interval):

@@ -24,7 +24,9 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 
-from cablejax.diagnose.fit import Candidate, Evidence, Fit
+from cablejax.diagnose.evidence import Evidence
+from cablejax.diagnose.fit import Fit
+from cablejax.diagnose.protocol import Explanation
 from cablejax.diagnose.repeats import episodes_by_motion
 
 
@@ -33,8 +35,8 @@ class Calibration:
     """Constants that were set on labelled development logs, see docs/diagnosis.md.
 
     Attributes:
-        baseline: root mean square error per coordinate of the simulator without any effect [m]; commissioning logs
-            replace it.
+        baseline: root mean square error per coordinate of the simulator without any effect, in the unit of the
+            observations; commissioning logs replace it.
         law_error: rho, of an effect's law relative to the gap it makes.
         correlated_samples: n, over which errors of simulators stay the same.
         freedom: nu of Student's distribution.
@@ -70,7 +72,7 @@ class Calibration:
         return 1.0 + self.correlated_samples * (self.baseline**2 + (self.law_error * gap) ** 2) / noise**2
 
     def smallest_gap(self, noise: float) -> float:
-        """The gap [m] from which on there is one."""
+        """The gap from which on there is one."""
         return self.resolvable * float(np.hypot(self.baseline, self.noise_share * noise))
 
     def complete(self, left: float, gap: float, noise: float) -> bool:
@@ -78,7 +80,7 @@ class Calibration:
         return left <= self.may_leave(gap, noise)
 
     def may_leave(self, gap: float, noise: float) -> float:
-        """So much of the gap [m] a complete explanation may leave."""
+        """So much of the gap a complete explanation may leave."""
         return max(self.adequate * gap, self.smallest_gap(noise))
 
 
@@ -106,7 +108,7 @@ def as_good(fit: Fit, best: Fit, evidence: Evidence, calibration: Calibration) -
 
 
 def left_by_motion(fit: Fit, evidence: Evidence) -> Float[np.ndarray, "M"]:
-    """What a fit leaves of each motion, root mean square per coordinate above the noise [m]."""
+    """What a fit leaves of each motion, root mean square per coordinate above the noise."""
     counts = evidence.count
     squares = [
         max(float((fit.sse - counts)[own].sum()), 0.0) / float(counts[own].sum())
@@ -116,20 +118,20 @@ def left_by_motion(fit: Fit, evidence: Evidence) -> Float[np.ndarray, "M"]:
 
 
 def excess(sse: float, evidence: Evidence) -> float:
-    """Root mean square per coordinate above the noise [m] that whitened residuals of this sum mean."""
+    """Root mean square per coordinate above the noise that whitened residuals of this sum mean."""
     count = float(evidence.count.sum())
     return float(np.sqrt(max(sse - count, 0.0) / count)) * level(evidence)
 
 
 def level(evidence: Evidence) -> float:
-    """Noise of a coordinate, root mean square over keypoints [m]."""
+    """Noise of a coordinate, root mean square over all coordinates."""
     return float(np.sqrt(np.mean(evidence.noise**2)))
 
 
 def log_scores(fits: Sequence[Fit], evidence: Evidence, calibration: Calibration) -> Float[np.ndarray, "F"]:
-    """Log posterior of every candidate, all sets of effects with as many members being equally likely beforehand."""
+    """Log posterior of every explanation, all sets of effects with as many members being equally likely beforehand."""
     scores = [
-        evidence.log_likelihood(fit.held_out_sse(evidence)) - calibration.term_cost * len(set(fit.candidate.terms))
+        evidence.log_likelihood(fit.held_out_sse(evidence)) - calibration.term_cost * len(set(fit.explanation.terms))
         for fit in fits
     ]
     return np.array(scores)
@@ -141,14 +143,14 @@ def probabilities(scores: Float[np.ndarray, "F"]) -> Float[np.ndarray, "F"]:
     return weights / weights.sum()
 
 
-def effect_names(candidate: Candidate) -> tuple[str, ...]:
-    """Names of the distinct effects of a candidate, sorted."""
-    return tuple(sorted(set(candidate.names)))
+def effect_names(explanation: Explanation) -> tuple[str, ...]:
+    """Names of the distinct effects of an explanation, sorted."""
+    return tuple(sorted(set(explanation.names)))
 
 
 def best_by_effects(fits: Sequence[Fit], scores: Float[np.ndarray, "F"]) -> dict[tuple[str, ...], int]:
     """The best fit of every set of effects, by its index; variants and starts of one effect compete here."""
     best: dict[tuple[str, ...], int] = {}
     for i in np.argsort(-scores):
-        best.setdefault(effect_names(fits[i].candidate), int(i))
+        best.setdefault(effect_names(fits[i].explanation), int(i))
     return best

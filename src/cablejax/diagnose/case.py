@@ -10,13 +10,15 @@ from jaxtyping import Float, Int
 
 from cablejax.cable import Discretisation
 from cablejax.diagnose.actuation import Actuation, actuation
-from cablejax.diagnose.belief import Calibration, level
-from cablejax.diagnose.fit import Candidate, Evidence
+from cablejax.diagnose.belief import Calibration
+from cablejax.diagnose.evidence import Evidence
 from cablejax.diagnose.noise import NoiseFloor, noise_floor
+from cablejax.diagnose.planar import PlanarCable
 from cablejax.diagnose.playback import Playback
 from cablejax.diagnose.recording import DiagnosisError, Recording, prepare
 from cablejax.diagnose.repeats import repeated_motions
-from cablejax.effects import Context
+from cablejax.diagnose.run import weighed
+from cablejax.effects import LIBRARY, CableEffect
 from cablejax.effects.physics import nominal_physics
 from cablejax.simulate.chain.step import FINE_STEP, LARGEST_STEP
 from cablejax.simulate.pose import wrapped
@@ -38,26 +40,28 @@ class Case:
         config: the nominal cable at the resolution of the fits.
         arms: how the grippers followed their commands.
         noise: floor of the recording.
-        playback: of the measured gripper poses.
         nominal: keypoints of a fine nominal cable under the measured poses [m], shape [E, T, N, 2].
-        coarse: the same at the resolution of the fits; the difference is the error of discretisation.
+        simulator: the cable under the measured poses, corrected for the error of discretisation.
         commanded_nominal: as `nominal`, under the poses that exact arms would have had.
-        predicted_playback: of the poses that the arms' effects predict.
+        predicted: as `simulator`, under the poses that the arms' effects predict.
     """
 
     recording: Recording
     config: Discretisation
     arms: Actuation
     noise: NoiseFloor
-    playback: Playback
     nominal: Float[np.ndarray, "E T N 2"]
-    coarse: Float[np.ndarray, "E T N 2"]
+    simulator: PlanarCable
     commanded_nominal: Float[np.ndarray, "E T N 2"]
-    predicted_playback: Playback
+    predicted: PlanarCable
 
     @classmethod
-    def of(cls, log: GapLog) -> Case:
+    def of(cls, log: GapLog, effects: Sequence[CableEffect] = LIBRARY) -> Case:
         """Checks a log and replays it.
+
+        Args:
+            log: of a cable on a table between two grippers.
+            effects: that may be at work.
 
         Raises:
             DiagnosisError: the log cannot be diagnosed; the message says why and what to do.
@@ -90,73 +94,53 @@ class Case:
         nominal = run(replay(FINE_LINKS, FINE_STEP, recording.gripper_pose))
         if not np.isfinite(nominal).all():
             raise DiagnosisError("The nominal simulation of this log breaks down: are the poses continuous, in metres?")
+        simulator = PlanarCable(
+            effects=effects,
+            playback=playback,
+            correction=nominal - run(playback),
+            duration=float((recording.interval * recording.length).min()),
+            max_curvature=_max_curvature(nominal, config),
+        )
         moved = arms.deviates
+        predicted = replay(FIT_LINKS, LARGEST_STEP, arms.predicted) if moved else playback
         return cls(
             recording=recording,
             config=config,
             arms=arms,
             noise=noise,
-            playback=playback,
             nominal=nominal,
-            coarse=run(playback),
+            simulator=simulator,
             commanded_nominal=run(replay(FINE_LINKS, FINE_STEP, arms.commanded)) if moved else nominal,
-            predicted_playback=replay(FIT_LINKS, LARGEST_STEP, arms.predicted) if moved else playback,
+            predicted=dataclasses.replace(simulator, playback=predicted),
         )
 
     def evidence(self, calibration: Calibration) -> Evidence:
         """What the log says, weighed by the noise and by what simulators get wrong without any effect."""
-        observed = self.recording.keypoints
-        target = observed - self.nominal + self.coarse
-        bare = Evidence(
-            self.playback,
-            target,
-            self.noise.std,
-            temper=np.ones(len(target)),
-            freedom=calibration.freedom,
-            motion=self.motion,
+        return weighed(
+            self.simulator,
+            self.recording.keypoints,
+            self.nominal,
+            self.noise.std[:, None],
+            self.motion,
+            calibration,
         )
-        squares = (bare.residuals(self.coarse) ** 2).sum(axis=1)
-        gap = level(bare) * np.sqrt(np.maximum(squares / np.maximum(bare.count, 1) - 1, 0.0))
-        return dataclasses.replace(bare, temper=calibration.temper(gap, level(bare)))
 
     @property
     def motion(self) -> Int[np.ndarray, "E"]:
         """Episodes with the same number repeat one another."""
         return repeated_motions(self.recording.gripper_pose, self.config.cable.length)
 
-    def context(self) -> Context:
-        """What effects take their first guesses from."""
-        chord = np.diff(self.nominal, axis=2)
-        turn = np.diff(np.arctan2(chord[..., 1], chord[..., 0]), axis=-1)
-        turn = np.abs(wrapped(turn))
-        spacing = self.config.cable.length / (self.config.cable.n_keypoints - 1)
-        return Context(
-            config=self.config,
-            keypoints=self.nominal,
-            residual=self.recording.keypoints - self.nominal,
-            duration=float((self.recording.interval * self.recording.length).min()),
-            max_curvature=turn.max(axis=(1, 2)) / spacing,
-        )
-
-    def simulate(
-        self, explanation: Candidate, episodes: Sequence[int] | None = None, *, predicted: bool = False
-    ) -> Float[np.ndarray, "E T N 2"]:
-        """Keypoints under an explanation [m], the error of discretisation taken out.
-
-        Args:
-            explanation: effects and their parameters.
-            episodes: to simulate; None = all.
-            predicted: drive the cable by what the arms' effects predict instead of the measured poses.
-        """
-        playback = self.predicted_playback if predicted else self.playback
-        chosen = slice(None) if episodes is None else list(episodes)
-        physics = explanation.physics(playback.believed, self.config)
-        return playback.keypoints([physics], episodes)[0] - self.coarse[chosen] + self.nominal[chosen]
-
     def to_log(self, keypoints: Float[np.ndarray, "E T N 2"]) -> Float[np.ndarray, "E T1 N 2"]:
         """NaN beyond an episode's end, and as long as the log."""
         valid = np.arange(keypoints.shape[1])[None] < self.recording.length[:, None]
         return np.where(valid[..., None, None], keypoints, np.nan)[:, : self.recording.length.max()]
+
+
+def _max_curvature(nominal: Float[np.ndarray, "E T N 2"], config: Discretisation) -> Float[np.ndarray, "E"]:
+    """Largest curvature of each episode [1/m], from the turns between neighbouring chords."""
+    chord = np.diff(nominal, axis=2)
+    turn = np.abs(wrapped(np.diff(np.arctan2(chord[..., 1], chord[..., 0]), axis=-1)))
+    return turn.max(axis=(1, 2)) / (config.cable.length / (config.cable.n_keypoints - 1))
 
 
 def _first_shapes(recording: Recording) -> list[np.ndarray | None]:

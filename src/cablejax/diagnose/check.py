@@ -9,8 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from cablejax.cable import Discretisation
-from cablejax.diagnose.fit import Candidate, candidate
-from cablejax.effects.base import Context, Effect
+from cablejax.diagnose.planar import physics_of
+from cablejax.diagnose.protocol import Explanation, explanation
+from cablejax.effects.base import CableEffect, Context
 from cablejax.effects.physics import nominal_physics
 from cablejax.simulate.chain.step import Chain, seen_by_camera
 from cablejax.simulate.compile import compiler_options
@@ -23,7 +24,7 @@ _STEP = 1e-6
 _TOLERANCE = 1e-4
 
 
-def check_effect(effect: Effect) -> None:
+def check_effect(effect: CableEffect) -> None:
     """Tries an effect on six seconds of a short built-in motion, in double precision.
 
     Raises:
@@ -44,17 +45,17 @@ def check_effect(effect: Effect) -> None:
         starts = effect.starts(_context(still))
         if not starts:
             raise ValueError(f"Effect {effect.name!r}: `starts` gave none for an ordinary log; expected at least one.")
-        candidates = [candidate((effect, variant, values)) for variant, values in starts]
+        trials = [explanation((effect, variant, values)) for variant, values in starts]
         moved = [
-            np.abs(np.asarray(_replay(c.physics(nominal, _CONFIG, c.z), motion, angles)) - still).max()
-            for c in candidates
+            np.abs(np.asarray(_replay(physics_of(c, nominal, _CONFIG, c.z), motion, angles)) - still).max()
+            for c in trials
         ]
         if not max(moved) > 1e-6:
             raise ValueError(
                 f"Effect {effect.name!r}: none of its {len(starts)} starts moves a keypoint by more than a micrometre; "
                 "expected an effect that shows."
             )
-        best = candidates[int(np.argmax(moved))]
+        best = trials[int(np.argmax(moved))]
         for i, parameter in enumerate(effect.parameters):
             exact, difference = _derivatives(best, i, nominal, motion, angles)
             error = np.abs(exact - difference).max()
@@ -66,13 +67,13 @@ def check_effect(effect: Effect) -> None:
                 )
 
 
-def _derivatives(best: Candidate, i: int, nominal, motion, angles):
+def _derivatives(best: Explanation, i: int, nominal, motion, angles):
     direction = jnp.zeros(len(best.z)).at[i].set(1.0)
     # at a place where nothing is at a kink by design
     z = jnp.asarray(best.z) + 0.01
 
     def physics(z):
-        return jax.tree.map(jnp.asarray, best.physics(nominal, _CONFIG, z))
+        return jax.tree.map(jnp.asarray, physics_of(best, nominal, _CONFIG, z))
 
     value, change = jax.jvp(physics, (z,), (direction,))
     exact = _replay_jvp(value, change, motion, angles)

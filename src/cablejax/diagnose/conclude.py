@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Any, get_args
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
-from cablejax.cable import Discretisation
-from cablejax.diagnose.actuation import Actuation
 from cablejax.diagnose.belief import (
     Calibration,
     as_good,
@@ -21,11 +19,13 @@ from cablejax.diagnose.belief import (
     probabilities,
 )
 from cablejax.diagnose.conformal import leftover_p, leftover_score
-from cablejax.diagnose.diagnosis import NamedEffect, ParameterEstimate, Ranked, Verdict
-from cablejax.diagnose.fit import Evidence, Fit
+from cablejax.diagnose.diagnosis import PLACES, NamedEffect, ParameterEstimate, Ranked, Verdict
+from cablejax.diagnose.evidence import Evidence
+from cablejax.diagnose.fit import Fit
+from cablejax.diagnose.judgement import judged
 from cablejax.diagnose.profile import scaled_draws
+from cablejax.diagnose.protocol import Simulator
 from cablejax.diagnose.search import Search
-from cablejax.simulate.pose import wrapped
 
 _DRAWS = 400
 
@@ -36,7 +36,7 @@ class Conclusion:
 
     Attributes:
         verdict: see the format.
-        best: the most probable explanation, the nominal cable included.
+        best: the most probable explanation, the nominal simulator included.
         effects: named; empty for "none" and "unknown".
         equivalent: sets of effects that this log cannot tell apart.
         ranking: of single effects.
@@ -57,7 +57,7 @@ def conclude(found: Search, evidence: Evidence, calibration: Calibration) -> Con
     """Probabilities, equivalence sets and the verdict."""
     chances = probabilities(found.scores)
     best = found.fits[0]
-    null = next(fit for fit in found.fits if not fit.candidate.terms)
+    null = next(fit for fit in found.fits if not fit.explanation.terms)
     gap = excess(float(null.sse.sum()), evidence)
     left = excess(float(best.sse.sum()), evidence)
     explained = 1.0 - (left / gap) ** 2 if gap > 0 else 0.0
@@ -65,18 +65,18 @@ def conclude(found: Search, evidence: Evidence, calibration: Calibration) -> Con
     smallest = calibration.smallest_gap(level(evidence))
     if gap <= smallest:
         return Conclusion("none", null, (), (), ranking, 0.0)
-    as_much = leftover_p(leftover_score(left, gap, level(evidence), calibration))
-    if not best.candidate.terms:
+    as_much = leftover_p(leftover_score(left, gap, level(evidence), calibration), evidence.simulator.right_scores)
+    if not best.explanation.terms:
         return Conclusion("unknown", best, (), (), ranking, explained, as_much)
 
     draws = scaled_draws(evidence, best, calibration.widening, _DRAWS, np.random.default_rng(0))
     effects, equivalent = [], []
-    for name in effect_names(best.candidate):
-        rest = set(effect_names(best.candidate)) - {name}
+    for name in effect_names(best.explanation):
+        rest = set(effect_names(best.explanation)) - {name}
         odds: dict[str, float] = {}
         alike_by_size: set[str] = set()
         for fit, chance in zip(found.fits, chances, strict=True):
-            names = set(effect_names(fit.candidate))
+            names = set(effect_names(fit.explanation))
             # the same explanation with another effect in this one's place
             if len(names) == len(rest) + 1 and rest <= names:
                 (other,) = names - rest
@@ -91,86 +91,47 @@ def conclude(found: Search, evidence: Evidence, calibration: Calibration) -> Con
         )
         if len(alike) > 1:
             equivalent.append(tuple(alike))
-        effects.append(_named(name, best, odds[name] / total, draws, evidence.playback.config))
+        effects.append(_named(name, best, odds[name] / total, draws, evidence.simulator))
     complete = calibration.complete(left, gap, level(evidence))
     telling = explained >= calibration.telling or explains_most_motions(best, null, evidence, calibration)
-    if not (telling or complete):
+    verdict = judged(resolvable=True, telling=telling or complete, complete=complete, alike=bool(equivalent))
+    if verdict == "unknown":
         return Conclusion("unknown", best, (), (), ranking, explained, as_much)
-    if not complete:
-        verdict: Verdict = "named+unknown"
-    else:
-        verdict = "ambiguous" if equivalent else "named"
-    order = np.argsort([-e.probability for e in effects])
+    order = np.argsort([-(e.probability or 0.0) for e in effects])
     named = tuple(effects[i] for i in order)
     return Conclusion(verdict, best, named, tuple(equivalent), ranking, explained, as_much)
 
 
-def with_arms(conclusion: Conclusion, arms: Actuation) -> Conclusion:
-    """Adds what the encoders show to what the keypoints show."""
-    if not arms.deviates:
-        return conclusion
-    named = tuple(
-        NamedEffect(
-            name=name,
-            probability=0.99 if arms.explained else 0.7,
-            parameters={key: ParameterEstimate(value, (float(ci[0]), float(ci[1])), unit)},
-            location={"along_cable_m": None, "time_s": None, "table_m": None},
-        )
-        for name, (value, ci, unit) in arms.effects.items()
-        for key in ("gain" if name == "actuation_gain" else "time_s",)
-    )
-    believed = {e.name: e.probability for e in named}
-    ranked = [
-        Ranked(name, believed.get(name, 0.0), float(np.clip(1 - (unseen / arms.deviation) ** 2, -1.0, 1.0)), 1e3 * left)
-        for name, (left, unseen) in arms.alone.items()
-    ]
-    changed: dict[Verdict, Verdict] = {}
-    if named and arms.explained:
-        changed = {"none": "named", "unknown": "named+unknown"}
-    elif named:
-        changed = dict.fromkeys(get_args(Verdict), "named+unknown")
-    else:
-        changed = {"none": "unknown", "named": "named+unknown", "ambiguous": "named+unknown"}
-    share = 1 - (arms.leftover / arms.deviation) ** 2
-    return dataclasses.replace(
-        conclusion,
-        verdict=changed.get(conclusion.verdict, conclusion.verdict),
-        effects=(*named, *conclusion.effects),
-        ranking=tuple(sorted([*ranked, *conclusion.ranking], key=lambda r: -r.probability)),
-        explained=share if conclusion.verdict == "none" else conclusion.explained,
-    )
-
-
 def baselines(found: Search, evidence: Evidence) -> dict[str, str]:
     """What simpler rules would have named, see `Diagnosis.baselines`."""
-    singles = [fit for fit in found.fits if len(effect_names(fit.candidate)) == 1]
+    singles = [fit for fit in found.fits if len(effect_names(fit.explanation)) == 1]
     if not singles:
         return {}
     samples = float(evidence.count.sum())
 
     def bic(fit: Fit) -> float:
-        return float(fit.sse.sum()) + len(fit.candidate.z) * float(np.log(samples))
+        return float(fit.sse.sum()) + len(fit.explanation.z) * float(np.log(samples))
 
     return {
-        "lowest_cost": min(singles, key=lambda fit: float(fit.sse.sum())).candidate.names[0],
-        "bic": min(singles, key=bic).candidate.names[0],
+        "lowest_cost": min(singles, key=lambda fit: float(fit.sse.sum())).explanation.names[0],
+        "bic": min(singles, key=bic).explanation.names[0],
         "sparse_regression": max(found.screened, key=lambda name: found.screened[name]),
     }
 
 
 def _ranking(found: Search, evidence: Evidence, calibration: Calibration) -> tuple[Ranked, ...]:
-    singles = [(f, s) for f, s in zip(found.fits, found.scores, strict=True) if len(effect_names(f.candidate)) == 1]
+    singles = [(f, s) for f, s in zip(found.fits, found.scores, strict=True) if len(effect_names(f.explanation)) == 1]
     if not singles:
         return ()
     chances = probabilities(np.array([s for _, s in singles]))
-    null = next(fit for fit in found.fits if not fit.candidate.terms)
+    null = next(fit for fit in found.fits if not fit.explanation.terms)
     before = max(float(null.sse.sum()) - evidence.count.sum(), 1e-9)
     result = []
     for (fit, _), chance in zip(singles, chances, strict=True):
         held_out = float(fit.held_out_sse(evidence).sum()) - evidence.count.sum()
         result.append(
             Ranked(
-                name=fit.candidate.names[0],
+                name=fit.explanation.names[0],
                 probability=float(chance),
                 held_out_shrinkage=float(np.clip(1 - held_out / before, -1.0, 1.0)),
                 leftover_mm=1e3 * excess(float(fit.sse.sum()), evidence),
@@ -183,27 +144,27 @@ def _ranking(found: Search, evidence: Evidence, calibration: Calibration) -> tup
         for name, share in found.screened.items()
         if name not in tried
     ]
-    return tuple(sorted(result, key=lambda r: -r.probability))
+    return tuple(sorted(result, key=lambda r: -(r.probability or 0.0)))
 
 
 def _named(
-    name: str, fit: Fit, probability: float, draws: Float[np.ndarray, "D P"], config: Discretisation
+    name: str, fit: Fit, probability: float, draws: Float[np.ndarray, "D P"], simulator: Simulator
 ) -> NamedEffect:
     """One effect of a fit, with intervals from draws of the fit's coordinates."""
     parts: list[dict[str, ParameterEstimate]] = []
-    location: dict[str, Any] = {"along_cable_m": None, "time_s": None, "table_m": None}
-    drawn = [fit.candidate.by_term(draw) for draw in draws]
-    for i, (term, z) in enumerate(fit.candidate.by_term()):
+    location: dict[str, Any] = dict.fromkeys(PLACES)
+    drawn = [fit.explanation.by_term(draw) for draw in draws]
+    for i, (term, z) in enumerate(fit.explanation.by_term()):
         if term.effect.name != name:
             continue
-        fitted = term.values(z)
-        sampled = [term.effect.reported(term.values(draw[i][1]), term.variant, config) for draw in drawn]
+        report = simulator.report(term, term.values(z))
+        sampled = [simulator.report(term, term.values(draw[i][1])).parameters for draw in drawn]
         parameters = {}
-        for key, (value, unit) in term.effect.reported(fitted, term.variant, config).items():
+        for key, (value, unit) in report.parameters.items():
             column = [sample[key][0] for sample in sampled]
             parameters[key] = ParameterEstimate(value, _interval(value, column, unit), unit)
         parts.append(parameters)
-        location = _spanning(location, term.effect.location(fitted, term.variant, config))
+        location = _spanning(location, report.location)
     return NamedEffect(name, probability, _merged(parts), location)
 
 
@@ -220,7 +181,7 @@ def _interval(value, column: Sequence[Any], unit: str):
     drawn = np.asarray(column, float)
     if unit == "rad":
         # angles near the turn of the circle
-        drawn = value + wrapped(drawn - value)
+        drawn = value + ((drawn - value + np.pi) % (2 * np.pi) - np.pi)
     low, high = np.quantile(drawn, (0.05, 0.95))
     return float(low), float(high)
 
@@ -235,25 +196,3 @@ def _merged(parts: list[dict[str, ParameterEstimate]]) -> dict[str, ParameterEst
         intervals: Any = None if first.ci90 is None else [e.ci90 for e in every]
         merged[key] = ParameterEstimate([e.value for e in every], intervals, first.unit)
     return merged
-
-
-def sentence(conclusion: Conclusion, shrinkage: float | None) -> str:
-    """The verdict in words, with the share of the squared gap that goes away.
-
-    Args:
-        conclusion: the verdict.
-        shrinkage: on episodes left out of the fit; None where nothing could be, which leaves that of the fit.
-    """
-    share = f"{100 * max(conclusion.explained if shrinkage is None else shrinkage, 0.0):.0f} %"
-    names = " and ".join(e.name.replace("_", " ") for e in conclusion.effects)
-    alike = "; ".join(" or ".join(n.replace("_", " ") for n in group) for group in conclusion.equivalent)
-    rivals = f" (this log cannot tell apart: {alike})" if alike else ""
-    return {
-        "none": "The simulator explains this log within what the noise and its own resolution allow.",
-        "named": f"The gap comes from {names}, which explains {share} of it.",
-        "ambiguous": f"The gap comes from {names} or a look-alike, which this log cannot tell apart: {alike}.",
-        "named+unknown": (
-            f"Part of the gap, {share}, is explained by {names}{rivals}; the rest by no effect of the library."
-        ),
-        "unknown": f"The gap has a cause that is not in the library: the best explanation takes away {share} of it.",
-    }[conclusion.verdict]

@@ -8,6 +8,8 @@ least as high, the new one counted. An explanation that is not complete, with a 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from cablejax.diagnose.belief import Calibration
 
 # fmt: off
@@ -20,14 +22,22 @@ SCORES = (
 )
 # fmt: on
 """Of 80 logs of the blind check of seed 20270404, printed by `python experiments/22_blind_score.py
-docs/results/blind/20270404/verdicts docs/results/blind/20270404 --leftovers`."""
+docs/results/blind/20270404/cases.jsonl --leftovers`."""
 
 
 def leftover_score(left: float, gap: float, noise: float, calibration: Calibration) -> float:
-    """What an explanation leaves of the gap, relative to what a complete one may leave; all in metres."""
+    """What an explanation leaves of the gap, relative to what a complete one may leave; all in one unit."""
     return left / calibration.may_leave(gap, noise)
 
 
-def leftover_p(score: float) -> float:
-    """Chance that a right explanation has a score at least as high; at least 1 / 81."""
-    return (1 + sum(other >= score for other in SCORES)) / (len(SCORES) + 1)
+def leftover_p(score: float, right: Sequence[float] = SCORES) -> float | None:
+    """Chance that a right explanation has a score at least as high; at least 1 / 81 for cables.
+
+    Args:
+        score: of the new explanation.
+        right: scores of right explanations on labelled recordings that are like the new one.
+
+    Returns:
+        None where there are no such recordings.
+    """
+    return (1 + sum(other >= score for other in right)) / (len(right) + 1) if right else None

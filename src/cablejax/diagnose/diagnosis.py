@@ -13,6 +13,9 @@ from cablejax.types import GapLog
 
 Verdict = Literal["none", "named", "ambiguous", "named+unknown", "unknown"]
 
+PLACES = ("along_cable_m", "time_s", "table_m")
+"""Where an effect may sit, by the keys of the verdict."""
+
 
 @dataclasses.dataclass(frozen=True)
 class ParameterEstimate:
@@ -35,30 +38,33 @@ class NamedEffect:
 
     Attributes:
         name: from the gap log's list of names.
-        probability: that this effect is a cause.
+        probability: posterior that this effect is a cause, among all explanations with it or with another effect in its
+            place, were the cause one of those that were tried; None where nothing of the kind was computed.
         parameters: by the names of the format.
-        location: keys "along_cable_m", "time_s", "table_m"; None where an effect has no such place.
+        location: keys `PLACES`; None where an effect has no such place.
     """
 
     name: str
-    probability: float
+    probability: float | None
     parameters: dict[str, ParameterEstimate]
     location: dict[str, Any]
 
 
 @dataclasses.dataclass(frozen=True)
 class Ranked:
-    """One effect that was tried alone.
+    """One effect that was tried: alone, or in a forward search on top of those kept before it.
 
     Attributes:
         name: of the effect.
-        probability: posterior among all single effects.
-        held_out_shrinkage: share of the squared gap that goes away on episodes left out of the fit.
-        leftover_mm: gap above the noise that is left on the episodes fitted, root mean square per coordinate [mm].
+        probability: posterior among all single effects; None in a forward search, which computes none.
+        held_out_shrinkage: share of the squared gap that goes away on episodes left out of the fit; negative where the
+            effect makes these worse.
+        leftover_mm: gap above the noise that is left, root mean square per coordinate [mm], on the episodes fitted; of
+            a forward search, on those left out.
     """
 
     name: str
-    probability: float
+    probability: float | None
     held_out_shrinkage: float
     leftover_mm: float
 
@@ -66,6 +72,8 @@ class Ranked:
 @dataclasses.dataclass(frozen=True)
 class Gap:
     """How large the gap is before and after, on episodes that no fit has seen. Root mean squares per coordinate [mm].
+
+    Where `unit` is not the metre, whatever is called `_mm` is in thousandths of it.
 
     Attributes:
         horizon_s: over which the simulations run freely that are compared: the longest episode, or a window in space.
@@ -80,6 +88,9 @@ class Gap:
         horizons_mm: {seconds since the episode's start: (before, after)}.
         held_out_episodes: those scored; all of them where every episode was held out once.
         split: shares of the squared error before: "noise", "named", "learnable", "unexplained"; they sum to 1.
+            "learnable" is what the online residual would take away of what is left; None where that was not computed,
+            and then it is part of "unexplained".
+        unit: of the observations.
     """
 
     horizon_s: float
@@ -91,7 +102,8 @@ class Gap:
     ahead_mm: dict[str, float] | None
     horizons_mm: dict[float, tuple[float, float]]
     held_out_episodes: tuple[int, ...]
-    split: dict[str, float]
+    split: dict[str, float | None]
+    unit: str = "m"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -112,33 +124,28 @@ class NextMotion:
     alternatives: dict[str, float]
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, kw_only=True)
 class Diagnosis:
-    """Where a simulator is wrong, which effect causes it, how far the gap shrinks with it.
+    """Which effect makes a simulator wrong on a recording, and how far the gap shrinks with it. Any simulator's.
+
+    What a simulator does not compute is None.
 
     Attributes:
         verdict: see the format.
         sentence: the verdict in words.
         effects: what is named as the cause; empty for "none" and "unknown".
         equivalent: sets of effects that this log cannot tell apart.
-        ranking: every effect tried, most probable first.
+        ranking: every effect tried, most probable first; without probabilities, the largest shrinkage first.
         leftover_p: chance that a right explanation leaves as much as the best one does, see `conformal`; None without a
             gap, and where no labelled logs are like this one.
         gap: before and after.
-        where: along the cable, in time, by regime, by frame.
-        next_motion: None if nothing would be gained.
+        where: along the cable, in time, by regime, by frame; None where no adapter localises.
+        next_motion: None if nothing would be gained, or no motions are known.
         baselines: the single effect that simpler rules would have named: "lowest_cost" (best fit in sample), "bic" (the
             same with Schwarz's penalty, all samples taken to be independent) and "sparse_regression" (the best template
-            without any fit); empty for the verdict "none".
+            without any fit); empty for the verdict "none", and where these rules were not evaluated.
         caveats: what the log did not allow, in words.
-        log: what was diagnosed.
-        nominal: keypoints of the nominal simulator [m], NaN beyond an episode's end, shape [E, T, N, 2].
-        explained: keypoints of the simulator with the named (or best) effects, each episode from a fit that left it
-            out [m], shape [E, T, N, 2]; None for the verdict "none".
-        noise_mm: standard deviation of each keypoint's coordinates [mm], shape [N].
-        noise_correlation: autocorrelation of the noise at lags 1, 2, ... samples.
         seconds: run time.
-        settings: versions and options, for the record.
     """
 
     verdict: Verdict
@@ -148,14 +155,31 @@ class Diagnosis:
     ranking: tuple[Ranked, ...]
     leftover_p: float | None
     gap: Gap
-    where: Where
+    where: Where | None
     next_motion: NextMotion | None
     baselines: dict[str, str]
     caveats: tuple[str, ...]
-    log: GapLog
-    nominal: Float[np.ndarray, "E T N 2"]
-    explained: Float[np.ndarray, "E T N 2"] | None
-    noise_mm: Float[np.ndarray, "N"]
-    noise_correlation: Float[np.ndarray, "K"]
     seconds: float
     settings: dict[str, Any]
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class CableDiagnosis(Diagnosis):
+    """The diagnosis of a cable between two grippers, with what its page shows.
+
+    Attributes:
+        where: along the cable, in time, by regime, by frame.
+        log: what was diagnosed.
+        nominal: keypoints of the nominal simulator [m], NaN beyond an episode's end, shape [E, T, N, D].
+        explained: keypoints of the simulator with the named (or best) effects, each episode from a fit that left it
+            out [m], shape [E, T, N, D]; None for the verdict "none".
+        noise_mm: standard deviation of each keypoint's coordinates [mm], shape [N].
+        noise_correlation: autocorrelation of the noise at lags 1, 2, ... samples.
+    """
+
+    where: Where
+    log: GapLog
+    nominal: Float[np.ndarray, "E T N D"]
+    explained: Float[np.ndarray, "E T N D"] | None
+    noise_mm: Float[np.ndarray, "N"]
+    noise_correlation: Float[np.ndarray, "K"]

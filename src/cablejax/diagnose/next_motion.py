@@ -8,8 +8,9 @@ import numpy as np
 from jaxtyping import Float
 
 from cablejax.diagnose.diagnosis import NextMotion
-from cablejax.diagnose.fit import Candidate
+from cablejax.diagnose.planar import physics_of
 from cablejax.diagnose.playback import Playback
+from cablejax.diagnose.protocol import Explanation
 from cablejax.diagnose.safe_motions import INTERVAL, safe_motions, starting_pose
 from cablejax.effects.physics import Physics
 
@@ -19,7 +20,7 @@ _USUAL_SAMPLES = 300
 
 
 def next_motion(
-    playback: Playback, candidates: Sequence[Candidate], noise: Float[np.ndarray, "N"], temper: float = 1.0
+    playback: Playback, explanations: Sequence[Explanation], noise: Float[np.ndarray, "N"], temper: float = 1.0
 ) -> NextMotion | None:
     """Simulates every safe motion from a first pose of the log under the two most probable explanations.
 
@@ -28,7 +29,7 @@ def next_motion(
 
     Args:
         playback: the log's motions.
-        candidates: fitted explanations, most probable first; all but the first two are ignored.
+        explanations: fitted explanations, most probable first; all but the first two are ignored.
         noise: standard deviation of each keypoint's coordinates [m].
         temper: how many correlated samples count as one, for the posterior; see `belief`.
 
@@ -36,9 +37,9 @@ def next_motion(
         The motion and its separation, or None if there is no motion that this cable bears and the simulation survives.
 
     Raises:
-        ValueError: no candidates.
+        ValueError: no explanations.
     """
-    if not candidates:
+    if not explanations:
         raise ValueError("next_motion needs at least one fitted explanation, got none.")
     config, first = playback.config, starting_pose(playback.gripper_pose)
     n_samples = playback.gripper_pose.shape[1]
@@ -59,12 +60,12 @@ def next_motion(
         interval=np.concatenate([m.interval for m in motions.values()]),
         believed=playback.believed,
     )
-    if len(candidates) > 1:
-        rivals = [c.physics(playback.believed, config) for c in candidates[:2]]
+    if len(explanations) > 1:
+        rivals = [physics_of(c, playback.believed, config) for c in explanations[:2]]
         separation = _difference(library, rivals[0], rivals[1:], noise)[0]
-        separates = _name(candidates[0]), _name(candidates[1])
+        separates = _name(explanations[0]), _name(explanations[1])
     else:
-        separation = _sensitivity(playback, library, candidates[0], noise, temper)
+        separation = _sensitivity(playback, library, explanations[0], noise, temper)
         separates = ()
     numbers = {name: float(value) for name, value in zip(motions, separation, strict=True) if np.isfinite(value)}
     if not numbers:
@@ -81,16 +82,14 @@ def _difference(
     return np.sqrt((((keypoints[1:] - keypoints[0]) / noise[:, None]) ** 2).mean(axis=(2, 3, 4)))
 
 
-def _sensitivity(playback, library, candidate: Candidate, noise, temper: float) -> Float[np.ndarray, "E"]:
+def _sensitivity(playback, library, explanation: Explanation, noise, temper: float) -> Float[np.ndarray, "E"]:
     """Root of the summed squared changes with every parameter, each moved by one posterior standard deviation."""
-    config, n_parameters = playback.config, len(candidate.z)
+    config, n_parameters = playback.config, len(explanation.z)
     if n_parameters == 0:
         return np.full(len(library.gripper_pose), np.nan)
-    base = candidate.physics(playback.believed, config)
-    steps = candidate.differences
-    moved = [
-        candidate.physics(playback.believed, config, (candidate.z + step).astype(np.float32)) for step in np.diag(steps)
-    ]
+    base = physics_of(explanation, playback.believed, config)
+    steps = explanation.differences
+    moved = [physics_of(explanation.moved(explanation.z + step), playback.believed, config) for step in np.diag(steps)]
     keypoints = playback.keypoints([base, *moved])
     jacobian = ((keypoints[1:] - keypoints[0]) / noise[:, None]).reshape(n_parameters, -1) / steps[:, None]
     jacobian = np.where(np.isfinite(jacobian), jacobian, 0.0)
@@ -100,5 +99,5 @@ def _sensitivity(playback, library, candidate: Candidate, noise, temper: float) 
     return np.sqrt((change**2).sum(axis=0))
 
 
-def _name(candidate: Candidate) -> str:
-    return " + ".join(dict.fromkeys(candidate.names)) or "nominal"
+def _name(explanation: Explanation) -> str:
+    return " + ".join(dict.fromkeys(explanation.names)) or "nominal"

@@ -32,14 +32,21 @@ class NoiseFloor:
     from_holds: bool
 
 
-def noise_floor(keypoints: Float[np.ndarray, "E T N 2"], hold: np.ndarray | None) -> NoiseFloor:
+def noise_floor(
+    keypoints: Float[np.ndarray, "E T N D"], hold: np.ndarray | None, *, smallest: float = SMALLEST
+) -> NoiseFloor:
     """Noise from holds, each detrended by a line since a cable may creep; without holds, from third differences.
 
     If the noise in the holds is white, third differences of the whole recording sharpen its level: there are many more
     of them, and no cable moves by jerks that fast. Keypoints share one level unless one is clearly noisier.
 
+    Args:
+        keypoints: N points of D coordinates that have the same noise, NaN = not observed.
+        hold: whether nothing moves, shape [E, T]; None = not known.
+        smallest: least noise that is believed.
+
     Raises:
-        ValueError: fewer than 20 observed samples of every keypoint.
+        ValueError: fewer than 20 observed samples of every keypoint, or no noise at all.
     """
     rapid, n_rapid = _third_differences(keypoints)
     held = _held(keypoints, hold) if hold is not None else None
@@ -57,7 +64,9 @@ def noise_floor(keypoints: Float[np.ndarray, "E T N 2"], hold: np.ndarray | None
     if count.max() < 20:
         raise ValueError(f"The log shows a keypoint at most {int(count.max())} times, expected at least 20 samples.")
     common = float(np.average(variance, weights=np.maximum(count, 1e-9)))
-    common, variance = max(common, SMALLEST**2), np.maximum(variance, SMALLEST**2)
+    common, variance = max(common, smallest**2), np.maximum(variance, smallest**2)
+    if not common > 0:
+        raise ValueError("The observations have no noise that could be estimated: say how large it is.")
     error = common * np.sqrt(2.0 / np.maximum(count, 1.0))
     distinct = (np.abs(variance - common) > _DISTINCT * error) & (count >= 20)
     return NoiseFloor(std=np.sqrt(np.where(distinct, variance, common)), correlation=correlation, from_holds=from_holds)
@@ -88,7 +97,7 @@ def _held(keypoints, hold):
             if end - begin < _SHORTEST_HOLD:
                 continue
             for n in range(n_points):
-                for axis in range(2):
+                for axis in range(keypoints.shape[3]):
                     values = episode[begin:end, n, axis]
                     seen = np.isfinite(values)
                     if seen.sum() < _SHORTEST_HOLD:

@@ -8,12 +8,11 @@ the fit, as in `Fit.precision`.
 
 from __future__ import annotations
 
-import dataclasses
-
 import numpy as np
 from jaxtyping import Float
 
-from cablejax.diagnose.fit import Evidence, Fit, evaluate
+from cablejax.diagnose.evidence import Evidence
+from cablejax.diagnose.fit import Fit, evaluate
 
 QUANTILE = 1.6449
 """Of the normal distribution, at 95 %: the intervals are two-sided 90 %."""
@@ -31,7 +30,7 @@ def profile_widths(evidence: Evidence, fit: Fit) -> Float[np.ndarray, "P 2"]:
         evidence: that was fitted.
         fit: at its optimum.
     """
-    z, bounds = fit.candidate.z, fit.candidate.bounds
+    z, bounds = fit.explanation.z, fit.explanation.bounds
     covariance = np.linalg.inv(fit.precision(evidence))
     deviation = np.sqrt(np.diagonal(covariance))
     width = np.repeat(QUANTILE * deviation[:, None], 2, axis=1)
@@ -43,7 +42,7 @@ def profile_widths(evidence: Evidence, fit: Fit) -> Float[np.ndarray, "P 2"]:
         trials = []
         for i, side in ends:
             moved = z + (2 * side - 1) * min(width[i, side], room[i, side]) * covariance[i] / covariance[i, i]
-            trials.append(dataclasses.replace(fit.candidate, z=np.clip(moved, bounds[:, 0], bounds[:, 1])))
+            trials.append(fit.explanation.moved(np.clip(moved, bounds[:, 0], bounds[:, 1])))
         for (i, side), trial in zip(ends, evaluate(evidence, trials), strict=True):
             rise = _profiled_cost(trial, weight, i) - cost
             scale = np.sqrt(0.5 * QUANTILE**2 / rise) if rise > 0 else _MOST
@@ -66,15 +65,15 @@ def scaled_draws(
     covariance = np.linalg.inv(fit.precision(evidence))
     draws = rng.multivariate_normal(np.zeros(len(covariance)), covariance, size=count, method="cholesky")
     down, up = (profile_widths(evidence, fit) / (QUANTILE * np.sqrt(np.diagonal(covariance)))[:, None]).T
-    moved = fit.candidate.z + widening * draws * np.where(draws < 0, down, up)
-    return np.clip(moved, *fit.candidate.bounds.T)
+    moved = fit.explanation.z + widening * draws * np.where(draws < 0, down, up)
+    return np.clip(moved, *fit.explanation.bounds.T)
 
 
 def _profiled_cost(trial: Fit, weight: Float[np.ndarray, "E"], fixed: int) -> float:
     """Cost after a Gauss-Newton step of all coordinates but one, as the step's own model has it."""
-    z = trial.candidate.z
-    gradient = trial.gradient.T @ weight + z
-    free = trial.free(gradient) & (np.arange(len(z)) != fixed)
-    precision = trial.weighted_precision(weight)[np.ix_(free, free)]
-    gain = 0.5 * float(gradient[free] @ np.linalg.solve(precision, gradient[free]))
-    return 0.5 * float(weight @ trial.sse + z @ z) - gain
+    model = trial.model(weight, 0.5 * float(weight @ trial.sse + trial.explanation.z @ trial.explanation.z))
+    free = model.free & (np.arange(len(model.point)) != fixed)
+    gain = 0.5 * float(
+        model.gradient[free] @ np.linalg.solve(model.curvature[np.ix_(free, free)], model.gradient[free])
+    )
+    return model.value - gain

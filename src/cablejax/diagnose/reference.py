@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from cablejax.diagnose.recording import Recording
 from cablejax.residual.ridge import RidgeConfig, apply, fit
 
 HORIZON = 5
@@ -68,6 +69,36 @@ def predicted_ahead(
     if not alone or not np.isfinite(np.concatenate(corrected)).any():
         return None
     return Ahead(*(float(np.sqrt(np.nanmean(np.concatenate(x) ** 2))) for x in (alone, corrected)))
+
+
+def ahead_of_observations(
+    recording: Recording,
+    before: Float[np.ndarray, "E T N 2"],
+    after: Float[np.ndarray, "E T N 2"],
+    noise: Float[np.ndarray, "N"],
+) -> tuple[dict[str, float] | None, float | None]:
+    """Errors five seconds ahead [mm], see `Gap.ahead_mm`, and the share of the squared leftover that is learnable.
+
+    Args:
+        recording: with the observed keypoints.
+        before: keypoints of the nominal simulator [m].
+        after: with the named effects [m].
+        noise: standard deviation of each keypoint's coordinates [m].
+
+    Returns:
+        Two times None where no episode is long enough, or none was observed for so long.
+    """
+    arguments = recording.gripper_pose, recording.interval, recording.length
+    nominal = predicted_ahead(recording.keypoints, before, *arguments)
+    named = predicted_ahead(recording.keypoints, after, *arguments)
+    if nominal is None or named is None:
+        return None, None
+    # both ends of the prediction are observed with noise
+    floor = 2 * float(np.mean(noise**2))
+    left = max(named.alone**2 - floor, 0.0)
+    learnable = (named.alone**2 - max(named.corrected**2, floor)) / left if left > 0.1 * floor else 0.0
+    errors = {"nominal": 1e3 * nominal.alone, "ridge": 1e3 * nominal.corrected, "named": 1e3 * named.alone}
+    return errors, float(np.clip(learnable, 0.0, 1.0))
 
 
 @functools.cache

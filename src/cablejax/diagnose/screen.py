@@ -8,8 +8,9 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 
-from cablejax.diagnose.fit import Candidate, Evidence, candidate
-from cablejax.effects.base import Context, Effect
+from cablejax.diagnose.evidence import Evidence
+from cablejax.diagnose.protocol import Explanation, explanation
+from cablejax.effects.effect import Effect
 
 # How far a template is stretched, at most, to meet the gap.
 _LARGEST_AMPLITUDE = 3.0
@@ -17,37 +18,39 @@ _LARGEST_AMPLITUDE = 3.0
 
 @dataclasses.dataclass(frozen=True)
 class Template:
-    """What one start of one effect does to the keypoints, against the gap.
+    """What one start of one effect does to the observations, against the gap.
 
     Attributes:
-        start: the candidate, moved along its amplitude to meet the gap where that is possible.
+        start: the explanation, moved along its amplitude to meet the gap where that is possible.
         explained: share of the squared gap that it takes away, the noise taken out of the gap: of the template at its
             best length where a parameter decides on that, else of the template as it is. At most about 1.
     """
 
-    start: Candidate
+    start: Explanation
     explained: float
 
 
 def screen(
-    evidence: Evidence,
-    base: Candidate,
-    effects: Sequence[Effect],
-    context: Context,
+    evidence: Evidence, base: Explanation, effects: Sequence[Effect], predicted: Float[np.ndarray, "E T *O"]
 ) -> list[Template]:
     """Templates of every start of every effect on top of a base explanation.
 
     An effect of finite size, not a derivative, is held against the gap: a cable that does not yield, slip or touch at
     the null value has no derivative there.
+
+    Args:
+        evidence: to explain.
+        base: what every template is added to.
+        effects: to try.
+        predicted: by the base.
     """
-    playback = evidence.playback
-    nominal, config = playback.believed, playback.config
-    begin = _parts(base)
+    begin, residual = _parts(base), evidence.observed - predicted
     starts = [
-        candidate(*begin, (effect, variant, values)) for effect in effects for variant, values in effect.starts(context)
+        explanation(*begin, (effect, variant, values))
+        for effect in effects
+        for variant, values in evidence.simulator.starts(effect, predicted, residual)
     ]
-    simulated = playback.keypoints([base.physics(nominal, config), *(s.physics(nominal, config) for s in starts)])
-    residuals = evidence.residuals(simulated).reshape(1 + len(starts), -1)
+    residuals = evidence.whitened(evidence.predict([base, *starts])).reshape(1 + len(starts), -1)
     gap = -residuals[0]
     power = max(float(gap @ gap) - float(evidence.count.sum()), 1e-6)
     result = []
@@ -66,11 +69,11 @@ def screen(
     return result
 
 
-def _parts(base: Candidate) -> list[tuple[Effect, int, Sequence[float]]]:
+def _parts(base: Explanation) -> list[tuple[Effect, int, Sequence[float]]]:
     return [(t.effect, t.variant, [float(x) for x in v]) for t, v in zip(base.terms, base.values(), strict=True)]
 
 
-def _stretch(start: Candidate, n_base: int, amplitude: float) -> Candidate | None:
+def _stretch(start: Explanation, n_base: int, amplitude: float) -> Explanation | None:
     """The start with its last effect made `amplitude` times as large; None where no parameter does that."""
     effect = start.terms[-1].effect
     if effect.amplitude is None or (amplitude <= 0 and not effect.reversible):
@@ -87,12 +90,12 @@ def _stretch(start: Candidate, n_base: int, amplitude: float) -> Candidate | Non
         origin = parameter.coordinate(null)
         z[index] = origin + amplitude * (z[index] - origin)
     z[index] = np.clip(z[index], *parameter.z_bounds)
-    return dataclasses.replace(start, z=z)
+    return start.moved(z)
 
 
-def shortlist(templates: Sequence[Template], per_variant: int = 3, per_effect: int = 3) -> list[Candidate]:
+def shortlist(templates: Sequence[Template], per_variant: int = 3, per_effect: int = 3) -> list[Explanation]:
     """The best starts: so many of each effect, of these so many of each variant."""
-    chosen: list[Candidate] = []
+    chosen: list[Explanation] = []
     taken: dict[str, int] = {}
     variants: dict[tuple[str, int], int] = {}
     for template in sorted(templates, key=lambda t: -t.explained):
@@ -103,10 +106,3 @@ def shortlist(templates: Sequence[Template], per_variant: int = 3, per_effect: i
             taken[name] = taken.get(name, 0) + 1
             variants[key] = variants.get(key, 0) + 1
     return chosen
-
-
-def residual_of(evidence: Evidence, fitted: Candidate) -> Float[np.ndarray, "E T N 2"]:
-    """Observed less simulated keypoints under a candidate [m]."""
-    playback = evidence.playback
-    simulated = playback.keypoints([fitted.physics(playback.believed, playback.config)])[0]
-    return evidence.target - simulated

@@ -10,9 +10,10 @@ import numpy as np
 from jaxtyping import Float
 
 from cablejax.diagnose.belief import Calibration, best_by_effects, effect_names, excess, level, log_scores
-from cablejax.diagnose.fit import Candidate, Evidence, Fit, evaluate, improve
-from cablejax.diagnose.screen import residual_of, screen, shortlist
-from cablejax.effects.base import Context, Effect
+from cablejax.diagnose.evidence import Evidence
+from cablejax.diagnose.fit import Fit, evaluate, improve
+from cablejax.diagnose.protocol import Explanation
+from cablejax.diagnose.screen import screen, shortlist
 
 _FIRST_STEPS = 3
 _LAST_STEPS = 8
@@ -40,8 +41,6 @@ class Search:
 def search(
     evidence: Evidence,
     null: Fit,
-    effects: Sequence[Effect],
-    context: Context,
     calibration: Calibration,
     *,
     deadline: float,
@@ -51,16 +50,15 @@ def search(
 
     Args:
         evidence: to explain.
-        null: the nominal cable, evaluated.
-        effects: to try.
-        context: of the log.
+        null: the nominal simulator, evaluated.
         calibration: of the judgement.
         deadline: on `time.perf_counter`; from then on no larger set is begun [s].
         progress: called with a line of text before each stage.
     """
     gap = excess(float(null.sse.sum()), evidence)
+    effects = evidence.simulator.effects
     progress(f"screening {len(effects)} effects")
-    templates = screen(evidence, null.candidate, effects, context)
+    templates = screen(evidence, null.explanation, effects, evidence.nominal)
     screened: dict[str, float] = {}
     for template in templates:
         name = template.start.names[-1]
@@ -77,25 +75,25 @@ def search(
     def adequate(fit: Fit) -> bool:
         return calibration.complete(excess(float(fit.sse.sum()), evidence), gap, level(evidence))
 
-    bases = [fit for fit in fits if fit.candidate.terms][:_BASES]
+    bases = [fit for fit in fits if fit.explanation.terms][:_BASES]
     for size in range(2, calibration.max_terms + 1):
         if adequate(fits[0]) or time.perf_counter() > deadline:
             break
         progress(f"fitting sets of {size} effects")
-        grown = [fit for base in bases for fit in _grown(evidence, base.candidate, effects, context)]
+        grown = [fit for base in bases for fit in _grown(evidence, base.explanation)]
         best_before = log_scores(fits[:1], evidence, calibration)[0]
         fits = _best([*fits, *grown], evidence, calibration)
         if log_scores(fits[:1], evidence, calibration)[0] < best_before + 1.0:
             break
         bases = fits[:1]
-    if len(effect_names(fits[0].candidate)) > 1 and time.perf_counter() < deadline:
+    if len(effect_names(fits[0].explanation)) > 1 and time.perf_counter() < deadline:
         progress("exchanging the effects of the best set one by one")
-        exchanged = [fit for rest in without_one(fits[0].candidate) for fit in _grown(evidence, rest, effects, context)]
+        exchanged = [fit for rest in without_one(fits[0].explanation) for fit in _grown(evidence, rest)]
         fits = _best([*fits, *exchanged], evidence, calibration)
     return Search(tuple(fits), log_scores(fits, evidence, calibration), screened)
 
 
-def _promising(starts: Sequence[Candidate], screened: dict[str, float]) -> list[Candidate]:
+def _promising(starts: Sequence[Explanation], screened: dict[str, float]) -> list[Explanation]:
     """Starts of effects whose best template explains a part of the gap worth a fit, and of the next best ones."""
     ordered = sorted(screened, key=lambda name: -screened[name])
     threshold = _NEGLIGIBLE * max(screened[ordered[0]], 0.0)
@@ -103,22 +101,19 @@ def _promising(starts: Sequence[Candidate], screened: dict[str, float]) -> list[
     return [start for start in starts if start.names[-1] in kept]
 
 
-def without_one(explanation: Candidate) -> list[Candidate]:
+def without_one(whole: Explanation) -> list[Explanation]:
     """The explanation without each of its effects."""
     result = []
-    for name in effect_names(explanation):
-        kept = [(t, z) for t, z in explanation.by_term() if t.effect.name != name]
-        result.append(Candidate(tuple(t for t, _ in kept), np.concatenate([np.zeros(0), *(z for _, z in kept)])))
+    for name in effect_names(whole):
+        kept = [(t, z) for t, z in whole.by_term() if t.effect.name != name]
+        result.append(Explanation(tuple(t for t, _ in kept), np.concatenate([np.zeros(0), *(z for _, z in kept)])))
     return result
 
 
-def _grown(evidence: Evidence, base: Candidate, effects: Sequence[Effect], context: Context) -> list[Fit]:
+def _grown(evidence: Evidence, base: Explanation) -> list[Fit]:
     """The base with one more effect each, the most promising ones fitted together with it."""
-    rest = residual_of(evidence, base)
-    rest = dataclasses.replace(context, keypoints=context.keypoints + context.residual - rest, residual=rest)
-    # a second piece of the same effect makes sense only for marks on the cable
-    partners = [e for e in effects if e.name not in base.names or e.name == "keypoint_bias"]
-    templates = screen(evidence, base, partners, rest)
+    partners = [e for e in evidence.simulator.effects if e.name not in base.names or e.repeatable]
+    templates = screen(evidence, base, partners, evidence.predict([base])[0])
     # An obstacle that is not quite in its place touches in other episodes: what its template takes away says little.
     fixed = [template for template in templates if template.start.terms[-1].effect.amplitude is None]
     starts = [start for start in shortlist(templates, per_variant=1, per_effect=2) if not _repeats(start)][:_PARTNERS]
@@ -127,7 +122,7 @@ def _grown(evidence: Evidence, base: Candidate, effects: Sequence[Effect], conte
     return improve(evidence, evaluate(evidence, starts), max_iterations=5)
 
 
-def _repeats(start: Candidate) -> bool:
+def _repeats(start: Explanation) -> bool:
     return start.terms[-1] in start.terms[:-1]
 
 

@@ -11,73 +11,37 @@ from typing import Any
 
 import numpy as np
 
-from cablejax.diagnose.diagnosis import Diagnosis, NamedEffect
+from cablejax.diagnose.diagnosis import PLACES, Diagnosis, Gap, NamedEffect, Ranked
+from cablejax.diagnose.where import Where
+from cablejax.effects.given import VERDICT_SCHEMA
 from cablejax.whole_file import whole_file
-
-SCHEMA = "cablejax-verdict/1"
-_PLACES = ("along_cable_m", "time_s", "table_m")
 
 
 def verdict_json(diagnosis: Diagnosis) -> dict[str, Any]:
-    """The verdict as a JSON object; what is not a finite number, or was never observed, is null.
+    """The verdict as a JSON object; what is not a finite number, was never observed or not computed, is null.
 
     Where the verdict is "unknown" nothing was added, and nothing shrinks; `gap.best_shrinkage` is that of the best
-    explanation all the same. `ci90` is null for a choice, such as a gripper, and a list where the value is one.
+    explanation all the same. `ci90` is null for a choice, such as a gripper, and a list where the value is one. All
+    `_mm` are null where observations are not in metres; `gap` has the sizes in their own unit too.
 
-    Beside the fields of the format it has `sentence`, `baselines`, `leftover_p`, `caveats` and `seconds`; `gap` has
-    also `horizons`, `split`, `ahead_mm` and `best_shrinkage`, `ranking` also `leftover_mm`, and `where` also
-    `sentences`, `per_horizon_mm` and `frames`.
+    In addition to the fields of the format it has `sentence`, `baselines`, `leftover_p`, `caveats` and `seconds`; `gap`
+    has also `unit`, `before_rmse`, `noise_floor`, `after_rmse`, `horizons`, `split`, `ahead_mm` and `best_shrinkage`,
+    `ranking` also `leftover_mm`, and `where` also `sentences`, `per_horizon_mm` and `frames`.
     """
-    gap, where = diagnosis.gap, diagnosis.where
-    # what no effect was named for has not shrunk, however much an explanation that was not believed takes away
-    blamed = diagnosis.verdict != "unknown"
-    log = diagnosis.log
-    valid = np.arange(log.keypoints.shape[1]) < log.episode_length[:, None]
-    seen = np.isfinite(log.keypoints).all(axis=-1) & valid[..., None]
+    gap = diagnosis.gap
     return _plain(
         {
-            "schema": SCHEMA,
+            "schema": VERDICT_SCHEMA,
             "verdict": diagnosis.verdict,
             "sentence": diagnosis.sentence,
             "effects": [_effect(effect) for effect in diagnosis.effects],
             "equivalent": diagnosis.equivalent,
             "baselines": diagnosis.baselines,
-            "ranking": [
-                {
-                    "name": ranked.name,
-                    "probability": ranked.probability,
-                    "held_out_shrinkage": ranked.held_out_shrinkage,
-                    "leftover_mm": ranked.leftover_mm,
-                }
-                for ranked in diagnosis.ranking
-            ],
+            "ranking": [_ranked(ranked, gap.unit) for ranked in diagnosis.ranking],
             "leftover_p": diagnosis.leftover_p,
-            "gap": {
-                "horizon_s": gap.horizon_s,
-                "before_rmse_mm": gap.before_rmse_mm,
-                "noise_floor_mm": gap.noise_floor_mm,
-                "after_rmse_mm": gap.after_rmse_mm if blamed else gap.before_rmse_mm,
-                "shrinkage": gap.shrinkage if blamed or gap.shrinkage is None else 0.0,
-                "shrinkage_ci90": gap.shrinkage_ci90 if blamed else None,
-                "best_shrinkage": gap.shrinkage,
-                "held_out_episodes": gap.held_out_episodes,
-                "ahead_mm": gap.ahead_mm,
-                "horizons": [
-                    {"horizon_s": seconds, "before_rmse_mm": before, "after_rmse_mm": after}
-                    for seconds, (before, after) in sorted(gap.horizons_mm.items())
-                ],
-                "split": gap.split,
-            },
-            "where": {
-                "along_cable_mm": np.where(seen.any(axis=(0, 1)), where.along_cable_mm, np.nan),
-                "per_episode_mm": np.where(seen.any(axis=(1, 2)), where.per_episode_mm, np.nan),
-                "regimes": where.regimes,
-                "per_horizon_mm": [
-                    {"horizon_s": seconds, "gap_mm": size} for seconds, size in sorted(where.horizons_mm.items())
-                ],
-                "frames": where.frames,
-                "sentences": where.sentences,
-            },
+            # what no effect was named for has not shrunk, however much an explanation that was not believed takes away
+            "gap": _gap(gap, blamed=diagnosis.verdict != "unknown"),
+            "where": None if diagnosis.where is None else _where(diagnosis.where),
             "next_motion": None if diagnosis.next_motion is None else diagnosis.next_motion.motion,
             "caveats": diagnosis.caveats,
             "seconds": diagnosis.seconds,
@@ -103,7 +67,56 @@ def _effect(effect: NamedEffect) -> dict[str, Any]:
             name: {"value": estimate.value, "ci90": estimate.ci90, "unit": estimate.unit}
             for name, estimate in effect.parameters.items()
         },
-        "location": {place: effect.location.get(place) for place in _PLACES},
+        "location": {place: effect.location.get(place) for place in PLACES},
+    }
+
+
+def _ranked(ranked: Ranked, unit: str) -> dict[str, Any]:
+    return {
+        "name": ranked.name,
+        "probability": ranked.probability,
+        "held_out_shrinkage": ranked.held_out_shrinkage,
+        "leftover_mm": ranked.leftover_mm if unit == "m" else None,
+    }
+
+
+def _gap(gap: Gap, *, blamed: bool) -> dict[str, Any]:
+    metres = gap.unit == "m"
+    after = gap.after_rmse_mm if blamed else gap.before_rmse_mm
+    sizes = {"before_rmse": gap.before_rmse_mm, "noise_floor": gap.noise_floor_mm, "after_rmse": after}
+    return {
+        "horizon_s": gap.horizon_s,
+        **{f"{name}_mm": size if metres else None for name, size in sizes.items()},
+        "unit": gap.unit,
+        **{name: 1e-3 * size for name, size in sizes.items()},
+        "shrinkage": gap.shrinkage if blamed or gap.shrinkage is None else 0.0,
+        "shrinkage_ci90": gap.shrinkage_ci90 if blamed else None,
+        "best_shrinkage": gap.shrinkage,
+        "held_out_episodes": gap.held_out_episodes,
+        "ahead_mm": gap.ahead_mm,
+        "horizons": [
+            {
+                "horizon_s": seconds,
+                "before_rmse_mm": before if metres else None,
+                "after_rmse_mm": after if metres else None,
+            }
+            for seconds, (before, after) in sorted(gap.horizons_mm.items())
+        ],
+        "split": gap.split,
+    }
+
+
+def _where(where: Where) -> dict[str, Any]:
+    seen = np.isfinite(where.heat)
+    return {
+        "along_cable_mm": np.where(seen.any(axis=(0, 1)), where.along_cable_mm, np.nan),
+        "per_episode_mm": np.where(seen.any(axis=(1, 2)), where.per_episode_mm, np.nan),
+        "regimes": where.regimes,
+        "per_horizon_mm": [
+            {"horizon_s": seconds, "gap_mm": size} for seconds, size in sorted(where.horizons_mm.items())
+        ],
+        "frames": where.frames,
+        "sentences": where.sentences,
     }
 
 

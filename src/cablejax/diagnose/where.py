@@ -46,10 +46,12 @@ class Where:
         along_cable_mm: at each keypoint, shape [N].
         bend_per_m: root mean square difference of the curvature at each inner keypoint, above the noise [1/m]. The gap
             itself is always small near the grippers, which hold the cable; this points closer to a cause that is local.
-            Shape [N - 2].
+            Shape [N - 2]; None where it was not computed, as for cables off the table.
         per_episode_mm: shape [E].
-        episode_p: of no gap in this episode, corrected for the number of episodes, shape [E].
-        keypoint_p: of no gap at this keypoint, corrected for the number of keypoints, shape [N].
+        episode_p: of no gap in this episode, corrected for the number of episodes, shape [E]; None where it was not
+            tested.
+        keypoint_p: of no gap at this keypoint, corrected for the number of keypoints, shape [N]; None where it was not
+            tested.
         heat: whitened gap, `sqrt(mean of two squared coordinates)` in noise units, NaN = not observed, shape [E, T, N].
         horizons_mm: by seconds since the episode's start, see `HORIZONS`.
         regimes: by "what: class", for example "speed: hold"; classes that a log does not visit are left out.
@@ -64,10 +66,10 @@ class Where:
     gap_mm: float
     smallest_mm: float
     along_cable_mm: Float[np.ndarray, "N"]
-    bend_per_m: Float[np.ndarray, "N2"]
+    bend_per_m: Float[np.ndarray, "N2"] | None
     per_episode_mm: Float[np.ndarray, "E"]
-    episode_p: Float[np.ndarray, "E"]
-    keypoint_p: Float[np.ndarray, "N"]
+    episode_p: Float[np.ndarray, "E"] | None
+    keypoint_p: Float[np.ndarray, "N"] | None
     heat: Float[np.ndarray, "E T N"]
     horizons_mm: dict[float, float]
     regimes: dict[str, float]
@@ -78,8 +80,8 @@ class Where:
 
     @property
     def episodes(self) -> tuple[int, ...]:
-        """Those whose gap stands out from the noise."""
-        return tuple(int(e) for e in np.flatnonzero(self.episode_p < LEVEL))
+        """Those whose gap stands out from the noise; none where that was not tested."""
+        return () if self.episode_p is None else tuple(int(e) for e in np.flatnonzero(self.episode_p < LEVEL))
 
 
 def localise(log: GapLog, nominal: Float[np.ndarray, "E T N 2"], noise: Float[np.ndarray, "N"]) -> Where:

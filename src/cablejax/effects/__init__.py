@@ -1,8 +1,9 @@
 """What a simulator may lack: the library of effects, by the names of the gap log's format."""
 
 from cablejax.effects.arms import ActuationGain, ActuationLag
-from cablejax.effects.base import Context, Effect, Hook, Parameter
+from cablejax.effects.base import CableEffect, Context, Hook
 from cablejax.effects.camera import CameraLag, CameraSimilarity, KeypointBias
+from cablejax.effects.effect import Effect, Parameter
 from cablejax.effects.grasp import GripperCompliance, GripperRotationOffset, GripperSlip
 from cablejax.effects.material import (
     AxialStretch,
@@ -17,7 +18,7 @@ from cablejax.effects.material import (
 )
 from cablejax.effects.table import FrictionPatch, GravityTilt, Obstacle, TableFriction, ViscousDrag
 
-LIBRARY: tuple[Effect, ...] = (
+LIBRARY: tuple[CableEffect, ...] = (
     BendingStiffness(),
     StiffnessProfile(),
     IntrinsicCurvature(),
@@ -41,7 +42,7 @@ LIBRARY: tuple[Effect, ...] = (
 )
 """Every effect of the cable and the camera."""
 
-ARMS: tuple[Effect, ...] = (ActuationGain(), ActuationLag())
+ARMS: tuple[CableEffect, ...] = (ActuationGain(), ActuationLag())
 """Effects of the arms. A diagnosis finds them from commands and encoders, see `cablejax.diagnose.actuation`."""
 
-__all__ = ["ARMS", "LIBRARY", "Context", "Effect", "Hook", "Parameter"]
+__all__ = ["ARMS", "LIBRARY", "CableEffect", "Context", "Effect", "Hook", "Parameter"]

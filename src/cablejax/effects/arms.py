@@ -7,11 +7,12 @@ from typing import Any
 
 import numpy as np
 
-from cablejax.effects.base import Effect, Parameter
+from cablejax.effects.base import CableEffect
+from cablejax.effects.effect import Parameter
 from cablejax.effects.physics import Physics
 
 
-class ActuationGain(Effect):
+class ActuationGain(CableEffect):
     """The arms move more or less than commanded, seen from where they started."""
 
     name = "actuation_gain"
@@ -27,7 +28,7 @@ class ActuationGain(Effect):
         return []
 
 
-class ActuationLag(Effect):
+class ActuationLag(CableEffect):
     """The arms move later than commanded: by a pure delay, and by a first-order lag for the rest of the time."""
 
     name = "actuation_lag"

@@ -1,4 +1,4 @@
-"""What an effect is: named parameters, and how they change the simulator."""
+"""What an effect of a cable is: an effect that says how it changes the cable's physics."""
 
 from __future__ import annotations
 
@@ -11,58 +11,8 @@ import numpy as np
 from jaxtyping import Float
 
 from cablejax.cable import Discretisation
+from cablejax.effects.effect import Effect
 from cablejax.effects.physics import Physics
-
-
-@dataclasses.dataclass(frozen=True)
-class Parameter:
-    """One parameter of an effect.
-
-    A fit works in coordinates `z`, in which the prior is a normal distribution: `value = centre + scale z`, or
-    `value = centre exp(scale z)` where `log` is set.
-
-    Attributes:
-        name: as in the verdict.
-        unit: "" for a pure number.
-        low, high: bounds of the value.
-        centre: prior median.
-        scale: prior standard deviation, of the logarithm where `log` is set.
-        log: the value is positive and known in its order of magnitude.
-        difference: step of forward differences, in prior standard deviations.
-    """
-
-    name: str
-    unit: str
-    low: float
-    high: float
-    centre: float
-    scale: float
-    log: bool = False
-    difference: float = 0.03
-
-    def __post_init__(self):
-        if not (self.low <= self.centre <= self.high and self.scale > 0 and (not self.log or self.low > 0)):
-            raise ValueError(
-                f"Parameter {self.name!r}: expected low <= centre <= high and scale > 0, and low > 0 if log; got low "
-                f"{self.low}, centre {self.centre}, high {self.high}, scale {self.scale}, log {self.log}."
-            )
-
-    def value(self, z: Any) -> Any:
-        """The value at coordinate `z`, a NumPy or JAX number."""
-        if self.log:
-            return self.centre * z.__array_namespace__().exp(self.scale * z)
-        return self.centre + self.scale * z
-
-    def coordinate(self, value: float) -> float:
-        """The coordinate `z` of a value."""
-        if self.log:
-            return float(np.log(value / self.centre) / self.scale)
-        return (value - self.centre) / self.scale
-
-    @property
-    def z_bounds(self) -> tuple[float, float]:
-        """Bounds of the coordinate."""
-        return self.coordinate(self.low), self.coordinate(self.high)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -90,29 +40,20 @@ remembers, the forces of the table, mass, how the grippers hold the cable, how t
 cable is observed, and what it touches. Every simulator states the hooks that it honours."""
 
 
-class Effect(abc.ABC):
+class CableEffect(Effect, abc.ABC):
     """Something that a real cable does and the nominal simulator does not.
 
     To add one of your own, subclass this in a dozen lines and pass it to `diagnose(log, effects=(*LIBRARY, Mine()))`;
-    `check_effect` says whether it behaves. Effects are stateless.
+    `check_effect` says whether it behaves. Effects are stateless: the attributes of `Effect` are those of the class.
     """
 
-    name: ClassVar[str]
-    parameters: ClassVar[tuple[Parameter, ...]]
-    null: ClassVar[tuple[float, ...]]
-    """Parameter values at which nothing changes. An effect that differs from a nominal value has a ratio to it."""
     hook: ClassVar[Hook]
     """The hook through which the effect acts."""
     side: ClassVar[Literal["dynamics", "observation"]] = "dynamics"
     """Whether the cable moves differently, or is only seen differently."""
-    amplitude: ClassVar[int | None] = None
-    """Which parameter makes the effect larger, counted from its null value; None = no single one does."""
-    reversible: ClassVar[bool] = False
-    """Whether that parameter may lie on the other side of its null value too."""
-    variants: ClassVar[tuple[int, ...]] = (0,)
-    """Discrete choices that are fitted one by one, for example the gripper."""
-    variant_name: ClassVar[str | None] = None
-    """What a variant is called in the verdict; None = there is only one."""
+
+    def __init__(self):
+        self.__post_init__()
 
     @abc.abstractmethod
     def apply(self, physics: Physics, values: Sequence[Any], variant: int, config: Discretisation) -> Physics:

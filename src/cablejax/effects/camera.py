@@ -6,10 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from cablejax.effects.base import Effect, Parameter
+from cablejax.effects.base import CableEffect
+from cablejax.effects.effect import Parameter
 
 
-class CameraSimilarity(Effect):
+class CameraSimilarity(CableEffect):
     """Scale, rotation and offset of the keypoints' frame."""
 
     name = "camera_similarity"
@@ -42,7 +43,7 @@ class CameraSimilarity(Effect):
         return [(0, (np.hypot(1 + a, b), np.arctan2(b, 1 + a), dx, dy))]
 
 
-class CameraLag(Effect):
+class CameraLag(CableEffect):
     """Keypoints are stamped late."""
 
     name = "camera_lag"
@@ -58,7 +59,7 @@ class CameraLag(Effect):
         return [(0, (0.15,)), (0, (0.6,))]
 
 
-class KeypointBias(Effect):
+class KeypointBias(CableEffect):
     """One keypoint sits off its nominal arc length or off the centreline; several are found one after the other.
 
     The variant is twice the keypoint's index, plus one for an offset across the cable.
@@ -72,6 +73,7 @@ class KeypointBias(Effect):
     side = "observation"
     variants = tuple(range(128))
     variant_name = "index"
+    repeatable = True
 
     def apply(self, physics, values, variant, config):
         index, across = divmod(variant, 2)

@@ -14,10 +14,10 @@ import numpy as np
 
 from cablejax.cable import Discretisation
 from cablejax.effects import ARMS, LIBRARY
-from cablejax.effects.base import Effect, Hook
+from cablejax.effects.base import CableEffect, Hook
 from cablejax.effects.physics import Physics
 
-EFFECTS: Mapping[str, Effect] = {effect.name: effect for effect in (*LIBRARY, *ARMS)}
+EFFECTS: Mapping[str, CableEffect] = {effect.name: effect for effect in (*LIBRARY, *ARMS)}
 """Every effect by its name in the gap log's format."""
 
 VERDICT_SCHEMA = "cablejax-verdict/1"
@@ -55,7 +55,7 @@ class GivenEffect:
             raise ValueError(f"{self.name} lacks {', '.join(missing)}. Expected {example}.")
 
     @property
-    def effect(self) -> Effect:
+    def effect(self) -> CableEffect:
         """Its entry of the library."""
         return EFFECTS[self.name]
 
@@ -169,7 +169,7 @@ def _number(value: float) -> str:
     return short if float(short) == value else repr(float(value))
 
 
-def _parameter_names(effect: Effect) -> tuple[tuple[str, ...], tuple[str, ...]]:
+def _parameter_names(effect: CableEffect) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Names of the verdict that an effect takes, and those of them that it needs."""
     chain = Discretisation()
     values = [p.centre for p in effect.parameters]
@@ -181,4 +181,4 @@ def _parameter_names(effect: Effect) -> tuple[tuple[str, ...], tuple[str, ...]]:
 
 
 OPTIONAL = frozenset({"hardening", "static_excess", "across", "delay_s"})
-"""Parameters beyond the format's, which need not be given; see `Effect.given`."""
+"""Parameters beyond the format's, which need not be given; see `CableEffect.given`."""

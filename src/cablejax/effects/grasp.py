@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from cablejax.effects.base import Effect, Parameter
+from cablejax.effects.base import CableEffect
+from cablejax.effects.effect import Parameter
 
 
 def _at(gripper: int, value):
@@ -18,7 +19,7 @@ def _end(gripper: int, config):
     return {"along_cable_m": [s, s]}
 
 
-class GripperSlip(Effect):
+class GripperSlip(CableEffect):
     """The cable slides through a gripper, once in every episode."""
 
     name = "gripper_slip"
@@ -45,7 +46,7 @@ class GripperSlip(Effect):
         return {**_end(variant, config), "time_s": float(values[0])}
 
 
-class GripperRotationOffset(Effect):
+class GripperRotationOffset(CableEffect):
     """The grasp angle is off."""
 
     name = "gripper_rotation_offset"
@@ -66,7 +67,7 @@ class GripperRotationOffset(Effect):
         return _end(variant, config)
 
 
-class GripperCompliance(Effect):
+class GripperCompliance(CableEffect):
     """The grasp yields in rotation."""
 
     name = "gripper_compliance"

@@ -6,13 +6,14 @@ from dataclasses import replace
 
 import numpy as np
 
-from cablejax.effects.base import Effect, Parameter, hat, section
+from cablejax.effects.base import CableEffect, hat, section
+from cablejax.effects.effect import Parameter
 
 # Where along the cable fits of local effects begin; a section of another sign is reached from the same place.
 _CENTRES = (0.08, 0.2, 0.32, 0.44, 0.56, 0.68, 0.8, 0.92)
 
 
-class _Section(Effect):
+class _Section(CableEffect):
     """An effect on a section of the cable; its first two parameters are centre and width over the cable's length."""
 
     def reported(self, values, variant, config):
@@ -33,7 +34,7 @@ class _Section(Effect):
         return {"along_cable_m": [max(centre - width / 2, 0.0), min(centre + width / 2, config.cable.length)]}
 
 
-class BendingStiffness(Effect):
+class BendingStiffness(CableEffect):
     """EI differs everywhere by one factor."""
 
     name = "bending_stiffness"
@@ -91,7 +92,7 @@ class IntrinsicCurvature(_Section):
         return [(0, (c, 0.15, 1.0)) for c in _CENTRES]
 
 
-class Plasticity(Effect):
+class Plasticity(CableEffect):
     """Bends beyond a yield curvature stay; what a bend beyond it costs more, the hardening, is fitted beside it."""
 
     name = "plasticity"
@@ -113,7 +114,7 @@ class Plasticity(Effect):
         ]
 
 
-class BendingHysteresis(Effect):
+class BendingHysteresis(CableEffect):
     """Rate-independent internal friction in bending, by Dahl's law."""
 
     name = "bending_hysteresis"
@@ -134,7 +135,7 @@ class BendingHysteresis(Effect):
         return [(0, (m * stiffness, k)) for m in (0.15, 0.6) for k in (0.15, 1.0)]
 
 
-class BendingDamping(Effect):
+class BendingDamping(CableEffect):
     """Internal viscous damping differs."""
 
     name = "bending_damping"
@@ -157,7 +158,7 @@ class BendingDamping(Effect):
         return {"ratio": parameters["time_s"] / (config.cable.damping_time or 0.001)}
 
 
-class AxialStretch(Effect):
+class AxialStretch(CableEffect):
     """The cable is extensible."""
 
     name = "axial_stretch"
@@ -173,7 +174,7 @@ class AxialStretch(Effect):
         return [(0, (2.0,)), (0, (15.0,)), (0, (150.0,))]
 
 
-class LinearDensity(Effect):
+class LinearDensity(CableEffect):
     """Mass per length differs: weight, and with it friction, and inertia."""
 
     name = "linear_density"
@@ -189,7 +190,7 @@ class LinearDensity(Effect):
         return [(0, (0.5,)), (0, (2.0,))]
 
 
-class LumpedMass(Effect):
+class LumpedMass(CableEffect):
     """A connector or clip."""
 
     name = "lumped_mass"

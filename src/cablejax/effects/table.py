@@ -7,7 +7,8 @@ from dataclasses import replace
 import numpy as np
 
 from cablejax.cable import Discretisation
-from cablejax.effects.base import Context, Effect, Parameter
+from cablejax.effects.base import CableEffect, Context
+from cablejax.effects.effect import Parameter
 
 
 def _believed(config: Discretisation) -> float:
@@ -15,7 +16,7 @@ def _believed(config: Discretisation) -> float:
     return config.cable.friction_coefficient or 0.01
 
 
-class TableFriction(Effect):
+class TableFriction(CableEffect):
     """The Coulomb coefficient differs everywhere. Variant 1 also sticks harder than it slides, by a fitted excess."""
 
     name = "table_friction"
@@ -52,7 +53,7 @@ def _swept(context: Context, spacing: float) -> np.ndarray:
     return squares[np.argsort(-visits)] * spacing
 
 
-class FrictionPatch(Effect):
+class FrictionPatch(CableEffect):
     """Another coefficient inside a round region of the table."""
 
     name = "friction_patch"
@@ -95,7 +96,7 @@ class FrictionPatch(Effect):
         return {"table_m": [float(values[0]), float(values[1])]}
 
 
-class ViscousDrag(Effect):
+class ViscousDrag(CableEffect):
     """Drag per length proportional to velocity."""
 
     name = "viscous_drag"
@@ -111,7 +112,7 @@ class ViscousDrag(Effect):
         return [(0, (1.0,)), (0, (8.0,))]
 
 
-class GravityTilt(Effect):
+class GravityTilt(CableEffect):
     """The table is tilted against what is believed. Fitted as what gravity's part in its plane is more, over g."""
 
     name = "gravity_tilt"
@@ -140,7 +141,7 @@ class GravityTilt(Effect):
         return {"sine_x": sine * np.cos(direction), "sine_y": sine * np.sin(direction)}
 
 
-class Obstacle(Effect):
+class Obstacle(CableEffect):
     """An unmodelled fixed disc touches the cable."""
 
     name = "obstacle"

@@ -13,11 +13,12 @@ from jaxtyping import Float
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from cablejax.evaluation.trials import TrialKey, append_line, read_lines
+from cablejax.evaluation.rows import append_row, read_rows
+from cablejax.evaluation.trials import TrialKey
 from cablejax.report.style import LIGHT, cable_curve
 
 if TYPE_CHECKING:
-    from cablejax.control.loop import ClosedLoopRun
+    from cablejax.control.run import ClosedLoopRun
 
 _PANEL = 2.1
 """Inches, width and height of the drawn part of a panel."""
@@ -63,9 +64,9 @@ def snapshot_of(run: ClosedLoopRun, key: TrialKey) -> Snapshot:
 
 
 def append_snapshot(path: str | os.PathLike[str], snapshot: Snapshot) -> None:
-    """Adds a snapshot to a file of JSON lines, as `trials.append_trial` does with a trial."""
+    """Adds a snapshot to a file of rows, see `rows.append_row`."""
     fields = dataclasses.asdict(snapshot)
-    append_line(path, {k: np.round(v, 6).tolist() if isinstance(v, np.ndarray) else v for k, v in fields.items()})
+    append_row(path, {k: np.round(v, 6).tolist() if isinstance(v, np.ndarray) else v for k, v in fields.items()})
 
 
 def read_snapshots(path: str | os.PathLike[str]) -> list[Snapshot]:
@@ -75,7 +76,7 @@ def read_snapshots(path: str | os.PathLike[str]) -> list[Snapshot]:
         ValueError: a line is not a snapshot.
     """
     snapshots: dict[TrialKey, Snapshot] = {}
-    for number, fields in read_lines(path):
+    for number, fields in enumerate(read_rows(path), start=1):
         try:
             table, method, scenario, stiffness, seed = fields.pop("key")
             shapes = {name: np.asarray(fields.pop(name), float) for name in ("start", "final", "target")}

@@ -7,18 +7,21 @@ import functools
 import pathlib
 import time
 from collections.abc import Callable, Sequence
+from typing import Any
 
-from tqdm import tqdm
-
-from cablejax.control.loop import ClosedLoopRun, run_closed_loop
+from cablejax.control.loop import run_closed_loop
+from cablejax.control.run import ClosedLoopRun
 from cablejax.control.shaping import Model, load_model
 from cablejax.evaluation.failures import Snapshot, append_snapshot, read_snapshots, snapshot_of
 from cablejax.evaluation.methods import MethodSpec, controller_of
 from cablejax.evaluation.protocols import GuessingCable, LaidOut, Task
-from cablejax.evaluation.trials import Trial, TrialKey, append_trial, read_trials, trial_of
+from cablejax.evaluation.rows import Rows
+from cablejax.evaluation.trials import KEY, Trial, TrialKey, read_trials, trial_of
 
 PATIENCE = 12
 """Commands without any change of the error after which a trial ends: nothing more happens."""
+TRIALS, SNAPSHOTS = "trials.jsonl", "snapshots.jsonl"
+"""Files of a suite's folder."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -75,29 +78,28 @@ def run_suite(
     Args:
         cases: of any tables.
         methods: each is tried on every case.
-        folder: receives `trials-P.jsonl` and `snapshots-P.jsonl`; read them with `read_suite`.
+        folder: receives `trials.jsonl` and `snapshots.jsonl`; read them with `read_suite`.
         fine_tuned: the model that was trained on a case's cable.
-        process: (index P, count): this process runs every `count`-th trial; each has files of its own.
+        process: (index P, count): this process runs every `count`-th trial; all of them append to the same files.
         progress: show a bar with the time left.
     """
-    index, count = process
-    wanted = [(case, method) for case in sorted(cases, key=lambda case: case.seed) for method in methods]
-    done = {trial.key for trial in read_suite(folder)[0]}
-    mine = [(c, m) for c, m in wanted[index::count] if key_of(c, m) not in done]
-    with tqdm(total=len(mine), unit="trial", disable=not progress, dynamic_ncols=True) as bar:
-        for case, method in mine:
-            key = key_of(case, method)
-            bar.set_postfix_str(" ".join(map(str, key)))
-            model = None
-            if method.weights is not None:
-                model = fine_tuned(case) if method.fine_tuned else released(method.weights)
-            begin = time.perf_counter()
-            run = run_case(case, method, model)
-            names = dict(zip(("table", "method", "scenario", "stiffness", "seed"), key, strict=True))
-            trial = trial_of(run, **names, wall_s=time.perf_counter() - begin)  # pyright: ignore[reportArgumentType]
-            append_snapshot(folder / f"snapshots-{index}.jsonl", snapshot_of(run, key))
-            append_trial(folder / f"trials-{index}.jsonl", trial)
-            bar.update()
+    pairs = [(case, method) for case in sorted(cases, key=lambda case: case.seed) for method in methods]
+    wanted = {key_of(case, method): (case, method) for case, method in pairs}
+
+    def run(*key: Any) -> dict[str, Any]:
+        case, method = wanted[key]
+        model = None
+        if method.weights is not None:
+            model = fine_tuned(case) if method.fine_tuned else released(method.weights)
+        begin = time.perf_counter()
+        finished = run_case(case, method, model)
+        names = dict(zip(KEY, key, strict=True))
+        trial = trial_of(finished, **names, wall_s=time.perf_counter() - begin)
+        append_snapshot(folder / SNAPSHOTS, snapshot_of(finished, trial.key))
+        return dataclasses.asdict(trial)
+
+    rows = Rows(folder / TRIALS, KEY)
+    rows.run(rows.missing(wanted, process), run, progress=progress)
 
 
 @functools.lru_cache(maxsize=8)
@@ -108,6 +110,6 @@ def released(name: str) -> Model:
 
 def read_suite(folder: pathlib.Path) -> tuple[list[Trial], list[Snapshot]]:
     """All trials in a suite's folder, and their pictures."""
-    trials = {t.key: t for path in sorted(folder.glob("trials-*.jsonl")) for t in read_trials(path)}
-    pictures = {s.key: s for path in sorted(folder.glob("snapshots-*.jsonl")) for s in read_snapshots(path)}
-    return list(trials.values()), [pictures[key] for key in trials if key in pictures]
+    trials = read_trials(folder / TRIALS)
+    pictures = {snapshot.key: snapshot for snapshot in read_snapshots(folder / SNAPSHOTS)}
+    return trials, [pictures[trial.key] for trial in trials if trial.key in pictures]

@@ -1,30 +1,27 @@
-"""One closed-loop run as a row of the evaluation, and a file of such rows that survives being killed.
-
-The file has one JSON object per line. A line is written by one call and flushed to the disk before the next trial
-starts, so that a run that was killed loses at most the trial it was in: what is left of a torn last line is cut off by
-the next writer and ignored by readers. Infinity and NaN, which JSON has no numbers for, are the strings "inf", "nan".
-"""
+"""One closed-loop run as a row of the evaluation."""
 
 from __future__ import annotations
 
 import dataclasses
-import json
 import math
 import os
-import pathlib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from cablejax.control.loop import settling_time, step_settling_time
+from cablejax.control.run import settling_time, step_settling_time
+from cablejax.evaluation.rows import read_rows
 
 if TYPE_CHECKING:
     from cablejax.control.batched import BatchRun
-    from cablejax.control.loop import ClosedLoopRun
+    from cablejax.control.run import ClosedLoopRun
 
 TrialKey = tuple[str, str, str, float, int]
 """(table, method, scenario, stiffness, seed): what makes a trial the one it is."""
+
+KEY = ("table", "method", "scenario", "stiffness", "seed")
+"""The same as names of fields."""
 
 LIANG_TABLE = "Liang"
 """Name of the table of random starts to random targets; its scenarios are "straight" and "diverse"."""
@@ -79,11 +76,11 @@ class Trial:
 
     @property
     def settling_time_s(self) -> float:
-        """See `control.loop.settling_time` [s]; infinite if the run never settled."""
+        """See `control.run.settling_time` [s]; infinite if the run never settled."""
         return settling_time(*self._course)
 
     def step_settling_time_s(self, fraction: float) -> float:
-        """See `control.loop.step_settling_time` [s]; likewise."""
+        """See `control.run.step_settling_time` [s]; likewise."""
         return step_settling_time(*self._course, fraction)
 
     @property
@@ -137,11 +134,6 @@ def trials_of_batch(
     ]
 
 
-def append_trial(path: str | os.PathLike[str], trial: Trial) -> None:
-    """Adds a trial to a file of trials, which is made if need be; on return it is on the disk. One writer at a time."""
-    append_line(path, dataclasses.asdict(trial))
-
-
 def read_trials(path: str | os.PathLike[str]) -> list[Trial]:
     """The trials in a file, in the order of their first appearance; of two with the same key the later one counts.
 
@@ -151,52 +143,10 @@ def read_trials(path: str | os.PathLike[str]) -> list[Trial]:
         ValueError: a line is not a trial.
     """
     trials: dict[TrialKey, Trial] = {}
-    for number, fields in read_lines(path):
+    for number, fields in enumerate(read_rows(path), start=1):
         trial = _parsed(fields, f"{os.fspath(path)}, line {number}")
         trials[trial.key] = trial
     return list(trials.values())
-
-
-def finished_keys(trials: Iterable[Trial]) -> set[TrialKey]:
-    """Keys of trials that need not be run again."""
-    return {trial.key for trial in trials}
-
-
-def append_line(path: str | os.PathLike[str], fields: Mapping[str, Any]) -> None:
-    """Adds one JSON object to a file of lines, whole; cuts off first what a killed writer left of its last line."""
-    path = pathlib.Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    line = json.dumps(_encoded(dict(fields)), allow_nan=False) + "\n"
-    with open(path, "a+b", buffering=0) as file:
-        end = file.seek(0, os.SEEK_END)
-        file.seek(max(end - 1, 0))
-        if end and file.read(1) != b"\n":
-            file.seek(0)
-            file.truncate(file.read().rfind(b"\n") + 1)
-        file.write(line.encode())
-        os.fsync(file.fileno())
-
-
-def read_lines(path: str | os.PathLike[str]) -> list[tuple[int, dict[str, Any]]]:
-    """The JSON objects in a file of lines with their line numbers; none if there is no file.
-
-    Raises:
-        ValueError: a line, other than a torn last one, is not a JSON object.
-    """
-    path = pathlib.Path(path)
-    if not path.exists():
-        return []
-    lines = path.read_bytes().split(b"\n")[:-1]  # what follows the last line break was torn off
-    rows = []
-    for number, line in enumerate(lines, start=1):
-        try:
-            fields = json.loads(line)
-        except ValueError as error:
-            raise ValueError(f"{path}, line {number} is not JSON ({error}): remove that line to go on.") from error
-        if not isinstance(fields, dict):
-            raise ValueError(f"{path}, line {number} is {type(fields).__name__}, expected a JSON object.")
-        rows.append((number, fields))
-    return rows
 
 
 def _parsed(fields: dict[str, Any], where: str) -> Trial:
@@ -218,14 +168,3 @@ _CONVERT: dict[Any, Any] = {
     "str | None": lambda value: None if value is None else str(value),
     "tuple[float, ...]": lambda values: tuple(map(float, values)),
 }
-
-
-def _encoded(value: Any) -> Any:
-    """JSON has no NaN and no infinity: they become strings."""
-    if isinstance(value, dict):
-        return {key: _encoded(item) for key, item in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_encoded(item) for item in value]
-    if isinstance(value, float) and not math.isfinite(value):
-        return str(value)
-    return value

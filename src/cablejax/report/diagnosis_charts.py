@@ -1,7 +1,7 @@
 """Charts of a diagnosis: which effect causes the gap, how far it shrinks, and what to record next.
 
-Each takes a `Diagnosis` and gives a `matplotlib.figure.Figure` that belongs to nobody else, or None if there is nothing
-to draw.
+Each takes a `CableDiagnosis` and gives a `matplotlib.figure.Figure` that belongs to nobody else, or None if there is
+nothing to draw.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from cablejax.cable import Discretisation
-from cablejax.diagnose.diagnosis import Diagnosis
+from cablejax.diagnose.diagnosis import CableDiagnosis
 from cablejax.diagnose.safe_motions import INTERVAL, safe_motions, starting_pose
 from cablejax.report.diagnosis_style import STYLE, explained_label
 from cablejax.report.effect_words import effect_title
@@ -33,9 +33,13 @@ _SPLIT = (
 )
 
 
-def ranking_figure(diagnosis: Diagnosis) -> Figure | None:
-    """Effects that were tried alone: how probable each is, and how much of the gap it takes away; None without any."""
-    ranked = [r for r in diagnosis.ranking if max(r.probability, r.held_out_shrinkage) >= 5e-3]
+def ranking_figure(diagnosis: CableDiagnosis) -> Figure | None:
+    """Effects that were tried: how probable each is, where that was computed, and how much of the gap it takes away.
+
+    None where none was tried.
+    """
+    likely = all(r.probability is not None for r in diagnosis.ranking)
+    ranked = [r for r in diagnosis.ranking if not likely or max(r.probability or 0.0, r.held_out_shrinkage) >= 5e-3]
     ranked = (ranked if len(ranked) >= 3 else list(diagnosis.ranking))[:_MAX_RANKED]
     if not ranked:
         return None
@@ -49,24 +53,24 @@ def ranking_figure(diagnosis: Diagnosis) -> Figure | None:
     chance = "probability [%]" if diagnosis.effects else "probability, were it in the library [%]"
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(10.0, 0.9 + 0.36 * rows), layout="constrained")
-        left, right = figure.subplots(1, 2, sharey=True)
-        for ax, values, title in (
-            (left, [100 * r.probability for r in ranked], chance),
-            (right, [100 * max(r.held_out_shrinkage, 0.0) for r in ranked], "share of the gap that it takes away [%]"),
-        ):
-            ax.barh(y, values, color=colours, height=0.62)
+        panels = [([100 * r.held_out_shrinkage for r in ranked], "share of the gap that it takes away [%]")]
+        if likely:
+            panels.insert(0, ([100 * (r.probability or 0.0) for r in ranked], chance))
+        axes = figure.subplots(1, len(panels), sharey=True, squeeze=False)[0]
+        for ax, (values, title) in zip(axes, panels, strict=True):
+            ax.barh(y, np.maximum(values, 0.0), color=colours, height=0.62)
             for row, value in zip(y, values, strict=True):
-                ax.text(value + 1.5, row, _percent(value), va="center", fontsize=10)
+                ax.text(max(value, 0.0) + 1.5, row, _percent(value), va="center", fontsize=10)
             ax.set(xlim=(0, 112), ylim=(-0.6, rows - 0.4), xticks=[])
             ax.spines[["bottom"]].set_visible(False)
             ax.set_title(title)
-        left.set_yticks(y, [effect_title(r.name) for r in ranked])
-        left.tick_params(length=0, labelcolor=LIGHT.ink)
-        right.tick_params(length=0)
+            ax.tick_params(length=0)
+        axes[0].set_yticks(y, [effect_title(r.name) for r in ranked])
+        axes[0].tick_params(labelcolor=LIGHT.ink)
     return figure
 
 
-def shrinkage_figure(diagnosis: Diagnosis) -> Figure:
+def shrinkage_figure(diagnosis: CableDiagnosis) -> Figure:
     """Error before and after by horizon over the noise floor, five seconds ahead beside a correction that knows no
     cause, and what the error before consists of."""
     gap = diagnosis.gap
@@ -99,7 +103,7 @@ def shrinkage_figure(diagnosis: Diagnosis) -> Figure:
     return figure
 
 
-def motion_figure(diagnosis: Diagnosis) -> Figure | None:
+def motion_figure(diagnosis: CableDiagnosis) -> Figure | None:
     """The motion to record next, and how well each motion of the library tells the explanations apart."""
     following = diagnosis.next_motion
     if following is None:
@@ -149,11 +153,11 @@ def _ahead(ax: Axes, errors: dict[str, float], believed: str, label: str | None)
     ax.set_title("5 s ahead, from an observation")
 
 
-def _split_bar(ax: Axes, split: dict[str, float]) -> None:
+def _split_bar(ax: Axes, split: dict[str, float | None]) -> None:
     """What the squared error before consists of."""
     begin = 0.0
     for key, label, colour in _SPLIT:
-        share = split.get(key, 0.0)
+        share = split.get(key) or 0.0
         if share >= 5e-3:
             ax.barh(0, share, left=begin, color=colour, height=0.6, label=f"{label} {100 * share:.0f} %")
             begin += share
@@ -197,6 +201,10 @@ def _film(figure: Any, config: Discretisation, poses: np.ndarray) -> None:
 
 
 def _percent(value: float) -> str:
+    if not np.isfinite(value):
+        return "n/a"
     if value >= 99.5:
         return "> 99"
+    if value <= -0.5:
+        return f"{value:.0f}"
     return f"{value:.0f}" if value >= 0.5 or value == 0 else "< 1"

@@ -1,6 +1,6 @@
 """Pictures of the gap: the moment at which it is largest, and where it lies along the cable and in time.
 
-Each takes a `Diagnosis` and gives a `matplotlib.figure.Figure` that belongs to nobody else.
+Each takes a `CableDiagnosis` and gives a `matplotlib.figure.Figure` that belongs to nobody else.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Rectangle
 
-from cablejax.diagnose.diagnosis import Diagnosis, NamedEffect
+from cablejax.diagnose.diagnosis import CableDiagnosis, NamedEffect
 from cablejax.report.diagnosis_style import STYLE, explained_label
 from cablejax.report.effect_words import effect_title
 from cablejax.report.style import LIGHT, cable_curve, gripper_outline
@@ -27,7 +27,7 @@ _LARGEST_ZOOM = 0.12
 _SMOOTHING_S = 1.0
 
 
-def worst_moment(diagnosis: Diagnosis) -> tuple[int, int]:
+def worst_moment(diagnosis: CableDiagnosis) -> tuple[int, int]:
     """Episode and sample at which the observed cable is furthest from the nominal one, over half a second."""
     seen = np.isfinite(diagnosis.where.heat)
     squared = np.where(seen, diagnosis.where.heat**2, 0.0).sum(axis=-1) / np.maximum(seen.sum(axis=-1), 1)
@@ -39,7 +39,7 @@ def worst_moment(diagnosis: Diagnosis) -> tuple[int, int]:
     return int(episode), int(sample)
 
 
-def cable_figure(diagnosis: Diagnosis) -> Figure:
+def cable_figure(diagnosis: CableDiagnosis) -> Figure:
     """The worst moment: observed, nominal and explained cable, where the named effects sit, and an enlarged part."""
     episode, sample = worst_moment(diagnosis)
     log = diagnosis.log
@@ -91,7 +91,7 @@ def cable_figure(diagnosis: Diagnosis) -> Figure:
     return figure
 
 
-def where_figure(diagnosis: Diagnosis) -> Figure:
+def where_figure(diagnosis: CableDiagnosis) -> Figure:
     """The gap along the cable, and along the cable over time in every episode, in units of the noise."""
     where, log = diagnosis.where, diagnosis.log
     arclength = np.asarray(log.meta["keypoint_arclength_m"])
@@ -130,12 +130,12 @@ def where_figure(diagnosis: Diagnosis) -> Figure:
     return figure
 
 
-def _interval(diagnosis: Diagnosis) -> float:
+def _interval(diagnosis: CableDiagnosis) -> float:
     steps = np.diff(diagnosis.log.time[0, : diagnosis.log.episode_length[0]])
     return float(np.median(steps)) if len(steps) else 1.0
 
 
-def _smoothed(diagnosis: Diagnosis, episode: int) -> np.ndarray:
+def _smoothed(diagnosis: CableDiagnosis, episode: int) -> np.ndarray:
     """Gap in noise units over about one second, noise taken out, shape [T, N]; NaN where nothing was observed."""
     length = int(diagnosis.log.episode_length[episode])
     squared = diagnosis.where.heat[episode, :length] ** 2
@@ -150,7 +150,7 @@ def _smoothed(diagnosis: Diagnosis, episode: int) -> np.ndarray:
         return np.sqrt(np.maximum(sums / np.where(counts > 0, counts, np.nan) - 1.0, 0.0)).T
 
 
-def _strip(ax: Axes, diagnosis: Diagnosis, arclength: np.ndarray) -> None:
+def _strip(ax: Axes, diagnosis: CableDiagnosis, arclength: np.ndarray) -> None:
     """The cable laid straight, coloured by the gap, with its numbers and the places of the named effects."""
     profile = diagnosis.where.along_cable_mm
     along = np.linspace(arclength[0], arclength[-1], 400)
@@ -182,7 +182,7 @@ def _strip(ax: Axes, diagnosis: Diagnosis, arclength: np.ndarray) -> None:
     ax.set_title("Gap above the noise along the cable [mm], gripper 0 on the left")
 
 
-def _mark_holds(ax: Axes, diagnosis: Diagnosis, episode: int, top: float) -> None:
+def _mark_holds(ax: Axes, diagnosis: CableDiagnosis, episode: int, top: float) -> None:
     """Bars over the time in which the grippers rest and the cable has settled."""
     length = int(diagnosis.log.episode_length[episode])
     masks = diagnosis.where.regime_masks
@@ -196,7 +196,7 @@ def _mark_holds(ax: Axes, diagnosis: Diagnosis, episode: int, top: float) -> Non
         ax.plot([time[begin], time[end - 1]], [top, top], color=LIGHT.ink, lw=3, solid_capstyle="butt", clip_on=False)
 
 
-def _draw_places(ax: Axes, diagnosis: Diagnosis, cable: np.ndarray) -> None:
+def _draw_places(ax: Axes, diagnosis: CableDiagnosis, cable: np.ndarray) -> None:
     """Broad bands and rings where the named effects sit."""
     arclength = np.asarray(diagnosis.log.meta["keypoint_arclength_m"])
     curve = cable_curve(cable, n_points=401)

@@ -7,7 +7,7 @@ import itertools
 import json
 from collections.abc import Sequence
 
-from cablejax.diagnose.diagnosis import Diagnosis
+from cablejax.diagnose.diagnosis import CableDiagnosis, NamedEffect
 from cablejax.report.effect_words import (
     EFFECTS,
     MOTIONS,
@@ -34,7 +34,7 @@ _RULES = {
 }
 
 
-def which_section(diagnosis: Diagnosis, ranking: str) -> str:
+def which_section(diagnosis: CableDiagnosis, ranking: str) -> str:
     parts = []
     if diagnosis.verdict == "none":
         parts.append("<p>There is no gap to explain, so no effect is named.</p>")
@@ -48,7 +48,7 @@ def which_section(diagnosis: Diagnosis, ranking: str) -> str:
         where = effect_place(effect)
         parts.append(
             f"<p><b>{html.escape(effect_title(effect.name).capitalize())}</b>: {html.escape(meaning)}"
-            f"{', ' + html.escape(where) if where else ''}. Probability {share(effect.probability)}.</p>"
+            f"{', ' + html.escape(where) if where else ''}.{_probability(effect)}</p>"
             f'<div class="scroll"><table><thead><tr><th>parameter</th><th>estimate (90 % interval)</th></tr></thead>'
             f"<tbody>{rows}</tbody></table></div>"
         )
@@ -65,19 +65,37 @@ def which_section(diagnosis: Diagnosis, ranking: str) -> str:
             f"{_as_much(diagnosis.leftover_p)}</p>"
         )
     if ranking:
-        note = "Every effect alone, the most probable first."
-        if len(diagnosis.effects) > 1:
-            note += " The cause named above is a set; alone, none of its members is enough."
-        parts.append(f"<figure>{ranking}<figcaption>{note}</figcaption></figure>")
+        parts.append(f"<figure>{ranking}<figcaption>{_ranking_note(diagnosis)}</figcaption></figure>")
     return "\n".join(parts)
 
 
-def _left(diagnosis: Diagnosis) -> float:
+def in_space(diagnosis: CableDiagnosis) -> bool:
+    """Whether the cable hangs in space, rather than lying on a table."""
+    return diagnosis.log.keypoints.shape[-1] == 3
+
+
+def _probability(effect: NamedEffect) -> str:
+    return "" if effect.probability is None else f" Probability {share(effect.probability)}."
+
+
+def _ranking_note(diagnosis: CableDiagnosis) -> str:
+    if any(ranked.probability is None for ranked in diagnosis.ranking):
+        return (
+            "Every effect tried in the forward search: what it takes away on unseen recordings when it joins those "
+            "kept before it, as a share of the squared error without any effect. Negative: it makes them worse."
+        )
+    note = "Every effect alone, the most probable first."
+    if len(diagnosis.effects) > 1:
+        note += " The cause named above is a set; alone, none of its members is enough."
+    return note
+
+
+def _left(diagnosis: CableDiagnosis) -> float:
     gap = diagnosis.gap
     return max(gap.after_rmse_mm**2 - gap.noise_floor_mm**2, 0.0) ** 0.5
 
 
-def far_section(diagnosis: Diagnosis, picture: str) -> str:
+def far_section(diagnosis: CableDiagnosis, picture: str) -> str:
     gap = diagnosis.gap
     added = listed([effect_title(e.name) for e in diagnosis.effects]) or "the best explanation"
     if diagnosis.verdict == "none":
@@ -97,11 +115,12 @@ def far_section(diagnosis: Diagnosis, picture: str) -> str:
         interval = ""
         if gap.shrinkage_ci90 is not None:
             interval = f" (90 % interval over episodes: {between(*gap.shrinkage_ci90)})"
+        besides = ", to which constant offsets of the markers add" if in_space(diagnosis) else ""
         text = (
             f"With {added} in the simulator, {share(gap.shrinkage)} of the squared gap above the noise goes "
             f"away{interval}, on {named}, each left out of the fit that predicts it. The error falls from "
             f"{millimetres(gap.before_rmse_mm)} to {millimetres(gap.after_rmse_mm)}; nothing can go below the noise of "
-            f"{millimetres(gap.noise_floor_mm)}."
+            f"{millimetres(gap.noise_floor_mm)}{besides}."
         )
     if gap.ahead_mm is not None:
         ahead = {name: millimetres(value) for name, value in gap.ahead_mm.items()}
@@ -114,9 +133,11 @@ def far_section(diagnosis: Diagnosis, picture: str) -> str:
     return f"<p>{html.escape(text)}</p>\n<figure>{picture}<figcaption>{caption}</figcaption></figure>"
 
 
-def next_section(diagnosis: Diagnosis, picture: str) -> str:
+def next_section(diagnosis: CableDiagnosis, picture: str) -> str:
     following = diagnosis.next_motion
     if following is None:
+        if in_space(diagnosis):
+            return "<p>No motion was evaluated: that is done for cables on a table only.</p>"
         settled = diagnosis.verdict in ("none", "named")
         words = "There is nothing left to tell apart." if settled else "No motion of the library would help."
         return f"<p>{words}</p>"
@@ -143,22 +164,23 @@ def _explanation(names: str) -> str:
     return listed([effect_title(name) for name in names.split(" + ")])
 
 
-def limits_section(diagnosis: Diagnosis) -> str:
+def limits_section(diagnosis: CableDiagnosis) -> str:
     if not diagnosis.caveats:
         return ""
     rows = "".join(f"<li>{html.escape(caveat)}</li>" for caveat in diagnosis.caveats)
     return f'<h2>What limits this verdict</h2>\n<ul class="limits">{rows}</ul>'
 
 
-def details_section(diagnosis: Diagnosis) -> str:
+def details_section(diagnosis: CableDiagnosis) -> str:
     where = diagnosis.where
+    alone = all(r.probability is not None for r in diagnosis.ranking)
     tried = _table(
-        ("effect", "what it is", "probability", "share taken away", "left"),
+        ("effect", "what it is", *(["probability"] if alone else []), "share taken away", "left"),
         [
             (
                 effect_title(r.name),
                 EFFECTS.get(r.name, ""),
-                share(r.probability),
+                *([share(r.probability)] if alone and r.probability is not None else []),
                 share(r.held_out_shrinkage),
                 millimetres(r.leftover_mm),
             )
@@ -200,7 +222,11 @@ def details_section(diagnosis: Diagnosis) -> str:
     rows = "".join(f"<dt>{html.escape(k)}</dt><dd>{html.escape(v)}</dd>" for k, v in facts.items())
     return (
         '<div class="details">'
-        + (f"<h3>All effects tried alone</h3>{tried}" if diagnosis.ranking else "")
+        + (
+            f"<h3>All effects tried{' alone' if alone else ', each on top of those kept before it'}</h3>{tried}"
+            if diagnosis.ranking
+            else ""
+        )
         + f"<h3>Gap above the noise by regime</h3>{regimes}"
         + (f"<h3>Comparisons, tested over episodes</h3>{contrasts}" if where.contrasts else "")
         + (f"<h3>Frames</h3>{frames}" if where.frames else "")

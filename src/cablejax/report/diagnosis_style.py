@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from cablejax.diagnose.diagnosis import Diagnosis
+from cablejax.diagnose.diagnosis import CableDiagnosis
 from cablejax.report.effect_words import effect_title
 from cablejax.report.style import FIGURE_STYLE
 
@@ -12,7 +12,7 @@ STYLE: dict[Any, Any] = FIGURE_STYLE | {"font.size": 11.0, "axes.titlesize": 11.
 """Settings for `matplotlib.rc_context`."""
 
 
-def explained_label(diagnosis: Diagnosis) -> str:
+def explained_label(diagnosis: CableDiagnosis) -> str:
     if not diagnosis.effects:
         return "with the best explanation found, not named"
     names = [effect_title(effect.name) for effect in diagnosis.effects]

@@ -19,6 +19,7 @@ EFFECTS: dict[str, str] = {
     "table_friction": "the friction of the table differs everywhere",
     "friction_patch": "another friction inside a region of the table",
     "viscous_drag": "a drag that grows with speed",
+    "quadratic_drag": "a drag that grows with the square of the speed",
     "gravity_tilt": "the table is tilted",
     "linear_density": "the mass per length differs",
     "lumped_mass": "a connector or clip on the cable",
@@ -38,6 +39,7 @@ _PARAMETERS: dict[str, str] = {
     "centre_m": "centre, from gripper 0",
     "width_m": "length of the section",
     "ratio": "ratio to the believed value",
+    "stiffness_over_density_m4_per_s2": "EI over the mass per length",
     "curvature_per_m": "rest curvature",
     "yield_curvature_per_m": "yield curvature",
     "moment_n_m": "largest moment of internal friction",
@@ -49,6 +51,7 @@ _PARAMETERS: dict[str, str] = {
     "hardening": "hardening beyond the yield",
     "radius_m": "radius",
     "coefficient_n_s_per_m2": "drag per length and speed",
+    "coefficient_per_m": "drag per mass and squared speed",
     "angle_rad": "angle",
     "direction_rad": "direction on the table",
     "mass_kg": "mass",
@@ -148,8 +151,10 @@ def effect_place(effect: NamedEffect) -> str:
     return _place(effect.location, None if gripper is None else gripper.value)
 
 
-def share(value: float) -> str:
-    """A share in per cent; never 0 or 100 where it is only close."""
+def share(value: float | None) -> str:
+    """A share in per cent; never 0 or 100 where it is only close, "n/a" where it was not computed."""
+    if value is None:
+        return "n/a"
     percent = 100 * value
     if percent >= 99.5:
         return "> 99 %"

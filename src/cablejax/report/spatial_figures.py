@@ -11,7 +11,7 @@ import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
 
-from cablejax.diagnose.diagnosis import Diagnosis
+from cablejax.diagnose.diagnosis import CableDiagnosis
 from cablejax.report.diagnosis_style import STYLE, explained_label
 from cablejax.report.style import LIGHT
 
@@ -20,19 +20,19 @@ _SHOWN = 4
 _LOST = 0.5  # [m]
 
 
-def error_per_file(diagnosis: Diagnosis, predicted: np.ndarray) -> np.ndarray:
+def error_per_file(diagnosis: CableDiagnosis, predicted: np.ndarray) -> np.ndarray:
     """Root mean square error of each keypoint in each episode [mm], shape [E, N]; NaN where nothing was predicted."""
     squared = np.minimum(np.abs(np.asarray(diagnosis.log.keypoints, float) - predicted), 1.0) ** 2
     count = np.isfinite(squared).sum(axis=(1, 3))
     return 1e3 * np.sqrt(np.where(count > 0, np.nansum(squared, axis=(1, 3)) / np.maximum(count, 1), np.nan))
 
 
-def _names(diagnosis: Diagnosis) -> list[str]:
+def _names(diagnosis: CableDiagnosis) -> list[str]:
     meta = diagnosis.log.meta
     return [str(n) for n in meta.get("file", meta.get("take", range(len(diagnosis.log.episode_length))))]
 
 
-def files_figure(diagnosis: Diagnosis) -> Figure:
+def files_figure(diagnosis: CableDiagnosis) -> Figure:
     """The error of every keypoint in every file, before and after."""
     parts = [("simulator as believed", diagnosis.nominal)]
     if diagnosis.explained is not None and diagnosis.effects:
@@ -57,7 +57,7 @@ def files_figure(diagnosis: Diagnosis) -> Figure:
     return figure
 
 
-def cable_still(diagnosis: Diagnosis) -> Figure:
+def cable_still(diagnosis: CableDiagnosis) -> Figure:
     """The moment of the largest gap, from the front and from the side."""
     e, t = _worst(diagnosis)
     points = {"observed": np.asarray(diagnosis.log.keypoints[e, t], float), "nominal": diagnosis.nominal[e, t]}
@@ -82,7 +82,7 @@ def cable_still(diagnosis: Diagnosis) -> Figure:
     return figure
 
 
-def orbit(diagnosis: Diagnosis) -> str:
+def orbit(diagnosis: CableDiagnosis) -> str:
     """The player as HTML: a canvas, its controls, the data and the script; nothing is fetched."""
     script = (importlib.resources.files("cablejax.report") / "orbit.js").read_text(encoding="utf-8")
     data = json.dumps(orbit_data(diagnosis), separators=(",", ":")).replace("</", "<\\/")
@@ -107,7 +107,7 @@ def orbit(diagnosis: Diagnosis) -> str:
 <script>{script}</script>"""
 
 
-def orbit_data(diagnosis: Diagnosis) -> dict[str, Any]:
+def orbit_data(diagnosis: CableDiagnosis) -> dict[str, Any]:
     """What the player draws: the files with the largest, the smallest and middling gaps, in whole millimetres."""
     log, names = diagnosis.log, _names(diagnosis)
     size = np.asarray(diagnosis.where.per_episode_mm, float)
@@ -147,7 +147,7 @@ def orbit_data(diagnosis: Diagnosis) -> dict[str, Any]:
     return {"interval": every * interval, "windows": windows}
 
 
-def _worst(diagnosis: Diagnosis) -> tuple[int, int]:
+def _worst(diagnosis: CableDiagnosis) -> tuple[int, int]:
     off = np.minimum(np.abs(np.asarray(diagnosis.log.keypoints, float) - diagnosis.nominal), 0.3)
     size = np.where(np.isfinite(off), off, 0.0).sum(axis=(2, 3))
     e, t = divmod(int(size.argmax()), size.shape[1])

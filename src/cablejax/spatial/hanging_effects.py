@@ -10,9 +10,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from cablejax.effects import BendingStiffness, IntrinsicCurvature, StiffnessProfile
-from cablejax.effects.base import Parameter
-from cablejax.spatial.hanging import Wire, hanging_angles, hanging_points, joint_arclength
+from cablejax.effects.effect import Parameter
+from cablejax.effects.material import BendingStiffness, IntrinsicCurvature, StiffnessProfile
+from cablejax.simulate.hanging import Wire, hanging_angles, hanging_points, joint_arclength
 
 PROFILE_SPREAD = 0.3
 """Prior standard deviation of the logarithm of EI along a wire, which is drawn in one piece: a third."""

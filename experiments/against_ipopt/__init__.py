@@ -1,0 +1,1 @@
+"""Planning problems solved by the package's solvers and by IPOPT."""

@@ -1,0 +1,177 @@
+"""The command line of the experiments on closed loops: runs missing trials, then writes the page."""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import functools
+import pathlib
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+
+from cablejax.control.shaping import Model
+from cablejax.dynamics.weights import FILE_NAME
+from cablejax.evaluation import tables
+from cablejax.evaluation.failures import failure_figure, worst
+from cablejax.evaluation.fine_tuning import FineTuneConfig, fine_tune, record
+from cablejax.evaluation.methods import ADAPTED_RESIDUAL, LABEL, METHODS
+from cablejax.evaluation.protocols import least_time
+from cablejax.evaluation.suite import Case, read_suite, released, run_suite
+from cablejax.evaluation.trials import LIANG_TABLE, Trial
+from cablejax.mpc import MPCConfig
+from pages import page_of_results, publish
+
+WORST = 10
+"""Runs shown as pictures: the ones that ended farthest off."""
+
+SETTLING_NOTE = (
+    "The settling time of a step response is that from which on the error stays within 5 or 2 % of the way that it "
+    "went; the strict one, in all other tables here, is within a tenth of the terminal error, or 1 mm. The paper does "
+    "not say which is its own."
+)
+
+
+@dataclasses.dataclass(frozen=True)
+class Extent:
+    """How much of an experiment is run.
+
+    Attributes:
+        cases: makes those of some seeds.
+        seeds: unless the command line names others.
+        methods: their names, likewise.
+    """
+
+    cases: Callable[[Sequence[int]], list[Case]]
+    seeds: Sequence[int]
+    methods: tuple[str, ...]
+
+
+@dataclasses.dataclass(frozen=True)
+class Experiment:
+    """What one script of `experiments/` measures.
+
+    Attributes:
+        name: of its default folder under runs/.
+        script: its file in experiments/.
+        title: of its page.
+        about: what was done, in a few sentences, for the page.
+        small: the short version.
+        full: the whole table.
+        tables: tables that the cases belong to, in the page's order.
+    """
+
+    name: str
+    script: str
+    title: str
+    about: str
+    small: Extent
+    full: Extent
+    tables: tuple[str, ...]
+
+
+def main(experiment: Experiment, arguments: Sequence[str] | None = None) -> None:
+    """Runs what is missing of an experiment and prints its page."""
+    parser = argparse.ArgumentParser(description=experiment.about)
+    parser.add_argument("--full", action="store_true", help="the whole table instead of the small version")
+    parser.add_argument("--out", type=pathlib.Path, help="folder for trials; a run goes on where it stopped")
+    parser.add_argument("--methods", nargs="*", choices=tuple(METHODS), help="only these")
+    parser.add_argument("--seeds", type=seed_range, metavar="FIRST:END", help="these instead of the table's own")
+    parser.add_argument(
+        "--process", nargs=2, type=int, default=(0, 1), metavar=("INDEX", "COUNT"), help="share of work"
+    )
+    parser.add_argument("--report", type=pathlib.Path, help="run nothing; write the page on what is done to this file")
+    options = parser.parse_args(arguments)
+    extent = experiment.full if options.full else experiment.small
+    seeds = options.seeds or extent.seeds
+    folder = options.out or pathlib.Path("runs") / (experiment.name if options.full else f"{experiment.name}-small")
+    if options.report is None:
+        run_suite(
+            extent.cases(seeds),
+            [METHODS[name] for name in options.methods or extent.methods],
+            folder,
+            fine_tuned=functools.partial(fine_tuned_model, folder / "fine-tuned"),
+            process=tuple(options.process),
+        )
+    everything, pictures = read_suite(folder)
+    trials = [trial for trial in everything if trial.seed in seeds]
+    shown = {trial.key for trial in trials}
+    picture = None
+    if options.report is not None:
+        picture = options.report.with_name(f"{options.report.stem}_worst.png")
+        # trials that are kept without their snapshots leave the figure as it is
+        if snapshots := [snapshot for snapshot in pictures if snapshot.key in shown]:
+            failure_figure(worst(snapshots, WORST)).savefig(picture, dpi=110, bbox_inches="tight")
+    name = picture.name if picture is not None and picture.exists() else None
+    publish(page(experiment, trials, command(experiment, options), picture=name), options.report)
+
+
+def seed_range(text: str) -> range:
+    """`"100:150"` = seeds 100 to 149; `"7"` = seed 7 alone."""
+    first, _, end = text.partition(":")
+    seeds = range(int(first), int(end) if end else int(first) + 1)
+    if not seeds:
+        raise argparse.ArgumentTypeError(f"{text!r} holds no seed; FIRST:END has END above FIRST, such as 100:150")
+    return seeds
+
+
+def fine_tuned_model(folder: pathlib.Path, case: Case) -> Model:
+    """The model trained on a case's cable, made when it is first asked for. Two processes must not make the same."""
+    config, home = FineTuneConfig(), folder / case.cable
+    if not (home / FILE_NAME).is_file():
+        plant: Any = case.plant()
+        fine_tune(record(plant, plant.config.cable, config, home / "recording.npz"), config, home)
+    return released(str(home))
+
+
+def page(experiment: Experiment, trials: Sequence[Trial], command: str, picture: str | None) -> str:
+    """The Markdown page of an experiment's trials."""
+    lines = [experiment.about]
+    for table in experiment.tables:
+        mine = [trial for trial in trials if trial.table == table]
+        if not mine:
+            continue
+        seeds = ", ".join(map(str, sorted({trial.seed for trial in mine})))
+        lines += ["", f"## Table {table}", "", f"Seeds: {seeds}.", ""]
+        if table == LIANG_TABLE:
+            lines += [tables.success_table(mine, labels=LABEL)]
+            continue
+        lines += [tables.comparison_table(mine, table, labels=LABEL)]
+        least = least_times(experiment, {trial.key[:1] + trial.key[2:] for trial in mine})
+        lines += ["", "### Settling time by other definitions", "", f"{SETTLING_NOTE} {least}"]
+        lines += ["", tables.settling_table(mine, table, labels=LABEL)]
+        lines += ["", "### By stiffness", "", tables.stiffness_table(mine, table, labels=LABEL)]
+        lines += ["", "### Intervals and failures", "", tables.interval_table(mine, table, labels=LABEL)]
+        methods = {trial.method for trial in mine}
+        if ADAPTED_RESIDUAL in methods and len(methods) > 1:
+            lines += ["", "### In pairs", "", tables.paired_table(mine, table, ADAPTED_RESIDUAL, labels=LABEL)]
+    if picture is not None:
+        lines += ["", "## The runs that ended farthest off", "", f"![start, end and target of each]({picture})"]
+    return page_of_results(experiment.title, f"`{command}`", lines)
+
+
+def least_times(experiment: Experiment, shown: set[tuple[str, str, float, int]]) -> str:
+    """How long the grippers' way alone takes, in a sentence. `shown`: (table, scenario, stiffness, seed) of cases."""
+    config, seconds = MPCConfig(), {}
+    for case in experiment.full.cases(sorted({seed for *_, seed in shown})):
+        if (case.table, case.scenario, float(case.stiffness), case.seed) in shown:
+            seconds.setdefault(case.scenario, []).append(least_time(case.task(), config))
+    means = ", ".join(f"{scenario} {np.mean(values):.1f} s" for scenario, values in sorted(seconds.items()))
+    return (
+        f"Straight and at the motion bound, {100 * config.radius_max:g} cm per command (a radian counts as "
+        f"{100 * config.objective.rotation_weight:g} cm), the grippers' way from these starts to where the targets' "
+        f"ends are held takes, on average: {means}."
+    )
+
+
+def command(experiment: Experiment, options: argparse.Namespace) -> str:
+    """The call that makes the page."""
+    parts = ["python", f"experiments/{experiment.script}"]
+    if options.full:
+        parts.append("--full")
+    if options.seeds is not None:
+        parts.append(f"--seeds {options.seeds.start}:{options.seeds.stop}")
+    if options.report is not None:
+        parts.append(f"--report {options.report}")
+    return " ".join(parts)

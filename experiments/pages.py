@@ -1,0 +1,35 @@
+"""Pages of results in Markdown, and their tables."""
+
+from __future__ import annotations
+
+import pathlib
+from collections.abc import Sequence
+
+from cablejax.report.provenance import machine, versions
+
+
+def markdown_table(rows: Sequence[Sequence[str]]) -> list[str]:
+    """Lines of a table; the first row is its title."""
+    title, *rest = ["| " + " | ".join(row) + " |" for row in rows]
+    return [title, "|" + " --- |" * len(rows[0]), *rest]
+
+
+def page_of_results(title: str, made_by: str, lines: Sequence[str], *, made_on: str | None = None) -> str:
+    """A page of results.
+
+    Args:
+        title: its first line.
+        made_by: the command that makes it, in backticks, and whatever else had to run.
+        lines: of Markdown, all that follows the head.
+        made_on: versions and machine; by default those of this process.
+    """
+    made_on = f"{versions()}; {machine()}." if made_on is None else made_on
+    return "\n".join([f"# {title}", "", f"Made by {made_by}.", made_on, "", *lines]).rstrip("\n") + "\n"
+
+
+def publish(text: str, out: pathlib.Path | None) -> None:
+    """Prints a page, and writes it where a file is named, whose folder is made if there is none."""
+    print(text)
+    if out is not None:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        out.write_text(text, encoding="utf-8")

@@ -1,0 +1,93 @@
+"""What a recording says, ready for fits: observations beside predictions, weighed by the noise."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from cablejax.diagnose.protocol import Explanation, Simulator
+from cablejax.diagnose.repeats import share_of_motion
+
+
+@dataclasses.dataclass(frozen=True)
+class Evidence:
+    """What a recording says. Lengths and errors are in the unit of the observations.
+
+    Attributes:
+        simulator: of the recorded motions.
+        episodes: which of its episodes these are, shape [E].
+        observed: NaN = not observed, shape [E, T, ...].
+        nominal: predictions without any effect, shape [E, T, ...].
+        noise: standard deviation of each observed coordinate, of a shape that broadcasts against `observed[e, t]`.
+        temper: how many correlated samples of each episode count as one independent, see `belief`, shape [E].
+        freedom: of Student's distribution over episodes, see `belief`.
+        motion: episodes with the same number repeat one another, see `repeats`, shape [E].
+    """
+
+    simulator: Simulator
+    episodes: Int[np.ndarray, "E"]
+    observed: Float[np.ndarray, "E T *O"]
+    nominal: Float[np.ndarray, "E T *O"]
+    noise: Float[np.ndarray, "*B"]
+    temper: Float[np.ndarray, "E"]
+    freedom: float
+    motion: Int[np.ndarray, "E"]
+
+    def restricted(self, rows: Sequence[int]) -> Evidence:
+        """The evidence of some of its episodes only."""
+        chosen = np.asarray(rows, int)
+        return dataclasses.replace(
+            self,
+            episodes=self.episodes[chosen],
+            observed=self.observed[chosen],
+            nominal=self.nominal[chosen],
+            temper=self.temper[chosen],
+            motion=self.motion[chosen],
+        )
+
+    def predict(self, explanations: Sequence[Explanation]) -> Float[np.ndarray, "X E T *O"]:
+        """Predictions of all episodes under each explanation."""
+        return self.simulator.predict(explanations, self.episodes)
+
+    def whitened(self, predicted: np.ndarray) -> np.ndarray:
+        """Predicted less observed in units of the noise, 0 where nothing was observed."""
+        difference = (predicted - self.observed) / self.noise
+        difference = np.where(np.isfinite(self.observed), difference, 0.0)
+        return difference.reshape(*difference.shape[: difference.ndim - self.observed.ndim + 1], -1)
+
+    def surprise(self, sse: Float[np.ndarray, "E"]) -> Float[np.ndarray, "E"]:
+        """Q of every episode: squared error above the noise, in units of what is to be expected."""
+        return (sse - self.count) / self.temper
+
+    def log_likelihood(self, sse: Float[np.ndarray, "E"]) -> float:
+        """Of the squared residuals, see `student_log_likelihood`."""
+        return student_log_likelihood(self.surprise(sse), self.freedom, self.motion)
+
+    def weight(self, sse: Float[np.ndarray, "E"]) -> Float[np.ndarray, "E"]:
+        """Weight of each episode's squared residuals in an equivalent least squares problem."""
+        share = share_of_motion(self.motion)
+        return share * (self.freedom + 1) / (self.freedom + np.maximum(self.surprise(sse), 0.0)) / self.temper
+
+    @property
+    def count(self) -> Float[np.ndarray, "E"]:
+        """Observed coordinates of each episode."""
+        return np.isfinite(self.observed).sum(axis=tuple(range(1, self.observed.ndim)))
+
+
+def student_log_likelihood(surprise: Float[np.ndarray, "E"], freedom: float, motion: Int[np.ndarray, "E"]) -> float:
+    """Student's log likelihood of all episodes up to a constant, see `belief`.
+
+    Below the noise floor it is its tangent there: the floor is an estimate, and a fit that comes out below it still has
+    a best value.
+
+    Args:
+        surprise: Q of every episode.
+        freedom: of Student's distribution.
+        motion: episodes with the same number repeat one another and share one vote.
+    """
+    scaled = surprise / freedom
+    each = np.where(scaled > 0, np.log1p(np.maximum(scaled, 0.0)), scaled)
+    return float(-0.5 * (freedom + 1) * (share_of_motion(motion) * each).sum())

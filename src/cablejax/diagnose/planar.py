@@ -1,0 +1,78 @@
+"""The planar cable as a diagnosis sees it: the chain's playback of a log behind the protocol of simulators."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any, cast
+
+import numpy as np
+from jaxtyping import Float
+
+from cablejax.cable import Discretisation
+from cablejax.diagnose.conformal import SCORES
+from cablejax.diagnose.playback import Playback
+from cablejax.diagnose.protocol import Explanation, Report, Simulator
+from cablejax.effects.base import CableEffect, Context
+from cablejax.effects.physics import Physics
+
+
+def physics_of(explanation: Explanation, nominal: Physics, config: Discretisation, z: Any = None) -> Physics:
+    """The physics of a cable with all effects of an explanation.
+
+    Args:
+        explanation: of effects of a cable.
+        nominal: physics without them.
+        config: the nominal cable.
+        z: coordinates in place of the explanation's own; the result is differentiable in them if they are a JAX array.
+    """
+    for term, part in explanation.by_term(np.asarray(explanation.z, np.float32) if z is None else z):
+        effect = cast(CableEffect, term.effect)
+        values = [p.value(x) for p, x in zip(effect.parameters, part, strict=True)]
+        nominal = effect.apply(nominal, values, term.variant, config)
+    return nominal
+
+
+@dataclasses.dataclass(frozen=True)
+class PlanarCable(Simulator):
+    """A cable on a table between two grippers that move as recorded.
+
+    Attributes:
+        effects: of the cable and the camera.
+        playback: of the recorded motions, at the resolution of the fits.
+        correction: what a finer cable without effects moves otherwise [m]; it is added to all predictions. Its shape
+            broadcasts against [E, T, N, 2].
+        duration: of the shortest episode [s].
+        max_curvature: largest curvature of the nominal cable in each episode [1/m], shape [E].
+    """
+
+    effects: Sequence[CableEffect]
+    playback: Playback
+    correction: Float[np.ndarray, "E T N 2"]
+    duration: float
+    max_curvature: Float[np.ndarray, "E"]
+    right_scores = SCORES
+
+    def predict(self, explanations, episodes) -> Float[np.ndarray, "X E T N 2"]:
+        """Keypoints [m] by the chain, in single precision; NaN where the simulation broke down."""
+        playback = self.playback
+        physics = [physics_of(one, playback.believed, playback.config) for one in explanations]
+        return playback.keypoints(physics, episodes) + self.correction[np.asarray(episodes, int)]
+
+    def starts(self, effect, predicted, residual):
+        """From the effect's own guesses, which see the cable as it is predicted and what that leaves."""
+        context = Context(
+            config=self.playback.config,
+            keypoints=predicted,
+            residual=residual,
+            duration=self.duration,
+            max_curvature=self.max_curvature,
+        )
+        return effect.starts(context)
+
+    def report(self, term, values) -> Report:
+        """By the names and in the units of the gap log's format."""
+        effect, config = cast(CableEffect, term.effect), self.playback.config
+        return Report(
+            effect.reported(values, term.variant, config), dict(effect.location(values, term.variant, config))
+        )

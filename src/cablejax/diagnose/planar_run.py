@@ -1,0 +1,142 @@
+"""`diagnose`: from a gap log of a cable on a table to a verdict."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import time
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from cablejax.diagnose.actuation import with_arms
+from cablejax.diagnose.belief import Calibration, excess
+from cablejax.diagnose.case import FINE_LINKS, FIT_LINKS, Case
+from cablejax.diagnose.conclude import Conclusion, baselines
+from cablejax.diagnose.diagnosis import CableDiagnosis, Gap
+from cablejax.diagnose.evidence import Evidence
+from cablejax.diagnose.fit import evaluate
+from cablejax.diagnose.gap import held_out_predictions, measure_gap
+from cablejax.diagnose.judgement import sentence
+from cablejax.diagnose.next_motion import next_motion
+from cablejax.diagnose.noise import SMALLEST
+from cablejax.diagnose.protocol import explanation
+from cablejax.diagnose.reference import ahead_of_observations
+from cablejax.diagnose.run import explain, settings_of
+from cablejax.diagnose.where import localise
+from cablejax.effects import LIBRARY, CableEffect
+from cablejax.types import GapLog
+
+
+def _silent(text: str) -> None:
+    del text
+
+
+def diagnose(
+    log: GapLog,
+    *,
+    effects: Sequence[CableEffect] = LIBRARY,
+    commissioning: Sequence[GapLog] = (),
+    calibration: Calibration = Calibration(),
+    budget: float = math.inf,
+    progress: Callable[[str], None] = _silent,
+) -> CableDiagnosis:
+    """Says where the nominal simulator is wrong on this log, which effect causes it, how far the gap shrinks with it.
+
+    Args:
+        log: of a cable on a table between two grippers; its `meta` states the cable and table believed in.
+        effects: what to look for; `LIBRARY` and effects of your own.
+        commissioning: logs known to have no effect: how far the simulator is off without any.
+        calibration: constants of the judgement.
+        budget: seconds after which no larger set of effects is tried; what was fitted until then counts.
+        progress: called with a line of text now and then.
+
+    Raises:
+        DiagnosisError: the log cannot be diagnosed; the message says why and what to do.
+    """
+    begin = time.perf_counter()
+    if commissioning:
+        calibration = dataclasses.replace(calibration, baseline=baseline_error(commissioning))
+    case = Case.of(log, effects)
+    evidence = case.evidence(calibration)
+    found, conclusion = explain(evidence, calibration, deadline=begin + budget, progress=progress)
+    conclusion = with_arms(conclusion, case.arms, calibration)
+
+    progress("fitting without each episode in turn")
+    gap, reference, after = _measured(case, evidence, conclusion)
+    progress("looking for the next motion")
+    rivals = [fit.explanation for fit in found.fits if fit.explanation.terms][:2]
+    following = None
+    if conclusion.verdict != "none" and rivals:
+        following = next_motion(case.simulator.playback, rivals, case.noise.std)
+    repaired = case.recording.as_log(log.meta)
+    return CableDiagnosis(
+        verdict=conclusion.verdict,
+        sentence=sentence(
+            conclusion.verdict,
+            conclusion.effects,
+            conclusion.equivalent,
+            conclusion.explained if gap.shrinkage is None else gap.shrinkage,
+        ),
+        effects=conclusion.effects,
+        equivalent=conclusion.equivalent,
+        ranking=conclusion.ranking,
+        leftover_p=conclusion.leftover_p,
+        gap=gap,
+        where=localise(repaired, case.to_log(reference), case.noise.std),
+        next_motion=following,
+        baselines=baselines(found, evidence),
+        caveats=_caveats(case, calibration, commissioned=bool(commissioning)),
+        log=repaired,
+        nominal=case.to_log(reference),
+        explained=None if conclusion.verdict == "none" else case.to_log(after),
+        noise_mm=1e3 * case.noise.std,
+        noise_correlation=case.noise.correlation,
+        seconds=time.perf_counter() - begin,
+        settings={**settings_of(case.simulator, calibration), "links": {"fit": FIT_LINKS, "nominal": FINE_LINKS}},
+    )
+
+
+def baseline_error(logs: Sequence[GapLog]) -> float:
+    """Root mean square error per coordinate above the noise [m] on logs without any effect."""
+    squares = []
+    for log in logs:
+        evidence = Case.of(log).evidence(Calibration())
+        squares.append(excess(float(evaluate(evidence, [explanation()])[0].sse.sum()), evidence) ** 2)
+    return max(float(np.sqrt(np.mean(squares))), 5e-5)
+
+
+def _measured(case: Case, evidence: Evidence, conclusion: Conclusion) -> tuple[Gap, np.ndarray, np.ndarray]:
+    """The gap, and keypoints [m] of the simulator as believed and of the best explanation, each episode held out."""
+    recording, best = case.recording, conclusion.best.explanation
+    after, held_out = held_out_predictions(evidence, conclusion.best)
+    reference = case.nominal
+    if case.arms.deviates:
+        # the simulator as believed follows the commands; with the arms' effects in it, what these predict
+        reference, every = case.commanded_nominal, evidence.episodes
+        after = after + (case.predicted.predict([best], every) - case.simulator.predict([best], every))[0]
+    ahead_mm, learnable = ahead_of_observations(recording, reference, after, case.noise.std)
+    gap = measure_gap(
+        evidence,
+        reference,
+        after,
+        interval=recording.interval,
+        length=recording.length,
+        held_out=held_out,
+        resolvable=conclusion.verdict != "none",
+        learnable=learnable,
+        ahead_mm=ahead_mm,
+    )
+    return gap, reference, after
+
+
+def _caveats(case: Case, calibration: Calibration, *, commissioned: bool) -> tuple[str, ...]:
+    caveats = list(case.recording.caveats)
+    if not commissioned:
+        caveats.append(
+            "No commissioning logs were given: the simulator's own error is not separated from the cable's gap; "
+            f"{1e3 * calibration.baseline:.2g} mm of it is assumed."
+        )
+    if case.noise.std.max() <= SMALLEST:
+        caveats.append(f"The keypoints carry no noise to speak of; {1e3 * SMALLEST:g} mm is assumed.")
+    return tuple(caveats)

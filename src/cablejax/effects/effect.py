@@ -1,0 +1,114 @@
+"""What an effect is to a diagnosis, whatever it acts on: a name, parameters with priors, null values."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+
+@dataclasses.dataclass(frozen=True)
+class Parameter:
+    """One parameter of an effect.
+
+    A fit works in coordinates `z`, in which the prior is a normal distribution: `value = centre + scale z`, or
+    `value = centre exp(scale z)` where `log` is set.
+
+    Attributes:
+        name: as in the verdict.
+        unit: "" for a pure number.
+        low, high: bounds of the value.
+        centre: prior median.
+        scale: prior standard deviation, of the logarithm where `log` is set.
+        log: the value is positive and known in its order of magnitude.
+        difference: step of forward differences, in prior standard deviations.
+    """
+
+    name: str
+    unit: str
+    low: float
+    high: float
+    centre: float
+    scale: float
+    log: bool = False
+    difference: float = 0.03
+
+    def __post_init__(self):
+        if not (self.low <= self.centre <= self.high and self.scale > 0 and (not self.log or self.low > 0)):
+            raise ValueError(
+                f"Parameter {self.name!r}: expected low <= centre <= high and scale > 0, and low > 0 if log; got low "
+                f"{self.low}, centre {self.centre}, high {self.high}, scale {self.scale}, log {self.log}."
+            )
+
+    def value(self, z: Any) -> Any:
+        """The value at coordinate `z`, a NumPy or JAX number."""
+        if self.log:
+            return self.centre * z.__array_namespace__().exp(self.scale * z)
+        return self.centre + self.scale * z
+
+    def coordinate(self, value: float) -> float:
+        """The coordinate `z` of a value."""
+        if self.log:
+            return float(np.log(value / self.centre) / self.scale)
+        return (value - self.centre) / self.scale
+
+    @property
+    def z_bounds(self) -> tuple[float, float]:
+        """Bounds of the coordinate."""
+        return self.coordinate(self.low), self.coordinate(self.high)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Effect:
+    """Something that a real system does and its nominal simulator does not.
+
+    How an effect acts is the simulator's business; a diagnosis needs what is stated here. An effect of a simulator of
+    your own is an instance of this class, see `cablejax.diagnose.Simulator`; effects of a cable are subclasses that say
+    what they do to its physics, see `CableEffect`.
+
+    Attributes:
+        name: as in the verdict.
+        parameters: of the effect.
+        null: parameter values at which nothing changes. An effect that differs from a nominal value has a ratio to it.
+        amplitude: which parameter makes the effect larger, counted from its null value; None = no single one does.
+        reversible: whether that parameter may lie on the other side of its null value too.
+        variants: discrete choices that are fitted one by one, for example the gripper.
+        variant_name: what a variant is called in the verdict; None = there is only one.
+        repeatable: whether one explanation may have several of them, of different variants.
+    """
+
+    name: str
+    parameters: tuple[Parameter, ...]
+    null: tuple[float, ...]
+    amplitude: int | None = None
+    reversible: bool = False
+    variants: tuple[int, ...] = (0,)
+    variant_name: str | None = None
+    repeatable: bool = False
+
+    def __post_init__(self):
+        if len(self.parameters) != len(self.null) or not self.parameters:
+            raise ValueError(
+                f"Effect {self.name!r} has {len(self.parameters)} parameters and {len(self.null)} null values, "
+                "expected as many of one as of the other, and at least one."
+            )
+
+    def starts(self, context: Any) -> Sequence[tuple[int, Sequence[float]]]:
+        """Pairs (variant, values) from which fits begin; enough of them that one is within reach of the truth.
+
+        Unless a subclass knows better: each parameter one prior standard deviation from its median, the others there.
+
+        Args:
+            context: what the simulator knows of the recording, see `Simulator.starts`.
+        """
+        del context
+        starts = []
+        for variant in self.variants:
+            for i, parameter in enumerate(self.parameters):
+                for z in (-1.0, 1.0):
+                    values = [p.centre for p in self.parameters]
+                    values[i] = float(np.clip(parameter.value(np.float64(z)), parameter.low, parameter.high))
+                    starts.append((variant, tuple(values)))
+        return starts

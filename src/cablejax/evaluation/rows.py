@@ -1,0 +1,134 @@
+"""Rows of results in a file, one JSON object per line: appended when finished, so that an interrupted run goes on.
+
+A line is written by one call and flushed to the disk before the next row is computed, so that a run that was killed
+loses at most the row it was in: readers ignore a torn last line, and the next writer cuts it off. Several processes may
+append to one file. Infinity and NaN, which JSON has no numbers for, are the strings "inf", "-inf" and "nan".
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import fcntl
+import json
+import math
+import os
+import pathlib
+import time
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any
+
+from tqdm import tqdm
+
+_NO_NUMBERS = ("inf", "-inf", "nan")
+
+
+@dataclasses.dataclass(frozen=True)
+class Rows:
+    """A file of rows that are known by some of their fields.
+
+    Attributes:
+        path: the file; it need not exist yet.
+        key: names of the fields that make a row the one it is.
+    """
+
+    path: pathlib.Path
+    key: tuple[str, ...]
+
+    def read(self) -> list[dict[str, Any]]:
+        """The rows in the order of their first appearance; of two with the same key the later one counts.
+
+        Raises:
+            ValueError: a line is not a JSON object, or lacks a field of the key.
+        """
+        rows = {}
+        for number, row in enumerate(read_rows(self.path), start=1):
+            if absent := [name for name in self.key if name not in row]:
+                raise ValueError(f"{self.path}, line {number} has no field {absent}: remove that line to go on.")
+            rows[tuple(row[name] for name in self.key)] = row
+        return list(rows.values())
+
+    def missing(self, wanted: Iterable[tuple], process: tuple[int, int] = (0, 1)) -> list[tuple]:
+        """The wanted keys that have no row yet; for process P of (P, count), of every `count`-th wanted key."""
+        done = {tuple(row[name] for name in self.key) for row in self.read()}
+        return [key for key in list(wanted)[process[0] :: process[1]] if key not in done]
+
+    def run(
+        self,
+        keys: Iterable[tuple],
+        make: Callable[..., Mapping[str, Any]],
+        *,
+        seconds: float = math.inf,
+        progress: bool = True,
+    ) -> None:
+        """Makes rows one after the other and appends each once it is finished.
+
+        Args:
+            keys: of the rows, in order.
+            make: called with a key's elements, returns the row's other fields.
+            seconds: no other row is begun after this time.
+            progress: show a bar with the time left.
+        """
+        began, keys = time.perf_counter(), list(keys)
+        with tqdm(total=len(keys), unit="row", disable=not progress, dynamic_ncols=True) as bar:
+            for key in keys:
+                if time.perf_counter() - began > seconds:
+                    break
+                bar.set_postfix_str(" ".join(map(str, key)))
+                append_row(self.path, {**dict(zip(self.key, key, strict=True)), **make(*key)})
+                bar.update()
+
+
+def append_row(path: str | os.PathLike[str], row: Mapping[str, Any]) -> None:
+    """Adds one row to a file, which is made if need be; on return the row is on the disk."""
+    path = pathlib.Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    line = json.dumps(_encoded(dict(row)), allow_nan=False) + "\n"
+    with open(path, "a+b", buffering=0) as file:
+        fcntl.flock(file, fcntl.LOCK_EX)  # until the file is closed
+        end = file.seek(0, os.SEEK_END)
+        file.seek(max(end - 1, 0))
+        if end and file.read(1) != b"\n":
+            file.seek(0)
+            file.truncate(file.read().rfind(b"\n") + 1)
+        file.write(line.encode())
+        os.fsync(file.fileno())
+
+
+def read_rows(path: str | os.PathLike[str]) -> list[dict[str, Any]]:
+    """The rows of a file, one for each line; none if there is no file.
+
+    Raises:
+        ValueError: a line, other than a torn last one, is not a JSON object.
+    """
+    path = pathlib.Path(path)
+    if not path.exists():
+        return []
+    rows = []
+    lines = path.read_bytes().split(b"\n")[:-1]  # what follows the last line break was torn off
+    for number, line in enumerate(lines, start=1):
+        try:
+            row = json.loads(line)
+        except ValueError as error:
+            raise ValueError(f"{path}, line {number} is not JSON ({error}): remove that line to go on.") from error
+        if not isinstance(row, dict):
+            raise ValueError(f"{path}, line {number} is {type(row).__name__}, expected a JSON object.")
+        rows.append(_decoded(row))
+    return rows
+
+
+def _encoded(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _encoded(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_encoded(item) for item in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return str(value)
+    return value
+
+
+def _decoded(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _decoded(item) for key, item in value.items()}
+    if isinstance(value, list):
+        return [_decoded(item) for item in value]
+    return float(value) if isinstance(value, str) and value in _NO_NUMBERS else value

@@ -1,0 +1,142 @@
+"""Computes the resting shapes of a cable at two pairs of gripper poses, compiled: what the network corrects.
+
+Without friction, a uniform inextensible cable clamped at both ends rests in a shape that depends on nothing but the
+gripper poses and the branch it is on (up or down, S or mirrored S): not on its stiffness, not on its weight. This file
+finds that shape by a few Newton steps on a chain of rigid links, from the observed keypoints before a command to the
+poses after it. An error in the keypoints fades instead of adding up over a rollout, since they only choose the branch.
+
+What is left for the network is what this leaves out: friction, damping, snap-through.
+"""
+
+from __future__ import annotations
+
+import functools
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+from scipy.interpolate import CubicSpline
+
+from cablejax.cable import Cable, Discretisation
+from cablejax.simulate.composite import link_lengths, node_offsets
+from cablejax.simulate.equilibrium import beyond_joints, links_of, with_tension
+from cablejax.simulate.keypoints import hermite_weights
+
+LINKS = 25
+"""Links of the chain. Its keypoints are within 2 mm of the exact elastica, a shape error that the network learns."""
+
+SETTLING_STEPS = 2
+"""Newton steps at the poses before the command."""
+
+FOLLOWING_STEPS = 4
+"""Newton steps at the poses after it."""
+
+DAMPING = 0.3
+"""Added to the second derivative, in units of EI / L (a stable cable's own is between 0 and 12): on the verge of
+snapping through a Newton step would be without bound."""
+
+MAX_TURN = 0.2
+"""Largest change of a joint angle in one Newton step [rad]."""
+
+_SMALL = 1e-6
+
+
+class ChainMatrices(NamedTuple):
+    """Constant matrices of one cable, NumPy or JAX arrays; n = LINKS, N keypoints, J = n - 1 joints."""
+
+    tangents_of_keypoints: Any  # [n, N], with the next: tangents at the nodes of the clamped cubic spline
+    tangents_of_ends: Any  # [n, 2]
+    keypoints_of_nodes: Any  # [N, n]
+    keypoints_of_tangents: Any  # [N, n]
+    link_lengths: Any  # [n]
+    node_offsets: Any  # [n]
+    later: Any  # [J, J], the later one of two joints
+
+
+@functools.lru_cache(maxsize=32)
+def chain(n_keypoints: int, length: float) -> ChainMatrices:
+    """The matrices for a cable of given keypoints and length [m]. Not to be modified: cached."""
+    config = Discretisation(Cable(length=length, n_keypoints=n_keypoints, diameter=1e-3 * length), n_links=LINKS)
+    nodes = np.linspace(0.0, length, LINKS)
+
+    def derivative(values: np.ndarray, first: float, last: float) -> np.ndarray:
+        return CubicSpline(config.cable.keypoint_arclength, values, bc_type=((1, first), (1, last)))(nodes, 1)  # pyright: ignore[reportArgumentType]
+
+    of_keypoints = np.stack([derivative(unit, 0.0, 0.0) for unit in np.eye(n_keypoints)], axis=1)
+    zero = np.zeros(n_keypoints)
+    of_ends = np.stack([derivative(zero, 1.0, 0.0), derivative(zero, 0.0, 1.0)], axis=1)
+    # int32 whether or not JAX is in 64-bit mode
+    joints = np.arange(LINKS - 1, dtype=np.int32)
+    return ChainMatrices(
+        of_keypoints,
+        of_ends,
+        *hermite_weights(config),
+        link_lengths(config),
+        node_offsets(config),
+        np.maximum.outer(joints, joints),
+    )
+
+
+def resting_shapes(
+    keypoints: Float[Array, "N 2"], before: Float[Array, "2 3"], after: Float[Array, "2 3"], *, length: float
+) -> tuple[Float[Array, "N 2"], Float[Array, "N 2"]]:
+    """Frictionless resting shapes at the gripper poses before and after a command, on the branch of `keypoints`.
+
+    Turns and shifts with the cable. Exact at gripper 0. Differentiable in all three arrays.
+
+    Args:
+        keypoints: observed positions [m], shape [N, 2].
+        before: (x, y, theta) of both grippers, theta the direction of the cable's tangent, shape [2, 3].
+        after: the same after the command; theta continues that of `before`.
+        length: free length of the cable [m].
+    """
+    constants = chain(len(keypoints), length)
+    matrices = ChainMatrices(*(jnp.asarray(m, keypoints.dtype) for m in constants[:-1]), later=constants.later)
+    angles = _observed_angles(matrices, keypoints, before)
+    turn = jnp.sum(angles)
+    for _ in range(SETTLING_STEPS):
+        angles = _newton_step(matrices, angles, before, turn, length)
+    resting = _chain_keypoints(matrices, angles, before)
+    turn = turn + (after[1, 2] - after[0, 2]) - (before[1, 2] - before[0, 2])
+    for _ in range(FOLLOWING_STEPS):
+        angles = _newton_step(matrices, angles, after, turn, length)
+    return resting, _chain_keypoints(matrices, angles, after)
+
+
+def _observed_angles(matrices: ChainMatrices, keypoints: Array, pose: Array) -> Float[Array, "J"]:
+    """Joint angles [rad] of the chain along the cubic spline through the keypoints, clamped in the grippers."""
+    heading = jnp.stack([jnp.cos(pose[:, 2]), jnp.sin(pose[:, 2])], axis=-1)
+    tangent = matrices.tangents_of_keypoints @ keypoints + matrices.tangents_of_ends @ heading
+    a, b = tangent[:-1], tangent[1:]
+    return jnp.arctan2(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0], jnp.sum(a * b, axis=-1))
+
+
+def _newton_step(matrices: ChainMatrices, angles: Array, pose: Array, turn: Array, length: float) -> Float[Array, "J"]:
+    """One step on `min sum angles^2 / 2h` with the far end at gripper 1's position and the angles' sum equal `turn`."""
+    joints = len(angles)
+    h = length / joints
+    _, links = links_of(matrices.link_lengths, angles, pose[0, 2])
+    beyond = beyond_joints(links)
+    jacobian = jnp.stack([-beyond[:, 1], beyond[:, 0], jnp.full(joints, length, angles.dtype)])
+    gap = pose[1, :2] - (pose[0, :2] + jnp.sum(links, axis=0))
+    error = jnp.concatenate([gap, (turn - jnp.sum(angles))[None] * length])
+    normal = jacobian @ jacobian.T
+    # relative regularisation: the constraints of a straight cable are dependent
+    normal = normal + _SMALL * jnp.trace(normal) * jnp.eye(3, dtype=angles.dtype)
+    tension = jnp.linalg.solve(normal, jacobian @ angles) / h
+    hessian = (1 / h + DAMPING / length) * jnp.eye(joints, dtype=angles.dtype)
+    hessian = with_tension(hessian, tension, beyond, matrices.later)
+    system = jnp.block([[hessian, -jacobian.T], [-jacobian, -_SMALL * jnp.eye(3, dtype=angles.dtype)]])
+    step = jnp.linalg.solve(system, jnp.concatenate([jacobian.T @ tension - angles / h, -error]))[:joints]
+    largest = jnp.sqrt(jnp.max(step**2) + 1e-20)
+    return angles + step * jnp.minimum(1.0, MAX_TURN / largest)
+
+
+def _chain_keypoints(matrices: ChainMatrices, angles: Array, pose: Array) -> Float[Array, "N 2"]:
+    """Keypoints of the chain that leaves gripper 0 with these joint angles."""
+    theta, links = links_of(matrices.link_lengths, angles, pose[0, 2])
+    tangents = jnp.stack([jnp.cos(theta), jnp.sin(theta)], axis=-1)
+    origins = pose[0, :2] + jnp.cumsum(jnp.concatenate([jnp.zeros((1, 2), angles.dtype), links[:-1]]), axis=0)
+    nodes = origins + matrices.node_offsets[:, None] * tangents
+    return matrices.keypoints_of_nodes @ nodes + matrices.keypoints_of_tangents @ tangents

@@ -1,0 +1,62 @@
+"""How grippers hold a cable in space: their frames, and the nodes of the rod that move with them."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from cablejax.simulate.rod.material import unit
+from cablejax.simulate.rod.physics import RodPhysics
+
+
+def frames_along(tangent: Float[np.ndarray, "*B 3"]) -> Float[np.ndarray, "*B 3 3"]:
+    """Gripper frames whose roll is not observed: the smallest rotation from the mean direction of all tangents.
+
+    Rows are the axes in the world. The grippers of a recording keep their roll about as they were mounted; what they do
+    turn about their own axis is not seen.
+    """
+    mean = tangent.reshape(-1, 3).mean(axis=0)
+    mean = mean / np.linalg.norm(mean)
+    side = np.cross(mean, np.eye(3)[np.argmin(np.abs(mean))])
+    side = np.broadcast_to(side / np.linalg.norm(side), tangent.shape)
+    axis, cosine = np.cross(mean, tangent), (tangent @ mean)[..., None]
+    second = (
+        cosine * side
+        + np.cross(axis, side)
+        + axis * (axis * side).sum(-1, keepdims=True) / np.maximum(1 + cosine, 1e-3)
+    )
+    return np.stack([tangent, second, np.cross(tangent, second)], axis=-2)
+
+
+def held_nodes(
+    physics: RodPhysics,
+    position: Float[Array, "T 2 3"],
+    frames: Float[Array, "T 2 3 3"],
+    h: Float[Array | np.ndarray, ""],
+) -> tuple[Float[Array, "T 4 3"], Float[Array, "T 2 3"]]:
+    """The four held nodes [m], and the directors of the two held edges: unit vectors across them.
+
+    Args:
+        physics: how the cable sits in the grippers.
+        position: of the grippers [m].
+        frames: of the grippers, rows are axes in the world.
+        h: length of an edge [m].
+    """
+    origin = position + jnp.einsum("qk,tqkc->tqc", physics.clamp_offset, frames)
+    angle = physics.clamp_rotation
+    along = unit(frames[:, :, 0] + angle[:, 1:] * frames[:, :, 1] - angle[:, :1] * frames[:, :, 2])
+    half = 0.5 * h * along
+    held = jnp.stack(
+        [
+            origin[:, 0] - half[:, 0],
+            origin[:, 0] + half[:, 0],
+            origin[:, 1] - half[:, 1],
+            origin[:, 1] + half[:, 1],
+        ],
+        axis=1,
+    )
+    side = jnp.stack(
+        [frames[:, 0, 1], jnp.cos(physics.roll) * frames[:, 1, 1] + jnp.sin(physics.roll) * frames[:, 1, 2]], axis=1
+    )
+    return held, unit(side - along * jnp.sum(side * along, axis=2, keepdims=True))

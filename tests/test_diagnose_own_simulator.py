@@ -1,0 +1,303 @@
+"""A simulator of one's own through the protocol: an arm in MJX, and adapters that do not keep to the protocol."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+from mujoco import mjx
+
+from cablejax.diagnose import (
+    Effect,
+    Parameter,
+    Simulator,
+    diagnose_simulator,
+    explanation,
+    in_batches,
+    verdict_json,
+    write_verdict,
+)
+
+ARM = """
+<mujoco>
+  <option timestep="0.02" integrator="implicitfast"><flag contact="disable" constraint="disable"/></option>
+  <worldbody>
+    <body><joint name="shoulder" axis="0 1 0" damping="0.4"/><geom type="capsule" fromto="0 0 0 .4 0 0" size=".03"/>
+      <body pos=".4 0 0">
+        <joint name="elbow" axis="0 1 0" damping="0.3"/><geom type="capsule" fromto="0 0 0 .3 0 0" size=".02"/>
+        <body pos=".3 0 0"><geom type="sphere" size=".02" mass="0.1"/></body>
+      </body>
+    </body>
+  </worldbody>
+  <actuator><position joint="shoulder" kp="60" kv="4"/><position joint="elbow" kp="30" kv="2"/></actuator>
+</mujoco>
+"""
+MODEL = mjx.put_model(mujoco.MjModel.from_xml_string(ARM))
+INTERVAL = float(MODEL.opt.timestep)
+
+
+def rollout(values, command):
+    """Joint angles [rad] of the arm that follows commanded angles, shape [T, 2]."""
+    friction, payload, gain, lag = values
+    model = MODEL.replace(body_mass=MODEL.body_mass.at[3].add(payload), actuator_gainprm=MODEL.actuator_gainprm * gain)
+
+    def step(carry, target):
+        data, followed = carry
+        followed += (target - followed) * -jnp.expm1(-INTERVAL / jnp.maximum(lag, 1e-4))
+        drag = -friction * jnp.tanh(data.qvel / 0.02)
+        data = mjx.step(model, data.replace(ctrl=followed, qfrc_applied=drag))
+        return (data, followed), data.qpos
+
+    start = mjx.make_data(model).replace(qpos=command[0])
+    return jax.lax.scan(step, (start, command[0]), command)[1]
+
+
+class Arm(Simulator):
+    """The arm as its maker believes it to be, with four things that may be otherwise."""
+
+    unit = "rad"
+    effects = (
+        Effect(name="joint_friction", parameters=(Parameter("torque_n_m", "N m", 0.0, 5.0, 0.5, 0.5),), null=(0.0,)),
+        Effect(name="payload", parameters=(Parameter("mass_kg", "kg", 0.0, 3.0, 0.3, 0.3),), null=(0.0,)),
+        Effect(name="actuator_gain", parameters=(Parameter("ratio", "", 0.5, 2.0, 1.0, 0.1, log=True),), null=(1.0,)),
+        Effect(name="actuator_lag", parameters=(Parameter("time_s", "s", 0.0, 0.5, 0.03, 0.03),), null=(0.0,)),
+    )
+    run = staticmethod(jax.jit(jax.vmap(rollout)))
+
+    def __init__(self, commands):
+        self.commands = commands
+
+    def predict(self, explanations, episodes):
+        values = np.stack([one.vector(self.effects) for one in explanations])
+        return in_batches(self.run, values.astype(np.float32), self.commands[episodes])
+
+
+def commands(episodes: int = 6, samples: int = 150) -> np.ndarray:
+    """Swings of both joints with other amplitudes, speeds and places in every episode [rad], shape [E, T, 2]."""
+    rng, t = np.random.default_rng(1), INTERVAL * np.arange(samples)[:, None]
+    drawn = [(rng.uniform(-1, 1, 2), rng.uniform(0.2, 0.7, 2), rng.uniform(1.5, 5.0, 2)) for _ in range(episodes)]
+    return np.stack([at + size * np.sin(speed * t) for at, size, speed in drawn]).astype(np.float32)
+
+
+NOISE = 1e-3
+HIDDEN = {"joint_friction": 0.8, "payload": 0.4, "actuator_gain": 0.95, "actuator_lag": 0.05}
+
+
+@functools.cache
+def recorded(name: str | None, seed: int = 0) -> np.ndarray:
+    """Encoders of an arm with one hidden effect, or none."""
+    arm = Arm(commands())
+    hidden = [(effect, 0, (HIDDEN[name],)) for effect in arm.effects if effect.name == name]
+    angles = arm.predict([explanation(*hidden)], np.arange(len(arm.commands)))[0]
+    return angles + np.random.default_rng(seed).normal(0.0, NOISE, angles.shape)
+
+
+@pytest.mark.parametrize("name", HIDDEN)
+def test_the_hidden_effect_is_named_with_its_size(name):
+    result = diagnose_simulator(Arm(commands()), recorded(name), interval=INTERVAL, noise=NOISE)
+    assert result.verdict == "named" and result.equivalent == ()
+    (effect,) = result.effects
+    assert effect.name == name == result.ranking[0].name and effect.probability > 0.9
+    (estimate,) = effect.parameters.values()
+    assert estimate.value == pytest.approx(HIDDEN[name], rel=0.03)
+    assert estimate.ci90[0] < HIDDEN[name] < estimate.ci90[1]
+    assert result.gap.shrinkage > 0.98
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_an_arm_as_believed_gets_no_name(seed):
+    result = diagnose_simulator(Arm(commands()), recorded(None, seed), interval=INTERVAL)
+    assert result.verdict == "none" and result.effects == () and result.gap.shrinkage is None
+    # estimated from the recording
+    assert result.gap.noise_floor_mm == pytest.approx(1e3 * NOISE, rel=0.1)
+
+
+def test_a_cause_outside_the_library_is_unknown():
+    """The elbow's resolver errs eight times per turn."""
+    observed = recorded(None).copy()
+    observed[..., 1] += 0.02 * np.sin(8 * observed[..., 1])
+    result = diagnose_simulator(Arm(commands()), observed, interval=INTERVAL, noise=NOISE)
+    assert result.verdict == "unknown" and result.effects == ()
+    assert verdict_json(result)["gap"]["shrinkage"] == 0.0
+
+
+def test_what_the_adapter_does_not_compute_is_null(tmp_path):
+    result = diagnose_simulator(Arm(commands()), recorded("payload"), interval=INTERVAL)
+    assert write_verdict(tmp_path / "verdict.json", result).stat().st_size > 100
+    verdict = verdict_json(result)
+    assert verdict["where"] is verdict["next_motion"] is verdict["leftover_p"] is None
+    gap = verdict["gap"]
+    assert gap["ahead_mm"] is gap["split"]["learnable"] is gap["before_rmse_mm"] is None
+    assert gap["unit"] == "rad" and gap["before_rmse"] > gap["after_rmse"] == pytest.approx(gap["noise_floor"], rel=0.1)
+    assert verdict["ranking"][0]["leftover_mm"] is None
+    assert verdict["effects"][0]["location"] == {"along_cable_m": None, "time_s": None, "table_m": None}
+
+
+# What follows needs no physics: a line through the origin, its slope and its offset, seen at two places.
+
+
+class Line(Simulator):
+    effects = (
+        Effect(name="slope", parameters=(Parameter("ratio", "", 0.1, 10.0, 1.0, 0.5),), null=(1.0,)),
+        Effect(
+            name="offset",
+            parameters=(Parameter("offset_m", "m", -1.0, 1.0, 0.0, 0.1),),
+            null=(0.0,),
+            amplitude=0,
+            reversible=True,
+            variants=(0, 1),
+            variant_name="place",
+            repeatable=True,
+        ),
+    )
+    right_scores = (0.1, 0.2, 0.3)
+
+    def __init__(self, x):
+        self.x = x
+
+    def predict(self, explanations, episodes):
+        result = []
+        for one in explanations:
+            seen = np.repeat(self.x[episodes][..., None], 2, axis=-1)
+            for term, z in one.by_term():
+                (value,) = term.values(z)
+                if term.effect.name == "slope":
+                    seen = value * seen
+                else:
+                    seen[..., term.variant] += value
+            result.append(seen)
+        return np.stack(result)
+
+
+X = np.cumsum(np.random.default_rng(0).normal(0.0, 0.05, (6, 200)), axis=1)
+
+
+def line(*parts, missing=None):
+    by_name = {effect.name: effect for effect in Line.effects}
+    truth = explanation(*((by_name[name], variant, (value,)) for name, variant, value in parts))
+    clean = Line(X).predict([truth], np.arange(len(X)))[0]
+    seen = clean + np.random.default_rng(1).normal(0.0, 1e-3, clean.shape)
+    if missing is not None:
+        seen[missing] = np.nan
+    return seen
+
+
+def diagnose_line(seen, simulator=None, **options):
+    return diagnose_simulator(simulator or Line(X), seen, interval=0.1, **{"noise": 1e-3, **options})
+
+
+def test_two_variants_of_one_effect_act_together():
+    result = diagnose_line(line(("offset", 0, 0.05), ("offset", 1, -0.03)))
+    (effect,) = result.effects
+    assert result.verdict == "named" and effect.name == "offset"
+    found = dict(zip(effect.parameters["place"].value, effect.parameters["offset_m"].value, strict=True))
+    assert found == {0: pytest.approx(0.05, abs=1e-3), 1: pytest.approx(-0.03, abs=1e-3)}
+    assert verdict_json(result)["gap"]["before_rmse_mm"] > 10 and result.leftover_p == 1.0
+
+
+def test_missing_observations_and_short_episodes_do_not_matter():
+    missing = np.zeros((6, 200, 2), bool)
+    missing[0, 120:], missing[1:3, 50:90, 1] = True, True
+    result = diagnose_line(line(("slope", 0, 1.3), missing=missing))
+    (effect,) = result.effects
+    assert effect.name == "slope" and effect.parameters["ratio"].value == pytest.approx(1.3, abs=0.005)
+    assert result.gap.horizon_s == pytest.approx(19.9)
+
+
+def test_derivatives_of_the_simulators_own_are_used():
+    class Exact(Line):
+        asked = 0
+
+        def linearise(self, explanations, episodes):
+            Exact.asked += 1
+            return super().linearise(explanations, episodes)
+
+    result = diagnose_line(line(("slope", 0, 1.3)), Exact(X))
+    assert result.effects[0].name == "slope" and Exact.asked > 3
+
+
+def test_a_simulation_that_breaks_down_beyond_a_value_is_survived():
+    class Fragile(Line):
+        def predict(self, explanations, episodes):
+            predicted = super().predict(explanations, episodes)
+            predicted[[bool(one.vector(self.effects[:1])[0] > 1.4) for one in explanations]] = np.nan
+            return predicted
+
+    (effect,) = diagnose_line(line(("slope", 0, 1.3)), Fragile(X)).effects
+    assert effect.name == "slope" and effect.parameters["ratio"].value == pytest.approx(1.3, abs=0.01)
+
+
+def test_one_motion_leaves_nothing_to_check_on():
+    result = diagnose_line(line(("slope", 0, 1.3)), motion=np.zeros(6, int))
+    assert result.gap.shrinkage is result.gap.shrinkage_ci90 is None and result.gap.held_out_episodes == ()
+
+
+def broken(**methods):
+    return type("Broken", (Line,), methods)(X)
+
+
+def moved_null():
+    slope = dataclasses.replace(Line.effects[0], null=(1.2,))
+    return broken(effects=(slope,))
+
+
+BAD = {
+    "no episodes": (lambda: Line(X), {}, np.zeros((3, 4)), r"\[E, T, \.\.\.\]"),
+    "nothing seen": (lambda: Line(X), {}, np.full((6, 200, 2), np.nan), "at least one observed"),
+    "interval": (lambda: Line(X), {"interval": 0.0}, None, "interval is 0.0 s"),
+    "noise of another shape": (lambda: Line(X), {"noise": np.ones(3)}, None, "does not broadcast"),
+    "no noise": (lambda: Line(X), {"noise": 0.0}, None, "no measurement is exact"),
+    "motion": (lambda: Line(X), {"motion": np.zeros(5, int)}, None, "one number for each of 6 episodes"),
+    "one name twice": (lambda: broken(effects=Line.effects[:1] * 2), {}, None, "every name once"),
+    "no effects": (lambda: broken(effects=()), {}, None, "at least one"),
+    "null that acts": (moved_null, {}, None, "at its null value .* changes the prediction"),
+    "another shape": (
+        lambda: broken(predict=lambda self, explanations, episodes: np.zeros((len(explanations), 6, 200))),
+        {},
+        None,
+        r"shape \(3, 6, 200\), expected \(3, 6, 200, 2\)",
+    ),
+    "all episodes always": (
+        lambda: broken(predict=lambda self, ones, episodes: Line.predict(self, ones, np.arange(6))),
+        {},
+        None,
+        "has to simulate the episodes that it is asked for",
+    ),
+    "breaks down": (
+        lambda: broken(predict=lambda self, ones, episodes: np.nan * Line.predict(self, ones, episodes)),
+        {},
+        None,
+        "breaks down",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_what_does_not_keep_to_the_protocol_is_refused(case):
+    build, options, seen, message = BAD[case]
+    options = {"noise": 1e-3, "interval": 0.1, **options}
+    with pytest.raises(ValueError, match=message):
+        diagnose_simulator(build(), line() if seen is None else seen, **options)
+
+
+def test_an_effect_has_a_null_for_each_parameter():
+    with pytest.raises(ValueError, match="1 parameters and 2 null values"):
+        Effect(name="odd", parameters=Line.effects[0].parameters, null=(0.0, 1.0))
+
+
+def test_batches_are_of_one_size_and_pairs_in_place():
+    sizes = []
+
+    def run(values, inputs):
+        sizes.append(len(values))
+        return values[:, :1] * inputs
+
+    values, inputs = np.arange(1.0, 6.0)[:, None], np.arange(12.0).reshape(3, 4)
+    result = in_batches(run, values, inputs, size=4)
+    np.testing.assert_array_equal(result, values[:, None] * inputs)
+    assert set(sizes) == {4} and len(sizes) == 4
