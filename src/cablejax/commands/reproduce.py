@@ -11,6 +11,7 @@ from cablejax.cable import Cable
 from cablejax.commands.options import Command
 from cablejax.commands.simulate import Simulate
 from cablejax.dataset.schema import DatasetConfig
+from cablejax.effects.given import number_text
 
 REPEATED = ("effect", "with_", "plant_effect")
 """Options that are given once for each of their values."""
@@ -69,4 +70,6 @@ def simulate_command(config: DatasetConfig, out: str, cable_file: str = "cable.t
 def _words(value: Any) -> list[str]:
     if value is True:
         return []
-    return [value.name if isinstance(value, pathlib.Path) else f"{value:g}" if isinstance(value, float) else str(value)]
+    if isinstance(value, float):
+        return [number_text(value)]
+    return [value.name if isinstance(value, pathlib.Path) else str(value)]

@@ -105,8 +105,9 @@ class Shape(Command):
         facts = {
             field.name.replace("_", " "): str(getattr(self, field.name))
             for field in dataclasses.fields(self)
-            if field.name not in ("json", "out", "overwrite", "device")
+            if field.name not in ("json", "out", "overwrite", "device", "plant_effect")
         }
+        facts["plant effect"] = ", ".join(texts) or "none"
         with unfinished(self.out, job.settings(), overwrite=self.overwrite) as parts:
             summary = shape_and_report(job, self.out, parts, facts=facts)
         table = text_table(*table_of(summary))

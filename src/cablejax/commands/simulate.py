@@ -135,7 +135,7 @@ class Simulate(Command):
                 max_amplification=self.max_amplification,
                 max_curvature=MotionConfig.max_curvature / cable.length,
             ),
-            discretisation=Discretisation(cable, n_links=self.links or Discretisation.n_links),
+            discretisation=Discretisation(cable, n_links=Discretisation.n_links if self.links is None else self.links),
             randomisation=Randomisation(
                 stiffness=self.stiffness_range, damping=self.damping_range, friction=self.friction_range
             ),

@@ -79,7 +79,7 @@ class GivenEffect:
 
     def __str__(self) -> str:
         """The effect as `parse_effect` reads it back, without loss."""
-        return f"{self.name}:{','.join(f'{name}={_number(value)}' for name, value in self.parameters)}"
+        return f"{self.name}:{','.join(f'{name}={number_text(value)}' for name, value in self.parameters)}"
 
 
 def with_effects(physics: Physics, effects: Iterable[GivenEffect], chain: Discretisation) -> Physics:
@@ -164,7 +164,8 @@ def _pieces(effect: Any, path: Any) -> list[GivenEffect]:
         raise ValueError(f"{path}: an effect is not of the verdict's format ({error}).") from error
 
 
-def _number(value: float) -> str:
+def number_text(value: float) -> str:
+    """A number as short as it can be without loss."""
     short = f"{value:g}"
     return short if float(short) == value else repr(float(value))
 
