@@ -15,7 +15,7 @@ from cablejax.commands.options import UsageError, say
 from cablejax.commands.parts import Parts
 from cablejax.commands.results import summarise, write_results
 from cablejax.control.run import ClosedLoopRun
-from cablejax.control.shaping import Method, Model, shape_once
+from cablejax.control.shaping import Method, Model, check_fit, shape_once
 from cablejax.control.targets import Target
 from cablejax.dynamics.fingerprint import fingerprint
 from cablejax.effects.given import GivenEffect
@@ -53,6 +53,7 @@ class Job:
     def __post_init__(self):
         if self.steps < 1:
             raise UsageError(f"--steps is {self.steps}, expected at least 1.")
+        check_fit(self.model, self.plant.cable)
 
     def settings(self) -> dict[str, Any]:
         """All that a run depends on, as for JSON: of the model its weights, since a name may stand for others later."""

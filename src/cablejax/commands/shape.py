@@ -105,7 +105,7 @@ class Shape(Command):
         facts = {
             field.name.replace("_", " "): str(getattr(self, field.name))
             for field in dataclasses.fields(self)
-            if field.name not in ("json", "out", "overwrite", "device", "plant_effect")
+            if field.name not in ("json", "out", "overwrite", "device", "cable", "plant_effect")
         }
         facts["plant effect"] = ", ".join(texts) or "none"
         with unfinished(self.out, job.settings(), overwrite=self.overwrite) as parts:

@@ -132,6 +132,10 @@ class Train(Command):
         """Refuses data sets of different cables, and keypoints that the network cannot have."""
         from cablejax.cable import differing
         from cablejax.cable_file import KEYS
+        from cablejax.dynamics.weights import cable_of_weights
+
+        def fields(other: dict[str, tuple[Any, Any]]) -> str:
+            return ", ".join(f"{KEYS[name]} is {a} and {b}" for name, (a, b) in other.items())
 
         if not stores:
             raise UsageError("--data names no data set, expected at least one.")
@@ -143,11 +147,15 @@ class Train(Command):
             )
         for store in stores[1:]:
             if other := differing(store.config.cable, first.config.cable):
-                fields = ", ".join(f"{KEYS[name]} is {a} and {b}" for name, (a, b) in other.items())
                 raise UsageError(
-                    f"{store.path} and {first.path} are of different cables: {fields}. Train on data sets of one "
+                    f"{store.path} and {first.path} are of different cables: {fields(other)}. Train on data sets of one "
                     "nominal cable; to vary it, give `cablejax simulate` ranges such as --stiffness-range."
                 )
+
+        if self.start_from is not None:
+            other = differing(cable_of_weights(self.start_from), first.config.cable)
+            if other:
+                say(f"{self.start_from} was trained on another cable than {first.path} holds: {fields(other)}.")
 
     def _config(self, store: Store) -> TrainConfig:
         """The preset's training with what the data and the options change."""

@@ -118,6 +118,25 @@ def initial_history(cable: Cable, config: ModelConfig) -> History:
     )
 
 
+def check_fit(model: Model, cable: Cable) -> None:
+    """Checks that a model can be used on a cable: they agree in length and keypoints.
+
+    Raises:
+        ValueError: they do not; names both.
+    """
+    config = model.config
+    if cable.n_keypoints != config.n_keypoints or abs(cable.length - config.length) > 1e-9:
+        raise ValueError(
+            f"The model {model.name} is for {config.n_keypoints} keypoints on {config.length} m of cable, but the "
+            f"plant has {cable.n_keypoints} on {cable.length} m: train one for this cable, or change the plant."
+        )
+    if cable.marks is not None and np.ptp(np.diff(cable.marks)) > 1e-6 * cable.length:
+        raise ValueError(
+            f"The plant's keypoints are unevenly spaced, but the model {model.name} expects {config.n_keypoints} at "
+            "equal distances along the cable: give the plant's cable n_keypoints instead of marks."
+        )
+
+
 def shape_once(
     plant: PlantConfig,
     model: Model,
@@ -142,17 +161,8 @@ def shape_once(
     Raises:
         ValueError: the plant's cable is not the one that the model was made for.
     """
+    check_fit(model, plant.cable)
     cable, config = plant.cable, model.config
-    if cable.n_keypoints != config.n_keypoints or abs(cable.length - config.length) > 1e-9:
-        raise ValueError(
-            f"The model {model.name} is for {config.n_keypoints} keypoints on {config.length} m of cable, but the "
-            f"plant has {cable.n_keypoints} on {cable.length} m: train one for this cable, or change the plant."
-        )
-    if cable.marks is not None and np.ptp(np.diff(cable.marks)) > 1e-6 * cable.length:
-        raise ValueError(
-            f"The plant's keypoints are unevenly spaced, but the model {model.name} expects {config.n_keypoints} at "
-            "equal distances along the cable: give the plant's cable n_keypoints instead of marks."
-        )
     return run_closed_loop(
         Plant(plant) if camera is None else CloudPlant(plant, camera=camera),
         make_controller(model, target, method=method, solver=solver),
