@@ -152,10 +152,8 @@ class Train(Command):
                     "nominal cable; to vary it, give `cablejax simulate` ranges such as --stiffness-range."
                 )
 
-        if self.start_from is not None:
-            other = differing(cable_of_weights(self.start_from), first.config.cable)
-            if other:
-                say(f"{self.start_from} was trained on another cable than {first.path} holds: {fields(other)}.")
+        if self.start_from is not None and (other := differing(cable_of_weights(self.start_from), first.config.cable)):
+            say(f"{self.start_from} and {first.path} are of different cables: {fields(other)}.")
 
     def _config(self, store: Store) -> TrainConfig:
         """The preset's training with what the data and the options change."""
