@@ -15,6 +15,7 @@ INWARDS = np.radians(120.0)
 _FEWEST = 5
 _DEGREES_OFF = 0.5
 _DEGREES_BETTER = 3.0
+_DEGREES_TURN = 10.0
 
 
 def far_keypoint(
@@ -78,7 +79,8 @@ def _angle_fault(angle: Float[np.ndarray, " S"], direction: Float[np.ndarray, " 
         return None
     off = float(np.median(np.arccos(np.cos(angle - direction))))
     in_degrees = float(np.median(np.arccos(np.cos(np.radians(angle) - direction))))
-    if np.abs(angle).max() > np.pi and off > max(_DEGREES_OFF, _DEGREES_BETTER * in_degrees):
+    turns_too_far = np.ptp(angle) > max(np.pi, _DEGREES_TURN * np.ptp(np.unwrap(direction)))
+    if turns_too_far and off > max(_DEGREES_OFF, _DEGREES_BETTER * in_degrees):
         return (
             f"up to {np.abs(angle).max():.3g}, which fits the cable beside it in degrees (median difference "
             f"{in_degrees:.2g} rad) and not in radians ({off:.2g} rad): expected radians. Multiply it by pi / 180."

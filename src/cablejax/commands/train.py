@@ -148,7 +148,7 @@ class Train(Command):
         for store in stores[1:]:
             if other := differing(store.config.cable, first.config.cable):
                 raise UsageError(
-                    f"{store.path} and {first.path} are of different cables: {fields(other)}. Train on data sets of one "
+                    f"{store.path} and {first.path} are of different cables: {fields(other)}. Train on data of one "
                     "nominal cable; to vary it, give `cablejax simulate` ranges such as --stiffness-range."
                 )
 
