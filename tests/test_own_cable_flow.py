@@ -6,11 +6,19 @@ import json
 import numpy as np
 import pytest
 
-from cablejax.cable import Cable
+from cablejax.cable import Cable, Discretisation
 from cablejax.cable_file import write_cable
 from cablejax.cli import main
 from cablejax.commands.cable import find_cable
-from cablejax.gaplog import read_gap_log
+from cablejax.commands.runs import plant_of
+from cablejax.diagnose.safe_motions import safe_motions
+from cablejax.effects.given import GivenEffect, parse_effect
+from cablejax.gaplog import Episode, gap_log_from_episodes, read_gap_log, write_gap_log
+from cablejax.simulate.plant import Plant
+from cablejax.types import GapLog
+
+REST = 15
+"""Samples at rest before each recorded motion."""
 
 CABLE = Cable(length=1.5, linear_density=0.05, bending_stiffness=0.05, n_keypoints=17)
 
@@ -93,3 +101,45 @@ def test_data_sets_of_different_cables_are_not_mixed(folder, capsys):
 def test_an_effect_that_the_plant_cannot_stage_is_refused(folder, capsys):
     assert main(shaping(folder, "lag", "--plant-effect", "friction_patch:x_m=0")) == 2
     assert "friction_patch" in capsys.readouterr().err and not (folder / "lag").exists()
+
+
+def recorded(effects: tuple[GivenEffect, ...], samples: int = 200) -> GapLog:
+    """The plant of `shape` with that cable and these effects, moved through motions that tell causes apart.
+
+    A controller with a barely trained network is too slow, and its few commands excite too little, for a diagnosis.
+    """
+    config = plant_of(CABLE, effects, links=24, seed=3, keypoint_noise=3e-4)
+    first = np.array([[-0.6, 0.0, 0.4], [0.6, 0.0, -0.3]])
+    episodes = []
+    for name, pose in safe_motions(Discretisation(CABLE), first, samples).items():
+        plant = Plant(config)
+        seen = [plant.reset(pose[0])]
+        twists = np.concatenate([np.zeros((REST, 2, 3)), np.diff(pose, axis=0) / 0.1])
+        for twist in twists:
+            seen += plant.record(twist, 0.1, samples=1)
+        episodes.append(
+            Episode(
+                motion=name,
+                time=np.array([one.time for one in seen]) - seen[0].time,
+                keypoints=np.stack([one.keypoints for one in seen]),
+                gripper_pose=np.stack([one.gripper_pose for one in seen]),
+                gripper_command=np.concatenate([twists, np.zeros((1, 2, 3))]),
+                hold=np.arange(len(seen)) <= REST,
+            )
+        )
+    return gap_log_from_episodes(episodes, CABLE, source="the contact plant")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("effect", "verdict"), [(None, "none"), ("stiffness_profile:centre_m=0.5,width_m=0.4,ratio=0.3", "named")]
+)
+def test_the_diagnosis_judges_by_that_cable(effect, verdict, tmp_path, capsys):
+    effects = () if effect is None else (parse_effect(effect),)
+    write_gap_log(tmp_path / "log.npz", recorded(effects))
+    found = result_of(["diagnose", str(tmp_path / "log.npz"), "--out", str(tmp_path / "report")], capsys)
+    assert found["verdict"] == verdict, found
+    assert [named["name"] for named in found["effects"]] == [one.name for one in effects]
+    for one in effects:
+        parameters = found["effects"][0]["parameters"]
+        assert parameters["centre_m"]["value"] == pytest.approx(dict(one.parameters)["centre_m"], abs=0.1)
