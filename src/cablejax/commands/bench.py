@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import pathlib
 import time
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Annotated, Any, get_args
@@ -39,6 +40,9 @@ class BenchSimulate(Command):
     links: int | None = None
     """Links of the cable; by default the package's."""
 
+    cable: pathlib.Path | None = None
+    """A cable file, or a data set, weights or a log that holds a cable. By default the reference cable."""
+
     def execute(self):
         import functools
 
@@ -46,18 +50,20 @@ class BenchSimulate(Command):
         import jax.numpy as jnp
         import numpy as np
 
-        from cablejax.cable import Discretisation
+        from cablejax.cable import Cable, Discretisation
+        from cablejax.commands.cable import find_cable
         from cablejax.effects.physics import nominal_physics
         from cablejax.simulate import MjxEngine, ThreadedEngine, compiler_options
 
         for name in ("batch", "seconds", "rounds", "threads"):
             if getattr(self, name) < 1:
                 raise UsageError(f"--{name} is {getattr(self, name)}, expected at least 1.")
-        config = Discretisation() if self.links is None else Discretisation(n_links=self.links)
+        cable = Cable() if self.cable is None else find_cable(self.cable)
+        config = Discretisation(cable, n_links=Discretisation.n_links if self.links is None else self.links)
         mjx, one, many = MjxEngine(config), ThreadedEngine(config, 1), ThreadedEngine(config, self.threads)
 
         # An arch, moved slowly: contact with the table, bending and grasps are all at work.
-        state = one.initial_state(jnp.array([[0.0, 0.0, 0.6], [0.8, 0.0, -0.6]]))
+        state = one.initial_state(jnp.array([[0.0, 0.0, 0.6], [0.8 * cable.length, 0.0, -0.6]]))
         rng = np.random.default_rng(self.seed)
         twist = jnp.asarray(rng.uniform(-0.01, 0.01, (self.batch, self.seconds, 2, 3)))
         params, states = jax.tree.map(
