@@ -18,7 +18,8 @@ if TYPE_CHECKING:
 class CableFile(Command):
     """Write a cable file to edit: the reference cable, or the cable inside of a data set, trained weights or a log.
 
-    `simulate` and `shape` take the file as `--cable`; data sets, weights and logs keep the cable that they were made with.
+    `simulate` and `shape` take the file as `--cable`. Data sets, weights and logs keep the cable that they were made
+    with.
     """
 
     out: pathlib.Path | None = None
