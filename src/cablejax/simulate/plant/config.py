@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+from typing import get_args
 
 import numpy as np
 
 from cablejax.cable import Cable, Discretisation
 from cablejax.effects import Hook
-from cablejax.effects.given import GivenEffect, check_hooks, with_effects
-from cablejax.effects.physics import Physics, nominal_physics
-from cablejax.simulate.table_plant import check_camera
+from cablejax.effects.given import GivenEffect, check_hooks
+from cablejax.effects.physics import Physics
+from cablejax.simulate.table_plant import check_camera, plant_physics
 
-HOOKS: frozenset[Hook] = frozenset({"bending", "mass"})
+HOOKS: frozenset[Hook] = frozenset(get_args(Hook))
 """Hooks of the effects that the contact plant can stage."""
 
 
@@ -56,8 +57,7 @@ class PlantConfig:
     @functools.cached_property
     def physics(self) -> Physics:
         """The cable with the effects, float64, each joint bending in the plane."""
-        planar = dataclasses.replace(self.discretisation, dimension=2)
-        return with_effects(nominal_physics(planar, np.float64), self.effects, planar)
+        return plant_physics(self.discretisation, self.effects)
 
     def __post_init__(self):
         if self.discretisation.dimension != 3:

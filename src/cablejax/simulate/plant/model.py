@@ -27,6 +27,14 @@ HELD_MASS, HELD_RADIUS = 10.0, 0.1
 CONTACT_IMPEDANCE = "0.3 0.99 0.0003"
 """MuJoCo's impedance of the table's contacts: at first touch, at depth, and the depth [m]. Contacts that are stiff from
 the first touch on chatter: the mean normal force then is up to three times the weight, and so is friction."""
+OBSTACLE_HEIGHT = 0.2
+"""How far an obstacle reaches above the table [m]."""
+INEXTENSIBLE = 1e4
+"""Axial stiffness [N] of a cable whose free length changes by slipping only: a newton stretches 1 m by 0.1 mm."""
+AXIAL_DAMPING = 0.01
+"""Time constant of the damping along the cable [s]; no measured one is known, and only slow stretch is of interest."""
+GRASP_DAMPING = 0.01
+"""Time constant of the damping of a compliant grasp [s]."""
 FRICTIONLESS = 1e-5
 """MuJoCo's smallest friction coefficient."""
 
@@ -56,23 +64,70 @@ def plant_model(config: PlantConfig) -> mujoco.MjModel:
     for link, mass in zip(links, np.asarray(physics.density) * lengths + physics.extra_mass, strict=True):
         link.geoms[0].mass = mass
     for gripper, (link, offset) in enumerate(((links[0], 0.0), (links[-1], h / 2))):
-        link.geoms[0].conaffinity = 0  # the gripper carries its link: it neither rubs on the table nor weighs on it
-        link.gravcomp = 1.0
-        link.add_geom(
-            type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[HELD_RADIUS, 0, 0], pos=[offset, 0, 0], mass=HELD_MASS,
-            contype=0, conaffinity=0,
-        )  # fmt: skip
-        mocap = spec.worldbody.add_body(name=f"gripper_{gripper}", mocap=True)
-        weld = spec.add_equality(
-            type=mujoco.mjtEq.mjEQ_WELD, objtype=mujoco.mjtObj.mjOBJ_BODY, name1=mocap.name, name2=link.name,
-            solref=[-GRASP_STIFFNESS / dt**2, 0.0], solimp=[0.9999, 0.9999, 0.001, 0.5, 2.0],
-        )  # fmt: skip
-        data = np.zeros(12)
-        data[6], data[10] = 1.0, 1.0  # identity quaternion between mocap and link, unit weight of the rotation
-        weld.data = data
+        _hold(spec, link, gripper, offset, config)
+    if extensible(physics):
+        _add_extension(links[1:], config)
+    if physics.obstacle_radius > 0:
+        _add_obstacle(spec, config)
     model = spec.compile()
     _set_bending(model, config)
+    if physics.drag > 0:
+        _set_drag(model, model.body(links[1].name).id, float(physics.drag) * h)
     return model
+
+
+def extensible(physics: Physics) -> bool:
+    """Whether the cable's free length changes."""
+    return bool(physics.axial_compliance > 0 or np.any(physics.slip))
+
+
+def _hold(spec: mujoco.MjSpec, link: mujoco.MjsBody, gripper: int, offset: float, config: PlantConfig) -> None:
+    """Welds a link to its gripper; a compliant grasp has a hand between the two, which turns against the link."""
+    link.geoms[0].conaffinity = 0  # the gripper carries its link: it neither rubs on the table nor weighs on it
+    link.gravcomp = 1.0
+    compliance = float(config.physics.rotation_compliance[gripper])
+    hand = link
+    if compliance > 0:
+        hand, offset = link.add_body(name=f"hand_{gripper}", pos=[offset, 0, 0], gravcomp=1.0), 0.0
+        turn = hand.add_joint(type=mujoco.mjtJoint.mjJNT_HINGE, axis=[0, 0, 1])
+        turn.stiffness, turn.damping = [1.0 / compliance, 0, 0], [GRASP_DAMPING / compliance, 0, 0]
+    hand.add_geom(
+        type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[HELD_RADIUS, 0, 0], pos=[offset, 0, 0], mass=HELD_MASS,
+        contype=0, conaffinity=0,
+    )  # fmt: skip
+    mocap = spec.worldbody.add_body(name=f"gripper_{gripper}", mocap=True)
+    weld = spec.add_equality(
+        type=mujoco.mjtEq.mjEQ_WELD, objtype=mujoco.mjtObj.mjOBJ_BODY, name1=mocap.name, name2=hand.name,
+        solref=[-GRASP_STIFFNESS / config.discretisation.timestep**2, 0.0], solimp=[0.9999, 0.9999, 0.001, 0.5, 2.0],
+    )  # fmt: skip
+    data = np.zeros(12)
+    data[6], data[10] = 1.0, 1.0  # identity quaternion between mocap and link, unit weight of the rotation
+    weld.data = data
+
+
+def _add_extension(links: list[mujoco.MjsBody], config: PlantConfig) -> None:
+    """Slides between the links, along the cable: springs of its axial stiffness, or stiff ones where it only slips."""
+    compliance = max(float(config.physics.axial_compliance), 1.0 / INEXTENSIBLE)
+    stiffness = 1.0 / (compliance * config.discretisation.link_length)
+    for link in links:
+        slide = link.add_joint(name=f"stretch_{link.name}", type=mujoco.mjtJoint.mjJNT_SLIDE, axis=[1, 0, 0])
+        slide.stiffness, slide.damping = [stiffness, 0, 0], [AXIAL_DAMPING * stiffness, 0, 0]
+
+
+def _add_obstacle(spec: mujoco.MjSpec, config: PlantConfig) -> None:
+    """A smooth upright pole, thinner than the obstacle by the cable's own radius."""
+    physics = config.physics
+    radius = float(physics.obstacle_radius) - config.cable.diameter / 2
+    if radius <= 0:
+        raise ValueError(
+            f"obstacle: radius_m is {float(physics.obstacle_radius):g}, expected more than the cable's own radius, "
+            f"{config.cable.diameter / 2:g} m: it reaches to the cable's centreline."
+        )
+    spec.worldbody.add_geom(
+        name="obstacle", type=mujoco.mjtGeom.mjGEOM_CAPSULE, size=[radius, OBSTACLE_HEIGHT, 0],
+        pos=[*physics.obstacle_centre, 0.0], contype=1, conaffinity=0, condim=1, priority=2,
+        solref=[config.contact_time, 1.0],
+    )  # fmt: skip
 
 
 def bending_joints(model: mujoco.MjModel) -> np.ndarray:
@@ -90,6 +145,17 @@ def _set_bending(model: mujoco.MjModel, config: PlantConfig) -> None:
         model.jnt_stiffness[joint] = own
         model.dof_damping[first : first + 3] = own * physics.damping_time
         model.qpos_spring[position : position + 4] = shape
+
+
+def _set_drag(model: mujoco.MjModel, link: int, coefficient: float) -> None:
+    """Viscous drag on the middle of every free link [N s/m]: that of MuJoCo's medium on a link's box of equal inertia.
+
+    The medium is part of the implicit step, at hardly any cost. It drags on `3 pi d` times its viscosity, d the mean
+    side of the box (MuJoCo's documentation, "Fluid forces, inertia model"); free links are all alike.
+    """
+    inertia = model.body_inertia[link]
+    sides = np.sqrt(6.0 * (inertia.sum() - 2.0 * inertia) / model.body_mass[link])
+    model.opt.viscosity = coefficient / (3.0 * np.pi * sides.mean())
 
 
 def gravity_of(physics: Physics) -> Float[np.ndarray, "3"]:
