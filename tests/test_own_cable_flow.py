@@ -1,6 +1,7 @@
 """The README's way from a cable of one's own to a diagnosis, at a small size."""
 
 import dataclasses
+import html
 import json
 
 import numpy as np
@@ -46,7 +47,7 @@ def folder(tmp_path_factory):
 
 
 def shaping(folder, name: str, *options: str) -> list[str]:
-    fast = ["--method", "direct", "--solver", "projected-gradient", "--links", "16"]
+    fast = ["--method", "residual", "--solver", "projected-gradient", "--links", "16"]
     return ["shape", "--weights", str(folder / "model"), "--out", str(folder / name), *fast, *options]
 
 
@@ -63,12 +64,18 @@ def test_the_page_says_what_the_plant_has_and_the_log_what_the_model_believes(fo
     shaped = result_of(shaping(folder, "run", *options), capsys)["shapes"]["U"]
     assert shaped["terminal_error_cm"] < 0.9 * shaped["initial_error_cm"]
 
-    page = (folder / "run" / "report.html").read_text()
+    page = html.unescape((folder / "run" / "report.html").read_text())
     assert "trained on a cable of 1.5 m with 17 keypoints, 0.05 kg/m and a bending stiffness of 0.05 N m^2" in page
     assert "The plant has bending stiffness 0.04 N m^2 (0.8 times the model's)." in page
 
     log = read_gap_log(folder / "run" / "log.npz")
+    assert log.meta["motion"] == ["approach_u_residual"]
     assert find_cable(folder / "run" / "log.npz") == CABLE
+    samples = log.episode_length[0]
+    sizes = np.linalg.norm(log.gripper_command[0, :samples] * [1.0, 1.0, 0.15], axis=-1)
+    assert sizes.max() <= 0.05 + 1e-6
+    ends = log.keypoints[0, :samples, [0, -1]].swapaxes(0, 1)
+    np.testing.assert_allclose(ends, log.gripper_pose[0, :samples, :, :2], atol=1e-3)
     steps = np.linalg.norm(np.diff(log.keypoints[0, 0], axis=0), axis=-1)
     assert log.keypoints.shape[2] == 17 and steps.sum() == pytest.approx(1.5, abs=0.01)
 
@@ -77,7 +84,7 @@ def test_a_plant_of_another_cable_is_compared_with_the_model_or_refused(folder, 
     write_cable(folder / "heavy.toml", dataclasses.replace(CABLE, linear_density=0.15, diameter=0.02))
     options = ["--target", "U", "--steps", "1", "--plant-effect", "none", "--cable", str(folder / "heavy.toml")]
     result_of(shaping(folder, "heavy", *options), capsys)
-    page = (folder / "heavy" / "report.html").read_text()
+    page = html.unescape((folder / "heavy" / "report.html").read_text())
     assert "mass per length 0.15 kg/m (3 times the model's) and diameter 0.02 m (2 times the model's)" in page
     assert find_cable(folder / "heavy" / "log.npz") == CABLE
 
