@@ -76,6 +76,7 @@ def diagnose(
             conclusion.verdict,
             conclusion.effects,
             conclusion.equivalent,
+            conclusion.ranking,
             conclusion.explained if gap.shrinkage is None else gap.shrinkage,
         ),
         effects=conclusion.effects,

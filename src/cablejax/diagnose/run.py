@@ -97,6 +97,7 @@ def diagnose_simulator(
             conclusion.verdict,
             conclusion.effects,
             conclusion.equivalent,
+            conclusion.ranking,
             conclusion.explained if gap.shrinkage is None else gap.shrinkage,
         ),
         effects=conclusion.effects,

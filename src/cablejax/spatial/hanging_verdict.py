@@ -104,7 +104,7 @@ def diagnose_wire(photographs: Photographs, progress: Callable[[str], None] = la
     ]
     return WireDiagnosis(
         verdict=verdict,
-        sentence=sentence(verdict, effects, equivalent, gap.shrinkage or 0.0),
+        sentence=sentence(verdict, effects, equivalent, ranking, gap.shrinkage or 0.0),
         effects=effects,
         equivalent=equivalent,
         ranking=tuple(ranking),
