@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import pathlib
 import time
 from typing import TYPE_CHECKING, Annotated, get_args
 
@@ -36,11 +37,15 @@ class BenchSimulate(Command):
     links: int | None = None
     """Links of the cable; by default the package's."""
 
+    cable: pathlib.Path | None = None
+    """A cable file, or a data set, weights or a log that holds a cable. By default the reference cable."""
+
     def execute(self):
         import jax
         import numpy as np
 
-        from cablejax.cable import Discretisation
+        from cablejax.cable import Cable, Discretisation
+        from cablejax.commands.cable import find_cable
         from cablejax.commands.workloads import moving_arches, program_bytes, seconds_in_turns, setting
         from cablejax.simulate import ChainEngine, MjxEngine, ThreadedEngine
         from cablejax.simulate.engine import compiled_rollout
@@ -48,7 +53,8 @@ class BenchSimulate(Command):
         for name in ("batch", "seconds", "rounds", "threads"):
             if getattr(self, name) < 1:
                 raise UsageError(f"--{name} is {getattr(self, name)}, expected at least 1.")
-        config = Discretisation() if self.links is None else Discretisation(n_links=self.links)
+        cable = Cable() if self.cable is None else find_cable(self.cable)
+        config = Discretisation(cable, n_links=Discretisation.n_links if self.links is None else self.links)
         mjx, one, many = MjxEngine(config), ThreadedEngine(config, 1), ThreadedEngine(config, self.threads)
         chain = ChainEngine(config)
 
@@ -126,7 +132,6 @@ class BenchMpc(Command):
         import jax
         import numpy as np
 
-        from cablejax.cable import Cable
         from cablejax.commands.workloads import batched_control, controller_to_s, seconds_in_turns, setting
         from cablejax.control.shaping import initial_history, load_model
         from cablejax.mpc import time_control
@@ -139,8 +144,8 @@ class BenchMpc(Command):
             )
         on_processor = jax.devices()[0].platform == "cpu"
         batches = self.batches or ((1, 16) if on_processor else (1, 64, 1024))
-        model, cable = load_model(self.weights), Cable()
-        history = initial_history(cable, model.config)
+        model = load_model(self.weights)
+        history = initial_history(model.cable, model.config)
         solvers = {}
         for name in self.solvers:
             say(f"compiling the control step with {name} ...")
@@ -271,7 +276,7 @@ class BenchLoop(Command):
             )
         model = load_model(self.weights)
         controller = controller_to_s(model, self.solver)
-        run = closed_loop(controller, model.config.history, self.steps, Discretisation())
+        run = closed_loop(controller, model.config.history, self.steps, Discretisation(model.cable))
         say(f"compiling the closed loop for batches of {', '.join(map(str, self.batches))} ...")
         contestants = {str(size): functools.partial(run, size) for size in self.batches}
         seconds = seconds_in_turns(contestants, self.rounds)
