@@ -14,6 +14,7 @@ import pathlib
 
 from cablejax.control.shaping import METHODS, load_model, shape_once
 from cablejax.control.targets import make_target
+from cablejax.effects.given import GivenEffect
 from cablejax.report import figures
 from cablejax.report.animation import write_gif
 from cablejax.simulate.plant import PlantConfig
@@ -28,7 +29,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--weights", default="gns-reference")
     options = parser.parse_args(arguments)
 
-    plant = PlantConfig(stiffness_ratio=2.0)
+    plant = PlantConfig(effects=(GivenEffect("bending_stiffness", (("ratio", 2.0),)),))
     plant = dataclasses.replace(plant, discretisation=dataclasses.replace(plant.discretisation, n_links=options.links))
     model = load_model(options.weights)
     target = make_target(options.shape, plant.cable)

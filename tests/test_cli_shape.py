@@ -83,7 +83,7 @@ def test_results_are_not_overwritten_unasked(weights, tmp_path, capsys):
         (["--weights", "nothing"], "nothing"),
         (["--steps", "0"], "--steps is 0"),
         (["--links", "2"], "n_links is 2"),
-        (["--stiffness-ratio", "-1"], "stiffness_ratio is -1"),
+        (["--stiffness-ratio", "-1"], "ratio is -1"),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else None,
 )

@@ -10,7 +10,7 @@ import pytest
 from cablejax.cable import Cable, Discretisation
 from cablejax.diagnose import LIBRARY, CableEffect, Calibration, Explanation, Parameter, explanation
 from cablejax.diagnose.belief import as_good, excess, explains_most_motions, level, log_scores
-from cablejax.diagnose.conclude import conclude
+from cablejax.diagnose.conclude import conclude, sentence
 from cablejax.diagnose.conformal import leftover_p, leftover_score
 from cablejax.diagnose.evidence import Evidence
 from cablejax.diagnose.fit import Fit, evaluate, improve
@@ -267,3 +267,22 @@ def test_every_start_of_the_library_lies_within_its_bounds():
             assert variant in effect.variants
             for parameter, value in zip(effect.parameters, values, strict=True):
                 assert parameter.low <= value <= parameter.high, (effect.name, parameter.name, value)
+
+
+def test_the_headline_lists_no_cause_whose_probability_is_below_one_per_cent():
+    """A likelihood may be sure against a look-alike that leaves as little: it is mentioned, not listed as a cause."""
+    facts = evidence(("bending_stiffness", (0.25,)), ("viscous_drag", (0.3,)), noise_mm=0.02)
+    fits = improve(facts, evaluate(facts, [explanation(*parts((n, v))) for n, v in LOOK_ALIKES]), max_iterations=15)
+    null = evaluate(facts, [explanation()])[0]
+    scores = log_scores([*fits, null], facts, Calibration())
+    order = np.argsort(-scores)
+    found = Search(tuple([*fits, null][i] for i in order), scores[order], {})
+    conclusion = conclude(found, facts, Calibration(as_good=1e3, adequate=1.0))
+    assert conclusion.verdict == "ambiguous" and conclusion.ranking[1].probability < 0.01
+    words = sentence(conclusion, 0.9)
+    assert words.startswith("The gap comes from bending stiffness.")
+    assert "Table friction would leave as little, at a probability below 1 %." in words
+    even = dataclasses.replace(
+        conclusion, ranking=tuple(dataclasses.replace(ranked, probability=0.5) for ranked in conclusion.ranking)
+    )
+    assert "cannot tell apart: bending stiffness or table friction." in sentence(even, 0.9)

@@ -289,9 +289,9 @@ def test_times_a_control_call():
         ({"restart_after": 2.5}, "restart_after"),
         ({"solver": "levenberg-marquardt"}, r"solver is 'levenberg-marquardt', expected a solver such as"),
         ({"solver": LevenbergMarquardt}, "expected a solver such as"),
-        ({"objective": None}, "objective is None, expected a ObjectiveConfig"),
-        ({"residual": True}, "residual is True, expected a RidgeConfig or None"),
-        ({"adaptation": 1.0}, "adaptation is 1.0, expected a AdaptationConfig or None"),
+        ({"objective": None}, "objective is None, expected ObjectiveConfig"),
+        ({"residual": True}, "residual is True, expected RidgeConfig or None"),
+        ({"adaptation": 1.0}, "adaptation is 1.0, expected AdaptationConfig or None"),
     ],
 )
 def test_impossible_settings_are_refused(change, message):

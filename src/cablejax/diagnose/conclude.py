@@ -206,4 +206,6 @@ def sentence(conclusion: Conclusion, shrinkage: float | None) -> str:
         shrinkage: on episodes left out of the fit; None where nothing could be, which leaves that of the fit.
     """
     explained = conclusion.explained if shrinkage is None else shrinkage
-    return verdict_sentence(conclusion.verdict, conclusion.effects, conclusion.equivalent, explained)
+    return verdict_sentence(
+        conclusion.verdict, conclusion.effects, conclusion.equivalent, conclusion.ranking, explained
+    )

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from jaxtyping import Float
 
-from cablejax.diagnose.where import Where
-from cablejax.types import GapLog
+if TYPE_CHECKING:
+    from cablejax.diagnose.where import Where
+    from cablejax.types import GapLog
 
 Verdict = Literal["none", "named", "ambiguous", "named+unknown", "unknown"]
 

@@ -122,7 +122,7 @@ class MPCConfig:
             value = getattr(self, name)
             if not (isinstance(value, kind) or (optional and value is None)):
                 raise ValueError(
-                    f"MPCConfig.{name} is {value!r}, expected a {kind.__name__}{' or None' if optional else ''}."
+                    f"MPCConfig.{name} is {value!r}, expected {kind.__name__}{' or None' if optional else ''}."
                 )
         if not (callable(self.solver) and isinstance(self.solver, Hashable)) or isinstance(self.solver, type):
             raise ValueError(

@@ -93,7 +93,7 @@ def diagnose_space(
     where = where_of(log, windows, nominal, before, noise, changes)
     return SpatialDiagnosis(
         verdict=verdict,
-        sentence=" ".join([verdict_sentence(verdict, effects, equivalent, gap.shrinkage or 0.0), *first]),
+        sentence=" ".join([verdict_sentence(verdict, effects, equivalent, (), gap.shrinkage or 0.0), *first]),
         effects=effects,
         equivalent=equivalent,
         ranking=_ranking(found),

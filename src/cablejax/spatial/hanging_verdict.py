@@ -103,7 +103,7 @@ def diagnose_wire(photographs: Photographs, progress: Callable[[str], None] = la
     ]
     return WireDiagnosis(
         verdict=verdict,
-        sentence=verdict_sentence(verdict, effects, equivalent, gap.shrinkage or 0.0),
+        sentence=verdict_sentence(verdict, effects, equivalent, ranking, gap.shrinkage or 0.0),
         effects=effects,
         equivalent=equivalent,
         ranking=tuple(ranking),
