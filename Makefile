@@ -8,12 +8,13 @@ STAMP := $(VENV)/.stamp
 NPROC ?= 4
 export NPROC
 
-.PHONY: help demo tables test test-full lint clean
+.PHONY: help demo tables quick test test-full lint clean
 .DEFAULT_GOAL := help
 
 help:
 	@echo "make demo       shape a cable into a U, an S and a Z; writes runs/demo/report.html"
 	@echo "make tables     the paper's tables at a small size; experiments/*.py --full is the rest"
+	@echo "make quick      the tests of the pipeline's spine, a minute and a half"
 	@echo "make test       lint, types and the quick tests"
 	@echo "make test-full  lint, types and every test"
 	@echo "make lint       ruff and pyright"
@@ -40,6 +41,15 @@ lint: $(STAMP)
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
 	$(BIN)/pyright
+
+# One file per stage of the pipeline, from the simulator to the verdict.
+SPINE := tests/test_simulate_engines.py tests/test_simulate_equilibrium.py tests/test_dataset_store.py \
+	tests/test_dynamics_graph.py tests/test_dynamics_jraph.py tests/test_residual_ridge.py tests/test_bounded_sets.py \
+	tests/test_mpc_feasible.py tests/test_control_targets.py tests/test_perceive_mixture.py tests/test_gaplog.py \
+	tests/test_diagnose_noise.py tests/test_cli.py
+
+quick: $(STAMP)
+	$(BIN)/python -m pytest -m "not slow" -n 2 --dist loadfile $(SPINE)
 
 test: lint
 	$(BIN)/python -m pytest -m "not slow" -n 2 --dist loadfile

@@ -14,7 +14,8 @@ import pathlib
 
 from cablejax.control.shaping import METHODS, load_model, shape_once
 from cablejax.control.targets import make_target
-from cablejax.report import figures, record_of
+from cablejax.effects.given import GivenEffect
+from cablejax.report import figures
 from cablejax.report.animation import write_gif
 from cablejax.simulate.plant import PlantConfig
 
@@ -28,21 +29,21 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--weights", default="gns-reference")
     options = parser.parse_args(arguments)
 
-    plant = PlantConfig(stiffness_ratio=2.0)
+    plant = PlantConfig(effects=(GivenEffect("bending_stiffness", (("ratio", 2.0),)),))
     plant = dataclasses.replace(plant, discretisation=dataclasses.replace(plant.discretisation, n_links=options.links))
     model = load_model(options.weights)
     target = make_target(options.shape, plant.cable)
 
-    records = []
+    runs = {}
     for method in METHODS:
-        run = shape_once(plant, model, target, method=method, solver="trust-region", steps=options.steps)
+        run = shape_once(plant, model, target, method=method, solver="levenberg-marquardt", steps=options.steps)
         print(f"{method:10s} {run.verdict()}")
-        records.append(record_of(run, method))
+        runs[target.name, method] = run
 
     options.out.mkdir(parents=True, exist_ok=True)
     for draw in (figures.snapshots, figures.final_shapes, figures.error_over_time, figures.residual_share):
-        draw(records).savefig(options.out / f"{draw.__name__}.png", dpi=160)
-    write_gif(options.out / "shape.gif", records)
+        draw(runs).savefig(options.out / f"{draw.__name__}.png", dpi=160)
+    write_gif(options.out / "shape.gif", runs)
     print(f"Figures and animation are in {options.out}")
 
 

@@ -68,7 +68,7 @@ STARTS = 6
 """Further starts, at most, for a problem on which the first does not meet all that is asked."""
 ITERATIONS, EXACT_ITERATIONS = 200, 60
 """Of IPOPT at most, with limited memory and with the exact Hessian, of which one costs as much as ten gradients."""
-CALLS = {name: SOLVERS[name] for name in ("trust-region", "deadline")}
+CALLS = {name: SOLVERS[name] for name in ("levenberg-marquardt", "two-trials")}
 """What a control call solves with."""
 
 

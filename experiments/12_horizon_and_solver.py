@@ -27,11 +27,11 @@ from cablejax.control.shaping import load_model
 from cablejax.evaluation.cases import PLANT_CHAIN, mujoco_plant
 from cablejax.evaluation.protocols import LaidOut, letter_task
 from cablejax.evaluation.rows import Rows
-from cablejax.mpc import MPC, SOLVERS, MPCConfig, TrustRegion
+from cablejax.mpc import MPC, SOLVERS, LevenbergMarquardt, MPCConfig
 from pages import markdown_table, page_of_results, publish
 
-CONVERGED = "trust-region, converged"
-PLANNERS = {**SOLVERS, CONVERGED: TrustRegion(max_iterations=12, trials_per_linearisation=1)}
+CONVERGED = "levenberg-marquardt, converged"
+PLANNERS = {**SOLVERS, CONVERGED: LevenbergMarquardt(max_iterations=12, trials_per_linearisation=1)}
 HORIZONS = (1, 2, 5, 10)
 SHAPES = ("U", "S", "Z")
 STIFFNESS = 2.0
@@ -166,9 +166,9 @@ def page(trials: list[Trial], table: dict, picture: str | None) -> str:
         ),
     ]
     slow = table.get((CONVERGED, MPCConfig().horizon))
-    fast = [(h, table["deadline", h]) for h in HORIZONS if ("deadline", h) in table]
+    fast = [(h, table["two-trials", h]) for h in HORIZONS if ("two-trials", h) in table]
     if slow and fast:
-        lines += ["", "## Deadline mode against converged", ""]
+        lines += ["", "## Two trials against converged", ""]
         lines += [
             f"- horizon {h}: {cell['error']:.3f} cm in {cell['p50']:.0f} ms, p95 {cell['p95']:.0f} ms, against "
             f"{slow['error']:.3f} cm in {slow['p50']:.0f} ms ({100 * (cell['error'] / slow['error'] - 1):+.0f} %)"

@@ -1,7 +1,8 @@
 """Are slopes in bfloat16 harmless? The same plans with exact and with rough slopes: objective, Jacobian, time.
 
 The planning problems are those of experiments/11_against_ipopt.py: what the controller asked its solver for on the way
-to U, S and Z, the same with other step bounds, and random shapes. Float32, the default solver and the deadline one.
+to U, S and Z, the same with other step bounds, and random shapes. Float32, the default solver, and the same with two
+trials.
 
     python experiments/13_rough_slopes.py                                  # the first 100 problems: some minutes
     python experiments/13_rough_slopes.py --out docs/results/rough_slopes.md
@@ -29,7 +30,7 @@ from cablejax.residual import Dynamics
 from pages import markdown_table, page_of_results, publish
 
 CASES = Path("docs") / "results" / "trials" / "against_ipopt" / "cases.npz"
-PLANNERS = ("trust-region", "deadline")
+PLANNERS = ("levenberg-marquardt", "two-trials")
 
 
 @dataclasses.dataclass(frozen=True)

@@ -101,7 +101,7 @@ def recorded():
     model, episodes = load_model("gns-reference"), []
     for case in stiffness_cases("USZ", (RATIO,), LOG_SEEDS):
         task, plant = case.task(), mujoco_plant(RATIO)
-        controller = make_controller(model, task.target, method="direct", solver="trust-region")
+        controller = make_controller(model, task.target, method="direct", solver="levenberg-marquardt")
         run = run_closed_loop(plant, controller, task.target, 30, start=task.start_pose, record_hz=10.0)
         rng = np.random.default_rng((case.seed, len(episodes)))
         noisy = run.episode.keypoints + rng.normal(0.0, NOISE, run.episode.keypoints.shape)

@@ -29,10 +29,10 @@ from cablejax.cable import GRAVITY
 from cablejax.recordings.wires import HangingWire, read_wires
 from cablejax.report.provenance import machine, versions
 from cablejax.report.style import LIGHT
-from cablejax.spatial.hanging import Wire, hanging_angles, hanging_points
+from cablejax.simulate.hanging import Wire, hanging_angles, hanging_points
 from cablejax.spatial.hanging_effects import EFFECTS
 from cablejax.spatial.hanging_fit import LINKS_PER_SPACING, Photographs
-from cablejax.spatial.hanging_verdict import WireDiagnosis, diagnose_wire, rig_error, verdict_of
+from cablejax.spatial.hanging_verdict import WireDiagnosis, diagnose_wire, rig_error, wire_verdict_json
 from pages import markdown_table, publish
 
 OUTSIDE = (0.0, 0.005, 0.01, 0.015)
@@ -84,6 +84,7 @@ def table(results: dict[str, dict[str, Any]]) -> str:
     for name, result in results.items():
         d: WireDiagnosis = result["diagnosis"]
         wire: HangingWire = result["wire"]
+        shrinkage, interval = d.gap.shrinkage, d.gap.shrinkage_ci90
         unit = 1e4 * float(wire.published_stiffness.mean())
         value, low, high = (unit * number for number in d.stiffness)
         published = 1e4 * wire.published_stiffness
@@ -92,9 +93,11 @@ def table(results: dict[str, dict[str, Any]]) -> str:
                 name,
                 d.verdict,
                 named(d),
-                f"{1e3 * d.before:.2f}",
-                f"{1e3 * d.after:.2f}",
-                f"{d.shrinkage[0]:.2f} ({d.shrinkage[1]:.2f} to {d.shrinkage[2]:.2f})",
+                f"{d.gap.before_rmse_mm:.2f}",
+                f"{d.gap.after_rmse_mm:.2f}",
+                "n/a"
+                if shrinkage is None or interval is None
+                else f"{shrinkage:.2f} ({interval[0]:.2f} to {interval[1]:.2f})",
                 f"{value:.2f} ({low:.2f} to {high:.2f})",
                 f"{unit:.2f} ({published.min():.2f} to {published.max():.2f})",
             ]
@@ -155,7 +158,8 @@ def draw(results: dict[str, dict[str, Any]], path: Path) -> None:
                 middle = photographs.points.mean(axis=0)[first : last + 1]
                 axis.plot(*middle.T, color=LIGHT.faint, lw=12, zorder=0, label="where the rest shape is curved")
         what = " + ".join(d.chosen.names) or "nothing named"
-        axis.set_title(f"{name}: {what}, {1e3 * d.before:.1f} to {1e3 * d.after:.1f} mm", color=LIGHT.ink, fontsize=10)
+        change = f"{d.gap.before_rmse_mm:.1f} to {d.gap.after_rmse_mm:.1f} mm"
+        axis.set_title(f"{name}: {what}, {change}", color=LIGHT.ink, fontsize=10)
         axis.set_aspect("equal")
         axis.set_xlabel("sideways [m]")
     axes[0].set_ylabel("up [m]")
@@ -226,7 +230,7 @@ def main() -> None:
                 "wire": wire,
                 "photographs": photographs,
                 "diagnosis": diagnosis,
-                "verdict": verdict_of(diagnosis, wire.length),
+                "verdict": wire_verdict_json(diagnosis),
                 "level": [level_stiffness(photographs, outside) for outside in OUTSIDE],
             }
     if options.verdicts is not None:

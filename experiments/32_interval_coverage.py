@@ -34,7 +34,7 @@ from cablejax.report.provenance import machine, versions
 from cablejax.spatial.estimate import UNMODELLED, Estimate, Interval, estimate, estimates_of_halves
 from cablejax.spatial.identify import Identified, identify
 from cablejax.spatial.named import parameters_of
-from cablejax.spatial.newton import improve, jackknife
+from cablejax.spatial.newton import fit_at, jackknife
 from cablejax.spatial.windows import Windows
 from pages import markdown_table, publish
 from real_cables.benchmark import protocol_windows
@@ -150,7 +150,7 @@ def jackknifed(found: Identified, half: int, windows: Windows) -> list[float]:
     """EI / rho of a half with the effects that stayed, and its interval from the jackknife alone."""
     layout, values = found.simulator.layout, found.half_values[half]
     part = windows.chosen(np.flatnonzero((found.first, ~found.first)[half]))
-    fit = improve(found.simulator, values, found.effects, part, iterations=0)
+    fit = fit_at(found.simulator, values, found.effects, part)
     return told(Estimate(layout, values.shared, jackknife(fit, layout), np.zeros((layout.size,) * 2)).stiffness)
 
 

@@ -7,7 +7,7 @@ import pathlib
 import numpy as np
 from flax import nnx
 
-from cablejax.control.loop import ClosedLoopRun, shape_error_cm
+from cablejax.control.run import ClosedLoopRun, shape_error_cm
 from cablejax.control.targets import Target
 from cablejax.dynamics.config import ModelConfig
 from cablejax.dynamics.gns import GNS

@@ -2,7 +2,10 @@
 
 import numpy as np
 
-from cablejax.report.record import RunRecord
+from cablejax.control.run import ClosedLoopRun
+from cablejax.control.shaping import Method
+from cablejax.control.targets import Target
+from cablejax.gaplog import Episode
 
 
 def arc(angle: float, n: int = 13) -> np.ndarray:
@@ -14,33 +17,38 @@ def arc(angle: float, n: int = 13) -> np.ndarray:
 
 
 def run(
-    shape: str = "U", method: str = "residual", *, angle: float = 1.2, short: float = 0.01, n: int = 9
-) -> RunRecord:
+    shape: str = "U", method: Method = "residual", *, angle: float = 1.2, short: float = 0.01, n: int = 9
+) -> ClosedLoopRun:
     """A run that ends with the fraction `short` of the bend missing."""
     bends = angle * (1.0 - short) * np.linspace(0.02, 1.0, n)
     keypoints = np.stack([arc(bend) for bend in bends])
     pose = np.stack([[[*x[0], -bend], [*x[-1], bend]] for x, bend in zip(keypoints, bends, strict=True)])
     target = arc(angle)
     last = np.arange(n) == n - 1
-    return RunRecord(
-        shape=shape,
-        method=method,
-        target=target,
-        times=np.arange(n, dtype=float),
+    error = 100 * np.sqrt(((keypoints - target) ** 2).sum(-1).mean(-1))
+    times, twist = np.arange(n, dtype=float), np.diff(pose, axis=0, append=np.nan)
+    return ClosedLoopRun(
+        target=Target(shape, target, np.array([[*target[0], -angle], [*target[-1], angle]])),
+        times=times,
         keypoints=keypoints,
         gripper_pose=pose,
-        error_cm=100 * np.sqrt(((keypoints - target) ** 2).sum(-1).mean(-1)),
+        twist=twist,
+        error_cm=error,
         residual_share=np.where(last, np.nan, 0.3 if method == "residual" else 0.0),
         radius=np.full(n, 0.05),
         mpc_ms=np.where(last, np.nan, 100.0),
+        unobserved=0,
+        stopped=None,
+        observed_error_cm=error,
+        episode=Episode("approach", times, keypoints, pose, np.nan_to_num(twist), hold=times < 1),
     )
 
 
-def demo_runs() -> list[RunRecord]:
+def demo_runs() -> dict[tuple[str, Method], ClosedLoopRun]:
     """Two shapes, each with and without residual."""
-    return [
-        run("U", "residual"),
-        run("U", "direct", short=0.1),
-        run("S", "residual", angle=0.8),
-        run("S", "direct", angle=0.8, short=0.1),
-    ]
+    return {
+        ("U", "residual"): run("U", "residual"),
+        ("U", "direct"): run("U", "direct", short=0.1),
+        ("S", "residual"): run("S", "residual", angle=0.8),
+        ("S", "direct"): run("S", "direct", angle=0.8, short=0.1),
+    }

@@ -11,9 +11,8 @@ from cablejax.cable import Cable
 from cablejax.gaplog import Episode, gap_log_from_episodes
 from cablejax.recordings.poses import twists
 from cablejax.simulate.compile import compiler_options
-from cablejax.spatial.clamps import frames_along
-from cablejax.spatial.physics import RodPhysics
-from cablejax.spatial.rod import Rod
+from cablejax.simulate.rod import Rod, RodPhysics
+from cablejax.simulate.rod.clamps import frames_along
 from cablejax.types import GapLog
 
 INTERVAL = 0.02

@@ -36,7 +36,9 @@ def test_the_kept_page_is_what_the_kept_rows_give(page):
     folder = RESULTS / "trials" / "against_ipopt" / PAGES[page]
 
     rows, explained, kinks, calls = (rows_of(folder, kind).read() for kind in ("rows", "explained", "kinks", "calls"))
-    lines = ipopt_sections(rows, {row["name"]: row for row in explained}, kinks, calls, ("trust-region", "deadline"))
+    lines = ipopt_sections(
+        rows, {row["name"]: row for row in explained}, kinks, calls, ("levenberg-marquardt", "two-trials")
+    )
     assert "\n".join(lines) in (RESULTS / page).read_text()
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import scipy.optimize
 
-from cablejax.bounded import BatchedGaussNewton, Linearised, Result
+from cablejax.bounded import BatchedGaussNewton, Linearised, Result, solve_arrow
 
 SOLVER = BatchedGaussNewton(tolerance=1e-14, max_steps=300)
 
@@ -125,3 +125,46 @@ def test_nothing_to_move_has_converged():
     empty = Linearised(np.zeros(0), np.zeros(0), np.zeros(0), 1.0, np.zeros(0), np.zeros((0, 0)), None)
     (ended,) = SOLVER.minimise([empty], lambda trials: pytest.fail("evaluated"))
     assert ended.result is Result.CONVERGED and ended.evaluations == 0
+
+
+def arrow(n_blocks: int, seed: int = 0):
+    """A positive definite arrow matrix of three shared coordinates and blocks of two, shuffled; and its blocks."""
+    generator, size = np.random.default_rng(seed), 3 + 2 * n_blocks
+    matrix = np.eye(size)
+    for k in range(n_blocks):
+        rows = np.r_[0:3, 3 + 2 * k, 4 + 2 * k]
+        root = generator.normal(size=(7, 5))
+        matrix[np.ix_(rows, rows)] += root.T @ root
+    order = generator.permutation(size)
+    place = np.argsort(order)
+    return matrix[np.ix_(order, order)], [place[[3 + 2 * k, 4 + 2 * k]] for k in range(n_blocks)]
+
+
+@pytest.mark.parametrize("columns", [(), (4,)])
+def test_elimination_of_blocks_solves_the_whole_system(columns):
+    matrix, blocks = arrow(6)
+    right = np.random.default_rng(1).normal(size=(len(matrix), *columns))
+    np.testing.assert_allclose(solve_arrow(matrix, right, blocks), np.linalg.solve(matrix, right), rtol=1e-9)
+    np.testing.assert_array_equal(solve_arrow(matrix, right), np.linalg.solve(matrix, right))
+
+
+def test_blocks_change_no_step_though_some_of_their_coordinates_are_at_a_bound():
+    matrix, blocks = arrow(4)
+    middle = np.random.default_rng(2).normal(size=len(matrix))
+
+    def quadratic(blocks):
+        def at(point):
+            off = point - middle
+            value, gradient = 0.5 * float(off @ matrix @ off) + 0.25 * float((off**4).sum()), matrix @ off + off**3
+            curvature = matrix + np.diag(3 * off**2)
+            return Linearised(
+                point, np.full(len(off), -0.3), np.full(len(off), 0.5), value, gradient, curvature, None, blocks
+            )
+
+        (ended,) = SOLVER.minimise([at(np.zeros(len(middle)))], lambda trials: [at(y) for y in trials.values()])
+        return ended
+
+    dense, eliminated = quadratic(()), quadratic(tuple(blocks))
+    assert dense.result == eliminated.result == Result.CONVERGED
+    assert 0 < (~dense.best.free).sum() < len(middle)
+    np.testing.assert_allclose(eliminated.best.point, dense.best.point, atol=1e-7)

@@ -185,7 +185,7 @@ def test_parts_are_of_these_weights_and_no_others(tmp_path):
             model=load_model(str(folder)),
             targets=(TARGET,),
             methods=("direct",),
-            solver="trust-region",
+            solver="levenberg-marquardt",
             steps=2,
         )
         return json.dumps(job.settings())

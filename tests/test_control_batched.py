@@ -17,6 +17,7 @@ from cablejax.control.batched import LoopConfig, shape_batch, varied_params
 from cablejax.control.loop import run_closed_loop
 from cablejax.control.shaping import NetworkDynamics, load_model, make_controller
 from cablejax.control.targets import Target, make_target, straight_start
+from cablejax.effects.given import GivenEffect
 from cablejax.effects.physics import Physics
 from cablejax.mpc import MPC, MPCConfig, Plan
 from cablejax.mpc.target_pose import target_pose
@@ -183,7 +184,7 @@ def test_the_batch_ends_where_the_contact_plant_ends():
     """
     cable, ratios, steps = Discretisation(), np.array([1.0, 3.0]), 20
     engine, model, target = MjxEngine(cable), load_model("gns-reference"), make_target("U", cable.cable)
-    controller = make_controller(model, target, method="residual", solver="trust-region")
+    controller = make_controller(model, target, method="residual", solver="levenberg-marquardt")
     state = engine.initial_state(np.stack([straight_start(cable.cable)] * 2))
     goals = np.stack([target.keypoints] * 2)
     run = shape_batch(
@@ -191,7 +192,9 @@ def test_the_batch_ends_where_the_contact_plant_ends():
     )  # fmt: skip
     fine = Discretisation(n_links=24, dimension=3, timestep=0.005)
     for i, ratio in enumerate(ratios):
-        plant = Plant(PlantConfig(discretisation=fine, stiffness_ratio=float(ratio)))
+        plant = Plant(
+            PlantConfig(discretisation=fine, effects=(GivenEffect("bending_stiffness", (("ratio", float(ratio)),)),))
+        )
         one = run_closed_loop(plant, controller, target, steps, start=straight_start(cable.cable), record_hz=1.0)
         assert np.abs(one.keypoints[:10] - run.keypoints[i, :10]).max() < 1.5e-3
         assert abs(one.terminal_error_cm - run.terminal_error_cm[i]) < 0.1

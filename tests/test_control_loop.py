@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from cablejax.cable import Discretisation
-from cablejax.control.loop import run_closed_loop, settling_time, shape_error_cm, step_settling_time
+from cablejax.control.loop import run_closed_loop
+from cablejax.control.run import settling_time, shape_error_cm, step_settling_time
 from cablejax.control.targets import Target, make_target, straight_start
 from cablejax.gaplog import gap_log_from_episodes, read_gap_log, write_gap_log
 from cablejax.simulate.plant import Plant, PlantConfig

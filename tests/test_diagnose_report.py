@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import html as html_module
 import html.parser
 import json
 import re
@@ -11,11 +12,16 @@ import numpy as np
 import pytest
 from PIL import Image
 
+import spatial_cases
 from cablejax.diagnose.diagnosis import CableDiagnosis, Gap, NamedEffect, NextMotion, ParameterEstimate, Ranked
 from cablejax.diagnose.verdict_json import verdict_json, write_verdict
 from cablejax.diagnose.where import localise
+from cablejax.report.diagnosis_charts import ranking_figure
 from cablejax.report.diagnosis_page import write_diagnosis_page
 from cablejax.report.effect_words import effect_place, quantity, share
+from cablejax.spatial.gap import gap_of, noise_of
+from cablejax.spatial.where import in_log, where_of
+from cablejax.spatial.windows import windows_of
 from diagnose_cases import log_of, poses
 
 MOTIONS = ("approach", "translation")
@@ -233,6 +239,71 @@ def test_verdict_has_the_formats_effects():
     }
     assert verdict["ranking"][2]["held_out_shrinkage"] is None
     assert verdict["next_motion"] == "mirror" and verdict["seconds"] == 12.3
+
+
+@pytest.fixture(scope="module")
+def space(tmp_path_factory):
+    """A made-up diagnosis in space that a forward search came to, and its page."""
+    log = spatial_cases.recording()
+    windows = windows_of(log)
+    noise, along = noise_of(windows), np.sin(np.pi * np.linspace(0, 1, windows.keypoints.shape[2]))[:, None]
+    before, after = (np.nan_to_num(windows.keypoints) + size * along for size in (0.03, 0.004))
+    nominal, explained = (in_log(log, windows, part) for part in (before, after))
+    stiffness = ParameterEstimate(0.06, (0.05, 0.07), "m^4/s^2")
+    result = Diagnosis(
+        verdict="named",
+        sentence="A sentence.",
+        effects=(
+            NamedEffect(
+                "bending_stiffness",
+                None,
+                {"ratio": ParameterEstimate(3.0, (2.5, 3.5), ""), "stiffness_over_density_m4_per_s2": stiffness},
+                {"along_cable_m": None, "time_s": None, "table_m": None},
+            ),
+        ),
+        equivalent=(),
+        ranking=(Ranked("bending_stiffness", None, 0.9, 8.0), Ranked("quadratic_drag", None, -3.19, 30.0)),
+        leftover_p=None,
+        gap=gap_of(before, after, windows, noise),
+        where=where_of(log, windows, nominal, before, noise, ()),
+        next_motion=None,
+        baselines={},
+        caveats=(),
+        log=log,
+        nominal=nominal,
+        explained=explained,
+        noise_mm=np.full(windows.n_keypoints, 1e3 * noise),
+        noise_correlation=np.zeros(0),
+        seconds=1.0,
+        settings={},
+    )
+    folder = tmp_path_factory.mktemp("space")
+    return result, write_diagnosis_page(result, folder).read_text(encoding="utf-8"), verdict_json(result)
+
+
+def test_in_space_what_was_not_computed_is_null_and_not_on_the_page(space):
+    result, page, verdict = space
+    assert [entry["probability"] for entry in (*verdict["effects"], *verdict["ranking"])] == [None] * 3
+    assert verdict["next_motion"] is None and verdict["gap"]["split"]["learnable"] is None
+    where = result.where
+    assert (where.bend_per_m, where.episode_p, where.keypoint_p) == (None, None, None)
+    assert "robability" not in page and "n/a" not in page.split("<h3>Record")[0].replace("> n/a <", "")
+    assert "No motion was evaluated" in page and "No motion of the library" not in page
+
+
+def test_in_space_the_page_describes_the_search_the_noise_and_the_units(space):
+    result, page, verdict = space
+    figure = ranking_figure(result)
+    assert figure is not None and len(figure.axes) == 1
+    assert [text.get_text() for text in figure.axes[0].texts] == ["90", "-319"]
+    assert "forward search" in page and "Every effect alone" not in page and "tried alone" not in page
+    assert "-319 %" in page
+    assert "without the markers' constant offsets" in html_module.unescape(page)
+    assert "0.060 m^4/s^2 (0.050 to 0.070)" in page
+    # sizes without a test: no statement on which files deviate
+    assert "It is largest in file" in page and "of 4 only" not in page
+    assert verdict["where"]["along_cable_mm"][4] == pytest.approx(30, rel=0.1)
+    assert [row["horizon_s"] for row in verdict["where"]["per_horizon_mm"]] == [1.0, 2.0]
 
 
 def test_failed_write_leaves_the_verdict_that_was_there(tmp_path):

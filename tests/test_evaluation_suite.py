@@ -14,6 +14,7 @@ from cablejax.control.shaping import load_model
 from cablejax.control.targets import make_target
 from cablejax.control.visual_servo import VisualServo
 from cablejax.dynamics.train_config import Phase
+from cablejax.effects.given import GivenEffect
 from cablejax.evaluation.cases import mujoco_plant, random_cases, stiffness_cases
 from cablejax.evaluation.fine_tuning import FineTuneConfig, fine_tune, record
 from cablejax.evaluation.methods import LABEL, METHODS, controller_of
@@ -64,7 +65,7 @@ def test_a_suite_is_shared_resumed_and_read_whole(tmp_path):
 def test_cases_are_those_of_the_paper():
     cases = stiffness_cases(("U", "S", "Z"), (0.1, 3.0), seeds=range(2))
     assert len({(c.scenario, c.stiffness, c.seed) for c in cases}) == len(cases) == 12
-    assert mujoco_plant(0.1).config.stiffness_ratio == 0.1
+    assert mujoco_plant(0.1).config.effects == (GivenEffect("bending_stiffness", (("ratio", 0.1),)),)
     pairs = random_cases(seeds=range(2))
     assert {(c.scenario, c.seed) for c in pairs} == {(s, k) for s in ("straight", "diverse") for k in range(2)}
     assert all(c.steps == 250 for c in pairs)
@@ -102,7 +103,7 @@ def test_a_run_ends_when_nothing_happens_any_more():
         def init(self, history):
             return None
 
-        def step(self, state, keypoints, gripper_pose):
+        def step(self, state, measurement):
             return None, np.zeros((2, 3)), None
 
     task = letter_task("U", 0, CABLE)

@@ -1,4 +1,4 @@
-"""Single plans: certificates, all bounds, bad input, deadline, sampling, many starts, and derivatives of the plan."""
+"""Single plans: certificates, all bounds, bad input, two trials, sampling, many starts, and derivatives of the plan."""
 
 import dataclasses
 import functools
@@ -13,9 +13,9 @@ from cablejax.mpc import (
     SOLVERS,
     Accurate,
     CrossEntropy,
+    LevenbergMarquardt,
     PathIntegral,
     ShapingProblem,
-    TrustRegion,
     differentiable_plan,
     feasible_from,
     multi_start,
@@ -82,12 +82,12 @@ def test_plan_is_a_minimum_and_its_derivatives_are_those_of_planning_again(name)
 
 
 @pytest.mark.slow
-def test_a_deadline_plan_is_feasible_most_of_the_way_and_one_linearisation():
+def test_a_plan_of_two_trials_is_feasible_most_of_the_way_and_one_linearisation():
     case = problem("U")
-    plan, value, violation = solved(SOLVERS["deadline"], case)
+    plan, value, violation = solved(SOLVERS["two-trials"], case)
     better = STILL
     for _ in range(4):
-        better = solved(TrustRegion(), case, better)[0].motion
+        better = solved(LevenbergMarquardt(), case, better)[0].motion
     best = float(value_at(case, better))
     start = float(value_at(case, jnp.asarray(STILL)))
     assert float(violation) == 0.0 and int(plan.linearisations) == 1
@@ -100,7 +100,7 @@ def test_workspace_and_change_of_motion_are_kept():
     pose, previous = jnp.asarray(START), jnp.full((2, 3), 0.01)
     bounds = {"workspace": ((-1.0, -0.02), (1.0, 0.03)), "change": 0.015, "previous": previous}
     case = dataclasses.replace(problem("U"), feasible=feasible_from(pose, 0.05, (0.15, 0.99), **bounds))
-    plan, value, violation = solved(TrustRegion(max_iterations=2), case)
+    plan, value, violation = solved(LevenbergMarquardt(max_iterations=2), case)
     motion = np.asarray(plan.motion)
     assert float(violation) <= 1e-7
     assert float(value) < float(value_at(case, jnp.asarray(STILL)))
@@ -130,7 +130,7 @@ BAD = {
 @pytest.mark.parametrize("name", BAD)
 def test_bad_input_gives_a_code(name):
     make, expected = BAD[name]
-    plan, _, _ = solved(TrustRegion(), make())
+    plan, _, _ = solved(LevenbergMarquardt(), make())
     result = Result(int(plan.result))
     assert result in expected and len(result.message) > 20
     if result is not Result.EMPTY_SET:
@@ -141,7 +141,7 @@ def test_bad_input_gives_a_code(name):
 @pytest.mark.parametrize("solver", [CrossEntropy(), PathIntegral()])
 def test_sampling_improves_on_the_guess_and_stays_inside(solver):
     case = problem("U")
-    start, best = float(case.value(jnp.asarray(STILL))), float(solved(TrustRegion(max_iterations=2), case)[1])
+    start, best = float(case.value(jnp.asarray(STILL))), float(solved(LevenbergMarquardt(max_iterations=2), case)[1])
     _, value, violation = solved(solver, case)
     assert float(violation) == 0.0
     assert start - float(value) > 0.5 * (start - best)
@@ -168,6 +168,6 @@ def test_sampling_knows_the_way_back_from_outside(solver):
 def test_many_starts_give_the_best_of_them():
     case = problem("S")
     starts = random_starts(case, STEPS, 4)
-    best, every, values = jax.jit(lambda case: multi_start(case, TrustRegion(), starts))(case)
+    best, every, values = jax.jit(lambda case: multi_start(case, LevenbergMarquardt(), starts))(case)
     assert every.motion.shape == (4, STEPS, 2, 3) and values.shape == (4,)
     assert float(case.value(best.motion)) == pytest.approx(float(values.min()), rel=1e-5)

@@ -9,14 +9,14 @@ import pytest
 import scipy.optimize
 
 from cablejax.bounded import Result
-from cablejax.mpc import Dogleg, GaussNewton, ProjectedGradient, TrustRegion
+from cablejax.mpc import Dogleg, GaussNewton, LevenbergMarquardt, ProjectedGradient
 from mpc_cases import TARGETS, problem, random_motion
 
 STEPS = 3
 SOLVERS = {
     "projected gradient": ProjectedGradient(max_evaluations=300, tolerance=1e-5),
     "nonmonotone": ProjectedGradient(max_evaluations=300, tolerance=1e-5, memory=6),
-    "trust region": TrustRegion(max_iterations=12, trials_per_linearisation=1, tolerance=1e-5),
+    "Levenberg-Marquardt": LevenbergMarquardt(max_iterations=12, trials_per_linearisation=1, tolerance=1e-5),
     "dogleg": Dogleg(max_iterations=12, trials_per_linearisation=1, tolerance=1e-5),
     "Gauss-Newton": GaussNewton(max_iterations=12, trials_per_linearisation=1, tolerance=1e-5),
 }
@@ -105,7 +105,7 @@ def test_says_when_it_has_converged(solver):
     assert same == pytest.approx(value, rel=1e-4)
 
 
-@pytest.mark.parametrize("solver", [ProjectedGradient(max_evaluations=3), TrustRegion(max_iterations=1)])
+@pytest.mark.parametrize("solver", [ProjectedGradient(max_evaluations=3), LevenbergMarquardt(max_iterations=1)])
 def test_stops_at_its_budget_with_an_improvement(solver):
     case, guess = problem("U"), jnp.zeros((STEPS, 2, 3))
 
@@ -129,7 +129,7 @@ def test_stays_finite_where_the_model_is_not(solver):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("solver", ["projected gradient", "trust region"])
+@pytest.mark.parametrize("solver", ["projected gradient", "Levenberg-Marquardt"])
 def test_solves_many_problems_at_once(solver):
     cases = [problem(target, radius=radius) for target, radius in (("U", 0.05), ("near", 0.05), ("S", 0.02))]
     batch = jax.tree.map(lambda *leaves: jnp.stack(leaves), *cases)
@@ -144,6 +144,6 @@ def test_budgets_that_make_no_sense_are_refused():
     with pytest.raises(ValueError, match="at least 2 evaluations"):
         ProjectedGradient(max_evaluations=1)
     with pytest.raises(ValueError, match="at least one"):
-        TrustRegion(max_iterations=0)
+        LevenbergMarquardt(max_iterations=0)
     with pytest.raises(ValueError, match="tolerance"):
-        TrustRegion(tolerance=0.0)
+        LevenbergMarquardt(tolerance=0.0)

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from cablejax.cable import Cable, Discretisation
-from cablejax.control.loop import run_closed_loop, shape_error_cm
+from cablejax.control.loop import run_closed_loop
+from cablejax.control.run import shape_error_cm
 from cablejax.control.targets import make_target, straight_start
 from cablejax.perceive.camera import CameraConfig, DepthCamera
 from cablejax.perceive.plant import CloudPlant

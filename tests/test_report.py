@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from cablejax.report import figures, pair_by_shape
+from cablejax.report import figures
 from cablejax.report.animation import write_gif
 from cablejax.report.page import animation_data, headline, write_page
-from cablejax.report.style import LIGHT, cable_curve, common_window, gripper_outline
+from cablejax.report.style import LIGHT, by_shape, cable_curve, common_window, gripper_outline
 from report_cases import arc, demo_runs, run
 
 
@@ -37,14 +37,14 @@ def test_curve_bridges_missing_keypoints():
 
 
 def test_windows_hold_every_cable_and_share_one_scale():
-    records = demo_runs()
-    views = common_window(records)
+    runs = demo_runs()
+    views = common_window(runs)
     sizes = {(round(x1 - x0, 9), round(y1 - y0, 9)) for x0, x1, y0, y1 in views.values()}
     assert len(sizes) == 1
-    for record in records:
-        x0, x1, y0, y1 = views[record.shape]
-        assert record.keypoints[..., 0].min() > x0 and record.keypoints[..., 0].max() < x1
-        assert record.keypoints[..., 1].min() > y0 and record.keypoints[..., 1].max() < y1
+    for (shape, _), one in runs.items():
+        x0, x1, y0, y1 = views[shape]
+        assert one.keypoints[..., 0].min() > x0 and one.keypoints[..., 0].max() < x1
+        assert one.keypoints[..., 1].min() > y0 and one.keypoints[..., 1].max() < y1
 
 
 @pytest.mark.parametrize("end", [0, 1])
@@ -56,22 +56,24 @@ def test_gripper_stands_behind_the_end_that_it_holds(end):
 
 
 @pytest.mark.parametrize(
-    "records",
-    [[run()], [run(n=2, short=0.5), run(method="direct", n=2, short=0.5)]],
+    "runs",
+    [
+        {("U", "residual"): run()},
+        {("U", "residual"): run(n=2, short=0.5), ("U", "direct"): run(method="direct", n=2, short=0.5)},
+    ],
     ids=["one method", "two methods, far from the goal"],
 )
-def test_figures_of_one_shape_have_room_for_their_legends(records, tmp_path):
-    for draw in (figures.final_shapes, figures.error_over_time, figures.residual_share, figures.trust_region):
-        draw(records).savefig(tmp_path / "figure.svg")  # matplotlib warns where it has no room
+def test_figures_of_one_shape_have_room_for_their_legends(runs, tmp_path):
+    for draw in (figures.final_shapes, figures.error_over_time, figures.residual_share, figures.motion_bound):
+        draw(runs).savefig(tmp_path / "figure.svg")  # matplotlib warns where it has no room
 
 
 @pytest.mark.parametrize(
     "draw",
-    [figures.final_shapes, figures.error_over_time, figures.residual_share, figures.trust_region, figures.snapshots],
+    [figures.final_shapes, figures.error_over_time, figures.residual_share, figures.motion_bound, figures.snapshots],
 )
 def test_every_figure_has_its_panels_and_marks(draw, tmp_path):
-    records = demo_runs()
-    figure = draw(records)
+    figure = draw(demo_runs())
     assert len(figure.axes) == (5 if draw is figures.snapshots else 2)
     figure.savefig(tmp_path / "figure.png")
     with Image.open(tmp_path / "figure.png") as picture:
@@ -80,23 +82,23 @@ def test_every_figure_has_its_panels_and_marks(draw, tmp_path):
 
 
 def test_error_figure_shows_the_errors():
-    records = demo_runs()
-    panel = figures.error_over_time(records).axes[0]
+    runs = demo_runs()
+    panel = figures.error_over_time(runs).axes[0]
     drawn = {tuple(np.round(line.get_ydata(), 9)) for line in panel.lines if len(line.get_ydata()) > 2}
-    assert drawn == {tuple(np.round(r.error_cm, 9)) for r in records if r.shape == "U"}
+    assert drawn == {tuple(np.round(r.error_cm, 9)) for (shape, _), r in runs.items() if shape == "U"}
 
 
 def test_share_is_blank_where_the_grippers_rested():
-    record = run()
-    pose = record.gripper_pose.copy()
+    one = run()
+    pose = one.gripper_pose.copy()
     pose[5:] = pose[5]
-    line = figures.residual_share([dataclasses.replace(record, gripper_pose=pose)]).axes[0].lines[0]
+    rested = {("U", "residual"): dataclasses.replace(one, gripper_pose=pose)}
+    line = figures.residual_share(rested).axes[0].lines[0]
     np.testing.assert_array_equal(np.isfinite(line.get_ydata()), np.arange(9) < 5)
 
 
 def test_gif_ends_on_the_last_sample_and_stays_small(tmp_path):
-    records = demo_runs()
-    size = write_gif(tmp_path / "demo.gif", records, width=480, frames_per_second=4)
+    size = write_gif(tmp_path / "demo.gif", demo_runs(), width=480, frames_per_second=4)
     assert size == (tmp_path / "demo.gif").stat().st_size < 3_000_000
     with Image.open(tmp_path / "demo.gif") as gif:
         assert gif.n_frames >= 3
@@ -125,23 +127,23 @@ class _Outside(html.parser.HTMLParser):
 
 @pytest.fixture
 def page(tmp_path):
-    records = demo_runs()
-    write_gif(tmp_path / "demo.gif", records, width=240, frames_per_second=2)
+    runs = demo_runs()
+    write_gif(tmp_path / "demo.gif", runs, width=240, frames_per_second=2)
     shapes = {
         shape: {
             "initial_error_cm": 20.0,
-            "terminal_error_cm": runs["residual"].final_error_cm,
-            "terminal_error_without_residual_cm": runs["direct"].final_error_cm,
+            "terminal_error_cm": pair["residual"].terminal_error_cm,
+            "terminal_error_without_residual_cm": pair["direct"].terminal_error_cm,
             "settling_time_s": None,
             "mpc_ms_p50": 100.0,
             "mpc_ms_p95": 120.0,
         }
-        for shape, runs in pair_by_shape(records).items()
+        for shape, pair in by_shape(runs).items()
     }
     facts = {"seed": "7", "machine": "two <cores>"}
     write_page(
         tmp_path / "report.html",
-        records,
+        runs,
         {"shapes": shapes, "total_s": 1.0},
         about="A test & nothing else.",
         facts=facts,
@@ -158,8 +160,8 @@ def test_page_needs_nothing_else(page):
 
 
 def test_page_says_the_numbers(page):
-    for record in demo_runs():
-        assert f"{record.final_error_cm:.2f}" in page
+    for one in demo_runs().values():
+        assert f"{one.terminal_error_cm:.2f}" in page
     assert "two &lt;cores&gt;" in page and "A test &amp; nothing else." in page
     assert page.count("<svg") == 4
     assert "$" not in re.sub(r"<script>.*?</script>", "", page, flags=re.DOTALL)
@@ -172,41 +174,41 @@ def test_pages_ids_are_unique(page):
 
 def test_page_carries_the_runs_for_its_player(page):
     data = json.loads(re.search(r'id="runs">(.*?)</script>', page, flags=re.DOTALL)[1])
-    record = demo_runs()[0]
-    run_ = next(r for r in data["shapes"][0]["runs"] if r["method"] == record.method)
-    np.testing.assert_allclose(np.reshape(run_["points"][-1], (-1, 2)) * 1e-4, record.keypoints[-1], atol=6e-5)
+    one = demo_runs()["U", "residual"]
+    run_ = next(r for r in data["shapes"][0]["runs"] if r["method"] == "residual")
+    np.testing.assert_allclose(np.reshape(run_["points"][-1], (-1, 2)) * 1e-4, one.keypoints[-1], atol=6e-5)
 
 
 def test_missing_keypoints_reach_the_player_as_null():
-    record = run()
-    keypoints = record.keypoints.copy()
+    one = run()
+    keypoints = one.keypoints.copy()
     keypoints[3, 5] = np.nan
-    data = animation_data([dataclasses.replace(record, keypoints=keypoints)])
+    data = animation_data({("U", "residual"): dataclasses.replace(one, keypoints=keypoints)})
     assert data["shapes"][0]["runs"][0]["points"][3][10:12] == [None, None]
 
 
 def test_headline_does_not_claim_what_the_residual_did_not_do():
-    worse = [run("U", "residual", short=0.2), run("U", "direct", short=0.05)]
-    title, lead = headline(pair_by_shape(worse))
-    assert title == f"The cable stays {worse[0].final_error_cm:.2f} cm away from U"
-    assert f"{worse[1].final_error_cm:.2f}" in lead
+    worse = {"residual": run("U", "residual", short=0.2), "direct": run("U", "direct", short=0.05)}
+    title, lead = headline({"U": worse})
+    assert title == f"The cable stays {worse['residual'].terminal_error_cm:.2f} cm away from U"
+    assert f"{worse['direct'].terminal_error_cm:.2f}" in lead
 
 
 def test_headline_tells_reached_from_missed():
-    records = [run("U"), run("S", short=0.3), run("Z", short=0.02)]
-    ends = [record.final_error_cm for record in records]
-    title, _ = headline(pair_by_shape(records))
+    runs = {"U": run("U"), "S": run("S", short=0.3), "Z": run("Z", short=0.02)}
+    ends = [one.terminal_error_cm for one in runs.values()]
+    title, _ = headline({shape: {"residual": one} for shape, one in runs.items()})
     assert title == (
         f"The cable reaches U and Z to within {max(ends[0], ends[2]):.2f} cm, but it stays {ends[1]:.2f} cm away from S"
     )
 
 
 def test_a_shape_name_cannot_break_the_page(tmp_path):
-    records = [run("</script><b>", "residual")]
-    write_gif(tmp_path / "demo.gif", records, width=120, frames_per_second=1)
+    runs = {("</script><b>", "residual"): run("</script><b>", "residual")}
+    write_gif(tmp_path / "demo.gif", runs, width=120, frames_per_second=1)
     write_page(
         tmp_path / "report.html",
-        records,
+        runs,
         {"shapes": {}, "total_s": 1.0},
         about="",
         facts={},
@@ -215,13 +217,6 @@ def test_a_shape_name_cannot_break_the_page(tmp_path):
     assert "</script><b>" not in (tmp_path / "report.html").read_text(encoding="utf-8")
 
 
-def test_records_of_the_wrong_shape_are_refused():
-    with pytest.raises(ValueError, match=r"error_cm of U/residual has shape \(3,\), expected \(9,\)"):
-        dataclasses.replace(run(), error_cm=np.zeros(3))
-
-
-def test_no_runs_or_two_of_a_kind_are_refused():
+def test_a_report_of_no_runs_is_refused():
     with pytest.raises(ValueError, match="at least one run"):
-        pair_by_shape([])
-    with pytest.raises(ValueError, match="Two runs of shape 'U'"):
-        pair_by_shape([run(), run()])
+        by_shape({})

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from cablejax.cable import GRAVITY, Cable, Discretisation
+from cablejax.effects.given import GivenEffect
 from cablejax.simulate.elastica import elastica
 from cablejax.simulate.plant import Plant, PlantConfig, plant_model
 
@@ -48,7 +49,8 @@ def test_cable_at_rest_stays_at_rest(plant):
 
 @pytest.mark.parametrize("ratio", [0.5, 3.0])
 def test_a_new_cable_has_the_shape_of_the_elastica_whatever_its_stiffness(ratio):
-    plant = Plant(dataclasses.replace(CONFIG, stiffness_ratio=ratio))
+    stiffer = GivenEffect("bending_stiffness", (("ratio", ratio),))
+    plant = Plant(dataclasses.replace(CONFIG, effects=(stiffer,)))
     pose = np.array([[-0.3, 0.1, -1.2], [0.3, 0.0, 1.0]])
     expected = elastica(pose, CABLE.cable.length, CABLE.cable.keypoint_arclength)
     np.testing.assert_allclose(plant.reset(pose).keypoints, expected, atol=3e-3)
@@ -103,8 +105,8 @@ def test_friction_keeps_a_cable_where_a_frictionless_one_springs_back():
 def test_bad_set_ups_are_refused():
     with pytest.raises(ValueError, match="dimension is 2"):
         PlantConfig(discretisation=Discretisation())
-    with pytest.raises(ValueError, match="stiffness_ratio"):
-        PlantConfig(stiffness_ratio=0.0)
+    with pytest.raises(ValueError, match="bending_stiffness: ratio is 0"):
+        PlantConfig(effects=(GivenEffect("bending_stiffness", (("ratio", 0.0),)),))
     with pytest.raises(ValueError, match="keypoint_dropout"):
         PlantConfig(keypoint_dropout=1.0)
 
@@ -114,3 +116,18 @@ def test_weight_and_plugins():
     free = model.body_mass[[i for i in range(model.nbody) if model.body(i).name.startswith("cable")]][1:-1]
     np.testing.assert_allclose(free, CABLE.cable.linear_density * CABLE.link_length)
     assert model.nplugin == 0
+
+
+def test_a_plant_without_effects_moves_as_it_always_has():
+    # recorded before the plant had effects
+    plant = Plant(CONFIG)
+    plant.reset(ARCH)
+    last = plant.record(np.array([[0.03, 0.02, -0.2], [-0.03, 0.03, 0.3]]), 2.0, samples=5)[-1]
+    expected = [
+        [-0.18682309638132236, 0.1341781690942661],
+        [-0.000555345103049145, 0.2748947690978218],
+        [0.1786202151733213, 0.11768642636906283],
+    ]
+    np.testing.assert_allclose(
+        last.keypoints[[3, 6, 9]], expected, rtol=0, atol=1e-9
+    )  # other processors round otherwise

@@ -12,6 +12,7 @@ import pytest
 import spatial_cases as cases
 from cablejax.diagnose import verdict_json
 from cablejax.report.diagnosis_page import write_diagnosis_page
+from cablejax.simulate.rod import Rod
 from cablejax.spatial.clock import on_one_clock
 from cablejax.spatial.diagnose import diagnose_space
 from cablejax.spatial.fit import Simulator, errors
@@ -19,7 +20,6 @@ from cablejax.spatial.gap import noise_of
 from cablejax.spatial.geometry import local_changes
 from cablejax.spatial.identify import layout_of
 from cablejax.spatial.newton import improve
-from cablejax.spatial.rod import Rod
 from cablejax.spatial.search import falls, halves
 from cablejax.spatial.values import shared_by_all
 from cablejax.spatial.windows import windows_of
@@ -44,7 +44,7 @@ def test_a_fit_finds_stiffness_and_damping():
     before = errors(simulator.predict(values, windows), windows).mean()
     values.shared[layout.slices["damping_time"]] = 0.05
     effects = ["bending_stiffness", "bending_damping"]
-    fit = improve(simulator, values, effects, windows, iterations=8)
+    fit = improve(simulator, values, effects, windows)
     after = errors(simulator.predict(fit.values, windows), windows).mean()
     assert after < 0.1 * before
     ratio = np.exp(fit.values.shared[layout.slices["log_stiffness"]])

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 import spatial_cases as cases
+from cablejax.simulate.rod import Rod
 from cablejax.spatial.estimate import UNMODELLED, Interval, estimate
 from cablejax.spatial.fit import Simulator
 from cablejax.spatial.identify import Identified, layout_of
 from cablejax.spatial.named import named_effects, parameters_of
 from cablejax.spatial.newton import improve
-from cablejax.spatial.rod import Rod
 from cablejax.spatial.time_steps import TimeSteps
 from cablejax.spatial.values import shared_by_all
 from cablejax.spatial.windows import windows_of
@@ -29,7 +29,7 @@ def found():
     simulator = Simulator(Rod(16, twisting=False), layout_of(windows, cases.NOMINAL, twisting=False))
     start = shared_by_all(np.zeros(simulator.layout.size), windows.group)
     start.shared[simulator.layout.slices["damping_time"]] = 0.05
-    values = improve(simulator, start, _FOUND, windows, iterations=8).values
+    values = improve(simulator, start, _FOUND, windows).values
     first = np.arange(len(windows)) < 2
     return windows, Identified(simulator, TimeSteps(1, 0.0), _FOUND, _FOUND, (), values, (values, values), first)
 
@@ -111,7 +111,9 @@ def test_says_more_from_more_recordings(found, estimated):
 def test_tells_every_effect_with_its_interval(found, everything):
     windows, identified = found
     stiffness, damping = named_effects(identified, everything, 0.05, windows)
-    (ratio,), (time,) = stiffness.parameters.values(), damping.parameters.values()
+    assert stiffness.probability is None and damping.probability is None
+    (ratio, absolute), (time,) = stiffness.parameters.values(), damping.parameters.values()
+    assert absolute.unit == "m^4/s^2" and absolute.value == pytest.approx(ratio.value * cases.NOMINAL)
     # the priors hold no drag at all impossible, and some is taken for damping
     assert ratio.value == pytest.approx(cases.TRUE_RATIO, rel=0.05)
     assert time.value == pytest.approx(cases.TRUE_DAMPING, rel=0.25)

@@ -12,10 +12,10 @@ from scipy.integrate import solve_bvp
 from cablejax.cable import GRAVITY
 from cablejax.recordings.wires import read_wires
 from cablejax.simulate.elastica import elastica
-from cablejax.spatial.hanging import Wire, hanging_angles, hanging_points, imbalance, joint_arclength
+from cablejax.simulate.hanging import Wire, hanging_angles, hanging_points, imbalance, joint_arclength
 from cablejax.spatial.hanging_effects import EFFECTS, wire_shape
 from cablejax.spatial.hanging_fit import Photographs, fit_wire
-from cablejax.spatial.hanging_verdict import diagnose_wire, rig_error, tracing_noise, verdict_of
+from cablejax.spatial.hanging_verdict import diagnose_wire, rig_error, tracing_noise, wire_verdict_json
 from recording_cases import DATA, needs_wires
 
 LENGTH, LINKS = 1.0, 80
@@ -191,7 +191,7 @@ def test_the_intervals_cover_a_softer_wire_with_a_permanent_set():
     assert low < 0.8 < high < 3 * low  # from three photographs; the prior's interval is a factor of 27
     both = diagnosis.fit("bending_stiffness", "intrinsic_curvature")
     assert both.held_out.max() < 1e-3  # the error that the photographs are said to have
-    effects = {effect["name"]: effect["parameters"] for effect in verdict_of(diagnosis, 1.5)["effects"]}
+    effects = {effect["name"]: effect["parameters"] for effect in wire_verdict_json(diagnosis)["effects"]}
     for name, true in (("centre_m", 0.375), ("width_m", 0.45), ("curvature_per_m", 5.0)):
         low, high = effects["intrinsic_curvature"][name]["ci90"]
         assert low < true < high, name
@@ -200,18 +200,23 @@ def test_the_intervals_cover_a_softer_wire_with_a_permanent_set():
 def test_a_permanent_set_is_named_where_there_is_one():
     diagnosis = diagnose_wire(photographs(5.0, 1.0))
     assert diagnosis.chosen.names == ("intrinsic_curvature",) and diagnosis.inclusion["intrinsic_curvature"] > 0.9
-    assert diagnosis.shrinkage[1] > 0.5 and diagnosis.verdict in ("named", "ambiguous")
-    verdict = json.loads(json.dumps(verdict_of(diagnosis, 1.5), allow_nan=False))
+    interval = diagnosis.gap.shrinkage_ci90
+    assert interval is not None and interval[0] > 0.5 and diagnosis.verdict in ("named", "ambiguous")
+    verdict = json.loads(json.dumps(wire_verdict_json(diagnosis), allow_nan=False))
     (effect,) = verdict["effects"]
     low, high = effect["parameters"]["centre_m"]["ci90"]
     assert low < 0.375 < high
     assert verdict["schema"] == "cablejax-verdict/1" and verdict["gap"]["held_out_episodes"] == [0, 1, 2]
     assert {entry["name"] for entry in verdict["ranking"]} == set(EFFECTS)
+    assert effect["probability"] == pytest.approx(diagnosis.inclusion["intrinsic_curvature"], rel=1e-5)
+    assert verdict["where"]["per_episode_mm"] == pytest.approx(1e3 * diagnosis.fit().held_out, rel=0.05)
+    # no motion was evaluated, and of a shape at rest nothing is learnable online
+    assert verdict["next_motion"] is None and verdict["gap"]["split"]["learnable"] is None
 
 
 def test_nothing_is_named_where_the_wire_is_as_believed():
     diagnosis = diagnose_wire(photographs(0.0, 1.0))
-    assert diagnosis.verdict == "none" and diagnosis.chosen.names == ()
+    assert diagnosis.verdict == "none" and diagnosis.chosen.names == () and diagnosis.gap.shrinkage is None
     low, high = diagnosis.stiffness[1:]
     assert low < 1.0 < high and high / low < 1.6
 
@@ -258,5 +263,5 @@ def test_real_wires_black_and_red_keep_a_set_and_white_does_not():
         stiffness = float(real.published_stiffness.mean()) / (GRAVITY * real.linear_density)
         diagnosis = diagnose_wire(Photographs(real.keypoints[..., [0, 2]], real.length, stiffness, error))
         assert ("intrinsic_curvature" in diagnosis.chosen.names) == (real.name != "white"), real.name
-        assert diagnosis.shrinkage[1] > 0
+        assert diagnosis.gap.shrinkage_ci90 is not None and diagnosis.gap.shrinkage_ci90[0] > 0
         assert 0.4 < diagnosis.stiffness[1] < diagnosis.stiffness[2] < 1.4

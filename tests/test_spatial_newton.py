@@ -7,11 +7,13 @@ import dataclasses
 import numpy as np
 
 import spatial_cases as cases
+from cablejax.bounded import Result
+from cablejax.simulate.rod import Rod
 from cablejax.spatial.fit import Simulator, Sums
 from cablejax.spatial.identify import layout_of
 from cablejax.spatial.newton import (
-    Fit,
     Move,
+    RodFit,
     coordinates,
     improve,
     jackknife,
@@ -20,7 +22,6 @@ from cablejax.spatial.newton import (
     prior_shifts,
     slopes,
 )
-from cablejax.spatial.rod import Rod
 from cablejax.spatial.values import Values, from_json, mean_of, shared_by_all, to_json
 from cablejax.spatial.windows import windows_of
 
@@ -75,7 +76,7 @@ def test_elimination_solves_the_whole_system():
     own[:, m] = 1e-3 * generator.normal(size=(3, len(m)))
     shared = np.where(active, 1e-3, 0.0)
     shared[layout.slices["damping_time"]] = 0.03
-    fit = Fit(Values(shared, np.array([0, 2, 5]), own), active, sums, group)
+    fit = RodFit(Values(shared, np.array([0, 2, 5]), own), active, sums, group)
 
     # all unknowns at once: shared coordinates, then every recording's own values
     slope, a = slopes(layout, shared), np.flatnonzero(active)
@@ -115,7 +116,8 @@ def test_grips_of_every_recording_are_found_and_leave_the_stiffness_alone():
 
     start = shared_by_all(np.zeros(layout.size), windows.group)
     start.shared[where["damping_time"]] = 0.06
-    fits = {own: improve(simulator, start, _EFFECTS[: 2 + own], seen, iterations=10) for own in (False, True)}
+    fits = {own: improve(simulator, start, _EFFECTS[: 2 + own], seen) for own in (False, True)}
+    assert all(fit.result is Result.CONVERGED for fit in fits.values())
     found = fits[True].values
     assert abs(found.shared[where["log_stiffness"]].item() - 0.7) < 0.05
     assert abs(found.shared[where["log_stiffness"]].item() - 0.7) < 0.5 * abs(

@@ -11,9 +11,8 @@ import pytest
 from cablejax.cable import Cable, Discretisation
 from cablejax.simulate.compile import compiler_options
 from cablejax.simulate.composite import build_grasped_chain
-from cablejax.spatial import rod as rod_module
-from cablejax.spatial.physics import RodPhysics
-from cablejax.spatial.rod import Rod
+from cablejax.simulate.rod import Rod, RodPhysics
+from cablejax.simulate.rod import rod as rod_module
 
 _INTERVAL = 0.01
 

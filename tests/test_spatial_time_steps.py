@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 import spatial_cases as cases
+from cablejax.simulate.rod import Rod
 from cablejax.spatial.fit import Simulator
 from cablejax.spatial.identify import layout_of
-from cablejax.spatial.rod import Rod
 from cablejax.spatial.time_steps import time_steps_for
 from cablejax.spatial.windows import Windows, windows_of
 

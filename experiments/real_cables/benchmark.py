@@ -12,7 +12,7 @@ from jaxtyping import Float
 
 from cablejax.npz import read_npz
 from cablejax.recordings.deform import NOMINAL, DeformRecordings
-from cablejax.spatial.clamps import frames_along
+from cablejax.simulate.rod.clamps import frames_along
 from cablejax.spatial.estimate import estimates_of_halves
 from cablejax.spatial.fit import errors, over_all_markers
 from cablejax.spatial.identify import Identified, identify

@@ -19,11 +19,10 @@ from jaxtyping import Float
 
 from cablejax.recordings.deform import SAMPLE_INTERVAL, DeformRecordings
 from cablejax.simulate.compile import compiler_options
-from cablejax.spatial.clamps import frames_along
+from cablejax.simulate.rod import Rod, RodPhysics
+from cablejax.simulate.rod.clamps import frames_along
 from cablejax.spatial.effects import CURVATURE_KNOTS, PROFILE_KNOTS, TWIST_RATIO
 from cablejax.spatial.identify import EDGES
-from cablejax.spatial.physics import RodPhysics
-from cablejax.spatial.rod import Rod
 
 RECORDINGS, SAMPLES, MARKERS = 16, 100, 6
 # The cable swings in before the recording begins, so that it does not start at rest or at a guess.

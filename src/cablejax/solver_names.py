@@ -3,6 +3,12 @@
 from typing import Literal
 
 SolverName = Literal[
-    "trust-region", "projected-gradient", "dogleg", "gauss-newton", "deadline", "cross-entropy", "path-integral"
+    "levenberg-marquardt",
+    "projected-gradient",
+    "dogleg",
+    "gauss-newton",
+    "two-trials",
+    "cross-entropy",
+    "path-integral",
 ]
 """A key of `cablejax.mpc.SOLVERS`."""

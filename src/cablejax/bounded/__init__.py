@@ -7,7 +7,7 @@ travels in their options:
     solution.value, solution.certificate(residuals, Box(lower, upper))
 """
 
-from cablejax.bounded.batched_gauss_newton import BatchedGaussNewton, Linearised, Minimised
+from cablejax.bounded.batched_gauss_newton import BatchedGaussNewton, Linearised, Minimised, solve_arrow
 from cablejax.bounded.certificate import Certificate, certify
 from cablejax.bounded.dogleg import BoundedDogleg, BoundedDoglegDescent
 from cablejax.bounded.gain_ratio import GainRatio
@@ -65,4 +65,5 @@ __all__ = [
     "minimise",
     "minimise_quadratic",
     "project_ball",
+    "solve_arrow",
 ]

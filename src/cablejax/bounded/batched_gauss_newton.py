@@ -13,7 +13,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Generic, TypeVar
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from cablejax.bounded.results import Result
 
@@ -32,9 +32,10 @@ class Linearised(Generic[Kept]):
         lower, upper: bounds of the point, shape [P]; infinite where there is none.
         value: of the function. What is not finite is never accepted.
         gradient: shape [P].
-        curvature: Gauss-Newton's matrix, positive definite (a prior makes it so), shape [P, P]. Where a problem has
-            blocks that do not see each other, such as recordings with values of their own, it is the arrow matrix.
+        curvature: Gauss-Newton's matrix, positive definite (a prior makes it so), shape [P, P].
         kept: what the caller wants back with the point.
+        blocks: sets of coordinates that do not see each other, such as each recording's own values: the curvature is an
+            arrow matrix, and steps eliminate them, see `solve_arrow`.
     """
 
     point: Float[np.ndarray, "P"]
@@ -44,6 +45,7 @@ class Linearised(Generic[Kept]):
     gradient: Float[np.ndarray, "P"]
     curvature: Float[np.ndarray, "P P"]
     kept: Kept
+    blocks: tuple[Int[np.ndarray, "B"], ...] = ()
 
     @property
     def free(self) -> Bool[np.ndarray, "P"]:
@@ -141,10 +143,38 @@ class BatchedGaussNewton:
 
     def _trial(self, at: Linearised[Kept], damping: float) -> Float[np.ndarray, "P"] | None:
         """The next point to try; None where that promises too little."""
-        free, step = at.free, np.zeros_like(at.point)
+        free, step = np.flatnonzero(at.free), np.zeros_like(at.point)
         damped = at.curvature + damping * np.diag(np.diagonal(at.curvature))
-        step[free] = -np.linalg.solve(damped[np.ix_(free, free)], at.gradient[free])
+        blocks = [np.flatnonzero(np.isin(free, block)) for block in at.blocks]
+        step[free] = -solve_arrow(damped[np.ix_(free, free)], at.gradient[free], blocks)
         if -(at.gradient @ step + 0.5 * step @ at.curvature @ step) < self.tolerance:
             return None
         step *= min(1.0, self.largest_step / max(np.abs(step).max(), 1e-12))
         return np.clip(at.point + step, at.lower, at.upper)
+
+
+def solve_arrow(
+    matrix: Float[np.ndarray, "P P"], right: Float[np.ndarray, "P *K"], blocks: Sequence[Int[np.ndarray, "B"]] = ()
+) -> Float[np.ndarray, "P *K"]:
+    """Solves `matrix x = right` by eliminating the blocks first (Schur complement).
+
+    What is left has the size of the other coordinates, however many blocks there are.
+
+    Args:
+        matrix: its entries between two different blocks are zero.
+        right: one right hand side, or several as columns.
+        blocks: disjoint sets of indices.
+    """
+    inner = np.setdiff1d(np.arange(len(matrix)), np.concatenate([np.zeros(0, int), *blocks]))
+    reduced, pull, kept = matrix[np.ix_(inner, inner)], right[inner], []
+    for block in blocks:
+        across = matrix[np.ix_(inner, block)]
+        solved = np.linalg.solve(matrix[np.ix_(block, block)], np.column_stack([across.T, right[block]]))
+        by_inner, alone = solved[:, : len(inner)], solved[:, len(inner) :].reshape(right[block].shape)
+        reduced, pull = reduced - across @ by_inner, pull - across @ alone
+        kept.append((by_inner, alone))
+    solution = np.empty(right.shape)
+    solution[inner] = np.linalg.solve(reduced, pull)
+    for block, (by_inner, alone) in zip(blocks, kept, strict=True):
+        solution[block] = alone - by_inner @ solution[inner]
+    return solution

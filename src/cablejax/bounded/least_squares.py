@@ -20,29 +20,43 @@ from cablejax.bounded.secant import secant_update
 
 
 class _Linearisation(eqx.Module):
+    """What changes where the solve linearises."""
+
     at: Array
     residual: Float[Array, " M"]
     jacobian: Float[Array, "M P"]
+    secant: Float[Array, "P P"]  # learned second-order part of the Hessian
+    optimality: Scalar
 
 
-class _State(eqx.Module):
+class _Model(eqx.Module):
+    """The quadratic model that steps are taken on: that of the last linearisation with Broyden's updates since."""
+
     f_info: Any  # FunctionInfo.EvalGradHessian
     residual: Float[Array, " M"]
-    jacobian: Float[Array, "M P"]  # that of `last` with Broyden's updates since
-    secant: Float[Array, "P P"]
-    last: _Linearisation
-    aux: Any  # of `fn` where the solve is
-    descent_state: Any
-    search_state: Any
+    jacobian: Float[Array, "M P"]
+    descent: Any
+    updates: Int[Array, ""]
+
+
+class _Trial(eqx.Module):
+    """What every trial point decides."""
+
+    search: Any
     step_size: Scalar
     objective: Scalar
-    optimality: Scalar
-    stale: Bool[Array, ""]
-    updates: Int[Array, ""]
+    aux: Any  # of `fn` where the solve is
+    stale: Bool[Array, ""]  # whether the solve has moved on from the last linearisation
     rounded: Bool[Array, ""]
     finite: Bool[Array, ""]  # whether all trials since the last real step had a value
     terminate: Bool[Array, ""]
     result: optx.RESULTS
+
+
+class _State(eqx.Module):
+    last: _Linearisation
+    model: _Model
+    trial: _Trial
     linearisations: Int[Array, ""]
     evaluations: Int[Array, ""]
 
@@ -60,7 +74,7 @@ class AbstractBoundedLeastSquares(optx.AbstractLeastSquaresSolver):
     change of the Jacobian, which makes the last steps fast where residuals stay large.
 
     With `trials_per_linearisation` above 1 a step goes on to so many trial points, and the Jacobian follows them by
-    Broyden's update (Math. Comp. 19, 1965): the least change with which the model foretells the residuals of the last
+    Broyden's update (Math. Comp. 19, 1965): the least change with which the model predicts the residuals of the last
     trial, accepted or not. It costs nothing, but its gradients are not exact: only a linearisation ends a solve.
 
     Options: `feasible`, the set; `linearise`, a function `(y, args) -> (residuals, Jacobian [M, P])`, if there is a
@@ -86,24 +100,20 @@ class AbstractBoundedLeastSquares(optx.AbstractLeastSquaresSolver):
         zero = jnp.zeros((), jnp.int32)
         residual, jacobian = jnp.zeros(f_struct.shape, dtype), jnp.zeros((*f_struct.shape, y.size), dtype)
         return _State(
-            f_info=info,
-            residual=residual,
-            jacobian=jacobian,
-            secant=square,
-            last=_Linearisation(y, residual, jacobian),
-            # a linearisation that is given tells none
-            aux=aux_at(fn, y, args, aux_struct),
-            descent_state=descent.init(y.ravel(), info),
-            search_state=self.search.init(y.ravel(), info),
-            step_size=jnp.ones((), dtype),
-            objective=jnp.asarray(jnp.inf, dtype),
-            optimality=jnp.asarray(jnp.inf, dtype),
-            stale=jnp.array(True),
-            updates=zero,
-            rounded=jnp.array(False),
-            finite=jnp.array(True),
-            terminate=jnp.array(False),
-            result=optx.RESULTS.successful,
+            last=_Linearisation(y, residual, jacobian, square, jnp.asarray(jnp.inf, dtype)),
+            model=_Model(info, residual, jacobian, descent.init(y.ravel(), info), zero),
+            trial=_Trial(
+                search=self.search.init(y.ravel(), info),
+                step_size=jnp.ones((), dtype),
+                objective=jnp.asarray(jnp.inf, dtype),
+                # a linearisation that is given returns no aux
+                aux=aux_at(fn, y, args, aux_struct),
+                stale=jnp.array(True),
+                rounded=jnp.array(False),
+                finite=jnp.array(True),
+                terminate=jnp.array(False),
+                result=optx.RESULTS.successful,
+            ),
             linearisations=zero,
             evaluations=zero,
         )
@@ -118,19 +128,19 @@ class AbstractBoundedLeastSquares(optx.AbstractLeastSquaresSolver):
         def one_trial(_, at):
             return self._trial(fn, args, options["feasible"], *at)
 
-        state = jax.lax.cond(state.stale, renewed, lambda: state)
+        state = jax.lax.cond(state.trial.stale, renewed, lambda: state)
         y, state = jax.lax.fori_loop(0, self.trials_per_linearisation, one_trial, (y, state))
-        return y, state, state.aux
+        return y, state, state.trial.aux
 
     def terminate(self, fn, y, args, options, state, tags):
         del fn, y, args, options, tags
-        return state.terminate, state.result
+        return state.trial.terminate, state.trial.result
 
     def postprocess(self, fn, y, aux, args, options, state, tags, result):
         del fn, args, options, tags, result
         stats = {
-            "objective": state.objective,
-            "optimality": state.optimality,
+            "objective": state.trial.objective,
+            "optimality": state.last.optimality,
             "evaluations": state.evaluations,
             "linearisations": state.linearisations,
             "projections": state.linearisations + state.evaluations,
@@ -139,17 +149,17 @@ class AbstractBoundedLeastSquares(optx.AbstractLeastSquaresSolver):
 
     def _trial(self, fn, args, feasible, y, state: _State) -> tuple[Array, _State]:
         """One trial point: where the solve goes on, and the state there."""
-        info, exact = state.f_info, state.updates == 0
-        converged = exact & (state.optimality <= self.atol + self.rtol * self.norm(y))
+        info, exact, before = state.model.f_info, state.model.updates == 0, state.trial
+        converged = exact & (state.last.optimality <= self.atol + self.rtol * self.norm(y))
         finite = jnp.isfinite(info.f) & jnp.isfinite(info.grad).all()
-        ended = state.terminate | converged | ~finite
+        ended = before.terminate | converged | ~finite
 
         def stay():
-            return y, jnp.full_like(state.residual, jnp.inf), state.aux
+            return y, jnp.full_like(state.model.residual, jnp.inf), before.aux
 
         def go():
             at = feasible.at(y)
-            move, _ = self.descent.within(at, y).step(state.step_size, state.descent_state)
+            move, _ = self.descent.within(at, y).step(before.step_size, state.model.descent)
             move = jnp.where(jnp.isfinite(move).all(), move, 0.0)
             trial = at.restore(y + move.reshape(y.shape))
             return trial, *fn(trial, args)
@@ -157,32 +167,30 @@ class AbstractBoundedLeastSquares(optx.AbstractLeastSquaresSolver):
         trial, residual, aux = jax.lax.cond(ended, stay, go)
         value = value_of(residual)
         move = (trial - y).ravel()
-        step_size, accept, _, search_state = self.search.step(
-            jnp.array(False), y.ravel(), trial.ravel(), info, optx.FunctionInfo.Eval(value), state.search_state
+        step_size, accept, _, search = self.search.step(
+            jnp.array(False), y.ravel(), trial.ravel(), info, optx.FunctionInfo.Eval(value), before.search
         )
         promised = promised_decrease(info, move)
         rounding = 4 * jnp.finfo(y.dtype).eps * jnp.abs(info.f)
         rounded = promised <= rounding
         # Gradients are known better than values: two more steps are taken on trust where values cannot tell.
         accept = (accept | (exact & rounded & (value <= info.f + rounding))) & jnp.isfinite(value) & ~ended
-        stalled = exact & rounded & state.rounded & ~ended
-        result = optx.RESULTS.where(stalled, optx.RESULTS.stagnation, state.result)  # pyright: ignore[reportArgumentType]
-        met = jnp.isfinite(value) & ((accept & ~rounded) | state.finite)
+        stalled = exact & rounded & before.rounded & ~ended
+        result = optx.RESULTS.where(stalled, optx.RESULTS.stagnation, before.result)  # pyright: ignore[reportArgumentType]
+        met = jnp.isfinite(value) & ((accept & ~rounded) | before.finite)
         broken = ~finite | (stalled & ~met)
-        result = optx.RESULTS.where(broken, optx.RESULTS.nonfinite, result)  # pyright: ignore[reportArgumentType]
-        state = dataclasses.replace(
-            state,
-            search_state=search_state,
+        after = _Trial(
+            search=search,
             step_size=step_size.astype(y.dtype),
+            objective=jnp.where(accept, value, info.f),
+            aux=chosen(accept, aux, before.aux),
             stale=accept,
-            rounded=jnp.where(exact, rounded, state.rounded),
+            rounded=jnp.where(exact, rounded, before.rounded),
             finite=met,
             terminate=ended | stalled,
-            result=result,
-            evaluations=state.evaluations + jnp.where(ended, 0, 1),
-            objective=jnp.where(accept, value, info.f),
-            aux=chosen(accept, aux, state.aux),
+            result=optx.RESULTS.where(broken, optx.RESULTS.nonfinite, result),  # pyright: ignore[reportArgumentType]
         )
+        state = dataclasses.replace(state, trial=after, evaluations=state.evaluations + jnp.where(ended, 0, 1))
         y = jnp.where(accept, trial, y)
         return y, state if self.trials_per_linearisation == 1 else self._updated(feasible, y, move, residual, state)
 
@@ -191,49 +199,42 @@ class AbstractBoundedLeastSquares(optx.AbstractLeastSquaresSolver):
         residual, jacobian = linearise(y, args)
         feasible = feasible.at(y)
         gradient = jacobian.T @ residual
-        secant, learned = state.secant, jnp.zeros_like(state.secant)
+        last = state.last
+        secant, learned = last.secant, jnp.zeros_like(last.secant)
         if self.secant:
-            last = state.last
             moved = (y - last.at).ravel()
             bent = gradient - last.jacobian.T @ residual
             slope = gradient - last.jacobian.T @ last.residual
-            # Used as long as it has foretold the change of the gradient better than nothing would have.
+            # Used as long as it has predicted the change of the gradient better than nothing would have.
             left = slope - last.jacobian.T @ (last.jacobian @ moved)
             telling = jnp.linalg.norm(left - secant @ moved) <= jnp.linalg.norm(left)
             secant = jnp.where(state.linearisations > 0, secant_update(secant, moved, bent, slope), secant)
             learned = jnp.where(telling, secant, 0.0)
         info = quadratic_info(value_of(residual), gradient, jacobian.T @ jacobian + learned)
+        descent = self.descent.within(feasible, y).query(y.ravel(), info, state.model.descent)
+        optimality = projected_gradient_size(feasible, y, gradient)
         return dataclasses.replace(
             state,
-            f_info=info,
-            residual=residual,
-            jacobian=jacobian,
-            secant=secant,
-            last=_Linearisation(y, residual, jacobian),
-            descent_state=self.descent.within(feasible, y).query(y.ravel(), info, state.descent_state),
-            optimality=projected_gradient_size(feasible, y, gradient),
+            last=_Linearisation(y, residual, jacobian, secant, optimality),
+            model=_Model(info, residual, jacobian, descent, jnp.zeros_like(state.model.updates)),
             linearisations=state.linearisations + 1,
-            updates=jnp.zeros_like(state.updates),
         )
 
     def _updated(self, feasible, y, move, residual, state: _State) -> _State:
-        """The state with a model that foretells the residuals of the last trial; `y` is where the solve goes on."""
-        missed = residual - state.residual - state.jacobian @ move
+        """The state with a model that predicts the residuals of the last trial; `y` is where the solve goes on."""
+        model = state.model
+        missed = residual - model.residual - model.jacobian @ move
         square = jnp.sum(move**2)
         telling = (square > jnp.finfo(move.dtype).tiny) & jnp.isfinite(missed).all()
         change = jnp.outer(jnp.where(telling, missed, 0.0), move) / jnp.where(telling, square, 1.0)
-        jacobian = state.jacobian + change
-        residual = jnp.where(state.stale, residual, state.residual)
+        jacobian = model.jacobian + change
+        residual = jnp.where(state.trial.stale, residual, model.residual)
         # what the model has learned beyond J'J stays until the next linearisation
-        learned = state.f_info.hessian.as_matrix() - state.jacobian.T @ state.jacobian
+        learned = model.f_info.hessian.as_matrix() - model.jacobian.T @ model.jacobian
         info = quadratic_info(value_of(residual), jacobian.T @ residual, jacobian.T @ jacobian + learned)
-        descent = self.descent.within(feasible.at(y), y).query(y.ravel(), info, state.descent_state)
+        descent = self.descent.within(feasible.at(y), y).query(y.ravel(), info, model.descent)
         return dataclasses.replace(
             state,
-            f_info=info,
-            residual=residual,
-            jacobian=jacobian,
-            descent_state=descent,
-            updates=state.updates + 1,
-            stale=jnp.array(True),
+            model=_Model(info, residual, jacobian, descent, model.updates + 1),
+            trial=dataclasses.replace(state.trial, stale=jnp.array(True)),
         )

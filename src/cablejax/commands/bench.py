@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import time
-from collections.abc import Callable
-from typing import TYPE_CHECKING, Annotated, Any, get_args
+from typing import TYPE_CHECKING, Annotated, get_args
 
 from tyro.conf import subcommand
 
@@ -13,9 +12,7 @@ from cablejax.commands.options import Command, UsageError, say, text_table
 from cablejax.solver_names import SolverName
 
 if TYPE_CHECKING:
-    from cablejax.control.shaping import Model
-    from cablejax.mpc import MPC
-    from cablejax.types import History
+    pass
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -43,11 +40,10 @@ class BenchSimulate(Command):
         import functools
 
         import jax
-        import jax.numpy as jnp
         import numpy as np
 
         from cablejax.cable import Discretisation
-        from cablejax.effects.physics import nominal_physics
+        from cablejax.commands.workloads import moving_arches, program_bytes, seconds_in_turns, setting
         from cablejax.simulate import MjxEngine, ThreadedEngine, compiler_options
 
         for name in ("batch", "seconds", "rounds", "threads"):
@@ -56,22 +52,13 @@ class BenchSimulate(Command):
         config = Discretisation() if self.links is None else Discretisation(n_links=self.links)
         mjx, one, many = MjxEngine(config), ThreadedEngine(config, 1), ThreadedEngine(config, self.threads)
 
-        # An arch, moved slowly: contact with the table, bending and grasps are all at work.
-        state = one.initial_state(jnp.array([[0.0, 0.0, 0.6], [0.8, 0.0, -0.6]]))
-        rng = np.random.default_rng(self.seed)
-        twist = jnp.asarray(rng.uniform(-0.01, 0.01, (self.batch, self.seconds, 2, 3)))
-        params, states = jax.tree.map(
-            lambda leaf: jnp.broadcast_to(jnp.asarray(leaf), (self.batch, *jnp.shape(leaf))),
-            (nominal_physics(config), state),
-        )
-
+        params, states, twist = moving_arches(config, self.batch, self.seconds, self.seed)
         say(f"compiling the MJX engine for {self.batch} cables of {config.n_links} links ...")
         begin = time.perf_counter()
         unroll = jax.vmap(functools.partial(mjx.unroll, interval=1.0))
         compiled = jax.jit(unroll, compiler_options=compiler_options()).lower(params, states, twist).compile()
         compile_s = time.perf_counter() - begin
-        memory: Any = compiled.memory_analysis()
-        memory_bytes = memory.temp_size_in_bytes + memory.argument_size_in_bytes + memory.output_size_in_bytes
+        memory_bytes = program_bytes(compiled)
 
         contestants = {
             "mjx": lambda: jax.block_until_ready(compiled(params, states, twist)),
@@ -79,7 +66,8 @@ class BenchSimulate(Command):
             "c_many": lambda: many.rollout(params, states, twist, 1.0),
         }
         steps = self.batch * self.seconds * mjx.substeps(1.0)
-        micros = {k: 1e6 * v / steps for k, v in _median_seconds(contestants, self.rounds).items()}
+        seconds = seconds_in_turns(contestants, self.rounds)
+        micros = {name: 1e6 * float(np.median(values)) / steps for name, values in seconds.items()}
         result = {
             "links": config.n_links,
             "timestep_s": config.timestep,
@@ -92,7 +80,7 @@ class BenchSimulate(Command):
             "threads_speedup": micros["c_one"] / micros["c_many"],
             "mjx_memory_per_env_bytes": memory_bytes / self.batch,
             "mjx_compile_s": compile_s,
-            **_machine(),
+            **setting(),
         }
         text = text_table(
             ["engine", "us per environment-step", "relative to C on one core"],
@@ -133,8 +121,10 @@ class BenchMpc(Command):
 
     def execute(self):
         import jax
+        import numpy as np
 
         from cablejax.cable import Cable
+        from cablejax.commands.workloads import batched_control, controller_to_s, seconds_in_turns, setting
         from cablejax.control.shaping import initial_history, load_model
         from cablejax.mpc import time_control
 
@@ -151,19 +141,21 @@ class BenchMpc(Command):
         solvers = {}
         for name in self.solvers:
             say(f"compiling the control step with {name} ...")
-            timing = time_control(_controller(model, name, self.horizon), history, self.repeats)
+            timing = time_control(controller_to_s(model, name, self.horizon), history, self.repeats)
             solvers[name] = {"p50_ms": timing.p50_ms, "p95_ms": timing.p95_ms, "first_call_s": timing.first_call_s}
-        first = _controller(model, self.solvers[0], self.horizon)
-        batched = {str(size): _batched_ms(first, history, size, self.repeats) for size in batches}
+        first, batched = controller_to_s(model, self.solvers[0], self.horizon), {}
+        for size in map(str, batches):
+            say(f"compiling the control step for {size} cables ...")
+            call, _ = batched_control(first, history, int(size))
+            batched[size] = 1e3 * float(np.median(seconds_in_turns({size: call}, min(self.repeats, 10))[size]))
         result = {
             "solver": self.solvers[0],
             "horizon": first.config.horizon,
             "repeats": self.repeats,
             **solvers[self.solvers[0]],
             "solvers": solvers,
-            "deadline": solvers.get("deadline"),
             "batched": {k: {"ms": v, "plans_per_second": 1e3 * int(k) / v} for k, v in batched.items()},
-            **_machine(),
+            **setting(),
         }
         rows = [
             [name, f"{s['p50_ms']:.1f}", f"{s['p95_ms']:.1f}", f"{s['first_call_s']:.1f}"]
@@ -193,6 +185,7 @@ class BenchPerception(Command):
     def execute(self):
         import numpy as np
 
+        from cablejax.commands.workloads import setting
         from cablejax.perceive import Status, Tracker, TrackerConfig
         from cablejax.perceive.synthetic import Clutter, scatter
         from cablejax.simulate.elastica import solve_elastica
@@ -233,7 +226,7 @@ class BenchPerception(Command):
             "p95_ms": float(p95),
             "frames_per_second": float(1e3 / p50),
             "first_frame_ms": float(np.median(first)),
-            **_machine(),
+            **setting(),
         }
         return result, (
             f"one frame of {self.points} points: median {p50:.1f} ms, 95th percentile {p95:.1f} ms, "
@@ -248,7 +241,7 @@ class BenchLoop(Command):
     weights: str = "gns-reference"
     """Released model by name, or the folder of a training by `cablejax train`."""
 
-    solver: SolverName = "trust-region"
+    solver: SolverName = "levenberg-marquardt"
     """How the plan is found."""
 
     batches: tuple[int, ...] = (1, 8)
@@ -263,41 +256,29 @@ class BenchLoop(Command):
     def execute(self):
         import functools
 
-        import jax
         import numpy as np
 
         from cablejax.cable import Discretisation
-        from cablejax.control.batched import LoopConfig, shape_batch, varied_params
-        from cablejax.control.shaping import load_model, make_controller
-        from cablejax.control.targets import make_target, straight_start
-        from cablejax.simulate import MjxEngine
+        from cablejax.commands.workloads import closed_loop, controller_to_s, seconds_in_turns, setting
+        from cablejax.control.shaping import load_model
 
         if not self.batches or min(*self.batches, self.steps, self.rounds) < 1:
             raise UsageError(
                 f"--batches {self.batches}, --steps {self.steps} and --rounds {self.rounds}: expected at least 1 each."
             )
-        model, chain = load_model(self.weights), Discretisation()
-        target = make_target("S", chain.cable)
-        controller = make_controller(model, target, method="residual", solver=self.solver)
-        config = LoopConfig(self.steps, interval=model.config.interval, history_length=model.config.history)
-        engine = MjxEngine(chain)
-
-        def run(size: int):
-            state = engine.initial_state(np.stack([straight_start(chain.cable)] * size))
-            params = varied_params(chain, np.linspace(0.5, 2.0, size))
-            goals = np.stack([target.keypoints] * size)
-            return jax.block_until_ready(shape_batch(engine, params, state, controller, goals, config))
-
+        model = load_model(self.weights)
+        controller = controller_to_s(model, self.solver)
+        run = closed_loop(controller, model.config.history, self.steps, Discretisation())
         say(f"compiling the closed loop for batches of {', '.join(map(str, self.batches))} ...")
         contestants = {str(size): functools.partial(run, size) for size in self.batches}
-        seconds = _median_seconds(contestants, self.rounds)
-        rates = {size: int(size) * self.steps / seconds[size] for size in contestants}
+        seconds = seconds_in_turns(contestants, self.rounds)
+        rates = {size: int(size) * self.steps / float(np.median(seconds[size])) for size in contestants}
         result = {
             "solver": self.solver,
             "horizon": controller.config.horizon,
             "steps": self.steps,
             "control_steps_per_second": rates,
-            **_machine(),
+            **setting(),
         }
         rows = [[size, f"{rate:.2f}", f"{1e3 / rate:.1f}"] for size, rate in rates.items()]
         return result, text_table(["cables at once", "control steps per second", "ms per control step"], rows)
@@ -313,61 +294,3 @@ class Bench:
         | Annotated[BenchLoop, subcommand("loop")]
         | Annotated[BenchPerception, subcommand("perception")]
     )
-
-
-def _controller(model: Model, solver: SolverName, horizon: int) -> MPC:
-    """The controller with the online residual on the way to an S, with one of the solvers at its defaults."""
-    from cablejax.control.shaping import make_controller
-    from cablejax.control.targets import make_target
-
-    controller = make_controller(model, make_target("S"), method="residual", solver=solver)
-    return dataclasses.replace(controller, config=dataclasses.replace(controller.config, horizon=horizon))
-
-
-def _batched_ms(controller: MPC, history: History, size: int, repeats: int) -> float:
-    """Median wall time [ms] of one call that controls so many cables, after the one that compiles."""
-    import jax
-    import jax.numpy as jnp
-    import numpy as np
-
-    from cablejax.types import Measurement
-
-    say(f"compiling the control step for {size} cables ...")
-    step = jax.jit(jax.vmap(controller.step))
-    state, measurement = jax.tree.map(
-        lambda leaf: jnp.broadcast_to(jnp.asarray(leaf), (size, *jnp.shape(leaf))),
-        (controller.init(history), Measurement(history.keypoints[-1], history.gripper_pose)),
-    )
-    seconds = []
-    for _ in range(min(repeats, 10) + 1):
-        begin = time.perf_counter()
-        state, twist, _ = jax.block_until_ready(step(state, measurement))
-        seconds.append(time.perf_counter() - begin)
-        pose = measurement.gripper_pose + controller.config.objective.interval * twist
-        measurement = Measurement(state.last.predicted, pose)
-    return 1e3 * float(np.median(seconds[1:]))
-
-
-def _median_seconds(contestants: dict[str, Callable[[], Any]], rounds: int) -> dict[str, float]:
-    """Median wall time [s] of each; they take turns, so that a busy moment of the machine hits all of them alike."""
-    import numpy as np
-
-    seconds: dict[str, list[float]] = {name: [] for name in contestants}
-    for run in contestants.values():
-        run()  # caches, and what is compiled on first use
-    for index in range(rounds):
-        for name, run in contestants.items():
-            begin = time.perf_counter()
-            run()
-            seconds[name].append(time.perf_counter() - begin)
-        say(f"round {index + 1} of {rounds}")
-    return {name: float(np.median(values)) for name, values in seconds.items()}
-
-
-def _machine() -> dict[str, Any]:
-    """What the numbers depend on."""
-    import jax
-
-    from cablejax.report.provenance import machine
-
-    return {"device": jax.devices()[0].device_kind, "machine": machine()}

@@ -40,7 +40,7 @@ class Demo(Command):
     links: int = 24
     """Links of the plant's cable."""
 
-    solver: Literal["trust-region", "projected-gradient"] = "trust-region"
+    solver: Literal["levenberg-marquardt", "projected-gradient"] = "levenberg-marquardt"
     """How the controller finds its plan."""
 
     def execute(self):
@@ -49,9 +49,10 @@ class Demo(Command):
         from cablejax.commands.runs import Job, shape_and_report
         from cablejax.control.shaping import METHODS, load_model
         from cablejax.control.targets import make_target
+        from cablejax.effects.given import GivenEffect
         from cablejax.simulate.plant import PlantConfig
 
-        plant = PlantConfig(stiffness_ratio=STIFFNESS_RATIO, seed=self.seed)
+        plant = PlantConfig(effects=(GivenEffect("bending_stiffness", (("ratio", STIFFNESS_RATIO),)),), seed=self.seed)
         plant = dataclasses.replace(plant, discretisation=dataclasses.replace(plant.discretisation, n_links=self.links))
         job = Job(
             plant=plant,

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from cablejax.commands.options import UsageError, output_folder, say
-from cablejax.control.loop import ClosedLoopRun
+from cablejax.control.run import ClosedLoopRun
 from cablejax.control.targets import Target
 from cablejax.gaplog import Episode
 from cablejax.json_file import parse_json, read_json, write_json

@@ -10,15 +10,11 @@ from typing import Any
 import numpy as np
 
 from cablejax.cable import Cable
-from cablejax.control.loop import ClosedLoopRun
+from cablejax.control.shaping import Runs
 from cablejax.gaplog import gap_log_from_episodes, write_gap_log
 from cablejax.report.animation import write_gif
 from cablejax.report.page import write_page
 from cablejax.report.provenance import machine, versions
-from cablejax.report.record import Method, record_of
-
-Runs = Mapping[tuple[str, Method], ClosedLoopRun]
-"""Runs by target's name and method."""
 
 
 def summarise(runs: Runs, total_s: float) -> dict[str, Any]:
@@ -84,11 +80,10 @@ def write_results(
         dataclasses.replace(run.episode, motion=f"{run.episode.motion}_{method}") for (_, method), run in runs.items()
     ]
     write_gap_log(out / "log.npz", gap_log_from_episodes(episodes, believed, source=about), overwrite=True)
-    records = [record_of(run, method) for (_, method), run in runs.items()]
-    write_gif(out / "demo.gif", records)
+    write_gif(out / "demo.gif", runs)
     write_page(
         out / "report.html",
-        records,
+        runs,
         summary,
         about=about,
         facts={**facts, "versions": versions(), "machine": machine()},

@@ -12,13 +12,12 @@ from cablejax.cable import Cable
 from cablejax.commands.options import UsageError, say
 from cablejax.commands.parts import Parts
 from cablejax.commands.results import summarise, write_results
-from cablejax.control.loop import ClosedLoopRun
-from cablejax.control.shaping import Model, shape_once
+from cablejax.control.run import ClosedLoopRun
+from cablejax.control.shaping import Method, Model, shape_once
 from cablejax.control.targets import Target
 from cablejax.dynamics.fingerprint import fingerprint
 from cablejax.json_file import write_json
 from cablejax.perceive.camera import CameraConfig
-from cablejax.report.record import Method
 from cablejax.report.style import METHOD_LABEL
 from cablejax.simulate.plant import PlantConfig
 from cablejax.solver_names import SolverName
@@ -35,7 +34,7 @@ class Job:
         methods: with the online residual, without, or both.
         solver: how plans are found.
         steps: commands per run.
-        camera: what the cable is seen with; None = its keypoints are told.
+        camera: what the cable is seen with; None = the controller observes the simulated keypoints directly.
     """
 
     plant: PlantConfig

@@ -34,7 +34,7 @@ class Shape(Command):
     weights: str = "gns-reference"
     """Released model by name, or the folder of a training by `cablejax train`."""
 
-    solver: SolverName = "trust-region"
+    solver: SolverName = "levenberg-marquardt"
     """How the controller finds its plan."""
 
     steps: int = 40
@@ -63,6 +63,7 @@ class Shape(Command):
         from cablejax.commands.runs import Job, shape_and_report
         from cablejax.control.shaping import METHODS, load_model
         from cablejax.control.targets import load_target, make_target
+        from cablejax.effects.given import GivenEffect
         from cablejax.perceive.camera import CameraConfig
         from cablejax.simulate.plant import PlantConfig
 
@@ -73,7 +74,7 @@ class Shape(Command):
         plant = dataclasses.replace(
             default,
             discretisation=dataclasses.replace(default.discretisation, cable=cable, n_links=self.links),
-            stiffness_ratio=self.stiffness_ratio,
+            effects=(GivenEffect("bending_stiffness", (("ratio", self.stiffness_ratio),)),),
             keypoint_noise=0.0 if cloud else 1e-3 * noise_mm,
             seed=self.seed,
         )

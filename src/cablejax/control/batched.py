@@ -21,7 +21,8 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Float, Int
 
 from cablejax.cable import Discretisation
-from cablejax.control.loop import Controller, settling_time
+from cablejax.control.loop import Controller
+from cablejax.control.run import settling_time
 from cablejax.effects.physics import Physics, nominal_physics
 from cablejax.simulate.compile import compiler_options
 from cablejax.simulate.mjx_engine import MjxEngine
@@ -84,7 +85,7 @@ class BatchRun:
         return np.asarray(self.error_cm[:, -1])
 
     def settling_time_s(self, interval: float = 1.0) -> Float[np.ndarray, " B"]:
-        """See `control.loop.settling_time` [s]; infinite for a trial that never settled."""
+        """See `control.run.settling_time` [s]; infinite for a trial that never settled."""
         errors = np.asarray(self.error_cm, float)
         times = interval * np.arange(errors.shape[1])
         return np.array([settling_time(times, error) for error in errors])
@@ -217,6 +218,6 @@ def _observed(config: LoopConfig, key: Array, keypoints: Float[Array, "N 2"]) ->
 
 
 def _shape_error_cm(keypoints: Float[Array, "T N 2"], target: Float[Array, "N 2"]) -> Float[Array, " T"]:
-    """`control.loop.shape_error_cm`; the held ends are always seen unless the simulation diverged."""
+    """`control.run.shape_error_cm`; the held ends are always seen unless the simulation diverged."""
     squared = ((keypoints - target) ** 2).sum(axis=-1)
     return 100.0 * jnp.sqrt(jnp.nanmean(squared, axis=-1))

@@ -9,20 +9,14 @@ from typing import Any, Protocol
 import numpy as np
 from jaxtyping import Array, Float
 
+from cablejax.control.run import ClosedLoopRun, shape_error_cm
 from cablejax.control.targets import Target
 from cablejax.gaplog import Episode
 from cablejax.simulate.table_plant import Observation, PlantError
 from cablejax.types import History, Measurement
 
-SETTLING_FRACTION = 0.1
-"""Half-width of the band around the terminal error in which a run counts as settled, relative to that error or, where
-that is less, to the change of the error over the run."""
-SETTLING_FLOOR_CM = 0.1
-"""Smallest half-width of that band [cm]."""
 RESTING_CM = 0.01
 """Range of the error [cm] over `patience` commands in which nothing more is expected to happen."""
-SETTLING_DWELL = 3
-"""Samples at the end that must lie in the band, or the run has not settled."""
 
 
 class ObservedCable(Protocol):
@@ -49,115 +43,6 @@ class Controller(Protocol):
         Of the report the fields `residual_share` and `radius` are recorded, where it has them.
         """
         ...
-
-
-@dataclasses.dataclass(frozen=True)
-class ClosedLoopRun:
-    """One cable brought towards one target, at the control instants; `episode` has it at the camera's rate.
-
-    At the last sample no command was computed: `twist`, `residual_share`, `radius` and `mpc_ms` are NaN there.
-
-    Attributes:
-        target: what was asked for.
-        times: seconds since the first command, shape [T].
-        keypoints: observed cable [m], NaN = not observed, shape [T, N, 2].
-        gripper_pose: (x, y, theta) [m, rad], shape [T, Q, 3].
-        twist: commands [m/s, rad/s], shape [T, Q, 3].
-        error_cm: root mean square distance to the target [cm], shape [T]: of the true keypoints where the cable is a
-            simulated one, which knows them, otherwise of the observed ones.
-        residual_share: the controller's report, NaN where it makes none, shape [T].
-        radius: the controller's bound on one step's motion [m], NaN where it reports none, shape [T].
-        mpc_ms: wall time of each control call [ms], compilation excluded, shape [T].
-        unobserved: keypoint observations that are missing, over the whole run.
-        stopped: why the run ended early, or None.
-        observed_error_cm: the same error of the observed keypoints, which is all that the controller knows, shape [T].
-        episode: the run for the gap log, resting time before the first command included.
-    """
-
-    target: Target
-    times: Float[np.ndarray, " T"]
-    keypoints: Float[np.ndarray, "T N 2"]
-    gripper_pose: Float[np.ndarray, "T Q 3"]
-    twist: Float[np.ndarray, "T Q 3"]
-    error_cm: Float[np.ndarray, " T"]
-    residual_share: Float[np.ndarray, " T"]
-    radius: Float[np.ndarray, " T"]
-    mpc_ms: Float[np.ndarray, " T"]
-    unobserved: int
-    stopped: str | None
-    observed_error_cm: Float[np.ndarray, " T"]
-    episode: Episode
-
-    @property
-    def initial_error_cm(self) -> float:
-        """Error before the first command [cm]."""
-        return float(self.error_cm[0])
-
-    @property
-    def terminal_error_cm(self) -> float:
-        """Error at the end [cm]."""
-        return float(self.error_cm[-1])
-
-    @property
-    def settling_time_s(self) -> float:
-        """See `settling_time`."""
-        return settling_time(self.times, self.error_cm)
-
-    def verdict(self, tolerance_cm: float = 1.0) -> str:
-        """One sentence: whether the target was reached, and if not, how far the cable got and where it is off."""
-        start, end = self.initial_error_cm, self.terminal_error_cm
-        early = f" It stopped after {self.times[-1]:.0f} s: {self.stopped}" if self.stopped else ""
-        if end <= tolerance_cm:
-            return f"{self.target.name}: reached, from {start:.2f} to {end:.2f} cm.{early}"
-        distance = 100 * np.linalg.norm(self.keypoints[-1] - self.target.keypoints, axis=-1)
-        best = int(np.nanargmin(self.error_cm))
-        return (
-            f"{self.target.name}: not reached within {tolerance_cm:.2f} cm. The error went from {start:.2f} to "
-            f"{end:.2f} cm (lowest {self.error_cm[best]:.2f} cm after {self.times[best]:.0f} s); keypoint "
-            f"{int(np.nanargmax(distance))} is farthest off, by {np.nanmax(distance):.2f} cm.{early}"
-        )
-
-
-def shape_error_cm(keypoints: Float[np.ndarray, "*T N 2"], target: Float[np.ndarray, "N 2"]) -> Float[np.ndarray, "*T"]:
-    """Root mean square distance [cm] of the observed keypoints to the target's; NaN where none was observed."""
-    squared = ((np.asarray(keypoints) - target) ** 2).sum(axis=-1)
-    seen = np.isfinite(squared)
-    count = seen.sum(axis=-1)
-    total = np.where(seen, squared, 0.0).sum(axis=-1)
-    return np.where(count > 0, 100 * np.sqrt(total / np.maximum(count, 1)), np.nan)
-
-
-def settling_time(times: Float[np.ndarray, " T"], error_cm: Float[np.ndarray, " T"]) -> float:
-    """First time from which on the error stays near its last value; infinite if it was still changing at the end.
-
-    Near means within 10 % of the last value, and within 10 % of the error's change over the run where the target stayed
-    far; 1 mm is near in any case. The last three samples must all be near.
-    """
-    error = np.asarray(error_cm)
-    band = max(SETTLING_FRACTION * min(error[-1], abs(error[0] - error[-1])), SETTLING_FLOOR_CM)
-    return _time_in_band(times, error, band)
-
-
-def step_settling_time(
-    times: Float[np.ndarray, " T"], error_cm: Float[np.ndarray, " T"], fraction: float = 0.02
-) -> float:
-    """Settling time of a step response: from when on the error stays within a fraction of the way that it went.
-
-    This is the textbook's definition (Ogata, Modern Control Engineering, 5-3; 2 or 5 % there), with the error's change
-    over the run for the step. It is the milder one where a run ends near its target: 2 % of 25 cm are 5 mm. As in
-    `settling_time`, the last three samples must be in the band; infinite if they are not.
-    """
-    error = np.asarray(error_cm)
-    return _time_in_band(times, error, fraction * abs(error[0] - error[-1]))
-
-
-def _time_in_band(times: Float[np.ndarray, " T"], error: Float[np.ndarray, " T"], band: float) -> float:
-    """First time from which on the error differs from its last value by at most `band`; infinite if there is none."""
-    if not np.isfinite(error[-1]):
-        return float("inf")
-    outside = np.flatnonzero(~(np.abs(error - error[-1]) <= band))
-    first = int(outside[-1]) + 1 if len(outside) else 0
-    return float(times[first]) if len(error) - first >= min(SETTLING_DWELL, len(error)) else float("inf")
 
 
 def run_closed_loop(

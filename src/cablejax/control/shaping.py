@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
 from typing import Literal, get_args
 
 import jax.numpy as jnp
@@ -12,7 +13,8 @@ from jaxtyping import Array, Float
 
 from cablejax.adaptation.belief import AdaptationConfig
 from cablejax.cable import Cable
-from cablejax.control.loop import ClosedLoopRun, run_closed_loop
+from cablejax.control.loop import run_closed_loop
+from cablejax.control.run import ClosedLoopRun
 from cablejax.control.targets import Target, straight_start
 from cablejax.dynamics.config import ModelConfig
 from cablejax.dynamics.model import apply
@@ -32,6 +34,9 @@ Method = Literal["residual", "direct"]
 """The learned model with the online residual, or as it was trained."""
 
 METHODS: tuple[Method, ...] = get_args(Method)
+
+Runs = Mapping[tuple[str, Method], ClosedLoopRun]
+"""Runs by name of the target and method."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -72,8 +77,8 @@ class NetworkDynamics:
         network = roughened(nnx.merge(self.graphdef, weights))
         between = reverse(lambda history, twist: apply(network, history, twist)[1:-1], history, twist)
         padded = StepJacobian(*(jnp.pad(part, [(1, 1)] + [(0, 0)] * (part.ndim - 1)) for part in between))
-        held = network.config.interval * jnp.eye(2, 3, dtype=twist.dtype)
-        return padded._replace(twist=padded.twist.at[0, :, 0].set(held).at[-1, :, 1].set(held))
+        grasped = network.config.interval * jnp.eye(2, 3, dtype=twist.dtype)
+        return padded._replace(twist=padded.twist.at[0, :, 0].set(grasped).at[-1, :, 1].set(grasped))
 
 
 def load_model(name: str) -> Model:

@@ -144,23 +144,6 @@ class ServoInfo:
     unobserved: Int[Array, "*batch"]
 
 
-def _initial_state(config: ServoConfig, history: History) -> ServoState:
-    keypoints = history.keypoints[-1]
-    n_keypoints, dtype = keypoints.shape[0], keypoints.dtype
-    return ServoState(
-        jacobian=jnp.zeros((n_keypoints, 2, history.gripper_pose.size), dtype),
-        displacement=jnp.zeros((config.window, n_keypoints, 2), dtype),
-        window_motion=jnp.zeros((config.window, history.gripper_pose.size), dtype),
-        valid=jnp.zeros((config.window, n_keypoints), bool),
-        keypoints=keypoints,
-        observed=jnp.ones(n_keypoints, bool),
-        gripper_pose=history.gripper_pose,
-        motion=jnp.zeros_like(history.gripper_pose),
-        steps=jnp.zeros((), jnp.int32),
-        unobserved=jnp.zeros((), jnp.int32),
-    )
-
-
 class VisualServo(eqx.Module):
     """Controller without a model: `init` once, then `step` at every control interval.
 
@@ -189,7 +172,21 @@ class VisualServo(eqx.Module):
                 keypoints than the target.
         """
         check_history(self.target, history)
-        return _initial_state(self.config, jax.tree.map(jnp.asarray, history))
+        history = jax.tree.map(jnp.asarray, history)
+        keypoints = history.keypoints[-1]
+        n_keypoints, dtype = keypoints.shape[0], keypoints.dtype
+        return ServoState(
+            jacobian=jnp.zeros((n_keypoints, 2, history.gripper_pose.size), dtype),
+            displacement=jnp.zeros((self.config.window, n_keypoints, 2), dtype),
+            window_motion=jnp.zeros((self.config.window, history.gripper_pose.size), dtype),
+            valid=jnp.zeros((self.config.window, n_keypoints), bool),
+            keypoints=keypoints,
+            observed=jnp.ones(n_keypoints, bool),
+            gripper_pose=history.gripper_pose,
+            motion=jnp.zeros_like(history.gripper_pose),
+            steps=jnp.zeros((), jnp.int32),
+            unobserved=jnp.zeros((), jnp.int32),
+        )
 
     def step(self, state: ServoState, measurement: Measurement) -> tuple[ServoState, Float[Array, "Q 3"], ServoInfo]:
         """One control step, compiled at its first call: the next state, the twist to hold until then, the report.
@@ -202,14 +199,12 @@ class VisualServo(eqx.Module):
 
 
 @jax.jit
-def _step(
-    servo: VisualServo, state: ServoState, measurement: Measurement
-) -> tuple[ServoState, Float[Array, "Q 3"], ServoInfo]:
+def _step(servo: VisualServo, state: ServoState, measurement: Measurement) -> tuple[ServoState, Array, ServoInfo]:
     """See `VisualServo.step`."""
     config = servo.config
     units = ObjectiveConfig(rotation_weight=config.rotation_weight, interval=config.interval)
     target = jnp.asarray(servo.target)
-    state, fit_error, unobserved = _observe(config, units, state, *map(jnp.asarray, measurement))
+    state, fit_error, unobserved = _observe(config, units, state, measurement)
     state = dataclasses.replace(state, jacobian=_fit_jacobian(config, state))
     error = state.keypoints - target
 
@@ -231,17 +226,13 @@ def _step(
 
 
 def _observe(
-    config: ServoConfig,
-    units: ObjectiveConfig,
-    state: ServoState,
-    keypoints: Float[Array, "N 2"],
-    gripper_pose: Float[Array, "Q 3"],
+    config: ServoConfig, units: ObjectiveConfig, state: ServoState, measurement: Measurement
 ) -> tuple[ServoState, Float[Array, ""], Int[Array, ""]]:
     """The state with the observation and the step that led to it, how far J was off, and how many keypoints lack.
 
     The motion is that of the measured poses, which a robot may reach only in part.
     """
-    dtype = state.keypoints.dtype
+    (keypoints, gripper_pose), dtype = map(jnp.asarray, measurement), state.keypoints.dtype
     expected = state.keypoints + state.jacobian @ state.motion.reshape(-1)
     observed = jnp.isfinite(keypoints).all(axis=-1)
     keypoints = jnp.where(observed[:, None], keypoints, expected).astype(dtype)

@@ -22,12 +22,11 @@ from cablejax.diagnose.conformal import leftover_p, leftover_score
 from cablejax.diagnose.diagnosis import PLACES, NamedEffect, ParameterEstimate, Ranked, Verdict
 from cablejax.diagnose.evidence import Evidence
 from cablejax.diagnose.fit import Fit
+from cablejax.diagnose.judgement import judged
 from cablejax.diagnose.profile import scaled_draws
 from cablejax.diagnose.protocol import Simulator
 from cablejax.diagnose.search import Search
 
-FAINT = 0.01
-"""A look-alike less probable than this is not listed with the causes."""
 _DRAWS = 400
 
 
@@ -95,13 +94,10 @@ def conclude(found: Search, evidence: Evidence, calibration: Calibration) -> Con
         effects.append(_named(name, best, odds[name] / total, draws, evidence.simulator))
     complete = calibration.complete(left, gap, level(evidence))
     telling = explained >= calibration.telling or explains_most_motions(best, null, evidence, calibration)
-    if not (telling or complete):
+    verdict = judged(resolvable=True, telling=telling or complete, complete=complete, alike=bool(equivalent))
+    if verdict == "unknown":
         return Conclusion("unknown", best, (), (), ranking, explained, as_much)
-    if not complete:
-        verdict: Verdict = "named+unknown"
-    else:
-        verdict = "ambiguous" if equivalent else "named"
-    order = np.argsort([-e.probability for e in effects])
+    order = np.argsort([-(e.probability or 0.0) for e in effects])
     named = tuple(effects[i] for i in order)
     return Conclusion(verdict, best, named, tuple(equivalent), ranking, explained, as_much)
 
@@ -200,47 +196,3 @@ def _merged(parts: list[dict[str, ParameterEstimate]]) -> dict[str, ParameterEst
         intervals: Any = None if first.ci90 is None else [e.ci90 for e in every]
         merged[key] = ParameterEstimate([e.value for e in every], intervals, first.unit)
     return merged
-
-
-def look_alikes(
-    group: Sequence[str], effects: Sequence[NamedEffect], ranking: Sequence[Ranked]
-) -> tuple[list[str], list[str]]:
-    """Members of a set that the log cannot tell apart: those with a chance, and those that merely leave as little.
-
-    Of a set in place of the only named effect, the ranking has the members' probabilities; members of an explanation
-    by several effects are not ranked as such, and all count.
-    """
-    chances = {ranked.name: ranked.probability for ranked in ranking} if len(effects) == 1 else {}
-    named = {effect.name for effect in effects}
-    faint = [n for n in group if n not in named and (chance := chances.get(n)) is not None and chance < FAINT]
-    return [name for name in group if name not in faint], faint
-
-
-def sentence(conclusion: Conclusion, shrinkage: float | None) -> str:
-    """The verdict in words, with the share of the squared gap that goes away.
-
-    Args:
-        conclusion: the verdict.
-        shrinkage: on episodes left out of the fit; None where nothing could be, which leaves that of the fit.
-    """
-    share = f"{100 * max(conclusion.explained if shrinkage is None else shrinkage, 0.0):.0f} %"
-    names = " and ".join(_words(e.name) for e in conclusion.effects)
-    split = [look_alikes(group, conclusion.effects, conclusion.ranking) for group in conclusion.equivalent]
-    alike = "; ".join(" or ".join(map(_words, likely)) for likely, _ in split if len(likely) > 1)
-    faint = " and ".join(_words(name) for _, members in split for name in members)
-    rivals = f" (this log cannot tell apart: {alike})" if alike else ""
-    too = f" {faint[:1].upper()}{faint[1:]} would leave as little, at a probability below 1 %." if faint else ""
-    either = f" or a look-alike, which this log cannot tell apart: {alike}" if alike else ""
-    return {
-        "none": "The simulator explains this log within what the noise and its own resolution allow.",
-        "named": f"The gap comes from {names}, which explains {share} of it.",
-        "ambiguous": f"The gap comes from {names}{either}.{too}",
-        "named+unknown": (
-            f"Part of the gap, {share}, is explained by {names}{rivals}; the rest by no effect of the library.{too}"
-        ),
-        "unknown": f"The gap has a cause that is not in the library: the best explanation takes away {share} of it.",
-    }[conclusion.verdict]
-
-
-def _words(name: str) -> str:
-    return name.replace("_", " ")

@@ -53,14 +53,15 @@ class NamedEffect:
 
 @dataclasses.dataclass(frozen=True)
 class Ranked:
-    """One effect that was tried alone.
+    """One effect that was tried: alone, or in a forward search on top of those kept before it.
 
     Attributes:
         name: of the effect.
-        probability: posterior among all single effects, were the cause one of them; None where it was not computed.
-        held_out_shrinkage: share of the squared gap that goes away on episodes left out of the fit.
-        leftover_mm: gap above the noise that is left on the episodes fitted, root mean square per coordinate [mm, or
-            thousandths of `Gap.unit`].
+        probability: posterior among all single effects; None in a forward search, which computes none.
+        held_out_shrinkage: share of the squared gap that goes away on episodes left out of the fit; negative where the
+            effect makes these worse.
+        leftover_mm: gap above the noise that is left, root mean square per coordinate [mm], on the episodes fitted; of
+            a forward search, on those left out.
     """
 
     name: str
@@ -135,7 +136,7 @@ class Diagnosis:
         sentence: the verdict in words.
         effects: what is named as the cause; empty for "none" and "unknown".
         equivalent: sets of effects that this log cannot tell apart.
-        ranking: every effect tried, most probable first.
+        ranking: every effect tried, most probable first; without probabilities, the largest shrinkage first.
         leftover_p: chance that a right explanation leaves as much as the best one does, see `conformal`; None without a
             gap, and where no labelled logs are like this one.
         gap: before and after.
@@ -143,10 +144,9 @@ class Diagnosis:
         next_motion: None if nothing would be gained, or no motions are known.
         baselines: the single effect that simpler rules would have named: "lowest_cost" (best fit in sample), "bic" (the
             same with Schwarz's penalty, all samples taken to be independent) and "sparse_regression" (the best template
-            without any fit); empty for the verdict "none".
+            without any fit); empty for the verdict "none", and where these rules were not evaluated.
         caveats: what the log did not allow, in words.
         seconds: run time.
-        settings: versions and options, for the record.
     """
 
     verdict: Verdict

@@ -48,10 +48,12 @@ class Where:
         along_cable_mm: at each keypoint, shape [N].
         bend_per_m: root mean square difference of the curvature at each inner keypoint, above the noise [1/m]. The gap
             itself is always small near the grippers, which hold the cable; this points closer to a cause that is local.
-            Shape [N - 2].
+            Shape [N - 2]; None where it was not computed, as for cables off the table.
         per_episode_mm: shape [E].
-        episode_p: of no gap in this episode, corrected for the number of episodes, shape [E].
-        keypoint_p: of no gap at this keypoint, corrected for the number of keypoints, shape [N].
+        episode_p: of no gap in this episode, corrected for the number of episodes, shape [E]; None where it was not
+            tested.
+        keypoint_p: of no gap at this keypoint, corrected for the number of keypoints, shape [N]; None where it was not
+            tested.
         heat: whitened gap, `sqrt(mean of two squared coordinates)` in noise units, NaN = not observed, shape [E, T, N].
         horizons_mm: by seconds since the episode's start, see `HORIZONS`.
         regimes: by "what: class", for example "speed: hold"; classes that a log does not visit are left out.

@@ -16,44 +16,58 @@ _CLEAR_RATIO = 1.5
 _FRAME_SHARE = 0.7
 
 
-def describe(where: Where, arclength: np.ndarray, noise: np.ndarray, level: float) -> tuple[str, ...]:
+def describe(
+    where: Where, arclength: np.ndarray, noise: np.ndarray, level: float, names: Sequence[str] | None = None
+) -> tuple[str, ...]:
     """Two to five sentences for a lab engineer.
 
     Args:
-        where: the numbers; its own sentences are not read.
+        where: the numbers; its own sentences are not read. Where nothing was tested, the sentences give sizes only.
         arclength: of the keypoints [m].
         noise: standard deviation of each keypoint's coordinates [m].
         level: below which a p-value counts.
+        names: what to call each episode; by default "episode 1" and so on.
     """
     floor = 1e3 * float(np.sqrt((noise**2).mean()))
-    shown = where.episodes
-    if not shown and not where.keypoints:
+    total = len(where.per_episode_mm)
+    names = names or [f"episode {e + 1}" for e in range(total)]
+    if where.episode_p is None or where.keypoint_p is None:
+        return (_size(where, None, floor, names), *_along(where, arclength), *_when(where, level), *_frame(where))[:5]
+    shown = [e for e in range(total) if where.episode_p[e] < level]
+    if not shown and not (where.keypoint_p < level).any():
         return (
             f"No episode deviates from the simulator by more than its noise of {_mm(floor)}.",
             f"A gap of {_mm(max(where.smallest_mm, 0.01))} or more over the whole log would have shown.",
         )
-    sentences = [_size(where, shown, floor), *_along(where, arclength), *_when(where, level), *_frame(where)]
-    if len(where.per_episode_mm) >= 6:
+    sentences = [_size(where, shown, floor, names), *_along(where, arclength), *_when(where, level), *_frame(where)]
+    if total >= 6:
         return tuple(sentences[:5])
-    number = _count(len(where.per_episode_mm), "episode")
-    few = f"With {number} no comparison between regimes can be tested at the 5 % level: six are needed."
+    few = (
+        f"With {_count(total, 'episode')} no comparison between regimes can be tested at the 5 % level: six are needed."
+    )
     return (*sentences[:4], few)
 
 
-def _size(where: Where, shown: tuple[int, ...], floor: float) -> str:
-    total = len(where.per_episode_mm)
+def _size(where: Where, shown: list[int] | None, floor: float, names: Sequence[str]) -> str:
+    """How large the gap is, and in which episodes; `shown` are those that tests found it in, None without tests."""
+    sizes, total = where.per_episode_mm, len(where.per_episode_mm)
     size = f"The gap is {_mm(where.gap_mm)} above the noise of {_mm(floor)}"
-    if not shown:
+    if shown is not None and not shown:
         return f"{size}, too small to show in any single episode."
-    if len(shown) == total:
-        sizes = where.per_episode_mm
-        worst = int(np.argmax(sizes))
-        others = np.delete(sizes, worst)
-        if total > 1 and sizes[worst] > 2.5 * np.median(others):
-            return f"{size}, in every episode but mostly in episode {worst + 1}: {sizes[worst]:.1f} mm."
-        return f"{size}, in {'every episode' if total > 1 else 'the one episode'}."
-    names = _listed([str(e + 1) for e in shown])
-    return f"{size}; it shows in {'episode' if len(shown) == 1 else 'episodes'} {names} of {total} only."
+    if shown is not None and len(shown) < total:
+        numbers = _listed([str(e + 1) for e in shown])
+        return f"{size}; it shows in {'episode' if len(shown) == 1 else 'episodes'} {numbers} of {total} only."
+    if total == 1:
+        return f"{size}, in the one episode."
+    worst = int(np.nanargmax(sizes))
+    others = float(np.nanmedian(np.delete(sizes, worst)))
+    if shown is None:
+        return (
+            f"{size}. It is largest in {names[worst]}, {_mm(sizes[worst])}; the median of the others is {_mm(others)}."
+        )
+    if sizes[worst] > 2.5 * others:
+        return f"{size}, in every episode but mostly in {names[worst]}: {sizes[worst]:.1f} mm."
+    return f"{size}, in every episode."
 
 
 def _along(where: Where, arclength: np.ndarray) -> list[str]:
@@ -95,6 +109,9 @@ def _when(where: Where, level: float) -> list[str]:
             )
         elif hold > 0.7 * moving and hold > 0:
             sentences.append(f"It stays while the grippers rest, {hold:.1f} mm in holds: not a lag.")
+    slow, fast = (where.regimes.get(f"speed: {name}") for name in ("slow", "fast"))
+    if where.episode_p is None and slow is not None and fast is not None:
+        sentences.append(f"It is {_mm(fast)} while the grippers move fast, {_mm(slow)} while they move slowly.")
     horizons = list(where.horizons_mm.items())
     if len(horizons) > 2:
         first, early = horizons[0]

@@ -57,7 +57,7 @@ class ModelConfig:
         hidden_layers: hidden layers of every network; recurrent layers.
         message_passing: message-passing steps, each with weights of its own.
         prior: movement that the network corrects: "static", towards the frictionless resting shape after the command,
-            see `cablejax.dynamics.statics`; "rigid", the interpolation of the grippers' motion; or "none".
+            see `cablejax.simulate.chain.statics`; "rigid", the interpolation of the grippers' motion; or "none".
         frame: axes that features and output are expressed in: "grippers", which turn and shift with the cable, or for
             comparison "world".
         normalisation: scales of features and output.

@@ -32,7 +32,7 @@ from jaxtyping import Array, Float
 
 from cablejax.dynamics.config import ModelConfig
 from cablejax.dynamics.interpolation import rigid_interpolation
-from cablejax.dynamics.statics import resting_shapes
+from cablejax.simulate.chain.statics import resting_shapes
 from cablejax.types import History
 
 

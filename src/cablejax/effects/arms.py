@@ -11,6 +11,9 @@ from cablejax.effects.base import CableEffect
 from cablejax.effects.effect import Parameter
 from cablejax.effects.physics import Physics
 
+SMALLEST_LAG = 1e-6
+"""Time constant [s] below which a lag counts as this one: none."""
+
 
 class ActuationGain(CableEffect):
     """The arms move more or less than commanded, seen from where they started."""
@@ -69,11 +72,23 @@ def executed(physics: Physics, commanded: Any, interval: Any) -> Any:
     return lagged(amplified, interval, physics.actuation_delay, physics.actuation_time)
 
 
+def lag_weights(ratio: Any) -> tuple[Any, Any, Any]:
+    """Weights of one interval of a first-order lag: `y_1 = d y_0 + w_0 u_0 + w_1 u_1`.
+
+    Exact for input that is linear over the interval dt: `slow y' + y = u` gives `d = exp(-dt / slow)`,
+    `w_0 = r - d - d r` and `w_1 = 1 - r + d r` with `r = slow / dt`.
+
+    Args:
+        ratio: r > 0, a NumPy or JAX number.
+    """
+    decay = ratio.__array_namespace__().exp(-1.0 / ratio)
+    return decay, ratio - decay - decay * ratio, 1 - ratio + decay * ratio
+
+
 def lagged(poses: Any, interval: Any, delay: Any, slow: Any) -> Any:
     """Poses after a pure delay [s], then a first-order lag of time constant `slow` [s]; shape [T, ...] as `poses`.
 
-    Exact for piecewise linear input: over one interval dt, `slow y' + y = u` gives
-    `y_1 = d y_0 + (r - d - d r) u_0 + (1 - r + d r) u_1` with `d = exp(-dt / slow)` and `r = slow / dt`.
+    Exact for piecewise linear input, see `lag_weights`.
     """
     xp = poses.__array_namespace__()
     n = len(poses)
@@ -83,9 +98,9 @@ def lagged(poses: Any, interval: Any, delay: Any, slow: Any) -> Any:
     )
     t = (back - before).reshape(-1, *(1,) * (poses.ndim - 1))
     late = (1 - t) * poses[before] + t * poses[before + 1]
-    ratio = xp.maximum(xp.asarray(slow, dtype=poses.dtype), 1e-6) / interval
-    decay = xp.exp(-1.0 / ratio)
-    driven = (ratio - decay - decay * ratio) * late[:-1] + (1 - ratio + decay * ratio) * late[1:]
+    ratio = xp.maximum(xp.asarray(slow, dtype=poses.dtype), SMALLEST_LAG) / interval
+    _, before_weight, after_weight = lag_weights(ratio)
+    driven = before_weight * late[:-1] + after_weight * late[1:]
     # the recursion as one product with the powers of the decay, bounded against overflow
     steps = np.subtract.outer(np.arange(n - 1), np.arange(n - 1))
     powers = xp.where(steps >= 0, xp.exp(-np.maximum(steps, 0) / ratio), 0.0)

@@ -8,6 +8,7 @@ from typing import get_args
 
 from cablejax.cable import Discretisation
 from cablejax.control.targets import Shape
+from cablejax.effects.given import GivenEffect
 from cablejax.evaluation.protocols import StartKind, letter_task, random_task
 from cablejax.evaluation.suite import Case
 from cablejax.evaluation.trials import LIANG_TABLE
@@ -91,4 +92,8 @@ def random_cases(seeds: Sequence[int], steps: int = 250) -> list[Case]:
 @functools.lru_cache(maxsize=8)
 def mujoco_plant(stiffness_ratio: float) -> Plant:
     """The plant with a cable of another stiffness; `reset` makes it new."""
-    return Plant(PlantConfig(discretisation=PLANT_CHAIN, stiffness_ratio=stiffness_ratio))
+    return Plant(
+        PlantConfig(
+            discretisation=PLANT_CHAIN, effects=(GivenEffect("bending_stiffness", (("ratio", stiffness_ratio),)),)
+        )
+    )

@@ -18,7 +18,7 @@ from cablejax.evaluation.trials import TrialKey
 from cablejax.report.style import LIGHT, cable_curve
 
 if TYPE_CHECKING:
-    from cablejax.control.loop import ClosedLoopRun
+    from cablejax.control.run import ClosedLoopRun
 
 _PANEL = 2.1
 """Inches, width and height of the drawn part of a panel."""

@@ -62,4 +62,6 @@ def controller_of(spec: MethodSpec, model: Model | None, target: Target) -> Cont
     """
     if model is None:
         return VisualServo(ServoConfig(), target.keypoints)
-    return make_controller(model, target, method="residual" if spec.residual else "direct", solver="trust-region")
+    return make_controller(
+        model, target, method="residual" if spec.residual else "direct", solver="levenberg-marquardt"
+    )

@@ -9,7 +9,8 @@ import time
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from cablejax.control.loop import ClosedLoopRun, run_closed_loop
+from cablejax.control.loop import run_closed_loop
+from cablejax.control.run import ClosedLoopRun
 from cablejax.control.shaping import Model, load_model
 from cablejax.evaluation.failures import Snapshot, append_snapshot, read_snapshots, snapshot_of
 from cablejax.evaluation.methods import MethodSpec, controller_of

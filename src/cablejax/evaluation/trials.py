@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from cablejax.control.loop import settling_time, step_settling_time
+from cablejax.control.run import settling_time, step_settling_time
 from cablejax.evaluation.rows import read_rows
 
 if TYPE_CHECKING:
     from cablejax.control.batched import BatchRun
-    from cablejax.control.loop import ClosedLoopRun
+    from cablejax.control.run import ClosedLoopRun
 
 TrialKey = tuple[str, str, str, float, int]
 """(table, method, scenario, stiffness, seed): what makes a trial the one it is."""
@@ -76,11 +76,11 @@ class Trial:
 
     @property
     def settling_time_s(self) -> float:
-        """See `control.loop.settling_time` [s]; infinite if the run never settled."""
+        """See `control.run.settling_time` [s]; infinite if the run never settled."""
         return settling_time(*self._course)
 
     def step_settling_time_s(self, fraction: float) -> float:
-        """See `control.loop.step_settling_time` [s]; likewise."""
+        """See `control.run.step_settling_time` [s]; likewise."""
         return step_settling_time(*self._course, fraction)
 
     @property

@@ -9,8 +9,8 @@ from cablejax.mpc.planners import (
     Accurate,
     Dogleg,
     GaussNewton,
+    LevenbergMarquardt,
     ProjectedGradient,
-    TrustRegion,
 )
 from cablejax.mpc.problem import ObjectiveConfig, Rollout, ShapingProblem
 from cablejax.mpc.sampling import CrossEntropy, PathIntegral
@@ -27,6 +27,7 @@ __all__ = [
     "Dogleg",
     "FeasibleSet",
     "GaussNewton",
+    "LevenbergMarquardt",
     "MPCConfig",
     "MPCInfo",
     "MPCState",
@@ -37,7 +38,6 @@ __all__ = [
     "Rollout",
     "ShapingProblem",
     "Solver",
-    "TrustRegion",
     "differentiable_plan",
     "feasible_from",
     "multi_start",

@@ -10,7 +10,7 @@ import numpy as np
 
 from cablejax.adaptation.belief import AdaptationConfig
 from cablejax.mpc.plan import Solver
-from cablejax.mpc.planners import TrustRegion
+from cablejax.mpc.planners import LevenbergMarquardt
 from cablejax.mpc.problem import ObjectiveConfig
 from cablejax.residual.ridge import RidgeConfig
 from cablejax.whole_number import is_whole
@@ -70,7 +70,7 @@ class MPCConfig:
     objective: ObjectiveConfig = ObjectiveConfig()
     residual: RidgeConfig | None = RidgeConfig(forgetting=0.5, outlier=0.02)
     adaptation: AdaptationConfig | None = None
-    solver: Solver = TrustRegion()
+    solver: Solver = LevenbergMarquardt()
 
     def __post_init__(self):
         if not is_whole(self.horizon, least=0):
@@ -98,7 +98,7 @@ class MPCConfig:
             )
         if not (self.shrink_below < self.grow_above and 0 < self.shrink <= 1 <= self.grow):
             raise ValueError(
-                f"MPCConfig trust region: thresholds {self.shrink_below}, {self.grow_above} must increase, and factors "
+                f"MPCConfig radius: thresholds {self.shrink_below}, {self.grow_above} must increase, and factors "
                 f"{self.shrink}, {self.grow} lie on either side of 1."
             )
         whole = is_whole(self.restart_after, least=1) and is_whole(self.max_restarts, least=0)
@@ -122,12 +122,12 @@ class MPCConfig:
             value = getattr(self, name)
             if not (isinstance(value, kind) or (optional and value is None)):
                 raise ValueError(
-                    f"MPCConfig.{name} is {value!r}, expected a {kind.__name__}{' or None' if optional else ''}."
+                    f"MPCConfig.{name} is {value!r}, expected {kind.__name__}{' or None' if optional else ''}."
                 )
         if not (callable(self.solver) and isinstance(self.solver, Hashable)) or isinstance(self.solver, type):
             raise ValueError(
-                f"MPCConfig.solver is {self.solver!r}, expected a solver such as TrustRegion(); `SOLVERS` has them by "
-                "name."
+                f"MPCConfig.solver is {self.solver!r}, expected a solver such as LevenbergMarquardt(); `SOLVERS` has "
+                "them by name."
             )
 
     @property

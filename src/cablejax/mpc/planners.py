@@ -71,7 +71,7 @@ class _LeastSquaresPlanner(abc.ABC):
 
 
 @dataclasses.dataclass(frozen=True)
-class TrustRegion(_LeastSquaresPlanner):
+class LevenbergMarquardt(_LeastSquaresPlanner):
     """Solver: damped Gauss-Newton models of the objective, minimised over the feasible set.
 
     Attributes:
@@ -195,11 +195,11 @@ class ProjectedGradient:
 
 SOLVERS: Mapping[str, Solver] = MappingProxyType(
     {
-        "trust-region": TrustRegion(),
+        "levenberg-marquardt": LevenbergMarquardt(),
         "projected-gradient": ProjectedGradient(),
         "dogleg": Dogleg(),
         "gauss-newton": GaussNewton(),
-        "deadline": TrustRegion(trials_per_linearisation=2),
+        "two-trials": LevenbergMarquardt(trials_per_linearisation=2),
         "cross-entropy": CrossEntropy(),
         "path-integral": PathIntegral(),
     }

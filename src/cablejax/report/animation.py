@@ -8,13 +8,25 @@ from __future__ import annotations
 
 import os
 import pathlib
+from typing import TYPE_CHECKING
 
 import matplotlib
 import numpy as np
 from PIL import Image, ImageColor, ImageDraw, ImageFont
 
-from cablejax.report.record import Method, RunRecord, pair_by_shape
-from cablejax.report.style import LIGHT, METHOD_LABEL, METHOD_ORDER, cable_curve, common_window, gripper_outline
+from cablejax.report.style import (
+    LIGHT,
+    METHOD_LABEL,
+    METHOD_ORDER,
+    by_shape,
+    cable_curve,
+    common_window,
+    gripper_outline,
+)
+
+if TYPE_CHECKING:
+    from cablejax.control.run import ClosedLoopRun
+    from cablejax.control.shaping import Method, Runs
 
 _OVERSAMPLING = 3
 _HEADER = 44
@@ -24,7 +36,7 @@ _FOOTER = 48
 
 def write_gif(
     path: str | os.PathLike[str],
-    records: list[RunRecord],
+    runs: Runs,
     *,
     width: int = 960,
     frames_per_second: float = 12.0,
@@ -35,7 +47,7 @@ def write_gif(
 
     Args:
         path: the file to write.
-        records: the runs; those of one shape share a panel.
+        runs: the runs; those of one shape share a panel.
         width: of the picture [pixels].
         frames_per_second: of the file.
         speed: seconds of the run per second of the animation.
@@ -44,12 +56,12 @@ def write_gif(
     Raises:
         ValueError: if there is no run.
     """
-    pairs = pair_by_shape(records)
-    end = max(float(r.times[-1]) for r in records)
+    pairs = by_shape(runs)
+    end = max(float(r.times[-1]) for r in runs.values())
     # The cable moves most at the start, so time runs slower there: frame times grow with the square.
     n_frames = max(2, round(end / speed * frames_per_second))
     instants = end * np.linspace(0.0, 1.0, n_frames) ** 2
-    scene = _Scene(pairs, common_window(records, margin=0.1), width)
+    scene = _Scene(pairs, common_window(runs, margin=0.1), width)
     frames = [scene.draw(t) for t in instants]
     palette = _palette()
     indexed = [frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]
@@ -78,7 +90,7 @@ def _palette(shades: int = 7) -> Image.Image:
 class _Scene:
     """What stays the same from frame to frame: the layout, the targets, the words."""
 
-    def __init__(self, pairs: dict[str, dict[Method, RunRecord]], views: dict, width: int):
+    def __init__(self, pairs: dict[str, dict[Method, ClosedLoopRun]], views: dict, width: int):
         self.pairs = pairs
         self.views = views
         x0, x1, y0, y1 = next(iter(views.values()))
@@ -124,7 +136,7 @@ class _Scene:
         canvas.text((360, 15), "target", LIGHT.muted, 14)
         for index, (shape, runs) in enumerate(self.pairs.items()):
             canvas.text((index * self.panel_width + 16, _HEADER), shape, LIGHT.ink, 20, bold=True)
-            target = next(iter(runs.values())).target
+            target = next(iter(runs.values())).target.keypoints
             canvas.dashes(self._pixels(index, shape, cable_curve(target, n_points=400)), LIGHT.target, 3.0)
         right, bottom = self.size[0] - 16, _HEADER + _TITLE + self.panel_height - 6
         bar = 0.2 * self.pixels_per_metre

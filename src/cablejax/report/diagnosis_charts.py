@@ -34,8 +34,12 @@ _SPLIT = (
 
 
 def ranking_figure(diagnosis: CableDiagnosis) -> Figure | None:
-    """Effects that were tried alone: how probable each is, and how much of the gap it takes away; None without any."""
-    ranked = [r for r in diagnosis.ranking if max(r.probability or 0.0, r.held_out_shrinkage) >= 5e-3]
+    """Effects that were tried: how probable each is, where that was computed, and how much of the gap it takes away.
+
+    None where none was tried.
+    """
+    likely = all(r.probability is not None for r in diagnosis.ranking)
+    ranked = [r for r in diagnosis.ranking if not likely or max(r.probability or 0.0, r.held_out_shrinkage) >= 5e-3]
     ranked = (ranked if len(ranked) >= 3 else list(diagnosis.ranking))[:_MAX_RANKED]
     if not ranked:
         return None
@@ -49,20 +53,20 @@ def ranking_figure(diagnosis: CableDiagnosis) -> Figure | None:
     chance = "probability [%]" if diagnosis.effects else "probability, were it in the library [%]"
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(10.0, 0.9 + 0.36 * rows), layout="constrained")
-        left, right = figure.subplots(1, 2, sharey=True)
-        for ax, values, title in (
-            (left, [np.nan if r.probability is None else 100 * r.probability for r in ranked], chance),
-            (right, [100 * max(r.held_out_shrinkage, 0.0) for r in ranked], "share of the gap that it takes away [%]"),
-        ):
-            ax.barh(y, values, color=colours, height=0.62)
+        panels = [([100 * r.held_out_shrinkage for r in ranked], "share of the gap that it takes away [%]")]
+        if likely:
+            panels.insert(0, ([100 * (r.probability or 0.0) for r in ranked], chance))
+        axes = figure.subplots(1, len(panels), sharey=True, squeeze=False)[0]
+        for ax, (values, title) in zip(axes, panels, strict=True):
+            ax.barh(y, np.maximum(values, 0.0), color=colours, height=0.62)
             for row, value in zip(y, values, strict=True):
-                ax.text(np.nan_to_num(value) + 1.5, row, _percent(value), va="center", fontsize=10)
+                ax.text(max(value, 0.0) + 1.5, row, _percent(value), va="center", fontsize=10)
             ax.set(xlim=(0, 112), ylim=(-0.6, rows - 0.4), xticks=[])
             ax.spines[["bottom"]].set_visible(False)
             ax.set_title(title)
-        left.set_yticks(y, [effect_title(r.name) for r in ranked])
-        left.tick_params(length=0, labelcolor=LIGHT.ink)
-        right.tick_params(length=0)
+            ax.tick_params(length=0)
+        axes[0].set_yticks(y, [effect_title(r.name) for r in ranked])
+        axes[0].tick_params(labelcolor=LIGHT.ink)
     return figure
 
 
@@ -197,8 +201,10 @@ def _film(figure: Any, config: Discretisation, poses: np.ndarray) -> None:
 
 
 def _percent(value: float) -> str:
-    if np.isnan(value):
+    if not np.isfinite(value):
         return "n/a"
     if value >= 99.5:
         return "> 99"
+    if value <= -0.5:
+        return f"{value:.0f}"
     return f"{value:.0f}" if value >= 0.5 or value == 0 else "< 1"

@@ -11,14 +11,15 @@ import string
 import numpy as np
 
 from cablejax.diagnose.belief import Calibration
-from cablejax.diagnose.conclude import look_alikes
 from cablejax.diagnose.diagnosis import CableDiagnosis, NamedEffect, Verdict
+from cablejax.diagnose.judgement import look_alikes
 from cablejax.diagnose.verdict_json import write_verdict
 from cablejax.report.diagnosis_charts import motion_figure, ranking_figure, shrinkage_figure
 from cablejax.report.diagnosis_figures import cable_figure, where_figure
 from cablejax.report.diagnosis_sections import (
     details_section,
     far_section,
+    in_space,
     limits_section,
     next_section,
     which_section,
@@ -64,10 +65,10 @@ def write_diagnosis_page(diagnosis: CableDiagnosis, out: str | os.PathLike[str])
     out = pathlib.Path(out)
     out.mkdir(parents=True, exist_ok=True)
     write_verdict(out / "verdict.json", diagnosis)
-    in_space = diagnosis.log.keypoints.shape[-1] == 3
+    space = in_space(diagnosis)
     drawn = {
-        "cable": cable_still(diagnosis) if in_space else cable_figure(diagnosis),
-        "where": files_figure(diagnosis) if in_space else where_figure(diagnosis),
+        "cable": cable_still(diagnosis) if space else cable_figure(diagnosis),
+        "where": files_figure(diagnosis) if space else where_figure(diagnosis),
         "ranking": ranking_figure(diagnosis),
         "shrinkage": shrinkage_figure(diagnosis),
         "motion": motion_figure(diagnosis),
@@ -92,12 +93,12 @@ def write_diagnosis_page(diagnosis: CableDiagnosis, out: str | os.PathLike[str])
         headline=html.escape(diagnosis.sentence),
         lead=_lead(diagnosis),
         cards="\n".join(_cards(diagnosis)),
-        cable=orbit(diagnosis) if in_space else inline["cable"],
-        cable_caption=_SPACE_CAPTION if in_space else _cable_caption(diagnosis),
+        cable=orbit(diagnosis) if space else inline["cable"],
+        cable_caption=_SPACE_CAPTION if space else _cable_caption(diagnosis),
         where="\n".join(f"<li>{html.escape(sentence)}</li>" for sentence in diagnosis.where.sentences),
         where_figure=inline["where"],
         where_caption=_FILES_CAPTION
-        if in_space
+        if space
         else (
             "Top: the gap of each keypoint over the whole log. Below: each episode over time; the darker, the further "
             "beyond the noise. Black bars mark holds. The cable's own gap fades towards the grippers that hold it."
@@ -120,8 +121,8 @@ def _lead(diagnosis: CableDiagnosis) -> str:
     episodes = len(log.episode_length)
     text = (
         f"{episodes} episode{'' if episodes == 1 else 's'}, {seconds:.0f} s, {log.keypoints.shape[2]} keypoints. "
-        f"The simulator misses the recorded cable by {millimetres(gap.before_rmse_mm)}; the recording's noise alone is "
-        f"{millimetres(gap.noise_floor_mm)}."
+        f"The simulator misses the recorded cable by {millimetres(gap.before_rmse_mm)}; the recording's own "
+        f"{_noise(diagnosis)}."
     )
     return html.escape(text)
 
@@ -130,13 +131,7 @@ def _cards(diagnosis: CableDiagnosis):
     gap = diagnosis.gap
     if diagnosis.effects:
         names = listed([listed(_alike(diagnosis, e), "or") for e in diagnosis.effects])
-        chance = min((e.probability for e in diagnosis.effects if e.probability is not None), default=None)
-        if diagnosis.equivalent:
-            note = (
-                f"most probable: {effect_title(diagnosis.effects[0].name)}, {share(diagnosis.effects[0].probability)}"
-            )
-        else:
-            note = f"probability {share(chance)}" + _most_telling(diagnosis.effects[0])
+        note = _chance(diagnosis)
         title = "Part of the cause" if diagnosis.verdict == "named+unknown" else "Cause"
         yield _card(title, names, note)
         places = [p for p in (effect_place(e) for e in diagnosis.effects) if p]
@@ -154,14 +149,33 @@ def _cards(diagnosis: CableDiagnosis):
         yield _card(
             "Error",
             f"{gap.before_rmse_mm:.1f} → {millimetres(gap.after_rmse_mm)}",
-            f"noise {millimetres(gap.noise_floor_mm)}",
+            _noise(diagnosis),
         )
     else:
-        yield _card("Error", millimetres(gap.before_rmse_mm), f"noise {millimetres(gap.noise_floor_mm)}")
+        yield _card("Error", millimetres(gap.before_rmse_mm), _noise(diagnosis))
+
+
+def _noise(diagnosis: CableDiagnosis) -> str:
+    """The noise, and what it leaves out: in space it is only what changes between samples."""
+    besides = ", without the markers' constant offsets" if in_space(diagnosis) else ""
+    return f"noise {millimetres(diagnosis.gap.noise_floor_mm)}{besides}"
+
+
+def _chance(diagnosis: CableDiagnosis) -> str:
+    """How probable the named effects are, as far as that was computed, and how strong the first one is."""
+    chances = [e.probability for e in diagnosis.effects if e.probability is not None]
+    strength = _most_telling(diagnosis.effects[0])
+    if not chances:
+        return strength
+    if diagnosis.equivalent:
+        return f"most probable: {effect_title(diagnosis.effects[0].name)}, {share(chances[0])}"
+    return "; ".join(part for part in (f"probability {share(min(chances))}", strength) if part)
 
 
 def _least(diagnosis: CableDiagnosis) -> float:
     """The gap [mm] from which on the verdict would not have been "none"."""
+    if in_space(diagnosis):
+        return diagnosis.where.smallest_mm
     calibration = Calibration(**diagnosis.settings.get("calibration", {}))
     noise = float(np.sqrt(np.mean(diagnosis.noise_mm**2)))
     return max(diagnosis.where.smallest_mm, 1e3 * calibration.smallest_gap(1e-3 * noise))
@@ -190,7 +204,7 @@ def _most_telling(effect: NamedEffect) -> str:
     places = {"centre_m", "width_m", "x_m", "y_m", "gripper", "index", "direction_rad"}
     for name, estimate in effect.parameters.items():
         if name not in places and estimate.ci90 is not None:
-            return f"; {parameter_title(name)} {quantity(estimate.value, estimate.unit, estimate.ci90, interval=False)}"
+            return f"{parameter_title(name)} {quantity(estimate.value, estimate.unit, estimate.ci90, interval=False)}"
     return ""
 
 

@@ -7,8 +7,8 @@ import itertools
 import json
 from collections.abc import Sequence
 
-from cablejax.diagnose.conclude import FAINT, look_alikes
-from cablejax.diagnose.diagnosis import CableDiagnosis
+from cablejax.diagnose.diagnosis import CableDiagnosis, NamedEffect
+from cablejax.diagnose.judgement import FAINT, look_alikes
 from cablejax.report.effect_words import (
     EFFECTS,
     MOTIONS,
@@ -49,7 +49,7 @@ def which_section(diagnosis: CableDiagnosis, ranking: str) -> str:
         where = effect_place(effect)
         parts.append(
             f"<p><b>{html.escape(effect_title(effect.name).capitalize())}</b>: {html.escape(meaning)}"
-            f"{', ' + html.escape(where) if where else ''}. Probability {share(effect.probability)}.</p>"
+            f"{', ' + html.escape(where) if where else ''}.{_probability(effect)}</p>"
             f'<div class="scroll"><table><thead><tr><th>parameter</th><th>estimate (90 % interval)</th></tr></thead>'
             f"<tbody>{rows}</tbody></table></div>"
         )
@@ -75,11 +75,29 @@ def which_section(diagnosis: CableDiagnosis, ranking: str) -> str:
             f"{_as_much(diagnosis.leftover_p)}</p>"
         )
     if ranking:
-        note = "Every effect alone, the most probable first."
-        if len(diagnosis.effects) > 1:
-            note += " The cause named above is a set; alone, none of its members is enough."
-        parts.append(f"<figure>{ranking}<figcaption>{note}</figcaption></figure>")
+        parts.append(f"<figure>{ranking}<figcaption>{_ranking_note(diagnosis)}</figcaption></figure>")
     return "\n".join(parts)
+
+
+def in_space(diagnosis: CableDiagnosis) -> bool:
+    """Whether the cable hangs in space, rather than lying on a table."""
+    return diagnosis.log.keypoints.shape[-1] == 3
+
+
+def _probability(effect: NamedEffect) -> str:
+    return "" if effect.probability is None else f" Probability {share(effect.probability)}."
+
+
+def _ranking_note(diagnosis: CableDiagnosis) -> str:
+    if any(ranked.probability is None for ranked in diagnosis.ranking):
+        return (
+            "Every effect tried in the forward search: what it takes away on unseen recordings when it joins those "
+            "kept before it, as a share of the squared error without any effect. Negative: it makes them worse."
+        )
+    note = "Every effect alone, the most probable first."
+    if len(diagnosis.effects) > 1:
+        note += " The cause named above is a set; alone, none of its members is enough."
+    return note
 
 
 def _left(diagnosis: CableDiagnosis) -> float:
@@ -107,11 +125,12 @@ def far_section(diagnosis: CableDiagnosis, picture: str) -> str:
         interval = ""
         if gap.shrinkage_ci90 is not None:
             interval = f" (90 % interval over episodes: {between(*gap.shrinkage_ci90)})"
+        besides = ", to which constant offsets of the markers add" if in_space(diagnosis) else ""
         text = (
             f"With {added} in the simulator, {share(gap.shrinkage)} of the squared gap above the noise goes "
             f"away{interval}, on {named}, each left out of the fit that predicts it. The error falls from "
             f"{millimetres(gap.before_rmse_mm)} to {millimetres(gap.after_rmse_mm)}; nothing can go below the noise of "
-            f"{millimetres(gap.noise_floor_mm)}."
+            f"{millimetres(gap.noise_floor_mm)}{besides}."
         )
     if gap.ahead_mm is not None:
         ahead = {name: millimetres(value) for name, value in gap.ahead_mm.items()}
@@ -127,6 +146,8 @@ def far_section(diagnosis: CableDiagnosis, picture: str) -> str:
 def next_section(diagnosis: CableDiagnosis, picture: str) -> str:
     following = diagnosis.next_motion
     if following is None:
+        if in_space(diagnosis):
+            return "<p>No motion was evaluated: that is done for cables on a table only.</p>"
         settled = diagnosis.verdict in ("none", "named")
         words = "There is nothing left to tell apart." if settled else "No motion of the library would help."
         return f"<p>{words}</p>"
@@ -162,13 +183,14 @@ def limits_section(diagnosis: CableDiagnosis) -> str:
 
 def details_section(diagnosis: CableDiagnosis) -> str:
     where = diagnosis.where
+    alone = all(r.probability is not None for r in diagnosis.ranking)
     tried = _table(
-        ("effect", "what it is", "probability", "share taken away", "left"),
+        ("effect", "what it is", *(["probability"] if alone else []), "share taken away", "left"),
         [
             (
                 effect_title(r.name),
                 EFFECTS.get(r.name, ""),
-                share(r.probability),
+                *([share(r.probability)] if alone and r.probability is not None else []),
                 share(r.held_out_shrinkage),
                 millimetres(r.leftover_mm),
             )
@@ -210,7 +232,11 @@ def details_section(diagnosis: CableDiagnosis) -> str:
     rows = "".join(f"<dt>{html.escape(k)}</dt><dd>{html.escape(v)}</dd>" for k, v in facts.items())
     return (
         '<div class="details">'
-        + (f"<h3>All effects tried alone</h3>{tried}" if diagnosis.ranking else "")
+        + (
+            f"<h3>All effects tried{' alone' if alone else ', each on top of those kept before it'}</h3>{tried}"
+            if diagnosis.ranking
+            else ""
+        )
         + f"<h3>Gap above the noise by regime</h3>{regimes}"
         + (f"<h3>Comparisons, tested over episodes</h3>{contrasts}" if where.contrasts else "")
         + (f"<h3>Frames</h3>{frames}" if where.frames else "")

@@ -1,4 +1,4 @@
-"""The report's figures: final shapes, error over time, the residual's share, the trust region, and snapshots.
+"""The report's figures: final shapes, error over time, the residual's share, the bound on a step, and snapshots.
 
 Each function takes the runs and gives a `matplotlib.figure.Figure` that belongs to nobody else: no pyplot, no global
 state, no display needed. Notebooks show it, `page.svg` inlines it, `figure.savefig` writes it.
@@ -6,7 +6,8 @@ state, no display needed. Notebooks show it, `page.svg` inlines it, `figure.save
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
 
 import matplotlib
 import numpy as np
@@ -14,16 +15,20 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from cablejax.report.record import Method, RunRecord, pair_by_shape
 from cablejax.report.style import (
     FIGURE_STYLE,
     LIGHT,
     METHOD_LABEL,
     METHOD_ORDER,
+    by_shape,
     cable_curve,
     common_window,
     gripper_outline,
 )
+
+if TYPE_CHECKING:
+    from cablejax.control.run import ClosedLoopRun
+    from cablejax.control.shaping import Method, Runs
 
 _REST = 5e-4
 """Grippers that move by less than this in a step [m, rad] rest."""
@@ -37,26 +42,26 @@ _STYLE: dict[Any, Any] = FIGURE_STYLE | {
 }
 
 
-def final_shapes(records: list[RunRecord]) -> Figure:
+def final_shapes(runs: Runs) -> Figure:
     """The cable at the end of each run over its target, one panel per shape, with the error in words."""
-    pairs = pair_by_shape(records)
-    views = common_window(records, margin=0.1, final_only=True)
+    pairs = by_shape(runs)
+    views = common_window(runs, margin=0.1, final_only=True)
     x0, x1, y0, y1 = next(iter(views.values()))
     panel_width = _panel_width(len(pairs))
     panel_height = panel_width * (y1 - y0) / (x1 - x0)
     with matplotlib.rc_context(_STYLE):
         figure = Figure(figsize=(panel_width * len(pairs), panel_height + 1.15), layout="constrained")
         axes = figure.subplots(1, len(pairs), squeeze=False)[0]
-        for ax, (shape, runs) in zip(axes, pairs.items(), strict=True):
+        for ax, (shape, pair) in zip(axes, pairs.items(), strict=True):
             _table_axes(ax, views[shape])
-            target = next(iter(runs.values())).target
+            target = next(iter(pair.values())).target.keypoints
             ax.plot(*cable_curve(target).T, color=LIGHT.target, lw=7, alpha=0.45, solid_capstyle="round")
-            for method in _present(runs):
-                run = runs[method]
+            for method in _present(pair):
+                run = pair[method]
                 _draw_cable(ax, run, -1, method)
             ax.set_title(shape, fontsize=14)
-            for row, method in enumerate(reversed(_present(runs))):
-                words = f"{runs[method].final_error_cm:.2f} cm {METHOD_LABEL[method]}"
+            for row, method in enumerate(reversed(_present(pair))):
+                words = f"{pair[method].terminal_error_cm:.2f} cm {METHOD_LABEL[method]}"
                 ax.annotate(
                     words, (0.0, 0.0), xycoords="axes fraction", xytext=(0.0, -4.0 - 15.0 * row),
                     textcoords="offset points", color=LIGHT.method(method), va="top", fontsize=10.5,
@@ -66,26 +71,26 @@ def final_shapes(records: list[RunRecord]) -> Figure:
         handles += [
             Line2D([], [], color=LIGHT.method(m), lw=2.2, label=METHOD_LABEL[m])
             for m in reversed(METHOD_ORDER)
-            if any(m in runs for runs in pairs.values())
+            if any(m in pair for pair in pairs.values())
         ]
         figure.legend(handles=handles, loc="outside upper left", ncols=3, handlelength=1.6)
     return figure
 
 
-def error_over_time(records: list[RunRecord], goal_cm: float | None = 1.0) -> Figure:
+def error_over_time(runs: Runs, goal_cm: float | None = 1.0) -> Figure:
     """Shape error against time on a logarithmic axis, one panel per shape; `goal_cm` draws a line to stay under."""
-    pairs = pair_by_shape(records)
+    pairs = by_shape(runs)
     with matplotlib.rc_context(_STYLE):
         figure, axes = _row_of_panels(list(pairs), "shape error [cm]")
-        low = min(float(np.nanmin(r.error_cm)) for r in records)
-        high = max(float(np.nanmax(r.error_cm)) for r in records)
+        low = min(float(np.nanmin(r.error_cm)) for r in runs.values())
+        high = max(float(np.nanmax(r.error_cm)) for r in runs.values())
         if goal_cm is not None:
             low, high = min(low, goal_cm), max(high, goal_cm)
-        for ax, (shape, runs) in zip(axes, pairs.items(), strict=True):
-            for method in _present(runs):
-                run = runs[method]
+        for ax, (shape, pair) in zip(axes, pairs.items(), strict=True):
+            for method in _present(pair):
+                run = pair[method]
                 ax.plot(run.times, run.error_cm, color=LIGHT.method(method), lw=2.2, label=METHOD_LABEL[method])
-                ax.plot(run.times[-1], run.final_error_cm, "o", ms=5, color=LIGHT.method(method))
+                ax.plot(run.times[-1], run.terminal_error_cm, "o", ms=5, color=LIGHT.method(method))
             ax.set_yscale("log")
             ax.set_ylim(low / 1.4, high * 1.3)
             ax.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
@@ -96,51 +101,49 @@ def error_over_time(records: list[RunRecord], goal_cm: float | None = 1.0) -> Fi
             ax.set_title(shape, fontsize=13)
         if goal_cm is not None:
             axes[0].text(0.0, goal_cm / 1.08, f"{goal_cm:g} cm", ha="left", va="top", color=LIGHT.muted, fontsize=9)
-        _method_legend(figure, records)
+        _method_legend(figure, runs)
     return figure
 
 
-def residual_share(records: list[RunRecord]) -> Figure:
+def residual_share(runs: Runs) -> Figure:
     """How much of the predicted motion the online residual contributes [%], one panel per shape.
 
     Blank where the grippers rested: a share of no motion means nothing.
     """
 
-    def share(run: RunRecord) -> np.ndarray:
+    def share(run: ClosedLoopRun) -> np.ndarray:
         moved = np.abs(np.diff(run.gripper_pose, axis=0, append=np.nan)).max(axis=(1, 2))
         return np.where(moved > _REST, 100.0 * run.residual_share, np.nan)
 
-    return _one_method_panels(records, share, "residual's share of\nthe predicted motion [%]", "residual")
+    return _one_method_panels(runs, share, "residual's share of\nthe predicted motion [%]", "residual")
 
 
-def trust_region(records: list[RunRecord]) -> Figure:
+def motion_bound(runs: Runs) -> Figure:
     """Bound on the motion of one gripper in one step [cm], one panel per shape."""
-    pairs = pair_by_shape(records)
+    pairs = by_shape(runs)
     with matplotlib.rc_context(_STYLE):
         figure, axes = _row_of_panels(list(pairs), "motion bound [cm]")
-        for ax, runs in zip(axes, pairs.values(), strict=True):
-            for method in _present(runs):
-                run = runs[method]
+        for ax, pair in zip(axes, pairs.values(), strict=True):
+            for method in _present(pair):
+                run = pair[method]
                 ax.step(run.times, 100.0 * run.radius, where="post", color=LIGHT.method(method), lw=2.0)
             ax.set_ylim(bottom=0.0)
         for ax, shape in zip(axes, pairs, strict=True):
             ax.set_title(shape, fontsize=13)
-        _method_legend(figure, records)
+        _method_legend(figure, runs)
     return figure
 
 
-def snapshots(
-    records: list[RunRecord], shape: str | None = None, method: Method = "residual", count: int = 5
-) -> Figure:
+def snapshots(runs: Runs, shape: str | None = None, method: Method = "residual", count: int = 5) -> Figure:
     """One run as a film strip: the cable and its grippers at `count` instants, dense at the start, over the target."""
-    pairs = pair_by_shape(records)
+    pairs = by_shape(runs)
     shape = next(iter(pairs)) if shape is None else shape
     if shape not in pairs or method not in pairs[shape]:
         raise ValueError(f"No run of shape {shape!r} with method {method!r}; shapes: {', '.join(pairs)}.")
     run = pairs[shape][method]
     last = len(run.times) - 1
     chosen = np.unique(np.round(last * np.linspace(0.0, 1.0, count) ** 1.6).astype(int))
-    view = common_window([run])[shape]
+    view = common_window({(shape, method): run})[shape]
     width = 2.3
     with matplotlib.rc_context(_STYLE):
         height = width * (view[3] - view[2]) / (view[1] - view[0])
@@ -148,15 +151,15 @@ def snapshots(
         axes = figure.subplots(1, len(chosen), squeeze=False)[0]
         for ax, index in zip(axes, chosen, strict=True):
             _table_axes(ax, view)
-            ax.plot(*cable_curve(run.target).T, color=LIGHT.target, lw=1.6, ls=(0, (4, 3)))
+            ax.plot(*cable_curve(run.target.keypoints).T, color=LIGHT.target, lw=1.6, ls=(0, (4, 3)))
             _draw_cable(ax, run, int(index), method)
             ax.set_title(f"{run.times[index]:.0f} s   {run.error_cm[index]:.2f} cm", fontsize=10)
         _scale_bar(axes[-1], view)
     return figure
 
 
-def _present(runs: dict[Method, RunRecord]) -> list[Method]:
-    return [method for method in METHOD_ORDER if method in runs]
+def _present(pair: Mapping[Method, ClosedLoopRun]) -> list[Method]:
+    return [method for method in METHOD_ORDER if method in pair]
 
 
 def _table_axes(ax: Axes, view: tuple[float, float, float, float]) -> None:
@@ -164,7 +167,7 @@ def _table_axes(ax: Axes, view: tuple[float, float, float, float]) -> None:
     ax.axis("off")
 
 
-def _draw_cable(ax: Axes, run: RunRecord, index: int, method: Method) -> None:
+def _draw_cable(ax: Axes, run: ClosedLoopRun, index: int, method: Method) -> None:
     colour = LIGHT.method(method)
     for end in range(2):
         for polygon in gripper_outline(run.gripper_pose[index, end], end):
@@ -196,8 +199,8 @@ def _row_of_panels(shapes: list[str], label: str) -> tuple[Figure, np.ndarray]:
     return figure, axes
 
 
-def _one_method_panels(records, quantity, label: str, method: Method) -> Figure:
-    pairs = {s: runs[method] for s, runs in pair_by_shape(records).items() if method in runs}
+def _one_method_panels(runs: Runs, quantity, label: str, method: Method) -> Figure:
+    pairs = {s: pair[method] for s, pair in by_shape(runs).items() if method in pair}
     if not pairs:
         raise ValueError(f"This figure needs runs with method {method!r}, got none.")
     top = max(float(np.nanmax(quantity(run), initial=0.0)) for run in pairs.values())
@@ -213,8 +216,8 @@ def _one_method_panels(records, quantity, label: str, method: Method) -> Figure:
     return figure
 
 
-def _method_legend(figure: Figure, records: list[RunRecord]) -> None:
-    present = {record.method for record in records}
+def _method_legend(figure: Figure, runs: Runs) -> None:
+    present = {method for _, method in runs}
     handles = [
         Line2D([], [], color=LIGHT.method(m), lw=2.2, label=METHOD_LABEL[m]) for m in METHOD_ORDER[::-1] if m in present
     ]

@@ -16,14 +16,25 @@ import pathlib
 import re
 import string
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from matplotlib.figure import Figure
 
 from cablejax.report import figures
-from cablejax.report.record import Method, RunRecord, pair_by_shape
-from cablejax.report.style import LIGHT, METHOD_LABEL, METHOD_ORDER, cable_curve, common_window, gripper_outline
+from cablejax.report.style import (
+    LIGHT,
+    METHOD_LABEL,
+    METHOD_ORDER,
+    by_shape,
+    cable_curve,
+    common_window,
+    gripper_outline,
+)
+
+if TYPE_CHECKING:
+    from cablejax.control.run import ClosedLoopRun
+    from cablejax.control.shaping import Method, Runs
 
 REACHED_CM = 1.0
 """Largest final error with which a target counts as reached [cm]."""
@@ -31,7 +42,7 @@ REACHED_CM = 1.0
 _UNITS_PER_METRE = 10_000
 _CSS_CLASS: dict[Method, str] = {"residual": "with", "direct": "without"}
 
-_SECTIONS: tuple[tuple[str, Callable[[list[RunRecord]], Figure], str], ...] = (
+_SECTIONS: tuple[tuple[str, Callable[[Any], Figure], str], ...] = (
     (
         "Where the cable ended",
         figures.final_shapes,
@@ -50,7 +61,7 @@ _SECTIONS: tuple[tuple[str, Callable[[list[RunRecord]], Figure], str], ...] = (
     ),
     (
         "How far the planner trusts itself",
-        figures.trust_region,
+        figures.motion_bound,
         "The bound on one gripper's motion in one step. It grows while the predicted progress is made and shrinks "
         "while it is not.",
     ),
@@ -59,7 +70,7 @@ _SECTIONS: tuple[tuple[str, Callable[[list[RunRecord]], Figure], str], ...] = (
 
 def write_page(
     path: str | os.PathLike[str],
-    records: list[RunRecord],
+    runs: Runs,
     summary: Mapping[str, Any],
     *,
     about: str,
@@ -70,13 +81,13 @@ def write_page(
 
     Args:
         path: the file to write.
-        records: the runs.
+        runs: the runs.
         summary: the demo's summary: `{"shapes": {name: {...}}, "total_s": ...}`.
         about: what plant and model these runs had, in a sentence or two.
         facts: versions, seed, machine: whatever is needed to make the page again, in order.
         gif: the animation's file, inlined for readers without scripts.
     """
-    pairs = pair_by_shape(records)
+    pairs = by_shape(runs)
     title, lead = headline(pairs)
     here = importlib.resources.files("cablejax.report")
     page = string.Template((here / "page.html").read_text(encoding="utf-8")).substitute(
@@ -85,22 +96,22 @@ def write_page(
         about=html.escape(about),
         css=(here / "page.css").read_text(encoding="utf-8"),
         player=(here / "player.js").read_text(encoding="utf-8"),
-        panels="\n".join(_panel(shape, runs) for shape, runs in pairs.items()),
+        panels="\n".join(_panel(shape, pair) for shape, pair in pairs.items()),
         toggles="\n".join(_toggle(method) for method in METHOD_ORDER[::-1] if any(method in r for r in pairs.values())),
         table=_table(summary["shapes"]),
-        figures="\n".join(_figures(records)),
+        figures="\n".join(_figures(runs)),
         facts="\n".join(f"<dt>{html.escape(k)}</dt><dd>{html.escape(v)}</dd>" for k, v in facts.items()),
         fallback="data:image/gif;base64," + base64.b64encode(pathlib.Path(gif).read_bytes()).decode(),
         # "</" would end the script element; "<\/" is the same JSON.
-        data=json.dumps(animation_data(records), separators=(",", ":"), allow_nan=False).replace("</", "<\\/"),
+        data=json.dumps(animation_data(runs), separators=(",", ":"), allow_nan=False).replace("</", "<\\/"),
     )
     pathlib.Path(path).write_text(page, encoding="utf-8")
 
 
-def headline(pairs: Mapping[str, Mapping[Method, RunRecord]]) -> tuple[str, str]:
+def headline(pairs: Mapping[str, Mapping[Method, ClosedLoopRun]]) -> tuple[str, str]:
     """The result as a title and, in HTML, a sentence that says the numbers with and without the residual."""
     main = {shape: runs.get("residual") or runs["direct"] for shape, runs in pairs.items()}
-    ends = {shape: run.final_error_cm for shape, run in main.items()}
+    ends = {shape: run.terminal_error_cm for shape, run in main.items()}
     reached = {shape: end for shape, end in ends.items() if end <= REACHED_CM}
     missed = {shape: end for shape, end in ends.items() if shape not in reached}
     parts = []
@@ -113,44 +124,42 @@ def headline(pairs: Mapping[str, Mapping[Method, RunRecord]]) -> tuple[str, str]
     start = _list([f"{run.error_cm[0]:.1f}" for run in main.values()])
     parts = [f"It starts {start} cm away."]
     for method in METHOD_ORDER[::-1]:
-        errors = [f"{runs[method].final_error_cm:.2f}" for runs in pairs.values() if method in runs]
+        errors = [f"{runs[method].terminal_error_cm:.2f}" for runs in pairs.values() if method in runs]
         if errors:
             words = METHOD_LABEL[method].capitalize()
             parts.append(f'<span class="{_CSS_CLASS[method]}">{words}</span> it ends {_list(errors)} cm away.')
     return title, " ".join(parts)
 
 
-def animation_data(records: list[RunRecord]) -> dict[str, Any]:
+def animation_data(runs: Runs) -> dict[str, Any]:
     """What the player draws, as JSON: curves in whole tenths of a millimetre, poses in metres and radians."""
 
     def integers(points: np.ndarray) -> list[int | None]:
         flat = np.asarray(points, dtype=float).ravel() * _UNITS_PER_METRE
         return [None if not np.isfinite(v) else round(v) for v in flat.tolist()]
 
-    def run(record: RunRecord) -> dict[str, Any]:
+    def course(method: Method, run: ClosedLoopRun) -> dict[str, Any]:
         return {
-            "method": record.method,
-            "times": [round(float(t), 3) for t in record.times],
-            "error": np.round(_bridged(record.error_cm), 6).tolist(),
-            "pose": np.round(record.gripper_pose.reshape(len(record.times), 6), 5).tolist(),
-            "points": [integers(x) for x in record.keypoints],
-            "curve": [
-                integers(cable_curve(x, g, 49)) for x, g in zip(record.keypoints, record.gripper_pose, strict=True)
-            ],
+            "method": method,
+            "times": [round(float(t), 3) for t in run.times],
+            "error": np.round(_bridged(run.error_cm), 6).tolist(),
+            "pose": np.round(run.gripper_pose.reshape(len(run.times), 6), 5).tolist(),
+            "points": [integers(x) for x in run.keypoints],
+            "curve": [integers(cable_curve(x, g, 49)) for x, g in zip(run.keypoints, run.gripper_pose, strict=True)],
         }
 
-    pairs = pair_by_shape(records)
+    pairs = by_shape(runs)
     return {
-        "end": max(float(r.times[-1]) for r in records),
-        "view": common_window(records, margin=0.1),
+        "end": max(float(r.times[-1]) for r in runs.values()),
+        "view": common_window(runs, margin=0.1),
         "gripper": [[polygon.tolist() for polygon in gripper_outline(np.zeros(3), end)] for end in range(2)],
         "shapes": [
             {
                 "name": shape,
-                "target": integers(cable_curve(next(iter(runs.values())).target, n_points=97)),
-                "runs": [run(runs[method]) for method in METHOD_ORDER if method in runs],
+                "target": integers(cable_curve(next(iter(pair.values())).target.keypoints, n_points=97)),
+                "runs": [course(method, pair[method]) for method in METHOD_ORDER if method in pair],
             }
-            for shape, runs in pairs.items()
+            for shape, pair in pairs.items()
         ],
     }
 
@@ -179,16 +188,16 @@ def svg(figure: Figure, name: str) -> str:
     return text
 
 
-def _figures(records: list[RunRecord]):
-    methods = {record.method for record in records}
+def _figures(runs: Runs):
+    methods = {method for _, method in runs}
     for index, (heading, draw, caption) in enumerate(_SECTIONS):
         if draw is figures.residual_share and "residual" not in methods:
             continue
-        picture = svg(draw(records), f"figure{index}")
+        picture = svg(draw(runs), f"figure{index}")
         yield f"<h2>{heading}</h2>\n<figure>{picture}<figcaption>{html.escape(caption)}</figcaption></figure>"
 
 
-def _panel(shape: str, runs: Mapping[Method, RunRecord]) -> str:
+def _panel(shape: str, runs: Mapping[Method, ClosedLoopRun]) -> str:
     name = html.escape(shape, quote=True)
     readings = "".join(
         f'<p class="reading {_CSS_CLASS[m]}"><b data-method="{m}"></b> cm {METHOD_LABEL[m]}</p>'

@@ -6,13 +6,15 @@ The colours are those of Okabe and Ito, which stay apart for colour-blind reader
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Float
 from scipy.interpolate import CubicSpline
 
-from cablejax.report.record import Method, RunRecord
+if TYPE_CHECKING:
+    from cablejax.control.run import ClosedLoopRun
+    from cablejax.control.shaping import Method, Runs
 
 METHOD_ORDER: tuple[Method, ...] = ("direct", "residual")
 """Drawing order: the corrected model lies on top."""
@@ -21,6 +23,20 @@ METHOD_LABEL: dict[Method, str] = {
     "residual": "with online residual",
     "direct": "without residual",
 }
+
+
+def by_shape(runs: Runs) -> dict[str, dict[Method, ClosedLoopRun]]:
+    """The runs grouped as `{shape: {method: run}}`, in the order of their first appearance.
+
+    Raises:
+        ValueError: there is no run.
+    """
+    if not runs:
+        raise ValueError("A report needs at least one run, got none.")
+    grouped: dict[str, dict[Method, ClosedLoopRun]] = {}
+    for (shape, method), run in runs.items():
+        grouped.setdefault(shape, {})[method] = run
+    return grouped
 
 
 @dataclasses.dataclass(frozen=True)
@@ -105,23 +121,23 @@ def cable_curve(
 
 
 def common_window(
-    records: list[RunRecord], margin: float = 0.12, *, final_only: bool = False
+    runs: Runs, margin: float = 0.12, *, final_only: bool = False
 ) -> dict[str, tuple[float, float, float, float]]:
     """For each shape a view (x0, x1, y0, y1) [m] of the table that holds all its runs; every view has the same size.
 
     Args:
-        records: the runs.
+        runs: the runs.
         margin: free space around the cable, where the grippers' bodies are drawn [m].
         final_only: whether only the last sample has to be in view.
     """
     boxes: dict[str, tuple[np.ndarray, np.ndarray]] = {}
-    for record in records:
-        drawn = record.keypoints[-1:] if final_only else record.keypoints
-        points = np.concatenate([drawn.reshape(-1, 2), record.target])
+    for (shape, _), run in runs.items():
+        drawn = run.keypoints[-1:] if final_only else run.keypoints
+        points = np.concatenate([drawn.reshape(-1, 2), run.target.keypoints])
         low, high = np.nanmin(points, axis=0), np.nanmax(points, axis=0)
-        if record.shape in boxes:
-            low, high = np.minimum(low, boxes[record.shape][0]), np.maximum(high, boxes[record.shape][1])
-        boxes[record.shape] = low, high
+        if shape in boxes:
+            low, high = np.minimum(low, boxes[shape][0]), np.maximum(high, boxes[shape][1])
+        boxes[shape] = low, high
     width, height = np.max([high - low for low, high in boxes.values()], axis=0) + 2 * margin
     half = 0.5 * np.array([width, height])
     views = {}

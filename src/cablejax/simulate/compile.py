@@ -1,8 +1,15 @@
-"""Compiler options for simulator functions."""
+"""How simulator functions are compiled."""
 
 from __future__ import annotations
 
+import functools
+from collections.abc import Callable
+from typing import ParamSpec, TypeVar
+
 import jax
+
+_Arguments = ParamSpec("_Arguments")
+_Result = TypeVar("_Result")
 
 
 def compiler_options() -> dict[str, bool]:
@@ -14,3 +21,18 @@ def compiler_options() -> dict[str, bool]:
     if jax.default_backend() == "cpu" and jax.__version_info__ < (0, 11):
         return {"xla_cpu_use_fusion_emitters": False}
     return {}
+
+
+def full_precision(function: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result]:
+    """Traces a simulator's function with matrix products in the precision of their arguments.
+
+    JAX's default on a GPU rounds single-precision factors to TF32, ten bits: keypoints of a cable of 1 m are then a
+    quarter of a millimetre off.
+    """
+
+    @functools.wraps(function)
+    def traced(*args: _Arguments.args, **kwargs: _Arguments.kwargs) -> _Result:
+        with jax.default_matmul_precision("highest"):
+            return function(*args, **kwargs)
+
+    return traced

@@ -8,6 +8,7 @@ the iteration ends in a minimum, a shape in which a real cable would rest, never
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -25,6 +26,38 @@ _MAX_ITERATIONS = 200
 _MAX_TURN = 0.2  # largest change of a joint angle in one iteration [rad]
 _MAX_STRETCH = 0.2  # largest correction of the far end in one iteration, relative to the length
 _TOLERANCE = 1e-10
+
+
+def links_of(lengths: Any, angles: Any, heading: Any) -> tuple[Any, Any]:
+    """Direction of every link [rad], shape [n], and the vector along it [m], shape [n, 2]. NumPy or JAX arrays.
+
+    Args:
+        lengths: of the links [m], shape [n].
+        angles: of the joints between them [rad], shape [n - 1].
+        heading: direction of the first link [rad].
+    """
+    xp = angles.__array_namespace__()
+    theta = heading + xp.concatenate([xp.zeros(1, dtype=angles.dtype), xp.cumsum(angles)])
+    return theta, lengths[:, None] * xp.stack([xp.cos(theta), xp.sin(theta)], axis=-1)
+
+
+def beyond_joints(links: Any) -> Any:
+    """Vector from every joint to the far end [m], shape [n - 1, 2]: what lies beyond a joint turns about it."""
+    return links[::-1].cumsum(axis=0)[::-1][1:]
+
+
+def with_tension(hessian: Any, tension: Any, beyond: Any, later: Any) -> Any:
+    """Second derivative of the energy in the joint angles, with the force that holds the far end.
+
+    The second derivative of the far end with respect to angles i and j is minus what lies beyond the later one.
+
+    Args:
+        hessian: of the bending energy, shape [J, J].
+        tension: force on the far end, x and y first.
+        beyond: from `beyond_joints`.
+        later: index of the later one of two joints, shape [J, J].
+    """
+    return hessian + tension[0] * beyond[later, 0] + tension[1] * beyond[later, 1]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -70,19 +103,16 @@ def find_equilibrium(
         )
     error = np.full(3, np.inf)
     for _ in range(_MAX_ITERATIONS):
-        theta = pose[0, 2] + np.concatenate([[0.0], np.cumsum(angles)])
-        steps = lengths[:, None] * np.stack([np.cos(theta), np.sin(theta)], axis=1)
+        theta, steps = links_of(lengths, angles, pose[0, 2])
         tip = pose[0, :2] + steps.sum(axis=0)
-        # what lies beyond joint i turns about it
-        beyond = np.cumsum(steps[::-1], axis=0)[::-1][1:]
+        beyond = beyond_joints(steps)
         jacobian = np.stack([-beyond[:, 1], beyond[:, 0], np.ones_like(angles)])
         error = np.array([*(pose[1, :2] - tip), pose[1, 2] - theta[-1]])
         left, singular, right = np.linalg.svd(jacobian)
         inverse = singular / (singular**2 + 1e-12 * singular[0] ** 2)
         gradient = angles / h
         multiplier = left @ (inverse * (right[:3] @ gradient))
-        # second derivative of the tip with respect to angles i, j: minus what lies beyond the later one
-        hessian = np.eye(len(angles)) / h + multiplier[0] * beyond[later, 0] + multiplier[1] * beyond[later, 1]
+        hessian = with_tension(np.eye(len(angles)) / h, multiplier, beyond, later)
         shrink = min(1.0, _MAX_STRETCH * config.cable.length / max(np.abs(error).max(), 1e-300))
         correction = right[:3].T @ (inverse * (left.T @ (shrink * error)))
         null = right[3:].T
@@ -116,8 +146,7 @@ def chain_nodes(
     config: Discretisation, gripper_pose: Float[np.ndarray, "2 3"], angles: Float[np.ndarray, "J"]
 ) -> Float[np.ndarray, "J 2"]:
     """Positions of the bending joints [m] of the chain that leaves gripper 0."""
-    theta = gripper_pose[0, 2] + np.concatenate([[0.0], np.cumsum(angles)])
-    steps = link_lengths(config)[:, None] * np.stack([np.cos(theta), np.sin(theta)], axis=1)
+    _, steps = links_of(link_lengths(config), angles, gripper_pose[0, 2])
     return gripper_pose[0, :2] + np.cumsum(steps, axis=0)[:-1]
 
 

@@ -14,7 +14,7 @@ from mujoco import mjx
 
 from cablejax.cable import GRAVITY, Discretisation
 from cablejax.effects.physics import Physics
-from cablejax.simulate.compile import compiler_options
+from cablejax.simulate.compile import compiler_options, full_precision
 from cablejax.simulate.composite import build_chain, refuse_plugins
 from cablejax.simulate.engine import Engine
 from cablejax.simulate.equilibrium import equilibrium_state
@@ -50,6 +50,7 @@ class MjxEngine(Engine):
     def initial_state(self, gripper_pose, *, guess=None) -> CableState:
         return equilibrium_state(self.config, gripper_pose, guess=guess)
 
+    @full_precision
     def keypoints(self, state: CableState) -> Float[Array, "N D"]:
         """Keypoints of one cable [m]. Differentiable in `state.qpos`."""
         model = mjx.put_model(self.mj_model)
@@ -62,6 +63,7 @@ class MjxEngine(Engine):
         self.substeps(interval)
         return _compiled_rollout(self, twist.ndim - 3, float(interval))(physics, state, twist)
 
+    @full_precision
     def unroll(
         self, physics: Physics, state: CableState, twist: Float[Array, "T Q V"], interval: float = 1.0
     ) -> tuple[CableState, Trajectory]:

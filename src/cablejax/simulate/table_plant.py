@@ -1,20 +1,24 @@
 """What all plants share: a cable between two grippers, commanded and observed as a robot's would be.
 
-A plant brings its own physics (`reset`, `nodes` and what moves them); checks, clock, sampling and camera noise are
-the same for all of them and live here.
+A plant brings its own physics (`reset`, `nodes` and what moves them); checks, clock, sampling, the arms' and the
+camera's effects and camera noise are the same for all of them and live here.
 """
 
 from __future__ import annotations
 
 import abc
 import dataclasses
+from collections.abc import Sequence
 from typing import Protocol
 
 import numpy as np
 from jaxtyping import Float
 
 from cablejax.cable import Cable, Discretisation
-from cablejax.simulate.keypoints import hermite_weights
+from cablejax.effects.given import GivenEffect, with_effects
+from cablejax.effects.physics import Physics, nominal_physics
+from cablejax.simulate.arms import Arms
+from cablejax.simulate.keypoints import biased_keypoints, camera_similarity, hermite_weights
 
 TAUT = 0.999
 """Largest distance between the grippers, in lengths of the cable, before a plant refuses to pull."""
@@ -30,9 +34,10 @@ class Observation:
 
     Attributes:
         keypoints: [m], NaN = not observed, float64, shape [N, 2].
-        gripper_pose: (x, y, theta) of both grippers [m, rad], shape [Q, 3]; theta counts turns.
+        gripper_pose: executed (x, y, theta) of both grippers [m, rad], shape [Q, 3]; theta counts turns.
         time: since the last reset [s].
-        true_keypoints: where they really are [m], shape [N, 2], which only a simulation knows; else None.
+        true_keypoints: where they really are [m], shape [N, 2], which only a simulation knows; else None. These are
+            the marks on the cable, whatever a camera reports and wherever its markers are stuck.
     """
 
     keypoints: Float[np.ndarray, "N 2"]
@@ -49,6 +54,9 @@ class ObservedConfig(Protocol):
 
     @property
     def discretisation(self) -> Discretisation: ...
+
+    @property
+    def physics(self) -> Physics: ...
 
     @property
     def keypoint_noise(self) -> float: ...
@@ -71,6 +79,8 @@ class TablePlant(abc.ABC):
         self._timestep = config.discretisation.timestep
         self._weights = hermite_weights(config.discretisation)
         self._pose = np.full((2, 3), np.nan)
+        self._arms = Arms(config.physics, self._pose)
+        self._seen: list[tuple[float, Float[np.ndarray, "N 2"]]] = []  # what a late camera has yet to report
         self._random = np.random.default_rng(config.seed)
         self._steps_done: int | None = None
 
@@ -122,10 +132,14 @@ class TablePlant(abc.ABC):
                 f"{samples} samples in {interval} s do not fall on time steps of {self._timestep} s: "
                 f"choose a divisor of {steps}."
             )
-        self._check_distance(self._pose + interval * twist)
+        self._check_distance(self._arms.target(twist, interval))
+        late = self.config.physics.camera_lag > 0
         observations = []
         for _ in range(samples):
-            self._advance(twist, steps // samples)
+            for executed, count in self._arms.follow(twist, steps // samples, self._timestep, pieces=late):
+                self._advance(executed, count)
+                if late:
+                    self._look()
             observations.append(self.observe())
         return observations
 
@@ -137,14 +151,52 @@ class TablePlant(abc.ABC):
     def observe(self) -> Observation:
         """Keypoints and gripper poses now, with the configured noise and gaps (drawn anew by every call)."""
         config, random = self.config, self._random
-        nodes, tangents = self.nodes()
-        truth = (self._weights[0] @ nodes + self._weights[1] @ tangents)[:, :2]
-        keypoints = truth.copy()
+        truth = self._true_keypoints()
+        keypoints = camera_similarity(config.physics, self._look())
         if config.keypoint_noise:
             keypoints += config.keypoint_noise * random.standard_normal(keypoints.shape)
         if config.keypoint_dropout:
             keypoints[1:-1][random.random(len(keypoints) - 2) < config.keypoint_dropout] = np.nan
         return Observation(keypoints=keypoints, gripper_pose=self._pose.copy(), time=self.time, true_keypoints=truth)
+
+    def _arclength(self) -> Float[np.ndarray, " N"] | None:
+        """Where the keypoints' marks are now, the free length scaled to the cable's [m]; None = where they belong."""
+        return None
+
+    def _stretch(self) -> float:
+        """Relative change of the free length."""
+        return 0.0
+
+    def _true_keypoints(self) -> Float[np.ndarray, "N 2"]:
+        arclength = self._arclength()
+        weights = self._weights if arclength is None else hermite_weights(self.config.discretisation, arclength)
+        nodes, tangents = self.nodes()
+        return (weights[0] @ nodes + weights[1] @ ((1.0 + self._stretch()) * tangents))[:, :2]
+
+    def _look(self) -> Float[np.ndarray, "N 2"]:
+        """What the camera reports now, in the world's frame: keypoints where their markers are, with its lag."""
+        physics, now = self.config.physics, self.time
+        if np.any(physics.bias_along) or np.any(physics.bias_across):
+            arclength, (nodes, tangents) = self._arclength(), self.nodes()
+            marks = biased_keypoints(
+                self.config.discretisation,
+                physics,
+                self.config.cable.keypoint_arclength if arclength is None else arclength,
+                nodes[:, :2],
+                (1.0 + self._stretch()) * tangents[:, :2],
+            )
+        else:
+            marks = self._true_keypoints()
+        then = now - float(physics.camera_lag)
+        if then == now:
+            return marks
+        if not self._seen or self._seen[-1][0] < now:
+            self._seen.append((now, marks))
+        while len(self._seen) > 2 and self._seen[1][0] <= then:
+            del self._seen[0]
+        (begin, first), (end, second) = self._seen[0], self._seen[min(1, len(self._seen) - 1)]
+        share = np.clip((then - begin) / (end - begin), 0.0, 1.0) if end > begin else 0.0
+        return (1.0 - share) * first + share * second
 
     def _checked_start(self, gripper_pose: np.ndarray) -> np.ndarray:
         """The pose to lay a cable out at, as `reset` takes it."""
@@ -155,6 +207,7 @@ class TablePlant(abc.ABC):
     def _restart(self, pose: np.ndarray) -> None:
         """Clock, noise and grippers of a new cable."""
         self._pose, self._steps_done = pose, 0
+        self._arms, self._seen = Arms(self.config.physics, pose), []
         self._random = np.random.default_rng(self.config.seed)
 
     def _moved(self, twist: np.ndarray, steps: int, *, stable: bool) -> None:
@@ -183,6 +236,16 @@ class TablePlant(abc.ABC):
                 f"The grippers would be {distance:.4g} m apart and pull the cable of {length:.4g} m taut: keep them "
                 f"within {TAUT * length:.4g} m."
             )
+
+
+def plant_physics(discretisation: Discretisation, effects: Sequence[GivenEffect]) -> Physics:
+    """A plant's cable with its effects, float64, every joint bending in the plane.
+
+    Raises:
+        ValueError: a parameter of an effect is out of its bounds.
+    """
+    planar = dataclasses.replace(discretisation, dimension=2)
+    return with_effects(nominal_physics(planar, np.float64), effects, planar)
 
 
 def checked(name: str, value: np.ndarray) -> np.ndarray:

@@ -10,8 +10,10 @@ from collections.abc import Callable, Sequence
 import jax
 import numpy as np
 
+from cablejax.bounded import Result
+from cablejax.diagnose.belief import Calibration
 from cablejax.diagnose.diagnosis import CableDiagnosis, Gap, Ranked, Verdict
-from cablejax.report.effect_words import effect_title, listed, millimetres, share
+from cablejax.diagnose.judgement import judged, sentence
 from cablejax.spatial.clock import on_one_clock
 from cablejax.spatial.estimate import estimate
 from cablejax.spatial.gap import RESOLVABLE, gap_of, noise_of
@@ -22,12 +24,10 @@ from cablejax.spatial.where import in_log, where_of
 from cablejax.spatial.windows import WINDOW, Windows, windows_of
 from cablejax.types import GapLog
 
-# An explanation that leaves less than this share of the gap is complete.
-_COMPLETE = 0.25
-_TELLING = 0.2
+_CALIBRATION = Calibration()
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, kw_only=True)
 class SpatialDiagnosis(CableDiagnosis):
     """A diagnosis in space. Arrays of keypoints have three coordinates; held keypoints are as observed.
 
@@ -83,18 +83,19 @@ def diagnose_space(
     after = found.unseen(windows)
     noise = noise_of(windows)
     gap = gap_of(before, after, windows, noise)
-    verdict = _verdict(gap, found)
+    verdict, equivalent = _verdict(gap, found), _equivalent(found)
     effects = ()
     if verdict not in ("none", "unknown"):
         told = estimate(found, found.values, windows, progress=progress)
         effects = named_effects(found, told, cable["linear_density_kg_per_m"], windows)
+    first = [change.sentence for change in changes[:1]]
     nominal, explained = (in_log(log, windows, part) for part in (before, after))
     where = where_of(log, windows, nominal, before, noise, changes)
     return SpatialDiagnosis(
         verdict=verdict,
-        sentence=_sentence(verdict, gap, effects, changes),
+        sentence=" ".join([sentence(verdict, effects, equivalent, (), gap.shrinkage or 0.0), *first]),
         effects=effects,
-        equivalent=_equivalent(found),
+        equivalent=equivalent,
         ranking=_ranking(found),
         leftover_p=None,
         gap=gap,
@@ -116,13 +117,13 @@ def diagnose_space(
 
 
 def _verdict(gap: Gap, found: Identified) -> Verdict:
-    if gap.shrinkage is None:
-        return "none"
-    if not found.effects or gap.shrinkage < _TELLING:
-        return "unknown"
-    if gap.after_rmse_mm > max(_COMPLETE * gap.before_rmse_mm, RESOLVABLE * gap.noise_floor_mm):
-        return "named+unknown"
-    return "ambiguous" if _equivalent(found) else "named"
+    allowed = max(_CALIBRATION.adequate * gap.before_rmse_mm, RESOLVABLE * gap.noise_floor_mm)
+    return judged(
+        resolvable=gap.shrinkage is not None,
+        telling=bool(found.effects) and gap.shrinkage_ci90 is not None and gap.shrinkage_ci90[0] > 0,
+        complete=gap.after_rmse_mm <= allowed,
+        alike=bool(_equivalent(found)),
+    )
 
 
 def _equivalent(found: Identified) -> tuple[tuple[str, ...], ...]:
@@ -140,27 +141,14 @@ def _ranking(found: Identified) -> tuple[Ranked, ...]:
     for step in found.steps[1:]:
         name = step.effect.split(" ")[0]
         gain = float((before**2).mean() - (step.error**2).mean()) / float((nominal**2).mean())
-        chance = min(step.chance, 0.99) if step.accepted else min(step.chance, 0.84)
-        ranked.append(Ranked(name, chance, gain, 1e3 * float(step.error.mean())))
+        # the share of resamples in which the error falls is no probability that the effect is there
+        ranked.append(Ranked(name, None, gain, 1e3 * float(step.error.mean())))
         before = step.error if step.accepted else before
     unique: dict[str, Ranked] = {}
     for entry in ranked:
         if entry.name not in unique or entry.held_out_shrinkage > unique[entry.name].held_out_shrinkage:
             unique[entry.name] = entry
     return tuple(sorted(unique.values(), key=lambda r: -r.held_out_shrinkage))
-
-
-def _sentence(verdict, gap, effects, changes) -> str:
-    if verdict == "none":
-        text = "The simulator reproduces the recorded motion to within the noise."
-    elif not effects:
-        text = "None of the effects tried explains the gap."
-    else:
-        names = listed([effect_title(e.name) for e in effects])
-        gone = f"explain {share(gap.shrinkage)} of the squared gap on recordings no fit has seen"
-        left = f"; {millimetres(gap.after_rmse_mm)} are left without a cause." if "unknown" in verdict else "."
-        text = f"{names[0].upper()}{names[1:]} {gone}{left}"
-    return f"{text} {changes[0].sentence}" if changes else text
 
 
 def _caveats(log, windows, left_out, found) -> tuple[str, ...]:
@@ -170,6 +158,9 @@ def _caveats(log, windows, left_out, found) -> tuple[str, ...]:
         "(linear_density) cannot be seen.",
         "A camera that lags would shift keypoints and grippers alike, for both come from the same marks: camera_lag "
         "cannot be seen.",
+        "The noise is what markers scatter by from one sample to the next. A marker that sits off the cable's "
+        "centreline, or off its stated place along the cable, is off all the time; that error is not part of the "
+        "noise.",
         "Roll of the grippers about the cable is not observed; it is taken as the least turn from their mean "
         "direction.",
         "Parameters are those of a fit in which everything that was tried is free. Predictions are made with the named "
@@ -187,8 +178,14 @@ def _caveats(log, windows, left_out, found) -> tuple[str, ...]:
     if not found.time_steps.fine_enough:
         result.append(
             f"The grippers move too fast for the finest time steps of the simulation: half of them would change it by "
-            f"{millimetres(1e3 * found.time_steps.error)}. Gaps of that size may be its own."
+            f"{1e3 * found.time_steps.error:.1f} mm. Gaps of that size may be its own."
         )
+    parts = ("one half of the recordings", "the other half", "all recordings")
+    for part, ended in zip(parts, found.results, strict=False):
+        if ended not in (Result.CONVERGED, Result.STALLED):
+            result.append(
+                f"The fit to {part} had not converged when it ended ({ended.name.lower().replace('_', ' ')})."
+            )
     groups = len(np.unique(windows.group))
     if groups < 6:
         result.append(f"Only {groups} recordings: intervals over recordings are rough.")

@@ -21,7 +21,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from cablejax.cable import GRAVITY
-from cablejax.spatial.physics import RodPhysics
+from cablejax.simulate.rod import RodPhysics
 
 PROFILE_KNOTS = 5
 CURVATURE_KNOTS = 5

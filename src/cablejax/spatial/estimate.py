@@ -27,10 +27,9 @@ from cablejax.spatial.newton import improve, jackknife, prior_shifts
 from cablejax.spatial.values import Values
 from cablejax.spatial.windows import Windows
 
-_ITERATIONS = 12
-# Predictions may be off by what a time step does; values are not to make up for it. The last iterations of the fit have
-# time steps that are so much shorter. They are few: they begin near their end.
-_FINER, _MORE = 4, 3
+# Predictions may be off by what a time step does; values are not to make up for it. The fit ends with time steps that
+# are so much shorter.
+_FINER = 4
 _TAIL = 0.95
 
 Quantity = Callable[[Float[Array, "P"]], Float[Array, ""]]
@@ -142,9 +141,9 @@ def estimate(
     start = dataclasses.replace(start, shared=np.where(off, layout.starts, start.shared))
     chosen = windows.chosen(np.flatnonzero(affordable(found.simulator, windows)))
     progress(f"all effects free: {len(chosen)} windows")
-    fit = improve(found.simulator, start, found.tried, chosen, iterations=_ITERATIONS, progress=progress)
+    fit = improve(found.simulator, start, found.tried, chosen, progress=progress)
     progress(f"the same with time steps of 1/{_FINER}")
-    fit = improve(found.simulator.finer(_FINER), fit.values, found.tried, chosen, iterations=_MORE, progress=progress)
+    fit = improve(found.simulator.finer(_FINER), fit.values, found.tried, chosen, progress=progress)
     return Estimate(layout, fit.values.shared, jackknife(fit, layout), prior_shifts(fit, layout))
 
 

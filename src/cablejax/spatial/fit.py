@@ -18,8 +18,8 @@ import numpy as np
 from jaxtyping import Float
 
 from cablejax.simulate.compile import compiler_options
+from cablejax.simulate.rod import Rod
 from cablejax.spatial.effects import Layout
-from cablejax.spatial.rod import Rod
 from cablejax.spatial.values import Values, shared_by_all
 from cablejax.spatial.windows import Windows
 

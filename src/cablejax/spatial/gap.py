@@ -36,7 +36,7 @@ def mean_of_finite(values: np.ndarray, axis: tuple[int, ...] | int | None) -> np
     return np.where(count > 0, np.where(seen, values, 0.0).sum(axis=axis) / np.maximum(count, 1), np.nan)
 
 
-def errors_ahead(squared: Float[np.ndarray, "W T F 3"], interval: float) -> dict[float, float]:
+def _until(squared: Float[np.ndarray, "W T F 3"], interval: float) -> dict[float, float]:
     """Root mean square of errors up to some seconds after a window's beginning [mm], from their squares [m^2]."""
     return {s: 1e3 * float(np.sqrt(np.nanmean(squared[:, : round(s / interval)]))) for s in (1.0, 2.0, 5.0)}
 
@@ -62,7 +62,7 @@ def gap_of(
         one, other = (resampled(w, windows.group) for w in windowed)
         low, high = np.quantile(1 - other / one, [0.05, 0.95])
         interval = (float(low), float(high))
-    ahead = [errors_ahead(s, windows.interval) for s in squared]
+    ahead = [_until(s, windows.interval) for s in squared]
     floor, left = float(noise**2 / means[0]), float(means[1] / means[0])
     return Gap(
         horizon_s=float((windows.valid.sum(axis=1).max() - 1) * windows.interval),
@@ -74,5 +74,12 @@ def gap_of(
         ahead_mm=None,
         horizons_mm={seconds: (ahead[0][seconds], ahead[1][seconds]) for seconds in ahead[0]},
         held_out_episodes=tuple(sorted({int(e) for e in windows.episode})),
-        split={"noise": floor, "named": max(1 - left, 0.0), "learnable": 0.0, "unexplained": max(left - floor, 0.0)},
+        split=split_of(floor, left),
     )
+
+
+def split_of(floor: float, left: float) -> dict[str, float | None]:
+    """`Gap.split` from the shares of the squared error before that are noise and that are left, noise included."""
+    floor = min(floor, 1.0)
+    unexplained = min(max(left - floor, 0.0), 1.0 - floor)
+    return {"noise": floor, "named": 1.0 - floor - unexplained, "learnable": None, "unexplained": unexplained}

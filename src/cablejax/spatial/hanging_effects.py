@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 
 from cablejax.effects.effect import Parameter
 from cablejax.effects.material import BendingStiffness, IntrinsicCurvature, StiffnessProfile
-from cablejax.spatial.hanging import Wire, hanging_angles, hanging_points, joint_arclength
+from cablejax.simulate.hanging import Wire, hanging_angles, hanging_points, joint_arclength
 
 PROFILE_SPREAD = 0.3
 """Prior standard deviation of the logarithm of EI along a wire, which is drawn in one piece: a third."""

@@ -16,8 +16,9 @@ from collections.abc import Callable, Sequence
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
+from cablejax.bounded import BatchedGaussNewton, Linearised, Minimised
 from cablejax.diagnose.belief import Calibration
 from cablejax.spatial.hanging_effects import EFFECTS, PARAMETERS, SLICES, linearised
 
@@ -30,7 +31,10 @@ CLAMP_ANGLE = np.radians(10.0)
 """Prior standard deviation of a clamp's angle [rad]: a wire leaves a clamp as level as one can hold it."""
 
 _CENTRES = (0.2, 0.5, 0.8)
-_MOST_ITERATIONS = 25
+# Steps are limited in prior standard deviations of the effects and in radians of the clamps.
+_SOLVER = BatchedGaussNewton(
+    tolerance=1e-4, max_steps=100, largest_step=1.0, damping=1e-3, least_damping=0.0, least_raised=0.0, most_damping=1e6
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -132,6 +136,15 @@ def fit_wire(
     return fits
 
 
+@dataclasses.dataclass(frozen=True)
+class _Shapes:
+    """Where a fit stands: `z`, `clamps` and `residual` as in `WireFit`, of the photographs fitted."""
+
+    z: Float[np.ndarray, " P"]
+    clamps: Float[np.ndarray, "R 2"]
+    residual: Float[np.ndarray, "R C"]
+
+
 class _Problem:
     """Photographs with what does not depend on the explanation: guesses, and the scale of their residuals."""
 
@@ -143,8 +156,8 @@ class _Problem:
         self.count = 2 * (photographs.points.shape[1] - 2)
         everyone = np.arange(len(photographs.points))
         self.scale = np.full(len(everyone), np.sqrt(self.count) * photographs.error)
-        _, _, residual, _ = self._fit(np.zeros(len(PARAMETERS)), (), everyone)
-        gap = np.sqrt((residual**2).mean(axis=1))
+        nominal = self._fit(np.zeros(len(PARAMETERS)), (), everyone).best.kept
+        gap = np.sqrt((nominal.residual**2).mean(axis=1))
         self.scale = np.sqrt(self.count * (photographs.error**2 + (CALIBRATION.law_error * gap) ** 2))
 
     def explain(self, names: tuple[str, ...], simpler: Sequence[WireFit]) -> WireFit:
@@ -153,81 +166,71 @@ class _Problem:
         parts = [fit.z for fit in simpler if len(fit.names) == 1 and fit.names[0] in names]
         starts = _starts(names) if len(names) < 2 else parts
         starts = [*starts, np.sum(parts, axis=0)] if len(parts) > 1 else starts or _starts(names)
-        z, clamps, residual, spread = min(
-            (self._fit(start, names, everyone) for start in starts), key=lambda fit: self._cost(*fit[:3], everyone)
-        )
+        best = min((self._fit(start, names, everyone) for start in starts), key=lambda ended: ended.best.value).best
+        found = best.kept
         left_out_z, held_out = [], []
         for one in everyone:
             others = np.delete(everyone, one)
-            there = self._fit(z, names, others, clamps[others])[0]
-            foretold = self._fit(there, (), np.array([one]), clamps[[one]])[2]
+            there = self._fit(found.z, names, others, found.clamps[others]).best.kept.z
+            foretold = self._fit(there, (), np.array([one]), found.clamps[[one]]).best.kept.residual
             left_out_z.append(there)
             held_out.append(np.sqrt((foretold**2).mean()))
+        spread, free = np.zeros(len(PARAMETERS)), _free(names)
+        spread[free] = np.sqrt(np.diag(np.linalg.inv(best.curvature))[: len(free)])
         surprise = self.count * np.square(held_out) / self.scale**2
         freedom = CALIBRATION.freedom
         likelihood = -0.5 * (freedom + 1) * np.log1p(surprise / freedom).sum()
-        score = float(likelihood - CALIBRATION.term_cost * len(names) - 0.5 * (z**2).sum())
-        return WireFit(names, z, clamps, residual, np.array(held_out), np.array(left_out_z), spread, score)
+        score = float(likelihood - CALIBRATION.term_cost * len(names) - 0.5 * (found.z**2).sum())
+        return WireFit(
+            names, found.z, found.clamps, found.residual, np.array(held_out), np.array(left_out_z), spread, score
+        )
 
-    def _cost(self, z, clamps, residual, members) -> float:
-        data = ((residual / self.scale[members][:, None]) ** 2).sum()
-        return float(data + (z**2).sum() + ((clamps / CLAMP_ANGLE) ** 2).sum())
+    def _fit(self, start, names, members, clamps=None) -> Minimised[_Shapes]:
+        """Fits the parameters of the named effects, and the clamps' angles in each photograph among `members`."""
+        clamps = np.zeros((len(members), 2)) if clamps is None else clamps
+        at = self._linearised(start, clamps, names, members)
 
-    def _linearise(self, z, clamps, members):
+        def linearise(trials):
+            (point,) = trials.values()
+            z, free = start.copy(), _free(names)
+            z[free] = point[: len(free)]
+            return [self._linearised(z, point[len(free) :].reshape(-1, 2), names, members)]
+
+        return _SOLVER.minimise([at], linearise)[0]
+
+    def _linearised(self, z, clamps, names, members) -> Linearised[_Shapes]:
+        """The cost with its derivatives by the named effects' coordinates, then by the clamps of each photograph."""
         # Always as many photographs, so that one program is compiled.
         places = np.resize(members, len(self.photographs.points))
         rows = np.resize(np.arange(len(members)), len(places))
-        parts = linearised(
-            z, clamps[rows], self.photographs.points[places], self.guess[places], self.photographs.stiffness,
-            self.photographs.length,
+        residual, by_z, by_clamps = (
+            np.asarray(part)[: len(members)]
+            for part in linearised(
+                z, clamps[rows], self.photographs.points[places], self.guess[places], self.photographs.stiffness,
+                self.photographs.length,
+            )
         )  # fmt: skip
-        return [np.asarray(part)[: len(members)] for part in parts]
+        free = _free(names)
+        point = np.r_[z[free], clamps.ravel()]
+        prior = np.r_[np.ones(len(free)), np.full(clamps.size, CLAMP_ANGLE**-2)]
+        value = 0.5 * float(z @ z + prior[len(free) :] @ clamps.ravel() ** 2)
+        gradient, curvature = prior * point, np.diag(prior)
+        blocks = tuple(len(free) + 2 * k + np.arange(2) for k in range(len(members)))
+        for k, (member, block) in enumerate(zip(members, blocks, strict=True)):
+            columns, off = np.r_[: len(free), block], residual[k] / self.scale[member]
+            jacobian = np.concatenate([by_z[k][:, free], by_clamps[k]], axis=1) / self.scale[member]
+            value += 0.5 * float(off @ off)
+            gradient[columns] += jacobian.T @ off
+            curvature[np.ix_(columns, columns)] += jacobian.T @ jacobian
+        bounds = np.array([parameter.z_bounds for parameter in PARAMETERS])[free]
+        wide = np.full((clamps.size, 2), [-np.inf, np.inf])
+        lower, upper = np.concatenate([bounds, wide]).T
+        return Linearised(point, lower, upper, value, gradient, curvature, _Shapes(z, clamps, residual), blocks)
 
-    def _fit(self, start, names, members, clamps=None):
-        """Levenberg-Marquardt in the parameters of the named effects, and in the clamps' angles.
 
-        Returns:
-            Coordinates, clamp angles, residuals and posterior standard deviations of the coordinates.
-        """
-        free = (
-            np.concatenate([np.arange(len(PARAMETERS))[SLICES[name]] for name in names]) if names else np.zeros(0, int)
-        )
-        z, clamps = start.copy(), np.zeros((len(members), 2)) if clamps is None else clamps
-        residual, by_z, by_clamps = self._linearise(z, clamps, members)
-        cost, damping = self._cost(z, clamps, residual, members), 1e-3
-        size = len(free) + 2 * len(members)
-        low, high = np.array([parameter.z_bounds for parameter in PARAMETERS]).T
-        normal = np.eye(size)
-        for _ in range(_MOST_ITERATIONS):
-            normal, slope = np.zeros((size, size)), np.zeros(size)
-            for k, member in enumerate(members):
-                columns = np.r_[np.arange(len(free)), len(free) + 2 * k, len(free) + 2 * k + 1]
-                jacobian = np.concatenate([by_z[k][:, free], by_clamps[k]], axis=1) / self.scale[member]
-                normal[np.ix_(columns, columns)] += jacobian.T @ jacobian
-                slope[columns] -= jacobian.T @ residual[k] / self.scale[member]
-            prior = np.r_[np.ones(len(free)), np.full(2 * len(members), CLAMP_ANGLE**-2)]
-            normal[np.diag_indices(size)] += prior
-            slope -= prior * np.r_[z[free], clamps.ravel()]
-            better = False
-            while damping < 1e6 and not better:
-                step = np.linalg.solve(normal + damping * np.diag(np.diag(normal)), slope)
-                step *= min(1.0, 1.0 / max(abs(step).max(), 1e-12))
-                tried = z.copy()
-                tried[free] = np.clip(z[free] + step[: len(free)], low[free], high[free])
-                turned = clamps + step[len(free) :].reshape(-1, 2)
-                there = self._linearise(tried, turned, members)
-                lower = self._cost(tried, turned, there[0], members)
-                better = bool(np.isfinite(lower) and lower < cost)
-                damping *= 0.2 if better else 8.0
-            if not better:
-                break
-            gain, cost = cost - lower, lower
-            z, clamps, (residual, by_z, by_clamps) = tried, turned, there
-            if gain < 1e-5 * (1 + cost):
-                break
-        spread = np.zeros(len(PARAMETERS))
-        spread[free] = np.sqrt(np.diag(np.linalg.inv(normal))[: len(free)])
-        return z, clamps, residual, spread
+def _free(names: tuple[str, ...]) -> Int[np.ndarray, " F"]:
+    """Indices of the named effects' parameters."""
+    return np.concatenate([np.zeros(0, int), *(np.arange(len(PARAMETERS))[SLICES[name]] for name in names)])
 
 
 def _starts(names: tuple[str, ...]) -> list[np.ndarray]:

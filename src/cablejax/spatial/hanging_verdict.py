@@ -7,16 +7,24 @@ at least a half; and the gap in the photographs left out shrinks by it, with an 
 from __future__ import annotations
 
 import dataclasses
+import time
 from collections.abc import Callable, Sequence
 from typing import Any
 
+import jax
 import numpy as np
 from jaxtyping import Float
 from scipy.optimize import brentq
 from scipy.stats import norm, t
 
 from cablejax.diagnose.belief import probabilities
-from cablejax.spatial.hanging_effects import EFFECTS
+from cablejax.diagnose.diagnosis import Diagnosis, Gap, NamedEffect, ParameterEstimate, Ranked
+from cablejax.diagnose.judgement import judged, sentence
+from cablejax.diagnose.verdict_json import verdict_json
+from cablejax.diagnose.where import LEVEL, Where
+from cablejax.diagnose.where_words import describe
+from cablejax.spatial.gap import split_of
+from cablejax.spatial.hanging_effects import EFFECTS, SLICES
 from cablejax.spatial.hanging_fit import CALIBRATION, EXPLANATIONS, Photographs, WireFit, fit_wire
 
 NAMED = 0.5
@@ -25,33 +33,22 @@ NAMED = 0.5
 _INTERVAL = 0.9
 
 
-@dataclasses.dataclass(frozen=True)
-class WireDiagnosis:
-    """The verdict on one wire.
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class WireDiagnosis(Diagnosis):
+    """The findings on one wire. Its episodes are the photographs.
 
     Attributes:
-        verdict: as in the format.
         fits: of all explanations, the most probable one first.
         chances: their probabilities, shape [F].
         inclusion: the probability of each effect.
         chosen: the explanation with the named effects and no other.
-        equivalent: sets of effects that these photographs cannot tell apart.
-        before, after: root mean square gap of the photographs left out [m], of the wire as believed and as chosen.
-        floor: noise of a traced coordinate [m].
-        shrinkage: of the squared gap, with its 90 % interval.
         stiffness: EI over the believed one, with its 90 % interval, over all explanations that fit it.
     """
 
-    verdict: str
     fits: tuple[WireFit, ...]
     chances: Float[np.ndarray, " F"]
     inclusion: dict[str, float]
     chosen: WireFit
-    equivalent: tuple[tuple[str, ...], ...]
-    before: float
-    after: float
-    floor: float
-    shrinkage: tuple[float, float, float]
     stiffness: tuple[float, float, float]
 
     def fit(self, *names: str) -> WireFit:
@@ -64,38 +61,67 @@ def diagnose_wire(photographs: Photographs, progress: Callable[[str], None] = la
 
     Args:
         photographs: of the wire, at least three.
-        progress: is told how it goes.
+        progress: called with a line of text after each explanation.
     """
+    begun = time.perf_counter()
     fits = fit_wire(photographs, EXPLANATIONS, progress)
     chances = probabilities(np.array([fit.score for fit in fits]))
     order = np.argsort(-chances)
     fits, chances = [fits[k] for k in order], chances[order]
-    nominal = next(fit for fit in fits if not fit.names)
+    by_names = {frozenset(fit.names): fit for fit in fits}
+    nominal = by_names[frozenset()]
     inclusion = {
         name: float(sum(chance for fit, chance in zip(fits, chances, strict=True) if name in fit.names))
         for name in EFFECTS
     }
     floor = tracing_noise(photographs.points)
-    likely = tuple(name for name in EFFECTS if inclusion[name] >= NAMED)
-    chosen = next((fit for fit in fits if set(fit.names) == set(likely)), nominal)
+    likely = frozenset(name for name in EFFECTS if inclusion[name] >= NAMED)
+    chosen = by_names.get(likely, nominal)
     shrinkage = _shrinkage(nominal.held_out, chosen.held_out, floor)
     if not shrinkage[1] > 0:
-        chosen, shrinkage = nominal, _shrinkage(nominal.held_out, nominal.held_out, floor)
-    smallest = CALIBRATION.smallest_gap(0.0) / CALIBRATION.baseline * photographs.error
-    gap, left = _rms(nominal.held_out), _rms(chosen.held_out)
+        chosen = nominal
     equivalent = _equivalent(chosen, fits, chances)
-    if gap <= smallest:
-        verdict, chosen, equivalent = "none", nominal, ()
-    elif not chosen.names:
-        verdict = "unknown"
-    elif left > max(CALIBRATION.adequate * gap, smallest):
-        verdict = "named+unknown"
-    else:
-        verdict = "ambiguous" if equivalent else "named"
+    smallest = CALIBRATION.smallest_gap(0.0) / CALIBRATION.baseline * photographs.error
+    before, left = _rms(nominal.held_out), _rms(chosen.held_out)
+    verdict = judged(
+        resolvable=before > smallest,
+        telling=bool(chosen.names),
+        complete=left <= max(CALIBRATION.adequate * before, smallest),
+        alike=bool(equivalent),
+    )
+    if verdict == "none":
+        chosen, equivalent = nominal, ()
+    gap = _gap(nominal, chosen, floor, resolvable=verdict != "none")
+    effects = tuple(_named(chosen, name, inclusion[name], photographs.length) for name in chosen.names)
+    ranking = [
+        Ranked(
+            name,
+            inclusion[name],
+            _shrinkage(nominal.held_out, by_names[frozenset({name})].held_out, floor)[0],
+            _above(by_names[frozenset({name})].residual ** 2, floor),
+        )
+        for name in sorted(EFFECTS, key=lambda name: -inclusion[name])
+    ]
     return WireDiagnosis(
-        verdict, tuple(fits), chances, inclusion, chosen, equivalent, gap, _rms(chosen.held_out), floor, shrinkage,
-        _stiffness(fits, chances),
-    )  # fmt: skip
+        verdict=verdict,
+        sentence=sentence(verdict, effects, equivalent, ranking, gap.shrinkage or 0.0),
+        effects=effects,
+        equivalent=equivalent,
+        ranking=tuple(ranking),
+        leftover_p=None,
+        gap=gap,
+        where=_where(photographs, nominal, floor, smallest),
+        next_motion=None,
+        baselines={},
+        caveats=(),
+        seconds=time.perf_counter() - begun,
+        settings={"effects": sorted(EFFECTS), "jax": jax.__version__},
+        fits=tuple(fits),
+        chances=chances,
+        inclusion=inclusion,
+        chosen=chosen,
+        stiffness=_stiffness(fits, chances),
+    )
 
 
 def tracing_noise(points: Float[np.ndarray, "R N 2"]) -> float:
@@ -112,80 +138,79 @@ def rig_error(ends: Float[np.ndarray, "R 2"]) -> float:
     return float(np.sqrt(ends.var(axis=0, ddof=1).mean()))
 
 
-def verdict_of(diagnosis: WireDiagnosis, length: float) -> dict[str, Any]:
-    """The verdict in the format `cablejax-verdict/1`; `stiffness_ratio` and `inclusion` come on top of it."""
-    chosen, before = diagnosis.chosen, diagnosis.before
-    effects = []
-    for name in chosen.names:
-        place = None
-        values = chosen.values(name)
-        if len(values) == 3:
-            place = [max(values[0] - values[1] / 2, 0.0) * length, min(values[0] + values[1] / 2, 1.0) * length]
-        effects.append(
-            {
-                "name": name,
-                "probability": diagnosis.inclusion[name],
-                "parameters": _parameters(chosen, name, length),
-                "location": {"along_cable_m": place, "time_s": None, "table_m": None},
-            }
-        )
-    return {
-        "schema": "cablejax-verdict/1",
-        "verdict": diagnosis.verdict,
-        "effects": effects,
-        "equivalent": [list(names) for names in diagnosis.equivalent],
-        "ranking": [
-            {
-                "name": name,
-                "probability": diagnosis.inclusion[name],
-                "held_out_shrinkage": _shrinkage(
-                    diagnosis.fit().held_out, diagnosis.fit(name).held_out, diagnosis.floor
-                )[0],
-            }
-            for name in sorted(EFFECTS, key=lambda name: -diagnosis.inclusion[name])
-        ],
-        "gap": {
-            "horizon_s": 0.0,
-            "before_rmse_mm": 1e3 * before,
-            "noise_floor_mm": 1e3 * diagnosis.floor,
-            "after_rmse_mm": 1e3 * diagnosis.after,
-            "shrinkage": diagnosis.shrinkage[0],
-            "shrinkage_ci90": list(diagnosis.shrinkage[1:]),
-            "held_out_episodes": list(range(len(chosen.held_out))),
-        },
-        "where": {
-            "along_cable_mm": _along(diagnosis.fit()),
-            "per_episode_mm": (1e3 * diagnosis.fit().held_out).tolist(),
-            "regimes": {},
-        },
-        "next_motion": "mirror" if diagnosis.equivalent else None,
-        "inclusion": diagnosis.inclusion,
-        "stiffness_ratio": {"value": diagnosis.stiffness[0], "ci90": list(diagnosis.stiffness[1:])},
-    }
+def wire_verdict_json(diagnosis: WireDiagnosis) -> dict[str, Any]:
+    """The verdict in the format `cablejax-verdict/1`, with `stiffness_ratio`: EI over the believed one."""
+    value, *interval = diagnosis.stiffness
+    return {**verdict_json(diagnosis), "stiffness_ratio": {"value": value, "ci90": interval, "unit": ""}}
 
 
 def _rms(values: Float[np.ndarray, " R"]) -> float:
     return float(np.sqrt((values**2).mean()))
 
 
-def _along(fit: WireFit) -> list[float]:
-    """Root mean square gap of each traced point [mm]; the ends are given."""
-    inner = fit.residual.reshape(len(fit.residual), -1, 2)
-    return [0.0, *(1e3 * np.sqrt((inner**2).sum(axis=-1).mean(axis=0))).tolist(), 0.0]
+def _above(squares: Float[np.ndarray, "*shape"], floor: float, axis: Any = None) -> Any:
+    """Root mean square above the noise [mm] of squared errors [m^2]."""
+    return 1e3 * np.sqrt(np.maximum(squares.mean(axis=axis) - floor**2, 0.0))
 
 
-def _parameters(fit: WireFit, name: str, length: float) -> dict[str, Any]:
+def _gap(nominal: WireFit, chosen: WireFit, floor: float, *, resolvable: bool) -> Gap:
+    before, after = _rms(nominal.held_out), _rms(chosen.held_out)
+    shrinkage = _shrinkage(nominal.held_out, chosen.held_out, floor) if resolvable else None
+    return Gap(
+        horizon_s=0.0,
+        before_rmse_mm=1e3 * before,
+        after_rmse_mm=1e3 * after,
+        noise_floor_mm=1e3 * floor,
+        shrinkage=None if shrinkage is None else shrinkage[0],
+        shrinkage_ci90=None if shrinkage is None else shrinkage[1:],
+        ahead_mm=None,
+        horizons_mm={},
+        held_out_episodes=tuple(range(len(chosen.held_out))),
+        split=split_of((floor / before) ** 2, (after / before) ** 2),
+    )
+
+
+def _where(photographs: Photographs, nominal: WireFit, floor: float, smallest: float) -> Where:
+    """Sizes of the gap of the wire as believed; at the ends, which are given to the model, there is none."""
+    squares = nominal.residual.reshape(len(nominal.residual), -1, 2) ** 2
+    along = np.pad(_above(squares, floor, (0, 2)), 1)
+    held_out = nominal.held_out[:, None] ** 2
+    where = Where(
+        gap_mm=float(_above(held_out, floor)),
+        smallest_mm=1e3 * smallest,
+        along_cable_mm=along,
+        bend_per_m=None,
+        per_episode_mm=_above(held_out, floor, 1),
+        episode_p=None,
+        keypoint_p=None,
+        heat=np.pad(np.sqrt(squares.mean(axis=2)), ((0, 0), (1, 1)))[:, None] / floor,
+        horizons_mm={},
+        regimes={},
+        frames={},
+        contrasts={},
+        regime_masks={},
+        sentences=(),
+    )
+    names = [f"photograph {k + 1}" for k in range(len(squares))]
+    places = np.linspace(0.0, photographs.length, len(along))
+    return dataclasses.replace(where, sentences=describe(where, places, np.array([floor]), LEVEL, names))
+
+
+def _named(fit: WireFit, name: str, probability: float, length: float) -> NamedEffect:
     """Values with 90 % intervals: posterior and leave-one-out spread together, in the fitted coordinates."""
-    first = sum(len(EFFECTS[other]) for other in list(EFFECTS)[: list(EFFECTS).index(name)])
-    told = {}
-    for k, parameter in enumerate(EFFECTS[name], first):
+    parameters: dict[str, ParameterEstimate] = {}
+    for k, parameter in enumerate(EFFECTS[name], SLICES[name].start):
         half = _half_width(fit, k)
         unit, scale = (parameter.unit, 1.0) if parameter.name not in ("centre", "width") else ("m", length)
         z = np.asarray([fit.z[k], fit.z[k] - half, fit.z[k] + half])
         value, low, high = (scale * np.clip(parameter.value(z), parameter.low, parameter.high)).tolist()
-        label = f"{parameter.name}_m" if unit == "m" else parameter.name
-        told[label] = {"value": value, "ci90": [low, high], "unit": unit}
-    return told
+        parameters[f"{parameter.name}_m" if unit == "m" else parameter.name] = ParameterEstimate(
+            value, (low, high), unit
+        )
+    along, values = None, fit.values(name)
+    if len(values) == 3:
+        along = [max(values[0] - values[1] / 2, 0.0) * length, min(values[0] + values[1] / 2, 1.0) * length]
+    return NamedEffect(name, probability, parameters, {"along_cable_m": along, "time_s": None, "table_m": None})
 
 
 def _half_width(fit: WireFit, k: int) -> float:

@@ -9,11 +9,12 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from cablejax.bounded import Result
+from cablejax.simulate.rod import Rod
 from cablejax.spatial.effects import Layout, blocks, effect_names
 from cablejax.spatial.fit import Simulator, errors
 from cablejax.spatial.memory import Memory, fingerprint
 from cablejax.spatial.newton import improve
-from cablejax.spatial.rod import Rod
 from cablejax.spatial.search import Step, accepted_effects, falls, halves, search
 from cablejax.spatial.time_steps import TimeSteps, time_steps_for
 from cablejax.spatial.values import Values, mean_of
@@ -23,7 +24,6 @@ EDGES = 20
 _SELECTED = 24
 _TIMED = 8
 _REFITTED = 24
-_FINAL = 12
 _SHORTEST = 0.8
 _MATERIAL = "intrinsic_curvature"
 _RIVAL = "stiffness_profile"
@@ -42,6 +42,7 @@ class Identified:
         values: fitted to all windows.
         half_values: fitted to either half of the recordings.
         first: windows of the first half, shape [W].
+        results: how the fits to the two halves and to all windows ended.
     """
 
     simulator: Simulator
@@ -52,6 +53,7 @@ class Identified:
     values: Values
     half_values: tuple[Values, Values]
     first: Float[np.ndarray, "W"] | np.ndarray
+    results: tuple[Result, ...] = ()
 
     def stiffness(self, values: Values) -> float:
         """EI / rho, geometric mean along the cable, rho with the markers [m^4/s^2]."""
@@ -162,8 +164,9 @@ def identify(
         for part, begin, word in list(zip(use, begins, words, strict=True))[len(finals) :]:
             progress(f"fitting {word}: {int(part.sum())} windows")
             chosen = windows.chosen(np.flatnonzero(part))
-            fit = improve(simulator, begin, effects, chosen, iterations=_FINAL, progress=progress)
-            finals.append(fit.values)
+            fit = improve(simulator, begin, effects, chosen, progress=progress)
+            assert fit.result is not None  # it was improved
+            finals.append((fit.values, fit.result))
             memory.keep_finals(finals)
     return Identified(
         simulator=simulator,
@@ -171,9 +174,10 @@ def identify(
         effects=tuple(effects),
         tried=tuple(names),
         steps=tuple(steps),
-        values=finals[2],
-        half_values=(finals[0], finals[1]),
+        values=finals[2][0],
+        half_values=(finals[0][0], finals[1][0]),
         first=first,
+        results=tuple(result for _, result in finals),
     )
 
 
@@ -191,7 +195,7 @@ def _material(full: Simulator, windows: Windows, steps, progress) -> list[Step]:
         fits = []
         for values, part in zip(start, (first, ~first), strict=True):
             index = np.flatnonzero(part)
-            fits.append(improve(full, values.without(off), effects, windows.chosen(index), iterations=4).values)
+            fits.append(improve(full, values.without(off), effects, windows.chosen(index)).values)
         predicted = [full.predict(values, windows) for values in fits]
         error = np.where(first, errors(predicted[1], windows), errors(predicted[0], windows))
         accepted, chance = falls(base.error, error, windows.group)

@@ -12,8 +12,9 @@ from typing import Any
 
 import numpy as np
 
+from cablejax.bounded import Result
 from cablejax.json_file import read_json
-from cablejax.spatial.rod import Rod
+from cablejax.simulate.rod import Rod
 from cablejax.spatial.search import Step
 from cablejax.spatial.values import Values, from_json, to_json
 from cablejax.spatial.windows import Windows
@@ -62,11 +63,11 @@ class Memory:
             ],
         )
 
-    def finals(self) -> list[Values]:
-        return [from_json(kept) for kept in self._held.get("fitted", [])]
+    def finals(self) -> list[tuple[Values, Result]]:
+        return [(from_json(kept), Result(kept["result"])) for kept in self._held.get("fits", [])]
 
-    def keep_finals(self, finals: Sequence[Values]) -> None:
-        self._write("fitted", [to_json(values) for values in finals])
+    def keep_finals(self, finals: Sequence[tuple[Values, Result]]) -> None:
+        self._write("fits", [{**to_json(values), "result": int(result)} for values, result in finals])
 
     def _write(self, name, value):
         self._held[name] = value

@@ -27,12 +27,11 @@ def named_effects(found: Identified, estimate: Estimate, density: float, windows
         density: mass per length, with the markers, that is believed true [kg/m], for what is known per mass only.
         windows: that it was found from.
     """
-    chance = {step.effect: step.chance for step in found.steps}
     named = []
     for name in found.effects:
         parameters, along = parameters_of(name, estimate, density, first_marker=windows.held[0])
         location = {"along_cable_m": along, "time_s": None, "table_m": None}
-        named.append(NamedEffect(name, min(chance.get(name, 0.9), 0.99), parameters, location))
+        named.append(NamedEffect(name, None, parameters, location))
     return tuple(named)
 
 
@@ -79,7 +78,10 @@ def parameters_of(
     along = None
     match effect:
         case "bending_stiffness":
-            parameters = {"ratio": _told(estimate.ratio(estimate.layout.log_stiffness).wider_by_factor(besides), "")}
+            parameters = {
+                "ratio": _told(estimate.ratio(estimate.layout.log_stiffness).wider_by_factor(besides), ""),
+                "stiffness_over_density_m4_per_s2": _told(estimate.stiffness.wider_by_factor(besides), "m^4/s^2"),
+            }
         case "stiffness_profile":
             profile = part("log_profile")
             knot = int(np.abs(profile - profile.mean()).argmax())

@@ -1,11 +1,12 @@
-"""Damped Gauss-Newton on what recordings share and on what each has for its own.
+"""Fits of a rod's values: what all recordings share, and what each has for its own.
 
 With s the shared parameters, in prior standard deviations, and d_r what recording r adds to some of them,
 
-    minimise  sum_r f_r(s + d_r) + |s|^2 / 2 + sum_r |d_r / spread|^2 / 2.
+    minimise  sum_r f_r(s + d_r) + |s|^2 / 2 + sum_r |d_r / spread|^2 / 2
 
-The recordings' own values enter no other recording's cost, so each is eliminated from its recording's share of the
-normal equations (Schur complement), and what is left has the size of s however many recordings there are.
+by `bounded.BatchedGaussNewton`. The recordings' own values enter no other recording's cost: they are blocks, which
+every solution of the normal equations eliminates, so that what is left has the size of s however many recordings there
+are.
 """
 
 from __future__ import annotations
@@ -16,17 +17,21 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from jaxtyping import Bool, Float
 
+from cablejax.bounded import BatchedGaussNewton, Linearised, Result, solve_arrow
 from cablejax.spatial.effects import Layout
 from cablejax.spatial.fit import Simulator, Sums
 from cablejax.spatial.values import Values
 from cablejax.spatial.windows import Windows
 
+# Nats per window: a step that promises less is not worth the simulations that it takes.
+_TOLERANCE = 0.1
+# Steps end by the tolerance. This is for fits that creep.
+_MOST_STEPS = 40
 _LARGEST_STEP = 1.0
-_CONVERGED = 2e-3
 
 
 @dataclasses.dataclass(frozen=True)
-class Fit:
+class RodFit:
     """Fitted values.
 
     Attributes:
@@ -34,12 +39,20 @@ class Fit:
         active: which were fitted, shape [P].
         sums: at the values, over the windows of the fit and whatever else was asked for.
         group: recording of each window of the sums, shape [W].
+        result: how the fit ended; None where nothing was fitted.
     """
 
     values: Values
     active: Bool[np.ndarray, "P"]
     sums: Sums
     group: np.ndarray
+    result: Result | None = None
+
+
+def fit_at(simulator: Simulator, values: Values, effects: Sequence[str], windows: Windows) -> RodFit:
+    """The sums at given values, with nothing fitted; see `improve` for the arguments."""
+    values = values.covering(windows.group)
+    return RodFit(values, simulator.layout.active(effects), simulator.sums(values, windows), windows.group)
 
 
 def improve(
@@ -49,10 +62,9 @@ def improve(
     windows: Windows,
     *,
     use: Bool[np.ndarray, "W"] | None = None,
-    iterations: int = 4,
     progress: Callable[[str], None] = lambda text: None,
-) -> Fit:
-    """Damped Gauss-Newton on some effects' values.
+) -> RodFit:
+    """Fits some effects' values until a step promises too little. No step raises the cost.
 
     Args:
         simulator: of the cable.
@@ -60,27 +72,35 @@ def improve(
         effects: whose values are free.
         windows: of the recordings.
         use: which of them are fitted; the sums are of all. By default all.
-        iterations: steps, accepted or not.
         progress: called with a line of text after each step.
     """
     layout = simulator.layout
     active, use = layout.active(effects), np.ones(len(windows), bool) if use is None else use
-    values = values.covering(windows.group)
-    fit, damping = Fit(values, active, simulator.sums(values, windows), windows.group), 1e-3
-    best = _objective(fit, layout, use)
-    for iteration in range(iterations):
-        moved = moved_by(layout, fit.values, active, newton_step(fit, layout, use, damping=damping))
-        trial = Fit(moved, active, simulator.sums(moved, windows), windows.group)
-        cost = _objective(trial, layout, use)
-        progress(f"    step {iteration + 1}: {1e3 * trial.sums.error[use].mean():.2f} mm")
-        if cost < best:
-            done = best - cost < _CONVERGED * best
-            fit, best, damping = trial, cost, max(damping / 5, 1e-5)
-            if done:
-                break
-        else:
-            damping = max(damping * 20, 3e-2)
-    return fit
+    start = now = normal_equations(fit_at(simulator, values, effects, windows), layout, use)
+
+    def linearise(trials):
+        nonlocal now
+        (point,) = trials.values()
+        # a value that is off moves along a line, one that is on by a factor: a step is one from where the fit stands
+        moved = moved_by(layout, now.kept.values, active, move_of(now.kept, layout, active, point - now.point))
+        fit = fit_at(simulator, moved, effects, windows)
+        there = normal_equations(fit, layout, use)
+        taken = there.value < now.value
+        progress(f"    {1e3 * fit.sums.error[use].mean():.2f} mm{'' if taken else ', not taken'}")
+        now = there if taken else now
+        return [there]
+
+    solver = BatchedGaussNewton(
+        tolerance=_TOLERANCE * int(use.sum()),
+        max_steps=_MOST_STEPS,
+        largest_step=_LARGEST_STEP,
+        damping=1e-3,
+        raised=20.0,
+        least_damping=1e-5,
+        least_raised=3e-2,
+    )
+    (ended,) = solver.minimise([start], linearise)
+    return dataclasses.replace(ended.best.kept, result=ended.result)
 
 
 def coordinates(layout: Layout, values: Float[np.ndarray, "P"]) -> Float[np.ndarray, "P"]:
@@ -117,22 +137,51 @@ def moved_by(layout: Layout, values: Values, active: Bool[np.ndarray, "P"], step
     return Values(shared, values.recordings, values.own + step.own)
 
 
-def newton_step(fit: Fit, layout: Layout, use: Bool[np.ndarray, "W"], *, damping: float = 0.0, active=None) -> Move:
-    """Gauss-Newton's step of the active values, from some of the windows."""
+def normal_equations(
+    fit: RodFit, layout: Layout, use: Bool[np.ndarray, "W"], active: Bool[np.ndarray, "P"] | None = None
+) -> Linearised[RodFit]:
+    """The cost of some windows with its derivatives by the active values.
+
+    The point holds the shared values' coordinates, then each recording's own, all in prior standard deviations.
+    """
     active = fit.active if active is None else active
     a, m = np.flatnonzero(active), np.flatnonzero(active & (layout.spreads > 0))
-    gradient, curvature, kept = _eliminated(fit, layout, use, m, damping)
-    matrix = curvature[np.ix_(a, a)]
-    matrix = matrix + damping * np.diag(np.diagonal(matrix))
-    step, own_step = np.zeros(len(active)), np.zeros_like(fit.values.own)
-    step[a] = -np.linalg.solve(matrix, gradient[a])
-    for r, solved in enumerate(kept):
-        own_step[r, m] = -(solved[:, 0] + solved[:, 1:] @ step)
-    size = max(np.abs(step).max(), np.abs(own_step[:, m] / layout.spreads[m]).max(initial=0.0), 1e-12)
-    return Move(step, own_step) * min(1.0, _LARGEST_STEP / size)
+    shared, own = fit.values.shared, fit.values.own
+    columns, scale = np.r_[a, m], np.r_[slopes(layout, shared)[a], layout.spreads[m]]
+    point = np.r_[coordinates(layout, shared)[a], (own[:, m] / layout.spreads[m]).ravel()]
+    lower = np.full(len(point), -np.inf)
+    lower[: len(a)][~np.isnan(layout.starts[a]) & (shared[a] <= 0)] = 0.0
+    # all priors are standard normal in these coordinates
+    cost, gradient, curvature = 0.5 * float(point @ point), point.copy(), np.eye(len(point))
+    blocks = tuple(len(a) + len(m) * r + np.arange(len(m)) for r in range(len(own)))
+    for recording, block in zip(fit.values.recordings, blocks, strict=True):
+        part, rows = use & (fit.group == recording), np.r_[: len(a), block]
+        cost += float(fit.sums.cost[part].sum())
+        gradient[rows] += scale * fit.sums.gradient[part].sum(axis=0)[columns]
+        curved = fit.sums.curvature[part].sum(axis=0)[np.ix_(columns, columns)]
+        curvature[np.ix_(rows, rows)] += np.outer(scale, scale) * curved
+    free = np.full(len(point), np.inf)
+    return Linearised(point, lower, free, cost, gradient, curvature, fit, blocks if len(m) else ())
 
 
-def jackknife(fit: Fit, layout: Layout) -> Float[np.ndarray, "R P"]:
+def move_of(fit: RodFit, layout: Layout, active: Bool[np.ndarray, "P"], step: Float[np.ndarray, "C"]) -> Move:
+    """A step of the point of `normal_equations` as one of the values."""
+    a, m = np.flatnonzero(active), np.flatnonzero(active & (layout.spreads > 0))
+    move = Move(np.zeros(len(active)), np.zeros_like(fit.values.own))
+    move.shared[a] = step[: len(a)]
+    move.own[:, m] = step[len(a) :].reshape(len(move.own), len(m)) * layout.spreads[m]
+    return move
+
+
+def newton_step(fit: RodFit, layout: Layout, use: Bool[np.ndarray, "W"], *, damping: float = 0.0, active=None) -> Move:
+    """Gauss-Newton's step of the active values, from some of the windows."""
+    active = fit.active if active is None else active
+    at = normal_equations(fit, layout, use, active)
+    step = -solve_arrow(at.curvature + damping * np.diag(np.diagonal(at.curvature)), at.gradient, at.blocks)
+    return move_of(fit, layout, active, step * min(1.0, _LARGEST_STEP / max(np.abs(step).max(initial=0.0), 1e-12)))
+
+
+def jackknife(fit: RodFit, layout: Layout) -> Float[np.ndarray, "R P"]:
     """What leaving out each recording does to the shared values, by one Gauss-Newton step (Miller 1974).
 
     Scaled so that the standard error of anything linear in the values is the root of its sum of squares over rows.
@@ -145,43 +194,14 @@ def jackknife(fit: Fit, layout: Layout) -> Float[np.ndarray, "R P"]:
     return np.where(fit.active, np.sqrt((len(names) - 1) / len(names)) * steps, 0.0)
 
 
-def prior_shifts(fit: Fit, layout: Layout) -> Float[np.ndarray, "P P"]:
+def prior_shifts(fit: RodFit, layout: Layout) -> Float[np.ndarray, "P P"]:
     """What moving the prior of each value by its standard deviation does to the shared values, by one step.
 
-    With S the curvature of the cost in prior standard deviations, the fit is off the true values by -S^-1 times these,
-    were there no errors in the data: it is drawn towards the prior. On average over the prior the square of that, for
-    anything linear in the values, is the sum of its squares over rows.
+    With S the curvature of the cost in prior standard deviations, the recordings' own values eliminated, the fit is off
+    the true values by -S^-1 times these, were there no errors in the data: it is drawn towards the prior. On average
+    over the prior the square of that, for anything linear in the values, is the sum of its squares over rows.
     """
-    a, m = np.flatnonzero(fit.active), np.flatnonzero(fit.active & (layout.spreads > 0))
-    _, curvature, _ = _eliminated(fit, layout, np.ones(len(fit.group), bool), m, 0.0)
-    shifts = np.zeros_like(curvature)
-    shifts[np.ix_(a, a)] = np.linalg.inv(curvature[np.ix_(a, a)])
+    at, a = normal_equations(fit, layout, np.ones(len(fit.group), bool)), np.flatnonzero(fit.active)
+    shifts = np.zeros((len(fit.active), len(fit.active)))
+    shifts[np.ix_(a, a)] = solve_arrow(at.curvature, np.eye(len(at.point), len(a)), at.blocks)[: len(a)]
     return shifts * slopes(layout, fit.values.shared)
-
-
-def _eliminated(fit: Fit, layout: Layout, use, m, damping):
-    """Gradient and curvature of the cost by the shared coordinates with the recordings' own values `m` eliminated, and
-    per recording its own values' step, first without a step of the shared ones, then by each of them."""
-    slope, spread = slopes(layout, fit.values.shared), layout.spreads[m]
-    gradient, curvature = coordinates(layout, fit.values.shared), np.eye(len(slope))
-    kept = []
-    for recording, own in zip(fit.values.recordings, fit.values.own, strict=True):
-        part = use & (fit.group == recording)
-        own_gradient, own_curvature = fit.sums.gradient[part].sum(axis=0), fit.sums.curvature[part].sum(axis=0)
-        block = own_curvature[np.ix_(m, m)] + np.diag(1 / spread**2)
-        block = block + damping * np.diag(np.diagonal(block))
-        across = own_curvature[:, m] * slope[:, None]
-        pull = own_gradient[m] + own[m] / spread**2
-        solved = np.linalg.solve(block, np.column_stack([pull, across.T])) if len(m) else np.zeros((0, len(slope) + 1))
-        gradient = gradient + own_gradient * slope - across @ solved[:, 0]
-        curvature = curvature + own_curvature * np.outer(slope, slope) - across @ solved[:, 1:]
-        kept.append(solved)
-    return gradient, curvature, kept
-
-
-def _objective(fit: Fit, layout: Layout, use) -> float:
-    prior = np.sum(coordinates(layout, fit.values.shared)[fit.active] ** 2)
-    m = fit.active & (layout.spreads > 0)
-    prior += np.sum((fit.values.own[:, m] / layout.spreads[m]) ** 2)
-    cost = float(fit.sums.cost[use].sum()) + 0.5 * float(prior)
-    return cost if np.isfinite(cost) else np.inf

@@ -15,11 +15,10 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from cablejax.spatial.fit import Simulator, errors
-from cablejax.spatial.newton import Fit, improve, moved_by, newton_step
+from cablejax.spatial.newton import RodFit, fit_at, improve, moved_by, newton_step
 from cablejax.spatial.values import Values, shared_by_all
 from cablejax.spatial.windows import Windows, dealt
 
-_STEPS = 5
 _FAILURES = 2
 _LEAST = 0.01
 _CHANCE = 0.84
@@ -109,7 +108,7 @@ def search(
         starts = {effect: _starts(simulator, fits, windows, parts, [*chosen, effect]) for effect in rest}
         effect = min(starts, key=lambda name: starts[name][1])
         trial = [
-            improve(simulator, values, [*chosen, effect], windows, use=part, iterations=_STEPS)
+            improve(simulator, values, [*chosen, effect], windows, use=part)
             for values, part in zip(starts[effect][0], parts, strict=True)
         ]
         error, before = _unseen(trial, first), _last(steps).error
@@ -131,17 +130,16 @@ def _last(steps):
     return [step for step in steps if step.accepted][-1]
 
 
-def _again(simulator, windows, steps) -> list[Fit]:
-    active = simulator.layout.active(accepted_effects(steps))
-    return [Fit(v, active, simulator.sums(v, windows), windows.group) for v in _last(steps).values]
+def _again(simulator, windows, steps) -> list[RodFit]:
+    return [fit_at(simulator, values, accepted_effects(steps), windows) for values in _last(steps).values]
 
 
-def _unseen(fits: Sequence[Fit], first):
+def _unseen(fits: Sequence[RodFit], first):
     """Every window's error from the fit of the other half."""
     return np.where(first, fits[1].sums.error, fits[0].sums.error)
 
 
-def _starts(simulator: Simulator, fits: Sequence[Fit], windows: Windows, parts, effects):
+def _starts(simulator: Simulator, fits: Sequence[RodFit], windows: Windows, parts, effects):
     """Where fits with the last effect may begin, per half, and the error on what each has not seen.
 
     Tried are the step that the quadratic model promises, in parts, and the effect's templates: far from the solution

@@ -12,9 +12,9 @@ import dataclasses
 
 import numpy as np
 
+from cablejax.simulate.rod import Rod
 from cablejax.spatial.effects import Layout
 from cablejax.spatial.fit import GOOD_FIT, Simulator, bounded
-from cablejax.spatial.rod import Rod
 from cablejax.spatial.windows import Windows
 
 _FINEST = 4

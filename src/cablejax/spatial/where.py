@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Float
 
-from cablejax.diagnose.where import Where
-from cablejax.report.effect_words import millimetres
-from cablejax.spatial.gap import RESOLVABLE, errors_ahead, mean_of_finite, squares
+from cablejax.diagnose.where import HORIZONS, LEVEL, Where
+from cablejax.diagnose.where_words import describe
+from cablejax.spatial.gap import RESOLVABLE, mean_of_finite, squares
 from cablejax.spatial.geometry import LocalChange
 from cablejax.spatial.windows import Windows, labels
 from cablejax.types import GapLog
@@ -46,43 +47,45 @@ def where_of(
     """
     off = np.minimum(np.abs(np.asarray(log.keypoints, float) - nominal), 1.0)
     squared = squares(before, windows)
-    level = max(noise, 1e-6)
-    along = 1e3 * np.sqrt(np.nan_to_num(mean_of_finite(off**2, (0, 1, 3))))
+
+    def above(values, axis=None):
+        return 1e3 * np.sqrt(np.maximum(mean_of_finite(values, axis) - noise**2, 0.0))
+
     episodes = np.full(len(log.keypoints), np.nan)
     for e in np.unique(windows.episode):
-        episodes[e] = 1e3 * float(np.sqrt(mean_of_finite(off[e] ** 2, None)))
-    arclength = log.meta["keypoint_arclength_m"]
+        episodes[e] = above(off[e] ** 2)
     speed = np.linalg.norm(np.diff(windows.position, axis=1, prepend=windows.position[:, :1]), axis=-1).max(axis=2)
-    fast = (speed > np.median(speed[windows.valid]))[..., None, None] & np.isfinite(squared)
-    regimes = {
-        "speed: fast": 1e3 * float(np.sqrt(squared[fast].mean())),
-        "speed: slow": 1e3 * float(np.sqrt(squared[~fast & np.isfinite(squared)].mean())),
-    }
-    worst = int(np.nanargmax(episodes))
-    names = labels(log, "file", "take")
-    sentences = [change.sentence for change in changes]
-    sentences += [
-        f"The gap is largest at keypoint {int(along.argmax())}, {arclength[int(along.argmax())]:.2f} m along the "
-        f"cable: {millimetres(along.max())}. A cable held at both ends deviates most in its middle whatever the cause.",
-        f"The worst file is {names[worst]} with {millimetres(episodes[worst])}; the median file has "
-        f"{millimetres(np.nanmedian(episodes))}.",
-        f"While the grippers move fast the gap is {millimetres(regimes['speed: fast'])}, slowly "
-        f"{millimetres(regimes['speed: slow'])}.",
-    ]
-    missing = np.ones(len(episodes))
-    return Where(
-        gap_mm=1e3 * float(np.sqrt(np.nanmean(squared))),
-        smallest_mm=1e3 * RESOLVABLE * level,
-        along_cable_mm=along,
-        bend_per_m=np.zeros(len(along) - 2),
+    fast = (speed > np.median(speed[windows.valid]))[..., None, None]
+    where = Where(
+        gap_mm=float(above(squared)),
+        smallest_mm=1e3 * RESOLVABLE * noise,
+        along_cable_mm=np.nan_to_num(above(off**2, (0, 1, 3))),
+        bend_per_m=None,
         per_episode_mm=episodes,
-        episode_p=np.where(episodes > 1e3 * RESOLVABLE * level, 0.0, missing),
-        keypoint_p=np.where(along > 1e3 * RESOLVABLE * level, 0.0, 1.0),
-        heat=np.sqrt(mean_of_finite(off**2, -1)) / level,
-        horizons_mm=errors_ahead(squared, windows.interval),
-        regimes=regimes,
+        episode_p=None,
+        keypoint_p=None,
+        heat=np.sqrt(mean_of_finite(off**2, -1)) / max(noise, 1e-6),
+        horizons_mm=_by_time(squared, windows.interval, above),
+        regimes={
+            "speed: fast": float(above(np.where(fast, squared, np.nan))),
+            "speed: slow": float(above(np.where(fast, np.nan, squared))),
+        },
         frames={},
         contrasts={},
         regime_masks={},
-        sentences=tuple(sentences),
+        sentences=(),
     )
+    arclength, names = np.asarray(log.meta["keypoint_arclength_m"]), [f"file {n}" for n in labels(log, "file", "take")]
+    found = describe(where, arclength, np.array([noise]), LEVEL, names)
+    return dataclasses.replace(where, sentences=(*(change.sentence for change in changes), *found))
+
+
+def _by_time(squared, interval: float, above) -> dict[float, float]:
+    """Gap [mm] by seconds since a window's beginning, each from the one before on."""
+    result, before = {}, 0
+    for horizon in HORIZONS:
+        end = round(horizon / interval)
+        if before < squared.shape[1]:
+            result[horizon] = float(above(squared[:, before:end]))
+        before = end
+    return {horizon: size for horizon, size in result.items() if np.isfinite(size)}

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, Int
 from cablejax.cable import GRAVITY
 from cablejax.cable_length import require_long_enough
 from cablejax.recordings.poses import rotated
-from cablejax.spatial.clamps import frames_along
+from cablejax.simulate.rod.clamps import frames_along
 from cablejax.types import GapLog
 
 WINDOW = 5.0

@@ -27,6 +27,7 @@ from jaxtyping import Array, Float
 
 from cablejax.cable import Discretisation
 from cablejax.effects.physics import Physics, normal_gravity
+from cablejax.simulate.compile import full_precision
 from cablejax.simulate.composite import link_lengths, node_offsets
 from cablejax.simulate.grasp import solve_positive
 
@@ -39,12 +40,14 @@ _SETTLE_STEP = 0.2
 # Stiffness of a contact of one link's length [N/m]: a cable of 0.1 N presses 0.1 mm into an obstacle.
 _CONTACT_STIFFNESS = 1000.0
 _CONTACT_POINTS = 4
-# Over which the edge of a friction patch and the onset of a contact are smoothed [m].
-_PATCH_EDGE = 0.005
+# Over which the onset of a contact is smoothed [m].
 _CONTACT_EDGE = 0.0005
-_SLIP_DURATION = 0.1
-# Speed at which sliding has taken away most of the static excess [m/s].
-_STRIBECK_SPEED = 0.004
+PATCH_EDGE = 0.005
+"""Over which the edge of a friction patch is smoothed [m]."""
+SLIP_DURATION = 0.1
+"""Time scale of the sigmoid with which the cable slips through a gripper [s]."""
+STRIBECK_SPEED = 0.004
+"""Speed at which sliding has taken away most of the static excess [m/s]."""
 _REGULARISATION = 1e-7
 
 
@@ -82,6 +85,7 @@ class Chain:
     config: Discretisation
     with_contact: bool = True
 
+    @full_precision
     def rollout(
         self,
         physics: Physics,
@@ -167,10 +171,10 @@ class Chain:
         free = jnp.ones(n, dtype).at[jnp.array([0, -1])].set(0.0)
         mass = physics.density * lengths + physics.extra_mass
         where = root + nodes
-        patch = jax.nn.sigmoid((physics.patch_radius - _length(where - physics.patch_centre)) / _PATCH_EDGE)
+        patch = jax.nn.sigmoid((physics.patch_radius - _length(where - physics.patch_centre)) / PATCH_EDGE)
         coefficient = physics.friction + physics.patch_friction * patch
         squared_speed = jnp.sum(velocity**2, axis=1)
-        coefficient = coefficient * (1.0 + physics.static_excess * jnp.exp(-squared_speed / _STRIBECK_SPEED**2))
+        coefficient = coefficient * (1.0 + physics.static_excess * jnp.exp(-squared_speed / STRIBECK_SPEED**2))
         speed = jnp.sqrt(squared_speed + self.config.friction_speed**2)
         drag = free * (coefficient * mass * normal_gravity(physics) / speed + physics.drag * h)
         push, contact = self._contact(physics, where, h * along)
@@ -239,7 +243,7 @@ class Chain:
                 jnp.append(none, 1.0),
             ]
         )
-        slipped = jnp.sum(physics.slip) * jax.nn.sigmoid((time - physics.slip_time) / _SLIP_DURATION)
+        slipped = jnp.sum(physics.slip) * jax.nn.sigmoid((time - physics.slip_time) / SLIP_DURATION)
         wanted = (
             jnp.stack(
                 [
@@ -331,7 +335,7 @@ class Chain:
         lengths, offsets = (jnp.asarray(f(config), dtype) for f in (link_lengths, node_offsets))
         nodes = root + _chained(lengths[:, None] * along) + offsets[:, None] * along
         # Keypoints are marks on the cable: where it slips through a gripper, they move away from that gripper.
-        slipped = physics.slip * jax.nn.sigmoid((time - physics.slip_time) / _SLIP_DURATION)
+        slipped = physics.slip * jax.nn.sigmoid((time - physics.slip_time) / SLIP_DURATION)
         marks = jnp.asarray(config.cable.keypoint_arclength, dtype) + physics.bias_along
         inner = (marks + slipped[0]) / (config.cable.length + jnp.sum(slipped))
         ends = np.zeros(config.cable.n_keypoints, bool)

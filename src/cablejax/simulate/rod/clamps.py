@@ -6,8 +6,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from cablejax.spatial.material import unit
-from cablejax.spatial.physics import RodPhysics
+from cablejax.simulate.rod.material import unit
+from cablejax.simulate.rod.physics import RodPhysics
 
 
 def frames_along(tangent: Float[np.ndarray, "*B 3"]) -> Float[np.ndarray, "*B 3 3"]:

@@ -25,11 +25,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from cablejax.spatial.clamps import held_nodes
-from cablejax.spatial.constrained import Chain, bends_of, constrained, spread_bends, with_held
-from cablejax.spatial.interpolation import along_joints, between_samples, cubic_weights
-from cablejax.spatial.material import joint_frames, transport, turned, twist, twist_matrix, unit
-from cablejax.spatial.physics import RodPhysics
+from cablejax.simulate.rod.clamps import held_nodes
+from cablejax.simulate.rod.constrained import Chain, bends_of, constrained, spread_bends, with_held
+from cablejax.simulate.rod.interpolation import along_joints, between_samples, cubic_weights
+from cablejax.simulate.rod.material import joint_frames, transport, turned, twist, twist_matrix, unit
+from cablejax.simulate.rod.physics import RodPhysics
 
 # With two iterations a step may end off the solution and blow up, where a cable swings fast at a sharply turned clamp.
 _NEWTON = 3

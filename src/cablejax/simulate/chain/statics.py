@@ -1,4 +1,4 @@
-"""What statics expects of the cable: the shape that the network corrects.
+"""Computes the resting shapes of a cable at two pairs of gripper poses, compiled: what the network corrects.
 
 Without friction, a uniform inextensible cable clamped at both ends rests in a shape that depends on nothing but the
 gripper poses and the branch it is on (up or down, S or mirrored S): not on its stiffness, not on its weight. This file
@@ -20,6 +20,7 @@ from scipy.interpolate import CubicSpline
 
 from cablejax.cable import Cable, Discretisation
 from cablejax.simulate.composite import link_lengths, node_offsets
+from cablejax.simulate.equilibrium import beyond_joints, links_of, with_tension
 from cablejax.simulate.keypoints import hermite_weights
 
 LINKS = 25
@@ -41,7 +42,7 @@ MAX_TURN = 0.2
 _SMALL = 1e-6
 
 
-class Chain(NamedTuple):
+class ChainMatrices(NamedTuple):
     """Constant matrices of one cable, NumPy or JAX arrays; n = LINKS, N keypoints, J = n - 1 joints."""
 
     tangents_of_keypoints: Any  # [n, N], with the next: tangents at the nodes of the clamped cubic spline
@@ -54,7 +55,7 @@ class Chain(NamedTuple):
 
 
 @functools.lru_cache(maxsize=32)
-def chain(n_keypoints: int, length: float) -> Chain:
+def chain(n_keypoints: int, length: float) -> ChainMatrices:
     """The matrices for a cable of given keypoints and length [m]. Not to be modified: cached."""
     config = Discretisation(Cable(length=length, n_keypoints=n_keypoints, diameter=1e-3 * length), n_links=LINKS)
     nodes = np.linspace(0.0, length, LINKS)
@@ -67,7 +68,7 @@ def chain(n_keypoints: int, length: float) -> Chain:
     of_ends = np.stack([derivative(zero, 1.0, 0.0), derivative(zero, 0.0, 1.0)], axis=1)
     # int32 whether or not JAX is in 64-bit mode
     joints = np.arange(LINKS - 1, dtype=np.int32)
-    return Chain(
+    return ChainMatrices(
         of_keypoints,
         of_ends,
         *hermite_weights(config),
@@ -91,7 +92,7 @@ def resting_shapes(
         length: free length of the cable [m].
     """
     constants = chain(len(keypoints), length)
-    matrices = Chain(*(jnp.asarray(m, keypoints.dtype) for m in constants[:-1]), later=constants.later)
+    matrices = ChainMatrices(*(jnp.asarray(m, keypoints.dtype) for m in constants[:-1]), later=constants.later)
     angles = _observed_angles(matrices, keypoints, before)
     turn = jnp.sum(angles)
     for _ in range(SETTLING_STEPS):
@@ -103,7 +104,7 @@ def resting_shapes(
     return resting, _chain_keypoints(matrices, angles, after)
 
 
-def _observed_angles(matrices: Chain, keypoints: Array, pose: Array) -> Float[Array, "J"]:
+def _observed_angles(matrices: ChainMatrices, keypoints: Array, pose: Array) -> Float[Array, "J"]:
     """Joint angles [rad] of the chain along the cubic spline through the keypoints, clamped in the grippers."""
     heading = jnp.stack([jnp.cos(pose[:, 2]), jnp.sin(pose[:, 2])], axis=-1)
     tangent = matrices.tangents_of_keypoints @ keypoints + matrices.tangents_of_ends @ heading
@@ -111,13 +112,12 @@ def _observed_angles(matrices: Chain, keypoints: Array, pose: Array) -> Float[Ar
     return jnp.arctan2(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0], jnp.sum(a * b, axis=-1))
 
 
-def _newton_step(matrices: Chain, angles: Array, pose: Array, turn: Array, length: float) -> Float[Array, "J"]:
+def _newton_step(matrices: ChainMatrices, angles: Array, pose: Array, turn: Array, length: float) -> Float[Array, "J"]:
     """One step on `min sum angles^2 / 2h` with the far end at gripper 1's position and the angles' sum equal `turn`."""
     joints = len(angles)
     h = length / joints
-    _, links = _links(matrices, angles, pose)
-    # what lies beyond joint i turns about it
-    beyond = jnp.cumsum(links[::-1], axis=0)[::-1][1:]
+    _, links = links_of(matrices.link_lengths, angles, pose[0, 2])
+    beyond = beyond_joints(links)
     jacobian = jnp.stack([-beyond[:, 1], beyond[:, 0], jnp.full(joints, length, angles.dtype)])
     gap = pose[1, :2] - (pose[0, :2] + jnp.sum(links, axis=0))
     error = jnp.concatenate([gap, (turn - jnp.sum(angles))[None] * length])
@@ -125,24 +125,17 @@ def _newton_step(matrices: Chain, angles: Array, pose: Array, turn: Array, lengt
     # relative regularisation: the constraints of a straight cable are dependent
     normal = normal + _SMALL * jnp.trace(normal) * jnp.eye(3, dtype=angles.dtype)
     tension = jnp.linalg.solve(normal, jacobian @ angles) / h
-    later = matrices.later
     hessian = (1 / h + DAMPING / length) * jnp.eye(joints, dtype=angles.dtype)
-    hessian = hessian + tension[0] * beyond[later, 0] + tension[1] * beyond[later, 1]
+    hessian = with_tension(hessian, tension, beyond, matrices.later)
     system = jnp.block([[hessian, -jacobian.T], [-jacobian, -_SMALL * jnp.eye(3, dtype=angles.dtype)]])
     step = jnp.linalg.solve(system, jnp.concatenate([jacobian.T @ tension - angles / h, -error]))[:joints]
     largest = jnp.sqrt(jnp.max(step**2) + 1e-20)
     return angles + step * jnp.minimum(1.0, MAX_TURN / largest)
 
 
-def _links(matrices: Chain, angles: Array, pose: Array) -> tuple[Float[Array, "n"], Float[Array, "n 2"]]:
-    """Direction [rad] of every link and the vector along it [m]."""
-    theta = pose[0, 2] + jnp.concatenate([jnp.zeros(1, angles.dtype), jnp.cumsum(angles)])
-    return theta, matrices.link_lengths[:, None] * jnp.stack([jnp.cos(theta), jnp.sin(theta)], axis=-1)
-
-
-def _chain_keypoints(matrices: Chain, angles: Array, pose: Array) -> Float[Array, "N 2"]:
+def _chain_keypoints(matrices: ChainMatrices, angles: Array, pose: Array) -> Float[Array, "N 2"]:
     """Keypoints of the chain that leaves gripper 0 with these joint angles."""
-    theta, links = _links(matrices, angles, pose)
+    theta, links = links_of(matrices.link_lengths, angles, pose[0, 2])
     tangents = jnp.stack([jnp.cos(theta), jnp.sin(theta)], axis=-1)
     origins = pose[0, :2] + jnp.cumsum(jnp.concatenate([jnp.zeros((1, 2), angles.dtype), links[:-1]]), axis=0)
     nodes = origins + matrices.node_offsets[:, None] * tangents

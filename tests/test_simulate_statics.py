@@ -8,7 +8,7 @@ import pytest
 from cablejax.cable import Discretisation
 from cablejax.dynamics.config import ModelConfig
 from cablejax.dynamics.graph import prior_of
-from cablejax.dynamics.statics import resting_shapes
+from cablejax.simulate.chain.statics import resting_shapes
 from cablejax.simulate.composite import link_lengths, node_offsets
 from cablejax.simulate.equilibrium import arch_angles, find_equilibrium
 from cablejax.simulate.keypoints import hermite_weights

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from cablejax.spatial.physics import RodPhysics
+from cablejax.simulate.rod.physics import RodPhysics
 
 
 def unit(x: Float[Array, "*B 3"]) -> Float[Array, "*B 3"]:

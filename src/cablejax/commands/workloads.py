@@ -1,0 +1,123 @@
+"""The workloads that `cablejax bench` and `benchmarks/` time, and the clock they share."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import time
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from cablejax.cable import Discretisation
+from cablejax.commands.options import say
+from cablejax.control.batched import BatchRun, LoopConfig, shape_batch, varied_params
+from cablejax.control.shaping import Model, make_controller
+from cablejax.control.targets import make_target, straight_start
+from cablejax.effects.physics import Physics, nominal_physics
+from cablejax.mpc import MPC, MPCConfig
+from cablejax.report.provenance import machine
+from cablejax.simulate import MjxEngine
+from cablejax.simulate.equilibrium import equilibrium_state
+from cablejax.solver_names import SolverName
+from cablejax.types import CableState, History, Measurement
+
+ARCH = np.array([[0.0, 0.0, 0.6], [0.8, 0.0, -0.6]])
+"""Gripper poses that bend the cable into an arch, shape [Q, 3]."""
+
+
+def seconds_in_turns(
+    contestants: Mapping[str, Callable[[], Any]], rounds: int, *, least: float = 0.0, most: float = np.inf
+) -> dict[str, list[float]]:
+    """Wall times [s] of every round, after one call each that does not count.
+
+    The contestants take turns, so that a busy moment of the machine hits all of them alike.
+
+    Args:
+        contestants: functions that return once their work is done.
+        rounds: how often each takes its turn.
+        least: further rounds follow until all together have taken so long [s].
+        most: no further round begins once all together have taken so long [s].
+    """
+    seconds: dict[str, list[float]] = {name: [] for name in contestants}
+    for run in contestants.values():
+        run()  # caches, and what is compiled on first use
+    done, spent = 0, 0.0
+    while (done < rounds or spent < least) and (done == 0 or spent < most):
+        for name, run in contestants.items():
+            begin = time.perf_counter()
+            run()
+            seconds[name].append(time.perf_counter() - begin)
+            spent += seconds[name][-1]
+        done += 1
+        if done <= rounds:
+            say(f"round {done} of {rounds}")
+    return seconds
+
+
+def setting() -> dict[str, str]:
+    """The device and the processor that a measurement depends on."""
+    return {"device": jax.devices()[0].device_kind, "machine": machine()}
+
+
+def program_bytes(compiled: Any) -> int:
+    """Memory [bytes] of a compiled program: its arguments, its results and what it needs in between."""
+    memory = compiled.memory_analysis()
+    return memory.temp_size_in_bytes + memory.argument_size_in_bytes + memory.output_size_in_bytes
+
+
+def moving_arches(
+    config: Discretisation, batch: int, commands: int, seed: int = 0
+) -> tuple[Physics, CableState, Float[Array, "B T Q 3"]]:
+    """Arguments of a batched rollout: arches moved slowly, so that table, bending and grasps are all at work."""
+    twist = np.random.default_rng(seed).uniform(-0.01, 0.01, (batch, commands, 2, 3))
+    params, states = repeated((nominal_physics(config), equilibrium_state(config, ARCH)), batch)
+    return params, states, jnp.asarray(twist, float)
+
+
+def repeated(tree: Any, size: int) -> Any:
+    """Every leaf `size` times along a new first axis."""
+    return jax.tree.map(lambda leaf: jnp.broadcast_to(jnp.asarray(leaf), (size, *jnp.shape(leaf))), tree)
+
+
+def controller_to_s(model: Model, solver: SolverName, horizon: int = MPCConfig.horizon) -> MPC:
+    """The controller with the online residual on the way to an S, with one of the solvers at its defaults."""
+    controller = make_controller(model, make_target("S"), method="residual", solver=solver)
+    return dataclasses.replace(controller, config=dataclasses.replace(controller.config, horizon=horizon))
+
+
+def batched_control(controller: MPC, history: History, size: int) -> tuple[Callable[[], None], int]:
+    """A function that controls `size` cables for one step at each call, compiled, and its memory [bytes]."""
+    measurement = Measurement(history.keypoints[-1], history.gripper_pose)
+    arguments = repeated((controller.init(history), measurement), size)
+    step = jax.jit(jax.vmap(controller.step)).lower(*arguments).compile()
+
+    def call() -> None:
+        nonlocal arguments
+        state, twist, _ = jax.block_until_ready(step(*arguments))
+        pose = arguments[1].gripper_pose + controller.config.objective.interval * twist
+        arguments = state, Measurement(state.last.predicted, pose)
+
+    return call, program_bytes(step)
+
+
+def closed_loop(controller: MPC, history_length: int, steps: int, chain: Discretisation) -> Callable[[int], BatchRun]:
+    """A function that shapes a number of straight cables, half to twice as stiff as nominal, for `steps` commands."""
+    config = LoopConfig(steps, interval=controller.config.objective.interval, history_length=history_length)
+    engine = MjxEngine(chain)
+
+    @functools.lru_cache
+    def inputs(size: int):
+        state = repeated(engine.initial_state(straight_start(chain.cable)), size)
+        return varied_params(chain, np.linspace(0.5, 2.0, size)), state, np.stack([controller.target] * size)
+
+    def run(size: int) -> BatchRun:
+        params, state, goals = inputs(size)
+        batch = shape_batch(engine, params, state, controller, goals, config)
+        return jax.block_until_ready(batch)
+
+    return run

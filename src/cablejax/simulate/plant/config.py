@@ -1,0 +1,74 @@
+"""Configuration of the contact plant: the cable, the effects that act on it, and the table's contacts."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from typing import get_args
+
+import numpy as np
+
+from cablejax.cable import Cable, Discretisation
+from cablejax.effects import Hook
+from cablejax.effects.given import GivenEffect, check_hooks
+from cablejax.effects.physics import Physics
+from cablejax.simulate.table_plant import check_camera, plant_physics
+
+HOOKS: frozenset[Hook] = frozenset(get_args(Hook))
+"""Hooks of the effects that the contact plant can stage."""
+
+
+@dataclasses.dataclass(frozen=True)
+class PlantConfig:
+    """What the plant is made of; the defaults are the reference cable, finer than the trained one.
+
+    Attributes:
+        discretisation: the cable as it is believed to be, its links and time step. `friction_speed` has no meaning
+            here and `dimension` must be 3.
+        effects: what the plant does beyond that cable, in this order.
+        cone_ratio: MuJoCo's `impratio`: how much harder the friction cone's tangent is than its normal direction; it
+            sets how slowly a cable at rest creeps.
+        contact_time: time constant of the table's contacts [s].
+        keypoint_noise: standard deviation of the observed keypoints [m] per coordinate, the held ends included.
+        keypoint_dropout: probability with which a keypoint is not observed (NaN), except the first and last, which the
+            grippers hold.
+        settle_time: simulated time [s] given to a new cable to settle: without friction, with it, and once more after
+            the grippers have come down to the height at which it lies.
+        seed: of noise and gaps.
+
+    Raises:
+        ValueError: a number is out of range, or an effect cannot be staged; the message names it.
+    """
+
+    discretisation: Discretisation = Discretisation(n_links=40, dimension=3, timestep=0.005)
+    effects: tuple[GivenEffect, ...] = ()
+    cone_ratio: float = 100.0
+    contact_time: float = 0.01
+    keypoint_noise: float = 0.0
+    keypoint_dropout: float = 0.0
+    settle_time: float = 0.5
+    seed: int = 0
+
+    @property
+    def cable(self) -> Cable:
+        """The cable without the effects."""
+        return self.discretisation.cable
+
+    @functools.cached_property
+    def physics(self) -> Physics:
+        """The cable with the effects, float64, each joint bending in the plane."""
+        return plant_physics(self.discretisation, self.effects)
+
+    def __post_init__(self):
+        if self.discretisation.dimension != 3:
+            raise ValueError(
+                f"PlantConfig.discretisation.dimension is {self.discretisation.dimension}, expected 3, the plant's."
+            )
+        for name in ("cone_ratio", "contact_time", "settle_time"):
+            value = getattr(self, name)
+            if not (np.isfinite(value) and value > 0):
+                raise ValueError(f"PlantConfig.{name} is {value}, expected a positive finite number.")
+        check_camera(self)
+        object.__setattr__(self, "effects", tuple(self.effects))
+        check_hooks(self.effects, HOOKS, "Plant", {})
+        _ = self.physics  # its errors name the effect and the parameter

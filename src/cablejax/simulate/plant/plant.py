@@ -1,0 +1,144 @@
+"""The cable in C MuJoCo between two grippers, on its table, with the calls of every plant."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+from jaxtyping import Float
+
+from cablejax.simulate.composite import node_offsets
+from cablejax.simulate.elastica import solve_elastica
+from cablejax.simulate.plant.config import PlantConfig
+from cablejax.simulate.plant.extension import Extension
+from cablejax.simulate.plant.friction import TableFriction
+from cablejax.simulate.plant.memory import Memory
+from cablejax.simulate.plant.model import FRICTIONLESS, bending_joints, extensible, plant_model, quaternions
+from cablejax.simulate.table_plant import Observation, TablePlant
+
+RESTING = 2e-4
+"""Motion within `settle_time` below which a cable has settled [m]."""
+LONGEST_SETTLING = 20
+"""How often `settle_time` passes before a cable that keeps moving counts as settled."""
+NO_YIELD = 1e3
+"""Curvature that no cable yields at [1/m]: the null value of `Physics.yield_curvature`."""
+
+
+class Plant(TablePlant):
+    """The cable in C MuJoCo, with the calls of every `TablePlant`."""
+
+    config: PlantConfig
+
+    def __init__(self, config: PlantConfig | None = None):
+        super().__init__(PlantConfig() if config is None else config)
+        self.model = plant_model(self.config)
+        self._data = mujoco.MjData(self.model)
+        names = (self.model.body(i).name for i in range(self.model.nbody))
+        self._links = np.array([i for i, name in enumerate(names) if name.startswith("cable")])
+        self._offsets = node_offsets(self.config.discretisation)[:, None]
+        self._balls = self.model.jnt_qposadr[bending_joints(self.model)][:, None] + np.arange(4)
+        self._height = np.nan
+        # The mocap bodies coincide with the frames of what they hold: the last link begins before the grasped end.
+        physics, h = self.config.physics, self.config.discretisation.link_length
+        self._inset = 0.0 if physics.rotation_compliance[1] > 0 else 0.5 * h
+        remembers = physics.hysteresis_moment > 0 or physics.yield_curvature < NO_YIELD
+        uneven = physics.patch_friction or physics.static_excess
+        self._memory = Memory(self.model, self._data, self.config) if remembers else None
+        self._friction = TableFriction(self.model, self._data, self._links, self.config) if uneven else None
+        self._extension = Extension(self.model, self._data, self.config) if extensible(physics) else None
+        self._acting = False
+
+    def reset(
+        self, gripper_pose: Float[np.ndarray, "Q 3"], *, guess: Float[np.ndarray, "S 2"] | None = None
+    ) -> Observation:
+        """See `TablePlant.reset`."""
+        pose = self._checked_start(gripper_pose)
+        cable, data, physics = self.config.cable, self._data, self.config.physics
+        held = pose + np.array([[0.0, 0.0, offset] for offset in physics.rotation_offset])
+        # A chain's links follow the elastica's chords; only the held ones have the exact direction of the grippers.
+        shape = solve_elastica(held, cable.length, guess=guess, n_samples=2 * self.config.discretisation.n_joints + 1)
+        vertices = np.concatenate([shape.position[:1], shape.position[1:-1:2], shape.position[-1:]])
+        chords = np.diff(vertices, axis=0)
+        angles = np.unwrap(np.arctan2(chords[:, 1], chords[:, 0]))
+        angles[[0, -1]] = held[:, 2]
+        mujoco.mj_resetData(self.model, data)
+        data.qpos[:2], data.qpos[2] = pose[0, :2], cable.diameter / 2
+        turns = quaternions(np.diff(angles, prepend=0.0))
+        data.qpos[3:7], data.qpos[self._balls] = turns[0], turns[1:]
+        self._height = cable.diameter / 2
+        self._restart(pose)
+        self._forget()
+        still, settle = np.zeros((2, 3)), self._steps(self.config.settle_time)
+        self._set_friction(0.0)
+        self._settle(still, settle)
+        self._set_friction(float(physics.friction))
+        self._advance(still, settle)
+        # Contacts yield a little. Held at the height at which the rest lies, the ends lift no weight off the table.
+        self._height = float(np.median(self.nodes()[0][1:-1, 2]))
+        self._advance(still, settle)
+        self._steps_done = 0
+        self._acting = True
+        return self.observe()
+
+    def _settle(self, still: np.ndarray, steps: int) -> None:
+        """To rest, without friction. Effects may bend the cable into another shape, which takes longer."""
+        for _ in range(LONGEST_SETTLING if self.config.effects else 1):
+            before = self.nodes()[0]
+            self._advance(still, steps)
+            if np.abs(self.nodes()[0] - before).max() < RESTING:
+                break
+
+    def _forget(self) -> None:
+        """What the last cable left behind: set bends, slipped length. None of these acts until the new one rests."""
+        self._acting = False
+        if self._memory is not None:
+            self._memory.reset()
+        if self._extension is not None:
+            self._extension.update(-np.inf)
+
+    def _act(self, time: float) -> None:
+        """Effects that change with time, place, speed or bending, for the step that ends at `time`."""
+        if self._memory is not None:
+            self._memory.update()
+        if self._friction is not None:
+            self._friction.update()
+        if self._extension is not None:
+            self._extension.update(time)
+
+    def _arclength(self) -> Float[np.ndarray, " N"] | None:
+        return None if self._extension is None or not self._acting else self._extension.arclength(self.time)
+
+    def _stretch(self) -> float:
+        return 0.0 if self._extension is None else self._extension.stretch()
+
+    def nodes(self) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
+        """Middle of every link, for the two held links the grasped end [m], and the links' unit directions."""
+        data = self._data
+        directions = data.xmat[self._links].reshape(-1, 3, 3)[:, :, 0]
+        return data.xpos[self._links] + self._offsets * directions, directions.copy()
+
+    def _advance(self, twist: np.ndarray, steps: int) -> None:
+        """`steps` time steps under one twist; the mocap bodies lead to the pose at the end of each."""
+        model, data, dt = self.model, self._data, self.config.discretisation.timestep
+        start, time = self._pose, self.time
+        for step in range(1, steps + 1):
+            self._place_grippers(start + (step * dt) * twist)
+            if self._acting:
+                self._act(time + step * dt)
+            mujoco.mj_step(model, data)
+        mujoco.mj_kinematics(model, data)
+        unstable = data.warning[mujoco.mjtWarning.mjWARN_BADQACC].number or not np.isfinite(data.qpos).all()
+        self._moved(twist, steps, stable=not unstable)
+
+    def _set_friction(self, coefficient: float) -> None:
+        """Of all links: they have priority over the table that they touch."""
+        self.model.geom_friction[self.model.body_geomadr[self._links], 0] = max(coefficient, FRICTIONLESS)
+
+    def _place_grippers(self, pose: np.ndarray) -> None:
+        """Mocap bodies at the frames of what they hold: position of the grippers, angle of the grasps."""
+        data = self._data
+        angles = pose[:, 2] + self.config.physics.rotation_offset
+        heading = np.array([np.cos(angles[1]), np.sin(angles[1])])
+        data.mocap_pos[:, :2] = pose[:, :2]
+        data.mocap_pos[1, :2] -= self._inset * heading
+        data.mocap_pos[:, 2] = self._height
+        data.mocap_quat[:] = quaternions(angles)
