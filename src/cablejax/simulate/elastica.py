@@ -174,7 +174,7 @@ def _continue(ends):
 
 
 def _follow(start, ends, solution):
-    """The solution for `ends` that grows out of one for `start`, in steps that halve where the solver fails, or None."""
+    """The solution for `ends` that grows out of one for `start`, or None. Steps halve where the solver fails."""
     done, step = 0.0, 0.25
     while done < 1.0:
         fraction = min(1.0, done + step)
