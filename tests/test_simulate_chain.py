@@ -291,7 +291,8 @@ def test_derivatives_in_every_hook(programs, start):
                 direction = jnp.ones_like(leaf) * jnp.where(leaf == 0, 0.01, leaf)
                 change = (dataclasses.replace(nothing[0], **{name: direction}), nothing[1])
                 exact = push(physics, state, twist, change)
-                size = 1e-5
+                # near rest, motion is linear only below the friction's regularisation speed
+                size = 1e-5 if start == "moving" else 3e-6
 
                 def shifted(s, name=name, direction=direction):
                     moved = dataclasses.replace(physics, **{name: getattr(physics, name) + s * direction})
