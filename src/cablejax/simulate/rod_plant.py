@@ -26,7 +26,6 @@ The rod lies in the table's plane. Its end elements are held rigidly and are hal
 from __future__ import annotations
 
 import dataclasses
-import functools
 
 import numpy as np
 from jaxtyping import Float
@@ -81,7 +80,7 @@ class RodPlantConfig:
         """The cable without the effects."""
         return self.discretisation.cable
 
-    @functools.cached_property
+    @property
     def physics(self) -> Physics:
         """The cable with the effects, float64."""
         return plant_physics(self.discretisation, self.effects)

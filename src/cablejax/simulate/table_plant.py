@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import abc
 import dataclasses
-from collections.abc import Sequence
+import functools
 from typing import Protocol
 
 import numpy as np
@@ -243,8 +243,9 @@ class TablePlant(abc.ABC):
             )
 
 
-def plant_physics(discretisation: Discretisation, effects: Sequence[GivenEffect]) -> Physics:
-    """A plant's cable with its effects, float64, every joint bending in the plane.
+@functools.lru_cache(maxsize=32)
+def plant_physics(discretisation: Discretisation, effects: tuple[GivenEffect, ...]) -> Physics:
+    """A plant's cable with its effects, float64, every joint bending in the plane. Not to be modified: cached.
 
     Raises:
         ValueError: a parameter of an effect is out of its bounds.

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
 from typing import get_args
 
 import numpy as np
@@ -54,7 +53,7 @@ class PlantConfig:
         """The cable without the effects."""
         return self.discretisation.cable
 
-    @functools.cached_property
+    @property
     def physics(self) -> Physics:
         """The cable with the effects, float64, each joint bending in the plane."""
         return plant_physics(self.discretisation, self.effects)
