@@ -1,7 +1,7 @@
-"""Is what the diagnosis names what has to be added? Every effect staged in the contact plant, named, and added to the data.
+"""Every effect staged in the contact plant, named by the diagnosis, and added to the engine that makes training data.
 
-    python experiments/24_named_is_added.py --rows runs/named/rows.jsonl       # a minute or two per effect; resumable
-    python experiments/24_named_is_added.py --rows docs/results/named_is_added.jsonl --report docs/results/named_is_added.md
+    python experiments/24_named_is_added.py --rows ROWS.jsonl    # a minute or two per effect; resumable
+    python experiments/24_named_is_added.py --rows ROWS.jsonl --report PAGE.md
 
 For each of the 22 effects the plant executes nine motions. Six of them are the log that is diagnosed (1 mm noise); the
 other three are held out, without noise. The effects of `verdict.json` are then added to the engine that makes training
