@@ -63,7 +63,7 @@ def camera_similarity(physics: Physics, keypoints: Float[np.ndarray, "N 2"]) -> 
     """Keypoints scaled and turned about the world's origin, then moved, as the camera reports them [m]."""
     cosine, sine = np.cos(physics.camera_angle), np.sin(physics.camera_angle)
     turned = keypoints @ np.array([[cosine, sine], [-sine, cosine]])
-    return physics.camera_scale * turned + np.asarray(physics.camera_offset)
+    return np.asarray(physics.camera_scale) * turned + np.asarray(physics.camera_offset)
 
 
 def _segments(config: Discretisation, arclength: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

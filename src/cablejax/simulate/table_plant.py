@@ -8,14 +8,16 @@ from __future__ import annotations
 
 import abc
 import dataclasses
-from collections.abc import Sequence
+import functools
+from collections.abc import Mapping
 from typing import Protocol
 
 import numpy as np
 from jaxtyping import Float
 
 from cablejax.cable import Cable, Discretisation
-from cablejax.effects.given import GivenEffect, with_effects
+from cablejax.effects import Hook
+from cablejax.effects.given import GivenEffect, check_hooks, with_effects
 from cablejax.effects.physics import Physics, nominal_physics
 from cablejax.simulate.arms import Arms
 from cablejax.simulate.keypoints import biased_keypoints, camera_similarity, hermite_weights
@@ -76,10 +78,11 @@ class TablePlant(abc.ABC):
 
     def __init__(self, config: ObservedConfig):
         self.config = config
+        self._physics = config.physics
         self._timestep = config.discretisation.timestep
         self._weights = hermite_weights(config.discretisation)
         self._pose = np.full((2, 3), np.nan)
-        self._arms = Arms(config.physics, self._pose)
+        self._arms = Arms(self._physics, self._pose)
         self._seen: list[tuple[float, Float[np.ndarray, "N 2"]]] = []  # what a late camera has yet to report
         self._random = np.random.default_rng(config.seed)
         self._steps_done: int | None = None
@@ -133,7 +136,7 @@ class TablePlant(abc.ABC):
                 f"choose a divisor of {steps}."
             )
         self._check_distance(self._arms.target(twist, interval), self._free_length(self.time + interval))
-        late = self.config.physics.camera_lag > 0
+        late = bool(self._physics.camera_lag > 0)
         observations = []
         for _ in range(samples):
             for executed, count in self._arms.follow(twist, steps // samples, self._timestep, pieces=late):
@@ -152,7 +155,7 @@ class TablePlant(abc.ABC):
         """Keypoints and gripper poses now, with the configured noise and gaps (drawn anew by every call)."""
         config, random = self.config, self._random
         truth = self._true_keypoints()
-        keypoints = camera_similarity(config.physics, self._look())
+        keypoints = camera_similarity(self._physics, self._look())
         if config.keypoint_noise:
             keypoints += config.keypoint_noise * random.standard_normal(keypoints.shape)
         if config.keypoint_dropout:
@@ -180,7 +183,7 @@ class TablePlant(abc.ABC):
 
     def _look(self) -> Float[np.ndarray, "N 2"]:
         """What the camera reports now, in the world's frame: keypoints where their markers are, with its lag."""
-        physics, now = self.config.physics, self.time
+        physics, now = self._physics, self.time
         if np.any(physics.bias_along) or np.any(physics.bias_across):
             arclength, (nodes, tangents) = self._arclength(), self.nodes()
             marks = biased_keypoints(
@@ -212,7 +215,7 @@ class TablePlant(abc.ABC):
     def _restart(self, pose: np.ndarray) -> None:
         """Clock, noise and grippers of a new cable."""
         self._pose, self._steps_done = pose, 0
-        self._arms, self._seen = Arms(self.config.physics, pose), []
+        self._arms, self._seen = Arms(self._physics, pose), []
         self._random = np.random.default_rng(self.config.seed)
 
     def _moved(self, twist: np.ndarray, steps: int, *, stable: bool) -> None:
@@ -243,7 +246,8 @@ class TablePlant(abc.ABC):
             )
 
 
-def plant_physics(discretisation: Discretisation, effects: Sequence[GivenEffect]) -> Physics:
+@functools.lru_cache(maxsize=64)
+def plant_physics(discretisation: Discretisation, effects: tuple[GivenEffect, ...]) -> Physics:
     """A plant's cable with its effects, float64, every joint bending in the plane.
 
     Raises:
@@ -265,6 +269,23 @@ def checked(name: str, value: np.ndarray) -> np.ndarray:
     if not np.isfinite(array).all():
         raise ValueError(f"{name} is not finite: {array.tolist()}. Check what produced it; the plant has not moved.")
     return array
+
+
+def check_effects(config, hooks: frozenset[Hook], able: Mapping[str, frozenset[Hook]]) -> None:
+    """Raises ValueError unless a plant can stage the `effects` of its configuration.
+
+    Args:
+        config: with `effects`, a tuple, and `discretisation`.
+        hooks: that the plant honours.
+        able: other plants by name with their hooks, for the message.
+    """
+    for effect in config.effects:
+        if not isinstance(effect, GivenEffect):
+            raise ValueError(
+                f"{type(config).__name__}.effects has {effect!r}, expected GivenEffect objects: use parse_effect(...)."
+            )
+    check_hooks(config.effects, hooks, type(config).__name__.removesuffix("Config"), able)
+    plant_physics(config.discretisation, config.effects)
 
 
 def check_camera(config) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
 from typing import get_args
 
 import numpy as np
@@ -12,7 +11,7 @@ from cablejax.cable import Cable, Discretisation
 from cablejax.effects import Hook
 from cablejax.effects.given import GivenEffect
 from cablejax.effects.physics import Physics
-from cablejax.simulate.table_plant import check_camera, plant_physics
+from cablejax.simulate.table_plant import check_camera, check_effects, plant_physics
 
 HOOKS: frozenset[Hook] = frozenset(get_args(Hook))
 """Hooks of the effects that the contact plant can stage."""
@@ -54,7 +53,7 @@ class PlantConfig:
         """The cable without the effects."""
         return self.discretisation.cable
 
-    @functools.cached_property
+    @property
     def physics(self) -> Physics:
         """The cable with the effects, float64, each joint bending in the plane."""
         return plant_physics(self.discretisation, self.effects)
@@ -70,6 +69,7 @@ class PlantConfig:
                 raise ValueError(f"PlantConfig.{name} is {value}, expected a positive finite number.")
         check_camera(self)
         object.__setattr__(self, "effects", tuple(self.effects))
+        check_effects(self, HOOKS, {})
         radius, own = float(self.physics.obstacle_radius), self.cable.diameter / 2
         if 0 < radius <= own:
             raise ValueError(
