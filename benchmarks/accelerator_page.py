@@ -143,7 +143,7 @@ _TABLES: dict[str, tuple[str, str, list[str], Callable[[Record], list[str]]]] = 
         "Simulation",
         "One simulated second of slowly moved arches on the table, time step 20 ms. `chain` is the closed-form chain "
         "of the\ndiagnosis without its obstacle; its 20 steps of settling count. Programs are compiled side by side, "
-        "so their compile\ntimes overlap.",
+        "so their\ncompile times overlap.",
         _ROLLOUT,
         _simulated,
     ),

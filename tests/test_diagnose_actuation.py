@@ -3,7 +3,10 @@
 import numpy as np
 import pytest
 
-from cablejax.diagnose.actuation import actuation
+from cablejax.diagnose import Calibration, explanation
+from cablejax.diagnose.actuation import actuation, with_arms
+from cablejax.diagnose.conclude import Conclusion
+from cablejax.diagnose.fit import Fit
 from diagnose_cases import INTERVAL, MOTIONS, poses
 
 FINE = 20
@@ -109,3 +112,33 @@ def test_padding_does_not_count():
     result = actuation(padded, more, np.full(4, INTERVAL), length, np.arange(4))
     assert result.effects["actuation_gain"][0] == pytest.approx(plain.effects["actuation_gain"][0], abs=1e-6)
     assert result.deviation == pytest.approx(plain.deviation)
+
+
+NOTHING = Conclusion("none", Fit(explanation(), np.zeros(4), np.zeros((4, 0)), np.zeros((4, 0, 0))), (), (), (), 0.0)
+
+
+@pytest.mark.parametrize(
+    ("faults", "names"),
+    [
+        ({"gain": 0.92}, {"actuation_gain"}),
+        ({"slow": 0.25}, {"actuation_lag"}),
+        ({"gain": 1.08, "slow": 0.25}, {"actuation_gain", "actuation_lag"}),
+    ],
+    ids=["gain", "lag", "both"],
+)
+def test_probabilities_are_those_of_errors_on_motions_that_no_fit_has_seen(faults, names):
+    conclusion = with_arms(NOTHING, told(**faults), Calibration())
+    assert conclusion.verdict == "named" and {effect.name for effect in conclusion.effects} == names
+    assert all(0.95 < effect.probability <= 1.0 for effect in conclusion.effects)
+    assert sum(ranked.probability for ranked in conclusion.ranking) == pytest.approx(1.0)
+
+
+def test_a_deviation_that_shows_in_one_motion_only_makes_nothing_certain():
+    """What was fitted to that motion is no help on the others, and the others say nothing of it."""
+    wanted = np.stack([poses(m) for m in MOTIONS])
+    one = np.arange(len(MOTIONS))[:, None, None, None] == 0
+    measured = np.where(one, arms(gain=1.08), arms())
+    shape = np.full(len(wanted), INTERVAL), np.full(len(wanted), wanted.shape[1])
+    result = actuation(measured, commands(), *shape, np.arange(len(wanted)))
+    conclusion = with_arms(NOTHING, result, Calibration())
+    assert max((effect.probability for effect in conclusion.effects), default=0.0) < 0.5

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import ast
 import dataclasses
 import functools
+import importlib
+import inspect
 
 import jax
 import jax.numpy as jnp
@@ -301,3 +304,18 @@ def test_batches_are_of_one_size_and_pairs_in_place():
     result = in_batches(run, values, inputs, size=4)
     np.testing.assert_array_equal(result, values[:, None] * inputs)
     assert set(sizes) == {4} and len(sizes) == 4
+
+
+GENERIC = (
+    "belief", "conclude", "conformal", "diagnosis", "evidence", "fit", "gap", "noise", "profile", "protocol", "repeats",
+    "run", "screen", "search",
+)  # fmt: skip
+ALLOWED = {f"cablejax.diagnose.{name}" for name in GENERIC} | {"cablejax.bounded", "cablejax.effects.effect"}
+
+
+@pytest.mark.parametrize("name", GENERIC)
+def test_what_is_generic_imports_no_cable(name):
+    tree = ast.parse(inspect.getsource(importlib.import_module(f"cablejax.diagnose.{name}")))
+    imported = {node.module for node in tree.body if isinstance(node, ast.ImportFrom) and node.module}
+    own = {module for module in imported if module.startswith("cablejax")}
+    assert own <= ALLOWED

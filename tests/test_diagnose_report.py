@@ -115,6 +115,7 @@ NO_GAP = Gap(
     split={"noise": 1.0, "named": 0.0, "learnable": 0.0, "unexplained": 0.0},
 )
 ALIKE = (("intrinsic_curvature", "gripper_rotation_offset"),)
+THREE = (("intrinsic_curvature", "gripper_rotation_offset", "obstacle"),)
 FAINT = NextMotion("taut", ("bending_stiffness", "table_friction"), 0.03, {"taut": 0.03, "mirror": 0.01})
 CASES = {
     "named": (
@@ -131,6 +132,15 @@ CASES = {
         lambda: diagnosis("ambiguous", equivalent=ALIKE, next_motion=FAINT),
         "Cause narrowed down",
         ["intrinsic curvature or gripper rotation offset", "cannot tell", "No safe motion tells"],
+    ),
+    "with one that is improbable": (
+        lambda: diagnosis("ambiguous", equivalent=THREE),
+        "Cause narrowed down",
+        [
+            "<p>intrinsic curvature or gripper rotation offset</p>",
+            "<b>intrinsic curvature</b> and <b>gripper rotation offset</b> apart",
+            "<b>obstacle</b> would leave as little of the gap, at a probability below 1 %",
+        ],
     ),
     "named+unknown": (
         lambda: diagnosis("named+unknown", effects=(CURVED, MARKS, OBSTACLE), next_motion=None),
@@ -240,7 +250,7 @@ def space(tmp_path_factory):
     before, after = (np.nan_to_num(windows.keypoints) + size * along for size in (0.03, 0.004))
     nominal, explained = (in_log(log, windows, part) for part in (before, after))
     stiffness = ParameterEstimate(0.06, (0.05, 0.07), "m^4/s^2")
-    result = Diagnosis(
+    result = CableDiagnosis(
         verdict="named",
         sentence="A sentence.",
         effects=(

@@ -103,7 +103,7 @@ def test_a_run_ends_when_nothing_happens_any_more():
         def init(self, history):
             return None
 
-        def step(self, state, keypoints, gripper_pose):
+        def step(self, state, measurement):
             return None, np.zeros((2, 3)), None
 
     task = letter_task("U", 0, CABLE)

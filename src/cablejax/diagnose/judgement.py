@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from cablejax.diagnose.diagnosis import NamedEffect, Verdict
+from cablejax.diagnose.diagnosis import NamedEffect, Ranked, Verdict
 
 
 def judged(*, resolvable: bool, telling: bool, complete: bool, alike: bool) -> Verdict:
@@ -27,8 +27,30 @@ def judged(*, resolvable: bool, telling: bool, complete: bool, alike: bool) -> V
     return "ambiguous" if alike else "named"
 
 
-def sentence(
-    verdict: Verdict, effects: Sequence[NamedEffect], equivalent: Sequence[Sequence[str]], explained: float
+FAINT = 0.01
+"""Probability below which a look-alike is not listed beside the named effect."""
+
+
+def look_alikes(
+    group: Sequence[str], effects: Sequence[NamedEffect], ranking: Sequence[Ranked]
+) -> tuple[list[str], list[str]]:
+    """Members of a set that the log cannot tell apart: those with a chance, and those that merely leave as little.
+
+    Of a set in place of the only named effect, the ranking has the members' probabilities; members of an explanation
+    by several effects are not ranked as such, and all count.
+    """
+    chances = {ranked.name: ranked.probability for ranked in ranking} if len(effects) == 1 else {}
+    named = {effect.name for effect in effects}
+    faint = [n for n in group if n not in named and (chance := chances.get(n)) is not None and chance < FAINT]
+    return [name for name in group if name not in faint], faint
+
+
+def verdict_sentence(
+    verdict: Verdict,
+    effects: Sequence[NamedEffect],
+    equivalent: Sequence[Sequence[str]],
+    ranking: Sequence[Ranked],
+    explained: float,
 ) -> str:
     """The verdict in words.
 
@@ -36,18 +58,27 @@ def sentence(
         verdict: to put into words.
         effects: named.
         equivalent: sets of effects that the log cannot tell apart.
+        ranking: every effect tried.
         explained: share of the squared gap that the best explanation takes away; a negative one reads as none.
     """
     share = f"{100 * max(explained, 0.0):.0f} %"
-    names = " and ".join(e.name.replace("_", " ") for e in effects)
-    alike = "; ".join(" or ".join(n.replace("_", " ") for n in group) for group in equivalent)
+    names = " and ".join(_words(e.name) for e in effects)
+    split = [look_alikes(group, effects, ranking) for group in equivalent]
+    alike = "; ".join(" or ".join(map(_words, likely)) for likely, _ in split if len(likely) > 1)
+    faint = " and ".join(_words(name) for _, members in split for name in members)
     rivals = f" (this log cannot tell apart: {alike})" if alike else ""
+    too = f" {faint[:1].upper()}{faint[1:]} would leave as little, at a probability below 1 %." if faint else ""
+    either = f" or a look-alike, which this log cannot tell apart: {alike}" if alike else ""
     return {
         "none": "The simulator explains this log within what the noise and its own resolution allow.",
         "named": f"The gap comes from {names}, which explains {share} of it.",
-        "ambiguous": f"The gap comes from {names} or a look-alike, which this log cannot tell apart: {alike}.",
+        "ambiguous": f"The gap comes from {names}{either}.{too}",
         "named+unknown": (
-            f"Part of the gap, {share}, is explained by {names}{rivals}; the rest by no effect of the library."
+            f"Part of the gap, {share}, is explained by {names}{rivals}; the rest by no effect of the library.{too}"
         ),
         "unknown": f"The gap has a cause that is not in the library: the best explanation takes away {share} of it.",
     }[verdict]
+
+
+def _words(name: str) -> str:
+    return name.replace("_", " ")

@@ -7,14 +7,16 @@ import math
 import os
 import pathlib
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from cablejax.diagnose.diagnosis import PLACES, Diagnosis, Gap, NamedEffect, Ranked
-from cablejax.diagnose.where import Where
 from cablejax.effects.given import VERDICT_SCHEMA
 from cablejax.whole_file import whole_file
+
+if TYPE_CHECKING:
+    from cablejax.diagnose.where import Where
 
 
 def verdict_json(diagnosis: Diagnosis) -> dict[str, Any]:

@@ -40,6 +40,8 @@ HORIZONS = (1.0, 2.0, 5.0, 10.0, 20.0, 30.0)
 class Where:
     """Sizes and places of the gap. All `_mm` are root mean squares per coordinate above the noise [mm].
 
+    What was not computed is None, or empty where it is a collection.
+
     Attributes:
         gap_mm: over the whole log.
         smallest_mm: the least gap over the whole log that would have been told from noise.
@@ -80,8 +82,17 @@ class Where:
 
     @property
     def episodes(self) -> tuple[int, ...]:
-        """Those whose gap stands out from the noise; none where that was not tested."""
-        return () if self.episode_p is None else tuple(int(e) for e in np.flatnonzero(self.episode_p < LEVEL))
+        """Those whose gap stands out from the noise."""
+        return _below(self.episode_p)
+
+    @property
+    def keypoints(self) -> tuple[int, ...]:
+        """Those whose gap stands out from the noise."""
+        return _below(self.keypoint_p)
+
+
+def _below(p: Float[np.ndarray, "K"] | None) -> tuple[int, ...]:
+    return () if p is None else tuple(int(i) for i in np.flatnonzero(p < LEVEL))
 
 
 def localise(log: GapLog, nominal: Float[np.ndarray, "E T N 2"], noise: Float[np.ndarray, "N"]) -> Where:

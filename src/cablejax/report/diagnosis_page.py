@@ -12,6 +12,7 @@ import numpy as np
 
 from cablejax.diagnose.belief import Calibration
 from cablejax.diagnose.diagnosis import CableDiagnosis, NamedEffect, Verdict
+from cablejax.diagnose.judgement import look_alikes
 from cablejax.diagnose.verdict_json import write_verdict
 from cablejax.report.diagnosis_charts import motion_figure, ranking_figure, shrinkage_figure
 from cablejax.report.diagnosis_figures import cable_figure, where_figure
@@ -85,7 +86,7 @@ def write_diagnosis_page(diagnosis: CableDiagnosis, out: str | os.PathLike[str])
     here = importlib.resources.files("cablejax.report")
     css = "\n".join((here / name).read_text(encoding="utf-8") for name in ("page.css", "diagnosis.css"))
     page = string.Template((here / "diagnosis.html").read_text(encoding="utf-8")).substitute(
-        title=html.escape(f"Diagnosis: {badge}"),
+        title=html.escape(f"CableDiagnosis: {badge}"),
         css=css,
         kind=kind,
         badge=badge,
@@ -187,8 +188,9 @@ def _peak(diagnosis: CableDiagnosis) -> str:
 
 
 def _alike(diagnosis: CableDiagnosis, effect: NamedEffect) -> list[str]:
-    """The effect and those that cannot be told from it, in words."""
-    group = next((g for g in diagnosis.equivalent if effect.name in g), ())
+    """The effect and those that cannot be told from it and have a chance, in words."""
+    whole = next((g for g in diagnosis.equivalent if effect.name in g), ())
+    group, _ = look_alikes(whole, diagnosis.effects, diagnosis.ranking)
     return [effect_title(effect.name), *(effect_title(name) for name in group if name != effect.name)]
 
 

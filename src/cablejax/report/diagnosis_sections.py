@@ -8,6 +8,7 @@ import json
 from collections.abc import Sequence
 
 from cablejax.diagnose.diagnosis import CableDiagnosis, NamedEffect
+from cablejax.diagnose.judgement import FAINT, look_alikes
 from cablejax.report.effect_words import (
     EFFECTS,
     MOTIONS,
@@ -53,11 +54,20 @@ def which_section(diagnosis: CableDiagnosis, ranking: str) -> str:
             f"<tbody>{rows}</tbody></table></div>"
         )
     for group in diagnosis.equivalent:
-        names = listed([f"<b>{html.escape(effect_title(name))}</b>" for name in group])
-        parts.append(
-            f"<p>This log cannot tell {names} apart: each explains the gap as well, within what noise and simulator "
-            "allow.</p>"
+        likely, faint = (
+            [f"<b>{html.escape(effect_title(name))}</b>" for name in members]
+            for members in look_alikes(group, diagnosis.effects, diagnosis.ranking)
         )
+        if len(likely) > 1:
+            parts.append(
+                f"<p>This log cannot tell {listed(likely)} apart: each explains the gap as well, within what noise and "
+                "simulator allow.</p>"
+            )
+        if faint:
+            parts.append(
+                f"<p>{listed(faint)} would leave as little of the gap, at a probability below {share(FAINT)}: a "
+                "likelihood is that sure only if every law is exact.</p>"
+            )
     if diagnosis.verdict in ("unknown", "named+unknown"):
         left = millimetres(_left(diagnosis))
         parts.append(

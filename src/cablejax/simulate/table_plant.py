@@ -20,7 +20,7 @@ from cablejax.effects import Hook
 from cablejax.effects.given import GivenEffect, check_hooks, with_effects
 from cablejax.effects.physics import Physics, nominal_physics
 from cablejax.simulate.arms import Arms
-from cablejax.simulate.keypoints import biased_keypoints, camera_similarity, hermite_weights
+from cablejax.simulate.keypoints import camera_similarity, hermite_weights, marked_keypoints
 
 TAUT = 0.999
 """Largest distance between the grippers, in lengths of the cable, before a plant refuses to pull."""
@@ -79,6 +79,8 @@ class TablePlant(abc.ABC):
     def __init__(self, config: ObservedConfig):
         self.config = config
         self._physics = config.physics
+        still = np.zeros(config.cable.n_keypoints)
+        self._unbiased = dataclasses.replace(config.physics, bias_along=still, bias_across=still)
         self._timestep = config.discretisation.timestep
         self._weights = hermite_weights(config.discretisation)
         self._pose = np.full((2, 3), np.nan)
@@ -162,8 +164,8 @@ class TablePlant(abc.ABC):
             keypoints[1:-1][random.random(len(keypoints) - 2) < config.keypoint_dropout] = np.nan
         return Observation(keypoints=keypoints, gripper_pose=self._pose.copy(), time=self.time, true_keypoints=truth)
 
-    def _arclength(self) -> Float[np.ndarray, " N"] | None:
-        """Where the keypoints' marks are now, the free length scaled to the cable's [m]; None = where they belong."""
+    def _slipped(self) -> Float[np.ndarray, "2"] | None:
+        """Cable that has come in through either gripper [m]; None where the free length stays as it is."""
         return None
 
     def _stretch(self) -> float:
@@ -175,26 +177,23 @@ class TablePlant(abc.ABC):
         del time
         return self.config.cable.length
 
+    def _marked(self, physics: Physics) -> Float[np.ndarray, "N 2"]:
+        (nodes, tangents), scale = self.nodes(), 1.0 + self._stretch()
+        return marked_keypoints(
+            self.config.discretisation, physics, nodes[:, :2], tangents[:, :2], scale=scale, slipped=self._slipped()
+        )
+
     def _true_keypoints(self) -> Float[np.ndarray, "N 2"]:
-        arclength = self._arclength()
-        weights = self._weights if arclength is None else hermite_weights(self.config.discretisation, arclength)
-        nodes, tangents = self.nodes()
-        return (weights[0] @ nodes + weights[1] @ ((1.0 + self._stretch()) * tangents))[:, :2]
+        if self._slipped() is None:
+            nodes, tangents = self.nodes()
+            return (self._weights[0] @ nodes + self._weights[1] @ tangents)[:, :2]
+        return self._marked(self._unbiased)
 
     def _look(self) -> Float[np.ndarray, "N 2"]:
         """What the camera reports now, in the world's frame: keypoints where their markers are, with its lag."""
         physics, now = self._physics, self.time
-        if np.any(physics.bias_along) or np.any(physics.bias_across):
-            arclength, (nodes, tangents) = self._arclength(), self.nodes()
-            marks = biased_keypoints(
-                self.config.discretisation,
-                physics,
-                self.config.cable.keypoint_arclength if arclength is None else arclength,
-                nodes[:, :2],
-                (1.0 + self._stretch()) * tangents[:, :2],
-            )
-        else:
-            marks = self._true_keypoints()
+        biased = np.any(physics.bias_along) or np.any(physics.bias_across)
+        marks = self._marked(physics) if biased else self._true_keypoints()
         then = now - float(physics.camera_lag)
         if then == now:
             return marks

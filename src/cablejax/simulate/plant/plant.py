@@ -104,8 +104,10 @@ class Plant(TablePlant):
         if self._extension is not None:
             self._extension.update(time)
 
-    def _arclength(self) -> Float[np.ndarray, " N"] | None:
-        return None if self._extension is None or not self._acting else self._extension.arclength(self.time)
+    def _slipped(self) -> Float[np.ndarray, "2"] | None:
+        if self._extension is None:
+            return None
+        return self._extension.slipped(self.time if self._acting else -np.inf)
 
     def _free_length(self, time: float) -> float:
         slipped = 0.0 if self._extension is None else float(self._extension.slipped(time).sum())
