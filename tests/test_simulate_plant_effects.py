@@ -143,6 +143,8 @@ def test_a_cable_that_slipped_out_is_taut_sooner():
 
 
 def test_bad_effects_are_refused():
+    with pytest.raises(ValueError, match="expected GivenEffect objects"):
+        PlantConfig(effects=("camera_lag:time_s=1",))  # pyright: ignore[reportArgumentType]
     with pytest.raises(ValueError, match=r"more than the cable's own radius, 0\.005 m"):
         PlantConfig(effects=(parse_effect("obstacle:x_m=0,y_m=0,radius_m=0.005"),))
     with pytest.raises(ValueError, match="friction_patch: radius"):

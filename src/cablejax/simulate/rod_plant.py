@@ -32,12 +32,12 @@ from jaxtyping import Float
 
 from cablejax.cable import GRAVITY, Cable, Discretisation
 from cablejax.effects import Hook
-from cablejax.effects.given import GivenEffect, check_hooks
+from cablejax.effects.given import GivenEffect
 from cablejax.effects.physics import Physics
 from cablejax.simulate.composite import link_lengths
 from cablejax.simulate.elastica import solve_elastica
 from cablejax.simulate.plant.config import HOOKS as CONTACT_PLANT_HOOKS
-from cablejax.simulate.table_plant import Observation, TablePlant, check_camera, plant_physics
+from cablejax.simulate.table_plant import Observation, TablePlant, check_camera, check_effects, plant_physics
 
 HOOKS: frozenset[Hook] = frozenset({"bending", "mass", "input", "observation"})
 """Hooks of the effects that the rod can stage."""
@@ -104,7 +104,7 @@ class RodPlantConfig:
             raise ValueError(f"RodPlantConfig.static_ratio is {self.static_ratio}, expected a finite number >= 1.")
         check_camera(self)
         object.__setattr__(self, "effects", tuple(self.effects))
-        check_hooks(self.effects, HOOKS, "RodPlant", {"Plant": CONTACT_PLANT_HOOKS})
+        check_effects(self, HOOKS, {"Plant": CONTACT_PLANT_HOOKS})
         if self.discretisation.timestep > self.longest_timestep:
             raise ValueError(
                 f"RodPlantConfig.discretisation.timestep is {self.discretisation.timestep} s, but this rod is "

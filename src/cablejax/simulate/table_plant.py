@@ -9,16 +9,18 @@ from __future__ import annotations
 import abc
 import dataclasses
 import functools
+from collections.abc import Mapping
 from typing import Protocol
 
 import numpy as np
 from jaxtyping import Float
 
 from cablejax.cable import Cable, Discretisation
-from cablejax.effects.given import GivenEffect, with_effects
+from cablejax.effects import Hook
+from cablejax.effects.given import GivenEffect, check_hooks, with_effects
 from cablejax.effects.physics import Physics, nominal_physics
 from cablejax.simulate.arms import Arms
-from cablejax.simulate.keypoints import biased_keypoints, camera_similarity, hermite_weights
+from cablejax.simulate.keypoints import camera_similarity, hermite_weights, marked_keypoints
 
 TAUT = 0.999
 """Largest distance between the grippers, in lengths of the cable, before a plant refuses to pull."""
@@ -76,10 +78,13 @@ class TablePlant(abc.ABC):
 
     def __init__(self, config: ObservedConfig):
         self.config = config
+        self._physics = config.physics
+        still = np.zeros(config.cable.n_keypoints)
+        self._unbiased = dataclasses.replace(config.physics, bias_along=still, bias_across=still)
         self._timestep = config.discretisation.timestep
         self._weights = hermite_weights(config.discretisation)
         self._pose = np.full((2, 3), np.nan)
-        self._arms = Arms(config.physics, self._pose)
+        self._arms = Arms(self._physics, self._pose)
         self._seen: list[tuple[float, Float[np.ndarray, "N 2"]]] = []  # what a late camera has yet to report
         self._random = np.random.default_rng(config.seed)
         self._steps_done: int | None = None
@@ -133,7 +138,7 @@ class TablePlant(abc.ABC):
                 f"choose a divisor of {steps}."
             )
         self._check_distance(self._arms.target(twist, interval), self._free_length(self.time + interval))
-        late = bool(self.config.physics.camera_lag > 0)
+        late = bool(self._physics.camera_lag > 0)
         observations = []
         for _ in range(samples):
             for executed, count in self._arms.follow(twist, steps // samples, self._timestep, pieces=late):
@@ -152,15 +157,15 @@ class TablePlant(abc.ABC):
         """Keypoints and gripper poses now, with the configured noise and gaps (drawn anew by every call)."""
         config, random = self.config, self._random
         truth = self._true_keypoints()
-        keypoints = camera_similarity(config.physics, self._look())
+        keypoints = camera_similarity(self._physics, self._look())
         if config.keypoint_noise:
             keypoints += config.keypoint_noise * random.standard_normal(keypoints.shape)
         if config.keypoint_dropout:
             keypoints[1:-1][random.random(len(keypoints) - 2) < config.keypoint_dropout] = np.nan
         return Observation(keypoints=keypoints, gripper_pose=self._pose.copy(), time=self.time, true_keypoints=truth)
 
-    def _arclength(self) -> Float[np.ndarray, " N"] | None:
-        """Where the keypoints' marks are now, the free length scaled to the cable's [m]; None = where they belong."""
+    def _slipped(self) -> Float[np.ndarray, "2"] | None:
+        """Cable that has come in through either gripper [m]; None where the free length stays as it is."""
         return None
 
     def _stretch(self) -> float:
@@ -172,26 +177,23 @@ class TablePlant(abc.ABC):
         del time
         return self.config.cable.length
 
+    def _marked(self, physics: Physics) -> Float[np.ndarray, "N 2"]:
+        (nodes, tangents), scale = self.nodes(), 1.0 + self._stretch()
+        return marked_keypoints(
+            self.config.discretisation, physics, nodes[:, :2], tangents[:, :2], scale=scale, slipped=self._slipped()
+        )
+
     def _true_keypoints(self) -> Float[np.ndarray, "N 2"]:
-        arclength = self._arclength()
-        weights = self._weights if arclength is None else hermite_weights(self.config.discretisation, arclength)
-        nodes, tangents = self.nodes()
-        return (weights[0] @ nodes + weights[1] @ ((1.0 + self._stretch()) * tangents))[:, :2]
+        if self._slipped() is None:
+            nodes, tangents = self.nodes()
+            return (self._weights[0] @ nodes + self._weights[1] @ tangents)[:, :2]
+        return self._marked(self._unbiased)
 
     def _look(self) -> Float[np.ndarray, "N 2"]:
         """What the camera reports now, in the world's frame: keypoints where their markers are, with its lag."""
-        physics, now = self.config.physics, self.time
-        if np.any(physics.bias_along) or np.any(physics.bias_across):
-            arclength, (nodes, tangents) = self._arclength(), self.nodes()
-            marks = biased_keypoints(
-                self.config.discretisation,
-                physics,
-                self.config.cable.keypoint_arclength if arclength is None else arclength,
-                nodes[:, :2],
-                (1.0 + self._stretch()) * tangents[:, :2],
-            )
-        else:
-            marks = self._true_keypoints()
+        physics, now = self._physics, self.time
+        biased = np.any(physics.bias_along) or np.any(physics.bias_across)
+        marks = self._marked(physics) if biased else self._true_keypoints()
         then = now - float(physics.camera_lag)
         if then == now:
             return marks
@@ -212,7 +214,7 @@ class TablePlant(abc.ABC):
     def _restart(self, pose: np.ndarray) -> None:
         """Clock, noise and grippers of a new cable."""
         self._pose, self._steps_done = pose, 0
-        self._arms, self._seen = Arms(self.config.physics, pose), []
+        self._arms, self._seen = Arms(self._physics, pose), []
         self._random = np.random.default_rng(self.config.seed)
 
     def _moved(self, twist: np.ndarray, steps: int, *, stable: bool) -> None:
@@ -243,9 +245,9 @@ class TablePlant(abc.ABC):
             )
 
 
-@functools.lru_cache(maxsize=32)
+@functools.lru_cache(maxsize=64)
 def plant_physics(discretisation: Discretisation, effects: tuple[GivenEffect, ...]) -> Physics:
-    """A plant's cable with its effects, float64, every joint bending in the plane. Not to be modified: cached.
+    """A plant's cable with its effects, float64, every joint bending in the plane.
 
     Raises:
         ValueError: a parameter of an effect is out of its bounds.
@@ -266,6 +268,23 @@ def checked(name: str, value: np.ndarray) -> np.ndarray:
     if not np.isfinite(array).all():
         raise ValueError(f"{name} is not finite: {array.tolist()}. Check what produced it; the plant has not moved.")
     return array
+
+
+def check_effects(config, hooks: frozenset[Hook], able: Mapping[str, frozenset[Hook]]) -> None:
+    """Raises ValueError unless a plant can stage the `effects` of its configuration.
+
+    Args:
+        config: with `effects`, a tuple, and `discretisation`.
+        hooks: that the plant honours.
+        able: other plants by name with their hooks, for the message.
+    """
+    for effect in config.effects:
+        if not isinstance(effect, GivenEffect):
+            raise ValueError(
+                f"{type(config).__name__}.effects has {effect!r}, expected GivenEffect objects: use parse_effect(...)."
+            )
+    check_hooks(config.effects, hooks, type(config).__name__.removesuffix("Config"), able)
+    plant_physics(config.discretisation, config.effects)
 
 
 def check_camera(config) -> None:

@@ -11,7 +11,7 @@ from cablejax.cable import Cable, Discretisation
 from cablejax.effects import Hook
 from cablejax.effects.given import GivenEffect
 from cablejax.effects.physics import Physics
-from cablejax.simulate.table_plant import check_camera, plant_physics
+from cablejax.simulate.table_plant import check_camera, check_effects, plant_physics
 
 HOOKS: frozenset[Hook] = frozenset(get_args(Hook))
 """Hooks of the effects that the contact plant can stage."""
@@ -69,6 +69,7 @@ class PlantConfig:
                 raise ValueError(f"PlantConfig.{name} is {value}, expected a positive finite number.")
         check_camera(self)
         object.__setattr__(self, "effects", tuple(self.effects))
+        check_effects(self, HOOKS, {})
         radius, own = float(self.physics.obstacle_radius), self.cable.diameter / 2
         if 0 < radius <= own:
             raise ValueError(

@@ -29,10 +29,3 @@ class Extension:
     def stretch(self) -> float:
         """Relative change of the free length."""
         return float(self._data.qpos[self._slides].sum()) / self._cable.length
-
-    def arclength(self, time: float) -> Float[np.ndarray, " N"]:
-        """Where the marks of the keypoints are, the free length scaled to the cable's [m]; the ends stay held."""
-        slipped, length = self.slipped(time), self._cable.length
-        marks = (self._cable.keypoint_arclength + slipped[0]) * (length / (length + slipped.sum()))
-        marks[[0, -1]] = 0.0, length
-        return np.clip(marks, 0.0, length)

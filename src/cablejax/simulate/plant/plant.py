@@ -38,7 +38,7 @@ class Plant(TablePlant):
         self._balls = self.model.jnt_qposadr[bending_joints(self.model)][:, None] + np.arange(4)
         self._height = np.nan
         # The mocap bodies coincide with the frames of what they hold: the last link begins before the grasped end.
-        physics, h = self.config.physics, self.config.discretisation.link_length
+        physics, h = self._physics, self.config.discretisation.link_length
         self._inset = 0.0 if physics.rotation_compliance[1] > 0 else 0.5 * h
         remembers = physics.hysteresis_moment > 0 or physics.yield_curvature < NO_YIELD
         uneven = physics.patch_friction or physics.static_excess
@@ -52,7 +52,7 @@ class Plant(TablePlant):
     ) -> Observation:
         """See `TablePlant.reset`."""
         pose = self._checked_start(gripper_pose)
-        cable, data, physics = self.config.cable, self._data, self.config.physics
+        cable, data, physics = self.config.cable, self._data, self._physics
         held = pose + np.array([[0.0, 0.0, offset] for offset in physics.rotation_offset])
         # A chain's links follow the elastica's chords; only the held ones have the exact direction of the grippers.
         shape = solve_elastica(held, cable.length, guess=guess, n_samples=2 * self.config.discretisation.n_joints + 1)
@@ -104,8 +104,10 @@ class Plant(TablePlant):
         if self._extension is not None:
             self._extension.update(time)
 
-    def _arclength(self) -> Float[np.ndarray, " N"] | None:
-        return None if self._extension is None or not self._acting else self._extension.arclength(self.time)
+    def _slipped(self) -> Float[np.ndarray, "2"] | None:
+        if self._extension is None:
+            return None
+        return self._extension.slipped(self.time if self._acting else -np.inf)
 
     def _free_length(self, time: float) -> float:
         slipped = 0.0 if self._extension is None else float(self._extension.slipped(time).sum())
@@ -140,7 +142,7 @@ class Plant(TablePlant):
     def _place_grippers(self, pose: np.ndarray) -> None:
         """Mocap bodies at the frames of what they hold: position of the grippers, angle of the grasps."""
         data = self._data
-        angles = pose[:, 2] + self.config.physics.rotation_offset
+        angles = pose[:, 2] + self._physics.rotation_offset
         heading = np.array([np.cos(angles[1]), np.sin(angles[1])])
         data.mocap_pos[:, :2] = pose[:, :2]
         data.mocap_pos[1, :2] -= self._inset * heading
