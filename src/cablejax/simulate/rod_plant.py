@@ -117,7 +117,7 @@ class RodPlantConfig:
     def longest_timestep(self) -> float:
         """Longest stable time step [s]: an axial wave crosses an element in it, and a tenth less for safety."""
         speed = np.sqrt(self.axial_stiffness / self.physics.density)
-        return 0.9 * self.discretisation.link_length / speed
+        return float(0.9 * self.discretisation.link_length / speed)
 
 
 ETHERNET = RodPlantConfig(
