@@ -10,12 +10,10 @@ from __future__ import annotations
 import dataclasses
 import functools
 import math
-from typing import Literal
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
-from typing import Any
-
 import numpy as np
 from jaxtyping import Float
 

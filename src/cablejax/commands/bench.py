@@ -55,9 +55,8 @@ class BenchSimulate(Command):
                 raise UsageError(f"--{name} is {getattr(self, name)}, expected at least 1.")
         cable = Cable() if self.cable is None else find_cable(self.cable)
         config = Discretisation(cable, n_links=Discretisation.n_links if self.links is None else self.links)
-        mjx, one, many = MjxEngine(config), ThreadedEngine(config, 1), ThreadedEngine(config, self.threads)
-        chain = ChainEngine(config)
-
+        mjx, chain = MjxEngine(config), ChainEngine(config)
+        one, many = ThreadedEngine(config, 1), ThreadedEngine(config, self.threads)
         params, states, twist = moving_arches(config, self.batch, self.seconds, self.seed)
         say(f"compiling the MJX engine for {self.batch} cables of {config.n_links} links ...")
         begin = time.perf_counter()
