@@ -55,9 +55,8 @@ class BenchSimulate(Command):
                 raise UsageError(f"--{name} is {getattr(self, name)}, expected at least 1.")
         cable = Cable() if self.cable is None else find_cable(self.cable)
         config = Discretisation(cable, n_links=Discretisation.n_links if self.links is None else self.links)
-        mjx, one, many = MjxEngine(config), ThreadedEngine(config, 1), ThreadedEngine(config, self.threads)
-        chain = ChainEngine(config)
-
+        mjx, chain = MjxEngine(config), ChainEngine(config)
+        one, many = ThreadedEngine(config, 1), ThreadedEngine(config, self.threads)
         params, states, twist = moving_arches(config, self.batch, self.seconds, self.seed)
         say(f"compiling the MJX engine for {self.batch} cables of {config.n_links} links ...")
         begin = time.perf_counter()
@@ -90,18 +89,15 @@ class BenchSimulate(Command):
             "mjx_compile_s": compile_s,
             **setting(),
         }
+        labels = {
+            "chain": f"chain, batch {self.batch}",
+            "mjx": f"MJX, batch {self.batch}",
+            "c_one": "C MuJoCo, one core",
+            "c_many": f"C MuJoCo, {self.threads} threads",
+        }
         text = text_table(
             ["engine", "us per environment-step", "relative to C on one core"],
-            [
-                [f"chain, batch {self.batch}", f"{micros['chain']:.2f}", f"{result['chain_over_c']:.2f}"],
-                [f"MJX, batch {self.batch}", f"{micros['mjx']:.2f}", f"{result['mjx_over_c']:.2f}"],
-                ["C MuJoCo, one core", f"{micros['c_one']:.2f}", "1.00"],
-                [
-                    f"C MuJoCo, {self.threads} threads",
-                    f"{micros['c_many']:.2f}",
-                    f"{micros['c_many'] / micros['c_one']:.2f} ({result['threads_speedup']:.2f} times as fast)",
-                ],
-            ],
+            [[labels[name], f"{value:.2f}", f"{value / micros['c_one']:.2f}"] for name, value in micros.items()],
         )
         return result, (
             f"{text}\n\nMJX: {memory_bytes / self.batch / 1024:.0f} KiB per environment, "
