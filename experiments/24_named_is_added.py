@@ -173,12 +173,12 @@ def page(rows: list[dict[str, Any]]) -> str:
     ]
     share = f"{np.median(ratios):.2f}" if ratios else "-"
     lines = [
-        f"{hits} of {len(table)} staged effects are in the reported set. The gap shrinks in the engine that makes data by",
-        f"{share} times what it shrinks by in the fitting simulator (median of {len(ratios)} effects).",
+        f"{hits} of {len(table)} staged effects are in the reported set. The gap shrinks in the engine that makes data",
+        f"by {share} times what it shrinks by in the fitting simulator (median of {len(ratios)} effects).",
         "",
-        f"One log each, six motions, {1e3 * NOISE:g} mm noise, seed {SEED}. Errors are root mean squares per coordinate",
-        f"on three held-out motions without noise. The floor, {floor:.2f} mm, is what the engine is off without any",
-        "effect. Shrinkage is `1 - (after^2 - floor^2) / (before^2 - floor^2)`, and not resolved where the gap is below",
+        f"One log each, six motions, {1e3 * NOISE:g} mm noise, seed {SEED}. Errors are root mean squares per",
+        f"coordinate on three held-out motions without noise. The floor, {floor:.2f} mm, is what the engine is off without any",
+        "effect. Shrinkage is `1 - (after^2 - floor^2) / (before^2 - floor^2)`, not resolved where the gap is below",
         "1.4 times the floor.",
         "",
         *markdown_table([head, *table]),
