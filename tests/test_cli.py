@@ -67,6 +67,8 @@ def test_help_is_fast_because_it_loads_neither_jax_nor_mujoco():
         (["train", "--steps", "-1"], "--steps is -1"),
         (["simulate", "--cable", "none.toml"], "none.toml could not be read"),
         (["simulate", "--effect", "magic:x=1"], "no effect 'magic'"),
+        (["simulate", "--effect", "bending_stiffness:ratio=-1"], "ratio is -1"),
+        (["simulate", "--effect", "plasticity:yield_curvature_per_m=5"], "Simulators that have: chain"),
         (["simulate", "--with", "none.json"], "none.json is no readable verdict"),
         (["simulate", "--seed", "-1"], "--seed is -1"),
         (["train", "--data", "nowhere.zarr"], "holds no data set"),

@@ -1,4 +1,4 @@
-"""A simulator of one's own through the protocol: an arm in MJX, and adapters that do not keep to the protocol."""
+"""A simulator of one's own through the protocol: the notebook's arm in MJX, and adapters that break the protocol."""
 
 from __future__ import annotations
 
@@ -7,13 +7,14 @@ import dataclasses
 import functools
 import importlib
 import inspect
+import pathlib
+import re
+from typing import Any
 
-import jax
-import jax.numpy as jnp
-import mujoco
+import nbformat
 import numpy as np
 import pytest
-from mujoco import mjx
+from nbclient import NotebookClient
 
 from cablejax.diagnose import (
     Effect,
@@ -26,58 +27,24 @@ from cablejax.diagnose import (
     write_verdict,
 )
 
-ARM = """
-<mujoco>
-  <option timestep="0.02" integrator="implicitfast"><flag contact="disable" constraint="disable"/></option>
-  <worldbody>
-    <body><joint name="shoulder" axis="0 1 0" damping="0.4"/><geom type="capsule" fromto="0 0 0 .4 0 0" size=".03"/>
-      <body pos=".4 0 0">
-        <joint name="elbow" axis="0 1 0" damping="0.3"/><geom type="capsule" fromto="0 0 0 .3 0 0" size=".02"/>
-        <body pos=".3 0 0"><geom type="sphere" size=".02" mass="0.1"/></body>
-      </body>
-    </body>
-  </worldbody>
-  <actuator><position joint="shoulder" kp="60" kv="4"/><position joint="elbow" kp="30" kv="2"/></actuator>
-</mujoco>
-"""
-MODEL = mjx.put_model(mujoco.MjModel.from_xml_string(ARM))
-INTERVAL = float(MODEL.opt.timestep)
+NOTEBOOK = pathlib.Path(__file__).parents[1] / "notebooks" / "05_your_own_simulator.ipynb"
 
 
-def rollout(values, command):
-    """Joint angles [rad] of the arm that follows commanded angles, shape [T, 2]."""
-    friction, payload, gain, lag = values
-    model = MODEL.replace(body_mass=MODEL.body_mass.at[3].add(payload), actuator_gainprm=MODEL.actuator_gainprm * gain)
-
-    def step(carry, target):
-        data, followed = carry
-        followed += (target - followed) * -jnp.expm1(-INTERVAL / jnp.maximum(lag, 1e-4))
-        drag = -friction * jnp.tanh(data.qvel / 0.02)
-        data = mjx.step(model, data.replace(ctrl=followed, qfrc_applied=drag))
-        return (data, followed), data.qpos
-
-    start = mjx.make_data(model).replace(qpos=command[0])
-    return jax.lax.scan(step, (start, command[0]), command)[1]
+def adapter_of(notebook: pathlib.Path) -> tuple[str, dict[str, Any]]:
+    """The cell that has the arm and its adapter, and what it defines."""
+    cells = nbformat.read(notebook, as_version=4).cells
+    (source,) = [cell.source for cell in cells if "adapter" in cell.metadata.get("tags", ())]
+    defined: dict[str, Any] = {}
+    exec(compile(source, str(notebook), "exec"), defined)
+    return source, defined
 
 
-class Arm(Simulator):
-    """The arm as its maker believes it to be, with four things that may be otherwise."""
+SOURCE, DEFINED = adapter_of(NOTEBOOK)
+Arm, INTERVAL = DEFINED["Arm"], DEFINED["INTERVAL"]
 
-    unit = "rad"
-    effects = (
-        Effect(name="joint_friction", parameters=(Parameter("torque_n_m", "N m", 0.0, 5.0, 0.5, 0.5),), null=(0.0,)),
-        Effect(name="payload", parameters=(Parameter("mass_kg", "kg", 0.0, 3.0, 0.3, 0.3),), null=(0.0,)),
-        Effect(name="actuator_gain", parameters=(Parameter("ratio", "", 0.5, 2.0, 1.0, 0.1, log=True),), null=(1.0,)),
-        Effect(name="actuator_lag", parameters=(Parameter("time_s", "s", 0.0, 0.5, 0.03, 0.03),), null=(0.0,)),
-    )
-    run = staticmethod(jax.jit(jax.vmap(rollout)))
 
-    def __init__(self, commands):
-        self.commands = commands
-
-    def predict(self, explanations, episodes):
-        values = np.stack([one.vector(self.effects) for one in explanations])
-        return in_batches(self.run, values.astype(np.float32), self.commands[episodes])
+def test_an_adapter_with_its_model_is_at_most_60_lines():
+    assert len(SOURCE.splitlines()) <= 60
 
 
 def commands(episodes: int = 6, samples: int = 150) -> np.ndarray:
@@ -139,6 +106,31 @@ def test_what_the_adapter_does_not_compute_is_null(tmp_path):
     assert gap["unit"] == "rad" and gap["before_rmse"] > gap["after_rmse"] == pytest.approx(gap["noise_floor"], rel=0.1)
     assert verdict["ranking"][0]["leftover_mm"] is None
     assert verdict["effects"][0]["location"] == {"along_cable_m": None, "time_s": None, "table_m": None}
+
+
+def tells_the_story(notebook):
+    """The hidden effect is named, an arm as believed is not blamed, and what nobody thought of is unknown."""
+    text = "".join(
+        output.get("text", "")
+        for cell in notebook.cells
+        if cell.cell_type == "code"
+        for output in cell.outputs
+        if output.get("name") == "stdout"
+    )
+    hidden = re.search(r"hidden: (\w+) = ", text)
+    assert hidden and f"one hidden effect: named - The gap comes from {hidden[1].replace('_', ' ')}," in text
+    assert "as believed: none - " in text and "resolver: unknown - " in text
+
+
+def test_the_notebook_was_run_before_it_was_kept():
+    tells_the_story(nbformat.read(NOTEBOOK, as_version=4))
+
+
+@pytest.mark.slow
+def test_the_notebook_runs():
+    notebook = nbformat.read(NOTEBOOK, as_version=4)
+    NotebookClient(notebook, timeout=500, kernel_name="python3").execute()
+    tells_the_story(notebook)
 
 
 # What follows needs no physics: a line through the origin, its slope and its offset, seen at two places.

@@ -105,9 +105,9 @@ def test_data_sets_of_different_cables_are_not_mixed(folder, capsys):
     assert "different cables: bending_stiffness_n_m2 is 0.1 and 0.05" in capsys.readouterr().err
 
 
-def test_an_effect_that_the_plant_cannot_stage_is_refused(folder, capsys):
+def test_an_effect_without_all_of_its_parameters_is_refused(folder, capsys):
     assert main(shaping(folder, "lag", "--plant-effect", "friction_patch:x_m=0")) == 2
-    assert "friction_patch" in capsys.readouterr().err and not (folder / "lag").exists()
+    assert "friction_patch lacks y_m" in capsys.readouterr().err and not (folder / "lag").exists()
 
 
 def recorded(effects: tuple[GivenEffect, ...], samples: int = 200) -> GapLog:

@@ -84,7 +84,7 @@ def test_every_effect_is_given_once():
 
 
 def test_an_obstacle_keeps_the_cable_out():
-    """The arch rises by 10 cm, and a disc stands 1 cm in its way.
+    """The arch rises by 10 cm, and a disc stands 1 cm in its way: a spring, into which the cable goes 1 mm deep.
 
     In C MuJoCo the links themselves are touched, straight lines that leave a curve by `curvature h^2 / 8`: 1 mm here.
     """
@@ -96,7 +96,7 @@ def test_an_obstacle_keeps_the_cable_out():
     found = {name: keypoints(engine(config), physics) for name, engine in ENGINES.items()}
     for name, points in found.items():
         distance = np.linalg.norm(points - [place["x_m"], place["y_m"]], axis=-1).min()
-        assert radius - 1e-3 < distance < radius + 2e-3, name
+        assert radius - 2e-3 < distance < radius + 2e-3, name
         assert np.abs(points - still).max() > 5e-3
     assert np.abs(found["mjx"] - found["chain"]).max() <= 3e-4
     assert np.abs(found["threaded"] - found["chain"]).max() <= 3e-3
@@ -124,9 +124,13 @@ def test_null_values_leave_a_rollout_as_it_is(nominal, name):
     engine = ENGINES[name](config)
     physics = nominal_physics(config)
     for effect in EFFECTS.values():
-        physics = effect.apply(physics, [np.float32(v) for v in effect.null], effect.variants[0], config)
-    # an obstacle that is far away is still looked for: nearly the same program
-    assert np.abs(keypoints(engine, physics) - still[name]).max() <= 1e-7
+        if effect.name != "obstacle":
+            physics = effect.apply(physics, [np.float32(v) for v in effect.null], effect.variants[0], config)
+    np.testing.assert_array_equal(keypoints(engine, physics), still[name])
+    # a disc that is far away is looked for, by another program that rounds otherwise
+    far = EFFECTS["obstacle"]
+    physics = far.apply(physics, [np.float32(v) for v in far.null], 0, config)
+    np.testing.assert_allclose(keypoints(engine, physics), still[name], rtol=0, atol=5e-7)
 
 
 def test_what_an_engine_cannot_simulate_is_refused_with_those_that_can():
@@ -291,7 +295,8 @@ def test_derivatives_in_every_hook(programs, start):
                 direction = jnp.ones_like(leaf) * jnp.where(leaf == 0, 0.01, leaf)
                 change = (dataclasses.replace(nothing[0], **{name: direction}), nothing[1])
                 exact = push(physics, state, twist, change)
-                size = 1e-5
+                # near rest, motion is linear only below the friction's regularisation speed
+                size = 1e-5 if start == "moving" else 3e-6
 
                 def shifted(s, name=name, direction=direction):
                     moved = dataclasses.replace(physics, **{name: getattr(physics, name) + s * direction})

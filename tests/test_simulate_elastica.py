@@ -4,7 +4,9 @@ import numpy as np
 import pytest
 from scipy.special import ellipk
 
+from cablejax.cable import Discretisation
 from cablejax.simulate.elastica import ElasticaError, elastica, solve_elastica
+from cablejax.simulate.equilibrium import arch_angles, chain_nodes, find_equilibrium
 
 
 def ends(start: float, end: float, distance: float, *, turn: float = 0.0, shift=(0.0, 0.0)) -> np.ndarray:
@@ -55,6 +57,16 @@ def test_ends_are_met_and_the_shape_moves_with_them(start, end, distance):
     # Twice the length and twice the distance: the same shape, twice as large.
     large = solve_elastica(ends(start, end, 2 * distance), 2.0)
     np.testing.assert_allclose(large.position, 2 * shape.position, atol=1e-6)
+
+
+def test_an_s_with_unequal_ends_is_found_where_the_chain_rests():
+    pose, config = ends(-70, -60, 0.7), Discretisation(n_links=97)
+    shape = solve_elastica(pose, 1.0)
+    assert shape.stability() > 0
+    angles = find_equilibrium(config, pose, arch_angles(config, pose)).angles
+    nodes = chain_nodes(config, pose, angles)
+    middle = np.stack([np.interp((np.arange(96) + 0.5) / 96, shape.arclength, shape.position[:, i]) for i in (0, 1)])
+    assert np.abs(nodes - middle.T).max() < 2e-3
 
 
 def test_slack_lies_on_the_side_to_which_the_ends_lean():

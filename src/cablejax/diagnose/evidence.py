@@ -1,4 +1,4 @@
-"""What a recording says, ready for fits: observations beside predictions, weighed by the noise."""
+"""What a recording says, ready for fits: observations and predictions, weighed by the noise."""
 
 from __future__ import annotations
 

@@ -100,6 +100,11 @@ def executed_twist(physics: Physics, start: Any, twist: Any, interval: Any) -> A
     return twist + (off[1:] - off[:-1]) / interval
 
 
+def follows_exactly(physics: Physics) -> bool:
+    """Whether arms of known parameters do what they are commanded."""
+    return bool(physics.actuation_gain == 1 and physics.actuation_delay == 0 and physics.actuation_time == 0)
+
+
 def lagged(poses: Any, interval: Any, delay: Any, slow: Any) -> Any:
     """Poses after a pure delay [s], then a first-order lag of time constant `slow` [s]; shape [T, ...] as `poses`.
 

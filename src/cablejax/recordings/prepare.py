@@ -95,7 +95,7 @@ def _without_outliers(takes: tuple[Take, ...]) -> tuple[tuple[Take, ...], list[s
     length, kept, count, farthest = float(typical_spacing(takes).sum()), [], 0, 0.0
     for take in takes:
         middle = np.full((len(take.time), 1, take.keypoints.shape[2]), np.nan)
-        shown = np.isfinite(take.keypoints).all(axis=2).any(axis=1)
+        shown = np.asarray(np.isfinite(take.keypoints).all(axis=2)).any(axis=1)
         middle[shown, 0] = np.nanmedian(take.keypoints[shown], axis=1)
         distance = np.nan_to_num(np.linalg.norm(take.keypoints - middle, axis=2), nan=0.0)
         far = distance > _OUTLIER * length

@@ -48,6 +48,7 @@ def advance(
     """All time steps of one cable. `pose` [Q, P] is advanced in place; samples go to nodes, tangents and poses."""
     model, data = addresses[0], addresses[1]
     n_free = actuator_velocity.shape[0] // 2
+    uneven = table[1] != 0.0 or table[5] != 0.0
     _sample(model, data, xipos, xmat, links, nodes[0], tangents[0])
     poses[0] = pose
     for t in range(twist.shape[0]):
@@ -58,25 +59,25 @@ def advance(
             _step1(model, data)
             for k in range(n_free):
                 vx, vy = actuator_velocity[2 * k], actuator_velocity[2 * k + 1]
-                node = xipos[links[k + 1]]
-                held_back = drag(table, table[7 + k], node[0], node[1], vx * vx + vy * vy, friction_speed)
-                actuator_biasprm[2 * k, 2] = -held_back
-                actuator_biasprm[2 * k + 1, 2] = -held_back
+                squared = vx * vx + vy * vy
+                coefficient = table[0]
+                if uneven:
+                    link = links[k + 1]
+                    coefficient = friction_there(table, xipos[link, 0], xipos[link, 1], squared)
+                drag = coefficient * table[7 + k] / np.sqrt(squared + friction_speed * friction_speed) + table[6]
+                actuator_biasprm[2 * k, 2] = -drag
+                actuator_biasprm[2 * k + 1, 2] = -drag
             _step2(model, data)
         _sample(model, data, xipos, xmat, links, nodes[t + 1], tangents[t + 1])
         poses[t + 1] = pose
 
 
 @numba.njit(nogil=True, cache=False)
-def drag(table, weight, x, y, squared_speed, friction_speed):
-    """`friction.drag_coefficient` of one node."""
-    coefficient = table[0]
-    if table[5] != 0.0:
-        distance = np.sqrt((x - table[2]) ** 2 + (y - table[3]) ** 2)
-        coefficient += table[5] / (1.0 + np.exp(-(table[4] - distance) / PATCH_EDGE))
-    if table[1] != 0.0:
-        coefficient *= 1.0 + table[1] * np.exp(-squared_speed / STRIBECK_SPEED**2)
-    return coefficient * weight / np.sqrt(squared_speed + friction_speed * friction_speed) + table[6]
+def friction_there(table, x, y, squared_speed):
+    """Coefficient of friction at one place and speed, see `friction.drag_coefficient`."""
+    distance = np.sqrt((x - table[2]) ** 2 + (y - table[3]) ** 2)
+    coefficient = table[0] + table[5] / (1.0 + np.exp(-(table[4] - distance) / PATCH_EDGE))
+    return coefficient * (1.0 + table[1] * np.exp(-squared_speed / STRIBECK_SPEED**2))
 
 
 @numba.njit(nogil=True, cache=False)

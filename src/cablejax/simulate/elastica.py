@@ -155,11 +155,27 @@ def _solve(ends, mesh, state, force):
 
 
 def _continue(ends):
-    """Follow the solution from a nearly straight rod to `ends`, in steps that halve where the solver fails."""
-    start, solution = _start(ends)
+    """The solution for `ends`, followed from a nearly straight rod.
+
+    Where the direct way ends at a fork, as it does for an S with unequal ends, it leads by the S with equal ones.
+    """
+    equal = np.array([ends[:2].mean(), ends[:2].mean(), ends[2]])
+    for stops in ([ends], [equal, ends]):
+        start, solution = _start(stops[0])
+        for stop in stops:
+            start, solution = stop, None if solution is None else _follow(start, stop, solution)
+        if solution is not None:
+            return solution
+    raise ElasticaError(
+        f"No equilibrium found for end angles {ends[0]:.3f} and {ends[1]:.3f} rad against the chord and a "
+        f"chord of {ends[2]:.3f} lengths: ends that turn so far so close together have none that grows "
+        "out of a straight cable. Choose gentler ends or pass a guess."
+    )
+
+
+def _follow(start, ends, solution):
+    """The solution for `ends` that grows out of one for `start`, or None. Steps halve where the solver fails."""
     done, step = 0.0, 0.25
-    if solution is None:
-        raise ElasticaError("No equilibrium found next to the straight rod for these ends.")
     while done < 1.0:
         fraction = min(1.0, done + step)
         trial = _solve(start + fraction * (ends - start), solution.x, solution.y, solution.p)
@@ -171,11 +187,7 @@ def _continue(ends):
         else:
             step /= 2
             if step < SMALLEST_STEP:
-                raise ElasticaError(
-                    f"No equilibrium found for end angles {ends[0]:.3f} and {ends[1]:.3f} rad against the chord and a "
-                    f"chord of {ends[2]:.3f} lengths: ends that turn so far so close together have none that grows "
-                    "out of a straight cable. Choose gentler ends or pass a guess."
-                )
+                return None
     return solution
 
 

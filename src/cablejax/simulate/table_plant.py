@@ -245,9 +245,9 @@ class TablePlant(abc.ABC):
             )
 
 
-@functools.lru_cache(maxsize=64)
+@functools.lru_cache(maxsize=32)
 def plant_physics(discretisation: Discretisation, effects: tuple[GivenEffect, ...]) -> Physics:
-    """A plant's cable with its effects, float64, every joint bending in the plane.
+    """A plant's cable with its effects, float64, every joint bending in the plane. Not to be modified: cached.
 
     Raises:
         ValueError: a parameter of an effect is out of its bounds.

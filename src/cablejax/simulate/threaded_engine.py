@@ -15,7 +15,7 @@ import mujoco
 import numpy as np
 
 from cablejax.cable import Discretisation
-from cablejax.effects.arms import executed_twist
+from cablejax.effects.arms import executed_twist, follows_exactly
 from cablejax.effects.base import Hook
 from cablejax.effects.camera import seen_by_camera
 from cablejax.effects.physics import Physics
@@ -112,7 +112,8 @@ class _Simulation:
         config, planar = self.config, self.config.dimension == 2
         if planar:
             self._place_obstacle(physics)
-            twist = executed_twist(physics, state.gripper_pose, twist, interval)
+            if not follows_exactly(physics):
+                twist = executed_twist(physics, state.gripper_pose, twist, interval)
         model, data = self.model, self.data
         self._write(physics)
         mujoco.mj_resetData(model, data)
@@ -157,7 +158,7 @@ class _Simulation:
             self.data = mujoco.MjData(self.model)
 
     def _table(self, physics: Physics) -> np.ndarray:
-        """The table of `compiled_steps.drag`: seven values, then the weight of each free node [N]."""
+        """The table of `compiled_steps.advance`: seven values, then the weight of each free node [N]."""
         h = self.config.link_length
         if self.config.dimension == 3:
             return np.zeros(7)

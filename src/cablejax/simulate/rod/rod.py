@@ -85,14 +85,23 @@ class Rod:
         discrete = DiscreteRod.of(jax.tree.map(jnp.asarray, physics), self.n_edges)
         held, side = held_nodes(discrete.physics, position, frames, discrete.h)
         first_points, state = self._begin(discrete, held, side, seen, interval)
+        chain = ElasticChain(
+            weight=discrete.mass[:, 0],
+            bending=(1.0 + 1.5 / dt * discrete.physics.damping_time) * discrete.bending,
+            edge=discrete.h,
+            compliance=discrete.compliance,
+            pins=jnp.zeros((0, discrete.n - 4)),
+        )
 
         def sample(state, window):
             if self.substeps == 1:
-                state = self._step(discrete, dt, state, *(leaf[2] for leaf in window))
+                state = self._step(discrete, chain, dt, state, *(leaf[2] for leaf in window))
             else:
                 state, _ = jax.lax.scan(
                     lambda s, i: (
-                        self._step(discrete, dt, s, *(_between(leaf, (i + 1) / self.substeps) for leaf in window)),
+                        self._step(
+                            discrete, chain, dt, s, *(_between(leaf, (i + 1) / self.substeps) for leaf in window)
+                        ),
                         None,
                     ),
                     state,
@@ -124,8 +133,11 @@ class Rod:
         motion = _Motion(second, second - dt * velocity, velocity, velocity, jnp.zeros(n - 3), *frames)
         return jnp.stack([discrete.weights @ start + offsets, discrete.weights @ second + offsets]), motion
 
-    def _step(self, discrete: DiscreteRod, dt, state: _Motion, ends, side) -> _Motion:
-        """One time step of BDF2, to where the held nodes are at `ends` and the held edges' directors are `side`."""
+    def _step(self, discrete: DiscreteRod, chain: ElasticChain, dt, state: _Motion, ends, side) -> _Motion:
+        """One time step of BDF2, to where the held nodes are at `ends` and the held edges' directors are `side`.
+
+        `chain` is that of a step but for the weights, which change with the drag.
+        """
         physics, bending, mass = discrete.physics, discrete.bending, discrete.mass
         x, x_old, v, v_old, tension, u, t = state
         x_next, v_next = 2 * x - x_old, 2 * v - v_old
@@ -139,13 +151,7 @@ class Rod:
         inertia = (3 * known / (2 * dt)) + (4 * v - v_old) / (2 * dt) + physics.gravity
         drag = physics.drag + physics.quadratic_drag * speed[2:-2]
         force = mass * inertia[2:-2] + drag * known[2:-2] + spread_bends(damped)
-        chain = ElasticChain(
-            weight=2.25 / dt**2 * mass[:, 0] + 1.5 / dt * drag[:, 0],
-            bending=(1.0 + 1.5 / dt * physics.damping_time) * bending,
-            edge=discrete.h,
-            compliance=discrete.compliance,
-            pins=jnp.zeros((0, discrete.n - 4)),
-        )
+        chain = dataclasses.replace(chain, weight=2.25 / dt**2 * mass[:, 0] + 1.5 / dt * drag[:, 0])
         if self.twisting:
             force = force + discrete.forces(x_next, transport(u, t, unit(edges)), unit(edges))
         free, tension = constrained(_NEWTON, chain, force, ends, x_next[2:-2], tension)
