@@ -34,7 +34,7 @@ from cablejax.dynamics.train import TrainState, chunk_update
 from cablejax.dynamics.train_config import Phase, TrainConfig
 from cablejax.effects.physics import nominal_physics
 from cablejax.simulate import MjxEngine, ThreadedEngine, compiler_options
-from cablejax.simulate.chain.step import Chain
+from cablejax.simulate.chain.replay import Chain
 from cablejax.types import Trajectory
 
 

@@ -19,23 +19,21 @@ import pathlib
 
 os.environ.setdefault("NPROC", "4")
 
-import jax
 import numpy as np
 
-from cablejax.cable import Cable, Discretisation
+from cablejax.cable import Cable
 from cablejax.control.loop import run_closed_loop
 from cablejax.control.shaping import Model, load_model, make_controller
+from cablejax.dataset.generate import make_engine, simulate
+from cablejax.dataset.schema import DatasetConfig
 from cablejax.diagnose import diagnose, write_verdict
-from cablejax.diagnose.diagnosis import NamedEffect, ParameterEstimate
-from cablejax.diagnose.into_simulator import params_with
-from cablejax.effects.physics import Physics
+from cablejax.effects.given import GivenEffect, effects_of_verdict
 from cablejax.evaluation.cases import mujoco_plant, stiffness_cases
 from cablejax.evaluation.fine_tuning import FineTuneConfig, fine_tune
 from cablejax.evaluation.methods import MethodSpec
 from cablejax.evaluation.suite import Case, read_suite, run_suite
 from cablejax.gaplog import gap_log_from_episodes, read_gap_log, write_gap_log
-from cablejax.simulate import ThreadedEngine
-from cablejax.simulate.motions import MotionConfig, random_motion
+from cablejax.simulate.motions import MotionConfig
 from cablejax.types import Trajectory
 from pages import page_of_results, publish
 
@@ -58,7 +56,7 @@ def main() -> None:
     parser.add_argument("--report", type=pathlib.Path, help="page to write")
     options = parser.parse_args()
     verdict, effects = named(options.out)
-    truth = (NamedEffect("bending_stiffness", 1.0, {"ratio": ParameterEstimate(RATIO, None, "")}, {}),)
+    truth = (GivenEffect("bending_stiffness", (("ratio", RATIO),)),)
     for spec in ARMS.values():
         kind = spec.name.split()[0]
         trained = functools.partial(
@@ -68,7 +66,7 @@ def main() -> None:
     publish(page(options.out, verdict), options.report)
 
 
-def named(out: pathlib.Path) -> tuple[dict, tuple[NamedEffect, ...]]:
+def named(out: pathlib.Path) -> tuple[dict, tuple[GivenEffect, ...]]:
     """The verdict on six logged runs, and its effects."""
     path = out / "verdict.json"
     if not path.exists():
@@ -77,23 +75,14 @@ def named(out: pathlib.Path) -> tuple[dict, tuple[NamedEffect, ...]]:
             write_gap_log(log, recorded())
         write_verdict(path, diagnose(read_gap_log(log), progress=print))
     verdict = json.loads(path.read_text(encoding="utf-8"))
-    effects = tuple(
-        NamedEffect(
-            e["name"],
-            e["probability"],
-            {k: ParameterEstimate(p["value"], p["ci90"], p["unit"]) for k, p in e["parameters"].items()},
-            e["location"],
-        )
-        for e in verdict["effects"]
-    )
-    return verdict, effects
+    return verdict, effects_of_verdict(path)
 
 
-def trained_with(effects: tuple[NamedEffect, ...], home: pathlib.Path, case: Case) -> Model:
+def trained_with(effects: tuple[GivenEffect, ...], home: pathlib.Path, case: Case) -> Model:
     """The released network after training on the simulator with these effects."""
     del case
     config = FineTuneConfig()
-    return fine_tune(transitions(params_with(effects, Discretisation()), config), config, home)
+    return fine_tune(transitions(effects, config), config, home)
 
 
 def recorded():
@@ -109,17 +98,19 @@ def recorded():
     return gap_log_from_episodes(episodes, Cable(), source="direct transfer on a plant with contact")
 
 
-def transitions(params: Physics, config: FineTuneConfig) -> Trajectory:
-    """Random motions of the simulated cable with these parameters, as many as `FineTuneConfig` says."""
-    cable, rng = Discretisation(), np.random.default_rng(config.seed)
-    engine = ThreadedEngine(cable)
-    drawn = [
-        random_motion(rng, cable, config.commands, MotionConfig(start="straight")) for _ in range(config.trajectories)
-    ]
-    state = engine.initial_state(np.stack([start for start, _ in drawn]))
-    batch = jax.tree.map(lambda x: np.broadcast_to(np.asarray(x), (len(drawn), *np.shape(x))), params)
-    data = engine.rollout(batch, state, np.stack([twist for _, twist in drawn]), 1.0)[1]
-    return Trajectory(*(np.asarray(x, np.float32) for x in (data.keypoints, data.gripper_pose, data.gripper_twist)))
+def transitions(effects: tuple[GivenEffect, ...], config: FineTuneConfig) -> Trajectory:
+    """Random motions of the simulated cable with these effects, as many as `FineTuneConfig` says."""
+    data = DatasetConfig(
+        n_trajectories=config.trajectories,
+        n_steps=config.commands,
+        seed=config.seed,
+        motion=MotionConfig(start="straight"),
+        engine="chain",
+        shard_size=config.trajectories,
+        effects=effects,
+    )
+    (block,) = simulate(data, make_engine(data), [0])
+    return Trajectory(block.keypoints, block.gripper_pose, block.gripper_twist)  # pyright: ignore[reportArgumentType]
 
 
 def page(out: pathlib.Path, verdict: dict) -> str:

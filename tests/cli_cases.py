@@ -7,6 +7,8 @@ import pathlib
 import numpy as np
 from flax import nnx
 
+from cablejax.cable import Cable
+from cablejax.cable_file import cable_to_fields
 from cablejax.control.run import ClosedLoopRun, shape_error_cm
 from cablejax.control.targets import Target
 from cablejax.dynamics.config import ModelConfig
@@ -15,11 +17,20 @@ from cablejax.dynamics.weights import FILE_NAME, save_weights
 from cablejax.gaplog import Episode
 
 
-def small_model(folder: pathlib.Path, seed: int = 0) -> pathlib.Path:
+def small_model(folder: pathlib.Path, seed: int = 0, cable: Cable = Cable()) -> pathlib.Path:
     """Writes the weights file of a small network into a folder, as `cablejax train` would, and returns the folder."""
-    config = ModelConfig(latent=8, hidden=8, hidden_layers=1, message_passing=1, prior="rigid")
+    config = ModelConfig(
+        n_keypoints=cable.n_keypoints,
+        length=cable.length,
+        latent=8,
+        hidden=8,
+        hidden_layers=1,
+        message_passing=1,
+        prior="rigid",
+    )
     folder.mkdir(parents=True, exist_ok=True)
-    save_weights(folder / FILE_NAME, config, nnx.split(GNS(config, nnx.Rngs(seed)))[1], {"source": "test"})
+    info = {"source": "test", "cable": cable_to_fields(cable)}
+    save_weights(folder / FILE_NAME, config, nnx.split(GNS(config, nnx.Rngs(seed)))[1], info)
     return folder
 
 

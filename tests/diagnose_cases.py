@@ -19,7 +19,7 @@ from cablejax.diagnose.evidence import Evidence
 from cablejax.diagnose.planar import PlanarCable, physics_of
 from cablejax.diagnose.playback import Playback
 from cablejax.gaplog import Episode, gap_log_from_episodes
-from cablejax.simulate.chain.step import FINE_STEP, LARGEST_STEP
+from cablejax.simulate.chain.replay import FINE_STEP, LARGEST_STEP
 from cablejax.types import GapLog
 
 CABLE = Cable()

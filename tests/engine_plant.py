@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float
 
 from cablejax.effects.physics import Physics, nominal_physics
-from cablejax.simulate.engine import Engine
+from cablejax.simulate.engine import Engine, refuse_lags
 from cablejax.simulate.table_plant import Observation
 from cablejax.types import CableState, Trajectory
 
@@ -17,11 +17,15 @@ class EnginePlant:
     Args:
         engine: planar.
         physics: of this cable; by default the nominal ones.
+
+    Raises:
+        ValueError: the engine simulates a cable in space, or arms or camera lag.
     """
 
     def __init__(self, engine: Engine, physics: Physics | None = None):
         self.engine = engine
         self.physics = nominal_physics(engine.config) if physics is None else physics
+        refuse_lags(self.physics)
         self._state: CableState | None = None
         self._time = 0.0
 

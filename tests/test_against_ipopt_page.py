@@ -11,6 +11,7 @@ from against_ipopt.page import ipopt_sections
 from against_ipopt.planning_problems import ProblemMaker
 from against_ipopt.solver_path import PathFinder
 from cablejax.bounded import BoundedQuasiNewton
+from cablejax.cable import Cable
 from cablejax.control.shaping import Model
 from mpc_cases import planning_case, relaxing_cable
 
@@ -86,7 +87,7 @@ def test_every_exception_is_explained(of_row, said, words):
 def test_other_starts_are_tried_until_one_has_all_that_is_asked():
     with jax.enable_x64(True):
         case = planning_case()
-        make = ProblemMaker(Model("analytic", None, relaxing_cable, jnp.asarray(0.8)))  # pyright: ignore[reportArgumentType]
+        make = ProblemMaker(Model("analytic", None, relaxing_cable, jnp.asarray(0.8), Cable()))  # pyright: ignore[reportArgumentType]
         finder = PathFinder(
             lambda motion, problem: problem.residuals(motion),
             BoundedQuasiNewton(atol=1e-10),

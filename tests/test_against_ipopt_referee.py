@@ -22,6 +22,7 @@ from against_ipopt.planning_problems import (
 from against_ipopt.referee import Limits, RefereeConfig, referee
 from against_ipopt.solver_path import PathFinder
 from cablejax.bounded import BoundedLevenbergMarquardt, SpectralProjectedGradient, certify
+from cablejax.cable import Cable
 from cablejax.control.shaping import Model
 from cablejax.mpc import MPC, SOLVERS
 from cablejax.types import Measurement
@@ -92,7 +93,7 @@ def test_seconds_are_compared_where_objectives_are_equal():
 
 def test_only_networks_have_corners_to_round():
     with pytest.raises(ValueError, match="nothing to round"):
-        smooth_model(Model("analytic", None, relaxing_cable, None))  # pyright: ignore[reportArgumentType]
+        smooth_model(Model("analytic", None, relaxing_cable, None, Cable()))  # pyright: ignore[reportArgumentType]
 
 
 @pytest.mark.slow
@@ -116,7 +117,7 @@ def test_the_referee_stops_in_time():
 @pytest.mark.slow
 def test_a_control_calls_solver_is_timed_beside_the_referee_in_single_precision():
     case = planning_case()
-    make = ProblemMaker(Model("analytic", None, relaxing_cable, jnp.asarray(0.8)), np.float32)  # pyright: ignore[reportArgumentType]
+    make = ProblemMaker(Model("analytic", None, relaxing_cable, jnp.asarray(0.8), Cable()), np.float32)  # pyright: ignore[reportArgumentType]
     one = {"two-trials": SOLVERS["two-trials"]}
     row = race(make, case, one)
     ours, theirs = row["two-trials"], row["ipopt"]

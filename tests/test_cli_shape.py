@@ -83,7 +83,10 @@ def test_results_are_not_overwritten_unasked(weights, tmp_path, capsys):
         (["--weights", "nothing"], "nothing"),
         (["--steps", "0"], "--steps is 0"),
         (["--links", "2"], "n_links is 2"),
-        (["--stiffness-ratio", "-1"], "ratio is -1"),
+        (["--plant-effect", "bending_stiffness:ratio=-1"], "ratio is -1"),
+        (["--plant-effect", "stiffness:ratio=2"], "no effect 'stiffness'"),
+        (["--plant-effect", "none", "--plant-effect", "linear_density:ratio=2"], "give either"),
+        (["--cable", "missing.toml"], "missing.toml could not be read"),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else None,
 )

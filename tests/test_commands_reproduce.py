@@ -1,6 +1,7 @@
 """Command lines in a model card make what they say, and name no local folder."""
 
 import dataclasses
+import json
 import pathlib
 import shlex
 
@@ -8,11 +9,15 @@ import pytest
 import tyro
 
 from cablejax.cable import Cable, Discretisation
+from cablejax.cable_file import write_cable
 from cablejax.commands.reproduce import command_line, simulate_command
 from cablejax.commands.simulate import Simulate
 from cablejax.commands.train import Train
 from cablejax.dataset.schema import DatasetConfig, Randomisation
+from cablejax.effects.given import parse_effect
 from cablejax.simulate.motions import MotionConfig
+
+LONG = Cable(length=1.5, linear_density=0.05, bending_stiffness=0.05, n_keypoints=17)
 
 
 @pytest.mark.parametrize(
@@ -26,21 +31,46 @@ from cablejax.simulate.motions import MotionConfig
         ),
         DatasetConfig(
             randomisation=Randomisation(stiffness=(0.1, 3.0)),
-            discretisation=Discretisation(Cable(bending_stiffness=0.05)),
+            discretisation=Discretisation(LONG),
+            motion=MotionConfig(max_curvature=12.0 / 1.5),
+        ),
+        DatasetConfig(
+            engine="chain",
+            effects=(
+                parse_effect("bending_stiffness:ratio=1.2345678901234567"),
+                parse_effect("friction_patch:x_m=0.1,y_m=-0.2,radius_m=0.05,coefficient=0.4"),
+            ),
         ),
     ],
-    ids=["default", "random", "free", "mjx", "stiffness"],
+    ids=["default", "random", "free", "mjx", "cable", "effects"],
 )
-def test_the_command_of_a_data_set_asks_for_that_data_set(config):
+def test_the_command_of_a_data_set_asks_for_that_data_set(config, tmp_path):
+    write_cable(tmp_path / "cable.toml", config.cable)
     words = shlex.split(simulate_command(config, "name.zarr"))
     assert words[:2] == ["cablejax", "simulate"]
+    assert ("--cable" in words) == (config.cable != Cable())
+    words = [str(tmp_path / word) if word == "cable.toml" else word for word in words]
     parsed = tyro.cli(Simulate, args=words[2:], config=(tyro.conf.FlagCreatePairsOff,))
     assert parsed.dataset_config() == config
     assert parsed.out.name == "name.zarr" or config == DatasetConfig()
 
 
+def test_the_effects_of_a_verdict_are_added_to_those_given(tmp_path):
+    verdict = {
+        "schema": "cablejax-verdict/1",
+        "verdict": "named",
+        "effects": [{"name": "linear_density", "parameters": {"ratio": {"value": 1.5, "ci90": None, "unit": ""}}}],
+    }
+    (tmp_path / "verdict.json").write_text(json.dumps(verdict))
+    words = ["--effect", "bending_stiffness:ratio=2", "--with", str(tmp_path / "verdict.json"), "--engine", "chain"]
+    parsed = tyro.cli(Simulate, args=words, config=(tyro.conf.FlagCreatePairsOff,)).dataset_config()
+    assert list(map(str, parsed.effects)) == ["bending_stiffness:ratio=2", "linear_density:ratio=1.5"]
+    words = shlex.split(simulate_command(parsed, "name.zarr"))
+    assert tyro.cli(Simulate, args=words[2:], config=(tyro.conf.FlagCreatePairsOff,)).dataset_config() == parsed
+
+
 def test_a_data_set_beyond_the_options_says_so():
-    config = DatasetConfig(discretisation=Discretisation(Cable(damping_time=0.3)))
+    config = DatasetConfig(interval=2.0)
     assert simulate_command(config, "name.zarr").startswith("# name.zarr: ")
 
 

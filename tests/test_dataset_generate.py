@@ -1,6 +1,7 @@
 """A data set is the same, byte by byte, however it was made: in one go or after a kill, by one process or by two."""
 
 import dataclasses
+import json
 import os
 import signal
 import socket
@@ -13,9 +14,18 @@ import numpy as np
 import pytest
 
 from cablejax.cable import Cable, Discretisation
-from cablejax.dataset.generate import MAX_ATTEMPTS, GenerationInterrupted, draw, find_fault, generate, simulate
-from cablejax.dataset.schema import DatasetConfig, Randomisation
+from cablejax.dataset.generate import (
+    MAX_ATTEMPTS,
+    GenerationInterrupted,
+    draw,
+    find_fault,
+    generate,
+    make_engine,
+    simulate,
+)
+from cablejax.dataset.schema import DatasetConfig, Randomisation, config_from_json, config_to_json, digest_of_config
 from cablejax.dataset.store import open_store
+from cablejax.effects.given import EFFECTS, GivenEffect
 from cablejax.simulate import ThreadedEngine
 from cablejax.simulate.motions import MotionConfig
 
@@ -29,6 +39,36 @@ TINY = DatasetConfig(
     discretisation=Discretisation(Cable(n_keypoints=4), n_links=7, timestep=0.02),
     randomisation=Randomisation(stiffness=(0.1, 3.0), friction=(0.5, 2.0)),
 )
+
+STAGED = dataclasses.replace(
+    TINY, n_trajectories=2, n_steps=4, shard_size=2, engine="chain", randomisation=Randomisation()
+)  # one shard
+VALUES = {
+    name: tuple(zip(names.split(), values, strict=True))
+    for name, names, values in (
+        ("bending_stiffness", "ratio", (3.0,)),
+        ("stiffness_profile", "centre_m width_m ratio", (0.3, 0.2, 0.3)),
+        ("intrinsic_curvature", "centre_m width_m curvature_per_m", (0.3, 0.2, 2.0)),
+        ("plasticity", "yield_curvature_per_m", (0.2,)),
+        ("bending_hysteresis", "moment_n_m transition_curvature_per_m", (0.02, 0.5)),
+        ("bending_damping", "time_s", (5.0,)),
+        ("axial_stretch", "stiffness_n", (1.0,)),
+        ("table_friction", "coefficient", (0.5,)),
+        ("friction_patch", "x_m y_m radius_m coefficient", (0.0, 0.0, 0.5, 1.0)),
+        ("viscous_drag", "coefficient_n_s_per_m2", (5.0,)),
+        ("gravity_tilt", "angle_rad direction_rad", (0.2, 1.0)),
+        ("linear_density", "ratio", (3.0,)),
+        ("lumped_mass", "centre_m mass_kg", (0.4, 0.1)),
+        ("gripper_slip", "gripper time_s distance_m", (1, 1.0, 0.02)),
+        ("gripper_rotation_offset", "gripper angle_rad", (0, 0.1)),
+        ("gripper_compliance", "gripper stiffness_n_m_per_rad", (0, 0.1)),
+        ("camera_similarity", "scale angle_rad x_m y_m", (1.02, 0.05, 0.01, 0.0)),
+        ("keypoint_bias", "index offset_m", (2, 0.01)),
+        ("camera_lag", "time_s", (0.3,)),
+        ("actuation_gain", "gain", (0.8,)),
+        ("actuation_lag", "time_s", (0.4,)),
+    )
+}
 
 # A second process makes the same configuration as this one: it is passed as the source text of a DatasetConfig.
 CHILD = """
@@ -103,6 +143,66 @@ def test_parameters_reach_the_simulator():
     )
     shapes = [simulate(config, ThreadedEngine(config.discretisation), [0])[0].keypoints for config in (stiff, soft)]
     assert np.abs(shapes[0] - shapes[1]).max() > 1e-3
+
+
+@pytest.fixture(scope="module")
+def by_chain() -> dict[str, np.ndarray]:
+    """Gripper poses and keypoints without any effect, by the engine that simulates all effects."""
+    (block,) = simulate(STAGED, make_engine(STAGED), [0])
+    return {"keypoints": block.keypoints, "pose": block.gripper_pose, "twist": block.gripper_twist}
+
+
+def in_the_way(keypoints: np.ndarray) -> tuple[tuple[str, float], ...]:
+    """A disc of 3 cm into which `keypoints` [T + 1, N, 2] end up 5 mm deep."""
+    along = keypoints[-1, -1] - keypoints[-1, 0]
+    across = np.array([-along[1], along[0]]) / np.hypot(*along)
+    moved = keypoints[-1, 2] - keypoints[0, 2]
+    x, y = keypoints[-1, 2] + np.sign(moved @ across) * 0.025 * across
+    return (("x_m", float(x)), ("y_m", float(y)), ("radius_m", 0.03))
+
+
+@pytest.mark.parametrize("effect", EFFECTS.values(), ids=lambda effect: effect.name)
+def test_every_effect_reaches_the_data(effect, by_chain):
+    one = GivenEffect(effect.name, VALUES.get(effect.name) or in_the_way(by_chain["keypoints"][0]))
+    config = dataclasses.replace(STAGED, effects=(one,))
+    (block,) = simulate(config, make_engine(config), [0])
+    assert block.attempts.max() == 0
+    assert np.abs(block.keypoints - by_chain["keypoints"]).max() > 1e-4
+    np.testing.assert_array_equal(block.gripper_twist, by_chain["twist"])
+    moved = np.abs(block.gripper_pose - by_chain["pose"]).max() > 1e-4
+    assert moved == (effect.hook == "input")
+
+
+def test_effects_travel_in_the_store(tmp_path):
+    effects = tuple(GivenEffect(name, VALUES[name]) for name in ("stiffness_profile", "lumped_mass"))
+    config = dataclasses.replace(TINY, n_trajectories=2, effects=effects)
+    assert config_from_json(DatasetConfig, json.loads(json.dumps(config_to_json(config)))) == config
+    info = generate(config, tmp_path / "data", progress=False)
+    assert open_store(tmp_path / "data").config.effects == effects
+    plain = generate(dataclasses.replace(config, effects=()), tmp_path / "plain", progress=False)
+    assert info.digest != plain.digest
+    with pytest.raises(ValueError, match="effects is"):
+        generate(dataclasses.replace(config, effects=effects[:1]), tmp_path / "data", progress=False)
+
+
+def test_a_store_without_effects_in_its_record_is_one_without_effects(tmp_path):
+    generate(dataclasses.replace(TINY, n_trajectories=2), tmp_path / "data", progress=False)
+    path = tmp_path / "data" / "zarr.json"
+    root = json.loads(path.read_text())
+    attributes = root["attributes"]
+    del attributes["config"]["effects"]
+    attributes["config_digest"] = digest_of_config(attributes["config"])
+    path.write_text(json.dumps(root))
+    assert generate(dataclasses.replace(TINY, n_trajectories=2), tmp_path / "data", progress=False).complete
+
+
+def test_effects_that_an_engine_cannot_simulate_are_refused():
+    with pytest.raises(ValueError, match=r"threaded cannot simulate axial_stretch.*: chain\."):
+        dataclasses.replace(TINY, effects=(GivenEffect("axial_stretch", VALUES["axial_stretch"]),))
+    with pytest.raises(ValueError, match="ratio is 1000"):
+        dataclasses.replace(TINY, effects=(GivenEffect("bending_stiffness", (("ratio", 1000.0),)),))
+    with pytest.raises(ValueError, match="'warp', expected one of threaded, mjx, chain"):
+        dataclasses.replace(TINY, engine="warp")
 
 
 def test_content_does_not_depend_on_the_shard_size(reference, tmp_path):

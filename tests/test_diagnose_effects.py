@@ -14,7 +14,7 @@ from cablejax.diagnose import LIBRARY, CableEffect, Parameter
 from cablejax.diagnose.check import check_effect
 from cablejax.effects.physics import nominal_physics
 from cablejax.simulate import MjxEngine, compiler_options
-from cablejax.simulate.chain.step import Chain
+from cablejax.simulate.chain.replay import Chain
 
 NAMES = {
     "bending_stiffness", "stiffness_profile", "intrinsic_curvature", "plasticity", "bending_hysteresis",

@@ -10,17 +10,16 @@ import pytest
 from cablejax.cable import Cable, Discretisation
 from cablejax.diagnose import LIBRARY, CableEffect, Calibration, Explanation, Parameter, explanation
 from cablejax.diagnose.belief import as_good, excess, explains_most_motions, level, log_scores
-from cablejax.diagnose.conclude import conclude
+from cablejax.diagnose.conclude import conclude, sentence
 from cablejax.diagnose.conformal import leftover_p, leftover_score
 from cablejax.diagnose.evidence import Evidence
 from cablejax.diagnose.fit import Fit, evaluate, improve
-from cablejax.diagnose.judgement import sentence
 from cablejax.diagnose.playback import Playback
 from cablejax.diagnose.protocol import Term
 from cablejax.diagnose.screen import screen, shortlist
 from cablejax.diagnose.search import Search
 from cablejax.effects import BendingStiffness
-from cablejax.simulate.chain.step import LARGEST_STEP
+from cablejax.simulate.chain.replay import LARGEST_STEP
 from diagnose_cases import BY_NAME, INTERVAL, evidence, parts
 
 LOOK_ALIKES = (("bending_stiffness", (0.3,)), ("table_friction", (0.3, 0.0)))
@@ -115,8 +114,8 @@ def test_a_motion_that_nothing_explains_does_not_hide_the_cause_of_the_others():
     assert conclusion.equivalent == ()
     left, gap = (excess(float(fit.sse.sum()), facts) for fit in (right, null))
     assert conclusion.leftover_p == leftover_p(leftover_score(left, gap, level(facts), calibration)) < 0.05
-    for explained, words in ((0.7, ", 70 %, is"), (-0.2, ", 0 %, is")):
-        assert words in sentence(conclusion.verdict, conclusion.effects, conclusion.equivalent, explained)
+    assert ", 70 %, is" in sentence(conclusion, 0.7) and ", 0 %, is" in sentence(conclusion, -0.2)
+    assert f", {100 * conclusion.explained:.0f} %, is" in sentence(conclusion, None)
 
 
 def test_two_effects_come_back_together():

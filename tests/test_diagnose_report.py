@@ -250,7 +250,7 @@ def space(tmp_path_factory):
     before, after = (np.nan_to_num(windows.keypoints) + size * along for size in (0.03, 0.004))
     nominal, explained = (in_log(log, windows, part) for part in (before, after))
     stiffness = ParameterEstimate(0.06, (0.05, 0.07), "m^4/s^2")
-    result = Diagnosis(
+    result = CableDiagnosis(
         verdict="named",
         sentence="A sentence.",
         effects=(

@@ -21,6 +21,7 @@ CABLE_META = {
     "linear_density_kg_per_m": 0.08,
     "bending_stiffness_n_m2": 0.02,
     "bending_damping_s": 0.1,
+    "rest_curvature_per_m": 0.0,
 }
 
 

@@ -11,8 +11,10 @@ pytest.importorskip("elastica", reason="PyElastica is not installed: pip install
 from cablejax.cable import GRAVITY, Cable, Discretisation
 from cablejax.control.loop import run_closed_loop
 from cablejax.control.targets import make_target, straight_start
+from cablejax.effects.given import parse_effect
 from cablejax.simulate import rod_plant
 from cablejax.simulate.elastica import elastica
+from cablejax.simulate.plant import Plant, PlantConfig
 from cablejax.simulate.rod_plant import ETHERNET, USB, RodPlant, RodPlantConfig
 
 CABLE = Discretisation(n_links=15, timestep=4e-4)
@@ -92,7 +94,8 @@ def test_friction_keeps_a_cable_where_a_frictionless_one_springs_back():
 def test_a_uniform_rest_curvature_does_not_show_between_two_clamps():
     shapes = []
     for curvature in (0.0, 2.0):
-        plant = rubbing(0.0, rest_curvature=curvature)
+        cable = Cable(friction_coefficient=0.0, rest_curvature=curvature)
+        plant = RodPlant(dataclasses.replace(CONFIG, discretisation=dataclasses.replace(CABLE, cable=cable)))
         shapes.append(plant.reset(ARCH).keypoints)
     np.testing.assert_allclose(shapes[1], shapes[0], atol=5e-4)
     assert plant._rod.rest_kappa[0, 3] == pytest.approx(2.0)
@@ -104,12 +107,40 @@ def test_bad_set_ups_are_refused():
         ({"discretisation": Discretisation(n_links=27, timestep=1e-3)}, "stable only up to"),
         ({"static_ratio": 0.9}, "static_ratio"),
         ({"axial_ratio": 0.0}, "axial_ratio"),
-        ({"rest_curvature": np.nan}, "rest_curvature"),
+        (
+            {"effects": (parse_effect("obstacle:x_m=0,y_m=0,radius_m=0.1"),)},
+            r"RodPlant cannot simulate obstacle.*Plant",
+        ),
+        ({"effects": (parse_effect("bending_stiffness:ratio=40"),)}, "stable only up to"),
         ({"keypoint_noise": -1.0}, "keypoint_noise"),
         ({"keypoint_dropout": 1.0}, "keypoint_dropout"),
     ]:
         with pytest.raises(ValueError, match=message):
             dataclasses.replace(CONFIG, **changes)
+
+
+@pytest.mark.parametrize(
+    "effect",
+    [
+        "stiffness_profile:centre_m=0.3,width_m=0.2,ratio=0.3",
+        "lumped_mass:centre_m=0.4,mass_kg=0.05",
+        "actuation_lag:time_s=0.4,delay_s=0.15",
+    ],
+)
+def test_an_effect_changes_the_rod_as_it_changes_the_contact_plant(effect):
+    given, changes = parse_effect(effect), []
+    contact = PlantConfig(discretisation=Discretisation(n_links=15, dimension=3, timestep=0.005))
+    for kind, config in ((RodPlant, dataclasses.replace(CONFIG, static_ratio=1.0)), (Plant, contact)):
+        shapes = []
+        for effects in ((), (given,)):
+            plant = kind(dataclasses.replace(config, effects=effects))
+            plant.reset(np.array([[-0.38, 0.0, 0.5], [0.38, 0.0, -0.5]]))
+            moved = plant.record(np.array([[0.04, 0.02, -0.15], [-0.04, 0.03, 0.15]]), 2.0, samples=5)
+            shapes.append(np.stack([observation.keypoints for observation in moved]))
+        changes.append(shapes[1] - shapes[0])
+    sizes = [np.linalg.norm(change) for change in changes]
+    assert (changes[0] * changes[1]).sum() > 0.95 * sizes[0] * sizes[1]
+    assert sizes[0] == pytest.approx(sizes[1], rel=0.2)
 
 
 def test_a_missing_library_says_how_to_get_it(monkeypatch):
@@ -146,4 +177,4 @@ def test_the_named_cables_differ_from_the_reference_in_opposite_directions():
     assert USB.cable.bending_stiffness < nominal.cable.bending_stiffness < ETHERNET.cable.bending_stiffness
     for config in (ETHERNET, USB):
         assert config.cable.n_keypoints == 13 and config.cable.length == 1.0
-        assert config.rest_curvature == 0.0
+        assert config.cable.rest_curvature == 0.0

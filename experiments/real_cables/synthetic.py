@@ -14,6 +14,8 @@ from typing import Literal
 
 import jax
 import jax.numpy as jnp
+from typing import Any
+
 import numpy as np
 from jaxtyping import Float
 
@@ -162,17 +164,15 @@ def _simulated(cable: SyntheticCable, s, position, frames) -> Float[np.ndarray, 
     """Free markers, from the beginning of the recordings on."""
     line = (s / cable.length)[:, None]
     sag = np.concatenate([0.5 * line, 0 * line, 0.6 - 0.35 * np.sin(np.pi * line)], axis=1)
-    values = {
+    values: dict[str, Any] = {
         "length": cable.length, "stiffness": cable.stiffness * np.exp(cable.profile),
         "rest_curvature": cable.rest_curvature, "damping_time": cable.damping_time, "drag": cable.drag,
         "quadratic_drag": cable.quadratic_drag, "twist_stiffness": TWIST_RATIO * cable.stiffness, "stretch": 5e4,
         "marker_mass": cable.marker_mass, "clamp_offset": np.zeros((2, 3)), "roll": 0.0, "arclength": s,
         "offset": cable.offset, "gravity": [0.0, 0.0, -9.81],
     }  # fmt: skip
-    physics = RodPhysics(
-        clamp_rotation=cable.grips,
-        **{name: np.repeat(np.asarray(value, float)[None], len(position), 0) for name, value in values.items()},
-    )
+    arrays: dict[str, Any] = {n: np.repeat(np.asarray(v, float)[None], len(position), 0) for n, v in values.items()}
+    physics = RodPhysics(**arrays, clamp_rotation=cable.grips)  # pyright: ignore[reportArgumentType]
     twisting = bool(cable.rest_curvature.any() or cable.offset.any())
     with jax.enable_x64(True):
         return np.asarray(_program(twisting)(physics, position, frames, np.stack([sag, sag])))[:, _LEAD:]

@@ -25,6 +25,9 @@ BOUNDS = {
 }
 """Smallest and largest accepted value of each number of a cable, SI units. What lies outside is a mistake in units."""
 
+MOST_KEYPOINTS = 1000
+"""Largest accepted number of keypoints."""
+
 
 @dataclasses.dataclass(frozen=True)
 class Cable:
@@ -67,8 +70,8 @@ class Cable:
                 f"Cable.diameter is {self.diameter} m and its length {self.length} m: expected a cable that is longer "
                 "than it is thick."
             )
-        if self.n_keypoints < 2:
-            raise ValueError(f"Cable.n_keypoints is {self.n_keypoints}, expected at least 2: both ends.")
+        if not 2 <= self.n_keypoints <= MOST_KEYPOINTS:
+            raise ValueError(f"Cable.n_keypoints is {self.n_keypoints}, expected 2, both ends, to {MOST_KEYPOINTS}.")
         if tuple(self.grasp) != ("clamped", "clamped"):
             raise ValueError(f'Cable.grasp is {self.grasp}, expected ("clamped", "clamped"), the only grasp simulated.')
         self._check_marks()

@@ -1,4 +1,4 @@
-"""The command line: `cablejax demo | simulate | train | shape | import | diagnose | bench`."""
+"""The command line: `cablejax demo | cable | simulate | train | shape | import | diagnose | bench`."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from tyro.conf import subcommand
 
 from cablejax import __version__
 from cablejax.commands.bench import Bench
+from cablejax.commands.cable import CableFile
 from cablejax.commands.demo import Demo
 from cablejax.commands.diagnose import Diagnose
 from cablejax.commands.import_recording import Import
@@ -27,6 +28,7 @@ INTERRUPTED = 130
 
 _COMMANDS: Any = (
     Annotated[Demo, subcommand("demo")]
+    | Annotated[CableFile, subcommand("cable")]
     | Annotated[Simulate, subcommand("simulate")]
     | Annotated[Train, subcommand("train")]
     | Annotated[Shape, subcommand("shape")]
@@ -36,9 +38,10 @@ _COMMANDS: Any = (
 )
 _DESCRIPTION = """Two robot grippers bring a cable to a shape.
 
-Start with `cablejax demo`: it needs nothing else and writes a page to look at. To make your own model: `simulate` a
-data set, `train` on it, `shape` a cable with the result, and `diagnose` what the simulator lacks. A recording of a
-real cable is `import`ed first. `cablejax COMMAND --help` explains each one, `cablejax --version` says which this is."""
+Start with `cablejax demo`: it needs nothing else and writes a page to look at. To make your own model: describe your
+`cable` in a file, `simulate` a data set, `train` on it, `shape` a cable with the result, and `diagnose` what the
+simulator lacks. A recording of a real cable is `import`ed first. `cablejax COMMAND --help` explains each one,
+`cablejax --version` says which this is."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

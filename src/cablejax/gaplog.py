@@ -17,6 +17,7 @@ from jaxtyping import Float
 
 from cablejax.cable import GRAVITY, Cable
 from cablejax.json_file import parse_json
+from cablejax.log_geometry import geometry_fault
 from cablejax.npz import NpzError, read_npz
 from cablejax.types import GapLog
 from cablejax.whole_file import whole_file
@@ -127,6 +128,7 @@ def gap_log_from_episodes(
                 "linear_density_kg_per_m": cable.linear_density,
                 "bending_stiffness_n_m2": cable.bending_stiffness,
                 "bending_damping_s": cable.damping_time,
+                "rest_curvature_per_m": cable.rest_curvature,
             },
             # a cable in the plane lies on a table even where that is perfectly smooth
             "table": {"friction_coefficient": cable.friction_coefficient}
@@ -145,13 +147,11 @@ def gap_log_from_episodes(
 
 
 def validate(log: GapLog) -> None:
-    """Checks a gap log against the format.
-
-    Raises:
-        GapLogError: names the field, what it is and what was expected.
-    """
+    """Checks a gap log; raises `GapLogError` with the field, what it is and what was expected."""
     _validate_arrays(log)
     _validate_meta(log)
+    if fault := geometry_fault(log):
+        raise GapLogError(fault)
 
 
 def write_gap_log(path: str | os.PathLike, log: GapLog, *, overwrite: bool = False) -> pathlib.Path:

@@ -25,6 +25,26 @@ PLANAR_DOF = 3
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
+class CableMemory:
+    """What a cable remembers beyond positions and velocities, in simulators with effects of extension and memory.
+
+    Attributes:
+        stretch: relative change of the free length, shape [].
+        stretch_rate: its velocity [1/s], shape [].
+        set_curvature: permanent part of the curvature of each joint [1/m], shape [J].
+        friction_state: internal friction of each joint, -1 to 1, shape [J].
+        time: since the initial state [s], shape [].
+    """
+
+    stretch: Float[Array, "*batch"]
+    stretch_rate: Float[Array, "*batch"]
+    set_curvature: Float[Array, "*batch J"]
+    friction_state: Float[Array, "*batch J"]
+    time: Float[Array, "*batch"]
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
 class CableState:
     """Full state of a simulated cable.
 
@@ -32,11 +52,13 @@ class CableState:
         qpos: generalised positions, shape [nq].
         qvel: generalised velocities, shape [nv].
         gripper_pose: (x, y, theta) of each gripper, shape [Q, 3]; in space (x, y, z, qw, qx, qy, qz), shape [Q, 7].
+        memory: what the cable remembers beyond that; None = nothing.
     """
 
     qpos: Float[Array, "*batch nq"]
     qvel: Float[Array, "*batch nv"]
     gripper_pose: Float[Array, "*batch Q P"]
+    memory: CableMemory | None = None
 
 
 @jax.tree_util.register_dataclass

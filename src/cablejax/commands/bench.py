@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import pathlib
 import time
 from typing import TYPE_CHECKING, Annotated, get_args
 
@@ -17,12 +18,12 @@ if TYPE_CHECKING:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class BenchSimulate(Command):
-    """Time the simulators: MJX in a batch, C MuJoCo on one core and on several.
+    """Time the simulators: the closed-form chain and MJX in a batch, C MuJoCo on one core and on several.
 
     An environment-step is one time step of one cable. The engines take turns, and the median of the rounds counts."""
 
     batch: int = 256
-    """Cables that MJX simulates at once; C simulates as many, one after the other."""
+    """Cables that chain and MJX simulate at once; C simulates as many, one after the other."""
 
     seconds: int = 1
     """Simulated seconds per round."""
@@ -36,31 +37,36 @@ class BenchSimulate(Command):
     links: int | None = None
     """Links of the cable; by default the package's."""
 
-    def execute(self):
-        import functools
+    cable: pathlib.Path | None = None
+    """A cable file, or a data set, weights or a log that holds a cable. By default the reference cable."""
 
+    def execute(self):
         import jax
         import numpy as np
 
-        from cablejax.cable import Discretisation
+        from cablejax.cable import Cable, Discretisation
+        from cablejax.commands.cable import find_cable
         from cablejax.commands.workloads import moving_arches, program_bytes, seconds_in_turns, setting
-        from cablejax.simulate import MjxEngine, ThreadedEngine, compiler_options
+        from cablejax.simulate import ChainEngine, MjxEngine, ThreadedEngine
+        from cablejax.simulate.engine import compiled_rollout
 
         for name in ("batch", "seconds", "rounds", "threads"):
             if getattr(self, name) < 1:
                 raise UsageError(f"--{name} is {getattr(self, name)}, expected at least 1.")
-        config = Discretisation() if self.links is None else Discretisation(n_links=self.links)
+        cable = Cable() if self.cable is None else find_cable(self.cable)
+        config = Discretisation(cable, n_links=Discretisation.n_links if self.links is None else self.links)
         mjx, one, many = MjxEngine(config), ThreadedEngine(config, 1), ThreadedEngine(config, self.threads)
+        chain = ChainEngine(config)
 
         params, states, twist = moving_arches(config, self.batch, self.seconds, self.seed)
         say(f"compiling the MJX engine for {self.batch} cables of {config.n_links} links ...")
         begin = time.perf_counter()
-        unroll = jax.vmap(functools.partial(mjx.unroll, interval=1.0))
-        compiled = jax.jit(unroll, compiler_options=compiler_options()).lower(params, states, twist).compile()
+        compiled = compiled_rollout(mjx, params, 1, 1.0).lower(params, states, twist).compile()
         compile_s = time.perf_counter() - begin
         memory_bytes = program_bytes(compiled)
 
         contestants = {
+            "chain": lambda: jax.block_until_ready(chain.rollout(params, states, twist, 1.0)),
             "mjx": lambda: jax.block_until_ready(compiled(params, states, twist)),
             "c_one": lambda: one.rollout(params, states, twist, 1.0),
             "c_many": lambda: many.rollout(params, states, twist, 1.0),
@@ -73,9 +79,11 @@ class BenchSimulate(Command):
             "timestep_s": config.timestep,
             "batch": self.batch,
             "threads": self.threads,
+            "chain_us_per_env_step": micros["chain"],
             "mjx_us_per_env_step": micros["mjx"],
             "c_us_per_env_step": micros["c_one"],
             "c_threads_us_per_env_step": micros["c_many"],
+            "chain_over_c": micros["chain"] / micros["c_one"],
             "mjx_over_c": micros["mjx"] / micros["c_one"],
             "threads_speedup": micros["c_one"] / micros["c_many"],
             "mjx_memory_per_env_bytes": memory_bytes / self.batch,
@@ -85,6 +93,7 @@ class BenchSimulate(Command):
         text = text_table(
             ["engine", "us per environment-step", "relative to C on one core"],
             [
+                [f"chain, batch {self.batch}", f"{micros['chain']:.2f}", f"{result['chain_over_c']:.2f}"],
                 [f"MJX, batch {self.batch}", f"{micros['mjx']:.2f}", f"{result['mjx_over_c']:.2f}"],
                 ["C MuJoCo, one core", f"{micros['c_one']:.2f}", "1.00"],
                 [
@@ -123,7 +132,6 @@ class BenchMpc(Command):
         import jax
         import numpy as np
 
-        from cablejax.cable import Cable
         from cablejax.commands.workloads import batched_control, controller_to_s, seconds_in_turns, setting
         from cablejax.control.shaping import initial_history, load_model
         from cablejax.mpc import time_control
@@ -136,8 +144,8 @@ class BenchMpc(Command):
             )
         on_processor = jax.devices()[0].platform == "cpu"
         batches = self.batches or ((1, 16) if on_processor else (1, 64, 1024))
-        model, cable = load_model(self.weights), Cable()
-        history = initial_history(cable, model.config)
+        model = load_model(self.weights)
+        history = initial_history(model.cable, model.config)
         solvers = {}
         for name in self.solvers:
             say(f"compiling the control step with {name} ...")
@@ -268,7 +276,7 @@ class BenchLoop(Command):
             )
         model = load_model(self.weights)
         controller = controller_to_s(model, self.solver)
-        run = closed_loop(controller, model.config.history, self.steps, Discretisation())
+        run = closed_loop(controller, model.config.history, self.steps, Discretisation(model.cable))
         say(f"compiling the closed loop for batches of {', '.join(map(str, self.batches))} ...")
         contestants = {str(size): functools.partial(run, size) for size in self.batches}
         seconds = seconds_in_turns(contestants, self.rounds)

@@ -8,9 +8,6 @@ from typing import ClassVar, Literal
 
 from cablejax.commands.options import Command, say, text_table
 
-STIFFNESS_RATIO = 2.0
-"""How much stiffer the plant's cable is than the one that the model was trained on."""
-
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Demo(Command):
@@ -46,25 +43,21 @@ class Demo(Command):
     def execute(self):
         from cablejax.commands.parts import unfinished
         from cablejax.commands.results import table_of
-        from cablejax.commands.runs import Job, shape_and_report
+        from cablejax.commands.runs import Job, plant_of, shape_and_report
+        from cablejax.commands.shape import PLANT_EFFECT
         from cablejax.control.shaping import METHODS, load_model
         from cablejax.control.targets import make_target
-        from cablejax.effects.given import GivenEffect
-        from cablejax.simulate.plant import PlantConfig
+        from cablejax.effects.given import parse_effect
 
-        plant = PlantConfig(effects=(GivenEffect("bending_stiffness", (("ratio", STIFFNESS_RATIO),)),), seed=self.seed)
-        plant = dataclasses.replace(plant, discretisation=dataclasses.replace(plant.discretisation, n_links=self.links))
+        model = load_model(self.weights)
+        plant = plant_of(model.cable, (parse_effect(PLANT_EFFECT),), links=self.links, seed=self.seed)
         job = Job(
             plant=plant,
-            model=load_model(self.weights),
+            model=model,
             targets=tuple(make_target(shape, plant.cable) for shape in dict.fromkeys(self.shapes)),
             methods=METHODS,
             solver=self.solver,
             steps=self.steps,
-        )
-        about = (
-            "The cable is twice as stiff as the one that the model was trained on. It touches the table with contact "
-            "and friction cones, where the training simulator has a smoothed friction law."
         )
         facts = {
             "command": f"cablejax demo --seed {self.seed} --steps {self.steps} --links {self.links}",
@@ -72,7 +65,7 @@ class Demo(Command):
             "solver": self.solver,
         }
         with unfinished(self.out, job.settings(), overwrite=self.overwrite) as parts:
-            summary = shape_and_report(job, self.out, parts, about=about, facts=facts)
+            summary = shape_and_report(job, self.out, parts, facts=facts)
             gap = self._diagnosed()
         table = text_table(*table_of(summary))
         text = f"{table}\n\n{summary['total_s']:.0f} s. Look at {self.out / 'report.html'}"

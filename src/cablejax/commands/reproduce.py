@@ -7,9 +7,14 @@ import pathlib
 import shlex
 from typing import Any
 
+from cablejax.cable import Cable
 from cablejax.commands.options import Command
 from cablejax.commands.simulate import Simulate
 from cablejax.dataset.schema import DatasetConfig
+from cablejax.effects.given import number_text
+
+REPEATED = ("effect", "with_", "plant_effect")
+"""Options that are given once for each of their values."""
 
 
 def command_line(command: Command, name: str) -> str:
@@ -17,13 +22,27 @@ def command_line(command: Command, name: str) -> str:
     words = ["cablejax", name]
     for field in dataclasses.fields(command):
         value = getattr(command, field.name)
-        if value != field.default and field.name not in ("json", "device", "overwrite"):
-            words += [f"--{field.name.replace('_', '-')}", *_words(value)]
+        if value == field.default or field.name in ("json", "device", "overwrite"):
+            continue
+        option = f"--{field.name.strip('_').replace('_', '-')}"
+        if field.name in REPEATED:
+            words += [word for item in value for word in (option, *_words(item))]
+        else:
+            words += [
+                option,
+                *(word for item in (value if isinstance(value, tuple) else (value,)) for word in _words(item)),
+            ]
     return shlex.join(words)
 
 
-def simulate_command(config: DatasetConfig, out: str) -> str:
-    """The `cablejax simulate` that makes a data set, or a comment that its options cannot."""
+def simulate_command(config: DatasetConfig, out: str, cable_file: str = "cable.toml") -> str:
+    """The `cablejax simulate` that makes a data set, or a comment that its options cannot.
+
+    Args:
+        config: of the data set.
+        out: its folder.
+        cable_file: where the command finds the cable, unless it is the reference cable.
+    """
     command = Simulate(
         out=pathlib.Path(out),
         seed=config.seed,
@@ -32,14 +51,16 @@ def simulate_command(config: DatasetConfig, out: str) -> str:
         start=config.motion.start,
         max_amplification=config.motion.max_amplification,
         engine=config.engine,
+        cable=None if config.cable == Cable() else pathlib.Path(cable_file),
+        effect=tuple(map(str, config.effects)),
         links=config.discretisation.n_links,
-        stiffness=config.cable.bending_stiffness,
-        friction=config.cable.friction_coefficient,
         stiffness_range=config.randomisation.stiffness,
         damping_range=config.randomisation.damping,
         friction_range=config.randomisation.friction,
     )
-    if command.dataset_config() != dataclasses.replace(config, shard_size=DatasetConfig.shard_size):
+    if command.config_of(config.cable, config.effects) != dataclasses.replace(
+        config, shard_size=DatasetConfig.shard_size
+    ):
         return f"# {out}: cablejax.dataset.generate.generate with the configuration recorded in the weights file"
     if command.links == DatasetConfig().discretisation.n_links:
         command = dataclasses.replace(command, links=None)
@@ -47,8 +68,8 @@ def simulate_command(config: DatasetConfig, out: str) -> str:
 
 
 def _words(value: Any) -> list[str]:
-    if isinstance(value, tuple):
-        return [word for item in value for word in _words(item)]
     if value is True:
         return []
-    return [value.name if isinstance(value, pathlib.Path) else f"{value:g}" if isinstance(value, float) else str(value)]
+    if isinstance(value, float):
+        return [number_text(value)]
+    return [value.name if isinstance(value, pathlib.Path) else str(value)]

@@ -8,16 +8,21 @@ import time
 from collections.abc import Mapping
 from typing import Any
 
-from cablejax.cable import Cable
+import numpy as np
+
+from cablejax.cable import Cable, Discretisation
 from cablejax.commands.options import UsageError, say
 from cablejax.commands.parts import Parts
 from cablejax.commands.results import summarise, write_results
 from cablejax.control.run import ClosedLoopRun
-from cablejax.control.shaping import Method, Model, shape_once
+from cablejax.control.shaping import Method, Model, check_fit, shape_once
 from cablejax.control.targets import Target
 from cablejax.dynamics.fingerprint import fingerprint
+from cablejax.effects.given import GivenEffect
+from cablejax.effects.physics import nominal_physics
 from cablejax.json_file import write_json
 from cablejax.perceive.camera import CameraConfig
+from cablejax.report.effect_words import EFFECTS, listed
 from cablejax.report.style import METHOD_LABEL
 from cablejax.simulate.plant import PlantConfig
 from cablejax.solver_names import SolverName
@@ -48,11 +53,16 @@ class Job:
     def __post_init__(self):
         if self.steps < 1:
             raise UsageError(f"--steps is {self.steps}, expected at least 1.")
+        check_fit(self.model, self.plant.cable)
 
     def settings(self) -> dict[str, Any]:
         """All that a run depends on, as for JSON: of the model its weights, since a name may stand for others later."""
         return {
-            "model": {"config": dataclasses.asdict(self.model.config), "weights": fingerprint(self.model.weights)},
+            "model": {
+                "config": dataclasses.asdict(self.model.config),
+                "weights": fingerprint(self.model.weights),
+                "cable": dataclasses.asdict(self.model.cable),
+            },
             "plant": dataclasses.asdict(self.plant),
             "camera": None if self.camera is None else dataclasses.asdict(self.camera),
             "targets": [target.keypoints.tolist() for target in self.targets],
@@ -61,16 +71,13 @@ class Job:
         }
 
 
-def shape_and_report(
-    job: Job, out: pathlib.Path, parts: Parts, *, about: str, facts: Mapping[str, str]
-) -> dict[str, Any]:
+def shape_and_report(job: Job, out: pathlib.Path, parts: Parts, *, facts: Mapping[str, str]) -> dict[str, Any]:
     """Makes the runs that are not among the parts yet and writes the results.
 
     Args:
         job: what to do.
         out: folder for `summary.json`, `log.npz`, `report.html` and `demo.gif`, replaced where they are there.
         parts: keeps finished runs.
-        about: plant and model in a sentence or two, for the page and the log.
         facts: settings to print on the page.
 
     Returns:
@@ -101,9 +108,85 @@ def shape_and_report(
             runs[target.name, method] = run
             say(f"{time.perf_counter() - begin:5.0f} s  {METHOD_LABEL[method]:22s}{run.verdict()}")
     summary = summarise(runs, total_s=0.0)
-    cable = job.plant.cable
-    believed = Cable(length=cable.length, n_keypoints=cable.n_keypoints)
-    write_results(out, runs, summary, believed=believed, about=about, facts=facts)
+    write_results(out, runs, summary, believed=job.model.cable, about=about(job), facts=facts)
     summary["total_s"] = round(time.perf_counter() - begin, 3)
     write_json(out / "summary.json", summary)
     return summary
+
+
+def plant_of(
+    cable: Cable, effects: tuple[GivenEffect, ...], *, links: int, seed: int, keypoint_noise: float = 0.0
+) -> PlantConfig:
+    """A plant with this cable and these effects, at the plant's own time step.
+
+    Args:
+        cable: what is simulated.
+        effects: what else acts.
+        links: of the chain.
+        seed: of noise.
+        keypoint_noise: standard deviation of the observed keypoints [m].
+    """
+    default = PlantConfig()
+    return dataclasses.replace(
+        default,
+        discretisation=dataclasses.replace(default.discretisation, cable=cable, n_links=links),
+        effects=effects,
+        keypoint_noise=keypoint_noise,
+        seed=seed,
+    )
+
+
+def about(job: Job) -> str:
+    """What the plant has that the model was not trained on, in sentences.
+
+    Every ratio is computed: the plant's cable with its effects over the model's cable.
+    """
+    believed, plant = job.model.cable, job.plant
+    sentences = [
+        f"The model was trained on a cable of {believed.length:g} m with {believed.n_keypoints} keypoints, "
+        f"{believed.linear_density:g} kg/m and a bending stiffness of {believed.bending_stiffness:g} N m^2, on a table "
+        f"with a friction coefficient of {believed.friction_coefficient:g}."
+    ]
+    if job.model.effects:
+        sentences.append(f"Its training data hold {listed(job.model.effects)}.")
+    changes = _changes(believed, plant)
+    if changes:
+        sentences.append(f"The plant has {listed(changes)}.")
+    if plant.effects:
+        sentences.append(f"Staged in the plant: {listed([f'{EFFECTS[e.name]} ({e})' for e in plant.effects])}.")
+    if not changes and not plant.effects:
+        sentences.append("The plant has the same cable.")
+    sentences.append(
+        "The plant touches its table with contact and friction cones, where the training simulator has a smoothed "
+        "friction law."
+    )
+    if job.camera is not None:
+        sentences.append(
+            f"The cable is seen by a depth camera with {1e3 * job.camera.range_noise:g} mm of noise in its range."
+        )
+    elif plant.keypoint_noise > 0:
+        sentences.append(f"The keypoints are seen with {1e3 * plant.keypoint_noise:g} mm of noise.")
+    return " ".join(sentences)
+
+
+_QUANTITIES = {
+    "stiffness": ("bending stiffness", " N m^2"),
+    "friction": ("friction coefficient", ""),
+    "density": ("mass per length", " kg/m"),
+    "damping_time": ("damping time", " s"),
+}
+"""Fields of `Physics` that are compared as a ratio where they are uniform along the cable: name and unit."""
+
+
+def _changes(believed: Cable, plant: PlantConfig) -> list[str]:
+    """The values that the plant's cable has everywhere and the believed one has not, with their ratio."""
+    ours, theirs = nominal_physics(Discretisation(believed)), plant.physics
+    pairs = [(*_QUANTITIES[name], getattr(ours, name), getattr(theirs, name)) for name in _QUANTITIES]
+    pairs.append(("diameter", " m", believed.diameter, plant.cable.diameter))
+    found = []
+    for name, unit, was, now in pairs:
+        was, now = np.ravel(np.asarray(was, float)), np.ravel(np.asarray(now, float))
+        if np.ptp(now) <= 1e-6 * np.abs(now).max() and abs(now[0] - was[0]) > 1e-6 * abs(was[0]):
+            against = f"{now[0] / was[0]:.3g} times the model's" if was[0] else "the model's is 0"
+            found.append(f"{name} {now[0]:.3g}{unit} ({against})")
+    return found

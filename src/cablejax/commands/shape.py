@@ -6,13 +6,18 @@ import dataclasses
 import pathlib
 from typing import ClassVar, Literal
 
-from cablejax.commands.options import Command, text_table
+import tyro
+
+from cablejax.commands.options import Command, UsageError, text_table
 from cablejax.solver_names import SolverName
+
+PLANT_EFFECT = "bending_stiffness:ratio=2"
+"""The gap between model and plant, unless another one is asked for."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Shape(Command):
-    """Shape one cable into a target of your own, on a simulated plant of your own.
+    """Shape one cable into a target of your own, on a simulated plant: the model's cable and effects of your choice.
 
     The target is a letter or a file: .npz or .json with "keypoints" [N, 2] in metres, or .csv with rows x,y. Writes
     summary.json, log.npz, report.html and demo.gif."""
@@ -40,11 +45,13 @@ class Shape(Command):
     steps: int = 40
     """Commands, one second each."""
 
-    stiffness_ratio: float = 2.0
-    """The plant's bending stiffness over that of the training."""
+    cable: pathlib.Path | None = None
+    """The plant's cable: a cable file, or a data set, weights or a log that holds one. By default the cable that the
+    model was trained on."""
 
-    friction: float = 0.1
-    """Coulomb friction coefficient of the plant's table."""
+    plant_effect: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
+    """An effect of the plant that the model may not know, as NAME:PARAMETER=VALUE,... in SI units; may be given several
+    times. By default bending_stiffness:ratio=2; `none` for no effect."""
 
     perception: Literal["true", "cloud"] = "true"
     """true: the controller is told the keypoints. cloud: it gets what is found in the clouds of a depth camera; the
@@ -58,47 +65,50 @@ class Shape(Command):
     """Links of the plant's cable."""
 
     def execute(self):
+        from cablejax.commands.cable import find_cable
         from cablejax.commands.parts import unfinished
         from cablejax.commands.results import table_of
-        from cablejax.commands.runs import Job, shape_and_report
+        from cablejax.commands.runs import Job, plant_of, shape_and_report
         from cablejax.control.shaping import METHODS, load_model
         from cablejax.control.targets import load_target, make_target
-        from cablejax.effects.given import GivenEffect
+        from cablejax.effects.given import parse_effect
         from cablejax.perceive.camera import CameraConfig
-        from cablejax.simulate.plant import PlantConfig
 
+        if "none" in self.plant_effect and len(self.plant_effect) > 1:
+            raise UsageError("--plant-effect is none and an effect: give either.")
+        texts = (PLANT_EFFECT,) if not self.plant_effect else () if "none" in self.plant_effect else self.plant_effect
         cloud = self.perception == "cloud"
         noise_mm = (2.0 if cloud else 0.0) if self.noise_mm is None else self.noise_mm
-        default = PlantConfig()
-        cable = dataclasses.replace(default.cable, friction_coefficient=self.friction)
-        plant = dataclasses.replace(
-            default,
-            discretisation=dataclasses.replace(default.discretisation, cable=cable, n_links=self.links),
-            effects=(GivenEffect("bending_stiffness", (("ratio", self.stiffness_ratio),)),),
-            keypoint_noise=0.0 if cloud else 1e-3 * noise_mm,
+        model = load_model(self.weights)
+        cable = model.cable if self.cable is None else find_cable(self.cable)
+        plant = plant_of(
+            cable,
+            tuple(map(parse_effect, texts)),
+            links=self.links,
             seed=self.seed,
+            keypoint_noise=0.0 if cloud else 1e-3 * noise_mm,
         )
-        seen = "The cable is seen by a depth camera" if cloud else "The keypoints are seen"
         target = make_target(self.target, cable) if self.target in ("U", "S", "Z") else load_target(self.target, cable)
+        # a longer cable is seen from farther away
+        camera = CameraConfig(
+            distance=CameraConfig.distance * cable.length, range_noise=1e-3 * noise_mm, seed=self.seed
+        )
         job = Job(
             plant=plant,
-            model=load_model(self.weights),
+            model=model,
             targets=(target,),
             methods=METHODS if self.method == "both" else (self.method,),
             solver=self.solver,
             steps=self.steps,
-            camera=CameraConfig(range_noise=1e-3 * noise_mm, seed=self.seed) if cloud else None,
-        )
-        about = (
-            f"The plant's cable is {self.stiffness_ratio:g} times as stiff as the one that the model was trained on; "
-            f"the table's friction coefficient is {self.friction:g}. {seen} with {noise_mm:g} mm of noise."
+            camera=camera if cloud else None,
         )
         facts = {
             field.name.replace("_", " "): str(getattr(self, field.name))
             for field in dataclasses.fields(self)
-            if field.name not in ("json", "out", "overwrite", "device")
+            if field.name not in ("json", "out", "overwrite", "device", "cable", "plant_effect")
         }
+        facts["plant effect"] = ", ".join(texts) or "none"
         with unfinished(self.out, job.settings(), overwrite=self.overwrite) as parts:
-            summary = shape_and_report(job, self.out, parts, about=about, facts=facts)
+            summary = shape_and_report(job, self.out, parts, facts=facts)
         table = text_table(*table_of(summary))
         return summary, f"{table}\n\nLook at {self.out / 'report.html'}"

@@ -5,12 +5,16 @@ from __future__ import annotations
 import dataclasses
 import pathlib
 import time
-from typing import TYPE_CHECKING, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
+
+import tyro
 
 from cablejax.commands.options import Command, say
 
 if TYPE_CHECKING:
+    from cablejax.cable import Cable
     from cablejax.dataset.schema import DatasetConfig
+    from cablejax.effects.given import GivenEffect
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -38,26 +42,31 @@ class Simulate(Command):
     """Largest movement of any point of the frictionless cable, relative to what the grippers move together. It keeps
     the cable from snapping through; 1000 lets it snap."""
 
-    engine: Literal["threaded", "mjx"] = "threaded"
-    """threaded: C MuJoCo on all CPU cores. mjx: batched in JAX, for an accelerator."""
+    engine: Literal["threaded", "mjx", "chain"] = "threaded"
+    """threaded: C MuJoCo on all CPU cores. mjx: batched in JAX, for an accelerator. chain: the same cable with its time
+    step written out, in JAX; it can simulate every effect."""
+
+    cable: pathlib.Path | None = None
+    """What is simulated: a cable file (see `cablejax cable`), or a data set, trained weights or a log that holds a
+    cable. By default the reference cable."""
+
+    effect: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
+    """An effect to add to every cable, as NAME:PARAMETER=VALUE,... in SI units; may be given several times."""
+
+    with_: Annotated[tuple[pathlib.Path, ...], tyro.conf.arg(name="with"), tyro.conf.UseAppendAction] = ()
+    """A verdict.json of `cablejax diagnose`: the effects that it names are added; may be given several times."""
 
     links: int | None = None
     """Links of the simulated cable; by default the resolution that the released model was trained on."""
 
-    stiffness: float = 0.02
-    """Bending stiffness of the cable [N m^2]."""
-
-    friction: float = 0.1
-    """Coulomb friction coefficient of the table; 0 for no table."""
-
     stiffness_range: tuple[float, float] | None = None
-    """Draw each cable's stiffness between these two factors of --stiffness; by default all are alike."""
+    """Draw each cable's stiffness between these two factors of the nominal one; by default all are alike."""
 
     damping_range: tuple[float, float] | None = None
     """Draw each cable's damping time between these two factors of the nominal one."""
 
     friction_range: tuple[float, float] | None = None
-    """Draw each cable's friction coefficient between these two factors of --friction."""
+    """Draw each cable's friction coefficient between these two factors of the nominal one."""
 
     process_index: int = 0
     """Number of this process, from 0."""
@@ -94,26 +103,42 @@ class Simulate(Command):
         )
 
     def dataset_config(self) -> DatasetConfig:
-        """What these options ask for.
+        """The data set that these options describe.
 
         Raises:
-            ValueError: an option is out of its range.
+            ValueError: an option is out of its range, or a file that it names cannot be used.
         """
-        from cablejax.cable import Cable, Discretisation
+        from cablejax.cable import Cable
+        from cablejax.commands.cable import find_cable
+        from cablejax.effects.given import effects_of_verdict, parse_effect
+
+        effects = [parse_effect(text) for text in self.effect]
+        effects += [effect for path in self.with_ for effect in effects_of_verdict(path)]
+        return self.config_of(Cable() if self.cable is None else find_cable(self.cable), tuple(effects))
+
+    def config_of(self, cable: Cable, effects: tuple[GivenEffect, ...]) -> DatasetConfig:
+        """The data set of a cable with effects, in place of those that the options name.
+
+        A gripper may force the same bend upon every cable relative to its length, so that cables of any length take the
+        same shapes.
+        """
+        from cablejax.cable import Discretisation
         from cablejax.dataset.schema import DatasetConfig, Randomisation
         from cablejax.simulate.motions import MotionConfig
 
-        chain = Discretisation(Cable(bending_stiffness=self.stiffness, friction_coefficient=self.friction))
-        if self.links is not None:
-            chain = dataclasses.replace(chain, n_links=self.links)
         return DatasetConfig(
             n_trajectories=self.trajectories,
             n_steps=self.steps,
             seed=self.seed,
-            motion=MotionConfig(start=self.start, max_amplification=self.max_amplification),
-            discretisation=chain,
+            motion=MotionConfig(
+                start=self.start,
+                max_amplification=self.max_amplification,
+                max_curvature=MotionConfig.max_curvature / cable.length,
+            ),
+            discretisation=Discretisation(cable, n_links=Discretisation.n_links if self.links is None else self.links),
             randomisation=Randomisation(
                 stiffness=self.stiffness_range, damping=self.damping_range, friction=self.friction_range
             ),
             engine=self.engine,
+            effects=effects,
         )

@@ -90,8 +90,7 @@ class Train(Command):
         if self.steps is not None and self.steps < 1:
             raise UsageError(f"--steps is {self.steps}, expected at least 1; leave it out for those of the preset.")
         stores = [open_store(path) for path in self.data]
-        if not stores:
-            raise UsageError("--data names no data set, expected at least one.")
+        self._check_cables(stores)
         config = self._config(stores[0])
         training, held_out = read_split(stores, self.held_out)
         count = sum(len(part.gripper_twist) for part in held_out)
@@ -129,6 +128,33 @@ class Train(Command):
         )
         return summary, f"{table}\n\nThe weights are in {self.out / FILE_NAME}; read {self.out / 'card.md'}"
 
+    def _check_cables(self, stores: list[Store]) -> None:
+        """Refuses data sets of different cables, and keypoints that the network cannot have."""
+        from cablejax.cable import differing
+        from cablejax.cable_file import KEYS
+        from cablejax.dynamics.weights import cable_of_weights
+
+        def fields(other: dict[str, tuple[Any, Any]]) -> str:
+            return ", ".join(f"{KEYS[name]} is {a} and {b}" for name, (a, b) in other.items())
+
+        if not stores:
+            raise UsageError("--data names no data set, expected at least one.")
+        first = stores[0]
+        if first.config.cable.marks is not None:
+            raise UsageError(
+                f"{first.path} has keypoints at given arc lengths, but a network is trained on evenly spaced ones. "
+                "Simulate a cable with `keypoints = N` in place of keypoint_arclength_m."
+            )
+        for store in stores[1:]:
+            if other := differing(store.config.cable, first.config.cable):
+                raise UsageError(
+                    f"{store.path} and {first.path} are of different cables: {fields(other)}. Train on data of one "
+                    "nominal cable; to vary it, give `cablejax simulate` ranges such as --stiffness-range."
+                )
+
+        if self.start_from is not None and (other := differing(cable_of_weights(self.start_from), first.config.cable)):
+            say(f"{self.start_from} and {first.path} are of different cables: {fields(other)}.")
+
     def _config(self, store: Store) -> TrainConfig:
         """The preset's training with what the data and the options change."""
         from cablejax.dynamics.train_config import PRESETS
@@ -142,6 +168,7 @@ class Train(Command):
             conditioned=self.conditioned,
             n_keypoints=cable.n_keypoints,
             length=cable.length,
+            radius=config.model.radius * (cable.length / (cable.n_keypoints - 1) / config.model.spacing),
             interval=store.config.interval,
         )
         if self.latent is not None:
@@ -161,6 +188,7 @@ class Train(Command):
 
     def _info(self, config: TrainConfig, stores: list[Store], held_out: list[int]) -> dict[str, Any]:
         """Where the weights come from, without local paths."""
+        from cablejax.cable_file import cable_to_fields
         from cablejax.dataset.schema import config_to_json
         from cablejax.report.provenance import machine, versions
 
@@ -169,6 +197,8 @@ class Train(Command):
         training = json.loads(json.dumps(dataclasses.asdict(config)))
         del training["model"]  # the weights file has it, with the normalisation
         return {
+            "cable": cable_to_fields(stores[0].config.cable),
+            "effects": list(dict.fromkeys(str(effect) for store in stores for effect in store.config.effects)),
             "data": [
                 {
                     "name": name,
@@ -185,6 +215,7 @@ class Train(Command):
         }
 
     def _write_card(self, model, info: dict[str, Any], stores: list[Store], report: ErrorReport) -> None:
+        from cablejax.cable import Cable
         from cablejax.commands.reproduce import command_line, simulate_command
         from cablejax.dynamics.card import write_card
 
@@ -196,6 +227,11 @@ class Train(Command):
             metrics=self.out / "metrics.csv",
             report=report,
             commands=[
+                *(
+                    [f"cablejax cable --from {self.out.name} --out cable.toml"]
+                    if stores[0].config.cable != Cable()
+                    else []
+                ),
                 *(simulate_command(store.config, store.path.name) for store in stores),
                 command_line(self, "train"),
             ],

@@ -27,7 +27,7 @@ from cablejax.solver_names import SolverName
 from cablejax.types import CableState, History, Measurement
 
 ARCH = np.array([[0.0, 0.0, 0.6], [0.8, 0.0, -0.6]])
-"""Gripper poses that bend the cable into an arch, shape [Q, 3]."""
+"""Gripper poses that bend a cable of 1 m into an arch, shape [Q, 3]."""
 
 
 def seconds_in_turns(
@@ -75,7 +75,8 @@ def moving_arches(
 ) -> tuple[Physics, CableState, Float[Array, "B T Q 3"]]:
     """Arguments of a batched rollout: arches moved slowly, so that table, bending and grasps are all at work."""
     twist = np.random.default_rng(seed).uniform(-0.01, 0.01, (batch, commands, 2, 3))
-    params, states = repeated((nominal_physics(config), equilibrium_state(config, ARCH)), batch)
+    pose = ARCH * [config.cable.length, config.cable.length, 1.0]
+    params, states = repeated((nominal_physics(config), equilibrium_state(config, pose)), batch)
     return params, states, jnp.asarray(twist, float)
 
 
@@ -86,7 +87,7 @@ def repeated(tree: Any, size: int) -> Any:
 
 def controller_to_s(model: Model, solver: SolverName, horizon: int = MPCConfig.horizon) -> MPC:
     """The controller with the online residual on the way to an S, with one of the solvers at its defaults."""
-    controller = make_controller(model, make_target("S"), method="residual", solver=solver)
+    controller = make_controller(model, make_target("S", model.cable), method="residual", solver=solver)
     return dataclasses.replace(controller, config=dataclasses.replace(controller.config, horizon=horizon))
 
 

@@ -23,8 +23,10 @@ from jaxtyping import Array, Float, Int
 from cablejax.cable import Discretisation
 from cablejax.control.loop import Controller
 from cablejax.control.run import settling_time
-from cablejax.effects.physics import Physics, nominal_physics
+from cablejax.effects.physics import Physics, may_touch, nominal_physics, without_obstacle
+from cablejax.simulate.chain.engine import ChainEngine
 from cablejax.simulate.compile import compiler_options
+from cablejax.simulate.engine import refuse_lags
 from cablejax.simulate.mjx_engine import MjxEngine
 from cablejax.simulate.table_plant import check_camera
 from cablejax.types import CableState, History, Measurement
@@ -92,7 +94,7 @@ class BatchRun:
 
 
 def shape_batch(
-    engine: MjxEngine,
+    engine: MjxEngine | ChainEngine,
     params: Physics,
     state: CableState,
     controller: Controller,
@@ -117,7 +119,8 @@ def shape_batch(
         devices: to spread the batch over; by default the one on which the arguments are.
 
     Raises:
-        ValueError: the batch axes differ, the cable is not planar, or a target has another number of keypoints.
+        ValueError: the batch axes differ, the cable is not planar, arms or camera lag, or a target has another number
+            of keypoints.
     """
     size, chain = len(targets), engine.config
     if chain.dimension != 2 or np.shape(targets) != (size, chain.cable.n_keypoints, 2):
@@ -126,6 +129,7 @@ def shape_batch(
             f"{chain.dimension} dimensions, expected (B, {chain.cable.n_keypoints}, 2) on a planar cable."
         )
     engine.substeps(config.interval)
+    refuse_lags(params)
     seeds = np.arange(size) if seeds is None else np.asarray(seeds)
     controllers = _with_target(controller, jnp.asarray(targets, float))
     batched = _with_target(jax.tree.map(lambda _: stacked, controller), True)
@@ -136,7 +140,7 @@ def shape_batch(
         raise ValueError(f"The leading axes are {sorted(lengths)}, expected {size}, the number of targets, everywhere.")
     if devices is not None:
         batch, shared = _spread(batch, shared, size, devices)
-    run = _compiled_batch(engine, config)(shared, *batch)
+    run = _compiled_batch(engine, config, may_touch(params))(shared, *batch)
     return run if devices is None else jax.tree.map(lambda leaf: leaf[:size], run)
 
 
@@ -163,15 +167,21 @@ def _spread(batch, shared, size: int, devices: Sequence[jax.Device]):  # pyright
 
 
 @functools.lru_cache(maxsize=16)
-def _compiled_batch(engine: MjxEngine, config: LoopConfig):
+def _compiled_batch(engine: MjxEngine | ChainEngine, config: LoopConfig, touching: bool):
     def one(shared, params, state, own, seed):
+        params = params if touching else without_obstacle(params)
         return _one_trial(engine, config, eqx.combine(own, shared), params, state, seed)
 
     return jax.jit(jax.vmap(one, in_axes=(None, 0, 0, 0, 0)), compiler_options=compiler_options())
 
 
 def _one_trial(
-    engine: MjxEngine, config: LoopConfig, controller: Any, params: Physics, cable: CableState, seed: Int[Array, ""]
+    engine: MjxEngine | ChainEngine,
+    config: LoopConfig,
+    controller: Any,
+    params: Physics,
+    cable: CableState,
+    seed: Int[Array, ""],
 ) -> BatchRun:
     key = jax.random.key(seed)
     still = jnp.zeros((config.rest, *cable.gripper_pose.shape), cable.qpos.dtype)

@@ -19,7 +19,7 @@ from cablejax.control.targets import Target, straight_start
 from cablejax.dynamics.config import ModelConfig
 from cablejax.dynamics.model import apply
 from cablejax.dynamics.rough import roughened
-from cablejax.dynamics.weights import load_weights
+from cablejax.dynamics.weights import cable_of_weights, load_info, load_weights
 from cablejax.mpc import MPC, SOLVERS, MPCConfig
 from cablejax.perceive.camera import CameraConfig
 from cablejax.perceive.plant import CloudPlant
@@ -48,12 +48,16 @@ class Model:
         config: its graph and sizes.
         dynamics: `(weights, history, twist) -> displacement`.
         weights: its arrays.
+        cable: nominal cable of the data that it was trained on.
+        effects: effects in those data, as `parse_effect` reads them.
     """
 
     name: str
     config: ModelConfig
     dynamics: Dynamics
     weights: nnx.State
+    cable: Cable
+    effects: tuple[str, ...] = ()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -85,10 +89,11 @@ def load_model(name: str) -> Model:
     """A released model by name, or the one in a training's folder.
 
     Raises:
-        ValueError: there is no such model, or its file does not fit this version of the network.
+        ValueError: there is no such model, its file does not fit this version of the network, or it names no cable.
     """
     config, graphdef, weights = load_weights(name)
-    return Model(name, config, NetworkDynamics(graphdef), weights)
+    effects = tuple(load_info(name).get("effects", ()))
+    return Model(name, config, NetworkDynamics(graphdef), weights, cable_of_weights(name), effects)
 
 
 def make_controller(model: Model, target: Target, *, method: Method, solver: SolverName) -> MPC:
@@ -111,6 +116,25 @@ def initial_history(cable: Cable, config: ModelConfig) -> History:
         keypoints=np.repeat(keypoints[None], config.history, axis=0),  # pyright: ignore[reportArgumentType]
         gripper_pose=pose,  # pyright: ignore[reportArgumentType]
     )
+
+
+def check_fit(model: Model, cable: Cable) -> None:
+    """Checks that a model can be used on a cable: they agree in length and keypoints.
+
+    Raises:
+        ValueError: they do not; names both.
+    """
+    config = model.config
+    if cable.n_keypoints != config.n_keypoints or abs(cable.length - config.length) > 1e-9:
+        raise ValueError(
+            f"The model {model.name} is for {config.n_keypoints} keypoints on {config.length} m of cable, but the "
+            f"plant has {cable.n_keypoints} on {cable.length} m: train one for this cable, or change the plant."
+        )
+    if cable.marks is not None and np.ptp(np.diff(cable.marks)) > 1e-6 * cable.length:
+        raise ValueError(
+            f"The plant's keypoints are unevenly spaced, but the model {model.name} expects {config.n_keypoints} at "
+            "equal distances along the cable: give the plant's cable n_keypoints instead of marks."
+        )
 
 
 def shape_once(
@@ -137,12 +161,8 @@ def shape_once(
     Raises:
         ValueError: the plant's cable is not the one that the model was made for.
     """
+    check_fit(model, plant.cable)
     cable, config = plant.cable, model.config
-    if cable.n_keypoints != config.n_keypoints or abs(cable.length - config.length) > 1e-9:
-        raise ValueError(
-            f"The model {model.name} is for {config.n_keypoints} keypoints on {config.length} m of cable, but the "
-            f"plant has {cable.n_keypoints} on {cable.length} m: train one for this cable, or change the plant."
-        )
     return run_closed_loop(
         Plant(plant) if camera is None else CloudPlant(plant, camera=camera),
         make_controller(model, target, method=method, solver=solver),

@@ -23,6 +23,13 @@ START_LEAN = 0.01
 LENGTH_TOLERANCE = 0.03
 """How far the length of a target's polyline may be from the cable's length, relative to it."""
 
+STRETCH = 0.2
+"""How much farther neighbouring keypoints may be apart than the cable between them is long, relative to it."""
+FARTHEST = 10.0
+"""Largest distance of a target's keypoints from the origin, in lengths of the cable."""
+MOST_TURNED = 4 * np.pi
+"""Largest angle of a target's gripper [rad]: two turns."""
+
 
 @dataclasses.dataclass(frozen=True)
 class Target:
@@ -101,6 +108,8 @@ def target_from_keypoints(
     Raises:
         ValueError: another number of points, points that are not finite, or a cable of another length.
     """
+    if np.iscomplexobj(keypoints):
+        raise ValueError(f"Target {name!r} has complex keypoints, expected real positions [m].")
     points = np.asarray(keypoints, float)
     if points.ndim != 2 or points.shape[1:] != (2,):
         raise ValueError(f"Target {name!r} has keypoints of shape {points.shape}, expected ({config.n_keypoints}, 2).")
@@ -112,6 +121,12 @@ def target_from_keypoints(
     if not np.isfinite(points).all():
         rows = np.flatnonzero(~np.isfinite(points).all(axis=1)).tolist()
         raise ValueError(f"Target {name!r} has keypoints that are not finite, at {rows}: fill them in or resample.")
+    away = float(np.linalg.norm(points, axis=1).max())
+    if away > FARTHEST * config.length:
+        raise ValueError(
+            f"Target {name!r} lies up to {away:.4g} m from the origin, where a cable of {config.length:.4g} m starts: "
+            f"expected at most {FARTHEST:g} lengths. Move it nearer, or check its unit."
+        )
     edges = np.diff(points, axis=0)
     angle = np.unwrap(np.arctan2(edges[:, 1], edges[:, 0]))
     # An edge is the chord of an arc: turned by a it is shorter than the arc by sin(a / 2) / (a / 2).
@@ -120,7 +135,14 @@ def target_from_keypoints(
     if abs(length - config.length) > LENGTH_TOLERANCE * config.length:
         raise ValueError(
             f"Target {name!r} is {length:.4g} m long, but the cable is {config.length:.4g} m long and does not "
-            "stretch: scale the target, or give the cable's length in the configuration."
+            "stretch: scale the target, or use a model of a cable of that length."
+        )
+    longest = int(np.hypot(*edges.T).argmax())
+    if np.hypot(*edges[longest]) > (1 + STRETCH) * config.length / (len(points) - 1):
+        raise ValueError(
+            f"Target {name!r} has keypoints {longest} and {longest + 1} {np.hypot(*edges[longest]):.4g} m apart, where "
+            f"{config.length / (len(points) - 1):.4g} m of cable lie between neighbours: resample it uniformly in arc "
+            "length."
         )
     if gripper_pose is None:
         ends = [1.5 * angle[0] - 0.5 * angle[1], 1.5 * angle[-1] - 0.5 * angle[-2]]
@@ -133,6 +155,13 @@ def target_from_keypoints(
         if gap > 0.01 * config.length:
             raise ValueError(
                 f"Target {name!r}: the grippers are {gap:.4g} m away from the first and last keypoint that they hold."
+            )
+        off = np.arccos(np.cos(pose[:, 2] - angle[[0, -1]]))
+        if np.abs(pose[:, 2]).max() > MOST_TURNED or off.max() > np.pi / 2:
+            raise ValueError(
+                f"Target {name!r} has gripper angles of {pose[0, 2]:.4g} and {pose[1, 2]:.4g}, but its ends lie in the "
+                f"directions {angle[0]:.4g} and {angle[-1]:.4g} rad: expected radians, both along the cable from "
+                "gripper 0 to gripper 1."
             )
     return Target(name, points, pose)
 

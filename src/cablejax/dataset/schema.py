@@ -13,6 +13,9 @@ from typing import Any, Literal
 import numpy as np
 
 from cablejax.cable import Cable, Discretisation
+from cablejax.effects.given import GivenEffect, with_effects
+from cablejax.effects.physics import nominal_physics
+from cablejax.simulate import ENGINES, check_effects
 from cablejax.simulate.equilibrium import FEWEST_LINKS
 from cablejax.simulate.motions import MotionConfig
 
@@ -55,8 +58,10 @@ class DatasetConfig:
         motion: where the grippers start and how they move.
         discretisation: the simulated cable, its links and time step.
         randomisation: ranges of the physical parameters.
-        engine: "threaded", MuJoCo in threads on the CPU, or "mjx", batched on the accelerator.
+        engine: "threaded", MuJoCo in threads on the CPU; "mjx", batched on the accelerator; or "chain", batched too,
+            which can simulate every effect.
         shard_size: trajectories per shard: the unit that one process writes and that a kill can cost.
+        effects: added to every cable after its parameters are drawn, in this order.
     """
 
     n_trajectories: int = 2000
@@ -66,8 +71,9 @@ class DatasetConfig:
     motion: MotionConfig = dataclasses.field(default_factory=MotionConfig)
     discretisation: Discretisation = Discretisation()
     randomisation: Randomisation = dataclasses.field(default_factory=Randomisation)
-    engine: Literal["threaded", "mjx"] = "threaded"
+    engine: Literal["threaded", "mjx", "chain"] = "threaded"
     shard_size: int = 32
+    effects: tuple[GivenEffect, ...] = ()
 
     def __post_init__(self):
         for name in ("n_trajectories", "n_steps", "shard_size"):
@@ -77,8 +83,8 @@ class DatasetConfig:
             raise ValueError(f"DatasetConfig.interval is {self.interval}, expected a positive number of seconds.")
         if self.seed < 0:
             raise ValueError(f"DatasetConfig.seed is {self.seed}, expected an integer >= 0.")
-        if self.engine not in ("threaded", "mjx"):
-            raise ValueError(f"DatasetConfig.engine is {self.engine!r}, expected 'threaded' or 'mjx'.")
+        if self.engine not in ENGINES:
+            raise ValueError(f"DatasetConfig.engine is {self.engine!r}, expected one of {', '.join(ENGINES)}.")
         if self.discretisation.dimension != 2:
             raise ValueError(
                 "DatasetConfig.discretisation has dimension 3; data sets hold cables on a table: use dimension=2."
@@ -88,6 +94,9 @@ class DatasetConfig:
                 f"DatasetConfig.discretisation has n_links {self.discretisation.n_links}, expected at least "
                 f"{FEWEST_LINKS}: with fewer the grippers' poses leave it no freedom."
             )
+        check_effects(self.effects, self.engine)
+        if self.effects:
+            with_effects(nominal_physics(self.discretisation), self.effects, self.discretisation)
 
     @property
     def cable(self) -> Cable:
@@ -175,7 +184,10 @@ def _decode(hint: Any, value: Any) -> Any:
         return config_from_json(typing.cast(type, hint), value)
     if typing.get_origin(hint) in (typing.Union, types.UnionType):
         return _decode(next(option for option in typing.get_args(hint) if option is not type(None)), value)
-    return tuple(value) if isinstance(value, list) else value
+    if isinstance(value, list):
+        items, repeated = typing.get_args(hint), typing.get_args(hint)[1:] == (...,)
+        return tuple(_decode(items[0], item) for item in value) if repeated else tuple(value)
+    return value
 
 
 def differences(stored: Mapping[str, Any], asked: Mapping[str, Any], prefix: str = "") -> list[str]:

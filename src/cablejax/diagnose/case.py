@@ -20,7 +20,7 @@ from cablejax.diagnose.repeats import repeated_motions
 from cablejax.diagnose.run import weighed
 from cablejax.effects import LIBRARY, CableEffect
 from cablejax.effects.physics import nominal_physics
-from cablejax.simulate.chain.step import FINE_STEP, LARGEST_STEP
+from cablejax.simulate.chain.replay import FINE_STEP, LARGEST_STEP
 from cablejax.simulate.pose import wrapped
 from cablejax.simulate.replay import config_of_log
 from cablejax.types import GapLog

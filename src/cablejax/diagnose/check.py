@@ -12,8 +12,9 @@ from cablejax.cable import Discretisation
 from cablejax.diagnose.planar import physics_of
 from cablejax.diagnose.protocol import Explanation, explanation
 from cablejax.effects.base import CableEffect, Context
+from cablejax.effects.camera import seen_by_camera
 from cablejax.effects.physics import nominal_physics
-from cablejax.simulate.chain.step import Chain, seen_by_camera
+from cablejax.simulate.chain.replay import Chain
 from cablejax.simulate.compile import compiler_options
 from cablejax.simulate.equilibrium import equilibrium_state
 

@@ -22,7 +22,7 @@ from cablejax.diagnose.conformal import leftover_p, leftover_score
 from cablejax.diagnose.diagnosis import PLACES, NamedEffect, ParameterEstimate, Ranked, Verdict
 from cablejax.diagnose.evidence import Evidence
 from cablejax.diagnose.fit import Fit
-from cablejax.diagnose.judgement import judged
+from cablejax.diagnose.judgement import judged, verdict_sentence
 from cablejax.diagnose.profile import scaled_draws
 from cablejax.diagnose.protocol import Simulator
 from cablejax.diagnose.search import Search
@@ -97,7 +97,7 @@ def conclude(found: Search, evidence: Evidence, calibration: Calibration) -> Con
     verdict = judged(resolvable=True, telling=telling or complete, complete=complete, alike=bool(equivalent))
     if verdict == "unknown":
         return Conclusion("unknown", best, (), (), ranking, explained, as_much)
-    order = np.argsort([-(e.probability or 0.0) for e in effects])
+    order = np.argsort([-e.probability for e in effects])
     named = tuple(effects[i] for i in order)
     return Conclusion(verdict, best, named, tuple(equivalent), ranking, explained, as_much)
 
@@ -196,3 +196,16 @@ def _merged(parts: list[dict[str, ParameterEstimate]]) -> dict[str, ParameterEst
         intervals: Any = None if first.ci90 is None else [e.ci90 for e in every]
         merged[key] = ParameterEstimate([e.value for e in every], intervals, first.unit)
     return merged
+
+
+def sentence(conclusion: Conclusion, shrinkage: float | None) -> str:
+    """The verdict in words, with the share of the squared gap that goes away.
+
+    Args:
+        conclusion: the verdict.
+        shrinkage: on episodes left out of the fit; None where nothing could be, which leaves that of the fit.
+    """
+    explained = conclusion.explained if shrinkage is None else shrinkage
+    return verdict_sentence(
+        conclusion.verdict, conclusion.effects, conclusion.equivalent, conclusion.ranking, explained
+    )

@@ -57,11 +57,12 @@ class Ranked:
 
     Attributes:
         name: of the effect.
-        probability: posterior among all single effects; None in a forward search, which computes none.
+        probability: posterior among all single effects, were the cause one of them; None where it was not computed, as
+            in a forward search.
         held_out_shrinkage: share of the squared gap that goes away on episodes left out of the fit; negative where the
             effect makes these worse.
-        leftover_mm: gap above the noise that is left, root mean square per coordinate [mm], on the episodes fitted; of
-            a forward search, on those left out.
+        leftover_mm: gap above the noise that is left, root mean square per coordinate [mm, or thousandths of
+            `Gap.unit`], on the episodes fitted; of a forward search, on those left out.
     """
 
     name: str
@@ -141,12 +142,13 @@ class Diagnosis:
             gap, and where no labelled logs are like this one.
         gap: before and after.
         where: along the cable, in time, by regime, by frame; None where no adapter localises.
-        next_motion: None if nothing would be gained, or no motions are known.
+        next_motion: None if nothing would be gained, or no motion was evaluated.
         baselines: the single effect that simpler rules would have named: "lowest_cost" (best fit in sample), "bic" (the
             same with Schwarz's penalty, all samples taken to be independent) and "sparse_regression" (the best template
-            without any fit); empty for the verdict "none", and where these rules were not evaluated.
+            without any fit); empty for the verdict "none".
         caveats: what the log did not allow, in words.
         seconds: run time.
+        settings: versions and options, for the record.
     """
 
     verdict: Verdict

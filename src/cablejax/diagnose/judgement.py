@@ -45,7 +45,7 @@ def look_alikes(
     return [name for name in group if name not in faint], faint
 
 
-def sentence(
+def verdict_sentence(
     verdict: Verdict,
     effects: Sequence[NamedEffect],
     equivalent: Sequence[Sequence[str]],

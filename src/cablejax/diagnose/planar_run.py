@@ -12,12 +12,11 @@ import numpy as np
 from cablejax.diagnose.actuation import with_arms
 from cablejax.diagnose.belief import Calibration, excess
 from cablejax.diagnose.case import FINE_LINKS, FIT_LINKS, Case
-from cablejax.diagnose.conclude import Conclusion, baselines
+from cablejax.diagnose.conclude import Conclusion, baselines, sentence
 from cablejax.diagnose.diagnosis import CableDiagnosis, Gap
 from cablejax.diagnose.evidence import Evidence
 from cablejax.diagnose.fit import evaluate
 from cablejax.diagnose.gap import held_out_predictions, measure_gap
-from cablejax.diagnose.judgement import sentence
 from cablejax.diagnose.next_motion import next_motion
 from cablejax.diagnose.noise import SMALLEST
 from cablejax.diagnose.protocol import explanation
@@ -72,13 +71,7 @@ def diagnose(
     repaired = case.recording.as_log(log.meta)
     return CableDiagnosis(
         verdict=conclusion.verdict,
-        sentence=sentence(
-            conclusion.verdict,
-            conclusion.effects,
-            conclusion.equivalent,
-            conclusion.ranking,
-            conclusion.explained if gap.shrinkage is None else gap.shrinkage,
-        ),
+        sentence=sentence(conclusion, gap.shrinkage),
         effects=conclusion.effects,
         equivalent=conclusion.equivalent,
         ranking=conclusion.ranking,

@@ -14,8 +14,9 @@ import numpy as np
 from jaxtyping import Float
 
 from cablejax.cable import Cable, Discretisation
+from cablejax.effects.camera import seen_by_camera
 from cablejax.effects.physics import Physics, nominal_physics
-from cablejax.simulate.chain.step import LARGEST_STEP, Chain, seen_by_camera
+from cablejax.simulate.chain.replay import LARGEST_STEP, Chain
 from cablejax.simulate.compile import compiler_options
 from cablejax.simulate.equilibrium import equilibrium_state
 
@@ -84,12 +85,7 @@ class Playback:
         """
         chosen = np.arange(len(self.gripper_pose)) if episodes is None else np.asarray(episodes, int)
         n_physics, n_samples = len(physics), self.gripper_pose.shape[1]
-        stacked = Physics(
-            **{
-                field.name: np.stack([np.asarray(getattr(p, field.name), np.float32) for p in physics])
-                for field in dataclasses.fields(Physics)
-            }
-        )
+        stacked = jax.tree.map(lambda *leaves: np.stack([np.asarray(leaf, np.float32) for leaf in leaves]), *physics)
         substeps = max(1, math.ceil(float(self.interval.max()) / self.largest_step - 1e-6))
         geometry = Discretisation(
             Cable(

@@ -12,12 +12,11 @@ import numpy as np
 from jaxtyping import ArrayLike, Float, Int
 
 from cablejax.diagnose.belief import Calibration, excess, level
-from cablejax.diagnose.conclude import Conclusion, baselines, conclude
+from cablejax.diagnose.conclude import Conclusion, baselines, conclude, sentence
 from cablejax.diagnose.diagnosis import Diagnosis
 from cablejax.diagnose.evidence import Evidence
 from cablejax.diagnose.fit import evaluate
 from cablejax.diagnose.gap import held_out_predictions, measure_gap
-from cablejax.diagnose.judgement import sentence
 from cablejax.diagnose.noise import noise_floor
 from cablejax.diagnose.protocol import Explanation, Simulator, explanation
 from cablejax.diagnose.search import Search, search
@@ -93,13 +92,7 @@ def diagnose_simulator(
     )
     return Diagnosis(
         verdict=conclusion.verdict,
-        sentence=sentence(
-            conclusion.verdict,
-            conclusion.effects,
-            conclusion.equivalent,
-            conclusion.ranking,
-            conclusion.explained if gap.shrinkage is None else gap.shrinkage,
-        ),
+        sentence=sentence(conclusion, gap.shrinkage),
         effects=conclusion.effects,
         equivalent=conclusion.equivalent,
         ranking=conclusion.ranking,

@@ -4,7 +4,8 @@ The file's metadata has one key, "cablejax", whose JSON object holds
 
     schema   "cablejax-weights/1"
     config   the `ModelConfig`, normalisation included
-    info     where the weights come from: data sets and their digests, seeds, package versions, kind of machine
+    info     where the weights come from: the cable (keys of the cable file), data sets and their digests, seeds,
+             package versions, kind of machine
 
 and its tensors are the network's, named by their place in it: "processor.0.edge.first.1.kernel".
 """
@@ -25,6 +26,8 @@ from flax import nnx
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
+from cablejax.cable import Cable
+from cablejax.cable_file import cable_from_fields
 from cablejax.dynamics.config import ModelConfig, Normalisation
 from cablejax.dynamics.transfer import structure_of
 from cablejax.whole_file import whole_file
@@ -107,6 +110,30 @@ def load_released(
 def load_info(source: str | os.PathLike[str]) -> dict[str, Any]:
     """Where the weights come from, as `save_weights` was told; `source` as in `load_weights`."""
     return _open(source)[1]["info"]
+
+
+def cable_of_weights(source: str | os.PathLike[str]) -> Cable:
+    """The nominal cable of the data that a network was trained on; `source` as in `load_weights`.
+
+    Weights that record no cable, as those of version 1 of the data sets' format, have it in their data's configuration.
+
+    Raises:
+        WeightsError: there is no such file, or it names no cable.
+    """
+    path, content = _open(source)
+    try:
+        info = content["info"]
+        if "cable" in info:
+            return cable_from_fields(info["cable"], f"{path}: info.cable")
+        flat = info["data"][0]["config"]["cable"]
+        return Cable(**{field.name: flat[field.name] for field in dataclasses.fields(Cable) if field.name in flat})
+    except (KeyError, IndexError, TypeError, AttributeError) as error:
+        raise WeightsError(
+            f"{path} does not say which cable the network was trained on (no {error} in its description). Train it "
+            "again with this version of cablejax."
+        ) from error
+    except ValueError as error:
+        raise WeightsError(str(error)) from error
 
 
 def released_names() -> tuple[str, ...]:

@@ -5,14 +5,12 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
+import jax
 import numpy as np
 
 from cablejax.effects.base import CableEffect
 from cablejax.effects.effect import Parameter
 from cablejax.effects.physics import Physics
-
-SMALLEST_LAG = 1e-6
-"""Time constant [s] below which a lag counts as this one: none."""
 
 
 class ActuationGain(CableEffect):
@@ -58,7 +56,7 @@ class ActuationLag(CableEffect):
 def executed(physics: Physics, commanded: Any, interval: Any) -> Any:
     """Gripper poses of arms with gain, delay and lag. Differentiable in all arguments.
 
-    The lag is exact for commands that are piecewise linear in time.
+    The lag is exact for commands that are piecewise linear in time. Exact arms follow to the last bit.
 
     Args:
         physics: of these arms; `actuation_gain`, `actuation_delay` and `actuation_time` are used.
@@ -68,7 +66,7 @@ def executed(physics: Physics, commanded: Any, interval: Any) -> Any:
     Returns:
         Poses of the same shape.
     """
-    amplified = commanded[:1] + physics.actuation_gain * (commanded - commanded[:1])
+    amplified = commanded + (physics.actuation_gain - 1.0) * (commanded - commanded[:1])
     return lagged(amplified, interval, physics.actuation_delay, physics.actuation_time)
 
 
@@ -79,10 +77,27 @@ def lag_weights(ratio: Any) -> tuple[Any, Any, Any]:
     `w_0 = r - d - d r` and `w_1 = 1 - r + d r` with `r = slow / dt`.
 
     Args:
-        ratio: r > 0, a NumPy or JAX number.
+        ratio: r >= 0, a NumPy or JAX number; 0 = no lag, to the last bit.
     """
-    decay = ratio.__array_namespace__().exp(-1.0 / ratio)
+    xp = ratio.__array_namespace__()
+    # below a thousandth of an interval nothing is left of the past
+    decay = xp.exp(-1.0 / xp.maximum(ratio, 1e-3))
     return decay, ratio - decay - decay * ratio, 1 - ratio + decay * ratio
+
+
+def executed_twist(physics: Physics, start: Any, twist: Any, interval: Any) -> Any:
+    """Mean twist of arms with gain, delay and lag over each command; the arms rest at `start` before the first one.
+
+    Args:
+        physics: of these arms.
+        start: pose at the first command, shape [Q, P].
+        twist: commanded in the plane [m/s, rad/s], shape [T, Q, P]. NumPy in, NumPy out; JAX in, JAX out.
+        interval: for which each twist is held [s].
+    """
+    xp = twist.__array_namespace__()
+    commanded = xp.concatenate([start[None], start + xp.cumsum(interval * twist, axis=0)])
+    off = executed(physics, commanded, interval) - commanded
+    return twist + (off[1:] - off[:-1]) / interval
 
 
 def lagged(poses: Any, interval: Any, delay: Any, slow: Any) -> Any:
@@ -90,20 +105,24 @@ def lagged(poses: Any, interval: Any, delay: Any, slow: Any) -> Any:
 
     Exact for piecewise linear input, see `lag_weights`.
     """
-    xp = poses.__array_namespace__()
-    n = len(poses)
+    xp, n = poses.__array_namespace__(), len(poses)
     back = xp.clip(np.arange(n) - delay / interval, 0.0, n - 1.0)
-    before = (
-        np.minimum(xp.floor(back).astype(int), n - 2) if xp is np else xp.minimum(xp.floor(back).astype(int), n - 2)
-    )
-    t = (back - before).reshape(-1, *(1,) * (poses.ndim - 1))
+    before = xp.clip(xp.floor(back).astype(int), 0, n - 2)
+    t = (back - before).reshape(-1, *(1,) * (poses.ndim - 1)).astype(poses.dtype)
     late = (1 - t) * poses[before] + t * poses[before + 1]
-    ratio = xp.maximum(xp.asarray(slow, dtype=poses.dtype), SMALLEST_LAG) / interval
-    _, before_weight, after_weight = lag_weights(ratio)
+    ratio = xp.asarray(slow, dtype=poses.dtype) / interval
+    decay, before_weight, after_weight = lag_weights(ratio)
     driven = before_weight * late[:-1] + after_weight * late[1:]
-    # the recursion as one product with the powers of the decay, bounded against overflow
-    steps = np.subtract.outer(np.arange(n - 1), np.arange(n - 1))
-    powers = xp.where(steps >= 0, xp.exp(-np.maximum(steps, 0) / ratio), 0.0)
-    first = xp.exp(-np.arange(1, n) / ratio).reshape(-1, *(1,) * (poses.ndim - 1)) * late[0]
-    rest = first + xp.tensordot(powers, driven, axes=1)
-    return xp.concatenate([late[:1], rest.astype(poses.dtype)])
+    return xp.concatenate([late[:1], _recursion(xp, decay, late[0], driven)])
+
+
+def _recursion(xp: Any, decay: Any, first: Any, driven: Any) -> Any:
+    """`y_k = decay y_(k - 1) + driven_k`, from `y_0 = first` on."""
+    if xp is np:
+        result = np.empty_like(driven)
+        for k in range(len(driven)):
+            first = result[k] = decay * first + driven[k]
+        return result
+    begun = driven.at[0].add(decay * first)
+    factors = xp.broadcast_to(decay, begun.shape)
+    return jax.lax.associative_scan(lambda a, b: (a[0] * b[0], b[0] * a[1] + b[1]), (factors, begun))[1]

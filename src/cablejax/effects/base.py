@@ -34,10 +34,12 @@ class Context:
     max_curvature: Float[np.ndarray, "E"]
 
 
-Hook = Literal["bending", "extension", "memory", "table", "mass", "grasp", "input", "observation", "obstacle"]
+Hook = Literal[
+    "bending", "extension", "memory", "table", "mass", "grasp", "compliance", "input", "observation", "obstacle"
+]
 """Where an effect acts on a simulation: the bending law along the cable, the change of its length, bends that the cable
-remembers, the forces of the table, mass, how the grippers hold the cable, how the arms follow their commands, how the
-cable is observed, and what it touches. Every simulator states the hooks that it honours."""
+remembers, the forces of the table, mass, how the grippers hold the cable, how their grasp yields, how the arms follow
+their commands, how the cable is observed, and what it touches. Every simulator states the hooks that it honours."""
 
 
 class CableEffect(Effect, abc.ABC):

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
 from cablejax.effects.base import CableEffect
 from cablejax.effects.effect import Parameter
+from cablejax.effects.physics import Physics
 
 
 class CameraSimilarity(CableEffect):
@@ -106,3 +108,22 @@ class KeypointBias(CableEffect):
     def location(self, values, variant, config):
         s = float(config.cable.keypoint_arclength[variant // 2])
         return {"along_cable_m": [s, s]}
+
+
+def seen_by_camera(physics: Physics, keypoints: Any, interval: Any) -> Any:
+    """Keypoints as the camera reports them: late, then scaled, turned and moved. Differentiable in all arguments.
+
+    Args:
+        physics: `camera_lag`, `camera_scale`, `camera_angle` and `camera_offset` are used.
+        keypoints: where they are, at even times [m], shape [T, N, 2]. NumPy in, NumPy out; JAX in, JAX out.
+        interval: between two samples [s].
+    """
+    xp, n = keypoints.__array_namespace__(), len(keypoints)
+    back = xp.clip(np.arange(n) - physics.camera_lag / interval, 0.0, n - 1.0)
+    before = xp.clip(xp.floor(back).astype(int), 0, n - 2)
+    t = (back - before)[:, None, None].astype(keypoints.dtype)
+    late = (1 - t) * keypoints[before] + t * keypoints[before + 1]
+    cosine, sine = xp.cos(physics.camera_angle), xp.sin(physics.camera_angle)
+    x, y = late[..., 0], late[..., 1]
+    turned = xp.stack([cosine * x - sine * y, sine * x + cosine * y], axis=-1)
+    return xp.asarray(physics.camera_scale * turned + physics.camera_offset)

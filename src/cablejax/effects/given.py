@@ -78,7 +78,8 @@ class GivenEffect:
         return self.effect.apply(physics, [np.float32(v) for v in values], variant, chain)
 
     def __str__(self) -> str:
-        return f"{self.name}:{','.join(f'{name}={value:g}' for name, value in self.parameters)}"
+        """The effect as `parse_effect` reads it back, without loss."""
+        return f"{self.name}:{','.join(f'{name}={number_text(value)}' for name, value in self.parameters)}"
 
 
 def with_effects(physics: Physics, effects: Iterable[GivenEffect], chain: Discretisation) -> Physics:
@@ -161,6 +162,12 @@ def _pieces(effect: Any, path: Any) -> list[GivenEffect]:
         return [GivenEffect(effect["name"], row) for row in rows]
     except (KeyError, TypeError, AttributeError, IndexError) as error:
         raise ValueError(f"{path}: an effect is not of the verdict's format ({error}).") from error
+
+
+def number_text(value: float) -> str:
+    """A number as short as it can be without loss."""
+    short = f"{value:g}"
+    return short if float(short) == value else repr(float(value))
 
 
 def _parameter_names(effect: CableEffect) -> tuple[tuple[str, ...], tuple[str, ...]]:

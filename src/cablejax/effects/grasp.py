@@ -71,7 +71,7 @@ class GripperCompliance(CableEffect):
     """The grasp yields in rotation."""
 
     name = "gripper_compliance"
-    hook = "grasp"
+    hook = "compliance"
     parameters = (Parameter("stiffness_n_m_per_rad", "N m/rad", 1e-3, 1e4, 0.3, 1.2, log=True),)
     null = (float("inf"),)
     amplitude = 0

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
+from typing import Any
 
 import jax
+import jax.core
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -60,39 +62,39 @@ class Physics:
         actuation_time: time constant of a first-order lag after that [s].
     """
 
-    stiffness: Float[Array | np.ndarray, "*B J"]
-    rest_curvature: Float[Array | np.ndarray, "*B J"] | Float[Array | np.ndarray, "*B J 3"]
-    damping_time: Float[Array | np.ndarray, "*B"]
-    yield_curvature: Float[Array | np.ndarray, "*B"]
-    hardening: Float[Array | np.ndarray, "*B"]
-    hysteresis_moment: Float[Array | np.ndarray, "*B"]
-    hysteresis_curvature: Float[Array | np.ndarray, "*B"]
-    axial_compliance: Float[Array | np.ndarray, "*B"]
-    friction: Float[Array | np.ndarray, "*B"]
-    static_excess: Float[Array | np.ndarray, "*B"]
-    patch_centre: Float[Array | np.ndarray, "*B 2"]
-    patch_radius: Float[Array | np.ndarray, "*B"]
-    patch_friction: Float[Array | np.ndarray, "*B"]
-    drag: Float[Array | np.ndarray, "*B"]
-    gravity: Float[Array | np.ndarray, "*B"]
-    tilt: Float[Array | np.ndarray, "*B 2"]
-    density: Float[Array | np.ndarray, "*B"]
-    extra_mass: Float[Array | np.ndarray, "*B n"]
-    slip: Float[Array | np.ndarray, "*B 2"]
-    slip_time: Float[Array | np.ndarray, "*B"]
-    rotation_offset: Float[Array | np.ndarray, "*B 2"]
-    rotation_compliance: Float[Array | np.ndarray, "*B 2"]
-    obstacle_centre: Float[Array | np.ndarray, "*B 2"]
-    obstacle_radius: Float[Array | np.ndarray, "*B"]
-    bias_along: Float[Array | np.ndarray, "*B N"]
-    bias_across: Float[Array | np.ndarray, "*B N"]
-    camera_scale: Float[Array | np.ndarray, "*B"]
-    camera_angle: Float[Array | np.ndarray, "*B"]
-    camera_offset: Float[Array | np.ndarray, "*B 2"]
-    camera_lag: Float[Array | np.ndarray, "*B"]
-    actuation_gain: Float[Array | np.ndarray, "*B"]
-    actuation_delay: Float[Array | np.ndarray, "*B"]
-    actuation_time: Float[Array | np.ndarray, "*B"]
+    stiffness: Float[Array, "*B J"]
+    rest_curvature: Float[Array, "*B J"] | Float[Array, "*B J 3"]
+    damping_time: Float[Array, "*B"]
+    yield_curvature: Float[Array, "*B"]
+    hardening: Float[Array, "*B"]
+    hysteresis_moment: Float[Array, "*B"]
+    hysteresis_curvature: Float[Array, "*B"]
+    axial_compliance: Float[Array, "*B"]
+    friction: Float[Array, "*B"]
+    static_excess: Float[Array, "*B"]
+    patch_centre: Float[Array, "*B 2"]
+    patch_radius: Float[Array, "*B"]
+    patch_friction: Float[Array, "*B"]
+    drag: Float[Array, "*B"]
+    gravity: Float[Array, "*B"]
+    tilt: Float[Array, "*B 2"]
+    density: Float[Array, "*B"]
+    extra_mass: Float[Array, "*B n"]
+    slip: Float[Array, "*B 2"]
+    slip_time: Float[Array, "*B"]
+    rotation_offset: Float[Array, "*B 2"]
+    rotation_compliance: Float[Array, "*B 2"]
+    obstacle_centre: Float[Array, "*B 2"]
+    obstacle_radius: Float[Array, "*B"]
+    bias_along: Float[Array, "*B N"]
+    bias_across: Float[Array, "*B N"]
+    camera_scale: Float[Array, "*B"]
+    camera_angle: Float[Array, "*B"]
+    camera_offset: Float[Array, "*B 2"]
+    camera_lag: Float[Array, "*B"]
+    actuation_gain: Float[Array, "*B"]
+    actuation_delay: Float[Array, "*B"]
+    actuation_time: Float[Array, "*B"]
 
 
 def nominal_physics(
@@ -147,9 +149,24 @@ def nominal_physics(
         "actuation_delay": 0.0,
         "actuation_time": 0.0,
     }
-    return Physics(**{name: np.asarray(value, np.dtype(dtype)) for name, value in values.items()})
+    arrays: dict[str, Any] = {name: np.asarray(value, np.dtype(dtype)) for name, value in values.items()}
+    return Physics(**arrays)
 
 
 def normal_gravity(physics: Physics) -> Float[Array, ""]:
     """Gravity across the table [m/s^2]; the part in its plane is `tilt`."""
     return jnp.sqrt(jnp.maximum(physics.gravity**2 - jnp.sum(physics.tilt**2), 0.0))
+
+
+def may_touch(physics: Physics) -> bool:
+    """Whether a cable of this physics can touch an obstacle: false only where the radius is known to be zero.
+
+    Inside `jit` the radius is known if it is a constant, see `without_obstacle`.
+    """
+    radius = physics.obstacle_radius
+    return isinstance(radius, jax.core.Tracer) or bool(np.any(np.asarray(radius) > 0))
+
+
+def without_obstacle(physics: Physics) -> Physics:
+    """The physics with an obstacle that is known to be absent, even inside `jit`: no time is spent on contacts."""
+    return dataclasses.replace(physics, obstacle_radius=np.zeros(np.shape(physics.obstacle_radius), np.float32))

@@ -9,6 +9,7 @@ import sys
 import numpy as np
 
 from cablejax.cable import Discretisation
+from cablejax.cable_file import cable_to_fields
 from cablejax.control.shaping import Model, load_model
 from cablejax.dynamics.fine_tune import starting_from
 from cablejax.dynamics.train import train
@@ -94,6 +95,10 @@ def fine_tune(data: Trajectory, config: FineTuneConfig, folder: pathlib.Path) ->
         result = train(training, data, folder / "training", initial=initial)
         if not result.completed:
             raise KeyboardInterrupt(f"Stopped while fine-tuning; run the same command again to go on in {folder}.")
-        info = {"started_from": config.weights, "transitions": int(np.prod(np.shape(data.gripper_twist)[:2]))}
+        info = {
+            "started_from": config.weights,
+            "cable": cable_to_fields(source.cable),
+            "transitions": int(np.prod(np.shape(data.gripper_twist)[:2])),
+        }
         save_weights(folder / FILE_NAME, result.model, result.weights, info)
     return load_model(str(folder))

@@ -8,10 +8,11 @@ import numpy as np
 from jaxtyping import Float
 
 from cablejax.cable import Cable
+from cablejax.effects.given import check_hooks
 from cablejax.perceive.camera import CameraConfig, DepthCamera
 from cablejax.perceive.registration import RegistrationConfig
 from cablejax.perceive.tracker import Status, Track, Tracker, TrackerConfig, TrackState
-from cablejax.simulate.plant import Plant, PlantConfig
+from cablejax.simulate.plant import HOOKS, Plant, PlantConfig
 from cablejax.simulate.table_plant import Observation
 
 
@@ -37,6 +38,8 @@ class CloudPlant(Plant):
         tracker: TrackerConfig | None = None,
     ):
         super().__init__(config)
+        # its keypoints come from a cloud, not from what a camera reports
+        check_hooks(self.config.effects, HOOKS - {"observation"}, "CloudPlant", {"Plant": HOOKS})
         cable = self.config.cable
         self.camera = DepthCamera(CameraConfig() if camera is None else camera, self.config.discretisation)
         self.tracker = Tracker(tracker_for(cable) if tracker is None else tracker)

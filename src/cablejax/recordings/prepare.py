@@ -14,6 +14,9 @@ from cablejax.recordings.poses import poses_from_markers
 from cablejax.recordings.take import Take, typical_spacing
 from cablejax.recordings.units import METRES, metres_per, recognised_unit, require_metres
 
+_OUTLIER = 1.5
+"""Distance of a keypoint from the median of its sample, in lengths of the cable, from which on it cannot be on it."""
+
 
 @dataclasses.dataclass(frozen=True)
 class Setup:
@@ -72,6 +75,7 @@ def prepare(takes: tuple[Take, ...], setup: Setup) -> tuple[tuple[Take, ...], li
             "poses, or two keypoints on each gripper."
         )
     takes, told = _in_metres(takes, setup)
+    takes, outliers = _without_outliers(takes)
     takes = tuple(into_frame(take, setup.frame) for take in takes)
     takes, exchanged = restore_order(takes)
     if setup.hangs and takes[0].keypoints.shape[2] == 3:
@@ -83,7 +87,26 @@ def prepare(takes: tuple[Take, ...], setup: Setup) -> tuple[tuple[Take, ...], li
         require_rigid(takes, pairs)
     if not measured:
         takes = tuple(_with_poses(take, pairs) for take in takes)
-    return takes, [*told, *exchanged, *cut]
+    return takes, [*told, *outliers, *exchanged, *cut]
+
+
+def _without_outliers(takes: tuple[Take, ...]) -> tuple[tuple[Take, ...], list[str]]:
+    """Marks keypoints as not observed that lie farther from the rest of their sample than the cable is long."""
+    length, kept, count, farthest = float(typical_spacing(takes).sum()), [], 0, 0.0
+    for take in takes:
+        middle = np.full((len(take.time), 1, take.keypoints.shape[2]), np.nan)
+        shown = np.asarray(np.isfinite(take.keypoints).all(axis=2)).any(axis=1)
+        middle[shown, 0] = np.nanmedian(take.keypoints[shown], axis=1)
+        distance = np.nan_to_num(np.linalg.norm(take.keypoints - middle, axis=2), nan=0.0)
+        far = distance > _OUTLIER * length
+        count, farthest = count + int(far.sum()), max(farthest, float(distance.max(initial=0.0)))
+        kept.append(dataclasses.replace(take, keypoints=np.where(far[..., None], np.nan, take.keypoints)))
+    if not count:
+        return takes, []
+    return tuple(kept), [
+        f"{count} keypoint{'s' if count > 1 else ''} lay up to {farthest:.3g} m from the rest of the cable, which is "
+        f"{length:.3g} m long: taken as not observed."
+    ]
 
 
 def _in_metres(takes: tuple[Take, ...], setup: Setup) -> tuple[tuple[Take, ...], list[str]]:

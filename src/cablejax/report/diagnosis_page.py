@@ -86,7 +86,7 @@ def write_diagnosis_page(diagnosis: CableDiagnosis, out: str | os.PathLike[str])
     here = importlib.resources.files("cablejax.report")
     css = "\n".join((here / name).read_text(encoding="utf-8") for name in ("page.css", "diagnosis.css"))
     page = string.Template((here / "diagnosis.html").read_text(encoding="utf-8")).substitute(
-        title=html.escape(f"Diagnosis: {badge}"),
+        title=html.escape(f"CableDiagnosis: {badge}"),
         css=css,
         kind=kind,
         badge=badge,

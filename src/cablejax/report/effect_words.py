@@ -151,10 +151,8 @@ def effect_place(effect: NamedEffect) -> str:
     return _place(effect.location, None if gripper is None else gripper.value)
 
 
-def share(value: float | None) -> str:
-    """A share in per cent; never 0 or 100 where it is only close, "n/a" where it was not computed."""
-    if value is None:
-        return "n/a"
+def share(value: float) -> str:
+    """A share in per cent; never 0 or 100 where it is only close."""
     percent = 100 * value
     if percent >= 99.5:
         return "> 99 %"

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 from jaxtyping import Float
 
-from cablejax.effects.arms import SMALLEST_LAG, lag_weights
+from cablejax.effects.arms import lag_weights
 from cablejax.effects.physics import Physics
 
 _PIECE = 0.005
@@ -55,7 +55,7 @@ class Arms:
                 continue
             duration = count * timestep
             before, after = (self._delayed(begin + k * timestep) for k in (done - count, done))
-            keep, first, second = lag_weights(np.float64(max(self._slow, SMALLEST_LAG) / duration))
+            keep, first, second = lag_weights(np.float64(self._slow / duration))
             reached = keep * self._executed + first * before + second * after
             yield (reached - self._executed) / duration, count
             self._executed = reached

@@ -11,6 +11,8 @@ Two variants of the same chain are built:
 
 from __future__ import annotations
 
+from typing import Any
+
 import mujoco
 import numpy as np
 
@@ -21,6 +23,8 @@ _HELD_MASS = 10.0  # [kg]
 _HELD_INERTIA = 0.04  # [kg m^2], a sphere of 10 cm
 # Constraint impedance, as close to a rigid weld as MuJoCo allows.
 _RIGID = (0.9999, 0.9999, 0.001, 0.5, 2.0)
+# Of an obstacle: a link of 2 g that is pressed by 0.1 N goes 0.2 mm deep.
+_CONTACT = (0.99, 0.99, 0.001, 0.5, 2.0)
 
 
 def build_chain(config: Discretisation) -> mujoco.MjModel:
@@ -28,7 +32,7 @@ def build_chain(config: Discretisation) -> mujoco.MjModel:
     return _chain_spec(config).compile()
 
 
-def build_grasped_chain(config: Discretisation) -> mujoco.MjModel:
+def build_grasped_chain(config: Discretisation, obstacle: tuple[float, float, float] | None = None) -> mujoco.MjModel:
     """The chain welded at both ends to mocap bodies `gripper_0`, `gripper_1`, with friction actuators in the plane.
 
     The welds are deadbeat: with `k = 1/dt^2` and `b = 1/dt` the held end reaches the mocap pose within the very step,
@@ -37,8 +41,14 @@ def build_grasped_chain(config: Discretisation) -> mujoco.MjModel:
     Friction: MuJoCo has no Coulomb friction in a plane without contacts. Every free link carries two actuators along
     the world's x and y with force `-c v`; the engine sets `c = mu w / sqrt(|v|^2 + v0^2)` before each step, and
     `implicitfast` treats the force implicitly in `v`.
+
+    Args:
+        config: the cable.
+        obstacle: centre and radius of a fixed disc, to the cable's centreline [m]; None = nothing can be touched.
     """
     spec = _chain_spec(config)
+    if obstacle is not None:
+        _add_obstacle(spec, obstacle, config.timestep)
     # a simulation that diverges shall say so, not start again in silence
     spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
     links = link_bodies(spec)
@@ -77,6 +87,28 @@ def build_grasped_chain(config: Discretisation) -> mujoco.MjModel:
     return spec.compile()
 
 
+def _add_obstacle(spec: mujoco.MjSpec, obstacle: tuple[float, float, float], dt: float) -> None:
+    """A sphere in the cable's plane, without friction. Sphere and links have half the radius each, so that it counts to
+    the centreline. A contact is as good as undone within one step, like a grasp."""
+    x, y, radius = obstacle
+    for link in link_bodies(spec):
+        for geom in link.geoms:
+            geom.contype, geom.conaffinity, geom.condim = 1, 0, 1
+            geom.size[0] = radius / 2
+            geom.solref, geom.solimp = [-1.0 / dt**2, -1.0 / dt], _CONTACT
+    spec.worldbody.add_geom(
+        name="obstacle",
+        type=mujoco.mjtGeom.mjGEOM_SPHERE,
+        pos=[x, y, 0.0],
+        size=[radius / 2, 0.0, 0.0],
+        contype=0,
+        conaffinity=1,
+        condim=1,
+        solref=[-1.0 / dt**2, -1.0 / dt],
+        solimp=_CONTACT,
+    )
+
+
 def refuse_plugins(model: mujoco.MjModel) -> None:
     """Raises `ValueError` if the model carries an engine plugin, which MJX would drop in silence."""
     if model.nplugin:
@@ -84,6 +116,15 @@ def refuse_plugins(model: mujoco.MjModel) -> None:
             f"The MuJoCo model has {model.nplugin} plugin instance(s). MJX ignores plugins, so the cable would have no "
             "bending stiffness. Build it with `cablejax.simulate.composite`, which uses joint springs instead."
         )
+
+
+def stable_damping_time(damping_time: Any, timestep: float) -> Any:
+    """The Kelvin-Voigt time [s] that MuJoCo's step can integrate: at least half a time step.
+
+    The step takes elastic moments where it starts and damping where it ends. Bending waves of short cables of links are
+    much faster than a step, and with less damping than this they grow without bound.
+    """
+    return damping_time.__array_namespace__().maximum(damping_time, 0.5 * timestep)
 
 
 def link_bodies(spec: mujoco.MjSpec) -> list[mujoco.MjsBody]:

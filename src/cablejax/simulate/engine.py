@@ -1,14 +1,29 @@
-"""The one interface of the simulators."""
+"""The one interface of the simulators, and what is the same in all of them."""
 
 from __future__ import annotations
 
 import abc
+import dataclasses
+import functools
+import warnings
+from collections.abc import Callable
+from typing import Any, ClassVar
 
+import jax
+import jax.core
+import jax.numpy as jnp
+import numpy as np
 from jaxtyping import ArrayLike, Float
 
 from cablejax.cable import Discretisation
-from cablejax.effects.physics import Physics
+from cablejax.effects.base import Hook
+from cablejax.effects.physics import Physics, may_touch, without_obstacle
+from cablejax.simulate.compile import compiler_options
 from cablejax.types import CableState, Trajectory
+
+_FINE_SAMPLE = 0.1
+"""Interval of the samples between which arms and camera with a lag move linearly [s]."""
+_LAGS = ("actuation_time", "actuation_delay", "camera_lag")
 
 
 class Engine(abc.ABC):
@@ -16,9 +31,16 @@ class Engine(abc.ABC):
 
     Engines are frozen dataclasses: the configuration is the object. All of them take and return the same pytrees, with
     the same meaning of `qpos` and `qvel`.
+
+    Attributes:
+        config: the cable, its resolution and time step.
+        name: of the engine in configurations and messages.
+        hooks: through which effects act on this engine; other fields of `Physics` must be at their null values.
     """
 
     config: Discretisation
+    name: ClassVar[str]
+    hooks: ClassVar[frozenset[Hook]]
 
     @abc.abstractmethod
     def initial_state(
@@ -37,7 +59,10 @@ class Engine(abc.ABC):
     ) -> tuple[CableState, Trajectory]:
         """Moves the grippers by T twists, each held for `interval` seconds.
 
-        All arguments carry the same leading batch axis, or none of them does.
+        A taut cable has no derivative along its chord: pulled, it does not move; pushed, it buckles.
+
+        All arguments carry the same leading batch axis, or none of them does. Arms that lag and a camera that lags
+        begin at rest, whatever was before `state`.
 
         Args:
             physics: physical parameters.
@@ -68,3 +93,81 @@ class Engine(abc.ABC):
                 f"The twist has shape {tuple(twist.shape)}, expected (..., T, 2, {width}): two grippers, "
                 f"{width} velocities each."
             )
+
+
+def finely_sampled(
+    run: Callable[..., tuple[CableState, Trajectory]],
+    engine: Engine,
+    physics: Physics,
+    state: CableState,
+    twist: Any,
+    interval: float,
+) -> tuple[CableState, Trajectory]:
+    """Calls `run(physics, state, twist, interval)`, with commands split into parts where arms or camera lag.
+
+    Between samples a lagging arm's path and the keypoints are taken as linear, so a lag needs samples nearer to each
+    other than commands of a second. The trajectory has its samples at the commands, the gripper's poses as they were,
+    and its twists as they were commanded.
+    """
+    parts = _parts(engine, physics, interval)
+    _warn_if_taut(engine, physics, state, twist, interval)
+    if parts == 1:
+        return run(physics, state, twist, float(interval))
+    xp = twist.__array_namespace__()
+    final, fine = run(physics, state, xp.repeat(twist, parts, axis=-3), float(interval) / parts)
+    keypoints, pose = fine.keypoints[..., ::parts, :, :], fine.gripper_pose[..., ::parts, :, :]
+    return final, dataclasses.replace(fine, keypoints=keypoints, gripper_pose=pose, gripper_twist=jnp.asarray(twist))
+
+
+def _warn_if_taut(engine: Engine, physics: Physics, state: CableState, twist: Any, interval: float) -> None:
+    """Warns where the grippers are commanded further apart than the cable is long, unless it can stretch or slip."""
+    inputs = (state.gripper_pose, twist, physics.axial_compliance, physics.slip)
+    if any(isinstance(x, jax.core.Tracer) for x in inputs) or any(np.any(np.asarray(x) != 0) for x in inputs[2:]):
+        return
+    pose, moved = np.asarray(state.gripper_pose)[..., :3], np.asarray(twist)[..., :3]
+    chord = (pose[..., 1, :] - pose[..., 0, :])[..., None, :] + interval * np.cumsum(
+        moved[..., 1, :] - moved[..., 0, :], axis=-2
+    )
+    reach = np.linalg.norm(chord[..., : engine.config.dimension], axis=-1).max()
+    if reach > engine.config.cable.length * (1 + 1e-4):
+        warnings.warn(
+            f"The grippers are commanded {reach:.4f} m apart and the cable is {engine.config.cable.length:g} m long: "
+            "its ends will leave the grippers, and derivatives mean nothing there. Bring the grippers closer.",
+            stacklevel=4,
+        )
+
+
+def refuse_lags(physics: Physics) -> None:
+    """Raises `ValueError` if arms or camera lag: in a closed loop every rollout would forget what went before."""
+    lags = {name: getattr(physics, name) for name in _LAGS}
+    late = [f"{name} {np.max(np.asarray(lag)):g} s" for name, lag in lags.items() if np.any(np.asarray(lag) > 0)]
+    if late:
+        raise ValueError(
+            f"The physics has {', '.join(late)}. An engine's rollouts begin with arms and camera at rest, so it cannot "
+            "simulate a lag command by command: leave the effect out, or use a plant that has it."
+        )
+
+
+def _parts(engine: Engine, physics: Physics, interval: float) -> int:
+    """Into how many parts a command is split: whole numbers of time steps, each about `_FINE_SAMPLE` long."""
+    count = engine.substeps(interval)
+    lags = [getattr(physics, name) for name in _LAGS]
+    if not any(isinstance(lag, jax.core.Tracer) or np.any(np.asarray(lag) > 0) for lag in lags):
+        return 1
+    wanted = min(max(round(interval / _FINE_SAMPLE), 1), count)
+    return next(parts for parts in range(wanted, count + 1) if count % parts == 0)
+
+
+def compiled_rollout(engine: Any, physics: Physics, batch_axes: int, interval: float) -> Callable[..., Any]:
+    """`engine.unroll` vmapped and jitted, for physics like this one: contacts cost nothing where no obstacle is."""
+    return _compiled(engine, batch_axes, interval, may_touch(physics))
+
+
+@functools.lru_cache(maxsize=32)
+def _compiled(engine: Any, batch_axes: int, interval: float, touching: bool):
+    def function(physics, state, twist):
+        return engine.unroll(physics if touching else without_obstacle(physics), state, twist, interval)
+
+    for _ in range(batch_axes):
+        function = jax.vmap(function)
+    return jax.jit(function, compiler_options=compiler_options())

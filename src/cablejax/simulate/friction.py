@@ -1,4 +1,4 @@
-"""Coulomb friction of a cable lying on a table, regularised at low speed and treated implicitly.
+"""Forces of the table: Coulomb friction regularised at low speed, its variations over the table, and viscous drag.
 
     f = -mu w v / sqrt(|v|^2 + v0^2)
 
@@ -9,22 +9,43 @@ is taken at the start of the step and the velocity at its end: `f = -c (v + dt a
 
 from __future__ import annotations
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from cablejax.effects.physics import Physics, normal_gravity
+from cablejax.simulate.contact import length
+
+PATCH_EDGE = 0.005
+"""Over which the edge of a friction patch is smoothed [m]."""
+STRIBECK_SPEED = 0.004
+"""Speed at which sliding has taken away most of the static excess [m/s]."""
+
 
 def drag_coefficient(
-    velocity: Float[Array, "n 2"], normal_load: Float[Array, "n"], friction_coefficient: Float[Array, ""], speed: float
+    physics: Physics,
+    position: Float[Array, "n 2"],
+    velocity: Float[Array, "n 2"],
+    mass: Float[Array, "n"],
+    link_length: float,
+    speed: float,
 ) -> Float[Array, "n"]:
-    """`c = mu w / sqrt(|v|^2 + v0^2)` of each link [N s/m]. Differentiable everywhere, at rest too.
+    """Force over velocity of the table on each link [N s/m]. Differentiable everywhere, at rest too.
 
     Args:
+        physics: `friction`, `static_excess`, the patch, `drag` and gravity are used.
+        position: of each link's node [m].
         velocity: of each link's node [m/s].
-        normal_load: weight carried by the table at each link [N].
-        friction_coefficient: mu.
+        mass: carried by the table at each node [kg].
+        link_length: [m].
         speed: regularisation speed v0 [m/s].
     """
-    return friction_coefficient * normal_load / jnp.sqrt(jnp.sum(velocity**2, axis=-1) + speed**2)
+    patch = jax.nn.sigmoid((physics.patch_radius - length(position - physics.patch_centre)) / PATCH_EDGE)
+    coefficient = physics.friction + physics.patch_friction * patch
+    squared = jnp.sum(velocity**2, axis=1)
+    coefficient = coefficient * (1.0 + physics.static_excess * jnp.exp(-squared / STRIBECK_SPEED**2))
+    regularised = jnp.sqrt(squared + speed**2)
+    return coefficient * mass * normal_gravity(physics) / regularised + physics.drag * link_length
 
 
 def implicit_drag(

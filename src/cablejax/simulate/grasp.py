@@ -27,21 +27,40 @@ def constrained_acceleration(
     force: Float[Array, "nv"],
     jacobian: Float[Array, "C nv"],
     acceleration: Float[Array, "C"],
+    yielding: Float[Array, "C"] | float = 0.0,
 ) -> Float[Array, "nv"]:
-    """Solves `inertia a = force + J' lambda` with `J a = acceleration`. Differentiable in every argument.
+    """Solves `inertia a = force + J' lambda` with `J a = acceleration - yielding lambda`. Differentiable throughout.
 
     Args:
         inertia: symmetric positive definite, `M + dt D`.
         force: generalised force without the grasps.
         jacobian: rows of the held ends' velocities.
         acceleration: wanted acceleration of these rows [m/s^2, rad/s^2].
+        yielding: compliance of each row over dt^2; zero is a rigid grasp.
     """
     solved = solve_positive(inertia, jnp.concatenate([force[:, None], jacobian.T], axis=1))
+    return solve_held(solved, jacobian, acceleration, yielding)
+
+
+def solve_held(
+    solved: Float[Array, "n C1"],
+    rows: Float[Array, "C n"],
+    wanted: Float[Array, "C"],
+    yielding: Float[Array, "C"] | float = 0.0,
+) -> Float[Array, "n"]:
+    """The dual form: `u` with `A u = b + G' lambda` and `G u = wanted - yielding lambda`, from `A^-1 [b, G']`.
+
+    Args:
+        solved: `A^-1 b` and, in the other columns, `A^-1 G'`.
+        rows: G.
+        wanted: value of each row.
+        yielding: diagonal that softens the rows.
+    """
     free, response = solved[:, 0], solved[:, 1:]
-    dual = jacobian @ response
-    scale = jnp.sqrt(jnp.diagonal(dual))
-    scaled = dual / (scale[:, None] * scale) + _REGULARISATION * jnp.eye(dual.shape[0], dtype=dual.dtype)
-    multiplier = solve_positive(scaled, ((acceleration - jacobian @ free) / scale)[:, None])[:, 0] / scale
+    dual = rows @ response + jnp.diag(jnp.broadcast_to(yielding, wanted.shape))
+    size = jnp.sqrt(jnp.diagonal(dual))
+    scaled = dual / (size[:, None] * size) + _REGULARISATION * jnp.eye(dual.shape[0], dtype=dual.dtype)
+    multiplier = solve_positive(scaled, ((wanted - rows @ free) / size)[:, None])[:, 0] / size
     return free + response @ multiplier
 
 

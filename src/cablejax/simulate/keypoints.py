@@ -2,11 +2,57 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from jaxtyping import Float
 
 from cablejax.cable import Discretisation
 from cablejax.effects.physics import Physics
+
+
+def marked_keypoints(
+    config: Discretisation, physics: Physics, nodes: Any, unit: Any, *, scale: Any = 1.0, slipped: Any = None
+) -> Any:
+    """Points of a planar cable where its keypoints are marked, with the bias of each mark. One function of all engines.
+
+    NumPy in, NumPy out; JAX in, JAX out, differentiable in all arrays. Without bias and slip the arc lengths are those
+    of `hermite_weights`, to the last bit.
+
+    Args:
+        config: of the cable.
+        physics: `bias_along` and `bias_across` are used.
+        nodes: positions [m], shape [..., n, 2].
+        unit: unit tangents at the nodes, shape [..., n, 2].
+        scale: length of the cable over its nominal length, shape [].
+        slipped: cable that came through either gripper [m], shape [2]: marks move away from that gripper.
+
+    Returns:
+        Keypoints [m], shape [..., N, 2].
+    """
+    xp, h, last = nodes.__array_namespace__(), config.link_length, config.n_links - 1
+    marks = config.cable.keypoint_arclength
+    # whole and broken part of the nominal place apart: at no shift, neither is rounded
+    segment = np.clip(np.floor(marks / h + 1e-9), 0, last - 1)
+    marks, segment, place, within = (
+        np.asarray(x, nodes.dtype) for x in (marks, segment, marks / h, marks / h - segment)
+    )
+    shift = physics.bias_along / h
+    if slipped is not None:
+        total = slipped[0] + slipped[1]
+        moved = physics.bias_along + slipped[0] - marks * total / config.cable.length
+        ends = np.isin(np.arange(len(marks)), (0, len(marks) - 1))
+        shift = xp.where(ends, shift, last * moved / (config.cable.length + total))
+    t = within + xp.clip(shift, -place, last - place)
+    further = xp.clip(xp.floor(t + 1e-4), -segment, last - 1 - segment)
+    t = (t - further)[:, None]
+    index = (segment + further).astype(int)
+    a, b, da, db = nodes[..., index, :], nodes[..., index + 1, :], unit[..., index, :], unit[..., index + 1, :]
+    points = (1 - 3 * t**2 + 2 * t**3) * a + (3 * t**2 - 2 * t**3) * b
+    points = points + scale * h * ((t - 2 * t**2 + t**3) * da + (t**3 - t**2) * db)
+    tangent = (1 - t) * da + t * db
+    normal = xp.stack([-tangent[..., 1], tangent[..., 0]], axis=-1)
+    return points + physics.bias_across[:, None] * normal
 
 
 def hermite_weights(
@@ -63,7 +109,7 @@ def camera_similarity(physics: Physics, keypoints: Float[np.ndarray, "N 2"]) -> 
     """Keypoints scaled and turned about the world's origin, then moved, as the camera reports them [m]."""
     cosine, sine = np.cos(physics.camera_angle), np.sin(physics.camera_angle)
     turned = keypoints @ np.array([[cosine, sine], [-sine, cosine]])
-    return physics.camera_scale * turned + np.asarray(physics.camera_offset)
+    return np.asarray(physics.camera_scale * turned + physics.camera_offset)
 
 
 def _segments(config: Discretisation, arclength: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -41,11 +41,28 @@ def config_of_log(log: GapLog, *, n_links: int | None = None, timestep: float | 
         linear_density=cable["linear_density_kg_per_m"],
         bending_stiffness=cable["bending_stiffness_n_m2"],
         damping_time=cable["bending_damping_s"],
+        rest_curvature=cable.get("rest_curvature_per_m", 0.0),
         friction_coefficient=0.0 if table is None else table["friction_coefficient"],
         n_keypoints=log.keypoints.shape[-2],
     )
     return Discretisation(
         described, dimension=dimension, **{name: value for name, value in chosen.items() if value is not None}
+    )
+
+
+def cable_of_log(log: GapLog) -> Cable:
+    """The cable that a log states, with its own diameter, marks and grasp.
+
+    Raises:
+        ValueError: it is not one that a simulator can take.
+    """
+    cable, marks = log.meta["cable"], np.asarray(log.meta["keypoint_arclength_m"], float)
+    uniform = np.allclose(marks, np.linspace(0.0, cable["length_m"], len(marks)), rtol=0, atol=1e-6 * cable["length_m"])
+    return dataclasses.replace(
+        config_of_log(log).cable,
+        diameter=cable["diameter_m"],
+        marks=None if uniform else tuple(marks.tolist()),
+        grasp=tuple(log.meta["grasp"]),
     )
 
 

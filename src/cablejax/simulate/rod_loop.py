@@ -43,7 +43,7 @@ def advance(
         twist: of the grippers [m/s, rad/s], shape [2, 3].
         steps: number of time steps.
         dt: time step [s].
-        damper: couple between neighbours per difference of their angular velocities [N m s].
+        damper: couple between neighbours per difference of their angular velocities [N m s], shape [n - 1].
         friction: mu_k g [m/s^2].
         static_ratio: mu_s / mu_k.
         stribeck_speed: v_s [m/s].
@@ -57,7 +57,7 @@ def advance(
     n_nodes = x.shape[1]
     n_elements = n_nodes - 1
     upper, rough = np.zeros(n_elements), np.zeros_like(v)
-    keep = np.exp(-damping * dt)
+    keep, resistance = np.exp(-damping * dt), dt * damper
     for step in range(steps):
         _hold(x, v, q, omega, rest_lengths, pose, twist, step * dt)
         overload_operator_kinematic_numba(0.5 * dt, x, q, v, omega)
@@ -88,7 +88,7 @@ def advance(
         for element in range(1, n_elements - 1):
             omega[0, element] = keep * (omega[0, element] + dt * alpha[0, element])
             omega[1, element], omega[2, element] = 0.0, 0.0
-        _damp_bending(omega[0], inertia[0, 0], dt * damper, upper)
+        _damp_bending(omega[0], inertia[0, 0], resistance, upper)
         overload_operator_kinematic_numba(0.5 * dt, x, q, v, omega)
     _hold(x, v, q, omega, rest_lengths, pose, twist, steps * dt)
 
@@ -119,8 +119,8 @@ def _damp_bending(omega, inertia, damper, upper):
     n = omega.shape[0]
     upper[0] = 0.0
     for i in range(1, n - 1):
-        pivot = inertia[i] + 2.0 * damper - damper * upper[i - 1]
-        upper[i] = damper / pivot
-        omega[i] = (inertia[i] * omega[i] + damper * omega[i - 1]) / pivot
+        pivot = inertia[i] + (damper[i - 1] + damper[i]) - damper[i - 1] * upper[i - 1]
+        upper[i] = damper[i] / pivot
+        omega[i] = (inertia[i] * omega[i] + damper[i - 1] * omega[i - 1]) / pivot
     for i in range(n - 2, 0, -1):
         omega[i] += upper[i] * omega[i + 1]

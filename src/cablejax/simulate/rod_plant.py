@@ -26,15 +26,22 @@ The rod lies in the table's plane. Its end elements are held rigidly and are hal
 from __future__ import annotations
 
 import dataclasses
+import functools
 
 import numpy as np
 from jaxtyping import Float
 
 from cablejax.cable import GRAVITY, Cable, Discretisation
+from cablejax.effects import Hook
+from cablejax.effects.given import GivenEffect, check_hooks
+from cablejax.effects.physics import Physics
 from cablejax.simulate.composite import link_lengths
 from cablejax.simulate.elastica import solve_elastica
-from cablejax.simulate.table_plant import Observation, TablePlant, check_camera
+from cablejax.simulate.plant.config import HOOKS as CONTACT_PLANT_HOOKS
+from cablejax.simulate.table_plant import Observation, TablePlant, check_camera, plant_physics
 
+HOOKS: frozenset[Hook] = frozenset({"bending", "mass", "input", "observation"})
+"""Hooks of the effects that the rod can stage."""
 SETTLE_DAMPING = 10.0
 """Rate [1/s] at which all motion is damped while a new cable settles."""
 LARGEST_STRETCH = 0.1
@@ -46,13 +53,13 @@ class RodPlantConfig:
     """What the rod is made of; the defaults are the reference cable.
 
     Attributes:
-        discretisation: the cable, its elements (`n_links`) and time step. `friction_coefficient` is the kinetic one
-            mu_k, `friction_speed` has no meaning here, and `dimension` must be 2.
+        discretisation: the cable, its elements (`n_links`) and time step. The cable's `friction_coefficient` is the
+            kinetic one, mu_k; `friction_speed` has no meaning here, and `dimension` must be 2.
+        effects: what the rod does beyond that cable, in this order; see `HOOKS` for those it knows.
         static_ratio: mu_s / mu_k >= 1.
         stribeck_speed: v_s [m/s], the speed at which sliding has taken away most of the difference.
-        axial_ratio: EA / EI [1/m^2]; `4 / r^2` for a solid rod of radius r. The stretch is the internal force over EI,
-            at most about 100 / m^2 in the shapes of interest, over this.
-        rest_curvature: kappa_0 everywhere [1/m].
+        axial_ratio: EA / EI [1/m^2], EI that of the stiffest joint; `4 / r^2` for a solid rod of radius r. The stretch
+            is the internal force over EI, at most about 100 / m^2 in the shapes of interest, over this.
         keypoint_noise: standard deviation of the observed keypoints [m] per coordinate, the held ends included.
         keypoint_dropout: probability with which a keypoint is not observed (NaN), except the first and last.
         settle_time: simulated time [s] given to a new cable to settle without friction.
@@ -60,10 +67,10 @@ class RodPlantConfig:
     """
 
     discretisation: Discretisation = Discretisation(n_links=27, timestep=2e-4)
+    effects: tuple[GivenEffect, ...] = ()
     static_ratio: float = 1.3
     stribeck_speed: float = 0.005
     axial_ratio: float = 1e5
-    rest_curvature: float = 0.0
     keypoint_noise: float = 0.0
     keypoint_dropout: float = 0.0
     settle_time: float = 1.0
@@ -71,8 +78,18 @@ class RodPlantConfig:
 
     @property
     def cable(self) -> Cable:
-        """What is simulated."""
+        """The cable without the effects."""
         return self.discretisation.cable
+
+    @functools.cached_property
+    def physics(self) -> Physics:
+        """The cable with the effects, float64."""
+        return plant_physics(self.discretisation, self.effects)
+
+    @property
+    def axial_stiffness(self) -> float:
+        """EA [N]."""
+        return self.axial_ratio * max(self.cable.bending_stiffness, float(np.max(self.physics.stiffness)))
 
     def __post_init__(self):
         if self.discretisation.dimension != 2:
@@ -86,9 +103,9 @@ class RodPlantConfig:
                 raise ValueError(f"RodPlantConfig.{name} is {value}, expected a positive finite number.")
         if not (np.isfinite(self.static_ratio) and self.static_ratio >= 1):
             raise ValueError(f"RodPlantConfig.static_ratio is {self.static_ratio}, expected a finite number >= 1.")
-        if not np.isfinite(self.rest_curvature):
-            raise ValueError(f"RodPlantConfig.rest_curvature is {self.rest_curvature}, expected a finite number [1/m].")
         check_camera(self)
+        object.__setattr__(self, "effects", tuple(self.effects))
+        check_hooks(self.effects, HOOKS, "RodPlant", {"Plant": CONTACT_PLANT_HOOKS})
         if self.discretisation.timestep > self.longest_timestep:
             raise ValueError(
                 f"RodPlantConfig.discretisation.timestep is {self.discretisation.timestep} s, but this rod is "
@@ -99,8 +116,8 @@ class RodPlantConfig:
     @property
     def longest_timestep(self) -> float:
         """Longest stable time step [s]: an axial wave crosses an element in it, and a tenth less for safety."""
-        speed = np.sqrt(self.axial_ratio * self.cable.bending_stiffness / self.cable.linear_density)
-        return 0.9 * self.discretisation.link_length / speed
+        speed = np.sqrt(self.axial_stiffness / self.physics.density)
+        return float(0.9 * self.discretisation.link_length / speed)
 
 
 ETHERNET = RodPlantConfig(
@@ -175,7 +192,7 @@ class RodPlant(TablePlant):
     def _advance(self, twist: np.ndarray, steps: int, *, settling: bool = False) -> None:
         """`steps` time steps under one twist; settling is without friction and with all motion damped."""
         config, rod = self.config, self._rod
-        cable, h = config.cable, config.discretisation.link_length
+        cable, physics, h = config.cable, config.physics, config.discretisation.link_length
         friction = 0.0 if settling else cable.friction_coefficient
         self._loop(
             rod.position_collection,
@@ -197,7 +214,7 @@ class RodPlant(TablePlant):
             twist,
             steps,
             config.discretisation.timestep,
-            cable.bending_stiffness * cable.damping_time / h,
+            np.asarray(physics.stiffness * physics.damping_time) / h,
             GRAVITY * friction,
             config.static_ratio,
             config.stribeck_speed,
@@ -213,7 +230,7 @@ def _straight_rod(config: RodPlantConfig):
     Directors are the table's normal, the in-plane normal and the tangent; bending in the plane is about the first.
     """
     rod_class = _import_rod_class()
-    cable, h = config.cable, config.discretisation.link_length
+    cable, physics, h = config.cable, config.physics, config.discretisation.link_length
     lengths = link_lengths(config.discretisation)
     position = np.zeros((3, config.discretisation.n_links + 1))
     position[0, 1:] = np.cumsum(lengths)
@@ -225,21 +242,24 @@ def _straight_rod(config: RodPlantConfig):
         np.array([0.0, 0.0, 1.0]),
         cable.length,
         cable.diameter / 2,
-        cable.linear_density / area,
+        float(physics.density) / area,
         youngs_modulus=1.0,
         shear_modulus=1.0,
         position=position,
     )
-    axial, bending = config.axial_ratio * cable.bending_stiffness, cable.bending_stiffness
+    axial = config.axial_stiffness
     # Shear at half the axial stiffness, and inertia of rotation with the gyration radius h / 2: then the fastest shear
     # mode is as fast as the fastest axial one.
     rod.shear_matrix[:] = np.diag([0.5 * axial, 0.5 * axial, axial])[:, :, None]
-    inertia = cable.linear_density * lengths * (h / 2) ** 2
+    inertia = physics.density * lengths * (h / 2) ** 2
     rod.mass_second_moment_of_inertia[:] = np.eye(3)[:, :, None] * inertia
     rod.inv_mass_second_moment_of_inertia[:] = np.eye(3)[:, :, None] / inertia
     # All joints bend alike, EI / h, those beside the half-length elements too: h is the cable's length per joint.
-    rod.bend_matrix[:] = np.eye(3)[:, :, None] * (bending * rod.rest_voronoi_lengths / h)
-    rod.rest_kappa[0] = config.rest_curvature * h / rod.rest_voronoi_lengths
+    rod.bend_matrix[:] = np.eye(3)[:, :, None] * (physics.stiffness * rod.rest_voronoi_lengths / h)
+    rod.rest_kappa[0] = physics.rest_curvature * h / rod.rest_voronoi_lengths
+    # the chain's nodes are the middles of the elements, and the ends
+    rod.mass[:-1] += 0.5 * physics.extra_mass
+    rod.mass[1:] += 0.5 * physics.extra_mass
     return rod
 
 

@@ -132,8 +132,8 @@ class TablePlant(abc.ABC):
                 f"{samples} samples in {interval} s do not fall on time steps of {self._timestep} s: "
                 f"choose a divisor of {steps}."
             )
-        self._check_distance(self._arms.target(twist, interval))
-        late = self.config.physics.camera_lag > 0
+        self._check_distance(self._arms.target(twist, interval), self._free_length(self.time + interval))
+        late = bool(self.config.physics.camera_lag > 0)
         observations = []
         for _ in range(samples):
             for executed, count in self._arms.follow(twist, steps // samples, self._timestep, pieces=late):
@@ -166,6 +166,11 @@ class TablePlant(abc.ABC):
     def _stretch(self) -> float:
         """Relative change of the free length."""
         return 0.0
+
+    def _free_length(self, time: float) -> float:
+        """Length of cable between the grippers at a time, not stretched [m]."""
+        del time
+        return self.config.cable.length
 
     def _true_keypoints(self) -> Float[np.ndarray, "N 2"]:
         arclength = self._arclength()
@@ -201,7 +206,7 @@ class TablePlant(abc.ABC):
     def _checked_start(self, gripper_pose: np.ndarray) -> np.ndarray:
         """The pose to lay a cable out at, as `reset` takes it."""
         pose = checked("gripper_pose", gripper_pose)
-        self._check_distance(pose)
+        self._check_distance(pose, self._free_length(0.0))
         return pose
 
     def _restart(self, pose: np.ndarray) -> None:
@@ -228,9 +233,9 @@ class TablePlant(abc.ABC):
             raise ValueError(f"{interval} s is not a whole number of time steps of {self._timestep} s.")
         return steps
 
-    def _check_distance(self, pose: np.ndarray) -> None:
+    def _check_distance(self, pose: np.ndarray, length: float) -> None:
         # A twist moves one gripper along a straight line relative to the other, so its end has the largest distance.
-        distance, length = np.hypot(*(pose[1, :2] - pose[0, :2])), self.config.cable.length
+        distance = np.hypot(*(pose[1, :2] - pose[0, :2]))
         if distance > TAUT * length:
             raise ValueError(
                 f"The grippers would be {distance:.4g} m apart and pull the cable of {length:.4g} m taut: keep them "

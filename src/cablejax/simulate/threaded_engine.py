@@ -4,24 +4,26 @@ from __future__ import annotations
 
 import concurrent.futures
 import copy
-import ctypes
 import dataclasses
 import functools
 import os
-import pathlib
+from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
 import mujoco
-import numba
 import numpy as np
 
-from cablejax.cable import GRAVITY, Discretisation
+from cablejax.cable import Discretisation
+from cablejax.effects.arms import executed_twist
+from cablejax.effects.base import Hook
+from cablejax.effects.camera import seen_by_camera
 from cablejax.effects.physics import Physics
-from cablejax.simulate.composite import build_grasped_chain
-from cablejax.simulate.engine import Engine
+from cablejax.simulate.compiled_steps import advance
+from cablejax.simulate.composite import build_grasped_chain, stable_damping_time
+from cablejax.simulate.engine import Engine, finely_sampled
 from cablejax.simulate.equilibrium import equilibrium_state
-from cablejax.simulate.keypoints import hermite_weights
+from cablejax.simulate.keypoints import hermite_weights, marked_keypoints
 from cablejax.types import CableState, Trajectory
 
 
@@ -40,6 +42,11 @@ class ThreadedEngine(Engine):
     config: Discretisation = Discretisation()
     n_threads: int | None = None
 
+    name: ClassVar[str] = "threaded"
+    hooks: ClassVar[frozenset[Hook]] = frozenset(
+        ("bending", "table", "mass", "grasp", "input", "observation", "obstacle")
+    )
+
     @functools.cached_property
     def mj_model(self) -> mujoco.MjModel:
         """The MuJoCo model: the chain welded to two mocap bodies."""
@@ -51,6 +58,9 @@ class ThreadedEngine(Engine):
     def rollout(self, physics, state, twist, interval=1.0):
         twist = np.asarray(twist, np.float64)
         self.check_twist(twist)
+        return finely_sampled(self._run, self, physics, state, twist, interval)
+
+    def _run(self, physics, state, twist, interval):
         count = self.substeps(interval)
         batch = twist.shape[:-3]
         size = int(np.prod(batch))
@@ -61,6 +71,7 @@ class ThreadedEngine(Engine):
         def restore(leaf):
             return jnp.asarray(leaf.reshape(*batch, *leaf.shape[1:]), float)
 
+        state = CableState(state.qpos, state.qvel, state.gripper_pose)
         physics, state, commands = jax.tree.map(flatten, (physics, state, twist))
         samples = twist.shape[-3] + 1
         keypoints = np.empty((size, samples, self.config.cable.n_keypoints, self.config.dimension))
@@ -72,7 +83,7 @@ class ThreadedEngine(Engine):
             simulation = _Simulation(self.config, self.mj_model)
             for i in range(worker, size, workers):
                 one, start = jax.tree.map(lambda leaf: leaf[i], (physics, state))  # noqa: B023, used at once
-                simulation.run(one, start, commands[i], count, keypoints[i], poses[i])
+                simulation.run(one, start, commands[i], count, interval, keypoints[i], poses[i])
                 qpos[i], qvel[i] = simulation.data.qpos, simulation.data.qvel
 
         if workers == 1:
@@ -91,22 +102,25 @@ class _Simulation:
         self.config = config
         self.model = copy.copy(model)
         self.data = mujoco.MjData(self.model)
-        self.weights = hermite_weights(config)
+        self.bare = self.model, self.data
         self.nominal_mass = self.model.body_mass.copy()
         self.nominal_inertia = self.model.body_inertia.copy()
         self.links = np.array([i for i in range(self.model.nbody) if self.model.body(i).name.startswith("cable")])
 
-    def run(self, physics: Physics, state: CableState, twist, count: int, keypoints, poses) -> None:
+    def run(self, physics: Physics, state: CableState, twist, count: int, interval: float, keypoints, poses) -> None:
         """Simulates in place; writes samples into `keypoints` [T + 1, N, D] and `poses` [T + 1, Q, P]."""
-        config, model, data = self.config, self.model, self.data
+        config, planar = self.config, self.config.dimension == 2
+        if planar:
+            self._place_obstacle(physics)
+            twist = executed_twist(physics, state.gripper_pose, twist, interval)
+        model, data = self.model, self.data
         self._write(physics)
         mujoco.mj_resetData(model, data)
         data.qpos[:], data.qvel[:] = state.qpos, state.qvel
-        load = float(physics.density) * config.link_length * GRAVITY * float(physics.friction)
         addresses = np.array([model._address, data._address], np.uint64)
         nodes = np.empty((len(twist) + 1, len(self.links), 3))
         tangents = np.empty_like(nodes)
-        _advance(
+        advance(
             addresses,
             data.mocap_pos,
             data.mocap_quat,
@@ -116,23 +130,47 @@ class _Simulation:
             data.xmat,
             self.links,
             np.array(state.gripper_pose),
+            np.asarray(physics.rotation_offset),
             twist,
             count,
             config.timestep,
-            load,
+            self._table(physics),
             config.friction_speed,
             nodes,
             tangents,
             poses,
         )
-        positions_w, tangents_w = self.weights
-        keypoints[:] = (positions_w @ nodes + tangents_w @ tangents)[..., : config.dimension]
+        if planar:
+            points = marked_keypoints(config, physics, nodes[..., :2], tangents[..., :2])
+            keypoints[:] = seen_by_camera(physics, points, interval)
+        else:
+            positions_w, tangents_w = hermite_weights(config)
+            keypoints[:] = positions_w @ nodes + tangents_w @ tangents
+
+    def _place_obstacle(self, physics: Physics) -> None:
+        """Takes the model with this obstacle: C MuJoCo builds its collision trees with the model."""
+        obstacle = (*map(float, physics.obstacle_centre), float(physics.obstacle_radius))
+        if obstacle[2] == 0:
+            self.model, self.data = self.bare
+        else:
+            self.model = copy.copy(_model_with(self.config, obstacle))
+            self.data = mujoco.MjData(self.model)
+
+    def _table(self, physics: Physics) -> np.ndarray:
+        """The table of `compiled_steps.drag`: seven values, then the weight of each free node [N]."""
+        h = self.config.link_length
+        if self.config.dimension == 3:
+            return np.zeros(7)
+        normal = np.sqrt(max(float(physics.gravity) ** 2 - float(np.sum(physics.tilt**2)), 0.0))
+        weight = (float(physics.density) * h + np.asarray(physics.extra_mass)[1:-1]) * normal
+        whole = (physics.friction, physics.static_excess, *physics.patch_centre, physics.patch_radius)
+        return np.array([*map(float, whole), float(physics.patch_friction), float(physics.drag) * h, *weight])
 
     def _write(self, physics: Physics) -> None:
         """Puts the parameters into the model."""
         model, h = self.model, self.config.link_length
         stiffness = np.asarray(physics.stiffness) / h
-        damping = float(physics.damping_time) * stiffness
+        damping = stable_damping_time(np.float64(physics.damping_time), self.config.timestep) * stiffness
         rest = np.asarray(physics.rest_curvature) * h
         if self.config.dimension == 2:
             model.jnt_stiffness[3:] = stiffness
@@ -149,96 +187,12 @@ class _Simulation:
         ratio = float(physics.density) / self.config.cable.linear_density
         model.body_mass[free] = self.nominal_mass[free] * ratio
         model.body_inertia[free] = self.nominal_inertia[free] * ratio
+        if self.config.dimension == 2:
+            model.body_mass[free] += physics.extra_mass[1:-1]
+            normal = np.sqrt(max(float(physics.gravity) ** 2 - float(np.sum(physics.tilt**2)), 0.0))
+            model.opt.gravity[:] = [*physics.tilt, -normal]
 
 
-def _c_function(name: str):
-    """A C function `void f(const mjModel*, mjData*)` of the very library that the Python bindings have loaded."""
-    folder = pathlib.Path(mujoco.__file__).parent
-    library = next(path for path in sorted(folder.iterdir()) if path.name.startswith(("libmujoco.", "mujoco.dll")))
-    function = getattr(ctypes.CDLL(str(library)), name)
-    function.argtypes, function.restype = (ctypes.c_void_p, ctypes.c_void_p), None
-    return function
-
-
-_step1, _step2, _kinematics = (_c_function(name) for name in ("mj_step1", "mj_step2", "mj_kinematics"))
-
-
-@numba.njit(nogil=True, cache=False)
-def _advance(
-    addresses,
-    mocap_pos,
-    mocap_quat,
-    actuator_velocity,
-    actuator_biasprm,
-    xipos,
-    xmat,
-    links,
-    pose,
-    twist,
-    count,
-    dt,
-    load,
-    friction_speed,
-    nodes,
-    tangents,
-    poses,
-):
-    """All time steps of one cable. `pose` [Q, P] is advanced in place; samples go to nodes, tangents and poses."""
-    model, data = addresses[0], addresses[1]
-    n_free = actuator_velocity.shape[0] // 2
-    _sample(model, data, xipos, xmat, links, nodes[0], tangents[0])
-    poses[0] = pose
-    for t in range(twist.shape[0]):
-        start = pose.copy()
-        for i in range(count):
-            _integrate(start, twist[t], (i + 1) * dt, pose)
-            _set_mocap(pose, mocap_pos, mocap_quat)
-            _step1(model, data)
-            for k in range(n_free):
-                vx, vy = actuator_velocity[2 * k], actuator_velocity[2 * k + 1]
-                drag = load / np.sqrt(vx * vx + vy * vy + friction_speed * friction_speed)
-                actuator_biasprm[2 * k, 2] = -drag
-                actuator_biasprm[2 * k + 1, 2] = -drag
-            _step2(model, data)
-        _sample(model, data, xipos, xmat, links, nodes[t + 1], tangents[t + 1])
-        poses[t + 1] = pose
-
-
-@numba.njit(nogil=True, cache=False)
-def _sample(model, data, xipos, xmat, links, nodes, tangents):
-    _kinematics(model, data)
-    for k in range(links.shape[0]):
-        for axis in range(3):
-            nodes[k, axis] = xipos[links[k], axis]
-            tangents[k, axis] = xmat[links[k], 3 * axis]
-
-
-@numba.njit(nogil=True, cache=False)
-def _integrate(start, twist, duration, pose):
-    """`pose.integrate_pose` in place."""
-    if start.shape[1] == 3:
-        pose[:] = start + duration * twist
-        return
-    for q in range(start.shape[0]):
-        pose[q, :3] = start[q, :3] + duration * twist[q, :3]
-        rotation = duration * twist[q, 3:]
-        angle = np.sqrt(np.sum(rotation**2))
-        w, sinc = np.cos(angle / 2), (np.sin(angle / 2) / angle if angle > 0 else 0.5)
-        x, y, z = sinc * rotation[0], sinc * rotation[1], sinc * rotation[2]
-        a, b, c, d = start[q, 3], start[q, 4], start[q, 5], start[q, 6]
-        pose[q, 3] = w * a - x * b - y * c - z * d
-        pose[q, 4] = w * b + x * a + y * d - z * c
-        pose[q, 5] = w * c - x * d + y * a + z * b
-        pose[q, 6] = w * d + x * c - y * b + z * a
-
-
-@numba.njit(nogil=True, cache=False)
-def _set_mocap(pose, mocap_pos, mocap_quat):
-    for q in range(pose.shape[0]):
-        if pose.shape[1] == 3:
-            mocap_pos[q, 0], mocap_pos[q, 1], mocap_pos[q, 2] = pose[q, 0], pose[q, 1], 0.0
-            mocap_quat[q, 0], mocap_quat[q, 1] = np.cos(pose[q, 2] / 2), 0.0
-            mocap_quat[q, 2], mocap_quat[q, 3] = 0.0, np.sin(pose[q, 2] / 2)
-        else:
-            mocap_pos[q] = pose[q, :3]
-            mocap_quat[q] = pose[q, 3:]
+@functools.lru_cache(maxsize=64)
+def _model_with(config: Discretisation, obstacle: tuple[float, float, float]) -> mujoco.MjModel:
+    return build_grasped_chain(config, obstacle)

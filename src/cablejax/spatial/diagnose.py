@@ -13,7 +13,7 @@ import numpy as np
 from cablejax.bounded import Result
 from cablejax.diagnose.belief import Calibration
 from cablejax.diagnose.diagnosis import CableDiagnosis, Gap, Ranked, Verdict
-from cablejax.diagnose.judgement import judged, sentence
+from cablejax.diagnose.judgement import judged, verdict_sentence
 from cablejax.spatial.clock import on_one_clock
 from cablejax.spatial.estimate import estimate
 from cablejax.spatial.gap import RESOLVABLE, gap_of, noise_of
@@ -93,7 +93,7 @@ def diagnose_space(
     where = where_of(log, windows, nominal, before, noise, changes)
     return SpatialDiagnosis(
         verdict=verdict,
-        sentence=" ".join([sentence(verdict, effects, equivalent, (), gap.shrinkage or 0.0), *first]),
+        sentence=" ".join([verdict_sentence(verdict, effects, equivalent, (), gap.shrinkage or 0.0), *first]),
         effects=effects,
         equivalent=equivalent,
         ranking=_ranking(found),

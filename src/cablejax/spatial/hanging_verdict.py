@@ -11,7 +11,6 @@ import time
 from collections.abc import Callable, Sequence
 from typing import Any
 
-import jax
 import numpy as np
 from jaxtyping import Float
 from scipy.optimize import brentq
@@ -19,7 +18,7 @@ from scipy.stats import norm, t
 
 from cablejax.diagnose.belief import probabilities
 from cablejax.diagnose.diagnosis import Diagnosis, Gap, NamedEffect, ParameterEstimate, Ranked
-from cablejax.diagnose.judgement import judged, sentence
+from cablejax.diagnose.judgement import judged, verdict_sentence
 from cablejax.diagnose.verdict_json import verdict_json
 from cablejax.diagnose.where import LEVEL, Where
 from cablejax.diagnose.where_words import describe
@@ -104,7 +103,7 @@ def diagnose_wire(photographs: Photographs, progress: Callable[[str], None] = la
     ]
     return WireDiagnosis(
         verdict=verdict,
-        sentence=sentence(verdict, effects, equivalent, ranking, gap.shrinkage or 0.0),
+        sentence=verdict_sentence(verdict, effects, equivalent, ranking, gap.shrinkage or 0.0),
         effects=effects,
         equivalent=equivalent,
         ranking=tuple(ranking),
@@ -115,7 +114,7 @@ def diagnose_wire(photographs: Photographs, progress: Callable[[str], None] = la
         baselines={},
         caveats=(),
         seconds=time.perf_counter() - begun,
-        settings={"effects": sorted(EFFECTS), "jax": jax.__version__},
+        settings={"calibration": dataclasses.asdict(CALIBRATION)},
         fits=tuple(fits),
         chances=chances,
         inclusion=inclusion,

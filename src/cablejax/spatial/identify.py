@@ -155,19 +155,7 @@ def identify(
     last = [step for step in steps if step.accepted][-1]
     start = [values.of_size(simulator.layout.size) for values in last.values]
 
-    first = halves(windows.group)
-    finals = memory.finals()
-    if len(finals) < 3:
-        use = [first, ~first, np.ones(len(windows), bool)]
-        use = [part & affordable(simulator, windows) for part in use]
-        begins, words = (*start, mean_of(*start)), ("one half", "the other half", "all")
-        for part, begin, word in list(zip(use, begins, words, strict=True))[len(finals) :]:
-            progress(f"fitting {word}: {int(part.sum())} windows")
-            chosen = windows.chosen(np.flatnonzero(part))
-            fit = improve(simulator, begin, effects, chosen, progress=progress)
-            assert fit.result is not None  # it was improved
-            finals.append((fit.values, fit.result))
-            memory.keep_finals(finals)
+    finals = _final_fits(simulator, windows, effects, start, memory, progress)
     return Identified(
         simulator=simulator,
         time_steps=time_steps,
@@ -176,9 +164,23 @@ def identify(
         steps=tuple(steps),
         values=finals[2][0],
         half_values=(finals[0][0], finals[1][0]),
-        first=first,
+        first=halves(windows.group),
         results=tuple(result for _, result in finals),
     )
+
+
+def _final_fits(simulator: Simulator, windows: Windows, effects, start, memory: Memory, progress):
+    """Values and result of the fits to either half of the recordings and to all; `start` holds values for each half."""
+    first, finals = halves(windows.group), memory.finals()
+    use = [part & affordable(simulator, windows) for part in (first, ~first, np.ones(len(windows), bool))]
+    begins, words = (*start, mean_of(*start)), ("one half", "the other half", "all")
+    for part, begin, word in list(zip(use, begins, words, strict=True))[len(finals) :]:
+        progress(f"fitting {word}: {int(part.sum())} windows")
+        fit = improve(simulator, begin, effects, windows.chosen(np.flatnonzero(part)), progress=progress)
+        assert fit.result is not None  # it was improved
+        finals.append((fit.values, fit.result))
+        memory.keep_finals(finals)
+    return finals
 
 
 def _material(full: Simulator, windows: Windows, steps, progress) -> list[Step]:

@@ -83,16 +83,9 @@ def parameters_of(
                 "stiffness_over_density_m4_per_s2": _told(estimate.stiffness.wider_by_factor(besides), "m^4/s^2"),
             }
         case "stiffness_profile":
-            profile = part("log_profile")
-            knot = int(np.abs(profile - profile.mean()).argmax())
-            rest = [i for i in range(PROFILE_KNOTS) if i != knot]
-
-            def against_the_rest(values):
-                profile = values[where["log_profile"]]
-                return profile[knot] - profile[np.array(rest)].mean()
-
+            knot, ratio = _section(estimate)
             parameters, along = place(knot, PROFILE_KNOTS)
-            parameters["ratio"] = _told(estimate.ratio(against_the_rest).wider_by_factor(besides), "")
+            parameters["ratio"] = _told(ratio.wider_by_factor(besides), "")
         case "bending_damping":
             parameters = {"time_s": _told(positive("damping_time"), "s")}
         case "viscous_drag":
@@ -122,6 +115,15 @@ def parameters_of(
         case _:
             raise ValueError(f"The effect is {effect!r}, expected one of {estimate.layout.effects}.")
     return parameters, along
+
+
+def _section(estimate: Estimate) -> tuple[int, Interval]:
+    """The knot where the stiffness differs most from that along the cable, and its ratio to that of the others."""
+    where = estimate.layout.slices["log_profile"]
+    profile = estimate.shared[where]
+    knot = int(np.abs(profile - profile.mean()).argmax())
+    rest = np.array([i for i in range(PROFILE_KNOTS) if i != knot])
+    return knot, estimate.ratio(lambda values: values[where][knot] - values[where][rest].mean())
 
 
 def _told(interval: Interval, unit: str, *, times: float = 1.0) -> ParameterEstimate:

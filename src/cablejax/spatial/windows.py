@@ -79,24 +79,7 @@ def windows_of(log: GapLog, *, length: float = WINDOW) -> Windows:
         ValueError: a log in the plane, of unequal sample intervals, of a cable shorter than its keypoints are apart, or
             one that has no window of a second.
     """
-    if log.keypoints.shape[-1] != 3 or log.gripper_pose.shape[2] != 2:
-        raise ValueError(
-            f"The log has keypoints in {log.keypoints.shape[-1]} dimensions and {log.gripper_pose.shape[2]} grippers, "
-            "expected a cable in space (3) between two grippers."
-        )
-    if log.meta["table"] is not None:
-        raise ValueError("The log has a table; a cable in space is expected to hang free (`table` null).")
-    intervals = np.concatenate([np.diff(t[:n]) for t, n in zip(log.time, log.episode_length, strict=True)])
-    interval = float(np.median(intervals))
-    if np.abs(intervals - interval).max() > 0.05 * interval:
-        raise ValueError(
-            f"Samples are {intervals.min():.4g} to {intervals.max():.4g} s apart, expected one interval: resample."
-        )
-    require_long_enough(
-        [np.asarray(p[:n], float) for p, n in zip(log.keypoints, log.episode_length, strict=True)],
-        np.asarray(log.meta["keypoint_arclength_m"], float),
-        "meta.keypoint_arclength_m",
-    )
+    interval = _sample_interval(log)
     samples = min(round(length / interval), int(log.episode_length.max()))
     points = np.asarray(log.keypoints, float)
     pose = np.asarray(log.gripper_pose, float)
@@ -104,13 +87,7 @@ def windows_of(log: GapLog, *, length: float = WINDOW) -> Windows:
     tangent = rotated(pose[..., 3:], np.array([1.0, 0.0, 0.0]))
     held = _held(points, pose[..., :3], tangent, valid)
     s = np.asarray(log.meta["keypoint_arclength_m"], float)
-    reach = np.array([s[held[0] - 1] - s[0] if held[0] else 0.0, s[-1] - s[len(s) - held[1]] if held[1] else 0.0])
-    # the second gripper's tangent points along the cable too: towards its end
-    clamp = pose[..., :3] + np.array([1.0, -1.0])[:, None] * reach[:, None] * tangent
-    # the innermost held keypoint is where the cable leaves the gripper: it is observed, so it is what moves the clamp
-    for q, k in enumerate((held[0] - 1, len(s) - held[1])):
-        if held[q]:
-            clamp[:, :, q] = np.where(np.isfinite(points[:, :, k]), points[:, :, k], clamp[:, :, q])
+    clamp = _clamps(points, pose[..., :3], tangent, s, held)
     first = s[held[0] - 1] if held[0] else s[0]
     last = s[len(s) - held[1]] if held[1] else s[-1]
     free = slice(held[0], len(s) - held[1])
@@ -202,3 +179,38 @@ def _held(points, position, tangent, valid):
             n += 1
         count.append(n)
     return tuple(count)
+
+
+def _sample_interval(log: GapLog) -> float:
+    """The one sample interval [s] of a log that has passed all checks, see `windows_of`."""
+    if log.keypoints.shape[-1] != 3 or log.gripper_pose.shape[2] != 2:
+        raise ValueError(
+            f"The log has keypoints in {log.keypoints.shape[-1]} dimensions and {log.gripper_pose.shape[2]} grippers, "
+            "expected a cable in space (3) between two grippers."
+        )
+    if log.meta["table"] is not None:
+        raise ValueError("The log has a table; a cable in space is expected to hang free (`table` null).")
+    intervals = np.concatenate([np.diff(t[:n]) for t, n in zip(log.time, log.episode_length, strict=True)])
+    interval = float(np.median(intervals))
+    if np.abs(intervals - interval).max() > 0.05 * interval:
+        raise ValueError(
+            f"Samples are {intervals.min():.4g} to {intervals.max():.4g} s apart, expected one interval: resample."
+        )
+    require_long_enough(
+        [np.asarray(p[:n], float) for p, n in zip(log.keypoints, log.episode_length, strict=True)],
+        np.asarray(log.meta["keypoint_arclength_m"], float),
+        "meta.keypoint_arclength_m",
+    )
+    return interval
+
+
+def _clamps(points, position, tangent, s, held):
+    """Where the cable leaves either gripper [m], shape [E, T, 2, 3]."""
+    reach = np.array([s[held[0] - 1] - s[0] if held[0] else 0.0, s[-1] - s[len(s) - held[1]] if held[1] else 0.0])
+    # the second gripper's tangent points along the cable too: towards its end
+    clamp = position + np.array([1.0, -1.0])[:, None] * reach[:, None] * tangent
+    # the innermost held keypoint is where the cable leaves the gripper: it is observed, so it is what moves the clamp
+    for q, k in enumerate((held[0] - 1, len(s) - held[1])):
+        if held[q]:
+            clamp[:, :, q] = np.where(np.isfinite(points[:, :, k]), points[:, :, k], clamp[:, :, q])
+    return clamp

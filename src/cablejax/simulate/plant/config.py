@@ -10,7 +10,7 @@ import numpy as np
 
 from cablejax.cable import Cable, Discretisation
 from cablejax.effects import Hook
-from cablejax.effects.given import GivenEffect, check_hooks
+from cablejax.effects.given import GivenEffect
 from cablejax.effects.physics import Physics
 from cablejax.simulate.table_plant import check_camera, plant_physics
 
@@ -37,7 +37,7 @@ class PlantConfig:
         seed: of noise and gaps.
 
     Raises:
-        ValueError: a number is out of range, or an effect cannot be staged; the message names it.
+        ValueError: a number or a parameter of an effect is out of range; the message names it.
     """
 
     discretisation: Discretisation = Discretisation(n_links=40, dimension=3, timestep=0.005)
@@ -70,5 +70,9 @@ class PlantConfig:
                 raise ValueError(f"PlantConfig.{name} is {value}, expected a positive finite number.")
         check_camera(self)
         object.__setattr__(self, "effects", tuple(self.effects))
-        check_hooks(self.effects, HOOKS, "Plant", {})
-        _ = self.physics  # its errors name the effect and the parameter
+        radius, own = float(self.physics.obstacle_radius), self.cable.diameter / 2
+        if 0 < radius <= own:
+            raise ValueError(
+                f"obstacle: radius_m is {radius:g} m, expected more than the cable's own radius, {own:g} m: it reaches "
+                "to the cable's centreline."
+            )

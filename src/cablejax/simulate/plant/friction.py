@@ -5,7 +5,7 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 
-from cablejax.simulate.chain.step import PATCH_EDGE, STRIBECK_SPEED
+from cablejax.simulate.friction import PATCH_EDGE, STRIBECK_SPEED
 from cablejax.simulate.plant.config import PlantConfig
 from cablejax.simulate.plant.model import FRICTIONLESS
 

@@ -118,11 +118,6 @@ def _add_obstacle(spec: mujoco.MjSpec, config: PlantConfig) -> None:
     """A smooth upright pole, thinner than the obstacle by the cable's own radius."""
     physics = config.physics
     radius = float(physics.obstacle_radius) - config.cable.diameter / 2
-    if radius <= 0:
-        raise ValueError(
-            f"obstacle: radius_m is {float(physics.obstacle_radius):g}, expected more than the cable's own radius, "
-            f"{config.cable.diameter / 2:g} m: it reaches to the cable's centreline."
-        )
     spec.worldbody.add_geom(
         name="obstacle", type=mujoco.mjtGeom.mjGEOM_CAPSULE, size=[radius, OBSTACLE_HEIGHT, 0],
         pos=[*physics.obstacle_centre, 0.0], contype=1, conaffinity=0, condim=1, priority=2,
@@ -145,6 +140,9 @@ def _set_bending(model: mujoco.MjModel, config: PlantConfig) -> None:
         model.jnt_stiffness[joint] = own
         model.dof_damping[first : first + 3] = own * physics.damping_time
         model.qpos_spring[position : position + 4] = shape
+    # MuJoCo's composite has a spring at its root too, which is of no account where a grasp holds the root rigidly
+    if physics.rotation_compliance[0] > 0:
+        model.jnt_stiffness[model.jnt_type == mujoco.mjtJoint.mjJNT_FREE] = 0.0
 
 
 def _set_drag(model: mujoco.MjModel, link: int, coefficient: float) -> None:

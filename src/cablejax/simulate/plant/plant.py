@@ -107,6 +107,10 @@ class Plant(TablePlant):
     def _arclength(self) -> Float[np.ndarray, " N"] | None:
         return None if self._extension is None or not self._acting else self._extension.arclength(self.time)
 
+    def _free_length(self, time: float) -> float:
+        slipped = 0.0 if self._extension is None else float(self._extension.slipped(time).sum())
+        return self.config.cable.length + slipped
+
     def _stretch(self) -> float:
         return 0.0 if self._extension is None else self._extension.stretch()
 

@@ -52,7 +52,7 @@ def spread_bends(forces: Float[Array, "J 3"]) -> Float[Array, "f 3"]:
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
-class Chain:
+class ElasticChain:
     """The constant part of the system: A0 x = weight o x + D2' (bending o D2 x) + P' P x.
 
     Attributes:
@@ -78,7 +78,7 @@ def with_held(free: Float[Array, "f 3"], held: Float[Array, "4 3"]) -> Float[Arr
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
 def constrained(
     iterations: int,
-    chain: Chain,
+    chain: ElasticChain,
     force: Float[Array, "f 3"],
     held: Float[Array, "4 3"],
     free: Float[Array, "f 3"],

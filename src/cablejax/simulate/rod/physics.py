@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 
 import jax
-import numpy as np
 from jaxtyping import Array, Float
 
 
@@ -32,18 +31,18 @@ class RodPhysics:
         gravity: [m/s^2], shape [3].
     """
 
-    length: Float[Array | np.ndarray, ""]
-    stiffness: Float[Array | np.ndarray, "J"]
-    rest_curvature: Float[Array | np.ndarray, "K 2"]
-    damping_time: Float[Array | np.ndarray, ""]
-    drag: Float[Array | np.ndarray, ""]
-    quadratic_drag: Float[Array | np.ndarray, ""]
-    twist_stiffness: Float[Array | np.ndarray, ""]
-    stretch: Float[Array | np.ndarray, ""]
-    marker_mass: Float[Array | np.ndarray, ""]
-    clamp_rotation: Float[Array | np.ndarray, "2 2"]
-    clamp_offset: Float[Array | np.ndarray, "2 3"]
-    roll: Float[Array | np.ndarray, ""]
-    arclength: Float[Array | np.ndarray, "N"]
-    offset: Float[Array | np.ndarray, "N 2"]
-    gravity: Float[Array | np.ndarray, "3"]
+    length: Float[Array, ""]
+    stiffness: Float[Array, "J"]
+    rest_curvature: Float[Array, "K 2"]
+    damping_time: Float[Array, ""]
+    drag: Float[Array, ""]
+    quadratic_drag: Float[Array, ""]
+    twist_stiffness: Float[Array, ""]
+    stretch: Float[Array, ""]
+    marker_mass: Float[Array, ""]
+    clamp_rotation: Float[Array, "2 2"]
+    clamp_offset: Float[Array, "2 3"]
+    roll: Float[Array, ""]
+    arclength: Float[Array, "N"]
+    offset: Float[Array, "N 2"]
+    gravity: Float[Array, "3"]

@@ -1,0 +1,182 @@
+"""Reads and writes a cable as a TOML file whose keys name their units.
+
+The same keys describe the cable in trained weights, so that a cable has one written form.
+"""
+
+from __future__ import annotations
+
+import difflib
+import math
+import os
+import tomllib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from cablejax.cable import BOUNDS, MOST_KEYPOINTS, Cable
+from cablejax.whole_file import whole_file
+
+NUMBERS: Mapping[str, tuple[str, str, str]] = {
+    "length_m": ("length", "m", "free length between the grippers"),
+    "diameter_m": ("diameter", "m", "thickness"),
+    "linear_density_kg_per_m": ("linear_density", "kg/m", "mass per length: weigh a metre"),
+    "bending_stiffness_n_m2": ("bending_stiffness", "N m^2", "EI"),
+    "bending_damping_s": ("damping_time", "s", "time constant of internal damping, 0 for none"),
+    "rest_curvature_per_m": ("rest_curvature", "1/m", "curvature without load, 0 for a straight cable"),
+    "friction_coefficient": ("friction_coefficient", "", "kinetic, between cable and table, 0 for a smooth table"),
+}
+"""Every number of a cable by its key: field of `Cable`, unit, and what it is."""
+
+OTHERS = ("keypoints", "keypoint_arclength_m", "grasp")
+"""Keys that are no single number."""
+
+KEYS: Mapping[str, str] = {
+    **{name: key for key, (name, _, _) in NUMBERS.items()},
+    "n_keypoints": "keypoints",
+    "marks": "keypoint_arclength_m",
+    "grasp": "grasp",
+}
+"""Key in the file of every field of `Cable`."""
+
+_OPTIONAL = {"rest_curvature_per_m": 0.0}
+_EXAMPLE = "Write an example with `cablejax cable --out cable.toml`."
+
+
+def read_cable(path: str | os.PathLike[str]) -> Cable:
+    """The cable in a TOML file.
+
+    Args:
+        path: of a file with the keys of `NUMBERS`, and `keypoints` or `keypoint_arclength_m`.
+
+    Raises:
+        ValueError: the file cannot be read, is no TOML, or does not describe a cable; says which key is wrong.
+    """
+    path = Path(path)
+    try:
+        fields = tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ValueError(f"The cable file {path} could not be read: {error.strerror}. {_EXAMPLE}") from None
+    except (ValueError, RecursionError) as error:
+        # TOML and text encoding errors are both ValueErrors
+        raise ValueError(f"The cable file {path} is no TOML: {error}. {_EXAMPLE}") from None
+    return cable_from_fields(fields, str(path))
+
+
+def write_cable(path: str | os.PathLike[str], cable: Cable) -> None:
+    """Writes a cable as commented TOML, whole or not at all."""
+    with whole_file(Path(path)) as stream:
+        stream.write(cable_text(cable).encode())
+
+
+def cable_text(cable: Cable) -> str:
+    """A cable as commented TOML, which `read_cable` reads back without loss."""
+    fields = cable_to_fields(cable)
+    lines = [
+        (f"{key} = {float(fields[key])!r}", f"{what} [{unit}]" if unit else what)
+        for key, (_, unit, what) in NUMBERS.items()
+    ]
+    if cable.marks is None:
+        lines.append((f"keypoints = {cable.n_keypoints}", "observed points, evenly spaced, both ends included"))
+    else:
+        marks = ", ".join(repr(float(s)) for s in cable.marks)
+        lines.append((f"keypoint_arclength_m = [{marks}]", "observed points, from gripper 0 [m]"))
+    lines.append((f'grasp = ["{cable.grasp[0]}", "{cable.grasp[1]}"]', "how each gripper holds the cable"))
+    width = max(len(text) for text, _ in lines if len(text) < 50)
+    return "\n".join(
+        ["# A cable held by two grippers on a table. SI units.", *(f"{t:{width}}  # {c}" for t, c in lines), ""]
+    )
+
+
+def cable_to_fields(cable: Cable) -> dict[str, Any]:
+    """A cable as a JSON or TOML object, the inverse of `cable_from_fields`."""
+    fields: dict[str, Any] = {key: getattr(cable, name) for key, (name, _, _) in NUMBERS.items()}
+    if cable.marks is None:
+        fields["keypoints"] = cable.n_keypoints
+    else:
+        fields["keypoint_arclength_m"] = list(cable.marks)
+    return {**fields, "grasp": list(cable.grasp)}
+
+
+def cable_from_fields(fields: Mapping[str, Any], where: str) -> Cable:
+    """A cable from the keys of its file.
+
+    Args:
+        fields: by key.
+        where: what they come from, for messages.
+
+    Raises:
+        ValueError: a key is unknown or missing, or a value is not possible; names the key.
+    """
+    for key in fields:
+        if key not in NUMBERS and key not in OTHERS:
+            raise ValueError(f"{where} has {_unknown(key)}")
+    values: dict[str, Any] = {}
+    for key, (name, unit, what) in NUMBERS.items():
+        if key not in fields and key not in _OPTIONAL:
+            raise ValueError(f"{where} lacks {key}, the {what}. Add `{key} = ...`. {_EXAMPLE}")
+        value = fields.get(key, _OPTIONAL.get(key))
+        low, high = BOUNDS[name]
+        if not _is_number(value) or not low <= value <= high:
+            raise ValueError(
+                f"{where}: {key} is {_shown(value)}, expected a number from {low:g} to {high:g} {unit}".rstrip()
+                + f" ({what}). Check its unit."
+            )
+        values[name] = float(value)
+    values |= _keypoints(fields, where)
+    if "grasp" in fields:
+        grasp = fields["grasp"]
+        if not isinstance(grasp, list) or len(grasp) != 2 or not all(isinstance(hold, str) for hold in grasp):
+            raise ValueError(f'{where}: grasp is {_shown(grasp)}, expected ["clamped", "clamped"].')
+        values["grasp"] = tuple(grasp)
+    try:
+        return Cable(**values)
+    except ValueError as error:
+        text = str(error)
+        for name, key in KEYS.items():
+            text = text.replace(f"Cable.{name} ", f"{key} ")
+        raise ValueError(f"{where}: {text}") from None
+
+
+def _keypoints(fields: Mapping[str, Any], where: str) -> dict[str, Any]:
+    """How many keypoints there are and where, as fields of `Cable`."""
+    count, marks = fields.get("keypoints"), fields.get("keypoint_arclength_m")
+    if (count is None) == (marks is None):
+        came = "neither keypoints nor keypoint_arclength_m" if count is None else "both"
+        raise ValueError(
+            f"{where} has {came}, expected one of them: keypoints = 13 for evenly spaced ones, or keypoint_arclength_m "
+            "= [0.0, ...] with the arc length of each from gripper 0."
+        )
+    if marks is None:
+        if isinstance(count, bool) or not isinstance(count, int) or not 2 <= count <= MOST_KEYPOINTS:
+            raise ValueError(
+                f"{where}: keypoints is {_shown(count)}, expected a whole number from 2 to {MOST_KEYPOINTS}."
+            )
+        return {"n_keypoints": count}
+    if not isinstance(marks, list) or not all(map(_is_number, marks)):
+        raise ValueError(f"{where}: keypoint_arclength_m is {_shown(marks)}, expected a list of numbers [m].")
+    return {"n_keypoints": len(marks), "marks": tuple(map(float, marks))}
+
+
+def _unknown(key: str) -> str:
+    """Says that a key is unknown, and which one may be meant."""
+    if bare := [known for known in (*NUMBERS, *OTHERS) if known.startswith(f"{key}_")]:
+        unit = NUMBERS.get(bare[0], ("", "m", ""))[1]
+        return f"{key} without its unit: write {bare[0]}, in {unit}."
+    near = [known for known in NUMBERS if key and key in known]
+    near = near or difflib.get_close_matches(key, (*NUMBERS, *OTHERS), 1, 0.5)
+    known = f"Did you mean {near[0]}?" if near else f"Expected {', '.join((*NUMBERS, *OTHERS))}."
+    return f"the unknown key {_shown(key)}. {known}"
+
+
+def _is_number(value: Any) -> bool:
+    # an integer may be larger than any float
+    return (
+        isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) < 1e300 and math.isfinite(value)
+    )
+
+
+def _shown(value: Any) -> str:
+    text = (
+        repr(value) if not isinstance(value, int) or abs(value) < 10**20 else f"an integer of {value.bit_length()} bits"
+    )
+    return text if len(text) <= 60 else f"{text[:57]}..."

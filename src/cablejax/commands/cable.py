@@ -1,0 +1,74 @@
+"""`cablejax cable`: a cable file to edit, or the cable inside of a data set, trained weights or a log."""
+
+from __future__ import annotations
+
+import dataclasses
+import pathlib
+from typing import TYPE_CHECKING, Annotated
+
+import tyro
+
+from cablejax.commands.options import Command, UsageError
+
+if TYPE_CHECKING:
+    from cablejax.cable import Cable
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class CableFile(Command):
+    """Write a cable file to edit: the reference cable, or the cable inside of a data set, trained weights or a log.
+
+    `simulate` and `shape` take the file as `--cable`. Data sets, weights and logs keep the cable that they were made
+    with.
+    """
+
+    out: pathlib.Path | None = None
+    """The file to write, by custom cable.toml; by default the text is only printed."""
+
+    from_: Annotated[str | None, tyro.conf.arg(name="from")] = None
+    """A data set, trained weights (a file, a folder, or a released model by name), a log, or another cable file. By
+    default the reference cable."""
+
+    overwrite: bool = False
+    """Replace a file that is there."""
+
+    def execute(self):
+        from cablejax.cable import Cable
+        from cablejax.cable_file import cable_text, cable_to_fields, write_cable
+
+        cable = Cable() if self.from_ is None else find_cable(self.from_)
+        if self.out is None:
+            return cable_to_fields(cable), cable_text(cable).rstrip()
+        if self.out.is_dir():
+            raise UsageError(f"--out is {self.out}, which is a folder; expected a file such as cable.toml.")
+        if self.out.exists() and not self.overwrite:
+            raise UsageError(f"{self.out} exists. Give another file with --out, or add --overwrite.")
+        self.out.parent.mkdir(parents=True, exist_ok=True)
+        write_cable(self.out, cable)
+        text = f"The cable is in {self.out}. Edit it, then: cablejax simulate --cable {self.out}"
+        return {"out": str(self.out), **cable_to_fields(cable)}, text
+
+
+def find_cable(source: str | pathlib.Path) -> Cable:
+    """The cable in a cable file (.toml), a gap log (.npz), a data set's folder or trained weights.
+
+    Raises:
+        ValueError: there is no such thing, or it cannot be read.
+    """
+    path = pathlib.Path(source)
+    if path.suffix == ".toml":
+        from cablejax.cable_file import read_cable
+
+        return read_cable(path)
+    if path.suffix == ".npz":
+        from cablejax.gaplog import read_gap_log
+        from cablejax.simulate.replay import cable_of_log
+
+        return cable_of_log(read_gap_log(path))
+    if (path / "zarr.json").is_file():
+        from cablejax.dataset.store import open_store
+
+        return open_store(path).config.cable
+    from cablejax.dynamics.weights import cable_of_weights
+
+    return cable_of_weights(source)

@@ -1,0 +1,93 @@
+"""Finds keypoints and gripper angles that no cable between these grippers can have."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float
+
+from cablejax.types import GapLog
+
+REACH = 5.0
+"""Largest distance of a keypoint from the nearer gripper, in lengths of the cable. A metre is added, by which the
+of camera and arms may differ."""
+INWARDS = np.radians(120.0)
+"""Median angle between a gripper's tangent and the cable beside it, at which the tangent points the wrong way."""
+_FEWEST = 5
+_DEGREES_OFF = 0.5
+_DEGREES_BETTER = 3.0
+_DEGREES_TURN = 10.0
+
+
+def far_keypoint(
+    keypoints: Float[np.ndarray, "T N D"], grippers: Float[np.ndarray, "T Q D"], length: float
+) -> tuple[int, int, float] | None:
+    """The sample, index and distance [m] of the keypoint farthest out of the cable's reach, or None.
+
+    Args:
+        keypoints: [m], NaN = not observed.
+        grippers: positions [m].
+        length: of the cable [m].
+    """
+    offset = np.asarray(keypoints, float)[:, :, None] - np.asarray(grippers, float)[:, None]
+    distance = np.nan_to_num(np.linalg.norm(offset, axis=-1).min(axis=-1), nan=0.0)
+    sample, index = np.unravel_index(int(distance.argmax()), distance.shape)
+    if distance[sample, index] <= REACH * length + 1.0:
+        return None
+    return int(sample), int(index), float(distance[sample, index])
+
+
+def geometry_fault(log: GapLog) -> str | None:
+    """What is impossible about a log's keypoints or gripper angles and what to do, or None.
+
+    Args:
+        log: follows the format otherwise. Angles are checked in the plane, between two grippers, with at least five
+            keypoints.
+    """
+    length, dimension = float(log.meta["cable"]["length_m"]), log.keypoints.shape[-1]
+    for episode, samples in enumerate(log.episode_length):
+        points, pose = log.keypoints[episode, :samples], log.gripper_pose[episode, :samples]
+        if far := far_keypoint(points, pose[..., :dimension], length):
+            sample, index, distance = far
+            return (
+                f"Field 'keypoints' has keypoint {index} of episode {episode} {distance:.3g} m away from both grippers "
+                f"at {log.time[episode, sample]:.3g} s, but the cable is {length:g} m long: expected metres, and NaN "
+                "where a keypoint was not observed."
+            )
+    if dimension != 2 or log.gripper_pose.shape[2] != 2 or log.keypoints.shape[2] < _FEWEST:
+        return None
+    for gripper in (0, 1):
+        if fault := _angle_fault(*_tangents(log, gripper)):
+            return f"Field 'gripper_pose' has the angle of gripper {gripper} {fault}"
+    return None
+
+
+def _tangents(log: GapLog, gripper: int) -> tuple[Float[np.ndarray, " S"], Float[np.ndarray, " S"]]:
+    """A gripper's angle, and the direction of the cable beside it [rad], in all samples that show it."""
+    angles, directions = [], []
+    for episode, samples in enumerate(log.episode_length):
+        ends = log.keypoints[episode, :samples, :2] if gripper == 0 else log.keypoints[episode, :samples, -2:]
+        along = np.diff(ends.astype(float), axis=1)[:, 0]
+        angles.append(log.gripper_pose[episode, :samples, gripper, 2].astype(float))
+        directions.append(np.arctan2(along[:, 1], along[:, 0]))
+    angle, direction = np.concatenate(angles), np.concatenate(directions)
+    seen = np.isfinite(direction)
+    return angle[seen], direction[seen]
+
+
+def _angle_fault(angle: Float[np.ndarray, " S"], direction: Float[np.ndarray, " S"]) -> str | None:
+    if not len(angle):
+        return None
+    off = float(np.median(np.arccos(np.cos(angle - direction))))
+    in_degrees = float(np.median(np.arccos(np.cos(np.radians(angle) - direction))))
+    turns_too_far = np.ptp(angle) > max(np.pi, _DEGREES_TURN * np.ptp(np.unwrap(direction)))
+    if turns_too_far and off > max(_DEGREES_OFF, _DEGREES_BETTER * in_degrees):
+        return (
+            f"up to {np.abs(angle).max():.3g}, which fits the cable beside it in degrees (median difference "
+            f"{in_degrees:.2g} rad) and not in radians ({off:.2g} rad): expected radians. Multiply it by pi / 180."
+        )
+    if off > INWARDS:
+        return (
+            f"{np.degrees(off):.0f} degrees off the cable beside it (median): expected the cable's tangent, from "
+            "gripper 0 towards gripper 1, at both grippers. Add pi if it points the other way."
+        )
+    return None

@@ -1,0 +1,120 @@
+"""The closed-form chain as an engine: every effect of the library, differentiable, and the fastest in batches."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import ClassVar, get_args
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from cablejax.cable import Discretisation
+from cablejax.effects.arms import executed_twist
+from cablejax.effects.base import Hook
+from cablejax.effects.camera import seen_by_camera
+from cablejax.effects.physics import Physics, may_touch
+from cablejax.simulate.chain.replay import centreline_keypoints, follow
+from cablejax.simulate.chain.step import ChainState
+from cablejax.simulate.engine import Engine, compiled_rollout, finely_sampled
+from cablejax.simulate.equilibrium import equilibrium_state
+from cablejax.simulate.pose import integrate_pose
+from cablejax.types import CableMemory, CableState, Trajectory
+
+
+@dataclasses.dataclass(frozen=True)
+class ChainEngine(Engine):
+    """A planar cable by the closed-form step of `chain.step`: vmapped, jitted, differentiable in both modes.
+
+    `rollout` and `unroll` are those of `MjxEngine`. States of other engines are accepted as they are; the states that
+    this engine returns carry the cable's memory.
+
+    Attributes:
+        config: the cable, its resolution and time step.
+
+    Raises:
+        ValueError: the cable is not planar.
+    """
+
+    config: Discretisation = Discretisation()
+
+    name: ClassVar[str] = "chain"
+    hooks: ClassVar[frozenset[Hook]] = frozenset(get_args(Hook))
+
+    def __post_init__(self):
+        if self.config.dimension != 2:
+            raise ValueError(
+                f"ChainEngine simulates cables in the plane, and the discretisation has dimension "
+                f"{self.config.dimension}. Use MjxEngine or ThreadedEngine for a cable in space."
+            )
+
+    def initial_state(self, gripper_pose, *, guess=None) -> CableState:
+        return self._remembering(equilibrium_state(self.config, gripper_pose, guess=guess))
+
+    def rollout(self, physics, state, twist, interval=1.0):
+        twist = jnp.asarray(twist)
+        self.check_twist(twist)
+
+        def run(physics, state, twist, interval):
+            return compiled_rollout(self, physics, twist.ndim - 3, interval)(physics, state, twist)
+
+        return finely_sampled(run, self, physics, self._remembering(state), twist, interval)
+
+    def unroll(
+        self, physics: Physics, state: CableState, twist: Float[Array, "T Q 3"], interval: float = 1.0
+    ) -> tuple[CableState, Trajectory]:
+        """`rollout` of one cable, uncompiled. Differentiable in `physics`, `state` and `twist`."""
+        count, config, contact = self.substeps(interval), self.config, may_touch(physics)
+        state = self._remembering(state)
+        assert state.memory is not None
+
+        def interval_step(carry, twist):
+            chain, pose, time = carry
+            target = integrate_pose(pose, twist, interval)
+            chain = follow(
+                config, physics, chain, pose, target, interval / count, time, n_substeps=count, with_contact=contact
+            )
+            time = time + interval
+            points = centreline_keypoints(config, physics, chain, target[0, :2], time)
+            return (chain, target, time), (points, target)
+
+        start, time = _chain_state(state), state.memory.time
+        first = centreline_keypoints(config, physics, start, state.gripper_pose[0, :2], time)
+        driven = executed_twist(physics, state.gripper_pose, twist, interval)
+        # Remember the start of each interval only: reverse mode recomputes the inside.
+        final, (points, poses) = jax.lax.scan(jax.checkpoint(interval_step), (start, state.gripper_pose, time), driven)
+        trajectory = Trajectory(
+            keypoints=seen_by_camera(physics, jnp.concatenate([first[None], points]), interval),
+            gripper_pose=jnp.concatenate([state.gripper_pose[None], poses]),
+            gripper_twist=twist,
+        )
+        return _cable_state(*final), trajectory
+
+    def _remembering(self, state: CableState) -> CableState:
+        """The state with a memory: a cable without one has never been bent beyond its limits."""
+        if state.memory is not None:
+            return state
+        batch, dtype = state.qpos.shape[:-1], state.qpos.dtype
+        nothing, joints = jnp.zeros(batch, dtype), jnp.zeros((*batch, self.config.n_joints), dtype)
+        return dataclasses.replace(state, memory=CableMemory(nothing, nothing, joints, joints, nothing))
+
+
+def _chain_state(state: CableState) -> ChainState:
+    assert state.memory is not None
+    return ChainState(
+        angles=state.qpos[2:],
+        stretch=state.memory.stretch,
+        velocity=jnp.append(state.qvel[2:], state.memory.stretch_rate),
+        set_curvature=state.memory.set_curvature,
+        friction_state=state.memory.friction_state,
+        root_velocity=state.qvel[:2],
+    )
+
+
+def _cable_state(chain: ChainState, pose: Float[Array, "Q 3"], time: Float[Array, ""]) -> CableState:
+    return CableState(
+        qpos=jnp.concatenate([pose[0, :2], chain.angles]),
+        qvel=jnp.concatenate([chain.root_velocity, chain.velocity[:-1]]),
+        gripper_pose=pose,
+        memory=CableMemory(chain.stretch, chain.velocity[-1], chain.set_curvature, chain.friction_state, time),
+    )

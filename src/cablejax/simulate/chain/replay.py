@@ -1,0 +1,137 @@
+"""Replays of measured gripper poses by the planar chain, from a settled start."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from cablejax.cable import Discretisation
+from cablejax.effects.physics import Physics
+from cablejax.simulate.chain.step import ChainState, advance, chain_nodes, slipped
+from cablejax.simulate.keypoints import marked_keypoints
+
+LARGEST_STEP = 0.05
+"""Longest time step of a fit [s]. What it is off for the nominal cable is known from one replay with `FINE_STEP`."""
+FINE_STEP = 0.01
+"""Longest time step of the nominal cable that a log is compared with [s]."""
+_SETTLE_STEPS = 20
+_SETTLE_STEP = 0.2
+
+
+@dataclasses.dataclass(frozen=True)
+class Chain:
+    """Replays gripper poses. Pure, to be vmapped and jitted by the caller.
+
+    Attributes:
+        config: geometry and resolution; its time step and nominal values are not used.
+        with_contact: whether the obstacle can be touched. Looking for contacts is a quarter of a step's work.
+    """
+
+    config: Discretisation
+    with_contact: bool = True
+
+    def rollout(
+        self,
+        physics: Physics,
+        angles: Float[Array, "n"],
+        gripper_pose: Float[Array, "T Q 3"],
+        interval: Float[Array, ""],
+        *,
+        n_substeps: int,
+    ) -> Float[Array, "T N 2"]:
+        """Keypoints on the centreline, as the physics has them: before any camera.
+
+        The cable first settles, without friction, from `angles` at the first pose. Differentiable in everything but
+        `n_substeps`.
+
+        Args:
+            physics: of this cable.
+            angles: theta of the first link and joint angles near the settled start [rad].
+            gripper_pose: (x, y, theta) at every sample, theta continuous.
+            interval: between two samples [s].
+            n_substeps: time steps between two samples.
+        """
+        config, first, zero = self.config, gripper_pose[0], jnp.zeros((), angles.dtype)
+        start = self._settled(physics, angles, first)
+
+        def sample(carry, target):
+            state, pose, time = carry
+            state = follow(
+                config,
+                physics,
+                state,
+                pose,
+                target,
+                interval / n_substeps,
+                time,
+                n_substeps=n_substeps,
+                with_contact=self.with_contact,
+            )
+            time = time + interval
+            return (state, target, time), centreline_keypoints(config, physics, state, target[0, :2], time)
+
+        _, moved = jax.lax.scan(sample, (start, first, zero), gripper_pose[1:])
+        return jnp.concatenate([centreline_keypoints(config, physics, start, first[0, :2], zero)[None], moved])
+
+    def _settled(self, physics: Physics, angles: Float[Array, "n"], pose: Float[Array, "Q 3"]) -> ChainState:
+        """The cable at rest at the first pose, with nothing locked in."""
+        zeros = jnp.zeros(self.config.n_joints, angles.dtype)
+        start = ChainState(
+            angles=angles,
+            stretch=jnp.zeros((), angles.dtype),
+            velocity=jnp.zeros(self.config.n_links + 1, angles.dtype),
+            set_curvature=zeros,
+            friction_state=zeros,
+            root_velocity=jnp.zeros(2, angles.dtype),
+        )
+        calm = dataclasses.replace(
+            physics,
+            friction=jnp.zeros_like(physics.friction),
+            patch_friction=jnp.zeros_like(physics.patch_friction),
+            hysteresis_moment=jnp.zeros_like(physics.hysteresis_moment),
+            yield_curvature=jnp.full_like(physics.yield_curvature, 1e3),
+            drag=jnp.zeros_like(physics.drag),
+        )
+
+        def settle(state, _):
+            state = advance(self.config, calm, state, pose, pose, _SETTLE_STEP, -1e3, with_contact=self.with_contact)
+            return state, None
+
+        start, _ = jax.lax.scan(settle, start, None, length=_SETTLE_STEPS)
+        return dataclasses.replace(start, velocity=jnp.zeros_like(start.velocity), friction_state=zeros)
+
+
+def follow(
+    config: Discretisation,
+    physics: Physics,
+    state: ChainState,
+    start: Float[Array, "Q 3"],
+    end: Float[Array, "Q 3"],
+    dt: Float[Array, ""] | float,
+    time: Float[Array, ""],
+    *,
+    n_substeps: int,
+    with_contact: bool,
+) -> ChainState:
+    """Moves the grippers on a straight line from one pose to another, in `n_substeps` steps of `dt` seconds."""
+
+    def substep(state, i):
+        before = start + (end - start) * (i / n_substeps)
+        after = start + (end - start) * ((i + 1) / n_substeps)
+        state = advance(config, physics, state, before, after, dt, time + (i + 1) * dt, with_contact=with_contact)
+        return state, None
+
+    return jax.lax.scan(substep, state, jnp.arange(n_substeps))[0]
+
+
+def centreline_keypoints(
+    config: Discretisation, physics: Physics, state: ChainState, root: Float[Array, "2"], time: Float[Array, ""]
+) -> Float[Array, "N 2"]:
+    """Keypoints [m] of the chain that leaves gripper 0 at `root`, before any camera."""
+    nodes, unit = chain_nodes(config, state.angles, state.stretch)
+    return marked_keypoints(
+        config, physics, root + nodes, unit, scale=1.0 + state.stretch, slipped=slipped(physics, time)
+    )

@@ -1,0 +1,120 @@
+"""The loop over time steps of C MuJoCo, compiled by numba: it calls MuJoCo's C functions without Python in between."""
+
+from __future__ import annotations
+
+import ctypes
+import pathlib
+
+import mujoco
+import numba
+import numpy as np
+
+from cablejax.simulate.friction import PATCH_EDGE, STRIBECK_SPEED
+
+
+def _c_function(name: str):
+    """A C function `void f(const mjModel*, mjData*)` of the very library that the Python bindings have loaded."""
+    folder = pathlib.Path(mujoco.__file__).parent
+    library = next(path for path in sorted(folder.iterdir()) if path.name.startswith(("libmujoco.", "mujoco.dll")))
+    function = getattr(ctypes.CDLL(str(library)), name)
+    function.argtypes, function.restype = (ctypes.c_void_p, ctypes.c_void_p), None
+    return function
+
+
+_step1, _step2, _kinematics = (_c_function(name) for name in ("mj_step1", "mj_step2", "mj_kinematics"))
+
+
+@numba.njit(nogil=True, cache=False)
+def advance(
+    addresses,
+    mocap_pos,
+    mocap_quat,
+    actuator_velocity,
+    actuator_biasprm,
+    xipos,
+    xmat,
+    links,
+    pose,
+    rotation_offset,
+    twist,
+    count,
+    dt,
+    table,
+    friction_speed,
+    nodes,
+    tangents,
+    poses,
+):
+    """All time steps of one cable. `pose` [Q, P] is advanced in place; samples go to nodes, tangents and poses."""
+    model, data = addresses[0], addresses[1]
+    n_free = actuator_velocity.shape[0] // 2
+    _sample(model, data, xipos, xmat, links, nodes[0], tangents[0])
+    poses[0] = pose
+    for t in range(twist.shape[0]):
+        start = pose.copy()
+        for i in range(count):
+            _integrate(start, twist[t], (i + 1) * dt, pose)
+            _set_mocap(pose, rotation_offset, mocap_pos, mocap_quat)
+            _step1(model, data)
+            for k in range(n_free):
+                vx, vy = actuator_velocity[2 * k], actuator_velocity[2 * k + 1]
+                node = xipos[links[k + 1]]
+                held_back = drag(table, table[7 + k], node[0], node[1], vx * vx + vy * vy, friction_speed)
+                actuator_biasprm[2 * k, 2] = -held_back
+                actuator_biasprm[2 * k + 1, 2] = -held_back
+            _step2(model, data)
+        _sample(model, data, xipos, xmat, links, nodes[t + 1], tangents[t + 1])
+        poses[t + 1] = pose
+
+
+@numba.njit(nogil=True, cache=False)
+def drag(table, weight, x, y, squared_speed, friction_speed):
+    """`friction.drag_coefficient` of one node."""
+    coefficient = table[0]
+    if table[5] != 0.0:
+        distance = np.sqrt((x - table[2]) ** 2 + (y - table[3]) ** 2)
+        coefficient += table[5] / (1.0 + np.exp(-(table[4] - distance) / PATCH_EDGE))
+    if table[1] != 0.0:
+        coefficient *= 1.0 + table[1] * np.exp(-squared_speed / STRIBECK_SPEED**2)
+    return coefficient * weight / np.sqrt(squared_speed + friction_speed * friction_speed) + table[6]
+
+
+@numba.njit(nogil=True, cache=False)
+def _sample(model, data, xipos, xmat, links, nodes, tangents):
+    _kinematics(model, data)
+    for k in range(links.shape[0]):
+        for axis in range(3):
+            nodes[k, axis] = xipos[links[k], axis]
+            tangents[k, axis] = xmat[links[k], 3 * axis]
+
+
+@numba.njit(nogil=True, cache=False)
+def _integrate(start, twist, duration, pose):
+    """`pose.integrate_pose` in place."""
+    if start.shape[1] == 3:
+        pose[:] = start + duration * twist
+        return
+    for q in range(start.shape[0]):
+        pose[q, :3] = start[q, :3] + duration * twist[q, :3]
+        rotation = duration * twist[q, 3:]
+        angle = np.sqrt(np.sum(rotation**2))
+        w, sinc = np.cos(angle / 2), (np.sin(angle / 2) / angle if angle > 0 else 0.5)
+        x, y, z = sinc * rotation[0], sinc * rotation[1], sinc * rotation[2]
+        a, b, c, d = start[q, 3], start[q, 4], start[q, 5], start[q, 6]
+        pose[q, 3] = w * a - x * b - y * c - z * d
+        pose[q, 4] = w * b + x * a + y * d - z * c
+        pose[q, 5] = w * c - x * d + y * a + z * b
+        pose[q, 6] = w * d + x * c - y * b + z * a
+
+
+@numba.njit(nogil=True, cache=False)
+def _set_mocap(pose, rotation_offset, mocap_pos, mocap_quat):
+    for q in range(pose.shape[0]):
+        if pose.shape[1] == 3:
+            half = (pose[q, 2] + rotation_offset[q]) / 2
+            mocap_pos[q, 0], mocap_pos[q, 1], mocap_pos[q, 2] = pose[q, 0], pose[q, 1], 0.0
+            mocap_quat[q, 0], mocap_quat[q, 1] = np.cos(half), 0.0
+            mocap_quat[q, 2], mocap_quat[q, 3] = 0.0, np.sin(half)
+        else:
+            mocap_pos[q] = pose[q, :3]
+            mocap_quat[q] = pose[q, 3:]

@@ -1,0 +1,90 @@
+"""Keypoints and gripper angles that no cable can have are refused, and those of a real recording are not."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from cablejax.cable import Cable
+from cablejax.gaplog import Episode, GapLogError, gap_log_from_episodes, validate
+from cablejax.recordings.prepare import Setup, prepare
+from cablejax.recordings.take import Take
+from cablejax.simulate.elastica import elastica
+from cablejax.types import GapLog
+
+CABLE = Cable()
+
+
+def motion(heading: float = 0.0, samples: int = 12) -> tuple[np.ndarray, np.ndarray]:
+    """An arch that closes, turns with both grippers and is seen from a heading: keypoints and gripper poses."""
+    way = np.linspace(0.0, 1.0, samples)
+    pose = np.zeros((samples, 2, 3))
+    pose[:, 0], pose[:, 1] = [0.0, 0.0, 0.4], [0.9, 0.0, -0.4]
+    pose[:, 0, 2] += 1.2 * way
+    pose[:, 1, 2] -= 1.2 * way
+    pose[:, 1, 0] -= 0.4 * way
+    points = np.stack([elastica(p, CABLE.length, CABLE.keypoint_arclength) for p in pose])
+    turn = np.array([[np.cos(heading), -np.sin(heading)], [np.sin(heading), np.cos(heading)]])
+    pose[..., :2] = pose[..., :2] @ turn.T
+    pose[..., 2] += heading
+    return points @ turn.T, pose
+
+
+def log_of(points: np.ndarray, pose: np.ndarray) -> GapLog:
+    n = len(points)
+    still = Episode("close", 0.1 * np.arange(n), points, pose, np.zeros((n, 2, 3)), np.zeros(n, bool))
+    return gap_log_from_episodes([still, still], CABLE, source="test")
+
+
+def changed(log: GapLog, name: str, change) -> GapLog:
+    array = getattr(log, name).copy()
+    change(array)
+    return dataclasses.replace(log, **{name: array})
+
+
+@pytest.mark.parametrize("heading", [0.0, 1.5, 3.1, -3.1, 20.0])
+def test_a_plausible_log_is_accepted(heading):
+    log = log_of(*motion(heading))
+    # offsets as large as the library's effects of grasp and camera may be
+    for offset in (-1.0, 1.0):
+        validate(changed(log, "gripper_pose", lambda pose, by=offset: pose[..., 2].__iadd__(by)))
+        validate(changed(log, "keypoints", lambda points, by=offset: points.__iadd__(0.5 * by)))
+
+
+@pytest.mark.parametrize("heading", [0.0, 1.5, 3.1])
+@pytest.mark.parametrize("gripper", [0, 1])
+def test_an_angle_that_points_the_other_way_is_refused(heading, gripper):
+    log = log_of(*motion(heading))
+    with pytest.raises(GapLogError, match=rf"angle of gripper {gripper} 1\d\d degrees off the cable.*Add pi"):
+        validate(changed(log, "gripper_pose", lambda pose: pose[..., gripper, 2].__iadd__(np.pi)))
+
+
+@pytest.mark.parametrize("heading", [0.0, 1.5, 3.1])
+def test_angles_in_degrees_are_refused(heading):
+    log = log_of(*motion(heading))
+    with pytest.raises(GapLogError, match=r"in degrees .* expected radians. Multiply it by pi / 180"):
+        validate(changed(log, "gripper_pose", lambda pose: pose[..., 2].__imul__(180 / np.pi)))
+
+
+@pytest.mark.parametrize("far", [1e30, 1e3, 9.0])
+def test_a_keypoint_out_of_reach_is_refused(far):
+    log = log_of(*motion())
+
+    def throw(points):
+        points[1, 4, 3, 0] = far
+
+    with pytest.raises(GapLogError, match=r"keypoint 3 of episode 1 .* m away from both grippers at 0.4 s.*NaN"):
+        validate(changed(log, "keypoints", throw))
+
+
+def test_an_import_marks_outliers_as_not_observed_and_says_so():
+    points, pose = motion()
+    points[2, 5] = [1000.0, 0.0]
+    points[7, 1, 1] = -3.0
+    take = Take("1", 0.1 * np.arange(len(points)), points, pose)
+    (prepared,), said = prepare((take,), Setup(on_grippers="ends", hangs=False))
+    missing = np.argwhere(np.isnan(prepared.keypoints).any(axis=-1))
+    assert missing.tolist() == [[2, 5], [7, 1]]
+    assert [text for text in said if "2 keypoints lay up to 1e+03 m from the rest" in text]
+    kept = ~np.isnan(prepared.keypoints)
+    np.testing.assert_array_equal(prepared.keypoints[kept], points[kept])

@@ -1,0 +1,314 @@
+"""The closed-form chain as an engine, and the effects in all engines."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from cablejax.cable import Cable, Discretisation
+from cablejax.effects.given import EFFECTS, GivenEffect, parse_effect, with_effects
+from cablejax.effects.physics import Physics, nominal_physics
+from cablejax.simulate import ENGINES, ChainEngine, MjxEngine, check_effects
+
+POSE = np.array([[-0.45, 0.0, 0.5], [0.45, 0.0, -0.5]])
+GIVEN = tuple(
+    map(
+        parse_effect,
+        (
+            "bending_stiffness:ratio=3",
+            "stiffness_profile:centre_m=0.3,width_m=0.2,ratio=0.3",
+            "intrinsic_curvature:centre_m=0.3,width_m=0.2,curvature_per_m=2",
+            "plasticity:yield_curvature_per_m=1.5",
+            "bending_hysteresis:moment_n_m=0.02,transition_curvature_per_m=0.5",
+            "bending_damping:time_s=2",
+            "axial_stretch:stiffness_n=5",
+            "table_friction:coefficient=0.3,static_excess=0.5",
+            "friction_patch:x_m=0,y_m=0.2,radius_m=0.12,coefficient=1",
+            "viscous_drag:coefficient_n_s_per_m2=5",
+            "gravity_tilt:angle_rad=0.1,direction_rad=1",
+            "linear_density:ratio=3",
+            "lumped_mass:centre_m=0.4,mass_kg=0.1",
+            "gripper_slip:gripper=1,time_s=1,distance_m=-0.02",
+            "gripper_rotation_offset:gripper=0,angle_rad=0.1",
+            "gripper_compliance:gripper=0,stiffness_n_m_per_rad=0.3",
+            "camera_similarity:scale=1.02,angle_rad=0.05,x_m=0.01,y_m=0.0",
+            "keypoint_bias:index=2,offset_m=0.01",
+            "camera_lag:time_s=0.3",
+            "actuation_gain:gain=0.8",
+            "actuation_lag:time_s=0.4,delay_s=0.1",
+        ),
+    )
+)
+
+
+def motion() -> np.ndarray:
+    twist = np.zeros((3, 2, 3))
+    twist[:, 0] = [0.03, 0.01, 0.15]
+    twist[:, 1] = [-0.03, -0.01, 0.1]
+    return twist
+
+
+def keypoints(engine, physics, twist=None) -> np.ndarray:
+    _, trajectory = engine.rollout(physics, engine.initial_state(POSE), motion() if twist is None else twist)
+    return np.asarray(trajectory.keypoints)
+
+
+def test_chain_follows_mjx_within_a_hundredth_of_a_millimetre():
+    """After 3 s at equal links and a time step of 2 ms.
+
+    Both are linearly implicit, but the chain takes elastic moments in the middle of a step and MJX where it starts.
+    That is MJX with a damping time longer by half a step, and with it they agree at any step, one of 20 ms included.
+    """
+    for timestep, extra, allowed in ((0.002, 0.0, 1e-5), (0.02, 0.01, 1e-5)):
+        config = Discretisation(n_links=17, timestep=timestep)
+        physics = nominal_physics(config)
+        longer = dataclasses.replace(physics, damping_time=physics.damping_time + np.float32(extra))
+        chain, mjx = keypoints(ChainEngine(config), physics), keypoints(MjxEngine(config), longer)
+        assert np.abs(chain[-1] - chain[0]).max() > 0.02
+        assert np.abs(chain - mjx).max() <= allowed
+
+
+@pytest.fixture(scope="module")
+def nominal():
+    config = Discretisation(Cable(n_keypoints=5), n_links=9)
+    return config, {name: keypoints(engine(config), nominal_physics(config)) for name, engine in ENGINES.items()}
+
+
+def test_every_effect_is_given_once():
+    assert sorted(effect.name for effect in GIVEN) == sorted(EFFECTS.keys() - {"obstacle"})
+
+
+def test_an_obstacle_keeps_the_cable_out():
+    """The arch rises by 10 cm, and a disc stands 1 cm in its way.
+
+    In C MuJoCo the links themselves are touched, straight lines that leave a curve by `curvature h^2 / 8`: 1 mm here.
+    """
+    config = Discretisation(Cable(n_keypoints=25), n_links=25)
+    still = keypoints(ChainEngine(config), nominal_physics(config))
+    (x, y), radius = still[-1, 12], 0.03
+    place = {"x_m": float(x), "y_m": float(y) + radius - 0.01, "radius_m": radius}
+    physics = with_effects(nominal_physics(config), [GivenEffect("obstacle", tuple(place.items()))], config)
+    found = {name: keypoints(engine(config), physics) for name, engine in ENGINES.items()}
+    for name, points in found.items():
+        distance = np.linalg.norm(points - [place["x_m"], place["y_m"]], axis=-1).min()
+        assert radius - 1e-3 < distance < radius + 2e-3, name
+        assert np.abs(points - still).max() > 5e-3
+    assert np.abs(found["mjx"] - found["chain"]).max() <= 3e-4
+    assert np.abs(found["threaded"] - found["chain"]).max() <= 3e-3
+
+
+@pytest.mark.parametrize("name", ENGINES)
+def test_effects_act_alike_in_every_engine_that_honours_them(nominal, name):
+    """What an effect moves in MJX and C is what it moves in the chain, to a twentieth and 0.2 mm."""
+    config, still = nominal
+    engine = ENGINES[name](config)
+    for given in GIVEN:
+        if given.effect.hook not in engine.hooks:
+            continue
+        physics = with_effects(nominal_physics(config), [given], config)
+        moved = keypoints(engine, physics) - still[name]
+        expected = keypoints(ChainEngine(config), physics) - still["chain"]
+        size = np.abs(expected).max()
+        assert size > 3e-4, f"{given} does not show"
+        assert np.abs(moved - expected).max() <= 0.05 * size + 2e-4, str(given)
+
+
+@pytest.mark.parametrize("name", ENGINES)
+def test_null_values_leave_a_rollout_as_it_is(nominal, name):
+    config, still = nominal
+    engine = ENGINES[name](config)
+    physics = nominal_physics(config)
+    for effect in EFFECTS.values():
+        physics = effect.apply(physics, [np.float32(v) for v in effect.null], effect.variants[0], config)
+    # an obstacle that is far away is still looked for: nearly the same program
+    assert np.abs(keypoints(engine, physics) - still[name]).max() <= 1e-7
+
+
+def test_what_an_engine_cannot_simulate_is_refused_with_those_that_can():
+    plastic = [GivenEffect("plasticity", (("yield_curvature_per_m", 2.0),))]
+    check_effects(plastic, "chain")
+    for engine in ("mjx", "threaded"):
+        with pytest.raises(ValueError, match=rf"{engine} cannot simulate plasticity.* memory.*: chain\."):
+            check_effects(plastic, engine)
+    compliant = [parse_effect("gripper_compliance:gripper=0,stiffness_n_m_per_rad=0.3")]
+    with pytest.raises(ValueError, match=r"threaded cannot simulate gripper_compliance.*: mjx, chain\."):
+        check_effects(compliant, "threaded")
+    with pytest.raises(ValueError, match="dimension 3"):
+        ChainEngine(Discretisation(dimension=3))
+
+
+def test_a_rollout_goes_on_where_another_ended():
+    """Bends that stay, a slip at a time and friction go on from the state; so do samples of a finer command."""
+    config = Discretisation(Cable(n_keypoints=5), n_links=9)
+    engine = ChainEngine(config)
+    effects = [effect for effect in GIVEN if effect.name in ("plasticity", "bending_hysteresis", "gripper_slip")]
+    physics = with_effects(nominal_physics(config), effects, config)
+    final, whole = engine.rollout(physics, engine.initial_state(POSE), motion())
+    state, first = engine.rollout(physics, engine.initial_state(POSE), motion()[:1])
+    state, rest = engine.rollout(physics, state, motion()[1:])
+    np.testing.assert_allclose(first.keypoints, whole.keypoints[:2], atol=1e-6)
+    np.testing.assert_allclose(rest.keypoints, whole.keypoints[1:], atol=2e-6)
+    assert np.abs(np.asarray(final.memory.set_curvature)).max() > 0.1
+    np.testing.assert_allclose(state.memory.set_curvature, final.memory.set_curvature, atol=1e-3)
+
+
+def test_a_batch_equals_its_members():
+    config = Discretisation(Cable(n_keypoints=5), n_links=9)
+    engine = ChainEngine(config)
+    one = [with_effects(nominal_physics(config), [effect], config) for effect in GIVEN[2:4]]
+    states = engine.initial_state(np.stack([POSE, POSE * [1, 1, -1]]))
+    physics = jax.tree.map(lambda *leaves: np.stack(leaves), *one)
+    _, batch = engine.rollout(physics, states, np.stack([motion(), 0.5 * motion()]))
+    for i in range(2):
+        state = jax.tree.map(lambda leaf, i=i: leaf[i], states)
+        _, alone = engine.rollout(one[i], state, motion() * (1.0 - 0.5 * i))
+        np.testing.assert_allclose(batch.keypoints[i], alone.keypoints, atol=2e-6)
+
+
+def test_an_arm_that_lags_follows_its_command_late():
+    """A ramp of one second, then rest: what is left decays from 0.4 s of motion with a time constant of 0.4 s."""
+    config = Discretisation(Cable(n_keypoints=5), n_links=9)
+    given = parse_effect("actuation_lag:time_s=0.4")
+    twist = np.zeros((3, 2, 3))
+    twist[0, :, 0] = 0.02
+    for name, engine in ENGINES.items():
+        physics = with_effects(nominal_physics(config), [given], config)
+        simulator = engine(config)
+        _, trajectory = simulator.rollout(physics, simulator.initial_state(POSE), twist)
+        late = np.asarray(trajectory.gripper_pose)[:, 0, 0] - POSE[0, 0]
+        left = 0.4 * (1 - np.exp(-1 / 0.4))
+        expected = [0.0, 0.02 * (1 - left), 0.02 * (1 - left * np.exp(-1 / 0.4)), 0.02 * (1 - left * np.exp(-2 / 0.4))]
+        np.testing.assert_allclose(late, expected, atol=2e-6, err_msg=name)
+        np.testing.assert_allclose(trajectory.gripper_twist, twist, atol=1e-8)
+
+
+@pytest.mark.parametrize("engine", ENGINES.values())
+def test_a_cable_without_damping_stays_finite(engine):
+    """Bending waves are faster than the time step; without damping MuJoCo's step let them grow without bound."""
+    config = Discretisation(Cable(damping_time=0.0), n_links=13)
+    fine = keypoints(ChainEngine(dataclasses.replace(config, timestep=0.001)), nominal_physics(config))
+    coarse = keypoints(engine(config), nominal_physics(config))
+    assert np.abs(coarse - fine).max() < 2e-3
+
+
+SMALL = Discretisation(Cable(n_keypoints=4), n_links=7)
+SMOOTH = {
+    "bending": ("stiffness", "rest_curvature", "damping_time"),
+    "extension": ("axial_compliance", "slip", "slip_time"),
+    "memory": ("yield_curvature", "hardening", "hysteresis_moment", "hysteresis_curvature"),
+    "table": ("friction", "static_excess", "patch_centre", "patch_radius", "patch_friction", "drag", "tilt", "gravity"),
+    "mass": ("density", "extra_mass"),
+    "grasp": ("rotation_offset",),
+    "compliance": ("rotation_compliance",),
+    "input": ("actuation_gain", "actuation_delay", "actuation_time"),
+    "observation": ("bias_along", "bias_across", "camera_scale", "camera_angle", "camera_offset", "camera_lag"),
+    "obstacle": ("obstacle_centre", "obstacle_radius"),
+}
+
+
+def acting(dtype) -> Physics:
+    """Every effect at work, away from kinks."""
+    nominal = nominal_physics(SMALL, dtype)
+    values = {
+        "stiffness": nominal.stiffness * np.linspace(0.8, 1.4, SMALL.n_joints),
+        "rest_curvature": np.linspace(-0.5, 0.8, SMALL.n_joints),
+        "axial_compliance": 0.02,
+        "slip": np.array([0.004, -0.006]),
+        "slip_time": 0.6,
+        "yield_curvature": 1.2,
+        "hardening": 0.4,
+        "hysteresis_moment": 0.004,
+        "hysteresis_curvature": 0.7,
+        "static_excess": 0.3,
+        "patch_centre": np.array([0.05, 0.1]),
+        "patch_radius": 0.1,
+        "patch_friction": 0.1,
+        "drag": 0.5,
+        "tilt": np.array([0.2, -0.1]),
+        "extra_mass": np.linspace(0.0, 0.01, SMALL.n_links),
+        "rotation_offset": np.array([0.03, -0.02]),
+        "rotation_compliance": np.array([0.3, 0.1]),
+        "obstacle_centre": np.array([0.0, 0.17]),
+        "obstacle_radius": 0.03,
+        "bias_along": np.array([0.0, 0.01, -0.006, 0.0]),
+        "bias_across": np.array([0.0, 0.004, 0.002, 0.0]),
+        "camera_scale": 1.02,
+        "camera_angle": 0.03,
+        "camera_offset": np.array([0.01, -0.02]),
+        "camera_lag": 0.13,
+        "actuation_gain": 0.9,
+        "actuation_delay": 0.07,
+        "actuation_time": 0.2,
+    }
+    return dataclasses.replace(nominal, **{name: np.asarray(value, dtype) for name, value in values.items()})
+
+
+@pytest.fixture(scope="module", params=["chain", "mjx"])
+def programs(request):
+    """The last keypoints of half a second in five commands, and their derivatives in both modes."""
+    engine = ENGINES[request.param](SMALL)
+
+    def final(physics, state, twist):
+        return engine.unroll(physics, state, twist, 0.2)[1].keypoints[-2:]
+
+    @jax.jit
+    def push(physics, state, twist, direction):
+        return jax.jvp(lambda physics, twist: final(physics, state, twist), (physics, twist), direction)[1]
+
+    @jax.jit
+    def pull(physics, state, twist, cotangent):
+        return jax.vjp(lambda physics, twist: final(physics, state, twist), physics, twist)[1](cotangent)
+
+    return engine, jax.jit(final), push, pull
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("start", ["moving", "straight at rest"])
+def test_derivatives_in_every_hook(programs, start):
+    """JVP against central differences, relative 1e-5, and against VJP, for every parameter of every hook."""
+    engine, final, push, pull = programs
+    with jax.enable_x64(True):
+        as_double = functools.partial(jax.tree.map, lambda leaf: jnp.asarray(leaf, jnp.float64))
+        pose, speed = (POSE, 1.0) if start == "moving" else (np.array([[-0.5, 0.0, 0.0], [0.5, 0.0, 0.0]]), 0.0)
+        twist = as_double(speed * np.repeat(motion()[:1], 5, axis=0))
+        physics, state = as_double(acting(np.float64)), as_double(engine.initial_state(pose))
+        if start != "moving":
+            # a straight cable between fixed grippers has no freedom to follow these
+            fixed = {"slip": 0.0, "rotation_offset": 0.0, "axial_compliance": 0.02, "obstacle_radius": 0.0}
+            physics = dataclasses.replace(
+                physics, **{name: jnp.full_like(getattr(physics, name), value) for name, value in fixed.items()}
+            )
+        nothing = jax.tree.map(jnp.zeros_like, (physics, twist))
+        found = {}
+        for hook in sorted(engine.hooks):
+            for name in SMOOTH[hook]:
+                leaf = getattr(physics, name)
+                direction = jnp.ones_like(leaf) * jnp.where(leaf == 0, 0.01, leaf)
+                change = (dataclasses.replace(nothing[0], **{name: direction}), nothing[1])
+                exact = push(physics, state, twist, change)
+                size = 1e-5
+
+                def shifted(s, name=name, direction=direction):
+                    moved = dataclasses.replace(physics, **{name: getattr(physics, name) + s * direction})
+                    return final(moved, state, twist)
+
+                difference = 8 * (shifted(size) - shifted(-size)) - (shifted(2 * size) - shifted(-2 * size))
+                difference = difference / (12 * size)
+                scale = jnp.abs(difference).max()
+                cotangent = jnp.asarray(np.random.default_rng(5).standard_normal(exact.shape))
+                gradient = jnp.sum(getattr(pull(physics, state, twist, cotangent)[0], name) * direction)
+                found[name] = (
+                    float(jnp.abs(exact - difference).max()),
+                    float(scale),
+                    float(jnp.abs(jnp.sum(exact * cotangent) - gradient)),
+                )
+        wrong = {n: v for n, v in found.items() if v[0] > 1e-5 * v[1] + 1e-10 or v[2] > 1e-7 * (v[1] + 1e-3)}
+        assert not wrong, wrong
+        if start == "moving":
+            silent = [name for name, value in found.items() if value[1] < 1e-7]
+            assert not silent, silent
