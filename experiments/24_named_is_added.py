@@ -178,8 +178,8 @@ def page(rows: list[dict[str, Any]]) -> str:
         "",
         f"One log each, six motions, {1e3 * NOISE:g} mm noise, seed {SEED}. Errors are root mean squares per",
         f"coordinate on three held-out motions without noise. The floor, {floor:.2f} mm, is what the engine is off",
-        "without any effect. Shrinkage is `1 - (after^2 - floor^2) / (before^2 - floor^2)`, not resolved where the gap is below",
-        "1.4 times the floor.",
+        "without any effect. Shrinkage is `1 - (after^2 - floor^2) / (before^2 - floor^2)`, not resolved where",
+        "the gap is below 1.4 times the floor.",
         "",
         *markdown_table([head, *table]),
     ]

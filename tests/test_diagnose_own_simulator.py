@@ -299,7 +299,7 @@ def test_batches_are_of_one_size_and_pairs_in_place():
 
 
 GENERIC = (
-    "belief", "conclude", "conformal", "diagnosis", "evidence", "fit", "gap", "noise", "profile", "protocol", "repeats",
+    "belief", "conclude", "conformal", "diagnosis", "evidence", "fit", "gap", "judgement", "noise", "profile", "protocol", "repeats",
     "run", "screen", "search",
 )  # fmt: skip
 ALLOWED = {f"cablejax.diagnose.{name}" for name in GENERIC} | {"cablejax.bounded", "cablejax.effects.effect"}
