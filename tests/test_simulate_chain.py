@@ -83,6 +83,7 @@ def test_every_effect_is_given_once():
     assert sorted(effect.name for effect in GIVEN) == sorted(EFFECTS.keys() - {"obstacle"})
 
 
+@pytest.mark.slow
 def test_an_obstacle_keeps_the_cable_out():
     """The arch rises by 10 cm, and a disc stands 1 cm in its way: a spring, into which the cable goes 1 mm deep.
 
