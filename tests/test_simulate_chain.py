@@ -83,6 +83,7 @@ def test_every_effect_is_given_once():
     assert sorted(effect.name for effect in GIVEN) == sorted(EFFECTS.keys() - {"obstacle"})
 
 
+@pytest.mark.slow
 def test_an_obstacle_keeps_the_cable_out():
     """The arch rises by 10 cm, and a disc stands 1 cm in its way: a spring, into which the cable goes 1 mm deep.
 
@@ -295,8 +296,8 @@ def test_derivatives_in_every_hook(programs, start):
                 direction = jnp.ones_like(leaf) * jnp.where(leaf == 0, 0.01, leaf)
                 change = (dataclasses.replace(nothing[0], **{name: direction}), nothing[1])
                 exact = push(physics, state, twist, change)
-                # near rest, motion is linear only below the friction's regularisation speed
-                size = 1e-5 if start == "moving" else 3e-6
+                # the grasps of a taut cable are nearly one condition too many, which rounds coarsely
+                size = 1e-5 if start == "moving" else 1e-4
 
                 def shifted(s, name=name, direction=direction):
                     moved = dataclasses.replace(physics, **{name: getattr(physics, name) + s * direction})
