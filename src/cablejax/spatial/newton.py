@@ -39,14 +39,14 @@ class RodFit:
         active: which were fitted, shape [P].
         sums: at the values, over the windows of the fit and whatever else was asked for.
         group: recording of each window of the sums, shape [W].
-        result: how the fit ended; None where nothing was fitted.
+        result: how the fit ended; `STEP_LIMIT` also where no step was made.
     """
 
     values: Values
     active: Bool[np.ndarray, "P"]
     sums: Sums
     group: np.ndarray
-    result: Result | None = None
+    result: Result = Result.STEP_LIMIT
 
 
 def fit_at(simulator: Simulator, values: Values, effects: Sequence[str], windows: Windows) -> RodFit:

@@ -64,12 +64,12 @@ class DiscreteRod:
 
     physics: RodPhysics
     n: int
-    h: Float[Array, ""]
+    h: Float[Array | np.ndarray, ""]
     weights: Float[Array, "N n"]
     bending: Float[Array, "J"]
     curve: Float[Array, "J 2"]
-    mass: Float[Array, "f 1"]
-    compliance: Float[Array, ""]
+    mass: Float[Array | np.ndarray, "f 1"]
+    compliance: Float[Array | np.ndarray, ""]
     turn_matrix: Float[Array, "e e"]
 
     @classmethod
@@ -154,7 +154,7 @@ class DiscreteRod:
     def marker_offsets(self, directors: Float[Array, "m 3"], tangents: Float[Array, "m 3"]) -> Float[Array, "N 3"]:
         """From the centreline to each marker [m]."""
         a, b = joint_frames(tangents, directors)
-        mark, offset = self.weights[:, 1:-1], self.physics.offset
+        mark, offset = self.weights[:, 1:-1], jnp.asarray(self.physics.offset)
         return offset[:, :1] * (mark @ a) + offset[:, 1:] * (mark @ b)
 
     def through(
