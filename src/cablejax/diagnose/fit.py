@@ -99,15 +99,16 @@ def _portions(explanations: Sequence[Explanation]) -> Iterator[list[Explanation]
 
 def _evaluated(evidence: Evidence, portion: Sequence[Explanation]) -> Iterator[Fit]:
     linearised = evidence.simulator.linearise(portion, evidence.episodes)
+    unseen = ~np.isfinite(evidence.observed).reshape(len(evidence.observed), -1)
     for one, (predicted, slopes) in zip(portion, linearised, strict=True):
         r = evidence.whitened(predicted)
         broken = np.asarray(~np.isfinite(r).all(axis=1))
-        jacobian = np.where(np.isfinite(evidence.observed), slopes / evidence.noise, 0.0)
-        jacobian = jacobian.reshape(len(slopes), *r.shape)
+        jacobian = np.asarray(slopes / evidence.noise, np.float64).reshape(len(slopes), *r.shape)
+        # in place: these are the largest arrays of a diagnosis
+        jacobian[:, unseen] = 0.0
         # a breakdown next door gives no derivative
-        jacobian = np.where(np.isfinite(jacobian).all(axis=2, keepdims=True), jacobian, 0.0)
-        r = np.where(broken[:, None], 0.0, r)
-        jacobian = np.where(broken[None, :, None], 0.0, jacobian).astype(np.float64)
+        jacobian[~np.isfinite(jacobian).all(axis=2)] = 0.0
+        jacobian[:, broken], r[broken] = 0.0, 0.0
         yield Fit(
             explanation=one,
             sse=np.where(broken, _BREAKDOWN, np.einsum("em,em->e", r, r)),

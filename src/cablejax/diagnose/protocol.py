@@ -173,7 +173,8 @@ class Simulator(abc.ABC):
             here, moved = predicted[begin], predicted[begin + 1 : begin + 1 + len(one.z)]
             begin += 1 + len(one.z)
             with np.errstate(invalid="ignore"):
-                slopes = (moved - here) / one.differences.reshape(-1, *[1] * here.ndim)
+                slopes = moved - here
+                slopes /= one.differences.reshape(-1, *[1] * here.ndim)
             result.append((here, slopes))
         return result
 
