@@ -64,7 +64,7 @@ class OneGradientStep:
 
 
 def targets(letters: str) -> list[Target]:
-    return [make_target(letter, CABLE) for letter in letters]  # pyright: ignore[reportArgumentType]
+    return [make_target(letter, CABLE.cable) for letter in letters]  # pyright: ignore[reportArgumentType]
 
 
 def arguments(letters="USU", ratios=RATIOS):

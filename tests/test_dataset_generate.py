@@ -23,7 +23,7 @@ from cablejax.dataset.generate import (
     make_engine,
     simulate,
 )
-from cablejax.dataset.schema import DatasetConfig, Randomisation, config_from_json, config_to_json, digest_of_config
+from cablejax.dataset.schema import DatasetConfig, Randomisation, config_from_json, config_to_json
 from cablejax.dataset.store import open_store
 from cablejax.effects.given import EFFECTS, GivenEffect
 from cablejax.simulate import ThreadedEngine
@@ -183,17 +183,6 @@ def test_effects_travel_in_the_store(tmp_path):
     assert info.digest != plain.digest
     with pytest.raises(ValueError, match="effects is"):
         generate(dataclasses.replace(config, effects=effects[:1]), tmp_path / "data", progress=False)
-
-
-def test_a_store_without_effects_in_its_record_is_one_without_effects(tmp_path):
-    generate(dataclasses.replace(TINY, n_trajectories=2), tmp_path / "data", progress=False)
-    path = tmp_path / "data" / "zarr.json"
-    root = json.loads(path.read_text())
-    attributes = root["attributes"]
-    del attributes["config"]["effects"]
-    attributes["config_digest"] = digest_of_config(attributes["config"])
-    path.write_text(json.dumps(root))
-    assert generate(dataclasses.replace(TINY, n_trajectories=2), tmp_path / "data", progress=False).complete
 
 
 def test_effects_that_an_engine_cannot_simulate_are_refused():

@@ -252,7 +252,7 @@ def open_or_create(path: str | os.PathLike[str], config: DatasetConfig) -> Store
     if not path.is_dir() or not any(path.iterdir()):
         _create(path, config, versions)
     store = open_store(path, mode="r+")
-    changes = differences(config_to_json(store.config), config_to_json(config))
+    changes = differences(store.recorded, config_to_json(config))
     if changes:
         raise ValueError(
             f"{path} holds a data set of another configuration: {'; '.join(changes)}. "

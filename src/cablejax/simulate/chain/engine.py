@@ -16,6 +16,7 @@ from cablejax.effects.camera import seen_by_camera
 from cablejax.effects.physics import Physics, may_touch
 from cablejax.simulate.chain.replay import centreline_keypoints, follow
 from cablejax.simulate.chain.step import ChainState
+from cablejax.simulate.compile import full_precision
 from cablejax.simulate.engine import Engine, compiled_rollout, finely_sampled
 from cablejax.simulate.equilibrium import equilibrium_state
 from cablejax.simulate.pose import integrate_pose
@@ -60,6 +61,7 @@ class ChainEngine(Engine):
 
         return finely_sampled(run, self, physics, self._remembering(state), twist, interval)
 
+    @full_precision
     def unroll(
         self, physics: Physics, state: CableState, twist: Float[Array, "T Q 3"], interval: float = 1.0
     ) -> tuple[CableState, Trajectory]:

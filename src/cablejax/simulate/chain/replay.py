@@ -11,6 +11,7 @@ from jaxtyping import Array, Float
 from cablejax.cable import Discretisation
 from cablejax.effects.physics import Physics
 from cablejax.simulate.chain.step import ChainState, advance, chain_nodes, slipped
+from cablejax.simulate.compile import full_precision
 from cablejax.simulate.keypoints import marked_keypoints
 
 LARGEST_STEP = 0.05
@@ -33,6 +34,7 @@ class Chain:
     config: Discretisation
     with_contact: bool = True
 
+    @full_precision
     def rollout(
         self,
         physics: Physics,
