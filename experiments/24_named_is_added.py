@@ -23,6 +23,7 @@ import numpy as np
 from jaxtyping import Float
 
 from blind.motions import INTERVAL, Commands, draw_motion
+from blind.rod import arch
 from cablejax.cable import Discretisation
 from cablejax.diagnose import diagnose, write_verdict
 from cablejax.effects.given import GivenEffect, effects_of_verdict, parse_effect, with_effects
@@ -75,7 +76,8 @@ def motions() -> tuple[list[Commands], list[Commands]]:
 def recorded(commands: Commands, effects: tuple[GivenEffect, ...], noise: np.random.Generator | None) -> Episode:
     """One motion of the plant; keypoints with noise unless `noise` is None."""
     plant = Plant(PlantConfig(discretisation=PLANT, effects=effects))
-    seen = [plant.reset(commands.start)]
+    # several shapes fit some starts; every motion begins with a gentle arch
+    seen = [plant.reset(commands.start, guess=arch(commands.start, ENGINE.cable.length, 2 * PLANT.n_links))]
     seen += [plant.step(twist, INTERVAL) for twist in commands.twist[:-1]]
     keypoints = np.stack([s.keypoints for s in seen])
     if noise is not None:
@@ -94,7 +96,9 @@ def replayed(commands: Commands, effects: tuple[GivenEffect, ...]) -> Float[np.n
     """The same commands in the engine that makes training data, open loop from the settled start."""
     engine = ChainEngine(ENGINE)
     physics = with_effects(nominal_physics(ENGINE), effects, ENGINE)
-    state = engine.initial_state(commands.start)
+    between = ENGINE.cable.n_keypoints - 1
+    guess = arch(commands.start, ENGINE.cable.length, 10 * between)[::10]
+    state = engine.initial_state(commands.start, guess=guess)
     _, trajectory = engine.rollout(physics, state, commands.twist[:-1].astype(np.float32), INTERVAL)
     return np.asarray(trajectory.keypoints, float)
 
