@@ -54,7 +54,7 @@ EFFECTS = (
     "gravity_tilt:angle_rad=0.1,direction_rad=1",
     "linear_density:ratio=3",
     "lumped_mass:centre_m=0.4,mass_kg=0.06",
-    "gripper_slip:gripper=1,time_s=6,distance_m=-0.03",
+    "gripper_slip:gripper=1,time_s=6,distance_m=0.02",
     "gripper_rotation_offset:gripper=0,angle_rad=0.15",
     "gripper_compliance:gripper=1,stiffness_n_m_per_rad=0.15",
     "actuation_gain:gain=0.93",
