@@ -31,10 +31,6 @@ from matplotlib.figure import Figure
 from cablejax.cable import Cable, Discretisation
 from cablejax.control.targets import Shape
 from cablejax.effects.physics import nominal_physics
-from cablejax.evaluation.cases import mujoco_plant, stiffness_cases
-from cablejax.evaluation.methods import ADAPTED_RESIDUAL, METHODS
-from cablejax.evaluation.rows import Rows
-from cablejax.evaluation.suite import released, run_case
 from cablejax.perceive import Status, Tracker, TrackerConfig
 from cablejax.perceive.camera import CameraConfig
 from cablejax.perceive.plant import CloudPlant
@@ -42,7 +38,11 @@ from cablejax.perceive.synthetic import Clutter, scatter
 from cablejax.report.style import LIGHT
 from cablejax.simulate import ThreadedEngine
 from cablejax.simulate.motions import random_motion
+from closed_loop.cases import mujoco_plant, stiffness_cases
+from closed_loop.methods import ADAPTED_RESIDUAL, METHODS
+from closed_loop.suite import released, run_case
 from pages import markdown_table, page_of_results, publish
+from rows import Rows
 
 HZ = 10
 FINE = 20

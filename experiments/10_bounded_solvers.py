@@ -35,9 +35,9 @@ from cablejax.bounded import (
     least_squares,
     minimise,
 )
-from cablejax.evaluation.rows import Rows
 from cablejax.report.provenance import machine, versions
 from pages import markdown_table, page_of_results, publish
+from rows import Rows
 from standard_problems import BoundedProblem, all_problems
 
 TOLERANCE = 1e-10

@@ -24,11 +24,11 @@ from matplotlib.ticker import FixedLocator, NullFormatter
 
 from cablejax.control.loop import run_closed_loop
 from cablejax.control.shaping import load_model
-from cablejax.evaluation.cases import PLANT_CHAIN, mujoco_plant
-from cablejax.evaluation.protocols import LaidOut, letter_task
-from cablejax.evaluation.rows import Rows
 from cablejax.mpc import MPC, SOLVERS, LevenbergMarquardt, MPCConfig
+from closed_loop.cases import PLANT_CHAIN, mujoco_plant
+from closed_loop.protocols import LaidOut, letter_task
 from pages import markdown_table, page_of_results, publish
+from rows import Rows
 
 CONVERGED = "levenberg-marquardt, converged"
 PLANNERS = {**SOLVERS, CONVERGED: LevenbergMarquardt(max_iterations=12, trials_per_linearisation=1)}

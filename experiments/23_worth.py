@@ -28,13 +28,13 @@ from cablejax.dataset.generate import make_engine, simulate
 from cablejax.dataset.schema import DatasetConfig
 from cablejax.diagnose import diagnose, write_verdict
 from cablejax.effects.given import GivenEffect, effects_of_verdict
-from cablejax.evaluation.cases import mujoco_plant, stiffness_cases
-from cablejax.evaluation.fine_tuning import FineTuneConfig, fine_tune
-from cablejax.evaluation.methods import MethodSpec
-from cablejax.evaluation.suite import Case, read_suite, run_suite
 from cablejax.gaplog import gap_log_from_episodes, read_gap_log, write_gap_log
 from cablejax.simulate.motions import MotionConfig
 from cablejax.types import Trajectory
+from closed_loop.cases import mujoco_plant, stiffness_cases
+from closed_loop.fine_tuning import FineTuneConfig, fine_tune
+from closed_loop.methods import MethodSpec
+from closed_loop.suite import Case, read_suite, run_suite
 from pages import page_of_results, publish
 
 RATIO = 0.1

@@ -17,11 +17,11 @@ import sys
 
 import matplotlib
 
-from cablejax.evaluation.rows import Rows
 from cablejax.recordings.deform import read_deform
 from cablejax.report.provenance import machine, versions
 from pages import publish
 from real_cables.benchmark import score_cable
+from rows import Rows
 
 CABLES = ("DLO1", "DLO2", "DLO3")
 _NINETY = 1.645

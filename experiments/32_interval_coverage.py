@@ -25,10 +25,8 @@ from pathlib import Path
 os.environ.setdefault("NPROC", "4")
 
 import numpy as np
-from scipy.stats import norm
+from scipy.stats import binomtest, norm
 
-from cablejax.evaluation.rows import Rows
-from cablejax.evaluation.statistics import clopper_pearson
 from cablejax.recordings.deform import NOMINAL, SAMPLE_INTERVAL
 from cablejax.report.provenance import machine, versions
 from cablejax.spatial.estimate import UNMODELLED, Estimate, Interval, estimate, estimates_of_halves
@@ -39,6 +37,7 @@ from cablejax.spatial.windows import Windows
 from pages import markdown_table, publish
 from real_cables.benchmark import protocol_windows
 from real_cables.synthetic import RECORDINGS, SAMPLES, Law, SyntheticCable, synthetic_recordings
+from rows import Rows
 
 TOLD = {
     "bending_damping": "time_s",
@@ -212,7 +211,7 @@ def coverage(name: str, true: list[float], intervals: list[list[float]], *, logs
     values = np.column_stack([true, intervals])
     truth, value, low, high = (np.log(values) if logs else values).T
     held = int(((low <= truth) & (truth <= high)).sum())
-    bounds = clopper_pearson(held, len(true))
+    bounds = binomtest(held, len(true)).proportion_ci()
     error = value - truth
     told = (lambda x, sign="": f"{100 * x:{sign}.0f} %") if logs else (lambda x, sign="": f"{x:{sign}.2f}")
     return [

@@ -25,8 +25,8 @@ from against_ipopt.referee import RefereeConfig, referee, slope_of, value_of
 from against_ipopt.solver_path import PathFinder, SolverPath
 from cablejax.bounded import certify
 from cablejax.control.shaping import Model
-from cablejax.evaluation.rows import Rows
 from cablejax.mpc import Accurate, ShapingProblem
+from rows import Rows
 
 EQUAL = 1e-6
 """Relative difference of objectives that counts as none."""

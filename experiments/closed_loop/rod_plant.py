@@ -152,7 +152,7 @@ class RodPlant(TablePlant):
     def __init__(self, config: RodPlantConfig | None = None):
         super().__init__(RodPlantConfig() if config is None else config)
         _import_rod_class()
-        from cablejax.simulate import rod_loop
+        from closed_loop import rod_loop
 
         self._loop = rod_loop.advance
         self._rod = _straight_rod(self.config)
