@@ -90,6 +90,7 @@ class AbstractBoundedLeastSquares(optx.AbstractLeastSquaresSolver):
     trials_per_linearisation: AbstractVar[int]
 
     def init(self, fn, y, args, options, f_struct, aux_struct, tags):
+        """The state before the first step. Raises `ValueError` unless `fn` gives one flat array."""
         del tags
         if len(f_struct.shape) != 1:
             raise ValueError(f"{type(self).__name__} got residuals of shape {f_struct.shape}, expected a flat array.")
@@ -119,6 +120,7 @@ class AbstractBoundedLeastSquares(optx.AbstractLeastSquaresSolver):
         )
 
     def step(self, fn, y, args, options, state, tags):
+        """Linearises once, then makes `trials_per_linearisation` trial points."""
         del tags
         linearise = options.get("linearise", None) or forward(lambda y, args: fn(y, args)[0])
 
@@ -133,10 +135,12 @@ class AbstractBoundedLeastSquares(optx.AbstractLeastSquaresSolver):
         return y, state, state.trial.aux
 
     def terminate(self, fn, y, args, options, state, tags):
+        """Whether the last trial point met a stopping rule, and its result code."""
         del fn, y, args, options, tags
         return state.trial.terminate, state.trial.result
 
     def postprocess(self, fn, y, aux, args, options, state, tags, result):
+        """Adds the objective, the optimality and the counts of calls to the statistics."""
         del fn, args, options, tags, result
         stats = {
             "objective": state.trial.objective,

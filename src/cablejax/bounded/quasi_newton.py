@@ -59,11 +59,12 @@ class BoundedQuasiNewton(optx.AbstractMinimiser):
     search: optx.AbstractSearch
 
     def __init__(self, rtol: float = 0.0, atol: float = 1e-8, damping: float = 1e-3):
-        """**Arguments:**
+        """Makes the solver.
 
-        - `rtol`: relative tolerance on the projected gradient.
-        - `atol`: absolute tolerance on it.
-        - `damping`: at the start, relative to the diagonal of the model's Hessian.
+        Args:
+            rtol: relative tolerance on the projected gradient.
+            atol: absolute tolerance on it.
+            damping: at the start, relative to the diagonal of the model's Hessian.
         """
         self.rtol, self.atol, self.norm = rtol, atol, optx.max_norm
         self.descent = DampedQuadratic(damping, secant=False)
@@ -71,6 +72,7 @@ class BoundedQuasiNewton(optx.AbstractMinimiser):
         self.search = GainRatio(largest=10.0)
 
     def init(self, fn, y, args, options, f_struct, aux_struct, tags):
+        """The state before the first step; `options["hessian"]`, where given, is the first model."""
         del fn, tags
         dtype, model = f_struct.dtype, options.get("hessian")
         hessian = jnp.zeros((y.size, y.size), dtype) if model is None else model(y, args)
@@ -172,10 +174,12 @@ class BoundedQuasiNewton(optx.AbstractMinimiser):
         )
 
     def terminate(self, fn, y, args, options, state: _State, tags):
+        """Whether the last step met a stopping rule, and its result code."""
         del fn, y, args, options, tags
         return state.terminate, state.result
 
     def postprocess(self, fn, y, aux, args, options, state: _State, tags, result):
+        """Adds the objective, the optimality and the counts of calls to the statistics."""
         del fn, args, options, tags, result
         stats = {
             "objective": state.f_info.f,

@@ -23,7 +23,8 @@ class Diagnose(Command):
 
     Reads a gap log (`cablejax-gap-log/1`, as `cablejax shape` writes it) and writes report.html, verdict.json and the
     figures. A log of six episodes on a table takes about half a minute; a log in space takes minutes to an hour, by
-    its length, and goes on where it was if interrupted."""
+    its length, and goes on where it was if interrupted.
+    """
 
     log: Annotated[pathlib.Path, tyro.conf.Positional]
     """The recorded run, an .npz file."""
@@ -43,6 +44,7 @@ class Diagnose(Command):
     """Replace a report that is there."""
 
     def execute(self):
+        """Diagnoses a log, on a table or in space, and writes its verdict and page."""
         from cablejax.commands.parts import unfinished
         from cablejax.diagnose import verdict_json
         from cablejax.gaplog import read_gap_log

@@ -53,7 +53,8 @@ class Deform(_Import):
     """Import recordings of the DEFORM data set: three-dimensional motion capture of one cable.
 
     SOURCE is upstream's folder of one cable, with pickles in train/ and eval/, one such pickle, or an .npz. Pickles are
-    read without running anything that they say."""
+    read without running anything that they say.
+    """
 
     unit: Literal["m", "cm", "mm", "in"] | None = None
     """Unit of length. By default metres, or another one where the length of the cable leaves no doubt."""
@@ -65,6 +66,7 @@ class Deform(_Import):
     """left: the coordinates are of a left-handed frame."""
 
     def logs(self):
+        """One log of one cable of the data set, and its repairs."""
         from cablejax.recordings.deform import import_deform
         from cablejax.recordings.frames import Frame
 
@@ -77,6 +79,7 @@ class Wires(_Import):
     """Import photographs of hanging wires: one log for each wire, --out with the wire's name before .npz."""
 
     def logs(self):
+        """One log per wire; nothing is repaired."""
         from cablejax.recordings.wires import read_wires, wire_log
 
         return [
@@ -93,6 +96,7 @@ class Csv(_Import):
     """The TOML file; docs/recordings.md has an example."""
 
     def logs(self):
+        """One log of the table, and its repairs."""
         from cablejax.recordings.table import import_csv
 
         return [(self.out, *import_csv(self.source, self.layout))]
@@ -106,6 +110,7 @@ class Mcap(_Import):
     """The TOML file; docs/recordings.md has an example."""
 
     def logs(self):
+        """One log of the bag, and its repairs."""
         from cablejax.recordings.bags import import_mcap
 
         return [(self.out, *import_mcap(self.source, self.layout))]

@@ -20,7 +20,8 @@ class Shape(Command):
     """Shape one cable into a target of your own, on a simulated plant: the model's cable and effects of your choice.
 
     The target is a letter or a file: .npz or .json with "keypoints" [N, 2] in metres, or .csv with rows x,y. Writes
-    summary.json, log.npz, report.html and demo.gif."""
+    summary.json, log.npz, report.html and demo.gif.
+    """
 
     resume_hint: ClassVar[str] = "Run the same command again: finished runs are kept and not repeated."
 
@@ -65,6 +66,7 @@ class Shape(Command):
     """Links of the plant's cable."""
 
     def execute(self):
+        """Brings the cable to the targets, keeps each run as it ends, and reports."""
         from cablejax.commands.cable import find_cable
         from cablejax.commands.parts import unfinished
         from cablejax.commands.results import table_of

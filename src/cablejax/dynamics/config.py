@@ -113,8 +113,11 @@ class ModelConfig:
 
     @property
     def node_features(self) -> int:
-        """Position, past displacements, arc length, control input and grasp, prior displacement, distance from rest,
-        and what is known of the cable."""
+        """Number of features of a node.
+
+        Position, past displacements, arc length, control input and grasp, prior displacement, distance from rest, and
+        the cable's descriptor where the network is conditioned on it.
+        """
         return 2 + 2 * (self.history - 1) + 2 + 7 + 2 + 2 + (2 if self.conditioned else 0)
 
     @property

@@ -229,6 +229,7 @@ class Validation:
         self.errors = make_errors(lambda weights: bind(graphdef, weights), config.model.interval)
 
     def __call__(self, weights: nnx.State) -> dict[int, float]:
+        """Median error over the validation windows by horizon [cm]."""
         error = np.asarray(self.errors((weights,), self.windows), np.float64)
         return {h: float(100 * np.median(error[:, h - 1])) for h in self.horizons}
 

@@ -36,6 +36,7 @@ _RULES = {
 
 
 def which_section(diagnosis: CableDiagnosis, ranking: str) -> str:
+    """HTML: the named effects with their parameters, and the look-alikes; `ranking` is the figure."""
     parts = []
     if diagnosis.verdict == "none":
         parts.append("<p>There is no gap to explain, so no effect is named.</p>")
@@ -106,6 +107,7 @@ def _left(diagnosis: CableDiagnosis) -> float:
 
 
 def far_section(diagnosis: CableDiagnosis, picture: str) -> str:
+    """HTML: how far the gap shrinks with the named effects; `picture` is the figure."""
     gap = diagnosis.gap
     added = listed([effect_title(e.name) for e in diagnosis.effects]) or "the best explanation"
     if diagnosis.verdict == "none":
@@ -144,6 +146,7 @@ def far_section(diagnosis: CableDiagnosis, picture: str) -> str:
 
 
 def next_section(diagnosis: CableDiagnosis, picture: str) -> str:
+    """HTML: the motion to record next and what it would separate; `picture` is the figure."""
     following = diagnosis.next_motion
     if following is None:
         if in_space(diagnosis):
@@ -175,6 +178,7 @@ def _explanation(names: str) -> str:
 
 
 def limits_section(diagnosis: CableDiagnosis) -> str:
+    """HTML: the caveats, or nothing where there are none."""
     if not diagnosis.caveats:
         return ""
     rows = "".join(f"<li>{html.escape(caveat)}</li>" for caveat in diagnosis.caveats)
@@ -182,6 +186,7 @@ def limits_section(diagnosis: CableDiagnosis) -> str:
 
 
 def details_section(diagnosis: CableDiagnosis) -> str:
+    """HTML: every effect tried, and the gap in numbers."""
     where = diagnosis.where
     alone = all(r.probability is not None for r in diagnosis.ranking)
     tried = _table(

@@ -52,22 +52,28 @@ class ObservedConfig(Protocol):
     """What the configuration of a plant says of its cable and of how that is seen; see `PlantConfig`."""
 
     @property
-    def cable(self) -> Cable: ...
+    def cable(self) -> Cable:
+        """The plant's cable."""
 
     @property
-    def discretisation(self) -> Discretisation: ...
+    def discretisation(self) -> Discretisation:
+        """Its links and time step."""
 
     @property
-    def physics(self) -> Physics: ...
+    def physics(self) -> Physics:
+        """Its physics with all effects."""
 
     @property
-    def keypoint_noise(self) -> float: ...
+    def keypoint_noise(self) -> float:
+        """Standard deviation of the observed keypoints [m]."""
 
     @property
-    def keypoint_dropout(self) -> float: ...
+    def keypoint_dropout(self) -> float:
+        """Probability that a keypoint is not observed in a sample."""
 
     @property
-    def seed(self) -> int: ...
+    def seed(self) -> int:
+        """Seed of noise and dropout."""
 
 
 class TablePlant(abc.ABC):
