@@ -1,4 +1,4 @@
-"""How far a model is trusted, by how well it has predicted."""
+"""Step sizes from the gain ratio: actual over predicted reduction."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the bounded least squares solvers share: one linearisation, one model, one trial point after the other."""
+"""Base of the bounded least squares solvers: one linearisation, one model, one trial point after the other."""
 
 import dataclasses
 from collections.abc import Callable
@@ -67,7 +67,7 @@ class AbstractBoundedLeastSquares(optx.AbstractLeastSquaresSolver):
     One step linearises at y (unless its only trial was rejected: then the linearisation there still holds), proposes a
     trial point and evaluates the residuals there; `optimistix.AbstractGaussNewton` would linearise at every trial
     point, used or not. It ends where `|P(y - g) - y|_inf <= atol + rtol |y|_inf`, or where the model promises less than
-    rounding can tell (`RESULTS.stagnation`, if the former does not hold).
+    rounding resolves (`RESULTS.stagnation`, if the former does not hold).
 
     The descent is given `FunctionInfo.EvalGradHessian` of the flattened point with the Hessian `J'J + S`. Without
     `secant`, S = 0 (Gauss and Newton). With it, S is what the residuals' own curvature contributes, learned from the
@@ -177,7 +177,7 @@ class AbstractBoundedLeastSquares(optx.AbstractLeastSquaresSolver):
         promised = promised_decrease(info, move)
         rounding = 4 * jnp.finfo(y.dtype).eps * jnp.abs(info.f)
         rounded = promised <= rounding
-        # Gradients are known better than values: two more steps are taken on trust where values cannot tell.
+        # Gradients are known better than values: two more steps are taken on trust where rounding hides their decrease.
         accept = (accept | (exact & rounded & (value <= info.f + rounding))) & jnp.isfinite(value) & ~ended
         stalled = exact & rounded & before.rounded & ~ended
         result = optx.RESULTS.where(stalled, optx.RESULTS.stagnation, before.result)  # pyright: ignore[reportArgumentType]

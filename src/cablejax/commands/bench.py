@@ -1,4 +1,4 @@
-"""`cablejax bench simulate | mpc | loop | perception`: how fast simulators, controller and tracker run here."""
+"""`cablejax bench simulate | mpc | loop | perception`: times simulators, controller and tracker on this machine."""
 
 from __future__ import annotations
 

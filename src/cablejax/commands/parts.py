@@ -117,7 +117,7 @@ def unfinished(out: pathlib.Path, settings: Mapping[str, Any], *, overwrite: boo
 
     Args:
         out: the folder.
-        settings: what tells this command from another, as for JSON.
+        settings: identify this command, as for JSON.
         overwrite: whether results that are there may be replaced.
 
     Raises:

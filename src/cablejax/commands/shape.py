@@ -55,8 +55,8 @@ class Shape(Command):
     times. By default bending_stiffness:ratio=2; `none` for no effect."""
 
     perception: Literal["true", "cloud"] = "true"
-    """true: the controller is told the keypoints. cloud: it gets what is found in the clouds of a depth camera; the
-    errors printed remain those of the true keypoints."""
+    """true: the controller observes the simulated keypoints. cloud: it observes keypoints estimated from the clouds of a
+    depth camera; the printed errors are still those of the true keypoints."""
 
     noise_mm: float | None = None
     """Noise: standard deviation of the observed keypoints, per coordinate, or of the camera's range [mm]. By default 0

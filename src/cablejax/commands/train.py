@@ -49,7 +49,7 @@ class Train(Command):
     """Axes that the network sees the cable in: the grippers' own, which turn with it, or the world's."""
 
     conditioned: bool = False
-    """Tell the network each cable's stiffness and friction; the data should vary in them."""
+    """Give the network each cable's stiffness and friction as inputs; the data should vary in them."""
 
     start_from: str | None = None
     """Weights to start from instead of random ones: a released model by name, or a training's folder."""

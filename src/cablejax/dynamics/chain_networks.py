@@ -1,4 +1,4 @@
-"""The two networks that the graph network is compared with: neither knows more of a cable than the order of its nodes.
+"""A perceptron and a bidirectional LSTM, the two networks that the graph network is compared with.
 
 Both see the same node features (`cablejax.dynamics.graph`), correct the same prior, and are trained alike. Edge
 features are not for them: what they hold follows from the nodes' positions.

@@ -1,4 +1,4 @@
-"""What training minimises: keypoint errors after one or several steps of the model's own rollout."""
+"""The training loss: keypoint errors after one or several steps of the model's own rollout."""
 
 from __future__ import annotations
 

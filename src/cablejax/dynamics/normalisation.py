@@ -1,4 +1,4 @@
-"""Scales of features and output, measured on training data, and the check that the data can be measured at all."""
+"""Scales of features and outputs, measured on training data, and the validation of these data."""
 
 from __future__ import annotations
 

@@ -101,7 +101,7 @@ class IntrinsicCurvature(_Section):
 
 
 class Plasticity(CableEffect):
-    """Bends beyond a yield curvature stay; what a bend beyond it costs more, the hardening, is fitted beside it."""
+    """Bends beyond a yield curvature are permanent; the hardening beyond it is fitted as well."""
 
     name = "plasticity"
     hook = "memory"

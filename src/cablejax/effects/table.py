@@ -184,7 +184,7 @@ class Obstacle(CableEffect):
 
 
 def _pushed(context: Context, radius: float = 0.03, count: int = 10) -> list[tuple[float, float]]:
-    """Where a disc may stand: beside the observed cable, on the side from which it is pushed, never inside it.
+    """Candidate places of a disc: next to the observed cable, on the side from which it is pushed, never inside it.
 
     The candidates are points a radius away from observed keypoints that deviate, against the deviation. An observed
     cable never passes through the obstacle, so candidates that it comes closer to than half a radius are dropped.

@@ -106,7 +106,7 @@ def shrinkage_figure(diagnosis: CableDiagnosis) -> Figure:
 
 
 def motion_figure(diagnosis: CableDiagnosis) -> Figure | None:
-    """The motion to record next, and how well each motion of the library tells the explanations apart."""
+    """The motion to record next, and how well each motion of the library separates the explanations."""
     following = diagnosis.next_motion
     if following is None:
         return None

@@ -1,4 +1,4 @@
-"""What the figures of a diagnosis share."""
+"""Common labels of the figures of a diagnosis."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Effects, parameters, places, motions and quantities in the words of a lab."""
+"""Names of effects, parameters, places, motions and quantities in plain words."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What several sets have in common."""
+"""The intersection of several sets."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class Intersection(ConvexSet):
         return jnp.stack([member.violation(y) for member in self.members]).max()
 
     def empty(self) -> Bool[Array, ""]:
-        """Whether a member is empty; members that contradict each other are told by `violation(project(y)) > 0`."""
+        """Whether a member is empty; members that contradict each other show as `violation(project(y)) > 0`."""
         return jnp.stack([member.empty() for member in self.members]).any()
 
 
