@@ -165,7 +165,7 @@ def _interior_point(quadrics: Quadrics, hessian, linear, centre):
     linear = linear / unit
 
     start = scaled.of_lift(scaled.offset)
-    # Newton's step to each bound tells how far outside; the value itself grows with the square of the distance.
+    # Newton's step to each bound is the distance outside; the value itself grows with the square of the distance.
     steepness = jnp.linalg.norm(scaled.jacobian(scaled.offset), axis=1) + jnp.finfo(dtype).tiny
     outside = jnp.max(jnp.where(present, jnp.maximum(start, 0.0) / steepness, 0.0))
     force = jnp.linalg.norm(linear) + outside + jnp.finfo(dtype).tiny

@@ -33,6 +33,7 @@ class CableFile(Command):
     """Replace a file that is there."""
 
     def execute(self):
+        """Writes a cable file, or prints it where no --out is given."""
         from cablejax.cable import Cable
         from cablejax.cable_file import cable_text, cable_to_fields, write_cable
 

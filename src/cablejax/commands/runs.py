@@ -1,4 +1,4 @@
-"""What `demo` and `shape` share: runs on the plant, kept as they finish, and their report."""
+"""Common part of `demo` and `shape`: runs on the plant, stored as they finish, and their report."""
 
 from __future__ import annotations
 

@@ -22,9 +22,11 @@ RESTING_CM = 0.01
 class ObservedCable(Protocol):
     """What is shaped: the plant, or a robot behind the same two calls; see `Plant` for their meaning."""
 
-    def reset(self, gripper_pose: Float[np.ndarray, "Q 3"]) -> Observation: ...
+    def reset(self, gripper_pose: Float[np.ndarray, "Q 3"]) -> Observation:
+        """Lays the cable at rest between these poses and observes it."""
 
-    def record(self, twist: Float[np.ndarray, "Q 3"], interval: float, *, samples: int) -> list[Observation]: ...
+    def record(self, twist: Float[np.ndarray, "Q 3"], interval: float, *, samples: int) -> list[Observation]:
+        """Executes a twist for `interval` seconds and observes `samples` times, evenly spaced, the last at its end."""
 
 
 class Controller(Protocol):

@@ -71,6 +71,7 @@ class NetworkDynamics:
     graphdef: nnx.GraphDef
 
     def __call__(self, weights: nnx.State, history: History, twist: Float[Array, "2 3"]) -> Float[Array, "N 2"]:
+        """Displacement of every keypoint [m] under a twist held for one interval."""
         return apply((self.graphdef, weights), history, twist)
 
     def jacobian(self, weights: nnx.State, history: History, twist: Float[Array, "2 3"]) -> StepJacobian:

@@ -96,7 +96,7 @@ def generate(
     """Makes this process' share of a data set, going on where an earlier run stopped.
 
     Process p of P makes the shards p, p + P, p + 2 P, ... and may be started by hand, by a batch system, or under
-    `jax.distributed.initialize`, which then tells p and P. The store is the same for any P.
+    `jax.distributed.initialize`, which then provides p and P. The store is the same for any P.
 
     Args:
         config: what to make.

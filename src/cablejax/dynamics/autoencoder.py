@@ -85,6 +85,7 @@ class AutoEncoders(nnx.Module):
     def __call__(
         self, nodes: Float[Array, "rows node_features"], edges: Float[Array, "rows_e edge_features"]
     ) -> tuple[Float[Array, "rows node_features"], Float[Array, "rows_e edge_features"]]:
+        """Reconstructs node and edge features from their latent vectors."""
         return self.psi_v(self.phi_v(nodes)), self.psi_e(self.phi_e(edges))
 
 

@@ -1,4 +1,4 @@
-"""What is fixed about a learned model: the graph it sees, the sizes of its networks, the scales of its numbers."""
+"""Configuration of a learned model: its graph, the sizes of its networks, and the scales of its features."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ class ModelConfig:
         length: free length of the cable [m].
         radius: connective radius [m], measured along the cable at rest.
         history: samples seen H = m + 1.
-        conditioned: whether the network is told what is known of the cable, `History.cable`.
+        conditioned: whether the cable's descriptor, `History.cable`, is an input of the network.
         interval: duration of one step [s].
         latent: size of latent node and edge vectors; of the recurrent state.
         hidden: width of the hidden layers of every network.
@@ -113,8 +113,11 @@ class ModelConfig:
 
     @property
     def node_features(self) -> int:
-        """Position, past displacements, arc length, control input and grasp, prior displacement, distance from rest,
-        and what is known of the cable."""
+        """Number of features of a node.
+
+        Position, past displacements, arc length, control input and grasp, prior displacement, distance from rest, and
+        the cable's descriptor where the network is conditioned on it.
+        """
         return 2 + 2 * (self.history - 1) + 2 + 7 + 2 + 2 + (2 if self.conditioned else 0)
 
     @property

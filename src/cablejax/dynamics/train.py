@@ -135,7 +135,7 @@ def train(
     scores: dict[int, float] = {}
     with Checkpoints(out_dir / CHECKPOINTS) as checkpoints, interrupt_flag() as interrupted:
         if checkpoints.latest() is not None:
-            state = checkpoints.restore(state, tell=functools.partial(tqdm.write, file=sys.stderr))
+            state = checkpoints.restore(state, report=functools.partial(tqdm.write, file=sys.stderr))
         step, total = int(state.step), config.total_steps
         bar = tqdm(total=total, initial=step, unit="step", disable=not progress, dynamic_ncols=True)
         with MetricsLog(out_dir, columns, step) as log, bar:
@@ -229,6 +229,7 @@ class Validation:
         self.errors = make_errors(lambda weights: bind(graphdef, weights), config.model.interval)
 
     def __call__(self, weights: nnx.State) -> dict[int, float]:
+        """Median error over the validation windows by horizon [cm]."""
         error = np.asarray(self.errors((weights,), self.windows), np.float64)
         return {h: float(100 * np.median(error[:, h - 1])) for h in self.horizons}
 

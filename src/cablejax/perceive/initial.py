@@ -1,4 +1,4 @@
-"""The first frame: where the cable is if nothing is known but one cloud and the grippers that hold its ends.
+"""Initialisation: finds the cable in one cloud, given only the poses of the grippers at its ends.
 
 Two kinds of guesses compete. Paths along the cloud: the shortest way from gripper to gripper over a graph of occupied
 cells, where a jump costs more than the same distance in small steps. And bent curves that need no cloud: arches,

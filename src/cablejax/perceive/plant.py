@@ -20,7 +20,7 @@ class CloudPlant(Plant):
     """A plant whose keypoints are what a tracker makes of a depth camera's clouds.
 
     `reset` and `record` are those of `Plant`; every observation is one frame of the camera. Where a frame is held, its
-    inner keypoints are NaN: a controller then goes by its own prediction. The true keypoints travel beside them.
+    inner keypoints are NaN: a controller then uses its own prediction. The true keypoints are returned as well.
 
     Attributes:
         camera: the camera.

@@ -139,7 +139,7 @@ def register(
     """Fits the cable to a cloud, starting from a known curve.
 
     Each iteration is one step of expectation maximisation. The M-step is a Gauss-Newton step on the joint angles under
-    the constraint that the curve ends in gripper 1. The standard deviation is estimated anew in each iteration; it may
+    the constraint that the curve ends in gripper 1. The standard deviation is estimated again in each iteration; it may
     fall to half at once but not grow, so a large start value anneals.
 
     Differentiable in `points`, `gripper_pose`, `angles`, `angles_pose` and `sigma`, in both modes, through all

@@ -1,4 +1,4 @@
-"""Following the cable from cloud to cloud: warm start, loss noticed, held while nothing fits, found again."""
+"""Tracks the cable from cloud to cloud: warm start, detection of a loss, and reacquisition."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The one interface of the simulators, and what is the same in all of them."""
+"""The common interface of the simulators, and code that all of them share."""
 
 from __future__ import annotations
 
