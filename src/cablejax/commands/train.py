@@ -75,7 +75,7 @@ class Train(Command):
     """Message-passing steps; by default those of the preset."""
 
     def execute(self):
-        from cablejax.dataset.store import open_store
+        from cablejax.dataset.opening import open_store
         from cablejax.dataset.windows import concatenate, read_split
         from cablejax.dynamics.autoencoder import PretrainConfig, pretrain
         from cablejax.dynamics.error_report import error_report
