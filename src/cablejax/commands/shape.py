@@ -55,7 +55,7 @@ class Shape(Command):
     times. By default bending_stiffness:ratio=2; `none` for no effect."""
 
     perception: Literal["true", "cloud"] = "true"
-    """true: the controller observes the simulated keypoints. cloud: it observes keypoints estimated from the clouds of a
+    """true: the controller observes the simulated keypoints. cloud: it observes keypoints estimated from clouds of a
     depth camera; the printed errors are still those of the true keypoints."""
 
     noise_mm: float | None = None
