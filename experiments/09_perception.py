@@ -327,8 +327,8 @@ def main() -> None:
         f"{seeds} cables move at random for {seconds} s each (seeds {FIRST_SEED} to {FIRST_SEED + seeds - 1}), seen at "
         f"{HZ} Hz as {Clutter().points} points with 2 mm of noise in every coordinate unless stated. The hidden "
         "stretch wanders along the cable. Errors are mean distances of the 13 keypoints to the true ones, over tracked "
-        f"frames; a cable is lost if it is off by more than {LOST_MM:.0f} mm in a frame reported as tracked, or if it is "
-        "not found in the last half second.",
+        f"frames; a cable is lost if it is off by more than {LOST_MM:.0f} mm in a frame reported as tracked, or if it "
+        "is not found in the last half second.",
         "",
         *markdown_table(accuracy_rows(ours, drifts)),
         "",
