@@ -45,7 +45,7 @@ class Diagnose(Command):
 
     def execute(self):
         """Diagnoses a log, on a table or in space, and writes its verdict and page."""
-        from cablejax.commands.parts import unfinished
+        from cablejax.commands.resuming import unfinished
         from cablejax.diagnose import verdict_json
         from cablejax.gaplog import read_gap_log
 

@@ -68,8 +68,8 @@ class Shape(Command):
     def execute(self):
         """Brings the cable to the targets, keeps each run as it ends, and reports."""
         from cablejax.commands.cable import find_cable
-        from cablejax.commands.parts import unfinished
         from cablejax.commands.results import table_of
+        from cablejax.commands.resuming import unfinished
         from cablejax.commands.runs import Job, plant_of, shape_and_report
         from cablejax.control.shaping import METHODS, load_model
         from cablejax.control.targets import load_target, make_target

@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float, Int
 from cablejax.perceive.cloud import PaddedCloud, padded
 from cablejax.perceive.initial import first_fit
 from cablejax.perceive.path import cloud_path, path_length
-from cablejax.perceive.registration import Fit, RegistrationConfig, register
+from cablejax.perceive.registration import CurveFit, RegistrationConfig, register
 
 ROTATION_WEIGHT = 0.15
 """Metres that one radian of a gripper's motion counts for."""
@@ -86,7 +86,7 @@ class TrackState(NamedTuple):
         gripper_pose: of the same frame, turns counted, shape [Q, 3].
         sigma: standard deviation of the points across the cable [m], shape [].
         travel: way of the grippers since the cable was last found [m], shape [].
-        held: frames since the cable was last found, shape [].
+        lost: frames since the cable was last found, shape [].
         misfits: frames on end whose cloud did not fit, shape [].
         found: whether it ever was, shape [].
     """
@@ -95,7 +95,7 @@ class TrackState(NamedTuple):
     gripper_pose: Float[Array, "*b Q 3"]
     sigma: Float[Array, "*b"]
     travel: Float[Array, "*b"]
-    held: Int[Array, "*b"]
+    lost: Int[Array, "*b"]
     misfits: Int[Array, "*b"]
     found: Bool[Array, "*b"]
 
@@ -104,10 +104,10 @@ class Track(NamedTuple):
     """What is known after a frame.
 
     Attributes:
-        keypoints: positions [m], shape [N, 2]; while held, those last found, carried along with the grippers; NaN if
+        keypoints: positions [m], shape [N, 2]; while lost, those last found, carried along with the grippers; NaN if
             the cable never was found.
         status: see `Status`, shape [].
-        held: frames since the cable was last found, shape [].
+        lost: frames since the cable was last found, shape [].
         sigma: standard deviation of the points across the cable [m], shape [].
         support: part of this cloud within reach of the fit, shape [].
         seen: part of the cable that has points, shape [].
@@ -115,7 +115,7 @@ class Track(NamedTuple):
 
     keypoints: Float[Array, "*b N 2"]
     status: Int[Array, "*b"]
-    held: Int[Array, "*b"]
+    lost: Int[Array, "*b"]
     sigma: Float[Array, "*b"]
     support: Float[Array, "*b"]
     seen: Float[Array, "*b"]
@@ -149,7 +149,7 @@ def track(
     )
     search = jnp.minimum(jnp.sqrt((WIDENING * state.sigma) ** 2 + travel**2), config.max_search)
 
-    def fit(mask) -> Fit:
+    def fit(mask) -> CurveFit:
         return register(
             settings,
             points,
@@ -168,22 +168,22 @@ def track(
     good = status == Status.TRACKED
     # Where the cloud is not to be trusted the registration without points carries the cable along.
     best = jax.lax.cond(good, lambda: seen, lambda: fit(jnp.zeros_like(mask)))
-    held = jnp.where(good, 0, state.held + 1)
+    lost = jnp.where(good, 0, state.lost + 1)
     after = TrackState(
         angles=best.angles,
         gripper_pose=pose,
         sigma=jnp.where(good, best.sigma, state.sigma),
         travel=jnp.where(good, 0.0, travel),
-        held=held,
+        lost=lost,
         misfits=jnp.where(status == Status.NO_FIT, state.misfits + 1, 0),
         found=state.found,
     )
     keypoints = jnp.where(state.found, best.keypoints, jnp.nan)
-    return after, Track(keypoints, status, held, seen.sigma, seen.support, seen.seen)
+    return after, Track(keypoints, status, lost, seen.sigma, seen.support, seen.seen)
 
 
 @functools.partial(jax.jit, static_argnames="config")
-def judge(config: TrackerConfig, fit: Fit, count: Int[Array, ""]) -> Int[Array, ""]:
+def judge(config: TrackerConfig, fit: CurveFit, count: Int[Array, ""]) -> Int[Array, ""]:
     """Whether a fit to a cloud of `count` points is that cloud's cable; see `Status`."""
     fits = (
         (fit.support >= config.min_support)
@@ -201,8 +201,8 @@ def judge(config: TrackerConfig, fit: Fit, count: Int[Array, ""]) -> Int[Array, 
 class Tracker:
     """The tracker for clouds as they come: any number of points, NaN among them, or none.
 
-    `init` and `step` are pure functions of their arguments. They raise only on what can never be a cloud; whatever a
-    camera may send is held and reported in `Track.status`, and in words by `explain`.
+    `init` and `step` are pure functions of their arguments. They raise only on input that can never be a cloud. A
+    frame without a cable is counted as lost and reported in `Track.status`, and in words by `explain`.
 
     Attributes:
         config: see `TrackerConfig`.
@@ -231,7 +231,7 @@ class Tracker:
             gripper_pose=jnp.asarray(pose, float),
             sigma=jnp.asarray(settings.min_sigma, float),
             travel=jnp.zeros((), float),
-            held=jnp.ones((), jnp.int32),
+            lost=jnp.ones((), jnp.int32),
             misfits=jnp.zeros((), jnp.int32),
             found=jnp.asarray(False),
         )
@@ -252,7 +252,7 @@ class Tracker:
     def explain(
         self, track: Track, points: Float[np.ndarray, "n D"], gripper_pose: Float[np.ndarray, "Q 3"]
     ) -> str | None:
-        """Why a frame was held, in a sentence with numbers; None if it was not."""
+        """Why a frame was lost, in a sentence with numbers; None if it was not."""
         status, config = Status(int(track.status)), self.config
         if status is Status.TRACKED:
             return None
@@ -282,13 +282,13 @@ class Tracker:
             fit = first_fit(config.registration, cloud.points, cloud.mask, pose, reach=config.reach)
             status = judge(config, fit, jnp.asarray(count))
             if int(status) == Status.TRACKED:
-                zero = jnp.zeros_like(state.held)
+                zero = jnp.zeros_like(state.lost)
                 found = TrackState(
                     angles=fit.angles,
                     gripper_pose=fit.gripper_pose,
                     sigma=fit.sigma,
                     travel=jnp.zeros_like(state.travel),
-                    held=zero,
+                    lost=zero,
                     misfits=zero,
                     found=jnp.asarray(True),
                 )
@@ -300,7 +300,7 @@ class Tracker:
         if otherwise is not None:
             return state, otherwise
         nowhere = jnp.full((config.registration.n_keypoints, 2), jnp.nan)
-        return state, Track(nowhere, status, state.held, sigma, support, seen)
+        return state, Track(nowhere, status, state.lost, sigma, support, seen)
 
 
 def _checked_pose(value: Float[np.ndarray, "Q 3"]) -> np.ndarray:
