@@ -33,7 +33,7 @@ TOGETHER = 8
 
 
 def simulated(config: DatasetConfig, rows: range) -> Trajectory:
-    """Some trajectories of a data set, made anew."""
+    """Some trajectories of a data set, generated again."""
     # The shard size does not change a trajectory: one each, so that any row can be made alone.
     config = dataclasses.replace(config, engine="threaded", shard_size=1)
     engine, parts = make_engine(config), []

@@ -26,8 +26,8 @@ if __name__ == "__main__":
             about=(
                 "The plants are Cosserat rods of PyElastica on a table with Stribeck friction "
                 "(`experiments/closed_loop/rod_plant.py`): no code, no friction law and no discretisation in common "
-                "with the training simulator. Table IV is the one that stands for the paper's Ethernet cable, table V "
-                "for its USB cable. The paper's own figures, of real cables, are printed beside ours for scale."
+                "with the training simulator. Table IV corresponds to the paper's Ethernet cable, table V to its USB "
+                "cable. The paper's own figures, of real cables, are printed next to ours for scale."
             ),
             small=Extent(
                 functools.partial(real_cable_cases, ("U", "S"), tables=("IV",)),

@@ -3,7 +3,7 @@
 A plant whose cable is a tenth as stiff as believed, on a table with contact. From six logged runs by direct transfer
 the diagnosis names a cause; the released network is then fine-tuned on 2,000 transitions simulated with it, never on
 the plant's own, and the same shaping tasks are run again: direct transfer, online residual, diagnosed, diagnosed with
-residual, and an oracle that was told the truth, with and without residual.
+residual, and an oracle that is given the true effect, with and without residual.
 
     python experiments/23_worth.py --report docs/results/worth.md     # resumable, about half an hour on two cores
 """
@@ -121,7 +121,7 @@ def page(out: pathlib.Path, verdict: dict) -> str:
     )
     lines = [
         f"The plant's cable has {RATIO:g} times the believed stiffness. Verdict on six logged runs by direct transfer "
-        f"(seeds {LOG_SEEDS}, 1 mm noise): **{verdict['verdict']}**, {effects or 'nothing'}; cannot be told apart: "
+        f"(seeds {LOG_SEEDS}, 1 mm noise): **{verdict['verdict']}**, {effects or 'nothing'}; indistinguishable: "
         f"{verdict['equivalent']}. The network was fine-tuned on 2,000 transitions of the simulator with that effect "
         "(oracle: with the true one). Terminal error [cm], mean and standard deviation over seeds "
         f"{TASK_SEEDS}, which the diagnosis has not seen.",

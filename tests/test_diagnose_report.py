@@ -138,7 +138,7 @@ CASES = {
         "Cause narrowed down",
         [
             "<p>intrinsic curvature or gripper rotation offset</p>",
-            "<b>intrinsic curvature</b> and <b>gripper rotation offset</b> apart",
+            "<b>intrinsic curvature</b> and <b>gripper rotation offset</b> are indistinguishable",
             "<b>obstacle</b> would leave as little of the gap, at a probability below 1 %",
         ],
     ),

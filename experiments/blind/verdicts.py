@@ -1,4 +1,4 @@
-"""What a diagnosis said of a case, beside what is true of it.
+"""Compares the diagnosis of a case with its label.
 
 Only the verdict's JSON (`cablejax-verdict/1`) is read, so that anything that writes it can be scored. A case without a
 verdict stays in every count as a failure.

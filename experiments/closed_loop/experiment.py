@@ -27,9 +27,9 @@ WORST = 10
 """Runs shown as pictures: the ones that ended farthest off."""
 
 SETTLING_NOTE = (
-    "The settling time of a step response is that from which on the error stays within 5 or 2 % of the way that it "
-    "went; the strict one, in all other tables here, is within a tenth of the terminal error, or 1 mm. The paper does "
-    "not say which is its own."
+    "The settling time of a step response is the time after which the error stays within 5 or 2 % of its total change; "
+    "the strict one, in all other tables here, is within a tenth of the terminal error, or 1 mm. The paper does not "
+    "define its settling time."
 )
 
 

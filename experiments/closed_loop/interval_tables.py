@@ -115,7 +115,7 @@ def success_table(
     methods: Sequence[str] | None = None,
     labels: Mapping[str, str] = METHOD_LABEL,
 ) -> str:
-    """How often a random target was reached from a random start, beside what Liang et al. published.
+    """How often a random target was reached from a random start, compared with Liang et al.
 
     A success is an error below 10 mm at the end of the run. That is stricter than below 10 mm at some time within the
     run, which has a column of its own.

@@ -2,7 +2,7 @@
 
 A failure is a value that is not finite: an error that is NaN because the cable was lost, a settling time that is
 infinite because the run never settled. Failures stay in every count. A mean and a standard deviation are those of the
-finite values, with the number of failures beside them; median and worst rank a failure behind every finite value.
+finite values, with the number of failures; median and worst rank a failure behind every finite value.
 """
 
 from __future__ import annotations
@@ -113,7 +113,7 @@ def bootstrap_interval(values: Values, *, confidence: float = 0.95, seed: int = 
     """
     x = _row(values)
     if not np.isfinite(x).all():
-        raise ValueError(f"{np.sum(~np.isfinite(x))} of {len(x)} values are not finite: count failures beside them.")
+        raise ValueError(f"{np.sum(~np.isfinite(x))} of {len(x)} values are not finite: count failures separately.")
     if not 0 < confidence < 1:
         raise ValueError(f"confidence is {confidence}, expected within (0, 1).")
     if len(x) < 2:

@@ -1,4 +1,4 @@
-"""Trials as Markdown tables in the layout of Wang et al., RA-L 2022, the paper's own figures beside ours.
+"""Trials as Markdown tables in the layout of Wang et al., RA-L 2022, next to the paper's own figures.
 
 No table drops a trial: a cell that holds failures says so after its mean, and every table's first column says over how
 many trials each method was run.

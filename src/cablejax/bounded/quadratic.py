@@ -100,11 +100,11 @@ def _solve_jvp(primals, tangents):
     size = step.size
     z = quadrics.lift(centre + step)
     active = multipliers > -quadrics.of_lift(z) * jnp.abs(multipliers).max() / _typical_length(quadrics, step)
-    held = jnp.where(active, multipliers, 0.0)
+    binding = jnp.where(active, multipliers, 0.0)
 
     def conditions(quadrics, hessian, linear, centre):
         z = quadrics.lift(centre + step)
-        pull = hessian @ step + linear + held @ quadrics.jacobian(z)
+        pull = hessian @ step + linear + binding @ quadrics.jacobian(z)
         return jnp.concatenate([pull, jnp.where(active, quadrics.of_lift(z), 0.0)])
 
     change = derivative_along(conditions, primals, tangents)
@@ -112,7 +112,7 @@ def _solve_jvp(primals, tangents):
     # a little below zero where active, so that normals which depend on each other do no harm
     shift = 8 * jnp.finfo(step.dtype).eps / (1.0 + jnp.abs(hessian).max())
     matrix = jnp.block(
-        [[hessian + quadrics.bend(held), normals.T], [normals, jnp.diag(jnp.where(active, -shift, 1.0))]]
+        [[hessian + quadrics.bend(binding), normals.T], [normals, jnp.diag(jnp.where(active, -shift, 1.0))]]
     )
     moved = jnp.linalg.solve(matrix, -change)
     tangent = moved[:size], jnp.where(active, moved[size:], 0.0)

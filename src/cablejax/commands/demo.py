@@ -43,8 +43,8 @@ class Demo(Command):
 
     def execute(self):
         """Shapes U, S and Z with and without the residual, reports, and diagnoses the run."""
-        from cablejax.commands.parts import unfinished
         from cablejax.commands.results import table_of
+        from cablejax.commands.resuming import unfinished
         from cablejax.commands.runs import Job, plant_of, shape_and_report
         from cablejax.commands.shape import PLANT_EFFECT
         from cablejax.control.shaping import METHODS, load_model

@@ -33,8 +33,8 @@ class Diagnose(Command):
     """Folder of the report."""
 
     commissioning: tuple[pathlib.Path, ...] = ()
-    """Logs of the same set-up known to have no effect: they separate the simulator's own error from the gap. For logs in
-    the plane."""
+    """Logs of the same set-up known to have no effect: they separate the simulator's own error from the gap. For planar
+    logs only."""
 
     only: tuple[str, ...] = ()
     """Names of the effects to look for; by default all; in space all but intrinsic_curvature, which takes four times as
@@ -45,7 +45,7 @@ class Diagnose(Command):
 
     def execute(self):
         """Diagnoses a log, on a table or in space, and writes its verdict and page."""
-        from cablejax.commands.parts import unfinished
+        from cablejax.commands.resuming import unfinished
         from cablejax.diagnose import verdict_json
         from cablejax.gaplog import read_gap_log
 

@@ -55,7 +55,7 @@ class Shape(Command):
     times. By default bending_stiffness:ratio=2; `none` for no effect."""
 
     perception: Literal["true", "cloud"] = "true"
-    """true: the controller observes the simulated keypoints. cloud: it observes keypoints estimated from the clouds of a
+    """true: the controller observes the simulated keypoints. cloud: it observes keypoints estimated from clouds of a
     depth camera; the printed errors are still those of the true keypoints."""
 
     noise_mm: float | None = None
@@ -68,8 +68,8 @@ class Shape(Command):
     def execute(self):
         """Brings the cable to the targets, keeps each run as it ends, and reports."""
         from cablejax.commands.cable import find_cable
-        from cablejax.commands.parts import unfinished
         from cablejax.commands.results import table_of
+        from cablejax.commands.resuming import unfinished
         from cablejax.commands.runs import Job, plant_of, shape_and_report
         from cablejax.control.shaping import METHODS, load_model
         from cablejax.control.targets import load_target, make_target

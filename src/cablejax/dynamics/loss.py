@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from cablejax.dataset.windows import Window
-from cablejax.dynamics.model import Dynamics
+from cablejax.dynamics.model import OneStepModel
 from cablejax.types import History, advance
 
 
@@ -25,7 +25,7 @@ def random_walk_noise(key: PRNGKeyArray, history: History, final_std: float) -> 
 
 
 def rollout_loss(
-    dynamics: Dynamics, window: Window, *, scale: float, robust: float, interval: float, pushforward: bool
+    dynamics: OneStepModel, window: Window, *, scale: float, robust: float, interval: float, pushforward: bool
 ) -> Float[Array, ""]:
     """Robust position error of a rollout, averaged over the K steps of a window.
 

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from cablejax.perceive.registration import Fit, RegistrationConfig, register
+from cablejax.perceive.registration import CurveFit, RegistrationConfig, register
 
 ROTATION_WEIGHT = 0.15
 """Metres that one radian of a gripper's motion counts for."""
@@ -83,7 +83,7 @@ class TrackState(NamedTuple):
         gripper_pose: of the same frame, turns counted, shape [Q, 3].
         sigma: standard deviation of the points across the cable [m], shape [].
         travel: way of the grippers since the cable was last found [m], shape [].
-        held: frames since the cable was last found, shape [].
+        lost: frames since the cable was last found, shape [].
         misfits: frames on end whose cloud did not fit, shape [].
         found: whether it ever was, shape [].
     """
@@ -92,7 +92,7 @@ class TrackState(NamedTuple):
     gripper_pose: Float[Array, "*b Q 3"]
     sigma: Float[Array, "*b"]
     travel: Float[Array, "*b"]
-    held: Int[Array, "*b"]
+    lost: Int[Array, "*b"]
     misfits: Int[Array, "*b"]
     found: Bool[Array, "*b"]
 
@@ -101,10 +101,10 @@ class Track(NamedTuple):
     """What is known after a frame.
 
     Attributes:
-        keypoints: positions [m], shape [N, 2]; while held, those last found, carried along with the grippers; NaN if
+        keypoints: positions [m], shape [N, 2]; while lost, those last found, carried along with the grippers; NaN if
             the cable never was found.
         status: see `Status`, shape [].
-        held: frames since the cable was last found, shape [].
+        lost: frames since the cable was last found, shape [].
         sigma: standard deviation of the points across the cable [m], shape [].
         support: part of this cloud within reach of the fit, shape [].
         seen: part of the cable that has points, shape [].
@@ -112,7 +112,7 @@ class Track(NamedTuple):
 
     keypoints: Float[Array, "*b N 2"]
     status: Int[Array, "*b"]
-    held: Int[Array, "*b"]
+    lost: Int[Array, "*b"]
     sigma: Float[Array, "*b"]
     support: Float[Array, "*b"]
     seen: Float[Array, "*b"]
@@ -146,7 +146,7 @@ def track(
     )
     search = jnp.minimum(jnp.sqrt((WIDENING * state.sigma) ** 2 + travel**2), config.max_search)
 
-    def fit(mask) -> Fit:
+    def fit(mask) -> CurveFit:
         return register(
             settings,
             points,
@@ -165,22 +165,22 @@ def track(
     good = status == Status.TRACKED
     # Where the cloud is not to be trusted the registration without points carries the cable along.
     best = jax.lax.cond(good, lambda: seen, lambda: fit(jnp.zeros_like(mask)))
-    held = jnp.where(good, 0, state.held + 1)
+    lost = jnp.where(good, 0, state.lost + 1)
     after = TrackState(
         angles=best.angles,
         gripper_pose=pose,
         sigma=jnp.where(good, best.sigma, state.sigma),
         travel=jnp.where(good, 0.0, travel),
-        held=held,
+        lost=lost,
         misfits=jnp.where(status == Status.NO_FIT, state.misfits + 1, 0),
         found=state.found,
     )
     keypoints = jnp.where(state.found, best.keypoints, jnp.nan)
-    return after, Track(keypoints, status, held, seen.sigma, seen.support, seen.seen)
+    return after, Track(keypoints, status, lost, seen.sigma, seen.support, seen.seen)
 
 
 @functools.partial(jax.jit, static_argnames="config")
-def judge(config: TrackerConfig, fit: Fit, count: Int[Array, ""]) -> Int[Array, ""]:
+def judge(config: TrackerConfig, fit: CurveFit, count: Int[Array, ""]) -> Int[Array, ""]:
     """Whether a fit to a cloud of `count` points is that cloud's cable; see `Status`."""
     fits = (
         (fit.support >= config.min_support)

@@ -18,8 +18,8 @@ from cablejax.perceive.path import cloud_path, path_length
 class Tracker:
     """The tracker for clouds as they come: any number of points, NaN among them, or none.
 
-    `init` and `step` are pure functions of their arguments. They raise only on what can never be a cloud; whatever a
-    camera may send is held and reported in `Track.status`, and in words by `explain`.
+    `init` and `step` are pure functions of their arguments. They raise only on input that can never be a cloud. A
+    frame without a cable is counted as lost and reported in `Track.status`, and in words by `explain`.
 
     Attributes:
         config: see `TrackerConfig`.
@@ -48,7 +48,7 @@ class Tracker:
             gripper_pose=jnp.asarray(pose, float),
             sigma=jnp.asarray(settings.min_sigma, float),
             travel=jnp.zeros((), float),
-            held=jnp.ones((), jnp.int32),
+            lost=jnp.ones((), jnp.int32),
             misfits=jnp.zeros((), jnp.int32),
             found=jnp.asarray(False),
         )
@@ -69,7 +69,7 @@ class Tracker:
     def explain(
         self, track: Track, points: Float[np.ndarray, "n D"], gripper_pose: Float[np.ndarray, "Q 3"]
     ) -> str | None:
-        """Why a frame was held, in a sentence with numbers; None if it was not."""
+        """Why a frame was lost, in a sentence with numbers; None if it was not."""
         status, config = Status(int(track.status)), self.config
         if status is Status.TRACKED:
             return None
@@ -99,13 +99,13 @@ class Tracker:
             fit = first_fit(config.registration, cloud.points, cloud.mask, pose, reach=config.reach)
             status = judge(config, fit, jnp.asarray(count))
             if int(status) == Status.TRACKED:
-                zero = jnp.zeros_like(state.held)
+                zero = jnp.zeros_like(state.lost)
                 found = TrackState(
                     angles=fit.angles,
                     gripper_pose=fit.gripper_pose,
                     sigma=fit.sigma,
                     travel=jnp.zeros_like(state.travel),
-                    held=zero,
+                    lost=zero,
                     misfits=zero,
                     found=jnp.asarray(True),
                 )
@@ -117,7 +117,7 @@ class Tracker:
         if otherwise is not None:
             return state, otherwise
         nowhere = jnp.full((config.registration.n_keypoints, 2), jnp.nan)
-        return state, Track(nowhere, status, state.held, sigma, support, seen)
+        return state, Track(nowhere, status, state.lost, sigma, support, seen)
 
 
 def _checked_pose(value: Float[np.ndarray, "Q 3"]) -> np.ndarray:

@@ -31,12 +31,12 @@ JUMP_RATIO = 2.5
 _HELD_SAMPLES, _HELD_PART = 3, 0.2
 
 
-def cut_at_gaps(takes: tuple[Take, ...], held: tuple[int, ...] | None) -> tuple[tuple[Take, ...], list[str]]:
+def cut_at_gaps(takes: tuple[Take, ...], on_grippers: tuple[int, ...] | None) -> tuple[tuple[Take, ...], list[str]]:
     """Cuts takes where samples are missing.
 
     Args:
         takes: of one cable.
-        held: keypoints on the grippers, which locate them; None where the poses were measured separately.
+        on_grippers: keypoints on the grippers, which locate them; None where the poses were measured separately.
 
     Returns:
         The takes, and one sentence for each that was changed.
@@ -44,17 +44,17 @@ def cut_at_gaps(takes: tuple[Take, ...], held: tuple[int, ...] | None) -> tuple[
     Raises:
         ValueError: nothing long enough is left, or one gripper is never seen; says why.
     """
-    _require_grippers(takes, held)
+    _require_grippers(takes, on_grippers)
     parts: list[Take] = []
     reports: list[str] = []
     for take in takes:
-        take, filled = _filled(_without_repeats(take, reports), held)
+        take, filled = _filled(_without_repeats(take, reports), on_grippers)
         if filled:
             reports.append(
                 f"Take {take.name}: {filled} samples without one of the grippers were filled in by straight lines: "
                 f"none of these gaps is longer than {FILLED:g} s."
             )
-        known = _known(take, held)
+        known = _known(take, on_grippers)
         breaks, reasons = _breaks(take)
         reports.extend(reasons)
         edges = np.zeros(len(take.time) + 1, bool)
@@ -87,16 +87,16 @@ def cut_at_gaps(takes: tuple[Take, ...], held: tuple[int, ...] | None) -> tuple[
     return tuple(parts), reports
 
 
-def _require_grippers(takes: tuple[Take, ...], held: tuple[int, ...] | None) -> None:
+def _require_grippers(takes: tuple[Take, ...], on_grippers: tuple[int, ...] | None) -> None:
     for gripper in (0, 1):
-        if held is None:
+        if on_grippers is None:
             seen = any(
                 take.gripper_pose is not None and np.isfinite(take.gripper_pose[:, gripper]).all(axis=-1).any()
                 for take in takes
             )
             what = "has no pose in any sample"
         else:
-            pair = held[:2] if gripper == 0 else held[2:]
+            pair = on_grippers[:2] if gripper == 0 else on_grippers[2:]
             seen = any(np.isfinite(take.keypoints[:, pair]).all(axis=(1, 2)).any() for take in takes)
             what = f"is located by keypoints {pair[0]} and {pair[1]}, which are never both observed"
         if not seen:
@@ -110,8 +110,8 @@ def _long_enough(time: np.ndarray) -> bool:
     return len(time) >= SHORTEST_SAMPLES and time[-1] - time[0] >= SHORTEST
 
 
-def _known(take: Take, held: tuple[int, ...] | None) -> np.ndarray:
-    ends = take.gripper_pose if held is None else take.keypoints[:, held]
+def _known(take: Take, on_grippers: tuple[int, ...] | None) -> np.ndarray:
+    ends = take.gripper_pose if on_grippers is None else take.keypoints[:, on_grippers]
     assert ends is not None
     return np.asarray(np.isfinite(ends).all(axis=(1, 2)))
 
@@ -122,29 +122,29 @@ def _without_repeats(take: Take, reports: list[str]) -> Take:
         same = (np.diff(take.keypoints, axis=0) == 0).all(axis=(1, 2))
     if not same.any() or same.mean() > _HELD_PART:
         return take
-    held = np.zeros(len(take.time), bool)
+    repeated = np.zeros(len(take.time), bool)
     edges = np.flatnonzero(np.diff(np.concatenate([[False], same, [False]]).astype(int)))
     for a, b in edges.reshape(-1, 2):
         if b - a >= _HELD_SAMPLES:
-            held[a + 1 : b + 1] = True
-    if not held.any():
+            repeated[a + 1 : b + 1] = True
+    if not repeated.any():
         return take
     reports.append(
-        f"Take {take.name}: {int(held.sum())} samples repeat the one before to the last digit, in a recording that "
+        f"Take {take.name}: {int(repeated.sum())} samples repeat the one before to the last digit, in a recording that "
         "otherwise moves: they are taken as not observed."
     )
     points = take.keypoints.copy()
-    points[held] = np.nan
+    points[repeated] = np.nan
     pose = take.gripper_pose
-    keep = ~held
+    keep = ~repeated
     if pose is None:
         return dataclasses.replace(take, keypoints=points)
     return dataclasses.replace(take, time=take.time[keep], keypoints=take.keypoints[keep], gripper_pose=pose[keep])
 
 
-def _filled(take: Take, held: tuple[int, ...] | None) -> tuple[Take, int]:
+def _filled(take: Take, on_grippers: tuple[int, ...] | None) -> tuple[Take, int]:
     """Short gaps in what is known of the grippers, filled in; and how many samples that were."""
-    known = _known(take, held)
+    known = _known(take, on_grippers)
     edges = np.flatnonzero(np.diff(np.concatenate([[False], ~known, [False]]).astype(int)))
     few = np.zeros(len(known), bool)
     for a, b in edges.reshape(-1, 2):
@@ -152,18 +152,18 @@ def _filled(take: Take, held: tuple[int, ...] | None) -> tuple[Take, int]:
             few[a:b] = True
     if not few.any():
         return take, 0
-    ends = take.keypoints[:, held] if held is not None else take.gripper_pose
+    ends = take.keypoints[:, on_grippers] if on_grippers is not None else take.gripper_pose
     assert ends is not None
     values = ends.reshape(len(known), -1).copy()
     for column in values.T:
         column[few] = np.interp(take.time[few], take.time[known], column[known])
     values = values.reshape(ends.shape)
-    if held is None:
+    if on_grippers is None:
         if take.keypoints.shape[2] == 3:
             values[..., 3:] /= np.linalg.norm(values[..., 3:], axis=-1, keepdims=True)
         return dataclasses.replace(take, gripper_pose=values), int(few.sum())
     points = take.keypoints.copy()
-    points[:, held] = values
+    points[:, on_grippers] = values
     return dataclasses.replace(take, keypoints=points), int(few.sum())
 
 

@@ -161,7 +161,7 @@ def next_section(diagnosis: CableDiagnosis, picture: str) -> str:
         if following.separation < SEPARABLE:
             text = (
                 f"No safe motion separates {one} from {other}, the two most probable explanations: on the best, "
-                f"{motion}, they differ by {following.separation:.2g} of the noise. Measure one of the two by other means."
+                f"{motion}, they differ by {following.separation:.2g} of the noise. Measure one of them by other means."
             )
         else:
             text = (

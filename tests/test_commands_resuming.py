@@ -9,7 +9,7 @@ import pytest
 from cablejax.cli import main
 from cablejax.commands import diagnose, runs
 from cablejax.commands.options import UsageError
-from cablejax.commands.parts import Parts, unfinished
+from cablejax.commands.resuming import Parts, unfinished
 from cablejax.commands.runs import Job
 from cablejax.control.shaping import load_model
 from cablejax.control.targets import make_target
