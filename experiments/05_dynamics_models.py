@@ -1,7 +1,8 @@
 """Which model of the cable? Open-loop error of every model over 1 to 20 steps, over 100, and on other cables.
 
 The models: the released graph network; a perceptron and a recurrence along the cable, trained on the same data, with
-and without the static prior; the graph network that is told stiffness and friction; and the training simulator itself,
+and without the static prior; the graph network conditioned on stiffness and "
+"friction; and the training simulator itself,
 started from the keypoints. Then what networks make of less: no prior, the world's axes instead of the grippers'. The
 rivals' weights are in experiments/weights; their cards say how they were made.
 
@@ -39,7 +40,7 @@ from pages import markdown_table, page_of_results, publish
 
 MODELS = {
     "GNS": "gns-reference",
-    "GNS, told the cable": "gns-conditioned",
+    "GNS, conditioned": "gns-conditioned",
     "Bi-LSTM": "lstm-static",
     "MLP": "mlp-static",
     "GNS, no statics": "gns-rigid",
@@ -74,7 +75,7 @@ def source(name: str) -> str | Path:
 
 
 def simulated(config: DatasetConfig, count: int) -> Trajectory:
-    """The last trajectories of a data set, made anew: those that training did not see."""
+    """The last trajectories of a data set, generated again: those held out from training."""
     config = dataclasses.replace(config, engine="threaded", shard_size=1)
     engine = make_engine(config)
     blocks = simulate(config, engine, range(config.n_trajectories - count, config.n_trajectories))
@@ -248,7 +249,7 @@ def main() -> None:
             "percentile over windows. The mean is decided by windows in which the cable snaps through or takes the "
             "other of two shapes, see [model_error](model_error.md).",
             "",
-            f"Optimiser steps: {budgets()}. The network that is told the cable started from the first one. Without "
+            f"Optimiser steps: {budgets()}. The conditioned network started from the first one. Without "
             "statics all networks had the same budget; with statics the released one had twice that of its rivals.",
             "",
             "![Error over steps](../images/dynamics_models.png)",
@@ -257,20 +258,21 @@ def main() -> None:
             "made the data: from the keypoints alone it finds its own state again within a few steps.",
             "",
             f"After 20 steps the median of the MLP is {worse['MLP']:.1f} times the GNS's and that of the Bi-LSTM "
-            f"{worse['Bi-LSTM']:.1f} times, where all correct the statics of the cable: a "
-            "recurrence along it does as well as messages between neighbours. Without statics the MLP's is "
+            f"{worse['Bi-LSTM']:.1f} times, where all correct the statics of the cable: a recurrence along the cable "
+            "is as good as messages between neighbours. Without statics the MLP's is "
             f"{worse['MLP, no statics']:.0f} times that of the GNS with statics, the Bi-LSTM's "
             f"{worse['Bi-LSTM, no statics']:.0f} times, and the GNS's own {worse['GNS, no statics']:.0f} times. What "
             "the prior knows, no network has to learn, and there the choice of the network matters little.",
             "",
-            "## What the networks are given to begin with",
+            "## Prior and frame of the networks",
             "",
             "Median error after one step and after twenty, all windows. The perceptron of Wang et al. is ten times "
-            "worse than their graph network; what it saw they do not say. In the grippers' frame a motion is the same "
-            "wherever on the table it happens. That is worth most to the perceptron, which in the world's axes has to "
-            "learn every place and heading anew; the graph network sees neighbours relative to each other anyway, "
-            "and for one step it can nearly do without. Still the ratio stays far below ten. None of these networks is "
-            "at its end: with ten times the steps the perceptron passes the graph network, which had no such training.",
+            "worse than their graph network; they do not state its inputs. In the grippers' frame a motion is the "
+            "same anywhere on the table. This helps the perceptron most, which in the world's frame has to learn "
+            "every place and heading separately. The graph network sees neighbours relative to each other in either "
+            "frame, and hardly needs the grippers' frame for one step. The ratio still stays far below ten. None of "
+            "these networks has converged: with ten times the steps the perceptron is better than the graph network "
+            "with the usual steps.",
             "",
             *markdown_table(medians_by_what_is_given(given, steps)),
             "",

@@ -2,7 +2,7 @@
 
 python experiments/06_stiffness.py                    # one seed, three methods, one stiffness: some minutes
 python experiments/06_stiffness.py --full             # all of it, hours on two cores; resumable
-python experiments/06_stiffness.py --full --process 1 2 &     # the second half of it, beside --process 0 2
+python experiments/06_stiffness.py --full --process 1 2 &     # the second half of it, at the same time as --process 0 2
 python experiments/06_stiffness.py --full --report docs/results/stiffness.md    # the page, of what is done so far
 """
 
@@ -13,11 +13,11 @@ import os
 
 os.environ.setdefault("NPROC", "4")
 
-from cablejax.evaluation.cases import STIFFNESS_RATIOS, stiffness_cases
-from cablejax.evaluation.methods import ADAPTED_RESIDUAL, METHODS
-from cablejax.evaluation.paper import DIRECT, RESIDUAL
-from cablejax.evaluation.suite import PATIENCE
-from closed_loops import Experiment, Extent, main
+from closed_loop.cases import STIFFNESS_RATIOS, stiffness_cases
+from closed_loop.experiment import Experiment, Extent, main
+from closed_loop.methods import ADAPTED_RESIDUAL, METHODS
+from closed_loop.paper import DIRECT, RESIDUAL
+from closed_loop.suite import PATIENCE
 
 if __name__ == "__main__":
     main(

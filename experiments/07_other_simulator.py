@@ -12,10 +12,10 @@ import os
 
 os.environ.setdefault("NPROC", "4")
 
-from cablejax.evaluation.cases import real_cable_cases
-from cablejax.evaluation.methods import ADAPTED_RESIDUAL, METHODS
-from cablejax.evaluation.paper import DIRECT
-from closed_loops import Experiment, Extent, main
+from closed_loop.cases import real_cable_cases
+from closed_loop.experiment import Experiment, Extent, main
+from closed_loop.methods import ADAPTED_RESIDUAL, METHODS
+from closed_loop.paper import DIRECT
 
 if __name__ == "__main__":
     main(
@@ -25,9 +25,9 @@ if __name__ == "__main__":
             title="U and S by cables of another simulator family",
             about=(
                 "The plants are Cosserat rods of PyElastica on a table with Stribeck friction "
-                "(`cablejax.simulate.rod_plant`): no code, no friction law and no discretisation in common with the "
-                "training simulator. Table IV is the one that stands for the paper's Ethernet cable, table V for its "
-                "USB cable. The paper's own figures, of real cables, are printed beside ours for scale."
+                "(`experiments/closed_loop/rod_plant.py`): no code, no friction law and no discretisation in common "
+                "with the training simulator. Table IV corresponds to the paper's Ethernet cable, table V to its USB "
+                "cable. The paper's own figures, of real cables, are printed next to ours for scale."
             ),
             small=Extent(
                 functools.partial(real_cable_cases, ("U", "S"), tables=("IV",)),

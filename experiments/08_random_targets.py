@@ -12,11 +12,11 @@ import os
 
 os.environ.setdefault("NPROC", "4")
 
-from cablejax.evaluation.cases import random_cases
-from cablejax.evaluation.methods import ADAPTED_RESIDUAL
-from cablejax.evaluation.paper import DIRECT, RESIDUAL
-from cablejax.evaluation.trials import LIANG_TABLE
-from closed_loops import Experiment, Extent, main
+from closed_loop.cases import random_cases
+from closed_loop.experiment import Experiment, Extent, main
+from closed_loop.methods import ADAPTED_RESIDUAL
+from closed_loop.paper import DIRECT, RESIDUAL
+from closed_loop.trials import LIANG_TABLE
 
 if __name__ == "__main__":
     main(
@@ -26,10 +26,10 @@ if __name__ == "__main__":
             title="Random targets from random starts",
             about=(
                 "Planar shaping by two arms, 13 keypoints, at most 250 commands of one second; success is a root mean "
-                "square error below 10 mm. Starts and targets are drawn as `cablejax.evaluation.protocols` says, since "
-                "Liang et al. give none as numbers; the cable is the MuJoCo plant's with contact and friction cones, "
-                "twice as stiff as the one trained on. The published figures are on Liang et al.'s own tasks and "
-                "simulator: for scale, not in competition."
+                "square error below 10 mm. Starts and targets are drawn as `experiments/closed_loop/protocols.py` "
+                "says, since Liang et al. give none as numbers; the cable is the MuJoCo plant's with contact and "
+                "friction cones, twice as stiff as the one trained on. The published figures are on Liang et al.'s "
+                "own tasks and simulator: for scale, not in competition."
             ),
             small=Extent(random_cases, seeds=range(2), methods=(ADAPTED_RESIDUAL,)),
             full=Extent(random_cases, seeds=range(50), methods=(DIRECT, RESIDUAL, ADAPTED_RESIDUAL)),

@@ -1,4 +1,4 @@
-"""How well is the cable found in point clouds? Structure preserved registration beside coherent point drift.
+"""How well is the cable found in point clouds? Structure preserved registration compared with coherent point drift.
 
 Cables move at random between two grippers, as in the training data, and are seen at 10 Hz. For every condition:
 
@@ -31,10 +31,6 @@ from matplotlib.figure import Figure
 from cablejax.cable import Cable, Discretisation
 from cablejax.control.targets import Shape
 from cablejax.effects.physics import nominal_physics
-from cablejax.evaluation.cases import mujoco_plant, stiffness_cases
-from cablejax.evaluation.methods import ADAPTED_RESIDUAL, METHODS
-from cablejax.evaluation.rows import Rows
-from cablejax.evaluation.suite import released, run_case
 from cablejax.perceive import Status, Tracker, TrackerConfig
 from cablejax.perceive.camera import CameraConfig
 from cablejax.perceive.plant import CloudPlant
@@ -42,7 +38,11 @@ from cablejax.perceive.synthetic import Clutter, scatter
 from cablejax.report.style import LIGHT
 from cablejax.simulate import ThreadedEngine
 from cablejax.simulate.motions import random_motion
+from closed_loop.cases import mujoco_plant, stiffness_cases
+from closed_loop.methods import ADAPTED_RESIDUAL, METHODS
+from closed_loop.suite import released, run_case
 from pages import markdown_table, page_of_results, publish
+from rows import Rows
 
 HZ = 10
 FINE = 20
@@ -116,7 +116,7 @@ def follow(seed: int, seconds: int, name: str) -> dict[str, Any]:
 
 
 def drift(seed: int, seconds: int, name: str) -> dict[str, Any]:
-    """The same by coherent point drift, which is told the first frame, the grippers, and to skip empty clouds."""
+    """The same by coherent point drift, given the true first frame and the grippers; it skips empty clouds."""
     from pycpd import DeformableRegistration
 
     curves, poses = moving_cable(seed, seconds)
@@ -326,15 +326,15 @@ def main() -> None:
     lines = [
         f"{seeds} cables move at random for {seconds} s each (seeds {FIRST_SEED} to {FIRST_SEED + seeds - 1}), seen at "
         f"{HZ} Hz as {Clutter().points} points with 2 mm of noise in every coordinate unless stated. The hidden "
-        "stretch wanders along the cable. Errors are mean distances of the 13 keypoints to the true ones, over frames "
-        f"that were not held; a cable is lost if it is off by more than {LOST_MM:.0f} mm in a frame that was not "
-        "reported as held, or if it is not seen in the last half second.",
+        "stretch wanders along the cable. Errors are mean distances of the 13 keypoints to the true ones, over tracked "
+        f"frames; a cable is lost if it is off by more than {LOST_MM:.0f} mm in a frame reported as tracked, or if it "
+        "is not found in the last half second.",
         "",
         *markdown_table(accuracy_rows(ours, drifts)),
         "",
         f"CPD: coherent point drift of pycpd 2.0.0, 61 points along the cable, on {drift_seeds} of the cables for "
-        f"{drift_seconds} s. It is told the first frame, and its ends are put into the grippers; a cable counts as "
-        "lost if the last frame is off by more than 10 mm.",
+        f"{drift_seconds} s. It is initialised with the true first frame, and its ends are set to the grippers; a "
+        "cable counts as lost if the last frame is off by more than 10 mm.",
         "",
         "![A cloud and what was found in it](../images/perception.png)",
         "",

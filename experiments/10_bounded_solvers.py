@@ -35,9 +35,9 @@ from cablejax.bounded import (
     least_squares,
     minimise,
 )
-from cablejax.evaluation.rows import Rows
 from cablejax.report.provenance import machine, versions
 from pages import markdown_table, page_of_results, publish
+from rows import Rows
 from standard_problems import BoundedProblem, all_problems
 
 TOLERANCE = 1e-10
@@ -77,7 +77,7 @@ class Run:
 
 @functools.cache
 def compiled(solver: str, residuals: Callable | None, function: Callable | None) -> Callable:
-    """One of our solvers on one function; bounds and start are traced, so that they do not compile anew."""
+    """One of our solvers on one function; bounds and start are traced, so that they do not compile again."""
     if residuals is not None:
         steps = GRADIENT_STEPS if solver in BY_GRADIENTS else LEAST_SQUARES_STEPS
         solve = functools.partial(least_squares, lambda y, _: residuals(y).ravel(), OURS[solver], max_steps=steps)
@@ -185,7 +185,7 @@ def slack_of(problem: BoundedProblem) -> dict:
 
 
 def verdict(problem: BoundedProblem, solver: str, point: np.ndarray, iterations: int, evaluations: int, said: str):
-    """What came of it; the objective is evaluated anew, the same for all."""
+    """The outcome; the objective is evaluated again, in the same way for all."""
     both = derivatives(problem.residuals, problem.function, problem.start.shape)[0]
     objective = float(both(jnp.asarray(point.ravel()))[0])
     violation = problem.violation(point) if np.isfinite(point).all() else np.inf
@@ -285,10 +285,10 @@ def page(runs: list[Run], command: str) -> str:
             f"set to {TOLERANCE:g}, {TIGHT:g} and {TIGHT:g}, and `least_squares` scales by the Jacobian. At most "
             f"{LEAST_SQUARES_STEPS} steps, {GRADIENT_STEPS} for methods that use gradients only. The families, their "
             "sources and what the best known values come from are in `experiments/standard_problems/`. All solvers are "
-            "local. Where a first version of a problem had a second minimum that chance decided on (Rosenbrock of four "
-            "and more variables, Wood, HS2, a rod that had to snap through), its box, start or target was changed "
-            "before this table was made, after some of these solvers, ours and scipy's, had failed on it; MGH17 and "
-            "Thurber have second minima still.",
+            "local. Some problems first had a second minimum, so that success was chance (Rosenbrock of four and "
+            "more variables, Wood, HS2, a rod that had to snap through). Their box, start or target was changed "
+            "before this table was made, after some of these solvers, ours and scipy's, had failed on them. MGH17 and "
+            "Thurber still have second minima.",
             "",
             "## Successes",
             "",

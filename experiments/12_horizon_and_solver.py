@@ -24,11 +24,11 @@ from matplotlib.ticker import FixedLocator, NullFormatter
 
 from cablejax.control.loop import run_closed_loop
 from cablejax.control.shaping import load_model
-from cablejax.evaluation.cases import PLANT_CHAIN, mujoco_plant
-from cablejax.evaluation.protocols import LaidOut, letter_task
-from cablejax.evaluation.rows import Rows
 from cablejax.mpc import MPC, SOLVERS, LevenbergMarquardt, MPCConfig
+from closed_loop.cases import PLANT_CHAIN, mujoco_plant
+from closed_loop.protocols import LaidOut, letter_task
 from pages import markdown_table, page_of_results, publish
+from rows import Rows
 
 CONVERGED = "levenberg-marquardt, converged"
 PLANNERS = {**SOLVERS, CONVERGED: LevenbergMarquardt(max_iterations=12, trials_per_linearisation=1)}
@@ -138,10 +138,10 @@ def page(trials: list[Trial], table: dict, picture: str | None) -> str:
         f"{len(trials)} closed loops: a straight cable, {STIFFNESS:g} times as stiff as the trained one, brought to "
         f"{', '.join(sorted({t.shape for t in trials}))} by {STEPS} commands on the contact plant; seeds "
         f"{', '.join(map(str, sorted({t.seed for t in trials})))}; gns-reference with the online residual. A horizon h "
-        "plans h + 1 commands. Milliseconds are those of a control call in the loop, beside whatever else this machine "
-        "did at the time: compare rows, and see [speed](speed.md) for the default alone. Means of "
-        "a few runs tell rows apart only roughly: plans that are solved "
-        "better do not end nearer to the target here, and short horizons end as near as long ones.",
+        "plans h + 1 commands. Milliseconds are those of a control call in the loop, while other work was running on "
+        "this machine: compare rows, and see [speed](speed.md) for the default alone. Means of a few runs support "
+        "only rough comparisons: better solved plans do not end nearer to the target here, and short horizons end as "
+        "near as long ones.",
     ]
     if picture is not None:
         lines += ["", f"![Error against milliseconds]({picture})"]

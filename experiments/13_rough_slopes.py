@@ -99,8 +99,8 @@ def main() -> None:
         f"`python experiments/13_rough_slopes.py --n {options.n} --weights {options.weights}`",
         [
             f"{options.n} planning problems, {model.name} with the residual fitted online, horizon 5, float32. Both "
-            "kinds take turns, so what else the machine does hits both. Exact is `jax.jacrev` of the whole model, "
-            "which has cotangents of the held keypoints besides. The difference is that of the Jacobian, "
+            "kinds take turns, so that other load on the machine affects both. Exact is `jax.jacrev` of the whole "
+            "model, which also has cotangents of the grasped keypoints. The difference is that of the Jacobian, "
             "relative to its Frobenius norm; of a plan, that of the objective at its end, relative: negative where "
             "the plan with rough slopes is better.",
             "",

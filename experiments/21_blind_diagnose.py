@@ -22,8 +22,8 @@ import jax
 
 from cablejax.diagnose import Calibration, DiagnosisError, diagnose, verdict_json
 from cablejax.diagnose.planar_run import baseline_error
-from cablejax.evaluation.rows import Rows
 from cablejax.gaplog import read_gap_log
+from rows import Rows
 
 
 def main() -> None:

@@ -3,7 +3,7 @@
 A plant whose cable is a tenth as stiff as believed, on a table with contact. From six logged runs by direct transfer
 the diagnosis names a cause; the released network is then fine-tuned on 2,000 transitions simulated with it, never on
 the plant's own, and the same shaping tasks are run again: direct transfer, online residual, diagnosed, diagnosed with
-residual, and an oracle that was told the truth, with and without residual.
+residual, and an oracle that is given the true effect, with and without residual.
 
     python experiments/23_worth.py --report docs/results/worth.md     # resumable, about half an hour on two cores
 """
@@ -28,13 +28,13 @@ from cablejax.dataset.generate import make_engine, simulate
 from cablejax.dataset.schema import DatasetConfig
 from cablejax.diagnose import diagnose, write_verdict
 from cablejax.effects.given import GivenEffect, effects_of_verdict
-from cablejax.evaluation.cases import mujoco_plant, stiffness_cases
-from cablejax.evaluation.fine_tuning import FineTuneConfig, fine_tune
-from cablejax.evaluation.methods import MethodSpec
-from cablejax.evaluation.suite import Case, read_suite, run_suite
 from cablejax.gaplog import gap_log_from_episodes, read_gap_log, write_gap_log
 from cablejax.simulate.motions import MotionConfig
 from cablejax.types import Trajectory
+from closed_loop.cases import mujoco_plant, stiffness_cases
+from closed_loop.fine_tuning import FineTuneConfig, fine_tune
+from closed_loop.methods import MethodSpec
+from closed_loop.suite import Case, read_suite, run_suite
 from pages import page_of_results, publish
 
 RATIO = 0.1
@@ -121,7 +121,7 @@ def page(out: pathlib.Path, verdict: dict) -> str:
     )
     lines = [
         f"The plant's cable has {RATIO:g} times the believed stiffness. Verdict on six logged runs by direct transfer "
-        f"(seeds {LOG_SEEDS}, 1 mm noise): **{verdict['verdict']}**, {effects or 'nothing'}; cannot be told apart: "
+        f"(seeds {LOG_SEEDS}, 1 mm noise): **{verdict['verdict']}**, {effects or 'nothing'}; indistinguishable: "
         f"{verdict['equivalent']}. The network was fine-tuned on 2,000 transitions of the simulator with that effect "
         "(oracle: with the true one). Terminal error [cm], mean and standard deviation over seeds "
         f"{TASK_SEEDS}, which the diagnosis has not seen.",

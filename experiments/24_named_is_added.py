@@ -28,12 +28,12 @@ from cablejax.cable import Discretisation
 from cablejax.diagnose import diagnose, write_verdict
 from cablejax.effects.given import GivenEffect, effects_of_verdict, parse_effect, with_effects
 from cablejax.effects.physics import nominal_physics
-from cablejax.evaluation.rows import Rows
 from cablejax.gaplog import Episode, gap_log_from_episodes
 from cablejax.simulate import ChainEngine
 from cablejax.simulate.plant import Plant, PlantConfig
 from cablejax.types import GapLog
 from pages import markdown_table, page_of_results, publish
+from rows import Rows
 
 LOGGED = ("approach_s", "mirror_approach_s", "overload_return", "translation", "ramp_hold", "taut")
 HELD_OUT = ("approach_u", "overload_return", "taut")

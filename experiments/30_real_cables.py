@@ -1,4 +1,4 @@
-"""Real cables, five seconds open loop: each step of the diagnosis, beside the published figures.
+"""Real cables, five seconds open loop: each step of the diagnosis, compared with the published figures.
 
     python experiments/30_real_cables.py --data $CABLEJAX_DATA/deform
 
@@ -17,11 +17,11 @@ import sys
 
 import matplotlib
 
-from cablejax.evaluation.rows import Rows
 from cablejax.recordings.deform import read_deform
 from cablejax.report.provenance import machine, versions
 from pages import publish
 from real_cables.benchmark import score_cable
+from rows import Rows
 
 CABLES = ("DLO1", "DLO2", "DLO3")
 _NINETY = 1.645
@@ -123,7 +123,8 @@ def _page(scores) -> str:
     lines = [
         "# Real cables: five seconds ahead, open loop",
         "",
-        "Mean absolute error of a coordinate over all markers in millimetres, the held ones counted as 0, frames 2 to "
+        "Mean absolute error of a coordinate over all markers in millimetres, the grasped ones counted as "
+        "0, frames 2 to "
         "499 of each window, on upstream's eval split: the number of Chen et al. (CoRL 2024, arXiv 2406.05931), on "
         "their recordings of three cables (`import deform`). Upstream's choice of files is theirs; nothing was chosen "
         "by looking at it.",
@@ -137,14 +138,14 @@ def _page(scores) -> str:
         *rows(2),
         _row("rod, every recording with the mean of how the grippers hold the cable", pick(lambda s: s["without_own"])),
         "",
-        "In bold what is best on recordings of the train split that it was not learned from. How the grippers hold the "
-        "cable is fitted for each recording: an eval window takes it from the train windows of its own recording, "
-        "where there are any; the last row does without.",
+        "Bold: the best on held-out recordings of the train split. The grip is fitted for each recording: an eval "
+        "window takes it from the train windows of its own recording, where there are any; the last row does not use "
+        "it.",
         "",
         "![Error of every step](../images/real_cables.png)",
         "",
-        "Split by recording: both halves of the recordings of the train split are fitted separately, with all that is "
-        "learned on top, and every window is scored with the half that it is not part of.",
+        "Split by recording: both halves of the recordings of the train split are fitted separately, with the "
+        "learned corrections, and every window is scored with the fit to the other half.",
         "",
         *head,
         *rows(1),
@@ -173,15 +174,16 @@ def _page(scores) -> str:
         _row("one rollout of 5 s, median [s]", pick(lambda s: s["seconds"][0], "{:.3f}")),
         _row("all 70 windows in batches of 8 [s]", pick(lambda s: s["seconds"][1], "{:.2f}")),
         "",
-        "rho is the mass per length of the cable with its markers. What a half is simulated with is not what the cable "
-        "is: where an effect did not stay in the search, EI/rho makes up for it. The estimate with every effect free "
-        "is the one to read as the cable's ([coverage](interval_coverage.md) on synthetic cables, of both). The halves "
+        "rho is the mass per length of the cable with its markers. The values with which a half is simulated are not "
+        "estimates of the cable: where an effect did not stay in the search, EI/rho compensates for it. The estimate "
+        "of the cable is the one with every effect free ([coverage](interval_coverage.md) on synthetic cables, of "
+        "both). The halves "
         "are different recordings of one cable: if both intervals are right, the estimates differ by less than "
-        f"{_NINETY:g} standard errors on nine cables of ten. An error that both halves share does not show here; what "
-        "a diagnosis tells is wider by what a cable has beyond the fitted law.",
+        f"{_NINETY:g} standard errors on nine cables of ten. An error that both halves share does not show here; the "
+        "intervals of a diagnosis are wider, by the effects of a cable beyond the fitted law.",
         "",
-        "Windows of the train split beside windows of the eval split in the same recording make upstream's "
-        "number easier than the split by recording; how much the choice of 14 files matters is the row of the spread.",
+        "Upstream's split is easier than the split by recording, since it has windows of both splits in the same "
+        "recording. The row of the spread shows how much the choice of 14 files matters.",
         "",
         "## Step by step",
         "",

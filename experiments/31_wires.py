@@ -2,7 +2,7 @@
 
 Photographs of three wires, each hung five times, traced by others, who also published EI of each
 (qj25/adapteddlo_muj, arXiv 2310.00911). For each wire: which effects explain how it differs from a straight wire of the
-published EI, judged by photographs left out; EI with a 90 % interval beside the published one; and what EI would be for
+published EI, judged by held-out photographs; EI with a 90 % interval and the published one; and what EI would be for
 other places of the clamps, which the photographs do not show.
 
     CABLEJAX_DATA=... python experiments/31_wires.py --out docs/results/wires.md --figure docs/images/wires.png
@@ -173,7 +173,7 @@ Made by `python experiments/31_wires.py {" ".join(arguments)}` in {seconds / 60:
 Three wires, each hung five times and traced in photographs (qj25/adapteddlo_muj, arXiv 2310.00911; 51 points, 1.5 m).
 The model is a planar elastica with weight; believed true is a straight wire of the published EI, in clamps that are
 level within 10 degrees. Effects are named by the rule of every diagnosis: the most probable explanation, if the gap in
-the photographs left out shrinks by it with an interval that excludes zero. All gaps are of photographs left out, root
+the held-out photographs shrinks by it with an interval that excludes zero. All gaps are of held-out photographs, root
 mean square per coordinate; only the angles of the clamps are fitted to them. An effect's probability is that among all
 explanations with it or with another effect in its place; the interval of a shrinkage is by resampling photographs.
 
@@ -189,7 +189,7 @@ explanations with it or with another effect in its place; the interval of a shri
 
 **What is not explained.** Photographs of one wire differ among each other by more than any shared effect can explain: a
 wire with a permanent set hangs differently each time that it is turned about its axis, and that turn is not known. A
-section with another EI and a section with a curved rest shape can be told apart only where the wire bends both ways.
+section with another EI and a section with a curved rest shape are distinguishable only where the wire bends both ways.
 The error of a coordinate, {1e3 * error:.2f} mm, is how much the line from clamp to clamp differs among all photographs;
 errors of one photograph count as one error.
 

@@ -25,11 +25,9 @@ from pathlib import Path
 os.environ.setdefault("NPROC", "4")
 
 import numpy as np
-from scipy.stats import norm
+from scipy.stats import binomtest, norm
 
 from cablejax.diagnose.fit import evaluate
-from cablejax.evaluation.rows import Rows
-from cablejax.evaluation.statistics import clopper_pearson
 from cablejax.recordings.deform import NOMINAL, SAMPLE_INTERVAL
 from cablejax.report.provenance import machine, versions
 from cablejax.spatial.estimate import UNMODELLED, Estimate, Interval, estimate, estimate_at, estimates_of_halves
@@ -38,6 +36,7 @@ from cablejax.spatial.named import parameters_of
 from pages import markdown_table, publish
 from real_cables.benchmark import protocol_windows
 from real_cables.synthetic import RECORDINGS, SAMPLES, Law, SyntheticCable, synthetic_recordings
+from rows import Rows
 
 TOLD = {
     "bending_damping": "time_s",
@@ -65,7 +64,7 @@ class Row:
         halves: EI / rho from either half of the recordings, all effects free, with its 90 % interval [m^4/s^2].
         everything: the same from all recordings.
         others: true values, estimates and intervals of other parameters, per mass; like `halves` and `everything`
-            without `UNMODELLED`, by which what a diagnosis tells is wider.
+            without `UNMODELLED`, by which the intervals of a diagnosis are widened.
         chosen: EI / rho from either half with the effects that stayed alone, and the jackknife's interval for that.
         effects: that the search named.
         error_mm: of the nominal simulator and of the last step of the search, on recordings that no fit has seen.
@@ -213,7 +212,7 @@ def coverage(name: str, true: list[float], intervals: list[list[float]], *, logs
     values = np.column_stack([true, intervals])
     truth, value, low, high = (np.log(values) if logs else values).T
     held = int(((low <= truth) & (truth <= high)).sum())
-    bounds = clopper_pearson(held, len(true))
+    bounds = binomtest(held, len(true)).proportion_ci()
     error = value - truth
     told = (lambda x, sign="": f"{100 * x:{sign}.0f} %") if logs else (lambda x, sign="": f"{x:{sign}.2f}")
     return [
@@ -230,7 +229,7 @@ HEAD = ["interval", "holds it", "share, with its 95 % interval", "median half wi
 
 
 def told_table(rows: list[Row]) -> list[str]:
-    """Every parameter as a diagnosis tells it, on cables that nothing was calibrated on."""
+    """Every parameter as a diagnosis reports it, on cables that nothing was calibrated on."""
     table = [[*HEAD, "share without `UNMODELLED`, all cables"]]
     fresh = [row for row in rows if not calibrates(row)]
     for name in (STIFFNESS, *rows[0].others):
@@ -285,10 +284,11 @@ def page(rows: list[Row]) -> str:
         "all. 90 % of the intervals should hold the true value. Widths and errors are of logarithms, of angles in rad. "
         "All is per mass of the cable with its markers on it: EI/rho where rho includes them.",
         "",
-        "## What a diagnosis tells",
+        "## Reported intervals",
         "",
-        "As if every effect were named: from all recordings, all effects free, and wider by `UNMODELLED`, what a cable "
-        "has beyond the fitted law does to it. That is calibrated on the cables of even seeds with the richer law (see "
+        "As if every effect were named: from all recordings, all effects free, and widened by `UNMODELLED`, the "
+        "error from effects beyond the fitted "
+        "law. That is calibrated on the cables of even seeds with the richer law (see "
         f"below); these are the {sum(not calibrates(row) for row in fitted)} of odd seeds. The ratio of a stiffness "
         "profile is that of the place where it differs most, against the mean of the other four; the angle between "
         "cable and gripper is the mean over recordings. Where the markers sit along the cable (`keypoint_bias`) is not "
@@ -302,7 +302,7 @@ def page(rows: list[Row]) -> str:
         "",
         *told_table(richer),
         "",
-        "The two drags do much the same, and what is taken from one goes to the other: each by itself is known to a "
+        "The two drags are nearly indistinguishable, and one compensates for the other: each by itself is known to a "
         "factor of four or five.",
         "",
         "## EI/rho from less",
@@ -311,10 +311,10 @@ def page(rows: list[Row]) -> str:
         "not independent of each other; within a row cables are.",
         "",
         "- **All effects free** is `cablejax.spatial.estimate`: every effect that the search tried is fitted, whether "
-        "it stayed or not, and the interval joins the jackknife over recordings with how far the priors draw the fit.",
+        "it stayed or not, and the interval combines the jackknife over recordings with the pull of the priors.",
         "- **The effects that stayed** is the fit that predictions are made with, and the jackknife of it alone. An "
-        "effect stays only if it helps on recordings that were not fitted, so drag, a profile or the grips are often "
-        "left out. What is left out pulls EI/rho the same way in all recordings, and no resampling shows it. Where the "
+        "effect stays only if it helps on held-out recordings, so drag, a profile or the grips are often left out. An "
+        "effect left out biases EI/rho the same way in all recordings, and no resampling shows it. Where the "
         "stiffness itself did not stay, EI/rho is the believed one but for its profile.",
         "",
         "Where the fitted law is right:",
@@ -336,10 +336,11 @@ def page(rows: list[Row]) -> str:
         "ones too, has an error of 0.3 mm with a correlation time of 0.3 s and one of 0.03 to 0.3 mm that is new at "
         "every sample (0.03 mm is what the real recordings have). Real windows are five times as long.",
         "",
-        "What is drawn is about as large as the priors say; on a cable beyond them intervals hold less. That all "
-        "effects have to be free was found on seeds 0 to 3 of an earlier draw, without markers' mass; that stiffness, "
-        "drag and markers' mass are better told per mass with the markers, and that the estimate needs shorter time "
-        "steps, on the cables of this page. How many cables there are was decided by the clock.",
+        "The drawn effects are about as large as the priors; on a cable beyond them intervals contain the true value "
+        "less often. That all effects have to be free was found on seeds 0 to 3 of an earlier draw, without markers' "
+        "mass; that stiffness, drag and markers' mass are better reported per mass with the markers, and that the "
+        "estimate needs shorter time steps, on the cables of this "
+        "page. How many cables there are was decided by the clock.",
         "",
         "## Every cable",
         "",

@@ -18,8 +18,8 @@ from blind.severity import search
 from blind.store import checked_labels, is_done, publish_hashes, read_cases, write_case
 from blind.unknown import UNSPECIFIED
 from blind.world import World
-from cablejax.evaluation.rows import read_rows
 from cablejax.gaplog import read_gap_log
+from rows import read_rows
 
 WORLD = World(stiffness=0.01, friction=0.3)
 

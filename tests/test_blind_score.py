@@ -4,11 +4,11 @@ import pathlib
 
 import pytest
 
-from blind.measures import baselines, clopper_pearson, reliability, table
+from blind.measures import baselines, rate_interval, reliability, table
 from blind.score_page import write_page
 from blind.store import checked_labels, digest, publish_hashes, read_cases, write_cases
 from blind.verdicts import Scored, coverages, place_error, scored, shrinkage_ratio
-from cablejax.evaluation.rows import append_row
+from rows import append_row
 
 NOISE = 1.0
 BLIND = pathlib.Path(__file__).parents[1] / "docs" / "results" / "blind"
@@ -100,7 +100,7 @@ def test_cases_without_a_trace_or_below_the_severity_are_not_counted_and_twins_h
 
 def test_false_alarms_have_an_exact_bound():
     cases = [Scored(str(i), label("none"), verdict("none")) for i in range(30)]
-    assert clopper_pearson(0, 30)[1] == pytest.approx(1 - 0.05 ** (1 / 30))
+    assert rate_interval(0, 30)[1] == pytest.approx(1 - 0.05 ** (1 / 30))
     assert "at most 10 % with 95 %" in row(cases, "false alarms").value
     cases[0] = Scored("0", label("none"), verdict("unknown"))
     assert row(cases, "false alarms").value.startswith("3 % (1/30")

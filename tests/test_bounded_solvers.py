@@ -195,7 +195,7 @@ def test_a_singular_jacobian_does_no_harm(solver):
         assert value.sum() == pytest.approx(0.4, abs=1e-8)
 
 
-def test_an_empty_set_is_told_from_a_point_set():
+def test_an_empty_set_is_distinguished_from_a_point_set():
     with jax.enable_x64(True):
         for bounds in ((UNIT[1], UNIT[0]), (UNIT[0], UNIT[1] * np.nan)):
             assert ended(lambda y, _: y, "Levenberg-Marquardt", bounds=bounds)[0] is Result.EMPTY_SET

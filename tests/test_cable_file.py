@@ -11,8 +11,8 @@ from cablejax.cable import BOUNDS, Cable
 from cablejax.cable_file import KEYS, NUMBERS, cable_from_fields, cable_text, cable_to_fields, read_cable, write_cable
 from cablejax.cli import main
 from cablejax.commands.cable import find_cable
+from cablejax.dataset.opening import open_or_create
 from cablejax.dataset.schema import DatasetConfig
-from cablejax.dataset.store import open_or_create
 from cablejax.dynamics.weights import WeightsError, cable_of_weights
 from cablejax.gaplog import Episode, gap_log_from_episodes, write_gap_log
 from cli_cases import small_model
@@ -47,6 +47,11 @@ def test_the_file_has_every_field_of_a_cable():
         ({"length_m": -1.0}, "length_m is -1.0, expected a number from 0.01 to 100 m"),
         ({"length_m": 1500}, "length_m is 1500, expected a number from 0.01 to 100 m"),
         ({"bending_stiffness_n_m2": 1e30}, "bending_stiffness_n_m2 is 1e\\+30, expected a number from 1e-09"),
+        (
+            {"linear_density_kg_per_m": 80.0},
+            r"is 80 kg/m at a diameter_m of 0.01 m.* 1.02e\+06 kg/m\^3, expected at most",
+        ),
+        ({"bending_stiffness_n_m2": 2e4}, r"is 20000 N m\^2 at a diameter_m of 0.01 m.* Pa, expected at most 1.5e\+12"),
         ({"friction_coefficient": 10**400}, "friction_coefficient is an integer of 1329 bits"),
         ({"diameter_m": "1 cm"}, "diameter_m is '1 cm'"),
         ({"bending_damping_s": True}, "bending_damping_s is True"),

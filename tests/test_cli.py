@@ -76,12 +76,12 @@ def test_help_is_fast_because_it_loads_neither_jax_nor_mujoco():
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else None,
 )
-def test_bad_input_is_told_without_a_traceback(arguments, message, tmp_path, monkeypatch, capsys):
+def test_bad_input_is_reported_without_a_traceback(arguments, message, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     assert main(arguments) == 2
-    told = capsys.readouterr()
-    assert message in told.err and "Traceback" not in told.err
-    assert told.out == ""
+    shown = capsys.readouterr()
+    assert message in shown.err and "Traceback" not in shown.err
+    assert shown.out == ""
     assert list(tmp_path.iterdir()) == []
 
 
@@ -99,9 +99,9 @@ def test_simulate_says_its_result_as_json_and_repeats_it(tmp_path, capsys):
     results = []
     for name in ("a", "b"):
         assert main([*arguments, "--out", str(tmp_path / name)]) == 0
-        told = capsys.readouterr()
-        results.append(json.loads(told.out))
-        assert "2 trajectories" in told.err
+        shown = capsys.readouterr()
+        results.append(json.loads(shown.out))
+        assert "2 trajectories" in shown.err
     assert results[0]["complete"] == results[0]["trajectories"] == 2
     assert results[0]["digest"] == results[1]["digest"]
 

@@ -64,7 +64,7 @@ def test_report_stands_alone_and_says_the_verdict(report):
     assert 'src="http' not in page and "<script src" not in page
 
 
-def test_what_is_there_stays_unless_told_otherwise(log, tmp_path, capsys):
+def test_what_is_there_stays_by_default(log, tmp_path, capsys):
     mine = tmp_path / "mine.txt"
     mine.write_text("keep me")
     assert main(["diagnose", str(log), "--out", str(tmp_path), *ONLY]) == 2
@@ -74,14 +74,14 @@ def test_what_is_there_stays_unless_told_otherwise(log, tmp_path, capsys):
 
 
 @pytest.mark.slow
-def test_script_gets_json_and_replaces_a_report_when_told(log, tmp_path, capsys):
+def test_script_gets_json_and_replaces_a_report_on_request(log, tmp_path, capsys):
     (tmp_path / "verdict.json").write_text("of yesterday")
     assert main(["diagnose", str(log), "--out", str(tmp_path), "--overwrite", "--json", *ONLY]) == 0
-    told = capsys.readouterr()
-    summary = json.loads(told.out)
+    shown = capsys.readouterr()
+    summary = json.loads(shown.out)
     assert summary["verdict"] == "named" and pathlib.Path(summary["report"]).is_file()
     assert json.loads((tmp_path / "verdict.json").read_text())["verdict"] == "named"
-    assert "screening 3 effects" in told.err, "progress goes to stderr"
+    assert "screening 3 effects" in shown.err, "progress goes to stderr"
 
 
 def test_goes_on_after_ctrl_c_with_half_a_report(log, tmp_path, capsys, monkeypatch):
@@ -103,9 +103,9 @@ def test_goes_on_after_ctrl_c_with_half_a_report(log, tmp_path, capsys, monkeypa
 
 def refused(arguments, capsys) -> str:
     assert main(["diagnose", *map(str, arguments)]) == 2
-    told = capsys.readouterr()
-    assert told.out == "" and told.err.startswith("cablejax: ") and told.err.count("\n") == 1
-    return told.err
+    shown = capsys.readouterr()
+    assert shown.out == "" and shown.err.startswith("cablejax: ") and shown.err.count("\n") == 1
+    return shown.err
 
 
 def test_unknown_effect_is_refused_with_the_known_ones(log, tmp_path, capsys):

@@ -90,10 +90,10 @@ def test_results_are_not_overwritten_unasked(weights, tmp_path, capsys):
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else None,
 )
-def test_bad_input_is_told_before_anything_is_written(change, message, weights, tmp_path, capsys):
+def test_bad_input_is_reported_before_anything_is_written(change, message, weights, tmp_path, capsys):
     assert main([*shape_arguments(weights, tmp_path / "run"), *change]) == 2
-    told = capsys.readouterr().err
-    assert message in told and "Traceback" not in told
+    shown = capsys.readouterr().err
+    assert message in shown and "Traceback" not in shown
     assert not (tmp_path / "run").exists()
 
 
@@ -111,9 +111,9 @@ def test_demo_tells_its_story_in_a_table(weights, tmp_path, capsys):
     out = tmp_path / "demo"
     arguments = ["demo", "--weights", str(weights), "--out", str(out), "--steps", "1", "--links", "12", "--shapes", "S"]
     assert main(arguments) == 0
-    told = capsys.readouterr()
-    assert told.out.startswith("shape") and "\nS " in told.out and "report.html" in told.out
-    assert "with online residual" in told.err and "without residual" in told.err
+    shown = capsys.readouterr()
+    assert shown.out.startswith("shape") and "\nS " in shown.out and "report.html" in shown.out
+    assert "with online residual" in shown.err and "without residual" in shown.err
     assert set(json.loads((out / "summary.json").read_text())["shapes"]) == {"S"}
 
 

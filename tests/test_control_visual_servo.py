@@ -73,7 +73,7 @@ def test_the_estimate_follows_a_jacobian_that_changes_and_keeps_what_was_not_mov
     before, other = np.asarray(state.jacobian), LinearCable(1).jacobian
     keypoints, pose = np.asarray(state.keypoints, float), np.asarray(state.gripper_pose, float)
     for _ in range(CONFIG.window + 4):
-        # A robot that moves only gripper 1 along y, whatever it is told, while the cable has become another one.
+        # A robot that moves only gripper 1 along y, whatever is commanded, while the cable has become another one.
         motion = np.array([[0.0, 0.0, 0.0], [0.0, 0.02, 0.0]])
         keypoints, pose = keypoints + other @ motion.ravel(), pose + motion
         state, _, _ = controller.step(state, Measurement(keypoints, pose))

@@ -23,8 +23,8 @@ from cablejax.dataset.generate import (
     make_engine,
     simulate,
 )
+from cablejax.dataset.opening import open_store
 from cablejax.dataset.schema import DatasetConfig, Randomisation, config_from_json, config_to_json
-from cablejax.dataset.store import open_store
 from cablejax.effects.given import EFFECTS, GivenEffect
 from cablejax.simulate import ThreadedEngine
 from cablejax.simulate.motions import MotionConfig
@@ -294,7 +294,7 @@ def test_a_trajectory_that_never_works_is_an_error_not_data(tmp_path):
     assert open_store(tmp_path / "data").info().n_complete == 4  # shards 0 and 1
 
 
-def test_faults_are_told_apart(reference):
+def test_faults_are_distinguished(reference):
     block = open_store(reference).read()
     one = dataclasses.replace(block, **{f.name: getattr(block, f.name)[0] for f in dataclasses.fields(block)})
     assert find_fault(TINY, one) is None

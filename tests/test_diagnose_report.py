@@ -129,19 +129,19 @@ CASES = {
     "none": (
         lambda: diagnosis("none", effects=(), ranking=(), gap=NO_GAP, next_motion=None, explained=None, caveats=()),
         "No gap found",
-        ["no effect is named", "nothing left to tell apart", "would have shown"],
+        ["no effect is named", "No explanations are left to separate", "would have shown"],
     ),
     "ambiguous": (
         lambda: diagnosis("ambiguous", equivalent=ALIKE, next_motion=FAINT),
         "Cause narrowed down",
-        ["intrinsic curvature or gripper rotation offset", "cannot tell", "No safe motion tells"],
+        ["intrinsic curvature or gripper rotation offset", "are indistinguishable", "No safe motion separates"],
     ),
     "with one that is improbable": (
         lambda: diagnosis("ambiguous", equivalent=THREE),
         "Cause narrowed down",
         [
             "<p>intrinsic curvature or gripper rotation offset</p>",
-            "<b>intrinsic curvature</b> and <b>gripper rotation offset</b> apart",
+            "<b>intrinsic curvature</b> and <b>gripper rotation offset</b> are indistinguishable",
             "<b>obstacle</b> would leave as little of the gap, at a probability below 1 %",
         ],
     ),

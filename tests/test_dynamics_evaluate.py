@@ -84,7 +84,7 @@ def snapping_data() -> Trajectory:
     return Trajectory(keypoints, np.zeros((2, 9, 2, 3), np.float32), twist)
 
 
-def test_windows_with_a_snap_through_are_told_from_the_truth_alone():
+def test_windows_with_a_snap_through_are_found_from_the_truth_alone():
     found = snapping(snapping_data(), steps=3, stride=1)
     assert found.shape == (2 * 6, 3)
     assert not found[:6].any()

@@ -1,4 +1,4 @@
-"""A model that is told what cable it is, and trainings that start from another."""
+"""A model conditioned on the cable, and trainings that start from another."""
 
 import dataclasses
 

@@ -105,7 +105,7 @@ def test_a_folder_with_another_training_is_left_alone(tmp_path):
         run(TINY_TRAINING, tmp_path, resume=False)
 
 
-def test_a_training_is_overwritten_when_told_and_nothing_else(tmp_path):
+def test_a_training_is_overwritten_on_request_and_nothing_else(tmp_path):
     first = {"config": {"seed": 0}, "data": "a"}
     claim_folder(tmp_path, first, resume=True, overwrite=False)
     kept = [tmp_path / "checkpoints" / "20" / "a", tmp_path / "weights.safetensors", tmp_path / "metrics.csv"]
@@ -143,8 +143,8 @@ def test_a_folder_that_is_a_users_own_is_left_alone(file, text, overwrite, messa
     assert mine.read_text() == text and len(list(tmp_path.rglob("*"))) <= 2
 
 
-def test_a_damaged_checkpoint_is_told_and_the_one_before_it_used(tmp_path):
-    state, told = {"a": jnp.arange(3000.0)}, []
+def test_a_damaged_checkpoint_is_reported_and_the_one_before_it_used(tmp_path):
+    state, lines = {"a": jnp.arange(3000.0)}, []
 
     def damage(step):
         for file in (tmp_path / str(step)).rglob("*"):
@@ -156,8 +156,8 @@ def test_a_damaged_checkpoint_is_told_and_the_one_before_it_used(tmp_path):
         checkpoints.save(20, {"a": jnp.zeros(3000)})
     damage(20)
     with Checkpoints(tmp_path) as checkpoints:
-        same(checkpoints.restore(state, tell=told.append), state)
-        assert told == ["The checkpoint of step 20 is damaged; going on from the one of step 10."]
+        same(checkpoints.restore(state, report=lines.append), state)
+        assert lines == ["The checkpoint of step 20 is damaged; resuming from the one of step 10."]
         checkpoints.save(20, state)
     damage(10), damage(20)
     with Checkpoints(tmp_path) as checkpoints, pytest.raises(ValueError, match=r"No checkpoint .* Delete this folder"):

@@ -1,4 +1,4 @@
-"""Damaged `.npz` and JSON files, wherever they come in, are told by a message."""
+"""Damaged `.npz` and JSON files, wherever they are read, raise an error."""
 
 import contextlib
 import json

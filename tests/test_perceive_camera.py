@@ -104,7 +104,7 @@ def test_keypoints_of_clouds_are_near_the_true_ones(plant):
     for seen in plant.record(twist, samples=5):
         error = np.linalg.norm(seen.keypoints - seen.true_keypoints, axis=1)
         assert 0 < error.mean() < 3e-3
-    assert plant.held == 0
+    assert plant.lost == 0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -131,7 +131,7 @@ def test_a_hidden_cable_is_reported_as_not_observed():
     seen = plant.reset(straight_start(SMALL_PLANT.cable))
     assert np.isnan(seen.keypoints[1:-1]).all() and np.isfinite(seen.true_keypoints).all()
     np.testing.assert_array_equal(seen.keypoints[[0, -1]], seen.gripper_pose[:, :2])
-    assert plant.held == 1
+    assert plant.lost == 1
 
 
 def test_tracker_and_plant_must_be_about_the_same_cable():

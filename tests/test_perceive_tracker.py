@@ -51,7 +51,7 @@ def test_a_moving_cable_is_followed_behind_clutter(tracker, motion, started):
     state, _ = started
     for frame, cable in enumerate(motion[1:]):
         state, seen = tracker.step(state, cloud(cable, frame, hidden=(0.1, 0.4), outliers=0.1), cable.pose)
-        assert seen.status == Status.TRACKED and seen.held == 0
+        assert seen.status == Status.TRACKED and seen.lost == 0
         assert mean_error(seen.keypoints, cable) < 3e-3
         assert tracker.explain(seen, NOTHING, cable.pose) is None
 
@@ -67,14 +67,14 @@ def test_a_second_without_a_cable_is_held_reported_and_recovered_from(tracker, m
     state, _ = started
     for frame, cable in enumerate(motion[1:11]):
         state, seen = tracker.step(state, clouds[sent], cable.pose)
-        assert seen.status == status and seen.held == frame + 1
+        assert seen.status == status and seen.lost == frame + 1
         assert np.isfinite(seen.keypoints).all()
     assert mean_error(seen.keypoints, motion[10]) < 0.05  # the ends went with the grippers
     np.testing.assert_allclose(seen.keypoints[jnp.array([0, -1])], motion[10].pose[:, :2], atol=2e-3)
-    told = tracker.explain(seen, clouds[sent], cable.pose)
-    assert told is not None and ("usable points" in told) == (status == Status.FEW_POINTS)
+    shown = tracker.explain(seen, clouds[sent], cable.pose)
+    assert shown is not None and ("usable points" in shown) == (status == Status.FEW_POINTS)
     state, seen = tracker.step(state, cloud(motion[11], 3), motion[11].pose)
-    assert seen.status == Status.TRACKED and seen.held == 0
+    assert seen.status == Status.TRACKED and seen.lost == 0
     assert mean_error(seen.keypoints, motion[11]) < 1e-3
 
 
@@ -94,8 +94,8 @@ def test_another_cable_is_not_taken_for_this_one(tracker, motion, started, lengt
     assert np.isnan(seen.keypoints).all()
     state, seen = tracker.step(started[0], cloud(other, 6), ARCH)
     assert seen.status == Status.NO_FIT and np.isfinite(seen.keypoints).all()
-    told = tracker.explain(seen, cloud(other, 6), ARCH)
-    assert told is not None and "cable of 1 m" in told and "shortest way along its points" in told
+    shown = tracker.explain(seen, cloud(other, 6), ARCH)
+    assert shown is not None and "cable of 1 m" in shown and "shortest way along its points" in shown
     # The right one is found again.
     state, seen = tracker.step(state, cloud(motion[0], 7), ARCH)
     assert seen.status == Status.TRACKED and mean_error(seen.keypoints, motion[0]) < 1e-3

@@ -87,9 +87,9 @@ def test_a_bag_is_read_with_both_kinds_of_storage(tmp_path, storage):
     points = swinging(201)
     points[30, 4] = np.nan
     bag = write_bag(tmp_path / "bag", points, grippers_of(points), storage)
-    log, told = import_mcap(bag, layout(tmp_path))
+    log, repairs = import_mcap(bag, layout(tmp_path))
     validate(log)
-    assert told == [] and log.keypoints.shape == (1, 201, 9, 3)
+    assert repairs == [] and log.keypoints.shape == (1, 201, 9, 3)
     np.testing.assert_allclose(log.keypoints[0], points, atol=1e-6)
     np.testing.assert_allclose(log.time[0], DT * np.arange(201), atol=1e-6)
     np.testing.assert_allclose(log.gripper_pose[0, ::2, 0, :3], points[::2, 0], atol=1e-5)
@@ -107,8 +107,8 @@ def test_a_single_mcap_file_is_read_like_its_bag(tmp_path):
     bag = write_bag(tmp_path / "bag", points, {}, StoragePlugin.MCAP)
     file = next(bag.glob("*.mcap"))
     text = LAYOUT.replace('grippers = ["/left/pose", "/right/pose"]', "")
-    log, told = import_mcap(file, layout(tmp_path, text))
-    assert told == []
+    log, repairs = import_mcap(file, layout(tmp_path, text))
+    assert repairs == []
     np.testing.assert_allclose(log.gripper_pose[0, :, 1, :3], points[:, 8], atol=1e-6)
 
 
@@ -118,8 +118,8 @@ def test_a_gap_in_a_gripper_cuts_the_recording(tmp_path):
     times, poses = grippers["/left/pose"]
     keep = (times < 0.795) | (times > 1.095)
     grippers["/left/pose"] = times[keep], poses[keep]
-    log, told = import_mcap(write_bag(tmp_path / "bag", points, grippers, StoragePlugin.MCAP), layout(tmp_path))
-    assert log.episode_length.tolist() == [79, 91] and "one of the grippers is not seen" in told[0]
+    log, repairs = import_mcap(write_bag(tmp_path / "bag", points, grippers, StoragePlugin.MCAP), layout(tmp_path))
+    assert log.episode_length.tolist() == [79, 91] and "one of the grippers is not seen" in repairs[0]
 
 
 @pytest.mark.parametrize(
@@ -133,14 +133,14 @@ def test_a_gap_in_a_gripper_cuts_the_recording(tmp_path):
         ("[topics]", '[topics]\nclock = "/clock"', "unknown fields clock"),
     ],
 )
-def test_a_wrong_layout_is_told(tmp_path, old, new, message):
+def test_a_wrong_layout_is_reported(tmp_path, old, new, message):
     points = swinging(60)
     bag = write_bag(tmp_path / "bag", points, grippers_of(points), StoragePlugin.MCAP)
     with pytest.raises(ValueError, match=message):
         import_mcap(bag, layout(tmp_path, LAYOUT.replace(old, new)))
 
 
-def test_positions_of_a_left_handed_frame_beside_quaternions_of_another_are_told(tmp_path):
+def test_positions_of_a_left_handed_frame_beside_quaternions_of_another_are_reported(tmp_path):
     points = swinging(201)
     grippers = grippers_of(points)
     mirrored = {topic: (times, poses * [1, -1, 1, 1, 1, 1, 1]) for topic, (times, poses) in grippers.items()}
@@ -149,7 +149,7 @@ def test_positions_of_a_left_handed_frame_beside_quaternions_of_another_are_told
         import_mcap(bag, layout(tmp_path))
 
 
-def test_messages_that_change_their_size_are_told(tmp_path):
+def test_messages_that_change_their_size_are_reported(tmp_path):
     with Writer(tmp_path / "bag", version=9, storage_plugin=StoragePlugin.MCAP) as bag:
         connection = bag.add_connection("/cable/keypoints", ARRAY.__msgtype__, typestore=STORE)
         for t, count in enumerate((9, 9, 8)):
@@ -160,7 +160,7 @@ def test_messages_that_change_their_size_are_told(tmp_path):
         import_mcap(tmp_path / "bag", layout(tmp_path, text))
 
 
-def test_what_is_no_bag_is_told(tmp_path):
+def test_what_is_no_bag_is_reported(tmp_path):
     (tmp_path / "run.mcap").write_bytes(b"nothing")
     (tmp_path / "run.txt").write_bytes(b"nothing")
     (tmp_path / "folder").mkdir()

@@ -29,8 +29,8 @@ def test_help_explains_every_kind(kind, capsys):
 def test_pickles_become_a_log(folder, tmp_path, capsys):
     out = tmp_path / "log.npz"
     assert main(["import", "deform", str(folder), "--out", str(out)]) == 0
-    told = capsys.readouterr().out
-    assert "2 episodes, 400 samples of 9 keypoints in space" in told and "Nothing had to be repaired." in told
+    shown = capsys.readouterr().out
+    assert "2 episodes, 400 samples of 9 keypoints in space" in shown and "Nothing had to be repaired." in shown
     assert read_gap_log(out).meta["split"] == ["train", "eval"]
     assert main(["import", "deform", str(folder), "--out", str(out)]) == 2
     assert "add --overwrite" in capsys.readouterr().err
@@ -38,7 +38,7 @@ def test_pickles_become_a_log(folder, tmp_path, capsys):
     assert json.loads(capsys.readouterr().out)["logs"][0]["episodes"] == 2
 
 
-def test_repairs_are_told(folder, tmp_path, capsys):
+def test_repairs_are_reported(folder, tmp_path, capsys):
     points = swinging(seed=1, phase=1)
     points[60:130] = points[60:130][:, [0, 1, 2, 4, 3, 5, 6, 7, 8]]
     (folder / "train" / "1.pkl").write_bytes(pickle.dumps(1000 * points.transpose(0, 2, 1)))
@@ -53,8 +53,8 @@ def test_repairs_are_told(folder, tmp_path, capsys):
 def test_a_dangerous_pickle_is_refused_without_a_traceback(folder, tmp_path, capsys):
     (folder / "train" / "1.pkl").write_bytes(b"cos\nsystem\n(S'true'\ntR.")
     assert main(["import", "deform", str(folder), "--out", str(tmp_path / "log.npz")]) == 2
-    told = capsys.readouterr()
-    assert "asks for os.system" in told.err and "Traceback" not in told.err and told.out == ""
+    shown = capsys.readouterr()
+    assert "asks for os.system" in shown.err and "Traceback" not in shown.err and shown.out == ""
     assert not (tmp_path / "log.npz").exists()
 
 

@@ -84,9 +84,9 @@ def in_the_plane() -> dict[str, list | np.ndarray]:
 def test_markers_in_millimetres(tmp_path):
     table = in_space()
     table["m5y"][40] = np.nan
-    log, told = import_csv(*written(tmp_path, table, PAIRS))
+    log, repairs = import_csv(*written(tmp_path, table, PAIRS))
     validate(log)
-    assert told == [] and log.keypoints.shape == (1, 200, 9, 3)
+    assert repairs == [] and log.keypoints.shape == (1, 200, 9, 3)
     expected = swinging().astype(np.float32)
     assert np.isnan(log.keypoints[0, 40, 4, 1])
     np.testing.assert_allclose(np.delete(log.keypoints[0], 40, 0), np.delete(expected, 40, 0), atol=1e-5)
@@ -94,9 +94,9 @@ def test_markers_in_millimetres(tmp_path):
 
 
 def test_a_table_seen_from_above_with_measured_grippers(tmp_path):
-    log, told = import_csv(*written(tmp_path, in_the_plane(), PLANAR))
+    log, repairs = import_csv(*written(tmp_path, in_the_plane(), PLANAR))
     validate(log)
-    assert told == [] and log.keypoints.shape == (2, 20, 4, 2)
+    assert repairs == [] and log.keypoints.shape == (2, 20, 4, 2)
     assert log.meta["motion"] == ["approach", "mirror"] and log.meta["take"] == ["1", "2"]
     assert log.meta["table"] == {"friction_coefficient": 0.1}
     assert log.meta["keypoint_arclength_m"] == [0.0, 0.2, 0.4, 0.6]
@@ -128,7 +128,7 @@ def test_a_table_seen_from_above_with_measured_grippers(tmp_path):
         ("[columns]", "[source]", r"lacks the table \[columns\]"),
     ],
 )
-def test_a_wrong_layout_is_told(tmp_path, old, new, message):
+def test_a_wrong_layout_is_reported(tmp_path, old, new, message):
     assert old in PAIRS
     path, layout = written(tmp_path, in_space(), PAIRS.replace(old, new))
     with pytest.raises(ValueError, match=message):
@@ -146,14 +146,14 @@ def test_a_wrong_layout_is_told(tmp_path, old, new, message):
     ],
     ids=["twice", "empty", "text", "cells", "time"],
 )
-def test_a_wrong_table_is_told(tmp_path, change, message):
+def test_a_wrong_table_is_reported(tmp_path, change, message):
     path, layout = written(tmp_path, in_space(), PAIRS)
     path.write_text(change(path.read_text()))
     with pytest.raises(ValueError, match=message):
         import_csv(path, layout)
 
 
-def test_a_quaternion_in_the_wrong_columns_is_told(tmp_path):
+def test_a_quaternion_in_the_wrong_columns_is_reported(tmp_path):
     table = in_space()
     pose = {f"g{q}{name}": np.zeros(200) for q in (0, 1) for name in ("x", "y", "z", "qw", "qx", "qy", "qz")}
     grippers = "".join(
@@ -164,7 +164,7 @@ def test_a_quaternion_in_the_wrong_columns_is_told(tmp_path):
         import_csv(path, layout)
 
 
-def test_missing_files_are_told(tmp_path):
+def test_missing_files_are_reported(tmp_path):
     path, layout = written(tmp_path, in_space(), PAIRS)
     with pytest.raises(ValueError, match=r"absent\.csv could not be read"):
         import_csv(tmp_path / "absent.csv", layout)

@@ -74,14 +74,14 @@ def test_a_short_block_ends_with_nan_and_its_episode_ends_there(folder):
     path.write_bytes(pickle.dumps(swinging(120).transpose(0, 2, 1)))
     recordings = read_deform(folder)
     assert np.isnan(recordings.keypoints[3, 120:]).all() and np.isfinite(recordings.keypoints[3, :120]).all()
-    log, told = import_deform(folder)
-    assert log.episode_length.tolist() == [200, 200, 200, 120] and told == []
+    log, repairs = import_deform(folder)
+    assert log.episode_length.tolist() == [200, 200, 200, 120] and repairs == []
 
 
 def test_the_log_carries_split_and_recordings(tmp_path, folder):
-    log, told = import_deform(folder)
+    log, repairs = import_deform(folder)
     back = read_gap_log(write_gap_log(tmp_path / "log.npz", log))
-    assert told == []
+    assert repairs == []
     assert back.meta["split"] == ["train", "eval", "train", "train"]
     assert back.meta["recording"] == [0, 0, 1, 2] and back.meta["file"] == [3, 4, 5, 9]
     assert "guesses" in back.meta["source"] and back.meta["table"] is None
@@ -159,10 +159,10 @@ def test_a_missing_gripper_pair_is_refused_and_a_missing_moment_cut(tmp_path):
     values["keypoints"][1, :, 7:] = np.nan  # in one block only: that block is left out
     values["keypoints"][2, 80:110] = np.nan
     np.savez(tmp_path / "DLO9.npz", **values)
-    log, told = import_deform(tmp_path / "DLO9.npz")
+    log, repairs = import_deform(tmp_path / "DLO9.npz")
     assert log.meta["take"] == ["3", "5/1", "5/2", "9"] and log.episode_length.tolist() == [200, 80, 90, 200]
-    assert any(line.startswith("Take 4: in 200 samples one of the grippers is not seen") for line in told)
-    assert all(line in log.meta["source"] for line in told)
+    assert any(line.startswith("Take 4: in 200 samples one of the grippers is not seen") for line in repairs)
+    assert all(line in log.meta["source"] for line in repairs)
 
 
 @needs_deform
@@ -172,12 +172,12 @@ def test_real_recordings_are_read(name, markers, length):
     assert isinstance(recordings, DeformRecordings)
     assert recordings.keypoints.shape == (70, 500, markers, 3)
     assert sorted(set(recordings.split)) == ["eval", "train"] and (recordings.split == "eval").sum() == 14
-    log, told = import_deform(DATA / "deform" / f"{name}.npz")
+    log, repairs = import_deform(DATA / "deform" / f"{name}.npz")
     assert log.meta["cable"]["length_m"] == pytest.approx(length, abs=0.01)
     assert np.isfinite(log.gripper_pose).all()
     # The recordings themselves have the faults that the importer looks for, and few of them.
-    assert len(told) < 25
-    exchanged = [line for line in told if "exchanged" in line]
+    assert len(repairs) < 25
+    exchanged = [line for line in repairs if "exchanged" in line]
     if name == "DLO1":
         assert [line.split(", and")[0] for line in exchanged] == [
             "Take 89: keypoints 11, 12 had exchanged their names in 71 of 500 samples, from sample 429",

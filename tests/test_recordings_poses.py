@@ -107,12 +107,12 @@ def test_a_planar_take_has_no_frame():
 
 @pytest.mark.parametrize("up", AXES)
 def test_a_cable_that_does_not_hang_down_names_the_vertical(up):
-    told = Frame()
+    stated = Frame()
     points = swinging() @ Frame(up).matrix  # a recording whose vertical is `up`
     require_hanging((into_frame(take(points), Frame(up)),), Frame(up))
     if up != "z":
         with pytest.raises(ValueError, match=f"say that {up} is up"):
-            require_hanging((into_frame(take(points), told),), told)
+            require_hanging((into_frame(take(points), stated),), stated)
 
 
 def test_a_taut_cable_does_not_say_what_is_up():
@@ -138,9 +138,9 @@ def test_orientations_of_another_frame_are_refused_and_the_frame_named(change, m
     pose = np.concatenate([points[:, [0, -1]], np.stack([quaternion, wandering(600)], axis=1)], axis=-1)
     require_rigid((take(points, pose=pose),), ((0, 1),))
     wrong, other = change(points, pose)
-    with pytest.raises(ValueError, match=message) as told:
+    with pytest.raises(ValueError, match=message) as raised:
         require_rigid((take(wrong, pose=other),), ((0, 1),))
-    assert "turn against its orientation" in str(told.value)
+    assert "turn against its orientation" in str(raised.value)
 
 
 def test_units_are_recognised_by_the_length_of_the_cable():

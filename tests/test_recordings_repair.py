@@ -1,4 +1,4 @@
-"""Bad recordings: repaired and told, or refused with what to do."""
+"""Bad recordings: repaired and reported, or rejected with advice."""
 
 import dataclasses
 
@@ -44,17 +44,17 @@ def exchanged(points: np.ndarray, rows: slice, order: list[int]) -> np.ndarray:
 )
 def test_exchanged_markers_are_put_back(rows, order):
     right = swinging()
-    restored, told = restore_order((take(exchanged(right, rows, order)), *others()))
+    restored, repairs = restore_order((take(exchanged(right, rows, order)), *others()))
     np.testing.assert_array_equal(restored[0].keypoints, right)
-    assert len(told) == 1 and told[0].startswith("Take a: ")
+    assert len(repairs) == 1 and repairs[0].startswith("Take a: ")
     for before, after in zip(others(), restored[1:], strict=True):
         np.testing.assert_array_equal(after.keypoints, before.keypoints)
 
 
-def test_exchanged_markers_are_told_by_number_and_sample():
+def test_exchanged_markers_are_reported_by_number_and_sample():
     points = exchanged(swinging(), slice(60, 130), [0, 1, 2, 4, 3, 5, 6, 7, 8])
-    _, told = restore_order((take(points), *others()))
-    assert told == [
+    _, repairs = restore_order((take(points), *others()))
+    assert repairs == [
         "Take a: keypoints 3, 4 had exchanged their names in 70 of 200 samples, from sample 60, and were put back."
     ]
 
@@ -63,13 +63,13 @@ def test_missing_markers_do_not_hinder():
     right = swinging()
     right[np.random.default_rng(0).random(right.shape[:2]) < 0.05] = np.nan
     points = exchanged(right, slice(60, 130), [0, 1, 2, 5, 4, 3, 6, 7, 8])
-    restored, told = restore_order((take(points), *others()))
+    restored, repairs = restore_order((take(points), *others()))
     wrong = ~np.isclose(restored[0].keypoints, right, equal_nan=True).all(axis=(1, 2))
     # Where a marker is missing the order of the sample before is kept: it is late by at most a few samples.
-    assert wrong.sum() <= 8 and len(told) == 1
-    unchanged, told = restore_order((take(right), *others()))
+    assert wrong.sum() <= 8 and len(repairs) == 1
+    unchanged, repairs = restore_order((take(right), *others()))
     np.testing.assert_array_equal(unchanged[0].keypoints, right)
-    assert told == []
+    assert repairs == []
 
 
 def test_columns_in_a_wrong_order_are_refused():
@@ -87,63 +87,63 @@ def test_a_gap_in_the_times_cuts_a_take():
     points = swinging()
     late = dataclasses.replace(take(points), time=DT * np.arange(200))
     late = Take("a", late.time[keep], points[keep])
-    parts, told = cut_at_gaps((late,), HELD)
+    parts, repairs = cut_at_gaps((late,), HELD)
     assert samples_of(parts) == [("a/1", 80), ("a/2", 90)]
-    assert len(told) == 1 and "no samples for 0.31 s after sample 79, where 0.01 s is usual" in told[0]
+    assert len(repairs) == 1 and "no samples for 0.31 s after sample 79, where 0.01 s is usual" in repairs[0]
     np.testing.assert_array_equal(parts[1].keypoints, points[110:])
 
 
 def test_a_gap_that_the_times_do_not_tell_cuts_a_take():
     points = swinging()[np.r_[0:80, 110:200]]
-    parts, told = cut_at_gaps((take(points),), HELD)
+    parts, repairs = cut_at_gaps((take(points),), HELD)
     assert samples_of(parts) == [("a/1", 80), ("a/2", 90)]
-    assert "the whole cable jumps between samples 79 and 80" in told[0]
+    assert "the whole cable jumps between samples 79 and 80" in repairs[0]
 
 
 @pytest.mark.parametrize("column", [0, 7])
 def test_a_gripper_not_seen_for_long_cuts_a_take(column):
     points = swinging()
     points[80:110, column] = np.nan
-    parts, told = cut_at_gaps((take(points),), HELD)
+    parts, repairs = cut_at_gaps((take(points),), HELD)
     assert samples_of(parts) == [("a/1", 80), ("a/2", 90)]
-    assert "in 30 samples one of the grippers is not seen" in told[0]
+    assert "in 30 samples one of the grippers is not seen" in repairs[0]
 
 
 def test_a_gripper_not_seen_for_a_moment_is_filled_in():
     right = swinging()
     points = right.copy()
     points[80:83, 7:] = np.nan
-    parts, told = cut_at_gaps((take(points),), HELD)
-    assert samples_of(parts) == [("a", 200)] and "3 samples without one of the grippers were filled in" in told[0]
+    parts, repairs = cut_at_gaps((take(points),), HELD)
+    assert samples_of(parts) == [("a", 200)] and "3 samples without one of the grippers were filled in" in repairs[0]
     assert np.linalg.norm(parts[0].keypoints - right, axis=-1).max() < 2e-3
 
 
 def test_keypoints_between_the_grippers_may_be_missing():
     points = swinging()
     points[20:180, 3:5] = np.nan
-    parts, told = cut_at_gaps((take(points),), HELD)
-    assert samples_of(parts) == [("a", 200)] and told == []
+    parts, repairs = cut_at_gaps((take(points),), HELD)
+    assert samples_of(parts) == [("a", 200)] and repairs == []
     np.testing.assert_array_equal(parts[0].keypoints, points)
 
 
 def test_a_tracker_that_holds_its_last_values_cuts_a_take():
     points = swinging()
     points[80:110] = points[79]
-    parts, told = cut_at_gaps((take(points),), HELD)
+    parts, repairs = cut_at_gaps((take(points),), HELD)
     assert samples_of(parts) == [("a/1", 80), ("a/2", 90)]
-    assert "30 samples repeat the one before to the last digit" in told[0]
+    assert "30 samples repeat the one before to the last digit" in repairs[0]
 
 
 def test_a_recording_without_noise_at_rest_is_no_gap():
     points = np.repeat(swinging(1), 200, axis=0)
-    parts, told = cut_at_gaps((take(points),), HELD)
-    assert samples_of(parts) == [("a", 200)] and told == []
+    parts, repairs = cut_at_gaps((take(points),), HELD)
+    assert samples_of(parts) == [("a", 200)] and repairs == []
 
 
 def test_a_gripper_never_seen_is_refused():
     points = swinging()
     points[:, 8] = np.nan
-    with pytest.raises(ValueError, match="Gripper 1 is told by the keypoints 7 and 8, which are in no sample both obs"):
+    with pytest.raises(ValueError, match="Gripper 1 is located by keypoints 7 and 8, which are never both obs"):
         cut_at_gaps((take(points),), HELD)
     with pytest.raises(ValueError, match="never observed together"):
         prepare((take(points),), PAIRS)
@@ -163,12 +163,12 @@ def test_nothing_left_between_gaps_is_refused():
 
 def test_millimetres_are_recognised_or_refused():
     points = swinging()
-    takes, told = prepare((take(1000 * points),), Setup(unit=None))
+    takes, repairs = prepare((take(1000 * points),), Setup(unit=None))
     np.testing.assert_allclose(takes[0].keypoints, points, rtol=1e-12)
-    assert "can only be mm" in told[0]
-    takes, told = prepare((take(1000 * points),), Setup(unit="mm"))
+    assert "can only be mm" in repairs[0]
+    takes, repairs = prepare((take(1000 * points),), Setup(unit="mm"))
     np.testing.assert_allclose(takes[0].keypoints, points, rtol=1e-12)
-    assert told == []
+    assert repairs == []
     with pytest.raises(ValueError, match=r"0\.684 m if they are in mm"):
         prepare((take(1000 * points),), Setup(unit="m"))
     with pytest.raises(ValueError, match="It may be in cm or in in: say which"):
@@ -185,12 +185,12 @@ def test_poses_in_other_units_are_converted_too():
     np.testing.assert_allclose(takes[0].gripper_pose, pose, atol=1e-12)
 
 
-def test_a_left_handed_frame_is_mirrored_when_told():
+def test_a_left_handed_frame_is_mirrored_when_stated():
     points = swinging()
     frame = Frame("y", "left")
-    takes, told = prepare((take(points @ frame.matrix),), Setup(frame=frame))
+    takes, repairs = prepare((take(points @ frame.matrix),), Setup(frame=frame))
     np.testing.assert_allclose(takes[0].keypoints, points, atol=1e-12)
-    assert told == []
+    assert repairs == []
     with pytest.raises(ValueError, match="say that y is up"):
         prepare((take(points @ frame.matrix),), Setup())
 
@@ -216,7 +216,7 @@ def test_takes_of_different_cables_are_refused():
 
 
 def test_a_single_marker_on_a_gripper_does_not_tell_its_pose():
-    with pytest.raises(ValueError, match="poses are not told, and only one keypoint is on each"):
+    with pytest.raises(ValueError, match="poses are not given, and only one keypoint is on each"):
         prepare((take(swinging()),), Setup(on_grippers="ends"))
 
 
@@ -224,8 +224,8 @@ def test_the_log_tells_of_repairs_and_carries_labels():
     points = exchanged(swinging(), slice(60, 130), [0, 1, 2, 4, 3, 5, 6, 7, 8])
     labelled = dataclasses.replace(take(points), labels={"split": "train", "motion": "swing"})
     second = dataclasses.replace(take(swinging(150, seed=5), "b"), labels={"split": "eval", "motion": "swing"})
-    takes, told = prepare((labelled, second), PAIRS)
-    log = gap_log_from_takes(takes, NOMINAL, source="Made up.", repairs=told)
+    takes, repairs = prepare((labelled, second), PAIRS)
+    log = gap_log_from_takes(takes, NOMINAL, source="Made up.", repairs=repairs)
     assert log.meta["source"].startswith("Made up. Take a: keypoints 3, 4 had exchanged")
     assert log.meta["split"] == ["train", "eval"] and log.meta["take"] == ["a", "b"]
     assert log.meta["motion"] == ["swing", "swing"] and log.meta["table"] is None and log.hold is None

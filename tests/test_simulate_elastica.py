@@ -59,8 +59,12 @@ def test_ends_are_met_and_the_shape_moves_with_them(start, end, distance):
     np.testing.assert_allclose(large.position, 2 * shape.position, atol=1e-6)
 
 
-def test_an_s_with_unequal_ends_is_found_where_the_chain_rests():
-    pose, config = ends(-70, -60, 0.7), Discretisation(n_links=97)
+@pytest.mark.parametrize(
+    ("start", "end", "distance"),
+    [(-70, -60, 0.7), (-70, -30, 0.7), (-80, -40, 0.6), (-60, -70, 0.6), (91, 57, 0.51), (-25, -21, 0.57)],
+)
+def test_an_s_with_unequal_ends_is_found_where_the_chain_rests(start, end, distance):
+    pose, config = ends(start, end, distance), Discretisation(n_links=97)
     shape = solve_elastica(pose, 1.0)
     assert shape.stability() > 0
     angles = find_equilibrium(config, pose, arch_angles(config, pose)).angles

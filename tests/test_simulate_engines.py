@@ -13,7 +13,7 @@ import pytest
 from cablejax.cable import Cable, Discretisation
 from cablejax.effects.physics import nominal_physics
 from cablejax.simulate import MjxEngine, ThreadedEngine
-from cablejax.simulate.composite import refuse_plugins
+from cablejax.simulate.composite import build_grasped_chain, refuse_plugins
 
 PLANAR = Discretisation(n_links=25)
 SPATIAL = Discretisation(Cable(bending_stiffness=0.05), n_links=13, dimension=3, timestep=0.01)
@@ -149,6 +149,20 @@ def test_friction_holds_a_cable_that_was_shifted():
     assert np.abs(lag).max() > 5e-3
     creep = np.abs(np.diff(np.asarray(held.keypoints), axis=0))[1:].max()
     assert creep < config.friction_speed * 1.0, "a held cable creeps no faster than the regularisation speed"
+
+
+def test_twists_beyond_the_cables_reach_are_warned_of_where_they_are_differentiated_too():
+    engine = MjxEngine(Discretisation(n_links=5))
+    state, params = engine.initial_state(np.array([[-0.5, 0.0, 0.0], [0.5, 0.0, 0.0]])), nominal_physics(engine.config)
+    apart = jnp.zeros((1, 2, 3)).at[0, 1, 0].set(1e-3)
+    for direction in (apart, jnp.zeros_like(apart)):
+        with pytest.warns(UserWarning, match=r"commanded 1\.0010 m apart and the cable is 1 m long"):
+            jax.jvp(lambda twist: engine.rollout(params, state, twist)[1].keypoints, (apart,), (direction,))
+    engine.rollout(params, state, 0.05 * apart)  # within the tolerance: no warning, which would be an error here
+
+
+def test_links_shorter_than_thick_have_an_inertia_that_mujoco_takes():
+    assert build_grasped_chain(Discretisation(n_links=200)).nbody > 200
 
 
 def test_bad_input_is_refused_with_what_came_and_what_was_expected():

@@ -7,8 +7,8 @@ import pytest
 
 from cablejax.cable import Discretisation
 from cablejax.simulate.plant import Plant, PlantConfig
-from cablejax.simulate.rod_plant import RodPlant, RodPlantConfig
 from cablejax.simulate.table_plant import PlantError
+from closed_loop.rod_plant import RodPlant, RodPlantConfig
 
 ARCH = np.array([[-0.45, 0.0, 0.0], [0.45, 0.0, 0.0]])
 STILL = np.zeros((2, 3))

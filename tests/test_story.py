@@ -29,8 +29,8 @@ def load(script: str):
 def test_experiment_shapes_a_cable(weights, tmp_path, capsys):
     arguments = ["--steps", "1", "--links", "12", "--weights", str(weights), "--out", str(tmp_path)]
     load("01_shape_a_cable.py").main(arguments)
-    told = capsys.readouterr().out
-    assert told.startswith("residual") and "\ndirect" in told
+    shown = capsys.readouterr().out
+    assert shown.startswith("residual") and "\ndirect" in shown
     assert sorted(path.name for path in tmp_path.iterdir()) == [
         "error_over_time.png",
         "final_shapes.png",

@@ -1,7 +1,7 @@
 """What a control call's solver reaches, and how long IPOPT takes to come as far.
 
 A control call does not go on until nothing is left: it makes one linearisation and a few trial plans. Here that solve,
-compiled and in the controller's single precision, is timed beside IPOPT from the same start. IPOPT gets the same
+compiled and in the controller's single precision, is compared with IPOPT from the same start. IPOPT gets the same
 compiled objective and gradient, and has come as far with its first feasible plan that is as good.
 """
 

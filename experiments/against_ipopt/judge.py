@@ -1,7 +1,8 @@
 """One planning problem by our solver and by IPOPT: objectives, feasibility, optimality, and the clock.
 
 The problems are those of the network with rounded corners (`cablejax.dynamics.smooth`): by the network as it was
-trained the gradient jumps, and there is no stationary point to be found. What the plans are worth by that is told too.
+trained the gradient jumps, and there is no stationary point to be found. The values of the plans by that network "
+"are reported too.
 
 Two KKT residuals are given. The absolute one is that of `certify`, in metres as the objective's gradient is: 1e-5 means
 that moving a gripper by 1 mm promises no more than 1e-8 m^2. The scaled one is what IPOPT calls the dual infeasibility,
@@ -25,8 +26,8 @@ from against_ipopt.referee import RefereeConfig, referee, slope_of, value_of
 from against_ipopt.solver_path import PathFinder, SolverPath
 from cablejax.bounded import certify
 from cablejax.control.shaping import Model
-from cablejax.evaluation.rows import Rows
 from cablejax.mpc import Accurate, ShapingProblem
+from rows import Rows
 
 EQUAL = 1e-6
 """Relative difference of objectives that counts as none."""

@@ -22,8 +22,6 @@ from cablejax.control.loop import run_closed_loop
 from cablejax.control.shaping import Model, NetworkDynamics
 from cablejax.control.targets import Shape
 from cablejax.dynamics.smooth import CORNER, smoothed
-from cablejax.evaluation.cases import PLANT_CHAIN, mujoco_plant
-from cablejax.evaluation.protocols import LaidOut, letter_task, random_task
 from cablejax.mpc import MPC, MPCConfig, ObjectiveConfig, Plan, ShapingProblem, Solver
 from cablejax.mpc.feasible import feasible_from
 from cablejax.mpc.problem import Rollout
@@ -31,6 +29,8 @@ from cablejax.npz import read_npz
 from cablejax.residual.corrected import Corrected
 from cablejax.residual.ridge import ResidualModel, zero_residual
 from cablejax.types import History
+from closed_loop.cases import PLANT_CHAIN, mujoco_plant
+from closed_loop.protocols import LaidOut, letter_task, random_task
 
 CONFIG = MPCConfig(objective=ObjectiveConfig(arrival_weight=0.0))
 """The controller whose problems these are: with the paper's objective, in which the keypoints alone decide where to

@@ -363,7 +363,7 @@ def _obstacle(rng, context):
                 "radius": radius,
                 "deepest": deepest,
             }
-    raise ValueError("No place for an obstacle beside these motions.")
+    raise ValueError("No place for an obstacle next to these motions.")
 
 
 @effect("obstacle", "world", (0.02, 1.0), _obstacle, ("ramp_hold", "approach_u"))

@@ -7,7 +7,7 @@ import itertools
 from collections.abc import Callable, Iterable
 
 import numpy as np
-from scipy.stats import beta
+from scipy.stats import binomtest
 
 from cablejax.diagnose.belief import Calibration
 from cablejax.diagnose.conformal import leftover_score
@@ -41,12 +41,10 @@ def share(hits: Iterable[bool]) -> tuple[int, int, float]:
     return sum(values), len(values), float(np.mean(values)) if values else float("nan")
 
 
-def clopper_pearson(hits: int, count: int, confidence: float = 0.9) -> tuple[float, float]:
-    """Exact two-sided interval of a rate; each side alone holds with (1 + confidence) / 2."""
-    side = (1 - confidence) / 2
-    low = 0.0 if hits == 0 else float(beta.ppf(side, hits, count - hits + 1))
-    high = 1.0 if hits == count else float(beta.ppf(1 - side, hits + 1, count - hits))
-    return low, high
+def rate_interval(hits: int, count: int) -> tuple[float, float]:
+    """Exact (Clopper-Pearson) 90 % interval of a rate; each side alone holds with 95 %."""
+    interval = binomtest(hits, count).proportion_ci(0.9)
+    return float(interval.low), float(interval.high)
 
 
 def text(hits: Iterable[bool]) -> str:
@@ -54,7 +52,7 @@ def text(hits: Iterable[bool]) -> str:
     found, count, rate = share(hits)
     if count == 0:
         return "no case"
-    low, high = clopper_pearson(found, count)
+    low, high = rate_interval(found, count)
     return f"{100 * rate:.0f} % ({found}/{count}; {100 * low:.0f}-{100 * high:.0f} %)"
 
 
@@ -104,7 +102,7 @@ def table(cases: list[Scored]) -> list[Row]:
     )
     alarms = [c.said not in ("none", "missing") for c in nones]
     found, count, rate = share(alarms)
-    bound = f", at most {100 * float(clopper_pearson(found, count)[1]):.0f} % with 95 %" if count else ""
+    bound = f", at most {100 * float(rate_interval(found, count)[1]):.0f} % with 95 %" if count else ""
     rows.append(
         Row(
             "false alarms on no-effect cases",

@@ -21,7 +21,7 @@ FASTEST, FASTEST_TURN = 0.06, 0.33
 
 @dataclasses.dataclass(frozen=True)
 class Commands:
-    """What the grippers are told in one episode.
+    """Commands of the grippers in one episode.
 
     Attributes:
         motion: its name.

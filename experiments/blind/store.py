@@ -17,10 +17,10 @@ from typing import Any
 
 import numpy as np
 
-from cablejax.evaluation.rows import Rows, append_row
 from cablejax.gaplog import SCHEMA, GapLog, write_gap_log
 from cablejax.json_file import write_json
 from cablejax.whole_file import whole_file
+from rows import Rows, append_row
 
 from .cases import Draft, label_of
 from .motions import INTERVAL

@@ -1,4 +1,4 @@
-"""Effects that no motion of a log tells apart, found by the simulator that knows both.
+"""Finds effects that are indistinguishable on the motions of a log, by the simulator that has both.
 
 In slow motion stiffness, friction and density act as one number, mu w / EI. A case is an honest test of the name only
 where that number's other readings would look different; where they would not, its label says so beforehand.

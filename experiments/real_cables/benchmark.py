@@ -73,7 +73,7 @@ class CableScore:
             windows as eval has) of the rod with all effects and of what is learned on top of it.
         without_own: the rod on the eval split, its recordings' own values left at what all recordings share.
         simulated: EI / rho that either half of the recordings is simulated with [m^4/s^2].
-        estimated: EI / rho of either half as `estimate` tells it, with its 90 % interval [m^4/s^2].
+        estimated: EI / rho of either half as `estimate` reports it, with its 90 % interval [m^4/s^2].
         seconds: of one 5 s rollout alone (median), and of a batch of all windows.
         effects: that were found.
         networks: size and rounds that were chosen for the graph network of all, and of either half.

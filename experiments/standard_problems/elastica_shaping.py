@@ -27,7 +27,7 @@ STEPS = 4
 ROTATION = 0.15
 """Length that a rotation of one radian counts as [m/rad]."""
 MOTION_WEIGHT = 1e-3
-"""Weight of the squared motion beside the squared distance to the target."""
+"""Weight of the squared motion relative to the squared distance to the target."""
 POINTS = 13
 """Points of the shape that is compared; the rod is 1 m long."""
 _SUBSTEPS = 4

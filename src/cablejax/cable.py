@@ -1,4 +1,4 @@
-"""The cable and its discretisation: what every stage of the pipeline agrees on.
+"""The cable as a physical object, and its discretisation into links.
 
 A `Cable` is the physical object on its table. A `Discretisation` is that cable cut into links for a simulator. The same
 two objects go into simulators, data sets, trained weights and logs, so that any two stages can be compared.

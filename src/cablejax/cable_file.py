@@ -38,6 +38,9 @@ KEYS: Mapping[str, str] = {
 }
 """Key in the file of every field of `Cable`."""
 
+DENSEST, STIFFEST = 25_000.0, 1.5e12
+"""Density [kg/m^3] and Young's modulus [Pa] that no material exceeds: osmium and diamond are the next."""
+
 _OPTIONAL = {"rest_curvature_per_m": 0.0}
 _EXAMPLE = "Write an example with `cablejax cable --out cable.toml`."
 
@@ -122,6 +125,7 @@ def cable_from_fields(fields: Mapping[str, Any], where: str) -> Cable:
                 + f" ({what}). Check its unit."
             )
         values[name] = float(value)
+    _check_material(values, where)
     values |= _keypoints(fields, where)
     if "grasp" in fields:
         grasp = fields["grasp"]
@@ -135,6 +139,21 @@ def cable_from_fields(fields: Mapping[str, Any], where: str) -> Cable:
         for name, key in KEYS.items():
             text = text.replace(f"Cable.{name} ", f"{key} ")
         raise ValueError(f"{where}: {text}") from None
+
+
+def _check_material(values: Mapping[str, float], where: str) -> None:
+    """Rejects numbers that are possible one by one, but that no material has together."""
+    diameter, density = values["diameter"], values["linear_density"] / (math.pi / 4 * values["diameter"] ** 2)
+    modulus = values["bending_stiffness"] / (math.pi / 64 * diameter**4)
+    for key, value, unit, found, most, what in (
+        ("linear_density_kg_per_m", values["linear_density"], "kg/m", f"{density:.3g} kg/m^3", DENSEST, density),
+        ("bending_stiffness_n_m2", values["bending_stiffness"], "N m^2", f"{modulus:.3g} Pa", STIFFEST, modulus),
+    ):
+        if what > most:
+            raise ValueError(
+                f"{where}: {key} is {value:g} {unit} at a diameter_m of {diameter:g} m. A solid rod would have "
+                f"{found}, expected at most {most:g}, which no material exceeds. Check the units of both."
+            )
 
 
 def _keypoints(fields: Mapping[str, Any], where: str) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""A cable is no shorter than its keypoints are apart: arc lengths that say so are refused."""
+"""Rejects arc lengths that are shorter than the polyline through the keypoints."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Reading and writing recorded cable runs: the `cablejax-gap-log/1` format, one `.npz` file per cable set-up.
+"""Reads and writes recorded cable runs: the `cablejax-gap-log/1` format, one `.npz` file per cable set-up.
 
 Files are read without unpickling, checked field by field, and written whole or not at all.
 """
@@ -44,7 +44,7 @@ _POSE_WIDTH, _TWIST_WIDTH = {2: 3, 3: 7}, {2: 3, 3: 6}
 
 
 class GapLogError(ValueError):
-    """A gap log that is not what the format says."""
+    """A gap log that violates the format."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -230,7 +230,7 @@ def _validate_arrays(log: GapLog) -> None:
     for name, shape in shapes.items():
         array = getattr(log, name)
         if array is not None and array.shape != shape:
-            raise GapLogError(f"Field '{name}' has shape {array.shape}, expected {shape} beside these keypoints.")
+            raise GapLogError(f"Field '{name}' has shape {array.shape}, expected {shape} for these keypoints.")
     for index, length in enumerate(log.episode_length):
         if not 1 <= length <= samples:
             raise GapLogError(f"Field 'episode_length' is {length} in episode {index}, expected 1 to {samples}.")

@@ -1,4 +1,4 @@
-"""JSON files: written whole or not at all, and read with a message where they are damaged."""
+"""Reads and writes JSON files; writes are atomic, and damaged files raise an error that names them."""
 
 from __future__ import annotations
 

@@ -8,10 +8,10 @@ from jaxtyping import Float
 from cablejax.types import GapLog
 
 REACH = 5.0
-"""Largest distance of a keypoint from the nearer gripper, in lengths of the cable. A metre is added, by which the
-of camera and arms may differ."""
+"""Largest distance of a keypoint from the nearer gripper, in lengths of the cable. A metre is added for the offset
+between the frames of camera and arms."""
 INWARDS = np.radians(120.0)
-"""Median angle between a gripper's tangent and the cable beside it, at which the tangent points the wrong way."""
+"""Median angle between a gripper's tangent and the cable next to it, at which the tangent points the wrong way."""
 _FEWEST = 5
 _DEGREES_OFF = 0.5
 _DEGREES_BETTER = 3.0
@@ -37,7 +37,7 @@ def far_keypoint(
 
 
 def geometry_fault(log: GapLog) -> str | None:
-    """What is impossible about a log's keypoints or gripper angles and what to do, or None.
+    """Finds impossible keypoints or gripper angles in a log; a message with advice, or None.
 
     Args:
         log: follows the format otherwise. Angles are checked in the plane, between two grippers, with at least five
@@ -62,7 +62,7 @@ def geometry_fault(log: GapLog) -> str | None:
 
 
 def _tangents(log: GapLog, gripper: int) -> tuple[Float[np.ndarray, " S"], Float[np.ndarray, " S"]]:
-    """A gripper's angle, and the direction of the cable beside it [rad], in all samples that show it."""
+    """A gripper's angle, and the direction of the cable next to it [rad], in all samples that show it."""
     angles, directions = [], []
     for episode, samples in enumerate(log.episode_length):
         ends = log.keypoints[episode, :samples, :2] if gripper == 0 else log.keypoints[episode, :samples, -2:]
@@ -82,12 +82,12 @@ def _angle_fault(angle: Float[np.ndarray, " S"], direction: Float[np.ndarray, " 
     turns_too_far = np.ptp(angle) > max(np.pi, _DEGREES_TURN * np.ptp(np.unwrap(direction)))
     if turns_too_far and off > max(_DEGREES_OFF, _DEGREES_BETTER * in_degrees):
         return (
-            f"up to {np.abs(angle).max():.3g}, which fits the cable beside it in degrees (median difference "
+            f"up to {np.abs(angle).max():.3g}, which fits the cable next to it in degrees (median difference "
             f"{in_degrees:.2g} rad) and not in radians ({off:.2g} rad): expected radians. Multiply it by pi / 180."
         )
     if off > INWARDS:
         return (
-            f"{np.degrees(off):.0f} degrees off the cable beside it (median): expected the cable's tangent, from "
+            f"{np.degrees(off):.0f} degrees off the cable next to it (median): expected the cable's tangent, from "
             "gripper 0 towards gripper 1, at both grippers. Add pi if it points the other way."
         )
     return None

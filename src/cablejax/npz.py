@@ -1,4 +1,4 @@
-"""Reading `.npz` files of plain arrays: nothing is ever unpickled, and a damaged file is told by a message."""
+"""Reads `.npz` files of plain arrays: nothing is unpickled, and a damaged file raises `NpzError`."""
 
 from __future__ import annotations
 

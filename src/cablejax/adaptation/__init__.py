@@ -1,1 +1,1 @@
-"""What cable is this? A belief about stiffness and friction, updated at every control step from the model's errors."""
+"""Online estimation of the cable: stiffness and friction, updated at every control step from the model's errors."""

@@ -1,14 +1,14 @@
-"""Which cable is in hand: an extended Kalman filter on the two numbers that a conditioned model is told.
+"""An extended Kalman filter on the two inputs of a conditioned model: stiffness and friction of the cable.
 
-A conditioned model predicts `f(X, R; c)` with `c = cable_descriptor(...)`. The error of one step says by how much c was
-wrong: with H = df/dc at the belief's mean,
+A conditioned model predicts `f(X, R; c)` with `c = cable_descriptor(...)`. The error of one step corrects c: with
+H = df/dc at the estimate's mean,
 
     Lambda' = phi Lambda + (1 - phi) Lambda_0                          c' = Lambda'^-1 phi Lambda c
     Lambda <- Lambda' + w H'H / sigma^2                                c <- c' + Lambda^-1 w H' (dX - f') / sigma^2
 
 in information form, with phi = `memory` and the prior (0, Lambda_0): old evidence fades and the prior takes its place,
-so that a changed cable is followed (stabilised forgetting, Kulhavy and Zarrop 1993). In slow motion stiffness and
-friction are seen as a ratio only; in the direction in which nothing is seen, c stays at the prior's mean.
+so that a changed cable is followed (stabilised forgetting, Kulhavy and Zarrop 1993). In slow motion only the ratio of
+stiffness to friction is identifiable; in the other direction c stays at the prior's mean.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What a function gives beside its value, `fn(y, args) -> (value, aux)`: kept for the point where a solve is."""
+"""Auxiliary output of a function, `fn(y, args) -> (value, aux)`: kept for the current point of a solve."""
 
 from __future__ import annotations
 

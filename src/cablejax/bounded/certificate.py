@@ -1,4 +1,4 @@
-"""Whether a point is a minimum, told by the point and the gradient alone."""
+"""First-order optimality (KKT) check of a point, from the point and its gradient alone."""
 
 from __future__ import annotations
 

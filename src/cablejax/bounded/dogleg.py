@@ -50,10 +50,12 @@ class BoundedDoglegDescent(optx.AbstractDescent):
         return BoundedDoglegDescent(self.secant, feasible, y)
 
     def init(self, y, f_info_struct):
+        """Two legs of length zero."""
         del f_info_struct
         return LegsState(jnp.zeros_like(y), jnp.zeros_like(y))
 
     def query(self, y, f_info, state):
+        """Computes both legs at a new point: to the Cauchy point, and to the minimum of the model in the set."""
         del state
         feasible, at = self.feasible, self.y
         if feasible is None or at is None:
@@ -69,6 +71,7 @@ class BoundedDoglegDescent(optx.AbstractDescent):
         return LegsState(cauchy, minimise_quadratic(model, gradient, feasible, at).point - y)
 
     def step(self, step_size, state):
+        """The point on the two legs whose distance along them is `step_size * |newton|`."""
         tiny = jnp.finfo(step_size.dtype).tiny
         cauchy, leg = state.cauchy, state.newton - state.cauchy
         reach = step_size * jnp.linalg.norm(state.newton)
@@ -98,12 +101,13 @@ class BoundedDogleg(AbstractBoundedLeastSquares):
     trials_per_linearisation: int = eqx.field(static=True)
 
     def __init__(self, rtol: float = 0.0, atol: float = 1e-8, secant: bool = True, trials_per_linearisation: int = 1):
-        """**Arguments:**
+        """Makes the solver.
 
-        - `rtol`: relative tolerance on the projected gradient.
-        - `atol`: absolute tolerance on it.
-        - `secant`: whether the curvature of the residuals is learned.
-        - `trials_per_linearisation`: trial points of one step, the Jacobian being updated in between.
+        Args:
+            rtol: relative tolerance on the projected gradient.
+            atol: absolute tolerance on it.
+            secant: whether the curvature of the residuals is learned.
+            trials_per_linearisation: trial points of one step, the Jacobian being updated in between.
         """
         self.rtol, self.atol, self.norm = rtol, atol, optx.max_norm
         self.descent = BoundedDoglegDescent(secant)

@@ -1,4 +1,4 @@
-"""How far a model is trusted, by how well it has predicted."""
+"""Step sizes from the gain ratio: actual over predicted reduction."""
 
 from __future__ import annotations
 
@@ -31,11 +31,13 @@ class GainRatio(optx.AbstractSearch):
     largest: float = 1e8
 
     def init(self, y, f_info_struct):
+        """A step size of one, not yet tried."""
         del y
         one = jnp.ones((), f_info_struct.f.dtype)
         return _GainState(one, 2 * one)
 
     def step(self, first_step, y, y_eval, f_info, f_eval_info, state):
+        """Accepts or rejects a trial point by its gain ratio, and gives the next step size."""
         move = y_eval - y
         promised = promised_decrease(f_info, move)
         actual = f_info.as_min() - f_eval_info.as_min()

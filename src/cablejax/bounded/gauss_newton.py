@@ -35,16 +35,19 @@ class ConstrainedNewton(optx.AbstractDescent):
         return ConstrainedNewton(self.secant, feasible, y)
 
     def init(self, y, f_info_struct):
+        """A direction of zeros."""
         del f_info_struct
         return jnp.zeros_like(y)
 
     def query(self, y, f_info, state):
+        """The direction to the minimum of the model over the feasible set."""
         del state
         hessian = f_info.hessian.as_matrix()
         regular = regularised(convex_part(hessian) if self.secant else hessian)
         return minimise_quadratic(regular, f_info.grad, self.feasible, self.y).point - y  # pyright: ignore[reportArgumentType]
 
     def step(self, step_size, state):
+        """The direction, shortened to `step_size` of it."""
         return step_size * state, optx.RESULTS.successful
 
 
@@ -63,12 +66,13 @@ class BoundedGaussNewton(AbstractBoundedLeastSquares):
     trials_per_linearisation: int = eqx.field(static=True)
 
     def __init__(self, rtol: float = 0.0, atol: float = 1e-8, secant: bool = False, trials_per_linearisation: int = 1):
-        """**Arguments:**
+        """Makes the solver.
 
-        - `rtol`: relative tolerance on the projected gradient.
-        - `atol`: absolute tolerance on it.
-        - `secant`: whether the curvature of the residuals is learned.
-        - `trials_per_linearisation`: trial points of one step, the Jacobian being updated in between.
+        Args:
+            rtol: relative tolerance on the projected gradient.
+            atol: absolute tolerance on it.
+            secant: whether the curvature of the residuals is learned.
+            trials_per_linearisation: trial points of one step, the Jacobian being updated in between.
         """
         self.rtol, self.atol, self.norm = rtol, atol, optx.max_norm
         self.descent = ConstrainedNewton(secant)

@@ -32,6 +32,7 @@ class FixedPointAdjoint(optx.AbstractAdjoint):
     linear_solver: lx.AbstractLinearSolver = lx.AutoLinearSolver(well_posed=None)
 
     def apply(self, primal_fn, rewrite_fn, inputs, tags):
+        """Solves, then differentiates the solver's fixed point by the implicit function theorem."""
         # The tags describe the Hessian, not this system.
         del rewrite_fn, tags
         return optx.ImplicitAdjoint(self.linear_solver).apply(primal_fn, _fixed_point, inputs, frozenset())

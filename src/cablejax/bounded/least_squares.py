@@ -1,4 +1,4 @@
-"""What the bounded least squares solvers share: one linearisation, one model, one trial point after the other."""
+"""Base of the bounded least squares solvers: one linearisation, one model, one trial point after the other."""
 
 import dataclasses
 from collections.abc import Callable
@@ -67,7 +67,7 @@ class AbstractBoundedLeastSquares(optx.AbstractLeastSquaresSolver):
     One step linearises at y (unless its only trial was rejected: then the linearisation there still holds), proposes a
     trial point and evaluates the residuals there; `optimistix.AbstractGaussNewton` would linearise at every trial
     point, used or not. It ends where `|P(y - g) - y|_inf <= atol + rtol |y|_inf`, or where the model promises less than
-    rounding can tell (`RESULTS.stagnation`, if the former does not hold).
+    rounding resolves (`RESULTS.stagnation`, if the former does not hold).
 
     The descent is given `FunctionInfo.EvalGradHessian` of the flattened point with the Hessian `J'J + S`. Without
     `secant`, S = 0 (Gauss and Newton). With it, S is what the residuals' own curvature contributes, learned from the
@@ -90,6 +90,7 @@ class AbstractBoundedLeastSquares(optx.AbstractLeastSquaresSolver):
     trials_per_linearisation: AbstractVar[int]
 
     def init(self, fn, y, args, options, f_struct, aux_struct, tags):
+        """The state before the first step. Raises `ValueError` unless `fn` gives one flat array."""
         del tags
         if len(f_struct.shape) != 1:
             raise ValueError(f"{type(self).__name__} got residuals of shape {f_struct.shape}, expected a flat array.")
@@ -119,6 +120,7 @@ class AbstractBoundedLeastSquares(optx.AbstractLeastSquaresSolver):
         )
 
     def step(self, fn, y, args, options, state, tags):
+        """Linearises once, then makes `trials_per_linearisation` trial points."""
         del tags
         linearise = options.get("linearise", None) or forward(lambda y, args: fn(y, args)[0])
 
@@ -133,10 +135,12 @@ class AbstractBoundedLeastSquares(optx.AbstractLeastSquaresSolver):
         return y, state, state.trial.aux
 
     def terminate(self, fn, y, args, options, state, tags):
+        """Whether the last trial point met a stopping rule, and its result code."""
         del fn, y, args, options, tags
         return state.trial.terminate, state.trial.result
 
     def postprocess(self, fn, y, aux, args, options, state, tags, result):
+        """Adds the objective, the optimality and the counts of calls to the statistics."""
         del fn, args, options, tags, result
         stats = {
             "objective": state.trial.objective,
@@ -173,7 +177,7 @@ class AbstractBoundedLeastSquares(optx.AbstractLeastSquaresSolver):
         promised = promised_decrease(info, move)
         rounding = 4 * jnp.finfo(y.dtype).eps * jnp.abs(info.f)
         rounded = promised <= rounding
-        # Gradients are known better than values: two more steps are taken on trust where values cannot tell.
+        # Gradients are known better than values: two more steps are taken on trust where rounding hides their decrease.
         accept = (accept | (exact & rounded & (value <= info.f + rounding))) & jnp.isfinite(value) & ~ended
         stalled = exact & rounded & before.rounded & ~ended
         result = optx.RESULTS.where(stalled, optx.RESULTS.stagnation, before.result)  # pyright: ignore[reportArgumentType]

@@ -49,15 +49,18 @@ class DampedQuadratic(optx.AbstractDescent):
         return DampedQuadratic(self.damping, self.secant, feasible, y)
 
     def init(self, y, f_info_struct):
+        """A model with the identity as its Hessian."""
         del f_info_struct
         return ModelState(jnp.zeros_like(y), jnp.eye(y.size, dtype=y.dtype))
 
     def query(self, y, f_info, state):
+        """Keeps gradient and Hessian of the model at a new point."""
         del y, state
         hessian = f_info.hessian.as_matrix()
         return ModelState(f_info.grad, convex_part(hessian) if self.secant else hessian)
 
     def step(self, step_size, state):
+        """The minimum over the set of the model with damping `damping / step_size` on its diagonal."""
         diagonal = jnp.diag(state.hessian)
         # no more than keeps what the model does not see at all from being singular: scales differ by as much as 1e10
         floor = jnp.finfo(diagonal.dtype).eps * diagonal.max() + jnp.finfo(diagonal.dtype).tiny
@@ -90,14 +93,15 @@ class BoundedLevenbergMarquardt(AbstractBoundedLeastSquares):
         trials_per_linearisation: int = 1,
         search: Any = None,
     ):
-        """**Arguments:**
+        """Makes the solver.
 
-        - `rtol`: relative tolerance on the projected gradient.
-        - `atol`: absolute tolerance on it.
-        - `damping`: at the start, relative to the diagonal of the model's Hessian.
-        - `secant`: whether the curvature of the residuals is learned.
-        - `trials_per_linearisation`: trial points of one step, the Jacobian being updated in between.
-        - `search`: how the damping follows the reductions; None = `GainRatio()`.
+        Args:
+            rtol: relative tolerance on the projected gradient.
+            atol: absolute tolerance on it.
+            damping: at the start, relative to the diagonal of the model's Hessian.
+            secant: whether the curvature of the residuals is learned.
+            trials_per_linearisation: trial points of one step, the Jacobian being updated in between.
+            search: how the damping follows the reductions; None = `GainRatio()`.
         """
         self.rtol, self.atol, self.norm = rtol, atol, optx.max_norm
         self.descent = DampedQuadratic(damping, secant)

@@ -1,4 +1,4 @@
-"""Residuals and their Jacobian, where the problem has no cheaper way."""
+"""Residuals and their Jacobian by forward mode, the default linearisation."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The function that is minimised, whether it is given itself or as residuals."""
+"""The objective of a minimisation: a function, or half the sum of squares of residuals."""
 
 from __future__ import annotations
 

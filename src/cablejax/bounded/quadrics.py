@@ -34,15 +34,15 @@ class Quadrics(eqx.Module):
     groups: Float[Array, "K M"]
 
     def lift(self, x: Float[Array, " P"]) -> Float[Array, " M"]:
-        """z at a point."""
+        """Z at a point."""
         return self.matrix @ x + self.offset
 
     def of_lift(self, z: Float[Array, " M"]) -> Float[Array, " K"]:
-        """c where the lifted point is z."""
+        """C where the lifted point is z."""
         return self.groups @ (0.5 * self.curvature * z**2 + self.slope * z) + self.level
 
     def values(self, x: Float[Array, " P"]) -> Float[Array, " K"]:
-        """c at a point."""
+        """C at a point."""
         return self.of_lift(self.lift(x))
 
     def jacobian(self, z: Float[Array, " M"]) -> Float[Array, "K P"]:

@@ -41,7 +41,7 @@ class BoundedQuasiNewton(optx.AbstractMinimiser):
     Every step takes the function and its gradient at one trial point. If that is accepted, the change of the gradient
     updates the model (`positive_update`, after Broyden, Fletcher, Goldfarb and Shanno). The model's minimum over the
     set, damped as in Levenberg and Marquardt's method, is the next trial point. It ends where
-    `|P(y - g) - y|_inf <= atol + rtol |y|_inf`, or where the model promises less than rounding can tell
+    `|P(y - g) - y|_inf <= atol + rtol |y|_inf`, or where the model promises less than rounding resolves
     (`RESULTS.stagnation`, if the former does not hold).
 
     It keeps a dense P by P matrix. Where bounds couple variables, or are active at the minimum, the model is minimised
@@ -59,11 +59,12 @@ class BoundedQuasiNewton(optx.AbstractMinimiser):
     search: optx.AbstractSearch
 
     def __init__(self, rtol: float = 0.0, atol: float = 1e-8, damping: float = 1e-3):
-        """**Arguments:**
+        """Makes the solver.
 
-        - `rtol`: relative tolerance on the projected gradient.
-        - `atol`: absolute tolerance on it.
-        - `damping`: at the start, relative to the diagonal of the model's Hessian.
+        Args:
+            rtol: relative tolerance on the projected gradient.
+            atol: absolute tolerance on it.
+            damping: at the start, relative to the diagonal of the model's Hessian.
         """
         self.rtol, self.atol, self.norm = rtol, atol, optx.max_norm
         self.descent = DampedQuadratic(damping, secant=False)
@@ -71,6 +72,7 @@ class BoundedQuasiNewton(optx.AbstractMinimiser):
         self.search = GainRatio(largest=10.0)
 
     def init(self, fn, y, args, options, f_struct, aux_struct, tags):
+        """The state before the first step; `options["hessian"]`, where given, is the first model."""
         del fn, tags
         dtype, model = f_struct.dtype, options.get("hessian")
         hessian = jnp.zeros((y.size, y.size), dtype) if model is None else model(y, args)
@@ -110,10 +112,10 @@ class BoundedQuasiNewton(optx.AbstractMinimiser):
             # a point without a gradient is no place to go on from, whatever its value
             *(optx.FunctionInfo.Eval(jnp.where(finite, value, jnp.nan)), state.search_state),
         )
-        # Gradients are known better than values: where values cannot tell, a step is taken on trust.
+        # Gradients are known better than values: where rounding hides the decrease, a step is taken on trust.
         rounding = 4 * jnp.finfo(y.dtype).eps * jnp.abs(info.f)
         accept = (accept | (state.rounded & (value <= info.f + rounding))) & finite
-        # the start is no step, and tells nothing about their size
+        # the start is no step, and has no size to learn from
         step_size = jnp.where(first, state.step_size, step_size).astype(y.dtype)
         search_state = jax.tree.map(lambda new, old: jnp.where(first, old, new), search_state, state.search_state)
 
@@ -172,10 +174,12 @@ class BoundedQuasiNewton(optx.AbstractMinimiser):
         )
 
     def terminate(self, fn, y, args, options, state: _State, tags):
+        """Whether the last step met a stopping rule, and its result code."""
         del fn, y, args, options, tags
         return state.terminate, state.result
 
     def postprocess(self, fn, y, aux, args, options, state: _State, tags, result):
+        """Adds the objective, the optimality and the counts of calls to the statistics."""
         del fn, args, options, tags, result
         stats = {
             "objective": state.f_info.f,

@@ -1,4 +1,4 @@
-"""How a bounded solve ended, what it cost and where."""
+"""Result codes of bounded solves, their statistics, and their solution."""
 
 from __future__ import annotations
 
@@ -103,7 +103,7 @@ class Solution:
     ) -> Certificate:
         """The first-order conditions at `value`, from the gradient of `fn` there; of residuals, half their squares'.
 
-        `near` tells how far from a bound counts as held by it, see `certify`.
+        `near` is the distance within which a bound counts as active, see `certify`.
         """
 
         def objective(y):

@@ -1,4 +1,4 @@
-"""Curvature learned along the way: all of it, or what a Gauss-Newton model leaves out."""
+"""Secant updates of the Hessian: of all of it, or of the part that a Gauss-Newton model leaves out."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The two ways in: minimise a function, or a sum of squares, over a feasible set."""
+"""Entry points of the solvers: minimise a function, or a sum of squares, over a feasible set."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def minimise(
         args: what else the function depends on.
         hessian: at the start a model of the Hessian [P, P], positive semi-definite, if there is one;
             `BoundedQuasiNewton` begins with it.
-        max_steps: of the solver at most, with one trial point each unless it is told to make more.
+        max_steps: of the solver at most, with one trial point each unless `trials_per_linearisation` is larger.
         throw: whether to raise outside compiled code; within, the result code is all there is.
 
     Returns:
@@ -74,7 +74,7 @@ def least_squares(
         feasible: the set.
         args: what else the residuals depend on.
         linearise: residuals and Jacobian [M, P], if there is a cheaper way than `jax.jacfwd`.
-        max_steps: of the solver at most, with one trial point each unless it is told to make more.
+        max_steps: of the solver at most, with one trial point each unless `trials_per_linearisation` is larger.
         throw: whether to raise outside compiled code; within, the result code is all there is.
 
     Returns:

@@ -40,12 +40,14 @@ class ProjectionArc(optx.AbstractDescent):
     longest: float = 1e10
 
     def init(self, y, f_info_struct):
+        """Starts with steps of `initial_length` times the gradient."""
         del f_info_struct
         inf = jnp.asarray(jnp.inf, y.dtype)
         start = jnp.asarray(self.initial_length, y.dtype)
         return _ArcState(self.feasible, y, jnp.zeros_like(y), start, jnp.array(True), inf)
 
     def query(self, y, f_info, state):
+        """Computes the next step's spectral length (Barzilai, Borwein) from the last move and change of gradient."""
         moved, bent = y - state.y, f_info.grad - state.grad
         curvature = jnp.sum(moved * bent)
         curved = curvature > 0
@@ -58,6 +60,7 @@ class ProjectionArc(optx.AbstractDescent):
         return _ArcState(feasible, y, f_info.grad, length, jnp.array(False), optimality)
 
     def step(self, step_size, state):
+        """The projection of a step against the gradient, `step_size` times the spectral length long."""
         target = state.y - step_size * state.length * state.grad
         return state.feasible.project(target) - state.y, optx.RESULTS.successful
 
@@ -91,10 +94,12 @@ class NonmonotoneArmijo(optx.AbstractSearch):
     shrink: float = 0.3
 
     def init(self, y, f_info_struct):
+        """A step size of one, and no values in memory."""
         values = jnp.full(self.memory, -jnp.inf, f_info_struct.f.dtype)
         return _MemoryState(jnp.ones((), y.dtype), values, jnp.zeros((), jnp.int32), jnp.array(True))
 
     def step(self, first_step, y, y_eval, f_info, f_eval_info, state):
+        """Accepts a trial point that is lower than the worst value in memory, else halves the step."""
         predicted = f_info.compute_grad_dot(y_eval - y)
         value = f_eval_info.as_min()
         reference = state.values.max()
@@ -142,13 +147,14 @@ class SpectralProjectedGradient(optx.AbstractGradientDescent):
         initial_length: float = 1.0,
         lengths: tuple[float, float] = (1e-10, 1e10),
     ):
-        """**Arguments:**
+        """Makes the solver.
 
-        - `rtol`: relative tolerance on the projected gradient.
-        - `atol`: absolute tolerance on it.
-        - `memory`: a trial is compared with the worst of so many last accepted values.
-        - `initial_length`: length of the first step, relative to the gradient.
-        - `lengths`: least and greatest length of a step, relative to the gradient.
+        Args:
+            rtol: relative tolerance on the projected gradient.
+            atol: absolute tolerance on it.
+            memory: a trial is compared with the worst of so many last accepted values.
+            initial_length: length of the first step, relative to the gradient.
+            lengths: least and greatest length of a step, relative to the gradient.
         """
         self.descent = ProjectionArc(None, initial_length, *lengths)
         self.search = NonmonotoneArmijo(memory)
@@ -159,12 +165,14 @@ class SpectralProjectedGradient(optx.AbstractGradientDescent):
         return eqx.tree_at(lambda s: s.descent.feasible, self, feasible, is_leaf=lambda x: x is None)
 
     def init(self, fn, y, args, options, f_struct, aux_struct, tags):
+        """The state before the first step."""
         solver = self.within(options["feasible"].at(y))
         inner = super(SpectralProjectedGradient, solver).init(fn, y, args, options, f_struct, aux_struct, tags)
         zero, inf = jnp.zeros((), jnp.int32), jnp.asarray(jnp.inf, f_struct.dtype)
         return _SpectralState(inner, y, inf, nothing_yet(aux_struct), zero, zero)
 
     def step(self, fn, y, args, options, state: Any, tags):
+        """One trial point; keeps the best one so far."""
         solver = self.within(options["feasible"].at(state.inner.y_eval))
         # the aux that this returns is that of the step before
         y, inner, _ = super(SpectralProjectedGradient, solver).step(fn, y, args, options, state.inner, tags)
@@ -181,6 +189,7 @@ class SpectralProjectedGradient(optx.AbstractGradientDescent):
         return y, state, state.best_aux
 
     def terminate(self, fn, y, args, options, state: Any, tags) -> tuple[Bool[Array, ""], optx.RESULTS]:
+        """Whether a stopping rule is met, and its result code."""
         del fn, args, options, tags
         inner = state.inner
         started = ~inner.first_step
@@ -193,6 +202,7 @@ class SpectralProjectedGradient(optx.AbstractGradientDescent):
         return done | broken | stalled, result
 
     def postprocess(self, fn, y, aux, args, options, state: Any, tags, result) -> tuple[Any, Any, dict[str, Any]]:
+        """Returns the last point where it is a minimum, else the best one, and the statistics."""
         del fn, y, aux, args, options, tags, result
         inner = state.inner
         # A lower value that was seen on the way does not meet the conditions of a minimum.

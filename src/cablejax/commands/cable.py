@@ -33,6 +33,7 @@ class CableFile(Command):
     """Replace a file that is there."""
 
     def execute(self):
+        """Writes a cable file, or prints it where no --out is given."""
         from cablejax.cable import Cable
         from cablejax.cable_file import cable_text, cable_to_fields, write_cable
 
@@ -66,7 +67,7 @@ def find_cable(source: str | pathlib.Path) -> Cable:
 
         return cable_of_log(read_gap_log(path))
     if (path / "zarr.json").is_file():
-        from cablejax.dataset.store import open_store
+        from cablejax.dataset.opening import open_store
 
         return open_store(path).config.cable
     from cablejax.dynamics.weights import cable_of_weights

@@ -15,7 +15,8 @@ class Demo(Command):
 
     The cable is twice as stiff as the one the model was trained on and rubs on the table by another law. Each shape is
     made with and without the online residual. Writes summary.json, log.npz, report.html and demo.gif, and ends by
-    diagnosing its own run: diagnosis/report.html says what the simulator lacks."""
+    diagnosing its own run: diagnosis/report.html names what the simulator lacks.
+    """
 
     resume_hint: ClassVar[str] = "Run the same command again: finished runs are kept and not repeated."
 
@@ -41,8 +42,9 @@ class Demo(Command):
     """How the controller finds its plan."""
 
     def execute(self):
-        from cablejax.commands.parts import unfinished
+        """Shapes U, S and Z with and without the residual, reports, and diagnoses the run."""
         from cablejax.commands.results import table_of
+        from cablejax.commands.resuming import unfinished
         from cablejax.commands.runs import Job, plant_of, shape_and_report
         from cablejax.commands.shape import PLANT_EFFECT
         from cablejax.control.shaping import METHODS, load_model
@@ -75,7 +77,7 @@ class Demo(Command):
         }, text if gap is None else f"{text}\nThe gap: {gap['sentence']}\n{gap['report']}"
 
     def _diagnosed(self) -> dict[str, str] | None:
-        """What the run tells about the gap between the plant and the simulator; None where it is too short to."""
+        """Diagnosis of the gap between plant and simulator; None for a run that is too short."""
         from cablejax.commands.diagnose import diagnose_and_report
         from cablejax.diagnose import DiagnosisError
         from cablejax.gaplog import read_gap_log

@@ -23,7 +23,8 @@ class Diagnose(Command):
 
     Reads a gap log (`cablejax-gap-log/1`, as `cablejax shape` writes it) and writes report.html, verdict.json and the
     figures. A log of six episodes on a table takes about half a minute; a log in space takes minutes to an hour, by
-    its length, and goes on where it was if interrupted."""
+    its length, and goes on where it was if interrupted.
+    """
 
     log: Annotated[pathlib.Path, tyro.conf.Positional]
     """The recorded run, an .npz file."""
@@ -32,8 +33,8 @@ class Diagnose(Command):
     """Folder of the report."""
 
     commissioning: tuple[pathlib.Path, ...] = ()
-    """Logs known to have no effect, of the same set-up: they tell the simulator's own error from the gap. For logs in
-    the plane."""
+    """Logs of the same set-up known to have no effect: they separate the simulator's own error from the gap. For planar
+    logs only."""
 
     only: tuple[str, ...] = ()
     """Names of the effects to look for; by default all; in space all but intrinsic_curvature, which takes four times as
@@ -43,7 +44,8 @@ class Diagnose(Command):
     """Replace a report that is there."""
 
     def execute(self):
-        from cablejax.commands.parts import unfinished
+        """Diagnoses a log, on a table or in space, and writes its verdict and page."""
+        from cablejax.commands.resuming import unfinished
         from cablejax.diagnose import verdict_json
         from cablejax.gaplog import read_gap_log
 
@@ -64,7 +66,7 @@ class Diagnose(Command):
         return {**verdict_json(result), "report": str(page)}, f"{result.verdict}: {result.sentence}\n{page}"
 
     def _check_plane(self) -> None:
-        """Refuses names of effects that the plane has none of."""
+        """Rejects names of effects that a planar log is not searched for."""
         from cablejax.diagnose import LIBRARY
         from cablejax.diagnose.actuation import ARMS
 
@@ -76,7 +78,7 @@ class Diagnose(Command):
                 raise UsageError(f"--only names the effect {name!r}, expected some of {', '.join(known)}.")
 
     def _check_space(self) -> None:
-        """Refuses what a log in space cannot be diagnosed with."""
+        """Rejects options that do not apply to a log in space."""
         from cablejax.spatial.effects import effect_names
 
         for name in self.only:
@@ -100,7 +102,7 @@ def diagnose_and_report(
     commissioning: Sequence[GapLog] = (),
     state: pathlib.Path | None = None,
 ) -> tuple[CableDiagnosis, pathlib.Path]:
-    """Diagnoses a log, tells how it goes, and writes verdict.json, report.html and the figures into an existing folder.
+    """Diagnoses a log, reports progress, and writes verdict.json, report.html and the figures into an existing folder.
 
     Args:
         log: in the plane or in space.

@@ -32,7 +32,7 @@ class _Import(Command, abc.ABC):
 
     @abc.abstractmethod
     def logs(self) -> list[tuple[pathlib.Path, GapLog, Sequence[str]]]:
-        """Where to write each log, the log, and what was repaired."""
+        """Path and content of each log, and its repairs."""
 
     def execute(self):
         from cablejax.gaplog import write_gap_log
@@ -43,9 +43,9 @@ class _Import(Command, abc.ABC):
         for path, _, _ in logs:
             if path.exists() and not self.overwrite:
                 raise UsageError(f"{path} exists. Give another file with --out, or add --overwrite.")
-        written = [(write_gap_log(path, log, overwrite=self.overwrite), log, told) for path, log, told in logs]
-        results = [_summary(path, log, told) for path, log, told in written]
-        return {"logs": results}, "\n\n".join(map(_told, results))
+        written = [(write_gap_log(path, log, overwrite=self.overwrite), log, repairs) for path, log, repairs in logs]
+        results = [_summary(path, log, repairs) for path, log, repairs in written]
+        return {"logs": results}, "\n\n".join(map(_as_text, results))
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -53,7 +53,8 @@ class Deform(_Import):
     """Import recordings of the DEFORM data set: three-dimensional motion capture of one cable.
 
     SOURCE is upstream's folder of one cable, with pickles in train/ and eval/, one such pickle, or an .npz. Pickles are
-    read without running anything that they say."""
+    read without running anything that they say.
+    """
 
     unit: Literal["m", "cm", "mm", "in"] | None = None
     """Unit of length. By default metres, or another one where the length of the cable leaves no doubt."""
@@ -65,11 +66,12 @@ class Deform(_Import):
     """left: the coordinates are of a left-handed frame."""
 
     def logs(self):
+        """One log of one cable of the data set, and its repairs."""
         from cablejax.recordings.deform import import_deform
         from cablejax.recordings.frames import Frame
 
-        log, told = import_deform(self.source, unit=self.unit, frame=Frame(self.up, self.handedness))
-        return [(self.out, log, told)]
+        log, repairs = import_deform(self.source, unit=self.unit, frame=Frame(self.up, self.handedness))
+        return [(self.out, log, repairs)]
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -77,6 +79,7 @@ class Wires(_Import):
     """Import photographs of hanging wires: one log for each wire, --out with the wire's name before .npz."""
 
     def logs(self):
+        """One log per wire; nothing is repaired."""
         from cablejax.recordings.wires import read_wires, wire_log
 
         return [
@@ -93,6 +96,7 @@ class Csv(_Import):
     """The TOML file; docs/recordings.md has an example."""
 
     def logs(self):
+        """One log of the table, and its repairs."""
         from cablejax.recordings.table import import_csv
 
         return [(self.out, *import_csv(self.source, self.layout))]
@@ -106,6 +110,7 @@ class Mcap(_Import):
     """The TOML file; docs/recordings.md has an example."""
 
     def logs(self):
+        """One log of the bag, and its repairs."""
         from cablejax.recordings.bags import import_mcap
 
         return [(self.out, *import_mcap(self.source, self.layout))]
@@ -123,7 +128,7 @@ class Import:
     )
 
 
-def _summary(path: pathlib.Path, log: GapLog, told: Sequence[str]) -> dict[str, Any]:
+def _summary(path: pathlib.Path, log: GapLog, repairs: Sequence[str]) -> dict[str, Any]:
     import numpy as np
 
     samples = log.episode_length
@@ -136,11 +141,11 @@ def _summary(path: pathlib.Path, log: GapLog, told: Sequence[str]) -> dict[str, 
         "dimension": int(log.keypoints.shape[3]),
         "length_m": float(log.meta["cable"]["length_m"]),
         "observed": float(np.average(seen, weights=samples)),
-        "repairs": list(told),
+        "repairs": list(repairs),
     }
 
 
-def _told(result: dict[str, Any]) -> str:
+def _as_text(result: dict[str, Any]) -> str:
     lines = [
         f"{result['log']}: {result['episodes']} episodes, {result['samples']} samples of {result['keypoints']} "
         f"keypoints in {'space' if result['dimension'] == 3 else 'the plane'}, {100 * result['observed']:.4g} % of "

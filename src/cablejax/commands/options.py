@@ -1,4 +1,4 @@
-"""What the subcommands share: their common options, where JAX computes, the output folder, and how results are told."""
+"""Common parts of the subcommands: their options, the choice of device, the output folder, and tables of results."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from typing import Any, ClassVar, Literal
 
 
 class UsageError(ValueError):
-    """A command line that cannot be carried out: says what came, what was expected and what to do."""
+    """A command line that cannot be carried out: names the value, what was expected and what to do."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -23,7 +23,7 @@ class Command(abc.ABC):
     """Options of every subcommand."""
 
     resume_hint: ClassVar[str] = "Run the same command again."
-    """What Ctrl-C tells the user to do to go on."""
+    """Advice that Ctrl-C prints: how to resume."""
 
     seed: int = 0
     """Seed of everything random; the same seed gives the same result."""
@@ -90,7 +90,7 @@ def output_folder(path: pathlib.Path, *, overwrite: bool) -> pathlib.Path:
 
 
 def say(message: str) -> None:
-    """Tells a person how it goes, on stderr."""
+    """Prints progress on stderr."""
     print(message, file=sys.stderr, flush=True)
 
 

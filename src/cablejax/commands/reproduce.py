@@ -1,4 +1,4 @@
-"""Command lines that make something again, as they go into a model card: without local folders."""
+"""Command lines that reproduce an artefact, for model cards: without local folders."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the closed-loop commands leave behind: a summary, a gap log, a page and an animation."""
+"""Writes the results of the closed-loop commands: a summary, a gap log, a page and an animation."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ def write_results(
         summary: of these runs.
         believed: the cable that the model was trained on, which is what the gap log states.
         about: what plant and model these runs had.
-        facts: settings to print on the page beside versions and machine.
+        facts: settings to print on the page, with versions and machine.
     """
     episodes = [
         dataclasses.replace(run.episode, motion=f"{run.episode.motion}_{method}") for (_, method), run in runs.items()

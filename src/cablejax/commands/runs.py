@@ -1,4 +1,4 @@
-"""What `demo` and `shape` share: runs on the plant, kept as they finish, and their report."""
+"""Common part of `demo` and `shape`: runs on the plant, stored as they finish, and their report."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ import numpy as np
 
 from cablejax.cable import Cable, Discretisation
 from cablejax.commands.options import UsageError, say
-from cablejax.commands.parts import Parts
 from cablejax.commands.results import summarise, write_results
+from cablejax.commands.resuming import Parts
 from cablejax.control.run import ClosedLoopRun
 from cablejax.control.shaping import Method, Model, check_fit, shape_once
 from cablejax.control.targets import Target

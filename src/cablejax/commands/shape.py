@@ -20,7 +20,8 @@ class Shape(Command):
     """Shape one cable into a target of your own, on a simulated plant: the model's cable and effects of your choice.
 
     The target is a letter or a file: .npz or .json with "keypoints" [N, 2] in metres, or .csv with rows x,y. Writes
-    summary.json, log.npz, report.html and demo.gif."""
+    summary.json, log.npz, report.html and demo.gif.
+    """
 
     resume_hint: ClassVar[str] = "Run the same command again: finished runs are kept and not repeated."
 
@@ -54,8 +55,8 @@ class Shape(Command):
     times. By default bending_stiffness:ratio=2; `none` for no effect."""
 
     perception: Literal["true", "cloud"] = "true"
-    """true: the controller is told the keypoints. cloud: it gets what is found in the clouds of a depth camera; the
-    errors printed remain those of the true keypoints."""
+    """true: the controller observes the simulated keypoints. cloud: it observes keypoints estimated from clouds of a
+    depth camera; the printed errors are still those of the true keypoints."""
 
     noise_mm: float | None = None
     """Noise: standard deviation of the observed keypoints, per coordinate, or of the camera's range [mm]. By default 0
@@ -65,9 +66,10 @@ class Shape(Command):
     """Links of the plant's cable."""
 
     def execute(self):
+        """Brings the cable to the targets, keeps each run as it ends, and reports."""
         from cablejax.commands.cable import find_cable
-        from cablejax.commands.parts import unfinished
         from cablejax.commands.results import table_of
+        from cablejax.commands.resuming import unfinished
         from cablejax.commands.runs import Job, plant_of, shape_and_report
         from cablejax.control.shaping import METHODS, load_model
         from cablejax.control.targets import load_target, make_target

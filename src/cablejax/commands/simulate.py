@@ -22,7 +22,8 @@ class Simulate(Command):
     """Simulate random two-gripper motions of a cable and store them as training data.
 
     The store can be interrupted at any time: the same command goes on where it stopped. Several processes may share
-    the work, each with its own --process-index; the result does not depend on how many there are."""
+    the work, each with its own --process-index; the result does not depend on how many there are.
+    """
 
     resume_hint: ClassVar[str] = "What was complete is kept; run the same command again to go on."
 
@@ -78,10 +79,11 @@ class Simulate(Command):
     """Delete a data set that is there and was made by other options. Nothing else is ever deleted."""
 
     def execute(self):
+        """Generates what the store lacks and returns its size and digest."""
         import shutil
 
         from cablejax.dataset.generate import generate
-        from cablejax.dataset.store import open_store
+        from cablejax.dataset.opening import open_store
 
         config = self.dataset_config()
         if self.overwrite and self.out.is_dir() and any(self.out.iterdir()) and open_store(self.out).config != config:

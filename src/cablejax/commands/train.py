@@ -21,7 +21,8 @@ class Train(Command):
     """Train a model of the cable's dynamics on data sets made by `cablejax simulate`.
 
     Writes checkpoints, metrics (CSV and TensorBoard), weights.safetensors, a model card, and the error on held-out
-    trajectories. A training that was interrupted goes on with the same command and ends in the very same weights."""
+    trajectories. A training that was interrupted goes on with the same command and ends in the very same weights.
+    """
 
     resume_hint: ClassVar[str] = "The last checkpoint is kept; run the same command again to go on."
 
@@ -47,8 +48,11 @@ class Train(Command):
     frame: Literal["grippers", "world"] = "grippers"
     """Axes that the network sees the cable in: the grippers' own, which turn with it, or the world's."""
 
+    symmetric: bool = False
+    """Tie the weights so that a mirrored cable, and one whose keypoints are counted from the other end, move alike."""
+
     conditioned: bool = False
-    """Tell the network each cable's stiffness and friction; the data should vary in them."""
+    """Give the network each cable's stiffness and friction as inputs; the data should vary in them."""
 
     start_from: str | None = None
     """Weights to start from instead of random ones: a released model by name, or a training's folder."""
@@ -75,7 +79,8 @@ class Train(Command):
     """Message-passing steps; by default those of the preset."""
 
     def execute(self):
-        from cablejax.dataset.store import open_store
+        """Trains, from a checkpoint where there is one, and reports the open-loop error."""
+        from cablejax.dataset.opening import open_store
         from cablejax.dataset.windows import concatenate, read_split
         from cablejax.dynamics.autoencoder import PretrainConfig, pretrain
         from cablejax.dynamics.error_report import error_report
@@ -165,6 +170,7 @@ class Train(Command):
             network=self.network,
             prior=self.prior,
             frame=self.frame,
+            symmetric=self.symmetric,
             conditioned=self.conditioned,
             n_keypoints=cable.n_keypoints,
             length=cable.length,

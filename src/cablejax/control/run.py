@@ -1,4 +1,4 @@
-"""The record of one closed-loop run, and what it is measured by."""
+"""The record of one closed-loop run, and its measures."""
 
 from __future__ import annotations
 

@@ -16,9 +16,9 @@ from cablejax.cable import Cable
 from cablejax.control.loop import run_closed_loop
 from cablejax.control.run import ClosedLoopRun
 from cablejax.control.targets import Target, straight_start
+from cablejax.dynamics.bfloat16_slopes import with_bfloat16_slopes
 from cablejax.dynamics.config import ModelConfig
 from cablejax.dynamics.model import apply
-from cablejax.dynamics.rough import roughened
 from cablejax.dynamics.weights import cable_of_weights, load_info, load_weights
 from cablejax.mpc import MPC, SOLVERS, MPCConfig
 from cablejax.perceive.camera import CameraConfig
@@ -71,14 +71,15 @@ class NetworkDynamics:
     graphdef: nnx.GraphDef
 
     def __call__(self, weights: nnx.State, history: History, twist: Float[Array, "2 3"]) -> Float[Array, "N 2"]:
+        """Displacement of every keypoint [m] under a twist held for one interval."""
         return apply((self.graphdef, weights), history, twist)
 
     def jacobian(self, weights: nnx.State, history: History, twist: Float[Array, "2 3"]) -> StepJacobian:
-        """Derivatives of a step. Exact in float64; in float32 good to about a thousandth, see `dynamics.rough`.
+        """Derivatives of a step: exact in float64, good to about a thousandth in float32 (`dynamics.bfloat16_slopes`).
 
         The grasped keypoints move as their grippers do, so that only the others' cotangents go through the network.
         """
-        network = roughened(nnx.merge(self.graphdef, weights))
+        network = with_bfloat16_slopes(nnx.merge(self.graphdef, weights))
         between = reverse(lambda history, twist: apply(network, history, twist)[1:-1], history, twist)
         padded = StepJacobian(*(jnp.pad(part, [(1, 1)] + [(0, 0)] * (part.ndim - 1)) for part in between))
         grasped = network.config.interval * jnp.eye(2, 3, dtype=twist.dtype)

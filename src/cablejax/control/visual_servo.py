@@ -256,8 +256,10 @@ def _observe(
 
 
 def _fit_jacobian(config: ServoConfig, state: ServoState) -> Float[Array, "N 2 R"]:
-    """The weighted, regularised least squares fit, as a correction of the last Jacobian. Each keypoint has its own
-    system, because its observations may lack at other times than its neighbours'."""
+    """The weighted, regularised least squares fit, as a correction of the last Jacobian.
+
+    Each keypoint has its own system, because it may be unobserved at other times than its neighbours.
+    """
     age = jnp.arange(config.window - 1, -1, -1)
     off = state.displacement - jnp.einsum("ndr,wr->wnd", state.jacobian, state.window_motion)
     distance = jnp.sqrt(jnp.sum(off**2, axis=-1) + 1e-18)

@@ -15,9 +15,10 @@ import jax.numpy as jnp
 import numpy as np
 from tqdm import tqdm
 
+from cablejax.dataset.opening import open_or_create
 from cablejax.dataset.parallel import DeviceParallel
 from cablejax.dataset.schema import Block, DatasetConfig
-from cablejax.dataset.store import DatasetInfo, open_or_create
+from cablejax.dataset.store import DatasetInfo
 from cablejax.effects.given import with_effects
 from cablejax.effects.physics import Physics, nominal_physics
 from cablejax.simulate import ENGINES, Engine, ThreadedEngine
@@ -96,7 +97,7 @@ def generate(
     """Makes this process' share of a data set, going on where an earlier run stopped.
 
     Process p of P makes the shards p, p + P, p + 2 P, ... and may be started by hand, by a batch system, or under
-    `jax.distributed.initialize`, which then tells p and P. The store is the same for any P.
+    `jax.distributed.initialize`, which then provides p and P. The store is the same for any P.
 
     Args:
         config: what to make.

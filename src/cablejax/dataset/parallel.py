@@ -41,6 +41,7 @@ class DeviceParallel(Engine):
         return len(self.devices)
 
     def initial_state(self, gripper_pose, *, guess=None) -> CableState:
+        """The engine's initial state."""
         return self.engine.initial_state(gripper_pose, guess=guess)
 
     def rollout(self, params, state, twist, interval=1.0):

@@ -1,4 +1,4 @@
-"""What a data set is: its configuration, its arrays, and how both are written down."""
+"""Schema of a data set: its configuration, its arrays, and their JSON form."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""From trajectories to what a one-step model is trained on: a history, the commands that follow, and what happened.
+"""Training windows from trajectories: a history, the commands that follow, and the true future.
 
 `read_trajectories` loads into memory, `split` sets rows aside, `read_split` does both for several stores, and
 `draw_windows` draws and augments inside jit. A draw depends on its key alone, so a training whose keys are counted, not
@@ -17,7 +17,8 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from cablejax.cable import GRAVITY
-from cablejax.dataset.store import Store, open_store
+from cablejax.dataset.opening import open_store
+from cablejax.dataset.store import Store
 from cablejax.types import History, Trajectory, cable_descriptor
 
 

@@ -121,7 +121,7 @@ class Fit:
         return Fit(self.explanation, self.sse[rows], self.gradient[rows], self.curvature[rows], recording)
 
     def held_out_sse(self, evidence: Evidence) -> Float[np.ndarray, "E"]:
-        """r'r of every episode if its motion had been left out of the fit: by `refits` where there are some.
+        """R'r of every episode if its motion had been left out of the fit: by `refits` where there are some.
 
         Else by one Gauss-Newton step without the episodes of this motion. Where that leads too far to be believed,
         because this motion alone shows the effect, or because there is no other, its episodes pay twice the number of

@@ -1,0 +1,1 @@
+"""Learned dynamics of a cable: its graph, networks, training, evaluation and weights."""

@@ -1,4 +1,4 @@
-"""The model card: what a person must know of trained weights before relying on them, as Markdown."""
+"""The model card of trained weights as Markdown: data, accuracy, limits."""
 
 from __future__ import annotations
 
@@ -58,7 +58,8 @@ def write_card(
         f"{config.n_keypoints} keypoints, one step of {config.interval:g} s, {config.history} samples of history. It "
         f"corrects {'no' if config.prior == 'none' else f'the {config.prior}'} prior"
         + (", sees the cable in the world's frame" if config.frame == "world" else "")
-        + (" and is told the cable's stiffness and friction." if config.conditioned else "."),
+        + (", commutes with mirroring and with reversing the cable" if config.symmetric else "")
+        + (" and has the cable's stiffness and friction as inputs." if config.conditioned else "."),
         "",
         "## Data",
         "",

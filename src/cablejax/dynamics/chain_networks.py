@@ -1,4 +1,4 @@
-"""The two networks that the graph network is compared with: neither knows more of a cable than the order of its nodes.
+"""A perceptron and a bidirectional LSTM, the two networks that the graph network is compared with.
 
 Both see the same node features (`cablejax.dynamics.graph`), correct the same prior, and are trained alike. Edge
 features are not for them: what they hold follows from the nodes' positions.
@@ -29,6 +29,7 @@ class FlatMLP(nnx.Module):
     def __call__(
         self, node_features: Float[Array, "N node_features"], edge_features: Float[Array, "E edge_features"]
     ) -> Float[Array, "N 2"]:
+        """Output of every keypoint from the node features of all; edge features are not used."""
         return self.layers(node_features.reshape(1, -1)).reshape(-1, 2)
 
 
@@ -41,6 +42,7 @@ class LSTM(nnx.Module):
         self.of_state = nnx.Linear(size, 4 * size, use_bias=False, kernel_init=nnx.initializers.orthogonal(), rngs=rngs)
 
     def __call__(self, along: Float[Array, "N inputs"]) -> Float[Array, "N size"]:
+        """Hidden state at every keypoint. `along` holds the inputs of the gates, before the recurrent part."""
         kernel = self.of_state.kernel.get_value()
 
         def cell(carry, given):
@@ -74,6 +76,7 @@ class BiLSTM(nnx.Module):
     def __call__(
         self, node_features: Float[Array, "N node_features"], edge_features: Float[Array, "E edge_features"]
     ) -> Float[Array, "N 2"]:
+        """Output of every keypoint from both directions; edge features are not used."""
         along = self.encoder(node_features)
         for forwards, backwards in zip(self.forwards, self.backwards, strict=True):
             along = jnp.concatenate([forwards(along), backwards(along)], axis=-1)

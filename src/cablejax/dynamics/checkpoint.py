@@ -36,12 +36,12 @@ class Checkpoints:
         if step != self.latest():
             self._manager.save(step, args=ocp.args.StandardSave(state))
 
-    def restore(self, like: Any, *, tell: Callable[[str], None] = lambda text: None) -> Any:
+    def restore(self, like: Any, *, report: Callable[[str], None] = lambda text: None) -> Any:
         """The newest state that can be read; newer ones, which are damaged, are deleted.
 
         Args:
             like: a pytree that shapes, dtypes and structure are checked against.
-            tell: called with a line of text on each state that cannot be read.
+            report: called with a line of text on each state that cannot be read.
 
         Raises:
             ValueError: none can be read.
@@ -57,9 +57,9 @@ class Checkpoints:
                 reason = next(iter(str(error).splitlines()), repr(error))
                 continue
             for newer in damaged:
-                tell(f"The checkpoint of step {newer} is damaged; going on from the one of step {step}.")
+                report(f"The checkpoint of step {newer} is damaged; resuming from the one of step {step}.")
                 self._manager.delete(newer)
             return state
         raise ValueError(
-            f"No checkpoint in {self._folder} can be read ({reason}). Delete this folder to begin the training anew."
+            f"No checkpoint in {self._folder} can be read ({reason}). Delete this folder to restart the training."
         )

@@ -1,4 +1,4 @@
-"""What is fixed about a learned model: the graph it sees, the sizes of its networks, the scales of its numbers."""
+"""Configuration of a learned model: its graph, the sizes of its networks, and the scales of its features."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ class ModelConfig:
         length: free length of the cable [m].
         radius: connective radius [m], measured along the cable at rest.
         history: samples seen H = m + 1.
-        conditioned: whether the network is told what is known of the cable, `History.cable`.
+        conditioned: whether the cable's descriptor, `History.cable`, is an input of the network.
         interval: duration of one step [s].
         latent: size of latent node and edge vectors; of the recurrent state.
         hidden: width of the hidden layers of every network.
@@ -60,6 +60,8 @@ class ModelConfig:
             see `cablejax.simulate.chain.statics`; "rigid", the interpolation of the grippers' motion; or "none".
         frame: axes that features and output are expressed in: "grippers", which turn and shift with the cable, or for
             comparison "world".
+        symmetric: whether the graph network's weights are tied so that mirrored or reversed cables move alike, see
+            `cablejax.dynamics.symmetry`.
         normalisation: scales of features and output.
     """
 
@@ -76,6 +78,7 @@ class ModelConfig:
     message_passing: int = 10
     prior: Literal["static", "rigid", "none"] = "static"
     frame: Literal["grippers", "world"] = "grippers"
+    symmetric: bool = False
     normalisation: Normalisation = Normalisation()
 
     def __post_init__(self):
@@ -100,6 +103,16 @@ class ModelConfig:
         ):
             if getattr(self, name) not in known:
                 raise ValueError(f"ModelConfig.{name} is {getattr(self, name)!r}, expected one of {known}.")
+        if self.symmetric and (self.network != "gns" or self.frame != "grippers"):
+            raise ValueError(
+                f"ModelConfig.symmetric is for the graph network in the grippers' frame, not for network "
+                f"{self.network!r} in frame {self.frame!r}: leave it False there."
+            )
+        if self.symmetric and (self.latent % 4 or self.hidden % 4):
+            raise ValueError(
+                f"ModelConfig.latent is {self.latent} and hidden {self.hidden}, expected multiples of 4: a symmetric "
+                "network has as many channels for each of the group's four elements."
+            )
         if self.radius < self.spacing:
             raise ValueError(
                 f"ModelConfig.radius is {self.radius} m but keypoints are {self.spacing:.4g} m apart: no two would be "
@@ -113,8 +126,11 @@ class ModelConfig:
 
     @property
     def node_features(self) -> int:
-        """Position, past displacements, arc length, control input and grasp, prior displacement, distance from rest,
-        and what is known of the cable."""
+        """Number of features of a node.
+
+        Position, past displacements, arc length, control input and grasp, prior displacement, distance from rest, and
+        the cable's descriptor where the network is conditioned on it.
+        """
         return 2 + 2 * (self.history - 1) + 2 + 7 + 2 + 2 + (2 if self.conditioned else 0)
 
     @property

@@ -1,4 +1,4 @@
-"""The open-loop accuracy of a network beside the floors that need none, as numbers and as tables.
+"""Open-loop accuracy of a network compared with baselines that learn nothing, as numbers and as tables.
 
 Windows in which the cable snaps through count apart: there the error is that of guessing when it happens, decimetres
 instead of millimetres, and a few of them decide a root mean square.

@@ -16,7 +16,7 @@ from jaxtyping import Array, Bool, Float
 from cablejax.dataset.windows import Window, window_at
 from cablejax.dynamics.config import ModelConfig
 from cablejax.dynamics.graph import prior_of
-from cablejax.dynamics.model import Dynamics, bind
+from cablejax.dynamics.model import OneStepModel, bind
 from cablejax.dynamics.normalisation import check_trajectories
 from cablejax.simulate.motions import MotionConfig, twist_size
 from cablejax.types import History, Trajectory, advance
@@ -62,7 +62,7 @@ class OpenLoopError:
 
 
 def predict(
-    dynamics: Dynamics, history: History, twist: Float[Array, "K Q 3"], interval: float = 1.0
+    dynamics: OneStepModel, history: History, twist: Float[Array, "K Q 3"], interval: float = 1.0
 ) -> Float[Array, "K N 2"]:
     """Keypoints [m] after each of K commands, by rolling out the model. Differentiable wherever the model is."""
 
@@ -78,7 +78,7 @@ def no_motion(history: History, twist: Float[Array, "2 3"]) -> Float[Array, "N 2
     return jnp.zeros_like(history.keypoints[-1])
 
 
-def prior_motion(config: ModelConfig, prior: Literal["static", "rigid", "none"]) -> Dynamics:
+def prior_motion(config: ModelConfig, prior: Literal["static", "rigid", "none"]) -> OneStepModel:
     """The floor that a model's prior is without learning."""
     config = dataclasses.replace(config, prior=prior)
     return lambda history, twist: prior_of(history, twist, config).displacement
@@ -94,7 +94,7 @@ def evaluation_windows(data: Trajectory, config: ModelConfig, *, steps: int, str
     return jax.tree.map(lambda x: x.reshape(m * starts.size, *x.shape[2:]), windows)
 
 
-def make_errors(rollout: Callable[..., Dynamics], interval: float) -> Callable[..., Array]:
+def make_errors(rollout: Callable[..., OneStepModel], interval: float) -> Callable[..., Array]:
     """Compiled `(model arguments, windows) -> error [m] of every window after every step`, shape [W, K]."""
 
     @jax.jit
@@ -111,7 +111,7 @@ def make_errors(rollout: Callable[..., Dynamics], interval: float) -> Callable[.
 
 
 def open_loop_error(
-    model: Dynamics | tuple[nnx.GraphDef, nnx.State],
+    model: OneStepModel | tuple[nnx.GraphDef, nnx.State],
     data: Trajectory,
     config: ModelConfig,
     *,
@@ -138,7 +138,7 @@ def open_loop_error(
 
 
 def window_errors(
-    model: Dynamics | tuple[nnx.GraphDef, nnx.State], windows: Window, config: ModelConfig, *, batch: int = 64
+    model: OneStepModel | tuple[nnx.GraphDef, nnx.State], windows: Window, config: ModelConfig, *, batch: int = 64
 ) -> Float[np.ndarray, "W K"]:
     """Error [m] of every window after every step; arguments as in `open_loop_error`."""
     if isinstance(model, tuple):

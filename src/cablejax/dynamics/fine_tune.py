@@ -1,4 +1,4 @@
-"""Starting a training from a model that is there, instead of from random weights."""
+"""Starts a training from an existing model instead of from random weights."""
 
 from __future__ import annotations
 

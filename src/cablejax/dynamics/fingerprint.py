@@ -1,4 +1,4 @@
-"""What tells arrays from others: their hash."""
+"""A content hash of arrays."""
 
 from __future__ import annotations
 

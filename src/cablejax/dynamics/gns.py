@@ -32,6 +32,7 @@ class MessagePassing(nnx.Module):
     def __call__(
         self, nodes: Float[Array, "N latent"], edges: Float[Array, "E latent"]
     ) -> tuple[Float[Array, "N latent"], Float[Array, "E latent"]]:
+        """One round of messages: every edge, then every node, is updated by its residual network."""
         own, sender, receiver = self.edge.first
         shared = gather(sender(nodes), receiver(nodes), self.offsets)
         message = self.edge.after_first(own(edges) + shared)
@@ -64,7 +65,8 @@ class EncodeProcessDecode(nnx.Module):
     """
 
     def __init__(self, features: tuple[int, int], outputs: int, config: ModelConfig, rngs: nnx.Rngs):
-        """
+        """Draws the first weights.
+
         Args:
             features: numbers of features of a node and of an edge.
             outputs: numbers predicted per node; all 0 before training.
@@ -81,6 +83,7 @@ class EncodeProcessDecode(nnx.Module):
     def __call__(
         self, node_features: Float[Array, "N node_features"], edge_features: Float[Array, "E edge_features"]
     ) -> Float[Array, "N outputs"]:
+        """Encodes nodes and edges, passes messages, and decodes the nodes."""
         nodes, edges = self.node_encoder(node_features), self.edge_encoder(edge_features)
         for step in self.processor:
             nodes, edges = step(nodes, edges)

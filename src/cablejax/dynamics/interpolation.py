@@ -1,4 +1,4 @@
-"""Where the keypoints would go if only the grippers' motion were known: the model's starting point, and its floor."""
+"""Keypoints interpolated from the grippers' motion alone: a prior for models, and a baseline."""
 
 from __future__ import annotations
 

@@ -43,6 +43,7 @@ class MLP(nnx.Module):
         return x if self.norm is None else self.norm(x)
 
     def __call__(self, *inputs: Float[Array, "rows _"]) -> Float[Array, "rows output"]:
+        """Applies the layers to the concatenation of the inputs, without concatenating them."""
         first = sum(layer(x) for layer, x in zip(self.first[1:], inputs[1:], strict=True))
         return self.after_first(self.first[0](inputs[0]) + first)
 

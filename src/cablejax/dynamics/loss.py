@@ -1,4 +1,4 @@
-"""What training minimises: keypoint errors after one or several steps of the model's own rollout."""
+"""The training loss: keypoint errors after one or several steps of the model's own rollout."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from cablejax.dataset.windows import Window
-from cablejax.dynamics.model import Dynamics
+from cablejax.dynamics.model import OneStepModel
 from cablejax.types import History, advance
 
 
@@ -25,13 +25,14 @@ def random_walk_noise(key: PRNGKeyArray, history: History, final_std: float) -> 
 
 
 def rollout_loss(
-    dynamics: Dynamics, window: Window, *, scale: float, robust: float, interval: float, pushforward: bool
+    dynamics: OneStepModel, window: Window, *, scale: float, robust: float, interval: float, pushforward: bool
 ) -> Float[Array, ""]:
-    """Position error over the K steps of a window: the mean of `2 d^2 (sqrt(1 + m / d^2) - 1)` with m the mean square
-    over free keypoints and coordinates in units of `scale`, and d = `robust`.
+    """Robust position error of a rollout, averaged over the K steps of a window.
 
-    Near zero this is m. Beyond d it grows like sqrt(m), so that steps in which the cable snaps through, which nobody
-    predicts to the millimetre, do not drown the rest: on random motions 1 % of the steps hold half of all m.
+    The mean of `2 d^2 (sqrt(1 + m / d^2) - 1)`, m being the mean square error over free keypoints and coordinates in
+    units of `scale`, and d = `robust`. Near zero this is m. Beyond d it grows like sqrt(m), so that steps in which the
+    cable snaps through, which no model predicts to the millimetre, do not dominate: on random motions 1 % of the steps
+    hold half of the sum of m.
     With K = 1 and a noisy history this is the one-step loss whose target is corrected for the noise: the displacement
     that leads from the noisy position to the true next one. Differentiable in the weights behind `dynamics`.
 

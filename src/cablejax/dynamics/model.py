@@ -14,7 +14,7 @@ from cablejax.dynamics.gns import GNS
 from cablejax.dynamics.graph import build_graph, frame_of, prior_of
 from cablejax.types import History
 
-Dynamics = Callable[[History, Float[Array, "Q 3"]], Float[Array, "N 2"]]
+OneStepModel = Callable[[History, Float[Array, "Q 3"]], Float[Array, "N 2"]]
 """A one-step model: the displacement X(t + 1) - X(t) [m] that a command causes after a history."""
 
 Network = GNS | FlatMLP | BiLSTM
@@ -31,9 +31,9 @@ def apply(
 ) -> Float[Array, "N 2"]:
     """Displacement X(t + 1) - X(t) [m] of every keypoint; at the two grasped ones it is the grippers', exactly.
 
-    Turns with the cable, unless it works in the world's frame: rotating and shifting the input rotates the output.
-    Differentiable in weights, history and
-    twist (almost everywhere: the activation is ReLU).
+    Rotating and shifting the input rotates the output, unless the model works in the world's frame. With tied weights
+    the same holds for mirroring the input and for counting its keypoints from the other end. Differentiable in weights,
+    history and twist (almost everywhere: the activation is ReLU).
 
     Args:
         model: the network, or its split form `(graphdef, weights)`.
@@ -50,6 +50,6 @@ def apply(
     return prior.displacement + jnp.pad(beyond @ axes, ((1, 1), (0, 0)))
 
 
-def bind(graphdef: nnx.GraphDef, weights: nnx.State) -> Dynamics:
+def bind(graphdef: nnx.GraphDef, weights: nnx.State) -> OneStepModel:
     """The model as a function of history and twist alone."""
     return lambda history, twist: apply((graphdef, weights), history, twist)

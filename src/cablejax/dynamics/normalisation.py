@@ -1,4 +1,4 @@
-"""Scales of features and output, measured on training data, and the check that the data can be measured at all."""
+"""Scales of features and outputs, measured on training data, and the validation of these data."""
 
 from __future__ import annotations
 
@@ -15,8 +15,12 @@ GRASP_TOLERANCE = 2e-2
 
 
 def check_trajectories(data: Trajectory, config: ModelConfig, *, steps: int, what: str) -> None:
-    """Raises ValueError unless `data` are float arrays [M, T + 1, N, 2], [M, T + 1, 2, 3], [M, T, 2, 3], all finite,
-    for this configuration, with ends on the grippers and at least `steps` commands."""
+    """Checks that trajectories can train this configuration.
+
+    Raises:
+        ValueError: `data` are not finite float arrays [M, T + 1, N, 2], [M, T + 1, 2, 3] and [M, T, 2, 3], the ends are
+            not on the grippers, or there are fewer than `steps` commands.
+    """
     x, pose, twist = np.shape(data.keypoints), np.shape(data.gripper_pose), np.shape(data.gripper_twist)
     n = config.n_keypoints
     expected = f"keypoints [M, T+1, {n}, 2], gripper_pose [M, T+1, 2, 3], gripper_twist [M, T, 2, 3]"
@@ -54,7 +58,8 @@ def check_trajectories(data: Trajectory, config: ModelConfig, *, steps: int, wha
 def fit_normalisation(data: Trajectory, config: ModelConfig) -> Normalisation:
     """Root mean squares of features and targets over trajectories [M, T, ...], see `Normalisation`.
 
-    The residual's leaves out the 5 % of steps with the largest."""
+    The residual's leaves out the 5 % of steps with the largest.
+    """
     x = np.asarray(data.keypoints, np.float64)
     pose, twist = np.asarray(data.gripper_pose, np.float64), np.asarray(data.gripper_twist, np.float64)
     moved = np.diff(x, axis=1)

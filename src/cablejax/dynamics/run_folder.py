@@ -1,4 +1,4 @@
-"""The folder of a training: whose it is, and what may be replaced in it."""
+"""The folder of a training: checks that it belongs to this training before anything in it is replaced."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ def _read(path: Path) -> dict[str, Any]:
         found = read_json(path)
     except ValueError as error:
         raise ValueError(
-            f"{error} Which training {path.parent} holds cannot be told: choose another folder, or delete this one."
+            f"{error} It is unknown which training {path.parent} holds: choose another folder, or delete this one."
         ) from error
     if not isinstance(found, dict) or not {"config", "data"} <= found.keys():
         raise ValueError(f"{path} was not made by a training: choose another folder.")

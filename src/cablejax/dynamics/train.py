@@ -35,6 +35,7 @@ from cablejax.dynamics.metrics import MetricsLog
 from cablejax.dynamics.model import bind, make_network
 from cablejax.dynamics.normalisation import check_trajectories, fit_normalisation
 from cablejax.dynamics.run_folder import CHECKPOINTS, claim_folder
+from cablejax.dynamics.symmetry import initially_symmetric, symmetrised
 from cablejax.dynamics.train_config import Phase, TrainConfig
 from cablejax.types import Trajectory
 
@@ -124,8 +125,7 @@ def train(
     claim_folder(out_dir, run, resume=resume, overwrite=overwrite)
 
     graphdef, weights = nnx.split(make_network(model_config, nnx.Rngs(config.seed)))
-    if initial is not None:
-        weights = initial[1]
+    weights = initially_symmetric(weights, model_config) if initial is None else initial[1]
     optimiser = config.optimiser()
     state = TrainState(weights, weights, optimiser.init(weights), jnp.zeros((), jnp.int32))
     device_data = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), data)
@@ -135,7 +135,7 @@ def train(
     scores: dict[int, float] = {}
     with Checkpoints(out_dir / CHECKPOINTS) as checkpoints, interrupt_flag() as interrupted:
         if checkpoints.latest() is not None:
-            state = checkpoints.restore(state, tell=functools.partial(tqdm.write, file=sys.stderr))
+            state = checkpoints.restore(state, report=functools.partial(tqdm.write, file=sys.stderr))
         step, total = int(state.step), config.total_steps
         bar = tqdm(total=total, initial=step, unit="step", disable=not progress, dynamic_ncols=True)
         with MetricsLog(out_dir, columns, step) as log, bar:
@@ -145,16 +145,7 @@ def train(
                 began = time.perf_counter()
                 state, losses = jax.block_until_ready(update(state, device_data))
                 seconds, done, step = time.perf_counter() - began, int(state.step) - step, int(state.step)
-                rate = float(np.asarray(config.learning_rate()(step - 1)))
-                row = {"phase": index, "learning_rate": rate, "seconds": seconds}
-                row |= {name: float(np.mean(values)) for name, values in losses.items()}
-                if not np.isfinite(row["loss"]):
-                    raise DivergedError(
-                        f"The training diverged: its loss is {row['loss']} after step {step}, at a learning rate of "
-                        f"{rate:.3g}. Train with a lower one (--lr, now {config.phases[0].lr_start:g}) or larger "
-                        f"batches, in another folder or with overwriting (--overwrite); {out_dir} keeps the last good "
-                        "checkpoint."
-                    )
+                row = {"phase": index, "seconds": seconds} | chunk_metrics(config, step, losses, out_dir)
                 chunks = -(-step // config.chunk)
                 if evaluate is not None and (chunks % config.evaluate_every == 0 or step == total):
                     scores = evaluate(state.average)
@@ -164,7 +155,7 @@ def train(
                     checkpoints.save(step, state)
                 bar.update(done)
                 bar.set_postfix({"loss": f"{row['loss']:.2e}"} | {f"e{h}_cm": f"{s:.3f}" for h, s in scores.items()})
-    return TrainResult(model_config, graphdef, state.average, step, step == total, scores)
+    return TrainResult(model_config, graphdef, symmetrised(state.average, model_config), step, step == total, scores)
 
 
 @functools.lru_cache(maxsize=8)
@@ -177,7 +168,7 @@ def chunk_update(config: TrainConfig, phase_index: int, graphdef: nnx.GraphDef, 
             key = jax.random.fold_in(jax.random.key(config.seed), state.step)
             windows = noisy_windows(key, data, phase, model.history)
             loss, gradient = jax.value_and_grad(batch_loss)(state.weights, graphdef, windows, phase, model)
-            change, inner = optimiser.update(gradient, state.optimiser, state.weights)
+            change, inner = optimiser.update(symmetrised(gradient, model), state.optimiser, state.weights)
             weights = optax.apply_updates(state.weights, change)
             # A short memory at first, so that the average does not remember the random start.
             decay = jnp.minimum(config.ema, (1.0 + state.step) / (10.0 + state.step))
@@ -188,6 +179,23 @@ def chunk_update(config: TrainConfig, phase_index: int, graphdef: nnx.GraphDef, 
         return jax.lax.scan(one, state, length=steps)
 
     return jax.jit(update)
+
+
+def chunk_metrics(config: TrainConfig, step: int, losses: dict[str, Array], out_dir: Path) -> dict[str, float]:
+    """Learning rate and mean metrics of the chunk that ended at `step`.
+
+    Raises:
+        DivergedError: the loss is no longer finite.
+    """
+    rate = float(np.asarray(config.learning_rate()(step - 1)))
+    row = {"learning_rate": rate} | {name: float(np.mean(values)) for name, values in losses.items()}
+    if not np.isfinite(row["loss"]):
+        raise DivergedError(
+            f"The training diverged: its loss is {row['loss']} after step {step}, at a learning rate of {rate:.3g}. "
+            f"Train with a lower one (--lr, now {config.phases[0].lr_start:g}) or larger batches, in another folder or "
+            f"with overwriting (--overwrite); {out_dir} keeps the last good checkpoint."
+        )
+    return row
 
 
 def noisy_windows(key: Array, data: Trajectory, phase: Phase, history: int) -> Window:
@@ -229,6 +237,7 @@ class Validation:
         self.errors = make_errors(lambda weights: bind(graphdef, weights), config.model.interval)
 
     def __call__(self, weights: nnx.State) -> dict[int, float]:
+        """Median error over the validation windows by horizon [cm]."""
         error = np.asarray(self.errors((weights,), self.windows), np.float64)
         return {h: float(100 * np.median(error[:, h - 1])) for h in self.horizons}
 

@@ -1,4 +1,4 @@
-"""How a model is trained: phases, optimiser, what is written when."""
+"""Configuration of a training: phases, optimiser, and outputs."""
 
 from __future__ import annotations
 

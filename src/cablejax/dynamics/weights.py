@@ -108,7 +108,7 @@ def load_released(
 
 
 def load_info(source: str | os.PathLike[str]) -> dict[str, Any]:
-    """Where the weights come from, as `save_weights` was told; `source` as in `load_weights`."""
+    """The provenance of the weights, as given to `save_weights`; `source` as in `load_weights`."""
     return _open(source)[1]["info"]
 
 

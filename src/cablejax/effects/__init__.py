@@ -1,4 +1,4 @@
-"""What a simulator may lack: the library of effects, by the names of the gap log's format."""
+"""The library of effects that a simulator may lack, by the names of the gap log's format."""
 
 from cablejax.effects.arms import ActuationGain, ActuationLag
 from cablejax.effects.base import CableEffect, Context, Hook

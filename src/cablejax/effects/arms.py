@@ -23,9 +23,11 @@ class ActuationGain(CableEffect):
     amplitude, reversible = 0, True
 
     def apply(self, physics, values, variant, config):
+        """Multiplies the distance that the arms move per commanded distance."""
         return replace(physics, actuation_gain=physics.actuation_gain * values[0])
 
     def starts(self, context):
+        """None: a regression of measured on commanded motion estimates the gain without simulation."""
         return []
 
 
@@ -42,6 +44,7 @@ class ActuationLag(CableEffect):
     amplitude = 0
 
     def apply(self, physics, values, variant, config):
+        """Adds the pure delay [s], and the rest of the time as the first-order lag's time constant [s]."""
         total, delay = values
         return replace(
             physics,
@@ -50,6 +53,7 @@ class ActuationLag(CableEffect):
         )
 
     def starts(self, context):
+        """None: a regression of measured on commanded motion estimates the lag without simulation."""
         return []
 
 

@@ -1,4 +1,4 @@
-"""What an effect of a cable is: an effect that says how it changes the cable's physics."""
+"""Effects of a cable: how they change its physics, and through which hook of a simulator."""
 
 from __future__ import annotations
 

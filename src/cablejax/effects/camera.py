@@ -27,6 +27,7 @@ class CameraSimilarity(CableEffect):
     side = "observation"
 
     def apply(self, physics, values, variant, config):
+        """Scales, turns [rad] and shifts [m] the keypoints' frame."""
         xp = values[0].__array_namespace__()
         return replace(
             physics,
@@ -55,9 +56,11 @@ class CameraLag(CableEffect):
     side = "observation"
 
     def apply(self, physics, values, variant, config):
+        """Adds to the keypoints' lag [s]."""
         return replace(physics, camera_lag=physics.camera_lag + values[0])
 
     def starts(self, context):
+        """A lag of 0.15 and of 0.6 s."""
         return [(0, (0.15,)), (0, (0.6,))]
 
 
@@ -78,6 +81,7 @@ class KeypointBias(CableEffect):
     repeatable = True
 
     def apply(self, physics, values, variant, config):
+        """Adds to the offset [m] of one keypoint, along or across the cable."""
         index, across = divmod(variant, 2)
         xp = values[0].__array_namespace__()
         one = (np.arange(config.cable.n_keypoints) == index).astype(np.float32)
@@ -100,12 +104,14 @@ class KeypointBias(CableEffect):
         return [(variant, (mean,)) for _, variant, mean in sorted(gains, reverse=True)[:3]]
 
     def reported(self, values, variant, config):
+        """The keypoint, whether its offset is across the cable, and the offset [m]."""
         return {"index": (variant // 2, ""), "across": (variant % 2, ""), "offset_m": (float(values[0]), "m")}
 
     def _from_reported(self, parameters, config):
         return parameters | {"variant": 2 * parameters["index"] + parameters.get("across", 0)}
 
     def location(self, values, variant, config):
+        """The keypoint's arc length [m], as a section without length."""
         s = float(config.cable.keypoint_arclength[variant // 2])
         return {"along_cable_m": [s, s]}
 

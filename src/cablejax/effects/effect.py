@@ -1,4 +1,4 @@
-"""What an effect is to a diagnosis, whatever it acts on: a name, parameters with priors, null values."""
+"""Effects as a diagnosis sees them, of any system: a name, parameters with priors, null values."""
 
 from __future__ import annotations
 

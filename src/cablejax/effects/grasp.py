@@ -34,15 +34,18 @@ class GripperSlip(CableEffect):
     variant_name = "gripper"
 
     def apply(self, physics, values, variant, config):
+        """Adds to the length that slips through one gripper [m], and sets the time at which it does [s]."""
         return replace(
             physics, slip=physics.slip + _at(variant, values[1]), slip_time=physics.slip_time * 0.0 + values[0]
         )
 
     def starts(self, context):
+        """A slip of 1 cm at six times, through either gripper."""
         times = [context.duration * f for f in (0.1, 0.25, 0.4, 0.55, 0.7, 0.85)]
         return [(g, (t, -0.01)) for g in (0, 1) for t in times]
 
     def location(self, values, variant, config):
+        """The gripper's end of the cable [m] and the time [s]."""
         return {**_end(variant, config), "time_s": float(values[0])}
 
 
@@ -58,12 +61,15 @@ class GripperRotationOffset(CableEffect):
     variant_name = "gripper"
 
     def apply(self, physics, values, variant, config):
+        """Adds to one gripper's angle between its pose and the cable's tangent [rad]."""
         return replace(physics, rotation_offset=physics.rotation_offset + _at(variant, values[0]))
 
     def starts(self, context):
+        """An offset of 0.05 rad at either gripper."""
         return [(g, (0.05,)) for g in (0, 1)]
 
     def location(self, values, variant, config):
+        """The gripper's end of the cable [m]."""
         return _end(variant, config)
 
 
@@ -79,10 +85,13 @@ class GripperCompliance(CableEffect):
     variant_name = "gripper"
 
     def apply(self, physics, values, variant, config):
+        """Adds to one grasp's compliance in rotation [rad/(N m)]."""
         return replace(physics, rotation_compliance=physics.rotation_compliance + _at(variant, 1.0 / values[0]))
 
     def starts(self, context):
+        """A soft and a stiff grasp, 0.08 and 0.4 N m/rad, at either gripper."""
         return [(g, (k,)) for g in (0, 1) for k in (0.08, 0.4)]
 
     def location(self, values, variant, config):
+        """The gripper's end of the cable [m]."""
         return _end(variant, config)

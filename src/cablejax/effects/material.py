@@ -17,6 +17,7 @@ class _Section(CableEffect):
     """An effect on a section of the cable; its first two parameters are centre and width over the cable's length."""
 
     def reported(self, values, variant, config):
+        """Centre and width of the section in metres, then the last parameter in its own unit."""
         last = self.parameters[2]
         return {
             "centre_m": (float(values[0]) * config.cable.length, "m"),
@@ -30,6 +31,7 @@ class _Section(CableEffect):
         return parameters | {name: shares[name] for name in ("centre", "width") if name in shares}
 
     def location(self, values, variant, config):
+        """The section's two ends along the cable [m]."""
         centre, width = float(values[0]) * config.cable.length, float(values[1]) * config.cable.length
         return {"along_cable_m": [max(centre - width / 2, 0.0), min(centre + width / 2, config.cable.length)]}
 
@@ -44,9 +46,11 @@ class BendingStiffness(CableEffect):
     amplitude, reversible = 0, True
 
     def apply(self, physics, values, variant, config):
+        """Multiplies EI of every joint by the ratio."""
         return replace(physics, stiffness=physics.stiffness * values[0])
 
     def starts(self, context):
+        """A cable 2.5 times softer and one 2.5 times stiffer."""
         return [(0, (0.4,)), (0, (2.5,))]
 
 
@@ -64,10 +68,12 @@ class StiffnessProfile(_Section):
     amplitude, reversible = 2, True
 
     def apply(self, physics, values, variant, config):
+        """Multiplies EI of the joints in the section by the ratio."""
         part = section(values[0] * config.cable.length, values[1] * config.cable.length, config)
         return replace(physics, stiffness=physics.stiffness * values[2] ** part)
 
     def starts(self, context):
+        """A section of half the stiffness at eight places along the cable."""
         return [(0, (c, 0.2, 0.5)) for c in _CENTRES]
 
 
@@ -85,15 +91,17 @@ class IntrinsicCurvature(_Section):
     amplitude, reversible = 2, True
 
     def apply(self, physics, values, variant, config):
+        """Adds to the rest curvature of the joints in the section [1/m]."""
         part = section(values[0] * config.cable.length, values[1] * config.cable.length, config)
         return replace(physics, rest_curvature=physics.rest_curvature + values[2] * part)
 
     def starts(self, context):
+        """A section curved by 1/m at eight places along the cable."""
         return [(0, (c, 0.15, 1.0)) for c in _CENTRES]
 
 
 class Plasticity(CableEffect):
-    """Bends beyond a yield curvature stay; what a bend beyond it costs more, the hardening, is fitted beside it."""
+    """Bends beyond a yield curvature are permanent; the hardening beyond it is fitted as well."""
 
     name = "plasticity"
     hook = "memory"
@@ -104,10 +112,12 @@ class Plasticity(CableEffect):
     null = (100.0, 0.3)
 
     def apply(self, physics, values, variant, config):
+        """Sets the yield curvature [1/m] and the hardening of every joint."""
         still = physics.hardening * 0.0
         return replace(physics, yield_curvature=still + values[0], hardening=still + values[1])
 
     def starts(self, context):
+        """Yield curvatures at five fractions of the sharpest nominal bend, each with weak and with full hardening."""
         sharpest = float(context.max_curvature.max())
         return [
             (0, (float(np.clip(f * sharpest, 0.3, 90.0)), h)) for f in (0.9, 0.75, 0.6, 0.45, 0.3) for h in (0.05, 1.0)
@@ -127,10 +137,12 @@ class BendingHysteresis(CableEffect):
     amplitude = 0
 
     def apply(self, physics, values, variant, config):
+        """Sets the friction moment [N m] and the transition curvature [1/m] of every joint."""
         still = physics.hysteresis_moment * 0.0
         return replace(physics, hysteresis_moment=still + values[0], hysteresis_curvature=still + values[1])
 
     def starts(self, context):
+        """Friction moments of 0.15 and 0.6 times EI per metre, each with two transition curvatures."""
         stiffness = context.config.cable.bending_stiffness
         return [(0, (m * stiffness, k)) for m in (0.15, 0.6) for k in (0.15, 1.0)]
 
@@ -144,14 +156,17 @@ class BendingDamping(CableEffect):
     null = (1.0,)
 
     def apply(self, physics, values, variant, config):
+        """Multiplies the damping time of every joint by the ratio."""
         # a cable believed to be undamped gets one millisecond to be a multiple of
         nominal = physics.damping_time + (0.001 if config.cable.damping_time == 0 else 0.0)
         return replace(physics, damping_time=nominal * values[0])
 
     def starts(self, context):
+        """A damping time 5 times shorter, and 4 and 20 times longer."""
         return [(0, (0.2,)), (0, (4.0,)), (0, (20.0,))]
 
     def reported(self, values, variant, config):
+        """The damping time [s], instead of its ratio to the nominal one."""
         return {"time_s": (float(values[0]) * (config.cable.damping_time or 0.001), "s")}
 
     def _from_reported(self, parameters, config):
@@ -168,9 +183,11 @@ class AxialStretch(CableEffect):
     amplitude = 0
 
     def apply(self, physics, values, variant, config):
+        """Adds the axial compliance, the inverse of EA [1/N]."""
         return replace(physics, axial_compliance=physics.axial_compliance + 1.0 / values[0])
 
     def starts(self, context):
+        """EA of 2, 15 and 150 N."""
         return [(0, (2.0,)), (0, (15.0,)), (0, (150.0,))]
 
 
@@ -184,9 +201,11 @@ class LinearDensity(CableEffect):
     amplitude, reversible = 0, True
 
     def apply(self, physics, values, variant, config):
+        """Multiplies the mass per length by the ratio."""
         return replace(physics, density=physics.density * values[0])
 
     def starts(self, context):
+        """Half and twice the mass per length."""
         return [(0, (0.5,)), (0, (2.0,))]
 
 
@@ -203,19 +222,23 @@ class LumpedMass(CableEffect):
     amplitude = 1
 
     def apply(self, physics, values, variant, config):
+        """Adds the mass [kg] to the two links next to its place."""
         return replace(
             physics, extra_mass=physics.extra_mass + values[1] * hat(values[0] * config.cable.length, config)
         )
 
     def starts(self, context):
+        """A mass of 30 g at eight places along the cable."""
         return [(0, (c, 0.03)) for c in _CENTRES]
 
     def reported(self, values, variant, config):
+        """The place along the cable [m] and the mass [kg]."""
         return {"centre_m": (float(values[0]) * config.cable.length, "m"), "mass_kg": (float(values[1]), "kg")}
 
     def _from_reported(self, parameters, config):
         return {"centre": parameters["centre_m"] / config.cable.length, "mass_kg": parameters["mass_kg"]}
 
     def location(self, values, variant, config):
+        """The place along the cable [m], as a section without length."""
         s = float(values[0]) * config.cable.length
         return {"along_cable_m": [s, s]}

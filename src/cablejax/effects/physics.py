@@ -1,4 +1,4 @@
-"""What the diagnosing simulator can do: the nominal cable and, switched off, every effect of the library."""
+"""The physics of one cable: the nominal parameters and, at their null values, those of every effect."""
 
 from __future__ import annotations
 

@@ -30,13 +30,16 @@ class TableFriction(CableEffect):
     amplitude, reversible = 0, True
 
     def apply(self, physics, values, variant, config):
+        """Multiplies the coefficient by the ratio; in variant 1 also adds the excess of static friction."""
         nominal = physics.friction + (_believed(config) if config.cable.friction_coefficient == 0 else 0.0)
         return replace(physics, friction=nominal * values[0], static_excess=physics.static_excess + variant * values[1])
 
     def starts(self, context):
+        """A table 2.5 times smoother and one 2.5 times rougher, in both variants."""
         return [(0, (0.4, 0.0)), (0, (2.5, 0.0)), (1, (0.4, 0.2)), (1, (2.5, 0.2))]
 
     def reported(self, values, variant, config):
+        """The coefficient instead of its ratio to the nominal one, and the excess in variant 1."""
         coefficient = {"coefficient": (float(values[0]) * _believed(config), "")}
         return {**coefficient, "static_excess": (float(values[1]), "")} if variant else coefficient
 
@@ -68,6 +71,7 @@ class FrictionPatch(CableEffect):
     amplitude, reversible = 3, True
 
     def apply(self, physics, values, variant, config):
+        """Sets the patch's centre and radius [m] and what it adds to the coefficient inside."""
         x, y, radius, ratio = values
         xp = ratio.__array_namespace__()
         return replace(
@@ -78,9 +82,11 @@ class FrictionPatch(CableEffect):
         )
 
     def starts(self, context):
+        """A patch three times as rough in each of the 14 squares of the table that the cable visits most."""
         return [(0, (x, y, 0.12, 3.0)) for x, y in _swept(context, 0.14)[:14]]
 
     def reported(self, values, variant, config):
+        """Centre and radius [m], and the coefficient inside instead of its ratio to the nominal one."""
         x, y, radius, ratio = (float(v) for v in values)
         return {
             "x_m": (x, "m"),
@@ -93,6 +99,7 @@ class FrictionPatch(CableEffect):
         return {**parameters, "ratio": parameters["coefficient"] / _believed(config)}
 
     def location(self, values, variant, config):
+        """The patch's centre on the table [m]."""
         return {"table_m": [float(values[0]), float(values[1])]}
 
 
@@ -106,9 +113,11 @@ class ViscousDrag(CableEffect):
     amplitude = 0
 
     def apply(self, physics, values, variant, config):
+        """Adds to the drag per length and velocity [N s/m^2]."""
         return replace(physics, drag=physics.drag + values[0])
 
     def starts(self, context):
+        """A drag of 1 and of 8 N s/m^2."""
         return [(0, (1.0,)), (0, (8.0,))]
 
 
@@ -124,14 +133,17 @@ class GravityTilt(CableEffect):
     null = (0.0, 0.0)
 
     def apply(self, physics, values, variant, config):
+        """Adds gravity's component in the plane of the table [m/s^2]."""
         xp = values[0].__array_namespace__()
         return replace(physics, tilt=physics.tilt + physics.gravity * xp.stack([values[0], values[1]]))
 
     def starts(self, context):
+        """A tilt of 0.1 in eight directions."""
         angle = np.arange(8) * np.pi / 4
         return [(0, (0.1 * np.cos(a), 0.1 * np.sin(a))) for a in angle]
 
     def reported(self, values, variant, config):
+        """The table's slope [rad] and the direction in which it falls [rad]."""
         x, y = float(values[0]), float(values[1])
         sine = float(np.clip(np.hypot(x, y), 0.0, 1.0))
         return {"angle_rad": (float(np.arcsin(sine)), "rad"), "direction_rad": (float(np.arctan2(y, x)), "rad")}
@@ -154,6 +166,7 @@ class Obstacle(CableEffect):
     null = (3.0, 3.0, 0.005)
 
     def apply(self, physics, values, variant, config):
+        """Sets the disc's centre and radius [m]."""
         x, y, radius = values
         return replace(
             physics,
@@ -162,14 +175,16 @@ class Obstacle(CableEffect):
         )
 
     def starts(self, context):
+        """A disc of 3 cm at the places from which the cable seems to be pushed."""
         return [(0, (x, y, 0.03)) for x, y in _pushed(context)]
 
     def location(self, values, variant, config):
+        """The disc's centre on the table [m]."""
         return {"table_m": [float(values[0]), float(values[1])]}
 
 
 def _pushed(context: Context, radius: float = 0.03, count: int = 10) -> list[tuple[float, float]]:
-    """Where a disc may stand: beside the observed cable, on the side from which it is pushed, never inside it.
+    """Candidate places of a disc: next to the observed cable, on the side from which it is pushed, never inside it.
 
     The candidates are points a radius away from observed keypoints that deviate, against the deviation. An observed
     cable never passes through the obstacle, so candidates that it comes closer to than half a radius are dropped.

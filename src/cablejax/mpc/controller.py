@@ -203,7 +203,7 @@ def _feasible_set(config: MPCConfig, state: MPCState) -> FeasibleSet:
 def _update_radius(
     config: MPCConfig, state: MPCState, error: Float[Array, ""], predicted_error: Float[Array, ""]
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """rho and the new bound on a step's motion, adapted as a trust region (Wang et al., RA-L 2022, algorithm 1).
+    """Rho and the new bound on a step's motion, adapted as a trust region (Wang et al., RA-L 2022, algorithm 1).
 
     A plan may accept a larger error now for a smaller one later. Then `rho = actual / predicted` would be large where
     the plant did worse than predicted, so it is written `1 + (actual - predicted) / |predicted|`: the same for a

@@ -1,4 +1,4 @@
-"""What is done where a solver's plan is no better than holding still, or leads nowhere."""
+"""Fallbacks where a plan is no better than holding still, or stays in another shape: hold, or straighten."""
 
 from __future__ import annotations
 

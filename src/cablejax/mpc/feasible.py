@@ -1,4 +1,4 @@
-"""Which gripper motions are allowed, and the nearest allowed motion to a given one.
+"""The feasible set of gripper motions, and the projection onto it.
 
 A plan is a motion `u` of shape [T, Q, 3]: what each gripper moves in each interval, with rotations turned into lengths,
 `u = (vx dt, vy dt, w omega dt)` in metres. Then the bound on one step is an ordinary Euclidean ball.
@@ -42,7 +42,7 @@ class FeasibleSet(AbstractSet):
     positions instead, which touches the disc on the side where the grippers are. Grippers that start outside have a
     bound that closes in on them as they can follow, so that distances or a workspace alone never leave the set empty.
     Together, outside both, they may contradict each other, and so may a bound on the change (it takes a way to stop):
-    `violation` of a projected plan tells.
+    `violation` of a projected plan is then positive.
 
     Attributes:
         separation: position of gripper 1 relative to gripper 0 at the plan's start [m], shape [2].

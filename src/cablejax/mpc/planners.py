@@ -86,6 +86,7 @@ class LevenbergMarquardt(_LeastSquaresPlanner):
         check_positive(self, "damping")
 
     def bounded(self) -> AbstractBoundedLeastSquares:
+        """The solver without a secant model: planning uses few steps."""
         return BoundedLevenbergMarquardt(
             atol=self.tolerance,
             damping=self.damping,
@@ -98,6 +99,7 @@ class Dogleg(_LeastSquaresPlanner):
     """Solver: a trust region around Gauss-Newton models, its steps along the dogleg inside the feasible set."""
 
     def bounded(self) -> AbstractBoundedLeastSquares:
+        """The solver without a secant model: planning uses few steps."""
         return BoundedDogleg(atol=self.tolerance, secant=False, trials_per_linearisation=self.trials_per_linearisation)
 
 
@@ -106,6 +108,7 @@ class GaussNewton(_LeastSquaresPlanner):
     """Solver: Gauss-Newton models without damping, minimised over the feasible set, and a line search towards that."""
 
     def bounded(self) -> AbstractBoundedLeastSquares:
+        """The solver with these settings."""
         return BoundedGaussNewton(atol=self.tolerance, trials_per_linearisation=self.trials_per_linearisation)
 
 
@@ -178,6 +181,7 @@ class ProjectedGradient:
         check_positive(self, "tolerance", "initial_step")
 
     def __call__(self, problem: ShapingProblem, guess: Rollout) -> Plan:
+        """Minimises the objective from `guess` and returns the plan."""
         solver = SpectralProjectedGradient(
             atol=self.tolerance, memory=self.memory, initial_length=self.initial_step, lengths=(1e-3, 1e2)
         )

@@ -22,8 +22,8 @@ class ObjectiveConfig:
 
     Attributes:
         terminal_weight: weight of the last predicted shape; every other shape has 1.
-        motion_weight: weight of the squared motion beside the squared keypoint error. It decides between plans that
-            shape the cable equally well: small enough not to be felt, large enough to make the problem well posed.
+        motion_weight: weight of the squared motion, relative to the squared keypoint error. It selects among plans
+            that shape the cable equally well: small enough not to matter, large enough to make the problem well posed.
         rotation_weight: w [m/rad], the length that a rotation of one radian counts as.
         interval: duration of one control step [s].
         arrival_weight: weight of the squared way that is left, at the end of the plan, to where the target's ends are

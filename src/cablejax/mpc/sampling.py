@@ -47,6 +47,8 @@ class CrossEntropy:
             )
 
     def __call__(self, problem: ShapingProblem, guess: Rollout) -> Plan:
+        """Draws plans around a mean, moves the mean to the best of them, and returns the best plan drawn."""
+
         def iterate(carry, key):
             best, mean, deviation = carry
             drawn = drawn_plans(problem, key, mean, deviation, self.samples)
@@ -88,6 +90,7 @@ class PathIntegral:
         check_positive(self, "spread", "temperature")
 
     def __call__(self, problem: ShapingProblem, guess: Rollout) -> Plan:
+        """Draws plans around a mean, moves the mean to their weighted average, and returns the best plan."""
         deviation = self.spread * problem.feasible.radius * jnp.ones_like(guess.motion)
 
         def iterate(carry, key):

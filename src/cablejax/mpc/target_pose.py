@@ -46,15 +46,16 @@ def straightened(target: Float[Array, "N 2"], distance: float) -> Float[Array, "
 
 
 def continued(pose: Float[Array, "2 3"], keypoints: Float[Array, "N 2"]) -> Float[Array, "2 3"]:
-    """Gripper poses with whole turns added to theta of the second, so that it continues that of the first along the
-    cable."""
+    """Gripper poses with whole turns added to the second theta, so that it continues the first along the cable."""
     turn = pose[1, 2] - pose[0, 2]
     return pose.at[1, 2].add(2 * jnp.pi * jnp.round((total_turn(keypoints) - turn) / (2 * jnp.pi)))
 
 
 def way_to(pose: Float[Array, "2 3"], target: Float[Array, "2 3"], rotation_weight: float) -> Float[Array, "2 3"]:
-    """The motion [m] from one pair of poses to another, both `continued` along their cable. Of the ways, which differ
-    by whole turns of both grippers together, the shortest."""
+    """The shortest motion [m] from one pair of poses to another, both `continued` along their cable.
+
+    Motions that differ by whole turns of both grippers together lead to the same poses.
+    """
     way = target - pose
     whole_turns = 2 * jnp.pi * jnp.round(jnp.mean(way[:, 2]) / (2 * jnp.pi))
     return jnp.concatenate([way[:, :2], rotation_weight * (way[:, 2:] - whole_turns)], axis=1)

@@ -1,4 +1,4 @@
-"""How long one control call takes."""
+"""Times a control call."""
 
 from __future__ import annotations
 

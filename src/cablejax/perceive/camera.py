@@ -15,12 +15,12 @@ from cablejax.simulate.composite import link_lengths, node_offsets
 CENTRE_DEPTH = np.pi / 4
 """How far behind its visible surface the axis of a cylinder lies on average, seen from the side, in radii."""
 MARGIN = 0.01
-"""Width [m] beside the cable's outline in which rays are cast. All others meet the table, which has a formula."""
+"""Width [m] around the cable's outline in which rays are cast. All others meet the table, which has a formula."""
 
 
 @dataclasses.dataclass(frozen=True)
 class CameraConfig:
-    """A camera over the table, how well it sees, and how the cable is told from the table.
+    """A camera over the table, its noise, and the threshold that separates the cable from the table.
 
     Attributes:
         centre: point of the table in the middle of the image (x, y) [m].
@@ -82,7 +82,7 @@ class CameraConfig:
 
 
 class DepthCamera:
-    """The camera in front of one cable. `look` gives clouds; noise is drawn anew by every call.
+    """The camera in front of one cable. `look` gives clouds; every call draws new noise.
 
     The scene is a model of its own with nothing but what can be seen, so that any simulated cable may be put into it.
     """

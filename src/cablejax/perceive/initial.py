@@ -1,4 +1,4 @@
-"""The first frame: where the cable is if nothing is known but one cloud and the grippers that hold its ends.
+"""Initialisation: finds the cable in one cloud, given only the poses of the grippers at its ends.
 
 Two kinds of guesses compete. Paths along the cloud: the shortest way from gripper to gripper over a graph of occupied
 cells, where a jump costs more than the same distance in small steps. And bent curves that need no cloud: arches,
@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from cablejax.perceive.path import cloud_path
-from cablejax.perceive.registration import Fit, RegistrationConfig, register
+from cablejax.perceive.registration import CurveFit, RegistrationConfig, register
 from cablejax.simulate.pose import wrapped
 
 JUMPS = (2.0, 4.0)
@@ -41,7 +41,7 @@ def first_fit(
     gripper_pose: Float[np.ndarray, "Q 3"],
     *,
     reach: float = 0.015,
-) -> Fit:
+) -> CurveFit:
     """The most likely cable in a cloud, without any prior.
 
     Not differentiable: it chooses. Deterministic.
@@ -87,7 +87,7 @@ def guessed_fits(
     gripper_pose: Float[np.ndarray, "Q 3"],
     *,
     reach: float = 0.015,
-) -> Fit:
+) -> CurveFit:
     """The fits of all guesses to a sample of the cloud, batched, best first; arguments as of `first_fit`."""
     present = np.asarray(points, float)[np.asarray(mask)]
     pose = np.asarray(gripper_pose, float)
@@ -119,7 +119,7 @@ def guessed_fits(
 
 
 @functools.partial(jax.jit, static_argnames=("config", "reach", "iterations"))
-def _register_all(config, points, mask, poses, angles, sigma, reach, iterations) -> Fit:
+def _register_all(config, points, mask, poses, angles, sigma, reach, iterations) -> CurveFit:
     def one(pose, angles, sigma):
         return register(
             config, points, mask, pose, angles, pose, sigma, iterations=iterations, coherent=False, reach=reach
@@ -128,7 +128,7 @@ def _register_all(config, points, mask, poses, angles, sigma, reach, iterations)
     return jax.vmap(one)(poses, angles, sigma)
 
 
-def _merit(config: RegistrationConfig, fits: Fit) -> np.ndarray:
+def _merit(config: RegistrationConfig, fits: CurveFit) -> np.ndarray:
     """Log posterior of every fit, minus infinity where the curve does not end in the gripper."""
     merit = np.asarray(fits.log_posterior, float)
     return np.where(np.isfinite(merit) & (np.asarray(fits.gap) < 0.02 * config.length), merit, -np.inf)

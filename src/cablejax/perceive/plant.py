@@ -10,8 +10,9 @@ from jaxtyping import Float
 from cablejax.cable import Cable
 from cablejax.effects.given import check_hooks
 from cablejax.perceive.camera import CameraConfig, DepthCamera
+from cablejax.perceive.frame import Status, Track, TrackerConfig, TrackState
 from cablejax.perceive.registration import RegistrationConfig
-from cablejax.perceive.tracker import Status, Track, Tracker, TrackerConfig, TrackState
+from cablejax.perceive.tracker import Tracker
 from cablejax.simulate.plant import HOOKS, Plant, PlantConfig
 from cablejax.simulate.table_plant import Observation
 
@@ -19,15 +20,15 @@ from cablejax.simulate.table_plant import Observation
 class CloudPlant(Plant):
     """A plant whose keypoints are what a tracker makes of a depth camera's clouds.
 
-    `reset` and `record` are those of `Plant`; every observation is one frame of the camera. Where a frame is held, its
-    inner keypoints are NaN: a controller then goes by its own prediction. The true keypoints travel beside them.
+    `reset` and `record` are those of `Plant`; every observation is one frame of the camera. Where a frame is lost, its
+    inner keypoints are NaN: a controller then uses its own prediction. The true keypoints are returned as well.
 
     Attributes:
         camera: the camera.
         tracker: what follows the cable.
         track: what came of the last frame, None before the first.
         cloud: the last frame's points [m], shape [S, 3].
-        held: frames held since the last reset.
+        lost: frames lost since the last reset.
     """
 
     def __init__(
@@ -55,7 +56,7 @@ class CloudPlant(Plant):
         self._state: TrackState | None = None
         self.track: Track | None = None
         self.cloud: Float[np.ndarray, "S 3"] = np.zeros((0, 3))
-        self.held = 0
+        self.lost = 0
 
     def reset(
         self, gripper_pose: Float[np.ndarray, "Q 3"], *, guess: Float[np.ndarray, "S 2"] | None = None
@@ -78,7 +79,7 @@ class CloudPlant(Plant):
         keypoints[[0, -1]] = truth.gripper_pose[:, :2]
         if self.track.status != Status.TRACKED:
             keypoints[1:-1] = np.nan
-            self.held += 1
+            self.lost += 1
         return dataclasses.replace(truth, keypoints=keypoints)
 
 

@@ -1,4 +1,4 @@
-"""Recorded cloud sequences: one `.npz` file, or a folder of PCD files beside the grippers' poses."""
+"""Recorded cloud sequences: one `.npz` file, or a folder of PCD files with the grippers' poses."""
 
 from __future__ import annotations
 

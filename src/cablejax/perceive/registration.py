@@ -94,7 +94,7 @@ class RegistrationConfig:
         return curve_matrices(self.n_links, self.n_keypoints, self.length, self.kernel_width)
 
 
-class Fit(NamedTuple):
+class CurveFit(NamedTuple):
     """A cable fitted to a cloud.
 
     Attributes:
@@ -135,11 +135,11 @@ def register(
     iterations: int,
     coherent: bool = True,
     reach: float = 0.015,
-) -> Fit:
+) -> CurveFit:
     """Fits the cable to a cloud, starting from a known curve.
 
     Each iteration is one step of expectation maximisation. The M-step is a Gauss-Newton step on the joint angles under
-    the constraint that the curve ends in gripper 1. The standard deviation is estimated anew in each iteration; it may
+    the constraint that the curve ends in gripper 1. The standard deviation is estimated again in each iteration; it may
     fall to half at once but not grow, so a large start value anneals.
 
     Differentiable in `points`, `gripper_pose`, `angles`, `angles_pose` and `sigma`, in both modes, through all
@@ -239,7 +239,7 @@ def _closure(config: RegistrationConfig, shape: Curve, angles, pose) -> Float[Ar
     return jnp.concatenate([pose[1, :2] - shape.end, config.length * turn[None]])
 
 
-def _assess(config: RegistrationConfig, points, mask, angles, pose, sigma, reach) -> Fit:
+def _assess(config: RegistrationConfig, points, mask, angles, pose, sigma, reach) -> CurveFit:
     shape = curve(config.matrices, angles, pose)
     moments = _expectation(config, points, mask, shape, sigma)
     spacing = config.length / (config.n_links - 1)
@@ -248,7 +248,7 @@ def _assess(config: RegistrationConfig, points, mask, angles, pose, sigma, reach
     # A link has been seen if it answers for a tenth of its even share of the points, and for one at least.
     share = count * jnp.asarray(config.matrices.lengths / config.length, angles.dtype)
     bending = 0.5 * config.bending / spacing * jnp.sum(angles**2)
-    return Fit(
+    return CurveFit(
         angles=angles,
         gripper_pose=pose,
         keypoints=keypoints_of(config.matrices, shape),

@@ -1,4 +1,4 @@
-"""What keeps the cable's structure while it follows the points: coherent motion and local linear embedding.
+"""Structure terms of the registration: coherent motion and local linear embedding.
 
 Tang and Tomizuka, "Track deformable objects from point clouds with structure preserved registration", IJRR 2018, add
 two terms to the mixture's likelihood. The displacement since the last frame shall be smooth, as the norm of a coherent

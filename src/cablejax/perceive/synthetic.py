@@ -1,4 +1,4 @@
-"""Clouds of a known curve: points on it, noise around them, a hidden stretch, and strays."""
+"""Synthetic clouds of a known curve: points on it, noise, a hidden stretch, and outliers."""
 
 from __future__ import annotations
 

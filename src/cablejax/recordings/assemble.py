@@ -1,4 +1,4 @@
-"""From checked takes to a gap log."""
+"""Assembles a gap log from checked takes."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def gap_log_from_takes(takes: Sequence[Take], nominal: Nominal, *, source: str, 
         takes: as `prepare` yields them.
         nominal: what is believed of the cable.
         source: where the recording is from, and which values are guesses.
-        repairs: what was changed; told in the log's source.
+        repairs: sentences on the changes, for the log's source.
 
     Raises:
         ValueError: takes or values that make no gap log, or a cable shorter than its keypoints are apart.

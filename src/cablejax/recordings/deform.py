@@ -26,7 +26,7 @@ from cablejax.recordings.take import Take
 from cablejax.types import GapLog
 
 SAMPLE_INTERVAL = 0.01
-"""Seconds between two samples of the data set, which its pickles do not tell."""
+"""Seconds between two samples of the data set; its pickles hold no times."""
 
 GRIPPER_MARKERS = (0, 1, -2, -1)
 """Markers on the two grippers: an outer and an inner one at each end of the cable."""

@@ -1,10 +1,9 @@
-"""Coordinate frames: which way is up, and whether positions and orientations are of the same frame.
+"""Coordinate frames: the vertical, the handedness, and the consistency of positions and orientations.
 
-What can be known of a frame from the numbers themselves is little. A hanging cable shows the vertical, so a wrong one
-is noticed. A left-handed frame is not, by itself: seen in a mirror, positions, orientations and motions all obey the
-same laws, and the mirror image of a cable is a cable. It has to be told, and is then mirrored into a right-handed one.
-What shows is a mixture, positions of one frame beside orientations of another: on a rigid gripper the direction from
-one marker to the other does not turn against the gripper, and in a mixture it does.
+The numbers show little of a frame. A hanging cable shows the vertical, so a wrong one is detected. A left-handed frame
+is not detectable: mirrored positions, orientations and motions obey the same laws. It has to be stated, and is then
+mirrored into a right-handed one. A mixture, positions in one frame and orientations in another, is detected: on a rigid
+gripper the direction between two markers does not turn against the gripper, and in a mixture it does.
 """
 
 from __future__ import annotations
@@ -23,7 +22,7 @@ Axis = Literal["x", "y", "z", "-x", "-y", "-z"]
 AXES: tuple[Axis, ...] = ("x", "y", "z", "-x", "-y", "-z")
 
 LARGEST_TILT = np.radians(50)
-"""Angle between what hangs and what was told to be up, above which the frame is refused."""
+"""Largest angle between the stated vertical and the direction in which the cable hangs."""
 
 RIGID = np.radians(8)
 """Largest root-mean-square angle by which a pair of markers may turn against the gripper that it is on."""
@@ -79,7 +78,7 @@ def require_hanging(takes: tuple[Take, ...], frame: Frame) -> None:
 
     Args:
         takes: already in a right-handed frame with z up, of a cable that hangs free.
-        frame: what was told, for the message.
+        frame: as stated, for the message.
 
     Raises:
         ValueError: names the axis along which the cable hangs.
@@ -93,9 +92,9 @@ def require_hanging(takes: tuple[Take, ...], frame: Frame) -> None:
         return
     if np.arccos(np.clip(mean[2] / size, -1, 1)) <= LARGEST_TILT:
         return
-    told = frame.matrix.T @ mean
-    axis = int(np.argmax(abs(told)))
-    found = ("" if told[axis] > 0 else "-") + "xyz"[axis]
+    up = frame.matrix.T @ mean
+    axis = int(np.argmax(abs(up)))
+    found = ("" if up[axis] > 0 else "-") + "xyz"[axis]
     raise ValueError(
         f"The frame was said to have {frame.up} up, but the cable hangs from its ends along the other way of {found}: "
         f"say that {found} is up, or check the order of the coordinates."

@@ -1,4 +1,4 @@
-"""Where a recording misses samples: it is cut there, since nobody knows what the grippers did meanwhile.
+"""Cuts recordings where samples are missing, since the grippers' motion in between is unknown.
 
 A cable can only be simulated through a gap if its ends' motion is known. So samples without a gripper's markers are
 filled in if they are few, and end a take otherwise; so do a step in the times, samples that repeat the one before, and
@@ -16,7 +16,7 @@ from jaxtyping import Float
 from cablejax.recordings.take import Take, median_step
 
 FILLED = 0.05
-"""Longest gap [s] in what is known of the grippers that is filled in by a straight line."""
+"""Longest gap [s] in the grippers' poses that is interpolated linearly."""
 
 SHORTEST_SAMPLES, SHORTEST = 10, 0.5
 """A take of fewer samples, or shorter [s], is left out after cutting."""
@@ -25,18 +25,18 @@ JUMP_ACCELERATION = 100.0
 """Acceleration [m/s^2] of the middle keypoint that is no motion: ten times that of gravity."""
 
 JUMP_RATIO = 2.5
-"""Such a step must also be so many times the steps beside it, which tells lost samples from a hard stop."""
+"""Such a step must also be so many times its neighbours: this separates lost samples from a hard stop."""
 
 # Repeated samples: so many in a row are a hold of the last value, if no more than this part of all steps are repeats.
 _HELD_SAMPLES, _HELD_PART = 3, 0.2
 
 
-def cut_at_gaps(takes: tuple[Take, ...], held: tuple[int, ...] | None) -> tuple[tuple[Take, ...], list[str]]:
+def cut_at_gaps(takes: tuple[Take, ...], on_grippers: tuple[int, ...] | None) -> tuple[tuple[Take, ...], list[str]]:
     """Cuts takes where samples are missing.
 
     Args:
         takes: of one cable.
-        held: keypoints that tell the grippers' poses; None where these were measured by themselves.
+        on_grippers: keypoints on the grippers, which locate them; None where the poses were measured separately.
 
     Returns:
         The takes, and one sentence for each that was changed.
@@ -44,19 +44,19 @@ def cut_at_gaps(takes: tuple[Take, ...], held: tuple[int, ...] | None) -> tuple[
     Raises:
         ValueError: nothing long enough is left, or one gripper is never seen; says why.
     """
-    _require_grippers(takes, held)
+    _require_grippers(takes, on_grippers)
     parts: list[Take] = []
-    told: list[str] = []
+    reports: list[str] = []
     for take in takes:
-        take, filled = _filled(_without_repeats(take, told), held)
+        take, filled = _filled(_without_repeats(take, reports), on_grippers)
         if filled:
-            told.append(
+            reports.append(
                 f"Take {take.name}: {filled} samples without one of the grippers were filled in by straight lines: "
                 f"none of these gaps is longer than {FILLED:g} s."
             )
-        known = _known(take, held)
+        known = _known(take, on_grippers)
         breaks, reasons = _breaks(take)
-        told.extend(reasons)
+        reports.extend(reasons)
         edges = np.zeros(len(take.time) + 1, bool)
         edges[[0, -1]] = True
         edges[breaks] = True
@@ -65,12 +65,12 @@ def cut_at_gaps(takes: tuple[Take, ...], held: tuple[int, ...] | None) -> tuple[
         spans = [(a, b) for a, b in itertools.pairwise(begins) if known[a]]
         kept = [(a, b) for a, b in spans if _long_enough(take.time[a:b])]
         if not known.all():
-            told.append(
+            reports.append(
                 f"Take {take.name}: in {int((~known).sum())} samples one of the grippers is not seen, for more than "
                 f"{FILLED:g} s; they were left out."
             )
         if lost := sum(b - a for a, b in spans) - sum(b - a for a, b in kept):
-            told.append(
+            reports.append(
                 f"Take {take.name}: {lost} samples in stretches shorter than {SHORTEST:g} s or {SHORTEST_SAMPLES} "
                 "samples were left out."
             )
@@ -82,23 +82,23 @@ def cut_at_gaps(takes: tuple[Take, ...], held: tuple[int, ...] | None) -> tuple[
         raise ValueError(
             f"Between its gaps the recording has no stretch of at least {SHORTEST:g} s and {SHORTEST_SAMPLES} samples "
             f"in "
-            "which both grippers are known. What was found: " + " ".join(told)
+            "which both grippers are known. What was found: " + " ".join(reports)
         )
-    return tuple(parts), told
+    return tuple(parts), reports
 
 
-def _require_grippers(takes: tuple[Take, ...], held: tuple[int, ...] | None) -> None:
+def _require_grippers(takes: tuple[Take, ...], on_grippers: tuple[int, ...] | None) -> None:
     for gripper in (0, 1):
-        if held is None:
+        if on_grippers is None:
             seen = any(
                 take.gripper_pose is not None and np.isfinite(take.gripper_pose[:, gripper]).all(axis=-1).any()
                 for take in takes
             )
             what = "has no pose in any sample"
         else:
-            pair = held[:2] if gripper == 0 else held[2:]
+            pair = on_grippers[:2] if gripper == 0 else on_grippers[2:]
             seen = any(np.isfinite(take.keypoints[:, pair]).all(axis=(1, 2)).any() for take in takes)
-            what = f"is told by the keypoints {pair[0]} and {pair[1]}, which are in no sample both observed"
+            what = f"is located by keypoints {pair[0]} and {pair[1]}, which are never both observed"
         if not seen:
             raise ValueError(
                 f"Gripper {gripper} {what}. Both ends must be known: name the columns or topic of its pose, or two "
@@ -110,41 +110,41 @@ def _long_enough(time: np.ndarray) -> bool:
     return len(time) >= SHORTEST_SAMPLES and time[-1] - time[0] >= SHORTEST
 
 
-def _known(take: Take, held: tuple[int, ...] | None) -> np.ndarray:
-    told = take.gripper_pose if held is None else take.keypoints[:, held]
-    assert told is not None
-    return np.asarray(np.isfinite(told).all(axis=(1, 2)))
+def _known(take: Take, on_grippers: tuple[int, ...] | None) -> np.ndarray:
+    ends = take.gripper_pose if on_grippers is None else take.keypoints[:, on_grippers]
+    assert ends is not None
+    return np.asarray(np.isfinite(ends).all(axis=(1, 2)))
 
 
-def _without_repeats(take: Take, told: list[str]) -> Take:
+def _without_repeats(take: Take, reports: list[str]) -> Take:
     """The take without the samples in which a tracker holds its last values."""
     with np.errstate(invalid="ignore"):
         same = (np.diff(take.keypoints, axis=0) == 0).all(axis=(1, 2))
     if not same.any() or same.mean() > _HELD_PART:
         return take
-    held = np.zeros(len(take.time), bool)
+    repeated = np.zeros(len(take.time), bool)
     edges = np.flatnonzero(np.diff(np.concatenate([[False], same, [False]]).astype(int)))
     for a, b in edges.reshape(-1, 2):
         if b - a >= _HELD_SAMPLES:
-            held[a + 1 : b + 1] = True
-    if not held.any():
+            repeated[a + 1 : b + 1] = True
+    if not repeated.any():
         return take
-    told.append(
-        f"Take {take.name}: {int(held.sum())} samples repeat the one before to the last digit, in a recording that "
+    reports.append(
+        f"Take {take.name}: {int(repeated.sum())} samples repeat the one before to the last digit, in a recording that "
         "otherwise moves: they are taken as not observed."
     )
     points = take.keypoints.copy()
-    points[held] = np.nan
+    points[repeated] = np.nan
     pose = take.gripper_pose
-    keep = ~held
+    keep = ~repeated
     if pose is None:
         return dataclasses.replace(take, keypoints=points)
     return dataclasses.replace(take, time=take.time[keep], keypoints=take.keypoints[keep], gripper_pose=pose[keep])
 
 
-def _filled(take: Take, held: tuple[int, ...] | None) -> tuple[Take, int]:
+def _filled(take: Take, on_grippers: tuple[int, ...] | None) -> tuple[Take, int]:
     """Short gaps in what is known of the grippers, filled in; and how many samples that were."""
-    known = _known(take, held)
+    known = _known(take, on_grippers)
     edges = np.flatnonzero(np.diff(np.concatenate([[False], ~known, [False]]).astype(int)))
     few = np.zeros(len(known), bool)
     for a, b in edges.reshape(-1, 2):
@@ -152,18 +152,18 @@ def _filled(take: Take, held: tuple[int, ...] | None) -> tuple[Take, int]:
             few[a:b] = True
     if not few.any():
         return take, 0
-    told = take.keypoints[:, held] if held is not None else take.gripper_pose
-    assert told is not None
-    values = told.reshape(len(known), -1).copy()
+    ends = take.keypoints[:, on_grippers] if on_grippers is not None else take.gripper_pose
+    assert ends is not None
+    values = ends.reshape(len(known), -1).copy()
     for column in values.T:
         column[few] = np.interp(take.time[few], take.time[known], column[known])
-    values = values.reshape(told.shape)
-    if held is None:
+    values = values.reshape(ends.shape)
+    if on_grippers is None:
         if take.keypoints.shape[2] == 3:
             values[..., 3:] /= np.linalg.norm(values[..., 3:], axis=-1, keepdims=True)
         return dataclasses.replace(take, gripper_pose=values), int(few.sum())
     points = take.keypoints.copy()
-    points[:, held] = values
+    points[:, on_grippers] = values
     return dataclasses.replace(take, keypoints=points), int(few.sum())
 
 
@@ -174,25 +174,25 @@ def _breaks(take: Take) -> tuple[list[int], list[str]]:
         return [], []
     usual = float(np.median(interval))
     late = interval > 1.5 * usual
-    breaks, told = [], []
+    breaks, reports = [], []
     for t in np.flatnonzero(late & (interval > FILLED)):
         breaks.append(int(t) + 1)
-        told.append(
+        reports.append(
             f"Take {take.name}: no samples for {interval[t]:.3g} s after sample {t}, where {usual:.3g} s is usual; the "
             "take was cut there."
         )
     for t in _jumps(median_step(take.keypoints), interval):
         breaks.append(t + 1)
-        told.append(
+        reports.append(
             f"Take {take.name}: the whole cable jumps between samples {t} and {t + 1}, so samples are missing that the "
-            "recording does not tell of; the take was cut there."
+            "times do not show; the take was cut there."
         )
-    return breaks, told
+    return breaks, reports
 
 
 def _jumps(step: Float[np.ndarray, " S"], interval: Float[np.ndarray, " S"]) -> list[int]:
     speed = np.nan_to_num(step / interval)
-    beside = np.maximum(np.append(speed[1:], 0.0), np.append(0.0, speed[:-1]))
-    acceleration = (speed - beside) / interval
-    found = (acceleration > JUMP_ACCELERATION) & (speed > JUMP_RATIO * beside)
+    neighbour = np.maximum(np.append(speed[1:], 0.0), np.append(0.0, speed[:-1]))
+    acceleration = (speed - neighbour) / interval
+    found = (acceleration > JUMP_ACCELERATION) & (speed > JUMP_RATIO * neighbour)
     return np.flatnonzero(found).tolist()

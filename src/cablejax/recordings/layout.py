@@ -1,4 +1,4 @@
-"""How a laboratory's own recording is laid out, told in a small TOML file.
+"""The layout of a laboratory's own recording, read from a small TOML file.
 
 Tables `[cable]`, `[table]`, `[frame]` and `[source]` are the same for every kind of file; `[columns]` is for csv and
 `[topics]` for bags. `docs/recordings.md` has a full example of each.

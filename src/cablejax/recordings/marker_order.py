@@ -1,4 +1,4 @@
-"""Markers that exchange their names in part of a recording, as motion capture does after it has lost them.
+"""Restores the order of markers that motion capture exchanged in part of a recording.
 
 A cable does not fold back within one spacing of its markers, and no marker crosses the distance to another one within
 one sample. Where the order breaks this, and another order does not, the other one is right. Positions alone cannot show
@@ -49,24 +49,24 @@ def restore_order(takes: tuple[Take, ...]) -> tuple[tuple[Take, ...], list[str]]
             f"The cable folds back between neighbouring keypoints in {100 * folded.mean():.0f} % of the samples: give "
             "the keypoints in their order along the cable, from gripper 0 to gripper 1."
         )
-    restored, told = [], []
+    restored, repairs = [], []
     for take in takes:
         turned = _reversed(take, usual)
         tracked = _tracked(take.keypoints[:, ::-1] if turned else take.keypoints, usual)
         changed = (tracked != np.arange(len(usual) + 1)).any(axis=1)
         if turned:
-            told.append(f"Take {take.name}: its keypoints ran from gripper 1 to gripper 0 and were reversed.")
+            repairs.append(f"Take {take.name}: its keypoints ran from gripper 1 to gripper 0 and were reversed.")
             take = dataclasses.replace(take, keypoints=take.keypoints[:, ::-1])
         if changed.any():
             markers = np.flatnonzero((tracked != np.arange(len(usual) + 1)).any(axis=0)).tolist()
-            told.append(
+            repairs.append(
                 f"Take {take.name}: keypoints {', '.join(map(str, markers))} had exchanged their names in "
                 f"{changed.sum()} of {len(changed)} samples, from sample {int(np.argmax(changed))}, and were put back."
             )
             points = np.take_along_axis(take.keypoints, tracked[:, :, None], axis=1)
             take = dataclasses.replace(take, keypoints=points)
         restored.append(take)
-    return tuple(restored), told
+    return tuple(restored), repairs
 
 
 def _worst_turn(points: Float[np.ndarray, "*B N D"]) -> Float[np.ndarray, "*B"]:

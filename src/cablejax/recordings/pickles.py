@@ -1,4 +1,4 @@
-"""Reading a pickle of number arrays without running anything that it says.
+"""Reads a pickle of number arrays without running anything in it.
 
 A pickle is a program: unpickling one from the internet with the standard loader can start any other. Here its
 opcodes are checked first, and the few names that a pickled array needs stand for classes of this file which only

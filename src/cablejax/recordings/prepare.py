@@ -1,4 +1,4 @@
-"""From takes as they were read to takes that a gap log may hold: every repair told, everything else refused."""
+"""Prepares takes for a gap log: repairs and reports what has one explanation, and rejects other faults."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _OUTLIER = 1.5
 
 @dataclasses.dataclass(frozen=True)
 class Setup:
-    """What has to be told of a recording, because its numbers do not show it.
+    """Facts about a recording that its numbers do not show.
 
     Attributes:
         unit: of all lengths: "m", "cm", "mm" or "in"; None = metres, or another unit if the length of the cable leaves
@@ -29,7 +29,7 @@ class Setup:
         on_grippers: "pairs" if the first two and the last two keypoints are on the grippers; "ends" if only the first
             and the last are.
         hangs: the cable hangs free and is not on a table.
-        plausible_length: what the cable may measure [m], for a unit that is not told.
+        plausible_length: plausible lengths of the cable [m], to recognise an unstated unit.
     """
 
     unit: str | None = "m"
@@ -71,10 +71,10 @@ def prepare(takes: tuple[Take, ...], setup: Setup) -> tuple[tuple[Take, ...], li
     measured = takes[0].gripper_pose is not None
     if not measured and setup.on_grippers == "ends":
         raise ValueError(
-            "The grippers' poses are not told, and only one keypoint is on each: name the columns or topics of the "
+            "The grippers' poses are not given, and only one keypoint is on each: name the columns or topics of the "
             "poses, or two keypoints on each gripper."
         )
-    takes, told = _in_metres(takes, setup)
+    takes, repairs = _in_metres(takes, setup)
     takes, outliers = _without_outliers(takes)
     takes = tuple(into_frame(take, setup.frame) for take in takes)
     takes, exchanged = restore_order(takes)
@@ -87,7 +87,7 @@ def prepare(takes: tuple[Take, ...], setup: Setup) -> tuple[tuple[Take, ...], li
         require_rigid(takes, pairs)
     if not measured:
         takes = tuple(_with_poses(take, pairs) for take in takes)
-    return takes, [*told, *outliers, *exchanged, *cut]
+    return takes, [*repairs, *outliers, *exchanged, *cut]
 
 
 def _without_outliers(takes: tuple[Take, ...]) -> tuple[tuple[Take, ...], list[str]]:
@@ -111,7 +111,7 @@ def _without_outliers(takes: tuple[Take, ...]) -> tuple[tuple[Take, ...], list[s
 
 def _in_metres(takes: tuple[Take, ...], setup: Setup) -> tuple[tuple[Take, ...], list[str]]:
     length = float(typical_spacing(takes).sum())
-    told: list[str] = []
+    repairs: list[str] = []
     unit = setup.unit
     if unit is None:
         low, high = setup.plausible_length
@@ -120,7 +120,7 @@ def _in_metres(takes: tuple[Take, ...], setup: Setup) -> tuple[tuple[Take, ...],
             unit = "m"
         elif len(candidates) == 1:
             unit = candidates[0]
-            told.append(
+            repairs.append(
                 f"The cable measures {length:.4g} along its keypoints, which can only be {unit}: all lengths were "
                 "converted to metres."
             )
@@ -132,7 +132,7 @@ def _in_metres(takes: tuple[Take, ...], setup: Setup) -> tuple[tuple[Take, ...],
             )
     require_metres(length * METRES[unit], unit)
     if unit == "m":
-        return takes, told
+        return takes, repairs
     scale = METRES[unit]
 
     def scaled(take: Take) -> Take:
@@ -142,7 +142,7 @@ def _in_metres(takes: tuple[Take, ...], setup: Setup) -> tuple[tuple[Take, ...],
             pose = np.concatenate([pose[..., :positions] * scale, pose[..., positions:]], axis=-1)
         return dataclasses.replace(take, keypoints=take.keypoints * scale, gripper_pose=pose)
 
-    return tuple(map(scaled, takes)), told
+    return tuple(map(scaled, takes)), repairs
 
 
 def _with_poses(take: Take, pairs: tuple[tuple[int, int], tuple[int, int]]) -> Take:

@@ -1,4 +1,4 @@
-"""What every reader yields: stretches of a recording, before they are checked and become episodes of a gap log."""
+"""Takes: stretches of a recording as readers return them, before checks turn them into episodes of a gap log."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def typical_spacing(takes: tuple[Take, ...]) -> Float[np.ndarray, " M"]:
     """Median distance of each pair of neighbouring keypoints over all samples [m], shape [N - 1].
 
     Raises:
-        ValueError: a keypoint that is never observed beside its neighbour.
+        ValueError: a keypoint that is never observed together with its neighbour.
     """
     distances = np.concatenate([spacing(take.keypoints) for take in takes])
     seen = np.isfinite(distances).any(axis=0)

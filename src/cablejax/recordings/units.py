@@ -1,4 +1,4 @@
-"""Units of length: told ones are converted, and what cannot be metres is noticed by the length of the cable."""
+"""Units of length: converts stated units, and rejects cables of implausible length."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def metres_per(unit: str) -> float:
 
 
 def recognised_unit(length: float, plausible: tuple[float, float] = PLAUSIBLE) -> tuple[str, ...]:
-    """The units in which a cable of this length is a plausible one; several where the length cannot tell."""
+    """The units in which a cable of this length is a plausible one; several where the length is ambiguous."""
     return tuple(name for name, metres in METRES.items() if plausible[0] <= length * metres <= plausible[1])
 
 
@@ -33,7 +33,7 @@ def require_metres(length: float, unit: str) -> None:
 
     Args:
         length: of the cable [m], after conversion from `unit`.
-        unit: that was told.
+        unit: as stated.
 
     Raises:
         ValueError: says in which units it would be plausible.

@@ -45,8 +45,10 @@ class HangingWire:
 
 
 def read_wires(path: str | os.PathLike[str]) -> tuple[HangingWire, ...]:
-    """Reads an `.npz` with `wire` [W], `keypoints` [W, R, N, 3], `length_m`, `mass_per_length_kg_m` [W] and
-    `EI_published_Nm2` [W, R].
+    """Reads W wires from an `.npz`, each photographed R times.
+
+    The fields are `wire` [W], `keypoints` [W, R, N, 3], `length_m`, `mass_per_length_kg_m` [W] and `EI_published_Nm2`
+    [W, R].
 
     Raises:
         ValueError: something in the file is missing, not finite or does not fit together, or it is no such file.
@@ -61,7 +63,7 @@ def read_wires(path: str | os.PathLike[str]) -> tuple[HangingWire, ...]:
         raise ValueError(f"{path}: keypoints has shape {points.shape}, expected [W, R, N, 3] with N at least 5.")
     for name, shape in shapes.items():
         if arrays[name].shape != shape:
-            raise ValueError(f"{path}: {name} has shape {arrays[name].shape}, expected {shape} beside these keypoints.")
+            raise ValueError(f"{path}: {name} has shape {arrays[name].shape}, expected {shape} for these keypoints.")
     for name in _FIELDS[1:]:
         if not np.issubdtype(arrays[name].dtype, np.floating) or not np.isfinite(arrays[name]).all():
             raise ValueError(f"{path}: {name} is not made of finite numbers.")
@@ -83,7 +85,7 @@ def wire_log(wire: HangingWire) -> GapLog:
     """A gap log in space with an episode of one sample for each time that the wire was hung.
 
     The mean of the published stiffnesses is what is believed true; the diameter is a guess. Gripper poses are the first
-    and last point with the direction to the point beside it, since the photographs do not show the clamps.
+    and last point with the direction to the point next to it, since the photographs do not show the clamps.
 
     Raises:
         ValueError: the wire is shorter than its points are apart.

@@ -1,1 +1,1 @@
-"""What a closed-loop run looks like: figures, an animation, and one self-contained HTML page."""
+"""Reports of closed-loop runs: figures, an animation, and one self-contained HTML page."""

@@ -71,8 +71,10 @@ def ranking_figure(diagnosis: CableDiagnosis) -> Figure | None:
 
 
 def shrinkage_figure(diagnosis: CableDiagnosis) -> Figure:
-    """Error before and after by horizon over the noise floor, five seconds ahead beside a correction that knows no
-    cause, and what the error before consists of."""
+    """Error before and after, by horizon, over the noise floor.
+
+    Also five seconds ahead compared with the online residual, and the parts of the error before.
+    """
     gap = diagnosis.gap
     explained = diagnosis.explained is not None
     believed = LIGHT.target if diagnosis.verdict == "none" else LIGHT.direct
@@ -104,7 +106,7 @@ def shrinkage_figure(diagnosis: CableDiagnosis) -> Figure:
 
 
 def motion_figure(diagnosis: CableDiagnosis) -> Figure | None:
-    """The motion to record next, and how well each motion of the library tells the explanations apart."""
+    """The motion to record next, and how well each motion of the library separates the explanations."""
     following = diagnosis.next_motion
     if following is None:
         return None

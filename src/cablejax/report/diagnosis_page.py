@@ -1,4 +1,4 @@
-"""A diagnosis as one HTML page that needs nothing else, for an engineer with two minutes."""
+"""A diagnosis as one self-contained HTML page."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ def write_diagnosis_page(diagnosis: CableDiagnosis, out: str | os.PathLike[str])
         if figure is not None and name != "motion":
             figure.savefig(picture, dpi=_DPI)
         else:
-            # none of an earlier diagnosis beside this page
+            # none of an earlier diagnosis next to this page
             picture.unlink(missing_ok=True)
     kind, badge = _BADGES[diagnosis.verdict]
     here = importlib.resources.files("cablejax.report")
@@ -188,7 +188,7 @@ def _peak(diagnosis: CableDiagnosis) -> str:
 
 
 def _alike(diagnosis: CableDiagnosis, effect: NamedEffect) -> list[str]:
-    """The effect and those that cannot be told from it and have a chance, in words."""
+    """The effect and its look-alikes that are not improbable, in words."""
     whole = next((g for g in diagnosis.equivalent if effect.name in g), ())
     group, _ = look_alikes(whole, diagnosis.effects, diagnosis.ranking)
     return [effect_title(effect.name), *(effect_title(name) for name in group if name != effect.name)]

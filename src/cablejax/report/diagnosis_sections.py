@@ -23,7 +23,7 @@ from cablejax.report.effect_words import (
 )
 
 SEPARABLE = 0.3
-"""A motion on which two explanations differ by less than this many noise units does not tell them apart."""
+"""A motion on which two explanations differ by less than this many noise units does not separate them."""
 
 # More episodes than this are counted, not listed.
 _LISTED = 8
@@ -36,6 +36,7 @@ _RULES = {
 
 
 def which_section(diagnosis: CableDiagnosis, ranking: str) -> str:
+    """HTML: the named effects with their parameters, and the look-alikes; `ranking` is the figure."""
     parts = []
     if diagnosis.verdict == "none":
         parts.append("<p>There is no gap to explain, so no effect is named.</p>")
@@ -60,8 +61,8 @@ def which_section(diagnosis: CableDiagnosis, ranking: str) -> str:
         )
         if len(likely) > 1:
             parts.append(
-                f"<p>This log cannot tell {listed(likely)} apart: each explains the gap as well, within what noise and "
-                "simulator allow.</p>"
+                f"<p>{listed(likely)} are indistinguishable on this log: each explains the gap as well, within the "
+                "errors of noise and simulator.</p>"
             )
         if faint:
             parts.append(
@@ -106,6 +107,7 @@ def _left(diagnosis: CableDiagnosis) -> float:
 
 
 def far_section(diagnosis: CableDiagnosis, picture: str) -> str:
+    """HTML: how far the gap shrinks with the named effects; `picture` is the figure."""
     gap = diagnosis.gap
     added = listed([effect_title(e.name) for e in diagnosis.effects]) or "the best explanation"
     if diagnosis.verdict == "none":
@@ -144,12 +146,13 @@ def far_section(diagnosis: CableDiagnosis, picture: str) -> str:
 
 
 def next_section(diagnosis: CableDiagnosis, picture: str) -> str:
+    """HTML: the motion to record next and what it would separate; `picture` is the figure."""
     following = diagnosis.next_motion
     if following is None:
         if in_space(diagnosis):
             return "<p>No motion was evaluated: that is done for cables on a table only.</p>"
         settled = diagnosis.verdict in ("none", "named")
-        words = "There is nothing left to tell apart." if settled else "No motion of the library would help."
+        words = "No explanations are left to separate." if settled else "No motion of the library would help."
         return f"<p>{words}</p>"
     motion = f"<b>{html.escape(effect_title(following.motion))}</b>"
     instruction = html.escape(MOTIONS.get(following.motion, ""))
@@ -157,12 +160,12 @@ def next_section(diagnosis: CableDiagnosis, picture: str) -> str:
         one, other = (f"<b>{html.escape(_explanation(name))}</b>" for name in following.separates)
         if following.separation < SEPARABLE:
             text = (
-                f"No safe motion tells {one} from {other}, the two most probable explanations: on the best, {motion}, "
-                f"they differ by {following.separation:.2g} of the noise. Measure one of the two by other means."
+                f"No safe motion separates {one} from {other}, the two most probable explanations: on the best, "
+                f"{motion}, they differ by {following.separation:.2g} of the noise. Measure one of them by other means."
             )
         else:
             text = (
-                f"Record {motion}. {instruction} It tells {one} from {other}, the two most probable explanations: "
+                f"Record {motion}. {instruction} It separates {one} from {other}, the two most probable explanations: "
                 f"there they differ by {following.separation:.2g} times the noise."
             )
     else:
@@ -175,6 +178,7 @@ def _explanation(names: str) -> str:
 
 
 def limits_section(diagnosis: CableDiagnosis) -> str:
+    """HTML: the caveats, or nothing where there are none."""
     if not diagnosis.caveats:
         return ""
     rows = "".join(f"<li>{html.escape(caveat)}</li>" for caveat in diagnosis.caveats)
@@ -182,6 +186,7 @@ def limits_section(diagnosis: CableDiagnosis) -> str:
 
 
 def details_section(diagnosis: CableDiagnosis) -> str:
+    """HTML: every effect tried, and the gap in numbers."""
     where = diagnosis.where
     alone = all(r.probability is not None for r in diagnosis.ranking)
     tried = _table(

@@ -1,4 +1,4 @@
-"""What the figures of a diagnosis share."""
+"""Common labels of the figures of a diagnosis."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ STYLE: dict[Any, Any] = FIGURE_STYLE | {"font.size": 11.0, "axes.titlesize": 11.
 
 
 def explained_label(diagnosis: CableDiagnosis) -> str:
+    """Legend of the curve with the explanation."""
     if not diagnosis.effects:
         return "with the best explanation found, not named"
     names = [effect_title(effect.name) for effect in diagnosis.effects]

@@ -1,4 +1,4 @@
-"""Effects, parameters, places, motions and quantities in the words of a lab."""
+"""Names of effects, parameters, places, motions and quantities in plain words."""
 
 from __future__ import annotations
 
@@ -139,11 +139,12 @@ def _place(location: dict[str, Any], gripper: Any = None) -> str:
 
 
 def listed(words: Sequence[str], last: str = "and") -> str:
-    """ "a, b and c"."""
+    """Joins words as in "a, b and c"."""
     return "" if not words else words[0] if len(words) == 1 else f"{', '.join(words[:-1])} {last} {words[-1]}"
 
 
 def effect_place(effect: NamedEffect) -> str:
+    """Where an effect acts, in words: keypoints, a gripper, or a place."""
     index = effect.parameters.get("index")
     if index is not None and isinstance(index.value, list):
         return f"at keypoints {listed([str(i) for i in sorted(index.value)])}"

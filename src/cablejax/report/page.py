@@ -1,4 +1,4 @@
-"""The report as one HTML page that needs nothing else: no network, no second file.
+"""The report as one self-contained HTML page.
 
 Figures are inline SVG whose colours follow the page's, so that they read on a light and on a dark screen. The animation
 is drawn by a small script from the recorded runs; without scripts the GIF stands in its place.
@@ -57,7 +57,7 @@ _SECTIONS: tuple[tuple[str, Callable[[Any], Figure], str], ...] = (
         "What the online residual contributes",
         figures.residual_share,
         "Size of the residual's prediction relative to the learned model's and its own together, at each command. "
-        "It is fitted anew on the last samples before every command. Blank where the grippers rested.",
+        "It is fitted to the last samples before every command. Blank where the grippers rested.",
     ),
     (
         "How far the planner trusts itself",

@@ -1,4 +1,4 @@
-"""What a result depends on besides the code: package versions and the machine."""
+"""Provenance of a result: package versions and the machine."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Figures of a diagnosis in space: a view that can be turned, and what is left in which file."""
+"""Figures of a diagnosis in space: a view that can be rotated, and the remaining error by file."""
 
 from __future__ import annotations
 

@@ -27,13 +27,14 @@ class Corrected:
     def __call__(
         self, weights: tuple[Any, ResidualModel], history: History, twist: Float[Array, "Q 3"]
     ) -> Float[Array, "N 2"]:
+        """Displacement by the offline model plus the residual [m], shape [N, 2]."""
         offline, residual = weights
         return self.dynamics(offline, history, twist) + apply(residual, twist)
 
     def jacobian(
         self, weights: tuple[Any, ResidualModel], history: History, twist: Float[Array, "Q 3"]
     ) -> StepJacobian:
-        """f's own, and J."""
+        """F's own, and J."""
         offline, residual = weights
         of_f = step_jacobian(self.dynamics, offline, history, twist)
         return of_f._replace(twist=of_f.twist + residual.gain.T.reshape(of_f.twist.shape))

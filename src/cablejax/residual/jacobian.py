@@ -1,4 +1,4 @@
-"""How one step of a dynamics model depends on what it starts from: what a planner linearises a rollout with."""
+"""Jacobian of one step of a dynamics model, from which a planner linearises a rollout."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
 """Ridge regression of the dynamics model's error on the grippers' motion, from the last few samples.
 
-The learned model is wrong about the cable in hand. Within a small step its error is taken as linear in the command,
-`delta = R J + b` (Wang et al., RA-L 2022, section "Online Residual Model Learning"), and `J`, `b` are fitted anew at
-every control step to the last W samples.
+The learned model errs on the actual cable. Within a small step its error is taken as linear in the command,
+`delta = R J + b` (Wang et al., RA-L 2022, section "Online Residual Model Learning"), and `J`, `b` are fitted at every
+control step to the last W samples.
 
 Units decide what the penalty does. With `R` in metres, five steps of 5 cm by both grippers have `R'R = 0.025`, so the
 paper's `lambda = 10` would shrink the residual 400 times: it would be switched off. Here one unit of the regressor is

@@ -1,4 +1,4 @@
-"""How simulator functions are compiled."""
+"""Compiler options and precision of simulator functions."""
 
 from __future__ import annotations
 

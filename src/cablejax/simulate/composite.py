@@ -88,8 +88,11 @@ def build_grasped_chain(config: Discretisation, obstacle: tuple[float, float, fl
 
 
 def _add_obstacle(spec: mujoco.MjSpec, obstacle: tuple[float, float, float], dt: float) -> None:
-    """A sphere in the cable's plane, without friction. Sphere and links have half the radius each, so that it counts to
-    the centreline. A contact is as good as undone within one step, like a grasp."""
+    """Adds a sphere in the cable's plane, without friction.
+
+    Sphere and links have half the radius each, so that it counts to the centreline. A contact is all but resolved
+    within one step, like a grasp.
+    """
     x, y, radius = obstacle
     for link in link_bodies(spec):
         for geom in link.geoms:

@@ -81,8 +81,8 @@ def solve_elastica(
     """Equilibrium shape of a uniform rod between two clamps.
 
     Several shapes can fit the same clamps. Without `guess` the solver follows the one that grows out of a nearly
-    straight rod as the ends turn and approach in proportion; for ends (almost) on their chord that is an arch to the
-    side to which they lean, to the left of the chord where they do not.
+    straight rod as the ends turn and approach in proportion, and another one where that is unstable; for ends (almost)
+    on their chord that is an arch to the side to which they lean, to the left of the chord where they do not.
 
     Args:
         gripper_pose: (x, y, theta) of the two ends [m, rad], shape [2, 3]; theta is the tangent's direction in the
@@ -107,23 +107,37 @@ def solve_elastica(
     direction = np.arctan2(delta[1], delta[0]) if chord > 0 else 0.0
     direction += 2 * np.pi * np.round((pose[:, 2].mean() - direction) / (2 * np.pi))
     ends = np.array([pose[0, 2] - direction, pose[1, 2] - direction, chord])
-    if guess is None:
-        solution = _continue(ends)
-    else:
+
+    def placed(solution) -> Elastica:
+        s = np.linspace(0.0, 1.0, n_samples)
+        x, y, angle, curvature = solution.sol(s)
+        cos, sin = np.cos(direction), np.sin(direction)
+        turn = np.array([[cos, -sin], [sin, cos]])
+        return Elastica(
+            arclength=s * length,
+            position=pose[0, :2] + length * np.stack([x, y], axis=1) @ turn.T,
+            angle=angle + direction,
+            curvature=curvature / length,
+            force=turn @ solution.p / length**2,
+        )
+
+    if guess is not None:
         solution = _solve(ends, *_from_points(np.asarray(guess, float), length, direction))
         if solution is None:
             raise ElasticaError("No equilibrium near the given guess: pass a guess closer to the wanted shape.")
-    s = np.linspace(0.0, 1.0, n_samples)
-    x, y, angle, curvature = solution.sol(s)
-    cos, sin = np.cos(direction), np.sin(direction)
-    turn = np.array([[cos, -sin], [sin, cos]])
-    return Elastica(
-        arclength=s * length,
-        position=pose[0, :2] + length * np.stack([x, y], axis=1) @ turn.T,
-        angle=angle + direction,
-        curvature=curvature / length,
-        force=turn @ solution.p / length**2,
-    )
+        return placed(solution)
+    shapes = []
+    for solution in _continue(ends):
+        shapes.append(placed(solution))
+        if shapes[-1].stability() > 0:
+            return shapes[-1]
+    if not shapes:
+        raise ElasticaError(
+            f"No equilibrium found for end angles {ends[0]:.3f} and {ends[1]:.3f} rad against the chord and a "
+            f"chord of {ends[2]:.3f} lengths: ends that turn so far so close together have none that grows "
+            "out of a straight cable. Choose gentler ends or pass a guess."
+        )
+    return shapes[0]
 
 
 def elastica(
@@ -155,30 +169,31 @@ def _solve(ends, mesh, state, force):
 
 
 def _continue(ends):
-    """The solution for `ends`, followed from a nearly straight rod.
+    """Solutions for `ends`, followed from a nearly straight rod in two ways.
 
-    Where the direct way ends at a fork, as it does for an S with unequal ends, it leads by the S with equal ones.
+    On the first way the ends approach in proportion as they turn. Early on they are then closer than their small angles
+    ask for, so that the rod buckles: for an S this may end at a fork, or in a shape that does not last. On the second
+    they approach with the square of the way, as the ends of a beam do.
     """
-    equal = np.array([ends[:2].mean(), ends[:2].mean(), ends[2]])
-    for stops in ([ends], [equal, ends]):
-        start, solution = _start(stops[0])
-        for stop in stops:
-            start, solution = stop, None if solution is None else _follow(start, stop, solution)
-        if solution is not None:
-            return solution
-    raise ElasticaError(
-        f"No equilibrium found for end angles {ends[0]:.3f} and {ends[1]:.3f} rad against the chord and a "
-        f"chord of {ends[2]:.3f} lengths: ends that turn so far so close together have none that grows "
-        "out of a straight cable. Choose gentler ends or pass a guess."
-    )
+    start, solution = _start(ends)
+    if solution is not None:
+        for power in (1, 2):
+            if found := _follow(start, ends, solution, power):
+                yield found
 
 
-def _follow(start, ends, solution):
-    """The solution for `ends` that grows out of one for `start`, or None. Steps halve where the solver fails."""
+def _follow(start, ends, solution, power):
+    """The solution for `ends` that grows out of one for `start`, or None. Steps halve where the solver fails.
+
+    The ends' angles change in proportion to the way, and their approach, to the power 1 / `power`, does as well.
+    """
     done, step = 0.0, 0.25
+    slack = (1.0 - np.array([start[2], ends[2]])) ** (1 / power)
     while done < 1.0:
         fraction = min(1.0, done + step)
-        trial = _solve(start + fraction * (ends - start), solution.x, solution.y, solution.p)
+        at = start + fraction * (ends - start)
+        at[2] = 1.0 - (slack[0] + fraction * (slack[1] - slack[0])) ** power
+        trial = _solve(at, solution.x, solution.y, solution.p)
         # A jump to another branch shows as an angle that changes by much more than the ends did.
         moved = np.inf if trial is None else np.abs(trial.sol(_PROBE)[2] - solution.sol(_PROBE)[2]).max()
         if trial is not None and moved < LARGEST_TURN:

@@ -1,4 +1,4 @@
-"""The one interface of the simulators, and what is the same in all of them."""
+"""The common interface of the simulators, and code that all of them share."""
 
 from __future__ import annotations
 
@@ -121,10 +121,11 @@ def finely_sampled(
 
 def _warn_if_taut(engine: Engine, physics: Physics, state: CableState, twist: Any, interval: float) -> None:
     """Warns where the grippers are commanded further apart than the cable is long, unless it can stretch or slip."""
-    inputs = (state.gripper_pose, twist, physics.axial_compliance, physics.slip)
+    # under `jax.grad` and the like the values are known all the same
+    inputs = jax.lax.stop_gradient((state.gripper_pose, twist, physics.axial_compliance, physics.slip))
     if any(isinstance(x, jax.core.Tracer) for x in inputs) or any(np.any(np.asarray(x) != 0) for x in inputs[2:]):
         return
-    pose, moved = np.asarray(state.gripper_pose)[..., :3], np.asarray(twist)[..., :3]
+    pose, moved = (np.asarray(x)[..., :3] for x in inputs[:2])
     chord = (pose[..., 1, :] - pose[..., 0, :])[..., None, :] + interval * np.cumsum(
         moved[..., 1, :] - moved[..., 0, :], axis=-2
     )

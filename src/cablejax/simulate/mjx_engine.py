@@ -58,6 +58,7 @@ class MjxEngine(Engine):
         return model
 
     def initial_state(self, gripper_pose, *, guess=None) -> CableState:
+        """See `Engine`."""
         return equilibrium_state(self.config, gripper_pose, guess=guess)
 
     @full_precision
@@ -68,6 +69,7 @@ class MjxEngine(Engine):
         return self._observe(data, nominal_physics(self.config))
 
     def rollout(self, physics, state, twist, interval=1.0):
+        """See `Engine`. Compiles on the first call for a shape and interval."""
         twist = jnp.asarray(twist)
         self.check_twist(twist)
 

@@ -21,7 +21,7 @@ class MotionConfig:
     """How the grippers move at random, and the poses they keep to.
 
     Velocities follow a first-order autoregressive process in each gripper's (vx, vy, omega). Its scale and persistence
-    are drawn anew for every trajectory, so that the data hold slow and fast, jerky and steady motions.
+    are drawn separately for every trajectory, so that the data hold slow and fast, jerky and steady motions.
 
     Attributes:
         start: "straight" (ends almost the full length apart, aligned) or "random" poses.
@@ -66,8 +66,9 @@ def random_motion(
     motion: MotionConfig = MotionConfig(),
     interval: float = 1.0,
 ) -> tuple[Float[np.ndarray, "Q 3"], Float[np.ndarray, "T Q 3"]]:
-    """Draws a start pose and n_steps twists. Every pose on the way is within `admissible`, and no command makes the
-    frictionless cable snap through.
+    """Draws a start pose and n_steps twists.
+
+    Every pose on the way is within `admissible`, and no command makes the frictionless cable snap through.
 
     Args:
         rng: source of all randomness.

@@ -29,7 +29,7 @@ class Replay:
 
 
 def config_of_log(log: GapLog, *, n_links: int | None = None, timestep: float | None = None) -> Discretisation:
-    """The simulator of the cable that a log states, at the default resolution unless told otherwise.
+    """The simulator of the cable that a log states, by default at the default resolution.
 
     In the plane the diameter hardly matters to the motion, and a cable thicker than a link is long gets a smaller one.
     """

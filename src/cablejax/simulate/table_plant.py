@@ -1,4 +1,4 @@
-"""What all plants share: a cable between two grippers, commanded and observed as a robot's would be.
+"""Base of all plants: a cable between two grippers, commanded and observed as a robot's would be.
 
 A plant brings its own physics (`reset`, `nodes` and what moves them); checks, clock, sampling, the arms' and the
 camera's effects and camera noise are the same for all of them and live here.
@@ -52,22 +52,28 @@ class ObservedConfig(Protocol):
     """What the configuration of a plant says of its cable and of how that is seen; see `PlantConfig`."""
 
     @property
-    def cable(self) -> Cable: ...
+    def cable(self) -> Cable:
+        """The plant's cable."""
 
     @property
-    def discretisation(self) -> Discretisation: ...
+    def discretisation(self) -> Discretisation:
+        """Its links and time step."""
 
     @property
-    def physics(self) -> Physics: ...
+    def physics(self) -> Physics:
+        """Its physics with all effects."""
 
     @property
-    def keypoint_noise(self) -> float: ...
+    def keypoint_noise(self) -> float:
+        """Standard deviation of the observed keypoints [m]."""
 
     @property
-    def keypoint_dropout(self) -> float: ...
+    def keypoint_dropout(self) -> float:
+        """Probability that a keypoint is not observed in a sample."""
 
     @property
-    def seed(self) -> int: ...
+    def seed(self) -> int:
+        """Seed of noise and dropout."""
 
 
 class TablePlant(abc.ABC):
@@ -154,7 +160,7 @@ class TablePlant(abc.ABC):
         return (self._steps_done or 0) * self._timestep
 
     def observe(self) -> Observation:
-        """Keypoints and gripper poses now, with the configured noise and gaps (drawn anew by every call)."""
+        """Keypoints and gripper poses now, with the configured noise and gaps; every call draws them again."""
         config, random = self.config, self._random
         truth = self._true_keypoints()
         keypoints = camera_similarity(self._physics, self._look())

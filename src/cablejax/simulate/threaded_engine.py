@@ -53,9 +53,11 @@ class ThreadedEngine(Engine):
         return build_grasped_chain(self.config)
 
     def initial_state(self, gripper_pose, *, guess=None) -> CableState:
+        """See `Engine`."""
         return equilibrium_state(self.config, gripper_pose, guess=guess)
 
     def rollout(self, physics, state, twist, interval=1.0):
+        """See `Engine`. Runs one cable per thread; not differentiable."""
         twist = np.asarray(twist, np.float64)
         self.check_twist(twist)
         return finely_sampled(self._run, self, physics, state, twist, interval)

@@ -1,4 +1,4 @@
-"""Feasible sets: bounds on elements, lengths and affine functions, and what they have in common."""
+"""Feasible sets: bounds on elements, lengths and affine functions, and their intersection."""
 
 from cablejax.bounded.sets.affine_balls import AffineBalls
 from cablejax.bounded.sets.balls import Balls, project_ball

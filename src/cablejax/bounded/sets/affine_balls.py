@@ -23,6 +23,7 @@ class AffineBalls(ConvexSet):
     radius: Float[Array, " K"]
 
     def quadrics(self, y: Float[Array, "..."]) -> Quadrics:
+        """One quadratic per ball."""
         return ball_quadrics(
             self.matrix.astype(y.dtype), self.offset.astype(y.dtype), jnp.asarray(self.radius, y.dtype)
         )
@@ -33,4 +34,5 @@ class AffineBalls(ConvexSet):
         return jnp.maximum((length - self.radius).max(), 0.0)
 
     def empty(self) -> Bool[Array, ""]:
+        """Whether a radius is negative, or an array is not finite."""
         return ~(jnp.all(self.radius >= 0) & jnp.isfinite(self.matrix).all() & jnp.isfinite(self.offset).all())

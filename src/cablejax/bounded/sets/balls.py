@@ -23,11 +23,13 @@ class Balls(ConvexSet):
     closed_form: ClassVar[bool] = True
 
     def project(self, y: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
+        """Shortens every vector that is longer than its radius; in closed form."""
         return project_ball(y, jnp.asarray(self.radius, y.dtype)[..., None])
 
     restore = project
 
     def quadrics(self, y: Float[Array, "..."]) -> Quadrics:
+        """One quadratic per ball."""
         n_balls, width = int(np.prod(y.shape[:-1])), y.shape[-1]
         radius = jnp.broadcast_to(self.radius, y.shape[:-1]).ravel().astype(y.dtype)
         return ball_quadrics(
@@ -39,6 +41,7 @@ class Balls(ConvexSet):
         return jnp.maximum((jnp.linalg.norm(y, axis=-1) - self.radius).max(), 0.0)
 
     def empty(self) -> Bool[Array, ""]:
+        """Whether a radius is negative or NaN."""
         return ~jnp.all(jnp.asarray(self.radius) >= 0)
 
 

@@ -1,4 +1,4 @@
-"""What a bounded solver must know of where it may go."""
+"""Base classes of feasible sets: bounds, projection, and quadratic form."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class AbstractSet(eqx.Module):
     def empty(self) -> Bool[Array, ""]:
         """Whether some bound contradicts itself or another bound of its kind, or is not a number.
 
-        Bounds of several kinds that contradict each other are told by `violation(project(y)) > 0`.
+        Bounds of several kinds that contradict each other show as `violation(project(y)) > 0`.
         """
 
     def violation(self, y: Float[Array, "..."]) -> Float[Array, ""]:

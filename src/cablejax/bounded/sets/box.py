@@ -25,11 +25,13 @@ class Box(ConvexSet):
     closed_form: ClassVar[bool] = True
 
     def project(self, y: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
+        """Clips every coordinate to its bounds; in closed form."""
         return jnp.clip(y, self.lower, self.upper)
 
     restore = project
 
     def quadrics(self, y: Float[Array, "..."]) -> Quadrics:
+        """Two linear functions per coordinate."""
         size = y.size
         lower = jnp.broadcast_to(self.lower, y.shape).ravel().astype(y.dtype)
         upper = jnp.broadcast_to(self.upper, y.shape).ravel().astype(y.dtype)
@@ -44,4 +46,5 @@ class Box(ConvexSet):
         )
 
     def empty(self) -> Bool[Array, ""]:
+        """Whether a lower bound lies above its upper bound."""
         return ~jnp.all(jnp.asarray(self.lower) <= jnp.asarray(self.upper))

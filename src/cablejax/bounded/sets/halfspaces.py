@@ -21,6 +21,7 @@ class Halfspaces(ConvexSet):
     bounds: Float[Array, " K"]
 
     def quadrics(self, y: Float[Array, "..."]) -> Quadrics:
+        """One linear function per plane, scaled to give the distance."""
         normals = self.normals.astype(y.dtype)
         length = jnp.linalg.norm(normals, axis=-1)
         n_planes = len(length)
@@ -34,4 +35,5 @@ class Halfspaces(ConvexSet):
         )
 
     def empty(self) -> Bool[Array, ""]:
+        """Whether a normal is not finite, or a bound is -inf or NaN."""
         return ~(jnp.isfinite(self.normals).all() & jnp.all(self.bounds > -jnp.inf))

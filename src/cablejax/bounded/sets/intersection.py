@@ -1,4 +1,4 @@
-"""What several sets have in common."""
+"""The intersection of several sets."""
 
 from __future__ import annotations
 
@@ -25,6 +25,7 @@ class Intersection(ConvexSet):
             raise ValueError("An Intersection needs at least one set.")
 
     def quadrics(self, y: Float[Array, "..."]) -> Quadrics:
+        """The members' quadratics, one after the other."""
         return joined([member.quadrics(y) for member in self.members])
 
     def project(self, y: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
@@ -36,6 +37,7 @@ class Intersection(ConvexSet):
         return _nearest_in_all(self, y)
 
     def restore(self, y: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
+        """Restores `y` to every member that has a closed form, one after the other."""
         for member in self.members:
             if member.closed_form:
                 y = member.restore(y)
@@ -46,7 +48,7 @@ class Intersection(ConvexSet):
         return jnp.stack([member.violation(y) for member in self.members]).max()
 
     def empty(self) -> Bool[Array, ""]:
-        """Whether a member is empty; members that contradict each other are told by `violation(project(y)) > 0`."""
+        """Whether a member is empty; members that contradict each other show as `violation(project(y)) > 0`."""
         return jnp.stack([member.empty() for member in self.members]).any()
 
 

@@ -50,9 +50,11 @@ class ChainEngine(Engine):
             )
 
     def initial_state(self, gripper_pose, *, guess=None) -> CableState:
+        """See `Engine`; the cable remembers nothing yet."""
         return self._remembering(equilibrium_state(self.config, gripper_pose, guess=guess))
 
     def rollout(self, physics, state, twist, interval=1.0):
+        """See `Engine`. Compiles on the first call for a shape and interval."""
         twist = jnp.asarray(twist)
         self.check_twist(twist)
 

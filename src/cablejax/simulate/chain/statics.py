@@ -1,4 +1,4 @@
-"""Computes the resting shapes of a cable at two pairs of gripper poses, compiled: what the network corrects.
+"""Computes the frictionless resting shapes of a cable at two pairs of gripper poses, compiled.
 
 Without friction, a uniform inextensible cable clamped at both ends rests in a shape that depends on nothing but the
 gripper poses and the branch it is on (up or down, S or mirrored S): not on its stiffness, not on its weight. This file

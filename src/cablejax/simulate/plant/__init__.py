@@ -1,4 +1,4 @@
-"""The contact plant: a cable in C MuJoCo that stands for reality, and any effect of the library staged in it."""
+"""The contact plant: a cable in C MuJoCo that represents reality, with any effect of the library staged in it."""
 
 from cablejax.simulate.plant.config import HOOKS, PlantConfig
 from cablejax.simulate.plant.model import plant_model

@@ -1,4 +1,4 @@
-"""The plant: a cable that stands for reality, with contact and friction that the trained simulator does not have.
+"""The MuJoCo model of the contact plant: a cable with contact and friction cones, which no training simulator has.
 
 C MuJoCo, in space: a chain of capsules on ball joints lies on a table under gravity and touches it by capsule-plane
 contacts with elliptic friction cones. The planar simulator that yields training data has another resolution, another

@@ -1,4 +1,4 @@
-"""How grippers hold a cable in space: their frames, and the nodes of the rod that move with them."""
+"""Grippers of a cable in space: their frames, and the nodes of the rod that move with them."""
 
 from __future__ import annotations
 

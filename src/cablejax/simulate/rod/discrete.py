@@ -1,4 +1,4 @@
-"""One cable as nodes and edges: what its law makes of them, besides what `constrained` solves.
+"""Discretised forces of one cable in space on its nodes and edges, apart from the constraints.
 
 Interpolation along the cable between nodes, joints and markers, forces of rest curvature and twist, the directors that
 follow the edges, and the shape through observed markers from which a motion begins.

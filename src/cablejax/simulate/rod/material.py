@@ -20,6 +20,7 @@ from cablejax.simulate.rod.physics import RodPhysics
 
 
 def unit(x: Float[Array, "*B 3"]) -> Float[Array, "*B 3"]:
+    """Vectors scaled to length one. Not finite at zero."""
     return x / jnp.sqrt(jnp.sum(x**2, axis=-1, keepdims=True))
 
 

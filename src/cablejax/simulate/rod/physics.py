@@ -1,4 +1,4 @@
-"""What there is to know of a cable in space for its motion to follow from that of the grippers."""
+"""Physical parameters of a cable in space."""
 
 from __future__ import annotations
 

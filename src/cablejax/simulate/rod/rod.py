@@ -1,8 +1,8 @@
 """A cable in space between two moving clamps: an inextensible rod in node coordinates, integrated by BDF2.
 
-Everything is per mass: no motion of a cable that hangs free tells its weight. Nodes x_j lie at arc lengths
-(j - 1/2) h, so that a clamp at s = 0 sits in the middle of the first edge and holds nodes 0 and 1; the same at the
-other end. With D1, D2 the first and second differences,
+All quantities are per mass: the motion of a freely hanging cable does not depend on its weight. Nodes x_j lie at arc
+lengths (j - 1/2) h, so that a clamp at s = 0 sits in the middle of the first edge and holds nodes 0 and 1; the same at
+the other end. With D1, D2 the first and second differences,
 
     a_j + c v_j + q |v_j| v_j + h^-4 [D2' B (D2 x - h^2 k + tau (D2 v - w x D2 x))]_j = g + t_j - [D1' lambda D1 x]_j,
     |D1 x| = h,

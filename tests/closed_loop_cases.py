@@ -1,11 +1,11 @@
-"""Made-up trials for the evaluation's tests."""
+"""Made-up trials for the tests of closed loops."""
 
 import dataclasses
 import math
 
 import numpy as np
 
-from cablejax.evaluation.trials import Trial
+from closed_loop.trials import Trial
 
 
 def course(terminal_cm: float = 0.25, settled_s: float = 8.0, best_cm: float = math.inf) -> tuple[float, ...]:

@@ -9,7 +9,7 @@ import pytest
 from cablejax.cli import main
 from cablejax.commands import diagnose, runs
 from cablejax.commands.options import UsageError
-from cablejax.commands.parts import Parts, unfinished
+from cablejax.commands.resuming import Parts, unfinished
 from cablejax.commands.runs import Job
 from cablejax.control.shaping import load_model
 from cablejax.control.targets import make_target
@@ -72,7 +72,7 @@ def test_a_damaged_run_is_made_again(tmp_path, capsys):
         assert "is damaged and made again" in capsys.readouterr().err
 
 
-def test_settings_that_cannot_be_read_are_told(tmp_path):
+def test_settings_that_cannot_be_read_are_reported(tmp_path):
     parts = Parts(tmp_path / "parts", SETTINGS)
     parts.begin()
     for text in ("", '{"schema": ', "[" * 100_000):
@@ -141,8 +141,8 @@ def test_shape_goes_on_after_ctrl_c_between_its_results(made, weights, tmp_path,
     with monkeypatch.context() as patch:
         patch.setattr("cablejax.commands.results.write_page", interrupted)
         assert main(arguments) == 130
-    told = capsys.readouterr().err
-    assert told.startswith("compiling the control step ...\n") and "Run the same command again" in told
+    shown = capsys.readouterr().err
+    assert shown.startswith("compiling the control step ...\n") and "Run the same command again" in shown
     assert (tmp_path / "log.npz").exists() and not (tmp_path / "summary.json").exists()
     assert main(arguments) == 0
     assert made == ["residual", "direct"], "no run was repeated"

@@ -12,11 +12,11 @@ from typing import Any
 from cablejax.control.loop import run_closed_loop
 from cablejax.control.run import ClosedLoopRun
 from cablejax.control.shaping import Model, load_model
-from cablejax.evaluation.failures import Snapshot, append_snapshot, read_snapshots, snapshot_of
-from cablejax.evaluation.methods import MethodSpec, controller_of
-from cablejax.evaluation.protocols import GuessingCable, LaidOut, Task
-from cablejax.evaluation.rows import Rows
-from cablejax.evaluation.trials import KEY, Trial, TrialKey, read_trials, trial_of
+from closed_loop.failures import Snapshot, append_snapshot, read_snapshots, snapshot_of
+from closed_loop.methods import MethodSpec, controller_of
+from closed_loop.protocols import GuessingCable, LaidOut, Task
+from closed_loop.trials import KEY, Trial, TrialKey, read_trials, trial_of
+from rows import Rows
 
 PATIENCE = 12
 """Commands without any change of the error after which a trial ends: nothing more happens."""

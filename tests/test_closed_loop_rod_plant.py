@@ -12,10 +12,10 @@ from cablejax.cable import GRAVITY, Cable, Discretisation
 from cablejax.control.loop import run_closed_loop
 from cablejax.control.targets import make_target, straight_start
 from cablejax.effects.given import parse_effect
-from cablejax.simulate import rod_plant
 from cablejax.simulate.elastica import elastica
 from cablejax.simulate.plant import Plant, PlantConfig
-from cablejax.simulate.rod_plant import ETHERNET, USB, RodPlant, RodPlantConfig
+from closed_loop import rod_plant
+from closed_loop.rod_plant import ETHERNET, USB, RodPlant, RodPlantConfig
 
 CABLE = Discretisation(n_links=15, timestep=4e-4)
 CONFIG = RodPlantConfig(discretisation=CABLE)

@@ -13,9 +13,9 @@ from jaxtyping import Float
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from cablejax.evaluation.rows import append_row, read_rows
-from cablejax.evaluation.trials import TrialKey
 from cablejax.report.style import LIGHT, cable_curve
+from closed_loop.trials import TrialKey
+from rows import append_row, read_rows
 
 if TYPE_CHECKING:
     from cablejax.control.run import ClosedLoopRun

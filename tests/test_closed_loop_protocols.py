@@ -8,8 +8,14 @@ import pytest
 
 from cablejax.cable import Discretisation
 from cablejax.control.targets import make_target
-from cablejax.evaluation import protocols
-from cablejax.evaluation.protocols import (
+from cablejax.mpc import MPCConfig
+from cablejax.mpc.target_pose import target_pose
+from cablejax.simulate.elastica import solve_elastica
+from cablejax.simulate.equilibrium import angles_of_keypoints, chain_nodes, find_equilibrium
+from cablejax.simulate.motions import admissible
+from cablejax.simulate.plant import Plant, PlantConfig
+from closed_loop import protocols
+from closed_loop.protocols import (
     LaidOut,
     ShapeConfig,
     least_time,
@@ -18,12 +24,6 @@ from cablejax.evaluation.protocols import (
     random_straight_start,
     random_task,
 )
-from cablejax.mpc import MPCConfig
-from cablejax.mpc.target_pose import target_pose
-from cablejax.simulate.elastica import solve_elastica
-from cablejax.simulate.equilibrium import angles_of_keypoints, chain_nodes, find_equilibrium
-from cablejax.simulate.motions import admissible
-from cablejax.simulate.plant import Plant, PlantConfig
 
 CHAIN = Discretisation()
 CABLE = CHAIN.cable

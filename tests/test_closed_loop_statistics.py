@@ -4,10 +4,9 @@ import math
 
 import numpy as np
 import pytest
-from scipy import stats
 
-from cablejax.evaluation.paper import LIANG, METHOD_LABEL, OFFLINE_METHODS, PAPER, best_in_paper
-from cablejax.evaluation.statistics import bootstrap_interval, clopper_pearson, paired_difference, summarise
+from closed_loop.paper import LIANG, METHOD_LABEL, OFFLINE_METHODS, PAPER, best_in_paper
+from closed_loop.statistics import bootstrap_interval, paired_difference, summarise
 
 
 def test_failures_are_counted_and_rank_last():
@@ -21,20 +20,11 @@ def test_failures_are_counted_and_rank_last():
         summarise([])
 
 
-@pytest.mark.parametrize("method", ["bca", "percentile"])
-def test_bootstrap_agrees_with_scipy(method):
-    x = np.random.default_rng(3).gamma(2.0, 1.0, 25)
-    ours = bootstrap_interval(x, method=method, resamples=20_000)
-    theirs = stats.bootstrap((x,), np.mean, method=method, n_resamples=20_000, rng=1).confidence_interval
-    np.testing.assert_allclose([ours.low, ours.high], theirs, atol=0.03)
-    assert bootstrap_interval(x, method=method) == bootstrap_interval(x, method=method)
-
-
 def test_bootstrap_covers_the_mean_about_as_often_as_it_says():
     rng = np.random.default_rng(0)
     hits = 0
     for _ in range(200):
-        interval = bootstrap_interval(rng.exponential(size=30), resamples=500)
+        interval = bootstrap_interval(rng.exponential(size=30))
         hits += interval.low <= 1.0 <= interval.high
     assert 0.88 <= hits / 200 <= 0.99  # 0.95 asked for; BCa at n = 30 on exponentials is a few per cent short
 
@@ -80,20 +70,6 @@ def test_trials_of_one_seed_are_one_cluster():
     assert (clustered.interval.low, clustered.interval.high) == pytest.approx((alone.low, alone.high))
     naive = paired_difference(copied, zero)
     assert naive.interval.high - naive.interval.low < 0.7 * (clustered.interval.high - clustered.interval.low)
-
-
-@pytest.mark.parametrize(
-    ("successes", "trials", "low", "high"),
-    [(47, 50, 0.8345, 0.9875), (43, 50, 0.7326, 0.9418), (0, 10, 0.0, 0.3085), (10, 10, 0.6915, 1.0)],
-)
-def test_clopper_pearson_has_the_tabulated_values(successes, trials, low, high):
-    interval = clopper_pearson(successes, trials)
-    assert (interval.low, interval.high) == pytest.approx((low, high), abs=1e-3)
-
-
-def test_clopper_pearson_refuses_nonsense():
-    with pytest.raises(ValueError, match="3 successes in 2 trials"):
-        clopper_pearson(3, 2)
 
 
 def test_the_paper_is_complete():

@@ -13,23 +13,23 @@ import numpy as np
 
 from cablejax.control.shaping import Model
 from cablejax.dynamics.weights import FILE_NAME
-from cablejax.evaluation import tables
-from cablejax.evaluation.failures import failure_figure, worst
-from cablejax.evaluation.fine_tuning import FineTuneConfig, fine_tune, record
-from cablejax.evaluation.methods import ADAPTED_RESIDUAL, LABEL, METHODS
-from cablejax.evaluation.protocols import least_time
-from cablejax.evaluation.suite import Case, read_suite, released, run_suite
-from cablejax.evaluation.trials import LIANG_TABLE, Trial
 from cablejax.mpc import MPCConfig
+from closed_loop import interval_tables, tables
+from closed_loop.failures import failure_figure, worst
+from closed_loop.fine_tuning import FineTuneConfig, fine_tune, record
+from closed_loop.methods import ADAPTED_RESIDUAL, LABEL, METHODS
+from closed_loop.protocols import least_time
+from closed_loop.suite import Case, read_suite, released, run_suite
+from closed_loop.trials import LIANG_TABLE, Trial
 from pages import page_of_results, publish
 
 WORST = 10
 """Runs shown as pictures: the ones that ended farthest off."""
 
 SETTLING_NOTE = (
-    "The settling time of a step response is that from which on the error stays within 5 or 2 % of the way that it "
-    "went; the strict one, in all other tables here, is within a tenth of the terminal error, or 1 mm. The paper does "
-    "not say which is its own."
+    "The settling time of a step response is the time after which the error stays within 5 or 2 % of its total change; "
+    "the strict one, in all other tables here, is within a tenth of the terminal error, or 1 mm. The paper does not "
+    "define its settling time."
 )
 
 
@@ -135,17 +135,17 @@ def page(experiment: Experiment, trials: Sequence[Trial], command: str, picture:
         seeds = ", ".join(map(str, sorted({trial.seed for trial in mine})))
         lines += ["", f"## Table {table}", "", f"Seeds: {seeds}.", ""]
         if table == LIANG_TABLE:
-            lines += [tables.success_table(mine, labels=LABEL)]
+            lines += [interval_tables.success_table(mine, labels=LABEL)]
             continue
         lines += [tables.comparison_table(mine, table, labels=LABEL)]
         least = least_times(experiment, {trial.key[:1] + trial.key[2:] for trial in mine})
         lines += ["", "### Settling time by other definitions", "", f"{SETTLING_NOTE} {least}"]
         lines += ["", tables.settling_table(mine, table, labels=LABEL)]
         lines += ["", "### By stiffness", "", tables.stiffness_table(mine, table, labels=LABEL)]
-        lines += ["", "### Intervals and failures", "", tables.interval_table(mine, table, labels=LABEL)]
+        lines += ["", "### Intervals and failures", "", interval_tables.interval_table(mine, table, labels=LABEL)]
         methods = {trial.method for trial in mine}
         if ADAPTED_RESIDUAL in methods and len(methods) > 1:
-            lines += ["", "### In pairs", "", tables.paired_table(mine, table, ADAPTED_RESIDUAL, labels=LABEL)]
+            lines += ["", "### In pairs", "", interval_tables.paired_table(mine, table, ADAPTED_RESIDUAL, labels=LABEL)]
     if picture is not None:
         lines += ["", "## The runs that ended farthest off", "", f"![start, end and target of each]({picture})"]
     return page_of_results(experiment.title, f"`{command}`", lines)

@@ -1,4 +1,4 @@
-"""What an unfinished command keeps, so that the same command goes on where it was interrupted."""
+"""Resumes commands: stores the finished runs of an unfinished command until it ends."""
 
 from __future__ import annotations
 
@@ -20,15 +20,14 @@ from cablejax.npz import read_npz
 from cablejax.whole_file import DRAFT, whole_file
 
 SCHEMA = "cablejax-parts/1"
-"""Tells the folder from one of that name that somebody else made."""
+"""Marks the folder as ours; a folder of that name without it belongs to somebody else."""
 
 _NESTED = {"target": Target, "episode": Episode}
 _SETTINGS, _STATE, _RUN = "settings.json", "state.json", ".run.npz"
 
 
 class Parts:
-    """A folder that is there while a command is unfinished. It holds the settings that tell this command from another,
-    and finished runs, one `.run.npz` each."""
+    """The folder of an unfinished command: its settings, which identify it, and one `.run.npz` per finished run."""
 
     def __init__(self, folder: pathlib.Path, settings: Mapping[str, Any]):
         self.folder = folder
@@ -53,7 +52,7 @@ class Parts:
         except (FileNotFoundError, NotADirectoryError):
             found = None
         except ValueError as error:
-            raise UsageError(f"{error} Delete {self.folder} to begin anew.") from error
+            raise UsageError(f"{error} Delete {self.folder} to start again.") from error
         if not isinstance(found, dict) or found.get("schema") != SCHEMA:
             raise UsageError(
                 f"{self.folder} was not made by this command, which needs a folder of that name for what is "
@@ -118,7 +117,7 @@ def unfinished(out: pathlib.Path, settings: Mapping[str, Any], *, overwrite: boo
 
     Args:
         out: the folder.
-        settings: what tells this command from another, as for JSON.
+        settings: identify this command, as for JSON.
         overwrite: whether results that are there may be replaced.
 
     Raises:

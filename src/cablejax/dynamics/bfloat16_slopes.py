@@ -17,8 +17,11 @@ from cablejax.dynamics.model import Network
 
 @jax.custom_vjp
 def product(x: Float[Array, "*rows inputs"], kernel: Float[Array, "inputs outputs"]) -> Float[Array, "*rows outputs"]:
-    """`x @ kernel`. In float32 its derivative by x, in reverse mode, is rounded to bfloat16 and summed in float32; in
-    any other precision it is exact, and so is that by the kernel. It has no derivative in forward mode."""
+    """`x @ kernel`, with a rounded derivative by x.
+
+    In float32, reverse mode rounds the factors of that derivative to bfloat16 and sums in float32. In any other
+    precision it is exact, and so is the derivative by the kernel. There is no derivative in forward mode.
+    """
     return x @ kernel
 
 
@@ -44,7 +47,7 @@ def _of_linear_layer(x, kernel, dimension_numbers, **options):
     return product(x, kernel)
 
 
-def roughened(network: Network) -> Network:
+def with_bfloat16_slopes(network: Network) -> Network:
     """The network, changed in place so that all its linear layers have rough slopes by their input."""
     for _, module in nnx.iter_graph(network):
         if isinstance(module, nnx.Linear):

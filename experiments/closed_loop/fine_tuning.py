@@ -15,11 +15,11 @@ from cablejax.dynamics.fine_tune import starting_from
 from cablejax.dynamics.train import train
 from cablejax.dynamics.train_config import Phase, TrainConfig
 from cablejax.dynamics.weights import FILE_NAME, save_weights
-from cablejax.evaluation.protocols import GuessingCable
 from cablejax.npz import read_npz
 from cablejax.simulate.motions import MotionConfig, random_motion
 from cablejax.simulate.table_plant import PlantError
 from cablejax.types import Trajectory
+from closed_loop.protocols import GuessingCable
 
 
 @dataclasses.dataclass(frozen=True)

@@ -5,16 +5,10 @@ import math
 import numpy as np
 import pytest
 
-from cablejax.evaluation.failures import Snapshot, append_snapshot, failure_figure, read_snapshots, worst
-from cablejax.evaluation.tables import (
-    comparison_table,
-    interval_table,
-    paired_table,
-    settling_table,
-    stiffness_table,
-    success_table,
-)
-from evaluation_cases import course, small_table, trial
+from closed_loop.failures import Snapshot, append_snapshot, failure_figure, read_snapshots, worst
+from closed_loop.interval_tables import interval_table, paired_table, success_table
+from closed_loop.tables import comparison_table, settling_table, stiffness_table
+from closed_loop_cases import course, small_table, trial
 from report_cases import arc
 
 

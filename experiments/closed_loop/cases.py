@@ -9,10 +9,10 @@ from typing import get_args
 from cablejax.cable import Discretisation
 from cablejax.control.targets import Shape
 from cablejax.effects.given import GivenEffect
-from cablejax.evaluation.protocols import StartKind, letter_task, random_task
-from cablejax.evaluation.suite import Case
-from cablejax.evaluation.trials import LIANG_TABLE
 from cablejax.simulate.plant import Plant, PlantConfig
+from closed_loop.protocols import StartKind, letter_task, random_task
+from closed_loop.suite import Case
+from closed_loop.trials import LIANG_TABLE
 
 STIFFNESS_RATIOS = (0.1, 0.5, 1.0, 2.0, 3.0)
 """Wang et al., RA-L 2022: the cable's stiffness over the trained one's."""
@@ -51,7 +51,7 @@ def real_cable_cases(
     Raises:
         ImportError: PyElastica is not installed; the message says how to install it.
     """
-    from cablejax.simulate.rod_plant import ETHERNET, USB, RodPlant
+    from closed_loop.rod_plant import ETHERNET, USB, RodPlant
 
     return [
         Case(

@@ -5,7 +5,7 @@ import multiprocessing
 
 import pytest
 
-from cablejax.evaluation.rows import Rows, append_row, read_rows
+from rows import Rows, append_row, read_rows
 
 WANTED = [("a", 1), ("a", 2), ("b", 1), ("b", 2)]
 

@@ -1,4 +1,4 @@
-"""Published figures to stand beside ours: tables III to V of Wang et al., RA-L 2022, and Liang et al., 2026."""
+"""Published figures to compare with: tables III to V of Wang et al., RA-L 2022, and Liang et al., 2026."""
 
 from __future__ import annotations
 

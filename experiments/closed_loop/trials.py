@@ -1,20 +1,18 @@
-"""One closed-loop run as a row of the evaluation."""
+"""One closed-loop run as a row of results."""
 
 from __future__ import annotations
 
 import dataclasses
 import math
 import os
-from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from cablejax.control.run import settling_time, step_settling_time
-from cablejax.evaluation.rows import read_rows
+from rows import read_rows
 
 if TYPE_CHECKING:
-    from cablejax.control.batched import BatchRun
     from cablejax.control.run import ClosedLoopRun
 
 TrialKey = tuple[str, str, str, float, int]
@@ -104,34 +102,6 @@ def trial_of(
         mpc_ms_median=float(np.median(timed)) if len(timed) else math.nan,
         wall_s=float(wall_s),
     )
-
-
-def trials_of_batch(
-    run: BatchRun,
-    *,
-    table: str,
-    method: str,
-    scenarios: Sequence[str],
-    stiffnesses: Sequence[float],
-    seeds: Sequence[int],
-    wall_s: float,
-) -> list[Trial]:
-    """The rows of a batch of runs; each gets its share of the wall time, and there is no time of a control call."""
-    errors = np.asarray(run.error_cm, float)
-    return [
-        Trial(
-            table=table,
-            method=method,
-            scenario=scenario,
-            stiffness=float(stiffness),
-            seed=int(seed),
-            errors_cm=tuple(map(float, error)),
-            stopped=None,
-            mpc_ms_median=math.nan,
-            wall_s=wall_s / len(errors),
-        )
-        for error, scenario, stiffness, seed in zip(errors, scenarios, stiffnesses, seeds, strict=True)
-    ]
 
 
 def read_trials(path: str | os.PathLike[str]) -> list[Trial]:

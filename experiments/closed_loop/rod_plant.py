@@ -152,7 +152,7 @@ class RodPlant(TablePlant):
     def __init__(self, config: RodPlantConfig | None = None):
         super().__init__(RodPlantConfig() if config is None else config)
         _import_rod_class()
-        from cablejax.simulate import rod_loop
+        from closed_loop import rod_loop
 
         self._loop = rod_loop.advance
         self._rod = _straight_rod(self.config)
@@ -253,7 +253,7 @@ def _straight_rod(config: RodPlantConfig):
     inertia = physics.density * lengths * (h / 2) ** 2
     rod.mass_second_moment_of_inertia[:] = np.eye(3)[:, :, None] * inertia
     rod.inv_mass_second_moment_of_inertia[:] = np.eye(3)[:, :, None] / inertia
-    # All joints bend alike, EI / h, those beside the half-length elements too: h is the cable's length per joint.
+    # All joints bend alike, EI / h, those next to the half-length elements too: h is the cable's length per joint.
     rod.bend_matrix[:] = np.eye(3)[:, :, None] * (physics.stiffness * rod.rest_voronoi_lengths / h)
     rod.rest_kappa[0] = physics.rest_curvature * h / rod.rest_voronoi_lengths
     # the chain's nodes are the middles of the elements, and the ends

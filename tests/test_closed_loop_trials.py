@@ -7,10 +7,9 @@ import math
 import numpy as np
 import pytest
 
-from cablejax.control.batched import BatchRun
-from cablejax.evaluation.rows import append_row
-from cablejax.evaluation.trials import Trial, read_trials, trial_of, trials_of_batch
-from evaluation_cases import TRIAL, course, trial
+from closed_loop.trials import Trial, read_trials, trial_of
+from closed_loop_cases import TRIAL, course, trial
+from rows import append_row
 
 
 def append_trial(path, row: Trial) -> None:
@@ -99,17 +98,3 @@ def test_a_run_becomes_a_trial():
     assert (row.best_error_cm, row.steps, row.mpc_ms_median) == (0.4, 3, 110.0)
     assert row.key == ("III", "direct", "Z", 3.0, 4)
     assert row.errors_cm[:2] == (20.0, 0.4) and math.isnan(row.errors_cm[2])
-
-
-def test_a_batch_becomes_trials():
-    error = np.array([[9.0, 2.0, 0.3, 0.25, 0.25], [9.0, np.nan, np.nan, np.nan, np.nan], [9.0, 8.0, 6.0, 4.0, 2.0]])
-    nothing = np.zeros((3, 1))
-    run = BatchRun(nothing, nothing, nothing, error, nothing, nothing)  # pyright: ignore[reportArgumentType]
-    rows = trials_of_batch(
-        run, table="III", method="residual", scenarios="USZ", stiffnesses=[1, 2, 3], seeds=[7, 8, 9], wall_s=6.0
-    )  # fmt: skip
-    assert [row.key[2:] for row in rows] == [("U", 1.0, 7), ("S", 2.0, 8), ("Z", 3.0, 9)]
-    assert [row.settling_time_s for row in rows] == [2.0, math.inf, math.inf]
-    assert [row.best_error_cm for row in rows] == [0.25, 9.0, 2.0]
-    assert math.isnan(rows[1].terminal_error_cm) and rows[2].terminal_error_cm == 2.0
-    assert [(row.steps, row.wall_s) for row in rows] == [(4, 2.0)] * 3

@@ -29,10 +29,15 @@ def advance(
     """Advances a rod by `steps` time steps in place; the arrays are those of `elastica.CosseratRod`.
 
     Args:
-        x, v, a: positions, velocities and accelerations of the nodes, shape [3, n + 1].
-        q, omega, alpha: directors [3, 3, n] of the elements, their angular velocities and accelerations [3, n].
+        x: positions of the nodes [m], shape [3, n + 1].
+        v: their velocities [m/s], shape [3, n + 1].
+        a: their accelerations [m/s^2], shape [3, n + 1].
+        q: directors of the elements, shape [3, 3, n].
+        omega: their angular velocities [rad/s], shape [3, n].
+        alpha: their angular accelerations [rad/s^2], shape [3, n].
         mass: of the nodes [kg], shape [n + 1].
-        inertia, inverse_inertia: of the elements' rotation, shape [3, 3, n].
+        inertia: of the elements' rotation [kg m^2], shape [3, 3, n].
+        inverse_inertia: its inverse, shape [3, 3, n].
         stiffness: shear and bend matrices, sigma and kappa at rest.
         geometry: volume, lengths, lengths at rest, Voronoi lengths at rest, tangents, radius.
         strain: dilatation, Voronoi dilatation, dilatation rate, sigma, kappa.

@@ -9,9 +9,9 @@ import numpy as np
 from flax import nnx
 
 from cablejax.control.shaping import NetworkDynamics
+from cablejax.dynamics.bfloat16_slopes import product, with_bfloat16_slopes
 from cablejax.dynamics.config import ModelConfig
 from cablejax.dynamics.model import apply
-from cablejax.dynamics.rough import product, roughened
 from cablejax.mpc.feasible import feasible_from
 from cablejax.mpc.problem import ShapingProblem
 from cablejax.residual import Corrected, zero_residual
@@ -47,7 +47,9 @@ def test_values_are_those_of_the_network_to_the_bit():
     def displacement(weights, change):
         return apply(change(nnx.merge(graphdef, weights)), history, TWIST)
 
-    exact, rough = (jax.jit(functools.partial(displacement, change=c))(weights) for c in (lambda n: n, roughened))
+    exact, rough = (
+        jax.jit(functools.partial(displacement, change=c))(weights) for c in (lambda n: n, with_bfloat16_slopes)
+    )
     np.testing.assert_array_equal(rough, exact)
 
 

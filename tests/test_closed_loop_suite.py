@@ -15,16 +15,16 @@ from cablejax.control.targets import make_target
 from cablejax.control.visual_servo import VisualServo
 from cablejax.dynamics.train_config import Phase
 from cablejax.effects.given import GivenEffect
-from cablejax.evaluation.cases import mujoco_plant, random_cases, stiffness_cases
-from cablejax.evaluation.fine_tuning import FineTuneConfig, fine_tune, record
-from cablejax.evaluation.methods import LABEL, METHODS, controller_of
-from cablejax.evaluation.paper import VISUAL_SERVO
-from cablejax.evaluation.protocols import LaidOut, letter_task
-from cablejax.evaluation.suite import Case, key_of, read_suite, run_suite
 from cablejax.mpc import MPC
 from cablejax.simulate.plant import Plant, PlantConfig
 from cli_cases import small_model
-from closed_loops import Experiment, Extent, page, seed_range
+from closed_loop.cases import mujoco_plant, random_cases, stiffness_cases
+from closed_loop.experiment import Experiment, Extent, page, seed_range
+from closed_loop.fine_tuning import FineTuneConfig, fine_tune, record
+from closed_loop.methods import LABEL, METHODS, controller_of
+from closed_loop.paper import VISUAL_SERVO
+from closed_loop.protocols import LaidOut, letter_task
+from closed_loop.suite import Case, key_of, read_suite, run_suite
 
 CABLE = Discretisation(n_links=12, dimension=3, timestep=0.005)
 SERVO = METHODS[VISUAL_SERVO]

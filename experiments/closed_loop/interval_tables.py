@@ -1,0 +1,173 @@
+"""How sure the tables are: intervals, differences in pairs, and rates of success with theirs."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+
+import numpy as np
+from scipy.stats import binomtest
+
+from closed_loop.cells import (
+    FAILED,
+    UNIT,
+    interval_text,
+    label_of,
+    markdown,
+    methods_of,
+    number_text,
+    of_scenario,
+    scenarios_of,
+    trials_of_table,
+    value_of,
+)
+from closed_loop.paper import LIANG, METHOD_LABEL, Measure
+from closed_loop.statistics import Interval, bootstrap_interval, paired_difference, summarise
+from closed_loop.trials import LIANG_TABLE, Trial
+
+SUCCESS_CM = 1.0
+"""Liang et al.: a shape is reached below this root mean square error [cm]."""
+
+
+def interval_table(
+    trials: Iterable[Trial],
+    table: str,
+    measure: Measure = "terminal",
+    *,
+    methods: Sequence[str] | None = None,
+    labels: Mapping[str, str] = METHOD_LABEL,
+) -> str:
+    """What a mean hides: its 95 % bootstrap interval, the median, the worst trial, and failures.
+
+    The interval resamples seeds, since trials of one seed share their start.
+
+    Raises:
+        ValueError: there is no trial of this table.
+    """
+    mine = trials_of_table(trials, table)
+    rows = []
+    for method in methods_of(mine, methods):
+        for scenario in scenarios_of(mine):
+            cell = of_scenario([trial for trial in mine if trial.method == method], scenario)
+            if not cell:
+                continue
+            summary = summarise([value_of(trial, measure) for trial in cell])
+            rows.append(
+                [
+                    label_of(method, labels), scenario, str(summary.count), str(summary.failures),
+                    str(sum(trial.stopped is not None for trial in cell)), number_text(summary.mean),
+                    interval_text(_seed_interval(cell, measure)), number_text(summary.median),
+                    number_text(summary.worst),
+                ]
+            )  # fmt: skip
+    title = [
+        "method", "scenario", "trials", FAILED[measure], "stopped early", f"mean {UNIT[measure]}", "95 % interval",
+        "median", "worst",
+    ]  # fmt: skip
+    return markdown(title, rows)
+
+
+def paired_table(
+    trials: Iterable[Trial],
+    table: str,
+    reference: str,
+    measure: Measure = "terminal",
+    *,
+    methods: Sequence[str] | None = None,
+    labels: Mapping[str, str] = METHOD_LABEL,
+) -> str:
+    """Every method against `reference` in the same trials (stiffness and seed): negative = lower than the reference.
+
+    Raises:
+        ValueError: there is no trial of this table, or none by the reference.
+    """
+    mine = trials_of_table(trials, table)
+    if all(trial.method != reference for trial in mine):
+        raise ValueError(f"Table {table} has no trial of {reference!r}, only of {sorted({t.method for t in mine})}.")
+
+    def values(method: str, scenario: str) -> dict[tuple[float, int], float]:
+        cell = of_scenario([trial for trial in mine if trial.method == method], scenario)
+        return {(trial.stiffness, trial.seed): value_of(trial, measure) for trial in cell}
+
+    rows = []
+    for method in methods_of(mine, methods):
+        for scenario in scenarios_of(mine):
+            if method == reference or not (ours := values(method, scenario)):
+                continue
+            result = paired_difference(ours, values(reference, scenario), cluster=lambda key: key[1])
+            rows.append(
+                [
+                    label_of(method, labels), scenario, str(result.pairs), str(result.unpaired), str(result.failures),
+                    f"{result.mean:+.3f}" if np.isfinite(result.mean) else "none",
+                    interval_text(result.interval, "+.3f"), f"{result.better} / {result.worse}",
+                ]
+            )  # fmt: skip
+    title = [
+        f"against {label_of(reference, labels)}", "scenario", "pairs", "unpaired", "pairs with a failure",
+        f"difference of {UNIT[measure]}", "95 % interval", "better / worse",
+    ]  # fmt: skip
+    return markdown(title, rows)
+
+
+def success_table(
+    trials: Iterable[Trial],
+    *,
+    table: str = LIANG_TABLE,
+    methods: Sequence[str] | None = None,
+    labels: Mapping[str, str] = METHOD_LABEL,
+) -> str:
+    """How often a random target was reached from a random start, compared with Liang et al.
+
+    A success is an error below 10 mm at the end of the run. That is stricter than below 10 mm at some time within the
+    run, which has a column of its own.
+
+    Raises:
+        ValueError: there is no trial of this table.
+    """
+    mine = trials_of_table(trials, table)
+    rows = []
+    for method in methods_of(mine, methods):
+        of_method = [trial for trial in mine if trial.method == method]
+        for scenario in sorted({trial.scenario for trial in of_method}, reverse=True):
+            cell = of_scenario(of_method, scenario)
+            reached = [trial for trial in cell if trial.terminal_error_cm < SUCCESS_CM]
+            once = sum(trial.best_error_cm < SUCCESS_CM for trial in cell)
+            every = summarise([10 * trial.terminal_error_cm for trial in cell])
+            lost = f" ({every.failures} lost)" if every.failures else ""
+            rows.append(
+                [
+                    label_of(method, labels), scenario, f"{len(reached)}/{len(cell)}",
+                    _rate_text(len(reached), len(cell)), f"{once}/{len(cell)}",
+                    number_text(summarise([10 * t.terminal_error_cm for t in reached]).mean if reached else np.nan),
+                    f"{number_text(every.mean)}{lost}", number_text(every.median),
+                    str(max(trial.steps for trial in cell)),
+                ]
+            )  # fmt: skip
+    for entry in LIANG:
+        rows.append(
+            [
+                f"*{entry.label}*", f"*{entry.scenario}*", f"*{entry.successes}/{entry.trials}*",
+                f"*{_rate_text(entry.successes, entry.trials)}*", "", "",
+                "" if entry.error_mm is None else f"*{entry.error_mm}*", "", "*250*",
+            ]
+        )  # fmt: skip
+    title = [
+        "method", "start", "success", "95 % interval", "below 10 mm at some time", "mean error of successes [mm]",
+        "mean error of all [mm]", "median [mm]", "steps at most",
+    ]  # fmt: skip
+    return markdown(title, rows)
+
+
+def _seed_interval(cell: Sequence[Trial], measure: Measure) -> Interval:
+    """Bootstrap interval of the mean of the trials that did not fail, seeds resampled."""
+    by_seed: dict[int, list[float]] = {}
+    for trial in cell:
+        if np.isfinite(value := value_of(trial, measure)):
+            by_seed.setdefault(trial.seed, []).append(value)
+    means = [float(np.mean(values)) for values in by_seed.values()]
+    return bootstrap_interval(means) if means else Interval(np.nan, np.nan)
+
+
+def _rate_text(successes: int, trials: int) -> str:
+    """Exact (Clopper-Pearson) 95 % interval of a success probability."""
+    interval = binomtest(successes, trials).proportion_ci()
+    return interval_text(Interval(interval.low, interval.high))
