@@ -25,8 +25,8 @@ from cablejax.commands.workloads import (
 )
 from cablejax.control.shaping import initial_history, load_model
 from cablejax.dataset.generate import cable_params, draw
+from cablejax.dataset.opening import open_or_create
 from cablejax.dataset.schema import Block, DatasetConfig
-from cablejax.dataset.store import open_or_create
 from cablejax.dynamics.config import ModelConfig
 from cablejax.dynamics.model import make_network
 from cablejax.dynamics.normalisation import fit_normalisation

@@ -20,8 +20,8 @@ os.environ.setdefault("NPROC", "4")
 import numpy as np
 
 from cablejax.dataset.generate import make_engine, simulate
+from cablejax.dataset.opening import open_store
 from cablejax.dataset.schema import DatasetConfig, config_from_json
-from cablejax.dataset.store import open_store
 from cablejax.dataset.windows import concatenate, read_trajectories
 from cablejax.dynamics.error_report import MODEL, error_report
 from cablejax.dynamics.evaluate import SNAP_FACTOR, SNAP_MARGIN

@@ -7,7 +7,7 @@ other places of the clamps, which the photographs do not show.
 
     CABLEJAX_DATA=... python experiments/31_wires.py --out docs/results/wires.md --figure docs/images/wires.png
 
-Takes about three minutes on two cores. The rule is the same for all wires, see `cablejax.spatial.hanging_verdict`.
+Takes about three minutes on two cores. The rule is the same for all wires, see `cablejax.diagnose`.
 """
 
 from __future__ import annotations
@@ -30,9 +30,8 @@ from cablejax.recordings.wires import HangingWire, read_wires
 from cablejax.report.provenance import machine, versions
 from cablejax.report.style import LIGHT
 from cablejax.simulate.hanging import Wire, hanging_angles, hanging_points
+from cablejax.spatial.hanging import Photographs, WireDiagnosis, diagnose_wire, rig_error, wire_verdict_json
 from cablejax.spatial.hanging_effects import EFFECTS
-from cablejax.spatial.hanging_fit import LINKS_PER_SPACING, Photographs
-from cablejax.spatial.hanging_verdict import WireDiagnosis, diagnose_wire, rig_error, wire_verdict_json
 from pages import markdown_table, publish
 
 OUTSIDE = (0.0, 0.005, 0.01, 0.015)
@@ -48,11 +47,9 @@ def photographs_of(wire: HangingWire, error: float) -> Photographs:
 def level_stiffness(photographs: Photographs, outside: float) -> float:
     """EI over the published one of a straight wire in level clamps, `outside` metres beyond the traced ends."""
     points = photographs.points
-    along = np.diff(points, axis=1)
-    traced = np.unwrap(np.arctan2(along[..., 1], along[..., 0]), axis=1)
-    guess = np.repeat(traced, LINKS_PER_SPACING, axis=1)
+    guess = photographs.guess
     links, length = guess.shape[1], photographs.length + 2 * outside
-    turns = 2 * np.pi * np.round(traced[:, [0, -1]] / (2 * np.pi))
+    turns = 2 * np.pi * np.round(guess[:, [0, -1]] / (2 * np.pi))
     clamps = np.concatenate([points[:, [0, -1]] + outside * np.array([[-1.0, 0], [1, 0]]), turns[..., None]], axis=2)
     places = outside + np.linspace(0, photographs.length, points.shape[1])
     nodes = np.linspace(0, length, links + 1)
@@ -75,7 +72,7 @@ def level_stiffness(photographs: Photographs, outside: float) -> float:
 
 
 def named(diagnosis: WireDiagnosis) -> str:
-    return ", ".join(f"`{name}` ({diagnosis.inclusion[name]:.2f})" for name in diagnosis.chosen.names) or "nothing"
+    return ", ".join(f"`{effect.name}` ({effect.probability:.2f})" for effect in diagnosis.effects) or "nothing"
 
 
 def table(results: dict[str, dict[str, Any]]) -> str:
@@ -106,11 +103,12 @@ def table(results: dict[str, dict[str, Any]]) -> str:
 
 
 def ranking(results: dict[str, dict[str, Any]]) -> str:
-    rows = [["wire", *(f"`{name}`" for name in EFFECTS)]]
+    names = [effect.name for effect in EFFECTS]
+    rows = [["wire", *(f"`{name}`" for name in names)]]
     for name, result in results.items():
-        d: WireDiagnosis = result["diagnosis"]
-        ranked = {entry["name"]: entry["held_out_shrinkage"] for entry in result["verdict"]["ranking"]}
-        rows.append([name, *(f"{d.inclusion[effect]:.2f}, {ranked[effect]:.2f}" for effect in EFFECTS)])
+        ranked = {entry["name"]: entry for entry in result["verdict"]["ranking"]}
+        told = (f"{ranked[n]['probability']:.2f}, {ranked[n]['held_out_shrinkage']:.2f}" for n in names)
+        rows.append([name, *told])
     return "\n".join(markdown_table(rows))
 
 
@@ -141,13 +139,11 @@ def draw(results: dict[str, dict[str, Any]], path: Path) -> None:
     axes = figure.subplots(1, len(results), sharey=True)
     for axis, (name, result) in zip(axes, results.items(), strict=True):
         d, photographs = result["diagnosis"], result["photographs"]
-        for fit, colour, label in (
-            (d.fit(), LIGHT.direct, "straight, published EI"),
-            (d.chosen, LIGHT.residual, "with what is named"),
+        for shapes, colour, label in (
+            (d.examined.before[:, 0], LIGHT.direct, "straight, published EI"),
+            (d.examined.after[:, 0], LIGHT.residual, "with what is named"),
         ):
-            for k, (points, residual) in enumerate(zip(photographs.points, fit.residual, strict=True)):
-                shape = points.copy()
-                shape[1:-1] += residual.reshape(-1, 2)
+            for k, shape in enumerate(shapes):
                 axis.plot(*shape.T, color=colour, lw=1, label=label if k == 0 else None)
         for k, points in enumerate(photographs.points):
             axis.plot(*points.T, ".", color=LIGHT.ink, ms=3, label="traced, five photographs" if k == 0 else None)
@@ -157,7 +153,7 @@ def draw(results: dict[str, dict[str, Any]], path: Path) -> None:
                 first, last = (round(s / photographs.length * (count - 1)) for s in place)
                 middle = photographs.points.mean(axis=0)[first : last + 1]
                 axis.plot(*middle.T, color=LIGHT.faint, lw=12, zorder=0, label="where the rest shape is curved")
-        what = " + ".join(d.chosen.names) or "nothing named"
+        what = " + ".join(effect.name for effect in d.effects) or "nothing named"
         change = f"{d.gap.before_rmse_mm:.1f} to {d.gap.after_rmse_mm:.1f} mm"
         axis.set_title(f"{name}: {what}, {change}", color=LIGHT.ink, fontsize=10)
         axis.set_aspect("equal")
@@ -176,9 +172,10 @@ Made by `python experiments/31_wires.py {" ".join(arguments)}` in {seconds / 60:
 
 Three wires, each hung five times and traced in photographs (qj25/adapteddlo_muj, arXiv 2310.00911; 51 points, 1.5 m).
 The model is a planar elastica with weight; believed true is a straight wire of the published EI, in clamps that are
-level within 10 degrees. Effects are named by one rule for all wires: a probability of at least a half, and a gap in the
-held-out photographs that shrinks by it, with an interval that excludes zero. All gaps are of held-out photographs, root
-mean square per coordinate; only the angles of the clamps are fitted to them.
+level within 10 degrees. Effects are named by the rule of every diagnosis: the most probable explanation, if the gap in
+held-out photographs shrinks by it with an interval that excludes zero. All gaps are of held-out photographs, root
+mean square per coordinate; only the angles of the clamps are fitted to them. An effect's probability is that among all
+explanations with it or with another effect in its place; the interval of a shrinkage is by resampling photographs.
 
 {table(results)}
 
@@ -186,7 +183,7 @@ mean square per coordinate; only the angles of the clamps are fitted to them.
 
 ![Traced wires, and what the model makes of them](../images/wires.png)
 
-**Effects**: probability, and shrinkage of the squared gap by that effect alone.
+**Effects**: probability among single effects, and shrinkage of the squared gap by that effect alone.
 
 {ranking(results)}
 

@@ -11,8 +11,8 @@ from cablejax.cable import BOUNDS, Cable
 from cablejax.cable_file import KEYS, NUMBERS, cable_from_fields, cable_text, cable_to_fields, read_cable, write_cable
 from cablejax.cli import main
 from cablejax.commands.cable import find_cable
+from cablejax.dataset.opening import open_or_create
 from cablejax.dataset.schema import DatasetConfig
-from cablejax.dataset.store import open_or_create
 from cablejax.dynamics.weights import WeightsError, cable_of_weights
 from cablejax.gaplog import Episode, gap_log_from_episodes, write_gap_log
 from cli_cases import small_model

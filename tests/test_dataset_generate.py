@@ -23,8 +23,8 @@ from cablejax.dataset.generate import (
     make_engine,
     simulate,
 )
+from cablejax.dataset.opening import open_store
 from cablejax.dataset.schema import DatasetConfig, Randomisation, config_from_json, config_to_json
-from cablejax.dataset.store import open_store
 from cablejax.effects.given import EFFECTS, GivenEffect
 from cablejax.simulate import ThreadedEngine
 from cablejax.simulate.motions import MotionConfig

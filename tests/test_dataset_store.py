@@ -13,8 +13,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from cablejax.cable import Cable, Discretisation
+from cablejax.dataset.opening import open_or_create, open_store
 from cablejax.dataset.schema import Block, DatasetConfig, Randomisation, digest_of_config
-from cablejax.dataset.store import Store, open_or_create, open_store
+from cablejax.dataset.store import Store
 from cablejax.simulate.motions import MotionConfig
 
 SMALL = DatasetConfig(

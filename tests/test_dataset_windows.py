@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from cablejax.cable import Cable, Discretisation
+from cablejax.dataset.opening import open_or_create
 from cablejax.dataset.schema import Block, DatasetConfig
-from cablejax.dataset.store import open_or_create
 from cablejax.dataset.windows import (
     Window,
     concatenate,

@@ -219,3 +219,28 @@ def _middle(said: dict[str, Any] | None) -> float | None:
 
 def _as_list(value: Any) -> list:
     return value if isinstance(value, list) else [value]
+
+
+def differences(before: dict[str, Any], after: dict[str, Any]) -> list[str]:
+    """What two verdicts on one log disagree in: the word, the causes, what is equivalent, values out of intervals.
+
+    Args:
+        before: whose 90 % intervals count.
+        after: of another version of the diagnosis.
+    """
+    found = []
+    if before["verdict"] != after["verdict"]:
+        found.append(f"{before['verdict']} -> {after['verdict']}")
+    causes, now = ({effect["name"]: effect["parameters"] for effect in v["effects"]} for v in (before, after))
+    if set(causes) != set(now):
+        found.append(f"named {sorted(causes)} -> {sorted(now)}")
+    groups, groups_now = ({tuple(sorted(group)) for group in v["equivalent"] or []} for v in (before, after))
+    if groups != groups_now:
+        found.append(f"equivalent {sorted(groups - groups_now)} -> {sorted(groups_now - groups)}")
+    for name in causes.keys() & now.keys():
+        for key, parameter in causes[name].items():
+            value, interval = now[name][key]["value"], parameter["ci90"]
+            same = value == parameter["value"] if interval is None else interval[0] <= value <= interval[1]
+            if not same:
+                found.append(f"{name}.{key} {parameter['value']} in {interval} -> {value}")
+    return found

@@ -1,4 +1,4 @@
-"""The minimiser of a convex quadratic over a convex set, by a primal-dual interior-point method."""
+"""The minimiser of a convex quadratic over a convex set, and its derivative."""
 
 from __future__ import annotations
 
@@ -9,16 +9,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from cablejax.bounded.interior_point import interior_point
 from cablejax.bounded.quadrics import Quadrics
 from cablejax.bounded.tangents import derivative_along
 
 if TYPE_CHECKING:
     from cablejax.bounded.sets.base import ConvexSet
-
-# Ten to fifteen is usual; from far away, with bounds that meet at a sharp angle, up to sixty.
-_ITERATIONS = 100
-# Share of the way to the nearest bound that a step may take.
-_TO_BOUND = 0.995
 
 
 class QuadraticMinimum(NamedTuple):
@@ -93,7 +89,7 @@ def _rounding_scale(quadrics: Quadrics, z):
 
 @eqx.filter_custom_jvp
 def _solve(quadrics: Quadrics, hessian, linear, centre):
-    return _interior_point(quadrics, hessian, linear, centre)
+    return interior_point(quadrics, hessian, linear, centre)
 
 
 @_solve.def_jvp
@@ -125,122 +121,3 @@ def _solve_jvp(primals, tangents):
 
 def _typical_length(quadrics: Quadrics, step):
     return jnp.abs(quadrics.matrix @ step).max() + jnp.finfo(step.dtype).tiny
-
-
-class _Iterate(NamedTuple):
-    x: Float[Array, " P"]
-    slack: Float[Array, " K"]
-    multipliers: Float[Array, " K"]
-
-
-class _Progress(NamedTuple):
-    now: _Iterate
-    gap: Float[Array, ""]
-    best: _Iterate
-    error: Float[Array, ""]
-    stale: Int[Array, ""]
-    count: Int[Array, ""]
-
-
-def _interior_point(quadrics: Quadrics, hessian, linear, centre):
-    """The step, its multipliers, whether they converged, iterations."""
-    dtype, eps = centre.dtype, jnp.finfo(centre.dtype).eps
-    present = jnp.isfinite(quadrics.level)
-    n_present = jnp.maximum(present.sum(), 1).astype(dtype)
-
-    # Unit diagonal of the Hessian and unit rows of L: then all lengths and all forces are of one size.
-    unit = jnp.sqrt(jnp.maximum(jnp.diag(hessian), eps * jnp.diag(hessian).max()) + jnp.finfo(dtype).tiny)
-    rows = jnp.linalg.norm(quadrics.matrix / unit, axis=1)
-    row_scale = jnp.max(quadrics.groups * rows, axis=1) + jnp.finfo(dtype).tiny
-    per_row = quadrics.groups.T @ (1.0 / row_scale)
-    scaled = Quadrics(
-        matrix=quadrics.matrix / unit,
-        offset=quadrics.lift(centre),
-        curvature=quadrics.curvature * per_row,
-        slope=quadrics.slope * per_row,
-        level=jnp.where(present, quadrics.level, 0.0) / row_scale,
-        groups=quadrics.groups * present[:, None],
-    )
-    hessian = hessian / jnp.outer(unit, unit)
-    linear = linear / unit
-
-    start = scaled.of_lift(scaled.offset)
-    # Newton's step to each bound is the distance outside; the value itself grows with the square of the distance.
-    steepness = jnp.linalg.norm(scaled.jacobian(scaled.offset), axis=1) + jnp.finfo(dtype).tiny
-    outside = jnp.max(jnp.where(present, jnp.maximum(start, 0.0) / steepness, 0.0))
-    force = jnp.linalg.norm(linear) + outside + jnp.finfo(dtype).tiny
-    # The step is about as long as the force, as far as there is room; a curved bound leaves its radius.
-    curved = scaled.groups @ scaled.curvature > 0
-    room = jnp.where(curved, jnp.minimum(-2.0 * scaled.level, force), force)
-    slack = jnp.where(present, jnp.maximum(-start, 0.1 * room), 1.0)
-    length = jnp.sum(jnp.where(present, jnp.minimum(slack, room), 0.0)) / n_present
-    length = jnp.where(present.any(), length, force) + jnp.finfo(dtype).tiny
-    multipliers = jnp.where(present, 0.1 * length * force / slack, 0.0)
-
-    def residuals(x, slack, multipliers):
-        z = scaled.lift(x)
-        jacobian = scaled.jacobian(z)
-        dual = hessian @ x + linear + multipliers @ jacobian
-        primal = jnp.where(present, scaled.of_lift(z) + slack, 0.0)
-        gap = jnp.sum(multipliers * slack) / n_present
-        error = jnp.maximum(
-            jnp.maximum(jnp.abs(dual).max() / force, jnp.abs(primal).max() / length), gap / (length * force)
-        )
-        return jacobian, dual, primal, gap, error
-
-    def one(progress: _Progress) -> _Progress:
-        x, slack, multipliers = progress.now
-        jacobian, dual, primal, gap, _ = residuals(x, slack, multipliers)
-        weight = multipliers / slack
-        matrix = hessian + scaled.bend(multipliers) + (jacobian.T * weight) @ jacobian
-        factor = jax.scipy.linalg.cho_factor(matrix + jnp.diag(4 * eps * (1.0 + jnp.diag(matrix))))
-
-        def direction(dual, primal, complement):
-            right = dual + (weight * primal - complement / slack) @ jacobian
-            along = -jax.scipy.linalg.cho_solve(factor, right)
-            # refined once: the factor is that of a matrix a little larger, and loses digits where weights differ much
-            along = along - jax.scipy.linalg.cho_solve(factor, right + matrix @ along)
-            opening = jnp.where(present, -primal - jacobian @ along, 0.0)
-            pressing = jnp.where(present, -(complement + multipliers * opening) / slack, 0.0)
-            return along, opening, pressing
-
-        def longest(opening, pressing):
-            of_slack = jnp.where(opening < 0, -slack / jnp.where(opening < 0, opening, 1.0), jnp.inf)
-            falling = present & (pressing < 0)
-            of_multipliers = jnp.where(falling, -multipliers / jnp.where(falling, pressing, 1.0), jnp.inf)
-            return jnp.minimum(of_slack.min(), of_multipliers.min())
-
-        along, opening, pressing = direction(dual, primal, multipliers * slack)
-        share = jnp.minimum(longest(opening, pressing), 1.0)
-        ahead = jnp.sum((slack + share * opening) * (multipliers + share * pressing)) / n_present
-        centring = (ahead / (gap + jnp.finfo(dtype).tiny)) ** 3
-        second = scaled.groups @ (0.5 * scaled.curvature * (scaled.matrix @ along) ** 2)
-        complement = jnp.where(present, multipliers * slack + opening * pressing - centring * gap, 0.0)
-        twist = scaled.bend(pressing) @ along
-        along, opening, pressing = direction(dual + share**2 * twist, primal + share**2 * second, complement)
-        share = jnp.minimum(_TO_BOUND * longest(opening, pressing), 1.0)
-
-        new = _Iterate(x + share * along, slack + share * opening, multipliers + share * pressing)
-        *_, gap, error = residuals(*new)
-        better = error < progress.error
-        return _Progress(
-            now=new,
-            gap=gap / (length * force),
-            best=jax.tree.map(lambda a, b: jnp.where(better, a, b), new, progress.best),
-            error=jnp.where(better, error, progress.error),
-            stale=jnp.where(error < 0.5 * progress.error, 0, progress.stale + 1),
-            count=progress.count + 1,
-        )
-
-    def unfinished(progress: _Progress):
-        # Once the gap is below rounding, further steps only press the slacks to nothing.
-        at_rounding = (progress.gap < eps) & (progress.stale > 1)
-        going = jnp.isfinite(progress.gap) & (progress.count < _ITERATIONS)
-        return (progress.error > 8 * eps) & ~at_rounding & going
-
-    first = _Iterate(jnp.zeros_like(centre), slack, multipliers)
-    zero = jnp.zeros((), jnp.int32)
-    error = jnp.asarray(jnp.inf, dtype)
-    last = jax.lax.while_loop(unfinished, one, _Progress(first, jnp.ones((), dtype), first, error, zero, zero))
-    step, forces = last.best.x / unit, jnp.where(present, last.best.multipliers / row_scale, 0.0)
-    return step, forces, last.error <= eps**0.6, last.count

@@ -5,15 +5,12 @@ from __future__ import annotations
 import dataclasses
 import pathlib
 import time
-from typing import TYPE_CHECKING, Annotated, get_args
+from typing import Annotated, get_args
 
 from tyro.conf import subcommand
 
 from cablejax.commands.options import Command, UsageError, say, text_table
 from cablejax.solver_names import SolverName
-
-if TYPE_CHECKING:
-    pass
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

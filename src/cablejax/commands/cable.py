@@ -67,7 +67,7 @@ def find_cable(source: str | pathlib.Path) -> Cable:
 
         return cable_of_log(read_gap_log(path))
     if (path / "zarr.json").is_file():
-        from cablejax.dataset.store import open_store
+        from cablejax.dataset.opening import open_store
 
         return open_store(path).config.cable
     from cablejax.dynamics.weights import cable_of_weights

@@ -83,7 +83,7 @@ class Simulate(Command):
         import shutil
 
         from cablejax.dataset.generate import generate
-        from cablejax.dataset.store import open_store
+        from cablejax.dataset.opening import open_store
 
         config = self.dataset_config()
         if self.overwrite and self.out.is_dir() and any(self.out.iterdir()) and open_store(self.out).config != config:

@@ -77,7 +77,7 @@ class Train(Command):
 
     def execute(self):
         """Trains, from a checkpoint where there is one, and reports the open-loop error."""
-        from cablejax.dataset.store import open_store
+        from cablejax.dataset.opening import open_store
         from cablejax.dataset.windows import concatenate, read_split
         from cablejax.dynamics.autoencoder import PretrainConfig, pretrain
         from cablejax.dynamics.error_report import error_report

@@ -86,18 +86,11 @@ def run_closed_loop(
             f"A run of {steps} steps after {rest} at rest, with {record_hz} samples per second in intervals of "
             f"{interval} s, is not possible: give at least one step and a whole number of samples in an interval."
         )
-    log = _Log(plant.reset(np.asarray(start, float)))
-    observation = log.observations[0]
-    if observation.keypoints.shape != target.keypoints.shape:
-        raise ValueError(
-            f"Target {target.name!r} has keypoints of shape {target.keypoints.shape}, but the cable is seen at "
-            f"{observation.keypoints.shape}: use a target with as many keypoints as the cable."
-        )
-    still = np.zeros_like(observation.gripper_pose)
+    log = _laid_out(plant, target, np.asarray(start, float))
+    still = np.zeros_like(log.observations[0].gripper_pose)
     for _ in range(rest):
         log.extend(plant.record(still, interval, samples=samples), still)
-    resting = len(log.observations)
-    observation = log.observations[-1]
+    resting, observation = len(log.observations), log.observations[-1]
     seen = _filled(observation.keypoints)
     history = History(
         keypoints=np.repeat(seen[None], history_length, axis=0),  # pyright: ignore[reportArgumentType]
@@ -125,24 +118,7 @@ def run_closed_loop(
         rows.append(_Row(observations[-1]))
         if patience is not None and _at_rest(rows[-patience - 1 :], patience, target):
             break
-    keypoints = np.stack([row.observation.keypoints for row in rows])
-    known = [row.observation.true_keypoints for row in rows]
-    truth = np.stack([seen if true is None else true for true, seen in zip(known, keypoints, strict=True)])
-    return ClosedLoopRun(
-        target=target,
-        times=np.array([row.observation.time for row in rows]) - rows[0].observation.time,
-        keypoints=keypoints,
-        gripper_pose=np.stack([row.observation.gripper_pose for row in rows]),
-        twist=np.stack([np.full_like(still, np.nan) if row.twist is None else row.twist for row in rows]),
-        error_cm=shape_error_cm(truth, target.keypoints),
-        residual_share=np.array([row.residual_share for row in rows]),
-        radius=np.array([row.radius for row in rows]),
-        mpc_ms=np.array([row.mpc_ms for row in rows]),
-        unobserved=int(np.isnan(keypoints).any(axis=-1).sum()),
-        stopped=stopped,
-        observed_error_cm=shape_error_cm(keypoints, target.keypoints),
-        episode=log.episode(f"approach_{target.name.lower()}", resting),
-    )
+    return _finished(target, rows, stopped, log.episode(f"approach_{target.name.lower()}", resting))
 
 
 @dataclasses.dataclass
@@ -183,6 +159,41 @@ class _Log:
             gripper_command=np.stack(commands),
             hold=np.arange(len(commands)) < resting,
         )
+
+
+def _laid_out(plant: ObservedCable, target: Target, start: np.ndarray) -> _Log:
+    """A new cable's recording, which holds its first observation; raises where the target is none for this cable."""
+    log = _Log(plant.reset(start))
+    shape = log.observations[0].keypoints.shape
+    if shape != target.keypoints.shape:
+        raise ValueError(
+            f"Target {target.name!r} has keypoints of shape {target.keypoints.shape}, but the cable is seen at "
+            f"{shape}: use a target with as many keypoints as the cable."
+        )
+    return log
+
+
+def _finished(target: Target, rows: list[_Row], stopped: str | None, episode: Episode) -> ClosedLoopRun:
+    """The run that these control instants make."""
+    keypoints = np.stack([row.observation.keypoints for row in rows])
+    known = [row.observation.true_keypoints for row in rows]
+    truth = np.stack([seen if true is None else true for true, seen in zip(known, keypoints, strict=True)])
+    none = np.full_like(rows[0].observation.gripper_pose, np.nan)
+    return ClosedLoopRun(
+        target=target,
+        times=np.array([row.observation.time for row in rows]) - rows[0].observation.time,
+        keypoints=keypoints,
+        gripper_pose=np.stack([row.observation.gripper_pose for row in rows]),
+        twist=np.stack([none if row.twist is None else row.twist for row in rows]),
+        error_cm=shape_error_cm(truth, target.keypoints),
+        residual_share=np.array([row.residual_share for row in rows]),
+        radius=np.array([row.radius for row in rows]),
+        mpc_ms=np.array([row.mpc_ms for row in rows]),
+        unobserved=int(np.isnan(keypoints).any(axis=-1).sum()),
+        stopped=stopped,
+        observed_error_cm=shape_error_cm(keypoints, target.keypoints),
+        episode=episode,
+    )
 
 
 def _measurement(observation: Observation) -> Measurement:

@@ -15,9 +15,10 @@ import jax.numpy as jnp
 import numpy as np
 from tqdm import tqdm
 
+from cablejax.dataset.opening import open_or_create
 from cablejax.dataset.parallel import DeviceParallel
 from cablejax.dataset.schema import Block, DatasetConfig
-from cablejax.dataset.store import DatasetInfo, open_or_create
+from cablejax.dataset.store import DatasetInfo
 from cablejax.effects.given import with_effects
 from cablejax.effects.physics import Physics, nominal_physics
 from cablejax.simulate import ENGINES, Engine, ThreadedEngine

@@ -14,8 +14,6 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import hashlib
-import importlib.metadata
-import os
 import shutil
 from collections.abc import Sequence
 from pathlib import Path
@@ -24,23 +22,10 @@ from typing import Any, Literal, cast
 import numpy as np
 import zarr
 
-from cablejax import __version__
 from cablejax.dataset.schema import (
-    PARAMETERS,
-    SCHEMA,
     Block,
     DatasetConfig,
-    config_from_json,
-    config_to_json,
-    differences,
-    digest_of_config,
 )
-from cablejax.json_file import read_json
-
-PACKAGES = ("jax", "jaxlib", "mujoco", "mujoco-mjx", "numpy")
-"""Packages whose versions decide the content, besides cablejax itself: those that begin a store must complete it."""
-
-_DIGEST = ((32,), "uint8")
 
 
 class MissingShardError(ValueError):
@@ -75,7 +60,7 @@ class DatasetInfo:
 
 @dataclasses.dataclass(frozen=True)
 class Store:
-    """An open data set. Made by `open_store` or `open_or_create`.
+    """An open data set. Made by `opening.open_store` or `opening.open_or_create`.
 
     Attributes:
         path: its folder.
@@ -207,105 +192,3 @@ class Store:
             f"Shard {shard} of {self.path} (trajectories {rows.start}..{rows.stop - 1}) {what}. "
             "Run the same generation again: it replaces this shard and keeps the others."
         )
-
-
-def open_store(path: str | os.PathLike[str], *, mode: Literal["r", "r+"] = "r") -> Store:
-    """Opens a data set, complete or not, to read ("r") or also to write its shards ("r+").
-
-    Raises:
-        ValueError: there is no data set, or one of another schema version.
-    """
-    path = Path(path)
-    if not (path / "zarr.json").is_file():
-        raise ValueError(f"{path} holds no data set (no zarr.json). Generate one there, or give another folder.")
-    try:
-        attributes: dict[str, Any] = read_json(path / "zarr.json").get("attributes", {})
-    except (ValueError, AttributeError) as error:
-        raise ValueError(f"The data set is damaged: {error} Generate it again elsewhere.") from error
-    if attributes.get("schema") != SCHEMA:
-        raise ValueError(
-            f"{path} has schema {attributes.get('schema')!r}, expected {SCHEMA!r}. "
-            "Read it with the version of cablejax that wrote it, or generate it again in another folder."
-        )
-    recorded = attributes.get("config", {})
-    if attributes.get("config_digest") != digest_of_config(recorded):
-        raise ValueError(
-            f"The configuration recorded in {path} was altered: it no longer matches its digest. "
-            "Restore its zarr.json, or generate the data set again elsewhere."
-        )
-    config = config_from_json(DatasetConfig, recorded)
-    return Store(path, config, recorded, attributes.get("versions", {}), zarr.open_group(path, mode=mode))
-
-
-def open_or_create(path: str | os.PathLike[str], config: DatasetConfig) -> Store:
-    """Opens the data set of `config` to continue it, or creates it. Safe when several processes do so at once.
-
-    Raises:
-        ValueError: the folder holds something else, another schema version, another configuration, or was begun by
-            other package versions.
-    """
-    path, versions = Path(path), package_versions()
-    if path.exists() and not path.is_dir():
-        raise ValueError(f"{path} is a file, expected a folder to write a data set to. Give another path.")
-    if path.is_dir() and any(path.iterdir()) and not (path / "zarr.json").is_file():
-        raise ValueError(f"{path} exists and holds no data set. Give an empty or new folder; nothing was changed.")
-    if not path.is_dir() or not any(path.iterdir()):
-        _create(path, config, versions)
-    store = open_store(path, mode="r+")
-    changes = differences(store.recorded, config_to_json(config))
-    if changes:
-        raise ValueError(
-            f"{path} holds a data set of another configuration: {'; '.join(changes)}. "
-            "Give another folder, or the configuration that the store was begun with. Nothing was changed."
-        )
-    changes = differences(store.versions, versions)
-    if changes and not store.info().complete:
-        raise ValueError(
-            f"{path} was begun with other packages: {'; '.join(changes)}. Trajectories of two versions are not mixed: "
-            "install those versions, or generate in another folder. Nothing was changed."
-        )
-    return store
-
-
-def package_versions() -> dict[str, str]:
-    """Versions of the packages that decide the content."""
-    versions = {"cablejax": __version__}
-    for name in PACKAGES:
-        try:
-            versions[name] = importlib.metadata.version(name)
-        except importlib.metadata.PackageNotFoundError:
-            versions[name] = "not installed"
-    return versions
-
-
-def _create(path: Path, config: DatasetConfig, versions: dict[str, str]) -> None:
-    """Makes the empty store under a temporary name and renames it: it appears whole, and only once."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    draft = path.parent / f".{path.name}.{os.getpid()}.draft"
-    shutil.rmtree(draft, ignore_errors=True)
-    group = zarr.create_group(
-        draft,
-        attributes={
-            "schema": SCHEMA,
-            "config": config_to_json(config),
-            "config_digest": digest_of_config(config_to_json(config)),
-            "versions": versions,
-            "parameters": list(PARAMETERS),
-        },
-    )
-    for name, (shape, dtype) in {**config.array_shapes(), "digest": _DIGEST}.items():
-        per_trajectory = dtype == "float32"  # the small arrays are one plain chunk per shard
-        group.create_array(
-            name,
-            shape=(config.n_trajectories, *shape),
-            dtype=dtype,
-            chunks=(1 if per_trajectory else config.shard_size, *shape),
-            shards=(config.shard_size, *shape) if per_trajectory else None,
-            fill_value=0,
-        )
-    try:
-        draft.rename(path)
-    except OSError:  # another process was first
-        shutil.rmtree(draft)
-        if not (path / "zarr.json").is_file():
-            raise

@@ -17,7 +17,8 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from cablejax.cable import GRAVITY
-from cablejax.dataset.store import Store, open_store
+from cablejax.dataset.opening import open_store
+from cablejax.dataset.store import Store
 from cablejax.types import History, Trajectory, cable_descriptor
 
 

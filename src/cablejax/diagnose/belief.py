@@ -29,6 +29,9 @@ from cablejax.diagnose.fit import Fit
 from cablejax.diagnose.protocol import Explanation
 from cablejax.diagnose.repeats import episodes_by_motion
 
+LEAST_SQUARES = 1e9
+"""Degrees of freedom with which Student's distribution is a normal one."""
+
 
 @dataclasses.dataclass(frozen=True)
 class Calibration:
@@ -40,7 +43,10 @@ class Calibration:
         law_error: rho, of an effect's law relative to the gap it makes.
         correlated_samples: n, over which errors of simulators stay the same.
         freedom: nu of Student's distribution.
+        fit_freedom: the same in fits; `LEAST_SQUARES` where episodes are so few that a fit may set none aside.
         term_cost: nats that each effect must pay for itself.
+        prior_cost: share of the nats that its parameters' prior takes away which it must pay too. The constants for
+            logs on a table were set without.
         resolvable: a gap up to this many baseline errors is none.
         noise_share: so much of the noise is added to the baseline error in that comparison, for the noise floor itself
             is an estimate.
@@ -57,7 +63,9 @@ class Calibration:
     law_error: float = 0.1
     correlated_samples: float = 800.0
     freedom: float = 6.0
+    fit_freedom: float = 6.0
     term_cost: float = 4.0
+    prior_cost: float = 0.0
     resolvable: float = 1.6
     noise_share: float = 0.15
     adequate: float = 0.25
@@ -130,11 +138,11 @@ def level(evidence: Evidence) -> float:
 
 def log_scores(fits: Sequence[Fit], evidence: Evidence, calibration: Calibration) -> Float[np.ndarray, "F"]:
     """Log posterior of every explanation, all sets of effects with as many members being equally likely beforehand."""
-    scores = [
-        evidence.log_likelihood(fit.held_out_sse(evidence)) - calibration.term_cost * len(set(fit.explanation.terms))
-        for fit in fits
-    ]
-    return np.array(scores)
+
+    def cost(one: Explanation) -> float:
+        return calibration.term_cost * len(set(one.terms)) + calibration.prior_cost * 0.5 * float(one.z @ one.z)
+
+    return np.array([evidence.log_likelihood(fit.held_out_sse(evidence)) - cost(fit.explanation) for fit in fits])
 
 
 def probabilities(scores: Float[np.ndarray, "F"]) -> Float[np.ndarray, "F"]:

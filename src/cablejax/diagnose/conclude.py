@@ -22,12 +22,15 @@ from cablejax.diagnose.conformal import leftover_p, leftover_score
 from cablejax.diagnose.diagnosis import PLACES, NamedEffect, ParameterEstimate, Ranked, Verdict
 from cablejax.diagnose.evidence import Evidence
 from cablejax.diagnose.fit import Fit
+from cablejax.diagnose.gap import shrinkage
 from cablejax.diagnose.judgement import judged, verdict_sentence
 from cablejax.diagnose.profile import scaled_draws
 from cablejax.diagnose.protocol import Simulator
 from cablejax.diagnose.search import Search
 
 _DRAWS = 400
+# These are not simulated, and Student's tails need more of them.
+_JACKKNIFE_DRAWS = 4000
 
 
 @dataclasses.dataclass(frozen=True)
@@ -69,7 +72,7 @@ def conclude(found: Search, evidence: Evidence, calibration: Calibration) -> Con
     if not best.explanation.terms:
         return Conclusion("unknown", best, (), (), ranking, explained, as_much)
 
-    draws = scaled_draws(evidence, best, calibration.widening, _DRAWS, np.random.default_rng(0))
+    draws = _draws(evidence, best, calibration)
     effects, equivalent = [], []
     for name in effect_names(best.explanation):
         rest = set(effect_names(best.explanation)) - {name}
@@ -93,13 +96,39 @@ def conclude(found: Search, evidence: Evidence, calibration: Calibration) -> Con
             equivalent.append(tuple(alike))
         effects.append(_named(name, best, odds[name] / total, draws, evidence.simulator))
     complete = calibration.complete(left, gap, level(evidence))
-    telling = explained >= calibration.telling or explains_most_motions(best, null, evidence, calibration)
-    verdict = judged(resolvable=True, telling=telling or complete, complete=complete, alike=bool(equivalent))
+    telling = _telling(best, null, explained, complete, evidence, calibration)
+    verdict = judged(resolvable=True, telling=telling, complete=complete, alike=bool(equivalent))
     if verdict == "unknown":
         return Conclusion("unknown", best, (), (), ranking, explained, as_much)
     order = np.argsort([-e.probability for e in effects])
     named = tuple(effects[i] for i in order)
     return Conclusion(verdict, best, named, tuple(equivalent), ranking, explained, as_much)
+
+
+def _telling(best: Fit, null: Fit, explained: float, complete: bool, evidence, calibration: Calibration) -> bool:
+    """Whether enough of the gap goes away to name an explanation, see `judged`."""
+    if best.refits is None or null.refits is None:
+        return complete or explained >= calibration.telling or explains_most_motions(best, null, evidence, calibration)
+    before, after = (fit.refits.sse - evidence.count for fit in (null, best) if fit.refits is not None)
+    interval = shrinkage(before, after, evidence.motion)[1]
+    return interval is not None and interval[0] > 0
+
+
+def _draws(evidence: Evidence, fit: Fit, calibration: Calibration) -> Float[np.ndarray, "D P"]:
+    """Coordinates as likely as the log says.
+
+    Where parts of the recordings were left out, how far that moves them (jackknife) adds to the posterior's width, and
+    the distribution is Student's with a degree of freedom fewer than parts; else they follow profiles of the posterior.
+    """
+    random = np.random.default_rng(0)
+    if fit.refits is None:
+        return scaled_draws(evidence, fit, calibration.widening, _DRAWS, random)
+    z = np.stack([one.z for one in fit.refits.explanations])
+    parts = len(z)
+    covariance = np.linalg.inv(fit.precision(evidence)) + (parts - 1) * np.cov(z.T, bias=True).reshape(2 * z.shape[1:])
+    normal = random.multivariate_normal(np.zeros(len(covariance)), covariance, _JACKKNIFE_DRAWS, method="cholesky")
+    drawn = fit.explanation.z + normal * np.sqrt((parts - 1) / random.chisquare(parts - 1, (_JACKKNIFE_DRAWS, 1)))
+    return np.clip(drawn, *fit.explanation.bounds.T)
 
 
 def baselines(found: Search, evidence: Evidence) -> dict[str, str]:
@@ -125,7 +154,7 @@ def _ranking(found: Search, evidence: Evidence, calibration: Calibration) -> tup
         return ()
     chances = probabilities(np.array([s for _, s in singles]))
     null = next(fit for fit in found.fits if not fit.explanation.terms)
-    before = max(float(null.sse.sum()) - evidence.count.sum(), 1e-9)
+    before = max(float(null.held_out_sse(evidence).sum()) - evidence.count.sum(), 1e-9)
     result = []
     for (fit, _), chance in zip(singles, chances, strict=True):
         held_out = float(fit.held_out_sse(evidence).sum()) - evidence.count.sum()

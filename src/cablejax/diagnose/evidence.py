@@ -25,6 +25,7 @@ class Evidence:
         temper: how many correlated samples of each episode count as one independent, see `belief`, shape [E].
         freedom: of Student's distribution over episodes, see `belief`.
         motion: episodes with the same number repeat one another, see `repeats`, shape [E].
+        fit_freedom: of the distribution that fits maximise; None = `freedom`.
     """
 
     simulator: Simulator
@@ -35,8 +36,9 @@ class Evidence:
     temper: Float[np.ndarray, "E"]
     freedom: float
     motion: Int[np.ndarray, "E"]
+    fit_freedom: float | None = None
 
-    def restricted(self, rows: Sequence[int]) -> Evidence:
+    def restricted(self, rows: Sequence[int] | Int[np.ndarray, "_"]) -> Evidence:
         """The evidence of some of its episodes only."""
         chosen = np.asarray(rows, int)
         return dataclasses.replace(
@@ -50,7 +52,7 @@ class Evidence:
 
     def predict(self, explanations: Sequence[Explanation]) -> Float[np.ndarray, "X E T *O"]:
         """Predictions of all episodes under each explanation."""
-        return self.simulator.predict(explanations, self.episodes)
+        return self.simulator.predict([self.simulator.with_own(one) for one in explanations], self.episodes)
 
     def whitened(self, predicted: np.ndarray) -> np.ndarray:
         """Predicted less observed in units of the noise, 0 where nothing was observed."""
@@ -66,10 +68,14 @@ class Evidence:
         """Of the squared residuals, see `student_log_likelihood`."""
         return student_log_likelihood(self.surprise(sse), self.freedom, self.motion)
 
+    def fit_log_likelihood(self, sse: Float[np.ndarray, "E"]) -> float:
+        """The same as fits have it."""
+        return student_log_likelihood(self.surprise(sse), self.fit_freedom or self.freedom, self.motion)
+
     def weight(self, sse: Float[np.ndarray, "E"]) -> Float[np.ndarray, "E"]:
-        """Weight of each episode's squared residuals in an equivalent least squares problem."""
-        share = share_of_motion(self.motion)
-        return share * (self.freedom + 1) / (self.freedom + np.maximum(self.surprise(sse), 0.0)) / self.temper
+        """Weight of each episode's squared residuals in the least squares problem that a fit solves in one step."""
+        share, freedom = share_of_motion(self.motion), self.fit_freedom or self.freedom
+        return share * (freedom + 1) / (freedom + np.maximum(self.surprise(sse), 0.0)) / self.temper
 
     @property
     def count(self) -> Float[np.ndarray, "E"]:

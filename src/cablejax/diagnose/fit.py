@@ -10,9 +10,9 @@ import dataclasses
 from collections.abc import Iterator, Sequence
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
-from cablejax.bounded import BatchedGaussNewton, Linearised
+from cablejax.bounded import BatchedGaussNewton, Linearised, Result, solve_arrow
 from cablejax.diagnose.evidence import Evidence
 from cablejax.diagnose.protocol import Explanation
 from cablejax.diagnose.repeats import episodes_by_motion
@@ -27,45 +27,108 @@ _PORTION = 64
 
 
 @dataclasses.dataclass(frozen=True)
+class Refits:
+    """Fits of one explanation without each part of the recordings.
+
+    Attributes:
+        explanations: fitted to all but one part; what the left out recordings have for their own is that of the check.
+        left_out: rows of the evidence that each has not seen.
+        sse: r'r of every episode, from the fit that has not seen it, shape [E].
+    """
+
+    explanations: tuple[Explanation, ...]
+    left_out: tuple[Int[np.ndarray, "_"], ...]
+    sse: Float[np.ndarray, "E"]
+
+
+@dataclasses.dataclass(frozen=True)
 class Fit:
     """An explanation after fitting. Sums over an episode's whitened residuals r and their derivatives J.
+
+    J's columns are the coordinates that all episodes share, then what the episode's recording has for its own.
 
     Attributes:
         explanation: with the fitted coordinates.
         sse: r'r of every episode, shape [E]; huge where the simulation broke down.
-        gradient: J'r, shape [E, P].
-        curvature: J'J, shape [E, P, P].
+        gradient: J'r, shape [E, C].
+        curvature: J'J, shape [E, C, C].
+        recording: row of each episode among the recordings' own numbers, shape [E]; empty where there are none.
+        refits: the same explanation without parts of the recordings, where that was fitted.
+        result: how the fit ended; `STEP_LIMIT` also where no step was made.
     """
 
     explanation: Explanation
     sse: Float[np.ndarray, "E"]
-    gradient: Float[np.ndarray, "E P"]
-    curvature: Float[np.ndarray, "E P P"]
+    gradient: Float[np.ndarray, "E C"]
+    curvature: Float[np.ndarray, "E C C"]
+    recording: Int[np.ndarray, "E"] = dataclasses.field(default_factory=lambda: np.zeros(0, int))
+    refits: Refits | None = None
+    result: Result = Result.STEP_LIMIT
 
     def cost(self, evidence: Evidence) -> float:
         """Negative log posterior density up to a constant."""
-        return -evidence.log_likelihood(self.sse) + 0.5 * float(self.explanation.z @ self.explanation.z)
+        own = self.explanation.own[np.unique(self.recording)]
+        prior = 0.5 * float(self.explanation.z @ self.explanation.z) + 0.5 * float((own**2).sum())
+        return -evidence.fit_log_likelihood(self.sse) + prior
 
     def precision(self, evidence: Evidence) -> Float[np.ndarray, "P P"]:
-        """Inverse posterior covariance of the coordinates, by Laplace's approximation with fixed weights."""
-        return self._precision(evidence.weight(self.sse))
+        """Inverse posterior covariance of the shared coordinates, by Laplace's approximation with fixed weights."""
+        model = self.model(evidence.weight(self.sse), 0.0)
+        if not model.blocks:
+            return model.curvature
+        shared = np.eye(len(model.point), len(self.explanation.z))
+        return np.linalg.inv(solve_arrow(model.curvature, shared, model.blocks)[: shared.shape[1]])
 
     def model(self, weight: Float[np.ndarray, "E"], cost: float) -> Linearised[Fit]:
-        """The quadratic model of a cost in which every episode has a fixed weight."""
-        z, (lower, upper) = self.explanation.z, self.explanation.bounds.T
-        gradient = self.gradient.T @ weight + z
-        return Linearised(z, lower, upper, cost, gradient, self._precision(weight), self)
+        """The quadratic model of a cost in which every episode has a fixed weight.
 
-    def _precision(self, weight):
-        return np.einsum("epq,e->pq", self.curvature, weight) + np.eye(len(self.explanation.z))
+        Its point holds z, then the own numbers of each recording that has episodes here: blocks, which every solution
+        eliminates, so that what is left has the size of z however many recordings there are.
+        """
+        z, (lower, upper) = self.explanation.z, self.explanation.bounds.T
+        n = len(z)
+        gradient = self.gradient[:, :n].T @ weight + z
+        curvature = np.einsum("epq,e->pq", self.curvature[:, :n, :n], weight) + np.eye(n)
+        rows, own = np.unique(self.recording), self.explanation.own
+        if not len(rows):
+            return Linearised(z, lower, upper, cost, gradient, curvature, self)
+        count = own.shape[1]
+        blocks = tuple(n + count * k + np.arange(count) for k in range(len(rows)))
+        point = np.concatenate([z, own[rows].ravel()])
+        whole, pull = np.eye(len(point)), point.copy()
+        whole[:n, :n], pull[:n] = curvature, gradient
+        for row, block in zip(rows, blocks, strict=True):
+            part = self.recording == row
+            pull[block] += self.gradient[part, n:].T @ weight[part]
+            curved = np.einsum("epq,e->pq", self.curvature[part], weight[part])
+            whole[np.ix_(block, block)] += curved[n:, n:]
+            whole[:n, block], whole[block, :n] = curved[:n, n:], curved[n:, :n]
+        wide = np.full(len(point) - n, np.inf)
+        return Linearised(
+            point, np.append(lower, -wide), np.append(upper, wide), cost, pull, whole, self, blocks
+        )  # fmt: skip
+
+    def at(self, point: Float[np.ndarray, "C"]) -> Explanation:
+        """The explanation at a point of `model`."""
+        n, own = len(self.explanation.z), self.explanation.own.copy()
+        if len(self.recording):
+            own[np.unique(self.recording)] = point[n:].reshape(-1, own.shape[1])
+        return self.explanation.moved(point[:n], own)
+
+    def restricted(self, rows: Int[np.ndarray, "_"]) -> Fit:
+        """The sums of some of the episodes."""
+        recording = self.recording[rows] if len(self.recording) else self.recording
+        return Fit(self.explanation, self.sse[rows], self.gradient[rows], self.curvature[rows], recording)
 
     def held_out_sse(self, evidence: Evidence) -> Float[np.ndarray, "E"]:
-        """r'r of every episode if its motion had been left out of the fit.
+        """r'r of every episode if its motion had been left out of the fit: by `refits` where there are some.
 
-        By one Gauss-Newton step without the episodes of this motion. Where that leads too far to be believed, because
-        this motion alone shows the effect, or because there is no other, its episodes pay twice the number of
+        Else by one Gauss-Newton step without the episodes of this motion. Where that leads too far to be believed,
+        because this motion alone shows the effect, or because there is no other, its episodes pay twice the number of
         parameters that it decides on instead, as in Akaike's criterion.
         """
+        if self.refits is not None:
+            return self.refits.sse
         precision, weight = self.precision(evidence), evidence.weight(self.sse)
         result = np.empty_like(self.sse)
         for left_out in episodes_by_motion(evidence.motion):
@@ -98,7 +161,9 @@ def _portions(explanations: Sequence[Explanation]) -> Iterator[list[Explanation]
 
 
 def _evaluated(evidence: Evidence, portion: Sequence[Explanation]) -> Iterator[Fit]:
-    linearised = evidence.simulator.linearise(portion, evidence.episodes)
+    simulator = evidence.simulator
+    portion = [simulator.with_own(one) for one in portion]
+    linearised = simulator.linearise(portion, evidence.episodes)
     unseen = ~np.isfinite(evidence.observed).reshape(len(evidence.observed), -1)
     for one, (predicted, slopes) in zip(portion, linearised, strict=True):
         r = evidence.whitened(predicted)
@@ -114,10 +179,13 @@ def _evaluated(evidence: Evidence, portion: Sequence[Explanation]) -> Iterator[F
             sse=np.where(broken, _BREAKDOWN, np.einsum("em,em->e", r, r)),
             gradient=np.einsum("pem,em->ep", jacobian, r),
             curvature=np.einsum("pem,qem->epq", jacobian, jacobian, optimize=True),
+            recording=np.asarray(simulator.recording, int)[evidence.episodes] if one.own.size else np.zeros(0, int),
         )
 
 
-def improve(evidence: Evidence, fits: Sequence[Fit], *, max_iterations: int, tolerance: float = 0.02) -> list[Fit]:
+def improve(
+    evidence: Evidence, fits: Sequence[Fit], *, max_iterations: int, tolerance: float = 0.02, own_only: bool = False
+) -> list[Fit]:
     """Damped Gauss-Newton from evaluated explanations, all in lockstep.
 
     The weights of the episodes are those of the fit from which a step begins: iteratively reweighted least squares.
@@ -127,14 +195,26 @@ def improve(evidence: Evidence, fits: Sequence[Fit], *, max_iterations: int, tol
         fits: from `evaluate`; each keeps its terms.
         max_iterations: steps, accepted or not.
         tolerance: an explanation is done once a step promises to lower its cost by less than this, in nats.
+        own_only: what all recordings share stays as it is.
     """
     solver = BatchedGaussNewton(tolerance=tolerance, max_steps=max_iterations, largest_step=_LARGEST_STEP)
 
     def linearised(fit: Fit) -> Linearised[Fit]:
-        return fit.model(evidence.weight(fit.sse), fit.cost(evidence))
+        model = fit.model(evidence.weight(fit.sse), fit.cost(evidence))
+        if not own_only:
+            return model
+        held = np.arange(len(model.point)) < len(fit.explanation.z)
+        lower, upper = (np.where(held, model.point, bound) for bound in (model.lower, model.upper))
+        return dataclasses.replace(model, lower=lower, upper=upper)
 
     def linearise(trials):
-        moved = [fits[i].explanation.moved(z) for i, z in trials.items()]
-        return [linearised(fit) for fit in evaluate(evidence, moved)]
+        return [linearised(fit) for fit in evaluate(evidence, [fits[i].at(point) for i, point in trials.items()])]
 
-    return [ended.best.kept for ended in solver.minimise([linearised(fit) for fit in fits], linearise)]
+    ended = solver.minimise([linearised(fit) for fit in fits], linearise)
+    return [dataclasses.replace(one.best.kept, result=one.result) for one in ended]
+
+
+def improved(evidence: Evidence, fits: Sequence[Fit], steps: int, *, own_only: bool = False) -> list[Fit]:
+    """`improve` by so many steps, with the tolerance of the simulator's plan."""
+    tolerance = evidence.simulator.plan.tolerance
+    return improve(evidence, fits, max_iterations=steps, tolerance=tolerance, own_only=own_only)

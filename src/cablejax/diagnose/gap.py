@@ -27,6 +27,11 @@ def held_out_predictions(evidence: Evidence, best: Fit) -> tuple[Float[np.ndarra
     nothing would be known of it before this episode.
     """
     n_episodes, motions = len(evidence.motion), episodes_by_motion(evidence.motion)
+    if best.refits is not None:
+        result = np.empty_like(evidence.nominal)
+        for one, rows in zip(best.refits.explanations, best.refits.left_out, strict=True):
+            result[rows] = evidence.restricted(rows).predict([one])[0]
+        return result, tuple(range(n_episodes))
     if not best.explanation.terms or len(motions) == 1:
         return evidence.predict([best.explanation])[0], tuple(range(n_episodes)) if len(motions) > 1 else ()
     folds = np.array_split(np.arange(len(motions)), min(len(motions), _FOLDS))
@@ -82,7 +87,7 @@ def measure_gap(
 
     (b, count), (a, _) = squares(before), squares(after)
     noise = floor**2 * count
-    ratio, interval90 = _shrinkage(b - noise, a - noise, evidence.motion, resolvable)
+    ratio, interval90 = shrinkage(b - noise, a - noise, evidence.motion) if resolvable else (None, None)
     whole = float(np.round((interval * (length - 1)).max(), 3))
     return Gap(
         horizon_s=whole,
@@ -101,10 +106,10 @@ def measure_gap(
     )
 
 
-def _shrinkage(before, after, motion, resolvable: bool) -> tuple[float | None, tuple[float, float] | None]:
+def shrinkage(
+    before: Float[np.ndarray, "E"], after: Float[np.ndarray, "E"], motion: Int[np.ndarray, "E"]
+) -> tuple[float, tuple[float, float] | None]:
     """Of the squared errors above the noise of each episode, with a 90 % interval by resampling motions."""
-    if not resolvable:
-        return None, None
 
     def of(chosen) -> float:
         denominator = before[chosen].sum()

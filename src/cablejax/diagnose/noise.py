@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 
 import numpy as np
 from jaxtyping import Float
@@ -33,7 +34,7 @@ class NoiseFloor:
 
 
 def noise_floor(
-    keypoints: Float[np.ndarray, "E T N D"], hold: np.ndarray | None, *, smallest: float = SMALLEST
+    keypoints: Float[np.ndarray, "E T N D"], hold: np.ndarray | None, *, smallest: float = SMALLEST, order: int = 3
 ) -> NoiseFloor:
     """Noise from holds, each detrended by a line since a cable may creep; without holds, from third differences.
 
@@ -44,11 +45,12 @@ def noise_floor(
         keypoints: N points of D coordinates that have the same noise, NaN = not observed.
         hold: whether nothing moves, shape [E, T]; None = not known.
         smallest: least noise that is believed.
+        order: of the differences; a higher one for motion that is fast between samples.
 
     Raises:
         ValueError: fewer than 20 observed samples of every keypoint, or no noise at all.
     """
-    rapid, n_rapid = _third_differences(keypoints)
+    rapid, n_rapid = _differences(keypoints, order)
     held = _held(keypoints, hold) if hold is not None else None
     if held is None:
         variance, count, correlation, from_holds = rapid, n_rapid, np.zeros(_LAGS), False
@@ -72,8 +74,8 @@ def noise_floor(
     return NoiseFloor(std=np.sqrt(np.where(distinct, variance, common)), correlation=correlation, from_holds=from_holds)
 
 
-def _third_differences(keypoints):
-    difference = np.diff(keypoints, n=3, axis=1)
+def _differences(keypoints, order: int):
+    difference, power = np.diff(keypoints, n=order, axis=1), math.comb(2 * order, order)
     difference = difference.transpose(2, 0, 1, 3).reshape(keypoints.shape[2], -1)
     variance, count = np.zeros(len(difference)), np.zeros(len(difference))
     for n, row in enumerate(difference):
@@ -81,9 +83,9 @@ def _third_differences(keypoints):
         if len(row) >= 20:
             # without the few where something snapped
             inner = row[np.abs(row) <= 4.0 * 1.4826 * np.median(np.abs(row))]
-            variance[n] = np.mean(inner**2) / 20.0
-            # overlapping differences: 20^2 / 924 of them are independent
-            count[n] = 0.43 * len(inner)
+            variance[n] = np.mean(inner**2) / power
+            # overlapping differences: 0.43 of third ones are independent
+            count[n] = power**2 / math.comb(4 * order, 2 * order) * len(inner)
     return variance, count
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from cablejax.diagnose.actuation import with_arms
 from cablejax.diagnose.belief import Calibration, excess
 from cablejax.diagnose.case import FINE_LINKS, FIT_LINKS, Case
-from cablejax.diagnose.conclude import Conclusion, baselines, sentence
+from cablejax.diagnose.conclude import Conclusion
 from cablejax.diagnose.diagnosis import CableDiagnosis, Gap
 from cablejax.diagnose.evidence import Evidence
 from cablejax.diagnose.fit import evaluate
@@ -21,7 +21,7 @@ from cablejax.diagnose.next_motion import next_motion
 from cablejax.diagnose.noise import SMALLEST
 from cablejax.diagnose.protocol import explanation
 from cablejax.diagnose.reference import ahead_of_observations
-from cablejax.diagnose.run import explain, settings_of
+from cablejax.diagnose.run import Examined, explain, settings_of
 from cablejax.diagnose.where import localise
 from cablejax.effects import LIBRARY, CableEffect
 from cablejax.types import GapLog
@@ -70,16 +70,9 @@ def diagnose(
         following = next_motion(case.simulator.playback, rivals, case.noise.std)
     repaired = case.recording.as_log(log.meta)
     return CableDiagnosis(
-        verdict=conclusion.verdict,
-        sentence=sentence(conclusion, gap.shrinkage),
-        effects=conclusion.effects,
-        equivalent=conclusion.equivalent,
-        ranking=conclusion.ranking,
-        leftover_p=conclusion.leftover_p,
-        gap=gap,
+        **Examined(evidence, found, conclusion, reference, after, gap).fields(),
         where=localise(repaired, case.to_log(reference), case.noise.std),
         next_motion=following,
-        baselines=baselines(found, evidence),
         caveats=_caveats(case, calibration, commissioned=bool(commissioning)),
         log=repaired,
         nominal=case.to_log(reference),

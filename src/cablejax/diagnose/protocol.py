@@ -30,6 +30,9 @@ from jaxtyping import Float, Int
 
 from cablejax.effects.effect import Effect
 
+# Forward differences in what a recording has for its own, in prior standard deviations.
+_OWN_DIFFERENCE = 0.03
+
 
 @dataclasses.dataclass(frozen=True)
 class Term:
@@ -59,10 +62,12 @@ class Explanation:
     Attributes:
         terms: applied in this order; none = the nominal simulator.
         z: coordinates of all parameters, in the order of the terms, see `Parameter`.
+        own: coordinates of what each recording has for its own, see `Simulator.own`.
     """
 
     terms: tuple[Term, ...]
     z: Float[np.ndarray, "P"]
+    own: Float[np.ndarray, "R M"] = dataclasses.field(default_factory=lambda: np.zeros((0, 0)))
 
     def by_term(self, z: Any = None) -> list[tuple[Term, Any]]:
         """Every term with its part of the coordinates."""
@@ -97,9 +102,9 @@ class Explanation:
         """Names of the effects."""
         return tuple(term.effect.name for term in self.terms)
 
-    def moved(self, z: Float[np.ndarray, "P"]) -> Explanation:
-        """The same effects with other values."""
-        return dataclasses.replace(self, z=z)
+    def moved(self, z: Float[np.ndarray, "P"], own: Float[np.ndarray, "R M"] | None = None) -> Explanation:
+        """The same effects with other values; what is a recording's own stays where none is given."""
+        return dataclasses.replace(self, z=z, own=self.own if own is None else own)
 
 
 def explanation(*parts: tuple[Effect, int, Sequence[float]]) -> Explanation:
@@ -125,6 +130,26 @@ class Report:
     location: dict[str, Any]
 
 
+@dataclasses.dataclass(frozen=True)
+class Plan:
+    """How thoroughly explanations are fitted and checked; a simulator states what suits it.
+
+    Attributes:
+        first_steps, last_steps, grown_steps: Gauss-Newton steps of every single effect, of the best ones, and of sets
+            of effects.
+        tolerance: a fit is done once a step promises to lower its cost by less than this [nats].
+        parts: recordings are dealt out to so many parts at most, and every explanation is fitted without each part in
+            turn; None = leaving out a motion is pictured by one linear step, which suits many episodes without anything
+            of their own.
+    """
+
+    first_steps: int = 3
+    last_steps: int = 8
+    grown_steps: int = 5
+    tolerance: float = 0.02
+    parts: int | None = None
+
+
 class Simulator(abc.ABC):
     """A simulator of one recording, as a diagnosis sees it.
 
@@ -135,11 +160,29 @@ class Simulator(abc.ABC):
         unit: of the observations; all have the same.
         right_scores: scores of right explanations on labelled recordings like this one, see `conformal`; empty where
             nobody has made any, and then no p-value is computed.
+        plan: of the search and of the fits.
+        recording: of every episode, counted from 0; only needed where a recording has numbers of its own.
+        fits_unseen: whether what a recording has for its own is fitted even to one that is held out: a nuisance that
+            says nothing of the cause. Otherwise it is 0 there.
     """
 
     effects: Sequence[Effect]
     unit: str = "m"
     right_scores: Sequence[float] = ()
+    plan: Plan = Plan()
+    recording: Sequence[int] | Int[np.ndarray, "E"] = ()
+    fits_unseen: bool = False
+
+    def own(self, one: Explanation) -> int:
+        """How many numbers each recording has for its own under an explanation, each standard normal beforehand."""
+        del one
+        return 0
+
+    def with_own(self, one: Explanation) -> Explanation:
+        """The explanation with a row of own numbers for each recording: 0 where it has none yet."""
+        count = self.own(one)
+        shape = (1 + max(self.recording), count) if count else (0, 0)
+        return one if one.own.shape == shape else dataclasses.replace(one, own=np.zeros(shape))
 
     @abc.abstractmethod
     def predict(self, explanations: Sequence[Explanation], episodes: Int[np.ndarray, "e"]) -> np.ndarray:
@@ -156,25 +199,29 @@ class Simulator(abc.ABC):
     def linearise(
         self, explanations: Sequence[Explanation], episodes: Int[np.ndarray, "e"]
     ) -> list[tuple[np.ndarray, np.ndarray]]:
-        """Predictions, and their derivatives by the coordinates z; by forward differences unless overridden.
+        """Predictions, and their derivatives by the coordinates; by forward differences unless overridden.
 
         These serve smooth effects and those with a threshold (yield, contact, slip) alike, where a derivative in the
         limit sees nothing at all on one side.
 
         Returns:
-            For every explanation a prediction [e, T, ...] and its derivatives [P, e, T, ...].
+            For every explanation a prediction [e, T, ...] and its derivatives [P + M, e, T, ...]: by z, then by the
+            M numbers that the episode's recording has for its own.
         """
-        asked = []
+        asked, counts = [], []
         for one in explanations:
+            differences = np.concatenate([one.differences, np.full(one.own.shape[1], _OWN_DIFFERENCE)])
             asked.append(one)
             asked += [one.moved(one.z + step) for step in np.diag(one.differences)]
+            asked += [one.moved(one.z, one.own + step) for step in _OWN_DIFFERENCE * np.eye(one.own.shape[1])]
+            counts.append(differences)
         predicted, result, begin = self.predict(asked, episodes), [], 0
-        for one in explanations:
-            here, moved = predicted[begin], predicted[begin + 1 : begin + 1 + len(one.z)]
-            begin += 1 + len(one.z)
+        for differences in counts:
+            here, moved = predicted[begin], predicted[begin + 1 : begin + 1 + len(differences)]
+            begin += 1 + len(differences)
             with np.errstate(invalid="ignore"):
                 slopes = moved - here
-                slopes /= one.differences.reshape(-1, *[1] * here.ndim)
+                slopes /= differences.reshape(-1, *[1] * here.ndim)
             result.append((here, slopes))
         return result
 
@@ -198,13 +245,13 @@ class Simulator(abc.ABC):
 
 
 def in_batches(
-    run: Callable[..., Any], values: Float[np.ndarray, "X V"], *inputs: np.ndarray, size: int = 32
+    run: Callable[..., Any], values: Float[np.ndarray, "X *E V"], *inputs: np.ndarray, size: int = 32
 ) -> np.ndarray:
     """Runs every set of values with every episode, in batches of one size, so that one program is compiled.
 
     Args:
         run: `run(values [B, V], *inputs [B, ...]) -> [B, ...]`, for example `jax.jit(jax.vmap(one))`.
-        values: one row for each explanation.
+        values: one row for each explanation, or for each explanation and episode: [X, E, V].
         inputs: one row for each episode.
         size: B, of a batch.
 
@@ -217,6 +264,7 @@ def in_batches(
     for begin in range(0, len(pairs), size):
         rows = pairs[begin : begin + size]
         x, e = np.concatenate([rows, np.repeat(rows[:1], size - len(rows), axis=0)]).T
-        parts.append(np.asarray(run(values[x], *(each[e] for each in inputs)))[: len(rows)])
+        here = values[x] if values.ndim == 2 else values[x, e]
+        parts.append(np.asarray(run(here, *(each[e] for each in inputs)))[: len(rows)])
     flat = np.concatenate(parts)
     return flat.reshape(len(values), n_episodes, *flat.shape[1:])

@@ -46,7 +46,7 @@ def screen(
     """
     begin, residual = _parts(base), evidence.observed - predicted
     starts = [
-        explanation(*begin, (effect, variant, values))
+        dataclasses.replace(explanation(*begin, (effect, variant, values)), own=base.own)
         for effect in effects
         for variant, values in evidence.simulator.starts(effect, predicted, residual)
     ]

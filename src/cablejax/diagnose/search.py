@@ -11,12 +11,11 @@ from jaxtyping import Float
 
 from cablejax.diagnose.belief import Calibration, best_by_effects, effect_names, excess, level, log_scores
 from cablejax.diagnose.evidence import Evidence
-from cablejax.diagnose.fit import Fit, evaluate, improve
+from cablejax.diagnose.fit import Fit, evaluate, improved
 from cablejax.diagnose.protocol import Explanation
+from cablejax.diagnose.refits import refitted
 from cablejax.diagnose.screen import screen, shortlist
 
-_FIRST_STEPS = 3
-_LAST_STEPS = 8
 _FINALISTS = 9
 _BASES = 3
 _PARTNERS = 6
@@ -64,13 +63,13 @@ def search(
         name = template.start.names[-1]
         screened[name] = max(screened.get(name, 0.0), template.explained)
     progress("fitting every effect")
+    plan = evidence.simulator.plan
     starts = _promising(shortlist(templates), screened)
-    singles = improve(evidence, evaluate(evidence, starts), max_iterations=_FIRST_STEPS)
-    singles = _best(singles, evidence, calibration)
-    fits = improve(evidence, singles[:_FINALISTS], max_iterations=_LAST_STEPS) + singles[_FINALISTS:]
+    singles = _best(improved(evidence, evaluate(evidence, starts), plan.first_steps), evidence, calibration)
+    fits = improved(evidence, singles[:_FINALISTS], plan.last_steps) + singles[_FINALISTS:]
     fits = _best([null, *fits], evidence, calibration)
     # the leaders until they rest: what is taken for a missing second effect may be a valley not walked to its end
-    fits = _best([*improve(evidence, fits[:_BASES], max_iterations=_LAST_STEPS), *fits[_BASES:]], evidence, calibration)
+    fits = _best([*improved(evidence, fits[:_BASES], plan.last_steps), *fits[_BASES:]], evidence, calibration)
 
     def adequate(fit: Fit) -> bool:
         return calibration.complete(excess(float(fit.sse.sum()), evidence), gap, level(evidence))
@@ -106,7 +105,8 @@ def without_one(whole: Explanation) -> list[Explanation]:
     result = []
     for name in effect_names(whole):
         kept = [(t, z) for t, z in whole.by_term() if t.effect.name != name]
-        result.append(Explanation(tuple(t for t, _ in kept), np.concatenate([np.zeros(0), *(z for _, z in kept)])))
+        z = np.concatenate([np.zeros(0), *(z for _, z in kept)])
+        result.append(Explanation(tuple(t for t, _ in kept), z, whole.own))
     return result
 
 
@@ -119,7 +119,7 @@ def _grown(evidence: Evidence, base: Explanation) -> list[Fit]:
     starts = [start for start in shortlist(templates, per_variant=1, per_effect=2) if not _repeats(start)][:_PARTNERS]
     tried = {start.names[-1] for start in starts}
     starts += [start for start in shortlist(fixed, per_variant=1, per_effect=1) if start.names[-1] not in tried]
-    return improve(evidence, evaluate(evidence, starts), max_iterations=5)
+    return improved(evidence, evaluate(evidence, starts), evidence.simulator.plan.grown_steps)
 
 
 def _repeats(start: Explanation) -> bool:
@@ -128,5 +128,9 @@ def _repeats(start: Explanation) -> bool:
 
 def _best(fits: Sequence[Fit], evidence: Evidence, calibration: Calibration) -> list[Fit]:
     """The best fit of every set of effects, best first."""
+    if evidence.simulator.plan.parts is not None:
+        # one of each set is worth the fits without parts of the recordings
+        cheapest = best_by_effects(fits, np.array([-fit.cost(evidence) for fit in fits]))
+        fits = refitted(evidence, [fits[i] for i in sorted(cheapest.values())])
     scores = log_scores(fits, evidence, calibration)
     return [fits[i] for i in best_by_effects(fits, scores).values()]

@@ -145,16 +145,7 @@ def train(
                 began = time.perf_counter()
                 state, losses = jax.block_until_ready(update(state, device_data))
                 seconds, done, step = time.perf_counter() - began, int(state.step) - step, int(state.step)
-                rate = float(np.asarray(config.learning_rate()(step - 1)))
-                row = {"phase": index, "learning_rate": rate, "seconds": seconds}
-                row |= {name: float(np.mean(values)) for name, values in losses.items()}
-                if not np.isfinite(row["loss"]):
-                    raise DivergedError(
-                        f"The training diverged: its loss is {row['loss']} after step {step}, at a learning rate of "
-                        f"{rate:.3g}. Train with a lower one (--lr, now {config.phases[0].lr_start:g}) or larger "
-                        f"batches, in another folder or with overwriting (--overwrite); {out_dir} keeps the last good "
-                        "checkpoint."
-                    )
+                row = {"phase": index, "seconds": seconds} | chunk_metrics(config, step, losses, out_dir)
                 chunks = -(-step // config.chunk)
                 if evaluate is not None and (chunks % config.evaluate_every == 0 or step == total):
                     scores = evaluate(state.average)
@@ -188,6 +179,23 @@ def chunk_update(config: TrainConfig, phase_index: int, graphdef: nnx.GraphDef, 
         return jax.lax.scan(one, state, length=steps)
 
     return jax.jit(update)
+
+
+def chunk_metrics(config: TrainConfig, step: int, losses: dict[str, Array], out_dir: Path) -> dict[str, float]:
+    """Learning rate and mean metrics of the chunk that ended at `step`.
+
+    Raises:
+        DivergedError: the loss is no longer finite.
+    """
+    rate = float(np.asarray(config.learning_rate()(step - 1)))
+    row = {"learning_rate": rate} | {name: float(np.mean(values)) for name, values in losses.items()}
+    if not np.isfinite(row["loss"]):
+        raise DivergedError(
+            f"The training diverged: its loss is {row['loss']} after step {step}, at a learning rate of {rate:.3g}. "
+            f"Train with a lower one (--lr, now {config.phases[0].lr_start:g}) or larger batches, in another folder or "
+            f"with overwriting (--overwrite); {out_dir} keeps the last good checkpoint."
+        )
+    return row
 
 
 def noisy_windows(key: Array, data: Trajectory, phase: Phase, history: int) -> Window:

@@ -10,8 +10,9 @@ from jaxtyping import Float
 from cablejax.cable import Cable
 from cablejax.effects.given import check_hooks
 from cablejax.perceive.camera import CameraConfig, DepthCamera
+from cablejax.perceive.frame import Status, Track, TrackerConfig, TrackState
 from cablejax.perceive.registration import RegistrationConfig
-from cablejax.perceive.tracker import Status, Track, Tracker, TrackerConfig, TrackState
+from cablejax.perceive.tracker import Tracker
 from cablejax.simulate.plant import HOOKS, Plant, PlantConfig
 from cablejax.simulate.table_plant import Observation
 

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
+import math
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
-from cablejax.effects.effect import Parameter
+from cablejax.effects.effect import Effect, Parameter
 from cablejax.effects.material import BendingStiffness, IntrinsicCurvature, StiffnessProfile
 from cablejax.simulate.hanging import Wire, hanging_angles, hanging_points, joint_arclength
 
@@ -21,25 +22,36 @@ LEVEL = 0.014
 """Prior standard deviation of the angle between a photograph and the plumb line [rad]: the slope that the line between
 the two clamps, which the rig keeps level, has in the published photographs, root mean square."""
 
-EFFECTS: dict[str, tuple[Parameter, ...]] = {
-    "bending_stiffness": BendingStiffness.parameters,
-    "intrinsic_curvature": IntrinsicCurvature.parameters,
-    "stiffness_profile": (
-        *StiffnessProfile.parameters[:2],
-        dataclasses.replace(StiffnessProfile.parameters[2], scale=PROFILE_SPREAD),
-    ),
-    "gravity_tilt": (Parameter("angle_rad", "rad", -0.5, 0.5, 0.0, LEVEL),),
-}
+CLAMP_ANGLE = math.radians(10.0)
+"""Prior standard deviation of a clamp's angle [rad]: a wire leaves a clamp as level as one can hold it."""
+
+_CENTRES = (0.2, 0.5, 0.8)
+
+
+class _Section(Effect):
+    """An effect on a section of the wire, of either sign; its first two parameters are centre and width over length."""
+
+    def starts(self, context):
+        last = self.parameters[2]
+        return [(0, (centre, 0.3, float(last.value(np.float64(z))))) for centre in _CENTRES for z in (-0.5, 0.5)]
+
+
+def _effect(kind: type[Effect], name: str, parameters: tuple[Parameter, ...], null: tuple[float, ...]) -> Effect:
+    return kind(name=name, parameters=parameters, null=null, amplitude=len(null) - 1, reversible=True)
+
+
+_PROFILE = (*StiffnessProfile.parameters[:2], dataclasses.replace(StiffnessProfile.parameters[2], scale=PROFILE_SPREAD))
+
+EFFECTS = (
+    _effect(Effect, "bending_stiffness", BendingStiffness.parameters, BendingStiffness.null),
+    _effect(_Section, "intrinsic_curvature", IntrinsicCurvature.parameters, IntrinsicCurvature.null),
+    _effect(_Section, "stiffness_profile", _PROFILE, StiffnessProfile.null),
+    _effect(Effect, "gravity_tilt", (Parameter("angle_rad", "rad", -0.5, 0.5, 0.0, LEVEL),), (0.0,)),
+)
 """Effects that a hanging wire can show, with the parameters of the planar diagnosis where these exist."""
 
-PARAMETERS = tuple(parameter for group in EFFECTS.values() for parameter in group)
+PARAMETERS = tuple(parameter for effect in EFFECTS for parameter in effect.parameters)
 """Of all effects, one after the other."""
-
-SLICES = {
-    name: slice(sum(map(len, list(EFFECTS.values())[:k])), sum(map(len, list(EFFECTS.values())[: k + 1])))
-    for k, name in enumerate(EFFECTS)
-}
-"""Place of each effect's among all parameters."""
 
 
 def wire_shape(
@@ -84,24 +96,3 @@ def wire_shape(
 def _section(s: Array, centre: Any, width: Any) -> Array:
     """Share of the wire about each joint in a section, all over the length; edges of a hundredth of it."""
     return jax.nn.sigmoid((s - centre + 0.5 * width) / 0.01) * jax.nn.sigmoid((centre + 0.5 * width - s) / 0.01)
-
-
-@jax.jit
-def linearised(
-    z: Float[Array, " P"],
-    clamps: Float[Array, "R 2"],
-    traced: Float[Array, "R N 2"],
-    guess: Float[Array, "R M"],
-    stiffness: Any,
-    length: Any,
-) -> tuple[Float[Array, "R C"], Float[Array, "R C P"], Float[Array, "R C 2"]]:
-    """Residuals of each photograph, and their derivatives in z and its clamps' angles."""
-
-    def residual(z, clamps, traced, guess):
-        return (wire_shape(z, clamps, traced, guess, stiffness, length) - traced)[1:-1].ravel()
-
-    def one(clamps, traced, guess):
-        both = functools.partial(residual, traced=traced, guess=guess)
-        return (both(z, clamps), *jax.jacfwd(both, (0, 1))(z, clamps))
-
-    return jax.vmap(one)(clamps, traced, guess)

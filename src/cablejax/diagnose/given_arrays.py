@@ -1,0 +1,97 @@
+"""Checks of what a user hands to a diagnosis: arrays, the noise, and a simulator that does what the protocol asks."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import ArrayLike, Float
+
+from cablejax.diagnose.noise import noise_floor
+from cablejax.diagnose.protocol import Explanation, Simulator, explanation
+
+# Of the noise: by so much predictions may differ that should be the same.
+_SAME = 0.01
+
+
+def checked_nominal(
+    simulator: Simulator, observed: Float[np.ndarray, "E T *O"], noise: Float[np.ndarray, "*O"]
+) -> Float[np.ndarray, "E T *O"]:
+    """Predictions without any effect, from a simulator that does what the protocol asks for.
+
+    Raises:
+        ValueError: it does not; the message says what came and what was expected.
+    """
+    effects = list(simulator.effects)
+    names = [effect.name for effect in effects]
+    if not effects or len(set(names)) < len(names):
+        raise ValueError(f"The simulator has the effects {names}, expected at least one, and every name once.")
+    nulls: list[Explanation] = []
+    for effect in effects:
+        with np.errstate(divide="ignore"):
+            null = explanation((effect, effect.variants[0], effect.null))
+        # a null value beyond the bounds is a limit that no fit reaches
+        if np.allclose(null.values()[0], effect.null):
+            nulls.append(null)
+    everything = np.arange(len(observed))
+    predicted = np.asarray(simulator.predict([explanation(), *nulls], everything), float)
+    expected = (1 + len(nulls), *observed.shape)
+    if predicted.shape != expected:
+        raise ValueError(f"predict gave an array of shape {predicted.shape}, expected {expected}: [X, E, T, ...].")
+    nominal = predicted[0]
+    seen = np.isfinite(observed)
+    if not np.isfinite(nominal[seen]).all():
+        raise ValueError("The simulation without any effect breaks down where something was observed.")
+
+    def off(one, other, where) -> float:
+        return float(np.where(where, np.abs(one - other) / noise, 0.0).max(initial=0.0))
+
+    for null, moved in zip(nulls, predicted[1:], strict=True):
+        if not off(moved, nominal, seen) <= _SAME:
+            raise ValueError(
+                f"Effect {null.names[0]!r} at its null value {null.terms[0].effect.null} changes the prediction by up "
+                f"to {off(moved, nominal, seen):.2g} times the noise, expected no change."
+            )
+    last = np.asarray(simulator.predict([explanation()], everything[-1:]), float)
+    if last.shape != (1, 1, *observed.shape[1:]) or not off(last[0], nominal[-1:], seen[-1:]) <= _SAME:
+        raise ValueError(
+            f"predict for episode {len(observed) - 1} alone gave an array of shape {last.shape} that is not the last "
+            "part of what it gave for all episodes: it has to simulate the episodes that it is asked for."
+        )
+    return nominal
+
+
+def recorded_arrays(observed: ArrayLike, interval: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
+    """What was observed, shape [E, T, ...], and the sample interval of each episode [s].
+
+    Raises:
+        ValueError: arrays that are no recording.
+    """
+    observed = np.asarray(observed, float)
+    if observed.ndim < 3 or not np.isfinite(observed).any():
+        raise ValueError(
+            f"observed has shape {observed.shape} and {np.isfinite(observed).sum()} finite values, expected episodes, "
+            "samples and at least one observed coordinate: [E, T, ...]."
+        )
+    every = np.broadcast_to(np.asarray(interval, float), len(observed))
+    if not (np.isfinite(every) & (every > 0)).all():
+        raise ValueError(f"interval is {interval} s, expected positive numbers.")
+    return observed, every
+
+
+def spread_of(observed: Float[np.ndarray, "E T *O"], noise: ArrayLike | None) -> np.ndarray:
+    """Standard deviation of the observed coordinates: as given, else from differences in time.
+
+    Raises:
+        ValueError: it does not broadcast to one sample, or is not positive.
+    """
+    shape = observed.shape[2:]
+    if noise is None:
+        flat = observed.reshape(*observed.shape[:2], -1, 1)
+        return noise_floor(flat, None, smallest=0.0).std.reshape(shape)
+    spread = np.asarray(noise, float)
+    try:
+        np.broadcast_to(spread, shape)
+    except ValueError as error:
+        raise ValueError(f"noise has shape {spread.shape}, which does not broadcast to {shape}.") from error
+    if not (np.isfinite(spread) & (spread > 0)).all():
+        raise ValueError(f"noise is {spread}, expected positive standard deviations: no measurement is exact.")
+    return spread

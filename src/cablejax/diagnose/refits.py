@@ -1,0 +1,62 @@
+"""Explanations that are fitted again without each part of the recordings, and judged by the part that was left out.
+
+Leaving out a motion is pictured by one linear step where that serves (`Fit.held_out_sse`). It does not where episodes
+are few, where they have numbers of their own, or where one of them decides on which of several minima a fit ends in:
+there a simulator's `Plan.parts` asks for fits.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Int
+
+from cablejax.diagnose.evidence import Evidence
+from cablejax.diagnose.fit import Fit, Refits, evaluate, improved
+from cablejax.diagnose.protocol import Explanation
+
+
+def dealt(group: Int[np.ndarray, "E"], parts: int) -> Int[np.ndarray, "E"]:
+    """The part that each episode falls to: groups are dealt out whole, the largest first to the smallest part."""
+    names, counts = np.unique(group, return_counts=True)
+    sizes, part_of = np.zeros(min(parts, len(names)), int), {}
+    for name, count in sorted(zip(names, counts, strict=True), key=lambda item: (-item[1], item[0])):
+        part_of[name] = int(sizes.argmin())
+        sizes[part_of[name]] += count
+    return np.array([part_of[name] for name in group])
+
+
+def refitted(evidence: Evidence, fits: Sequence[Fit]) -> list[Fit]:
+    """The fits with `Refits`, where the simulator's plan asks for them; those that have some stay as they are."""
+    plan, todo = evidence.simulator.plan, [i for i, fit in enumerate(fits) if fit.refits is None]
+    if plan.parts is None or not todo:
+        return list(fits)
+    several = len(np.unique(evidence.motion)) > 1
+    part_of = dealt(evidence.motion if several else evidence.episodes, plan.parts)
+    result = list(fits)
+    sse, ended, left_out = [np.zeros(len(part_of)) for _ in todo], [[] for _ in todo], []
+    for part in range(part_of.max() + 1):
+        out, rest = np.flatnonzero(part_of == part), np.flatnonzero(part_of != part)
+        left_out.append(out)
+        seen, unseen = evidence.restricted(rest), evidence.restricted(out)
+        there = improved(seen, [fits[i].restricted(rest) for i in todo], plan.last_steps)
+        checks = evaluate(unseen, [_forgotten(unseen, fit.explanation) for fit in there])
+        if evidence.simulator.fits_unseen:
+            checks = improved(unseen, checks, plan.last_steps, own_only=True)
+        for k, check in enumerate(checks):
+            sse[k][out] = check.sse
+            ended[k].append(check.explanation)
+    for k, i in enumerate(todo):
+        result[i] = dataclasses.replace(fits[i], refits=Refits(tuple(ended[k]), tuple(left_out), sse[k]))
+    return result
+
+
+def _forgotten(unseen: Evidence, one: Explanation) -> Explanation:
+    """Without what was fitted to the recordings of these episodes; as a start it may stay where it is fitted again."""
+    if not one.own.size or unseen.simulator.fits_unseen:
+        return one
+    own = one.own.copy()
+    own[np.asarray(unseen.simulator.recording, int)[unseen.episodes]] = 0.0
+    return one.moved(one.z, own)

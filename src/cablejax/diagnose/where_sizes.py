@@ -1,0 +1,69 @@
+"""Where the gap lies where nothing is tested: sizes along the cable and by episode, for cables off the table."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
+
+import numpy as np
+from jaxtyping import Float
+
+from cablejax.diagnose.where import LEVEL, Where
+from cablejax.diagnose.where_words import describe
+
+
+def mean_of_finite(values: np.ndarray, axis: tuple[int, ...] | int | None) -> np.ndarray:
+    """Mean of what is finite; NaN where nothing is."""
+    seen = np.isfinite(values)
+    count = seen.sum(axis=axis)
+    return np.where(count > 0, np.where(seen, values, 0.0).sum(axis=axis) / np.maximum(count, 1), np.nan)
+
+
+def above(squares: np.ndarray, noise: float, axis: tuple[int, ...] | int | None = None) -> np.ndarray:
+    """Root mean square above the noise [mm] of squared errors [m^2], NaN where none is finite."""
+    return 1e3 * np.sqrt(np.maximum(mean_of_finite(squares, axis) - noise**2, 0.0))
+
+
+def sizes_of(
+    squares: Float[np.ndarray, "E T N D"],
+    noise: float,
+    arclength: Float[np.ndarray, "N"],
+    *,
+    smallest_mm: float,
+    names: Sequence[str],
+    gap_mm: float | None = None,
+    horizons_mm: Mapping[float, float] = MappingProxyType({}),
+    regimes: Mapping[str, float] = MappingProxyType({}),
+    first: Sequence[str] = (),
+) -> Where:
+    """Keypoints and episodes at which a nominal simulation is off.
+
+    Args:
+        squares: squared errors of every coordinate [m^2], NaN = not observed.
+        noise: standard deviation of a coordinate [m].
+        arclength: of the keypoints [m].
+        smallest_mm: the least gap that would have been seen.
+        names: what to call each episode.
+        gap_mm: over all that is compared, where that is not all of `squares`.
+        horizons_mm, regimes: see `Where`.
+        first: sentences that come before all others.
+    """
+    where = Where(
+        gap_mm=float(above(squares, noise)) if gap_mm is None else gap_mm,
+        smallest_mm=smallest_mm,
+        along_cable_mm=np.nan_to_num(above(squares, noise, (0, 1, 3))),
+        bend_per_m=None,
+        per_episode_mm=above(squares, noise, (1, 2, 3)),
+        episode_p=None,
+        keypoint_p=None,
+        heat=np.sqrt(mean_of_finite(squares, -1)) / max(noise, 1e-6),
+        horizons_mm=dict(horizons_mm),
+        regimes=dict(regimes),
+        frames={},
+        contrasts={},
+        regime_masks={},
+        sentences=(),
+    )
+    found = describe(where, np.asarray(arclength), np.array([noise]), LEVEL, names)
+    return dataclasses.replace(where, sentences=(*first, *found))

@@ -1,0 +1,194 @@
+"""One frame of tracking, compiled: register from the last state, judge the fit, carry the cable along if none fits."""
+
+from __future__ import annotations
+
+import dataclasses
+import enum
+import functools
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from cablejax.perceive.registration import CurveFit, RegistrationConfig, register
+
+ROTATION_WEIGHT = 0.15
+"""Metres that one radian of a gripper's motion counts for."""
+WIDENING = 1.5
+"""Factor on the last standard deviation from which the next frame starts."""
+
+
+class Status(enum.IntEnum):
+    """What became of a frame."""
+
+    TRACKED = 0
+    """The cable was found in the cloud."""
+    FEW_POINTS = 1
+    """Lost: the cloud is empty or nearly so."""
+    NO_FIT = 2
+    """Lost: the cloud is not that of this cable between these grippers."""
+
+
+@dataclasses.dataclass(frozen=True)
+class TrackerConfig:
+    """How clouds are followed.
+
+    Attributes:
+        registration: the cable and its registration.
+        capacity: points that a frame is thinned or padded to.
+        iterations: of registration per frame.
+        reach: distance [m] within which a point supports the fit.
+        min_points: a cloud of fewer points is not looked at.
+        min_support: part of the cloud that must be within reach of the cable.
+        min_seen: part of the cable that must have points.
+        max_sigma: largest standard deviation of the points across the cable [m].
+        max_curvature: largest curvature of the fit [1/m]. One that is too long for its cloud hides the rest in a fold.
+        max_search: largest standard deviation that a frame starts from [m]. It starts from the last frame's, plus the
+            way that the grippers have gone since.
+        retry: the cable is looked for without a prior in the first frame that does not fit, and then every so many.
+    """
+
+    registration: RegistrationConfig = dataclasses.field(default_factory=RegistrationConfig)
+    capacity: int = 2000
+    iterations: int = 6
+    reach: float = 0.015
+    min_points: int = 30
+    min_support: float = 0.75
+    min_seen: float = 0.15
+    max_sigma: float = 0.008
+    max_curvature: float = 25.0
+    max_search: float = 0.05
+    retry: int = 5
+
+    def __post_init__(self):
+        for name in ("capacity", "iterations", "min_points", "retry"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"TrackerConfig.{name} is {getattr(self, name)}, expected at least 1.")
+        for name in ("reach", "max_sigma", "max_curvature", "max_search"):
+            value = getattr(self, name)
+            if not (np.isfinite(value) and value > 0):
+                raise ValueError(f"TrackerConfig.{name} is {value}, expected a positive finite number.")
+        for name in ("min_support", "min_seen"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise ValueError(f"TrackerConfig.{name} is {getattr(self, name)}, expected a number in [0, 1].")
+
+
+class TrackState(NamedTuple):
+    """What is carried from frame to frame.
+
+    Attributes:
+        angles: joint angles of the chain [rad], shape [J].
+        gripper_pose: of the same frame, turns counted, shape [Q, 3].
+        sigma: standard deviation of the points across the cable [m], shape [].
+        travel: way of the grippers since the cable was last found [m], shape [].
+        lost: frames since the cable was last found, shape [].
+        misfits: frames on end whose cloud did not fit, shape [].
+        found: whether it ever was, shape [].
+    """
+
+    angles: Float[Array, "*b J"]
+    gripper_pose: Float[Array, "*b Q 3"]
+    sigma: Float[Array, "*b"]
+    travel: Float[Array, "*b"]
+    lost: Int[Array, "*b"]
+    misfits: Int[Array, "*b"]
+    found: Bool[Array, "*b"]
+
+
+class Track(NamedTuple):
+    """What is known after a frame.
+
+    Attributes:
+        keypoints: positions [m], shape [N, 2]; while lost, those last found, carried along with the grippers; NaN if
+            the cable never was found.
+        status: see `Status`, shape [].
+        lost: frames since the cable was last found, shape [].
+        sigma: standard deviation of the points across the cable [m], shape [].
+        support: part of this cloud within reach of the fit, shape [].
+        seen: part of the cable that has points, shape [].
+    """
+
+    keypoints: Float[Array, "*b N 2"]
+    status: Int[Array, "*b"]
+    lost: Int[Array, "*b"]
+    sigma: Float[Array, "*b"]
+    support: Float[Array, "*b"]
+    seen: Float[Array, "*b"]
+
+
+@functools.partial(jax.jit, static_argnames="config")
+def track(
+    config: TrackerConfig,
+    state: TrackState,
+    points: Float[Array, "S 2"],
+    mask: Bool[Array, " S"],
+    gripper_pose: Float[Array, "Q 3"],
+) -> tuple[TrackState, Track]:
+    """One frame, compiled and pure: register from the last state, judge, hold if it does not fit.
+
+    Batched by `jax.vmap`. Piecewise differentiable as `register` is.
+
+    Args:
+        config: see `TrackerConfig`.
+        state: after the last frame.
+        points: the cloud on the table [m].
+        mask: false where a row of `points` is only padding.
+        gripper_pose: (x, y, theta) of both grippers now; angles may be given modulo a turn.
+    """
+    settings = config.registration
+    step = gripper_pose - state.gripper_pose
+    step = step.at[:, 2].set((step[:, 2] + jnp.pi) % (2 * jnp.pi) - jnp.pi)
+    pose = state.gripper_pose + step
+    travel = state.travel + jnp.max(
+        jnp.sqrt(jnp.sum(step[:, :2] ** 2, axis=-1) + (ROTATION_WEIGHT * step[:, 2]) ** 2 + 1e-16)
+    )
+    search = jnp.minimum(jnp.sqrt((WIDENING * state.sigma) ** 2 + travel**2), config.max_search)
+
+    def fit(mask) -> CurveFit:
+        return register(
+            settings,
+            points,
+            mask,
+            pose,
+            state.angles,
+            state.gripper_pose,
+            search,
+            iterations=config.iterations,
+            reach=config.reach,
+        )
+
+    seen = fit(mask)
+    status = judge(config, seen, jnp.sum(mask))
+    status = jnp.where(~state.found & (status == Status.TRACKED), Status.NO_FIT, status)
+    good = status == Status.TRACKED
+    # Where the cloud is not to be trusted the registration without points carries the cable along.
+    best = jax.lax.cond(good, lambda: seen, lambda: fit(jnp.zeros_like(mask)))
+    lost = jnp.where(good, 0, state.lost + 1)
+    after = TrackState(
+        angles=best.angles,
+        gripper_pose=pose,
+        sigma=jnp.where(good, best.sigma, state.sigma),
+        travel=jnp.where(good, 0.0, travel),
+        lost=lost,
+        misfits=jnp.where(status == Status.NO_FIT, state.misfits + 1, 0),
+        found=state.found,
+    )
+    keypoints = jnp.where(state.found, best.keypoints, jnp.nan)
+    return after, Track(keypoints, status, lost, seen.sigma, seen.support, seen.seen)
+
+
+@functools.partial(jax.jit, static_argnames="config")
+def judge(config: TrackerConfig, fit: CurveFit, count: Int[Array, ""]) -> Int[Array, ""]:
+    """Whether a fit to a cloud of `count` points is that cloud's cable; see `Status`."""
+    fits = (
+        (fit.support >= config.min_support)
+        & (fit.seen >= config.min_seen)
+        & (fit.sigma <= config.max_sigma)
+        & (fit.curvature <= config.max_curvature)
+        & (fit.gap <= config.reach)
+        & jnp.all(jnp.isfinite(fit.keypoints))
+    )
+    status = jnp.where(count < config.min_points, Status.FEW_POINTS, jnp.where(fits, Status.TRACKED, Status.NO_FIT))
+    return status.astype(jnp.int32)

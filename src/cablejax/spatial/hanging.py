@@ -1,0 +1,267 @@
+"""A hanging wire as a diagnosis sees it: photographs of a wire at rest behind the protocol of simulators.
+
+Each photograph is an episode of one sample and a recording of its own; the angles of both clamps are what it has for
+its own, nuisances that are fitted in every explanation alike, and to photographs that are held out too. Errors of one
+photograph are one error: its coordinates count as correlated samples, and the error of the rig is the baseline.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import math
+import time
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+from scipy.optimize import brentq
+from scipy.stats import norm, t
+
+from cablejax.diagnose.belief import LEAST_SQUARES, Calibration, log_scores, probabilities
+from cablejax.diagnose.diagnosis import PLACES, Diagnosis
+from cablejax.diagnose.fit import Fit, evaluate, improved
+from cablejax.diagnose.given_arrays import checked_nominal
+from cablejax.diagnose.noise import noise_floor
+from cablejax.diagnose.protocol import Explanation, Plan, Report, Simulator, Term, in_batches
+from cablejax.diagnose.refits import refitted
+from cablejax.diagnose.run import Examined, examine, settings_of, weighed
+from cablejax.diagnose.verdict_json import verdict_json
+from cablejax.diagnose.where_sizes import sizes_of
+from cablejax.spatial.hanging_effects import CLAMP_ANGLE, EFFECTS, wire_shape
+
+LINKS_PER_SPACING = 2
+"""Links of the model from one traced point to the next."""
+
+_TAIL = 0.95
+
+
+@dataclasses.dataclass(frozen=True)
+class Photographs:
+    """Photographs of one wire.
+
+    Attributes:
+        points: traced at equal arc lengths, horizontal and vertical coordinate [m], shape [R, N, 2].
+        length: of the wire [m].
+        stiffness: EI over the weight per length that is believed true [m^3].
+        error: root mean square error of a coordinate that the rig shows [m].
+    """
+
+    points: Float[np.ndarray, "R N 2"]
+    length: float
+    stiffness: float
+    error: float
+
+    def __post_init__(self):
+        shape = self.points.shape
+        if len(shape) != 3 or shape[0] < 3 or shape[1] < 5 or shape[2] != 2 or not np.isfinite(self.points).all():
+            raise ValueError(
+                f"Photographs have points of shape {shape}, expected finite ones of shape [R, N, 2] with at least "
+                "three photographs, so that one can be left out, and five points."
+            )
+        for name in ("length", "stiffness", "error"):
+            if not (np.isfinite(getattr(self, name)) and getattr(self, name) > 0):
+                raise ValueError(f"Photographs.{name} is {getattr(self, name)}, expected a positive number.")
+        longest = np.linalg.norm(np.diff(self.points, axis=1), axis=-1).sum(axis=1).max()
+        if not 0.9 * self.length < longest < 1.02 * self.length:
+            raise ValueError(
+                f"Along its traced points the wire measures {longest:.4g} m, expected its length, {self.length:g} m: "
+                "check the scale of the photographs."
+            )
+
+    @property
+    def guess(self) -> Float[np.ndarray, "R M"]:
+        """Angles of the model's links as they are traced [rad]."""
+        along = np.diff(self.points, axis=1)
+        return np.repeat(np.unwrap(np.arctan2(along[..., 1], along[..., 0]), axis=1), LINKS_PER_SPACING, axis=1)
+
+
+class HangingWire(Simulator):
+    """One wire in its photographs, between the traced ends.
+
+    Args:
+        photographs: of the wire.
+
+    Raises:
+        ValueError: JAX computes in single precision.
+    """
+
+    effects = EFFECTS
+    plan = Plan(first_steps=40, last_steps=100, grown_steps=100, tolerance=1e-4, parts=1000)
+    fits_unseen = True
+
+    def __init__(self, photographs: Photographs):
+        if jnp.zeros(()).dtype != jnp.float64:
+            raise ValueError("Fits of hanging wires need double precision: call them under jax.enable_x64(True).")
+        self.photographs = photographs
+        self.recording = range(len(photographs.points))
+
+    def own(self, one) -> int:
+        """The angles of both clamps."""
+        return 2
+
+    def predict(self, explanations, episodes) -> Float[np.ndarray, "X E 1 N 2"]:
+        """Points of the wire [m] in each photograph."""
+        return self._run(explanations, episodes)[:, :, :1]
+
+    def linearise(self, explanations, episodes):
+        """By the implicit function theorem, exact."""
+        result, sizes = [], [len(effect.parameters) for effect in self.effects]
+        ends = dict(zip((e.name for e in self.effects), np.cumsum([0, *sizes[:-1]]), strict=True))
+        for one, found in zip(explanations, self._run(explanations, episodes), strict=True):
+            columns = [ends[term.effect.name] + k for term in one.terms for k in range(term.size)]
+            slopes = np.moveaxis(found[:, 1:], 1, 0)[[*columns, -2, -1]]
+            result.append((found[:, :1], slopes[:, :, None]))
+        return result
+
+    def report(self, term, values) -> Report:
+        """In metres along the wire."""
+        length, parameters = self.photographs.length, {}
+        for parameter, value in zip(term.effect.parameters, values, strict=True):
+            along = parameter.name in ("centre", "width")
+            name, unit = (f"{parameter.name}_m", "m") if along else (parameter.name, parameter.unit)
+            parameters[name] = float(np.clip(value, parameter.low, parameter.high)) * (length if along else 1), unit
+        if "width_m" not in parameters:
+            return Report(parameters, dict.fromkeys(PLACES))
+        centre, half = parameters["centre_m"][0], parameters["width_m"][0] / 2
+        return Report(
+            parameters, dict.fromkeys(PLACES) | {"along_cable_m": [max(centre - half, 0.0), min(centre + half, length)]}
+        )
+
+    def _run(self, explanations: Sequence[Explanation], episodes) -> Float[np.ndarray, "X E 11 N 2"]:
+        """Points, and their derivatives by the coordinates of all effects and by what the photograph has of its own."""
+        count = sum(len(effect.parameters) for effect in self.effects)
+        z = np.zeros((len(explanations), len(episodes), count + 2))
+        for row, one in zip(z, explanations, strict=True):
+            present = {term.effect.name: part for term, part in one.by_term()}
+            shared = [present.get(e.name, [p.coordinate(v) for p, v in zip(e.parameters, e.null, strict=True)])
+                      for e in self.effects]  # fmt: skip
+            row[:, :count] = np.concatenate(shared)
+            row[:, count:] = self.with_own(one).own[np.asarray(episodes, int)]
+        p = self.photographs
+        points, guess = p.points[episodes], p.guess[episodes]
+        believed, length = np.full(len(points), p.stiffness), np.full(len(points), p.length)
+        return in_batches(_points_and_slopes, z, points, guess, believed, length, size=len(p.points))
+
+
+@jax.jit
+@jax.vmap
+def _points_and_slopes(z, traced, guess, stiffness, length):
+    def points(z):
+        return wire_shape(z[:-2], CLAMP_ANGLE * z[-2:], traced, guess, stiffness, length)
+
+    return jnp.concatenate([points(z)[None], jnp.moveaxis(jax.jacfwd(points)(z), -1, 0)])
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class WireDiagnosis(Diagnosis):
+    """The findings on one wire. Its episodes are the photographs.
+
+    Attributes:
+        stiffness: EI over the believed one, with its 90 % interval, over all explanations that fit it.
+        examined: fits, and points of the wire as believed and with what explains it best.
+    """
+
+    stiffness: tuple[float, float, float]
+    examined: Examined
+
+
+def diagnose_wire(photographs: Photographs, progress: Callable[[str], None] = lambda text: None) -> WireDiagnosis:
+    """Diagnoses one wire. Needs JAX in double precision.
+
+    Args:
+        photographs: of the wire, at least three.
+        progress: called with a line of text before each stage.
+    """
+    begun = time.perf_counter()
+    wire, noise = HangingWire(photographs), tracing_noise(photographs.points)
+    observed = photographs.points[:, None].copy()
+    # where the wire leaves the clamps is given to the model
+    observed[:, :, [0, -1]] = np.nan
+    calibration = Calibration(
+        baseline=photographs.error,
+        correlated_samples=observed[0].size - 4,
+        fit_freedom=LEAST_SQUARES,
+        prior_cost=1.0,
+        as_good=1.0,
+        max_terms=2,
+    )
+    spread = np.full((observed.shape[2], 1), noise)
+    nominal = checked_nominal(wire, observed, spread)
+    everyone = np.arange(len(observed))
+    evidence = weighed(wire, observed, nominal, spread, everyone, calibration)
+    examined = examine(evidence, np.ones(len(observed)), calibration, deadline=math.inf, progress=progress)
+    where = sizes_of(
+        (observed - examined.before) ** 2,
+        noise,
+        np.linspace(0.0, photographs.length, observed.shape[2]),
+        smallest_mm=1e3 * calibration.smallest_gap(noise),
+        names=[f"photograph {k + 1}" for k in everyone],
+    )
+    return WireDiagnosis(
+        **examined.fields(),
+        where=where,
+        next_motion=None,
+        caveats=(),
+        seconds=time.perf_counter() - begun,
+        settings=settings_of(wire, calibration),
+        stiffness=_stiffness(examined, calibration),
+        examined=examined,
+    )
+
+
+def tracing_noise(points: Float[np.ndarray, "R N 2"]) -> float:
+    """Noise of a traced coordinate [m], from fourth differences along the wire, to which its shape adds little."""
+    return float(noise_floor(points[:, :, None], None, order=4).std[0])
+
+
+def rig_error(ends: Float[np.ndarray, "R 2"]) -> float:
+    """Root mean square error of a coordinate [m] that photographs of one rig show.
+
+    Args:
+        ends: from the first clamp to the second, in every photograph of the rig [m]; the rig itself keeps this.
+    """
+    return float(np.sqrt(ends.var(axis=0, ddof=1).mean()))
+
+
+def wire_verdict_json(diagnosis: WireDiagnosis) -> dict[str, Any]:
+    """The verdict in the format `cablejax-verdict/1`, with `stiffness_ratio`: EI over the believed one."""
+    value, *interval = diagnosis.stiffness
+    return {**verdict_json(diagnosis), "stiffness_ratio": {"value": value, "ci90": interval, "unit": ""}}
+
+
+def _stiffness(examined: Examined, calibration: Calibration) -> tuple[float, float, float]:
+    """Median and 90 % interval of the ratio of EI, over the explanations that fit it."""
+    evidence, effect = examined.evidence, EFFECTS[0]
+    fits = [fit for fit in examined.found.fits if effect.name in fit.explanation.names]
+    best = examined.found.fits[0].explanation
+    if not any({*best.names, effect.name} == set(fit.explanation.names) for fit in fits):
+        # a search ends where an explanation is adequate; EI is of interest all the same
+        both = Explanation((*best.terms, Term(effect, 0)), np.append(best.z, 0.0), best.own)
+        fits += refitted(evidence, improved(evidence, evaluate(evidence, [both]), evidence.simulator.plan.last_steps))
+    parts = list(zip(fits, probabilities(log_scores(fits, evidence, calibration)), strict=True))
+    weights = np.array([chance for _, chance in parts]) / sum(chance for _, chance in parts)
+    centres, spreads = np.array([_centre_and_spread(fit, evidence) for fit, _ in parts]).T
+
+    def missing(z, share):
+        return float((weights * norm.cdf(z, centres, spreads)).sum()) - share
+
+    reach = 20 * spreads.max() + np.ptp(centres)
+    ends = centres.min() - reach, centres.max() + reach
+    found = [brentq(functools.partial(missing, share=share), *ends) for share in (0.5, 1 - _TAIL, _TAIL)]
+    middle, low, high = (float(effect.parameters[0].value(np.asarray(z))) for z in found)
+    return middle, low, high
+
+
+def _centre_and_spread(fit: Fit, evidence) -> tuple[float, float]:
+    """Of the ratio's coordinate: posterior and jackknife over photographs together, as of a normal distribution."""
+    assert fit.refits is not None  # the plan asks for them
+    k = list(fit.explanation.names).index(EFFECTS[0].name)
+    k = sum(term.size for term in fit.explanation.terms[:k])
+    left_out = np.array([one.z[k] for one in fit.refits.explanations])
+    variance = np.linalg.inv(fit.precision(evidence))[k, k] + (len(left_out) - 1) * left_out.var()
+    wider = t.ppf(_TAIL, len(left_out) - 1) / norm.ppf(_TAIL)
+    return float(fit.explanation.z[k]), float(wider * np.sqrt(variance))
