@@ -7,8 +7,8 @@ import dataclasses
 from cablejax.control.loop import Controller
 from cablejax.control.shaping import Model, make_controller
 from cablejax.control.targets import Target
-from cablejax.control.visual_servo import ServoConfig, VisualServo
 from closed_loop.paper import DIRECT, FINE_TUNED, METHOD_LABEL, RANDOMISED, RESIDUAL, VISUAL_SERVO
+from closed_loop.visual_servo import ServoConfig, VisualServo
 
 ADAPTED = "adapted"
 ADAPTED_RESIDUAL = "adapted residual"
