@@ -352,3 +352,13 @@ def test_motions_of_a_longer_cable_are_in_proportion():
         drawn.append(random_motion(np.random.default_rng(3), config, 8, MotionConfig.for_length(length)))
     for short, long in zip(*drawn, strict=True):
         np.testing.assert_allclose(long, short * [1.5, 1.5, 1.0], atol=1e-9)
+
+
+def test_unevenly_spaced_keypoints_are_no_fault(tmp_path):
+    marks = (0.0, 0.05, 0.55, 1.0)
+    config = dataclasses.replace(TINY, discretisation=Discretisation(Cable(n_keypoints=4, marks=marks), n_links=7))
+    assert generate(config, tmp_path / "data", progress=False).n_complete == TINY.n_trajectories
+    points = open_store(tmp_path / "data").read().keypoints
+    chords = np.linalg.norm(np.diff(points, axis=2), axis=-1)
+    assert (chords <= 1.02 * np.diff(marks)).all() and chords[..., 0].max() < 0.06 < chords[..., 1].min()
+    assert open_store(tmp_path / "data").config.cable.marks == marks
