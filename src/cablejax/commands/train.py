@@ -48,6 +48,9 @@ class Train(Command):
     frame: Literal["grippers", "world"] = "grippers"
     """Axes that the network sees the cable in: the grippers' own, which turn with it, or the world's."""
 
+    symmetric: bool = False
+    """Tie the weights so that a mirrored cable, and one whose keypoints are counted from the other end, move alike."""
+
     conditioned: bool = False
     """Give the network each cable's stiffness and friction as inputs; the data should vary in them."""
 
@@ -167,6 +170,7 @@ class Train(Command):
             network=self.network,
             prior=self.prior,
             frame=self.frame,
+            symmetric=self.symmetric,
             conditioned=self.conditioned,
             n_keypoints=cable.n_keypoints,
             length=cable.length,

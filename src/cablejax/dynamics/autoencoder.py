@@ -24,6 +24,7 @@ from cablejax.dynamics.gns import GNS
 from cablejax.dynamics.graph import build_graph, prior_of
 from cablejax.dynamics.layers import MLP
 from cablejax.dynamics.normalisation import check_trajectories, fit_normalisation
+from cablejax.dynamics.symmetry import initially_symmetric, symmetrised
 from cablejax.dynamics.train_config import TrainConfig
 from cablejax.types import Trajectory
 
@@ -117,6 +118,7 @@ def pretrain(
     gns = GNS(model, rngs)
     pair = AutoEncoders(gns, rngs)
     graphdef, weights = nnx.split(pair)
+    weights = initially_symmetric(weights, model)
     schedule = optax.cosine_decay_schedule(
         pretraining.lr_start, pretraining.steps, pretraining.lr_end / pretraining.lr_start
     )
@@ -137,7 +139,7 @@ def pretrain(
             key = jax.random.fold_in(root, step)
             windows = draw_windows(key, data, batch=pretraining.batch, history=model.history, steps=1)
             gradient, relative = jax.grad(loss, has_aux=True)(weights, *features(windows, model))
-            change, state = optimiser.update(gradient, state, weights)
+            change, state = optimiser.update(symmetrised(gradient, model), state, weights)
             return (optax.apply_updates(weights, change), state), relative
 
         (weights, state), relative = jax.lax.scan(one, (weights, state), steps)
@@ -151,7 +153,7 @@ def pretrain(
             bar.update(steps.size)
     nnx.update(pair, weights)  # and with it the encoders of `gns`, which are the same objects
     _take_over(gns.decoder, pair.psi_v)
-    return Pretrained(model, nnx.split(gns)[1], float(relative[0]), float(relative[1]))
+    return Pretrained(model, symmetrised(nnx.split(gns)[1], model), float(relative[0]), float(relative[1]))
 
 
 def _take_over(decoder: MLP, psi: MLP) -> None:

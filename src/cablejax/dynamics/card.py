@@ -58,6 +58,7 @@ def write_card(
         f"{config.n_keypoints} keypoints, one step of {config.interval:g} s, {config.history} samples of history. It "
         f"corrects {'no' if config.prior == 'none' else f'the {config.prior}'} prior"
         + (", sees the cable in the world's frame" if config.frame == "world" else "")
+        + (", commutes with mirroring and with reversing the cable" if config.symmetric else "")
         + (" and has the cable's stiffness and friction as inputs." if config.conditioned else "."),
         "",
         "## Data",

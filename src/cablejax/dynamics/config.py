@@ -60,6 +60,8 @@ class ModelConfig:
             see `cablejax.simulate.chain.statics`; "rigid", the interpolation of the grippers' motion; or "none".
         frame: axes that features and output are expressed in: "grippers", which turn and shift with the cable, or for
             comparison "world".
+        symmetric: whether the graph network's weights are tied so that mirrored or reversed cables move alike, see
+            `cablejax.dynamics.symmetry`.
         normalisation: scales of features and output.
     """
 
@@ -76,6 +78,7 @@ class ModelConfig:
     message_passing: int = 10
     prior: Literal["static", "rigid", "none"] = "static"
     frame: Literal["grippers", "world"] = "grippers"
+    symmetric: bool = False
     normalisation: Normalisation = Normalisation()
 
     def __post_init__(self):
@@ -100,6 +103,16 @@ class ModelConfig:
         ):
             if getattr(self, name) not in known:
                 raise ValueError(f"ModelConfig.{name} is {getattr(self, name)!r}, expected one of {known}.")
+        if self.symmetric and (self.network != "gns" or self.frame != "grippers"):
+            raise ValueError(
+                f"ModelConfig.symmetric is for the graph network in the grippers' frame, not for network "
+                f"{self.network!r} in frame {self.frame!r}: leave it False there."
+            )
+        if self.symmetric and (self.latent % 4 or self.hidden % 4):
+            raise ValueError(
+                f"ModelConfig.latent is {self.latent} and hidden {self.hidden}, expected multiples of 4: a symmetric "
+                "network has as many channels for each of the group's four elements."
+            )
         if self.radius < self.spacing:
             raise ValueError(
                 f"ModelConfig.radius is {self.radius} m but keypoints are {self.spacing:.4g} m apart: no two would be "

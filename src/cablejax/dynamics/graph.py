@@ -4,7 +4,7 @@ Node features, in order, with N keypoints and H history samples (all in the mode
 
     2            position at t
     2 (H - 1)    displacements between the history's samples, oldest first
-    2            arc-length fraction s and 4 s (1 - s)
+    2            arc-length fraction s, from the middle in a symmetric model, and 4 s (1 - s)
     5            at a grasped node its gripper's control input (vx, vy, omega) and heading (cos, sin); elsewhere 0
     2            1 at the node held by gripper 0, by gripper 1
     2            displacement that the prior expects
@@ -119,7 +119,8 @@ def build_graph(history: History, twist: Float[Array, "2 3"], prior: Prior, conf
     now = past[-1]
 
     s = np.linspace(0.0, 1.0, config.n_keypoints)
-    arclength = jnp.asarray(np.stack([s, 4 * s * (1 - s)], axis=-1), now.dtype)
+    # counted from the middle, reversal changes nothing but its sign
+    arclength = jnp.asarray(np.stack([s - 0.5 * config.symmetric, 4 * s * (1 - s)], axis=-1), now.dtype)
     heading = jnp.stack([jnp.cos(pose[:, 2]), jnp.sin(pose[:, 2])], axis=-1) @ axes.T
     control = jnp.concatenate(
         [twist[:, :2] @ axes.T / scale.linear_speed, twist[:, 2:] / scale.angular_speed, heading], axis=-1

@@ -31,9 +31,9 @@ def apply(
 ) -> Float[Array, "N 2"]:
     """Displacement X(t + 1) - X(t) [m] of every keypoint; at the two grasped ones it is the grippers', exactly.
 
-    Turns with the cable, unless it works in the world's frame: rotating and shifting the input rotates the output.
-    Differentiable in weights, history and
-    twist (almost everywhere: the activation is ReLU).
+    Rotating and shifting the input rotates the output, unless the model works in the world's frame. With tied weights
+    the same holds for mirroring the input and for counting its keypoints from the other end. Differentiable in weights,
+    history and twist (almost everywhere: the activation is ReLU).
 
     Args:
         model: the network, or its split form `(graphdef, weights)`.

@@ -35,6 +35,7 @@ from cablejax.dynamics.metrics import MetricsLog
 from cablejax.dynamics.model import bind, make_network
 from cablejax.dynamics.normalisation import check_trajectories, fit_normalisation
 from cablejax.dynamics.run_folder import CHECKPOINTS, claim_folder
+from cablejax.dynamics.symmetry import initially_symmetric, symmetrised
 from cablejax.dynamics.train_config import Phase, TrainConfig
 from cablejax.types import Trajectory
 
@@ -124,8 +125,7 @@ def train(
     claim_folder(out_dir, run, resume=resume, overwrite=overwrite)
 
     graphdef, weights = nnx.split(make_network(model_config, nnx.Rngs(config.seed)))
-    if initial is not None:
-        weights = initial[1]
+    weights = initially_symmetric(weights, model_config) if initial is None else initial[1]
     optimiser = config.optimiser()
     state = TrainState(weights, weights, optimiser.init(weights), jnp.zeros((), jnp.int32))
     device_data = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), data)
@@ -155,7 +155,7 @@ def train(
                     checkpoints.save(step, state)
                 bar.update(done)
                 bar.set_postfix({"loss": f"{row['loss']:.2e}"} | {f"e{h}_cm": f"{s:.3f}" for h, s in scores.items()})
-    return TrainResult(model_config, graphdef, state.average, step, step == total, scores)
+    return TrainResult(model_config, graphdef, symmetrised(state.average, model_config), step, step == total, scores)
 
 
 @functools.lru_cache(maxsize=8)
@@ -168,7 +168,7 @@ def chunk_update(config: TrainConfig, phase_index: int, graphdef: nnx.GraphDef, 
             key = jax.random.fold_in(jax.random.key(config.seed), state.step)
             windows = noisy_windows(key, data, phase, model.history)
             loss, gradient = jax.value_and_grad(batch_loss)(state.weights, graphdef, windows, phase, model)
-            change, inner = optimiser.update(gradient, state.optimiser, state.weights)
+            change, inner = optimiser.update(symmetrised(gradient, model), state.optimiser, state.weights)
             weights = optax.apply_updates(state.weights, change)
             # A short memory at first, so that the average does not remember the random start.
             decay = jnp.minimum(config.ema, (1.0 + state.step) / (10.0 + state.step))
