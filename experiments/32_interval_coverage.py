@@ -27,13 +27,12 @@ os.environ.setdefault("NPROC", "4")
 import numpy as np
 from scipy.stats import binomtest, norm
 
+from cablejax.diagnose.fit import evaluate
 from cablejax.recordings.deform import NOMINAL, SAMPLE_INTERVAL
 from cablejax.report.provenance import machine, versions
-from cablejax.spatial.estimate import UNMODELLED, Estimate, Interval, estimate, estimates_of_halves
+from cablejax.spatial.estimate import UNMODELLED, Estimate, Interval, estimate, estimate_at, estimates_of_halves
 from cablejax.spatial.identify import Identified, identify
 from cablejax.spatial.named import parameters_of
-from cablejax.spatial.newton import fit_at, jackknife
-from cablejax.spatial.windows import Windows
 from pages import markdown_table, publish
 from real_cables.benchmark import protocol_windows
 from real_cables.synthetic import RECORDINGS, SAMPLES, Law, SyntheticCable, synthetic_recordings
@@ -95,16 +94,16 @@ def trial(seed: int, law: Law, cache: Path | None) -> Row:
         state=None if cache is None else cache / f"{seed} {law}.json",
         progress=lambda text: print(f"cable {seed}, {law}: {text}", file=sys.stderr, flush=True),
     )
-    everything = estimate(found, found.values, windows)
+    everything = estimate(found, found.everything, found.cable)
     accepted = [step for step in found.steps if step.accepted]
     return Row(
         seed=seed,
         law=law,
         truth={k: v for k, v in dataclasses.asdict(cable).items() if isinstance(v, float)} | {"laden": cable.laden},
-        halves=[told(half.stiffness) for half in estimates_of_halves(found, windows)],
+        halves=[told(half.stiffness) for half in estimates_of_halves(found)],
         everything=told(everything.stiffness),
         others=others(cable, everything),
-        chosen=[jackknifed(found, half, windows) for half in range(2)],
+        chosen=[jackknifed(found, half) for half in range(2)],
         effects=list(found.effects),
         error_mm=[1e3 * float(step.error.mean()) for step in (accepted[0], accepted[-1])],
         seconds=time.perf_counter() - begun,
@@ -145,12 +144,14 @@ def others(cable: SyntheticCable, everything: Estimate) -> dict[str, list[float]
     return rows
 
 
-def jackknifed(found: Identified, half: int, windows: Windows) -> list[float]:
+def jackknifed(found: Identified, half: int) -> list[float]:
     """EI / rho of a half with the effects that stayed, and its interval from the jackknife alone."""
-    layout, values = found.simulator.layout, found.half_values[half]
-    part = windows.chosen(np.flatnonzero((found.first, ~found.first)[half]))
-    fit = fit_at(found.simulator, values, found.effects, part)
-    return told(Estimate(layout, values.shared, jackknife(fit, layout), np.zeros((layout.size,) * 2)).stiffness)
+    part = found.cable.windows.chosen(np.flatnonzero((found.first, ~found.first)[half]))
+    evidence = found.cable.on(part).evidence()
+    (fit,) = evaluate(evidence, [found.halves[half]])
+    return told(
+        dataclasses.replace(estimate_at(evidence, fit), shifts=np.zeros((1, found.cable.layout.size))).stiffness
+    )
 
 
 def main() -> None:

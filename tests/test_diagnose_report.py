@@ -19,7 +19,10 @@ from cablejax.diagnose.where import localise
 from cablejax.report.diagnosis_charts import ranking_figure
 from cablejax.report.diagnosis_page import write_diagnosis_page
 from cablejax.report.effect_words import effect_place, quantity, share
+from cablejax.simulate.rod import Rod
+from cablejax.spatial.cable import SpatialCable
 from cablejax.spatial.gap import gap_of, noise_of
+from cablejax.spatial.identify import layout_of
 from cablejax.spatial.where import in_log, where_of
 from cablejax.spatial.windows import windows_of
 from diagnose_cases import log_of, poses
@@ -246,6 +249,7 @@ def space(tmp_path_factory):
     """A made-up diagnosis in space that a forward search came to, and its page."""
     log = spatial_cases.recording()
     windows = windows_of(log)
+    cable = SpatialCable(Rod(16, twisting=False), layout_of(windows, spatial_cases.NOMINAL), windows)
     noise, along = noise_of(windows), np.sin(np.pi * np.linspace(0, 1, windows.keypoints.shape[2]))[:, None]
     before, after = (np.nan_to_num(windows.keypoints) + size * along for size in (0.03, 0.004))
     nominal, explained = (in_log(log, windows, part) for part in (before, after))
@@ -264,7 +268,7 @@ def space(tmp_path_factory):
         equivalent=(),
         ranking=(Ranked("bending_stiffness", None, 0.9, 8.0), Ranked("quadratic_drag", None, -3.19, 30.0)),
         leftover_p=None,
-        gap=gap_of(before, after, windows, noise),
+        gap=gap_of(before, after, cable, noise),
         where=where_of(log, windows, nominal, before, noise, ()),
         next_motion=None,
         baselines={},

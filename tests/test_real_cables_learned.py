@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import spatial_cases as cases
-from cablejax.spatial.fit import errors
+from cablejax.spatial.cable import errors
 from cablejax.spatial.windows import windows_of
 from real_cables import network
 from real_cables.residual import fit_residual

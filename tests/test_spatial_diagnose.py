@@ -10,18 +10,18 @@ import numpy as np
 import pytest
 
 import spatial_cases as cases
-from cablejax.diagnose import verdict_json
+from cablejax.bounded import Result
+from cablejax.diagnose import explanation, verdict_json
+from cablejax.diagnose.fit import evaluate, improved
 from cablejax.report.diagnosis_page import write_diagnosis_page
 from cablejax.simulate.rod import Rod
+from cablejax.spatial.cable import SpatialCable, errors
 from cablejax.spatial.clock import on_one_clock
 from cablejax.spatial.diagnose import diagnose_space
-from cablejax.spatial.fit import Simulator, errors
 from cablejax.spatial.gap import noise_of
 from cablejax.spatial.geometry import local_changes
 from cablejax.spatial.identify import layout_of
-from cablejax.spatial.newton import improve
 from cablejax.spatial.search import falls, halves
-from cablejax.spatial.values import shared_by_all
 from cablejax.spatial.windows import windows_of
 
 
@@ -38,19 +38,17 @@ def test_windows_know_what_the_grippers_hold():
 
 def test_a_fit_finds_stiffness_and_damping():
     windows = windows_of(cases.recording())
-    simulator = Simulator(Rod(16, twisting=False), layout_of(windows, cases.NOMINAL, twisting=False))
-    layout = simulator.layout
-    values = shared_by_all(np.zeros(layout.size), windows.group)
-    before = errors(simulator.predict(values, windows), windows).mean()
-    values.shared[layout.slices["damping_time"]] = 0.05
-    effects = ["bending_stiffness", "bending_damping"]
-    fit = improve(simulator, values, effects, windows)
-    after = errors(simulator.predict(fit.values, windows), windows).mean()
-    assert after < 0.1 * before
-    ratio = np.exp(fit.values.shared[layout.slices["log_stiffness"]])
+    cable = SpatialCable(Rod(16, twisting=False), layout_of(windows, cases.NOMINAL), windows)
+    before = errors(cable.motion(explanation()), windows).mean()
+    effects = [cable.layout.named(name) for name in ("bending_stiffness", "bending_damping")]
+    start = explanation(*((effect, 0, (value,)) for effect, value in zip(effects, (1.0, 0.05), strict=True)))
+    evidence = cable.evidence()
+    (fit,) = improved(evidence, evaluate(evidence, [start]), cable.plan.last_steps)
+    assert fit.result is Result.CONVERGED
+    assert errors(cable.motion(fit.explanation), windows).mean() < 0.1 * before
+    (ratio,), (damping,) = fit.explanation.values()
     np.testing.assert_allclose(ratio, cases.TRUE_RATIO, rtol=0.15)
-    np.testing.assert_allclose(fit.values.shared[layout.slices["damping_time"]], cases.TRUE_DAMPING, rtol=0.2)
-    assert not fit.values.shared[~layout.active(effects)].any()
+    np.testing.assert_allclose(damping, cases.TRUE_DAMPING, rtol=0.2)
 
 
 def test_finds_the_file_that_was_gripped_anew():
@@ -100,8 +98,8 @@ def test_gravity_is_the_one_that_the_log_states():
     log = cases.recording()
     gravity = [0.0, -9.81, 0.0]
     windows = windows_of(dataclasses.replace(log, meta={**log.meta, "gravity_m_per_s2": gravity}))
-    layout = layout_of(windows, 0.02, twisting=False)
-    np.testing.assert_allclose(layout.physics(np.zeros(layout.size)).gravity, gravity, rtol=1e-6)
+    layout = layout_of(windows, 0.02)
+    np.testing.assert_allclose(layout.physics(layout.null).gravity, gravity, rtol=1e-6)
 
 
 def test_a_keypoint_that_is_never_seen_is_named():
@@ -152,7 +150,7 @@ def test_names_the_cause_and_goes_on_where_it_was(tmp_path):
     assert interval[0] < 1.1 * cases.TRUE_DAMPING and interval[1] > 0.9 * cases.TRUE_DAMPING  # type: ignore[operator]
     assert "gripper 0" in result.sentence
     again = diagnose_space(log, only=only, state=state)
-    np.testing.assert_array_equal(again.identified.values.shared, result.identified.values.shared)
+    np.testing.assert_array_equal(again.identified.everything.z, result.identified.everything.z)
     page = write_diagnosis_page(result, tmp_path / "report").read_text()
     assert 'id="orbit"' in page and "http://" not in page.replace("http://www.w3.org", "")
     verdict = json.loads((tmp_path / "report" / "verdict.json").read_text())

@@ -5,18 +5,19 @@ from __future__ import annotations
 import dataclasses
 import functools
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import spatial_cases as cases
+from cablejax.diagnose.fit import evaluate, improved
+from cablejax.diagnose.protocol import explanation
 from cablejax.simulate.rod import Rod
+from cablejax.spatial.cable import TWISTED, SpatialCable
 from cablejax.spatial.estimate import UNMODELLED, Interval, estimate
-from cablejax.spatial.fit import Simulator
 from cablejax.spatial.identify import Identified, layout_of
 from cablejax.spatial.named import named_effects, parameters_of
-from cablejax.spatial.newton import improve
 from cablejax.spatial.time_steps import TimeSteps
-from cablejax.spatial.values import shared_by_all
 from cablejax.spatial.windows import windows_of
 
 _FOUND = ("bending_stiffness", "bending_damping")
@@ -26,23 +27,22 @@ _TRUE_STIFFNESS = cases.TRUE_RATIO * cases.NOMINAL
 @pytest.fixture(scope="module")
 def found():
     windows = windows_of(cases.recording())
-    simulator = Simulator(Rod(16, twisting=False), layout_of(windows, cases.NOMINAL, twisting=False))
-    start = shared_by_all(np.zeros(simulator.layout.size), windows.group)
-    start.shared[simulator.layout.slices["damping_time"]] = 0.05
-    values = improve(simulator, start, _FOUND, windows).values
-    first = np.arange(len(windows)) < 2
-    return windows, Identified(simulator, TimeSteps(1, 0.0), _FOUND, _FOUND, (), values, (values, values), first)
+    cable = SpatialCable(Rod(16, twisting=False), layout_of(windows, cases.NOMINAL), windows)
+    start = explanation(*((cable.layout.named(n), 0, (v,)) for n, v in zip(_FOUND, (1.0, 0.05), strict=True)))
+    evidence = cable.evidence()
+    (fit,) = improved(evidence, evaluate(evidence, [start]), 40)
+    first, best = np.arange(len(windows)) < 2, fit.explanation
+    return Identified(cable, TimeSteps(1, 0.0), _FOUND, _FOUND, (), best, (best, best), first)
 
 
 @pytest.fixture(scope="module")
 def estimated(found):
     """The estimate when so many more effects were tried, made once."""
-    windows, identified = found
 
     @functools.cache
     def with_tried(*more: str):
-        tried = dataclasses.replace(identified, tried=tuple(dict.fromkeys((*_FOUND, *more))))
-        return estimate(tried, identified.values, windows)
+        tried = dataclasses.replace(found, tried=tuple(dict.fromkeys((*_FOUND, *more))))
+        return estimate(tried, found.everything, found.cable)
 
     return with_tried
 
@@ -50,7 +50,7 @@ def estimated(found):
 @pytest.fixture(scope="module")
 def everything(found, estimated):
     """With all that the rod without twist can be taught."""
-    return estimated(*found[1].simulator.layout.effects)
+    return estimated(*(e.name for e in found.cable.layout.effects if e.name != TWISTED))
 
 
 def _width(interval):
@@ -71,7 +71,7 @@ def test_is_wider_the_more_may_be_true_and_holds_the_true_value(estimated):
 def test_stiffness_is_per_mass_with_the_markers_since_motion_does_not_tell_theirs_from_the_cables(estimated):
     without, found_with = estimated("viscous_drag").stiffness, estimated("viscous_drag", "lumped_mass")
     where = found_with.layout.slices
-    bare = found_with.ratio(lambda values: values[where["log_stiffness"].start])
+    bare = found_with.ratio(lambda values: jnp.log(values[where["ratio"].start]))
     assert _width(found_with.stiffness) < 1.2 * _width(without) < 0.4 * _width(bare)
     laden, spacing = float(found_with.layout.laden(found_with.shared)), cases.LENGTH / (len(cases.MARKS) + 1)
     assert laden == pytest.approx(1 + found_with.shared[where["marker_mass"]].item() / spacing, rel=1e-3)
@@ -102,15 +102,13 @@ def test_what_is_told_is_wider_by_what_the_law_leaves_out(everything):
 
 
 def test_says_more_from_more_recordings(found, estimated):
-    windows, identified = found
     every = estimated().stiffness
-    two = estimate(identified, identified.values, windows.chosen([0, 1])).stiffness
+    two = estimate(found, found.everything, found.cable.on(found.cable.windows.chosen([0, 1]))).stiffness
     assert _width(every) < 0.7 * _width(two)
 
 
 def test_tells_every_effect_with_its_interval(found, everything):
-    windows, identified = found
-    stiffness, damping = named_effects(identified, everything, 0.05, windows)
+    stiffness, damping = named_effects(found, everything, 0.05)
     assert stiffness.probability is None and damping.probability is None
     (ratio, absolute), (time,) = stiffness.parameters.values(), damping.parameters.values()
     assert absolute.unit == "m^4/s^2" and absolute.value == pytest.approx(ratio.value * cases.NOMINAL)
@@ -118,7 +116,7 @@ def test_tells_every_effect_with_its_interval(found, everything):
     assert ratio.value == pytest.approx(cases.TRUE_RATIO, rel=0.05)
     assert time.value == pytest.approx(cases.TRUE_DAMPING, rel=0.25)
     assert ratio.value == pytest.approx(everything.stiffness.value / cases.NOMINAL)
-    for effect in everything.layout.effects:
+    for effect in (e.name for e in found.cable.layout.effects if e.name != TWISTED):
         parameters, along = parameters_of(effect, everything, 0.05)
         assert (along is None) == (effect != "stiffness_profile")
         for parameter in parameters.values():

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 import spatial_cases as cases
+from cablejax.diagnose.protocol import explanation
 from cablejax.simulate.rod import Rod
-from cablejax.spatial.fit import Simulator
+from cablejax.spatial.cable import SpatialCable
 from cablejax.spatial.identify import layout_of
 from cablejax.spatial.time_steps import time_steps_for
 from cablejax.spatial.windows import Windows, windows_of
@@ -24,8 +25,12 @@ def _swung(factor: float) -> Windows:
     return dataclasses.replace(windows, position=begin + factor * (windows.position - begin))
 
 
+def _cable(windows: Windows) -> SpatialCable:
+    return SpatialCable(Rod(_EDGES, 1, twisting=False), layout_of(windows, cases.NOMINAL), windows)
+
+
 def _found(windows: Windows):
-    return time_steps_for(windows, layout_of(windows, cases.NOMINAL, twisting=False), _EDGES)
+    return time_steps_for(_cable(windows))
 
 
 @pytest.fixture(scope="module")
@@ -42,12 +47,9 @@ def test_a_step_for_every_sample_will_do_for_a_hand():
 def test_fast_grippers_need_more(fast):
     windows, found = fast
     assert found.substeps > 1
-    layout = layout_of(windows, cases.NOMINAL, twisting=False)
-    damped = np.where(layout.active(["bending_damping", "viscous_drag"]), layout.starts, 0.0)
-    once, chosen, exact = (
-        Simulator(Rod(_EDGES, substeps, twisting=False), layout).predict(damped, windows)
-        for substeps in (1, found.substeps, 8)
-    )
+    effects = [_cable(windows).layout.named(name) for name in ("bending_damping", "viscous_drag")]
+    damped = explanation(*((effect, 0, (effect.parameters[0].centre,)) for effect in effects))
+    once, chosen, exact = (_cable(windows).finer(substeps).motion(damped) for substeps in (1, found.substeps, 8))
     assert np.abs(chosen - exact).mean() < 0.5 * np.abs(once - exact).mean()
 
 

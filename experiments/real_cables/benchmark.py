@@ -10,11 +10,12 @@ from collections.abc import Callable
 import numpy as np
 from jaxtyping import Float
 
+from cablejax.diagnose.protocol import Explanation
 from cablejax.npz import read_npz
 from cablejax.recordings.deform import NOMINAL, DeformRecordings
 from cablejax.simulate.rod.clamps import frames_along
+from cablejax.spatial.cable import errors, over_all_markers
 from cablejax.spatial.estimate import estimates_of_halves
-from cablejax.spatial.fit import errors, over_all_markers
 from cablejax.spatial.identify import Identified, identify
 from cablejax.spatial.windows import Windows
 from real_cables.network import fit_network
@@ -101,26 +102,27 @@ def score_cable(recordings: DeformRecordings, *, state: pathlib.Path, progress: 
     train, kept = (windows.chosen(np.flatnonzero(split == name)) for name in ("train", "eval"))
     nominal = NOMINAL.bending_stiffness / NOMINAL.linear_density
     found = identify(train, nominal, state=state / f"{recordings.name}_search.json", progress=progress)
-    simulator = found.simulator
     # scored as published: every frame, whatever was lost in between
     whole = dataclasses.replace(kept, valid=np.ones_like(kept.valid))
 
     by_recording = {name: np.zeros_like(train.keypoints) for name in _LEARNED}
     networks = []
-    for k, (values, half) in enumerate(zip(found.half_values, (found.first, ~found.first), strict=True)):
+    for k, one in enumerate(found.halves):
+        half = found.first if k == 0 else ~found.first
         part, other = (train.chosen(np.flatnonzero(use)) for use in (half, ~half))
         # a recording that is not seen has no values of its own; nor have those that its corrections are learned from
-        fitted, unseen = (simulator.predict(values.shared, w) for w in (part, other))
+        fitted, unseen = (found.cable.on(w).motion(shared_only(one)) for w in (part, other))
         progress(f"learning corrections, half {k + 1}")
         path = state / f"{recordings.name}_half{k + 1}.npz"
         corrected, network = _learned(fitted, part, unseen, other, path, progress)
         networks.append(network)
         for name, predicted in corrected.items():
             by_recording[name][~half] = predicted
-    final = simulator.predict(found.values, whole)
+    on_whole, everything = found.cable.on(whole), found.everything
+    final = on_whole.motion(everything)
     progress("learning corrections, all of train")
     path = state / f"{recordings.name}_all.npz"
-    on_eval, network = _learned(simulator.predict(found.values, train), train, final, whole, path, progress)
+    on_eval, network = _learned(found.cable.motion(everything), train, final, whole, path, progress)
 
     def metric(predicted, of) -> Float[np.ndarray, "W"]:
         return 1e3 * over_all_markers(errors(predicted, of), of)
@@ -128,7 +130,7 @@ def score_cable(recordings: DeformRecordings, *, state: pathlib.Path, progress: 
     stages, share = [], train.keypoints.shape[2] / train.n_keypoints
     for step in found.steps:
         if step.accepted:
-            scored = [metric(simulator.predict(values, whole), whole).mean() for values in step.values]
+            scored = [metric(on_whole.motion(one), whole).mean() for one in step.halves]
             name = f"+ {step.effect}" if step.effect else "nominal"
             stages.append((name, 1e3 * share * float(step.error.mean()), float(np.mean(scored))))
     learned, draws = [], np.random.default_rng(0)
@@ -141,15 +143,18 @@ def score_cable(recordings: DeformRecordings, *, state: pathlib.Path, progress: 
     return CableScore(
         stages=tuple(stages),
         learned=tuple(learned),
-        without_own=float(metric(simulator.predict(found.values.shared, whole), whole).mean()),
-        simulated=tuple(found.stiffness(values) for values in found.half_values),
-        estimated=tuple(
-            dataclasses.astuple(half.stiffness) for half in estimates_of_halves(found, train, progress=progress)
-        ),
+        without_own=float(metric(on_whole.motion(shared_only(everything)), whole).mean()),
+        simulated=tuple(found.stiffness(one) for one in found.halves),
+        estimated=tuple(dataclasses.astuple(half.stiffness) for half in estimates_of_halves(found, progress=progress)),
         seconds=_seconds(found, windows),
         effects=found.effects,
         networks=(network, *networks),
     )
+
+
+def shared_only(one: Explanation) -> Explanation:
+    """Without what single recordings have for their own."""
+    return one.moved(one.z, np.zeros_like(one.own))
 
 
 def _learned(fitted, windows: Windows, simulated, others: Windows, path: pathlib.Path, progress):
@@ -179,7 +184,7 @@ def _seconds(found: Identified, windows: Windows) -> tuple[float, float]:
         repeats = []
         for _ in range(5):
             begun = time.perf_counter()
-            found.simulator.predict(found.values, part)
+            found.cable.on(part).motion(found.everything)
             repeats.append(time.perf_counter() - begun)
         times.append(float(np.median(repeats)))
     return times[0], times[1]

@@ -23,11 +23,12 @@ import optax
 from flax import nnx
 from jaxtyping import Float
 
+from cablejax.diagnose.refits import dealt
 from cablejax.dynamics.config import ModelConfig
 from cablejax.dynamics.gns import EncodeProcessDecode
 from cablejax.dynamics.graph import topology_of
 from cablejax.simulate.compile import compiler_options
-from cablejax.spatial.windows import Windows, dealt
+from cablejax.spatial.windows import Windows
 from real_cables.features import earlier, in_frame, moving_frame
 
 _MOVED = (0.05, 0.1, 0.2, 0.4)  # [s]

@@ -17,7 +17,8 @@ import itertools
 import numpy as np
 from jaxtyping import Float
 
-from cablejax.spatial.windows import Windows, dealt
+from cablejax.diagnose.refits import dealt
+from cablejax.spatial.windows import Windows
 from real_cables.features import clamp_history, earlier, in_frame, moving_frame
 
 _VELOCITY = 0.05  # [s], over which the simulated markers' velocity is taken

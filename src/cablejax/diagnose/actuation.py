@@ -238,7 +238,8 @@ def with_arms(conclusion: Conclusion, arms: Actuation, calibration: Calibration)
 
 def _chances(arms: Actuation, calibration: Calibration) -> dict[tuple[str, ...], float]:
     """Probability of every set of effects of the arms, by the rule of `belief`: errors of motions that a fit has not
-    seen, tempered for what laws of arms get wrong, and a cost for every effect."""
+    seen, tempered for what laws of arms get wrong, and a cost for every effect.
+    """
     calibration = dataclasses.replace(calibration, baseline=_NEGLIGIBLE)
     temper = calibration.temper(arms.unseen[()], _ENCODER_NOISE)
     scores = [

@@ -109,7 +109,8 @@ def explains_most_motions(fit: Fit, null: Fit, evidence: Evidence, calibration: 
 
 def as_good(fit: Fit, best: Fit, evidence: Evidence, calibration: Calibration) -> bool:
     """Whether a fit leaves little more of the gap than the best, over the whole log and in at least half of its
-    motions: one motion that nothing explains makes all explanations look alike."""
+    motions: one motion that nothing explains makes all explanations look alike.
+    """
     whole = excess(float(fit.sse.sum()), evidence) <= calibration.as_good * excess(float(best.sse.sum()), evidence)
     least = np.maximum(left_by_motion(best, evidence), calibration.smallest_gap(level(evidence)))
     return whole and float(np.mean(left_by_motion(fit, evidence) <= calibration.as_good * least)) >= 0.5

@@ -13,6 +13,23 @@ from cablejax.diagnose.repeats import share_of_motion
 
 
 @dataclasses.dataclass(frozen=True)
+class Robust:
+    """Pseudo-Huber loss 2 d^2 (sqrt(1 + (r / d)^2) - 1) of the distance r between predicted and observed points.
+
+    A simulation that swings over another way must not decide alone, and one that breaks down is one bad episode.
+
+    Attributes:
+        distance: d, in the unit of the observations.
+        lost: distance at which a point counts whose prediction broke down.
+        steepest: derivative by a coordinate from which on it has broken down.
+    """
+
+    distance: float
+    lost: float
+    steepest: float = 1e3
+
+
+@dataclasses.dataclass(frozen=True)
 class Evidence:
     """What a recording says. Lengths and errors are in the unit of the observations.
 
@@ -26,6 +43,7 @@ class Evidence:
         freedom: of Student's distribution over episodes, see `belief`.
         motion: episodes with the same number repeat one another, see `repeats`, shape [E].
         fit_freedom: of the distribution that fits maximise; None = `freedom`.
+        robust: loss of the distances between points, over the last axis; None = squares.
     """
 
     simulator: Simulator
@@ -37,6 +55,7 @@ class Evidence:
     freedom: float
     motion: Int[np.ndarray, "E"]
     fit_freedom: float | None = None
+    robust: Robust | None = None
 
     def restricted(self, rows: Sequence[int] | Int[np.ndarray, "_"]) -> Evidence:
         """The evidence of some of its episodes only."""

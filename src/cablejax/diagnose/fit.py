@@ -121,7 +121,7 @@ class Fit:
         return Fit(self.explanation, self.sse[rows], self.gradient[rows], self.curvature[rows], recording)
 
     def held_out_sse(self, evidence: Evidence) -> Float[np.ndarray, "E"]:
-        """r'r of every episode if its motion had been left out of the fit: by `refits` where there are some.
+        """R'r of every episode if its motion had been left out of the fit: by `refits` where there are some.
 
         Else by one Gauss-Newton step without the episodes of this motion. Where that leads too far to be believed,
         because this motion alone shows the effect, or because there is no other, its episodes pay twice the number of
@@ -164,23 +164,51 @@ def _evaluated(evidence: Evidence, portion: Sequence[Explanation]) -> Iterator[F
     simulator = evidence.simulator
     portion = [simulator.with_own(one) for one in portion]
     linearised = simulator.linearise(portion, evidence.episodes)
-    unseen = ~np.isfinite(evidence.observed).reshape(len(evidence.observed), -1)
     for one, (predicted, slopes) in zip(portion, linearised, strict=True):
-        r = evidence.whitened(predicted)
-        broken = np.asarray(~np.isfinite(r).all(axis=1))
-        jacobian = np.asarray(slopes / evidence.noise, np.float64).reshape(len(slopes), *r.shape)
-        # in place: these are the largest arrays of a diagnosis
-        jacobian[:, unseen] = 0.0
-        # a breakdown next door gives no derivative
-        jacobian[~np.isfinite(jacobian).all(axis=2)] = 0.0
-        jacobian[:, broken], r[broken] = 0.0, 0.0
+        weighted = _squares if evidence.robust is None else _robust
+        sse, r, jacobian = weighted(evidence, predicted, slopes)
         yield Fit(
             explanation=one,
-            sse=np.where(broken, _BREAKDOWN, np.einsum("em,em->e", r, r)),
+            sse=sse,
             gradient=np.einsum("pem,em->ep", jacobian, r),
             curvature=np.einsum("pem,qem->epq", jacobian, jacobian, optimize=True),
             recording=np.asarray(simulator.recording, int)[evidence.episodes] if one.own.size else np.zeros(0, int),
         )
+
+
+def _squares(evidence: Evidence, predicted, slopes):
+    """Sums of squares, whitened residuals and derivatives; an episode that broke down counts as a whole."""
+    unseen = ~np.isfinite(evidence.observed).reshape(len(evidence.observed), -1)
+    r = evidence.whitened(predicted)
+    broken = np.asarray(~np.isfinite(r).all(axis=1))
+    jacobian = np.asarray(slopes / evidence.noise, np.float64).reshape(len(slopes), *r.shape)
+    # in place: these are the largest arrays of a diagnosis
+    jacobian[:, unseen] = 0.0
+    # a breakdown next door gives no derivative
+    jacobian[~np.isfinite(jacobian).all(axis=2)] = 0.0
+    jacobian[:, broken], r[broken] = 0.0, 0.0
+    return np.where(broken, _BREAKDOWN, np.einsum("em,em->e", r, r)), r, jacobian
+
+
+def _robust(evidence: Evidence, predicted, slopes):
+    """The same with the loss of `Evidence.robust`; what broke down counts point by point."""
+    loss = evidence.robust
+    assert loss is not None
+    seen = np.isfinite(evidence.observed).all(axis=-1)
+    lost = ~np.isfinite(predicted).all(axis=-1)
+    if len(slopes):
+        lost |= ~(np.abs(slopes).max(axis=(0, -1)) < loss.steepest)
+    use = (seen & ~lost)[..., None]
+    miss = np.where(use, predicted - np.where(use, evidence.observed, 0.0), 0.0)
+    root = np.sqrt(1 + (miss**2).sum(axis=-1, keepdims=True) / loss.distance**2)
+    unit = 2 * (loss.distance / evidence.noise) ** 2 * np.ones_like(root)
+    inner = tuple(range(1, root.ndim))
+    sse = (unit * np.where(use, root - 1, 0.0)).sum(axis=inner)
+    sse += (unit * (seen & lost)[..., None]).sum(axis=inner) * loss.lost / loss.distance
+    scale = np.where(use, 1 / (np.sqrt(root) * evidence.noise), 0.0)
+    jacobian = np.where(use, slopes, 0.0)
+    jacobian *= scale
+    return sse, (miss * scale).reshape(len(miss), -1), jacobian.reshape(len(slopes), len(miss), -1)
 
 
 def improve(

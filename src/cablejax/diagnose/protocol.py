@@ -102,6 +102,13 @@ class Explanation:
         """Names of the effects."""
         return tuple(term.effect.name for term in self.terms)
 
+    def without(self, name: str) -> Explanation:
+        """The same without one of its effects."""
+        kept = [(term, z) for term, z in self.by_term() if term.effect.name != name]
+        return Explanation(
+            tuple(term for term, _ in kept), np.concatenate([np.zeros(0), *(z for _, z in kept)]), self.own
+        )
+
     def moved(self, z: Float[np.ndarray, "P"], own: Float[np.ndarray, "R M"] | None = None) -> Explanation:
         """The same effects with other values; what is a recording's own stays where none is given."""
         return dataclasses.replace(self, z=z, own=self.own if own is None else own)
@@ -181,8 +188,15 @@ class Simulator(abc.ABC):
     def with_own(self, one: Explanation) -> Explanation:
         """The explanation with a row of own numbers for each recording: 0 where it has none yet."""
         count = self.own(one)
-        shape = (1 + max(self.recording), count) if count else (0, 0)
-        return one if one.own.shape == shape else dataclasses.replace(one, own=np.zeros(shape))
+        if not count:
+            return one if not one.own.size else dataclasses.replace(one, own=np.zeros((0, 0)))
+        kept = one.own if one.own.shape[1] == count else np.zeros((0, count))
+        more = 1 + max(self.recording) - len(kept)
+        return (
+            one
+            if more <= 0 and kept is one.own
+            else dataclasses.replace(one, own=np.pad(kept, ((0, max(more, 0)), (0, 0))))
+        )
 
     @abc.abstractmethod
     def predict(self, explanations: Sequence[Explanation], episodes: Int[np.ndarray, "e"]) -> np.ndarray:

@@ -31,7 +31,8 @@ _SEGMENT_SAMPLES = 200
 @dataclasses.dataclass(frozen=True)
 class _Pair:
     """Both grippers: middle [m], heading of the line from one to the other [rad], their distance [m], and the angle of
-    either gripper to that line [rad]."""
+    either gripper to that line [rad].
+    """
 
     middle: Float[np.ndarray, "2"]
     heading: float
@@ -52,7 +53,8 @@ class _Pair:
 
 def starting_pose(gripper_pose: Float[np.ndarray, "E T 2 3"]) -> Float[np.ndarray, "2 3"]:
     """The first pose from which a next motion starts: that of the episode that begins with the grippers furthest apart,
-    whatever the order of the episodes."""
+    whatever the order of the episodes.
+    """
     first = np.asarray(gripper_pose, np.float64)[:, 0]
     return first[np.argmax(np.linalg.norm(first[:, 1, :2] - first[:, 0, :2], axis=-1))]
 

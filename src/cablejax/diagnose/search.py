@@ -102,12 +102,7 @@ def _promising(starts: Sequence[Explanation], screened: dict[str, float]) -> lis
 
 def without_one(whole: Explanation) -> list[Explanation]:
     """The explanation without each of its effects."""
-    result = []
-    for name in effect_names(whole):
-        kept = [(t, z) for t, z in whole.by_term() if t.effect.name != name]
-        z = np.concatenate([np.zeros(0), *(z for _, z in kept)])
-        result.append(Explanation(tuple(t for t, _ in kept), z, whole.own))
-    return result
+    return [whole.without(name) for name in effect_names(whole)]
 
 
 def _grown(evidence: Evidence, base: Explanation) -> list[Fit]:

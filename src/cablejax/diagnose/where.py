@@ -231,7 +231,7 @@ def _contrasts(residual, noise, squared, regimes: Regimes, motion) -> dict[str, 
     floor = float((noise**2).mean())
 
     def size(mask) -> np.ndarray:
-        """log of the square above the noise of each episode; bounded where it is all noise."""
+        """Log of the square above the noise of each episode; bounded where it is all noise."""
         square = np.where(mask, (squared - 1.0) * noise**2, 0.0).sum(axis=(1, 2)) / np.maximum(mask.sum(axis=(1, 2)), 1)
         return np.log(np.maximum(square, 0.0) + 0.1 * floor)
 

@@ -14,14 +14,16 @@ from cablejax.bounded import Result
 from cablejax.diagnose.belief import Calibration
 from cablejax.diagnose.diagnosis import CableDiagnosis, Gap, Ranked, Verdict
 from cablejax.diagnose.judgement import judged, verdict_sentence
+from cablejax.diagnose.protocol import explanation
 from cablejax.spatial.clock import on_one_clock
+from cablejax.spatial.effects import GRIP
 from cablejax.spatial.estimate import estimate
 from cablejax.spatial.gap import RESOLVABLE, gap_of, noise_of
 from cablejax.spatial.geometry import LocalChange, local_changes
 from cablejax.spatial.identify import EDGES, Identified, identify
 from cablejax.spatial.named import named_effects
 from cablejax.spatial.where import in_log, where_of
-from cablejax.spatial.windows import WINDOW, Windows, windows_of
+from cablejax.spatial.windows import WINDOW, windows_of
 from cablejax.types import GapLog
 
 _CALIBRATION = Calibration()
@@ -34,12 +36,10 @@ class SpatialDiagnosis(CableDiagnosis):
     Attributes:
         changes: places and files where the set-up differs from the rest.
         identified: the simulator with the effects that were found.
-        windows: that it was found from.
     """
 
     changes: tuple[LocalChange, ...]
     identified: Identified
-    windows: Windows
 
 
 def diagnose_space(
@@ -51,7 +51,7 @@ def diagnose_space(
 ) -> SpatialDiagnosis:
     """Diagnoses a log of a cable that hangs between two grippers and moves.
 
-    Episodes whose `split` is "eval" are left untouched. Everything is told per mass, since the motion of a hanging
+    Episodes whose `split` is "eval" are left untouched. Everything is reported per mass, since the motion of a hanging
     cable does not depend on its weight.
 
     Args:
@@ -78,16 +78,14 @@ def diagnose_space(
         progress(change.sentence)
     found = identify(windows, stiffness, only=only, state=state, progress=progress)
 
-    nothing = np.zeros(found.simulator.layout.size)
-    before = found.simulator.predict(nothing, windows)
-    after = found.unseen(windows)
+    before, after = found.cable.motion(explanation()), found.unseen()
     noise = noise_of(windows)
-    gap = gap_of(before, after, windows, noise)
+    gap = gap_of(before, after, found.cable, noise)
     verdict, equivalent = _verdict(gap, found), _equivalent(found)
     effects = ()
     if verdict not in ("none", "unknown"):
-        told = estimate(found, found.values, windows, progress=progress)
-        effects = named_effects(found, told, cable["linear_density_kg_per_m"], windows)
+        everything = estimate(found, found.everything, found.cable, progress=progress)
+        effects = named_effects(found, everything, cable["linear_density_kg_per_m"])
     first = [change.sentence for change in changes[:1]]
     nominal, explained = (in_log(log, windows, part) for part in (before, after))
     where = where_of(log, windows, nominal, before, noise, changes)
@@ -112,7 +110,6 @@ def diagnose_space(
         settings={"edges": EDGES, "window_s": WINDOW, "jax": jax.__version__, "devices": jax.default_backend()},
         changes=changes,
         identified=found,
-        windows=windows,
     )
 
 
@@ -167,7 +164,7 @@ def _caveats(log, windows, left_out, found) -> tuple[str, ...]:
         "effects alone, whose values differ from these where something that was not named is there nevertheless.",
     ]
     if "gripper_rotation_offset" in found.effects:
-        own = found.values.own[:, found.simulator.layout.slices["clamp_rotation"]]
+        own = GRIP * found.everything.own[np.unique(windows.group)]
         result.append(
             "How the cable sits in the grippers is fitted for each recording: it differs by "
             f"{np.sqrt((own**2).mean()):.2f} rad (root mean square) from the mean that is named. Recordings that no "

@@ -1,4 +1,4 @@
-"""What recordings tell of a cable: EI / rho and the parameters of all effects that were tried, with 90 % intervals.
+"""Estimates of a cable: EI / rho and the parameters of all effects that were tried, with 90 % intervals.
 
 An effect stays in the search when recordings that no fit has seen are simulated better with it. That is strict: drag, a
 stiffness profile or a recording's own grip may be there and yet not help elsewhere, and what is left out pulls the
@@ -6,7 +6,7 @@ others' values the same way in all recordings, where no resampling of the record
 simulate with is not what the cable is. Here all effects that were tried are free, chosen or not, and an interval has
 two parts: how a value changes when recordings are left out (jackknife), and how it changes when the priors move by
 their standard deviation, which is how far the fit may be drawn towards them. What a cable has beyond the law that is
-fitted shows in neither; what is told of an effect (`named`) is wider by what that does to synthetic cables.
+fitted shows in neither; what is reported of an effect (`named`) is wider by what that does to synthetic cables.
 """
 
 from __future__ import annotations
@@ -21,16 +21,19 @@ import numpy as np
 from jaxtyping import Array, Float
 from scipy.stats import norm, t
 
+from cablejax.bounded import solve_arrow
+from cablejax.diagnose.evidence import Evidence
+from cablejax.diagnose.fit import Fit, evaluate, improved
+from cablejax.diagnose.protocol import Explanation, explanation
+from cablejax.spatial.cable import SpatialCable
 from cablejax.spatial.effects import Layout
 from cablejax.spatial.identify import Identified, affordable
-from cablejax.spatial.newton import improve, jackknife, prior_shifts
-from cablejax.spatial.values import Values
-from cablejax.spatial.windows import Windows
 
 # Predictions may be off by what a time step does; values are not to make up for it. The fit ends with time steps that
 # are so much shorter.
 _FINER = 4
 _TAIL = 0.95
+_LARGEST_STEP = 1.0
 
 Quantity = Callable[[Float[Array, "P"]], Float[Array, ""]]
 """Something that follows from the values of all effects, differentiably."""
@@ -81,14 +84,14 @@ class Estimate:
     Attributes:
         layout: of the values.
         shared: values that all recordings share, shape [P].
-        moves: what leaving out each recording does to them, see `newton.jackknife`, shape [R, P].
-        shifts: what moving each value's prior does to them, see `newton.prior_shifts`, shape [P, P].
+        moves: what leaving out each recording does to them, see `jackknife`, shape [R, P].
+        shifts: what moving each prior by its standard deviation does to them, see `estimate_at`, shape [K, P].
     """
 
     layout: Layout
     shared: Float[np.ndarray, "P"]
     moves: Float[np.ndarray, "R P"]
-    shifts: Float[np.ndarray, "P P"]
+    shifts: Float[np.ndarray, "K P"]
 
     def of(self, quantity: Quantity) -> Interval:
         """A quantity, its interval by its slope at the fitted values."""
@@ -104,7 +107,7 @@ class Estimate:
         return Interval(*np.exp(dataclasses.astuple(self.of(log))).tolist())
 
     def positive(self, field: str) -> Interval:
-        """A positive value, by the name of its block in `effects`; what is per mass is per that of the laden cable."""
+        """A positive value, by the name of its field in `effects`; what is per mass is per that of the laden cable."""
         where = self.layout.slices[field].start
 
         def log(values):
@@ -122,8 +125,8 @@ class Estimate:
 
 def estimate(
     found: Identified,
-    start: Values,
-    windows: Windows,
+    start: Explanation,
+    cable: SpatialCable,
     *,
     progress: Callable[[str], None] = lambda text: None,
 ) -> Estimate:
@@ -131,34 +134,70 @@ def estimate(
 
     Args:
         found: what was tried.
-        start: values to start from, fitted to the same windows with the effects that stayed.
-        windows: to fit.
+        start: explanation to start from, fitted to the same windows with the effects that stayed.
+        cable: in the windows to fit.
         progress: called with a line of text.
     """
-    layout = found.simulator.layout
-    # a positive value that is off starts at its prior's median: the logarithm of nothing leads nowhere
-    off = layout.active(found.tried) & ~np.isnan(layout.starts) & (start.shared == 0)
-    start = dataclasses.replace(start, shared=np.where(off, layout.starts, start.shared))
-    chosen = windows.chosen(np.flatnonzero(affordable(found.simulator, windows)))
-    progress(f"all effects free: {len(chosen)} windows")
-    fit = improve(found.simulator, start, found.tried, chosen, progress=progress)
-    progress(f"the same with time steps of 1/{_FINER}")
-    fit = improve(found.simulator.finer(_FINER), fit.values, found.tried, chosen, progress=progress)
-    return Estimate(layout, fit.values.shared, jackknife(fit, layout), prior_shifts(fit, layout))
+    more = [effect for effect in cable.layout.effects if effect.name in found.tried and effect.name not in start.names]
+    # a positive value that is absent starts at its prior's median: the logarithm of nothing leads nowhere
+    added = explanation(*((effect, 0, [p.centre for p in effect.parameters]) for effect in more))
+    start = Explanation((*start.terms, *added.terms), np.append(start.z, added.z), start.own)
+    windows = cable.windows
+    cable = cable.on(windows.chosen(np.flatnonzero(affordable(start, windows))))
+    progress(f"all effects free: {len(cable.windows)} windows")
+    for name, finer in (("", cable), (f"the same with time steps of 1/{_FINER}", cable.finer(_FINER))):
+        if name:
+            progress(name)
+        evidence = finer.evidence()
+        (fit,) = improved(evidence, evaluate(evidence, [start]), finer.plan.last_steps)
+        start = fit.explanation
+    return estimate_at(evidence, fit)
+
+
+def estimate_at(evidence: Evidence, fit: Fit) -> Estimate:
+    """The estimate that a fit of a cable's windows amounts to.
+
+    With S the curvature of the cost in prior standard deviations, the recordings' own values eliminated, the fit is off
+    the true values by -S^-1 times these, were there no errors in the data: it is drawn towards the prior. On average
+    over the prior the square of that, for anything linear in the values, is the sum of its squares over rows.
+    """
+    cable, one = evidence.simulator, fit.explanation
+    assert isinstance(cable, SpatialCable)
+    # of the vector by the coordinates
+    slopes = cable.directions(one)[0][: len(one.z)]
+    shifts = np.linalg.inv(fit.precision(evidence))
+    return Estimate(cable.layout, one.vector(cable.effects), jackknife(evidence, fit) @ slopes, shifts @ slopes)
+
+
+def jackknife(evidence: Evidence, fit: Fit) -> Float[np.ndarray, "R K"]:
+    """What leaving out each recording does to the shared coordinates, by one Gauss-Newton step (Miller 1974).
+
+    Scaled so that the standard error of anything linear in them is the root of its sum of squares over rows.
+    """
+    group = np.asarray(evidence.simulator.recording)[evidence.episodes]
+    label = group if len(np.unique(group)) > 1 else np.arange(len(group))
+    weight, names = evidence.weight(fit.sse), np.unique(label)
+
+    def step(use):
+        model = fit.model(np.where(use, weight, 0.0), 0.0)
+        found = -solve_arrow(model.curvature, model.gradient, model.blocks)
+        return (found * min(1.0, _LARGEST_STEP / max(np.abs(found).max(initial=0.0), 1e-12)))[: len(fit.explanation.z)]
+
+    full = step(np.ones(len(label), bool))
+    return np.sqrt((len(names) - 1) / len(names)) * np.array([step(label != name) - full for name in names])
 
 
 def estimates_of_halves(
-    found: Identified, windows: Windows, *, progress: Callable[[str], None] = lambda text: None
+    found: Identified, *, progress: Callable[[str], None] = lambda text: None
 ) -> tuple[Estimate, Estimate]:
     """`estimate` from either half of the recordings, as the search split them.
 
     Args:
-        found: from these windows.
-        windows: of all recordings.
+        found: by `identify`.
         progress: called with a line of text.
     """
     one, other = (
-        estimate(found, values, windows.chosen(np.flatnonzero(half)), progress=progress)
-        for values, half in zip(found.half_values, (found.first, ~found.first), strict=True)
+        estimate(found, start, found.cable.on(found.cable.windows.chosen(np.flatnonzero(half))), progress=progress)
+        for start, half in zip(found.halves, (found.first, ~found.first), strict=True)
     )
     return one, other

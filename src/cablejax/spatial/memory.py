@@ -13,17 +13,18 @@ from typing import Any
 import numpy as np
 
 from cablejax.bounded import Result
+from cablejax.diagnose.protocol import Explanation, Term
 from cablejax.json_file import read_json
-from cablejax.simulate.rod import Rod
+from cablejax.spatial.cable import SpatialCable
+from cablejax.spatial.effects import Layout
 from cablejax.spatial.search import Step
-from cablejax.spatial.values import Values, from_json, to_json
-from cablejax.spatial.windows import Windows
 from cablejax.whole_file import whole_file
 
 
-def fingerprint(rod: Rod, windows: Windows, nominal_stiffness: float, names: Sequence[str]) -> str:
+def fingerprint(cable: SpatialCable, names: Sequence[str]) -> str:
     """What a kept state must have been made from to be of use."""
-    digest = hashlib.sha256(repr((rod, float(nominal_stiffness), list(names), windows.name)).encode())
+    layout, windows = cable.layout, cable.windows
+    digest = hashlib.sha256(repr((cable.rod, layout.nominal_stiffness, list(names), windows.name)).encode())
     for array in (windows.keypoints, windows.position, windows.valid, windows.group):
         digest.update(np.ascontiguousarray(array).tobytes())
     return digest.hexdigest()
@@ -32,8 +33,8 @@ def fingerprint(rod: Rod, windows: Windows, nominal_stiffness: float, names: Seq
 class Memory:
     """What is done, in one JSON file that is written whole."""
 
-    def __init__(self, path: pathlib.Path | None, fingerprint: str):
-        self._path = path
+    def __init__(self, path: pathlib.Path | None, fingerprint: str, layout: Layout):
+        self._path, self._layout = path, layout
         self._held: dict[str, Any] = {"fingerprint": fingerprint}
         if path is not None and path.exists():
             # what cannot be read is found again
@@ -43,11 +44,12 @@ class Memory:
                     self._held = found
 
     def steps(self, name: str) -> list[Step]:
+        """Steps of a search that was begun."""
         return [
             Step(
                 s["effect"],
                 s["accepted"],
-                (from_json(s["values"][0]), from_json(s["values"][1])),
+                (self._read(s["halves"][0]), self._read(s["halves"][1])),
                 np.array(s["error"]),
                 s["chance"],
             )
@@ -55,19 +57,29 @@ class Memory:
         ]
 
     def keep(self, name: str, steps: Sequence[Step]) -> None:
-        self._write(
-            name,
-            [
-                {**dataclasses.asdict(s), "values": [to_json(v) for v in s.values], "error": s.error.tolist()}
-                for s in steps
-            ],
-        )
+        """Keeps the steps of a search."""
+        plain = [
+            {
+                **{f.name: getattr(s, f.name) for f in dataclasses.fields(s)},
+                "halves": [_plain(half) for half in s.halves],
+                "error": s.error.tolist(),
+            }
+            for s in steps
+        ]
+        self._write(name, plain)
 
-    def finals(self) -> list[tuple[Values, Result]]:
-        return [(from_json(kept), Result(kept["result"])) for kept in self._held.get("fits", [])]
+    def finals(self) -> list[tuple[Explanation, Result]]:
+        """Last fits that are done."""
+        return [(self._read(kept), Result(kept["result"])) for kept in self._held.get("fits", [])]
 
-    def keep_finals(self, finals: Sequence[tuple[Values, Result]]) -> None:
-        self._write("fits", [{**to_json(values), "result": int(result)} for values, result in finals])
+    def keep_finals(self, finals: Sequence[tuple[Explanation, Result]]) -> None:
+        """Keeps the last fits."""
+        self._write("fits", [{**_plain(one), "result": int(result)} for one, result in finals])
+
+    def _read(self, kept: dict[str, Any]) -> Explanation:
+        own = np.array(kept["own"], float)
+        terms = tuple(Term(self._layout.named(name), 0) for name in kept["effects"])
+        return Explanation(terms, np.array(kept["z"], float), own if own.size else np.zeros((0, 0)))
 
     def _write(self, name, value):
         self._held[name] = value
@@ -76,3 +88,7 @@ class Memory:
         self._path.parent.mkdir(parents=True, exist_ok=True)
         with whole_file(self._path) as stream:
             stream.write(json.dumps(self._held).encode())
+
+
+def _plain(one: Explanation) -> dict[str, Any]:
+    return {"effects": list(one.names), "z": one.z.tolist(), "own": one.own.tolist()}

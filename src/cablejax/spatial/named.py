@@ -12,24 +12,22 @@ from cablejax.diagnose.diagnosis import NamedEffect, ParameterEstimate
 from cablejax.spatial.effects import CURVATURE_KNOTS, PROFILE_KNOTS
 from cablejax.spatial.estimate import UNMODELLED, Estimate, Interval
 from cablejax.spatial.identify import Identified
-from cablejax.spatial.windows import Windows
 
 # A marker that is this near to its nominal place is not told as displaced [m].
 _PLACED = 1e-3
 
 
-def named_effects(found: Identified, estimate: Estimate, density: float, windows: Windows) -> tuple[NamedEffect, ...]:
+def named_effects(found: Identified, estimate: Estimate, density: float) -> tuple[NamedEffect, ...]:
     """The effects that stayed in the search, with parameters and 90 % intervals.
 
     Args:
         found: by `identify`.
         estimate: from the same windows. What is told comes from it, not from the values that predictions are made with.
         density: mass per length, with the markers, that is believed true [kg/m], for what is known per mass only.
-        windows: that it was found from.
     """
     named = []
     for name in found.effects:
-        parameters, along = parameters_of(name, estimate, density, first_marker=windows.held[0])
+        parameters, along = parameters_of(name, estimate, density, first_marker=found.cable.windows.held[0])
         location = {"along_cable_m": along, "time_s": None, "table_m": None}
         named.append(NamedEffect(name, None, parameters, location))
     return tuple(named)

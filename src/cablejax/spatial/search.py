@@ -4,6 +4,12 @@ Recordings are split into two halves. Both halves are fitted separately all alon
 fit of the other half. At each step the effect is tried with which unseen windows are simulated best
 from the start; it stays if the error on unseen recordings falls by more than a hundredth, and in more than 84 % of
 resamples of the recordings, one standard error. After two effects in a row that did not, the search ends.
+
+Fits, priors, losses and what is a recording's own are those of every diagnosis. This search is not: that of
+`cablejax.diagnose.search` fits all candidates of a step and believes the likelihood of whole episodes with a
+calibration from labelled logs. Here one fit takes as long as that search, and there are no labelled logs, so candidates
+are ordered by what one Gauss-Newton step promises and judged by resampling; probabilities do not follow from that, and
+none are reported.
 """
 
 from __future__ import annotations
@@ -14,14 +20,18 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from cablejax.spatial.fit import Simulator, errors
-from cablejax.spatial.newton import RodFit, fit_at, improve, moved_by, newton_step
-from cablejax.spatial.values import Values, shared_by_all
-from cablejax.spatial.windows import Windows, dealt
+from cablejax.bounded import solve_arrow
+from cablejax.diagnose.evidence import Evidence
+from cablejax.diagnose.fit import evaluate, improved
+from cablejax.diagnose.protocol import Explanation, Term, explanation
+from cablejax.diagnose.refits import dealt
+from cablejax.spatial.cable import SpatialCable, mean_error
+from cablejax.spatial.effects import SpatialEffect
 
 _FAILURES = 2
 _LEAST = 0.01
 _CHANCE = 0.84
+_DAMPING, _LARGEST_STEP = 1e-3, 1.0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -31,14 +41,14 @@ class Step:
     Attributes:
         effect: its name; "" for the nominal simulator.
         accepted: whether it stayed.
-        values: of both halves' fits.
+        halves: fits of both halves.
         error: mean absolute error of each window's free coordinates, from the fit that has not seen it [m], shape [W].
         chance: share of resamples of the recordings in which the error falls.
     """
 
     effect: str
     accepted: bool
-    values: tuple[Values, Values]
+    halves: tuple[Explanation, Explanation]
     error: Float[np.ndarray, "W"]
     chance: float
 
@@ -52,24 +62,17 @@ def halves(group: Int[np.ndarray, "W"]) -> Bool[np.ndarray, "W"]:
 
 def falls(before: Float[np.ndarray, "W"], after: Float[np.ndarray, "W"], group) -> tuple[bool, float]:
     """Whether an error falls beyond chance, and the share of resamples of the recordings in which it does."""
-    chance = float((resampled(before - after, group) > 0).mean())
+    chance = float((_resampled(before - after, group) > 0).mean())
     return bool(chance > _CHANCE and after.mean() < (1 - _LEAST) * before.mean()), chance
 
 
-def resampled(
-    change: Float[np.ndarray, "W"], group: Int[np.ndarray, "W"], *, draws: int = 2000
-) -> Float[np.ndarray, "D"]:
-    """Means over windows of recordings drawn anew, with a fixed seed."""
-    names = np.unique(group)
-    total = np.array([change[group == g].sum() for g in names])
-    count = np.array([(group == g).sum() for g in names])
-    pick = np.random.default_rng(0).integers(len(names), size=(draws, len(names)))
-    return total[pick].sum(axis=1) / count[pick].sum(axis=1)
+def accepted_effects(steps: Sequence[Step]) -> list[str]:
+    """Names of the effects that stayed."""
+    return [step.effect for step in steps if step.accepted and step.effect]
 
 
 def search(
-    simulator: Simulator,
-    windows: Windows,
+    cable: SpatialCable,
     candidates: Sequence[str],
     *,
     begun: Sequence[Step] = (),
@@ -79,8 +82,7 @@ def search(
     """Adds effects one by one as long as recordings that no fit has seen are simulated better.
 
     Args:
-        simulator: of the cable.
-        windows: to explain.
+        cable: in the windows to explain.
         candidates: names of the effects to try.
         begun: steps of an earlier call that was interrupted.
         save: called with all steps after each.
@@ -89,73 +91,115 @@ def search(
     Returns:
         All steps, the nominal simulator first.
     """
-    layout, first = simulator.layout, halves(windows.group)
-    parts = (first, ~first)
-    steps = list(begun)
+    evidence, steps = cable.evidence(), list(begun)
     if not steps:
-        nothing = shared_by_all(np.zeros(layout.size), windows.group)
-        sums = simulator.sums(nothing, windows)
-        steps = [Step("", True, (nothing, nothing), sums.error, 0.0)]
-        progress(f"nominal simulator: {1e3 * sums.error.mean():.1f} mm from the free markers")
-    fits = _again(simulator, windows, steps)
+        null = explanation()
+        error = mean_error(evidence.predict([null])[0], evidence.observed)
+        steps = [Step("", True, (null, null), error, 0.0)]
+        progress(f"nominal simulator: {1e3 * error.mean():.1f} mm from the free markers")
     while True:
-        chosen = accepted_effects(steps)
+        last = [i for i, step in enumerate(steps) if step.accepted][-1]
         # what did not help before another effect came in may help now
-        tried = [step.effect for step in steps[max(i for i, step in enumerate(steps) if step.accepted) :]][1:]
-        rest = [effect for effect in candidates if effect not in chosen and effect not in tried]
+        tried = [step.effect for step in steps[last + 1 :]]
+        rest = [name for name in candidates if name not in [*accepted_effects(steps), *tried]]
         if not rest or len(tried) == _FAILURES:
-            break
-        starts = {effect: _starts(simulator, fits, windows, parts, [*chosen, effect]) for effect in rest}
-        effect = min(starts, key=lambda name: starts[name][1])
-        trial = [
-            improve(simulator, values, [*chosen, effect], windows, use=part)
-            for values, part in zip(starts[effect][0], parts, strict=True)
-        ]
-        error, before = _unseen(trial, first), _last(steps).error
-        accepted, chance = falls(before, error, windows.group)
-        steps.append(Step(effect, accepted, (trial[0].values, trial[1].values), error, chance))
+            return steps
+        starts = {name: _starts(evidence, steps[last].halves, cable.layout.named(name)) for name in rest}
+        name = min(starts, key=lambda name: starts[name][1])
+        steps.append(tried_with(evidence, name, starts[name][0], steps[last], progress))
         save(steps)
-        word = "stays" if accepted else "does not help"
-        progress(f"{effect}: {1e3 * before.mean():.2f} -> {1e3 * error.mean():.2f} mm on unseen recordings, {word}")
-        if accepted:
-            fits = trial
-    return steps
 
 
-def accepted_effects(steps: Sequence[Step]) -> list[str]:
-    return [step.effect for step in steps if step.accepted and step.effect]
+def tried_with(
+    evidence: Evidence,
+    name: str,
+    starts: tuple[Explanation, Explanation],
+    before: Step,
+    progress: Callable[[str], None],
+) -> Step:
+    """Fits both halves from starts, and says whether that simulates what they have not seen better than before.
 
-
-def _last(steps):
-    return [step for step in steps if step.accepted][-1]
-
-
-def _again(simulator, windows, steps) -> list[RodFit]:
-    return [fit_at(simulator, values, accepted_effects(steps), windows) for values in _last(steps).values]
-
-
-def _unseen(fits: Sequence[RodFit], first):
-    """Every window's error from the fit of the other half."""
-    return np.where(first, fits[1].sums.error, fits[0].sums.error)
-
-
-def _starts(simulator: Simulator, fits: Sequence[RodFit], windows: Windows, parts, effects):
-    """Where fits with the last effect may begin, per half, and the error on what each has not seen.
-
-    Tried are the step that the quadratic model promises, in parts, and the effect's templates: far from the solution
-    the model says little.
+    Args:
+        evidence: all windows.
+        name: of what is tried.
+        starts: for either half.
+        before: the step to compare with.
+        progress: called with a line of text.
     """
-    layout, result, error = simulator.layout, [], np.zeros(len(windows))
-    for fit, part in zip(fits, parts, strict=True):
-        active = layout.active(effects)
-        step = newton_step(fit, layout, part, damping=1e-3, active=active)
-        trials = [moved_by(layout, fit.values, active, step * scale) for scale in (1.0, 0.4)]
-        for where, value in layout.templates(effects[-1]):
-            shared = fit.values.shared.copy()
-            shared[where] = value
-            trials.append(dataclasses.replace(fit.values, shared=shared))
-        own, other = windows.chosen(np.flatnonzero(part)), windows.chosen(np.flatnonzero(~part))
-        best = min(trials, key=lambda values: errors(simulator.predict(values, own), own).mean())
-        result.append(best)
-        error[~part] = errors(simulator.predict(best, other), other)
-    return result, float(error.mean())
+    fits = []
+    for start, (seen, _) in zip(starts, _parts(evidence), strict=True):
+        (fit,) = improved(seen, evaluate(seen, [start]), evidence.simulator.plan.last_steps)
+        fits.append(fit.explanation)
+    halves = fits[0], fits[1]
+    error, group = unseen_error(evidence, halves), np.asarray(evidence.simulator.recording)
+    accepted, chance = falls(before.error, error, group)
+    word = "stays" if accepted else "does not help"
+    progress(f"{name}: {1e3 * before.error.mean():.2f} -> {1e3 * error.mean():.2f} mm on unseen recordings, {word}")
+    return Step(name, accepted, halves, error, chance)
+
+
+def unseen_error(evidence: Evidence, halves: tuple[Explanation, Explanation]) -> Float[np.ndarray, "W"]:
+    """Error of every window by the fit of the other half [m]."""
+    error = np.zeros(len(evidence.episodes))
+    for one, (_, other) in zip(halves, _parts(evidence), strict=True):
+        error[other.episodes] = mean_error(other.predict([one])[0], other.observed)
+    return error
+
+
+def _parts(evidence: Evidence) -> list[tuple[Evidence, Evidence]]:
+    """What either half's fit sees, and what it does not."""
+    first = halves(np.asarray(evidence.simulator.recording))
+    both = [evidence.restricted(np.flatnonzero(half)) for half in (first, ~first)]
+    return [(both[0], both[1]), (both[1], both[0])]
+
+
+def _starts(
+    evidence: Evidence, before: tuple[Explanation, Explanation], effect: SpatialEffect
+) -> tuple[tuple[Explanation, Explanation], float]:
+    """Where fits with one more effect may begin, per half, and the error on what each has not seen."""
+    found, total = [], 0.0
+    for base, (seen, other) in zip(before, _parts(evidence), strict=True):
+        found.append(_start(seen, base, effect))
+        total += float(mean_error(other.predict([found[-1]])[0], other.observed).sum())
+    return (found[0], found[1]), total
+
+
+def _start(seen: Evidence, base: Explanation, effect: SpatialEffect) -> Explanation:
+    """The best of the effect's starts, and of parts of the step that the quadratic model promises from there.
+
+    Far from the solution the model says little.
+    """
+    trials = [with_effect(seen, base, effect, values) for _, values in effect.starts(None)]
+    (fit,) = evaluate(seen, [_best(seen, trials)])
+    model = fit.model(seen.weight(fit.sse), 0.0)
+    step = -solve_arrow(
+        model.curvature + _DAMPING * np.diag(np.diagonal(model.curvature)), model.gradient, model.blocks
+    )
+    step *= min(1.0, _LARGEST_STEP / max(np.abs(step).max(initial=0.0), 1e-12))
+    moved = [fit.at(np.clip(model.point + share * step, model.lower, model.upper)) for share in (1.0, 0.4)]
+    return _best(seen, [fit.explanation, *moved])
+
+
+def with_effect(evidence: Evidence, base: Explanation, effect: SpatialEffect, values: Sequence[float]) -> Explanation:
+    """A base with one more effect at these values."""
+    added = explanation((effect, 0, values))
+    both = Explanation((*base.terms, Term(effect, 0)), np.append(base.z, added.z), base.own)
+    return evidence.simulator.with_own(both)
+
+
+def _best(seen: Evidence, trials: Sequence[Explanation]) -> Explanation:
+    if len(trials) == 1:
+        return trials[0]
+    found = [mean_error(part, seen.observed).mean() for part in seen.predict(trials)]
+    return trials[int(np.argmin(found))]
+
+
+def _resampled(
+    change: Float[np.ndarray, "W"], group: Int[np.ndarray, "W"], *, draws: int = 2000
+) -> Float[np.ndarray, "D"]:
+    """Means over windows of recordings that are drawn with replacement, with a fixed seed."""
+    names = np.unique(group)
+    total = np.array([change[group == g].sum() for g in names])
+    count = np.array([(group == g).sum() for g in names])
+    pick = np.random.default_rng(0).integers(len(names), size=(draws, len(names)))
+    return total[pick].sum(axis=1) / count[pick].sum(axis=1)

@@ -2,7 +2,7 @@
 
 A cable is simulated with steps of a sample's length where that is fine enough: on recordings at 100 Hz of clamps that
 move like a hand it is. Clamps that swing by decimetres twice a second, or samples that are far apart, need more. How
-many is told by the recorded motion alone, before anything is fitted: steps are halved until a cable with the believed
+many follows from the recorded motion alone, before anything is fitted: steps are halved until a cable with the believed
 stiffness and ordinary damping moves as it does with half of them.
 """
 
@@ -12,10 +12,8 @@ import dataclasses
 
 import numpy as np
 
-from cablejax.simulate.rod import Rod
-from cablejax.spatial.effects import Layout
-from cablejax.spatial.fit import GOOD_FIT, Simulator, bounded
-from cablejax.spatial.windows import Windows
+from cablejax.diagnose.protocol import explanation
+from cablejax.spatial.cable import GOOD_FIT, SpatialCable, bounded
 
 _FINEST = 4
 # Errors of the time steps may be so large a part of what a good fit leaves, on half of the windows. The others may hold
@@ -41,24 +39,22 @@ class TimeSteps:
         return self.error <= _SHARE * GOOD_FIT
 
 
-def time_steps_for(windows: Windows, layout: Layout, edges: int) -> TimeSteps:
+def time_steps_for(cable: SpatialCable) -> TimeSteps:
     """The fewest steps that are fine enough, or `_FINEST`.
 
     Args:
-        windows: whose motion is to be simulated.
-        layout: of the parameters, without twist.
-        edges: of the rod.
+        cable: with one step between two samples, in windows whose motion is to be simulated.
     """
-    ordinary = np.where(layout.active(["bending_damping", "viscous_drag"]), layout.starts, 0.0)
+    ordinary = [(e, 0, (e.parameters[0].centre,)) for e in map(cable.layout.named, ("bending_damping", "viscous_drag"))]
 
     def predicted(substeps):
-        return Simulator(Rod(edges, substeps, twisting=False), layout).predict(ordinary, windows)
+        return cable.finer(substeps).motion(explanation(*ordinary))
 
     substeps, coarse = 1, predicted(1)
     while True:
         fine = predicted(2 * substeps)
         off = bounded(coarse - fine)
-        each = [part[valid].mean() for part, valid in zip(off, windows.valid, strict=True)]
+        each = [part[valid].mean() for part, valid in zip(off, cable.windows.valid, strict=True)]
         found = TimeSteps(substeps, float(np.median(each)))
         if found.fine_enough or substeps >= _FINEST:
             return found

@@ -59,6 +59,11 @@ class Windows:
     def __len__(self) -> int:
         return len(self.keypoints)
 
+    @property
+    def observed(self) -> Float[np.ndarray, "W T F 3"]:
+        """The keypoints, NaN also where nothing is recorded."""
+        return np.where(self.valid[:, :, None, None], self.keypoints, np.nan)
+
     def chosen(self, index) -> Windows:
         """Some of the windows."""
         index = np.asarray(index, int)
@@ -153,16 +158,6 @@ def labels(log: GapLog, *names: str, default: str | None = None) -> list[str]:
         if all(isinstance(entry, (str, int, float)) for entry in value):
             return [str(entry) for entry in value]
     return [str(e) if default is None else default for e in range(len(log.keypoints))]
-
-
-def dealt(group: Int[np.ndarray, "W"], parts: int) -> Int[np.ndarray, "W"]:
-    """The part that each window falls to: recordings are dealt out whole, the largest first to the smallest part."""
-    names, counts = np.unique(group, return_counts=True)
-    sizes, part_of = np.zeros(parts, int), {}
-    for name, count in sorted(zip(names, counts, strict=True), key=lambda item: (-item[1], item[0])):
-        part_of[name] = int(sizes.argmin())
-        sizes[part_of[name]] += count
-    return np.array([part_of[g] for g in group])
 
 
 def _held(points, position, tangent, valid):

@@ -1,0 +1,214 @@
+"""A cable in space as a diagnosis sees it: windows of its motion, simulated by the rod, behind the protocol.
+
+A window is an episode. Distances between simulated and recorded markers count as pseudo-Huber: a window in which the
+cable swings over another way must not decide alone. They stay the same for tenths of a second, so a sample counts as
+the share of a correlation time that it stands for, in units of what a good fit leaves.
+"""
+
+from __future__ import annotations
+
+import concurrent.futures
+import dataclasses
+import functools
+import os
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float, Int
+
+from cablejax.diagnose.belief import LEAST_SQUARES
+from cablejax.diagnose.evidence import Evidence, Robust
+from cablejax.diagnose.protocol import Explanation, Plan, Simulator
+from cablejax.simulate.compile import compiler_options
+from cablejax.simulate.rod import Rod
+from cablejax.spatial.effects import GRIP, Layout
+from cablejax.spatial.windows import Windows
+
+GOOD_FIT = 0.01
+"""What is left of a good fit [m]: unit of the residuals."""
+TWISTED = "intrinsic_curvature"
+"""The effect that needs the material frame, whose derivatives take four times as long as all others together."""
+_CHUNK = 8
+_COLUMNS = 8
+_ROBUST = Robust(distance=0.02, lost=1.0)
+_CORRELATION = 0.3  # [s]
+# Samples that fits look at: every fourth, after the two that the simulation begins from.
+_FITTED = slice(2, None, 4)
+# Nats per window: a step that promises less is not worth the simulations that it takes.
+_TOLERANCE = 0.1
+# Steps end by the tolerance. This is for fits that creep.
+_MOST_STEPS = 40
+
+
+@dataclasses.dataclass(frozen=True)
+class SpatialCable(Simulator):
+    """The rod of one cable between the clamps of some windows.
+
+    Attributes:
+        rod: resolution; the material frame is followed where an explanation needs it.
+        layout: of the effects.
+        windows: to simulate.
+        samples: of the windows that are predicted.
+    """
+
+    rod: Rod
+    layout: Layout
+    windows: Windows
+    samples: slice = dataclasses.field(default_factory=lambda: _FITTED)
+
+    @property
+    def effects(self):  # type: ignore[override]
+        return self.layout.effects
+
+    @property
+    def recording(self) -> Int[np.ndarray, "E"]:  # type: ignore[override]
+        return self.windows.group
+
+    @property
+    def plan(self) -> Plan:  # type: ignore[override]
+        return Plan(last_steps=_MOST_STEPS, tolerance=_TOLERANCE * len(self.windows), parts=2)
+
+    def on(self, windows: Windows) -> SpatialCable:
+        """The same cable in other windows."""
+        return dataclasses.replace(self, windows=windows)
+
+    def finer(self, factor: int) -> SpatialCable:
+        """With so many times as many time steps."""
+        return dataclasses.replace(self, rod=dataclasses.replace(self.rod, substeps=factor * self.rod.substeps))
+
+    def own(self, one: Explanation) -> int:
+        """How the cable sits in the grippers is set up anew for each recording."""
+        return sum(len(e.null) for e in self.layout.effects if e.own and e.name in one.names)
+
+    def motion(self, one: Explanation) -> Float[np.ndarray, "W T F 3"]:
+        """Free markers at every sample [m]."""
+        return dataclasses.replace(self, samples=slice(None)).predict([one], np.arange(len(self.windows)))[0]
+
+    def predict(self, explanations, episodes) -> Float[np.ndarray, "X E T F 3"]:
+        """Free markers [m] at the samples that are compared; NaN where the simulation broke down."""
+        parts = ((self._in_parallel(0, one, episodes, ())) for one in explanations)
+        return np.stack([np.concatenate(part)[:, self.samples] for part in parts])
+
+    def linearise(self, explanations, episodes):
+        """Forward derivatives, exact."""
+        result = []
+        for one in explanations:
+            directions, own = self.directions(one)
+            parts = self._in_parallel(1, one, episodes, (directions,))
+            predicted = np.concatenate([part[0] for part in parts])[:, self.samples]
+            slopes = np.concatenate([part[1][:, :, self.samples] for part in parts])
+            result.append((predicted, np.moveaxis(slopes, 1, 0)[own]))
+        return result
+
+    def evidence(self) -> Evidence:
+        """The windows, weighed for fits."""
+        windows, stride = self.windows, self.samples.step or 1
+        unit = GOOD_FIT * np.sqrt(3 * _CORRELATION / (stride * windows.interval))
+        return Evidence(
+            simulator=self,
+            episodes=np.arange(len(windows)),
+            observed=windows.observed[:, self.samples],
+            nominal=np.zeros_like(windows.keypoints[:, self.samples]),
+            noise=np.full((windows.keypoints.shape[2], 1), unit),
+            temper=np.ones(len(windows)),
+            freedom=LEAST_SQUARES,
+            motion=np.arange(len(windows)),
+            robust=_ROBUST,
+        )
+
+    def _in_parallel(self, which: int, one: Explanation, episodes, more: tuple):
+        """Batches of one size, so that one compilation serves, by as many threads as there are cores."""
+        rod = dataclasses.replace(self.rod, twisting=TWISTED in one.names)
+        run, windows = _compiled(rod, self.layout, self.windows.interval)[which], self.windows.chosen(episodes)
+        values = self._values(one, episodes)
+        # one rollout's operations are too small to share; a window alone is not worth a batch
+        size = _CHUNK if len(windows) > 1 else 1
+
+        def batch(begin):
+            index = np.arange(begin, min(begin + size, len(windows)))
+            full = np.concatenate([index, np.full(size - len(index), index[0])])
+            part = windows.chosen(full)
+            found = run(values[full], *more, part.position, part.frames, part.keypoints[:, :2])
+            return jax.tree.map(lambda a: np.asarray(a)[: len(index)], found)
+
+        with concurrent.futures.ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
+            return list(pool.map(batch, range(0, len(windows), size)))
+
+    def _values(self, one: Explanation, episodes) -> Float[np.ndarray, "e P"]:
+        """Physical values of every window; a recording that has no row of its own has what all share."""
+        one, group = self.with_own(one), self.windows.group[episodes]
+        values = np.repeat(one.vector(self.effects)[None], len(group), axis=0)
+        if one.own.size:
+            values[:, self._own_slots] += GRIP * one.own[group]
+        return values
+
+    def directions(self, one: Explanation) -> tuple[Float[np.ndarray, "K P"], Int[np.ndarray, "C"]]:
+        """Rows of derivatives of the vector by the coordinates, padded, and which of them each column of a fit is."""
+        slots = {e.name: np.arange(self.layout.size)[self.layout.slots(e.name)] for e in self.effects}
+        columns = np.concatenate([np.zeros(0, int), *(slots[name] for name in one.names)])
+        parameters = [p for term in one.terms for p in term.effect.parameters]
+        values = np.concatenate([np.zeros(0), *one.values()])
+        count = len(columns)
+        rows = np.zeros((max(_COLUMNS * -(-count // _COLUMNS), _COLUMNS), self.layout.size))
+        rows[np.arange(count), columns] = [
+            p.scale * (v if p.log else 1.0) for p, v in zip(parameters, values, strict=True)
+        ]
+        # what a recording adds moves the same values, in the same units
+        own = np.flatnonzero(np.isin(columns, self._own_slots)) if one.own.size else np.zeros(0, int)
+        return rows, np.concatenate([np.arange(count), own])
+
+    @property
+    def _own_slots(self) -> Int[np.ndarray, "M"]:
+        every = np.arange(self.layout.size)
+        return np.concatenate([every[self.layout.slots(e.name)] for e in self.layout.effects if e.own])
+
+
+def mean_error(predicted: Float[np.ndarray, "W T F 3"], observed: Float[np.ndarray, "W T F 3"]) -> np.ndarray:
+    """Mean absolute error of each window's observed coordinates [m], shape [W]."""
+    seen = np.isfinite(observed)
+    off = np.where(seen, bounded(predicted - observed), 0.0)
+    return off.sum(axis=(1, 2, 3)) / seen.sum(axis=(1, 2, 3))
+
+
+def bounded(off: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape"]:
+    """Sizes of errors [m]; what a simulation has lost, NaN included, is off by a metre."""
+    lost = _ROBUST.lost
+    return np.minimum(np.nan_to_num(np.abs(off), nan=lost, posinf=lost), lost)
+
+
+def errors(predicted: Float[np.ndarray, "W T F 3"], windows: Windows) -> Float[np.ndarray, "W"]:
+    """Mean absolute error of a coordinate of the free markers, from the third sample on [m]."""
+    return mean_error(predicted[:, 2:], windows.observed[:, 2:])
+
+
+def over_all_markers(error: Float[np.ndarray, "W"], windows: Windows) -> Float[np.ndarray, "W"]:
+    """The same with the held markers counted as predicted without error, as Chen et al. (2024) count [m]."""
+    return error * windows.keypoints.shape[2] / windows.n_keypoints
+
+
+@functools.lru_cache(maxsize=8)
+def _compiled(rod: Rod, layout: Layout, interval: float):
+    def one(values, position, frames, seen):
+        return rod.rollout(layout.physics(values), position, frames, seen, interval)
+
+    def batch(values, *inputs):
+        return jax.vmap(one)(values, *inputs)
+
+    def both(values, directions, *inputs):
+        def tangent(direction):
+            return jax.jvp(lambda v: batch(v, *inputs), (values,), (jnp.broadcast_to(direction, values.shape),))
+
+        predicted, derivative = jax.vmap(tangent, out_axes=(None, 1))(directions)
+        return predicted, derivative
+
+    options = compiler_options()
+    return _double(jax.jit(batch, compiler_options=options)), _double(jax.jit(both, compiler_options=options))
+
+
+def _double(run):
+    def call(*arguments):
+        with jax.enable_x64(True):
+            return run(*(jnp.asarray(np.asarray(a, float)) for a in arguments))
+
+    return call

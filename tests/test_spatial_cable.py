@@ -1,0 +1,154 @@
+"""The rod behind the protocol: derivatives, what is a recording's own, robust losses, and fits that hold all of it."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+import spatial_cases as cases
+from cablejax.bounded import Result
+from cablejax.diagnose.evidence import Robust
+from cablejax.diagnose.fit import Fit, evaluate, improved
+from cablejax.diagnose.protocol import Explanation, explanation
+from cablejax.simulate.rod import Rod
+from cablejax.spatial.cable import SpatialCable
+from cablejax.spatial.estimate import estimate_at, jackknife
+from cablejax.spatial.identify import layout_of, mean_of
+from cablejax.spatial.memory import Memory
+from cablejax.spatial.search import Step
+from cablejax.spatial.windows import windows_of
+
+_EFFECTS = ("bending_stiffness", "bending_damping", "gripper_rotation_offset")
+
+
+@pytest.fixture(scope="module")
+def cable():
+    windows = windows_of(cases.recording())
+    return SpatialCable(Rod(16, twisting=False), layout_of(windows, cases.NOMINAL), windows)
+
+
+def at(cable: SpatialCable, effects=_EFFECTS, *, seed: int | None = None) -> Explanation:
+    """All parameters at their prior medians, or drawn near there."""
+    named = [cable.layout.named(name) for name in effects]
+    one = cable.with_own(explanation(*((e, 0, [p.centre for p in e.parameters]) for e in named)))
+    if seed is None:
+        return one
+    random = np.random.default_rng(seed)
+    return one.moved(0.3 * random.normal(size=one.z.shape), 0.5 * random.normal(size=one.own.shape))
+
+
+def test_a_recording_that_was_not_fitted_has_what_all_share(cable):
+    own = np.array([[0.5] * 4, [0.0] * 4, [-1.0] * 4, [0.0] * 4])
+    one = at(cable, seed=0).moved(at(cable, seed=0).z, own)
+    short = one.moved(one.z, own[:1])
+    same = cable.motion(short)
+    np.testing.assert_array_equal(same[0], cable.motion(one)[0])
+    np.testing.assert_array_equal(same[1:], cable.motion(one.moved(one.z, 0 * own))[1:])
+    # without the effect nothing is a recording's own, and it comes back as nothing
+    bare = cable.with_own(one.without("gripper_rotation_offset"))
+    assert bare.own.size == 0 and cable.with_own(dataclasses.replace(one, own=bare.own)).own.shape == (4, 4)
+    other = one.moved(one.z + 1.0, np.array([[0.1] * 4, [0.2] * 4]))
+    mean = mean_of(one, other)
+    np.testing.assert_allclose(mean.z, one.z + 0.5)
+    np.testing.assert_allclose(mean.own[:, 0], [0.3, 0.2, -1.0, 0.0])
+
+
+def test_derivatives_are_those_of_finite_differences(cable):
+    trial, episodes = at(cable, (*_EFFECTS, "keypoint_bias"), seed=1), np.array([0, 3])
+    ((here, slopes),) = cable.linearise([trial], episodes)
+    assert slopes.shape == (len(trial.z) + 4, *here.shape)
+    np.testing.assert_allclose(here, cable.predict([trial], episodes)[0], atol=1e-9)
+    random, step = np.random.default_rng(2), 1e-4
+    shared, own = random.normal(size=trial.z.shape), random.normal(size=4)
+    ahead, behind = (
+        cable.predict([trial.moved(trial.z + s * shared, trial.own + s * own)], episodes)[0] for s in (step, -step)
+    )
+    central = (ahead - behind) / (2 * step)
+    along = np.tensordot(np.concatenate([shared, own]), slopes, 1)
+    np.testing.assert_allclose(along, central, atol=1e-5 * np.abs(central).max())
+
+
+def test_the_loss_is_the_pseudo_huber_one_and_its_derivatives_are(cable):
+    evidence, trial = cable.evidence(), at(cable, seed=3)
+    (fit,) = evaluate(evidence, [trial])
+    step = 1e-4
+    for k in range(2):
+        ends = [evaluate(evidence, [trial.moved(trial.z + s * np.eye(len(trial.z))[k])])[0].sse for s in (step, -step)]
+        np.testing.assert_allclose(2 * fit.gradient[:, k], (ends[0] - ends[1]) / (2 * step), rtol=1e-4, atol=1e-6)
+    # what broke down counts as a metre off, point by point, and has no derivative
+    lost = np.full((1, *evidence.observed.shape), np.nan)
+    broken = dataclasses.replace(cable)
+    object.__setattr__(broken, "linearise", lambda explanations, episodes: [(lost[0], np.zeros((0, *lost.shape[1:])))])
+    (gone,) = evaluate(dataclasses.replace(evidence, simulator=broken), [explanation()])
+    loss = evidence.robust
+    assert isinstance(loss, Robust)
+    points = np.isfinite(evidence.observed).all(axis=-1).sum(axis=(1, 2))
+    np.testing.assert_allclose(gone.sse, 2 * loss.distance * loss.lost * points / evidence.noise[0, 0] ** 2)
+
+
+def test_elimination_solves_the_whole_system(cable):
+    random, group = np.random.default_rng(0), np.array([0, 0, 2, 3, 3])
+    trial, n, m = at(cable, seed=4), 6, 4
+    roots = random.normal(size=(5, 40, n + m))
+    fit = Fit(trial, np.ones(5), random.normal(size=(5, n + m)), roots.transpose(0, 2, 1) @ roots, group)
+    weight = random.uniform(0.5, 2.0, 5)
+
+    # all unknowns at once: shared coordinates, then the own numbers of every recording that is there
+    rows = [0, 2, 3]
+    whole, pull = np.eye(n + m * len(rows)), np.concatenate([trial.z, trial.own[rows].ravel()])
+    for k, recording in enumerate(rows):
+        into = np.zeros((n + m, len(pull)))
+        into[:n, :n], into[n:, n + m * k : n + m * (k + 1)] = np.eye(n), np.eye(m)
+        for e in np.flatnonzero(group == recording):
+            whole += weight[e] * into.T @ fit.curvature[e] @ into
+            pull += weight[e] * into.T @ fit.gradient[e]
+    model = fit.model(weight, 0.0)
+    np.testing.assert_allclose(model.curvature, whole, rtol=1e-9)
+    np.testing.assert_allclose(model.gradient, pull, rtol=1e-9)
+    evidence = dataclasses.replace(
+        cable.evidence(), temper=np.ones(5), motion=np.arange(5), observed=np.zeros((5, 1, 1, 3)), episodes=np.arange(5)
+    )
+    flat = fit.model(evidence.weight(fit.sse), 0.0).curvature
+    np.testing.assert_allclose(np.linalg.inv(fit.precision(evidence)), np.linalg.inv(flat)[:n, :n], rtol=1e-7)
+    moved = fit.at(model.point + 1.0)
+    np.testing.assert_allclose(moved.own[rows], trial.own[rows] + 1.0)
+    np.testing.assert_array_equal(moved.own[1], trial.own[1])
+
+
+def test_grips_of_every_recording_are_found_and_leave_the_stiffness_alone(cable):
+    true = at(cable)
+    own = 0.25 / 0.3 * np.random.default_rng(2).normal(size=(4, 4))
+    true = true.moved(np.array([0.7, 0.0, 0.0, 0.0, 0.0, 0.0]), own)
+    seen = cable.on(dataclasses.replace(cable.windows, keypoints=cable.motion(true)))
+    evidence, fits = seen.evidence(), {}
+    for grips in (False, True):
+        start = at(cable, _EFFECTS[: 2 + grips])
+        (fits[grips],) = improved(evidence, evaluate(evidence, [start]), 40)
+        assert fits[grips].result is Result.CONVERGED
+    found = fits[True].explanation
+    assert abs(found.z[0] - 0.7) < 0.05
+    assert abs(found.z[0] - 0.7) < 0.5 * abs(fits[False].explanation.z[0] - 0.7)
+    held = [0.3 * (one.z[2:] + one.own) for one in (found, true)]
+    assert np.abs(held[0] - held[1]).max() < 0.1 and np.abs(held[1]).max() > 0.3
+    moves = jackknife(evidence, fits[True])
+    assert moves.shape == (4, 6) and 0 < np.sqrt((moves[:, 0] ** 2).sum()) < 0.2
+    told = estimate_at(evidence, fits[True]).stiffness
+    assert told.low < cases.NOMINAL * np.exp(0.7) < told.high
+
+
+def test_what_was_done_is_read_back(cable, tmp_path):
+    one, path = at(cable, seed=5), tmp_path / "state.json"
+    step = Step("bending_damping", True, (one, explanation()), np.array([0.1, 0.2]), 0.9)
+    memory = Memory(path, "mark", cable.layout)
+    memory.keep("search", [step])
+    memory.keep_finals([(one, Result.CONVERGED)])
+    again = Memory(path, "mark", cable.layout)
+    (read,), ((final, result),) = again.steps("search"), again.finals()
+    assert (read.effect, read.accepted, read.chance, result) == ("bending_damping", True, 0.9, Result.CONVERGED)
+    for kept in (read.halves[0], final):
+        assert kept.terms == one.terms
+        np.testing.assert_array_equal(kept.z, one.z)
+        np.testing.assert_array_equal(kept.own, one.own)
+    assert read.halves[1].terms == () and Memory(path, "other", cable.layout).steps("search") == []
