@@ -7,11 +7,9 @@ import math
 import numpy as np
 import pytest
 
-from cablejax.cable import Cable, Discretisation
-from cablejax.control.loop import run_closed_loop
+from cablejax.cable import Cable
 from cablejax.control.targets import make_target, straight_start
 from cablejax.simulate.elastica import elastica
-from cablejax.simulate.plant import Plant, PlantConfig
 from cablejax.types import Measurement
 from closed_loop.baselines import StraightDrive
 from closed_loop.trials import Trial, read_trials, trial_of
@@ -100,10 +98,12 @@ def test_a_run_becomes_a_trial():
         error_cm = np.array([20.0, 0.4, np.nan, 0.5])
         mpc_ms = np.array([90.0, 110.0, 130.0, np.nan])
         stopped = None
+        twist = np.tile([[0.01, 0.0, 0.0], [0.0, 0.0, 0.1]], (4, 1, 1))
 
     row = trial_of(Run(), table="III", method="direct", scenario="Z", stiffness=3, seed=4, wall_s=2)  # pyright: ignore[reportArgumentType]
     assert (row.best_error_cm, row.steps, row.mpc_ms_median) == (0.4, 3, 110.0)
     assert row.key == ("III", "direct", "Z", 3.0, 4)
+    assert row.motion_m == pytest.approx((0.025,) * 3), "a radian counts as 15 cm; the last sample has no command"
     assert row.errors_cm[:2] == (20.0, 0.4) and math.isnan(row.errors_cm[2])
 
 
@@ -114,20 +114,6 @@ def test_the_end_of_a_run_is_judged_over_its_last_ten_seconds():
     assert chattering.worse_than_best and not TRIAL.worse_than_best
     assert trial(errors_cm=course(math.nan)).worse_than_best, "a lost cable is worse than any"
     assert math.isnan(TRIAL.late_travel_m), "older rows have no motions"
-
-
-def test_the_commands_of_a_run_are_kept_as_lengths():
-    class Turning:
-        def init(self, history):
-            return None
-
-        def step(self, state, measurement):
-            return None, np.array([[0.01, 0.0, 0.0], [0.0, 0.0, 0.1]]), None
-
-    plant = Plant(PlantConfig(discretisation=Discretisation(n_links=12, dimension=3, timestep=0.005), settle_time=0.1))
-    run = run_closed_loop(plant, Turning(), make_target("U"), 2, start=straight_start(Cable()), record_hz=1.0)
-    row = trial_of(run, table="III", method="x", scenario="U", stiffness=1.0, seed=0, wall_s=1.0)
-    assert row.motion_m == pytest.approx((0.025, 0.025))
 
 
 def test_a_straight_drive_ends_at_the_goal_and_stays():

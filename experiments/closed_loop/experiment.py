@@ -142,6 +142,7 @@ def page(experiment: Experiment, trials: Sequence[Trial], command: str, picture:
         lines += ["", "### Settling time by other definitions", "", f"{SETTLING_NOTE} {least}"]
         lines += ["", tables.settling_table(mine, table, labels=LABEL)]
         lines += ["", "### By stiffness", "", tables.stiffness_table(mine, table, labels=LABEL)]
+        lines += ["", "### How runs end", "", interval_tables.end_table(mine, table, labels=LABEL)]
         lines += ["", "### Intervals and failures", "", interval_tables.interval_table(mine, table, labels=LABEL)]
         methods = {trial.method for trial in mine}
         if ADAPTED_RESIDUAL in methods and len(methods) > 1:
