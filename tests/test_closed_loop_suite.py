@@ -59,6 +59,7 @@ def test_a_suite_is_shared_resumed_and_read_whole(tmp_path):
     experiment = Experiment("x", "x.py", "Title", "About.", extent, extent, ("III", "IV"))
     text = page(experiment, trials, "python x.py", picture=None)
     assert "| online visual servo | 2 |" in text and "Table IV" not in text and "Seeds: 0, 1." in text
+    assert "### How runs end" in text and "| online visual servo | U | 2 |" in text
     assert re.search(r"takes, on average: U [789]\.\d s\.", text)
 
 
