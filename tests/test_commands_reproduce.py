@@ -32,7 +32,7 @@ LONG = Cable(length=1.5, linear_density=0.05, bending_stiffness=0.05, n_keypoint
         DatasetConfig(
             randomisation=Randomisation(stiffness=(0.1, 3.0)),
             discretisation=Discretisation(LONG),
-            motion=MotionConfig(max_curvature=12.0 / 1.5),
+            motion=MotionConfig.for_length(1.5),
         ),
         DatasetConfig(
             engine="chain",

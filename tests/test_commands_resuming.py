@@ -77,7 +77,7 @@ def test_settings_that_cannot_be_read_are_reported(tmp_path):
     parts.begin()
     for text in ("", '{"schema": ', "[" * 100_000):
         (parts.folder / "settings.json").write_text(text)
-        with pytest.raises(UsageError, match=r"settings\.json is .* Delete .*parts to begin anew"):
+        with pytest.raises(UsageError, match=r"settings\.json is .* Delete .*parts to start again"):
             parts.match()
 
 

@@ -27,7 +27,7 @@ from cablejax.dataset.opening import open_store
 from cablejax.dataset.schema import DatasetConfig, Randomisation, config_from_json, config_to_json
 from cablejax.effects.given import EFFECTS, GivenEffect
 from cablejax.simulate import ThreadedEngine
-from cablejax.simulate.motions import MotionConfig
+from cablejax.simulate.motions import MotionConfig, random_motion
 
 TINY = DatasetConfig(
     n_trajectories=8,
@@ -76,7 +76,7 @@ import sys
 from cablejax.dataset.generate import generate
 from cablejax.dataset.schema import *
 from cablejax.cable import Cable, Discretisation
-from cablejax.simulate.motions import MotionConfig
+from cablejax.simulate.motions import MotionConfig, random_motion
 config, path = eval(sys.argv[1]), sys.argv[2]
 """
 
@@ -342,3 +342,23 @@ def test_two_devices_make_the_bytes_of_one(tmp_path):
     block = simulate(config, ThreadedEngine(config.discretisation), range(config.n_shards))
     other = np.concatenate([part.keypoints for part in block])
     np.testing.assert_allclose(here.keypoints, other, atol=1e-3)
+
+
+def test_motions_of_a_longer_cable_are_in_proportion():
+    assert MotionConfig.for_length(1.0) == MotionConfig()
+    drawn = []
+    for length in (1.0, 1.5):
+        config = Discretisation(Cable(length=length), n_links=13)
+        drawn.append(random_motion(np.random.default_rng(3), config, 8, MotionConfig.for_length(length)))
+    for short, long in zip(*drawn, strict=True):
+        np.testing.assert_allclose(long, short * [1.5, 1.5, 1.0], atol=1e-9)
+
+
+def test_unevenly_spaced_keypoints_are_no_fault(tmp_path):
+    marks = (0.0, 0.05, 0.55, 1.0)
+    config = dataclasses.replace(TINY, discretisation=Discretisation(Cable(n_keypoints=4, marks=marks), n_links=7))
+    assert generate(config, tmp_path / "data", progress=False).n_complete == TINY.n_trajectories
+    points = open_store(tmp_path / "data").read().keypoints
+    chords = np.linalg.norm(np.diff(points, axis=2), axis=-1)
+    assert (chords <= 1.02 * np.diff(marks)).all() and chords[..., 0].max() < 0.06 < chords[..., 1].min()
+    assert open_store(tmp_path / "data").config.cable.marks == marks

@@ -65,6 +65,48 @@ def test_brings_the_cable_to_the_target_and_holds_it_there(solver):
     assert size[-3:].max() < 2e-3
 
 
+def test_settings_scale_with_the_length():
+    assert MPCConfig.for_length(1.0) == MPCConfig()
+    long = MPCConfig.for_length(1.5, horizon=2)
+    assert (long.horizon, long.cable_length, long.radius_max) == (2, 1.5, 1.5 * MPCConfig.radius_max)
+
+
+@pytest.mark.slow
+def test_a_longer_cable_is_shaped_in_proportion():
+    """Everything 1.5 times as long: commands, errors and bounds are 1.5 times as large, angles the same."""
+    sizes = np.array([1.5, 1.5, 1.0])
+
+    def longer(weights, history, twist):
+        small = History(keypoints=history.keypoints / 1.5, gripper_pose=history.gripper_pose / sizes)
+        return 1.5 * relaxing_cable(weights, small, twist / sizes)
+
+    class LongCable(Cable):
+        def step(self, twist):
+            self.pose, self.keypoints = self.pose / sizes, self.keypoints / 1.5
+            super().step(twist / sizes)
+            self.pose, self.keypoints = self.pose * sizes, self.keypoints * 1.5
+
+    with jax.enable_x64(True):
+        rate, goal = jnp.asarray(0.8), hermite_shape(TARGETS["U"], N)
+        long = LongCable()
+        long.pose, long.keypoints = long.pose * sizes, long.keypoints * 1.5
+        steps = {}
+        for length, cable, dynamics in ((1.0, Cable(), relaxing_cable), (1.5, long, longer)):
+            control = MPC(MPCConfig.for_length(length, horizon=2), dynamics, rate, length * goal)
+            state, steps[length] = (
+                control.init(History(np.repeat(cable.keypoints[None], 3, axis=0), np.asarray(cable.pose))),
+                [],
+            )
+            for _ in range(6):
+                state, twist, info = control.step(state, Measurement(cable.keypoints, cable.pose))
+                cable.step(twist)
+                steps[length].append((np.asarray(twist), float(info.shape_error)))
+    for (twist, error), (longer_twist, longer_error) in zip(steps[1.0], steps[1.5], strict=True):
+        np.testing.assert_allclose(longer_twist, twist * sizes, atol=1e-4)
+        assert longer_error == pytest.approx(1.5 * error, rel=1e-3)
+    assert max(np.linalg.norm(twist * [1, 1, 0.15], axis=1).max() for twist, _ in steps[1.0]) > 0.049
+
+
 @pytest.mark.parametrize("target", ["U", "S"])
 def test_residual_removes_most_of_what_the_model_gets_wrong(target):
     _, _, without = run(controller(target, WITHOUT), Cable(), 25)

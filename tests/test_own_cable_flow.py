@@ -72,8 +72,8 @@ def test_the_page_says_what_the_plant_has_and_the_log_what_the_model_believes(fo
     assert log.meta["motion"] == ["approach_u_residual"]
     assert find_cable(folder / "run" / "log.npz") == CABLE
     samples = log.episode_length[0]
-    sizes = np.linalg.norm(log.gripper_command[0, :samples] * [1.0, 1.0, 0.15], axis=-1)
-    assert sizes.max() <= 0.05 + 1e-6
+    sizes = np.linalg.norm(log.gripper_command[0, :samples] * [1.0, 1.0, 0.15 * 1.5], axis=-1)
+    assert 0.05 < sizes.max() <= 0.05 * 1.5 + 1e-6
     ends = log.keypoints[0, :samples, [0, -1]].swapaxes(0, 1)
     np.testing.assert_allclose(ends, log.gripper_pose[0, :samples, :, :2], atol=1e-3)
     steps = np.linalg.norm(np.diff(log.keypoints[0, 0], axis=0), axis=-1)

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from cablejax.cable import Discretisation
+from cablejax.cable import Cable, Discretisation
 from cablejax.simulate import MjxEngine
-from cablejax.simulate.elastica import elastica
-from cablejax.simulate.equilibrium import arch_angles, find_equilibrium
+from cablejax.simulate.elastica import elastica, solve_elastica
+from cablejax.simulate.equilibrium import angles_of_keypoints, arch_angles, find_equilibrium
 
 POSE = np.array([[-0.3, 0.05, 1.2], [0.35, -0.02, -0.7]])
 
@@ -47,3 +47,14 @@ def test_a_pose_out_of_reach_is_refused():
     config = Discretisation(n_links=13)
     with pytest.raises(ValueError, match=r"1\.2000 m apart"):
         find_equilibrium(config, np.array([[-0.6, 0, 0], [0.6, 0, 0.0]]), np.zeros(12))
+
+
+def test_a_guess_is_read_at_the_marks_of_the_cable():
+    pose = np.array([[-0.4, 0.0, 0.9], [0.4, 0.0, -0.5]])
+    uneven = (0.0, 0.05, 0.1, 0.2, 0.6, 0.8, 1.0)
+    config = Discretisation(Cable(n_keypoints=7, marks=uneven), n_links=33)
+    exact = solve_elastica(pose, 1.0)
+    points = np.stack([np.interp(uneven, exact.arclength, exact.position[:, i]) for i in range(2)], axis=1)
+    turned = pose[0, 2] + np.cumsum(angles_of_keypoints(config, pose, points))
+    inner = np.interp((np.arange(32) + 1) / 32, exact.arclength, exact.angle)
+    assert np.abs(turned - inner).max() < 0.25

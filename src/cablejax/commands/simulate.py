@@ -121,8 +121,7 @@ class Simulate(Command):
     def config_of(self, cable: Cable, effects: tuple[GivenEffect, ...]) -> DatasetConfig:
         """The data set of a cable with effects, in place of those that the options name.
 
-        A gripper may force the same bend upon every cable relative to its length, so that cables of any length take the
-        same shapes.
+        Motions and bends scale with the cable's length, see `MotionConfig.for_length`.
         """
         from cablejax.cable import Discretisation
         from cablejax.dataset.schema import DatasetConfig, Randomisation
@@ -132,11 +131,7 @@ class Simulate(Command):
             n_trajectories=self.trajectories,
             n_steps=self.steps,
             seed=self.seed,
-            motion=MotionConfig(
-                start=self.start,
-                max_amplification=self.max_amplification,
-                max_curvature=MotionConfig.max_curvature / cable.length,
-            ),
+            motion=MotionConfig.for_length(cable.length, start=self.start, max_amplification=self.max_amplification),
             discretisation=Discretisation(cable, n_links=Discretisation.n_links if self.links is None else self.links),
             randomisation=Randomisation(
                 stiffness=self.stiffness_range, damping=self.damping_range, friction=self.friction_range

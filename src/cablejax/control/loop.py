@@ -30,7 +30,7 @@ class ObservedCable(Protocol):
 
 
 class Controller(Protocol):
-    """What shapes it: an object with two pure functions. Those of the package are `mpc.MPC` and `VisualServo`.
+    """What shapes it: an object with two pure functions. `mpc.MPC` is one.
 
     For `control.batched` it is a pytree with a leaf `target` as well, the keypoints [N, 2] that it steers towards.
     """

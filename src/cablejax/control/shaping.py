@@ -98,9 +98,12 @@ def load_model(name: str) -> Model:
 
 
 def make_controller(model: Model, target: Target, *, method: Method, solver: SolverName) -> MPC:
-    """The controller for one target, with or without the online residual; a conditioned model adapts in any case."""
-    config = MPCConfig(
-        cable_length=model.config.length,
+    """The controller for one target, with or without the online residual; a conditioned model adapts in any case.
+
+    Bounds on motions scale with the cable's length, see `MPCConfig.for_length`.
+    """
+    config = MPCConfig.for_length(
+        model.config.length,
         adaptation=AdaptationConfig() if model.config.conditioned else None,
         solver=SOLVERS[solver],
     )

@@ -202,8 +202,8 @@ def find_fault(config: DatasetConfig, one: Block) -> str | None:
         return f"an end of the cable is {gap:.2g} m from its gripper (allowed: {GRASP_TOLERANCE:.2g} m)"
     if "extension" in hooks:
         return None
-    spacing = config.cable.length / (config.cable.n_keypoints - 1)
-    stretch = np.linalg.norm(np.diff(keypoints, axis=1), axis=-1).max() / spacing - 1
+    spacing = np.diff(config.cable.keypoint_arclength)
+    stretch = (np.linalg.norm(np.diff(keypoints, axis=1), axis=-1) / spacing).max() - 1
     if stretch > STRETCH_TOLERANCE:
         return f"the cable is stretched by {100 * stretch:.2g} % (allowed: {100 * STRETCH_TOLERANCE:.2g} %)"
     return None

@@ -28,6 +28,13 @@ PACKAGES = ("jax", "jaxlib", "mujoco", "mujoco-mjx", "numpy")
 
 _DIGEST = ((32,), "uint8")
 
+_CHANGES = {
+    "cablejax-dataset/1": "It recorded the cable and its links as one; its options are in `attributes.config` of "
+    "its zarr.json. For `cablejax simulate` put them into a cable file (`cablejax cable --out cable.toml`), --links, "
+    "--trajectories, --steps and --seed. "
+}
+"""How to go on from stores of earlier schemas."""
+
 
 def open_store(path: str | os.PathLike[str], *, mode: Literal["r", "r+"] = "r") -> Store:
     """Opens a data set, complete or not, to read ("r") or also to write its shards ("r+").
@@ -43,8 +50,9 @@ def open_store(path: str | os.PathLike[str], *, mode: Literal["r", "r+"] = "r") 
     except (ValueError, AttributeError) as error:
         raise ValueError(f"The data set is damaged: {error} Generate it again elsewhere.") from error
     if attributes.get("schema") != SCHEMA:
+        again = _CHANGES.get(attributes.get("schema"), "")
         raise ValueError(
-            f"{path} has schema {attributes.get('schema')!r}, expected {SCHEMA!r}. "
+            f"{path} has schema {attributes.get('schema')!r}, expected {SCHEMA!r}. {again}"
             "Read it with the version of cablejax that wrote it, or generate it again in another folder."
         )
     recorded = attributes.get("config", {})

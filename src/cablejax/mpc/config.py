@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Hashable
+from typing import Any
 
 import numpy as np
 
@@ -72,6 +73,29 @@ class MPCConfig:
     adaptation: AdaptationConfig | None = None
     solver: Solver = LevenbergMarquardt()
 
+    @classmethod
+    def for_length(cls, length: float, **settings: Any) -> MPCConfig:
+        """The defaults for a cable of this length [m]: every length among them is in proportion to it.
+
+        Args:
+            length: free length of the cable [m].
+            settings: fields that are to differ from these defaults.
+        """
+        ratio = length / cls.cable_length
+        own = (
+            "cable_length",
+            "radius",
+            "radius_min",
+            "radius_max",
+            "min_reduction",
+            "hold_improvement",
+            "restart_above",
+        )
+        scaled = {name: ratio * getattr(cls, name) for name in own}
+        scaled["objective"] = _scaled(cls.objective, ratio, "rotation_weight", "arrival_margin")
+        scaled["residual"] = _scaled(cls.residual, ratio, "motion_scale", "rotation_weight", "outlier")
+        return cls(**{**scaled, **settings})
+
     def __post_init__(self):
         if not is_whole(self.horizon, least=0):
             raise ValueError(f"MPCConfig.horizon is {self.horizon}, expected a whole number, at least 0 (one command).")
@@ -134,3 +158,7 @@ class MPCConfig:
     def n_commands(self) -> int:
         """Commands of a plan, T = h + 1."""
         return self.horizon + 1
+
+
+def _scaled(config: Any, ratio: float, *names: str) -> Any:
+    return dataclasses.replace(config, **{name: ratio * getattr(config, name) for name in names})

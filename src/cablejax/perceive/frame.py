@@ -26,9 +26,9 @@ class Status(enum.IntEnum):
     TRACKED = 0
     """The cable was found in the cloud."""
     FEW_POINTS = 1
-    """Held: the cloud is empty or nearly so."""
+    """Lost: the cloud is empty or nearly so."""
     NO_FIT = 2
-    """Held: the cloud is not that of this cable between these grippers."""
+    """Lost: the cloud is not that of this cable between these grippers."""
 
 
 @dataclasses.dataclass(frozen=True)

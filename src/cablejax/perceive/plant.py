@@ -84,5 +84,10 @@ class CloudPlant(Plant):
 
 
 def tracker_for(cable: Cable) -> TrackerConfig:
-    """A tracker's settings for a cable, the default ones but for its length and keypoints."""
-    return TrackerConfig(registration=RegistrationConfig(length=cable.length, n_keypoints=cable.n_keypoints))
+    """A tracker's settings for a cable: the defaults, with lengths that depend on the cable's in proportion to it."""
+    ratio = cable.length / Cable.length
+    return TrackerConfig(
+        registration=RegistrationConfig(length=cable.length, n_keypoints=cable.n_keypoints),
+        max_curvature=TrackerConfig.max_curvature / ratio,
+        max_search=ratio * TrackerConfig.max_search,
+    )

@@ -168,13 +168,17 @@ def arch_angles(config: Discretisation, gripper_pose: Float[np.ndarray, "2 3"]) 
 def angles_of_keypoints(
     config: Discretisation, gripper_pose: Float[np.ndarray, "2 3"], keypoints: Float[np.ndarray, "N 2"]
 ) -> Float[np.ndarray, "J"]:
-    """Joint angles of the chain through given keypoints; missing ones (NaN) are bridged."""
+    """Joint angles of the chain through given keypoints; missing ones (NaN) are bridged.
+
+    As many points as the cable has keypoints are taken to be at its marks, others to be evenly spaced.
+    """
     pose = np.asarray(gripper_pose, np.float64)
     points = np.asarray(keypoints, np.float64)
     seen = np.all(np.isfinite(points), axis=1)
     if seen.sum() < 3:
         raise ValueError(f"Only {seen.sum()} of {len(points)} keypoints are finite, expected at least 3 as a guess.")
-    arclength = np.linspace(0.0, config.cable.length, len(points))[seen]
+    marks = config.cable.keypoint_arclength
+    arclength = (marks if len(points) == len(marks) else np.linspace(0.0, config.cable.length, len(points)))[seen]
     tangents = np.unwrap(np.arctan2(*np.diff(points[seen], axis=0).T[::-1]))
     tangents += 2 * np.pi * np.round((pose[0, 2] - tangents[0]) / (2 * np.pi))
     s = np.concatenate([[0.0], (arclength[1:] + arclength[:-1]) / 2, [config.cable.length]])

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float
 
-from cablejax.cable import Discretisation
+from cablejax.cable import Cable, Discretisation
 from cablejax.simulate.equilibrium import arch_angles, chain_nodes, find_equilibrium
 from cablejax.simulate.pose import wrapped
 
@@ -50,6 +50,20 @@ class MotionConfig:
     max_angle: float = 2.2
     max_curvature: float = 12.0
     max_amplification: float = 1.5
+
+    @classmethod
+    def for_length(cls, length: float, **settings: Any) -> MotionConfig:
+        """The defaults for a cable of this length [m]: lengths in proportion to it, curvature inversely.
+
+        Cables of any length then make the same shapes and motions, relative to their length.
+        """
+        ratio = length / Cable.length
+        return cls(
+            max_step=ratio * cls.max_step,
+            rotation_weight=ratio * cls.rotation_weight,
+            max_curvature=cls.max_curvature / ratio,
+            **settings,
+        )
 
     def __post_init__(self):
         if not self.max_amplification > 0:
