@@ -1,4 +1,4 @@
-"""What each recording has for its own: a nuisance that is fitted, no gap and no cause; and fits that leave parts out."""
+"""What each recording has for its own: a nuisance that is fitted, no gap and no cause; fits that leave parts out."""
 
 from __future__ import annotations
 
