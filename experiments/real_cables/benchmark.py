@@ -118,11 +118,11 @@ def score_cable(recordings: DeformRecordings, *, state: pathlib.Path, progress: 
         networks.append(network)
         for name, predicted in corrected.items():
             by_recording[name][~half] = predicted
-    on_whole, everything = found.cable.on(whole), found.everything
-    final = on_whole.motion(everything)
+    on_whole = found.cable.on(whole)
+    final = on_whole.motion(found.everything)
     progress("learning corrections, all of train")
     path = state / f"{recordings.name}_all.npz"
-    on_eval, network = _learned(found.cable.motion(everything), train, final, whole, path, progress)
+    on_eval, network = _learned(found.cable.motion(found.everything), train, final, whole, path, progress)
 
     def metric(predicted, of) -> Float[np.ndarray, "W"]:
         return 1e3 * over_all_markers(errors(predicted, of), of)
@@ -143,7 +143,7 @@ def score_cable(recordings: DeformRecordings, *, state: pathlib.Path, progress: 
     return CableScore(
         stages=tuple(stages),
         learned=tuple(learned),
-        without_own=float(metric(on_whole.motion(shared_only(everything)), whole).mean()),
+        without_own=float(metric(on_whole.motion(shared_only(found.everything)), whole).mean()),
         simulated=tuple(found.stiffness(one) for one in found.halves),
         estimated=tuple(dataclasses.astuple(half.stiffness) for half in estimates_of_halves(found, progress=progress)),
         seconds=_seconds(found, windows),

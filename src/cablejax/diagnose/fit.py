@@ -208,7 +208,8 @@ def _robust(evidence: Evidence, predicted, slopes):
     scale = np.where(use, 1 / (np.sqrt(root) * evidence.noise), 0.0)
     jacobian = np.where(use, slopes, 0.0)
     jacobian *= scale
-    return sse, (miss * scale).reshape(len(miss), -1), jacobian.reshape(len(slopes), len(miss), -1)
+    r = (miss * scale).reshape(len(miss), -1)
+    return sse, r, jacobian.reshape(len(slopes), *r.shape)
 
 
 def improve(

@@ -48,6 +48,7 @@ class Term:
 
     @property
     def size(self) -> int:
+        """Number of its parameters."""
         return len(self.effect.parameters)
 
     def values(self, z: Sequence[float]) -> list[Any]:

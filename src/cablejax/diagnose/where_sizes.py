@@ -46,7 +46,8 @@ def sizes_of(
         smallest_mm: the least gap that would have been seen.
         names: what to call each episode.
         gap_mm: over all that is compared, where that is not all of `squares`.
-        horizons_mm, regimes: see `Where`.
+        horizons_mm: see `Where`.
+        regimes: see `Where`.
         first: sentences that come before all others.
     """
     where = Where(

@@ -59,14 +59,17 @@ class SpatialCable(Simulator):
 
     @property
     def effects(self):  # type: ignore[override]
+        """Those of the layout."""
         return self.layout.effects
 
     @property
     def recording(self) -> Int[np.ndarray, "E"]:  # type: ignore[override]
+        """That of each window."""
         return self.windows.group
 
     @property
     def plan(self) -> Plan:  # type: ignore[override]
+        """Fits end by a tolerance for each window; either half of the recordings is left out."""
         return Plan(last_steps=_MOST_STEPS, tolerance=_TOLERANCE * len(self.windows), parts=2)
 
     def on(self, windows: Windows) -> SpatialCable:

@@ -51,6 +51,7 @@ class SpatialEffect(Effect):
     own: bool = False
 
     def starts(self, context):
+        """The templates, or the null value."""
         del context
         return [(0, (value,)) for value in self.templates] or [(0, self.null)]
 

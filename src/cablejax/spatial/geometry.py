@@ -46,6 +46,7 @@ class LocalChange:
 
     @property
     def sentence(self) -> str:
+        """The change in words."""
         where = f"at gripper {self.gripper}" if self.gripper is not None else "on the free cable"
         files = f"file{'' if len(self.files) == 1 else 's'} {_ranges(self.files)}"
         return (
@@ -97,7 +98,7 @@ def pair_distances(log: GapLog, rigid: Sequence[bool]) -> Float[np.ndarray, "E M
 
 
 def _ranges(files):
-    """ "102 to 106, 111"."""
+    """Runs of numbers, as in: 102 to 106, 111."""
     if not all(name.isdecimal() for name in files):
         return ", ".join(files)
     numbers = sorted(int(name) for name in files)

@@ -180,15 +180,15 @@ def mean_of(one: Explanation, other: Explanation) -> Explanation:
 
 def _twisted(cable: SpatialCable, steps: Sequence[Step], progress) -> list[Step]:
     """Rest curvature on top of what was found, and in place of a stiffness profile, its look-alike."""
-    before, evidence = [step for step in steps if step.accepted][-1], cable.evidence()
+    before = [step for step in steps if step.accepted][-1]
     variants = {TWISTED: before.halves}
     if _RIVAL in before.halves[0].names:
         variants[f"{TWISTED} for {_RIVAL}"] = (before.halves[0].without(_RIVAL), before.halves[1].without(_RIVAL))
     trials = []
     for name, bases in variants.items():
         effect = cable.layout.named(TWISTED)
-        one, other = (with_effect(evidence, base, effect, effect.null) for base in bases)
-        trials.append(tried_with(evidence, name, (one, other), before, progress))
+        one, other = (with_effect(cable, base, effect, effect.null) for base in bases)
+        trials.append(tried_with(cable, name, (one, other), before, progress))
     best = min((t for t in trials if t.accepted), key=lambda t: t.error.mean(), default=None)
     # the better one of the two stays, and comes last
     result = [dataclasses.replace(t, accepted=False) for t in trials if t is not best]

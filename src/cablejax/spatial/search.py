@@ -23,7 +23,7 @@ from jaxtyping import Bool, Float, Int
 from cablejax.bounded import solve_arrow
 from cablejax.diagnose.evidence import Evidence
 from cablejax.diagnose.fit import evaluate, improved
-from cablejax.diagnose.protocol import Explanation, Term, explanation
+from cablejax.diagnose.protocol import Explanation, Simulator, Term, explanation
 from cablejax.diagnose.refits import dealt
 from cablejax.spatial.cable import SpatialCable, mean_error
 from cablejax.spatial.effects import SpatialEffect
@@ -91,10 +91,10 @@ def search(
     Returns:
         All steps, the nominal simulator first.
     """
-    evidence, steps = cable.evidence(), list(begun)
+    steps = list(begun)
     if not steps:
         null = explanation()
-        error = mean_error(evidence.predict([null])[0], evidence.observed)
+        error = unseen_error(cable, (null, null))
         steps = [Step("", True, (null, null), error, 0.0)]
         progress(f"nominal simulator: {1e3 * error.mean():.1f} mm from the free markers")
     while True:
@@ -104,14 +104,14 @@ def search(
         rest = [name for name in candidates if name not in [*accepted_effects(steps), *tried]]
         if not rest or len(tried) == _FAILURES:
             return steps
-        starts = {name: _starts(evidence, steps[last].halves, cable.layout.named(name)) for name in rest}
+        starts = {name: _starts(cable, steps[last].halves, cable.layout.named(name)) for name in rest}
         name = min(starts, key=lambda name: starts[name][1])
-        steps.append(tried_with(evidence, name, starts[name][0], steps[last], progress))
+        steps.append(tried_with(cable, name, starts[name][0], steps[last], progress))
         save(steps)
 
 
 def tried_with(
-    evidence: Evidence,
+    cable: SpatialCable,
     name: str,
     starts: tuple[Explanation, Explanation],
     before: Step,
@@ -120,45 +120,46 @@ def tried_with(
     """Fits both halves from starts, and says whether that simulates what they have not seen better than before.
 
     Args:
-        evidence: all windows.
+        cable: in all windows.
         name: of what is tried.
         starts: for either half.
         before: the step to compare with.
         progress: called with a line of text.
     """
     fits = []
-    for start, (seen, _) in zip(starts, _parts(evidence), strict=True):
-        (fit,) = improved(seen, evaluate(seen, [start]), evidence.simulator.plan.last_steps)
+    for start, (seen, _, _) in zip(starts, _parts(cable), strict=True):
+        (fit,) = improved(seen, evaluate(seen, [start]), cable.plan.last_steps)
         fits.append(fit.explanation)
     halves = fits[0], fits[1]
-    error, group = unseen_error(evidence, halves), np.asarray(evidence.simulator.recording)
-    accepted, chance = falls(before.error, error, group)
+    error = unseen_error(cable, halves)
+    accepted, chance = falls(before.error, error, cable.recording)
     word = "stays" if accepted else "does not help"
     progress(f"{name}: {1e3 * before.error.mean():.2f} -> {1e3 * error.mean():.2f} mm on unseen recordings, {word}")
     return Step(name, accepted, halves, error, chance)
 
 
-def unseen_error(evidence: Evidence, halves: tuple[Explanation, Explanation]) -> Float[np.ndarray, "W"]:
+def unseen_error(cable: SpatialCable, halves: tuple[Explanation, Explanation]) -> Float[np.ndarray, "W"]:
     """Error of every window by the fit of the other half [m]."""
-    error = np.zeros(len(evidence.episodes))
-    for one, (_, other) in zip(halves, _parts(evidence), strict=True):
-        error[other.episodes] = mean_error(other.predict([one])[0], other.observed)
+    error = np.zeros(len(cable.windows))
+    for one, (_, other, index) in zip(halves, _parts(cable), strict=True):
+        error[index] = mean_error(other.predict([one])[0], other.observed)
     return error
 
 
-def _parts(evidence: Evidence) -> list[tuple[Evidence, Evidence]]:
-    """What either half's fit sees, and what it does not."""
-    first = halves(np.asarray(evidence.simulator.recording))
-    both = [evidence.restricted(np.flatnonzero(half)) for half in (first, ~first)]
-    return [(both[0], both[1]), (both[1], both[0])]
+def _parts(cable: SpatialCable) -> list[tuple[Evidence, Evidence, Int[np.ndarray, "_"]]]:
+    """What either half's fit sees, and what it does not, with its place among the windows."""
+    first = halves(cable.recording)
+    index = [np.flatnonzero(half) for half in (first, ~first)]
+    one, other = (cable.on(cable.windows.chosen(part)).evidence() for part in index)
+    return [(one, other, index[1]), (other, one, index[0])]
 
 
 def _starts(
-    evidence: Evidence, before: tuple[Explanation, Explanation], effect: SpatialEffect
+    cable: SpatialCable, before: tuple[Explanation, Explanation], effect: SpatialEffect
 ) -> tuple[tuple[Explanation, Explanation], float]:
     """Where fits with one more effect may begin, per half, and the error on what each has not seen."""
     found, total = [], 0.0
-    for base, (seen, other) in zip(before, _parts(evidence), strict=True):
+    for base, (seen, other, _) in zip(before, _parts(cable), strict=True):
         found.append(_start(seen, base, effect))
         total += float(mean_error(other.predict([found[-1]])[0], other.observed).sum())
     return (found[0], found[1]), total
@@ -169,7 +170,7 @@ def _start(seen: Evidence, base: Explanation, effect: SpatialEffect) -> Explanat
 
     Far from the solution the model says little.
     """
-    trials = [with_effect(seen, base, effect, values) for _, values in effect.starts(None)]
+    trials = [with_effect(seen.simulator, base, effect, values) for _, values in effect.starts(None)]
     (fit,) = evaluate(seen, [_best(seen, trials)])
     model = fit.model(seen.weight(fit.sse), 0.0)
     step = -solve_arrow(
@@ -180,11 +181,11 @@ def _start(seen: Evidence, base: Explanation, effect: SpatialEffect) -> Explanat
     return _best(seen, [fit.explanation, *moved])
 
 
-def with_effect(evidence: Evidence, base: Explanation, effect: SpatialEffect, values: Sequence[float]) -> Explanation:
+def with_effect(cable: Simulator, base: Explanation, effect: SpatialEffect, values: Sequence[float]) -> Explanation:
     """A base with one more effect at these values."""
     added = explanation((effect, 0, values))
     both = Explanation((*base.terms, Term(effect, 0)), np.append(base.z, added.z), base.own)
-    return evidence.simulator.with_own(both)
+    return cable.with_own(both)
 
 
 def _best(seen: Evidence, trials: Sequence[Explanation]) -> Explanation:

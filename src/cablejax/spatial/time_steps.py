@@ -36,6 +36,7 @@ class TimeSteps:
 
     @property
     def fine_enough(self) -> bool:
+        """Whether finer steps would change less than a part of what a good fit leaves."""
         return self.error <= _SHARE * GOOD_FIT
 
 
