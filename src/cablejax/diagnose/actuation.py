@@ -1,7 +1,7 @@
-"""Effects of the arms: what shows between commands and measured gripper poses, before any cable is simulated.
+"""Effects of the arms, estimated from commands and measured gripper poses before any cable is simulated.
 
-The grippers' encoders are logged, so the cable is always driven by where the grippers were, and whatever the arms do
-wrong is told from commands and poses alone. It neither hides an effect of the cable nor is taken for one.
+The grippers' encoders are logged, so the cable is always driven by where the grippers were, and errors of the
+arms are estimated from commands and poses alone. They neither hide an effect of the cable nor are taken for one.
 """
 
 from __future__ import annotations
@@ -237,8 +237,10 @@ def with_arms(conclusion: Conclusion, arms: Actuation, calibration: Calibration)
 
 
 def _chances(arms: Actuation, calibration: Calibration) -> dict[tuple[str, ...], float]:
-    """Probability of every set of effects of the arms, by the rule of `belief`: errors of motions that a fit has not
-    seen, tempered for what laws of arms get wrong, and a cost for every effect.
+    """Probability of every set of effects of the arms.
+
+    By the rule of `belief`: likelihoods of held-out motions, tempered for errors of the arms' laws, and a cost for
+    every effect.
     """
     calibration = dataclasses.replace(calibration, baseline=_NEGLIGIBLE)
     temper = calibration.temper(arms.unseen[()], _ENCODER_NOISE)

@@ -1,4 +1,4 @@
-"""One log under the nominal simulator: what a diagnosis starts from."""
+"""One log, simulated nominally: the input of a planar diagnosis."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Whether an explanation leaves more than a right one does: a conformal test (Vovk, Gammerman and Shafer 2005).
+"""A conformal test of whether an explanation is complete (Vovk, Gammerman and Shafer 2005).
 
 The score of an explanation is what it leaves over what `Calibration.complete` allows. On labelled logs of other
 simulators that show one effect of the library, the right explanation has the scores below. If a new log is like these

@@ -1,4 +1,4 @@
-"""What a diagnosis returns."""
+"""The result of a diagnosis."""
 
 from __future__ import annotations
 
@@ -110,7 +110,7 @@ class Gap:
 
 @dataclasses.dataclass(frozen=True)
 class NextMotion:
-    """The motion that would best separate what could not be told apart, or sharpen what was named.
+    """The motion that would best separate indistinguishable effects, or sharpen the named one.
 
     Attributes:
         motion: its name, from `cablejax.diagnose.next_motion`.
@@ -136,7 +136,7 @@ class Diagnosis:
         verdict: see the format.
         sentence: the verdict in words.
         effects: what is named as the cause; empty for "none" and "unknown".
-        equivalent: sets of effects that this log cannot tell apart.
+        equivalent: sets of effects that are indistinguishable on this log.
         ranking: every effect tried, most probable first; without probabilities, the largest shrinkage first.
         leftover_p: chance that a right explanation leaves as much as the best one does, see `conformal`; None without a
             gap, and where no labelled logs are like this one.

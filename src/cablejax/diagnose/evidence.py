@@ -1,4 +1,4 @@
-"""What a recording says, ready for fits: observations and predictions, weighed by the noise."""
+"""The evidence of a recording: observations and predictions, weighed by the noise."""
 
 from __future__ import annotations
 

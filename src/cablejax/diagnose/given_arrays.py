@@ -1,4 +1,4 @@
-"""Checks of what a user hands to a diagnosis: arrays, the noise, and a simulator that does what the protocol asks."""
+"""Validates the input of a diagnosis: arrays, the noise, and a simulator that follows the protocol."""
 
 from __future__ import annotations
 

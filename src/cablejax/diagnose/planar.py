@@ -1,4 +1,4 @@
-"""The planar cable as a diagnosis sees it: the chain's playback of a log behind the protocol of simulators."""
+"""The adapter of planar cables: the chain's playback of a log behind the protocol of simulators."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a diagnosis needs of a simulator, and what an explanation of a gap is.
+"""The protocol of simulators that can be diagnosed, and explanations of a gap.
 
 A diagnosis asks a simulator three things: which effects could be at work, with priors; what it predicts for the
 recorded motions under some of them; and, where it knows better than forward differences, how predictions change with

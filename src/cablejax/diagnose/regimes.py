@@ -1,4 +1,4 @@
-"""In which regime the cable is at every sample of a log: what the grippers do, and how it lies."""
+"""Regimes of the samples of a log, by the grippers' motion and the shape of the cable."""
 
 from __future__ import annotations
 

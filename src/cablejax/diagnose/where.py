@@ -44,7 +44,7 @@ class Where:
 
     Attributes:
         gap_mm: over the whole log.
-        smallest_mm: the least gap over the whole log that would have been told from noise.
+        smallest_mm: the least gap over the whole log that would have been distinguished from noise.
         along_cable_mm: at each keypoint, shape [N].
         bend_per_m: root mean square difference of the curvature at each inner keypoint, above the noise [1/m]. The gap
             itself is always small near the grippers, which hold the cable; this points closer to a cause that is local.

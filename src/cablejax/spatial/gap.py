@@ -1,4 +1,4 @@
-"""How far a simulation is off the recorded windows, and how much of that an explanation takes away."""
+"""Error of a simulation on the recorded windows, and its shrinkage by an explanation."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What an identification has done, kept in a file so that an interrupted one goes on where it was."""
+"""Progress of an identification in a file, so that an interrupted one resumes."""
 
 from __future__ import annotations
 
