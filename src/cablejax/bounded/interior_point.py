@@ -46,14 +46,14 @@ class _Iterate(NamedTuple):
 
 
 class _Sizes(NamedTuple):
-    """What residuals are compared with: a typical length of slacks and force of multipliers."""
+    """Scales of the residuals: a typical length of slacks and force of multipliers."""
 
     length: Float[Array, ""]
     force: Float[Array, ""]
 
 
 class _Residuals(NamedTuple):
-    """How far an iterate is from the conditions of Karush, Kuhn and Tucker.
+    """Residuals of the Karush-Kuhn-Tucker conditions at an iterate.
 
     Attributes:
         jacobian: of the bounds, shape [K, P].

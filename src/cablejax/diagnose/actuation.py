@@ -34,7 +34,7 @@ _GAIN, _LAG = ARMS = "actuation_gain", "actuation_lag"
 
 @dataclasses.dataclass(frozen=True)
 class Actuation:
-    """How the arms follow their commands.
+    """Fits of the arms to their commands.
 
     Attributes:
         effects: names and parameters (value, 90 % interval, unit) of what explains the deviation, at most both.
@@ -70,7 +70,7 @@ class Actuation:
 
 @dataclasses.dataclass(frozen=True)
 class _Arms:
-    """What was measured and what was commanded; fits what lies between.
+    """Measured and commanded motion, and fits of one to the other.
 
     Attributes:
         pose: measured, shape [E, T, 2, 3].
@@ -98,7 +98,7 @@ class _Arms:
         )
 
     def off(self, poses: Float[np.ndarray, "E T 2 3"]) -> Float[np.ndarray, "E T 2 3"]:
-        """What measured poses are off [m]; 0 in the padding."""
+        """Errors of the measured poses [m]; 0 in the padding."""
         return np.array([1.0, 1.0, _ROTATION_WEIGHT]) * self.valid[:, :, None, None] * (self.pose - poses)
 
     def each(self, poses: Float[np.ndarray, "E T 2 3"]) -> Float[np.ndarray, "E"]:

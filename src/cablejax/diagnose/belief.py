@@ -118,7 +118,7 @@ def as_good(fit: Fit, best: Fit, evidence: Evidence, calibration: Calibration) -
 
 
 def left_by_motion(fit: Fit, evidence: Evidence) -> Float[np.ndarray, "M"]:
-    """What a fit leaves of each motion, root mean square per coordinate above the noise."""
+    """Remaining error of each motion, root mean square per coordinate above the noise."""
     counts = evidence.count
     squares = [
         max(float((fit.sse - counts)[own].sum()), 0.0) / float(counts[own].sum())

@@ -45,7 +45,7 @@ def usual_interval(time: Float[np.ndarray, "T"]) -> float:
 
 
 def furthest_off(time: Float[np.ndarray, "T"], interval: float) -> float:
-    """How far a sample is from an even clock, at most [s]."""
+    """Largest distance of a sample from an even clock [s]."""
     return float(np.abs(time - time[0] - interval * np.arange(len(time))).max())
 
 

@@ -132,7 +132,7 @@ def _draws(evidence: Evidence, fit: Fit, calibration: Calibration) -> Float[np.n
 
 
 def baselines(found: Search, evidence: Evidence) -> dict[str, str]:
-    """What simpler rules would have named, see `Diagnosis.baselines`."""
+    """Effects that simpler rules would have named, see `Diagnosis.baselines`."""
     singles = [fit for fit in found.fits if len(effect_names(fit.explanation)) == 1]
     if not singles:
         return {}

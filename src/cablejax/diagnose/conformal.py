@@ -26,7 +26,7 @@ docs/results/blind/20270404/cases.jsonl --leftovers`."""
 
 
 def leftover_score(left: float, gap: float, noise: float, calibration: Calibration) -> float:
-    """What an explanation leaves of the gap, relative to what a complete one may leave; all in one unit."""
+    """Remaining gap of an explanation, relative to that of a complete one; all in one unit."""
     return left / calibration.may_leave(gap, noise)
 
 

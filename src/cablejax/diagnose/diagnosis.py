@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 Verdict = Literal["none", "named", "ambiguous", "named+unknown", "unknown"]
 
 PLACES = ("along_cable_m", "time_s", "table_m")
-"""Where an effect may sit, by the keys of the verdict."""
+"""Place of an effect, by the keys of the verdict."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -73,7 +73,7 @@ class Ranked:
 
 @dataclasses.dataclass(frozen=True)
 class Gap:
-    """How large the gap is before and after, on episodes that no fit has seen. Root mean squares per coordinate [mm].
+    """Size of the gap before and after, on held-out episodes. Root mean squares per coordinate [mm].
 
     Where `unit` is not the metre, whatever is called `_mm` is in thousandths of it.
 
@@ -128,7 +128,7 @@ class NextMotion:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Diagnosis:
-    """Which effect makes a simulator wrong on a recording, and how far the gap shrinks with it. Any simulator's.
+    """Diagnosis of any simulator: the effect it lacks on a recording, and how far the gap shrinks with it.
 
     What a simulator does not compute is None.
 

@@ -60,7 +60,7 @@ def checked_nominal(
 
 
 def recorded_arrays(observed: ArrayLike, interval: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
-    """What was observed, shape [E, T, ...], and the sample interval of each episode [s].
+    """The observations, shape [E, T, ...], and the sample interval of each episode [s].
 
     Raises:
         ValueError: arrays that are no recording.

@@ -20,7 +20,7 @@ SMALLEST = 5e-5
 
 @dataclasses.dataclass(frozen=True)
 class NoiseFloor:
-    """What no simulator can explain.
+    """Noise floor of a recording.
 
     Attributes:
         std: standard deviation of each keypoint's coordinates [m], shape [N].

@@ -60,7 +60,7 @@ class PlanarCable(Simulator):
         return playback.keypoints(physics, episodes) + self.correction[np.asarray(episodes, int)]
 
     def starts(self, effect, predicted, residual):
-        """From the effect's own guesses, which see the cable as it is predicted and what that leaves."""
+        """The effect's own guesses, from the predicted cable and the residual."""
         context = Context(
             config=self.playback.config,
             keypoints=predicted,

@@ -153,7 +153,7 @@ def _samples(log: GapLog, e: int, *, observed: bool) -> tuple[Float[np.ndarray, 
 
 
 def _whole_turns(points: Float[np.ndarray, "T N 2"], pose: Float[np.ndarray, "T 2 3"]) -> float:
-    """What to add to the second gripper's angle so that it continues the first one's along the cable [rad].
+    """Whole turns to add to the second gripper's angle, so that it continues the first one's along the cable [rad].
 
     An angle is known up to whole turns, a cable is not: between the same directions it may lie straight or with a loop
     in it. The keypoints decide, in the samples that show most of them.

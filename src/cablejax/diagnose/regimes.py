@@ -20,7 +20,7 @@ _REVERSAL_EDGES = (0.0, 1.0, 3.0, 10.0)
 
 @dataclasses.dataclass(frozen=True)
 class Regimes:
-    """Which samples are of which regime.
+    """Regimes of the samples.
 
     Attributes:
         masks: by "what: class", shape [E, T] each; the classes of one "what" do not overlap.

@@ -20,7 +20,7 @@ from cablejax.simulate.pose import wrapped
 INTERVAL = 0.1
 """Between two samples of a motion [s]."""
 LIMITS = MotionConfig(straight_slack=0.005, min_distance=0.15, max_step=0.05, rotation_weight=0.15)
-"""What the grippers keep to: distance 0.15 to 0.995 of the length, 0.05 m/s with 0.15 m/rad."""
+"""Bounds on the grippers: distance 0.15 to 0.995 of the length, 0.05 m/s with 0.15 m/rad."""
 _SLOW = 0.3
 _HOLD = 3.0
 _FAR, _NEAR, _OVERLOAD = 0.93, 0.6, 0.3

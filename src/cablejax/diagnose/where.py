@@ -186,7 +186,7 @@ def _horizons(log: GapLog, valid, everywhere, above) -> dict[float, float]:
 
 
 def _frames(residual, noise, nominal, log: GapLog) -> dict[str, float]:
-    """How much of the squared gap a constant error in each frame explains, noise taken out of both."""
+    """Share of the squared gap that a constant error in each frame explains, noise taken out of both."""
     seen = np.isfinite(residual).all(axis=-1)
     floor = np.broadcast_to(noise**2, seen.shape)
     power = (np.where(seen[..., None], residual**2, 0.0)).sum() - 2 * floor[seen].sum()

@@ -26,7 +26,7 @@ from cablejax.spatial.effects import GRIP, Layout
 from cablejax.spatial.windows import Windows
 
 GOOD_FIT = 0.01
-"""What is left of a good fit [m]: unit of the residuals."""
+"""Error of a good fit [m]: unit of the residuals."""
 TWISTED = "intrinsic_curvature"
 """The effect that needs the material frame, whose derivatives take four times as long as all others together."""
 _CHUNK = 8

@@ -153,7 +153,7 @@ class Layout:
         return bare - jnp.log(self.laden(values))
 
     def physics(self, values: Float[Array, "P"] | np.ndarray) -> RodPhysics:
-        """What the simulator needs; differentiable in `values`."""
+        """Parameters of the simulator; differentiable in `values`."""
         part: Mapping[str, Array] = {name: jnp.asarray(values)[where] for name, where in self.slices.items()}
         arclength = jnp.asarray(self.arclength) + part["along"]
         stiffness = self.nominal_stiffness * part["ratio"] * jnp.exp(part["log_profile"])

@@ -30,7 +30,7 @@ _RIVAL = "stiffness_profile"
 
 @dataclasses.dataclass(frozen=True)
 class Identified:
-    """What was found.
+    """Result of an identification.
 
     Attributes:
         cable: the simulator, in the windows that it was found from.
