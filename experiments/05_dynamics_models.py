@@ -23,6 +23,7 @@ os.environ.setdefault("NPROC", "4")
 import jax
 import matplotlib.pyplot as plt
 import numpy as np
+from flax import nnx
 
 from cablejax.cable import Cable, Discretisation
 from cablejax.dataset.generate import make_engine, simulate
@@ -30,7 +31,7 @@ from cablejax.dataset.schema import DatasetConfig, config_from_json
 from cablejax.dataset.windows import Window, concatenate
 from cablejax.dynamics.config import ModelConfig
 from cablejax.dynamics.evaluate import evaluation_windows, no_motion, prior_motion, snapping, window_errors
-from cablejax.dynamics.transfer import on_another_cable
+from cablejax.dynamics.model import structure_of
 from cablejax.dynamics.weights import load_info, load_weights
 from cablejax.effects.physics import nominal_physics
 from cablejax.simulate import ThreadedEngine
@@ -184,6 +185,25 @@ def draw(errors: dict[str, np.ndarray], bare: dict[str, np.ndarray], calm: np.nd
         axis.legend(fontsize=8, frameon=False, loc="lower right", ncols=2)
     axes[0].set_ylabel("keypoint error [cm]: median, mean (dashed), 10 to 90 %")
     figure.savefig(path, dpi=140)
+
+
+def on_another_cable(config: ModelConfig, *, n_keypoints: int, length: float) -> tuple[ModelConfig, nnx.GraphDef]:
+    """Configuration and structure with which the same weights read another cable.
+
+    A graph network has the same weights at every node and edge, and so has a recurrence along the cable. The connective
+    radius stays what it was in metres, so that finer keypoints have more neighbours; nothing says that the network has
+    learned what those mean.
+
+    Raises:
+        ValueError: the network has weights of its own for every keypoint, or no two keypoints would be connected.
+    """
+    if config.network == "mlp" and n_keypoints != config.n_keypoints:
+        raise ValueError(
+            f"The network is a perceptron over {config.n_keypoints} keypoints: it cannot read {n_keypoints}. "
+            "Train another one."
+        )
+    other = dataclasses.replace(config, n_keypoints=n_keypoints, length=length)
+    return other, structure_of(other)[0]
 
 
 def main() -> None:

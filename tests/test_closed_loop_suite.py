@@ -12,7 +12,6 @@ from cablejax.cable import Discretisation
 from cablejax.control.loop import run_closed_loop
 from cablejax.control.shaping import load_model
 from cablejax.control.targets import make_target
-from cablejax.control.visual_servo import VisualServo
 from cablejax.dynamics.train_config import Phase
 from cablejax.effects.given import GivenEffect
 from cablejax.mpc import MPC
@@ -25,6 +24,7 @@ from closed_loop.methods import LABEL, METHODS, controller_of
 from closed_loop.paper import VISUAL_SERVO
 from closed_loop.protocols import LaidOut, letter_task
 from closed_loop.suite import Case, key_of, read_suite, run_suite
+from closed_loop.visual_servo import VisualServo
 
 CABLE = Discretisation(n_links=12, dimension=3, timestep=0.005)
 SERVO = METHODS[VISUAL_SERVO]
@@ -59,6 +59,7 @@ def test_a_suite_is_shared_resumed_and_read_whole(tmp_path):
     experiment = Experiment("x", "x.py", "Title", "About.", extent, extent, ("III", "IV"))
     text = page(experiment, trials, "python x.py", picture=None)
     assert "| online visual servo | 2 |" in text and "Table IV" not in text and "Seeds: 0, 1." in text
+    assert "### How runs end" in text and "| online visual servo | U | 2 |" in text
     assert re.search(r"takes, on average: U [789]\.\d s\.", text)
 
 

@@ -7,6 +7,11 @@ import math
 import numpy as np
 import pytest
 
+from cablejax.cable import Cable
+from cablejax.control.targets import make_target, straight_start
+from cablejax.simulate.elastica import elastica
+from cablejax.types import Measurement
+from closed_loop.baselines import StraightDrive
 from closed_loop.trials import Trial, read_trials, trial_of
 from closed_loop_cases import TRIAL, course, trial
 from rows import append_row
@@ -93,8 +98,32 @@ def test_a_run_becomes_a_trial():
         error_cm = np.array([20.0, 0.4, np.nan, 0.5])
         mpc_ms = np.array([90.0, 110.0, 130.0, np.nan])
         stopped = None
+        twist = np.tile([[0.01, 0.0, 0.0], [0.0, 0.0, 0.1]], (4, 1, 1))
 
     row = trial_of(Run(), table="III", method="direct", scenario="Z", stiffness=3, seed=4, wall_s=2)  # pyright: ignore[reportArgumentType]
     assert (row.best_error_cm, row.steps, row.mpc_ms_median) == (0.4, 3, 110.0)
     assert row.key == ("III", "direct", "Z", 3.0, 4)
+    assert row.motion_m == pytest.approx((0.025,) * 3), "a radian counts as 15 cm; the last sample has no command"
     assert row.errors_cm[:2] == (20.0, 0.4) and math.isnan(row.errors_cm[2])
+
+
+def test_the_end_of_a_run_is_judged_over_its_last_ten_seconds():
+    chattering = trial(errors_cm=(20.0, *[0.2, 0.8] * 8), motion_m=(0.05,) * 16)
+    assert len(chattering.late_errors_cm) == 10 and np.ptp(chattering.late_errors_cm) == pytest.approx(0.6)
+    assert chattering.late_travel_m == pytest.approx(0.5)
+    assert chattering.worse_than_best and not TRIAL.worse_than_best
+    assert trial(errors_cm=course(math.nan)).worse_than_best, "a lost cable is worse than any"
+    assert math.isnan(TRIAL.late_travel_m), "older rows have no motions"
+
+
+def test_a_straight_drive_ends_at_the_goal_and_stays():
+    drive, goal = StraightDrive(make_target("S").keypoints), make_target("S").gripper_pose
+    pose = straight_start(Cable())
+    keypoints = elastica(pose, 1.0, Cable().keypoint_arclength)
+    for _ in range(20):
+        _, twist, _ = drive.step((), Measurement(keypoints, pose))
+        assert np.linalg.norm(twist * np.array([1.0, 1.0, 0.15]), axis=1).max() <= 0.05 + 1e-6
+        pose = pose + np.asarray(twist)
+        keypoints = np.linspace(pose[0, :2], pose[1, :2], 13)
+    np.testing.assert_allclose(pose[:, :2], goal[:, :2], atol=1e-3)
+    assert np.abs(twist).max() < 1e-3

@@ -189,15 +189,15 @@ def test_missing_keypoints_reach_the_player_as_null():
 
 def test_headline_does_not_claim_what_the_residual_did_not_do():
     worse = {"residual": run("U", "residual", short=0.2), "direct": run("U", "direct", short=0.05)}
-    title, lead = headline({"U": worse})
+    title, _, ends = headline({"U": worse})
     assert title == f"The cable stays {worse['residual'].terminal_error_cm:.2f} cm away from U"
-    assert f"{worse['direct'].terminal_error_cm:.2f}" in lead
+    assert f"{worse['direct'].terminal_error_cm:.2f}" in ends["direct"]
 
 
 def test_headline_tells_reached_from_missed():
     runs = {"U": run("U"), "S": run("S", short=0.3), "Z": run("Z", short=0.02)}
     ends = [one.terminal_error_cm for one in runs.values()]
-    title, _ = headline({shape: {"residual": one} for shape, one in runs.items()})
+    title, *_ = headline({shape: {"residual": one} for shape, one in runs.items()})
     assert title == (
         f"The cable reaches U and Z to within {max(ends[0], ends[2]):.2f} cm, but it stays {ends[1]:.2f} cm away from S"
     )

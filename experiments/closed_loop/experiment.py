@@ -17,9 +17,9 @@ from cablejax.mpc import MPCConfig
 from closed_loop import interval_tables, tables
 from closed_loop.failures import failure_figure, worst
 from closed_loop.fine_tuning import FineTuneConfig, fine_tune, record
-from closed_loop.methods import ADAPTED_RESIDUAL, LABEL, METHODS
+from closed_loop.methods import ADAPTED_RESIDUAL, LABEL, METHODS, model_named
 from closed_loop.protocols import least_time
-from closed_loop.suite import Case, read_suite, released, run_suite
+from closed_loop.suite import Case, read_suite, run_suite
 from closed_loop.trials import LIANG_TABLE, Trial
 from pages import page_of_results, publish
 
@@ -122,7 +122,7 @@ def fine_tuned_model(folder: pathlib.Path, case: Case) -> Model:
     if not (home / FILE_NAME).is_file():
         plant: Any = case.plant()
         fine_tune(record(plant, plant.config.cable, config, home / "recording.npz"), config, home)
-    return released(str(home))
+    return model_named(str(home))
 
 
 def page(experiment: Experiment, trials: Sequence[Trial], command: str, picture: str | None) -> str:
@@ -142,6 +142,7 @@ def page(experiment: Experiment, trials: Sequence[Trial], command: str, picture:
         lines += ["", "### Settling time by other definitions", "", f"{SETTLING_NOTE} {least}"]
         lines += ["", tables.settling_table(mine, table, labels=LABEL)]
         lines += ["", "### By stiffness", "", tables.stiffness_table(mine, table, labels=LABEL)]
+        lines += ["", "### How runs end", "", interval_tables.end_table(mine, table, labels=LABEL)]
         lines += ["", "### Intervals and failures", "", interval_tables.interval_table(mine, table, labels=LABEL)]
         methods = {trial.method for trial in mine}
         if ADAPTED_RESIDUAL in methods and len(methods) > 1:

@@ -22,8 +22,10 @@ from closed_loop.cells import (
 )
 from closed_loop.paper import LIANG, METHOD_LABEL, Measure
 from closed_loop.statistics import Interval, bootstrap_interval, paired_difference, summarise
-from closed_loop.trials import LIANG_TABLE, Trial
+from closed_loop.trials import LATE, LIANG_TABLE, Trial
 
+RESTING_MM = 0.3
+"""Peak to peak of the error over the last `LATE` seconds below which a run counts as at rest [mm]."""
 SUCCESS_CM = 1.0
 """Liang et al.: a shape is reached below this root mean square error [cm]."""
 
@@ -153,6 +155,45 @@ def success_table(
     title = [
         "method", "start", "success", "95 % interval", "below 10 mm at some time", "mean error of successes [mm]",
         "mean error of all [mm]", "median [mm]", "steps at most",
+    ]  # fmt: skip
+    return markdown(title, rows)
+
+
+def end_table(
+    trials: Iterable[Trial],
+    table: str,
+    *,
+    methods: Sequence[str] | None = None,
+    labels: Mapping[str, str] = METHOD_LABEL,
+) -> str:
+    """How runs end: the error over the last `LATE` seconds, whether it still moves, and what the grippers still do.
+
+    Raises:
+        ValueError: there is no trial of this table.
+    """
+    mine = trials_of_table(trials, table)
+    rows = []
+    for method in methods_of(mine, methods):
+        for scenario in scenarios_of(mine):
+            cell = of_scenario([trial for trial in mine if trial.method == method], scenario)
+            if not cell:
+                continue
+            late = [trial.late_errors_cm for trial in cell]
+            swing = 10 * np.array([np.ptp(errors) for errors in late])
+            travel = [trial.late_travel_m for trial in cell]
+            rows.append(
+                [
+                    label_of(method, labels), scenario, str(len(cell)),
+                    number_text(float(np.mean([errors.mean() for errors in late]))),
+                    number_text(float(np.max([errors.max() for errors in late]))),
+                    number_text(float(np.median(swing))), f"{np.sum(swing <= RESTING_MM)}/{len(cell)}",
+                    f"{sum(trial.worse_than_best for trial in cell)}/{len(cell)}",
+                    number_text(100 * float(np.mean(travel))) if np.isfinite(travel).all() else "",
+                ]
+            )  # fmt: skip
+    title = [
+        "method", "scenario", "trials", f"mean of the last {LATE} s [cm]", "worst [cm]", "median swing [mm]",
+        f"swing of at most {RESTING_MM} mm", "50 % above own best", "travel of the grippers there [cm]",
     ]  # fmt: skip
     return markdown(title, rows)
 

@@ -3,19 +3,32 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
+from pathlib import Path
 
 from cablejax.control.loop import Controller
-from cablejax.control.shaping import Model, make_controller
+from cablejax.control.shaping import Model, load_model, make_controller
 from cablejax.control.targets import Target
-from cablejax.control.visual_servo import ServoConfig, VisualServo
+from closed_loop.baselines import StraightDrive, statics_model
 from closed_loop.paper import DIRECT, FINE_TUNED, METHOD_LABEL, RANDOMISED, RESIDUAL, VISUAL_SERVO
+from closed_loop.visual_servo import ServoConfig, VisualServo
 
 ADAPTED = "adapted"
 ADAPTED_RESIDUAL = "adapted residual"
+DRIVE = "straight drive"
+STATICS = "statics"
+PAPER_DIRECT = "paper network"
+PAPER_RESIDUAL = "paper network residual"
+RECURRENT_RESIDUAL = "recurrent residual"
 
 LABEL = METHOD_LABEL | {
     ADAPTED: "conditioned GNS + online estimate",
     ADAPTED_RESIDUAL: "conditioned GNS + estimate + residual",
+    DRIVE: "straight drive to the goal, no model",
+    STATICS: "statics alone",
+    PAPER_DIRECT: "GNS without statics, world's frame, direct",
+    PAPER_RESIDUAL: "GNS without statics, world's frame + residual",
+    RECURRENT_RESIDUAL: "Bi-LSTM + online residual",
 }
 """Names for readers."""
 
@@ -26,7 +39,7 @@ class MethodSpec:
 
     Attributes:
         name: in trials, see `LABEL`.
-        weights: released model that it plans with; None = it has no model.
+        weights: model that it plans with, see `model_named`; None = it has no model.
         residual: whether the model's errors are corrected online.
         fine_tuned: whether the model is first trained on transitions of the very cable that it will shape.
     """
@@ -47,9 +60,24 @@ METHODS: dict[str, MethodSpec] = {
         MethodSpec(RESIDUAL, "gns-reference", residual=True),
         MethodSpec(ADAPTED, "gns-conditioned"),
         MethodSpec(ADAPTED_RESIDUAL, "gns-conditioned", residual=True),
+        MethodSpec(DRIVE, None),
+        MethodSpec(STATICS, STATICS),
+        MethodSpec(PAPER_DIRECT, "gns-none-world"),
+        MethodSpec(PAPER_RESIDUAL, "gns-none-world", residual=True),
+        MethodSpec(RECURRENT_RESIDUAL, "lstm-static", residual=True),
     )
 }
-"""The paper's methods in its order, then two beyond it. A conditioned model estimates its cable in any case."""
+"""The paper's methods in its order, two beyond it, and what they have to beat. A conditioned model estimates its cable
+in any case."""
+
+
+@functools.lru_cache(maxsize=8)
+def model_named(name: str) -> Model:
+    """A released model, one of `experiments/weights`, a training's folder, or the statics; loaded once."""
+    if name == STATICS:
+        return statics_model()
+    folder = Path(__file__).parents[1] / "weights" / name
+    return load_model(str(folder) if folder.is_dir() else name)
 
 
 def controller_of(spec: MethodSpec, model: Model | None, target: Target) -> Controller:
@@ -60,6 +88,8 @@ def controller_of(spec: MethodSpec, model: Model | None, target: Target) -> Cont
         model: as the method's weights say, fine-tuned if it asks for that; None for one without a model.
         target: the wanted shape.
     """
+    if spec.name == DRIVE:
+        return StraightDrive(target.keypoints)  # pyright: ignore[reportArgumentType]
     if model is None:
         return VisualServo(ServoConfig(), target.keypoints)
     return make_controller(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
 import pathlib
 import time
 from collections.abc import Callable, Sequence
@@ -11,9 +10,9 @@ from typing import Any
 
 from cablejax.control.loop import run_closed_loop
 from cablejax.control.run import ClosedLoopRun
-from cablejax.control.shaping import Model, load_model
+from cablejax.control.shaping import Model
 from closed_loop.failures import Snapshot, append_snapshot, read_snapshots, snapshot_of
-from closed_loop.methods import MethodSpec, controller_of
+from closed_loop.methods import MethodSpec, controller_of, model_named
 from closed_loop.protocols import GuessingCable, LaidOut, Task
 from closed_loop.trials import KEY, Trial, TrialKey, read_trials, trial_of
 from rows import Rows
@@ -90,7 +89,7 @@ def run_suite(
         case, method = wanted[key]
         model = None
         if method.weights is not None:
-            model = fine_tuned(case) if method.fine_tuned else released(method.weights)
+            model = fine_tuned(case) if method.fine_tuned else model_named(method.weights)
         begin = time.perf_counter()
         finished = run_case(case, method, model)
         names = dict(zip(KEY, key, strict=True))
@@ -100,12 +99,6 @@ def run_suite(
 
     rows = Rows(folder / TRIALS, KEY)
     rows.run(rows.missing(wanted, process), run, progress=progress)
-
-
-@functools.lru_cache(maxsize=8)
-def released(name: str) -> Model:
-    """A released model, loaded once."""
-    return load_model(name)
 
 
 def read_suite(folder: pathlib.Path) -> tuple[list[Trial], list[Snapshot]]:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from cablejax.control.run import settling_time, step_settling_time
+from cablejax.mpc import ObjectiveConfig
 from rows import read_rows
 
 if TYPE_CHECKING:
@@ -20,6 +21,9 @@ TrialKey = tuple[str, str, str, float, int]
 
 KEY = ("table", "method", "scenario", "stiffness", "seed")
 """The same as names of fields."""
+
+LATE = 10
+"""Samples at the end of a run, a second apart, in which it is judged whether it has settled."""
 
 LIANG_TABLE = "Liang"
 """Name of the table of random starts to random targets; its scenarios are "straight" and "diverse"."""
@@ -40,6 +44,8 @@ class Trial:
         stopped: why the run ended early, or None.
         mpc_ms_median: median wall time of a control call [ms].
         wall_s: wall time of the whole trial [s].
+        motion_m: how far the grippers were commanded in each step [m], both together, a radian counting as 0.15 m;
+            None in rows that were written before it was recorded.
     """
 
     table: str
@@ -51,6 +57,7 @@ class Trial:
     stopped: str | None
     mpc_ms_median: float
     wall_s: float
+    motion_m: tuple[float, ...] | None = None
 
     @property
     def key(self) -> TrialKey:
@@ -66,6 +73,21 @@ class Trial:
     def best_error_cm(self) -> float:
         """The lowest error on the way [cm]."""
         return min((error for error in self.errors_cm if math.isfinite(error)), default=math.nan)
+
+    @property
+    def late_errors_cm(self) -> np.ndarray:
+        """Errors of the last `LATE` seconds [cm]: a single last value may be a snapshot of an oscillation."""
+        return np.array(self.errors_cm[-LATE:])
+
+    @property
+    def worse_than_best(self) -> bool:
+        """Whether the run ends half as far again from the target as it has been, and by more than 0.1 mm."""
+        return not self.terminal_error_cm <= max(1.5 * self.best_error_cm, self.best_error_cm + 0.01)
+
+    @property
+    def late_travel_m(self) -> float:
+        """Motion of both grippers in the last `LATE` commands [m]; NaN where it was not recorded."""
+        return math.nan if self.motion_m is None else float(sum(self.motion_m[-LATE:]))
 
     @property
     def steps(self) -> int:
@@ -90,6 +112,7 @@ def trial_of(
     run: ClosedLoopRun, *, table: str, method: str, scenario: str, stiffness: float, seed: int, wall_s: float
 ) -> Trial:
     """The row of one finished run."""
+    motion = run.twist[:-1] * np.array([1.0, 1.0, ObjectiveConfig().rotation_weight])
     timed = run.mpc_ms[np.isfinite(run.mpc_ms)]
     return Trial(
         table=table,
@@ -101,6 +124,7 @@ def trial_of(
         stopped=run.stopped,
         mpc_ms_median=float(np.median(timed)) if len(timed) else math.nan,
         wall_s=float(wall_s),
+        motion_m=tuple(map(float, np.linalg.norm(motion, axis=-1).sum(axis=-1))),
     )
 
 
@@ -121,7 +145,8 @@ def read_trials(path: str | os.PathLike[str]) -> list[Trial]:
 
 def _parsed(fields: dict[str, Any], where: str) -> Trial:
     kinds = {field.name: field.type for field in dataclasses.fields(Trial)}
-    missing, unknown = sorted(set(kinds) - set(fields)), sorted(set(fields) - set(kinds))
+    missing = sorted(set(kinds) - set(fields) - {"motion_m"})
+    unknown = sorted(set(fields) - set(kinds))
     if missing or unknown:
         raise ValueError(f"{where} is not a trial: missing fields {missing}, unknown fields {unknown}.")
     try:
@@ -137,4 +162,5 @@ _CONVERT: dict[Any, Any] = {
     "int": int,
     "str | None": lambda value: None if value is None else str(value),
     "tuple[float, ...]": lambda values: tuple(map(float, values)),
+    "tuple[float, ...] | None": lambda values: None if values is None else tuple(map(float, values)),
 }

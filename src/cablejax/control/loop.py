@@ -24,13 +24,15 @@ class ObservedCable(Protocol):
 
     def reset(self, gripper_pose: Float[np.ndarray, "Q 3"]) -> Observation:
         """Lays the cable at rest between these poses and observes it."""
+        ...
 
     def record(self, twist: Float[np.ndarray, "Q 3"], interval: float, *, samples: int) -> list[Observation]:
         """Executes a twist for `interval` seconds and observes `samples` times, evenly spaced, the last at its end."""
+        ...
 
 
 class Controller(Protocol):
-    """A controller: an object with two pure functions. Those of the package are `mpc.MPC` and `VisualServo`.
+    """A controller: an object with two pure functions. `mpc.MPC` is one.
 
     For `control.batched` it is a pytree with a leaf `target` as well, the keypoints [N, 2] that it steers towards.
     """

@@ -53,3 +53,8 @@ def apply(
 def bind(graphdef: nnx.GraphDef, weights: nnx.State) -> OneStepModel:
     """The model as a function of history and twist alone."""
     return lambda history, twist: apply((graphdef, weights), history, twist)
+
+
+def structure_of(config: ModelConfig) -> tuple[nnx.GraphDef, nnx.State]:
+    """The structure of a network and the shapes and dtypes of its weights, without any memory."""
+    return nnx.split(nnx.eval_shape(lambda: make_network(config, nnx.Rngs(0))))

@@ -29,7 +29,7 @@ from safetensors.numpy import save
 from cablejax.cable import Cable
 from cablejax.cable_file import cable_from_fields
 from cablejax.dynamics.config import ModelConfig, Normalisation
-from cablejax.dynamics.transfer import structure_of
+from cablejax.dynamics.model import structure_of
 from cablejax.whole_file import whole_file
 
 SCHEMA = "cablejax-weights/1"

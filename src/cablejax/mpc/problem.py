@@ -196,7 +196,7 @@ class ShapingProblem:
         return jnp.concatenate([shape.ravel(), self.objective.motion_weight**0.5 * motion.ravel()])
 
     def _of_grippers(self, motion: Float[Array, "T Q 3"]) -> Float[Array, " T+Q"]:
-        """Residuals of the grippers' poses: winding after every step, and the weighted distance after the last one [m]."""
+        """Residuals of the grippers' poses: winding after every step, weighted distance after the last one [m]."""
         pose, weight = continued(self.history.gripper_pose, self.history.keypoints[-1]), self.objective.rotation_weight
         turn = pose[1, 2] - pose[0, 2] + jnp.cumsum(motion[:, 1, 2] - motion[:, 0, 2]) / weight
         wound = weight * jnp.maximum(jnp.abs(turn - total_turn(self.target)) - jnp.pi, 0.0)

@@ -2,29 +2,23 @@
 
 from __future__ import annotations
 
-import html
-import importlib.resources
 import os
 import pathlib
-import string
+from collections.abc import Iterator
 
 import numpy as np
 
 from cablejax.diagnose.belief import Calibration
 from cablejax.diagnose.diagnosis import CableDiagnosis, NamedEffect, Verdict
-from cablejax.diagnose.judgement import look_alikes
+from cablejax.diagnose.judgement import FAINT, look_alikes
 from cablejax.diagnose.verdict_json import write_verdict
+from cablejax.report import diagnosis_sections as sections
 from cablejax.report.diagnosis_charts import motion_figure, ranking_figure, shrinkage_figure
 from cablejax.report.diagnosis_figures import cable_figure, where_figure
-from cablejax.report.diagnosis_sections import (
-    details_section,
-    far_section,
-    in_space,
-    limits_section,
-    next_section,
-    which_section,
-)
+from cablejax.report.diagnosis_sections import in_space
+from cablejax.report.diagnosis_style import explained_label
 from cablejax.report.effect_words import (
+    MOTIONS,
     between,
     effect_place,
     effect_title,
@@ -34,8 +28,8 @@ from cablejax.report.effect_words import (
     quantity,
     share,
 )
-from cablejax.report.page import svg
-from cablejax.report.spatial_figures import cable_still, files_figure, orbit
+from cablejax.report.html import json_script, svg, write_html
+from cablejax.report.spatial_figures import cable_still, files_figure, orbit_data
 
 PAGE = "report.html"
 _BADGES: dict[Verdict, tuple[str, str]] = {
@@ -49,6 +43,12 @@ _DPI = 150
 _SPACE_CAPTION = (
     "Five seconds from two observations on, in the files with the largest, middling and smallest gaps. Drag to turn, "
     "scroll to zoom. The solid line is a fit to recordings that this file is not part of."
+)
+SEPARABLE = 0.3
+"""A motion on which two explanations differ by less than this many noise units does not separate them."""
+_WHERE_CAPTION = (
+    "Top: the gap of each keypoint over the whole log. Below: each episode over time; the darker, the further beyond "
+    "the noise. Black bars mark holds. The cable's own gap fades towards the grippers that hold it."
 )
 _FILES_CAPTION = (
     "Each column is a file, each row a keypoint. The cable's own gap fades towards the grippers that hold it; a "
@@ -83,35 +83,41 @@ def write_diagnosis_page(diagnosis: CableDiagnosis, out: str | os.PathLike[str])
             # none of an earlier diagnosis next to this page
             picture.unlink(missing_ok=True)
     kind, badge = _BADGES[diagnosis.verdict]
-    here = importlib.resources.files("cablejax.report")
-    css = "\n".join((here / name).read_text(encoding="utf-8") for name in ("page.css", "diagnosis.css"))
-    page = string.Template((here / "diagnosis.html").read_text(encoding="utf-8")).substitute(
-        title=html.escape(f"CableDiagnosis: {badge}"),
-        css=css,
+    following = diagnosis.next_motion
+    path = out / PAGE
+    write_html(
+        path,
+        "diagnosis.html",
+        title=f"CableDiagnosis: {badge}",
         kind=kind,
         badge=badge,
-        headline=html.escape(diagnosis.sentence),
+        diagnosis=diagnosis,
         lead=_lead(diagnosis),
-        cards="\n".join(_cards(diagnosis)),
-        cable=orbit(diagnosis) if space else inline["cable"],
+        cards=_cards(diagnosis),
+        pictures=inline,
+        orbit=_orbit(diagnosis) if space else None,
         cable_caption=_SPACE_CAPTION if space else _cable_caption(diagnosis),
-        where="\n".join(f"<li>{html.escape(sentence)}</li>" for sentence in diagnosis.where.sentences),
-        where_figure=inline["where"],
-        where_caption=_FILES_CAPTION
-        if space
-        else (
-            "Top: the gap of each keypoint over the whole log. Below: each episode over time; the darker, the further "
-            "beyond the noise. Black bars mark holds. The cable's own gap fades towards the grippers that hold it."
-        ),
-        which=which_section(diagnosis, inline["ranking"]),
-        far=far_section(diagnosis, inline["shrinkage"]),
-        next=next_section(diagnosis, inline["motion"]),
-        caveats=limits_section(diagnosis),
-        details=details_section(diagnosis),
+        where_caption=_FILES_CAPTION if space else _WHERE_CAPTION,
+        effects=sections.named_effects(diagnosis),
+        alike=sections.alike(diagnosis),
+        faint_below=FAINT,
+        left=sections.what_is_left(diagnosis),
+        ranking_note=sections.ranking_note(diagnosis),
+        far=sections.how_far(diagnosis),
+        following=following,
+        nothing_next=sections.nothing_next(diagnosis),
+        separable=SEPARABLE,
+        instruction="" if following is None else MOTIONS.get(following.motion, ""),
+        tables=sections.detail_tables(diagnosis),
+        record=sections.record(diagnosis),
     )
-    path = out / PAGE
-    path.write_text(page, encoding="utf-8")
     return path
+
+
+def _orbit(diagnosis: CableDiagnosis) -> dict[str, str]:
+    """What the view in space needs: its data, and the name of the explained cable where there is one."""
+    explained = diagnosis.explained is not None and diagnosis.effects
+    return {"data": json_script(orbit_data(diagnosis)), "explained": explained_label(diagnosis) if explained else ""}
 
 
 def _lead(diagnosis: CableDiagnosis) -> str:
@@ -119,40 +125,40 @@ def _lead(diagnosis: CableDiagnosis) -> str:
     log, gap = diagnosis.log, diagnosis.gap
     seconds = sum(float(t[n - 1] - t[0]) for t, n in zip(log.time, log.episode_length, strict=True))
     episodes = len(log.episode_length)
-    text = (
+    return (
         f"{episodes} episode{'' if episodes == 1 else 's'}, {seconds:.0f} s, {log.keypoints.shape[2]} keypoints. "
         f"The simulator misses the recorded cable by {millimetres(gap.before_rmse_mm)}; the recording's own "
         f"{_noise(diagnosis)}."
     )
-    return html.escape(text)
 
 
-def _cards(diagnosis: CableDiagnosis):
+def _cards(diagnosis: CableDiagnosis) -> Iterator[tuple[str, str, str]]:
+    """Heading, text and note of each card."""
     gap = diagnosis.gap
     if diagnosis.effects:
         names = listed([listed(_alike(diagnosis, e), "or") for e in diagnosis.effects])
         note = _chance(diagnosis)
         title = "Part of the cause" if diagnosis.verdict == "named+unknown" else "Cause"
-        yield _card(title, names, note)
+        yield (title, names, note)
         places = [p for p in (effect_place(e) for e in diagnosis.effects) if p]
-        yield _card("Place of the cause", listed(places) if places else "no single place", _peak(diagnosis))
+        yield ("Place of the cause", listed(places) if places else "no single place", _peak(diagnosis))
     elif diagnosis.verdict == "none":
-        yield _card("Cause", "none needed", f"a gap of {millimetres(_least(diagnosis))} would have shown")
+        yield ("Cause", "none needed", f"a gap of {millimetres(_least(diagnosis))} would have shown")
     else:
         best = diagnosis.ranking[0] if diagnosis.ranking else None
         note = "" if best is None else f"closest: {effect_title(best.name)}, which is not enough"
-        yield _card("Cause", "not in the library", note)
-        yield _card("Place of the cause", "unknown", _peak(diagnosis))
+        yield ("Cause", "not in the library", note)
+        yield ("Place of the cause", "unknown", _peak(diagnosis))
     if gap.shrinkage is not None and diagnosis.explained is not None:
         interval = "" if gap.shrinkage_ci90 is None else f"90 % interval {between(*gap.shrinkage_ci90)}, "
-        yield _card("The gap shrinks by", share(gap.shrinkage), f"{interval}on episodes that no fit has seen")
-        yield _card(
+        yield ("The gap shrinks by", share(gap.shrinkage), f"{interval}on episodes that no fit has seen")
+        yield (
             "Error",
             f"{gap.before_rmse_mm:.1f} → {millimetres(gap.after_rmse_mm)}",
             _noise(diagnosis),
         )
     else:
-        yield _card("Error", millimetres(gap.before_rmse_mm), _noise(diagnosis))
+        yield ("Error", millimetres(gap.before_rmse_mm), _noise(diagnosis))
 
 
 def _noise(diagnosis: CableDiagnosis) -> str:
@@ -194,11 +200,6 @@ def _alike(diagnosis: CableDiagnosis, effect: NamedEffect) -> list[str]:
     return [effect_title(effect.name), *(effect_title(name) for name in group if name != effect.name)]
 
 
-def _card(title: str, text: str, note: str = "") -> str:
-    small = f"<small>{html.escape(note)}</small>" if note else ""
-    return f'<div class="card"><h3>{title}</h3><p>{html.escape(text)}</p>{small}</div>'
-
-
 def _most_telling(effect: NamedEffect) -> str:
     """The parameter that says how strong an effect is, which is neither a place nor a choice."""
     places = {"centre_m", "width_m", "x_m", "y_m", "gripper", "index", "direction_rad"}
@@ -214,4 +215,4 @@ def _cable_caption(diagnosis: CableDiagnosis) -> str:
         parts.append("Shaded blue: where the named effect sits.")
     if diagnosis.explained is not None:
         parts.append("The solid line comes from a fit that has not seen this episode.")
-    return html.escape(" ".join(parts))
+    return " ".join(parts)

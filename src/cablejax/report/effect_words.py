@@ -81,6 +81,11 @@ def effect_title(name: str) -> str:
     return name.replace("_", " ")
 
 
+def explanation_title(names: str) -> str:
+    """Effects joined by " + " as words: "a, b and c"."""
+    return listed([effect_title(name) for name in names.split(" + ")])
+
+
 def parameter_title(name: str) -> str:
     """A parameter in words; one that is not of the format keeps its name."""
     return _PARAMETERS.get(name, name.replace("_", " "))

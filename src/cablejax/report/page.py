@@ -1,4 +1,4 @@
-"""The report as one self-contained HTML page.
+"""The report of closed loops as one HTML page.
 
 Figures are inline SVG whose colours follow the page's, so that they read on a light and on a dark screen. The animation
 is drawn by a small script from the recorded runs; without scripts the GIF stands in its place.
@@ -7,14 +7,8 @@ is drawn by a small script from the recorded runs; without scripts the GIF stand
 from __future__ import annotations
 
 import base64
-import html
-import importlib.resources
-import io
-import json
 import os
 import pathlib
-import re
-import string
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
@@ -22,8 +16,9 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from cablejax.report import figures
+from cablejax.report.effect_words import listed
+from cablejax.report.html import json_script, svg, write_html
 from cablejax.report.style import (
-    LIGHT,
     METHOD_LABEL,
     METHOD_ORDER,
     by_shape,
@@ -88,47 +83,44 @@ def write_page(
         gif: the animation's file, inlined for readers without scripts.
     """
     pairs = by_shape(runs)
-    title, lead = headline(pairs)
-    here = importlib.resources.files("cablejax.report")
-    page = string.Template((here / "page.html").read_text(encoding="utf-8")).substitute(
-        title=html.escape(title),
-        lead=lead,
-        about=html.escape(about),
-        css=(here / "page.css").read_text(encoding="utf-8"),
-        player=(here / "player.js").read_text(encoding="utf-8"),
-        panels="\n".join(_panel(shape, pair) for shape, pair in pairs.items()),
-        toggles="\n".join(_toggle(method) for method in METHOD_ORDER[::-1] if any(method in r for r in pairs.values())),
-        table=_table(summary["shapes"]),
-        figures="\n".join(_figures(runs)),
-        facts="\n".join(f"<dt>{html.escape(k)}</dt><dd>{html.escape(v)}</dd>" for k, v in facts.items()),
+    title, start, ends = headline(pairs)
+    write_html(
+        path,
+        "page.html",
+        title=title,
+        start=start,
+        methods=ends,
+        about=about,
+        css=_CSS_CLASS,
+        label=METHOD_LABEL,
+        shapes=pairs,
+        columns=_COLUMNS,
+        results={shape: _cells(values) for shape, values in summary["shapes"].items()},
+        figures=_figures(runs),
+        made=facts,
         fallback="data:image/gif;base64," + base64.b64encode(pathlib.Path(gif).read_bytes()).decode(),
-        # "</" would end the script element; "<\/" is the same JSON.
-        data=json.dumps(animation_data(runs), separators=(",", ":"), allow_nan=False).replace("</", "<\\/"),
+        data=json_script(animation_data(runs)),
     )
-    pathlib.Path(path).write_text(page, encoding="utf-8")
 
 
-def headline(pairs: Mapping[str, Mapping[Method, ClosedLoopRun]]) -> tuple[str, str]:
-    """The result as a title and, in HTML, a sentence that says the numbers with and without the residual."""
+def headline(pairs: Mapping[str, Mapping[Method, ClosedLoopRun]]) -> tuple[str, str, dict[Method, str]]:
+    """The result as a title, a sentence on the errors at the start, and the errors at the end by method [cm]."""
     main = {shape: runs.get("residual") or runs["direct"] for shape, runs in pairs.items()}
     ends = {shape: run.terminal_error_cm for shape, run in main.items()}
     reached = {shape: end for shape, end in ends.items() if end <= REACHED_CM}
     missed = {shape: end for shape, end in ends.items() if shape not in reached}
     parts = []
     if reached:
-        parts.append(f"The cable reaches {_list(list(reached))} to within {max(reached.values()):.2f} cm")
+        parts.append(f"The cable reaches {listed(list(reached))} to within {max(reached.values()):.2f} cm")
     if missed:
-        far = _list([f"{end:.2f}" for end in missed.values()])
-        parts.append(f"{'it' if reached else 'The cable'} stays {far} cm away from {_list(list(missed))}")
-    title = ", but ".join(parts)
-    start = _list([f"{run.error_cm[0]:.1f}" for run in main.values()])
-    parts = [f"It starts {start} cm away."]
-    for method in METHOD_ORDER[::-1]:
-        errors = [f"{runs[method].terminal_error_cm:.2f}" for runs in pairs.values() if method in runs]
-        if errors:
-            words = METHOD_LABEL[method].capitalize()
-            parts.append(f'<span class="{_CSS_CLASS[method]}">{words}</span> it ends {_list(errors)} cm away.')
-    return title, " ".join(parts)
+        far = listed([f"{end:.2f}" for end in missed.values()])
+        parts.append(f"{'it' if reached else 'The cable'} stays {far} cm away from {listed(list(missed))}")
+    start = listed([f"{run.error_cm[0]:.1f}" for run in main.values()])
+    errors: dict[Method, list[str]] = {
+        method: [f"{runs[method].terminal_error_cm:.2f}" for runs in pairs.values() if method in runs]
+        for method in METHOD_ORDER[::-1]
+    }
+    return ", but ".join(parts), f"It starts {start} cm away.", {m: listed(e) for m, e in errors.items() if e}
 
 
 def animation_data(runs: Runs) -> dict[str, Any]:
@@ -170,72 +162,29 @@ def _bridged(values: np.ndarray) -> np.ndarray:
     return np.interp(index, index[seen], values[seen]) if seen.any() else np.zeros(len(values))
 
 
-def svg(figure: Figure, name: str) -> str:
-    """A figure as an inline SVG element in the page's own colours; `name` keeps its ids apart from those of others."""
-    buffer = io.StringIO()
-    figure.savefig(buffer, format="svg", transparent=True, metadata={"Date": None})
-    text = buffer.getvalue()
-    text = text[text.index("<svg") :]
-    # As wide as the page, but a figure of one panel not blown up.
-    width = figure.get_size_inches()[0]
-    text = re.sub(r'width="[\d.]+pt" height="[\d.]+pt"', f'style="max-width: {1.4 * width:.1f}in"', text, count=1)
-    text = re.sub(r"<metadata>.*?</metadata>", "", text, flags=re.DOTALL)
-    text = re.sub(r'\bid="', f'id="{name}-', text)
-    text = re.sub(r"url\(#", f"url(#{name}-", text)
-    text = re.sub(r'xlink:href="#', f'xlink:href="#{name}-', text)
-    for role in ("ink", "muted", "faint", "gripper", "target", "residual", "direct"):
-        text = re.sub(getattr(LIGHT, role), f"var(--{role})", text, flags=re.IGNORECASE)
-    return text
-
-
 def _figures(runs: Runs):
     methods = {method for _, method in runs}
     for index, (heading, draw, caption) in enumerate(_SECTIONS):
         if draw is figures.residual_share and "residual" not in methods:
             continue
-        picture = svg(draw(runs), f"figure{index}")
-        yield f"<h2>{heading}</h2>\n<figure>{picture}<figcaption>{html.escape(caption)}</figcaption></figure>"
+        yield heading, svg(draw(runs), f"figure{index}"), caption
 
 
-def _panel(shape: str, runs: Mapping[Method, ClosedLoopRun]) -> str:
-    name = html.escape(shape, quote=True)
-    readings = "".join(
-        f'<p class="reading {_CSS_CLASS[m]}"><b data-method="{m}"></b> cm {METHOD_LABEL[m]}</p>'
-        for m in METHOD_ORDER[::-1]
-        if m in runs
-    )
-    return (
-        f'    <div data-shape="{name}"><h3>{name}</h3>'
-        f'<canvas role="img" aria-label="The cable and its target {name}"></canvas>{readings}</div>'
-    )
+_COLUMNS = (
+    ("initial", "error [cm]", "", "initial_error_cm"),
+    ("final error", "with residual [cm]", "with", "terminal_error_cm"),
+    ("final error", "without residual [cm]", "without", "terminal_error_without_residual_cm"),
+    ("settling", "time [s]", "", "settling_time_s"),
+    ("MPC", "median [ms]", "", "mpc_ms_p50"),
+    ("MPC", "95 % [ms]", "", "mpc_ms_p95"),
+)
+"""Of the table of results: both lines of its head, the class of its cells, and the summary's field."""
 
 
-def _toggle(method: Method) -> str:
-    label = METHOD_LABEL[method]
-    return (
-        f'    <label class="{_CSS_CLASS[method]}"><input type="checkbox" data-show="{method}" checked>{label}</label>'
-    )
-
-
-def _table(shapes: Mapping[str, Mapping[str, Any]]) -> str:
-    columns = (
-        ("initial_error_cm", "initial<br>error [cm]", "{:.2f}", ""),
-        ("terminal_error_cm", "final error<br>with residual [cm]", "{:.2f}", "with"),
-        ("terminal_error_without_residual_cm", "final error<br>without residual [cm]", "{:.2f}", "without"),
-        ("settling_time_s", "settling<br>time [s]", "{:.0f}", ""),
-        ("mpc_ms_p50", "MPC<br>median [ms]", "{:.0f}", ""),
-        ("mpc_ms_p95", "MPC<br>95 % [ms]", "{:.0f}", ""),
-    )
-    head = "".join(f"<th>{label}</th>" for _, label, _, _ in columns)
-    rows = []
-    for shape, values in shapes.items():
-        cells = "".join(
-            f'<td class="{css}">{"n/a" if values.get(key) is None else form.format(values[key])}</td>'
-            for key, _, form, css in columns
-        )
-        rows.append(f"<tr><th>{html.escape(shape)}</th>{cells}</tr>")
-    return f"<table><thead><tr><th>shape</th>{head}</tr></thead><tbody>{''.join(rows)}</tbody></table>"
-
-
-def _list(words: list[str]) -> str:
-    return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} and {words[-1]}"
+def _cells(values: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """One shape's cells of the table, with their classes: centimetres to two digits, times whole."""
+    known = ((values.get(key), key, css) for _, _, css, key in _COLUMNS)
+    return [
+        ("n/a" if value is None else f"{value:.2f}" if key.endswith("_cm") else f"{value:.0f}", css)
+        for value, key, css in known
+    ]

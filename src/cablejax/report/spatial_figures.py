@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import html
-import importlib.resources
-import json
 from typing import Any
 
 import matplotlib
@@ -80,31 +77,6 @@ def cable_still(diagnosis: CableDiagnosis) -> Figure:
         axes[0].set_ylabel("z [m]")
         axes[0].legend(loc="best")
     return figure
-
-
-def orbit(diagnosis: CableDiagnosis) -> str:
-    """The player as HTML: a canvas, its controls, the data and the script; nothing is fetched."""
-    script = (importlib.resources.files("cablejax.report") / "orbit.js").read_text(encoding="utf-8")
-    data = json.dumps(orbit_data(diagnosis), separators=(",", ":")).replace("</", "<\\/")
-    explained = ""
-    if diagnosis.explained is not None and diagnosis.effects:
-        label = html.escape(explained_label(diagnosis))
-        explained = f'<span><i class="key" style="border-color: var(--residual)"></i>{label}</span>'
-    dot = '<i class="key" style="border: 0; height: auto; width: auto">&#9679;</i>'
-    dashes = '<i class="key" style="border-top-style: dashed; border-color: var(--direct)"></i>'
-    return f"""<div class="player" id="orbit-player" hidden>
-<canvas id="orbit" style="display: block; width: 100%; touch-action: none; cursor: grab" role="img"
- aria-label="The recorded cable and the simulated ones in space"></canvas>
-<p class="reading"><span>{dot} recorded</span>
-<span>{dashes}simulator as believed</span>
-{explained}</p>
-<div class="controls"><button id="orbit-play" type="button">Play</button>
-<input type="range" id="orbit-time" min="0" step="0.02" value="0" aria-label="time">
-<output id="orbit-clock"></output>
-<label>file <select id="orbit-window"></select></label></div>
-</div>
-<script type="application/json" id="cables">{data}</script>
-<script>{script}</script>"""
 
 
 def orbit_data(diagnosis: CableDiagnosis) -> dict[str, Any]:

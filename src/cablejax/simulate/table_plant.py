@@ -54,26 +54,32 @@ class ObservedConfig(Protocol):
     @property
     def cable(self) -> Cable:
         """The plant's cable."""
+        ...
 
     @property
     def discretisation(self) -> Discretisation:
         """Its links and time step."""
+        ...
 
     @property
     def physics(self) -> Physics:
         """Its physics with all effects."""
+        ...
 
     @property
     def keypoint_noise(self) -> float:
         """Standard deviation of the observed keypoints [m]."""
+        ...
 
     @property
     def keypoint_dropout(self) -> float:
         """Probability that a keypoint is not observed in a sample."""
+        ...
 
     @property
     def seed(self) -> int:
         """Seed of noise and dropout."""
+        ...
 
 
 class TablePlant(abc.ABC):

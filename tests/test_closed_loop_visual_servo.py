@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from cablejax.control.visual_servo import ServoConfig, VisualServo
 from cablejax.types import History, Measurement
+from closed_loop.visual_servo import ServoConfig, VisualServo
 from mpc_cases import START, TARGETS, at_rest, hermite_shape, relaxing_cable
 
 N = 7

@@ -1,0 +1,59 @@
+"""HTML from the templates of this room: pages that need nothing else, no network and no second file."""
+
+from __future__ import annotations
+
+import functools
+import io
+import json
+import os
+import pathlib
+import re
+from typing import Any
+
+import jinja2
+from markupsafe import Markup
+from matplotlib.figure import Figure
+
+from cablejax.report.effect_words import explanation_title, share
+from cablejax.report.style import LIGHT
+
+
+def write_html(path: str | os.PathLike[str], template: str, **values: Any) -> None:
+    """Writes a template filled in; strings are escaped unless they are `Markup`."""
+    pathlib.Path(path).write_text(_environment().get_template(template).render(**values), encoding="utf-8")
+
+
+@functools.cache
+def _environment() -> jinja2.Environment:
+    environment = jinja2.Environment(
+        loader=jinja2.PackageLoader("cablejax.report"),
+        autoescape=True,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        undefined=jinja2.StrictUndefined,
+    )
+    environment.filters |= {"words": explanation_title, "share": share}
+    return environment
+
+
+def json_script(value: Any) -> Markup:
+    """JSON for a script element, which "</" would end; "<\\/" is the same JSON."""
+    return Markup(json.dumps(value, separators=(",", ":"), allow_nan=False).replace("</", "<\\/"))
+
+
+def svg(figure: Figure, name: str) -> Markup:
+    """A figure as an inline SVG element in the page's own colours; `name` keeps its ids apart from those of others."""
+    buffer = io.StringIO()
+    figure.savefig(buffer, format="svg", transparent=True, metadata={"Date": None})
+    text = buffer.getvalue()
+    text = text[text.index("<svg") :]
+    # As wide as the page, but a figure of one panel not blown up.
+    width = figure.get_size_inches()[0]
+    text = re.sub(r'width="[\d.]+pt" height="[\d.]+pt"', f'style="max-width: {1.4 * width:.1f}in"', text, count=1)
+    text = re.sub(r"<metadata>.*?</metadata>", "", text, flags=re.DOTALL)
+    text = re.sub(r'\bid="', f'id="{name}-', text)
+    text = re.sub(r"url\(#", f"url(#{name}-", text)
+    text = re.sub(r'xlink:href="#', f'xlink:href="#{name}-', text)
+    for role in ("ink", "muted", "faint", "gripper", "target", "residual", "direct"):
+        text = re.sub(getattr(LIGHT, role), f"var(--{role})", text, flags=re.IGNORECASE)
+    return Markup(text)
