@@ -32,7 +32,7 @@ class PlantError(RuntimeError):
 
 @dataclasses.dataclass(frozen=True)
 class Observation:
-    """What a camera over the table and the arms' encoders report at one instant.
+    """Observation by a camera over the table and the arms' encoders at one instant.
 
     Attributes:
         keypoints: [m], NaN = not observed, float64, shape [N, 2].
@@ -49,31 +49,37 @@ class Observation:
 
 
 class ObservedConfig(Protocol):
-    """What the configuration of a plant says of its cable and of how that is seen; see `PlantConfig`."""
+    """Fields of a plant's configuration for its cable and the observation of it; see `PlantConfig`."""
 
     @property
     def cable(self) -> Cable:
         """The plant's cable."""
+        ...
 
     @property
     def discretisation(self) -> Discretisation:
         """Its links and time step."""
+        ...
 
     @property
     def physics(self) -> Physics:
         """Its physics with all effects."""
+        ...
 
     @property
     def keypoint_noise(self) -> float:
         """Standard deviation of the observed keypoints [m]."""
+        ...
 
     @property
     def keypoint_dropout(self) -> float:
         """Probability that a keypoint is not observed in a sample."""
+        ...
 
     @property
     def seed(self) -> int:
         """Seed of noise and dropout."""
+        ...
 
 
 class TablePlant(abc.ABC):
@@ -196,7 +202,7 @@ class TablePlant(abc.ABC):
         return self._marked(self._unbiased)
 
     def _look(self) -> Float[np.ndarray, "N 2"]:
-        """What the camera reports now, in the world's frame: keypoints where their markers are, with its lag."""
+        """The camera's present report in the world's frame: keypoints at their markers, with its lag."""
         physics, now = self._physics, self.time
         biased = np.any(physics.bias_along) or np.any(physics.bias_across)
         marks = self._marked(physics) if biased else self._true_keypoints()
