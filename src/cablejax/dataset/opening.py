@@ -50,7 +50,7 @@ def open_store(path: str | os.PathLike[str], *, mode: Literal["r", "r+"] = "r") 
     except (ValueError, AttributeError) as error:
         raise ValueError(f"The data set is damaged: {error} Generate it again elsewhere.") from error
     if attributes.get("schema") != SCHEMA:
-        again = _CHANGES.get(attributes.get("schema"), "")
+        again = _CHANGES.get(str(attributes.get("schema")), "")
         raise ValueError(
             f"{path} has schema {attributes.get('schema')!r}, expected {SCHEMA!r}. {again}"
             "Read it with the version of cablejax that wrote it, or generate it again in another folder."
