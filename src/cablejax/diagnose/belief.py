@@ -29,7 +29,7 @@ from cablejax.diagnose.fit import Fit
 from cablejax.diagnose.protocol import Explanation
 from cablejax.diagnose.repeats import episodes_by_motion
 
-LEAST_SQUARES = 1e9
+LEAST_SQUARES = 1e12
 """Degrees of freedom with which Student's distribution is a normal one."""
 
 

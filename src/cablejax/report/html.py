@@ -37,7 +37,7 @@ def _environment() -> jinja2.Environment:
 
 
 def json_script(value: Any) -> Markup:
-    """JSON for a script element; slashes after "<" are escaped, since "</" would end the element."""
+    """JSON for a script element. A closing tag within a string would end the element, so its slash is escaped."""
     return Markup(json.dumps(value, separators=(",", ":"), allow_nan=False).replace("</", "<\\/"))
 
 
