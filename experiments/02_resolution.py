@@ -4,7 +4,7 @@ Three questions, one row per resolution:
 
   * elastica   largest distance of a keypoint of the resting chain from the exact elastica, over three shapes [mm]
   * recorded   root mean square error per coordinate of open-loop replays of another program's recordings, as a multiple
-               of their noise: worst gentle episode, worst S or Z approach (needs $CABLEJAX_DATA with gap-dev beside it)
+               of their noise: worst gentle episode, worst S or Z approach (needs gap-dev next to $CABLEJAX_DATA)
   * cost       microseconds per time step of C MuJoCo on one core
 
     python experiments/02_resolution.py --out docs/results/resolution.md

@@ -1,10 +1,9 @@
 """Which model of the cable? Open-loop error of every model over 1 to 20 steps, over 100, and on other cables.
 
 The models: the released graph network; a perceptron and a recurrence along the cable, trained on the same data, with
-and without the static prior; the graph network conditioned on stiffness and "
-"friction; and the training simulator itself,
-started from the keypoints. Then what networks make of less: no prior, the world's axes instead of the grippers'. The
-rivals' weights are in experiments/weights; their cards say how they were made.
+and without the static prior; the graph network conditioned on stiffness and friction; and the training simulator
+itself, started from the keypoints. Then what networks make of less: no prior, the world's axes instead of the
+grippers'. The rivals' weights are in experiments/weights; their cards say how they were made.
 
     python experiments/05_dynamics_models.py                   # a part of the held-out trajectories: some minutes
     python experiments/05_dynamics_models.py --full --out docs/results/dynamics_models.md

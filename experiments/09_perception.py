@@ -168,7 +168,7 @@ def loop(target_name: Shape, perception: str, seed: int) -> dict[str, Any]:
     if perception == "cloud":
         plant = CloudPlant(plant.config, camera=CameraConfig(seed=seed))
     run = run_case(dataclasses.replace(case, plant=lambda: plant), spec, released(str(spec.weights)))
-    return {"terminal_cm": run.terminal_error_cm, "held": getattr(plant, "held", 0)}
+    return {"terminal_cm": run.terminal_error_cm, "held": getattr(plant, "lost", 0)}
 
 
 class Kept:
@@ -219,11 +219,11 @@ def loop_rows(kept: Kept) -> list[list[str]]:
     """The table of terminal errors."""
     rows = [["target", "true keypoints [cm]", "clouds [cm]", "difference [cm]", "from", "to", "frames held"]]
     for name in get_args(Shape):
-        told, seen = (
+        true_keypoints, seen = (
             [kept(f"loop-{name}-{how}-{s}", lambda n=name, h=how, s=s: loop(n, h, s)) for s in LOOP_SEEDS]
             for how in ("true", "cloud")
         )
-        true, cloud = (np.array([one["terminal_cm"] for one in runs]) for runs in (told, seen))
+        true, cloud = (np.array([one["terminal_cm"] for one in runs]) for runs in (true_keypoints, seen))
         errors = true.mean(), cloud.mean()
         differences = (cloud - true).mean(), (cloud - true).min(), (cloud - true).max()
         held = sum(one["held"] for one in seen)

@@ -7,8 +7,7 @@ same objective and gradient from JAX, the same start, and on `--exact` of the pr
 
     python experiments/11_against_ipopt.py --draw                 # once, and done: the problems, some minutes
     python experiments/11_against_ipopt.py --n 20                 # the first 20 of them, resumable
-    python experiments/11_against_ipopt.py --n 1000 --process 1 2 &   # every second one, at the same time as "
-    "--process 0 2
+    python experiments/11_against_ipopt.py --n 1000 --process 1 2 &   # every second one; --process 0 2 does the others
     python experiments/11_against_ipopt.py --explain              # the exceptions
     python experiments/11_against_ipopt.py --kinks 10             # why the network's corners are rounded
     python experiments/11_against_ipopt.py --calls 60             # a control call, and IPOPT until it is as good
@@ -173,7 +172,7 @@ def page(options: argparse.Namespace, folder: Path, n_all: int) -> str:
         lines,
         made_on=f"{versions()}, ipyopt {version('ipyopt')}; {machines}; {platform.machine()}, "
         f"NPROC={'/'.join(sorted({row['threads'] for row in rows}))}. The machine had other work to do meanwhile: "
-        "seconds are long, and say something only beside each other.",
+        "seconds are long, and say something only in comparison with each other.",
     )
 
 

@@ -107,8 +107,8 @@ def ranking(results: dict[str, dict[str, Any]]) -> str:
     rows = [["wire", *(f"`{name}`" for name in names)]]
     for name, result in results.items():
         ranked = {entry["name"]: entry for entry in result["verdict"]["ranking"]}
-        told = (f"{ranked[n]['probability']:.2f}, {ranked[n]['held_out_shrinkage']:.2f}" for n in names)
-        rows.append([name, *told])
+        shares = (f"{ranked[n]['probability']:.2f}, {ranked[n]['held_out_shrinkage']:.2f}" for n in names)
+        rows.append([name, *shares])
     return "\n".join(markdown_table(rows))
 
 

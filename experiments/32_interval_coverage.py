@@ -38,7 +38,7 @@ from real_cables.benchmark import protocol_windows
 from real_cables.synthetic import RECORDINGS, SAMPLES, Law, SyntheticCable, synthetic_recordings
 from rows import Rows
 
-TOLD = {
+REPORTED = {
     "bending_damping": "time_s",
     "viscous_drag": "coefficient_n_s_per_m2",
     "quadratic_drag": "coefficient_per_m",
@@ -100,8 +100,8 @@ def trial(seed: int, law: Law, cache: Path | None) -> Row:
         seed=seed,
         law=law,
         truth={k: v for k, v in dataclasses.asdict(cable).items() if isinstance(v, float)} | {"laden": cable.laden},
-        halves=[told(half.stiffness) for half in estimates_of_halves(found)],
-        everything=told(everything.stiffness),
+        halves=[reported(half.stiffness) for half in estimates_of_halves(found)],
+        everything=reported(everything.stiffness),
         others=others(cable, everything),
         chosen=[jackknifed(found, half) for half in range(2)],
         effects=list(found.effects),
@@ -115,13 +115,13 @@ def true_stiffness(row: Row) -> float:
     return row.truth["stiffness"] / row.truth["laden"]
 
 
-def told(interval: Interval) -> list[float]:
+def reported(interval: Interval) -> list[float]:
     return list(dataclasses.astuple(interval))
 
 
 def others(cable: SyntheticCable, everything: Estimate) -> dict[str, list[float]]:
     """Of the other effects, as if each of them were named; the true value first."""
-    part = {effect: parameters_of(effect, everything, density=1.0, unmodelled={})[0] for effect in TOLD}
+    part = {effect: parameters_of(effect, everything, density=1.0, unmodelled={})[0] for effect in REPORTED}
     knots = len(cable.profile)
     knot = round(part["stiffness_profile"]["centre_m"].value / everything.layout.arclength[-1] * (knots - 1))
     # the mean over these recordings, which is what a diagnosis speaks of
@@ -135,7 +135,7 @@ def others(cable: SyntheticCable, everything: Estimate) -> dict[str, list[float]
         "gripper_rotation_offset": [float(angle) for angle in angles],
     }
     rows = {}
-    for effect, parameter in TOLD.items():
+    for effect, parameter in REPORTED.items():
         one = part[effect][parameter]
         true, value, ends = np.ravel(truths[effect]), np.ravel(one.value), np.reshape(np.array(one.ci90), (-1, 2))
         for k in range(len(true)):
@@ -149,7 +149,7 @@ def jackknifed(found: Identified, half: int) -> list[float]:
     part = found.cable.windows.chosen(np.flatnonzero((found.first, ~found.first)[half]))
     evidence = found.cable.on(part).evidence()
     (fit,) = evaluate(evidence, [found.halves[half]])
-    return told(
+    return reported(
         dataclasses.replace(estimate_at(evidence, fit), shifts=np.zeros((1, found.cable.layout.size))).stiffness
     )
 
@@ -198,13 +198,13 @@ def besides(of: list[list[float]], *, angle: bool) -> float:
     return float(missing[math.ceil(0.9 * len(missing)) - 1] / norm.ppf(0.95))
 
 
-def as_told(row: Row, name: str) -> list[float]:
+def as_reported(row: Row, name: str) -> list[float]:
     """True value, estimate, low, high, with what a diagnosis adds."""
     true, *interval = with_truth(row, name)
     more = UNMODELLED.get(name.split(",")[0], 0.0)
     found = Interval(*interval)
     wide = found.wider(more) if is_angle(name) else found.wider_by_factor(more)
-    return [true, *told(wide)]
+    return [true, *reported(wide)]
 
 
 def coverage(name: str, true: list[float], intervals: list[list[float]], *, logs: bool = True) -> list[str]:
@@ -214,26 +214,26 @@ def coverage(name: str, true: list[float], intervals: list[list[float]], *, logs
     held = int(((low <= truth) & (truth <= high)).sum())
     bounds = binomtest(held, len(true)).proportion_ci()
     error = value - truth
-    told = (lambda x, sign="": f"{100 * x:{sign}.0f} %") if logs else (lambda x, sign="": f"{x:{sign}.2f}")
+    reported = (lambda x, sign="": f"{100 * x:{sign}.0f} %") if logs else (lambda x, sign="": f"{x:{sign}.2f}")
     return [
         name,
         f"{held} of {len(true)}",
         f"{100 * held / len(true):.0f} % ({100 * bounds.low:.0f} to {100 * bounds.high:.0f})",
-        told(np.median(high - low) / 2),
-        told(np.sqrt(np.mean(error**2))),
-        told(error.mean(), "+"),
+        reported(np.median(high - low) / 2),
+        reported(np.sqrt(np.mean(error**2))),
+        reported(error.mean(), "+"),
     ]
 
 
 HEAD = ["interval", "holds it", "share, with its 95 % interval", "median half width", "rms error", "mean error"]
 
 
-def told_table(rows: list[Row]) -> list[str]:
+def reported_table(rows: list[Row]) -> list[str]:
     """Every parameter as a diagnosis reports it, on cables that nothing was calibrated on."""
     table = [[*HEAD, "share without `UNMODELLED`, all cables"]]
     fresh = [row for row in rows if not calibrates(row)]
     for name in (STIFFNESS, *rows[0].others):
-        of, plain = [as_told(row, name) for row in fresh], [with_truth(row, name) for row in rows]
+        of, plain = [as_reported(row, name) for row in fresh], [with_truth(row, name) for row in rows]
         angle = is_angle(name)
         cells = coverage(f"{name} [rad]" if angle else name, [o[0] for o in of], [o[1:] for o in of], logs=not angle)
         held = sum(low <= true <= high for true, _, low, high in plain)
@@ -296,11 +296,11 @@ def page(rows: list[Row]) -> str:
         "",
         "Where the fitted law is right:",
         "",
-        *told_table(fitted),
+        *reported_table(fitted),
         "",
         "Where the cable has more than is fitted:",
         "",
-        *told_table(richer),
+        *reported_table(richer),
         "",
         "The two drags are nearly indistinguishable, and one compensates for the other: each by itself is known to a "
         "factor of four or five.",

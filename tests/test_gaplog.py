@@ -197,7 +197,7 @@ def test_logs_of_another_program():
     data = os.environ.get("CABLEJAX_DATA")
     files = sorted((pathlib.Path(data).parent / "gap-dev").glob("*.npz")) if data else []
     if not files:
-        pytest.skip("CABLEJAX_DATA does not point to a folder with gap-dev beside it")
+        pytest.skip("CABLEJAX_DATA does not point to a folder with gap-dev next to it")
     for path in files:
         log = read_gap_log(path)
         assert log.keypoints.dtype == np.float32 and log.gripper_pose.dtype == np.float32

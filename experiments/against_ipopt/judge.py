@@ -1,8 +1,8 @@
 """One planning problem by our solver and by IPOPT: objectives, feasibility, optimality, and the clock.
 
 The problems are those of the network with rounded corners (`cablejax.dynamics.smooth`): by the network as it was
-trained the gradient jumps, and there is no stationary point to be found. The values of the plans by that network "
-"are reported too.
+trained the gradient jumps, and there is no stationary point to be found. The values of the plans by that
+network are reported too.
 
 Two KKT residuals are given. The absolute one is that of `certify`, in metres as the objective's gradient is: 1e-5 means
 that moving a gripper by 1 mm promises no more than 1e-8 m^2. The scaled one is what IPOPT calls the dual infeasibility,

@@ -251,7 +251,7 @@ def advance(
                                 _add(a0, b0, v, n, i, gradient[j, c, 0], gradient[j, c, 1],
                                      other, gradient[j, d, 0], gradient[j, d, 1], weight)  # fmt: skip
 
-            # Things beside the cable.
+            # Things other than the cable.
             if p[OBSTACLE_R] > 0.0 and memory:
                 for i in range(n):
                     for part in range(4):

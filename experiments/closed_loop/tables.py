@@ -104,7 +104,7 @@ def settling_table(
     methods: Sequence[str] | None = None,
     labels: Mapping[str, str] = METHOD_LABEL,
 ) -> str:
-    """Settling times by the textbook's two bands, beside the stricter one of the other tables and the paper's own.
+    """Settling times by the textbook's two bands, next to the stricter one of the other tables and the paper's own.
 
     Raises:
         ValueError: there is no trial of this table.

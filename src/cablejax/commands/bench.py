@@ -187,7 +187,7 @@ class BenchPerception(Command):
     """Frames to time, after the first ones, which compile."""
 
     def execute(self):
-        """Times the registration of a cloud and returns milliseconds."""
+        """Times frames of the tracker and returns frames per second."""
         import numpy as np
 
         from cablejax.commands.workloads import setting
@@ -195,9 +195,8 @@ class BenchPerception(Command):
         from cablejax.perceive.synthetic import Clutter, scatter
         from cablejax.simulate.elastica import solve_elastica
 
-        for name in ("points", "repeats"):
-            if getattr(self, name) < 1:
-                raise UsageError(f"--{name} is {getattr(self, name)}, expected at least 1.")
+        if min(self.points, self.repeats) < 1:
+            raise UsageError(f"--points is {self.points} and --repeats {self.repeats}, expected at least 1 each.")
         tracker = Tracker(dataclasses.replace(TrackerConfig(), capacity=self.points))
         random = np.random.default_rng(self.seed)
         # An arch that is carried to and fro by a millimetre per frame.
@@ -269,9 +268,8 @@ class BenchLoop(Command):
         from cablejax.control.shaping import load_model
 
         if not self.batches or min(*self.batches, self.steps, self.rounds) < 1:
-            raise UsageError(
-                f"--batches {self.batches}, --steps {self.steps} and --rounds {self.rounds}: expected at least 1 each."
-            )
+            given = f"--batches {self.batches}, --steps {self.steps} and --rounds {self.rounds}"
+            raise UsageError(f"{given}: expected at least 1 each.")
         model = load_model(self.weights)
         controller = controller_to_s(model, self.solver)
         run = closed_loop(controller, model.config.history, self.steps, Discretisation(model.cable))

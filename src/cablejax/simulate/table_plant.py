@@ -48,38 +48,26 @@ class Observation:
     true_keypoints: Float[np.ndarray, "N 2"] | None = None
 
 
-class ObservedConfig(Protocol):
+class _ObservedConfig(Protocol):
     """Fields of a plant's configuration for its cable and the observation of it; see `PlantConfig`."""
 
     @property
-    def cable(self) -> Cable:
-        """The plant's cable."""
-        ...
+    def cable(self) -> Cable: ...
 
     @property
-    def discretisation(self) -> Discretisation:
-        """Its links and time step."""
-        ...
+    def discretisation(self) -> Discretisation: ...
 
     @property
-    def physics(self) -> Physics:
-        """Its physics with all effects."""
-        ...
+    def physics(self) -> Physics: ...
 
     @property
-    def keypoint_noise(self) -> float:
-        """Standard deviation of the observed keypoints [m]."""
-        ...
+    def keypoint_noise(self) -> float: ...
 
     @property
-    def keypoint_dropout(self) -> float:
-        """Probability that a keypoint is not observed in a sample."""
-        ...
+    def keypoint_dropout(self) -> float: ...
 
     @property
-    def seed(self) -> int:
-        """Seed of noise and dropout."""
-        ...
+    def seed(self) -> int: ...
 
 
 class TablePlant(abc.ABC):
@@ -88,7 +76,7 @@ class TablePlant(abc.ABC):
     Unlike everything else in the package a plant has a state of its own, as reality does.
     """
 
-    def __init__(self, config: ObservedConfig):
+    def __init__(self, config: _ObservedConfig):
         self.config = config
         self._physics = config.physics
         still = np.zeros(config.cable.n_keypoints)
