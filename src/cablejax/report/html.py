@@ -37,7 +37,7 @@ def _environment() -> jinja2.Environment:
 
 
 def json_script(value: Any) -> Markup:
-    """JSON for a script element, which "</" would end; "<\\/" is the same JSON."""
+    r"""JSON for a script element, which "</" would end; "<\/" is the same JSON."""
     return Markup(json.dumps(value, separators=(",", ":"), allow_nan=False).replace("</", "<\\/"))
 
 
