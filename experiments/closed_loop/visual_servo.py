@@ -95,7 +95,7 @@ class ServoConfig:
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class ServoState:
-    """What the visual servo remembers from one step to the next.
+    """State of the visual servo between steps.
 
     Attributes:
         jacobian: J, displacement of each keypoint by each input's motion [m/m], shape [N, 2, 6].
@@ -125,7 +125,7 @@ class ServoState:
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class ServoInfo:
-    """What one step reports; every field has shape [].
+    """Report of one step; every field has shape [].
 
     Attributes:
         shape_error: root mean square distance to the target now [m].

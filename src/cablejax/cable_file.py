@@ -157,7 +157,7 @@ def _check_material(values: Mapping[str, float], where: str) -> None:
 
 
 def _keypoints(fields: Mapping[str, Any], where: str) -> dict[str, Any]:
-    """How many keypoints there are and where, as fields of `Cable`."""
+    """Number and places of the keypoints, as fields of `Cable`."""
     count, marks = fields.get("keypoints"), fields.get("keypoint_arclength_m")
     if (count is None) == (marks is None):
         came = "neither keypoints nor keypoint_arclength_m" if count is None else "both"

@@ -21,7 +21,7 @@ def write_json(path: pathlib.Path, value: Mapping[str, Any]) -> None:
 
 
 def read_json(path: pathlib.Path) -> Any:
-    """What a JSON file holds.
+    """Reads a JSON file.
 
     Raises:
         ValueError: it is no JSON, or nested too deep.
@@ -34,7 +34,7 @@ def read_json(path: pathlib.Path) -> Any:
 
 
 def parse_json(text: str | bytes) -> Any:
-    """What a JSON text says.
+    """Parses a JSON text.
 
     Raises:
         ValueError: "is no JSON" or "is nested too deep", to be put after what it is.

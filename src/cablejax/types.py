@@ -26,7 +26,7 @@ PLANAR_DOF = 3
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class CableMemory:
-    """What a cable remembers beyond positions and velocities, in simulators with effects of extension and memory.
+    """Internal state of a cable beyond positions and velocities, in simulators with effects of extension and memory.
 
     Attributes:
         stretch: relative change of the free length, shape [].
@@ -64,7 +64,7 @@ class CableState:
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Trajectory:
-    """What a rollout yields: T commands and the T + 1 samples around them.
+    """Result of a rollout: T commands and the T + 1 samples around them.
 
     Attributes:
         keypoints: keypoint positions [m], shape [T + 1, N, D]; sample 0 is the initial state.
@@ -82,7 +82,7 @@ class Trajectory:
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class History:
-    """What a one-step model of the cable sees: the last H samples, oldest first.
+    """Input of a one-step model of the cable: the last H samples, oldest first.
 
     Attributes:
         keypoints: positions [m] at t - m, ..., t, shape [H, N, 2] with H = m + 1.
@@ -96,7 +96,7 @@ class History:
 
 
 class Measurement(NamedTuple):
-    """What a controller is given at each of its steps.
+    """Input of a controller at each of its steps.
 
     Attributes:
         keypoints: observed now [m], NaN = not observed, shape [N, 2].

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from typing import BinaryIO
 
 DRAFT = ".part"
-"""What the name of a file ends in until it is whole."""
+"""Ending of a file's name until it is complete."""
 
 
 @contextlib.contextmanager

@@ -57,7 +57,7 @@ class AdaptationConfig:
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class CableBelief:
-    """What is believed of the cable after the observations so far.
+    """Estimate of the cable after the observations so far.
 
     Attributes:
         mean: of the log ratios of stiffness and friction, see `cable_descriptor`, shape [2].

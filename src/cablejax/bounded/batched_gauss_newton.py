@@ -57,7 +57,7 @@ class Linearised(Generic[Kept]):
 
 @dataclasses.dataclass(frozen=True)
 class Minimised(Generic[Kept]):
-    """How one problem ended.
+    """Result of one problem.
 
     Attributes:
         best: the point of the lowest value that was met.

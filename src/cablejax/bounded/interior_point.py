@@ -46,14 +46,14 @@ class _Iterate(NamedTuple):
 
 
 class _Sizes(NamedTuple):
-    """What residuals are compared with: a typical length of slacks and force of multipliers."""
+    """Scales of the residuals: a typical length of slacks and force of multipliers."""
 
     length: Float[Array, ""]
     force: Float[Array, ""]
 
 
 class _Residuals(NamedTuple):
-    """How far an iterate is from the conditions of Karush, Kuhn and Tucker.
+    """Residuals of the Karush-Kuhn-Tucker conditions at an iterate.
 
     Attributes:
         jacobian: of the bounds, shape [K, P].
@@ -139,7 +139,7 @@ def _start(problem: _Scaled) -> tuple[_Iterate, _Sizes]:
     """The first iterate: no step yet, and slacks as large as there is room."""
     quadrics, present, dtype = problem.quadrics, problem.present, problem.linear.dtype
     start = quadrics.of_lift(quadrics.offset)
-    # Newton's step to each bound tells how far outside; the value itself grows with the square of the distance.
+    # Newton's step to each bound is the distance outside; the value itself grows with the square of the distance.
     steepness = jnp.linalg.norm(quadrics.jacobian(quadrics.offset), axis=1) + jnp.finfo(dtype).tiny
     outside = jnp.max(jnp.where(present, jnp.maximum(start, 0.0) / steepness, 0.0))
     force = jnp.linalg.norm(problem.linear) + outside + jnp.finfo(dtype).tiny

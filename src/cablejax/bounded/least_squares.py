@@ -20,7 +20,7 @@ from cablejax.bounded.secant import secant_update
 
 
 class _Linearisation(eqx.Module):
-    """What changes where the solve linearises."""
+    """State that changes when the solve linearises."""
 
     at: Array
     residual: Float[Array, " M"]
@@ -40,7 +40,7 @@ class _Model(eqx.Module):
 
 
 class _Trial(eqx.Module):
-    """What every trial point decides."""
+    """State that changes with every trial point."""
 
     search: Any
     step_size: Scalar

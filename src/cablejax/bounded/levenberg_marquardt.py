@@ -18,7 +18,7 @@ from cablejax.bounded.sets import ConvexSet
 
 
 class ModelState(eqx.Module):
-    """What a descent keeps of the model at a point.
+    """The model at a point, as a descent keeps it.
 
     Attributes:
         gradient: shape [P].

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 class QuadraticMinimum(NamedTuple):
-    """Where a quadratic over a set is smallest.
+    """The minimum of a quadratic over a set.
 
     Attributes:
         point: the minimiser, in the set as far as rounding allows, shape [P].

@@ -103,7 +103,7 @@ class BoundedQuasiNewton(optx.AbstractMinimiser):
         return y, self._next_trial(options["feasible"], y, state), state.aux
 
     def _decide(self, y, value, aux, gradient, given: bool, state: _State) -> tuple[Array, _State]:
-        """Where the solve goes on, and the model there; `given` = the first model was."""
+        """The next point and its model; `given` = the first model was."""
         info, first = state.f_info, state.evaluations == 0
         move, bent = (state.trial - y).ravel(), gradient - info.grad
         finite = jnp.isfinite(value) & jnp.isfinite(gradient).all()

@@ -18,7 +18,7 @@ from cablejax.bounded.sets import AbstractSet
 
 
 class Result(enum.IntEnum):
-    """How a solve ended, from the solvers to the controller's report. Inside compiled code it is an int32."""
+    """Result code of a solve, from the solvers to the controller's report. Inside compiled code it is an int32."""
 
     CONVERGED = 0
     """The projected gradient is within the tolerance."""
@@ -64,7 +64,7 @@ def result_of(theirs: optx.RESULTS) -> Int[Array, ""]:
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Stats:
-    """What a solve cost; every field has shape [].
+    """Cost of a solve; every field has shape [].
 
     Attributes:
         iterations: steps of the solver.
@@ -82,7 +82,7 @@ class Stats:
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Solution:
-    """What `minimise` and `least_squares` return.
+    """Solution of `minimise` and `least_squares`.
 
     Attributes:
         value: the best feasible point found.

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class _Import(Command, abc.ABC):
-    """What the kinds of recording share."""
+    """Common options of all kinds of recordings."""
 
     source: Annotated[pathlib.Path, tyro.conf.Positional]
     """The recording."""

@@ -137,7 +137,7 @@ def plant_of(
 
 
 def about(job: Job) -> str:
-    """What the plant has that the model was not trained on, in sentences.
+    """Differences of the plant from the model's training data, in sentences.
 
     Every ratio is computed: the plant's cable with its effects over the model's cable.
     """

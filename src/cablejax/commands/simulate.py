@@ -48,7 +48,7 @@ class Simulate(Command):
     step written out, in JAX; it can simulate every effect."""
 
     cable: pathlib.Path | None = None
-    """What is simulated: a cable file (see `cablejax cable`), or a data set, trained weights or a log that holds a
+    """The cable to simulate: a cable file (see `cablejax cable`), or a data set, trained weights or a log that holds a
     cable. By default the reference cable."""
 
     effect: tyro.conf.UseAppendAction[tuple[str, ...]] = ()

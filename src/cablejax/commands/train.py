@@ -42,8 +42,8 @@ class Train(Command):
     """gns: the graph network. mlp, lstm: the networks that it is compared with."""
 
     prior: Literal["static", "rigid", "none"] = "static"
-    """What the network corrects. static: the frictionless resting shape. rigid: the grippers' motion, interpolated.
-    none: nothing."""
+    """The prior that the network corrects. static: the frictionless resting shape. rigid: the grippers' motion,
+    interpolated. none: nothing."""
 
     frame: Literal["grippers", "world"] = "grippers"
     """Axes that the network sees the cable in: the grippers' own, which turn with it, or the world's."""
@@ -193,7 +193,7 @@ class Train(Command):
         return dataclasses.replace(config, seed=self.seed, model=model, phases=phases)
 
     def _info(self, config: TrainConfig, stores: list[Store], held_out: list[int]) -> dict[str, Any]:
-        """Where the weights come from, without local paths."""
+        """Provenance of the weights, without local paths."""
         from cablejax.cable_file import cable_to_fields
         from cablejax.dataset.schema import config_to_json
         from cablejax.report.provenance import machine, versions

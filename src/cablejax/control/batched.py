@@ -34,7 +34,7 @@ from cablejax.types import CableState, History, Measurement
 
 @dataclasses.dataclass(frozen=True)
 class LoopConfig:
-    """How a batch of trials is run.
+    """Settings of a batch of trials.
 
     Attributes:
         steps: commands of each trial, T.
@@ -217,7 +217,7 @@ def _noisy(config: LoopConfig, key: Array, keypoints: Float[Array, "N 2"]) -> Fl
 
 
 def _observed(config: LoopConfig, key: Array, keypoints: Float[Array, "N 2"]) -> Float[Array, "N 2"]:
-    """What the camera reports of the true keypoints."""
+    """The camera's report of the true keypoints."""
     noise, gaps = jax.random.split(key)
     keypoints = _noisy(config, noise, keypoints)
     if not config.keypoint_dropout:

@@ -20,17 +20,19 @@ RESTING_CM = 0.01
 
 
 class ObservedCable(Protocol):
-    """What is shaped: the plant, or a robot behind the same two calls; see `Plant` for their meaning."""
+    """The cable to shape: a plant, or a robot behind the same two calls; see `Plant`."""
 
     def reset(self, gripper_pose: Float[np.ndarray, "Q 3"]) -> Observation:
         """Lays the cable at rest between these poses and observes it."""
+        ...
 
     def record(self, twist: Float[np.ndarray, "Q 3"], interval: float, *, samples: int) -> list[Observation]:
         """Executes a twist for `interval` seconds and observes `samples` times, evenly spaced, the last at its end."""
+        ...
 
 
 class Controller(Protocol):
-    """What shapes it: an object with two pure functions. `mpc.MPC` is one.
+    """A controller: an object with two pure functions. `mpc.MPC` is one.
 
     For `control.batched` it is a pytree with a leaf `target` as well, the keypoints [N, 2] that it steers towards.
     """
@@ -123,7 +125,7 @@ def run_closed_loop(
 
 @dataclasses.dataclass
 class _Row:
-    """What is known at one control instant."""
+    """Measurement at one control instant."""
 
     observation: Observation
     twist: np.ndarray | None = None

@@ -24,7 +24,7 @@ from cablejax.dataset.store import Store
 from cablejax.json_file import read_json
 
 PACKAGES = ("jax", "jaxlib", "mujoco", "mujoco-mjx", "numpy")
-"""Packages whose versions decide the content, beside cablejax itself: those that begin a store must complete it."""
+"""Packages whose versions decide the content, besides cablejax itself: those that begin a store must complete it."""
 
 _DIGEST = ((32,), "uint8")
 
@@ -50,7 +50,7 @@ def open_store(path: str | os.PathLike[str], *, mode: Literal["r", "r+"] = "r") 
     except (ValueError, AttributeError) as error:
         raise ValueError(f"The data set is damaged: {error} Generate it again elsewhere.") from error
     if attributes.get("schema") != SCHEMA:
-        again = _CHANGES.get(attributes.get("schema"), "")
+        again = _CHANGES.get(str(attributes.get("schema")), "")
         raise ValueError(
             f"{path} has schema {attributes.get('schema')!r}, expected {SCHEMA!r}. {again}"
             "Read it with the version of cablejax that wrote it, or generate it again in another folder."
@@ -107,7 +107,7 @@ def package_versions() -> dict[str, str]:
 
 
 def _create(path: Path, config: DatasetConfig, versions: dict[str, str]) -> None:
-    """Makes the empty store beside its place and renames it there: it appears whole, and only once."""
+    """Makes the empty store under a temporary name and renames it: it appears whole, and only once."""
     path.parent.mkdir(parents=True, exist_ok=True)
     draft = path.parent / f".{path.name}.{os.getpid()}.draft"
     shutil.rmtree(draft, ignore_errors=True)

@@ -100,7 +100,7 @@ class DatasetConfig:
 
     @property
     def cable(self) -> Cable:
-        """What is simulated."""
+        """The simulated cable."""
         return self.discretisation.cable
 
     @property

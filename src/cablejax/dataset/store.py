@@ -34,7 +34,7 @@ class MissingShardError(ValueError):
 
 @dataclasses.dataclass(frozen=True)
 class DatasetInfo:
-    """What a store holds.
+    """Summary of a store.
 
     Attributes:
         path: its folder.
@@ -146,7 +146,7 @@ class Store:
         return Block(**out)
 
     def info(self) -> DatasetInfo:
-        """What is on disk now, going by the digests alone: fast, and reads no trajectory."""
+        """Summary of what is on disk, from the digests alone: fast, and reads no trajectory."""
         digest = np.zeros((self.config.n_trajectories, 32), np.uint8)
         attempts = np.zeros(self.config.n_trajectories, np.int32)
         for shard in range(self.config.n_shards):

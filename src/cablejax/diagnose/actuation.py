@@ -1,7 +1,7 @@
-"""Effects of the arms: what shows between commands and measured gripper poses, before any cable is simulated.
+"""Effects of the arms, estimated from commands and measured gripper poses before any cable is simulated.
 
-The grippers' encoders are logged, so the cable is always driven by where the grippers were, and whatever the arms do
-wrong is told from commands and poses alone. It neither hides an effect of the cable nor is taken for one.
+The grippers' encoders are logged, so the cable is always driven by where the grippers were, and errors of the
+arms are estimated from commands and poses alone. They neither hide an effect of the cable nor are taken for one.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ _GAIN, _LAG = ARMS = "actuation_gain", "actuation_lag"
 
 @dataclasses.dataclass(frozen=True)
 class Actuation:
-    """How the arms follow their commands.
+    """Fits of the arms to their commands.
 
     Attributes:
         effects: names and parameters (value, 90 % interval, unit) of what explains the deviation, at most both.
@@ -70,7 +70,7 @@ class Actuation:
 
 @dataclasses.dataclass(frozen=True)
 class _Arms:
-    """What was measured and what was commanded; fits what lies between.
+    """Measured and commanded motion, and fits of one to the other.
 
     Attributes:
         pose: measured, shape [E, T, 2, 3].
@@ -98,7 +98,7 @@ class _Arms:
         )
 
     def off(self, poses: Float[np.ndarray, "E T 2 3"]) -> Float[np.ndarray, "E T 2 3"]:
-        """What measured poses are off [m]; 0 in the padding."""
+        """Errors of the measured poses [m]; 0 in the padding."""
         return np.array([1.0, 1.0, _ROTATION_WEIGHT]) * self.valid[:, :, None, None] * (self.pose - poses)
 
     def each(self, poses: Float[np.ndarray, "E T 2 3"]) -> Float[np.ndarray, "E"]:
@@ -237,8 +237,10 @@ def with_arms(conclusion: Conclusion, arms: Actuation, calibration: Calibration)
 
 
 def _chances(arms: Actuation, calibration: Calibration) -> dict[tuple[str, ...], float]:
-    """Probability of every set of effects of the arms, by the rule of `belief`: errors of motions that a fit has not
-    seen, tempered for what laws of arms get wrong, and a cost for every effect.
+    """Probability of every set of effects of the arms.
+
+    By the rule of `belief`: likelihoods of held-out motions, tempered for errors of the arms' laws, and a cost for
+    every effect.
     """
     calibration = dataclasses.replace(calibration, baseline=_NEGLIGIBLE)
     temper = calibration.temper(arms.unseen[()], _ENCODER_NOISE)

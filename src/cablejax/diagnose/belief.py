@@ -1,4 +1,4 @@
-"""How sure a diagnosis may be: from fits to probabilities.
+"""Probabilities of explanations from their fits.
 
 A simulator that has the right effect still differs from a real cable, by more samples than a likelihood of white noise
 believes independent, and by more where the effect is large. So the squared error of each episode, above the noise, is
@@ -29,7 +29,7 @@ from cablejax.diagnose.fit import Fit
 from cablejax.diagnose.protocol import Explanation
 from cablejax.diagnose.repeats import episodes_by_motion
 
-LEAST_SQUARES = 1e9
+LEAST_SQUARES = 1e12
 """Degrees of freedom with which Student's distribution is a normal one."""
 
 
@@ -108,8 +108,9 @@ def explains_most_motions(fit: Fit, null: Fit, evidence: Evidence, calibration: 
 
 
 def as_good(fit: Fit, best: Fit, evidence: Evidence, calibration: Calibration) -> bool:
-    """Whether a fit leaves little more of the gap than the best, over the whole log and in at least half of its
-    motions: one motion that nothing explains makes all explanations look alike.
+    """Whether a fit leaves little more than the best, over the whole log and in at least half of its motions.
+
+    One motion that no effect explains would make all explanations look alike.
     """
     whole = excess(float(fit.sse.sum()), evidence) <= calibration.as_good * excess(float(best.sse.sum()), evidence)
     least = np.maximum(left_by_motion(best, evidence), calibration.smallest_gap(level(evidence)))
@@ -117,7 +118,7 @@ def as_good(fit: Fit, best: Fit, evidence: Evidence, calibration: Calibration) -
 
 
 def left_by_motion(fit: Fit, evidence: Evidence) -> Float[np.ndarray, "M"]:
-    """What a fit leaves of each motion, root mean square per coordinate above the noise."""
+    """Remaining error of each motion, root mean square per coordinate above the noise."""
     counts = evidence.count
     squares = [
         max(float((fit.sse - counts)[own].sum()), 0.0) / float(counts[own].sum())

@@ -1,4 +1,4 @@
-"""One log under the nominal simulator: what a diagnosis starts from."""
+"""One log, simulated nominally: the input of a planar diagnosis."""
 
 from __future__ import annotations
 
@@ -115,7 +115,7 @@ class Case:
         )
 
     def evidence(self, calibration: Calibration) -> Evidence:
-        """What the log says, weighed by the noise and by what simulators get wrong without any effect."""
+        """The log as evidence, weighed by the noise and the simulator's baseline error."""
         return weighed(
             self.simulator,
             self.recording.keypoints,
@@ -158,7 +158,7 @@ def _first_shapes(recording: Recording) -> list[np.ndarray | None]:
 def _at_uniform_marks(
     keypoints: Float[np.ndarray, "N 2"] | None, marks: Float[np.ndarray, "N"]
 ) -> Float[np.ndarray, "N 2"] | None:
-    """Where keypoints uniform in arc length would be, roughly: by straight lines between those that are seen."""
+    """Approximate positions of keypoints uniform in arc length, by linear interpolation between the observed ones."""
     if keypoints is None:
         return None
     uniform, seen = np.linspace(0.0, marks[-1], len(marks)), np.isfinite(keypoints).all(axis=1)

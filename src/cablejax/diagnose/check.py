@@ -1,4 +1,4 @@
-"""The check that every effect has to pass before it takes part in a diagnosis."""
+"""Checks an effect before it is used in a diagnosis."""
 
 from __future__ import annotations
 

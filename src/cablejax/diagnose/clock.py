@@ -1,4 +1,4 @@
-"""Samples of one episode on an even clock.
+"""Resamples one episode on an even clock.
 
 The simulator and everything that looks at correlation in time want samples a fixed interval apart. Clocks of real
 recordings jitter, drift and drop samples. Between two samples the grippers move with the twist that was held, so their
@@ -17,7 +17,7 @@ from jaxtyping import Bool, Float
 _EVEN = 0.01
 # Samples farther apart than this many intervals have a gap between them, which is not bridged.
 _GAP = 1.7
-# A sample within this share of the interval from the clock is taken as it is beside a gap.
+# A sample within this share of the interval from the clock is taken as it is next to a gap.
 _CLOSE = 0.05
 
 
@@ -45,7 +45,7 @@ def usual_interval(time: Float[np.ndarray, "T"]) -> float:
 
 
 def furthest_off(time: Float[np.ndarray, "T"], interval: float) -> float:
-    """How far a sample is from an even clock, at most [s]."""
+    """Largest distance of a sample from an even clock [s]."""
     return float(np.abs(time - time[0] - interval * np.arange(len(time))).max())
 
 

@@ -1,4 +1,4 @@
-"""From fitted explanations to a verdict."""
+"""Concludes a verdict from fitted explanations."""
 
 from __future__ import annotations
 
@@ -35,13 +35,13 @@ _JACKKNIFE_DRAWS = 4000
 
 @dataclasses.dataclass(frozen=True)
 class Conclusion:
-    """What the search amounts to.
+    """The conclusion of a search.
 
     Attributes:
         verdict: see the format.
         best: the most probable explanation, the nominal simulator included.
         effects: named; empty for "none" and "unknown".
-        equivalent: sets of effects that this log cannot tell apart.
+        equivalent: sets of effects that are indistinguishable on this log.
         ranking: of single effects.
         explained: share of the squared gap that the best explanation takes away, on the episodes of the fit.
         leftover_p: of the test whether it leaves more than a right one does, see `conformal`; None without a gap.
@@ -87,7 +87,7 @@ def conclude(found: Search, evidence: Evidence, calibration: Calibration) -> Con
                 if as_good(fit, best, evidence, calibration):
                     alike_by_size.add(other)
         total = sum(odds.values())
-        # In a wide gap a likelihood is sure of differences that are small beside what any law leaves.
+        # In a wide gap a likelihood is sure of differences that are small compared with the error of any law.
         alike = sorted(
             (n for n in odds if odds[n] >= calibration.set_odds * odds[name] or n in alike_by_size),
             key=lambda n: -odds[n],
@@ -132,7 +132,7 @@ def _draws(evidence: Evidence, fit: Fit, calibration: Calibration) -> Float[np.n
 
 
 def baselines(found: Search, evidence: Evidence) -> dict[str, str]:
-    """What simpler rules would have named, see `Diagnosis.baselines`."""
+    """Effects that simpler rules would have named, see `Diagnosis.baselines`."""
     singles = [fit for fit in found.fits if len(effect_names(fit.explanation)) == 1]
     if not singles:
         return {}

@@ -1,4 +1,4 @@
-"""Whether an explanation leaves more than a right one does: a conformal test (Vovk, Gammerman and Shafer 2005).
+"""A conformal test of whether an explanation is complete (Vovk, Gammerman and Shafer 2005).
 
 The score of an explanation is what it leaves over what `Calibration.complete` allows. On labelled logs of other
 simulators that show one effect of the library, the right explanation has the scores below. If a new log is like these
@@ -26,7 +26,7 @@ docs/results/blind/20270404/cases.jsonl --leftovers`."""
 
 
 def leftover_score(left: float, gap: float, noise: float, calibration: Calibration) -> float:
-    """What an explanation leaves of the gap, relative to what a complete one may leave; all in one unit."""
+    """Remaining gap of an explanation, relative to that of a complete one; all in one unit."""
     return left / calibration.may_leave(gap, noise)
 
 

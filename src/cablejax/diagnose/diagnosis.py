@@ -1,4 +1,4 @@
-"""What a diagnosis returns."""
+"""The result of a diagnosis."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 Verdict = Literal["none", "named", "ambiguous", "named+unknown", "unknown"]
 
 PLACES = ("along_cable_m", "time_s", "table_m")
-"""Where an effect may sit, by the keys of the verdict."""
+"""Place of an effect, by the keys of the verdict."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -73,7 +73,7 @@ class Ranked:
 
 @dataclasses.dataclass(frozen=True)
 class Gap:
-    """How large the gap is before and after, on episodes that no fit has seen. Root mean squares per coordinate [mm].
+    """Size of the gap before and after, on held-out episodes. Root mean squares per coordinate [mm].
 
     Where `unit` is not the metre, whatever is called `_mm` is in thousandths of it.
 
@@ -110,7 +110,7 @@ class Gap:
 
 @dataclasses.dataclass(frozen=True)
 class NextMotion:
-    """The motion that would best separate what could not be told apart, or sharpen what was named.
+    """The motion that would best separate indistinguishable effects, or sharpen the named one.
 
     Attributes:
         motion: its name, from `cablejax.diagnose.next_motion`.
@@ -128,7 +128,7 @@ class NextMotion:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Diagnosis:
-    """Which effect makes a simulator wrong on a recording, and how far the gap shrinks with it. Any simulator's.
+    """Diagnosis of any simulator: the effect it lacks on a recording, and how far the gap shrinks with it.
 
     What a simulator does not compute is None.
 
@@ -136,7 +136,7 @@ class Diagnosis:
         verdict: see the format.
         sentence: the verdict in words.
         effects: what is named as the cause; empty for "none" and "unknown".
-        equivalent: sets of effects that this log cannot tell apart.
+        equivalent: sets of effects that are indistinguishable on this log.
         ranking: every effect tried, most probable first; without probabilities, the largest shrinkage first.
         leftover_p: chance that a right explanation leaves as much as the best one does, see `conformal`; None without a
             gap, and where no labelled logs are like this one.

@@ -1,4 +1,4 @@
-"""What a recording says, ready for fits: observations and predictions, weighed by the noise."""
+"""The evidence of a recording: observations and predictions, weighed by the noise."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class Robust:
 
 @dataclasses.dataclass(frozen=True)
 class Evidence:
-    """What a recording says. Lengths and errors are in the unit of the observations.
+    """Evidence of a recording. Lengths and errors are in the unit of the observations.
 
     Attributes:
         simulator: of the recorded motions.

@@ -1,4 +1,4 @@
-"""How far the gap shrinks, on episodes that no fit has seen."""
+"""Shrinkage of the gap on held-out episodes."""
 
 from __future__ import annotations
 

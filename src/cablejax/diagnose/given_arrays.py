@@ -1,4 +1,4 @@
-"""Checks of what a user hands to a diagnosis: arrays, the noise, and a simulator that does what the protocol asks."""
+"""Validates the input of a diagnosis: arrays, the noise, and a simulator that follows the protocol."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def checked_nominal(
 
 
 def recorded_arrays(observed: ArrayLike, interval: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
-    """What was observed, shape [E, T, ...], and the sample interval of each episode [s].
+    """The observations, shape [E, T, ...], and the sample interval of each episode [s].
 
     Raises:
         ValueError: arrays that are no recording.

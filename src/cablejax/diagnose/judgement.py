@@ -1,4 +1,4 @@
-"""The rule by which every diagnosis names a cause, and the sentence that says so."""
+"""The rule by which every diagnosis names a cause, and the sentence of its verdict."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ def judged(*, resolvable: bool, telling: bool, complete: bool, alike: bool) -> V
 
 
 FAINT = 0.01
-"""Probability below which a look-alike is not listed beside the named effect."""
+"""Probability below which a look-alike is not listed with the named effect."""
 
 
 def look_alikes(
     group: Sequence[str], effects: Sequence[NamedEffect], ranking: Sequence[Ranked]
 ) -> tuple[list[str], list[str]]:
-    """Members of a set that the log cannot tell apart: those with a chance, and those that merely leave as little.
+    """Members of a set of look-alikes: the probable ones, and those that merely leave as little of the gap.
 
     Of a set in place of the only named effect, the ranking has the members' probabilities; members of an explanation
     by several effects are not ranked as such, and all count.
@@ -57,7 +57,7 @@ def verdict_sentence(
     Args:
         verdict: to put into words.
         effects: named.
-        equivalent: sets of effects that the log cannot tell apart.
+        equivalent: sets of effects that are indistinguishable on the log.
         ranking: every effect tried.
         explained: share of the squared gap that the best explanation takes away; a negative one reads as none.
     """

@@ -1,4 +1,4 @@
-"""What to record next: the safe motion on which the most probable explanations differ most."""
+"""Chooses the motion to record next: the one on which the most probable explanations differ most."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The noise floor of a recording: how far keypoints scatter that do not move."""
+"""The noise floor of a recording: the scatter of keypoints at rest."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import math
 import numpy as np
 from jaxtyping import Float
 
-# Shortest hold that tells anything, in samples.
+# Shortest hold that is used, in samples.
 _SHORTEST_HOLD = 10
 _LAGS = 5
 # A keypoint counts as noisier than the others beyond this many standard errors.
@@ -20,7 +20,7 @@ SMALLEST = 5e-5
 
 @dataclasses.dataclass(frozen=True)
 class NoiseFloor:
-    """What no simulator can explain.
+    """Noise floor of a recording.
 
     Attributes:
         std: standard deviation of each keypoint's coordinates [m], shape [N].

@@ -1,4 +1,4 @@
-"""The planar cable as a diagnosis sees it: the chain's playback of a log behind the protocol of simulators."""
+"""The adapter of planar cables: the chain's playback of a log behind the protocol of simulators."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ class PlanarCable(Simulator):
         return playback.keypoints(physics, episodes) + self.correction[np.asarray(episodes, int)]
 
     def starts(self, effect, predicted, residual):
-        """From the effect's own guesses, which see the cable as it is predicted and what that leaves."""
+        """The effect's own guesses, from the predicted cable and the residual."""
         context = Context(
             config=self.playback.config,
             keypoints=predicted,

@@ -77,7 +77,7 @@ class Playback:
     def keypoints(
         self, physics: Sequence[Physics], episodes: Sequence[int] | np.ndarray | None = None
     ) -> Float[np.ndarray, "P E T N 2"]:
-        """What the camera would have seen under each physics [m]; NaN where a simulation broke down.
+        """Keypoints as the camera would have seen them under each physics [m]; NaN where a simulation diverged.
 
         Args:
             physics: of one cable each.

@@ -1,4 +1,4 @@
-"""How far each coordinate of a fit may move before the log disagrees: profiles of the posterior.
+"""Intervals of a fit's coordinates by profiles of the posterior.
 
 The interval of one coordinate ends where the cost, minimised over all others, has risen by `z^2 / 2` (Venzon and
 Moolgavkar 1988), with z the quantile of the normal distribution. A threshold, a stretch limit or a place makes profiles

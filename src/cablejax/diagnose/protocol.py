@@ -1,4 +1,4 @@
-"""What a diagnosis needs of a simulator, and what an explanation of a gap is.
+"""The protocol of simulators that can be diagnosed, and explanations of a gap.
 
 A diagnosis asks a simulator three things: which effects could be at work, with priors; what it predicts for the
 recorded motions under some of them; and, where it knows better than forward differences, how predictions change with
@@ -140,7 +140,7 @@ class Report:
 
 @dataclasses.dataclass(frozen=True)
 class Plan:
-    """How thoroughly explanations are fitted and checked; a simulator states what suits it.
+    """Effort of fits and checks; a simulator states what suits it.
 
     Attributes:
         first_steps, last_steps, grown_steps: Gauss-Newton steps of every single effect, of the best ones, and of sets
@@ -182,7 +182,7 @@ class Simulator(abc.ABC):
     fits_unseen: bool = False
 
     def own(self, one: Explanation) -> int:
-        """How many numbers each recording has for its own under an explanation, each standard normal beforehand."""
+        """Number of parameters of each recording alone under an explanation, each with a standard normal prior."""
         del one
         return 0
 
@@ -201,7 +201,7 @@ class Simulator(abc.ABC):
 
     @abc.abstractmethod
     def predict(self, explanations: Sequence[Explanation], episodes: Int[np.ndarray, "e"]) -> np.ndarray:
-        """What would have been observed under each explanation.
+        """Predicts the observations under each explanation.
 
         Args:
             explanations: to simulate, each for every episode.

@@ -1,4 +1,4 @@
-"""A gap log made ready for diagnosis: checked, on an even clock, angles continuous."""
+"""Prepares a gap log for diagnosis: checked, on an even clock, angles continuous."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ def prepare(log: GapLog) -> Recording:
     caveats: list[str] = []
     if n_episodes == 1:
         caveats.append(
-            "One episode only: nothing can be held out, so there is no shrinkage to tell, and every probability is "
+            "One episode only: nothing can be held out, so no shrinkage is reported, and every probability is "
             "less certain than it looks."
         )
     short = [e for e in range(n_episodes) if log.episode_length[e] < _SHORTEST]
@@ -134,7 +134,7 @@ def prepare(log: GapLog) -> Recording:
     if log.hold is None or not hold.any():
         caveats.append("No holds are marked: the noise is taken to be white, and a slow drift would count as a gap.")
     if not recording.has_commands:
-        caveats.append("No commands were logged although the grippers move: effects of the arms cannot be told.")
+        caveats.append("No commands were logged although the grippers move: effects of the arms cannot be estimated.")
     return dataclasses.replace(recording, caveats=tuple(caveats))
 
 
@@ -153,10 +153,10 @@ def _samples(log: GapLog, e: int, *, observed: bool) -> tuple[Float[np.ndarray, 
 
 
 def _whole_turns(points: Float[np.ndarray, "T N 2"], pose: Float[np.ndarray, "T 2 3"]) -> float:
-    """What to add to the second gripper's angle so that it continues the first one's along the cable [rad].
+    """Whole turns to add to the second gripper's angle, so that it continues the first one's along the cable [rad].
 
     An angle is known up to whole turns, a cable is not: between the same directions it may lie straight or with a loop
-    in it. The keypoints tell, in the samples that show most of them.
+    in it. The keypoints decide, in the samples that show most of them.
     """
     seen = np.isfinite(points).all(axis=-1)
     best = seen & (seen.sum(axis=1) == seen.sum(axis=1).max())[:, None]

@@ -1,4 +1,4 @@
-"""What a correction gives that knows no cause: the online ridge residual of the controller, on a recorded run."""
+"""The controller's online ridge residual on a recorded run: a correction without a cause, to compare with."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Explanations that are fitted again without each part of the recordings, and judged by the part that was left out.
+"""Fits explanations again without each part of the recordings, and scores them on the held-out part.
 
 Leaving out a motion is pictured by one linear step where that serves (`Fit.held_out_sse`). It does not where episodes
 are few, where they have numbers of their own, or where one of them decides on which of several minima a fit ends in:

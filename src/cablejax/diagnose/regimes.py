@@ -1,4 +1,4 @@
-"""In which regime the cable is at every sample of a log: what the grippers do, and how it lies."""
+"""Regimes of the samples of a log, by the grippers' motion and the shape of the cable."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _REVERSAL_EDGES = (0.0, 1.0, 3.0, 10.0)
 
 @dataclasses.dataclass(frozen=True)
 class Regimes:
-    """Which samples are of which regime.
+    """Regimes of the samples.
 
     Attributes:
         masks: by "what: class", shape [E, T] each; the classes of one "what" do not overlap.

@@ -1,4 +1,4 @@
-"""Which episodes repeat one another.
+"""Finds episodes that repeat one another.
 
 A law that is not quite the real one errs in the same way each time the grippers move in the same way. Such episodes are
 one piece of evidence, whatever the number of samples: they are left out of a fit together, and share one vote.

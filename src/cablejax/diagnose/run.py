@@ -90,7 +90,7 @@ def diagnose_simulator(
 
 @dataclasses.dataclass(frozen=True)
 class Examined:
-    """What every diagnosis has in common.
+    """Common part of all diagnoses.
 
     Attributes:
         evidence: that was explained.
@@ -166,7 +166,7 @@ def weighed(
     motion: Int[np.ndarray, "E"],
     calibration: Calibration,
 ) -> Evidence:
-    """What a recording says, weighed by the noise and by what simulators get wrong without any effect.
+    """Evidence of a recording, weighed by the noise and the simulator's baseline error.
 
     Where recordings have numbers of their own, the nominal simulator has them fitted: they are no part of the gap.
     """
@@ -215,7 +215,7 @@ def _null(evidence: Evidence) -> Fit:
 
 
 def settings_of(simulator: Simulator, calibration: Calibration) -> dict:
-    """What a diagnosis was made with, for the record."""
+    """Provenance of a diagnosis."""
     return {
         "effects": [effect.name for effect in simulator.effects],
         "calibration": dataclasses.asdict(calibration),

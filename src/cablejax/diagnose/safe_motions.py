@@ -1,4 +1,4 @@
-"""A few gripper motions that tell causes apart and that every cable of the format bears.
+"""A few gripper motions that separate causes and that every cable of the format bears.
 
 Each starts from where a log started. A pair of grippers is moved in coordinates of the line between them, so that their
 distance keeps to its limits on the whole way.
@@ -20,7 +20,7 @@ from cablejax.simulate.pose import wrapped
 INTERVAL = 0.1
 """Between two samples of a motion [s]."""
 LIMITS = MotionConfig(straight_slack=0.005, min_distance=0.15, max_step=0.05, rotation_weight=0.15)
-"""What the grippers keep to: distance 0.15 to 0.995 of the length, 0.05 m/s with 0.15 m/rad."""
+"""Bounds on the grippers: distance 0.15 to 0.995 of the length, 0.05 m/s with 0.15 m/rad."""
 _SLOW = 0.3
 _HOLD = 3.0
 _FAR, _NEAR, _OVERLOAD = 0.93, 0.6, 0.3
@@ -30,8 +30,13 @@ _SEGMENT_SAMPLES = 200
 
 @dataclasses.dataclass(frozen=True)
 class _Pair:
-    """Both grippers: middle [m], heading of the line from one to the other [rad], their distance [m], and the angle of
-    either gripper to that line [rad].
+    """Both grippers by the line between them.
+
+    Attributes:
+        middle: of that line [m].
+        heading: its direction, from gripper 0 to gripper 1 [rad].
+        distance: its length [m].
+        angles: of either gripper to that line [rad].
     """
 
     middle: Float[np.ndarray, "2"]
@@ -52,9 +57,7 @@ class _Pair:
 
 
 def starting_pose(gripper_pose: Float[np.ndarray, "E T 2 3"]) -> Float[np.ndarray, "2 3"]:
-    """The first pose from which a next motion starts: that of the episode that begins with the grippers furthest apart,
-    whatever the order of the episodes.
-    """
+    """The pose from which a next motion starts: the first pose of the episode with the grippers furthest apart."""
     first = np.asarray(gripper_pose, np.float64)[:, 0]
     return first[np.argmax(np.linalg.norm(first[:, 1, :2] - first[:, 0, :2], axis=-1))]
 
@@ -68,9 +71,9 @@ def safe_motions(
       varies along the cable and a curved rest shape answer with opposite signs.
     - `translation`: both grippers across the cable and back: friction and nothing else bends the cable.
     - `ramp_hold`: closing in fast, then slowly, with holds: viscous against Coulomb forces, lags.
-    - `overload_return`: bent tightly and back: what stays bent has yielded.
+    - `overload_return`: bent tightly and back: a remaining bend is plastic.
     - `taut`: pulled nearly straight: stretch, slip, and the length.
-    - `shifted_repeat`: the same approach at two places of the table: what belongs to the table does not move along.
+    - `shifted_repeat`: the same approach at two places of the table: effects of the table do not move with the cable.
 
     Motions that this cable would not bear from this first pose are left out.
 

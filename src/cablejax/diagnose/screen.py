@@ -18,7 +18,7 @@ _LARGEST_AMPLITUDE = 3.0
 
 @dataclasses.dataclass(frozen=True)
 class Template:
-    """What one start of one effect does to the observations, against the gap.
+    """Change of the observations by one start of one effect, compared with the gap.
 
     Attributes:
         start: the explanation, moved along its amplitude to meet the gap where that is possible.

@@ -1,4 +1,4 @@
-"""What can be said of a gap beyond chance, with few episodes and correlated samples."""
+"""Significance tests for few episodes and correlated samples."""
 
 from __future__ import annotations
 

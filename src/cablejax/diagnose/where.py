@@ -44,7 +44,7 @@ class Where:
 
     Attributes:
         gap_mm: over the whole log.
-        smallest_mm: the least gap over the whole log that would have been told from noise.
+        smallest_mm: the least gap over the whole log that would have been distinguished from noise.
         along_cable_mm: at each keypoint, shape [N].
         bend_per_m: root mean square difference of the curvature at each inner keypoint, above the noise [1/m]. The gap
             itself is always small near the grippers, which hold the cable; this points closer to a cause that is local.
@@ -186,7 +186,7 @@ def _horizons(log: GapLog, valid, everywhere, above) -> dict[float, float]:
 
 
 def _frames(residual, noise, nominal, log: GapLog) -> dict[str, float]:
-    """How much of the squared gap a constant error in each frame explains, noise taken out of both."""
+    """Share of the squared gap that a constant error in each frame explains, noise taken out of both."""
     seen = np.isfinite(residual).all(axis=-1)
     floor = np.broadcast_to(noise**2, seen.shape)
     power = (np.where(seen[..., None], residual**2, 0.0)).sum() - 2 * floor[seen].sum()

@@ -1,4 +1,4 @@
-"""Where the gap lies where nothing is tested: sizes along the cable and by episode, for cables off the table."""
+"""Sizes of the gap along the cable and by episode, without tests, for cables off the table."""
 
 from __future__ import annotations
 

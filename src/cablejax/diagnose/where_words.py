@@ -49,7 +49,7 @@ def describe(
 
 
 def _size(where: Where, shown: list[int] | None, floor: float, names: Sequence[str]) -> str:
-    """How large the gap is, and in which episodes; `shown` are those that tests found it in, None without tests."""
+    """Size of the gap, and its episodes; `shown` are those in which tests found it, None without tests."""
     sizes, total = where.per_episode_mm, len(where.per_episode_mm)
     size = f"The gap is {_mm(where.gap_mm)} above the noise of {_mm(floor)}"
     if shown is not None and not shown:

@@ -35,7 +35,7 @@ _STREAM = 0x70726574
 
 @dataclasses.dataclass(frozen=True)
 class PretrainConfig:
-    """How the encoders are pretrained.
+    """Settings of the pretraining of the encoders.
 
     Attributes:
         steps: optimiser steps.
@@ -59,7 +59,7 @@ class PretrainConfig:
 
 @dataclasses.dataclass(frozen=True)
 class Pretrained:
-    """What pretraining leaves behind.
+    """Result of pretraining.
 
     Attributes:
         model: configuration of the network, with the normalisation measured on the data.

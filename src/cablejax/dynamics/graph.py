@@ -38,7 +38,7 @@ from cablejax.types import History
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Topology:
-    """Who is connected with whom: fixed by the rest shape, so built once and never padded.
+    """Edges of the graph: fixed by the rest shape, so built once and never padded.
 
     Edges are sorted by their offset `receiver - sender`, then by sender. On keypoints uniform in arc length this makes
     gathering and aggregating a matter of shifted slices, several times faster on a CPU than indexed scatter.
@@ -55,7 +55,7 @@ class Topology:
 
 
 class Prior(NamedTuple):
-    """What is known of a command's effect before any learning.
+    """Prior of a command's effect, before any learning.
 
     Attributes:
         displacement: expected X(t + 1) - X(t) [m], shape [N, 2], exact at the two grasped nodes.
@@ -83,7 +83,7 @@ def topology_of(config: ModelConfig) -> Topology:
 
 
 class Frame(NamedTuple):
-    """Where a model looks at the cable from: `axes @ v` expresses a vector in the frame, `v @ axes` brings it back.
+    """Frame in which a model sees the cable: `axes @ v` expresses a vector in the frame, `v @ axes` brings it back.
 
     Attributes:
         origin: in the world [m], shape [2].
@@ -170,7 +170,7 @@ def build_graph(history: History, twist: Float[Array, "2 3"], prior: Prior, conf
 
 
 def prior_of(history: History, twist: Float[Array, "2 3"], config: ModelConfig) -> Prior:
-    """What the model's prior expects of a command. Differentiable in `history` and `twist`."""
+    """The prior's prediction for a command. Differentiable in `history` and `twist`."""
     now, interval = history.keypoints[-1], config.interval
     if config.prior == "none":
         known = jnp.zeros_like(now).at[0].set(interval * twist[0, :2]).at[-1].set(interval * twist[1, :2])

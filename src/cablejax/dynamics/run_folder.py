@@ -62,7 +62,7 @@ def claim_folder(out_dir: Path, run: dict[str, Any], *, resume: bool, overwrite:
 
 
 def differences(old: Any, new: Any, name: str = "") -> list[str]:
-    """Where two JSON trees differ, as `path (old, now new)`."""
+    """Differences of two JSON trees, as `path (old, now new)`."""
     if isinstance(old, dict) and isinstance(new, dict):
         keys = sorted(old.keys() | new.keys())
         return [d for k in keys for d in differences(old.get(k), new.get(k), f"{name}.{k}" if name else k)]

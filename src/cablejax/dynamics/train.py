@@ -64,7 +64,7 @@ class TrainState:
 
 @dataclasses.dataclass(frozen=True)
 class TrainResult:
-    """What a call of `train` leaves behind.
+    """Result of `train`.
 
     Attributes:
         model: configuration of the network, with the normalisation measured on the data.

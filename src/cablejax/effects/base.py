@@ -17,7 +17,7 @@ from cablejax.effects.physics import Physics
 
 @dataclasses.dataclass(frozen=True)
 class Context:
-    """What is known of a log before any effect is fitted: where `Effect.starts` takes its guesses from.
+    """Facts of a log before any effect is fitted, from which `Effect.starts` makes its guesses.
 
     Attributes:
         config: the nominal cable.
@@ -37,9 +37,9 @@ class Context:
 Hook = Literal[
     "bending", "extension", "memory", "table", "mass", "grasp", "compliance", "input", "observation", "obstacle"
 ]
-"""Where an effect acts on a simulation: the bending law along the cable, the change of its length, bends that the cable
-remembers, the forces of the table, mass, how the grippers hold the cable, how their grasp yields, how the arms follow
-their commands, how the cable is observed, and what it touches. Every simulator states the hooks that it honours."""
+"""Points at which an effect acts on a simulation: the bending law along the cable, the change of its length, its memory
+of bends, the forces of the table, mass, the grasp, its compliance, the arms' response to commands, the observation of
+the cable, and obstacles. Every simulator states the hooks that it honours."""
 
 
 class CableEffect(Effect, abc.ABC):
@@ -93,7 +93,7 @@ class CableEffect(Effect, abc.ABC):
         return parameters
 
     def location(self, values: Sequence[float], variant: int, config: Discretisation) -> dict[str, Any]:
-        """Where the effect sits: keys "along_cable_m", "time_s", "table_m" of the verdict, where they apply."""
+        """The effect's place: keys "along_cable_m", "time_s", "table_m" of the verdict, where they apply."""
         del values, variant, config
         return {}
 

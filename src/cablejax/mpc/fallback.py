@@ -18,7 +18,7 @@ from cablejax.mpc.warm_start import Starts, StraightWay
 
 
 class Decision(NamedTuple):
-    """What is done.
+    """The decision on a command.
 
     Attributes:
         plan: to carry out the first command of; its `result` is the solver's.

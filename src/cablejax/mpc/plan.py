@@ -18,7 +18,7 @@ from cablejax.mpc.problem import Rollout, ShapingProblem
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Plan:
-    """What a solver returns.
+    """Result of a solver.
 
     Attributes:
         motion: feasible motions [m], shape [T, Q, 3].

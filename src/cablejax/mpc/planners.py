@@ -44,7 +44,7 @@ def bounded_plan(
 
 @dataclasses.dataclass(frozen=True)
 class _LeastSquaresPlanner(abc.ABC):
-    """What these planners share.
+    """Common settings of these planners.
 
     Attributes:
         max_iterations: linearisations at most; one costs as much as about ten rollouts.

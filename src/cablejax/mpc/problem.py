@@ -18,7 +18,7 @@ from cablejax.types import History, advance
 
 @dataclasses.dataclass(frozen=True)
 class ObjectiveConfig:
-    """What a plan is judged by.
+    """Weights and units of the objective.
 
     Attributes:
         terminal_weight: weight of the last predicted shape; every other shape has 1.
@@ -60,7 +60,7 @@ class ObjectiveConfig:
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Rollout:
-    """What `ShapingProblem.rollout` gives.
+    """Result of `ShapingProblem.rollout`.
 
     Attributes:
         motion: the plan [m], shape [T, Q, 3].
@@ -107,11 +107,11 @@ class ShapingProblem:
     objective: ObjectiveConfig = dataclasses.field(default=ObjectiveConfig(), metadata={"static": True})
 
     def start(self, motion: Float[Array, "T Q 3"]) -> Rollout:
-        """Where a solver begins from a plan: the nearest feasible one, rolled out."""
+        """The start of a solver from a plan: the nearest feasible one, rolled out."""
         return self.rollout(self.feasible.project(motion))
 
     def rollout(self, motion: Float[Array, "T Q 3"]) -> Rollout:
-        """What the model expects of a plan."""
+        """Rolls a plan out with the model."""
 
         def one_step(history, twist):
             after = self._advance(history, twist)
@@ -196,7 +196,7 @@ class ShapingProblem:
         return jnp.concatenate([shape.ravel(), self.objective.motion_weight**0.5 * motion.ravel()])
 
     def _of_grippers(self, motion: Float[Array, "T Q 3"]) -> Float[Array, " T+Q"]:
-        """What the grippers' poses cost: winding after every step, and the weighted way left after the last one [m]."""
+        """Residuals of the grippers' poses: winding after every step, weighted distance after the last one [m]."""
         pose, weight = continued(self.history.gripper_pose, self.history.keypoints[-1]), self.objective.rotation_weight
         turn = pose[1, 2] - pose[0, 2] + jnp.cumsum(motion[:, 1, 2] - motion[:, 0, 2]) / weight
         wound = weight * jnp.maximum(jnp.abs(turn - total_turn(self.target)) - jnp.pi, 0.0)

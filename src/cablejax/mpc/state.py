@@ -16,7 +16,7 @@ from cablejax.types import History
 
 
 class Action(enum.IntEnum):
-    """What a command does. Inside compiled code it is an int32."""
+    """Kind of a command. Inside compiled code it is an int32."""
 
     FOLLOW = 0
     """It is the first one of the solver's plan."""

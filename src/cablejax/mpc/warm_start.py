@@ -26,7 +26,7 @@ class StraightWay(NamedTuple):
 
 
 class Starts(NamedTuple):
-    """What is known before a solver is asked.
+    """Inputs of the warm start.
 
     Attributes:
         guess: the better of two starts: the last plan, shifted by the command that was executed, and the straight way.
@@ -42,7 +42,7 @@ class Starts(NamedTuple):
 
 
 def find_starts(config: MPCConfig, problem: ShapingProblem, last: Float[Array, "T Q 3"]) -> Starts:
-    """What may be begun from, and what it is worth.
+    """Candidates of a start, and their values.
 
     Args:
         config: settings.
@@ -68,7 +68,7 @@ def find_starts(config: MPCConfig, problem: ShapingProblem, last: Float[Array, "
 
 
 def _straight_way(config: MPCConfig, problem: ShapingProblem, to: Float[Array, "2 3"]) -> StraightWay:
-    """From where the grippers are to a pair of poses, within the bound on a step and no other."""
+    """Motions from the grippers' present poses to a pair of poses, within the bound on a step and no other."""
     pose = continued(problem.history.gripper_pose, problem.history.keypoints[-1])
     weight = config.objective.rotation_weight
     motion = straight_plan(pose, to, problem.feasible.radius, weight, config.n_commands)

@@ -161,7 +161,7 @@ class DepthCamera:
         mujoco.mj_kinematics(model, data)
 
     def _near_cable(self, nodes: np.ndarray) -> np.ndarray:
-        """Which pixels may see the cable: those around its projection."""
+        """Pixels that may see the cable: those around its projection."""
         config = self.config
         across, down = config.resolution
         sight, right, below = _axes(config)
@@ -180,7 +180,7 @@ class DepthCamera:
         return near.ravel()
 
     def _in_company(self, pixels: np.ndarray) -> np.ndarray:
-        """Which of these pixels have enough of them around."""
+        """Mask of the pixels with enough neighbours."""
         across, down = self.config.resolution
         image = np.zeros((down, across), np.int32)
         image.ravel()[pixels] = 1

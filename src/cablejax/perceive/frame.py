@@ -21,7 +21,7 @@ WIDENING = 1.5
 
 
 class Status(enum.IntEnum):
-    """What became of a frame."""
+    """Outcome of a frame."""
 
     TRACKED = 0
     """The cable was found in the cloud."""
@@ -33,7 +33,7 @@ class Status(enum.IntEnum):
 
 @dataclasses.dataclass(frozen=True)
 class TrackerConfig:
-    """How clouds are followed.
+    """Settings of the tracker.
 
     Attributes:
         registration: the cable and its registration.
@@ -76,7 +76,7 @@ class TrackerConfig:
 
 
 class TrackState(NamedTuple):
-    """What is carried from frame to frame.
+    """State of the tracker between frames.
 
     Attributes:
         angles: joint angles of the chain [rad], shape [J].
@@ -98,7 +98,7 @@ class TrackState(NamedTuple):
 
 
 class Track(NamedTuple):
-    """What is known after a frame.
+    """Estimate after a frame.
 
     Attributes:
         keypoints: positions [m], shape [N, 2]; while lost, those last found, carried along with the grippers; NaN if

@@ -234,7 +234,7 @@ def _maximisation(
 
 
 def _closure(config: RegistrationConfig, shape: Curve, angles, pose) -> Float[Array, "3"]:
-    """What is missing for the curve to end in gripper 1: position [m], and turn in units of the length."""
+    """Gap between the curve's end and gripper 1: position [m], and turn in units of the length."""
     turn = (pose[1, 2] - pose[0, 2]) - jnp.sum(angles)
     return jnp.concatenate([pose[1, :2] - shape.end, config.length * turn[None]])
 

@@ -13,7 +13,7 @@ BORDER = 0.1
 
 @dataclasses.dataclass(frozen=True)
 class Clutter:
-    """What stands between a cable and its cloud.
+    """Disturbances between a cable and its cloud.
 
     Attributes:
         points: in the cloud.

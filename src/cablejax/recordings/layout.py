@@ -20,7 +20,7 @@ from cablejax.recordings.prepare import Setup
 
 @dataclasses.dataclass(frozen=True)
 class Layout:
-    """What a layout file says.
+    """Content of a layout file.
 
     Attributes:
         nominal: what is believed of the cable.

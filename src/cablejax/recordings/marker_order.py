@@ -92,7 +92,7 @@ def _reversed(take: Take, usual: Float[np.ndarray, " M"]) -> bool:
 
 
 def _tracked(points: Float[np.ndarray, "T N D"], usual: Float[np.ndarray, " M"]) -> np.ndarray:
-    """Which of the given keypoints is at each place of the cable, shape [T, N]."""
+    """Index of the given keypoint at each place of the cable, shape [T, N]."""
     samples, count, _ = points.shape
     order = np.tile(np.arange(count), (samples, 1))
     broken = _broken(points, usual)

@@ -120,7 +120,7 @@ def _no_bytes(*arguments: Any) -> bytes:
 
 
 class _Name:
-    """What a pickle gets for a name: it may call it, but not, as it could with a function, set its attributes."""
+    """Stand-in for a name in a pickle: may be called, but its attributes, unlike a function's, cannot be set."""
 
     __slots__ = ("_function",)
 

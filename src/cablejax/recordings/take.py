@@ -78,7 +78,7 @@ def typical_spacing(takes: tuple[Take, ...]) -> Float[np.ndarray, " M"]:
 
 
 def median_step(points: Float[np.ndarray, "T N D"]) -> Float[np.ndarray, " S"]:
-    """How far the middle one of the observed keypoints moves from each sample to the next [m], shape [T - 1].
+    """Distance that the middle one of the observed keypoints moves from each sample to the next [m], shape [T - 1].
 
     NaN where none is observed in both.
     """

@@ -88,7 +88,7 @@ def _palette(shades: int = 7) -> Image.Image:
 
 
 class _Scene:
-    """What stays the same from frame to frame: the layout, the targets, the words."""
+    """The constant part of all frames: the layout, the targets, the words."""
 
     def __init__(self, pairs: dict[str, dict[Method, ClosedLoopRun]], views: dict, width: int):
         self.pairs = pairs

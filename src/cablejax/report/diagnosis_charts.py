@@ -156,7 +156,7 @@ def _ahead(ax: Axes, errors: dict[str, float], believed: str, label: str | None)
 
 
 def _split_bar(ax: Axes, split: dict[str, float | None]) -> None:
-    """What the squared error before consists of."""
+    """Parts of the squared error before."""
     begin = 0.0
     for key, label, colour in _SPLIT:
         share = split.get(key) or 0.0

@@ -214,7 +214,7 @@ def _draw_places(ax: Axes, diagnosis: CableDiagnosis, cable: np.ndarray) -> None
 
 
 def _sections(effect: NamedEffect, arclength: np.ndarray) -> list[tuple[float, float]]:
-    """Where along the cable an effect sits; one that names several keypoints sits at each of them."""
+    """Places of an effect along the cable; one that names several keypoints has one at each."""
     index = effect.parameters.get("index")
     if index is not None:
         return [(float(arclength[i]), float(arclength[i])) for i in np.atleast_1d(index.value)]

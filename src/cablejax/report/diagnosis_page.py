@@ -121,7 +121,7 @@ def _orbit(diagnosis: CableDiagnosis) -> dict[str, str]:
 
 
 def _lead(diagnosis: CableDiagnosis) -> str:
-    """What was looked at, and the gap in one line."""
+    """The log and its gap in one line."""
     log, gap = diagnosis.log, diagnosis.gap
     seconds = sum(float(t[n - 1] - t[0]) for t, n in zip(log.time, log.episode_length, strict=True))
     episodes = len(log.episode_length)
@@ -168,7 +168,7 @@ def _noise(diagnosis: CableDiagnosis) -> str:
 
 
 def _chance(diagnosis: CableDiagnosis) -> str:
-    """How probable the named effects are, as far as that was computed, and how strong the first one is."""
+    """Probability of the named effects, where computed, and strength of the first one."""
     chances = [e.probability for e in diagnosis.effects if e.probability is not None]
     strength = _most_telling(diagnosis.effects[0])
     if not chances:

@@ -33,7 +33,7 @@ EFFECTS: dict[str, str] = {
     "camera_lag": "the keypoints are stamped late",
     "obstacle": "a fixed object touches the cable",
 }
-"""What each effect of the format is."""
+"""Description of each effect of the format."""
 
 _PARAMETERS: dict[str, str] = {
     "centre_m": "centre, from gripper 0",
@@ -73,7 +73,7 @@ MOTIONS: dict[str, str] = {
     "taut": "Pull the cable nearly straight, to 99.5 % of its length, hold, and go back.",
     "shifted_repeat": "Close in and go back; repeat it shifted across the table by 20 % of the cable's length.",
 }
-"""What each motion of `cablejax.diagnose.safe_motions` is, in an instruction."""
+"""Instruction for each motion of `cablejax.diagnose.safe_motions`."""
 
 
 def effect_title(name: str) -> str:
@@ -125,7 +125,7 @@ def _short(value: float) -> str:
 
 
 def _place(location: dict[str, Any], gripper: Any = None) -> str:
-    """Where an effect sits: "between 0.19 and 0.42 m from gripper 0"; "" where it has no place."""
+    """Place of an effect: "between 0.19 and 0.42 m from gripper 0"; "" where it has no place."""
     parts = []
     along, time, table = (location.get(key) for key in ("along_cable_m", "time_s", "table_m"))
     if gripper is not None:
@@ -149,7 +149,7 @@ def listed(words: Sequence[str], last: str = "and") -> str:
 
 
 def effect_place(effect: NamedEffect) -> str:
-    """Where an effect acts, in words: keypoints, a gripper, or a place."""
+    """Place of an effect in words: keypoints, a gripper, or a stretch of cable."""
     index = effect.parameters.get("index")
     if index is not None and isinstance(index.value, list):
         return f"at keypoints {listed([str(i) for i in sorted(index.value)])}"

@@ -106,7 +106,7 @@ def error_over_time(runs: Runs, goal_cm: float | None = 1.0) -> Figure:
 
 
 def residual_share(runs: Runs) -> Figure:
-    """How much of the predicted motion the online residual contributes [%], one panel per shape.
+    """Share of the online residual in the predicted motion [%], one panel per shape.
 
     Blank where the grippers rested: a share of no motion means nothing.
     """

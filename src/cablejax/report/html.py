@@ -37,7 +37,7 @@ def _environment() -> jinja2.Environment:
 
 
 def json_script(value: Any) -> Markup:
-    r"""JSON for a script element, which "</" would end; "<\/" is the same JSON."""
+    """JSON for a script element. A closing tag within a string would end the element, so its slash is escaped."""
     return Markup(json.dumps(value, separators=(",", ":"), allow_nan=False).replace("</", "<\\/"))
 
 

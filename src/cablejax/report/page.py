@@ -124,7 +124,7 @@ def headline(pairs: Mapping[str, Mapping[Method, ClosedLoopRun]]) -> tuple[str, 
 
 
 def animation_data(runs: Runs) -> dict[str, Any]:
-    """What the player draws, as JSON: curves in whole tenths of a millimetre, poses in metres and radians."""
+    """Data of the player as JSON: curves in whole tenths of a millimetre, poses in metres and radians."""
 
     def integers(points: np.ndarray) -> list[int | None]:
         flat = np.asarray(points, dtype=float).ravel() * _UNITS_PER_METRE

@@ -80,7 +80,7 @@ def cable_still(diagnosis: CableDiagnosis) -> Figure:
 
 
 def orbit_data(diagnosis: CableDiagnosis) -> dict[str, Any]:
-    """What the player draws: the files with the largest, the smallest and middling gaps, in whole millimetres."""
+    """Data of the player: the files with the largest, the smallest and middling gaps, in whole millimetres."""
     log, names = diagnosis.log, _names(diagnosis)
     size = np.asarray(diagnosis.where.per_episode_mm, float)
     used = np.flatnonzero(np.isfinite(size))

@@ -35,7 +35,7 @@ _LARGEST_TURN = 0.3
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Wire:
-    """What decides the shape of a hanging wire of M links.
+    """Parameters of the shape of a hanging wire of M links.
 
     Attributes:
         stiffness: EI over the weight per length [m^3], at each of the M + 1 joints, the two at the clamps included.

@@ -203,7 +203,7 @@ class MjxEngine(Engine):
         return jacobian * mask[..., None], angular[None] * mask[..., None]
 
     def _held_pose(self, data) -> Float[Array, "Q P"]:
-        """Where the held ends are: (x, y, theta) or (position, quaternion)."""
+        """Poses of the grasped ends: (x, y, theta) or (position, quaternion)."""
         ends = data.xipos[jnp.array([1, -1])]
         if self.config.dimension == 3:
             return jnp.concatenate([ends, data.xquat[jnp.array([1, -1])]], axis=1)

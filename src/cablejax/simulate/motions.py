@@ -18,7 +18,7 @@ _COARSE_LINKS = 13
 
 @dataclasses.dataclass(frozen=True)
 class MotionConfig:
-    """How the grippers move at random, and the poses they keep to.
+    """Settings of random gripper motions, and bounds on their poses.
 
     Velocities follow a first-order autoregressive process in each gripper's (vx, vy, omega). Its scale and persistence
     are drawn separately for every trajectory, so that the data hold slow and fast, jerky and steady motions.

@@ -16,7 +16,7 @@ from cablejax.effects.physics import Physics, nominal_physics
 
 
 class ObservedConfig(Protocol):
-    """What the configuration of a plant says of its cable and of how that is seen; see `PlantConfig`."""
+    """Fields of a plant's configuration for its cable and the observation of it; see `PlantConfig`."""
 
     @property
     def cable(self) -> Cable:

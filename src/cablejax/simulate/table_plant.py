@@ -27,7 +27,7 @@ class PlantError(RuntimeError):
 
 @dataclasses.dataclass(frozen=True)
 class Observation:
-    """What a camera over the table and the arms' encoders report at one instant.
+    """Observation by a camera over the table and the arms' encoders at one instant.
 
     Attributes:
         keypoints: [m], NaN = not observed, float64, shape [N, 2].
@@ -163,7 +163,7 @@ class TablePlant(abc.ABC):
         return self._marked(self._unbiased)
 
     def _look(self) -> Float[np.ndarray, "N 2"]:
-        """What the camera reports now, in the world's frame: keypoints where their markers are, with its lag."""
+        """The camera's present report in the world's frame: keypoints at their markers, with its lag."""
         physics, now = self._physics, self.time
         biased = np.any(physics.bias_along) or np.any(physics.bias_across)
         marks = self._marked(physics) if biased else self._true_keypoints()

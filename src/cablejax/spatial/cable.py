@@ -1,4 +1,4 @@
-"""A cable in space as a diagnosis sees it: windows of its motion, simulated by the rod, behind the protocol.
+"""The adapter of cables in space: windows of motion, simulated by the rod, behind the protocol of simulators.
 
 A window is an episode. Distances between simulated and recorded markers count as pseudo-Huber: a window in which the
 cable swings over another way must not decide alone. They stay the same for tenths of a second, so a sample counts as
@@ -26,7 +26,7 @@ from cablejax.spatial.effects import GRIP, Layout
 from cablejax.spatial.windows import Windows
 
 GOOD_FIT = 0.01
-"""What is left of a good fit [m]: unit of the residuals."""
+"""Error of a good fit [m]: unit of the residuals."""
 TWISTED = "intrinsic_curvature"
 """The effect that needs the material frame, whose derivatives take four times as long as all others together."""
 _CHUNK = 8
@@ -81,7 +81,7 @@ class SpatialCable(Simulator):
         return dataclasses.replace(self, rod=dataclasses.replace(self.rod, substeps=factor * self.rod.substeps))
 
     def own(self, one: Explanation) -> int:
-        """How the cable sits in the grippers is set up anew for each recording."""
+        """Number of parameters of each recording alone: those of the grip."""
         return sum(len(e.null) for e in self.layout.effects if e.own and e.name in one.names)
 
     def motion(self, one: Explanation) -> Float[np.ndarray, "W T F 3"]:

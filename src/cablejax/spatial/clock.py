@@ -1,4 +1,4 @@
-"""A log in space with all its samples one interval apart."""
+"""Resamples a log in space to one interval."""
 
 from __future__ import annotations
 
@@ -44,11 +44,11 @@ def on_one_clock(log: GapLog) -> tuple[GapLog, tuple[str, ...]]:
         whole["gripper_command"][e, :samples] = log.gripper_command[e, before]
         if log.hold is not None:
             whole["hold"][e, :samples] = log.hold[e, before] & log.hold[e, np.minimum(before + 1, n - 1)]
-    told = (
+    report = (
         f"Samples are {1e3 * steps.min():.3g} to {1e3 * steps.max():.3g} ms apart: sampled again every "
         f"{1e3 * interval:.3g} ms."
     )
-    return dataclasses.replace(log, episode_length=np.array(length, np.int32), **whole), (told,)
+    return dataclasses.replace(log, episode_length=np.array(length, np.int32), **whole), (report,)
 
 
 def _points(grid, time, points: Float[np.ndarray, "T N 3"], interval: float) -> Float[np.ndarray, "G N 3"]:

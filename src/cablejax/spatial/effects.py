@@ -30,7 +30,7 @@ CURVATURE_KNOTS = 5
 # Torsional over bending stiffness of a round cord with Poisson's ratio 0.45.
 TWIST_RATIO = 0.7
 # Two markers that sit 5 mm off the centreline on different sides, 30 mm apart, see a gripper turned by so much [rad].
-# It turns about the cable with the roll, which is not seen, and is another one when the cable is gripped anew.
+# It turns about the cable with the roll, which is not seen, and differs each time that the cable is gripped.
 GRIP = 0.3
 # Almost inextensible: 1 m of cable that hangs by its end stretches by 0.2 mm.
 _STRETCH = 5e4
@@ -43,7 +43,7 @@ class SpatialEffect(Effect):
     Attributes:
         fields: names of what its parameters are, each with their number, in order.
         templates: values of a single parameter from which fits begin; by default from the null value.
-        own: whether each recording adds values of its own, with the prior of those that all share: what is set up anew.
+        own: whether each recording adds values of its own, with the prior of the common ones, as set-ups differ.
     """
 
     fields: tuple[tuple[str, int], ...]
@@ -141,7 +141,7 @@ class Layout:
         """Mass of the cable with its markers over that of the bare one; differentiable in `values`.
 
         A marker's mass counts for the cable from halfway to the last to halfway to the next. For modes that do not move
-        at the clamps and are long beside that, it is then no other whether it is there or spread evenly.
+        at the clamps and are long compared with that, the place of the mass does not matter.
         """
         spacing = self.arclength[-1] / len(self.arclength)
         return 1.0 + jnp.asarray(values)[self.slices["marker_mass"].start] / spacing
@@ -153,7 +153,7 @@ class Layout:
         return bare - jnp.log(self.laden(values))
 
     def physics(self, values: Float[Array, "P"] | np.ndarray) -> RodPhysics:
-        """What the simulator needs; differentiable in `values`."""
+        """Parameters of the simulator; differentiable in `values`."""
         part: Mapping[str, Array] = {name: jnp.asarray(values)[where] for name, where in self.slices.items()}
         arclength = jnp.asarray(self.arclength) + part["along"]
         stiffness = self.nominal_stiffness * part["ratio"] * jnp.exp(part["log_profile"])

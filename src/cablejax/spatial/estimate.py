@@ -170,7 +170,7 @@ def estimate_at(evidence: Evidence, fit: Fit) -> Estimate:
 
 
 def jackknife(evidence: Evidence, fit: Fit) -> Float[np.ndarray, "R K"]:
-    """What leaving out each recording does to the shared coordinates, by one Gauss-Newton step (Miller 1974).
+    """Change of the shared coordinates when each recording is left out, by one Gauss-Newton step (Miller 1974).
 
     Scaled so that the standard error of anything linear in them is the root of its sum of squares over rows.
     """

@@ -1,4 +1,4 @@
-"""How far a simulation is off the recorded windows, and how much of that an explanation takes away."""
+"""Error of a simulation on the recorded windows, and its shrinkage by an explanation."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def squares(predicted: Float[np.ndarray, "W T F 3"], windows: Windows) -> Float[
 def gap_of(
     before: Float[np.ndarray, "W T F 3"], after: Float[np.ndarray, "W T F 3"], cable: SpatialCable, noise: float
 ) -> Gap:
-    """How far two predictions of the windows are off, and how much of that goes from one to the other.
+    """Errors of two predictions of the windows, and the shrinkage from one to the other.
 
     Args:
         before: of the nominal simulator [m].

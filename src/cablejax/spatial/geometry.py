@@ -52,7 +52,7 @@ class LocalChange:
         return (
             f"In {files}, keypoints {self.pair[0]} and {self.pair[1]} {where} ({self.arclength[0]:.2f} to "
             f"{self.arclength[1]:.2f} m) are {1e3 * self.here:.1f} mm apart instead of {1e3 * self.usual:.1f} mm: "
-            f"{'it was gripped anew' if self.gripper is not None else 'a marker or the cable between has moved'}."
+            f"{'it was gripped again' if self.gripper is not None else 'a marker or the cable between has moved'}."
         )
 
 

@@ -1,4 +1,4 @@
-"""A hanging wire as a diagnosis sees it: photographs of a wire at rest behind the protocol of simulators.
+"""The adapter of hanging wires: photographs of a wire at rest behind the protocol of simulators.
 
 Each photograph is an episode of one sample and a recording of its own; the angles of both clamps are what it has for
 its own, nuisances that are fitted in every explanation alike, and to photographs that are held out too. Errors of one

@@ -1,4 +1,4 @@
-"""What a hanging wire may show: effects with their parameters, and the shape of the wire that they make."""
+"""Effects of a hanging wire: their parameters, and the shape of the wire with them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""From windows of recordings to a simulator that explains them: effects, values, and predictions nobody fitted."""
+"""Identifies a cable in space from windows of recordings: effects, values, and held-out predictions."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _RIVAL = "stiffness_profile"
 
 @dataclasses.dataclass(frozen=True)
 class Identified:
-    """What was found.
+    """Result of an identification.
 
     Attributes:
         cable: the simulator, in the windows that it was found from.

@@ -1,4 +1,4 @@
-"""What an identification has done, kept in a file so that an interrupted one goes on where it was."""
+"""Progress of an identification in a file, so that an interrupted one resumes."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from cablejax.whole_file import whole_file
 
 
 def fingerprint(cable: SpatialCable, names: Sequence[str]) -> str:
-    """What a kept state must have been made from to be of use."""
+    """Inputs that a stored state must have been made from."""
     layout, windows = cable.layout, cable.windows
     digest = hashlib.sha256(repr((cable.rod, layout.nominal_stiffness, list(names), windows.name)).encode())
     for array in (windows.keypoints, windows.position, windows.valid, windows.group):
@@ -31,7 +31,7 @@ def fingerprint(cable: SpatialCable, names: Sequence[str]) -> str:
 
 
 class Memory:
-    """What is done, in one JSON file that is written whole."""
+    """Progress in one JSON file that is written atomically."""
 
     def __init__(self, path: pathlib.Path | None, fingerprint: str, layout: Layout):
         self._path, self._layout = path, layout

@@ -1,4 +1,4 @@
-"""What an estimate says of each effect: parameters with intervals, and where on the cable they sit."""
+"""Named effects from an estimate: parameters with intervals, and their place on the cable."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from cablejax.spatial.effects import CURVATURE_KNOTS, PROFILE_KNOTS
 from cablejax.spatial.estimate import UNMODELLED, Estimate, Interval
 from cablejax.spatial.identify import Identified
 
-# A marker that is this near to its nominal place is not told as displaced [m].
+# A marker that is this near to its nominal place is not reported as displaced [m].
 _PLACED = 1e-3
 
 
@@ -22,7 +22,7 @@ def named_effects(found: Identified, estimate: Estimate, density: float) -> tupl
 
     Args:
         found: by `identify`.
-        estimate: from the same windows. What is told comes from it, not from the values that predictions are made with.
+        estimate: from the same windows. Reported values are its own, not those that predictions are made with.
         density: mass per length, with the markers, that is believed true [kg/m], for what is known per mass only.
     """
     named = []
@@ -62,8 +62,8 @@ def parameters_of(
         value = float(np.linalg.norm(estimate.shared[slots]))
         ends = [estimate.of(lambda values, i=i: values[i]) for i in slots]
         error = max(end.high - end.value for end in ends)
-        told = Interval(value, value - error, value + error).wider(besides)
-        return dataclasses.replace(told, low=max(told.low, 0.0))
+        wide = Interval(value, value - error, value + error).wider(besides)
+        return dataclasses.replace(wide, low=max(wide.low, 0.0))
 
     def positive(field):
         return estimate.positive(field).wider_by_factor(besides)

@@ -1,4 +1,4 @@
-"""Which effects the gap needs: forward selection, scored on the half of the recordings that no fit has seen.
+"""Forward selection of effects, scored on the held-out half of the recordings.
 
 Recordings are split into two halves. Both halves are fitted separately all along, and every window is scored with the
 fit of the other half. At each step the effect is tried with which unseen windows are simulated best

@@ -1,4 +1,4 @@
-"""How finely time has to be cut between two samples for the motion that was recorded.
+"""Chooses the number of time steps between two samples for the recorded motion.
 
 A cable is simulated with steps of a sample's length where that is fine enough: on recordings at 100 Hz of clamps that
 move like a hand it is. Clamps that swing by decimetres twice a second, or samples that are far apart, need more. How

@@ -1,4 +1,4 @@
-"""Where a simulation in space is off: along the cable, in which files, at which speeds."""
+"""Localises the error of a simulation in space: along the cable, by file, and by speed."""
 
 from __future__ import annotations
 

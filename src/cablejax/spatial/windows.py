@@ -146,7 +146,7 @@ def windows_of(log: GapLog, *, length: float = WINDOW) -> Windows:
 
 
 def labels(log: GapLog, *names: str, default: str | None = None) -> list[str]:
-    """What a log says of each episode under the first of these names, which the format does not know; else its number.
+    """Labels of the episodes by the first of these extra fields that the log has; else their numbers.
 
     Only lists of one text or number for each episode are labels; what another program means by these names is left
     alone.
@@ -161,7 +161,7 @@ def labels(log: GapLog, *names: str, default: str | None = None) -> list[str]:
 
 
 def _held(points, position, tangent, valid):
-    """How many keypoints of either end move with the gripper."""
+    """Numbers of keypoints that move with either gripper."""
     count = []
     for q, order in enumerate((range(points.shape[2]), range(points.shape[2] - 1, -1, -1))):
         n = 0
@@ -200,7 +200,7 @@ def _sample_interval(log: GapLog) -> float:
 
 
 def _clamps(points, position, tangent, s, held):
-    """Where the cable leaves either gripper [m], shape [E, T, 2, 3]."""
+    """Points at which the cable leaves either gripper [m], shape [E, T, 2, 3]."""
     reach = np.array([s[held[0] - 1] - s[0] if held[0] else 0.0, s[-1] - s[len(s) - held[1]] if held[1] else 0.0])
     # the second gripper's tangent points along the cable too: towards its end
     clamp = position + np.array([1.0, -1.0])[:, None] * reach[:, None] * tangent

@@ -12,7 +12,7 @@ from cablejax.bounded.sets.base import ConvexSet
 
 
 class Intersection(ConvexSet):
-    """What several convex sets have in common.
+    """The intersection of several convex sets.
 
     Attributes:
         members: the sets.

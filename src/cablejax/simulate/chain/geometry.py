@@ -8,7 +8,7 @@ from jaxtyping import Array, Float
 
 
 def chained(steps: Float[Array, "n 2"]) -> Float[Array, "n 2"]:
-    """Where each link begins if link k leads on by `steps[k]`."""
+    """Start of each link if link k leads on by `steps[k]`."""
     return jnp.concatenate([jnp.zeros((1, 2), steps.dtype), jnp.cumsum(steps[:-1], axis=0)])
 
 

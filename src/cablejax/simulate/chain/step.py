@@ -59,7 +59,7 @@ class ChainState:
 
 
 class Frame(NamedTuple):
-    """Where the links are and how they move, relative to gripper 0.
+    """Positions and velocities of the links, relative to gripper 0.
 
     Attributes:
         theta: angle of each link [rad], shape [n].
@@ -83,7 +83,7 @@ class Frame(NamedTuple):
 
 
 class Load(NamedTuple):
-    """What acts on the nodes.
+    """Forces on the nodes.
 
     Attributes:
         mass: [kg], shape [n].

@@ -19,7 +19,7 @@ HOOKS: frozenset[Hook] = frozenset(get_args(Hook))
 
 @dataclasses.dataclass(frozen=True)
 class PlantConfig:
-    """What the plant is made of; the defaults are the reference cable, finer than the trained one.
+    """Configuration of the plant; the defaults are the reference cable, finer than the trained one.
 
     Attributes:
         discretisation: the cable as it is believed to be, its links and time step. `friction_speed` has no meaning

@@ -88,7 +88,7 @@ class Plant(TablePlant):
                 break
 
     def _forget(self) -> None:
-        """What the last cable left behind: set bends, slipped length. None of these acts until the new one rests."""
+        """Clears the state of the last cable: set bends, slipped length. None of these acts until the new one rests."""
         self._acting = False
         if self._memory is not None:
             self._memory.reset()
