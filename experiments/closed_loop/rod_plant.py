@@ -37,7 +37,8 @@ from cablejax.effects.physics import Physics
 from cablejax.simulate.composite import link_lengths
 from cablejax.simulate.elastica import solve_elastica
 from cablejax.simulate.plant.config import HOOKS as CONTACT_PLANT_HOOKS
-from cablejax.simulate.table_plant import Observation, TablePlant, check_camera, check_effects, plant_physics
+from cablejax.simulate.plant_config import check_camera, check_effects, plant_physics
+from cablejax.simulate.table_plant import Observation, TablePlant
 
 HOOKS: frozenset[Hook] = frozenset({"bending", "mass", "input", "observation"})
 """Hooks of the effects that the rod can stage."""

@@ -19,6 +19,7 @@ from cablejax.commands.options import Command
 from cablejax.commands.shape import Shape
 from cablejax.commands.simulate import Simulate
 from cablejax.commands.train import Train
+from cablejax.compiled_programs import keep_compiled_programs
 
 USER_ERROR = 2
 """Exit code for input that cannot be used."""
@@ -61,6 +62,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         args=given,
         config=(tyro.conf.OmitArgPrefixes, tyro.conf.OmitSubcommandPrefixes, tyro.conf.FlagCreatePairsOff),
     )
+    if not isinstance(command, Bench):  # which times compilations too
+        keep_compiled_programs()
     command = command.what if isinstance(command, (Bench, Import)) else command
     try:
         command.run()

@@ -190,21 +190,13 @@ class BenchPerception(Command):
         """Times frames of the tracker and returns frames per second."""
         import numpy as np
 
-        from cablejax.commands.workloads import setting
+        from cablejax.commands.workloads import clouds_of_an_arch, setting
         from cablejax.perceive import Status, Tracker, TrackerConfig
-        from cablejax.perceive.synthetic import Clutter, scatter
-        from cablejax.simulate.elastica import solve_elastica
 
         if min(self.points, self.repeats) < 1:
             raise UsageError(f"--points is {self.points} and --repeats {self.repeats}, expected at least 1 each.")
         tracker = Tracker(dataclasses.replace(TrackerConfig(), capacity=self.points))
-        random = np.random.default_rng(self.seed)
-        # An arch that is carried to and fro by a millimetre per frame.
-        pose = np.array([[-0.3, 0.0, 0.8], [0.35, 0.0, -0.6]])
-        curve = solve_elastica(pose, tracker.config.registration.length).position
-        shifts = 0.01 * np.sin(0.1 * np.arange(self.repeats + 2))
-        clouds = [scatter(curve + np.array([shift, 0.0]), Clutter(points=self.points), random) for shift in shifts]
-        poses = [pose + np.array([shift, 0.0, 0.0]) for shift in shifts]
+        clouds, poses = clouds_of_an_arch(self.repeats + 2, self.points, tracker.config.registration.length, self.seed)
         say("compiling the tracker ...")
         state, seen = tracker.init(clouds[0], poses[0])
         first, frame = [], []

@@ -20,8 +20,10 @@ from cablejax.control.shaping import Model, make_controller
 from cablejax.control.targets import make_target, straight_start
 from cablejax.effects.physics import Physics, nominal_physics
 from cablejax.mpc import MPC, MPCConfig
+from cablejax.perceive.synthetic import Clutter, scatter
 from cablejax.report.provenance import machine
 from cablejax.simulate import MjxEngine
+from cablejax.simulate.elastica import solve_elastica
 from cablejax.simulate.equilibrium import equilibrium_state
 from cablejax.solver_names import SolverName
 from cablejax.types import CableState, History, Measurement
@@ -68,6 +70,24 @@ def program_bytes(compiled: Any) -> int:
     """Memory [bytes] of a compiled program: its arguments, its results and what it needs in between."""
     memory = compiled.memory_analysis()
     return memory.temp_size_in_bytes + memory.argument_size_in_bytes + memory.output_size_in_bytes
+
+
+def clouds_of_an_arch(
+    count: int, points: int, length: float, seed: int = 0
+) -> tuple[list[Float[np.ndarray, "n 2"]], list[Float[np.ndarray, "Q 3"]]]:
+    """Point clouds of an arch that is carried to and fro by a millimetre per frame, and the grippers' poses.
+
+    Args:
+        count: number of frames.
+        points: in each cloud.
+        length: of the cable [m].
+        seed: of the clouds.
+    """
+    random, pose = np.random.default_rng(seed), np.array([[-0.3, 0.0, 0.8], [0.35, 0.0, -0.6]])
+    curve = solve_elastica(pose, length).position
+    shifts = 0.01 * np.sin(0.1 * np.arange(count))
+    clouds = [scatter(curve + np.array([shift, 0.0]), Clutter(points=points), random) for shift in shifts]
+    return clouds, [pose + np.array([shift, 0.0, 0.0]) for shift in shifts]
 
 
 def moving_arches(

@@ -28,7 +28,7 @@ from cablejax.simulate.chain.engine import ChainEngine
 from cablejax.simulate.compile import compiler_options
 from cablejax.simulate.engine import refuse_lags
 from cablejax.simulate.mjx_engine import MjxEngine
-from cablejax.simulate.table_plant import check_camera
+from cablejax.simulate.plant_config import check_camera
 from cablejax.types import CableState, History, Measurement
 
 

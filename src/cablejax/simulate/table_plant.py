@@ -8,19 +8,14 @@ from __future__ import annotations
 
 import abc
 import dataclasses
-import functools
-from collections.abc import Mapping
-from typing import Protocol
 
 import numpy as np
 from jaxtyping import Float
 
-from cablejax.cable import Cable, Discretisation
-from cablejax.effects import Hook
-from cablejax.effects.given import GivenEffect, check_hooks, with_effects
-from cablejax.effects.physics import Physics, nominal_physics
+from cablejax.effects.physics import Physics
 from cablejax.simulate.arms import Arms
 from cablejax.simulate.keypoints import camera_similarity, hermite_weights, marked_keypoints
+from cablejax.simulate.plant_config import ObservedConfig
 
 TAUT = 0.999
 """Largest distance between the grippers, in lengths of the cable, before a plant refuses to pull."""
@@ -48,35 +43,13 @@ class Observation:
     true_keypoints: Float[np.ndarray, "N 2"] | None = None
 
 
-class _ObservedConfig(Protocol):
-    """Fields of a plant's configuration for its cable and the observation of it; see `PlantConfig`."""
-
-    @property
-    def cable(self) -> Cable: ...
-
-    @property
-    def discretisation(self) -> Discretisation: ...
-
-    @property
-    def physics(self) -> Physics: ...
-
-    @property
-    def keypoint_noise(self) -> float: ...
-
-    @property
-    def keypoint_dropout(self) -> float: ...
-
-    @property
-    def seed(self) -> int: ...
-
-
 class TablePlant(abc.ABC):
     """A cable on a table between two grippers: `reset` once, then `step` it with commands.
 
     Unlike everything else in the package a plant has a state of its own, as reality does.
     """
 
-    def __init__(self, config: _ObservedConfig):
+    def __init__(self, config: ObservedConfig):
         self.config = config
         self._physics = config.physics
         still = np.zeros(config.cable.n_keypoints)
@@ -245,17 +218,6 @@ class TablePlant(abc.ABC):
             )
 
 
-@functools.lru_cache(maxsize=64)
-def plant_physics(discretisation: Discretisation, effects: tuple[GivenEffect, ...]) -> Physics:
-    """A plant's cable with its effects, float64, every joint bending in the plane.
-
-    Raises:
-        ValueError: a parameter of an effect is out of its bounds.
-    """
-    planar = dataclasses.replace(discretisation, dimension=2)
-    return with_effects(nominal_physics(planar, np.float64), effects, planar)
-
-
 def checked(name: str, value: np.ndarray) -> np.ndarray:
     """A planar row for each gripper, float64, shape [2, 3].
 
@@ -268,29 +230,3 @@ def checked(name: str, value: np.ndarray) -> np.ndarray:
     if not np.isfinite(array).all():
         raise ValueError(f"{name} is not finite: {array.tolist()}. Check what produced it; the plant has not moved.")
     return array
-
-
-def check_effects(config, hooks: frozenset[Hook], able: Mapping[str, frozenset[Hook]]) -> None:
-    """Raises ValueError unless a plant can stage the `effects` of its configuration.
-
-    Args:
-        config: with `effects`, a tuple, and `discretisation`.
-        hooks: that the plant honours.
-        able: other plants by name with their hooks, for the message.
-    """
-    for effect in config.effects:
-        if not isinstance(effect, GivenEffect):
-            raise ValueError(
-                f"{type(config).__name__}.effects has {effect!r}, expected GivenEffect objects: use parse_effect(...)."
-            )
-    check_hooks(config.effects, hooks, type(config).__name__.removesuffix("Config"), able)
-    plant_physics(config.discretisation, config.effects)
-
-
-def check_camera(config) -> None:
-    """Raises ValueError unless `keypoint_noise` and `keypoint_dropout` of a configuration make sense."""
-    name, noise, dropout = type(config).__name__, config.keypoint_noise, config.keypoint_dropout
-    if not (np.isfinite(noise) and noise >= 0):
-        raise ValueError(f"{name}.keypoint_noise is {noise}, expected a finite number >= 0 [m].")
-    if not 0 <= dropout < 1:
-        raise ValueError(f"{name}.keypoint_dropout is {dropout}, expected a number in [0, 1).")

@@ -11,7 +11,7 @@ from cablejax.cable import Cable, Discretisation
 from cablejax.effects import Hook
 from cablejax.effects.given import GivenEffect
 from cablejax.effects.physics import Physics
-from cablejax.simulate.table_plant import check_camera, check_effects, plant_physics
+from cablejax.simulate.plant_config import check_camera, check_effects, plant_physics
 
 HOOKS: frozenset[Hook] = frozenset(get_args(Hook))
 """Hooks of the effects that the contact plant can stage."""

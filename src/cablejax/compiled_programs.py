@@ -1,0 +1,60 @@
+"""Where JAX keeps compiled programs between runs of the command line."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import pathlib
+import platform
+import sys
+
+FOLDER = "CABLEJAX_CACHE"
+"""Environment variable that names the folder for compiled programs; empty = keep none."""
+
+LARGEST_BYTES = 1024**3
+"""Beyond this size the programs that were not used for longest go. A diagnosis keeps about 15 MB, a shaping 5 MB."""
+
+LEAST_SECONDS = 0.5
+"""Programs that compile faster than this are not kept."""
+
+
+def keep_compiled_programs() -> pathlib.Path | None:
+    """Has JAX keep its compiled programs on disk, and take them from there in later runs.
+
+    The folder is `$CABLEJAX_CACHE`, or `cablejax` in the user's cache folder, with a folder inside for each kind of
+    processor: code compiled for one may hold instructions that another lacks. JAX itself tells programs, versions and
+    compiler flags apart. What the user has set for JAX (`JAX_COMPILATION_CACHE_DIR` and others) is left as it is.
+
+    Returns:
+        The folder; None where nothing is kept by this call: the user has decided, JAX has been imported and so belongs
+        to somebody else, or the folder cannot be written to.
+    """
+    chosen = os.environ.get(FOLDER)
+    if chosen == "" or "jax" in sys.modules or "JAX_COMPILATION_CACHE_DIR" in os.environ:
+        return None
+    base = pathlib.Path(chosen) if chosen else _user_cache() / "cablejax"
+    folder = base.expanduser().absolute() / f"programs-{_processor()}"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError:
+        return None
+    if not os.access(folder, os.W_OK):
+        return None
+    os.environ["JAX_COMPILATION_CACHE_DIR"] = str(folder)
+    os.environ.setdefault("JAX_COMPILATION_CACHE_MAX_SIZE", str(LARGEST_BYTES))
+    os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", str(LEAST_SECONDS))
+    return folder
+
+
+def _user_cache() -> pathlib.Path:
+    """The user's cache folder by the XDG base directory specification; a relative `XDG_CACHE_HOME` does not count."""
+    named = pathlib.Path(os.environ.get("XDG_CACHE_HOME", ""))
+    return named if named.is_absolute() else pathlib.Path("~/.cache")
+
+
+def _processor() -> str:
+    """A digest of the processor's model and instructions."""
+    cpuinfo = pathlib.Path("/proc/cpuinfo")
+    lines = cpuinfo.read_text(encoding="utf-8", errors="replace").splitlines() if cpuinfo.is_file() else []
+    telling = {line for line in lines if line.startswith(("model name", "flags", "Features", "CPU part"))}
+    return hashlib.sha256("\n".join([platform.machine(), *sorted(telling)]).encode()).hexdigest()[:12]

@@ -1,0 +1,86 @@
+"""What the configurations of all plants have in common, and its checks."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Mapping
+from typing import Protocol
+
+import numpy as np
+
+from cablejax.cable import Cable, Discretisation
+from cablejax.effects import Hook
+from cablejax.effects.given import GivenEffect, check_hooks, with_effects
+from cablejax.effects.physics import Physics, nominal_physics
+
+
+class ObservedConfig(Protocol):
+    """Fields of a plant's configuration for its cable and the observation of it; see `PlantConfig`."""
+
+    @property
+    def cable(self) -> Cable:
+        """The plant's cable."""
+        ...
+
+    @property
+    def discretisation(self) -> Discretisation:
+        """Its links and time step."""
+        ...
+
+    @property
+    def physics(self) -> Physics:
+        """Its physics with all effects."""
+        ...
+
+    @property
+    def keypoint_noise(self) -> float:
+        """Standard deviation of the observed keypoints [m]."""
+        ...
+
+    @property
+    def keypoint_dropout(self) -> float:
+        """Probability that a keypoint is not observed in a sample."""
+        ...
+
+    @property
+    def seed(self) -> int:
+        """Seed of noise and dropout."""
+        ...
+
+
+@functools.lru_cache(maxsize=64)
+def plant_physics(discretisation: Discretisation, effects: tuple[GivenEffect, ...]) -> Physics:
+    """A plant's cable with its effects, float64, every joint bending in the plane.
+
+    Raises:
+        ValueError: a parameter of an effect is out of its bounds.
+    """
+    planar = dataclasses.replace(discretisation, dimension=2)
+    return with_effects(nominal_physics(planar, np.float64), effects, planar)
+
+
+def check_effects(config, hooks: frozenset[Hook], able: Mapping[str, frozenset[Hook]]) -> None:
+    """Raises ValueError unless a plant can stage the `effects` of its configuration.
+
+    Args:
+        config: with `effects`, a tuple, and `discretisation`.
+        hooks: that the plant honours.
+        able: other plants by name with their hooks, for the message.
+    """
+    for effect in config.effects:
+        if not isinstance(effect, GivenEffect):
+            raise ValueError(
+                f"{type(config).__name__}.effects has {effect!r}, expected GivenEffect objects: use parse_effect(...)."
+            )
+    check_hooks(config.effects, hooks, type(config).__name__.removesuffix("Config"), able)
+    plant_physics(config.discretisation, config.effects)
+
+
+def check_camera(config) -> None:
+    """Raises ValueError unless `keypoint_noise` and `keypoint_dropout` of a configuration make sense."""
+    name, noise, dropout = type(config).__name__, config.keypoint_noise, config.keypoint_dropout
+    if not (np.isfinite(noise) and noise >= 0):
+        raise ValueError(f"{name}.keypoint_noise is {noise}, expected a finite number >= 0 [m].")
+    if not 0 <= dropout < 1:
+        raise ValueError(f"{name}.keypoint_dropout is {dropout}, expected a number in [0, 1).")
