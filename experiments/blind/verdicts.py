@@ -10,6 +10,8 @@ import dataclasses
 import math
 from typing import Any
 
+import numpy as np
+
 SCHEMA = "cablejax-verdict/1"
 VERDICTS = ("none", "named", "ambiguous", "named+unknown", "unknown")
 TRACE = 0.7
@@ -240,7 +242,11 @@ def differences(before: dict[str, Any], after: dict[str, Any]) -> list[str]:
     for name in causes.keys() & now.keys():
         for key, parameter in causes[name].items():
             value, interval = now[name][key]["value"], parameter["ci90"]
-            same = value == parameter["value"] if interval is None else interval[0] <= value <= interval[1]
+            if interval is None:
+                same = value == parameter["value"]
+            else:  # one interval, or one for each keypoint
+                lower, upper = np.transpose(interval)
+                same = bool(np.all((lower <= np.array(value)) & (np.array(value) <= upper)))
             if not same:
                 found.append(f"{name}.{key} {parameter['value']} in {interval} -> {value}")
     return found
