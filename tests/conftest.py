@@ -2,30 +2,29 @@
 
 from __future__ import annotations
 
-import atexit
 import gc
+import importlib.metadata
 import itertools
 import os
 import pathlib
-import shutil
-import tempfile
 
-# Tests compile far more than they compute: code that LLVM did not optimise is there in two thirds of the time, and
-# differs by rounding only. It has to be said before JAX starts; programs that tests start inherit it. The diagnosis
-# asks for optimised code all the same (`diagnose.playback`).
-os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} --xla_backend_optimization_level=0"
-
-# One program is compiled once for all workers and all that tests start: this file is loaded first by the process that
-# starts the workers, and they inherit what it sets. With a bound on its size JAX locks the folder.
-if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
-    _programs = tempfile.mkdtemp(prefix="cablejax-tests-")
-    atexit.register(shutil.rmtree, _programs, ignore_errors=True)
-    os.environ["JAX_COMPILATION_CACHE_DIR"] = _programs
-    os.environ["JAX_COMPILATION_CACHE_MAX_SIZE"] = str(4 * 1024**3)
-    os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0.3"
-
-import jax
 import pytest
+
+from cablejax.compiled_programs import FOLDER, keep_compiled_programs
+
+# Tests compile far more than they compute. Code that LLVM did not optimise, without the fusion emitters of jaxlib 0.10,
+# takes a third of the time to compile and differs by rounding only. It has to be said before JAX starts; programs that
+# tests start inherit it. The diagnosis asks for optimised code all the same (`diagnose.playback`).
+_FLAGS = ["--xla_backend_optimization_level=0"]
+if tuple(map(int, importlib.metadata.version("jaxlib").split(".")[:2])) < (0, 11):
+    _FLAGS.append("--xla_cpu_use_fusion_emitters=false")
+os.environ["XLA_FLAGS"] = " ".join([os.environ.get("XLA_FLAGS", ""), *_FLAGS])
+
+# A program is compiled once for all workers, all that tests start, and later runs: this file is loaded first by the
+# process that starts the workers, and they inherit what it sets.
+os.environ.setdefault(FOLDER, str(pathlib.Path(__file__).parents[1] / ".pytest_cache" / "jax"))
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.3")
+keep_compiled_programs()
 
 _MAPS = pathlib.Path("/proc/self/maps")
 _MANY, _SOME = 40_000, 10
@@ -38,6 +37,8 @@ _run = itertools.count(1)
 def compiled_programs_are_dropped_when_there_are_many():
     """Every compiled program holds mappings, and one process runs hundreds of tests."""
     yield
+    import jax
+
     if next(_run) % _SOME == 0 and _MAPS.exists() and _MAPS.read_bytes().count(b"\n") > _MANY:
         jax.clear_caches()
         gc.collect()
