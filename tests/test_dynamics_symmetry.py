@@ -1,6 +1,7 @@
 """Tied weights: a mirrored cable, and one counted from its other end, move alike."""
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -59,9 +60,10 @@ def test_mirrored_and_reversed_cables_move_alike(prior, conditioned):
         config = dataclasses.replace(CONFIG, prior=prior, conditioned=conditioned)
         network = jax.tree.map(lambda x: x.astype(jnp.float64), random_network(config, seed=1))
         history, twist = jax.tree.map(lambda x: jnp.asarray(x, jnp.float64), (swaying_history(config), TWIST))
-        moved = apply(network, history, twist)
-        across = apply(network, *mirrored(history, twist)) * jnp.array([1.0, -1.0])
-        backwards = apply(network, *reversed_(history, twist))[::-1]
+        move = jax.jit(functools.partial(apply, network))
+        moved = move(history, twist)
+        across = move(*mirrored(history, twist)) * jnp.array([1.0, -1.0])
+        backwards = move(*reversed_(history, twist))[::-1]
     size = np.abs(moved).max()
     assert size > 1e-3
     np.testing.assert_allclose(across, moved, atol=1e-6 * size)
@@ -72,8 +74,9 @@ def test_mirrored_and_reversed_cables_move_alike(prior, conditioned):
 def test_an_untied_network_does_not():
     config = dataclasses.replace(CONFIG, symmetric=False)
     network, history = random_network(config, seed=1), swaying_history(config)
-    across = apply(network, *mirrored(history, TWIST)) * jnp.array([1.0, -1.0])
-    assert np.abs(across - apply(network, history, TWIST)).max() > 1e-3
+    move = jax.jit(functools.partial(apply, network))
+    across = move(*mirrored(history, TWIST)) * jnp.array([1.0, -1.0])
+    assert np.abs(across - move(history, TWIST)).max() > 1e-3
 
 
 def test_the_average_is_a_projection_and_its_own_adjoint():
@@ -108,11 +111,11 @@ def test_training_and_pretraining_keep_them_tied(tmp_path):
     initial = pretrained.model, pretrained.weights
     for folder, start in (("random", None), ("pretrained", initial)):
         result = train(training, data, tmp_path / folder, initial=start, progress=False)
-        network = nnx.merge(result.graphdef, result.weights)
+        move = jax.jit(functools.partial(apply, (result.graphdef, result.weights)))
         history = History(jnp.asarray(data.keypoints[0, :3]), jnp.asarray(data.gripper_pose[0, 2]))
-        moved = apply(network, history, TWIST)
-        np.testing.assert_allclose(apply(network, *mirrored(history, TWIST)) * jnp.array([1.0, -1.0]), moved, atol=1e-6)
-        np.testing.assert_allclose(apply(network, *reversed_(history, TWIST))[::-1], moved, atol=1e-6)
+        moved = move(history, TWIST)
+        np.testing.assert_allclose(move(*mirrored(history, TWIST)) * jnp.array([1.0, -1.0]), moved, atol=1e-6)
+        np.testing.assert_allclose(move(*reversed_(history, TWIST))[::-1], moved, atol=1e-6)
 
 
 @pytest.mark.parametrize("change", [{"network": "mlp"}, {"frame": "world"}, {"latent": 10}])

@@ -1,6 +1,7 @@
 """Keypoints and gripper angles that no cable can have are refused, and those of a real recording are not."""
 
 import dataclasses
+import functools
 
 import numpy as np
 import pytest
@@ -15,19 +16,23 @@ from cablejax.types import GapLog
 CABLE = Cable()
 
 
-def motion(heading: float = 0.0, samples: int = 12) -> tuple[np.ndarray, np.ndarray]:
-    """An arch that closes, turns with both grippers and is seen from a heading: keypoints and gripper poses."""
+@functools.cache
+def arch(samples: int) -> tuple[np.ndarray, np.ndarray]:
+    """An arch that closes and turns with both grippers: keypoints and gripper poses."""
     way = np.linspace(0.0, 1.0, samples)
     pose = np.zeros((samples, 2, 3))
     pose[:, 0], pose[:, 1] = [0.0, 0.0, 0.4], [0.9, 0.0, -0.4]
     pose[:, 0, 2] += 1.2 * way
     pose[:, 1, 2] -= 1.2 * way
     pose[:, 1, 0] -= 0.4 * way
-    points = np.stack([elastica(p, CABLE.length, CABLE.keypoint_arclength) for p in pose])
+    return np.stack([elastica(p, CABLE.length, CABLE.keypoint_arclength) for p in pose]), pose
+
+
+def motion(heading: float = 0.0, samples: int = 12) -> tuple[np.ndarray, np.ndarray]:
+    """The same seen from a heading."""
+    points, pose = arch(samples)
     turn = np.array([[np.cos(heading), -np.sin(heading)], [np.sin(heading), np.cos(heading)]])
-    pose[..., :2] = pose[..., :2] @ turn.T
-    pose[..., 2] += heading
-    return points @ turn.T, pose
+    return points @ turn.T, np.concatenate([pose[..., :2] @ turn.T, pose[..., 2:] + heading], axis=-1)
 
 
 def log_of(points: np.ndarray, pose: np.ndarray) -> GapLog:

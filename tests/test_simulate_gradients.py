@@ -14,7 +14,7 @@ from cablejax.cable import Discretisation
 from cablejax.effects.physics import Physics, nominal_physics
 from cablejax.simulate import MjxEngine
 
-CONFIG = Discretisation(n_links=7, timestep=0.02)
+CONFIG = Discretisation(n_links=5, timestep=0.02)
 STRAIGHT = np.array([[-0.5, 0.0, 0.0], [0.5, 0.0, 0.0]])
 ARCH = np.array([[-0.42, 0.0, 0.6], [0.42, 0.0, -0.4]])
 
