@@ -15,7 +15,7 @@ os.environ.setdefault("NPROC", "4")
 
 from closed_loop.cases import STIFFNESS_RATIOS, stiffness_cases
 from closed_loop.experiment import Experiment, Extent, main
-from closed_loop.methods import ADAPTED_RESIDUAL, METHODS
+from closed_loop.methods import ADAPTED_LEARNER, LEARNER, METHODS
 from closed_loop.paper import DIRECT, RESIDUAL
 from closed_loop.suite import PATIENCE
 
@@ -36,7 +36,7 @@ if __name__ == "__main__":
             small=Extent(
                 functools.partial(stiffness_cases, ("U", "S", "Z"), (2.0,)),
                 seeds=range(1),
-                methods=(DIRECT, RESIDUAL, ADAPTED_RESIDUAL),
+                methods=(DIRECT, RESIDUAL, LEARNER, ADAPTED_LEARNER),
             ),
             full=Extent(
                 functools.partial(stiffness_cases, ("U", "S", "Z"), STIFFNESS_RATIOS),

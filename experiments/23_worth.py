@@ -29,6 +29,7 @@ from cablejax.dataset.schema import DatasetConfig
 from cablejax.diagnose import diagnose, write_verdict
 from cablejax.effects.given import GivenEffect, effects_of_verdict
 from cablejax.gaplog import gap_log_from_episodes, read_gap_log, write_gap_log
+from cablejax.residual import LearnerConfig
 from cablejax.simulate.motions import MotionConfig
 from cablejax.types import Trajectory
 from closed_loop.cases import mujoco_plant, stiffness_cases
@@ -42,11 +43,11 @@ LOG_SEEDS, TASK_SEEDS = (100, 101), (0, 1, 2)
 NOISE = 1e-3
 ARMS = {
     "direct transfer": MethodSpec("direct", "gns-reference"),
-    "online residual": MethodSpec("residual", "gns-reference", residual=True),
+    "online residual": MethodSpec("residual", "gns-reference", learner=LearnerConfig()),
     "diagnosed": MethodSpec("diagnosed", "gns-reference", fine_tuned=True),
-    "diagnosed + residual": MethodSpec("diagnosed residual", "gns-reference", residual=True, fine_tuned=True),
+    "diagnosed + residual": MethodSpec("diagnosed residual", "gns-reference", learner=LearnerConfig(), fine_tuned=True),
     "oracle": MethodSpec("oracle", "gns-reference", fine_tuned=True),
-    "oracle + residual": MethodSpec("oracle residual", "gns-reference", residual=True, fine_tuned=True),
+    "oracle + residual": MethodSpec("oracle residual", "gns-reference", learner=LearnerConfig(), fine_tuned=True),
 }
 
 

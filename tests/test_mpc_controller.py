@@ -179,7 +179,7 @@ def test_missing_keypoints_are_held_and_counted_and_not_learned_from():
     assert int(state.unobserved) == 4
     assert np.isfinite(twists).all() and np.isfinite(info.shape_error).all()
     # Steps that end at 4 and 5, and the one that starts from 5, say nothing about the two keypoints.
-    valid = np.asarray(state.window.valid)
+    valid = np.asarray(state.learner.window.valid)
     assert valid[:, [0, 1, 4, 5, 6]].all()
     assert valid[:, 2].tolist() == [True, False, False, False, True]
     _, _, clear = run(controller(), Cable(), 25)
@@ -199,7 +199,7 @@ def test_nothing_observed_at_all_keeps_going_on_predictions():
         np.testing.assert_allclose(state.history.gripper_pose, cable.pose, atol=1e-5)
         cable.step(twist)
     assert int(state.unobserved) == 2 * N
-    assert not state.window.valid.any()
+    assert not state.learner.window.valid.any()
 
 
 def test_a_model_that_yields_nan_makes_the_grippers_hold_still_and_says_so():
@@ -332,7 +332,7 @@ def test_times_a_control_call():
         ({"solver": "levenberg-marquardt"}, r"solver is 'levenberg-marquardt', expected a solver such as"),
         ({"solver": LevenbergMarquardt}, "expected a solver such as"),
         ({"objective": None}, "objective is None, expected ObjectiveConfig"),
-        ({"residual": True}, "residual is True, expected RidgeConfig or None"),
+        ({"residual": True}, "residual is True, expected LearnerConfig or None"),
         ({"adaptation": 1.0}, "adaptation is 1.0, expected AdaptationConfig or None"),
     ],
 )

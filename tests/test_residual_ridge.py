@@ -39,7 +39,7 @@ def primal_prediction(delta, twist, weight, config, query):
 @pytest.mark.parametrize("bias", [False, True])
 @pytest.mark.parametrize("n", [3, 5, 9])
 def test_dual_form_equals_primal_form(bias, n):
-    config = RidgeConfig(window=n, bias=bias, forgetting=0.8)
+    config = RidgeConfig(bias=bias, forgetting=0.8)
     with jax.enable_x64(True):
         delta, twist, valid = window(n=n)
         weight = 0.8 ** np.arange(n - 1, -1, -1)
@@ -61,7 +61,7 @@ def test_dual_gram_is_never_worse_conditioned_than_the_primal():
 
 
 def test_recovers_an_affine_error():
-    config = RidgeConfig(window=12, regularisation=1e-4)
+    config = RidgeConfig(regularisation=1e-4)
     rng = np.random.default_rng(1)
     gain, bias = rng.normal(size=(3 * Q, 2 * N)) * 0.1, rng.normal(size=2 * N) * 2e-3
     _, twist, valid = window(n=12)
@@ -107,7 +107,7 @@ def test_half_full_window_is_the_fit_to_what_is_there():
     delta, twist, valid = window()
     valid = valid.at[:2].set(False)
     masked = fit(delta.at[:2].set(jnp.nan), twist, valid, RidgeConfig())
-    short = fit(delta[2:], twist[2:], valid[2:], RidgeConfig(window=3))
+    short = fit(delta[2:], twist[2:], valid[2:], RidgeConfig())
     np.testing.assert_allclose(masked.gain, short.gain, rtol=1e-5, atol=1e-8)
     np.testing.assert_allclose(masked.bias, short.bias, rtol=1e-5, atol=1e-8)
 
@@ -191,8 +191,6 @@ def test_batches_over_cables():
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"window": 0}, "at least 1"),
-        ({"window": 2.5}, "whole number"),
         ({"regularisation": 0.0}, "regularisation"),
         ({"motion_scale": float("nan")}, "motion_scale"),
         ({"forgetting": 0.0}, "forgetting"),

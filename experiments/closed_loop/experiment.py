@@ -17,7 +17,7 @@ from cablejax.mpc import MPCConfig
 from closed_loop import interval_tables, tables
 from closed_loop.failures import failure_figure, worst
 from closed_loop.fine_tuning import FineTuneConfig, fine_tune, record
-from closed_loop.methods import ADAPTED_RESIDUAL, LABEL, METHODS, model_named
+from closed_loop.methods import ADAPTED_LEARNER, LABEL, METHODS, model_named
 from closed_loop.protocols import least_time
 from closed_loop.suite import Case, read_suite, run_suite
 from closed_loop.trials import LIANG_TABLE, Trial
@@ -145,8 +145,8 @@ def page(experiment: Experiment, trials: Sequence[Trial], command: str, picture:
         lines += ["", "### How runs end", "", interval_tables.end_table(mine, table, labels=LABEL)]
         lines += ["", "### Intervals and failures", "", interval_tables.interval_table(mine, table, labels=LABEL)]
         methods = {trial.method for trial in mine}
-        if ADAPTED_RESIDUAL in methods and len(methods) > 1:
-            lines += ["", "### In pairs", "", interval_tables.paired_table(mine, table, ADAPTED_RESIDUAL, labels=LABEL)]
+        if ADAPTED_LEARNER in methods and len(methods) > 1:
+            lines += ["", "### In pairs", "", interval_tables.paired_table(mine, table, ADAPTED_LEARNER, labels=LABEL)]
     if picture is not None:
         lines += ["", "## The runs that ended farthest off", "", f"![start, end and target of each]({picture})"]
     return page_of_results(experiment.title, f"`{command}`", lines)

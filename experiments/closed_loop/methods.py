@@ -9,12 +9,14 @@ from pathlib import Path
 from cablejax.control.loop import Controller
 from cablejax.control.shaping import Model, load_model, make_controller
 from cablejax.control.targets import Target
+from cablejax.residual import PAPER, LearnerConfig
 from closed_loop.baselines import StraightDrive, statics_model
 from closed_loop.paper import DIRECT, FINE_TUNED, METHOD_LABEL, RANDOMISED, RESIDUAL, VISUAL_SERVO
 from closed_loop.visual_servo import ServoConfig, VisualServo
 
 ADAPTED = "adapted"
-ADAPTED_RESIDUAL = "adapted residual"
+LEARNER = "learner"
+ADAPTED_LEARNER = "adapted learner"
 DRIVE = "straight drive"
 STATICS = "statics"
 PAPER_DIRECT = "paper network"
@@ -23,7 +25,8 @@ RECURRENT_RESIDUAL = "recurrent residual"
 
 LABEL = METHOD_LABEL | {
     ADAPTED: "conditioned GNS + online estimate",
-    ADAPTED_RESIDUAL: "conditioned GNS + estimate + residual",
+    LEARNER: "GNS + online learner",
+    ADAPTED_LEARNER: "conditioned GNS + estimate + learner",
     DRIVE: "straight drive to the goal, no model",
     STATICS: "statics alone",
     PAPER_DIRECT: "GNS without statics, world's frame, direct",
@@ -40,13 +43,13 @@ class MethodSpec:
     Attributes:
         name: in trials, see `LABEL`.
         weights: model that it plans with, see `model_named`; None = it has no model.
-        residual: whether the model's errors are corrected online.
+        learner: what corrects the model's errors online; None = nothing does.
         fine_tuned: whether the model is first trained on transitions of the very cable that it will shape.
     """
 
     name: str
     weights: str | None
-    residual: bool = False
+    learner: LearnerConfig | None = None
     fine_tuned: bool = False
 
 
@@ -57,14 +60,15 @@ METHODS: dict[str, MethodSpec] = {
         MethodSpec(DIRECT, "gns-reference"),
         MethodSpec(RANDOMISED, "gns-randomised"),
         MethodSpec(FINE_TUNED, "gns-reference", fine_tuned=True),
-        MethodSpec(RESIDUAL, "gns-reference", residual=True),
+        MethodSpec(RESIDUAL, "gns-reference", learner=PAPER),
+        MethodSpec(LEARNER, "gns-reference", learner=LearnerConfig()),
         MethodSpec(ADAPTED, "gns-conditioned"),
-        MethodSpec(ADAPTED_RESIDUAL, "gns-conditioned", residual=True),
+        MethodSpec(ADAPTED_LEARNER, "gns-conditioned", learner=LearnerConfig()),
         MethodSpec(DRIVE, None),
         MethodSpec(STATICS, STATICS),
         MethodSpec(PAPER_DIRECT, "gns-none-world"),
-        MethodSpec(PAPER_RESIDUAL, "gns-none-world", residual=True),
-        MethodSpec(RECURRENT_RESIDUAL, "lstm-static", residual=True),
+        MethodSpec(PAPER_RESIDUAL, "gns-none-world", learner=PAPER),
+        MethodSpec(RECURRENT_RESIDUAL, "lstm-static", learner=PAPER),
     )
 }
 """The paper's methods in its order, two beyond it, and what they have to beat. A conditioned model estimates its cable
@@ -92,6 +96,6 @@ def controller_of(spec: MethodSpec, model: Model | None, target: Target) -> Cont
         return StraightDrive(target.keypoints)  # pyright: ignore[reportArgumentType]
     if model is None:
         return VisualServo(ServoConfig(), target.keypoints)
-    return make_controller(
-        model, target, method="residual" if spec.residual else "direct", solver="levenberg-marquardt"
-    )
+    controller = make_controller(model, target, method="direct", solver="levenberg-marquardt")
+    learner = spec.learner and spec.learner.scaled(model.config.length)
+    return dataclasses.replace(controller, config=dataclasses.replace(controller.config, residual=learner))

@@ -17,6 +17,7 @@ HORIZON = 5
 """Steps that the residual is carried on."""
 _STEP = 1.0
 _RIDGE = RidgeConfig()
+_WINDOW = 5
 
 
 @dataclasses.dataclass(frozen=True)
@@ -55,7 +56,7 @@ def predicted_ahead(
         pose = gripper_pose[e, samples]
         twist = np.diff(pose, axis=0) / (stride * float(interval[e]))
         delta = np.diff(error, axis=0)
-        window = _RIDGE.window
+        window = _WINDOW
         n_starts = len(delta) - window - HORIZON + 1
         if n_starts < 1:
             continue

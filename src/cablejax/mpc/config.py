@@ -13,7 +13,7 @@ from cablejax.adaptation.belief import AdaptationConfig
 from cablejax.mpc.plan import Solver
 from cablejax.mpc.planners import LevenbergMarquardt
 from cablejax.mpc.problem import ObjectiveConfig
-from cablejax.residual.ridge import RidgeConfig
+from cablejax.residual.learner import LearnerConfig
 from cablejax.whole_number import is_whole
 
 
@@ -45,7 +45,7 @@ class MPCConfig:
             than holding still.
         max_restarts: how often that may happen; a shape that is fallen into again and again is the model's.
         objective: weights and units of the planning problem.
-        residual: settings of the online residual; None = trust the offline model.
+        residual: settings of the online learner of its errors; None = trust the offline model.
         adaptation: settings of the online estimate of the cable, for a conditioned model; None = no estimate.
         solver: any `Solver`.
     """
@@ -69,7 +69,7 @@ class MPCConfig:
     restart_after: int = 12
     max_restarts: int = 3
     objective: ObjectiveConfig = ObjectiveConfig()
-    residual: RidgeConfig | None = RidgeConfig(forgetting=0.5, outlier=0.02)
+    residual: LearnerConfig | None = LearnerConfig()
     adaptation: AdaptationConfig | None = None
     solver: Solver = LevenbergMarquardt()
 
@@ -93,7 +93,7 @@ class MPCConfig:
         )
         scaled = {name: ratio * getattr(cls, name) for name in own}
         scaled["objective"] = _scaled(cls.objective, ratio, "rotation_weight", "arrival_margin")
-        scaled["residual"] = _scaled(cls.residual, ratio, "motion_scale", "rotation_weight", "outlier")
+        scaled["residual"] = cls.residual and cls.residual.scaled(ratio)
         return cls(**{**scaled, **settings})
 
     def __post_init__(self):
@@ -140,7 +140,7 @@ class MPCConfig:
         """Raises ValueError unless every part of the settings is of its kind."""
         for name, kind, optional in (
             ("objective", ObjectiveConfig, False),
-            ("residual", RidgeConfig, True),
+            ("residual", LearnerConfig, True),
             ("adaptation", AdaptationConfig, True),
         ):
             value = getattr(self, name)

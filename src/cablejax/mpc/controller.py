@@ -16,12 +16,14 @@ from cablejax.mpc.config import MPCConfig
 from cablejax.mpc.fallback import plan_or_hold, plan_or_restart
 from cablejax.mpc.feasible import FeasibleSet, feasible_from
 from cablejax.mpc.problem import ShapingProblem
-from cablejax.mpc.state import CableEstimate, ErrorWindow, LastCommand, MPCInfo, MPCState, initial_state
+from cablejax.mpc.state import CableEstimate, LastCommand, MPCInfo, MPCState, initial_state
 from cablejax.mpc.validation import check_history, check_measurement, check_target
 from cablejax.mpc.warm_start import find_starts
 from cablejax.residual.corrected import Corrected
 from cablejax.residual.jacobian import Dynamics
-from cablejax.residual.ridge import ResidualModel, apply, fit
+from cablejax.residual.learner import Sample, learned, observe
+from cablejax.residual.learner import weights as weights_of
+from cablejax.residual.ridge import ResidualModel, apply
 from cablejax.types import History, Measurement
 
 
@@ -82,7 +84,10 @@ def _step(mpc: MPC, state: MPCState, measurement: Measurement) -> tuple[MPCState
     """See `MPC.step`."""
     config, dynamics, weights = mpc.config, mpc.dynamics, mpc.weights
     state, unobserved = _observe(config, state, measurement)
-    residual = _fit_residual(config, state)
+    drift = jnp.zeros_like(state.last.drift)
+    if config.residual is not None:
+        drift = dynamics(weights, state.history, jnp.zeros_like(state.last.twist))
+    residual = _learned(config, state, drift)
     problem = ShapingProblem(
         dynamics=dynamics if residual is None else Corrected(dynamics),
         weights=weights if residual is None else (weights, residual),
@@ -119,11 +124,12 @@ def _step(mpc: MPC, state: MPCState, measurement: Measurement) -> tuple[MPCState
         residual_share=jnp.nan_to_num(size_online / jnp.maximum(size_offline + size_online, 1e-12)),
         condition=jnp.ones_like(error) if residual is None else residual.condition,
         unobserved=unobserved,
+        weights=None if state.learner is None else weights_of(config.residual, state.learner),
         belief=None if estimate is None else estimate.belief,
     )
     state = dataclasses.replace(
         state,
-        last=LastCommand(plan.motion, twist, offline, predicted, error),
+        last=LastCommand(plan.motion, twist, offline, drift, predicted, error),
         progress=progress,
         estimate=estimate,
         radius=radius,
@@ -168,6 +174,9 @@ def _observe(config: MPCConfig, state: MPCState, measurement: Measurement) -> tu
     past = jnp.where(first, past, jnp.roll(past, -1, axis=0)).at[-1].set(keypoints)
     error = keypoints - state.history.keypoints[-1] - last.displacement
     valid = observed & state.observed & jnp.isfinite(error).all(axis=-1) & ~first
+    learner = state.learner
+    if config.residual is not None and learner is not None:
+        learner = observe(config.residual, learner, Sample(error, last.twist, valid, last.drift))
     estimate, cable = state.estimate, state.history.cable
     if config.adaptation is not None and estimate is not None:
         belief = update(config.adaptation, estimate.belief, estimate.sensitivity, error, valid)
@@ -176,16 +185,16 @@ def _observe(config: MPCConfig, state: MPCState, measurement: Measurement) -> tu
         state,
         history=History(keypoints=past, gripper_pose=gripper_pose, cable=cable),
         observed=observed,
-        window=ErrorWindow(*map(_push, state.window, (error, last.twist, valid))),
+        learner=learner,
         estimate=estimate,
     )
     return state, jnp.sum(~observed, dtype=jnp.int32)
 
 
-def _fit_residual(config: MPCConfig, state: MPCState) -> ResidualModel | None:
-    if config.residual is None:
+def _learned(config: MPCConfig, state: MPCState, drift: Float[Array, "N 2"]) -> ResidualModel | None:
+    if config.residual is None or state.learner is None:
         return None
-    return fit(*state.window, config.residual)
+    return learned(config.residual, state.learner, drift)
 
 
 def _feasible_set(config: MPCConfig, state: MPCState) -> FeasibleSet:
@@ -216,7 +225,3 @@ def _update_radius(
     factor = jnp.where(rho >= config.grow_above, config.grow, jnp.where(rho <= config.shrink_below, config.shrink, 1.0))
     radius = state.radius * jnp.where(telling, factor, 1.0)
     return rho, jnp.clip(radius, config.radius_min, config.radius_max)
-
-
-def _push(window: Array, newest: Array) -> Array:
-    return jnp.concatenate([window, newest[None]])[1:]

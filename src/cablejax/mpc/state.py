@@ -12,6 +12,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from cablejax.adaptation.belief import CableBelief, prior_belief
 from cablejax.mpc.config import MPCConfig
+from cablejax.residual.learner import LearnerState, initial_learner
 from cablejax.types import History
 
 
@@ -26,20 +27,6 @@ class Action(enum.IntEnum):
     """The error stayed where it is, as in another shape between the same grippers: the cable is straightened first."""
 
 
-class ErrorWindow(NamedTuple):
-    """The last W steps, oldest first; every step adds one.
-
-    Attributes:
-        error: observed displacement minus the offline model's [m], shape [W, N, 2].
-        twist: commands, shape [W, Q, 3].
-        valid: keypoints whose error was observed, shape [W, N].
-    """
-
-    error: Float[Array, "*batch W N 2"]
-    twist: Float[Array, "*batch W Q 3"]
-    valid: Bool[Array, "*batch W N"]
-
-
 class LastCommand(NamedTuple):
     """The last command and what was expected of it; replaced at the end of every step.
 
@@ -47,6 +34,7 @@ class LastCommand(NamedTuple):
         plan: the plan whose first command it is [m], shape [T, Q, 3].
         twist: the command, shape [Q, 3].
         displacement: the offline model's, of this command [m], shape [N, 2].
+        drift: the same, of no command.
         predicted: keypoints that model and residual expect after it [m], shape [N, 2].
         shape_error: root mean square distance to the target before it [m], shape [].
     """
@@ -54,6 +42,7 @@ class LastCommand(NamedTuple):
     plan: Float[Array, "*batch T Q 3"]
     twist: Float[Array, "*batch Q 3"]
     displacement: Float[Array, "*batch N 2"]
+    drift: Float[Array, "*batch N 2"]
     predicted: Float[Array, "*batch N 2"]
     shape_error: Float[Array, "*batch"]
 
@@ -94,7 +83,7 @@ class MPCState:
     Attributes:
         history: what the model sees; gaps are filled.
         observed: keypoints that were observed at the last step, shape [N].
-        window: the offline model's errors, which the residual is fitted to.
+        learner: what is learned from the offline model's errors; None without.
         last: the last command.
         progress: counts for restarts.
         estimate: the cable; None without adaptation.
@@ -105,7 +94,7 @@ class MPCState:
 
     history: History
     observed: Bool[Array, "*batch N"]
-    window: ErrorWindow
+    learner: LearnerState | None
     last: LastCommand
     progress: Progress
     estimate: CableEstimate | None
@@ -117,7 +106,7 @@ class MPCState:
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class MPCInfo:
-    """Report of one control step; every field but the last has shape [].
+    """Report of one control step; every field but the last two has shape [].
 
     Attributes:
         shape_error: root mean square distance to the target now [m].
@@ -132,6 +121,7 @@ class MPCInfo:
         residual_share: |residual's displacement| / (|model's| + |residual's|) of the command, in [0, 1].
         condition: condition number of the ridge system.
         unobserved: keypoints not observed now, replaced by their prediction.
+        weights: how far each of the learner's candidates is believed, shape [K]; None without a learner.
         belief: what is believed of the cable now, None without adaptation.
     """
 
@@ -147,13 +137,13 @@ class MPCInfo:
     residual_share: Float[Array, "*batch"]
     condition: Float[Array, "*batch"]
     unobserved: Int[Array, "*batch"]
+    weights: Float[Array, "*batch K"] | None
     belief: CableBelief | None
 
 
 def initial_state(config: MPCConfig, history: History) -> MPCState:
     """The controller's state before its first step; pure, vmappable."""
     n_keypoints, n_grippers = history.keypoints.shape[1], history.gripper_pose.shape[0]
-    window = 0 if config.residual is None else config.residual.window
     dtype, zero = history.keypoints.dtype, jnp.zeros((), jnp.int32)
     estimate = None
     if config.adaptation is not None:
@@ -162,15 +152,12 @@ def initial_state(config: MPCConfig, history: History) -> MPCState:
     return MPCState(
         history=history,
         observed=jnp.ones(n_keypoints, bool),
-        window=ErrorWindow(
-            error=jnp.zeros((window, n_keypoints, 2), dtype),
-            twist=jnp.zeros((window, n_grippers, 3), dtype),
-            valid=jnp.zeros((window, n_keypoints), bool),
-        ),
+        learner=config.residual and initial_learner(config.residual, n_keypoints, n_grippers, dtype),
         last=LastCommand(
             plan=jnp.zeros((config.n_commands, n_grippers, 3), dtype),
             twist=jnp.zeros((n_grippers, 3), dtype),
             displacement=jnp.zeros((n_keypoints, 2), dtype),
+            drift=jnp.zeros((n_keypoints, 2), dtype),
             predicted=history.keypoints[-1],
             shape_error=jnp.zeros((), dtype),
         ),

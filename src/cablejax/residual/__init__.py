@@ -2,6 +2,18 @@
 
 from cablejax.residual.corrected import Corrected
 from cablejax.residual.jacobian import Dynamics
+from cablejax.residual.learner import PAPER, Candidate, LearnerConfig
 from cablejax.residual.ridge import ResidualModel, RidgeConfig, apply, fit, zero_residual
 
-__all__ = ["Corrected", "Dynamics", "ResidualModel", "RidgeConfig", "apply", "fit", "zero_residual"]
+__all__ = [
+    "PAPER",
+    "Candidate",
+    "Corrected",
+    "Dynamics",
+    "LearnerConfig",
+    "ResidualModel",
+    "RidgeConfig",
+    "apply",
+    "fit",
+    "zero_residual",
+]

@@ -19,15 +19,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from cablejax.whole_number import is_whole
-
 
 @dataclasses.dataclass(frozen=True)
 class RidgeConfig:
     """Settings of the residual fit.
 
     Attributes:
-        window: samples W that the fit looks back on.
         regularisation: the penalty lambda on the scaled coefficients.
         motion_scale: gripper travel per step that counts as one unit of regressor [m].
         rotation_weight: w [m/rad], turns a rotation into a length before scaling.
@@ -43,7 +40,6 @@ class RidgeConfig:
             plan look worse than standing still. Infinite = all samples are believed.
     """
 
-    window: int = 5
     regularisation: float = 10.0
     motion_scale: float = 0.01
     rotation_weight: float = 0.15
@@ -53,8 +49,6 @@ class RidgeConfig:
     outlier: float = math.inf
 
     def __post_init__(self):
-        if not is_whole(self.window, least=1):
-            raise ValueError(f"RidgeConfig.window is {self.window}, expected a whole number of samples, at least 1.")
         for name in ("regularisation", "motion_scale", "rotation_weight", "bias_scale"):
             value = getattr(self, name)
             if not (math.isfinite(value) and value > 0):
@@ -63,6 +57,11 @@ class RidgeConfig:
             raise ValueError(f"RidgeConfig.outlier is {self.outlier}, expected a positive number [m], or infinity.")
         if not 0 < self.forgetting <= 1:
             raise ValueError(f"RidgeConfig.forgetting is {self.forgetting}, expected a number in (0, 1].")
+
+    def scaled(self, ratio: float) -> RidgeConfig:
+        """The settings for a cable so many times as long."""
+        lengths = ("motion_scale", "rotation_weight", "outlier")
+        return dataclasses.replace(self, **{name: ratio * getattr(self, name) for name in lengths})
 
 
 @jax.tree_util.register_dataclass

@@ -51,6 +51,7 @@ class ChainMatrices(NamedTuple):
     keypoints_of_tangents: Any  # [N, n]
     link_lengths: Any  # [n]
     node_offsets: Any  # [n]
+    arclengths: Any  # [N], of the keypoints, from 0 to 1
     later: Any  # [J, J], the later one of two joints
 
 
@@ -74,6 +75,7 @@ def chain(n_keypoints: int, length: float) -> ChainMatrices:
         *hermite_weights(config),
         link_lengths(config),
         node_offsets(config),
+        np.asarray(config.cable.keypoint_arclength) / length,
         np.maximum.outer(joints, joints),
     )
 
@@ -83,7 +85,8 @@ def resting_shapes(
 ) -> tuple[Float[Array, "N 2"], Float[Array, "N 2"]]:
     """Frictionless resting shapes at the gripper poses before and after a command, on the branch of `keypoints`.
 
-    Turns and shifts with the cable. Exact at gripper 0. Differentiable in all three arrays.
+    Turns and shifts with the cable, and does not depend on which end comes first. Exact at both grippers.
+    Differentiable in all three arrays.
 
     Args:
         keypoints: observed positions [m], shape [N, 2].
@@ -97,11 +100,11 @@ def resting_shapes(
     turn = jnp.sum(angles)
     for _ in range(SETTLING_STEPS):
         angles = _newton_step(matrices, angles, before, turn, length)
-    resting = _chain_keypoints(matrices, angles, before)
+    resting = _chain_keypoints(matrices, angles, before, turn)
     turn = turn + (after[1, 2] - after[0, 2]) - (before[1, 2] - before[0, 2])
     for _ in range(FOLLOWING_STEPS):
         angles = _newton_step(matrices, angles, after, turn, length)
-    return resting, _chain_keypoints(matrices, angles, after)
+    return resting, _chain_keypoints(matrices, angles, after, turn)
 
 
 def _observed_angles(matrices: ChainMatrices, keypoints: Array, pose: Array) -> Float[Array, "J"]:
@@ -112,31 +115,44 @@ def _observed_angles(matrices: ChainMatrices, keypoints: Array, pose: Array) -> 
     return jnp.arctan2(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0], jnp.sum(a * b, axis=-1))
 
 
+def _heading(angles: Array, pose: Array, turn: Array) -> Float[Array, ""]:
+    """Direction of the first link [rad]: what the angles lack of `turn` is shared by both grippers.
+
+    Counted from gripper 0 alone, the steps would depend on which end of the cable comes first.
+    """
+    return pose[0, 2] + (turn - jnp.sum(angles)) / 2
+
+
 def _newton_step(matrices: ChainMatrices, angles: Array, pose: Array, turn: Array, length: float) -> Float[Array, "J"]:
     """One step on `min sum angles^2 / 2h` with the far end at gripper 1's position and the angles' sum equal `turn`."""
     joints = len(angles)
     h = length / joints
-    _, links = links_of(matrices.link_lengths, angles, pose[0, 2])
-    beyond = beyond_joints(links)
-    jacobian = jnp.stack([-beyond[:, 1], beyond[:, 0], jnp.full(joints, length, angles.dtype)])
-    gap = pose[1, :2] - (pose[0, :2] + jnp.sum(links, axis=0))
-    error = jnp.concatenate([gap, (turn - jnp.sum(angles))[None] * length])
+    _, links = links_of(matrices.link_lengths, angles, _heading(angles, pose, turn))
+    beyond, chord = beyond_joints(links), jnp.sum(links, axis=0)
+    # a joint turns what lies beyond it by half its angle, and what lies before it by as much the other way
+    lever = beyond - chord / 2
+    jacobian = jnp.stack([-lever[:, 1], lever[:, 0], jnp.full(joints, length, angles.dtype)])
+    error = jnp.append(pose[1, :2] - pose[0, :2] - chord, (turn - jnp.sum(angles)) * length)
     normal = jacobian @ jacobian.T
     # relative regularisation: the constraints of a straight cable are dependent
     normal = normal + _SMALL * jnp.trace(normal) * jnp.eye(3, dtype=angles.dtype)
     tension = jnp.linalg.solve(normal, jacobian @ angles) / h
+    pulled = beyond @ tension[:2]
     hessian = (1 / h + DAMPING / length) * jnp.eye(joints, dtype=angles.dtype)
     hessian = with_tension(hessian, tension, beyond, matrices.later)
+    hessian = hessian - (pulled[:, None] + pulled) / 2 + chord @ tension[:2] / 4
     system = jnp.block([[hessian, -jacobian.T], [-jacobian, -_SMALL * jnp.eye(3, dtype=angles.dtype)]])
     step = jnp.linalg.solve(system, jnp.concatenate([jacobian.T @ tension - angles / h, -error]))[:joints]
     largest = jnp.sqrt(jnp.max(step**2) + 1e-20)
     return angles + step * jnp.minimum(1.0, MAX_TURN / largest)
 
 
-def _chain_keypoints(matrices: ChainMatrices, angles: Array, pose: Array) -> Float[Array, "N 2"]:
-    """Keypoints of the chain that leaves gripper 0 with these joint angles."""
-    theta, links = links_of(matrices.link_lengths, angles, pose[0, 2])
+def _chain_keypoints(matrices: ChainMatrices, angles: Array, pose: Array, turn: Array) -> Float[Array, "N 2"]:
+    """Keypoints of the chain with these joint angles, what it misses gripper 1 by spread evenly along it."""
+    theta, links = links_of(matrices.link_lengths, angles, _heading(angles, pose, turn))
     tangents = jnp.stack([jnp.cos(theta), jnp.sin(theta)], axis=-1)
     origins = pose[0, :2] + jnp.cumsum(jnp.concatenate([jnp.zeros((1, 2), angles.dtype), links[:-1]]), axis=0)
     nodes = origins + matrices.node_offsets[:, None] * tangents
-    return matrices.keypoints_of_nodes @ nodes + matrices.keypoints_of_tangents @ tangents
+    missed = pose[1, :2] - pose[0, :2] - jnp.sum(links, axis=0)
+    along = matrices.arclengths[:, None] * missed
+    return matrices.keypoints_of_nodes @ nodes + matrices.keypoints_of_tangents @ tangents + along

@@ -1,0 +1,229 @@
+"""Learns online what the dynamics model gets wrong, by several candidates that are believed as they have predicted.
+
+A few samples may say more about noise than about the cable, and a correction that is wrong does harm in a closed loop.
+So a candidate has to earn its influence. At every step each one predicts the model's error before it is seen, and is
+weighed by the likelihood of what it has predicted so far,
+
+    w_k  ~  (a s^2 + d S_k / 2) ^ -(a + d n / 2),      S_k = sum_t phi^(n - t) |error(t) - predicted_k(t)|^2 / N
+
+with fading memory phi: the marginal likelihood of d independent Gaussian errors a step whose unknown variance has an
+inverse gamma prior around s^2. Candidates are affine in the command, so that their mixture is again one affine
+correction, and its squared error is at most the candidates' weighted mean (Jensen's inequality).
+
+The candidates are made of two parts:
+
+- Ridge regression on the command (`residual.ridge`, the paper's).
+- The share of the model's drift that does not take place. A model in whose data a cable relaxes predicts motion at
+  rest; where friction holds the actual one, that is an error f(X, 0) of known direction and one unknown number, the
+  share alpha in [0, 1] that all keypoints have in common. The correction is -alpha f(X, 0): with a share of 1, the
+  corrected model predicts no motion without a command.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from cablejax.residual.ridge import ResidualModel, RidgeConfig, apply, fit, zero_residual
+from cablejax.whole_number import is_whole
+
+
+@dataclasses.dataclass(frozen=True)
+class Candidate:
+    """One way to predict the model's error.
+
+    Attributes:
+        drift: whether it removes the share of the model's drift at rest that has not taken place.
+        ridge: regression of what is left on the command; None = no regression.
+    """
+
+    drift: bool = False
+    ridge: RidgeConfig | None = None
+
+
+_REGRESSION = RidgeConfig(bias=False, forgetting=0.5, outlier=0.02)
+
+
+@dataclasses.dataclass(frozen=True)
+class LearnerConfig:
+    """Settings of the online learner.
+
+    Attributes:
+        candidates: what is weighed; a single one is always believed.
+        window: samples W that they are fitted to.
+        forgetting: weight ratio of a sample and the next newer one where the share of the drift is fitted, in (0, 1].
+        drift_floor: root mean square drift [m] below which its share is not learned: the error is noise there.
+        memory: phi, by which evidence fades in one step, in (0, 1].
+        error_std: s, root mean square error of a good prediction [m].
+        outlier: root mean square error [m] beyond which a step that no candidate predicted counts less and less, as in
+            `RidgeConfig`: that a cable has snapped through says little about any of them.
+        dimensions: d, independent numbers in the error of one step; neighbouring keypoints err alike.
+    """
+
+    candidates: tuple[Candidate, ...] = (
+        Candidate(),
+        Candidate(drift=True),
+        Candidate(ridge=_REGRESSION),
+        Candidate(drift=True, ridge=_REGRESSION),
+    )
+    window: int = 5
+    forgetting: float = 0.8
+    drift_floor: float = 2e-4
+    memory: float = 0.8
+    error_std: float = 2e-4
+    outlier: float = 0.02
+    dimensions: float = 4.0
+
+    def __post_init__(self):
+        if not self.candidates or not all(isinstance(candidate, Candidate) for candidate in self.candidates):
+            raise ValueError(f"LearnerConfig.candidates are {self.candidates}, expected one `Candidate` or more.")
+        if not is_whole(self.window, least=1):
+            raise ValueError(f"LearnerConfig.window is {self.window}, expected a whole number of samples, at least 1.")
+        for name in ("drift_floor", "error_std", "outlier", "dimensions"):
+            value = getattr(self, name)
+            if not (math.isfinite(value) and value > 0):
+                raise ValueError(f"LearnerConfig.{name} is {value}, expected a positive finite number.")
+        for name in ("forgetting", "memory"):
+            if not 0 < getattr(self, name) <= 1:
+                raise ValueError(f"LearnerConfig.{name} is {getattr(self, name)}, expected a number in (0, 1].")
+
+    def scaled(self, ratio: float) -> LearnerConfig:
+        """The settings for a cable so many times as long."""
+
+        def of(candidate: Candidate) -> Candidate:
+            ridge = candidate.ridge
+            return candidate if ridge is None else dataclasses.replace(candidate, ridge=ridge.scaled(ratio))
+
+        lengths = {name: ratio * getattr(self, name) for name in ("drift_floor", "error_std", "outlier")}
+        return dataclasses.replace(self, candidates=tuple(map(of, self.candidates)), **lengths)
+
+
+PAPER = LearnerConfig(candidates=(Candidate(ridge=RidgeConfig(bias=False)),))
+"""The residual of Wang et al., RA-L 2022: ridge regression on the last five commands, without a bias."""
+
+
+class Sample(NamedTuple):
+    """One step, or with a leading axis W the last ones, oldest first.
+
+    Attributes:
+        error: observed displacement minus the offline model's [m], shape [N, 2].
+        twist: the command [m/s, rad/s], shape [Q, 3].
+        valid: keypoints whose error was observed, shape [N].
+        drift: displacement that the offline model predicted without a command [m], shape [N, 2].
+    """
+
+    error: Float[Array, "*batch N 2"]
+    twist: Float[Array, "*batch Q 3"]
+    valid: Bool[Array, "*batch N"]
+    drift: Float[Array, "*batch N 2"]
+
+
+class LearnerState(NamedTuple):
+    """What has been learned from.
+
+    Attributes:
+        window: the last W samples.
+        evidence: faded sum S_k of the candidates' mean squared errors [m^2], shape [K].
+        count: the steps in it, faded alike, shape [].
+        loss: sums over the run of the candidates' mean squared errors and, last, of the mixture's [m^2], shape [K + 1].
+    """
+
+    window: Sample
+    evidence: Float[Array, "*batch K"]
+    count: Float[Array, "*batch"]
+    loss: Float[Array, "*batch K1"]
+
+    @property
+    def regret(self) -> Float[Array, "*batch"]:
+        """By how much the mixture's summed squared error exceeds that of the candidate that was best in hindsight."""
+        return self.loss[..., -1] - self.loss[..., :-1].min(axis=-1)
+
+
+def initial_learner(config: LearnerConfig, n_keypoints: int, n_grippers: int, dtype) -> LearnerState:
+    """The state before the first sample, for N keypoints and Q grippers."""
+    n, shape = len(config.candidates), (config.window, n_keypoints)
+    window = Sample(
+        error=jnp.zeros((*shape, 2), dtype),
+        twist=jnp.zeros((config.window, n_grippers, 3), dtype),
+        valid=jnp.zeros(shape, bool),
+        drift=jnp.zeros((*shape, 2), dtype),
+    )
+    return LearnerState(window, jnp.zeros(n, dtype), jnp.zeros((), dtype), jnp.zeros(n + 1, dtype))
+
+
+def observe(config: LearnerConfig, state: LearnerState, sample: Sample) -> LearnerState:
+    """The state with one more sample: the candidates are judged by it first, and fitted to it then.
+
+    Values of `sample.error` where it is not valid are ignored, NaN included; a drift that is not finite counts as none.
+    """
+    sample = sample._replace(drift=jnp.nan_to_num(sample.drift, posinf=0.0, neginf=0.0))
+    window = jax.tree.map(lambda old, new: jnp.concatenate([old, new[None]])[1:], state.window, sample)
+    models = _candidates(config, state.window, sample.drift)
+    mixture = _mixed(models, weights(config, state))
+    error = jnp.where(sample.valid[:, None], sample.error, 0.0)
+    predicted = jnp.stack([*(apply(model, sample.twist) for model in models), apply(mixture, sample.twist)])
+    seen = jnp.sum(sample.valid)
+    wrong = jnp.where(sample.valid[:, None], error - predicted, 0.0)
+    loss = jnp.sum(wrong**2, axis=(1, 2)) / jnp.maximum(seen, 1)
+    # as in the ridge: the weight of Geman and McClure
+    telling = (1.0 + loss[:-1].min() / config.outlier**2) ** -2
+    # a step of which nothing was seen is no evidence
+    fade = jnp.where(seen > 0, config.memory, 1.0).astype(loss.dtype)
+    return LearnerState(
+        window=window,
+        evidence=fade * state.evidence + telling * loss[:-1],
+        count=fade * state.count + telling * (seen > 0),
+        loss=state.loss + loss,
+    )
+
+
+def weights(config: LearnerConfig, state: LearnerState) -> Float[Array, " K"]:
+    """How far each candidate is believed, shape [K]; they sum to 1."""
+    half = config.dimensions / 2.0
+    return jax.nn.softmax(-(1.0 + half * state.count) * jnp.log(config.error_std**2 + half * state.evidence))
+
+
+def learned(config: LearnerConfig, state: LearnerState, drift: Float[Array, "N 2"]) -> ResidualModel:
+    """The correction to plan with. Differentiable in `drift` and the samples' errors and commands.
+
+    Args:
+        config: settings.
+        state: after the newest sample.
+        drift: displacement that the offline model predicts now without a command [m], shape [N, 2].
+    """
+    return _mixed(_candidates(config, state.window, drift), weights(config, state))
+
+
+def _candidates(config: LearnerConfig, window: Sample, drift: Float[Array, "N 2"]) -> list[ResidualModel]:
+    share, models = _drift_share(config, window), []
+    for candidate in config.candidates:
+        model = jax.tree.map(lambda x: x.astype(drift.dtype), zero_residual(len(drift), window.twist.shape[1]))
+        removed = share if candidate.drift else jnp.zeros_like(share)
+        if candidate.ridge is not None:
+            left = window.error + removed * window.drift
+            model = fit(left, window.twist, window.valid, candidate.ridge)
+        models.append(dataclasses.replace(model, bias=model.bias - removed * drift.ravel()))
+    return models
+
+
+def _drift_share(config: LearnerConfig, window: Sample) -> Float[Array, ""]:
+    """Share alpha of the model's drift that has not taken place, in [0, 1]: least squares, shrunk towards 0."""
+    age = jnp.arange(config.window - 1, -1, -1)
+    weight = (config.forgetting**age).astype(window.drift.dtype)[:, None, None] * window.valid[..., None]
+    error = jnp.where(window.valid[..., None], window.error, 0.0)
+    size = jnp.sum(weight * window.drift**2)
+    floor = config.drift_floor**2 * window.drift.shape[1]
+    return jnp.clip(-jnp.sum(weight * error * window.drift) / (size + floor), 0.0, 1.0)
+
+
+def _mixed(models: list[ResidualModel], weight: Float[Array, " K"]) -> ResidualModel:
+    """The candidates' weighted mean; its condition number is the worst of theirs."""
+    gain = sum(w * model.gain for w, model in zip(weight, models, strict=True))
+    bias = sum(w * model.bias for w, model in zip(weight, models, strict=True))
+    condition = jnp.stack([model.condition for model in models]).max()
+    return ResidualModel(gain, bias, condition)  # pyright: ignore[reportArgumentType]

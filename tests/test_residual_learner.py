@@ -1,0 +1,144 @@
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from cablejax.residual import PAPER, Candidate, LearnerConfig, RidgeConfig, apply, fit
+from cablejax.residual.learner import Sample, initial_learner, learned, observe, weights
+
+N, Q = 13, 2
+CONFIG = LearnerConfig()
+NONE, DRIFT, RIDGE, BOTH = range(4)
+
+
+def steps(kind, n=40, seed=0):
+    """Samples of a plant that the model is right about but for one thing, with 0.1 mm of noise."""
+    rng = np.random.default_rng(seed)
+    gain, course = rng.normal(size=(Q * 3, N * 2)) * 0.1, rng.normal(size=(Q, 3)) * 0.03
+    for _ in range(n):
+        # a gripper that is under way keeps its course, more or less
+        twist, drift = (
+            course + rng.normal(size=(Q, 3)) * 0.01,
+            rng.normal(size=(1, 2)) * 1e-3 + rng.normal(size=(N, 2)) * 1e-3,
+        )
+        error = {"nothing": 0.0 * drift, "drift": -drift, "gain": (twist.ravel() @ gain).reshape(N, 2)}[kind]
+        yield Sample(
+            jnp.asarray(error + rng.normal(size=(N, 2)) * 1e-4),
+            jnp.asarray(twist),
+            jnp.ones(N, bool),
+            jnp.asarray(drift),
+        )
+
+
+@functools.cache
+def compiled(config):
+    return jax.jit(functools.partial(observe, config)), jax.jit(functools.partial(learned, config))
+
+
+def after(samples, config=CONFIG):
+    state = initial_learner(config, N, Q, jnp.float32)
+    for sample in samples:
+        state = compiled(config)[0](state, sample)
+    return state
+
+
+@pytest.mark.parametrize(
+    ("kind", "believed", "share"),
+    [("nothing", (NONE, DRIFT), 0.6), ("drift", (DRIFT, BOTH), 0.99), ("gain", (RIDGE, BOTH), 0.95)],
+)
+def test_what_has_predicted_well_is_believed_and_the_mixture_is_never_much_worse_than_the_best(kind, believed, share):
+    state = after(steps(kind))
+    assert float(weights(CONFIG, state)[jnp.array(believed)].sum()) > share
+    *candidates, mixture = np.asarray(state.loss)
+    # it starts undecided
+    assert mixture <= 1.1 * min(candidates) + 2e-6
+    assert float(state.regret) == pytest.approx(mixture - min(candidates), abs=1e-9)
+    if kind != "nothing":
+        assert mixture < 0.5 * candidates[NONE]
+
+
+def test_where_friction_holds_the_cable_the_corrected_model_predicts_no_motion_at_rest():
+    state = after(steps("drift"))
+    drift = jnp.asarray(np.random.default_rng(1).normal(size=(N, 2)) * 1e-3)
+    moved = drift + apply(compiled(CONFIG)[1](state, drift), jnp.zeros((Q, 3)))
+    assert float(jnp.abs(moved).max()) < 0.05 * float(jnp.abs(drift).max())
+
+
+def test_a_single_candidate_is_the_papers_ridge():
+    samples = list(steps("gain", 5))
+    stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *samples)
+    expected = fit(stacked.error, stacked.twist, stacked.valid, RidgeConfig(bias=False))
+    model = compiled(PAPER)[1](after(samples, PAPER), samples[-1].drift)
+    np.testing.assert_allclose(model.gain, expected.gain, rtol=1e-5, atol=1e-7)
+    assert (np.asarray(model.bias) == 0).all()
+
+
+def test_one_snap_through_does_not_stay_in_the_evidence_and_what_was_not_seen_is_none():
+    calm = list(steps("drift"))
+    lost = calm[30]._replace(error=calm[30].error + 0.1)
+    blind = calm[31]._replace(error=calm[31].error * jnp.nan, valid=jnp.zeros(N, bool))
+    state = after([*calm[:30], lost, blind])
+    assert float(state.count) == pytest.approx(float(after([*calm[:30], lost]).count))
+    again = after([*calm[:30], lost, blind, *calm[32:], *calm])
+    np.testing.assert_allclose(weights(CONFIG, again), weights(CONFIG, after([*calm, *calm])), atol=0.02)
+    assert np.isfinite(again.loss).all()
+
+
+def test_gradients_match_finite_differences():
+    with jax.enable_x64(True):
+        samples = jax.tree.map(lambda *leaves: jnp.stack(leaves), *steps("gain", 6))
+        probe = jnp.asarray(np.random.default_rng(2).normal(size=(Q, 3)) * 0.02)
+
+        def displacement(inputs):
+            error, drift = inputs
+            state = initial_learner(CONFIG, N, Q, jnp.float64)
+            for i in range(6):
+                state = observe(CONFIG, state, Sample(error[i], samples.twist[i], samples.valid[i], samples.drift[i]))
+            return apply(learned(CONFIG, state, drift), probe)
+
+        rng = np.random.default_rng(3)
+        at = samples.error, samples.drift[-1]
+        along = jax.tree.map(lambda leaf: jnp.asarray(rng.normal(size=leaf.shape) * 1e-3), at)
+        f = jax.jit(displacement)
+        _, tangent = jax.jvp(f, (at,), (along,))
+
+        def moved(by):
+            return f(jax.tree.map(lambda a, d: a + by * d, at, along))
+
+        ahead, behind = moved(1e-3), moved(-1e-3)
+        np.testing.assert_allclose(tangent, (ahead - behind) / 2e-3, rtol=1e-5, atol=1e-9)
+        cotangent = jnp.asarray(rng.normal(size=(N, 2)))
+        (pulled,) = jax.vjp(f, at)[1](cotangent)
+        back = sum(jnp.vdot(a, d) for a, d in zip(pulled, along, strict=True))
+        np.testing.assert_allclose(back, jnp.vdot(cotangent, tangent), rtol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"candidates": ()}, "expected one `Candidate` or more"),
+        ({"candidates": (RidgeConfig(),)}, "expected one `Candidate` or more"),
+        ({"window": 0}, "window is 0"),
+        ({"error_std": 0.0}, "error_std is 0.0"),
+        ({"memory": 1.5}, "memory is 1.5"),
+    ],
+)
+def test_impossible_settings_are_refused(change, message):
+    with pytest.raises(ValueError, match=message):
+        LearnerConfig(**change)
+
+
+def test_a_longer_cable_is_learned_like_a_short_one():
+    config = LearnerConfig((Candidate(), Candidate(ridge=RidgeConfig(outlier=0.02)))).scaled(2.0)
+    assert config.candidates[1].ridge == RidgeConfig(motion_scale=0.02, rotation_weight=0.3, outlier=0.04)
+    samples = list(steps("gain", 6))
+    double = [
+        s._replace(error=2 * s.error, twist=s.twist * jnp.array([2.0, 2.0, 1.0]), drift=2 * s.drift) for s in samples
+    ]
+    one, two = (
+        after(samples, LearnerConfig((Candidate(), Candidate(ridge=RidgeConfig(outlier=0.02))))),
+        after(double, config),
+    )
+    np.testing.assert_allclose(two.loss, 4 * one.loss, rtol=1e-4)
