@@ -39,6 +39,9 @@ class MPCConfig:
         min_reduction: predicted changes of the error below this say nothing about the model: the radius stays [m].
         hold_improvement: the grippers hold still if the plan lowers the error over the horizon, as a root mean square
             distance, by less than this compared with holding still [m].
+        settle_after: commands without a lower error after which the grippers go back to where it was lowest and rest.
+        wake: rise of the error at rest [m] that counts as a disturbance: planning begins again.
+        arrived: way left [m] at which the grippers count as being there.
         restart_above: where the error stays above this [m], the cable is in another shape than the target's, between
             the same grippers or others. No plan of a few steps leads out: it is straightened, and shaped from there.
         restart_after: commands without a lower error after which it counts as staying; at once where no plan is better
@@ -65,6 +68,9 @@ class MPCConfig:
     shrink: float = 0.95
     min_reduction: float = 1e-4
     hold_improvement: float = 2e-5
+    settle_after: int = 8
+    wake: float = 1e-3
+    arrived: float = 1e-4
     restart_above: float = 0.05
     restart_after: int = 12
     max_restarts: int = 3
@@ -89,6 +95,8 @@ class MPCConfig:
             "radius_max",
             "min_reduction",
             "hold_improvement",
+            "wake",
+            "arrived",
             "restart_above",
         )
         scaled = {name: ratio * getattr(cls, name) for name in own}
@@ -132,8 +140,13 @@ class MPCConfig:
                 f"max_restarts {self.max_restarts}: expected a positive length, a whole number of at least 1, and one "
                 "of at least 0."
             )
-        if not (self.min_reduction > 0 and self.hold_improvement >= 0):
-            raise ValueError("MPCConfig.min_reduction must be positive and hold_improvement not negative [m].")
+        if not (self.min_reduction > 0 and self.wake > 0 and self.arrived > 0 and self.hold_improvement >= 0):
+            raise ValueError(
+                f"MPCConfig lengths: min_reduction {self.min_reduction}, wake {self.wake}, arrived {self.arrived}, "
+                f"hold_improvement {self.hold_improvement}: expected positive lengths [m], the last may be 0."
+            )
+        if not is_whole(self.settle_after, least=1):
+            raise ValueError(f"MPCConfig.settle_after is {self.settle_after}, expected a whole number, at least 1.")
         self._check_parts()
 
     def _check_parts(self) -> None:

@@ -13,7 +13,7 @@ from jaxtyping import Array, Float, Int
 
 from cablejax.adaptation.belief import update
 from cablejax.mpc.config import MPCConfig
-from cablejax.mpc.fallback import plan_or_hold, plan_or_restart
+from cablejax.mpc.fallback import plan_or_hold, plan_or_recover
 from cablejax.mpc.feasible import FeasibleSet, feasible_from
 from cablejax.mpc.problem import ShapingProblem
 from cablejax.mpc.state import CableEstimate, LastCommand, MPCInfo, MPCState, initial_state
@@ -99,9 +99,9 @@ def _step(mpc: MPC, state: MPCState, measurement: Measurement) -> tuple[MPCState
     error = problem.shape_error(state.history.keypoints[-1])
     rho, radius = _update_radius(config, state, error, problem.shape_error(state.last.predicted))
     problem = dataclasses.replace(problem, feasible=dataclasses.replace(problem.feasible, radius=radius))
-    start = find_starts(config, problem, state.last.plan)
+    start = find_starts(config, problem, state.last.plan, state.progress.best_pose)
     decision = plan_or_hold(config, config.solver(problem, start.guess), start)
-    decision, progress = plan_or_restart(config, state.progress, problem, error, decision, start.straightening)
+    decision, progress = plan_or_recover(config, state.progress, problem, error, decision, start)
     plan = decision.plan
 
     twist = config.objective.to_twist(plan.motion[0])

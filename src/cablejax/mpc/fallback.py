@@ -1,4 +1,4 @@
-"""Fallbacks where a plan is no better than holding still, or stays in another shape: hold, or straighten."""
+"""Fallbacks where no plan is better than holding still, or nothing gets better: hold, straighten, go back and rest."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from cablejax.mpc.config import MPCConfig
 from cablejax.mpc.plan import Plan
 from cablejax.mpc.problem import ShapingProblem
 from cablejax.mpc.state import Action, Progress
-from cablejax.mpc.warm_start import Starts, StraightWay
+from cablejax.mpc.warm_start import Starts
 
 
 class Decision(NamedTuple):
@@ -45,40 +45,77 @@ def plan_or_hold(config: MPCConfig, plan: Plan, start: Starts) -> Decision:
     return Decision(plan, jnp.where(worthwhile, Action.FOLLOW, Action.HOLD).astype(jnp.int32))
 
 
-def plan_or_restart(
+def plan_or_recover(
     config: MPCConfig,
     progress: Progress,
     problem: ShapingProblem,
     error: Float[Array, ""],
     decision: Decision,
-    straight: StraightWay,
+    start: Starts,
 ) -> tuple[Decision, Progress]:
-    """The decision, or the next step of straightening the cable; and the progress with what is counted for that.
+    """The decision, or the next step of a way to poses that are known to be good; and the progress.
 
-    A cable has several shapes between the same grippers, and near another one than the target's every plan of a few
-    steps makes the error worse before it makes it better. From the straight cable the target can be reached.
+    Where no command has lowered the error for a while, none that the model can find will. There are two cases:
+
+    - Far from the target. A cable has several shapes between the same grippers, and near another one than the target's
+      every plan of a few steps makes the error worse before it makes it better. From the straight cable the target can
+      be reached, so it is straightened.
+    - Near it. Stick and slip are of the size of what the model promises. The grippers go back to where the cable was
+      nearest to the target, and rest there until the error rises, as after a disturbance.
     """
-    plan, radius, sound = decision.plan, problem.feasible.radius, _sound(decision.plan.result)
-    better = error < 0.99 * progress.best_error
-    since = jnp.where(better, 0, progress.since_best + 1)
-    staying = (sound & (decision.action == Action.HOLD)) | (since >= config.restart_after)
-    stuck = staying & (error > config.restart_above) & (progress.restarts < config.max_restarts)
-    # half as many steps again as the way is long: the bounds on the grippers' distance may lead it round
-    needed = jnp.ceil(1.5 * straight.length / radius).astype(jnp.int32)
-    left = jnp.where(progress.straightening > 0, progress.straightening - 1, jnp.where(stuck, needed, 0))
-    left = jnp.where((straight.length > radius) & sound, left, 0)
-    restarting = left > 0
-    progress = Progress(
-        best_error=jnp.where(restarting, jnp.inf, jnp.where(better, error, progress.best_error)).astype(error.dtype),
-        since_best=jnp.where(restarting, 0, since),
-        straightening=left,
-        restarts=progress.restarts + (restarting & (progress.straightening == 0)),
+    plan, sound = decision.plan, _sound(decision.plan.result)
+    held = sound & (decision.action == Action.HOLD)
+    progress = _followed(config, progress, problem.history.gripper_pose, error, held, start)
+    mode = jnp.where(sound, progress.mode, Action.FOLLOW)
+    motion = jnp.select(
+        [mode == Action.STRAIGHTEN, mode == Action.RETURN, mode == Action.HOLD],
+        [start.straightening.motion, start.back.motion, start.still],
+        plan.motion,
     )
-    motion = jnp.where(restarting, straight.motion, plan.motion)
     # a rollout that is needed in few calls
-    value = jax.lax.cond(restarting, problem.value, lambda motion: plan.value, straight.motion)
-    action = jnp.where(restarting, Action.STRAIGHTEN, decision.action).astype(jnp.int32)
+    value = jax.lax.cond(mode == Action.FOLLOW, lambda motion: plan.value, problem.value, motion)
+    action = jnp.where(mode == Action.FOLLOW, decision.action, mode).astype(jnp.int32)
     return Decision(dataclasses.replace(plan, motion=motion, value=value), action), progress
+
+
+def _followed(
+    config: MPCConfig,
+    before: Progress,
+    pose: Float[Array, "Q 3"],
+    error: Float[Array, ""],
+    held: Bool[Array, ""],
+    start: Starts,
+) -> Progress:
+    """The progress after one more observation."""
+    resting = before.mode == Action.HOLD
+    woken = resting & (error > before.rest_error + config.wake)
+    planning = (before.mode == Action.FOLLOW) | woken
+    best = jnp.where(woken, jnp.inf, before.best_error)
+    better = planning & (error < 0.99 * best)
+    since = jnp.where(planning & ~better & ~woken, before.since_best + 1, 0)
+
+    far = error > config.restart_above
+    tired = planning & ((far & held) | (since >= jnp.where(far, config.restart_after, config.settle_after)))
+    straighten = tired & far & (before.restarts < config.max_restarts)
+    straightening = straighten | (before.mode == Action.STRAIGHTEN)
+    returning = (tired & ~far) | (before.mode == Action.RETURN)
+    length = jnp.where(straightening, start.straightening.length, start.back.length)
+    # half as many steps again as the way is long: the bounds on the grippers' distance may lead it round
+    needed = jnp.ceil(1.5 * length / config.radius_max).astype(jnp.int32)
+    left = jnp.where(tired, needed, before.way_left - 1)
+    on_way = (left > 0) & (length > config.arrived)
+    mode = jnp.where(straightening & on_way, Action.STRAIGHTEN, Action.FOLLOW)
+    mode = jnp.where(returning, jnp.where(on_way, Action.RETURN, Action.HOLD), mode)
+    mode = jnp.where(resting & ~woken, Action.HOLD, mode)
+    return Progress(
+        best_error=jnp.where(straightening, jnp.inf, jnp.where(better, error, best)).astype(error.dtype),
+        best_pose=jnp.where(better, pose, before.best_pose),
+        since_best=jnp.where(straightening, 0, since),
+        mode=mode.astype(jnp.int32),
+        way_left=left,
+        restarts=before.restarts + straighten,
+        rest_error=jnp.where(resting & ~woken, before.rest_error, error),
+    )
 
 
 def _sound(result: Int[Array, ""]) -> Bool[Array, ""]:

@@ -25,6 +25,8 @@ class Action(enum.IntEnum):
     """The grippers hold, or brake as fast as they may: no plan is better, or none can be trusted (see the result)."""
     STRAIGHTEN = 2
     """The error stayed where it is, as in another shape between the same grippers: the cable is straightened first."""
+    RETURN = 3
+    """The error does not fall any more near the target: the grippers go back to where it was lowest, and rest there."""
 
 
 class LastCommand(NamedTuple):
@@ -48,19 +50,25 @@ class LastCommand(NamedTuple):
 
 
 class Progress(NamedTuple):
-    """Counts that decide when the cable is straightened to begin again; every field has shape [].
+    """What decides when the cable is straightened to begin again, or rests; every field but `best_pose` has shape [].
 
     Attributes:
-        best_error: lowest shape error since the last restart [m].
+        best_error: lowest shape error since the last restart or rest [m].
+        best_pose: gripper poses at which it was seen, shape [Q, 3].
         since_best: commands since it fell by a hundredth or more.
-        straightening: commands left for straightening the cable; 0 = planning.
-        restarts: how often that was begun.
+        mode: an `Action`: plans are followed, the cable is straightened, the grippers go back, or rest (`HOLD`).
+        way_left: commands left for the way there or back.
+        restarts: how often straightening was begun.
+        rest_error: shape error when the rest began [m].
     """
 
     best_error: Float[Array, "*batch"]
+    best_pose: Float[Array, "*batch Q 3"]
     since_best: Int[Array, "*batch"]
-    straightening: Int[Array, "*batch"]
+    mode: Int[Array, "*batch"]
+    way_left: Int[Array, "*batch"]
     restarts: Int[Array, "*batch"]
+    rest_error: Float[Array, "*batch"]
 
 
 class CableEstimate(NamedTuple):
@@ -161,7 +169,15 @@ def initial_state(config: MPCConfig, history: History) -> MPCState:
             predicted=history.keypoints[-1],
             shape_error=jnp.zeros((), dtype),
         ),
-        progress=Progress(best_error=jnp.asarray(jnp.inf, dtype), since_best=zero, straightening=zero, restarts=zero),
+        progress=Progress(
+            best_error=jnp.asarray(jnp.inf, dtype),
+            best_pose=jnp.asarray(history.gripper_pose, dtype),
+            since_best=zero,
+            mode=zero,
+            way_left=zero,
+            restarts=zero,
+            rest_error=jnp.zeros((), dtype),
+        ),
         estimate=estimate,
         radius=jnp.asarray(config.radius, dtype),
         steps=zero,
