@@ -17,6 +17,7 @@ from cablejax.mpc import MPCConfig
 from closed_loop import interval_tables, tables
 from closed_loop.failures import failure_figure, worst
 from closed_loop.fine_tuning import FineTuneConfig, fine_tune, record
+from closed_loop.harder import MARGIN_CM
 from closed_loop.methods import ADAPTED_LEARNER, LABEL, METHODS, model_named
 from closed_loop.protocols import least_time
 from closed_loop.suite import Case, read_suite, run_suite
@@ -136,6 +137,9 @@ def page(experiment: Experiment, trials: Sequence[Trial], command: str, picture:
         lines += ["", f"## Table {table}", "", f"Seeds: {seeds}.", ""]
         if table == LIANG_TABLE:
             lines += [interval_tables.success_table(mine, labels=LABEL)]
+            continue
+        if table in MARGIN_CM:
+            lines += [interval_tables.reached_table(mine, table, MARGIN_CM[table], labels=LABEL)]
             continue
         lines += [tables.comparison_table(mine, table, labels=LABEL)]
         least = least_times(experiment, {trial.key[:1] + trial.key[2:] for trial in mine})

@@ -110,6 +110,38 @@ def paired_table(
     return markdown(title, rows)
 
 
+def reached_table(
+    trials: Iterable[Trial], table: str, margin_cm: float, *, labels: Mapping[str, str] = METHOD_LABEL
+) -> str:
+    """How many runs end within a margin of the best that a cable at rest can do, by scenario.
+
+    A run ends where the mean of its last ten seconds is; `Trial.reachable_cm` is the best.
+
+    Raises:
+        ValueError: there is no trial of this table.
+    """
+    mine, rows = trials_of_table(trials, table), []
+    for method in methods_of(mine, None):
+        of_method = [trial for trial in mine if trial.method == method]
+        scenarios = sorted({trial.scenario for trial in of_method})
+        for scenario in [*scenarios, "all"] if len(scenarios) > 1 else scenarios:
+            cell = of_method if scenario == "all" else of_scenario(of_method, scenario)
+            over = np.array([trial.late_errors_cm.mean() - trial.reachable_cm for trial in cell])
+            reached = int((over <= margin_cm).sum())
+            rows.append(
+                [
+                    label_of(method, labels), scenario, f"{reached}/{len(cell)}", _rate_text(reached, len(cell)),
+                    number_text(float(np.median(over))), number_text(float(np.nanquantile(over, 0.9))),
+                    str(sum(trial.stopped is not None for trial in cell)),
+                ]
+            )  # fmt: skip
+    head = [
+        "method", "task", f"within {10 * margin_cm:g} mm", "95 % interval", "median over the best [cm]", "90 %",
+        "stopped",
+    ]  # fmt: skip
+    return markdown(head, rows)
+
+
 def success_table(
     trials: Iterable[Trial],
     *,

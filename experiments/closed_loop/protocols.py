@@ -89,12 +89,14 @@ class Task:
         start_shape: points of the cable at the start [m], uniform in arc length, shape [S, 2]: several shapes may fit
             between the grippers, and this is the one. Give it to the plant as a guess, see `LaidOut`.
         target: the wanted shape.
+        reachable_cm: how near a cable at rest can come to it [cm].
     """
 
     name: str
     start_pose: Float[np.ndarray, "Q 3"]
     start_shape: Float[np.ndarray, "S 2"]
     target: Target
+    reachable_cm: float = 0.0
 
 
 def least_time(task: Task, config: MPCConfig) -> float:
@@ -146,7 +148,7 @@ def letter_task(
     Raises:
         ValueError: another letter.
     """
-    return _straight_task(f"{shape} {seed}", make_target(shape, config.cable), seed, config, start)
+    return straight_task(f"{shape} {seed}", make_target(shape, config.cable), seed, config, start)
 
 
 def random_task(
@@ -164,7 +166,7 @@ def random_task(
     name = f"{kind} {seed}"
     target, _ = random_shape(_stream(seed, _TARGET), name, config, shapes)
     if kind == "straight":
-        return _straight_task(name, target, seed, config, start)
+        return straight_task(name, target, seed, config, start)
     if kind != "diverse":
         raise ValueError(f'The start is {kind!r}, expected "straight" or "diverse".')
     first, rest = random_shape(_stream(seed, _START), name, config, shapes)
@@ -199,7 +201,10 @@ def random_shape(
     raise ValueError(f"None of {MAX_DRAWS} random shapes met {shapes}: widen the limits.")
 
 
-def _straight_task(name: str, target: Target, seed: int, config: Discretisation, start: StartConfig) -> Task:
+def straight_task(
+    name: str, target: Target, seed: int, config: Discretisation = Discretisation(), start: StartConfig = StartConfig()
+) -> Task:
+    """A target from the straight start of a seed."""
     pose = random_straight_start(seed, config, start)
     return Task(name, pose, elastica(pose, config.cable.length, np.linspace(0.0, config.cable.length, 101)), target)
 

@@ -36,6 +36,7 @@ class Case:
         plant: the cable, made when it is needed.
         cable: name of the physical cable: a fine-tuned model serves all cases of one.
         steps: most commands of a run.
+        patience: commands without any change of the error after which it ends; None = it goes on.
     """
 
     table: str
@@ -46,6 +47,7 @@ class Case:
     plant: Callable[[], GuessingCable]
     cable: str
     steps: int
+    patience: int | None = PATIENCE
 
 
 def key_of(case: Case, method: MethodSpec) -> TrialKey:
@@ -53,13 +55,13 @@ def key_of(case: Case, method: MethodSpec) -> TrialKey:
     return case.table, method.name, case.scenario, float(case.stiffness), case.seed
 
 
-def run_case(case: Case, method: MethodSpec, model: Model | None) -> ClosedLoopRun:
-    """One trial, without keeping anything."""
-    task = case.task()
+def run_case(case: Case, method: MethodSpec, model: Model | None, task: Task | None = None) -> ClosedLoopRun:
+    """One trial, without keeping anything; `task` if it was made already."""
+    task = case.task() if task is None else task
     plant = LaidOut(case.plant(), task.start_shape)
     controller = controller_of(method, model, task.target)
     return run_closed_loop(
-        plant, controller, task.target, case.steps, start=task.start_pose, record_hz=1.0, patience=PATIENCE
+        plant, controller, task.target, case.steps, start=task.start_pose, record_hz=1.0, patience=case.patience
     )
 
 
@@ -90,10 +92,10 @@ def run_suite(
         model = None
         if method.weights is not None:
             model = fine_tuned(case) if method.fine_tuned else model_named(method.weights)
-        begin = time.perf_counter()
-        finished = run_case(case, method, model)
+        begin, task = time.perf_counter(), case.task()
+        finished = run_case(case, method, model, task)
         names = dict(zip(KEY, key, strict=True))
-        trial = trial_of(finished, **names, wall_s=time.perf_counter() - begin)
+        trial = trial_of(finished, **names, wall_s=time.perf_counter() - begin, reachable_cm=task.reachable_cm)
         append_snapshot(folder / SNAPSHOTS, snapshot_of(finished, trial.key))
         return dataclasses.asdict(trial)
 

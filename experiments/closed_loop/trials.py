@@ -46,6 +46,7 @@ class Trial:
         wall_s: wall time of the whole trial [s].
         motion_m: how far the grippers were commanded in each step [m], both together, a radian counting as 0.15 m;
             None in rows that were written before it was recorded.
+        reachable_cm: how near a cable at rest can come to the target [cm].
     """
 
     table: str
@@ -58,6 +59,7 @@ class Trial:
     mpc_ms_median: float
     wall_s: float
     motion_m: tuple[float, ...] | None = None
+    reachable_cm: float = 0.0
 
     @property
     def key(self) -> TrialKey:
@@ -109,7 +111,15 @@ class Trial:
 
 
 def trial_of(
-    run: ClosedLoopRun, *, table: str, method: str, scenario: str, stiffness: float, seed: int, wall_s: float
+    run: ClosedLoopRun,
+    *,
+    table: str,
+    method: str,
+    scenario: str,
+    stiffness: float,
+    seed: int,
+    wall_s: float,
+    reachable_cm: float = 0.0,
 ) -> Trial:
     """The row of one finished run."""
     motion = run.twist[:-1] * np.array([1.0, 1.0, ObjectiveConfig().rotation_weight])
@@ -124,6 +134,7 @@ def trial_of(
         stopped=run.stopped,
         mpc_ms_median=float(np.median(timed)) if len(timed) else math.nan,
         wall_s=float(wall_s),
+        reachable_cm=float(reachable_cm),
         motion_m=tuple(map(float, np.linalg.norm(motion, axis=-1).sum(axis=-1))),
     )
 
@@ -145,7 +156,7 @@ def read_trials(path: str | os.PathLike[str]) -> list[Trial]:
 
 def _parsed(fields: dict[str, Any], where: str) -> Trial:
     kinds = {field.name: field.type for field in dataclasses.fields(Trial)}
-    missing = sorted(set(kinds) - set(fields) - {"motion_m"})
+    missing = sorted(set(kinds) - set(fields) - {"motion_m", "reachable_cm"})
     unknown = sorted(set(fields) - set(kinds))
     if missing or unknown:
         raise ValueError(f"{where} is not a trial: missing fields {missing}, unknown fields {unknown}.")

@@ -1,0 +1,168 @@
+"""Tasks that need a model: shapes of other cables given as keypoints only, and runs that are disturbed in the middle.
+
+- **Keypoints only** (`recorded_task`). Another cable, of random stiffness, friction and bend at rest, is moved on the
+  contact plant and lies as friction leaves it. Its keypoints are the target: nobody says where the grippers are to be,
+  and our cable cannot take the shape exactly. How near it can come at rest is found by `nearest_rest`, which looks
+  through all gripper poses without friction.
+- **Disturbed** (`disturbed_task`). A letter, and half-way through the run something happens: a push, a slip through one
+  gripper, friction or stiffness that change; or the keypoints are noisy, or come from clouds with gaps, all the time.
+
+Seeds from `HELD_OUT` on are those of the tables; nothing is chosen on them.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Callable, Sequence
+from typing import get_args
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+from scipy.optimize import least_squares
+
+from cablejax.cable import Cable
+from cablejax.control.targets import Shape, target_from_keypoints
+from cablejax.effects.given import GivenEffect, parse_effect
+from cablejax.mpc.target_pose import target_pose
+from cablejax.perceive.camera import CameraConfig
+from cablejax.perceive.plant import CloudPlant
+from cablejax.simulate.chain.statics import resting_shapes
+from cablejax.simulate.plant import Plant, PlantConfig
+from cablejax.simulate.table_plant import PlantError
+from closed_loop.cases import PLANT_CHAIN
+from closed_loop.protocols import Task, letter_task, random_shape, straight_task
+from closed_loop.suite import Case
+
+RECORDED, DISTURBED = "keypoints only", "disturbed"
+"""Names of the tables."""
+MARGIN_CM = {RECORDED: 0.2, DISTURBED: 0.3}
+"""How far a run may end above the best that a cable at rest can do, to have reached its target [cm]."""
+HELD_OUT = 1000
+"""First seed of the tables."""
+STEPS, DISTURBED_AT = 60, 30.0
+"""Commands of a run, and when it is disturbed [s]."""
+_TOWARDS = 6
+"""Commands by which another cable is brought to the shape that is recorded."""
+_PASSES = 6
+"""How often the branch that `nearest_rest` follows is taken up from where it has come."""
+
+FRICTION = Cable().friction_coefficient
+
+DISTURBANCES: dict[str, tuple[str, ...]] = {
+    "push": ("gravity_tilt:angle_rad=0.6,direction_rad={angle},from_s=30,until_s=31.5",),
+    "slip": ("gripper_slip:gripper={gripper},time_s=30,distance_m=0.005",),
+    "friction rises": (f"table_friction:coefficient={3 * FRICTION:g},from_s=30",),
+    "stiffness falls": ("bending_stiffness:ratio=0.3,from_s=30",),
+    "2 mm noise": (),
+    "clouds": (),
+}
+"""What happens, as effects of the plant."""
+
+
+def recorded_task(seed: int) -> Task:
+    """A straight start and the recorded shape of another cable; the same for all who ask."""
+    rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(7,)))
+    while True:
+        effects = (
+            f"bending_stiffness:ratio={np.exp(rng.uniform(-1.2, 1.2)):.4f}",
+            f"table_friction:coefficient={FRICTION * np.exp(rng.uniform(-0.7, 0.7)):.4f}",
+            f"intrinsic_curvature:centre_m=0.5,width_m=0.4,curvature_per_m={rng.uniform(-2.0, 2.0):.4f}",
+        )
+        other = Plant(PlantConfig(discretisation=PLANT_CHAIN, effects=tuple(map(parse_effect, effects))))
+        _, rest = random_shape(rng, "", PLANT_CHAIN)
+        twist = rng.uniform(-1.0, 1.0, (2, 3)) * np.array([0.03, 0.03, 0.2])
+        pose = np.array([[*rest.position[0], rest.angle[0]], [*rest.position[-1], rest.angle[-1]]])
+        try:
+            other.reset(pose, guess=rest.position)
+            keypoints = other.step(twist, float(_TOWARDS)).true_keypoints
+        except (ValueError, PlantError):
+            continue  # pulled taut, or no rest with these effects: another draw
+        target = target_from_keypoints(f"{RECORDED} {seed}", keypoints)
+        task = straight_task(target.name, target, seed, PLANT_CHAIN)
+        return dataclasses.replace(task, reachable_cm=nearest_rest(keypoints))
+
+
+def nearest_rest(keypoints: Float[np.ndarray, "N 2"]) -> float:
+    """How near a frictionless cable at rest comes to these keypoints [cm], at the best of all gripper poses nearby."""
+    wanted, branch = jnp.asarray(keypoints), jnp.asarray(keypoints)
+    pose, error = np.asarray(target_pose(wanted), float).ravel(), np.inf
+    for _ in range(_PASSES):
+        solution = least_squares(
+            lambda pose, branch=branch: np.asarray(_away(pose, branch, wanted)),
+            pose,
+            jac=lambda pose, branch=branch: np.asarray(_slope(pose, branch, wanted)),  # pyright: ignore[reportArgumentType]
+        )
+        pose, before = solution.x, error
+        branch = _at_rest(jnp.asarray(pose), branch)
+        error = 100 * float(np.sqrt(np.mean(np.sum((np.asarray(branch) - keypoints) ** 2, axis=1))))
+        if before - error < 1e-3:
+            break
+    return error
+
+
+@jax.jit
+def _at_rest(pose: Float[jax.Array, " 6"], branch: Float[jax.Array, "N 2"]) -> Float[jax.Array, "N 2"]:
+    both = pose.reshape(2, 3)
+    for _ in range(3):
+        branch = resting_shapes(branch, both, both, length=PLANT_CHAIN.cable.length)[1]
+    return branch
+
+
+@jax.jit
+def _away(pose: Float[jax.Array, " 6"], branch: Float[jax.Array, "N 2"], wanted: Float[jax.Array, "N 2"]):
+    return (_at_rest(pose, branch) - wanted).ravel()
+
+
+_slope = jax.jit(jax.jacfwd(_away))
+
+
+def disturbed_task(seed: int) -> Task:
+    """A letter; the disturbance is the plant's, see `disturbed_plant`."""
+    shapes = get_args(Shape)
+    return letter_task(shapes[(seed // len(DISTURBANCES)) % len(shapes)], seed, PLANT_CHAIN)
+
+
+def disturbance_of(seed: int) -> str:
+    """A key of `DISTURBANCES`."""
+    return list(DISTURBANCES)[seed % len(DISTURBANCES)]
+
+
+def disturbed_plant(seed: int) -> Plant:
+    """The plant in which it happens; the cable is half, once or twice as stiff as the one trained on."""
+    rng, name = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(8,))), disturbance_of(seed)
+    stiffness = GivenEffect("bending_stiffness", (("ratio", float(rng.choice([0.5, 1.0, 2.0]))),))
+    random = {"angle": f"{rng.uniform(0.0, 2 * np.pi):.3f}", "gripper": rng.integers(2)}
+    effects = (stiffness, *(parse_effect(text.format(**random)) for text in DISTURBANCES[name]))
+    noise = 2e-3 if name == "2 mm noise" else 0.0
+    config = PlantConfig(discretisation=PLANT_CHAIN, effects=effects, keypoint_noise=noise, seed=seed)
+    return CloudPlant(config, camera=CameraConfig(seed=seed)) if name == "clouds" else Plant(config)
+
+
+def recorded_plant() -> Plant:
+    """Our cable, twice as stiff as the one trained on."""
+    return Plant(
+        PlantConfig(discretisation=PLANT_CHAIN, effects=(GivenEffect("bending_stiffness", (("ratio", 2.0),)),))
+    )
+
+
+def harder_cases(seeds: Sequence[int]) -> list[Case]:
+    """Both tables, one case of each for a seed."""
+
+    def case(table: str, scenario: str, seed: int, task: Callable[[], Task], plant: Callable[[], Plant]) -> Case:
+        return Case(table, scenario, 1.0, seed, task, plant, f"{table} {seed}", STEPS, patience=None)
+
+    recorded = functools.lru_cache(maxsize=2)(recorded_task)
+    return [
+        made
+        for seed in seeds
+        for made in (
+            case(RECORDED, RECORDED, seed, functools.partial(recorded, seed), recorded_plant),
+            case(
+                DISTURBED, disturbance_of(seed), seed, functools.partial(disturbed_task, seed),
+                functools.partial(disturbed_plant, seed),
+            ),
+        )
+    ]  # fmt: skip
