@@ -64,8 +64,8 @@ def plan_or_recover(
       nearest to the target, and rest there until the error rises, as after a disturbance.
     """
     plan, sound = decision.plan, _sound(decision.plan.result)
-    held = sound & (decision.action == Action.HOLD)
-    progress = _followed(config, progress, problem.history.gripper_pose, error, held, start)
+    held = decision.action == Action.HOLD
+    progress = _followed(config, progress, problem.history.gripper_pose, error, start, sound=sound, held=held)
     mode = jnp.where(sound, progress.mode, Action.FOLLOW)
     motion = jnp.select(
         [mode == Action.STRAIGHTEN, mode == Action.RETURN, mode == Action.HOLD],
@@ -83,10 +83,12 @@ def _followed(
     before: Progress,
     pose: Float[Array, "Q 3"],
     error: Float[Array, ""],
-    held: Bool[Array, ""],
     start: Starts,
+    *,
+    sound: Bool[Array, ""],
+    held: Bool[Array, ""],
 ) -> Progress:
-    """The progress after one more observation."""
+    """The progress after one more observation; `sound`: the plan may be carried out; `held`: it is to hold."""
     resting = before.mode == Action.HOLD
     woken = resting & (error > before.rest_error + config.wake)
     planning = (before.mode == Action.FOLLOW) | woken
@@ -95,15 +97,17 @@ def _followed(
     since = jnp.where(planning & ~better & ~woken, before.since_best + 1, 0)
 
     far = error > config.restart_above
-    tired = planning & ((far & held) | (since >= jnp.where(far, config.restart_after, config.settle_after)))
-    straighten = tired & far & (before.restarts < config.max_restarts)
+    tired = planning & sound & ((far & held) | (since >= jnp.where(far, config.restart_after, config.settle_after)))
+    far_to_go = start.straightening.length > config.radius_max
+    straighten = tired & far & far_to_go & (before.restarts < config.max_restarts)
     straightening = straighten | (before.mode == Action.STRAIGHTEN)
     returning = (tired & ~far) | (before.mode == Action.RETURN)
     length = jnp.where(straightening, start.straightening.length, start.back.length)
     # half as many steps again as the way is long: the bounds on the grippers' distance may lead it round
     needed = jnp.ceil(1.5 * length / config.radius_max).astype(jnp.int32)
     left = jnp.where(tired, needed, before.way_left - 1)
-    on_way = (left > 0) & (length > config.arrived)
+    # from within a step of straight the planner goes on by itself
+    on_way = (left > 0) & (length > jnp.where(straightening, config.radius_max, config.arrived))
     mode = jnp.where(straightening & on_way, Action.STRAIGHTEN, Action.FOLLOW)
     mode = jnp.where(returning, jnp.where(on_way, Action.RETURN, Action.HOLD), mode)
     mode = jnp.where(resting & ~woken, Action.HOLD, mode)
