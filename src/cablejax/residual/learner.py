@@ -4,10 +4,12 @@ A few samples may say more about noise than about the cable, and a correction th
 So a candidate has to earn its influence. At every step each one predicts the model's error before it is seen, and is
 weighed by the likelihood of what it has predicted so far,
 
-    w_k  ~  (a s^2 + d S_k / 2) ^ -(a + d n / 2),      S_k = sum_t phi^(n - t) |error(t) - predicted_k(t)|^2 / N
+    w_k  ~  (1 + d S_k / 2) ^ -(1 + d n / 2),      S_k = sum_t phi^(n - t) |error(t) - predicted_k(t)|^2 / (N s(t)^2)
 
-with fading memory phi: the marginal likelihood of d independent Gaussian errors a step whose unknown variance has an
-inverse gamma prior around s^2. Candidates are affine in the command, so that their mixture is again one affine
+with fading memory phi: the marginal likelihood of d independent Gaussian errors a step, of variance s(t)^2 up to an
+unknown factor with an inverse gamma prior around 1. Models err in proportion to the motion, s(t)^2 = s^2 + (r |R(t)|)^2: a
+millimetre says much about a cable at rest, and little about one that moves by decimetres.
+Candidates are affine in the command, so that their mixture is again one affine
 correction, and its squared error is at most the candidates' weighted mean (Jensen's inequality).
 
 The candidates are made of two parts:
@@ -59,7 +61,9 @@ class LearnerConfig:
         forgetting: weight ratio of a sample and the next newer one where the share of the drift is fitted, in (0, 1].
         drift_floor: root mean square drift [m] below which its share is not learned: the error is noise there.
         memory: phi, by which evidence fades in one step, in (0, 1].
-        error_std: s, root mean square error of a good prediction [m].
+        error_std: s, root mean square error of a good prediction at rest [m].
+        error_ratio: r, the same relative to the grippers' motion.
+        rotation_weight: w [m/rad], turns a rotation into a length.
         outlier: root mean square error [m] beyond which a step that no candidate predicted counts less and less, as in
             `RidgeConfig`: that a cable has snapped through says little about any of them.
         dimensions: d, independent numbers in the error of one step; neighbouring keypoints err alike.
@@ -76,6 +80,8 @@ class LearnerConfig:
     drift_floor: float = 2e-4
     memory: float = 0.8
     error_std: float = 2e-4
+    error_ratio: float = 0.1
+    rotation_weight: float = 0.15
     outlier: float = 0.02
     dimensions: float = 4.0
 
@@ -84,7 +90,7 @@ class LearnerConfig:
             raise ValueError(f"LearnerConfig.candidates are {self.candidates}, expected one `Candidate` or more.")
         if not is_whole(self.window, least=1):
             raise ValueError(f"LearnerConfig.window is {self.window}, expected a whole number of samples, at least 1.")
-        for name in ("drift_floor", "error_std", "outlier", "dimensions"):
+        for name in ("drift_floor", "error_std", "error_ratio", "rotation_weight", "outlier", "dimensions"):
             value = getattr(self, name)
             if not (math.isfinite(value) and value > 0):
                 raise ValueError(f"LearnerConfig.{name} is {value}, expected a positive finite number.")
@@ -99,7 +105,9 @@ class LearnerConfig:
             ridge = candidate.ridge
             return candidate if ridge is None else dataclasses.replace(candidate, ridge=ridge.scaled(ratio))
 
-        lengths = {name: ratio * getattr(self, name) for name in ("drift_floor", "error_std", "outlier")}
+        lengths = {
+            name: ratio * getattr(self, name) for name in ("drift_floor", "error_std", "rotation_weight", "outlier")
+        }
         return dataclasses.replace(self, candidates=tuple(map(of, self.candidates)), **lengths)
 
 
@@ -128,9 +136,9 @@ class LearnerState(NamedTuple):
 
     Attributes:
         window: the last W samples.
-        evidence: faded sum S_k of the candidates' mean squared errors [m^2], shape [K].
+        evidence: S_k, the faded sum of the candidates' mean squared errors in units of s(t)^2, shape [K].
         count: the steps in it, faded alike, shape [].
-        loss: sums over the run of the candidates' mean squared errors and, last, of the mixture's [m^2], shape [K + 1].
+        loss: the same sums over the run, not faded, and last that of the mixture, shape [K + 1].
     """
 
     window: Sample
@@ -169,9 +177,10 @@ def observe(config: LearnerConfig, state: LearnerState, sample: Sample) -> Learn
     predicted = jnp.stack([*(apply(model, sample.twist) for model in models), apply(mixture, sample.twist)])
     seen = jnp.sum(sample.valid)
     wrong = jnp.where(sample.valid[:, None], error - predicted, 0.0)
-    loss = jnp.sum(wrong**2, axis=(1, 2)) / jnp.maximum(seen, 1)
+    squared = jnp.sum(wrong**2, axis=(1, 2)) / jnp.maximum(seen, 1)
+    loss = squared / _expected(config, sample.twist)
     # as in the ridge: the weight of Geman and McClure
-    telling = (1.0 + loss[:-1].min() / config.outlier**2) ** -2
+    telling = (1.0 + squared[:-1].min() / config.outlier**2) ** -2
     # a step of which nothing was seen is no evidence
     fade = jnp.where(seen > 0, config.memory, 1.0).astype(loss.dtype)
     return LearnerState(
@@ -185,7 +194,14 @@ def observe(config: LearnerConfig, state: LearnerState, sample: Sample) -> Learn
 def weights(config: LearnerConfig, state: LearnerState) -> Float[Array, " K"]:
     """How far each candidate is believed, shape [K]; they sum to 1."""
     half = config.dimensions / 2.0
-    return jax.nn.softmax(-(1.0 + half * state.count) * jnp.log(config.error_std**2 + half * state.evidence))
+    return jax.nn.softmax(-(1.0 + half * state.count) * jnp.log1p(half * state.evidence))
+
+
+def _expected(config: LearnerConfig, twist: Float[Array, "*batch Q 3"]) -> Float[Array, "*batch"]:
+    """Mean squared error s(t)^2 of a good prediction [m^2]."""
+    weight = jnp.asarray([1.0, 1.0, config.rotation_weight], twist.dtype)
+    motion = jnp.mean(jnp.sum((weight * twist) ** 2, axis=-1), axis=-1)
+    return config.error_std**2 + config.error_ratio**2 * motion
 
 
 def learned(config: LearnerConfig, state: LearnerState, drift: Float[Array, "N 2"]) -> ResidualModel:
@@ -214,10 +230,11 @@ def _candidates(config: LearnerConfig, window: Sample, drift: Float[Array, "N 2"
 def _drift_share(config: LearnerConfig, window: Sample) -> Float[Array, ""]:
     """Share alpha of the model's drift that has not taken place, in [0, 1]: least squares, shrunk towards 0."""
     age = jnp.arange(config.window - 1, -1, -1)
-    weight = (config.forgetting**age).astype(window.drift.dtype)[:, None, None] * window.valid[..., None]
+    trust = (config.forgetting**age).astype(window.drift.dtype) / _expected(config, window.twist)
+    weight = trust[:, None, None] * window.valid[..., None]
     error = jnp.where(window.valid[..., None], window.error, 0.0)
     size = jnp.sum(weight * window.drift**2)
-    floor = config.drift_floor**2 * window.drift.shape[1]
+    floor = (config.drift_floor / config.error_std) ** 2 * window.drift.shape[1]
     return jnp.clip(-jnp.sum(weight * error * window.drift) / (size + floor), 0.0, 1.0)
 
 
