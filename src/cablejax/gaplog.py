@@ -16,9 +16,9 @@ import numpy as np
 from jaxtyping import Float
 
 from cablejax.cable import GRAVITY, Cable
-from cablejax.json_file import parse_json
 from cablejax.log_geometry import geometry_fault
 from cablejax.npz import NpzError, read_npz
+from cablejax.text_file import parse_json
 from cablejax.types import GapLog
 from cablejax.whole_file import whole_file
 

@@ -15,8 +15,8 @@ from cablejax.commands.options import UsageError, output_folder, say
 from cablejax.control.run import ClosedLoopRun
 from cablejax.control.targets import Target
 from cablejax.gaplog import Episode
-from cablejax.json_file import parse_json, read_json, write_json
 from cablejax.npz import read_npz
+from cablejax.text_file import parse_json, read_json, write_json
 from cablejax.whole_file import DRAFT, whole_file
 
 SCHEMA = "cablejax-parts/1"

@@ -20,12 +20,12 @@ from cablejax.control.targets import Target
 from cablejax.dynamics.fingerprint import fingerprint
 from cablejax.effects.given import GivenEffect
 from cablejax.effects.physics import nominal_physics
-from cablejax.json_file import write_json
 from cablejax.perceive.camera import CameraConfig
 from cablejax.report.effect_words import EFFECTS, listed
 from cablejax.report.style import METHOD_LABEL
 from cablejax.simulate.plant import PlantConfig
 from cablejax.solver_names import SolverName
+from cablejax.text_file import write_json
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

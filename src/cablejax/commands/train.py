@@ -8,7 +8,7 @@ import pathlib
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from cablejax.commands.options import Command, UsageError, say, text_table
-from cablejax.json_file import write_json
+from cablejax.text_file import write_json
 
 if TYPE_CHECKING:
     from cablejax.dataset.store import Store

@@ -21,7 +21,7 @@ from cablejax.dataset.schema import (
     digest_of_config,
 )
 from cablejax.dataset.store import Store
-from cablejax.json_file import read_json
+from cablejax.text_file import read_json
 
 PACKAGES = ("jax", "jaxlib", "mujoco", "mujoco-mjx", "numpy")
 """Packages whose versions decide the content, besides cablejax itself: those that begin a store must complete it."""

@@ -15,6 +15,7 @@ import numpy as np
 from cablejax.cable import Cable, Discretisation
 from cablejax.effects.given import GivenEffect, with_effects
 from cablejax.effects.physics import nominal_physics
+from cablejax.limits import LIMITS, check, shown
 from cablejax.simulate import ENGINES, check_effects
 from cablejax.simulate.equilibrium import FEWEST_LINKS
 from cablejax.simulate.motions import MotionConfig
@@ -40,9 +41,12 @@ class Randomisation:
     def __post_init__(self):
         for field in dataclasses.fields(self):
             value = getattr(self, field.name)
-            if value is not None and not (len(value) == 2 and np.all(np.isfinite(value)) and 0 < value[0] <= value[1]):
+            if value is not None and not (
+                len(value) == 2 and all(factor in LIMITS["factor"] for factor in value) and value[0] <= value[1]
+            ):
                 raise ValueError(
-                    f"Randomisation.{field.name} is {value}, expected None or factors (low, high), 0 < low <= high."
+                    f"Randomisation.{field.name} is {shown(value)}, expected None or factors (low, high), each "
+                    f"{LIMITS['factor']}, low <= high."
                 )
 
 
@@ -76,13 +80,7 @@ class DatasetConfig:
     effects: tuple[GivenEffect, ...] = ()
 
     def __post_init__(self):
-        for name in ("n_trajectories", "n_steps", "shard_size"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"DatasetConfig.{name} is {getattr(self, name)}, expected at least 1.")
-        if not (np.isfinite(self.interval) and self.interval > 0):
-            raise ValueError(f"DatasetConfig.interval is {self.interval}, expected a positive number of seconds.")
-        if self.seed < 0:
-            raise ValueError(f"DatasetConfig.seed is {self.seed}, expected an integer >= 0.")
+        check(self, "shard_size", "interval", "seed", n_trajectories="trajectories", n_steps="commands")
         if self.engine not in ENGINES:
             raise ValueError(f"DatasetConfig.engine is {self.engine!r}, expected one of {', '.join(ENGINES)}.")
         if self.discretisation.dimension != 2:

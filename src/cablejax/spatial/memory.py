@@ -14,10 +14,10 @@ import numpy as np
 
 from cablejax.bounded import Result
 from cablejax.diagnose.protocol import Explanation, Term
-from cablejax.json_file import read_json
 from cablejax.spatial.cable import SpatialCable
 from cablejax.spatial.effects import Layout
 from cablejax.spatial.search import Step
+from cablejax.text_file import read_json
 from cablejax.whole_file import whole_file
 
 
