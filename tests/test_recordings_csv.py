@@ -114,13 +114,13 @@ def test_a_table_seen_from_above_with_measured_grippers(tmp_path):
         ('unit = "mm"', 'unit = "mm"\nup = "w"', "up is 'w'"),
         ("count = 9", "count = 10", "has no column 'm10x'"),
         ("count = 9", 'count = "9"', r"\[columns\] count is '9', expected how many"),
-        ("count = 9", "count = 9\ngriper_0 = 3", "unknown fields griper_0"),
+        ("count = 9", "count = 9\ngriper_0 = 3", "unknown fields .*griper_0"),
         ("count = 9", 'count = 9\ngripper_0 = ["a", "b", "c", "d", "e", "f", "g"]', "but not gripper_1"),
         ("count = 9", 'count = 9\ngripper_0 = ["a", "b", "c"]', "expected the 7 columns"),
         ('"m{i}x"', '"mx"', "with {i} in it"),
         ('time_unit = "ms"', 'time_unit = "min"', "time_unit is 'min'"),
-        ("diameter_m = 0.006", "diameter_m = -1", "expected a finite number > 0"),
-        ("diameter_m = 0.006", "diameter_m = inf", "expected a finite number > 0"),
+        ("diameter_m = 0.006", "diameter_m = -1", "expected a number from 1e-06 to 1 m"),
+        ("diameter_m = 0.006", "diameter_m = inf", "expected a number from 1e-06 to 1 m"),
         ("diameter_m = 0.006", "", r"\[cable\] lacks diameter_m"),
         ("diameter_m = 0.006", "diameter_m = 0.006\nkeypoint_arclength_m = [0, 1]", "expected 9 increasing numbers"),
         ("[cable]", "[cables]", "unknown tables cables"),
@@ -168,7 +168,7 @@ def test_missing_files_are_reported(tmp_path):
     path, layout = written(tmp_path, in_space(), PAIRS)
     with pytest.raises(ValueError, match=r"absent\.csv could not be read"):
         import_csv(tmp_path / "absent.csv", layout)
-    with pytest.raises(ValueError, match=r"absent\.toml could not be read"):
+    with pytest.raises(ValueError, match=r"no layout: There is no file"):
         import_csv(path, tmp_path / "absent.toml")
 
 

@@ -109,7 +109,7 @@ def cable_from_fields(fields: Mapping[str, Any], where: str) -> Cable:
     values: dict[str, Any] = {}
     for key, (name, what) in NUMBERS.items():
         if key not in fields and key not in _OPTIONAL:
-            raise ValueError(f"{where} lacks {key}, the {what}. Add `{key} = ...`. {_EXAMPLE}")
+            raise ValueError(f"{where} lacks {key}, the {what}. Add `{key} = ...`.")
         value = fields.get(key, _OPTIONAL.get(key))
         require(value, name, f"{where}: {key}", f"It is the {what}: check its unit.")
         values[name] = float(value)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 import os
 import pathlib
 from collections.abc import Mapping, Sequence
@@ -16,6 +17,8 @@ import numpy as np
 from jaxtyping import Float
 
 from cablejax.cable import GRAVITY, Cable
+from cablejax.cable_file import NUMBERS, cable_from_fields
+from cablejax.limits import LIMITS, require, shown
 from cablejax.log_geometry import geometry_fault
 from cablejax.npz import NpzError, read_npz
 from cablejax.text_file import parse_json
@@ -32,13 +35,13 @@ _DTYPES = {
     "episode_length": np.int32,
     "hold": np.bool_,
 }
-_CABLE_POSITIVE = ("length_m", "diameter_m", "linear_density_kg_per_m", "bending_stiffness_n_m2")
-_CABLE_NOT_NEGATIVE = ("bending_damping_s",)
 _META_FIELDS = (
     "schema", "cable", "table", "gravity_m_per_s2", "keypoint_arclength_m", "grasp", "motion", "source",
 )  # fmt: skip
 # By how much the first and the last mark may miss the cable's ends, relative to its length.
 _ENDS = 0.05
+# Of the samples on an even clock of its usual interval, an episode has at least one in so many.
+_LOST = 20
 # Columns of a pose and of a twist, by the dimension of the keypoints.
 _POSE_WIDTH, _TWIST_WIDTH = {2: 3, 3: 7}, {2: 3, 3: 6}
 
@@ -162,7 +165,7 @@ def write_gap_log(path: str | os.PathLike, log: GapLog, *, overwrite: bool = Fal
         FileExistsError: there is such a file and `overwrite` is false.
     """
     path = pathlib.Path(path)
-    if path.suffix != ".npz":
+    if path.suffix.lower() != ".npz":
         raise GapLogError(f"A gap log is an .npz file, got {path.name!r}.")
     validate(log)
     if path.exists() and not overwrite:
@@ -237,16 +240,42 @@ def _validate_arrays(log: GapLog) -> None:
         time = log.time[index, :length]
         if not np.isfinite(time).all() or (np.diff(time) <= 0).any():
             raise GapLogError(f"Field 'time' does not increase, or is not finite, in episode {index}.")
+        _check_clock(time, f"of episode {index}")
         # the last command is held for no sample
         for name, end in (("gripper_pose", length), ("gripper_command", length - 1)):
             if not np.isfinite(getattr(log, name)[index, :end]).all():
                 raise GapLogError(f"Field '{name}' is not finite in episode {index}; only keypoints may be NaN.")
         if np.isinf(log.keypoints[index, :length]).any():
             raise GapLogError(f"Field 'keypoints' is infinite in episode {index}; a keypoint not observed is NaN.")
+        for name, limit, end in (("gripper_pose", "coordinate", length), ("gripper_command", "speed", length - 1)):
+            largest = float(np.abs(getattr(log, name)[index, :end]).max(initial=0.0))
+            _require(largest, limit, f"The largest entry of field '{name}' in episode {index}")
         if dimension == 3:
             norm = np.linalg.norm(log.gripper_pose[index, :length, :, 3:], axis=-1)
             if np.abs(norm - 1).max() > 1e-3:
                 raise GapLogError(f"Field 'gripper_pose' has quaternions not of unit length in episode {index}.")
+
+
+def _check_clock(time: Float[np.ndarray, " T"], which: str) -> None:
+    """Raises unless the samples are as far apart as those of a recording may be."""
+    step = np.diff(time)
+    if not len(step):
+        return
+    usual, advice = float(np.median(step)), "Is the unit of time right, which is a second?"
+    _require(usual, "sample_interval", f"The usual time between samples {which}", advice)
+    _require(float(time[-1] - time[0]), "duration", f"The time from the first to the last sample {which}", advice)
+    if time[-1] - time[0] > _LOST * usual * len(time):
+        raise GapLogError(
+            f"Field 'time' has a pause of {step.max():.4g} s after sample {int(step.argmax())} {which}, where "
+            f"{usual:.4g} s is usual: make two episodes of it."
+        )
+
+
+def _require(value: object, limit: str, name: str, advice: str = "") -> None:
+    try:
+        require(value, limit, name, advice)
+    except ValueError as error:
+        raise GapLogError(str(error)) from None
 
 
 def _validate_meta(log: GapLog) -> None:
@@ -254,18 +283,20 @@ def _validate_meta(log: GapLog) -> None:
     if not isinstance(meta, dict):
         raise GapLogError(f"Field 'meta' is a {type(meta).__name__}, expected a JSON object.")
     if "schema" in meta and meta["schema"] != SCHEMA:
-        raise GapLogError(f"Field 'meta.schema' is {meta['schema']!r}, expected {SCHEMA!r}.")
+        raise GapLogError(f"Field 'meta.schema' is {shown(meta['schema'])}, expected {SCHEMA!r}.")
     for name in _META_FIELDS:
         if name not in meta:
             raise GapLogError(f"Field 'meta.{name}' is missing.")
-    _check_numbers("cable", meta["cable"], _CABLE_POSITIVE, _CABLE_NOT_NEGATIVE)
-    if meta["table"] is not None:
-        _check_numbers("table", meta["table"], (), ("friction_coefficient",))
     points, grippers = log.keypoints.shape[2], log.gripper_pose.shape[2]
+    _check_cable(meta, points)
     for name, length in (("gravity_m_per_s2", 3), ("keypoint_arclength_m", points)):
         value = meta[name]
-        if not isinstance(value, list) or len(value) != length or not all(_is_number(entry) for entry in value):
-            raise GapLogError(f"Field 'meta.{name}' is {value!r}, expected {length} finite numbers.")
+        if not isinstance(value, list) or len(value) != length or not all(v in LIMITS["finite"] for v in value):
+            raise GapLogError(f"Field 'meta.{name}' is {shown(value)}, expected {length} finite numbers.")
+    gravity = meta["gravity_m_per_s2"]
+    _require(math.hypot(*gravity), "gravity", "The magnitude of field 'meta.gravity_m_per_s2'")
+    if log.keypoints.shape[3] == 2 and gravity[2] > 0:
+        raise GapLogError(f"Field 'meta.gravity_m_per_s2' is {gravity}: off the table, expected the third negative.")
     marks, cable_length = np.asarray(meta["keypoint_arclength_m"], float), float(meta["cable"]["length_m"])
     if (np.diff(marks) <= 0).any():
         raise GapLogError("Field 'meta.keypoint_arclength_m' does not increase.")
@@ -277,23 +308,19 @@ def _validate_meta(log: GapLog) -> None:
     for name, length in (("grasp", grippers), ("motion", len(log.episode_length))):
         value = meta[name]
         if not isinstance(value, list) or len(value) != length or not all(isinstance(entry, str) for entry in value):
-            raise GapLogError(f"Field 'meta.{name}' is {value!r}, expected {length} strings.")
+            raise GapLogError(f"Field 'meta.{name}' is {shown(value)}, expected {length} strings.")
     if not isinstance(meta["source"], str):
-        raise GapLogError(f"Field 'meta.source' is {meta['source']!r}, expected text.")
+        raise GapLogError(f"Field 'meta.source' is {shown(meta['source'])}, expected text.")
 
 
-def _check_numbers(group: str, value: Any, positive: Sequence[str], not_negative: Sequence[str]) -> None:
-    names = (*positive, *not_negative)
-    if not isinstance(value, dict):
-        raise GapLogError(f"Field 'meta.{group}' is {value!r}, expected an object with {', '.join(names)}.")
-    for name in names:
-        if name not in value:
-            raise GapLogError(f"Field 'meta.{group}.{name}' is missing.")
-        least = "> 0" if name in positive else ">= 0"
-        if not _is_number(value[name]) or value[name] < 0 or (value[name] == 0 and name in positive):
-            raise GapLogError(f"Field 'meta.{group}.{name}' is {value[name]!r}, expected a finite number {least}.")
-
-
-def _is_number(value: Any) -> bool:
-    # an integer may be larger than any float
-    return isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) < 1e300
+def _check_cable(meta: dict[str, Any], points: int) -> None:
+    """Raises unless the cable and its table could exist."""
+    cable, table = meta["cable"], {"friction_coefficient": 0.0} if meta["table"] is None else meta["table"]
+    for name, value in (("cable", cable), ("table", table)):
+        if not isinstance(value, dict):
+            raise GapLogError(f"Field 'meta.{name}' is {shown(value)}, expected an object.")
+    known = {key: value for key, value in {**cable, **table}.items() if key in NUMBERS}
+    try:
+        cable_from_fields({**known, "keypoints": points}, "Field 'meta.cable' or 'meta.table'")
+    except ValueError as error:
+        raise GapLogError(str(error)) from None

@@ -81,8 +81,9 @@ LIMITS: Mapping[str, Limit] = MappingProxyType(
         # a recording
         "recorded_length": Limit(0.05, 20.0, "m"),
         "sample_interval": Limit(1e-4, 1.0, "s"),
+        "coordinate": Limit(0.0, 1e4, "m or rad"),
+        "speed": Limit(0.0, 1e3, "m/s or rad/s"),
         "duration": Limit(0.0, 1e4, "s"),
-        "gripper_angle": Limit(-1000 * math.pi, 1000 * math.pi, "rad"),
         # a target
         "target_angle": Limit(-4 * math.pi, 4 * math.pi, "rad"),
         "target_distance": Limit(0.0, 10.0, "lengths of the cable"),

@@ -1,4 +1,4 @@
-"""Reads and writes text, JSON and TOML files; writes are atomic, and what cannot be read raises an error that names it."""
+"""Reads and writes text, JSON and TOML files; writes are atomic, and errors name the file."""
 
 from __future__ import annotations
 

@@ -79,8 +79,8 @@ def _takes(path: pathlib.Path, how: Layout) -> tuple[Take, ...]:
 def _read(path: pathlib.Path) -> dict[str, list[str]]:
     try:
         rows = [row for row in csv.reader(io.StringIO(read_text(path), newline="")) if row]
-    except csv.Error as error:
-        raise ValueError(f"{path} is no csv: {error}.") from None
+    except (csv.Error, FileNotFoundError) as error:
+        raise ValueError(f"{path} could not be read as csv: {error}") from None
     if len(rows) < 3:
         raise ValueError(f"{path} has {len(rows)} rows, expected a header and at least two samples.")
     header = [name.strip() for name in rows[0]]
@@ -108,7 +108,7 @@ def _numbers(path: pathlib.Path, columns: dict[str, list[str]], names: list[str]
             try:
                 values[row, place] = np.nan if cell in _EMPTY else float(cell)
             except ValueError:
-                raise ValueError(f"{path}, line {row + 2}: column {shown(name)} is {shown(cell)}, expected a number.") from None
+                raise ValueError(f"{path}, line {row + 2}: column {shown(name)} is {shown(cell)}, no number.") from None
     return values
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from cablejax.cable import Cable
-from cablejax.cable_length import require_long_enough
+from cablejax.cable_length import require_fitting_length
 from cablejax.gaplog import Episode, gap_log_from_episodes
 from cablejax.npz import read_npz
 from cablejax.recordings.poses import poses_from_markers
@@ -91,7 +91,7 @@ def wire_log(wire: HangingWire) -> GapLog:
         ValueError: the wire is shorter than its points are apart.
     """
     repeats, count, _ = wire.keypoints.shape
-    require_long_enough(
+    require_fitting_length(
         [points[None] for points in wire.keypoints], np.linspace(0.0, wire.length, count), f"length_m, for {wire.name},"
     )
     cable = Cable(
