@@ -165,6 +165,8 @@ def config_from_json(cls: type, value: Mapping[str, Any]) -> Any:
     Raises:
         ValueError: the record has a field that this version does not know; the message names it.
     """
+    if not isinstance(value, Mapping):
+        raise ValueError(f"The recorded {cls.__name__} is {shown(value)}, expected an object.")
     hints = typing.get_type_hints(cls)
     unknown = sorted(set(value) - {field.name for field in dataclasses.fields(cls)})
     if unknown:
@@ -172,7 +174,10 @@ def config_from_json(cls: type, value: Mapping[str, Any]) -> Any:
             f"The recorded {cls.__name__} has the unknown {', '.join(unknown)}: another version of cablejax wrote it. "
             "Read it with that version, or make the data set again."
         )
-    return cls(**{name: _decode(hints[name], item) for name, item in value.items()})
+    try:
+        return cls(**{name: _decode(hints[name], item) for name, item in value.items()})
+    except (TypeError, AttributeError) as error:
+        raise ValueError(f"The recorded {cls.__name__} has a value of another type: {error}.") from error
 
 
 def _decode(hint: Any, value: Any) -> Any:
