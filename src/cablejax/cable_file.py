@@ -111,7 +111,7 @@ def cable_from_fields(fields: Mapping[str, Any], where: str) -> Cable:
         if key not in fields and key not in _OPTIONAL:
             raise ValueError(f"{where} lacks {key}, the {what}. Add `{key} = ...`.")
         value = fields.get(key, _OPTIONAL.get(key))
-        require(value, name, f"{where}: {key}", f"It is the {what}: check its unit.")
+        require(value, name, f"{where}: {key}", f"Check its unit ({what}).")
         values[name] = float(value)
     values |= _keypoints(fields, where)
     if "grasp" in fields:

@@ -87,7 +87,8 @@ LIMITS: Mapping[str, Limit] = MappingProxyType(
         # a target
         "target_angle": Limit(-4 * math.pi, 4 * math.pi, "rad"),
         "target_distance": Limit(0.0, 10.0, "lengths of the cable"),
-        # a command
+        # a controller and a command
+        "horizon": Limit(0, 1000, whole=True),
         "seed": Limit(0, 2**32 - 1, whole=True),
         "count": Limit(1, 1_000_000, whole=True),
         "count_from_zero": Limit(0, 1_000_000, whole=True),

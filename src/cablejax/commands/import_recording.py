@@ -37,7 +37,7 @@ class _Import(Command, abc.ABC):
     def execute(self):
         from cablejax.gaplog import write_gap_log
 
-        if self.out.suffix != ".npz":
+        if self.out.suffix.lower() != ".npz":
             raise UsageError(f"--out is {self.out}, expected a file name that ends in .npz.")
         logs = self.logs()
         for path, _, _ in logs:

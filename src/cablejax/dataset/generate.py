@@ -34,6 +34,9 @@ MAX_ATTEMPTS = 10
 GRASP_TOLERANCE = 1e-2
 """Largest distance of an end keypoint from its gripper [m]: a cable that snaps through pulls its ends off a bit."""
 
+WRITER = ".writer-"
+"""A folder of this name in the store, with its share after it, is locked by each process that writes there."""
+
 STRETCH_TOLERANCE = 0.01
 """Largest excess of the chord between neighbouring keypoints over the arc length between them, relative."""
 
@@ -134,7 +137,7 @@ def generate(
     done: list[int] = []
     total = sum(len(config.shard_rows(shard)) for shard in mine)
     label = "trajectories" if count == 1 else f"trajectories ({index + 1}/{count})"
-    writer = store.path / f".writer-{index}-of-{count}"
+    writer = store.path / f"{WRITER}{index}-of-{count}"
     writer.mkdir(exist_ok=True)
     with sole_writer(writer), tqdm(total=total, desc=label, unit="traj", disable=not progress) as bar:
 

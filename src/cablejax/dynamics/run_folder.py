@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from cablejax.text_file import read_json, write_json
+from cablejax.whole_file import sole_writer
 
 RUN, CHECKPOINTS, METRICS, BOARD = "run.json", "checkpoints", "metrics.csv", "tensorboard"
 
@@ -84,9 +85,10 @@ def _read(path: Path) -> dict[str, Any]:
 def _discard(out_dir: Path) -> None:
     """Deletes what a training wrote, its name last: until then it can be deleted again."""
     checkpoints, board = out_dir / CHECKPOINTS, out_dir / BOARD
-    for step in checkpoints.glob("[0-9]*"):
-        shutil.rmtree(step)
-    for events in board.glob("events.*"):
-        events.unlink()
-    for name in (METRICS, *_RESULTS, RUN):
-        (out_dir / name).unlink(missing_ok=True)
+    with sole_writer(out_dir):
+        for step in checkpoints.glob("[0-9]*"):
+            shutil.rmtree(step)
+        for events in board.glob("events.*"):
+            events.unlink()
+        for name in (METRICS, *_RESULTS, RUN):
+            (out_dir / name).unlink(missing_ok=True)

@@ -39,6 +39,7 @@ from cablejax.dynamics.symmetry import initially_symmetric, symmetrised
 from cablejax.dynamics.train_config import Phase, TrainConfig
 from cablejax.interrupts import saving, unless
 from cablejax.types import Trajectory
+from cablejax.whole_file import sole_writer
 
 
 class DivergedError(ValueError):
@@ -109,7 +110,8 @@ def train(
         progress: show a progress bar with remaining time.
 
     Raises:
-        ValueError: bad data, or `out_dir` holds a run of another configuration or data, or something else.
+        ValueError: bad data, or `out_dir` holds a run of another configuration or data, or something else, or another
+            process trains there.
         DivergedError: the loss is no longer finite.
     """
     check_trajectories(data, config.model, steps=config.longest_rollout, what="training data")
@@ -134,7 +136,7 @@ def train(
     columns = ("phase", "learning_rate", "loss", "gradient_norm", *(f"open_loop_{h}_cm" for h in HORIZONS), "seconds")
 
     scores: dict[int, float] = {}
-    with Checkpoints(out_dir / CHECKPOINTS) as checkpoints, interrupt_flag() as interrupted:
+    with sole_writer(out_dir), Checkpoints(out_dir / CHECKPOINTS) as checkpoints, interrupt_flag() as interrupted:
         if checkpoints.latest() is not None:
             state = checkpoints.restore(state, report=functools.partial(tqdm.write, file=sys.stderr))
         step, total = int(state.step), config.total_steps

@@ -92,9 +92,9 @@ def read_deform(path: str | os.PathLike[str]) -> DeformRecordings:
     path = pathlib.Path(path)
     if path.is_dir():
         return _read_pickles(path, sorted([*path.glob("*.pkl"), *path.glob("*/*.pkl")]))
-    if path.suffix == ".npz":
+    if path.suffix.lower() == ".npz":
         return _read_npz(path)
-    if path.suffix in (".pkl", ".pickle"):
+    if path.suffix.lower() in (".pkl", ".pickle"):
         return _read_pickles(path, [path])
     raise ValueError(f"{path} is not what was expected: an .npz file, a .pkl file, or a folder of .pkl files.")
 
