@@ -150,7 +150,7 @@ def read_gap_log(path: str | os.PathLike) -> GapLog:
         FileNotFoundError: there is no such file.
     """
     try:
-        fields = read_npz(path, [*(name for name in DTYPES if name != "hold"), "meta"], ["hold"])
+        fields = read_npz(path, [*(name for name in DTYPES if name != "hold"), "meta"], ["hold"], text=["meta"])
     except NpzError as error:
         raise GapLogError(f"{error} Expected a gap log ({SCHEMA}).") from error
     try:

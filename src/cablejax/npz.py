@@ -28,14 +28,15 @@ class NpzError(ValueError):
 
 
 def read_npz(
-    path: str | os.PathLike[str], required: Sequence[str], optional: Sequence[str] = ()
+    path: str | os.PathLike[str], required: Sequence[str], optional: Sequence[str] = (), *, text: Sequence[str] = ()
 ) -> dict[str, np.ndarray]:
-    """The named arrays of an `.npz` file, of real numbers, truth values or text. What else it holds is not looked at.
+    """The named arrays of an `.npz` file. What else it holds is not looked at.
 
     Args:
         path: the file.
         required: names of arrays that must be there.
         optional: names of arrays that are read where they are there.
+        text: those of both that may hold text; all others hold real numbers or truth values.
 
     Raises:
         NpzError: the file is no `.npz`, cannot be read, is too large when decompressed, lacks a required array, or
@@ -58,9 +59,10 @@ def read_npz(
         raise NpzError(f"{path} could not be read: {_reason(error)}") from error
     for name, array in arrays.items():
         # a member that is no array comes as its bytes
-        if not isinstance(array, np.ndarray) or array.dtype.kind not in "biufUS":
-            came = f"{array.dtype} values" if isinstance(array, np.ndarray) else "no array"
-            raise NpzError(f"{path} holds {came} under {name}, expected an array of real numbers or text.")
+        if not isinstance(array, np.ndarray) or array.dtype.kind not in ("biufU" if name in text else "biuf"):
+            came = f"values of type {array.dtype}" if isinstance(array, np.ndarray) else "no array"
+            expected = "real numbers or text" if name in text else "real numbers"
+            raise NpzError(f"{path} holds {came} under {name}, expected an array of {expected}.")
     if missing := [name for name in required if name not in arrays]:
         raise NpzError(f"{path} lacks {', '.join(missing)}, it has {', '.join(there) or 'nothing'}.")
     return arrays

@@ -10,6 +10,7 @@ from typing import Annotated, get_args
 from tyro.conf import subcommand
 
 from cablejax.commands.options import Command, UsageError, say, text_table
+from cablejax.limits import require
 from cablejax.solver_names import SolverName
 
 

@@ -77,7 +77,7 @@ class Parts:
     def load(self, name: str) -> ClosedLoopRun | None:
         """A run that was kept; None where there is none, or a damaged one, which has to be made again."""
         try:
-            arrays = read_npz(self.folder / f"{name}{_RUN}", ["text"], _FIELDS)
+            arrays = read_npz(self.folder / f"{name}{_RUN}", ["text"], _FIELDS, text=["text"])
             fields: dict[str, Any] = {**parse_json(str(arrays.pop("text"))), **arrays}
             nested = {
                 group: cls(**{f.name: fields.pop(f"{group}.{f.name}") for f in dataclasses.fields(cls)})

@@ -59,7 +59,7 @@ def _recorded(path: Path, mode: Literal["r", "r+"]) -> Store:
         raise ValueError(f"{path} holds no data set (no zarr.json). Generate one there, or give another folder.")
     try:
         group = zarr.open_group(path, mode=mode)
-        attributes: dict[str, Any] = read_json(path / "zarr.json")["attributes"]
+        attributes: dict[str, Any] = dict(read_json(path / "zarr.json")["attributes"])
     except Exception as error:  # zarr raises what its parts raise
         raise ValueError(f"The data set {path} is damaged: {_reason(error)}. Generate it again elsewhere.") from error
     if attributes.get("schema") != SCHEMA:

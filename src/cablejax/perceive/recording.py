@@ -9,7 +9,7 @@ import pathlib
 import numpy as np
 from jaxtyping import Float
 
-from cablejax.limits import shown
+from cablejax.limits import require, shown
 from cablejax.npz import read_npz
 from cablejax.perceive.pcd import read_pcd
 from cablejax.text_file import read_text
@@ -24,7 +24,7 @@ class CloudSequence:
 
     Attributes:
         time: [s], increasing, shape [T].
-        clouds: T arrays [m], shape [S, 2 or 3]; S varies and may be 0, NaN = no measurement.
+        clouds: T arrays [m], shape [S, 2 or 3]; S varies and may be 0, NaN or infinite = no measurement.
         gripper_pose: (x, y, theta) [m, rad], shape [T, Q, 3].
     """
 
@@ -52,6 +52,10 @@ class CloudSequence:
                     f"The cloud of frame {frame} has shape {cloud.shape} and type {cloud.dtype}, expected floating "
                     "point numbers of shape [S, 2] or [S, 3]."
                 )
+            farthest = float(np.abs(cloud[np.isfinite(cloud)]).max(initial=0.0))
+            require(farthest, "coordinate", f"The farthest point of frame {frame}")
+        require(float(np.abs(self.gripper_pose).max()), "coordinate", "The largest entry of the gripper poses")
+        require(float(np.abs(self.time).max()), "finite", "The largest time")
         if not any(np.isfinite(cloud).all(axis=1).any() for cloud in self.clouds):
             raise ValueError("No cloud of the sequence has a point with finite coordinates: there is nothing to see.")
 

@@ -100,7 +100,10 @@ def read_deform(path: str | os.PathLike[str]) -> DeformRecordings:
 
 
 def _read_npz(path: pathlib.Path) -> DeformRecordings:
-    arrays = read_npz(path, ["keypoints", "dt", "split", "source_id", "recording_guess"])
+    arrays = read_npz(path, ["keypoints", "dt", "split", "source_id", "recording_guess"], text=["split"])
+    for name in ("source_id", "recording_guess"):
+        if not np.issubdtype(arrays[name].dtype, np.integer):
+            raise ValueError(f"{path}: {name} is {arrays[name].dtype}, expected whole numbers.")
     if not np.issubdtype(arrays["keypoints"].dtype, np.floating):
         raise ValueError(f"{path}: keypoints is {arrays['keypoints'].dtype}, expected floating point numbers.")
     if arrays["dt"].size != 1:

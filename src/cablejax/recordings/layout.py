@@ -110,7 +110,7 @@ def read_layout(path: str | os.PathLike[str], place: str) -> Layout:
         raise ValueError(f"This is no layout: {error} docs/recordings.md has one.") from None
     if unknown := set(values) - {"cable", "table", "frame", "source", place}:
         raise ValueError(
-            f"{path} has the unknown tables {', '.join(sorted(unknown))}, expected [cable], [table], [frame], [source] "
+            f"{path} has the unknown tables {shown(sorted(unknown))}, expected [cable], [table], [frame], [source] "
             f"and [{place}]."
         )
     if place not in values:

@@ -65,9 +65,6 @@ def prepare(takes: tuple[Take, ...], setup: Setup) -> tuple[tuple[Take, ...], li
             f"The takes have keypoints of the shapes {', '.join(map(str, shapes))}, expected one shape with at least "
             "three keypoints, or five if the first two and the last two are on the grippers."
         )
-    for take in takes:
-        if np.isinf(take.keypoints).any():
-            raise ValueError(f"Take {take.name} has infinite positions; a keypoint that was not observed is NaN.")
     if all(len(take.time) > 1 and _frozen(take.keypoints) for take in takes):
         raise ValueError(
             "All samples have the same keypoints to the last digit, which no tracker measures: expected a recording of "

@@ -95,7 +95,7 @@ def _read(path: pathlib.Path) -> dict[str, list[str]]:
 
 def _column(path: pathlib.Path, columns: dict[str, list[str]], name: str) -> list[str]:
     if name not in columns:
-        known = ", ".join(list(columns)[:12]) + (", ..." if len(columns) > 12 else "")
+        known = shown(", ".join(columns))
         raise ValueError(f"{path} has no column {shown(name)}; it has {known}. Correct the name in the layout.")
     return columns[name]
 

@@ -55,7 +55,7 @@ def read_wires(path: str | os.PathLike[str]) -> tuple[HangingWire, ...]:
         FileNotFoundError: there is none.
     """
     path = pathlib.Path(path)
-    arrays = read_npz(path, _FIELDS)
+    arrays = read_npz(path, _FIELDS, text=["wire"])
     points = arrays["keypoints"]
     count = points.shape[:2]
     shapes = {"wire": count[:1], "length_m": (), "mass_per_length_kg_m": count[:1], "EI_published_Nm2": count}
