@@ -238,7 +238,6 @@ def store_files(folder, edit):
     else:
         file = files[which % len(files)]
         file.write_bytes(edges.edited_bytes(file.read_bytes(), raw))
-    command("cable", "--from", path)
     read = answer(lambda: open_store(path).read())
     again = answer(lambda: stores.complete(open_or_create(path, stores.SMALL)))
     if again is not None:  # the same generation mends what it does not refuse
@@ -330,19 +329,19 @@ EDGES = {
     "log bytes": Edge(80, edges.BYTES, diagnose_bytes),
     "cable file": Edge(180, edges.WORDS, cable_words),
     "target npz": Edge(120, edges.ARRAYS, target_arrays),
-    "target json": Edge(120, edges.TREE, target_json),
+    "target json": Edge(160, edges.TREE, target_json),
     "target csv": Edge(60, edges.BYTES, target_csv),
     "csv": Edge(160, pair(pair(st.integers(0, 1), st.integers(0, 1)), edges.WORDS), import_table),
-    "deform": Edge(60, edges.ARRAYS, import_deform),
-    "pickle": Edge(40, edges.BYTES, import_pickle),
+    "deform": Edge(80, edges.ARRAYS, import_deform),
+    "pickle": Edge(60, edges.BYTES, import_pickle),
     "wires": Edge(60, edges.ARRAYS, import_wires),
     "bag": Edge(30, edges.BYTES, import_bag),
-    "cloud npz": Edge(100, edges.ARRAYS, cloud_arrays),
+    "cloud npz": Edge(120, edges.ARRAYS, cloud_arrays),
     "cloud folder": Edge(120, pair(st.sampled_from(("ascii", "binary")), edges.WORDS), cloud_folder),
-    "store": Edge(120, pair(st.integers(0, 100), edges.TREE, st.none() | edges.BYTES), store_files),
+    "store": Edge(60, pair(st.integers(0, 100), edges.TREE, st.none() | edges.BYTES), store_files),
     "weights": Edge(60, pair(edges.TREE, st.none() | edges.BYTES), weights_file),
-    "verdict": Edge(100, edges.TREE, verdict_file),
-    "kept": Edge(50, pair(st.integers(0, 2), edges.BYTES), kept_files),
+    "verdict": Edge(120, edges.TREE, verdict_file),
+    "kept": Edge(60, pair(st.integers(0, 2), edges.BYTES), kept_files),
     "options": Edge(
         120,
         pair(

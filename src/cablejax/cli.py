@@ -22,6 +22,7 @@ from cablejax.commands.simulate import Simulate
 from cablejax.commands.train import Train
 from cablejax.compiled_programs import keep_compiled_programs
 from cablejax.interrupts import INTERRUPTED, answered
+from cablejax.whole_file import DRAFT
 
 USER_ERROR = 2
 """Exit code for input that cannot be used."""
@@ -89,7 +90,8 @@ def _run(given: list[str]) -> int:
     except BrokenPipeError:
         raise
     except OSError as error:
-        what = f"{error.filename}: {error.strerror}." if error.filename and error.strerror else f"{error}"
+        where = str(error.filename or "").removesuffix(DRAFT)
+        what = f"{where}: {error.strerror}." if where and error.strerror else error.strerror or f"{error}"
         print(f"cablejax: {what}", file=sys.stderr)
         return USER_ERROR
     except ValueError as error:

@@ -165,24 +165,28 @@ def _draft(path: Path, config: DatasetConfig, versions: dict[str, str]) -> Path:
     path.parent.mkdir(parents=True, exist_ok=True)
     draft = path.parent / f".{path.name}.{os.getpid()}.draft"
     shutil.rmtree(draft, ignore_errors=True)
-    group = zarr.create_group(
-        draft,
-        attributes={
-            "schema": SCHEMA,
-            "config": config_to_json(config),
-            "config_digest": digest_of_config(config_to_json(config)),
-            "versions": versions,
-            "parameters": list(PARAMETERS),
-        },
-    )
-    for name, (shape, dtype) in _arrays(config).items():
-        per_trajectory = dtype == "float32"  # the small arrays are one plain chunk per shard
-        group.create_array(
-            name,
-            shape=(config.n_trajectories, *shape),
-            dtype=dtype,
-            chunks=(1 if per_trajectory else config.shard_size, *shape),
-            shards=(config.shard_size, *shape) if per_trajectory else None,
-            fill_value=0,
+    try:
+        group = zarr.create_group(
+            draft,
+            attributes={
+                "schema": SCHEMA,
+                "config": config_to_json(config),
+                "config_digest": digest_of_config(config_to_json(config)),
+                "versions": versions,
+                "parameters": list(PARAMETERS),
+            },
         )
+        for name, (shape, dtype) in _arrays(config).items():
+            per_trajectory = dtype == "float32"  # the small arrays are one plain chunk per shard
+            group.create_array(
+                name,
+                shape=(config.n_trajectories, *shape),
+                dtype=dtype,
+                chunks=(1 if per_trajectory else config.shard_size, *shape),
+                shards=(config.shard_size, *shape) if per_trajectory else None,
+                fill_value=0,
+            )
+    except BaseException:  # a full disk
+        shutil.rmtree(draft, ignore_errors=True)
+        raise
     return draft
