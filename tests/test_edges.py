@@ -288,16 +288,17 @@ def kept_files(folder, edit):
 
 
 OPTIONS = {
-    "simulate": "--trajectories --steps --max-amplification --links --seed --stiffness-range --effect --cable --with --out --process-count --process-index --device",
+    "simulate": "--trajectories --steps --max-amplification --links --seed --stiffness-range --effect --cable --with "
+    "--out --process-count --process-index --device",
     "train": "--lr --held-out --steps --batch --latent --message-passing --pretrain --seed --start-from",
     "shape": "--steps --noise-mm --links --seed --target --weights --plant-effect --cable --solver",
     "cable": "--from --out --seed",
     "bench simulate": "--batch --seconds --rounds --threads --links",
 }
 WORDS = (
-    "0", "-1", "1", "99999999999999999999", "9" * 5000, "1e308", "-1e30", "1e-30", "nan", "inf", "", "x", "1.5", "/dev/zero",
-    "/", "a.npz", "a.toml", "none:", "bending_stiffness:ratio=1e308", "bending_stiffness:ratio=nan", "bending_stiffness",
-    ":=,", "\udc80", "cpu", "--",
+    "0", "-1", "1", "99999999999999999999", "9" * 5000, "1e308", "-1e30", "1e-30", "nan", "inf", "", "x", "1.5",
+    "/dev/zero", "/", "a.npz", "a.toml", "none:", "bending_stiffness:ratio=1e308", "bending_stiffness:ratio=nan",
+    "bending_stiffness", ":=,", "\udc80", "cpu", "--",
 )  # fmt: skip
 
 

@@ -121,6 +121,10 @@ def test_a_table_seen_from_above_with_measured_grippers(tmp_path):
         ('time_unit = "ms"', 'time_unit = "min"', "time_unit is 'min'"),
         ("diameter_m = 0.006", "diameter_m = -1", "expected a number from 1e-06 to 1 m"),
         ("diameter_m = 0.006", "diameter_m = inf", "expected a number from 1e-06 to 1 m"),
+        ('time_unit = "ms"', "", "usual time between samples of episode 0 is 10.0, expected .* unit of time"),
+        ("diameter_m = 0.006", f"diameter_m = 0.006\nkeypoint_arclength_m = {list(range(9))}", "gives it 8 m: correct"),
+        ("diameter_m = 0.006", f"diameter_m = {10**50}", "diameter_m is an integer of 167 bits"),
+        ("count = 9", "count = 100000000", "count is 100000000, expected a whole number from 2 to 1000"),
         ("diameter_m = 0.006", "", r"\[cable\] lacks diameter_m"),
         ("diameter_m = 0.006", "diameter_m = 0.006\nkeypoint_arclength_m = [0, 1]", "expected 9 increasing numbers"),
         ("[cable]", "[cables]", "unknown tables .*cables"),
@@ -151,6 +155,21 @@ def test_a_wrong_table_is_reported(tmp_path, change, message):
     path.write_text(change(path.read_text()))
     with pytest.raises(ValueError, match=message):
         import_csv(path, layout)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda values: np.full_like(values, values[0]), "the same keypoints to the last digit"),
+        (lambda values: values * np.linspace(1.0, 1.5, len(values)), "a cable does not stretch so far"),
+        (lambda values: 1e30 * values, "largest entry of keypoints is .*, expected a number"),
+    ],
+    ids=["frozen", "stretched", "huge"],
+)
+def test_what_no_cable_does_is_refused(tmp_path, change, message):
+    table = {name: values if name == "t" else change(values) for name, values in in_space().items()}
+    with pytest.raises(ValueError, match=message):
+        import_csv(*written(tmp_path, table, PAIRS))
 
 
 def test_a_quaternion_in_the_wrong_columns_is_reported(tmp_path):

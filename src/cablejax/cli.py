@@ -59,7 +59,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     given = sys.argv[1:] if arguments is None else list(arguments)
     try:
         try:
-            return _run(given)
+            code = _run(given)
+        except KeyboardInterrupt as interrupt:
+            print(f"\ncablejax: {interrupt or 'Interrupted.'}", file=sys.stderr)
+            code = INTERRUPTED
         finally:
             sys.stdout.flush()
     except BrokenPipeError:
@@ -67,6 +70,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         with open(os.devnull, "w") as nowhere:
             os.dup2(nowhere.fileno(), sys.stdout.fileno())
         return CLOSED
+    if code == INTERRUPTED and arguments is None:
+        # what was interrupted may still run in another thread, and Python would wait for it, or crash
+        sys.stderr.flush()
+        os._exit(code)
+    return code
 
 
 def _run(given: list[str]) -> int:
@@ -83,7 +91,7 @@ def _run(given: list[str]) -> int:
     if not isinstance(command, Bench):  # which times compilations too
         keep_compiled_programs()
     command = command.what if isinstance(command, (Bench, Import)) else command
-    hint = f"cablejax: Interrupted. {command.resume_hint}"
+    hint = f"Interrupted. {command.resume_hint}"
     try:
         with answered(hint):
             command.run()
@@ -101,6 +109,5 @@ def _run(given: list[str]) -> int:
         print("cablejax: There is not enough memory for this input: give a smaller one.", file=sys.stderr)
         return USER_ERROR
     except KeyboardInterrupt as interrupt:
-        print(f"\n{f'cablejax: {interrupt}' if str(interrupt) else hint}", file=sys.stderr)
-        return INTERRUPTED
+        raise KeyboardInterrupt(str(interrupt) or hint) from interrupt
     return 0

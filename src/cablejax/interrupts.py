@@ -6,11 +6,9 @@ of this package is written whole or not at all, so that the process may end at a
 
 from __future__ import annotations
 
-import atexit
 import contextlib
 import os
 import signal
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -47,7 +45,7 @@ def answered(message: str) -> Iterator[None]:
                 while _saving.is_set() and time.monotonic() < deadline:
                     time.sleep(0.05)
                 if not left.wait(0.1):
-                    os.write(2, f"\n{message}\n".encode())
+                    os.write(2, f"\ncablejax: {message}\n".encode())
                     os._exit(INTERRUPTED)
 
     before = signal.set_wakeup_fd(signalled, warn_on_full_buffer=False)
@@ -85,8 +83,6 @@ def unless(event: threading.Event, compute: Callable[[], _T]) -> _T | None:
         thread.join(0.05)
     if errors:
         raise errors[0]
-    if not results:
-        atexit.register(_leave, thread)
     return results[0] if results else None
 
 
@@ -98,11 +94,3 @@ def saving() -> Iterator[None]:
         yield
     finally:
         _saving.clear()
-
-
-def _leave(thread: threading.Thread) -> None:
-    """Ends the process without waiting for an abandoned computation."""
-    if thread.is_alive():
-        sys.stdout.flush()
-        sys.stderr.flush()
-        os._exit(INTERRUPTED)
