@@ -9,7 +9,6 @@ from typing import ClassVar, Literal
 import tyro
 
 from cablejax.commands.options import Command, UsageError, text_table
-from cablejax.limits import require
 from cablejax.solver_names import SolverName
 
 PLANT_EFFECT = "bending_stiffness:ratio=2"
@@ -82,7 +81,6 @@ class Shape(Command):
         texts = (PLANT_EFFECT,) if not self.plant_effect else () if "none" in self.plant_effect else self.plant_effect
         cloud = self.perception == "cloud"
         noise_mm = (2.0 if cloud else 0.0) if self.noise_mm is None else self.noise_mm
-        require(1e-3 * noise_mm, "noise", "--noise-mm, a thousandth of it,")
         model = load_model(self.weights)
         cable = model.cable if self.cable is None else find_cable(self.cable)
         plant = plant_of(
