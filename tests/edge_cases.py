@@ -113,16 +113,16 @@ def edited_tree(tree: Any, edits) -> Any:
     for place, kind, value in edits:
         places = list(_places(tree))
         if not places:
-            return VALUES[value]
+            return copy.deepcopy(VALUES[value])
         holder, key = places[place % len(places)]
         if kind == "put":
-            holder[key] = VALUES[value]
+            holder[key] = copy.deepcopy(VALUES[value])
         elif kind == "drop":
             del holder[key]
         elif isinstance(holder, dict):
-            holder[f"{key}x"] = VALUES[value]
+            holder[f"{key}x"] = copy.deepcopy(VALUES[value])
         else:
-            holder.append(VALUES[value])
+            holder.append(copy.deepcopy(VALUES[value]))
     return tree
 
 
@@ -169,7 +169,7 @@ def _changed(array: np.ndarray, kind: str, place: int) -> np.ndarray:
         "objects": lambda: np.array([{}, None], object),
         "turned": lambda: array.T,
         "flat": lambda: array.reshape(-1),
-        "small": lambda: filled.clip(-100, 100).astype(np.int8),
+        "small": lambda: np.nan_to_num(filled).clip(-100, 100).astype(np.int8),
         "scalar": lambda: np.array(3.0),
         "twice": lambda: np.concatenate([array, array]) if array.ndim else np.stack([array, array]),
         "backwards": lambda: array[::-1] if array.ndim else array,

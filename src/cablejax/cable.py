@@ -11,7 +11,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from cablejax.limits import LIMITS, check
+from cablejax.limits import LIMITS, check, shown
 
 GRAVITY = 9.81
 """Magnitude of gravity [m/s^2]."""
@@ -67,7 +67,7 @@ class Cable:
                 "than it is thick."
             )
         if tuple(self.grasp) != ("clamped", "clamped"):
-            raise ValueError(f'Cable.grasp is {self.grasp}, expected ("clamped", "clamped"), the only grasp simulated.')
+            raise ValueError(f'Cable.grasp is {shown(self.grasp)}, expected ("clamped", "clamped"), the only grasp simulated.')
         self._check_marks()
 
     def _check_marks(self) -> None:

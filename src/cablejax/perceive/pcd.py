@@ -7,6 +7,7 @@ import pathlib
 import numpy as np
 from jaxtyping import Float
 
+from cablejax.limits import shown
 from cablejax.text_file import read_bytes
 
 _KINDS = {"F": "f", "I": "i", "U": "u"}
@@ -56,7 +57,7 @@ def read_pcd(path: pathlib.Path) -> Float[np.ndarray, "S 3"]:
         try:
             values = [[float(row[column[names.index(axis)]]) for axis in "xyz"] for row in rows[:points]]
         except ValueError as error:
-            raise ValueError(f"{path} has a point that is not a number: {error}") from None
+            raise ValueError(f"{path} has a point that is not a number: {shown(str(error))}") from None
         return np.array(values).reshape(points, 3).astype(np.float32)
     raise ValueError(
         f"{path} has DATA {encoding}, expected ascii or binary: convert it with pcl_convert_pcd_ascii_binary."

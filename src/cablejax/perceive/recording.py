@@ -130,7 +130,7 @@ def _read_folder(folder: pathlib.Path) -> CloudSequence:
     try:
         rows = np.array([[float(value) for value in line.split(",")] for line in lines])
     except ValueError as error:
-        raise ValueError(f"{poses} has a row that is not seven numbers: {error}") from None
+        raise ValueError(f"{poses} has a row that is not seven numbers: {shown(str(error))}") from None
     if rows.shape != (len(files), len(POSES_HEADER)):
         raise ValueError(
             f"{poses} has rows of shape {rows.shape}, expected {len(files)} rows of {len(POSES_HEADER)}: one per file."
