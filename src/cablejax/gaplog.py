@@ -23,6 +23,7 @@ from cablejax.types import GapLog
 from cablejax.whole_file import whole_file
 
 SCHEMA = "cablejax-gap-log/1"
+"""Format and version of a gap log."""
 
 _DTYPES = {
     "time": np.float64,

@@ -126,6 +126,7 @@ class Import:
         | Annotated[Csv, subcommand("csv")]
         | Annotated[Mcap, subcommand("mcap")]
     )
+    """Format of the recording."""
 
 
 def _summary(path: pathlib.Path, log: GapLog, repairs: Sequence[str]) -> dict[str, Any]:

@@ -15,6 +15,7 @@ from cablejax.npz import read_npz
 from cablejax.simulate.elastica import elastica
 
 Shape = Literal["U", "S", "Z"]
+"""The letters of Wang et al., RA-L 2022."""
 
 START_DISTANCE = 0.99
 """Distance between the grippers of a straight cable, in lengths."""

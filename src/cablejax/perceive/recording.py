@@ -13,7 +13,9 @@ from cablejax.npz import read_npz
 from cablejax.perceive.pcd import read_pcd
 
 POSES_FILE = "poses.csv"
+"""Name of the file with the gripper poses in a folder of PCD files."""
 POSES_HEADER = ("time", "x0", "y0", "theta0", "x1", "y1", "theta1")
+"""Its columns [s, m, rad]."""
 
 
 @dataclasses.dataclass(frozen=True)
