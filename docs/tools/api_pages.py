@@ -40,9 +40,9 @@ def api_pages(package: Path) -> dict[str, str]:
         KeyError: if `EXPLAINED` has no entry for a folder.
     """
     whole = griffe.load(package.name, search_paths=[package.parent])
-    inner = {name: room for name, room in sorted(whole.modules.items()) if room.is_subpackage}
+    inner = {room.name: room for room in _inside(whole) if room.is_subpackage}
     pages = {f"api/{name}.md": _room_page(room, list(_modules(room))) for name, room in inner.items()}
-    files = [module for name, module in sorted(whole.modules.items()) if name not in inner and name[0] != "_"]
+    files = [module for module in _inside(whole) if module.name not in inner]
     pages[f"api/{package.name}.md"] = _room_page(whole, files)
     own = f"| [`{package.name}`]({package.name}.md) | The cable, the types, the files and the command line. |"
     rows = [f"| [`{room.path}`]({name}.md) | {_summary(room)} |" for name, room in inner.items()]
@@ -51,8 +51,8 @@ def api_pages(package: Path) -> dict[str, str]:
 
 _INDEX = """# API reference
 
-Every public name of the package, from its docstring. A page for each room of the code; at the top of a page are the names
-that its room exports. Shapes are written as `[E, T, N, D]`:
+Every public name of the package, from its docstring. Each room of the code has a page; at the top of a page are the
+names that its room exports. Shapes are written as `[E, T, N, D]`:
 
 | letter | size | letter | size |
 | --- | --- | --- | --- |
@@ -76,12 +76,17 @@ def _room_page(room: griffe.Module, modules: list[griffe.Module]) -> str:
     return "\n".join([*parts, *(f"\n::: {module.path}\n" for module in [room, *modules])])
 
 
+def _inside(room: griffe.Module) -> list[griffe.Module]:
+    """The public modules of a folder; a module that is imported from elsewhere is none of them."""
+    modules = [module for _, module in sorted(room.modules.items()) if not module.is_alias]
+    return [module for module in modules if not module.name.startswith("_")]
+
+
 def _modules(room: griffe.Module) -> Iterator[griffe.Module]:
     """The public modules below a room, in the order of their names."""
-    for name, module in sorted(room.modules.items()):
-        if not name.startswith("_"):
-            yield module
-            yield from _modules(module)
+    for module in _inside(room):
+        yield module
+        yield from _modules(module)
 
 
 def _summary(one: griffe.Object) -> str:

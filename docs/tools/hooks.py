@@ -28,6 +28,7 @@ PACKAGE = ROOT / "src" / "cablejax"
 PAGES = {"README.md": "index.md", "CONTRIBUTING.md": "contributing.md", "CHANGELOG.md": "changelog.md"}
 """Files outside `docs` that are pages, by their path in the repository."""
 NOTEBOOKS = {f"notebooks/{path.name}": f"notebooks/{path.stem}.md" for path in (ROOT / "notebooks").glob("*.ipynb")}
+SHIM = "assets/iframe-worker.js"
 LINK = re.compile(r"(!?\[(?:[^\[\]]|\[[^\]]*\])*\])\(([^()#\s:]+)(#[^()\s]*)?\)")
 MERMAID = re.compile(r"```mermaid\n(.*?)```", re.DOTALL)
 FORMULA = re.compile(r'<(span|div) class="arithmatex">\\([(\[])(.*?)\\[)\]]</\1>', re.DOTALL)
@@ -78,6 +79,12 @@ def on_page_content(content: str, **_: Any) -> str:
         return latex2mathml.converter.convert(html.unescape(found[3]), display=display)
 
     return FORMULA.sub(formula, content)
+
+
+def on_post_page(output: str, page: Page, config: MkDocsConfig) -> str:
+    """Takes the one script that the theme would fetch from elsewhere, for the search in a folder, from the site itself."""
+    here = posixpath.relpath(SHIM, posixpath.dirname(page.url) or ".")
+    return output.replace("https://unpkg.com/iframe-worker/shim", here)
 
 
 def on_post_build(config: MkDocsConfig) -> None:

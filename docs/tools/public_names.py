@@ -1,8 +1,8 @@
 """Lists the public names of a package, and those without documentation, from its source alone.
 
-A name is public if neither it nor a module on its path begins with an underscore. A module, class, function or method is
-documented by its docstring. A module's variable is documented by a string below it, a field of a class by such a string
-or by an entry under "Attributes" in the class's docstring or in that of a class that it inherits from.
+A name is public if neither it nor a module on its path begins with an underscore. A module, class, function or method
+is documented by its docstring. A variable of a module is documented by a string below it; a field of a class by such a
+string, or by an entry under "Attributes" in the docstring of the class or of one that it inherits from.
 """
 
 from __future__ import annotations
@@ -89,7 +89,8 @@ def _names(owner: str, node: ast.stmt, below: ast.stmt | None, classes: dict[str
         kind = "class" if isinstance(node, ast.ClassDef) else "function"
         return [] if node.name.startswith("_") else [Name(f"{owner}.{node.name}", kind, _has_docstring(node))]
     targets = node.targets if isinstance(node, ast.Assign) else [node.target] if isinstance(node, ast.AnnAssign) else []
-    names = [target.id for target in targets if isinstance(target, ast.Name) and not target.id.startswith("_")]
+    each = [name for target in targets for name in (target.elts if isinstance(target, ast.Tuple) else [target])]
+    names = [name.id for name in each if isinstance(name, ast.Name) and not name.id.startswith("_")]
     if owner not in classes:
         return [Name(f"{owner}.{name}", "variable", _describes(below)) for name in names]
     listed = _fields(owner, classes)

@@ -33,7 +33,7 @@ class Randomisation:
     Wang et al., RA-L 2022, randomise stiffness and damping by factors of 0.1 to 3.
 
     Attributes:
-        stiffness, damping, friction: range of the factor on the bending stiffness, damping time and friction coefficient.
+        stiffness, damping, friction: range of the factor on bending stiffness, damping time and friction coefficient.
     """
 
     stiffness: tuple[float, float] | None = None

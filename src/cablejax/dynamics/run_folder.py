@@ -10,6 +10,7 @@ from typing import Any
 from cablejax.json_file import read_json, write_json
 
 RUN, CHECKPOINTS, METRICS, BOARD = "run.json", "checkpoints", "metrics.csv", "tensorboard"
+"""What a training's folder holds: its settings, checkpoints, errors by step, and curves for TensorBoard."""
 
 # What `cablejax train` adds in the end.
 _RESULTS = ("weights.safetensors", "card.md", "summary.json")

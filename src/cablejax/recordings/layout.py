@@ -1,7 +1,7 @@
 """The layout of a laboratory's own recording, read from a small TOML file.
 
 Tables `[cable]`, `[table]`, `[frame]` and `[source]` are the same for every kind of file; `[columns]` is for csv and
-`[topics]` for bags. `docs/recordings.md` has a full example of each.
+`[topics]` for bags. `docs/how_to/own_recording.md` has a full example of each.
 """
 
 from __future__ import annotations
@@ -109,7 +109,7 @@ def read_layout(path: str | os.PathLike[str], place: str) -> Layout:
         values = tomllib.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise ValueError(
-            f"The layout {path} could not be read: {error.strerror}. docs/recordings.md has one."
+            f"The layout {path} could not be read: {error.strerror}. docs/how_to/own_recording.md has one."
         ) from None
     except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
         raise ValueError(f"The layout {path} is no TOML: {error}") from None

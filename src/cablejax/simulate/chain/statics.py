@@ -46,7 +46,7 @@ class ChainMatrices(NamedTuple):
     """Constant matrices of one cable, NumPy or JAX arrays; n = LINKS, N keypoints, J = n - 1 joints.
 
     Attributes:
-        tangents_of_keypoints, tangents_of_ends: tangents at the nodes of the clamped cubic spline, shapes [n, N], [n, 2].
+        tangents_of_keypoints, tangents_of_ends: tangents at the nodes of the clamped spline, shapes [n, N], [n, 2].
         keypoints_of_nodes, keypoints_of_tangents: Hermite weights of nodes and of tangents [m], shape [N, n].
         link_lengths, node_offsets: of the links [m], and from a link's start to its node [m], shape [n].
         later: the later one of two joints, shape [J, J].
