@@ -73,7 +73,15 @@ def _room_page(room: griffe.Module, modules: list[griffe.Module]) -> str:
     if exported:
         parts += ["| name | what it is |", "| --- | --- |"]
         parts += [f"| [`{one.name}`][{one.path}] | {_summary(one)} |" for one in exported]
-    return "\n".join([*parts, *(f"\n::: {module.path}\n" for module in [room, *modules])])
+    return "\n".join([*parts, *(_directive(module) for module in [room, *modules])])
+
+
+def _directive(module: griffe.Module) -> str:
+    """What mkdocstrings replaces by the module's documentation; of a folder's, without the names that it gathers."""
+    if not module.is_init_module:
+        return f"\n::: {module.path}\n"
+    own = [name for name, one in module.members.items() if not one.is_alias and not one.is_module and name[0] != "_"]
+    return f"\n::: {module.path}\n    options:\n      members: {own or 'false'}\n"
 
 
 def _inside(room: griffe.Module) -> list[griffe.Module]:
@@ -92,4 +100,6 @@ def _modules(room: griffe.Module) -> Iterator[griffe.Module]:
 def _summary(one: griffe.Object) -> str:
     """The first paragraph of a docstring, for a cell of a table."""
     paragraph = one.docstring.value.split("\n\n")[0] if one.docstring else ""
-    return " ".join(paragraph.split()).replace("|", "\\|")
+    # Markdown's tables know code by themselves
+    text = " ".join(paragraph.split()).split("`")
+    return "`".join(part if inside % 2 else part.replace("|", "\\|") for inside, part in enumerate(text))

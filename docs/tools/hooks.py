@@ -82,7 +82,7 @@ def on_page_content(content: str, **_: Any) -> str:
 
 
 def on_post_page(output: str, page: Page, config: MkDocsConfig) -> str:
-    """Takes the one script that the theme would fetch from elsewhere, for the search in a folder, from the site itself."""
+    """Takes the one script that the theme would fetch, for the search on pages in a folder, from the site itself."""
     here = posixpath.relpath(SHIM, posixpath.dirname(page.url) or ".")
     return output.replace("https://unpkg.com/iframe-worker/shim", here)
 
