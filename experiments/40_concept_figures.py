@@ -51,7 +51,7 @@ def frictions() -> Figure:
     config = Discretisation()
     start = np.array([[-0.35, 0.0, 1.0], [0.35, 0.0, -1.0]])
     twist = np.tile(np.array([0.08, 0.0, 0.0], np.float32), (6, 2, 1))
-    end = start + [0.48, 0.0, 0.0]
+    end = start + np.array([0.48, 0.0, 0.0])
     engine = ChainEngine(config)
     state = engine.initial_state(start)
     resting = elastica(end, config.cable.length, config.cable.keypoint_arclength)
