@@ -63,12 +63,12 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
 
 
 def _arrows(mermaid: str) -> str:
-    """The arrows of a flowchart as a table."""
+    """The arrows of the map of the code as a table."""
     above: dict[str, list[str]] = {}
     for left, right in re.findall(r"^\s*(\w+)\s*-->\s*(\w+)$", mermaid, re.MULTILINE):
         above.setdefault(left, []).append(right)
     rows = [f"| `{left}` | {', '.join(f'`{name}`' for name in right)} |" for left, right in above.items()]
-    return "\n".join(["| from | to |", "| --- | --- |", *rows, ""])
+    return "\n".join(["| room | may import |", "| --- | --- |", *rows, ""])
 
 
 def on_page_content(content: str, **_: Any) -> str:
