@@ -17,7 +17,7 @@ from cablejax.recordings.bags import import_mcap  # noqa: E402
 from cablejax.recordings.poses import poses_from_markers, rotated  # noqa: E402
 from recording_cases import DT, swinging  # noqa: E402
 
-DOCUMENTATION = Path(__file__).parents[1] / "docs" / "recordings.md"
+DOCUMENTATION = Path(__file__).parents[1] / "docs" / "how_to" / "own_recording.md"
 STORE = get_typestore(Stores.ROS2_HUMBLE)
 POINT = STORE.types["geometry_msgs/msg/Point"]
 QUATERNION = STORE.types["geometry_msgs/msg/Quaternion"]

@@ -10,7 +10,7 @@ from cablejax.gaplog import validate
 from cablejax.recordings.table import import_csv
 from recording_cases import DT, swinging
 
-DOCUMENTATION = Path(__file__).parents[1] / "docs" / "recordings.md"
+DOCUMENTATION = Path(__file__).parents[1] / "docs" / "how_to" / "own_recording.md"
 
 PAIRS = """
 [cable]

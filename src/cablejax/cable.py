@@ -67,7 +67,8 @@ class Cable:
                 "than it is thick."
             )
         if tuple(self.grasp) != ("clamped", "clamped"):
-            raise ValueError(f'Cable.grasp is {shown(self.grasp)}, expected ("clamped", "clamped"), the only grasp simulated.')
+            grasp = shown(self.grasp)
+            raise ValueError(f'Cable.grasp is {grasp}, expected ("clamped", "clamped"), the only grasp simulated.')
         self._check_marks()
 
     def _check_marks(self) -> None:

@@ -14,6 +14,7 @@ from cablejax.log_geometry import geometry_fault
 from cablejax.types import GapLog
 
 SCHEMA = "cablejax-gap-log/1"
+"""Format and version of a gap log."""
 
 DTYPES = {
     "time": np.float64,
@@ -23,9 +24,11 @@ DTYPES = {
     "episode_length": np.int32,
     "hold": np.bool_,
 }
+"""Type of each array of a gap log."""
 META_FIELDS = (
     "schema", "cable", "table", "gravity_m_per_s2", "keypoint_arclength_m", "grasp", "motion", "source",
 )  # fmt: skip
+"""Fields that `meta` has to have."""
 # By how much the first and the last mark may miss the cable's ends, relative to its length.
 _ENDS = 0.05
 # Of the samples on an even clock of its usual interval, an episode has at least one in so many.

@@ -291,3 +291,4 @@ class Bench:
         | Annotated[BenchLoop, subcommand("loop")]
         | Annotated[BenchPerception, subcommand("perception")]
     )
+    """What is measured."""

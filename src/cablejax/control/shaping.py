@@ -35,6 +35,7 @@ Method = Literal["residual", "direct"]
 """The learned model with the online residual, or as it was trained."""
 
 METHODS: tuple[Method, ...] = get_args(Method)
+"""Both methods."""
 
 Runs = Mapping[tuple[str, Method], ClosedLoopRun]
 """Runs by name of the target and method."""

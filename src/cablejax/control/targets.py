@@ -16,6 +16,7 @@ from cablejax.simulate.elastica import elastica
 from cablejax.text_file import read_json, read_text
 
 Shape = Literal["U", "S", "Z"]
+"""The letters of Wang et al., RA-L 2022."""
 
 START_DISTANCE = 0.99
 """Distance between the grippers of a straight cable, in lengths."""

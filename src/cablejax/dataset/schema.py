@@ -32,6 +32,9 @@ class Randomisation:
     """Ranges (low, high) of factors on the nominal parameters, drawn log-uniformly per trajectory; None = nominal.
 
     Wang et al., RA-L 2022, randomise stiffness and damping by factors of 0.1 to 3.
+
+    Attributes:
+        stiffness, damping, friction: range of the factor on bending stiffness, damping time and friction coefficient.
     """
 
     stiffness: tuple[float, float] | None = None

@@ -11,6 +11,7 @@ from cablejax.text_file import read_json, write_json
 from cablejax.whole_file import sole_writer
 
 RUN, CHECKPOINTS, METRICS, BOARD = "run.json", "checkpoints", "metrics.csv", "tensorboard"
+"""What a training's folder holds: its settings, checkpoints, errors by step, and curves for TensorBoard."""
 
 # What `cablejax train` adds in the end.
 _RESULTS = ("weights.safetensors", "card.md", "summary.json")

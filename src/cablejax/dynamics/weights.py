@@ -41,6 +41,7 @@ FILE_NAME = "weights.safetensors"
 """Name of the file in a training's folder."""
 
 SUFFIX = ".safetensors"
+"""Ending of files with weights."""
 
 _KEY = "cablejax"
 

@@ -21,6 +21,7 @@ EFFECTS: Mapping[str, CableEffect] = {effect.name: effect for effect in (*LIBRAR
 """Every effect by its name in the gap log's format."""
 
 VERDICT_SCHEMA = "cablejax-verdict/1"
+"""Format and version of `verdict.json`."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -15,7 +15,9 @@ from cablejax.perceive.pcd import read_pcd
 from cablejax.text_file import read_text
 
 POSES_FILE = "poses.csv"
+"""Name of the file with the gripper poses in a folder of PCD files."""
 POSES_HEADER = ("time", "x0", "y0", "theta0", "x1", "y1", "theta1")
+"""Its columns [s, m, rad]."""
 
 
 @dataclasses.dataclass(frozen=True)

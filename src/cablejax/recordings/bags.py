@@ -19,6 +19,7 @@ from cablejax.recordings.take import Take
 from cablejax.types import GapLog
 
 POSE_ARRAY, POSE_STAMPED = "geometry_msgs/msg/PoseArray", "geometry_msgs/msg/PoseStamped"
+"""ROS types of the keypoints and of a gripper."""
 
 LARGEST_LAG = 0.05
 """Farthest from a sample of the keypoints [s] that the poses of a gripper on both sides of it may be."""
@@ -35,7 +36,7 @@ def import_mcap(path: str | os.PathLike[str], layout: str | os.PathLike[str]) ->
 
     Args:
         path: of the bag.
-        layout: TOML file that names the topics, see `docs/recordings.md`.
+        layout: TOML file that names the topics, see `docs/how_to/own_recording.md`.
 
     Returns:
         A gap log in space, and a sentence on each repair.

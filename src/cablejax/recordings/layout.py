@@ -1,7 +1,7 @@
 """The layout of a laboratory's own recording, read from a small TOML file.
 
 Tables `[cable]`, `[table]`, `[frame]` and `[source]` are the same for every kind of file; `[columns]` is for csv and
-`[topics]` for bags. `docs/recordings.md` has a full example of each.
+`[topics]` for bags. `docs/how_to/own_recording.md` has a full example of each.
 """
 
 from __future__ import annotations
@@ -107,7 +107,7 @@ def read_layout(path: str | os.PathLike[str], place: str) -> Layout:
     try:
         values = read_toml(path)
     except (ValueError, OSError) as error:
-        raise ValueError(f"This is no layout: {error} docs/recordings.md has one.") from None
+        raise ValueError(f"This is no layout: {error} docs/how_to/own_recording.md has one.") from None
     if unknown := set(values) - {"cable", "table", "frame", "source", place}:
         raise ValueError(
             f"{path} has the unknown tables {shown(sorted(unknown))}, expected [cable], [table], [frame], [source] "

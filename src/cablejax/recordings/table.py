@@ -31,7 +31,7 @@ def import_csv(path: str | os.PathLike[str], layout: str | os.PathLike[str]) -> 
 
     Args:
         path: comma-separated, with a header; empty or "nan" where nothing was observed.
-        layout: TOML file that names the columns and units, see `docs/recordings.md`.
+        layout: TOML file that names the columns and units, see `docs/how_to/own_recording.md`.
 
     Returns:
         A gap log, planar or in space, and a sentence on each repair.
