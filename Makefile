@@ -8,7 +8,7 @@ STAMP := $(VENV)/.stamp
 NPROC ?= 4
 export NPROC
 
-.PHONY: help demo tables quick test test-full lint clean
+.PHONY: help demo tables quick test test-full lint docs dist clean
 .DEFAULT_GOAL := help
 
 help:
@@ -18,6 +18,8 @@ help:
 	@echo "make test       lint, types and the quick tests"
 	@echo "make test-full  lint, types and every test"
 	@echo "make lint       ruff and pyright"
+	@echo "make docs       the documentation as a site, site/index.html"
+	@echo "make dist       wheel and source distribution, checked, in dist/"
 	@echo "make clean      remove .venv and caches (runs/ stays)"
 
 $(STAMP): pyproject.toml constraints.txt
@@ -57,5 +59,18 @@ test: lint
 test-full: lint
 	$(BIN)/python -m pytest
 
+$(VENV)/.docs-stamp: $(STAMP)
+	$(BIN)/python -m pip install --disable-pip-version-check --quiet -c constraints.txt -e '.[docs]'
+	@touch $@
+
+# Strict: a broken link, a page outside the navigation or an undocumented public name fails.
+docs: $(VENV)/.docs-stamp
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict
+
+dist: $(VENV)/.docs-stamp
+	rm -rf dist
+	$(BIN)/python -m build --outdir dist
+	$(BIN)/python -m twine check --strict dist/*
+
 clean:
-	rm -rf $(VENV) build dist .pytest_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) build dist site .pytest_cache .ruff_cache .hypothesis

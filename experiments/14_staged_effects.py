@@ -1,6 +1,6 @@
 """Every effect of the library, staged in the contact plant and in the planar chain: the same change of the keypoints?
 
-    python experiments/14_staged_effects.py            # a minute or two; prints the table of docs/simulator.md
+    python experiments/14_staged_effects.py            # a minute or two; docs/results/staged_effects.md
     python experiments/14_staged_effects.py --only obstacle
 
 The plant is C MuJoCo in space with contacts, the chain is the simulator by which a diagnosis explains logs. They differ

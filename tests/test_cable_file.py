@@ -7,7 +7,8 @@ import pathlib
 import numpy as np
 import pytest
 
-from cablejax.cable import BOUNDS, Cable
+from cablejax.cable import NUMBERS as CABLE_NUMBERS
+from cablejax.cable import Cable
 from cablejax.cable_file import KEYS, NUMBERS, cable_from_fields, cable_text, cable_to_fields, read_cable, write_cable
 from cablejax.cli import main
 from cablejax.commands.cable import find_cable
@@ -33,7 +34,7 @@ def test_a_cable_is_read_as_it_was_written(cable, tmp_path):
 
 def test_the_file_has_every_field_of_a_cable():
     assert set(KEYS) == {field.name for field in dataclasses.fields(Cable)}
-    assert {name for name, _, _ in NUMBERS.values()} == set(BOUNDS)
+    assert {name for name, _ in NUMBERS.values()} == set(CABLE_NUMBERS)
 
 
 @pytest.mark.parametrize(
@@ -49,9 +50,9 @@ def test_the_file_has_every_field_of_a_cable():
         ({"bending_stiffness_n_m2": 1e30}, "bending_stiffness_n_m2 is 1e\\+30, expected a number from 1e-09"),
         (
             {"linear_density_kg_per_m": 80.0},
-            r"is 80 kg/m at a diameter_m of 0.01 m.* 1.02e\+06 kg/m\^3, expected at most",
+            r"is 80 kg/m at a diameter of 0.01 m.* 1.02e\+06 kg/m\^3, expected at most",
         ),
-        ({"bending_stiffness_n_m2": 2e4}, r"is 20000 N m\^2 at a diameter_m of 0.01 m.* Pa, expected at most 1.5e\+12"),
+        ({"bending_stiffness_n_m2": 2e4}, r"is 20000 N m\^2 at a diameter of 0.01 m.* Pa, expected at most 1.5e\+12"),
         ({"friction_coefficient": 10**400}, "friction_coefficient is an integer of 1329 bits"),
         ({"diameter_m": "1 cm"}, "diameter_m is '1 cm'"),
         ({"bending_damping_s": True}, "bending_damping_s is True"),
@@ -78,10 +79,10 @@ def test_what_is_no_cable_is_refused_by_the_name_of_its_key(changes, message):
 )
 def test_a_file_that_is_no_toml_is_refused(content, tmp_path):
     (tmp_path / "cable.toml").write_bytes(content)
-    with pytest.raises(ValueError, match=r"is no TOML.*cablejax cable --out"):
+    with pytest.raises(ValueError, match=r"no cable file.*(no TOML|no text).*cablejax cable --out"):
         read_cable(tmp_path / "cable.toml")
     for missing in (tmp_path, tmp_path / "none.toml"):
-        with pytest.raises(ValueError, match="could not be read"):
+        with pytest.raises(ValueError, match="This is no cable file"):
             read_cable(missing)
 
 

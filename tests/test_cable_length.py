@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from cablejax.cable_length import require_long_enough
+from cablejax.cable_length import require_fitting_length
 from cablejax.recordings.assemble import Nominal, gap_log_from_takes
 from cablejax.recordings.take import Take
 from cablejax.recordings.wires import HangingWire, wire_log
@@ -26,25 +26,25 @@ def taut(noise: float = 0.0, scale: float = 1.0) -> np.ndarray:
 
 @pytest.mark.parametrize("noise", [0.0, 1e-3, 5e-3, 2e-2])
 def test_noise_and_slight_stretch_are_allowed_for(noise):
-    require_long_enough([taut(noise)], MARKS, NAME)
-    require_long_enough([taut(noise, scale=1.01)], MARKS, NAME)
+    require_fitting_length([taut(noise)], MARKS, NAME)
+    require_fitting_length([taut(noise, scale=1.01)], MARKS, NAME)
 
 
 @pytest.mark.parametrize("noise", [0.0, 1e-3, 5e-3])
 def test_a_cable_that_is_too_short_is_refused(noise):
     with pytest.raises(ValueError, match=r"gives them .* m of cable.*correct meta\.keypoint_arclength_m"):
-        require_long_enough([taut(noise, scale=1.06)], MARKS, NAME)
+        require_fitting_length([taut(noise, scale=1.06)], MARKS, NAME)
 
 
 def test_one_mark_in_the_wrong_place_is_refused_and_keypoints_not_seen_are_left_out():
     marks = MARKS.copy()
     marks[6] += 0.06
     with pytest.raises(ValueError, match="From keypoint 6 to 7 "):
-        require_long_enough([taut()], marks, NAME)
+        require_fitting_length([taut()], marks, NAME)
     hidden = taut()
     hidden[:, 6] = np.nan
-    require_long_enough([hidden], marks, NAME)
-    require_long_enough([hidden[:2]], MARKS, NAME)
+    require_fitting_length([hidden], marks, NAME)
+    require_fitting_length([hidden[:2]], MARKS, NAME)
 
 
 def take() -> Take:

@@ -156,6 +156,33 @@ def test_lost_data_file_is_noticed(tmp_path):
         open_store(path).read()
 
 
+def edit_json(file: Path, **changes) -> None:
+    file.write_text(json.dumps({**json.loads(file.read_text()), **changes}))
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda path: (path / "keypoints" / "zarr.json").unlink(),
+        lambda path: (path / "digest" / "zarr.json").unlink(),
+        lambda path: (path / "attempts" / "zarr.json").write_text("{"),
+        lambda path: edit_json(path / "attempts" / "zarr.json", shape=[0]),
+        lambda path: edit_json(path / "keypoints" / "zarr.json", data_type="float64"),
+    ],
+    ids=["no keypoints", "no digest", "cut", "shape", "type"],
+)
+def test_a_damaged_description_is_refused_and_mended(tmp_path, damage):
+    path = tmp_path / "data"
+    complete(open_or_create(path, SMALL))
+    digest = open_store(path).info().digest
+    damage(path)
+    with pytest.raises(ValueError, match=r"is damaged: .*Run the generation that began it again"):
+        open_store(path)
+    store = open_or_create(path, SMALL)
+    assert [store.status(shard) for shard in range(3)] == ["complete"] * 3
+    assert open_store(path).info().digest == digest and [file.name for file in tmp_path.iterdir()] == ["data"]
+
+
 def test_another_configuration_is_refused_with_the_difference(tmp_path):
     path = tmp_path / "data"
     complete(open_or_create(path, SMALL))

@@ -199,8 +199,8 @@ def test_a_rollout_longer_than_the_data_is_refused(tmp_path):
     ("make", "message"),
     [
         (lambda: Phase(steps=0), "Phase.steps is 0"),
-        (lambda: Phase(steps=1, noise=-1.0), "Phase.noise is -1.0 m"),
-        (lambda: Phase(steps=1, lr_end=0.0), "learning rates"),
+        (lambda: Phase(steps=1, noise=-1.0), "Phase.noise is -1.0"),
+        (lambda: Phase(steps=1, lr_end=0.0), "Phase.lr_end is 0.0"),
         (lambda: Phase(steps=1, robust=0.0), "Phase.robust is 0"),
         (lambda: TrainConfig(phases=()), "phases is empty"),
         (lambda: TrainConfig(ema=1.0), "ema is 1.0"),

@@ -69,6 +69,10 @@ def test_missing_measurements_stay_missing(tmp_path):
     assert np.isnan(read_clouds(tmp_path).clouds[0]).all()
 
 
+def edit(file, old, new):
+    file.write_bytes(file.read_bytes().replace(old, new, 1))
+
+
 def broken(path, what):
     if what == "no file":
         return path / "absent.npz"
@@ -83,7 +87,7 @@ def broken(path, what):
     if what == "text":
         (path / "a.npz").write_text("time")
         return path / "a.npz"
-    if what in ("lacks", "shape", "count", "order", "pose"):
+    if what in ("lacks", "shape", "count", "negative", "words", "infinite", "order", "pose"):
         arrays = {"time": TIME, "gripper_pose": POSES, "points": np.zeros((3, 5, 3))}
         if what == "lacks":
             del arrays["gripper_pose"]
@@ -91,6 +95,12 @@ def broken(path, what):
             arrays["points"] = np.zeros((3, 5))
         if what == "count":
             arrays |= {"points": np.zeros((7, 3)), "count": np.array([4, 0, 2])}
+        if what == "negative":
+            arrays |= {"points": np.zeros((7, 3)), "count": np.array([9, -4, 2])}
+        if what == "words":
+            arrays |= {"points": np.zeros((7, 3)), "count": np.array(["4", "0", "3"])}
+        if what == "infinite":
+            arrays["points"] += np.inf
         if what == "order":
             arrays["time"] = TIME[::-1]
         if what == "pose":
@@ -102,6 +112,9 @@ def broken(path, what):
         "compressed": lambda: folder(path, "binary_compressed"),
         "cut": lambda: folder(path, cut=3),
         "cut text": lambda: folder(path, "ascii", cut=40),
+        "points": lambda: (folder(path), edit(path / "0000.pcd", b"POINTS 4", b"POINTS -1"))[0],
+        "no values": lambda: (folder(path), edit(path / "0000.pcd", b"COUNT 1", b"COUNT 0"))[0],
+        "inner folder": lambda: (folder(path), (path / "a.pcd").mkdir())[0],
         "no z": lambda: folder(path, fields="rgb x y w"),
         "no data": lambda: (folder(path), (path / "0000.pcd").write_text("VERSION 0.7\n"), path)[-1],
     }[what]()
@@ -118,6 +131,12 @@ def broken(path, what):
         ("lacks", "lacks gripper_pose"),
         ("shape", "points has shape"),
         ("count", "sums up to 6"),
+        ("negative", "whole numbers >= 0"),
+        ("words", "under count, expected an array of real numbers"),
+        ("infinite", "nothing to see"),
+        ("points", "contradicts itself: -1 points"),
+        ("no values", "contradicts itself: 4 points of 0 values"),
+        ("inner folder", "expected 4 rows|is a folder"),
         ("order", "increasing"),
         ("pose", "frame 0 is not finite"),
         ("few rows", "expected 3 rows"),

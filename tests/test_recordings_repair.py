@@ -198,7 +198,7 @@ def test_a_left_handed_frame_is_mirrored_when_stated():
 @pytest.mark.parametrize(
     ("points", "message"),
     [
-        (np.full((50, 9, 3), np.inf), "infinite positions"),
+        (np.full((50, 9, 3), np.inf), "largest entry of keypoints is inf"),
         (np.full((50, 9, 3), np.nan), "never observed together"),
         (np.zeros((50, 4, 3)), "at least three keypoints, or five"),
         (np.zeros((50, 9, 3)), "expected 0.05 to 20"),

@@ -30,7 +30,7 @@ def write_page(cases: list[Scored], path: pathlib.Path, command: str) -> None:
     parts = [
         "# Blind check of the diagnosis",
         f"Made by `{command}`; logs by `20_blind_generate.py`, verdicts by `21_blind_diagnose.py`. What the numbers "
-        "mean, and what was seen only afterwards: docs/diagnosis.md.",
+        "mean, and what was seen only afterwards: docs/results/diagnosis.md.",
         f"{len(cases)} cases: {kinds['none']} without effect, {kinds['single']} single effects, {kinds['pair']} pairs, "
         f"{kinds['unknown']} effects outside the library; {len(missing)} without a verdict, which count as failures. "
         "Labels fit the hashes published before. Rates have their exact 90 % interval. A case counts from severity 4 "

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from cablejax.gaplog import SCHEMA, GapLog, write_gap_log
-from cablejax.json_file import write_json
+from cablejax.text_file import write_json
 from cablejax.whole_file import whole_file
 from rows import Rows, append_row
 

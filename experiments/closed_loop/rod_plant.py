@@ -127,7 +127,7 @@ ETHERNET = RodPlantConfig(
         timestep=1e-4,
     ),
 )
-"""A shielded installation cable (Cat 7 S/FTP), stiffer than the reference: see docs/simulator.md for the values."""
+"""A shielded installation cable (Cat 7 S/FTP), stiffer than the reference: see docs/concepts/plants.md."""
 
 USB = RodPlantConfig(
     discretisation=Discretisation(
@@ -138,7 +138,7 @@ USB = RodPlantConfig(
         timestep=2e-4,
     ),
 )
-"""A USB 2.0 cable, softer and lighter than the reference: see docs/simulator.md for the values."""
+"""A USB 2.0 cable, softer and lighter than the reference: see docs/concepts/plants.md."""
 
 
 class RodPlant(TablePlant):

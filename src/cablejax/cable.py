@@ -11,22 +11,21 @@ from typing import Any, Literal
 
 import numpy as np
 
+from cablejax.limits import LIMITS, check, shown
+
 GRAVITY = 9.81
 """Magnitude of gravity [m/s^2]."""
 
-BOUNDS = {
-    "length": (1e-2, 1e2),
-    "diameter": (1e-6, 1.0),
-    "linear_density": (1e-6, 1e3),
-    "bending_stiffness": (1e-9, 1e6),
-    "damping_time": (0.0, 1e3),
-    "rest_curvature": (-1e3, 1e3),
-    "friction_coefficient": (0.0, 1e2),
-}
-"""Smallest and largest accepted value of each number of a cable, SI units. What lies outside is a mistake in units."""
-
-MOST_KEYPOINTS = 1000
-"""Largest accepted number of keypoints."""
+NUMBERS = (
+    "length",
+    "diameter",
+    "linear_density",
+    "bending_stiffness",
+    "damping_time",
+    "rest_curvature",
+    "friction_coefficient",
+)
+"""Fields of a `Cable` that are single numbers; `cablejax.limits` has the limits of each."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -46,7 +45,7 @@ class Cable:
         grasp: how grippers 0 and 1 hold the cable. Simulators know "clamped": position and direction are held.
 
     Raises:
-        ValueError: a number is not finite or outside of `BOUNDS`, or the marks do not fit.
+        ValueError: a number is outside of its limit, or the marks do not fit.
     """
 
     length: float = 1.0
@@ -61,19 +60,15 @@ class Cable:
     grasp: tuple[str, str] = ("clamped", "clamped")
 
     def __post_init__(self):
-        for name, (low, high) in BOUNDS.items():
-            value = getattr(self, name)
-            if isinstance(value, bool) or not (np.isfinite(value) and low <= value <= high):
-                raise ValueError(f"Cable.{name} is {value}, expected {low:g} to {high:g} in SI units.")
+        check(self, *NUMBERS, n_keypoints="keypoints")
         if self.diameter >= self.length:
             raise ValueError(
                 f"Cable.diameter is {self.diameter} m and its length {self.length} m: expected a cable that is longer "
                 "than it is thick."
             )
-        if not 2 <= self.n_keypoints <= MOST_KEYPOINTS:
-            raise ValueError(f"Cable.n_keypoints is {self.n_keypoints}, expected 2, both ends, to {MOST_KEYPOINTS}.")
         if tuple(self.grasp) != ("clamped", "clamped"):
-            raise ValueError(f'Cable.grasp is {self.grasp}, expected ("clamped", "clamped"), the only grasp simulated.')
+            grasp = shown(self.grasp)
+            raise ValueError(f'Cable.grasp is {grasp}, expected ("clamped", "clamped"), the only grasp simulated.')
         self._check_marks()
 
     def _check_marks(self) -> None:
@@ -90,6 +85,24 @@ class Cable:
                 f"Cable.marks goes from {marks[0]:g} to {marks[-1]:g} m, expected 0 to the cable's length of "
                 f"{self.length:g} m: the first and the last keypoint are at the grippers."
             )
+
+    def check_material(self) -> None:
+        """Rejects numbers that are possible one by one, but that no material has together.
+
+        Raises:
+            ValueError: names the field, and the density or Young's modulus of a solid rod of this diameter.
+        """
+        rod = {
+            "density": ("linear_density", self.linear_density / (np.pi / 4 * self.diameter**2)),
+            "elastic_modulus": ("bending_stiffness", self.bending_stiffness / (np.pi / 64 * self.diameter**4)),
+        }
+        for limit, (name, value) in rod.items():
+            if value not in LIMITS[limit]:
+                raise ValueError(
+                    f"Cable.{name} is {getattr(self, name):g} {LIMITS[name].unit} at a diameter of {self.diameter:g} "
+                    f"m. A solid rod would have {value:.3g} {LIMITS[limit].unit}, expected at most "
+                    f"{LIMITS[limit].high:g}, which no material exceeds. Check the units of both."
+                )
 
     @property
     def keypoint_arclength(self) -> np.ndarray:
@@ -125,14 +138,8 @@ class Discretisation:
     friction_speed: float = 2e-4
 
     def __post_init__(self):
-        for name in ("timestep", "friction_speed"):
-            value = getattr(self, name)
-            if not (np.isfinite(value) and value > 0):
-                raise ValueError(f"Discretisation.{name} is {value}, expected a positive finite number in SI units.")
-        if self.n_links < 3:
-            raise ValueError(
-                f"Discretisation.n_links is {self.n_links}, expected at least 3: two held links and one free."
-            )
+        # two held links and one free
+        check(self, "timestep", "friction_speed", n_links="links")
         if self.dimension not in (2, 3):
             raise ValueError(f"Discretisation.dimension is {self.dimension}, expected 2 (table plane) or 3 (space).")
 

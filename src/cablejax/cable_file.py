@@ -6,40 +6,37 @@ The same keys describe the cable in trained weights, so that a cable has one wri
 from __future__ import annotations
 
 import difflib
-import math
 import os
-import tomllib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from cablejax.cable import BOUNDS, MOST_KEYPOINTS, Cable
+from cablejax.cable import Cable
+from cablejax.limits import LIMITS, require, shown
+from cablejax.text_file import read_toml
 from cablejax.whole_file import whole_file
 
-NUMBERS: Mapping[str, tuple[str, str, str]] = {
-    "length_m": ("length", "m", "free length between the grippers"),
-    "diameter_m": ("diameter", "m", "thickness"),
-    "linear_density_kg_per_m": ("linear_density", "kg/m", "mass per length: weigh a metre"),
-    "bending_stiffness_n_m2": ("bending_stiffness", "N m^2", "EI"),
-    "bending_damping_s": ("damping_time", "s", "time constant of internal damping, 0 for none"),
-    "rest_curvature_per_m": ("rest_curvature", "1/m", "curvature without load, 0 for a straight cable"),
-    "friction_coefficient": ("friction_coefficient", "", "kinetic, between cable and table, 0 for a smooth table"),
+NUMBERS: Mapping[str, tuple[str, str]] = {
+    "length_m": ("length", "free length between the grippers"),
+    "diameter_m": ("diameter", "thickness"),
+    "linear_density_kg_per_m": ("linear_density", "mass per length: weigh a metre"),
+    "bending_stiffness_n_m2": ("bending_stiffness", "EI"),
+    "bending_damping_s": ("damping_time", "time constant of internal damping, 0 for none"),
+    "rest_curvature_per_m": ("rest_curvature", "curvature without load, 0 for a straight cable"),
+    "friction_coefficient": ("friction_coefficient", "kinetic, between cable and table, 0 for a smooth table"),
 }
-"""Every number of a cable by its key: field of `Cable`, unit, and what it is."""
+"""Every number of a cable by its key: field of `Cable`, which is also the name of its limit, and what it is."""
 
 OTHERS = ("keypoints", "keypoint_arclength_m", "grasp")
 """Keys that are no single number."""
 
 KEYS: Mapping[str, str] = {
-    **{name: key for key, (name, _, _) in NUMBERS.items()},
+    **{name: key for key, (name, _) in NUMBERS.items()},
     "n_keypoints": "keypoints",
     "marks": "keypoint_arclength_m",
     "grasp": "grasp",
 }
 """Key in the file of every field of `Cable`."""
-
-DENSEST, STIFFEST = 25_000.0, 1.5e12
-"""Density [kg/m^3] and Young's modulus [Pa] that no material exceeds: osmium and diamond are the next."""
 
 _OPTIONAL = {"rest_curvature_per_m": 0.0}
 _EXAMPLE = "Write an example with `cablejax cable --out cable.toml`."
@@ -54,14 +51,10 @@ def read_cable(path: str | os.PathLike[str]) -> Cable:
     Raises:
         ValueError: the file cannot be read, is no TOML, or does not describe a cable; says which key is wrong.
     """
-    path = Path(path)
     try:
-        fields = tomllib.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise ValueError(f"The cable file {path} could not be read: {error.strerror}. {_EXAMPLE}") from None
-    except (ValueError, RecursionError) as error:
-        # TOML and text encoding errors are both ValueErrors
-        raise ValueError(f"The cable file {path} is no TOML: {error}. {_EXAMPLE}") from None
+        fields = read_toml(path)
+    except (ValueError, OSError) as error:
+        raise ValueError(f"This is no cable file: {error} {_EXAMPLE}") from None
     return cable_from_fields(fields, str(path))
 
 
@@ -75,8 +68,8 @@ def cable_text(cable: Cable) -> str:
     """A cable as commented TOML, which `read_cable` reads back without loss."""
     fields = cable_to_fields(cable)
     lines = [
-        (f"{key} = {float(fields[key])!r}", f"{what} [{unit}]" if unit else what)
-        for key, (_, unit, what) in NUMBERS.items()
+        (f"{key} = {float(fields[key])!r}", f"{what} [{LIMITS[name].unit}]" if LIMITS[name].unit else what)
+        for key, (name, what) in NUMBERS.items()
     ]
     if cable.marks is None:
         lines.append((f"keypoints = {cable.n_keypoints}", "observed points, evenly spaced, both ends included"))
@@ -92,7 +85,7 @@ def cable_text(cable: Cable) -> str:
 
 def cable_to_fields(cable: Cable) -> dict[str, Any]:
     """A cable as a JSON or TOML object, the inverse of `cable_from_fields`."""
-    fields: dict[str, Any] = {key: getattr(cable, name) for key, (name, _, _) in NUMBERS.items()}
+    fields: dict[str, Any] = {key: getattr(cable, name) for key, (name, _) in NUMBERS.items()}
     if cable.marks is None:
         fields["keypoints"] = cable.n_keypoints
     else:
@@ -114,46 +107,27 @@ def cable_from_fields(fields: Mapping[str, Any], where: str) -> Cable:
         if key not in NUMBERS and key not in OTHERS:
             raise ValueError(f"{where} has {_unknown(key)}")
     values: dict[str, Any] = {}
-    for key, (name, unit, what) in NUMBERS.items():
+    for key, (name, what) in NUMBERS.items():
         if key not in fields and key not in _OPTIONAL:
-            raise ValueError(f"{where} lacks {key}, the {what}. Add `{key} = ...`. {_EXAMPLE}")
+            raise ValueError(f"{where} lacks {key}, the {what}. Add `{key} = ...`.")
         value = fields.get(key, _OPTIONAL.get(key))
-        low, high = BOUNDS[name]
-        if not _is_number(value) or not low <= value <= high:
-            raise ValueError(
-                f"{where}: {key} is {_shown(value)}, expected a number from {low:g} to {high:g} {unit}".rstrip()
-                + f" ({what}). Check its unit."
-            )
+        require(value, name, f"{where}: {key}", f"Check its unit ({what}).")
         values[name] = float(value)
-    _check_material(values, where)
     values |= _keypoints(fields, where)
     if "grasp" in fields:
         grasp = fields["grasp"]
         if not isinstance(grasp, list) or len(grasp) != 2 or not all(isinstance(hold, str) for hold in grasp):
-            raise ValueError(f'{where}: grasp is {_shown(grasp)}, expected ["clamped", "clamped"].')
+            raise ValueError(f'{where}: grasp is {shown(grasp)}, expected ["clamped", "clamped"].')
         values["grasp"] = tuple(grasp)
     try:
-        return Cable(**values)
+        cable = Cable(**values)
+        cable.check_material()
+        return cable
     except ValueError as error:
         text = str(error)
         for name, key in KEYS.items():
             text = text.replace(f"Cable.{name} ", f"{key} ")
         raise ValueError(f"{where}: {text}") from None
-
-
-def _check_material(values: Mapping[str, float], where: str) -> None:
-    """Rejects numbers that are possible one by one, but that no material has together."""
-    diameter, density = values["diameter"], values["linear_density"] / (math.pi / 4 * values["diameter"] ** 2)
-    modulus = values["bending_stiffness"] / (math.pi / 64 * diameter**4)
-    for key, value, unit, found, most, what in (
-        ("linear_density_kg_per_m", values["linear_density"], "kg/m", f"{density:.3g} kg/m^3", DENSEST, density),
-        ("bending_stiffness_n_m2", values["bending_stiffness"], "N m^2", f"{modulus:.3g} Pa", STIFFEST, modulus),
-    ):
-        if what > most:
-            raise ValueError(
-                f"{where}: {key} is {value:g} {unit} at a diameter_m of {diameter:g} m. A solid rod would have "
-                f"{found}, expected at most {most:g}, which no material exceeds. Check the units of both."
-            )
 
 
 def _keypoints(fields: Mapping[str, Any], where: str) -> dict[str, Any]:
@@ -166,36 +140,18 @@ def _keypoints(fields: Mapping[str, Any], where: str) -> dict[str, Any]:
             "= [0.0, ...] with the arc length of each from gripper 0."
         )
     if marks is None:
-        if isinstance(count, bool) or not isinstance(count, int) or not 2 <= count <= MOST_KEYPOINTS:
-            raise ValueError(
-                f"{where}: keypoints is {_shown(count)}, expected a whole number from 2 to {MOST_KEYPOINTS}."
-            )
+        require(count, "keypoints", f"{where}: keypoints")
         return {"n_keypoints": count}
-    if not isinstance(marks, list) or not all(map(_is_number, marks)):
-        raise ValueError(f"{where}: keypoint_arclength_m is {_shown(marks)}, expected a list of numbers [m].")
+    if not isinstance(marks, list) or not all(mark in LIMITS["not_negative"] for mark in marks):
+        raise ValueError(f"{where}: keypoint_arclength_m is {shown(marks)}, expected a list of numbers [m].")
     return {"n_keypoints": len(marks), "marks": tuple(map(float, marks))}
 
 
 def _unknown(key: str) -> str:
     """Says that a key is unknown, and which one may be meant."""
     if bare := [known for known in (*NUMBERS, *OTHERS) if known.startswith(f"{key}_")]:
-        unit = NUMBERS.get(bare[0], ("", "m", ""))[1]
-        return f"{key} without its unit: write {bare[0]}, in {unit}."
+        return f"{key} without its unit: write {bare[0]}, in {LIMITS[NUMBERS.get(bare[0], ('length',))[0]].unit}."
     near = [known for known in NUMBERS if key and key in known]
     near = near or difflib.get_close_matches(key, (*NUMBERS, *OTHERS), 1, 0.5)
     known = f"Did you mean {near[0]}?" if near else f"Expected {', '.join((*NUMBERS, *OTHERS))}."
-    return f"the unknown key {_shown(key)}. {known}"
-
-
-def _is_number(value: Any) -> bool:
-    # an integer may be larger than any float
-    return (
-        isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) < 1e300 and math.isfinite(value)
-    )
-
-
-def _shown(value: Any) -> str:
-    text = (
-        repr(value) if not isinstance(value, int) or abs(value) < 10**20 else f"an integer of {value.bit_length()} bits"
-    )
-    return text if len(text) <= 60 else f"{text[:57]}..."
+    return f"the unknown key {shown(key)}. {known}"

@@ -1,4 +1,4 @@
-"""Rejects arc lengths that are shorter than the polyline through the keypoints."""
+"""Rejects arc lengths that do not fit the keypoints, and keypoints of a cable that stretches."""
 
 from __future__ import annotations
 
@@ -12,10 +12,18 @@ TOLERANCE = 0.03
 off the centreline, and real cables stretch a little."""
 
 
-def require_long_enough(
+BENT = 0.12
+"""By how much keypoints may lie closer together than their arc lengths say, relative to it, beyond what a cable bent
+into a ring accounts for."""
+
+STRETCH = 0.2
+"""By how much the polyline through the keypoints may grow in the course of a recording, relative to it."""
+
+
+def require_fitting_length(
     episodes: Sequence[Float[np.ndarray, "T N D"]], arclength: Float[np.ndarray, " N"], name: str
 ) -> None:
-    """Refuses arc lengths that are shorter than the polyline of the keypoints, over any stretch of the cable.
+    """Refuses arc lengths that are shorter than the polyline of the keypoints, over any stretch, or far longer.
 
     Args:
         episodes: keypoints [m], NaN = not observed.
@@ -23,7 +31,8 @@ def require_long_enough(
         name: what the arc lengths are called where they come from.
 
     Raises:
-        ValueError: they are shorter by more than noise and `TOLERANCE`.
+        ValueError: they are shorter by more than noise and `TOLERANCE`, longer by more than `BENT`, or the polyline
+            grows by more than `STRETCH`.
     """
     chords = np.concatenate([np.linalg.norm(np.diff(points, axis=1), axis=-1) for points in episodes])
     stated = np.diff(arclength)
@@ -43,6 +52,24 @@ def require_long_enough(
             f"{name} gives them {stated[begin:end].sum():.4g} m of cable, and a cable does not stretch so far (noise "
             f"of {1e3 * noise:.2g} mm is allowed for): correct {name}, or the unit of length."
         )
+    ring = bent_chord(len(arclength))
+    if usual.sum() < (ring - BENT) * stated.sum():
+        raise ValueError(
+            f"Along the keypoints the cable usually measures {usual.sum():.4g} m, but {name} gives it "
+            f"{stated.sum():.4g} m: correct {name}, or the unit of length."
+        )
+    whole = chords.sum(axis=1)[np.isfinite(chords).all(axis=1)]
+    short, long = np.quantile(whole, [0.05, 0.95]) if len(whole) else (1.0, 1.0)
+    if long > (1 + STRETCH) / ring * short + 2 * len(stated) * noise:
+        raise ValueError(
+            f"Along the keypoints the cable measures {short:.4g} m in some samples and {long:.4g} m in others, and a "
+            "cable does not stretch so far: check the camera's scale, and that the markers stay on the cable."
+        )
+
+
+def bent_chord(n_keypoints: int) -> float:
+    """Chord between neighbouring keypoints over the arc between them, where the cable is bent into a ring."""
+    return 1 - (2 * np.pi / (n_keypoints - 1)) ** 2 / 24
 
 
 def _noise(episodes: Sequence[Float[np.ndarray, "T N D"]]) -> float:

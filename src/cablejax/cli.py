@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Sequence
 from typing import Annotated, Any
@@ -20,12 +21,14 @@ from cablejax.commands.shape import Shape
 from cablejax.commands.simulate import Simulate
 from cablejax.commands.train import Train
 from cablejax.compiled_programs import keep_compiled_programs
+from cablejax.interrupts import INTERRUPTED, answered
+from cablejax.whole_file import DRAFT
 
 USER_ERROR = 2
 """Exit code for input that cannot be used."""
 
-INTERRUPTED = 130
-"""Exit code after Ctrl-C, as shells have it."""
+CLOSED = 141
+"""Exit code where the reader of the output has gone, as shells have it."""
 
 _COMMANDS: Any = (
     Annotated[Demo, subcommand("demo")]
@@ -46,12 +49,35 @@ simulator lacks. A recording of a real cable is `import`ed first. `cablejax COMM
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Runs one command and returns the exit code: 0, 2 for input that cannot be used, 130 after Ctrl-C.
+    """Runs one command and returns the exit code.
+
+    That is 0, 2 for input that cannot be used, 130 after Ctrl-C, or 141 for a closed pipe.
 
     Args:
         arguments: what follows `cablejax` on the command line; by default that of this process.
     """
     given = sys.argv[1:] if arguments is None else list(arguments)
+    try:
+        try:
+            code = _run(given)
+        except KeyboardInterrupt as interrupt:
+            print(f"\ncablejax: {interrupt or 'Interrupted.'}", file=sys.stderr)
+            code = INTERRUPTED
+        finally:
+            sys.stdout.flush()
+    except BrokenPipeError:
+        # as `cablejax --help | head` does; what is left to print goes nowhere, or Python would complain at its end
+        with open(os.devnull, "w") as nowhere:
+            os.dup2(nowhere.fileno(), sys.stdout.fileno())
+        return CLOSED
+    if code == INTERRUPTED and arguments is None:
+        # what was interrupted may still run in another thread, and Python would wait for it, or crash
+        sys.stderr.flush()
+        os._exit(code)
+    return code
+
+
+def _run(given: list[str]) -> int:
     if given == ["--version"]:
         print(f"cablejax {__version__}")
         return 0
@@ -65,13 +91,23 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if not isinstance(command, Bench):  # which times compilations too
         keep_compiled_programs()
     command = command.what if isinstance(command, (Bench, Import)) else command
+    hint = f"Interrupted. {command.resume_hint}"
     try:
-        command.run()
-    except (ValueError, OSError) as error:
+        with answered(hint):
+            command.run()
+    except BrokenPipeError:
+        raise
+    except OSError as error:
+        where = str(error.filename or "").removesuffix(DRAFT)
+        what = f"{where}: {error.strerror}." if where and error.strerror else error.strerror or f"{error}"
+        print(f"cablejax: {what}", file=sys.stderr)
+        return USER_ERROR
+    except ValueError as error:
         print(f"cablejax: {error}", file=sys.stderr)
         return USER_ERROR
+    except MemoryError:
+        print("cablejax: There is not enough memory for this input: give a smaller one.", file=sys.stderr)
+        return USER_ERROR
     except KeyboardInterrupt as interrupt:
-        said = str(interrupt)
-        print(f"\ncablejax: {said or 'Interrupted. ' + command.resume_hint}", file=sys.stderr)
-        return INTERRUPTED
+        raise KeyboardInterrupt(str(interrupt) or hint) from interrupt
     return 0

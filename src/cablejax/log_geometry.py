@@ -12,6 +12,8 @@ REACH = 5.0
 between the frames of camera and arms."""
 INWARDS = np.radians(120.0)
 """Median angle between a gripper's tangent and the cable next to it, at which the tangent points the wrong way."""
+MOVED = 0.02
+"""Motion of a gripper, in lengths of the cable, in which keypoints that are held by it move too."""
 _FEWEST = 5
 _DEGREES_OFF = 0.5
 _DEGREES_BETTER = 3.0
@@ -46,6 +48,12 @@ def geometry_fault(log: GapLog) -> str | None:
     length, dimension = float(log.meta["cable"]["length_m"]), log.keypoints.shape[-1]
     for episode, samples in enumerate(log.episode_length):
         points, pose = log.keypoints[episode, :samples], log.gripper_pose[episode, :samples]
+        moved = float(np.linalg.norm(np.ptp(pose[..., :dimension], axis=0), axis=-1).max())
+        if moved > MOVED * length and np.isfinite(points).any() and np.array_equal(points[1:], points[:-1], True):
+            return (
+                f"Field 'keypoints' is the same to the last digit in all {samples} samples of episode {episode}, but a "
+                f"gripper moves by {moved:.3g} m: expected measured keypoints, and NaN where one was not observed."
+            )
         if far := far_keypoint(points, pose[..., :dimension], length):
             sample, index, distance = far
             return (

@@ -19,8 +19,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-# The gripper's pose in the plane is (x, y, theta); its twist is (vx, vy, omega), both in the world's frame.
 PLANAR_DOF = 3
+"""A gripper's pose in the plane is (x, y, theta), its twist (vx, vy, omega), both in the world's frame."""
 
 
 @jax.tree_util.register_dataclass

@@ -1,8 +1,10 @@
-"""Files that are written whole or not at all."""
+"""Files that are written whole or not at all, and folders that one process writes to at a time."""
 
 from __future__ import annotations
 
 import contextlib
+import errno
+import fcntl
 import os
 import pathlib
 from collections.abc import Iterator
@@ -18,11 +20,46 @@ def whole_file(path: pathlib.Path) -> Iterator[BinaryIO]:
 
     Until then its name ends in `DRAFT`; a block that is left early leaves nothing, and a kill no more than that. Its
     mode is the umask's.
+
+    Raises:
+        ValueError: another process is writing the file.
     """
     draft = path.with_name(f"{path.name}{DRAFT}")
-    try:
-        with draft.open("wb") as stream:
+    # truncated only once it is known that nobody else writes it
+    with open(draft, "wb", opener=lambda name, _: os.open(name, os.O_WRONLY | os.O_CREAT, 0o666)) as stream:
+        _lock(stream.fileno(), path)
+        try:
+            stream.truncate()
             yield stream
-        os.replace(draft, path)
+            stream.flush()
+            os.replace(draft, path)
+        except BaseException:
+            draft.unlink(missing_ok=True)
+            raise
+
+
+@contextlib.contextmanager
+def sole_writer(folder: pathlib.Path) -> Iterator[None]:
+    """Keeps other processes from writing to an existing folder until the block has ended; a kill frees it too.
+
+    Raises:
+        ValueError: another process holds the folder.
+    """
+    place = os.open(folder, os.O_RDONLY)
+    try:
+        _lock(place, folder)
+        yield
     finally:
-        draft.unlink(missing_ok=True)
+        os.close(place)
+
+
+def _lock(place: int, path: pathlib.Path) -> None:
+    try:
+        fcntl.flock(place, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError as error:
+        # some network file systems know no locks
+        if error.errno in (errno.EWOULDBLOCK, errno.EACCES):
+            raise ValueError(
+                f"Another process is writing to {path}. Wait until it has ended, or give another place; nothing was "
+                "changed."
+            ) from None

@@ -18,6 +18,7 @@ from jaxtyping import Bool, Float, Int
 from cablejax.bounded.results import Result
 
 Kept = TypeVar("Kept")
+"""What the caller keeps of each linearisation."""
 
 # A coordinate this close to its bound is at it.
 _AT_BOUND = 1e-9

@@ -79,6 +79,13 @@ class AbstractBoundedLeastSquares(optx.AbstractLeastSquaresSolver):
 
     Options: `feasible`, the set; `linearise`, a function `(y, args) -> (residuals, Jacobian [M, P])`, if there is a
     cheaper one than `jax.jacfwd`.
+
+    Attributes:
+        rtol, atol: relative and absolute tolerance on the projected gradient.
+        norm: always `optimistix.max_norm`.
+        descent, search: the step that is proposed, and what accepts it and sets its size.
+        secant: whether the curvature of the residuals is learned.
+        trials_per_linearisation: trial points of one step.
     """
 
     rtol: AbstractVar[float]

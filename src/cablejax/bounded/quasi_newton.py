@@ -50,6 +50,11 @@ class BoundedQuasiNewton(optx.AbstractMinimiser):
     Options: `feasible`, the set; `hessian`, a function `(y, args) -> [P, P]` that gives the first model, positive
     semi-definite. Without it the model begins as a multiple of the identity, with which the first step is not longer
     than 1 nor than the gradient. `least_squares` gives `J'J` at the start.
+
+    Attributes:
+        rtol, atol: relative and absolute tolerance on the projected gradient.
+        norm: always `optimistix.max_norm`.
+        descent, search: the step that is proposed, and what accepts it and sets its size.
     """
 
     rtol: float

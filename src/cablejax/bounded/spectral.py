@@ -131,6 +131,11 @@ class SpectralProjectedGradient(optx.AbstractGradientDescent):
     one its gradient. All points are feasible if the first is.
 
     Options: `feasible`, the set.
+
+    Attributes:
+        rtol, atol: relative and absolute tolerance on the projected gradient.
+        norm: always `optimistix.max_norm`.
+        descent, search: the projection arc, and what accepts a point on it.
     """
 
     rtol: float

@@ -10,6 +10,7 @@ from typing import Annotated, get_args
 from tyro.conf import subcommand
 
 from cablejax.commands.options import Command, UsageError, say, text_table
+from cablejax.limits import require
 from cablejax.solver_names import SolverName
 
 
@@ -50,8 +51,7 @@ class BenchSimulate(Command):
         from cablejax.simulate.engine import compiled_rollout
 
         for name in ("batch", "seconds", "rounds", "threads"):
-            if getattr(self, name) < 1:
-                raise UsageError(f"--{name} is {getattr(self, name)}, expected at least 1.")
+            require(getattr(self, name), "count", f"--{name}")
         cable = Cable() if self.cable is None else find_cable(self.cable)
         config = Discretisation(cable, n_links=Discretisation.n_links if self.links is None else self.links)
         mjx, chain = MjxEngine(config), ChainEngine(config)
@@ -193,8 +193,8 @@ class BenchPerception(Command):
         from cablejax.commands.workloads import clouds_of_an_arch, setting
         from cablejax.perceive import Status, Tracker, TrackerConfig
 
-        if min(self.points, self.repeats) < 1:
-            raise UsageError(f"--points is {self.points} and --repeats {self.repeats}, expected at least 1 each.")
+        for name in ("points", "repeats"):
+            require(getattr(self, name), "count", f"--{name}")
         tracker = Tracker(dataclasses.replace(TrackerConfig(), capacity=self.points))
         clouds, poses = clouds_of_an_arch(self.repeats + 2, self.points, tracker.config.registration.length, self.seed)
         say("compiling the tracker ...")
@@ -259,9 +259,10 @@ class BenchLoop(Command):
         from cablejax.commands.workloads import closed_loop, controller_to_s, seconds_in_turns, setting
         from cablejax.control.shaping import load_model
 
-        if not self.batches or min(*self.batches, self.steps, self.rounds) < 1:
-            given = f"--batches {self.batches}, --steps {self.steps} and --rounds {self.rounds}"
-            raise UsageError(f"{given}: expected at least 1 each.")
+        if not self.batches:
+            raise UsageError("--batches is empty, expected at least one size.")
+        for name, value in (("steps", self.steps), ("rounds", self.rounds), *(("batches", n) for n in self.batches)):
+            require(value, "count", f"--{name}")
         model = load_model(self.weights)
         controller = controller_to_s(model, self.solver)
         run = closed_loop(controller, model.config.history, self.steps, Discretisation(model.cable))
@@ -290,3 +291,4 @@ class Bench:
         | Annotated[BenchLoop, subcommand("loop")]
         | Annotated[BenchPerception, subcommand("perception")]
     )
+    """What is measured."""

@@ -57,11 +57,11 @@ def find_cable(source: str | pathlib.Path) -> Cable:
         ValueError: there is no such thing, or it cannot be read.
     """
     path = pathlib.Path(source)
-    if path.suffix == ".toml":
+    if path.suffix.lower() == ".toml":
         from cablejax.cable_file import read_cable
 
         return read_cable(path)
-    if path.suffix == ".npz":
+    if path.suffix.lower() == ".npz":
         from cablejax.gaplog import read_gap_log
         from cablejax.simulate.replay import cable_of_log
 

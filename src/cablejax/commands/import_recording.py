@@ -37,7 +37,7 @@ class _Import(Command, abc.ABC):
     def execute(self):
         from cablejax.gaplog import write_gap_log
 
-        if self.out.suffix != ".npz":
+        if self.out.suffix.lower() != ".npz":
             raise UsageError(f"--out is {self.out}, expected a file name that ends in .npz.")
         logs = self.logs()
         for path, _, _ in logs:
@@ -93,7 +93,7 @@ class Csv(_Import):
     """Import a csv file of your own, one row per sample; a small TOML file names its columns and units."""
 
     layout: pathlib.Path = pathlib.Path("layout.toml")
-    """The TOML file; docs/recordings.md has an example."""
+    """The TOML file; docs/how_to/own_recording.md has an example."""
 
     def logs(self):
         """One log of the table, and its repairs."""
@@ -107,7 +107,7 @@ class Mcap(_Import):
     """Import a ROS 2 bag or MCAP file with pose arrays; a small TOML file names its topics and units."""
 
     layout: pathlib.Path = pathlib.Path("layout.toml")
-    """The TOML file; docs/recordings.md has an example."""
+    """The TOML file; docs/how_to/own_recording.md has an example."""
 
     def logs(self):
         """One log of the bag, and its repairs."""
@@ -126,6 +126,7 @@ class Import:
         | Annotated[Csv, subcommand("csv")]
         | Annotated[Mcap, subcommand("mcap")]
     )
+    """Format of the recording."""
 
 
 def _summary(path: pathlib.Path, log: GapLog, repairs: Sequence[str]) -> dict[str, Any]:

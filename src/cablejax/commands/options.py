@@ -13,6 +13,8 @@ import sys
 from collections.abc import Mapping
 from typing import Any, ClassVar, Literal
 
+from cablejax.limits import require
+
 
 class UsageError(ValueError):
     """A command line that cannot be carried out: names the value, what was expected and what to do."""
@@ -40,8 +42,7 @@ class Command(abc.ABC):
 
     def run(self) -> None:
         """Chooses the device, does the work and prints the result."""
-        if self.seed < 0:
-            raise UsageError(f"--seed is {self.seed}, expected an integer >= 0.")
+        require(self.seed, "seed", "--seed")
         choose_device(self.device)
         # MJX prints that Warp is missing, which nothing here needs.
         with contextlib.redirect_stdout(io.StringIO()):

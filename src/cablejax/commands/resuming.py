@@ -15,9 +15,9 @@ from cablejax.commands.options import UsageError, output_folder, say
 from cablejax.control.run import ClosedLoopRun
 from cablejax.control.targets import Target
 from cablejax.gaplog import Episode
-from cablejax.json_file import parse_json, read_json, write_json
 from cablejax.npz import read_npz
-from cablejax.whole_file import DRAFT, whole_file
+from cablejax.text_file import parse_json, read_json, write_json
+from cablejax.whole_file import DRAFT, sole_writer, whole_file
 
 SCHEMA = "cablejax-parts/1"
 """Marks the folder as ours; a folder of that name without it belongs to somebody else."""
@@ -62,7 +62,7 @@ class Parts:
 
     def begin(self) -> None:
         """Makes the folder ready; of a command of other settings, what it kept is deleted."""
-        self.remove()
+        self._discard()
         self.folder.mkdir(parents=True, exist_ok=True)
         write_json(self.folder / _SETTINGS, self._settings)
 
@@ -77,7 +77,7 @@ class Parts:
     def load(self, name: str) -> ClosedLoopRun | None:
         """A run that was kept; None where there is none, or a damaged one, which has to be made again."""
         try:
-            arrays = read_npz(self.folder / f"{name}{_RUN}", ["text"], _FIELDS)
+            arrays = read_npz(self.folder / f"{name}{_RUN}", ["text"], _FIELDS, text=["text"])
             fields: dict[str, Any] = {**parse_json(str(arrays.pop("text"))), **arrays}
             nested = {
                 group: cls(**{f.name: fields.pop(f"{group}.{f.name}") for f in dataclasses.fields(cls)})
@@ -86,7 +86,7 @@ class Parts:
             return ClosedLoopRun(**fields, **nested)
         except FileNotFoundError:
             return None
-        except (ValueError, TypeError, KeyError) as error:
+        except (ValueError, TypeError, KeyError, AttributeError) as error:
             say(f"The run {name} was kept, but is damaged and made again: {error}")
             return None
 
@@ -100,12 +100,15 @@ class Parts:
 
     def remove(self) -> None:
         """Deletes what the command kept, and the folder unless it holds something else."""
+        self._discard()
+        with contextlib.suppress(OSError):
+            self.folder.rmdir()
+
+    def _discard(self) -> None:
         # the settings last: until then the same command goes on
         for pattern in (f"*{_RUN}", _STATE, _SETTINGS):
             for file in (*self.folder.glob(f"{pattern}{DRAFT}"), *self.folder.glob(pattern)):
                 file.unlink()
-        with contextlib.suppress(OSError):
-            self.folder.rmdir()
 
 
 @contextlib.contextmanager
@@ -122,19 +125,24 @@ def unfinished(out: pathlib.Path, settings: Mapping[str, Any], *, overwrite: boo
 
     Raises:
         UsageError: the folder holds other results and `overwrite` is false, or is a file.
+        ValueError: another process is at work in the folder.
     """
     parts = Parts(out / "parts", settings)
-    if not parts.match():
+    begun = parts.match()
+    if not begun:
         output_folder(out, overwrite=overwrite)
-        parts.begin()
-    try:
-        yield parts
-    except ValueError:
-        # input that is refused before anything was made of it leaves the folder free for other input
-        if parts.empty and list(out.iterdir()) == [parts.folder]:
-            parts.remove()
-        raise
-    parts.remove()
+        parts.folder.mkdir(exist_ok=True)
+    with sole_writer(parts.folder):
+        if not begun:
+            parts.begin()
+        try:
+            yield parts
+        except ValueError:
+            # input that is refused before anything was made of it leaves the folder free for other input
+            if parts.empty and list(out.iterdir()) == [parts.folder]:
+                parts.remove()
+            raise
+        parts.remove()
 
 
 def _names() -> list[str]:

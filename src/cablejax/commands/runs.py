@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from cablejax.cable import Cable, Discretisation
-from cablejax.commands.options import UsageError, say
+from cablejax.commands.options import say
 from cablejax.commands.results import summarise, write_results
 from cablejax.commands.resuming import Parts
 from cablejax.control.run import ClosedLoopRun
@@ -20,12 +20,13 @@ from cablejax.control.targets import Target
 from cablejax.dynamics.fingerprint import fingerprint
 from cablejax.effects.given import GivenEffect
 from cablejax.effects.physics import nominal_physics
-from cablejax.json_file import write_json
+from cablejax.limits import require
 from cablejax.perceive.camera import CameraConfig
 from cablejax.report.effect_words import EFFECTS, listed
 from cablejax.report.style import METHOD_LABEL
 from cablejax.simulate.plant import PlantConfig
 from cablejax.solver_names import SolverName
+from cablejax.text_file import write_json
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -51,8 +52,7 @@ class Job:
     camera: CameraConfig | None = None
 
     def __post_init__(self):
-        if self.steps < 1:
-            raise UsageError(f"--steps is {self.steps}, expected at least 1.")
+        require(self.steps, "commands", "--steps")
         check_fit(self.model, self.plant.cable)
 
     def settings(self) -> dict[str, Any]:

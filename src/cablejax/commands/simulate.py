@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 import tyro
 
 from cablejax.commands.options import Command, say
+from cablejax.whole_file import sole_writer
 
 if TYPE_CHECKING:
     from cablejax.cable import Cable
@@ -82,11 +83,14 @@ class Simulate(Command):
         """Generates what the store lacks and returns its size and digest."""
         import shutil
 
-        from cablejax.dataset.generate import generate
+        from cablejax.dataset.generate import WRITER, generate
         from cablejax.dataset.opening import open_store
 
         config = self.dataset_config()
         if self.overwrite and self.out.is_dir() and any(self.out.iterdir()) and open_store(self.out).config != config:
+            for writer in self.out.glob(f"{WRITER}*"):
+                with sole_writer(writer):
+                    pass
             shutil.rmtree(self.out)
         say(f"{config.n_trajectories} trajectories of {config.n_steps} steps into {self.out}")
         begin = time.perf_counter()

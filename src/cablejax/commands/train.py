@@ -8,7 +8,8 @@ import pathlib
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from cablejax.commands.options import Command, UsageError, say, text_table
-from cablejax.json_file import write_json
+from cablejax.limits import require
+from cablejax.text_file import write_json
 
 if TYPE_CHECKING:
     from cablejax.dataset.store import Store
@@ -90,10 +91,11 @@ class Train(Command):
 
         if self.start_from is not None and self.pretrain:
             raise UsageError("--start-from and --pretrain both say where to start: give one of them.")
-        if self.pretrain < 0:
-            raise UsageError(f"--pretrain is {self.pretrain}, expected 0 or a number of steps.")
-        if self.steps is not None and self.steps < 1:
-            raise UsageError(f"--steps is {self.steps}, expected at least 1; leave it out for those of the preset.")
+        require(self.pretrain, "count_from_zero", "--pretrain")
+        if self.steps is not None:
+            require(self.steps, "optimiser_steps", "--steps", "Leave it out for those of the preset.")
+        if self.lr is not None:
+            require(self.lr, "learning_rate", "--lr")
         stores = [open_store(path) for path in self.data]
         self._check_cables(stores)
         config = self._config(stores[0])

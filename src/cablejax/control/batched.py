@@ -24,6 +24,7 @@ from cablejax.cable import Discretisation
 from cablejax.control.loop import Controller
 from cablejax.control.run import settling_time
 from cablejax.effects.physics import Physics, may_touch, nominal_physics, without_obstacle
+from cablejax.limits import check
 from cablejax.simulate.chain.engine import ChainEngine
 from cablejax.simulate.compile import compiler_options
 from cablejax.simulate.engine import refuse_lags
@@ -54,9 +55,7 @@ class LoopConfig:
     keypoint_dropout: float = 0.0
 
     def __post_init__(self):
-        for name, least in (("steps", 1), ("history_length", 1), ("rest", 0)):
-            if getattr(self, name) < least:
-                raise ValueError(f"LoopConfig.{name} is {getattr(self, name)}, expected an integer >= {least}.")
+        check(self, "interval", steps="commands", history_length="history", rest="count_from_zero")
         check_camera(self)
 
 

@@ -20,6 +20,7 @@ from cablejax.dynamics.bfloat16_slopes import with_bfloat16_slopes
 from cablejax.dynamics.config import ModelConfig
 from cablejax.dynamics.model import apply
 from cablejax.dynamics.weights import cable_of_weights, load_info, load_weights
+from cablejax.limits import shown
 from cablejax.mpc import MPC, SOLVERS, MPCConfig
 from cablejax.perceive.camera import CameraConfig
 from cablejax.perceive.plant import CloudPlant
@@ -34,6 +35,7 @@ Method = Literal["residual", "direct"]
 """The learned model with the online residual, or as it was trained."""
 
 METHODS: tuple[Method, ...] = get_args(Method)
+"""Both methods."""
 
 Runs = Mapping[tuple[str, Method], ClosedLoopRun]
 """Runs by name of the target and method."""
@@ -93,8 +95,10 @@ def load_model(name: str) -> Model:
         ValueError: there is no such model, its file does not fit this version of the network, or it names no cable.
     """
     config, graphdef, weights = load_weights(name)
-    effects = tuple(load_info(name).get("effects", ()))
-    return Model(name, config, NetworkDynamics(graphdef), weights, cable_of_weights(name), effects)
+    effects = load_info(name).get("effects", [])
+    if not isinstance(effects, list) or not all(isinstance(effect, str) for effect in effects):
+        raise ValueError(f"{name} records the effects {shown(effects)}, expected a list of texts.")
+    return Model(name, config, NetworkDynamics(graphdef), weights, cable_of_weights(name), tuple(effects))
 
 
 def make_controller(model: Model, target: Target, *, method: Method, solver: SolverName) -> MPC:

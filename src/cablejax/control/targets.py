@@ -10,11 +10,13 @@ import numpy as np
 from jaxtyping import Float
 
 from cablejax.cable import Cable
-from cablejax.json_file import read_json
+from cablejax.limits import LIMITS
 from cablejax.npz import read_npz
 from cablejax.simulate.elastica import elastica
+from cablejax.text_file import read_json, read_text
 
 Shape = Literal["U", "S", "Z"]
+"""The letters of Wang et al., RA-L 2022."""
 
 START_DISTANCE = 0.99
 """Distance between the grippers of a straight cable, in lengths."""
@@ -25,10 +27,6 @@ LENGTH_TOLERANCE = 0.03
 
 STRETCH = 0.2
 """How much farther neighbouring keypoints may be apart than the cable between them is long, relative to it."""
-FARTHEST = 10.0
-"""Largest distance of a target's keypoints from the origin, in lengths of the cable."""
-MOST_TURNED = 4 * np.pi
-"""Largest angle of a target's gripper [rad]: two turns."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -106,11 +104,10 @@ def target_from_keypoints(
             the polyline's bend to its ends.
 
     Raises:
-        ValueError: another number of points, points that are not finite, or a cable of another length.
+        ValueError: another number of points, points that are not finite, a cable of another length, or grippers that
+            do not hold its ends.
     """
-    if np.iscomplexobj(keypoints):
-        raise ValueError(f"Target {name!r} has complex keypoints, expected real positions [m].")
-    points = np.asarray(keypoints, float)
+    points = _real(keypoints, f"Target {name!r} has keypoints")
     if points.ndim != 2 or points.shape[1:] != (2,):
         raise ValueError(f"Target {name!r} has keypoints of shape {points.shape}, expected ({config.n_keypoints}, 2).")
     if len(points) != config.n_keypoints:
@@ -122,10 +119,10 @@ def target_from_keypoints(
         rows = np.flatnonzero(~np.isfinite(points).all(axis=1)).tolist()
         raise ValueError(f"Target {name!r} has keypoints that are not finite, at {rows}: fill them in or resample.")
     away = float(np.linalg.norm(points, axis=1).max())
-    if away > FARTHEST * config.length:
+    if away / config.length not in LIMITS["target_distance"]:
         raise ValueError(
             f"Target {name!r} lies up to {away:.4g} m from the origin, where a cable of {config.length:.4g} m starts: "
-            f"expected at most {FARTHEST:g} lengths. Move it nearer, or check its unit."
+            f"expected {LIMITS['target_distance']}. Move it nearer, or check its unit."
         )
     edges = np.diff(points, axis=0)
     angle = np.unwrap(np.arctan2(edges[:, 1], edges[:, 0]))
@@ -148,7 +145,7 @@ def target_from_keypoints(
         ends = [1.5 * angle[0] - 0.5 * angle[1], 1.5 * angle[-1] - 0.5 * angle[-2]]
         pose = np.concatenate([points[[0, -1]], np.array(ends)[:, None]], axis=1)
     else:
-        pose = np.asarray(gripper_pose, float)
+        pose = _real(gripper_pose, f"Target {name!r} has a gripper_pose")
         if pose.shape != (2, 3) or not np.isfinite(pose).all():
             raise ValueError(f"Target {name!r} has a gripper_pose not finite or of shape {pose.shape}, not (2, 3).")
         gap = np.abs(pose[:, :2] - points[[0, -1]]).max()
@@ -157,7 +154,7 @@ def target_from_keypoints(
                 f"Target {name!r}: the grippers are {gap:.4g} m away from the first and last keypoint that they hold."
             )
         off = np.arccos(np.cos(pose[:, 2] - angle[[0, -1]]))
-        if np.abs(pose[:, 2]).max() > MOST_TURNED or off.max() > np.pi / 2:
+        if not all(angle in LIMITS["target_angle"] for angle in pose[:, 2]) or off.max() > np.pi / 2:
             raise ValueError(
                 f"Target {name!r} has gripper angles of {pose[0, 2]:.4g} and {pose[1, 2]:.4g}, but its ends lie in the "
                 f"directions {angle[0]:.4g} and {angle[-1]:.4g} rad: expected radians, both along the cable from "
@@ -175,15 +172,26 @@ def load_target(path: str | pathlib.Path, config: Cable = Cable()) -> Target:
         FileNotFoundError: there is no such file.
     """
     path = pathlib.Path(path)
-    if path.suffix not in _READERS:
+    read = _READERS.get(path.suffix.lower())
+    if read is None:
         raise ValueError(f"{path} is none of {', '.join(_READERS)}: save the target's keypoints in one of these.")
     try:
-        fields = _READERS[path.suffix](path)
-    except FileNotFoundError:
-        raise
-    except (ValueError, TypeError, OSError) as error:
+        fields = read(path)
+    except (ValueError, TypeError) as error:
         raise ValueError(f"{path} could not be read as a target: {error}") from error
     return target_from_keypoints(path.stem, fields["keypoints"], config, fields.get("gripper_pose"))
+
+
+def _real(values: object, what: str) -> np.ndarray:
+    """The values in double precision; raises ValueError unless they are real numbers."""
+    try:
+        array = np.asarray(values)
+        if array.dtype.kind in "biuf":
+            return array.astype(float)
+        came = "complex values" if array.dtype.kind == "c" else f"values of type {array.dtype}"
+    except ValueError:
+        came = "rows of different lengths"
+    raise ValueError(f"{what} of {came}, expected real numbers.")
 
 
 def _read_npz(path: pathlib.Path) -> dict[str, np.ndarray]:
@@ -194,11 +202,11 @@ def _read_json(path: pathlib.Path) -> dict[str, np.ndarray]:
     content = read_json(path)
     if not isinstance(content, dict) or "keypoints" not in content:
         raise ValueError('expected an object with the field "keypoints"')
-    return {name: np.asarray(content[name], float) for name in ("keypoints", "gripper_pose") if name in content}
+    return {name: content[name] for name in ("keypoints", "gripper_pose") if name in content}
 
 
 def _read_csv(path: pathlib.Path) -> dict[str, np.ndarray]:
-    lines = [line for line in path.read_text().splitlines() if line.strip()]
+    lines = [line for line in read_text(path).splitlines() if line.strip()]
     if lines and lines[0].lstrip()[0] not in "+-.0123456789" and not lines[0].strip().lower().startswith("nan"):
         lines = lines[1:]  # a heading
     return {"keypoints": np.array([[float(cell) for cell in line.split(",")] for line in lines])}

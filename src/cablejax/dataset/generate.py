@@ -6,9 +6,11 @@ devices or processes, writes the same bytes (with the same engine on the same ki
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
+import itertools
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import jax
 import jax.numpy as jnp
@@ -24,12 +26,16 @@ from cablejax.effects.physics import Physics, nominal_physics
 from cablejax.simulate import ENGINES, Engine, ThreadedEngine
 from cablejax.simulate.motions import random_motion
 from cablejax.types import Trajectory
+from cablejax.whole_file import sole_writer
 
 MAX_ATTEMPTS = 10
 """Motions drawn for one trajectory before generation gives up."""
 
 GRASP_TOLERANCE = 1e-2
 """Largest distance of an end keypoint from its gripper [m]: a cable that snaps through pulls its ends off a bit."""
+
+WRITER = ".writer-"
+"""A folder of this name in the store, with its share after it, is locked by each process that writes there."""
 
 STRETCH_TOLERANCE = 0.01
 """Largest excess of the chord between neighbouring keypoints over the arc length between them, relative."""
@@ -123,29 +129,41 @@ def generate(
         raise ValueError(f"process_index is {index} and process_count {count}, expected 0 <= index < count.")
     store = open_or_create(path, config)
     mine = range(index, config.n_shards, count)
-    states = {shard: store.status(shard) for shard in mine}
-    if not resume and any(state != "missing" for state in states.values()):
+    if not resume and any(store.status(shard) != "missing" for shard in mine):
         raise ValueError(f"{path} exists and holds trajectories. Allow resuming, or give a new folder.")
-    todo = [shard for shard in mine if states[shard] != "complete"]
     simulator = engine or make_engine(config)
     at_once = simulator.shards_at_once if isinstance(simulator, DeviceParallel) else 1
 
+    done: list[int] = []
     total = sum(len(config.shard_rows(shard)) for shard in mine)
-    done = total - sum(len(config.shard_rows(shard)) for shard in todo)
     label = "trajectories" if count == 1 else f"trajectories ({index + 1}/{count})"
-    with tqdm(total=total, initial=done, desc=label, unit="traj", disable=not progress) as bar:
+    writer = store.path / f"{WRITER}{index}-of-{count}"
+    writer.mkdir(exist_ok=True)
+    with sole_writer(writer), tqdm(total=total, desc=label, unit="traj", disable=not progress) as bar:
+
+        def lacking(shard: int) -> bool:
+            if store.status(shard) != "complete":
+                return True
+            done.append(shard)
+            if progress:
+                bar.initial += len(config.shard_rows(shard))  # which took no time
+            bar.update(len(config.shard_rows(shard)))
+            return False
+
         try:
-            for first in range(0, len(todo), at_once):
-                shards = todo[first : first + at_once]
-                for shard, block in zip(shards, simulate(config, simulator, shards), strict=True):
+            todo = filter(lacking, mine)
+            while shards := list(itertools.islice(todo, at_once)):
+                for shard, block in zip(shards, simulate(config, simulator, shards, bar.update), strict=True):
                     store.write_shard(shard, block)
-                    done += len(block)
-                    bar.update(len(block))
+                    done.append(shard)
         except KeyboardInterrupt:
             raise GenerationInterrupted(
-                f"Stopped at {done} of {total} trajectories; they are kept in {path}. "
+                f"Stopped at {sum(len(config.shard_rows(shard)) for shard in done)} of {total} trajectories; they are "
+                f"kept in {path}. "
                 "Run the same generation again to go on from there."
             ) from None
+    with contextlib.suppress(OSError):
+        writer.rmdir()
     if distributed:
         from jax.experimental import multihost_utils
 
@@ -153,26 +171,38 @@ def generate(
     return store.info()
 
 
-def simulate(config: DatasetConfig, engine: Engine, shards: Sequence[int]) -> list[Block]:
+def simulate(
+    config: DatasetConfig, engine: Engine, shards: Sequence[int], progress: Callable[[int], object] = lambda count: None
+) -> list[Block]:
     """The trajectories of some shards, checked by `find_fault`. What fails is drawn again, as the next attempt.
+
+    Args:
+        config: what to make.
+        engine: the simulator.
+        shards: their numbers.
+        progress: called with the number of trajectories whenever some more are done.
 
     Raises:
         ValueError: a trajectory failed `MAX_ATTEMPTS` times.
     """
     rows = np.concatenate([np.asarray(config.shard_rows(shard)) for shard in shards])
     out = {name: np.zeros((len(rows), *shape), dtype) for name, (shape, dtype) in config.array_shapes().items()}
+    # one compiled program simulates whole shards; threads take any number of cables
+    at_once = len(rows) if isinstance(engine, DeviceParallel) else 2 * (os.cpu_count() or 1)
     pending, problems = np.arange(len(rows)), {}
     for attempt in range(MAX_ATTEMPTS):
-        draws = [draw(config, int(index), attempt) for index in rows[pending]]
-        trajectory = _rollout(config, engine, draws)
-        out["keypoints"][pending] = trajectory.keypoints
-        out["gripper_pose"][pending] = trajectory.gripper_pose
-        out["gripper_twist"][pending] = [item.gripper_twist for item in draws]
-        out["parameters"][pending] = [item.parameters for item in draws]
-        out["attempts"][pending] = attempt
-        problems = {
-            k: fault for k in pending if (fault := find_fault(config, Block(**{n: a[k] for n, a in out.items()})))
-        }
+        problems = {}
+        for part in np.split(pending, range(at_once, len(pending), at_once)):
+            draws = [draw(config, int(index), attempt) for index in rows[part]]
+            trajectory = _rollout(config, engine, draws)
+            out["keypoints"][part] = trajectory.keypoints
+            out["gripper_pose"][part] = trajectory.gripper_pose
+            out["gripper_twist"][part] = [item.gripper_twist for item in draws]
+            out["parameters"][part] = [item.parameters for item in draws]
+            out["attempts"][part] = attempt
+            faults = {k: find_fault(config, Block(**{n: a[k] for n, a in out.items()})) for k in part}
+            problems |= {k: fault for k, fault in faults.items() if fault}
+            progress(len(part) - sum(fault is not None for fault in faults.values()))
         pending = np.array(sorted(problems), dtype=int)
         if not problems:
             block = Block(**out)

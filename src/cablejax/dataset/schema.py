@@ -15,6 +15,7 @@ import numpy as np
 from cablejax.cable import Cable, Discretisation
 from cablejax.effects.given import GivenEffect, with_effects
 from cablejax.effects.physics import nominal_physics
+from cablejax.limits import LIMITS, check, shown
 from cablejax.simulate import ENGINES, check_effects
 from cablejax.simulate.equilibrium import FEWEST_LINKS
 from cablejax.simulate.motions import MotionConfig
@@ -31,6 +32,9 @@ class Randomisation:
     """Ranges (low, high) of factors on the nominal parameters, drawn log-uniformly per trajectory; None = nominal.
 
     Wang et al., RA-L 2022, randomise stiffness and damping by factors of 0.1 to 3.
+
+    Attributes:
+        stiffness, damping, friction: range of the factor on bending stiffness, damping time and friction coefficient.
     """
 
     stiffness: tuple[float, float] | None = None
@@ -40,9 +44,12 @@ class Randomisation:
     def __post_init__(self):
         for field in dataclasses.fields(self):
             value = getattr(self, field.name)
-            if value is not None and not (len(value) == 2 and np.all(np.isfinite(value)) and 0 < value[0] <= value[1]):
+            if value is not None and not (
+                len(value) == 2 and all(factor in LIMITS["factor"] for factor in value) and value[0] <= value[1]
+            ):
                 raise ValueError(
-                    f"Randomisation.{field.name} is {value}, expected None or factors (low, high), 0 < low <= high."
+                    f"Randomisation.{field.name} is {shown(value)}, expected None or factors (low, high), each "
+                    f"{LIMITS['factor']}, low <= high."
                 )
 
 
@@ -76,13 +83,7 @@ class DatasetConfig:
     effects: tuple[GivenEffect, ...] = ()
 
     def __post_init__(self):
-        for name in ("n_trajectories", "n_steps", "shard_size"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"DatasetConfig.{name} is {getattr(self, name)}, expected at least 1.")
-        if not (np.isfinite(self.interval) and self.interval > 0):
-            raise ValueError(f"DatasetConfig.interval is {self.interval}, expected a positive number of seconds.")
-        if self.seed < 0:
-            raise ValueError(f"DatasetConfig.seed is {self.seed}, expected an integer >= 0.")
+        check(self, "shard_size", "interval", "seed", n_trajectories="trajectories", n_steps="commands")
         if self.engine not in ENGINES:
             raise ValueError(f"DatasetConfig.engine is {self.engine!r}, expected one of {', '.join(ENGINES)}.")
         if self.discretisation.dimension != 2:
@@ -167,6 +168,8 @@ def config_from_json(cls: type, value: Mapping[str, Any]) -> Any:
     Raises:
         ValueError: the record has a field that this version does not know; the message names it.
     """
+    if not isinstance(value, Mapping):
+        raise ValueError(f"The recorded {cls.__name__} is {shown(value)}, expected an object.")
     hints = typing.get_type_hints(cls)
     unknown = sorted(set(value) - {field.name for field in dataclasses.fields(cls)})
     if unknown:
@@ -174,7 +177,10 @@ def config_from_json(cls: type, value: Mapping[str, Any]) -> Any:
             f"The recorded {cls.__name__} has the unknown {', '.join(unknown)}: another version of cablejax wrote it. "
             "Read it with that version, or make the data set again."
         )
-    return cls(**{name: _decode(hints[name], item) for name, item in value.items()})
+    try:
+        return cls(**{name: _decode(hints[name], item) for name, item in value.items()})
+    except (TypeError, AttributeError) as error:
+        raise ValueError(f"The recorded {cls.__name__} has a value of another type: {error}.") from error
 
 
 def _decode(hint: Any, value: Any) -> Any:

@@ -112,14 +112,17 @@ class Store:
         """
         rows = self._slice(shard)
         try:
-            block = Block(**{name: self._load(name, rows) for name in self.config.array_shapes()})
             digest = self._load("digest", rows)
+            if not digest.any():
+                raise MissingShardError(
+                    f"Shard {shard} of {self.path} has not been generated yet. Run the same generation again to make "
+                    "it."
+                )
+            block = Block(**{name: self._load(name, rows) for name in self.config.array_shapes()})
+        except MissingShardError:
+            raise
         except Exception as error:  # a damaged file may fail in any codec
             raise ValueError(self._damaged(shard, f"cannot be decoded ({error})")) from error
-        if not digest.any():
-            raise MissingShardError(
-                f"Shard {shard} of {self.path} has not been generated yet. Run the same generation again to make it."
-            )
         if not np.array_equal(digest, block.digests()):
             raise ValueError(self._damaged(shard, "does not match its checksums"))
         return block

@@ -29,7 +29,9 @@ _NEGLIGIBLE = 2e-4
 _EXPLAINED = 0.25
 # An effect that leaves more of it than this is not named.
 _TELLING = 0.7
-_GAIN, _LAG = ARMS = "actuation_gain", "actuation_lag"
+ARMS = ("actuation_gain", "actuation_lag")
+"""Names of the effects of the arms."""
+_GAIN, _LAG = ARMS
 
 
 @dataclasses.dataclass(frozen=True)

@@ -35,7 +35,7 @@ LEAST_SQUARES = 1e12
 
 @dataclasses.dataclass(frozen=True)
 class Calibration:
-    """Constants that were set on labelled development logs, see docs/diagnosis.md.
+    """Constants that were set on labelled development logs, see docs/results/diagnosis.md.
 
     Attributes:
         baseline: root mean square error per coordinate of the simulator without any effect, in the unit of the

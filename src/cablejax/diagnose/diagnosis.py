@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from cablejax.types import GapLog
 
 Verdict = Literal["none", "named", "ambiguous", "named+unknown", "unknown"]
+"""No gap; one cause; one of several; a part of the gap; no cause in the library."""
 
 PLACES = ("along_cable_m", "time_s", "table_m")
 """Place of an effect, by the keys of the verdict."""

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from cablejax.cable_length import BENT, bent_chord
 from cablejax.diagnose.clock import Samples, furthest_off, is_even, on_even_clock, usual_interval
 from cablejax.gaplog import validate
 from cablejax.types import GapLog
@@ -18,7 +19,6 @@ _SHORTEST = 20
 # Of an episode of one sample.
 _ANY_INTERVAL = 0.1
 _FAR = 0.1
-_WRONG_LENGTH = 0.12
 # Share of gravity in the plane of the table beyond which it is none.
 _STEEP = 0.9
 
@@ -108,8 +108,6 @@ def prepare(log: GapLog) -> Recording:
             samples = on_even_clock(time, samples, interval)
         episodes.append(samples)
         intervals.append(interval)
-    if max(intervals) > 1.0:
-        raise DiagnosisError(f"The samples are {max(intervals):g} s apart, expected at most 1 s.")
     lengths = [len(samples.hold) for samples in episodes]
     total = -(-max(lengths) // _PADDING) * _PADDING
     shape = (n_episodes, total)
@@ -201,8 +199,7 @@ def _plausible(log: GapLog, recording: Recording) -> list[str]:
     nominal = np.diff(log.meta["keypoint_arclength_m"])
     chord = np.linalg.norm(np.diff(points, axis=2), axis=-1)
     ratio = float(np.nanmedian(chord / nominal)) if np.isfinite(chord).any() else 1.0
-    bent = (2 * np.pi / (points.shape[2] - 1)) ** 2 / 24  # a cable bent into a ring
-    if not 1 - _WRONG_LENGTH - bent <= ratio <= 1 + _WRONG_LENGTH:
+    if not bent_chord(points.shape[2]) - BENT <= ratio <= 1 + BENT:
         raise DiagnosisError(
             f"The keypoints lie {ratio:.2f} times as far apart as meta.keypoint_arclength_m says: correct the length, "
             "the unit, or the marks."

@@ -26,6 +26,7 @@ from cablejax.dynamics.layers import MLP
 from cablejax.dynamics.normalisation import check_trajectories, fit_normalisation
 from cablejax.dynamics.symmetry import initially_symmetric, symmetrised
 from cablejax.dynamics.train_config import TrainConfig
+from cablejax.limits import check
 from cablejax.types import Trajectory
 
 _CHUNK = 100
@@ -50,11 +51,7 @@ class PretrainConfig:
     lr_end: float = 1e-5
 
     def __post_init__(self):
-        for name in ("steps", "batch"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"PretrainConfig.{name} is {getattr(self, name)}, expected an integer >= 1.")
-        if not (self.lr_start > 0 and self.lr_end > 0):
-            raise ValueError(f"PretrainConfig learning rates are {self.lr_start}, {self.lr_end}, expected both > 0.")
+        check(self, "batch", steps="optimiser_steps", lr_start="learning_rate", lr_end="learning_rate")
 
 
 @dataclasses.dataclass(frozen=True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from typing import Literal
 
-import numpy as np
+from cablejax.limits import check
 
 
 @dataclasses.dataclass(frozen=True)
@@ -31,12 +31,7 @@ class Normalisation:
     residual: float = 0.005
 
     def __post_init__(self):
-        for field in dataclasses.fields(self):
-            value = getattr(self, field.name)
-            if not (np.isfinite(value) and value > 0):
-                raise ValueError(
-                    f"Normalisation.{field.name} is {value}, expected a positive finite scale in SI units."
-                )
+        check(self, **{field.name: "positive" for field in dataclasses.fields(self)})
 
 
 @dataclasses.dataclass(frozen=True)
@@ -82,20 +77,18 @@ class ModelConfig:
     normalisation: Normalisation = Normalisation()
 
     def __post_init__(self):
-        for name, least in (
-            ("n_keypoints", 3),
-            ("history", 1),
-            ("latent", 1),
-            ("hidden", 1),
-            ("hidden_layers", 1),
-            ("message_passing", 1),
-        ):
-            if getattr(self, name) < least:
-                raise ValueError(f"ModelConfig.{name} is {getattr(self, name)}, expected an integer >= {least}.")
-        for name in ("length", "radius", "interval"):
-            value = getattr(self, name)
-            if not (np.isfinite(value) and value > 0):
-                raise ValueError(f"ModelConfig.{name} is {value}, expected a positive finite number in SI units.")
+        check(
+            self,
+            "length",
+            "history",
+            "interval",
+            n_keypoints="at_least_three",
+            radius="length_scale",
+            latent="width",
+            hidden="width",
+            hidden_layers="layers",
+            message_passing="layers",
+        )
         for name, known in (
             ("network", ("gns", "mlp", "lstm")),
             ("prior", ("static", "rigid", "none")),

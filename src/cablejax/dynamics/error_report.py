@@ -29,7 +29,9 @@ from cablejax.dynamics.evaluate import (
 from cablejax.types import Trajectory
 
 MODEL = "network"
+"""Name of the network among the predictors."""
 GROUPS = ("all windows", "no snap-through", "snap-through")
+"""Windows by whether the cable snaps through in them."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -7,9 +7,11 @@ import shutil
 from pathlib import Path
 from typing import Any
 
-from cablejax.json_file import read_json, write_json
+from cablejax.text_file import read_json, write_json
+from cablejax.whole_file import sole_writer
 
 RUN, CHECKPOINTS, METRICS, BOARD = "run.json", "checkpoints", "metrics.csv", "tensorboard"
+"""What a training's folder holds: its settings, checkpoints, errors by step, and curves for TensorBoard."""
 
 # What `cablejax train` adds in the end.
 _RESULTS = ("weights.safetensors", "card.md", "summary.json")
@@ -84,9 +86,10 @@ def _read(path: Path) -> dict[str, Any]:
 def _discard(out_dir: Path) -> None:
     """Deletes what a training wrote, its name last: until then it can be deleted again."""
     checkpoints, board = out_dir / CHECKPOINTS, out_dir / BOARD
-    for step in checkpoints.glob("[0-9]*"):
-        shutil.rmtree(step)
-    for events in board.glob("events.*"):
-        events.unlink()
-    for name in (METRICS, *_RESULTS, RUN):
-        (out_dir / name).unlink(missing_ok=True)
+    with sole_writer(out_dir):
+        for step in checkpoints.glob("[0-9]*"):
+            shutil.rmtree(step)
+        for events in board.glob("events.*"):
+            events.unlink()
+        for name in (METRICS, *_RESULTS, RUN):
+            (out_dir / name).unlink(missing_ok=True)

@@ -37,7 +37,9 @@ from cablejax.dynamics.normalisation import check_trajectories, fit_normalisatio
 from cablejax.dynamics.run_folder import CHECKPOINTS, claim_folder
 from cablejax.dynamics.symmetry import initially_symmetric, symmetrised
 from cablejax.dynamics.train_config import Phase, TrainConfig
+from cablejax.interrupts import saving, unless
 from cablejax.types import Trajectory
+from cablejax.whole_file import sole_writer
 
 
 class DivergedError(ValueError):
@@ -108,7 +110,8 @@ def train(
         progress: show a progress bar with remaining time.
 
     Raises:
-        ValueError: bad data, or `out_dir` holds a run of another configuration or data, or something else.
+        ValueError: bad data, or `out_dir` holds a run of another configuration or data, or something else, or another
+            process trains there.
         DivergedError: the loss is no longer finite.
     """
     check_trajectories(data, config.model, steps=config.longest_rollout, what="training data")
@@ -133,7 +136,7 @@ def train(
     columns = ("phase", "learning_rate", "loss", "gradient_norm", *(f"open_loop_{h}_cm" for h in HORIZONS), "seconds")
 
     scores: dict[int, float] = {}
-    with Checkpoints(out_dir / CHECKPOINTS) as checkpoints, interrupt_flag() as interrupted:
+    with sole_writer(out_dir), Checkpoints(out_dir / CHECKPOINTS) as checkpoints, interrupt_flag() as interrupted:
         if checkpoints.latest() is not None:
             state = checkpoints.restore(state, report=functools.partial(tqdm.write, file=sys.stderr))
         step, total = int(state.step), config.total_steps
@@ -142,8 +145,11 @@ def train(
             while step < total and not interrupted.is_set():
                 index, end = config.phase_at(step)
                 update = chunk_update(config, index, graphdef, min(config.chunk, end - step))
-                began = time.perf_counter()
-                state, losses = jax.block_until_ready(update(state, device_data))
+                began, current = time.perf_counter(), state
+                made = unless(interrupted, lambda: jax.block_until_ready(update(current, device_data)))  # noqa: B023
+                if made is None:
+                    break
+                state, losses = made
                 seconds, done, step = time.perf_counter() - began, int(state.step) - step, int(state.step)
                 row = {"phase": index, "seconds": seconds} | chunk_metrics(config, step, losses, out_dir)
                 chunks = -(-step // config.chunk)
@@ -151,10 +157,13 @@ def train(
                     scores = evaluate(state.average)
                     row |= {f"open_loop_{h}_cm": score for h, score in scores.items()}
                 log.write(step, row)
-                if chunks % config.checkpoint_every == 0 or step == total or interrupted.is_set():
+                if chunks % config.checkpoint_every == 0 or step == total:
                     checkpoints.save(step, state)
                 bar.update(done)
                 bar.set_postfix({"loss": f"{row['loss']:.2e}"} | {f"e{h}_cm": f"{s:.3f}" for h, s in scores.items()})
+            if interrupted.is_set() and step:
+                with saving():
+                    checkpoints.save(step, state)
     return TrainResult(model_config, graphdef, symmetrised(state.average, model_config), step, step == total, scores)
 
 

@@ -8,6 +8,7 @@ from typing import Literal
 import optax
 
 from cablejax.dynamics.config import ModelConfig
+from cablejax.limits import check
 
 
 @dataclasses.dataclass(frozen=True)
@@ -37,15 +38,16 @@ class Phase:
     pushforward: bool = False
 
     def __post_init__(self):
-        for name in ("steps", "batch", "rollout"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"Phase.{name} is {getattr(self, name)}, expected an integer >= 1.")
-        if not self.robust > 0:
-            raise ValueError(f"Phase.robust is {self.robust}, expected > 0.")
-        if not self.noise >= 0:
-            raise ValueError(f"Phase.noise is {self.noise} m, expected >= 0.")
-        if not (self.lr_start > 0 and self.lr_end > 0):
-            raise ValueError(f"Phase learning rates are {self.lr_start} and {self.lr_end}, expected both > 0.")
+        check(
+            self,
+            "batch",
+            "noise",
+            steps="optimiser_steps",
+            rollout="commands",
+            robust="positive",
+            lr_start="learning_rate",
+            lr_end="learning_rate",
+        )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -84,9 +86,8 @@ class TrainConfig:
     def __post_init__(self):
         if not self.phases:
             raise ValueError("TrainConfig.phases is empty, expected at least one Phase.")
-        for name in ("chunk", "checkpoint_every", "evaluate_every", "evaluate_starts"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"TrainConfig.{name} is {getattr(self, name)}, expected an integer >= 1.")
+        counts = ("chunk", "checkpoint_every", "evaluate_every", "evaluate_starts")
+        check(self, "seed", **dict.fromkeys(counts, "count"))
         if not 0 <= self.ema < 1:
             raise ValueError(f"TrainConfig.ema is {self.ema}, expected 0 <= ema < 1.")
 

@@ -30,6 +30,8 @@ from cablejax.cable import Cable
 from cablejax.cable_file import cable_from_fields
 from cablejax.dynamics.config import ModelConfig, Normalisation
 from cablejax.dynamics.model import structure_of
+from cablejax.limits import shown
+from cablejax.text_file import parse_json
 from cablejax.whole_file import whole_file
 
 SCHEMA = "cablejax-weights/1"
@@ -39,6 +41,7 @@ FILE_NAME = "weights.safetensors"
 """Name of the file in a training's folder."""
 
 SUFFIX = ".safetensors"
+"""Ending of files with weights."""
 
 _KEY = "cablejax"
 
@@ -172,13 +175,14 @@ def _open(source: str | os.PathLike[str]) -> tuple[Path, dict[str, Any]]:
     try:
         with safe_open(path, framework="numpy") as file:
             metadata = file.metadata() or {}
-        content = json.loads(metadata.get(_KEY, "null"))
-    except (SafetensorError, OSError, ValueError, RecursionError) as error:
+        content = parse_json(metadata.get(_KEY, "null"))
+    except (SafetensorError, OSError, ValueError) as error:
         raise WeightsError(f"{path} is no safetensors file, or a damaged one ({error}).") from error
     schema = content.get("schema") if isinstance(content, dict) else None
-    if not isinstance(content, dict) or schema != SCHEMA or not {"config", "info"} <= content.keys():
+    if not isinstance(content, dict) or schema != SCHEMA or not isinstance(content.get("info"), dict):
         raise WeightsError(
-            f"{path} has schema {schema!r}, expected {SCHEMA!r}. Read it with the version of cablejax that wrote it."
+            f"{path} has schema {shown(schema)}, expected {SCHEMA!r} with its config and info. Read it with the "
+            "version of cablejax that wrote it."
         )
     return path, content
 
@@ -188,7 +192,7 @@ def _config_of(content: dict[str, Any], path: Path) -> ModelConfig:
         recorded: dict[str, Any] = dict(content["config"])
         recorded["normalisation"] = Normalisation(**recorded["normalisation"])
         return ModelConfig(**recorded)
-    except (TypeError, KeyError) as error:
+    except (TypeError, KeyError, AttributeError) as error:
         raise WeightsError(
             f"{path} records a configuration that this version of cablejax does not know ({error}). "
             "Read it with the version that wrote it."

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 import math
 import os
 from collections.abc import Iterable, Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,11 +14,14 @@ from cablejax.cable import Discretisation
 from cablejax.effects import ARMS, LIBRARY
 from cablejax.effects.base import CableEffect, Hook
 from cablejax.effects.physics import Physics
+from cablejax.limits import require, shown
+from cablejax.text_file import read_json
 
 EFFECTS: Mapping[str, CableEffect] = {effect.name: effect for effect in (*LIBRARY, *ARMS)}
 """Every effect by its name in the gap log's format."""
 
 VERDICT_SCHEMA = "cablejax-verdict/1"
+"""Format and version of `verdict.json`."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -43,21 +44,20 @@ class GivenEffect:
     until_s: float = math.inf
 
     def __post_init__(self):
+        if not isinstance(self.name, str) or self.name not in EFFECTS:
+            raise ValueError(f"There is no effect {shown(self.name)}. Expected one of: {', '.join(sorted(EFFECTS))}.")
         if not 0 <= self.from_s < self.until_s:
             raise ValueError(
                 f"{self.name}: from_s is {self.from_s}, until_s {self.until_s}; expected 0 <= from_s < until_s [s]."
             )
-        if self.name not in EFFECTS:
-            raise ValueError(f"There is no effect {self.name!r}. Expected one of: {', '.join(sorted(EFFECTS))}.")
         object.__setattr__(self, "parameters", tuple((str(n), v) for n, v in self.parameters))
         known, required = _parameter_names(self.effect)
         named = dict(self.parameters)
         example = f"{self.name}:{','.join(f'{name}=...' for name in required)}"
         for name, value in named.items():
             if name not in known:
-                raise ValueError(f"{self.name} has no parameter {name!r}, expected {', '.join(known)}: {example}.")
-            if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-                raise ValueError(f"{self.name}: {name} is {value!r}, expected a finite number.")
+                raise ValueError(f"{self.name} has no parameter {shown(name)}, expected {', '.join(known)}: {example}.")
+            require(value, "finite", f"{self.name}: {name}")
         missing = [name for name in required if name not in named]
         if missing:
             raise ValueError(f"{self.name} lacks {', '.join(missing)}. Expected {example}.")
@@ -125,7 +125,7 @@ def parse_effect(text: str) -> GivenEffect:
         except ValueError:
             value = math.nan
         if not math.isfinite(value):
-            raise ValueError(f"Effect {text!r}: {item!r} is not of the form parameter=number.")
+            raise ValueError(f"Effect {shown(text)}: {shown(item)} is not of the form parameter=number.")
         parameters.append((key.strip(), value))
     times = {key: value for key, value in parameters if key in ("from_s", "until_s")}
     return GivenEffect(name.strip(), tuple(pair for pair in parameters if pair[0] not in times), **times)
@@ -138,16 +138,18 @@ def effects_of_verdict(path: str | os.PathLike[str]) -> tuple[GivenEffect, ...]:
         ValueError: the file is no verdict, or it names no effect ("none" and "unknown").
     """
     try:
-        verdict = json.loads(Path(path).read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError) as error:
-        raise ValueError(f"{path} is no readable verdict ({error}). Expected a verdict.json of `diagnose`.") from error
+        verdict = read_json(path)
+    except (OSError, ValueError) as error:
+        raise ValueError(f"This is no verdict: {error} Expected a verdict.json of `diagnose`.") from error
     if not isinstance(verdict, dict) or verdict.get("schema") != VERDICT_SCHEMA:
         came = verdict.get("schema") if isinstance(verdict, dict) else None
-        raise ValueError(f"{path} has schema {came!r}, expected {VERDICT_SCHEMA!r}: a verdict.json of `diagnose`.")
-    named = verdict.get("effects") or []
+        raise ValueError(f"{path} has schema {shown(came)}, expected {VERDICT_SCHEMA!r}: a verdict.json of `diagnose`.")
+    named = verdict.get("effects")
+    if not isinstance(named, list):
+        raise ValueError(f"{path}: effects is {shown(named)}, expected a list.")
     if not named:
         raise ValueError(
-            f"{path} names no effect (its verdict is {verdict.get('verdict')!r}), so there is nothing to add. "
+            f"{path} names no effect (its verdict is {shown(verdict.get('verdict'))}), so there is nothing to add. "
             "Leave --with out, or give an effect with --effect."
         )
     return tuple(piece for effect in named for piece in _pieces(effect, path))

@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 from collections.abc import Hashable
 from typing import Any
 
 import numpy as np
 
 from cablejax.adaptation.belief import AdaptationConfig
+from cablejax.limits import check
 from cablejax.mpc.plan import Solver
 from cablejax.mpc.planners import LevenbergMarquardt
 from cablejax.mpc.problem import ObjectiveConfig
 from cablejax.residual.learner import LearnerConfig
-from cablejax.whole_number import is_whole
 
 
 @dataclasses.dataclass(frozen=True)
@@ -105,10 +104,21 @@ class MPCConfig:
         return cls(**{**scaled, **settings})
 
     def __post_init__(self):
-        if not is_whole(self.horizon, least=0):
-            raise ValueError(f"MPCConfig.horizon is {self.horizon}, expected a whole number, at least 0 (one command).")
-        if not (math.isfinite(self.cable_length) and self.cable_length > 0):
-            raise ValueError(f"MPCConfig.cable_length is {self.cable_length}, expected a positive length [m].")
+        check(
+            self,
+            "horizon",
+            cable_length="positive",
+            radius_max="positive",
+            grow="positive",
+            min_reduction="positive",
+            hold_improvement="not_negative",
+            settle_after="count",
+            wake="positive",
+            arrived="positive",
+            restart_above="positive",
+            restart_after="count",
+            max_restarts="count_from_zero",
+        )
         if not 0 <= self.min_distance < self.max_distance <= 1:
             raise ValueError(
                 f"MPCConfig distances {self.min_distance} to {self.max_distance}: expected 0 <= min_distance < "
@@ -121,8 +131,8 @@ class MPCConfig:
                     f"MPCConfig.workspace is {self.workspace}, expected ((x, y) of the lowest, (x, y) of the highest "
                     "corner) [m]."
                 )
-        if self.max_change is not None and not self.max_change > 0:
-            raise ValueError(f"MPCConfig.max_change is {self.max_change}, expected a positive length [m] or None.")
+        if self.max_change is not None:
+            check(self, max_change="positive")
         if not 0 < self.radius_min <= self.radius <= self.radius_max:
             raise ValueError(
                 f"MPCConfig radii {self.radius_min}, {self.radius}, {self.radius_max}: expected "
@@ -133,20 +143,6 @@ class MPCConfig:
                 f"MPCConfig radius: thresholds {self.shrink_below}, {self.grow_above} must increase, and factors "
                 f"{self.shrink}, {self.grow} lie on either side of 1."
             )
-        whole = is_whole(self.restart_after, least=1) and is_whole(self.max_restarts, least=0)
-        if not (self.restart_above > 0 and whole):
-            raise ValueError(
-                f"MPCConfig restarts: restart_above {self.restart_above} m, restart_after {self.restart_after}, "
-                f"max_restarts {self.max_restarts}: expected a positive length, a whole number of at least 1, and one "
-                "of at least 0."
-            )
-        if not (self.min_reduction > 0 and self.wake > 0 and self.arrived > 0 and self.hold_improvement >= 0):
-            raise ValueError(
-                f"MPCConfig lengths: min_reduction {self.min_reduction}, wake {self.wake}, arrived {self.arrived}, "
-                f"hold_improvement {self.hold_improvement}: expected positive lengths [m], the last may be 0."
-            )
-        if not is_whole(self.settle_after, least=1):
-            raise ValueError(f"MPCConfig.settle_after is {self.settle_after}, expected a whole number, at least 1.")
         self._check_parts()
 
     def _check_parts(self) -> None:

@@ -208,3 +208,4 @@ SOLVERS: Mapping[str, Solver] = MappingProxyType(
         "path-integral": PathIntegral(),
     }
 )
+"""The planners by their names on the command line."""

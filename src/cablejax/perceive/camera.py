@@ -10,6 +10,7 @@ from jaxtyping import Float
 from scipy.ndimage import convolve
 
 from cablejax.cable import Discretisation
+from cablejax.limits import check
 from cablejax.simulate.composite import link_lengths, node_offsets
 
 CENTRE_DEPTH = np.pi / 4
@@ -60,15 +61,14 @@ class CameraConfig:
     seed: int = 0
 
     def __post_init__(self):
-        for name in ("distance", "field_of_view"):
-            value = getattr(self, name)
-            if not (np.isfinite(value) and value > 0):
-                raise ValueError(f"CameraConfig.{name} is {value}, expected a positive finite number.")
-        if not (np.isfinite(self.range_noise) and self.range_noise >= 0):
-            raise ValueError(f"CameraConfig.range_noise is {self.range_noise}, expected a finite number >= 0 [m].")
-        for name in ("dropout", "outliers"):
-            if not 0 <= getattr(self, name) <= 1:
-                raise ValueError(f"CameraConfig.{name} is {getattr(self, name)}, expected a probability.")
+        check(
+            self,
+            distance="positive",
+            field_of_view="positive",
+            range_noise="noise",
+            dropout="probability",
+            outliers="probability",
+        )
         if not 0 <= self.tilt <= 1.2:
             raise ValueError(
                 f"CameraConfig.tilt is {self.tilt} rad, expected 0 (straight above) to 1.2: a flatter view does not "

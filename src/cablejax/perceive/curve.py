@@ -23,15 +23,23 @@ KERNEL_FLOOR = 1e-3
 
 
 class CurveMatrices(NamedTuple):
-    """Constant matrices of one cable; n links, J joints, N keypoints. Read only: cached."""
+    """Constant matrices of one cable; n links, J joints, N keypoints. Read only: cached.
 
-    lengths: Any  # [n]
-    node_offsets: Any  # [n]
-    keypoints_of_nodes: Any  # [N, n]
-    keypoints_of_tangents: Any  # [N, n]
-    beyond: Any  # [n, J], 1 where the link lies beyond the joint
-    arclength: Any  # [n], of the links' middles, as a fraction of the length
-    stiffness_of_motion: Any  # [n, n], inverse of the kernel of coherent motion
+    Attributes:
+        lengths, node_offsets: of the links [m], and from a link's start to its node [m], shape [n].
+        keypoints_of_nodes, keypoints_of_tangents: Hermite weights of nodes and of tangents [m], shape [N, n].
+        beyond: 1 where the link lies beyond the joint, shape [n, J].
+        arclength: of the links' middles, as a fraction of the length, shape [n].
+        stiffness_of_motion: inverse of the kernel of coherent motion, shape [n, n].
+    """
+
+    lengths: Any
+    node_offsets: Any
+    keypoints_of_nodes: Any
+    keypoints_of_tangents: Any
+    beyond: Any
+    arclength: Any
+    stiffness_of_motion: Any
 
 
 class Curve(NamedTuple):

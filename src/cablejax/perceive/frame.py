@@ -9,9 +9,9 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from cablejax.limits import check
 from cablejax.perceive.registration import CurveFit, RegistrationConfig, register
 
 ROTATION_WEIGHT = 0.15
@@ -63,16 +63,9 @@ class TrackerConfig:
     retry: int = 5
 
     def __post_init__(self):
-        for name in ("capacity", "iterations", "min_points", "retry"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"TrackerConfig.{name} is {getattr(self, name)}, expected at least 1.")
-        for name in ("reach", "max_sigma", "max_curvature", "max_search"):
-            value = getattr(self, name)
-            if not (np.isfinite(value) and value > 0):
-                raise ValueError(f"TrackerConfig.{name} is {value}, expected a positive finite number.")
-        for name in ("min_support", "min_seen"):
-            if not 0 <= getattr(self, name) <= 1:
-                raise ValueError(f"TrackerConfig.{name} is {getattr(self, name)}, expected a number in [0, 1].")
+        counts, sizes = ("capacity", "iterations", "min_points", "retry"), ("reach", "max_sigma", "max_curvature")
+        check(self, **dict.fromkeys(counts, "count"), **dict.fromkeys((*sizes, "max_search"), "positive"))
+        check(self, min_support="probability", min_seen="probability")
 
 
 class TrackState(NamedTuple):

@@ -26,10 +26,11 @@ BOWS = (1.2, -1.2, 2.2, -2.2)
 GUESS_SIGMA, PATH_SIGMA = 0.1, 0.03
 """Standard deviation from which the guesses anneal, in lengths of the cable: those without the cloud, and along it."""
 ITERATIONS = 30
+"""Iterations of each guess on the sample."""
 SAMPLE = 500
 """Points by which the guesses are judged at first; the best few are refined with all."""
-FINALISTS = 4
-REFINEMENTS = 8
+FINALISTS, REFINEMENTS = 4, 8
+"""How many guesses are refined with all points, and by how many iterations."""
 SAME = 0.01
 """Mean distance of keypoints, in lengths, up to which two fits are the same."""
 

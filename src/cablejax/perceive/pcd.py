@@ -7,6 +7,9 @@ import pathlib
 import numpy as np
 from jaxtyping import Float
 
+from cablejax.limits import shown
+from cablejax.text_file import read_bytes
+
 _KINDS = {"F": "f", "I": "i", "U": "u"}
 
 
@@ -18,7 +21,7 @@ def read_pcd(path: pathlib.Path) -> Float[np.ndarray, "S 3"]:
     Raises:
         ValueError: the file is not a PCD file, is compressed, cut short, or has no x, y and z.
     """
-    content = path.read_bytes()
+    content = read_bytes(path)
     header, start = _header(path, content)
     try:
         names = header["FIELDS"]
@@ -26,6 +29,8 @@ def read_pcd(path: pathlib.Path) -> Float[np.ndarray, "S 3"]:
         sizes = [int(value) for value in header["SIZE"]]
         kinds = [_KINDS[value] for value in header["TYPE"]]
         points = int(header["POINTS"][0])
+        if points < 0 or min(counts) < 1:
+            raise ValueError(f"{points} points of {min(counts)} values")
         encoding = header["DATA"][0].lower()
         columns = [
             (f"{index}", f"<{kind}{size}", (count,))
@@ -33,7 +38,7 @@ def read_pcd(path: pathlib.Path) -> Float[np.ndarray, "S 3"]:
         ]
         layout = np.dtype(columns)
     except (KeyError, ValueError, IndexError, TypeError) as error:
-        raise ValueError(f"{path} has a PCD header that is incomplete or contradicts itself: {error!r}.") from None
+        raise ValueError(f"{path} has a PCD header that is incomplete or contradicts itself: {error}.") from None
     if len(columns) != len(names) or not {"x", "y", "z"} <= set(names):
         raise ValueError(
             f"{path} has the fields {' '.join(names)}, expected x, y and z among them, each with its type."
@@ -52,8 +57,8 @@ def read_pcd(path: pathlib.Path) -> Float[np.ndarray, "S 3"]:
         try:
             values = [[float(row[column[names.index(axis)]]) for axis in "xyz"] for row in rows[:points]]
         except ValueError as error:
-            raise ValueError(f"{path} has a point that is not a number: {error}") from None
-        return np.array(values, np.float32).reshape(points, 3)
+            raise ValueError(f"{path} has a point that is not a number: {shown(str(error))}") from None
+        return np.array(values).reshape(points, 3).astype(np.float32)
     raise ValueError(
         f"{path} has DATA {encoding}, expected ascii or binary: convert it with pcl_convert_pcd_ascii_binary."
     )

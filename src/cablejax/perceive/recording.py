@@ -9,11 +9,15 @@ import pathlib
 import numpy as np
 from jaxtyping import Float
 
+from cablejax.limits import require, shown
 from cablejax.npz import read_npz
 from cablejax.perceive.pcd import read_pcd
+from cablejax.text_file import read_text
 
 POSES_FILE = "poses.csv"
+"""Name of the file with the gripper poses in a folder of PCD files."""
 POSES_HEADER = ("time", "x0", "y0", "theta0", "x1", "y1", "theta1")
+"""Its columns [s, m, rad]."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -22,7 +26,7 @@ class CloudSequence:
 
     Attributes:
         time: [s], increasing, shape [T].
-        clouds: T arrays [m], shape [S, 2 or 3]; S varies and may be 0, NaN = no measurement.
+        clouds: T arrays [m], shape [S, 2 or 3]; S varies and may be 0, NaN or infinite = no measurement.
         gripper_pose: (x, y, theta) [m, rad], shape [T, Q, 3].
     """
 
@@ -50,6 +54,12 @@ class CloudSequence:
                     f"The cloud of frame {frame} has shape {cloud.shape} and type {cloud.dtype}, expected floating "
                     "point numbers of shape [S, 2] or [S, 3]."
                 )
+            farthest = float(np.abs(cloud[np.isfinite(cloud)]).max(initial=0.0))
+            require(farthest, "coordinate", f"The farthest point of frame {frame}")
+        require(float(np.abs(self.gripper_pose).max()), "coordinate", "The largest entry of the gripper poses")
+        require(float(np.abs(self.time).max()), "finite", "The largest time")
+        if not any(np.isfinite(cloud).all(axis=1).any() for cloud in self.clouds):
+            raise ValueError("No cloud of the sequence has a point with finite coordinates: there is nothing to see.")
 
 
 def read_clouds(path: str | os.PathLike[str]) -> CloudSequence:
@@ -70,15 +80,21 @@ def read_clouds(path: str | os.PathLike[str]) -> CloudSequence:
     if not path.is_file():
         raise ValueError(f"{path} does not exist, expected an .npz file or a folder of PCD files.")
     arrays = read_npz(path, ["time", "gripper_pose", "points"], ["count"])
+    for name in ("time", "gripper_pose", "points"):
+        if not np.issubdtype(arrays[name].dtype, np.floating):
+            raise ValueError(f"{path}: {name} is of type {arrays[name].dtype}, expected floating point numbers.")
     points = arrays["points"]
-    if not np.issubdtype(points.dtype, np.floating):
-        raise ValueError(f"{path}: points are {points.dtype}, expected floating point numbers.")
     if "count" in arrays:
         count = arrays["count"]
-        if points.ndim != 2 or not np.issubdtype(count.dtype, np.integer) or count.sum() != len(points):
+        if count.ndim != 1 or not np.issubdtype(count.dtype, np.integer) or (count < 0).any():
             raise ValueError(
-                f"{path}: count {count.shape} of type {count.dtype} sums up to {count.sum()}, but points has shape "
-                f"{points.shape}: expected as many rows."
+                f"{path}: count has shape {count.shape} and type {count.dtype}, expected whole numbers >= 0, one for "
+                "each frame."
+            )
+        if points.ndim != 2 or sum(count.tolist()) != len(points):
+            raise ValueError(
+                f"{path}: count sums up to {sum(count.tolist())}, but points has shape {points.shape}: expected as "
+                "many rows."
             )
         clouds = np.split(points, np.cumsum(count)[:-1]) if len(count) else []
     elif points.ndim == 3:
@@ -103,22 +119,20 @@ def write_clouds(path: str | os.PathLike[str], sequence: CloudSequence) -> pathl
 
 
 def _read_folder(folder: pathlib.Path) -> CloudSequence:
-    files = sorted(folder.glob("*.pcd"))
+    files = sorted(path for path in folder.iterdir() if path.suffix.lower() == ".pcd")
     poses = folder / POSES_FILE
     if not files or not poses.is_file():
         raise ValueError(
             f"{folder} has {len(files)} PCD files and {'a' if poses.is_file() else 'no'} {POSES_FILE}, expected at "
             f"least one, and the grippers' poses with the header {','.join(POSES_HEADER)}."
         )
-    with poses.open(encoding="utf-8") as text:
-        header = tuple(name.strip() for name in text.readline().split(","))
-        if header != POSES_HEADER:
-            raise ValueError(f"{poses} begins with {','.join(header)!r}, expected {','.join(POSES_HEADER)!r}.")
-        lines = [line for line in text if line.strip()]
+    first, *lines = [line for line in read_text(poses).splitlines() if line.strip()] or [""]
+    if tuple(name.strip() for name in first.split(",")) != POSES_HEADER:
+        raise ValueError(f"{poses} begins with {shown(first)}, expected {','.join(POSES_HEADER)!r}.")
     try:
         rows = np.array([[float(value) for value in line.split(",")] for line in lines])
     except ValueError as error:
-        raise ValueError(f"{poses} has a row that is not seven numbers: {error}") from None
+        raise ValueError(f"{poses} has a row that is not seven numbers: {shown(str(error))}") from None
     if rows.shape != (len(files), len(POSES_HEADER)):
         raise ValueError(
             f"{poses} has rows of shape {rows.shape}, expected {len(files)} rows of {len(POSES_HEADER)}: one per file."

@@ -8,9 +8,9 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from cablejax.limits import check
 from cablejax.perceive.curve import (
     Curve,
     CurveMatrices,
@@ -69,14 +69,8 @@ class RegistrationConfig:
     bending: float = 100.0
 
     def __post_init__(self):
-        for name in ("length", "area", "min_sigma", "settled_sigma", "kernel_width", "bending"):
-            value = getattr(self, name)
-            if not (np.isfinite(value) and value > 0):
-                raise ValueError(f"RegistrationConfig.{name} is {value}, expected a positive finite number.")
-        for name in ("coherence", "structure"):
-            value = getattr(self, name)
-            if not (np.isfinite(value) and value >= 0):
-                raise ValueError(f"RegistrationConfig.{name} is {value}, expected a finite number >= 0.")
+        scales = ("area", "min_sigma", "settled_sigma", "kernel_width", "bending")
+        check(self, "length", coherence="not_negative", structure="not_negative", **dict.fromkeys(scales, "positive"))
         if not 0 < self.outlier_weight < 1:
             raise ValueError(
                 f"RegistrationConfig.outlier_weight is {self.outlier_weight}, expected a number in (0, 1)."

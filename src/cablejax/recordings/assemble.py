@@ -11,7 +11,7 @@ from jaxtyping import Float
 from scipy.interpolate import CubicSpline
 
 from cablejax.cable import Cable
-from cablejax.cable_length import require_long_enough
+from cablejax.cable_length import require_fitting_length
 from cablejax.gaplog import Episode, gap_log_from_episodes
 from cablejax.recordings.poses import twists
 from cablejax.recordings.take import Take, typical_spacing
@@ -63,7 +63,7 @@ def gap_log_from_takes(takes: Sequence[Take], nominal: Nominal, *, source: str, 
         raise ValueError(
             f"The arc lengths of the keypoints are {arclength.tolist()}, expected {points} increasing numbers from 0."
         )
-    require_long_enough([take.keypoints for take in takes], arclength, "keypoint_arclength_m")
+    require_fitting_length([take.keypoints for take in takes], arclength, "keypoint_arclength_m")
     cable = Cable(
         length=float(arclength[-1]),
         diameter=nominal.diameter,

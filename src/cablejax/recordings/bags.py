@@ -19,9 +19,14 @@ from cablejax.recordings.take import Take
 from cablejax.types import GapLog
 
 POSE_ARRAY, POSE_STAMPED = "geometry_msgs/msg/PoseArray", "geometry_msgs/msg/PoseStamped"
+"""ROS types of the keypoints and of a gripper."""
 
 LARGEST_LAG = 0.05
 """Farthest from a sample of the keypoints [s] that the poses of a gripper on both sides of it may be."""
+
+
+class BagError(ValueError):
+    """A bag that cannot be read, or without the topics that are wanted."""
 
 
 def import_mcap(path: str | os.PathLike[str], layout: str | os.PathLike[str]) -> tuple[GapLog, list[str]]:
@@ -31,7 +36,7 @@ def import_mcap(path: str | os.PathLike[str], layout: str | os.PathLike[str]) ->
 
     Args:
         path: of the bag.
-        layout: TOML file that names the topics, see `docs/recordings.md`.
+        layout: TOML file that names the topics, see `docs/how_to/own_recording.md`.
 
     Returns:
         A gap log in space, and a sentence on each repair.
@@ -71,7 +76,7 @@ def _take(path: pathlib.Path, how: Layout) -> Take:
 def _messages(path: pathlib.Path, wanted: dict[str, str]) -> dict[str, list[tuple[float, np.ndarray]]]:
     """Time [s] and poses (x, y, z, qw, qx, qy, qz) of every message on the wanted topics."""
     try:
-        from rosbags.highlevel import AnyReader, AnyReaderError
+        from rosbags.highlevel import AnyReader
         from rosbags.typesys import Stores, get_typestore
     except ModuleNotFoundError:
         raise ValueError("Reading bags needs the library rosbags: pip install 'cablejax[recordings]'.") from None
@@ -92,8 +97,10 @@ def _messages(path: pathlib.Path, wanted: dict[str, str]) -> dict[str, list[tupl
                 found[connection.topic].append(
                     (stamp.sec + 1e-9 * stamp.nanosec, np.array([_numbers(p) for p in poses]))
                 )
-    except (AnyReaderError, OSError) as error:
-        raise ValueError(f"{path} could not be read as a bag: {error}") from None
+    except BagError:
+        raise
+    except Exception as error:  # on a damaged file rosbags raises what its parts raise
+        raise BagError(f"{path} could not be read as a bag: {error}") from error
     for topic, messages in found.items():
         if len(messages) < 2:
             raise ValueError(f"{path} has {len(messages)} messages on {topic}, expected at least two.")
@@ -104,9 +111,9 @@ def _require_topics(path: pathlib.Path, types: dict[str, str], wanted: dict[str,
     for topic, kind in wanted.items():
         if topic not in types:
             listed = ", ".join(f"{name} ({of})" for name, of in sorted(types.items()))
-            raise ValueError(f"{path} has no topic {topic}; it has {listed}. Correct the name in the layout.")
+            raise BagError(f"{path} has no topic {topic}; it has {listed}. Correct the name in the layout.")
         if types[topic] != kind:
-            raise ValueError(f"{path}: {topic} has messages of type {types[topic]}, expected {kind}.")
+            raise BagError(f"{path}: {topic} has messages of type {types[topic]}, expected {kind}.")
 
 
 def _numbers(pose: Any) -> list[float]:

@@ -92,15 +92,18 @@ def read_deform(path: str | os.PathLike[str]) -> DeformRecordings:
     path = pathlib.Path(path)
     if path.is_dir():
         return _read_pickles(path, sorted([*path.glob("*.pkl"), *path.glob("*/*.pkl")]))
-    if path.suffix == ".npz":
+    if path.suffix.lower() == ".npz":
         return _read_npz(path)
-    if path.suffix in (".pkl", ".pickle"):
+    if path.suffix.lower() in (".pkl", ".pickle"):
         return _read_pickles(path, [path])
     raise ValueError(f"{path} is not what was expected: an .npz file, a .pkl file, or a folder of .pkl files.")
 
 
 def _read_npz(path: pathlib.Path) -> DeformRecordings:
-    arrays = read_npz(path, ["keypoints", "dt", "split", "source_id", "recording_guess"])
+    arrays = read_npz(path, ["keypoints", "dt", "split", "source_id", "recording_guess"], text=["split"])
+    for name in ("source_id", "recording_guess"):
+        if not np.issubdtype(arrays[name].dtype, np.integer):
+            raise ValueError(f"{path}: {name} is {arrays[name].dtype}, expected whole numbers.")
     if not np.issubdtype(arrays["keypoints"].dtype, np.floating):
         raise ValueError(f"{path}: keypoints is {arrays['keypoints'].dtype}, expected floating point numbers.")
     if arrays["dt"].size != 1:

@@ -19,7 +19,9 @@ from cablejax.recordings.poses import rotated
 from cablejax.recordings.take import Take
 
 Axis = Literal["x", "y", "z", "-x", "-y", "-z"]
+"""An axis with its sign."""
 AXES: tuple[Axis, ...] = ("x", "y", "z", "-x", "-y", "-z")
+"""All six."""
 
 LARGEST_TILT = np.radians(50)
 """Largest angle between the stated vertical and the direction in which the cable hangs."""

@@ -1,21 +1,21 @@
 """The layout of a laboratory's own recording, read from a small TOML file.
 
 Tables `[cable]`, `[table]`, `[frame]` and `[source]` are the same for every kind of file; `[columns]` is for csv and
-`[topics]` for bags. `docs/recordings.md` has a full example of each.
+`[topics]` for bags. `docs/how_to/own_recording.md` has a full example of each.
 """
 
 from __future__ import annotations
 
 import dataclasses
-import math
 import os
 import pathlib
-import tomllib
 from typing import Any
 
+from cablejax.limits import LIMITS, require, shown
 from cablejax.recordings.assemble import Nominal
 from cablejax.recordings.frames import Frame
 from cablejax.recordings.prepare import Setup
+from cablejax.text_file import read_toml
 
 
 @dataclasses.dataclass(frozen=True)
@@ -48,7 +48,7 @@ class Fields:
 
     def __init__(self, path: pathlib.Path, name: str, values: Any):
         if not isinstance(values, dict):
-            raise ValueError(f"{path}: [{name}] is {values!r}, expected a table.")
+            raise ValueError(f"{path}: [{name}] is {shown(values)}, expected a table.")
         self.path, self.name, self._left = path, name, dict(values)
 
     def __contains__(self, field: str) -> bool:
@@ -66,22 +66,21 @@ class Fields:
             return default
         value = self._left.pop(field)
         if not isinstance(value, kind) or isinstance(value, bool):
-            raise ValueError(f"{self.path}: [{self.name}] {field} is {value!r}, expected {what}.")
+            raise ValueError(f"{self.path}: [{self.name}] {field} is {shown(value)}, expected {what}.")
         return value
 
-    def number(self, field: str, default: Any = ..., *, positive: bool = True) -> Any:
-        """Removes a field with a finite number > 0, or >= 0."""
-        value = self.take(field, (int, float), "a number", default)
-        if value is not default and not (0 < value < math.inf or (value == 0 and not positive)):
-            limit = "> 0" if positive else ">= 0"
-            raise ValueError(f"{self.path}: [{self.name}] {field} is {value!r}, expected a finite number {limit}.")
+    def number(self, field: str, limit: str, default: Any = ...) -> Any:
+        """Removes a field with a number within a limit of `cablejax.limits`."""
+        value = self.take(field, (int, float), str(LIMITS[limit]), default)
+        if value is not default:
+            require(value, limit, f"{self.path}: [{self.name}] {field}")
         return value
 
     def names(self, field: str, counts: tuple[int, ...], what: str, default: Any = ...) -> Any:
         """Removes a field with a list of strings, of one of some lengths."""
         value = self.take(field, list, what, default)
         if value is not default and (len(value) not in counts or not all(isinstance(name, str) for name in value)):
-            raise ValueError(f"{self.path}: [{self.name}] {field} is {value!r}, expected {what}.")
+            raise ValueError(f"{self.path}: [{self.name}] {field} is {shown(value)}, expected {what}.")
         return value
 
     def nothing_left(self) -> None:
@@ -91,7 +90,7 @@ class Fields:
             ValueError: names them.
         """
         if self._left:
-            raise ValueError(f"{self.path}: [{self.name}] has the unknown fields {', '.join(sorted(self._left))}.")
+            raise ValueError(f"{self.path}: [{self.name}] has the unknown fields {shown(sorted(self._left))}.")
 
 
 def read_layout(path: str | os.PathLike[str], place: str) -> Layout:
@@ -106,16 +105,12 @@ def read_layout(path: str | os.PathLike[str], place: str) -> Layout:
     """
     path = pathlib.Path(path)
     try:
-        values = tomllib.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise ValueError(
-            f"The layout {path} could not be read: {error.strerror}. docs/recordings.md has one."
-        ) from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise ValueError(f"The layout {path} is no TOML: {error}") from None
+        values = read_toml(path)
+    except (ValueError, OSError) as error:
+        raise ValueError(f"This is no layout: {error} docs/how_to/own_recording.md has one.") from None
     if unknown := set(values) - {"cable", "table", "frame", "source", place}:
         raise ValueError(
-            f"{path} has the unknown tables {', '.join(sorted(unknown))}, expected [cable], [table], [frame], [source] "
+            f"{path} has the unknown tables {shown(sorted(unknown))}, expected [cable], [table], [frame], [source] "
             f"and [{place}]."
         )
     if place not in values:
@@ -125,14 +120,14 @@ def read_layout(path: str | os.PathLike[str], place: str) -> Layout:
     frame = Fields(path, "frame", values.get("frame", {}))
     source = Fields(path, "source", values.get("source", {}))
     arclength = cable.take("keypoint_arclength_m", list, "a list of numbers", None)
-    if arclength is not None and not all(isinstance(s, (int, float)) for s in arclength):
-        raise ValueError(f"{path}: [cable] keypoint_arclength_m is {arclength!r}, expected a list of numbers.")
+    if arclength is not None and not all(s in LIMITS["not_negative"] for s in arclength):
+        raise ValueError(f"{path}: [cable] keypoint_arclength_m is {shown(arclength)}, expected a list of numbers.")
     nominal = Nominal(
-        diameter=cable.number("diameter_m"),
-        linear_density=cable.number("linear_density_kg_per_m"),
-        bending_stiffness=cable.number("bending_stiffness_n_m2"),
-        damping_time=cable.number("bending_damping_s", 0.0, positive=False),
-        friction_coefficient=None if table is None else table.number("friction_coefficient"),
+        diameter=cable.number("diameter_m", "diameter"),
+        linear_density=cable.number("linear_density_kg_per_m", "linear_density"),
+        bending_stiffness=cable.number("bending_stiffness_n_m2", "bending_stiffness"),
+        damping_time=cable.number("bending_damping_s", "damping_time", 0.0),
+        friction_coefficient=None if table is None else table.number("friction_coefficient", "friction_coefficient"),
         arclength=None if arclength is None else tuple(map(float, arclength)),
     )
     try:

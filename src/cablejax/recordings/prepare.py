@@ -65,9 +65,6 @@ def prepare(takes: tuple[Take, ...], setup: Setup) -> tuple[tuple[Take, ...], li
             f"The takes have keypoints of the shapes {', '.join(map(str, shapes))}, expected one shape with at least "
             "three keypoints, or five if the first two and the last two are on the grippers."
         )
-    for take in takes:
-        if np.isinf(take.keypoints).any():
-            raise ValueError(f"Take {take.name} has infinite positions; a keypoint that was not observed is NaN.")
     measured = takes[0].gripper_pose is not None
     if not measured and setup.on_grippers == "ends":
         raise ValueError(
@@ -75,6 +72,11 @@ def prepare(takes: tuple[Take, ...], setup: Setup) -> tuple[tuple[Take, ...], li
             "poses, or two keypoints on each gripper."
         )
     takes, repairs = _in_metres(takes, setup)
+    if all(len(take.time) > 1 and _frozen(take.keypoints) for take in takes):
+        raise ValueError(
+            "All samples have the same keypoints to the last digit, which no tracker measures: expected a recording of "
+            "a cable that moves. Check the columns, and that the tracker ran."
+        )
     takes, outliers = _without_outliers(takes)
     takes = tuple(into_frame(take, setup.frame) for take in takes)
     takes, exchanged = restore_order(takes)
@@ -88,6 +90,10 @@ def prepare(takes: tuple[Take, ...], setup: Setup) -> tuple[tuple[Take, ...], li
     if not measured:
         takes = tuple(_with_poses(take, pairs) for take in takes)
     return takes, [*repairs, *outliers, *exchanged, *cut]
+
+
+def _frozen(keypoints: np.ndarray) -> bool:
+    return bool(np.array_equal(keypoints[1:], keypoints[:-1], equal_nan=True))
 
 
 def _without_outliers(takes: tuple[Take, ...]) -> tuple[tuple[Take, ...], list[str]]:

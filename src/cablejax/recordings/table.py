@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import io
 import itertools
 import math
 import os
@@ -10,10 +11,12 @@ import pathlib
 
 import numpy as np
 
+from cablejax.limits import require, shown
 from cablejax.recordings.assemble import gap_log_from_takes
 from cablejax.recordings.layout import Fields, Layout, read_layout
 from cablejax.recordings.prepare import prepare
 from cablejax.recordings.take import Take
+from cablejax.text_file import read_text
 from cablejax.types import GapLog
 
 SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
@@ -28,7 +31,7 @@ def import_csv(path: str | os.PathLike[str], layout: str | os.PathLike[str]) -> 
 
     Args:
         path: comma-separated, with a header; empty or "nan" where nothing was observed.
-        layout: TOML file that names the columns and units, see `docs/recordings.md`.
+        layout: TOML file that names the columns and units, see `docs/how_to/own_recording.md`.
 
     Returns:
         A gap log, planar or in space, and a sentence on each repair.
@@ -75,9 +78,8 @@ def _takes(path: pathlib.Path, how: Layout) -> tuple[Take, ...]:
 
 def _read(path: pathlib.Path) -> dict[str, list[str]]:
     try:
-        with path.open(encoding="utf-8-sig", newline="") as text:
-            rows = [row for row in csv.reader(text) if row]
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        rows = [row for row in csv.reader(io.StringIO(read_text(path), newline="")) if row]
+    except (csv.Error, FileNotFoundError) as error:
         raise ValueError(f"{path} could not be read as csv: {error}") from None
     if len(rows) < 3:
         raise ValueError(f"{path} has {len(rows)} rows, expected a header and at least two samples.")
@@ -93,8 +95,8 @@ def _read(path: pathlib.Path) -> dict[str, list[str]]:
 
 def _column(path: pathlib.Path, columns: dict[str, list[str]], name: str) -> list[str]:
     if name not in columns:
-        shown = ", ".join(list(columns)[:12]) + (", ..." if len(columns) > 12 else "")
-        raise ValueError(f"{path} has no column {name!r}; it has {shown}. Correct the name in the layout.")
+        known = shown(", ".join(columns))
+        raise ValueError(f"{path} has no column {shown(name)}; it has {known}. Correct the name in the layout.")
     return columns[name]
 
 
@@ -106,7 +108,7 @@ def _numbers(path: pathlib.Path, columns: dict[str, list[str]], names: list[str]
             try:
                 values[row, place] = np.nan if cell in _EMPTY else float(cell)
             except ValueError:
-                raise ValueError(f"{path}, line {row + 2}: column {name!r} is {cell!r}, expected a number.") from None
+                raise ValueError(f"{path}, line {row + 2}: column {shown(name)} is {shown(cell)}, no number.") from None
     return values
 
 
@@ -116,6 +118,8 @@ def _keypoints(path: pathlib.Path, columns: dict[str, list[str]], fields: Fields
     count = fields.take("count", int, "how many keypoints there are")
     if bad := [name for name in templates if "{i}" not in name]:
         raise ValueError(f"{fields.path}: [columns] keypoint has {bad[0]!r}, expected a name with {{i}} in it.")
+    require(count, "keypoints", f"{fields.path}: [columns] count")
+    require(abs(first), "count_from_zero", f"{fields.path}: [columns] first")
     names = [name.replace("{i}", str(i)) for i in range(first, first + count) for name in templates]
     return _numbers(path, columns, names).reshape(-1, count, len(templates))
 

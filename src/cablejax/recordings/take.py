@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from cablejax.limits import require
+
 
 @dataclasses.dataclass(frozen=True)
 class Take:
@@ -41,6 +43,9 @@ class Take:
                 f"Take {self.name}: its times do not increase (sample {row}: {self.time[row]!r} after "
                 f"{self.time[row - 1]!r}): sort the samples and leave out what is there twice."
             )
+        for name, values in (("keypoints", self.keypoints), ("gripper_pose", self.gripper_pose)):
+            largest = 0.0 if values is None else float(np.nanmax(np.abs(values), initial=0.0))
+            require(largest, "reading", f"Take {self.name}: the largest entry of {name}", "Not observed is NaN.")
         shape = (samples, 2, 3 if self.keypoints.shape[2] == 2 else 7)
         if self.gripper_pose is not None and self.gripper_pose.shape != shape:
             raise ValueError(

@@ -5,10 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from types import MappingProxyType
 
+from cablejax.limits import LIMITS
+
 METRES: Mapping[str, float] = MappingProxyType({"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254})
 """Metres in one of each unit of length that a recording may have."""
 
-PLAUSIBLE = (0.05, 20.0)
+PLAUSIBLE = (LIMITS["recorded_length"].low, LIMITS["recorded_length"].high)
 """Lengths [m] that a cable between two arms may have."""
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from cablejax.cable import Cable
-from cablejax.cable_length import require_long_enough
+from cablejax.cable_length import require_fitting_length
 from cablejax.gaplog import Episode, gap_log_from_episodes
 from cablejax.npz import read_npz
 from cablejax.recordings.poses import poses_from_markers
@@ -55,7 +55,7 @@ def read_wires(path: str | os.PathLike[str]) -> tuple[HangingWire, ...]:
         FileNotFoundError: there is none.
     """
     path = pathlib.Path(path)
-    arrays = read_npz(path, _FIELDS)
+    arrays = read_npz(path, _FIELDS, text=["wire"])
     points = arrays["keypoints"]
     count = points.shape[:2]
     shapes = {"wire": count[:1], "length_m": (), "mass_per_length_kg_m": count[:1], "EI_published_Nm2": count}
@@ -91,7 +91,7 @@ def wire_log(wire: HangingWire) -> GapLog:
         ValueError: the wire is shorter than its points are apart.
     """
     repeats, count, _ = wire.keypoints.shape
-    require_long_enough(
+    require_fitting_length(
         [points[None] for points in wire.keypoints], np.linspace(0.0, wire.length, count), f"length_m, for {wire.name},"
     )
     cable = Cable(

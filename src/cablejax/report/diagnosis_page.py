@@ -32,6 +32,7 @@ from cablejax.report.html import json_script, svg, write_html
 from cablejax.report.spatial_figures import cable_still, files_figure, orbit_data
 
 PAGE = "report.html"
+"""Name of the page in a diagnosis' folder."""
 _BADGES: dict[Verdict, tuple[str, str]] = {
     "none": ("none", "No gap found"),
     "named": ("named", "Cause named"),

@@ -23,6 +23,7 @@ METHOD_LABEL: dict[Method, str] = {
     "residual": "with online residual",
     "direct": "without residual",
 }
+"""Labels of the methods in figures."""
 
 
 def by_shape(runs: Runs) -> dict[str, dict[Method, ClosedLoopRun]]:
@@ -41,7 +42,12 @@ def by_shape(runs: Runs) -> dict[str, dict[Method, ClosedLoopRun]]:
 
 @dataclasses.dataclass(frozen=True)
 class Colours:
-    """One colour scheme, as hexadecimal strings."""
+    """One colour scheme, as hexadecimal strings.
+
+    Attributes:
+        background, ink, muted, faint: of the page, its text, its captions and its lines.
+        gripper, target, residual, direct: of the grippers, the target, and the cable by each method.
+    """
 
     background: str
     ink: str
@@ -67,6 +73,7 @@ LIGHT = Colours(
     residual="#0072b2",
     direct="#d55e00",
 )
+"""On white."""
 DARK = Colours(
     background="#14181c",
     ink="#e8ecef",
@@ -77,6 +84,7 @@ DARK = Colours(
     residual="#56b4e9",
     direct="#ff9d4d",
 )
+"""On black."""
 
 FIGURE_STYLE: dict[Any, Any] = {
     "font.family": "sans-serif",

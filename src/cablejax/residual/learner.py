@@ -7,10 +7,10 @@ weighed by the likelihood of what it has predicted so far,
     w_k  ~  (1 + d S_k / 2) ^ -(1 + d n / 2),      S_k = sum_t phi^(n - t) |error(t) - predicted_k(t)|^2 / (N s(t)^2)
 
 with fading memory phi: the marginal likelihood of d independent Gaussian errors a step, of variance s(t)^2 up to an
-unknown factor with an inverse gamma prior around 1. Models err in proportion to the motion, s(t)^2 = s^2 + (r |R(t)|)^2: a
-millimetre says much about a cable at rest, and little about one that moves by decimetres.
-Candidates are affine in the command, so that their mixture is again one affine
-correction, and its squared error is at most the candidates' weighted mean (Jensen's inequality).
+unknown factor with an inverse gamma prior around 1. Models err in proportion to the motion, s(t)^2 = s^2 + (r |R|)^2: a
+millimetre says much about a cable at rest, and little about one that moves by decimetres. Candidates are affine in
+the command, so that their mixture is again one affine correction, and its squared error is at most the candidates'
+weighted mean (Jensen's inequality).
 
 The candidates are made of two parts:
 
@@ -24,15 +24,14 @@ The candidates are made of two parts:
 from __future__ import annotations
 
 import dataclasses
-import math
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from cablejax.limits import check
 from cablejax.residual.ridge import ResidualModel, RidgeConfig, apply, fit, zero_residual
-from cablejax.whole_number import is_whole
 
 
 @dataclasses.dataclass(frozen=True)
@@ -88,15 +87,18 @@ class LearnerConfig:
     def __post_init__(self):
         if not self.candidates or not all(isinstance(candidate, Candidate) for candidate in self.candidates):
             raise ValueError(f"LearnerConfig.candidates are {self.candidates}, expected one `Candidate` or more.")
-        if not is_whole(self.window, least=1):
-            raise ValueError(f"LearnerConfig.window is {self.window}, expected a whole number of samples, at least 1.")
-        for name in ("drift_floor", "error_std", "error_ratio", "rotation_weight", "outlier", "dimensions"):
-            value = getattr(self, name)
-            if not (math.isfinite(value) and value > 0):
-                raise ValueError(f"LearnerConfig.{name} is {value}, expected a positive finite number.")
-        for name in ("forgetting", "memory"):
-            if not 0 < getattr(self, name) <= 1:
-                raise ValueError(f"LearnerConfig.{name} is {getattr(self, name)}, expected a number in (0, 1].")
+        check(
+            self,
+            window="count",
+            forgetting="share",
+            memory="share",
+            drift_floor="length_scale",
+            error_std="length_scale",
+            error_ratio="positive",
+            rotation_weight="positive",
+            outlier="length_scale",
+            dimensions="positive",
+        )
 
     def scaled(self, ratio: float) -> LearnerConfig:
         """The settings for a cable so many times as long."""

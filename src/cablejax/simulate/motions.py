@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from cablejax.cable import Cable, Discretisation
+from cablejax.limits import check
 from cablejax.simulate.equilibrium import arch_angles, chain_nodes, find_equilibrium
 from cablejax.simulate.pose import wrapped
 
@@ -66,11 +67,21 @@ class MotionConfig:
         )
 
     def __post_init__(self):
-        if not self.max_amplification > 0:
-            raise ValueError(
-                f"MotionConfig.max_amplification is {self.max_amplification}, expected > 0: 1.5 keeps the cable from "
-                "snapping through, 1000 lets it snap."
-            )
+        if self.start not in ("straight", "random"):
+            raise ValueError(f"MotionConfig.start is {self.start!r}, expected 'straight' or 'random'.")
+        check(
+            self,
+            max_step="length_scale",
+            rotation_weight="length_scale",
+            min_scale="share",
+            max_persistence="probability",
+            rest_probability="probability",
+            straight_slack="share",
+            min_distance="share",
+            max_angle="angle",
+            max_curvature="positive",
+            max_amplification="amplification",
+        )
 
 
 def random_motion(

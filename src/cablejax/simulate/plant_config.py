@@ -13,6 +13,7 @@ from cablejax.cable import Cable, Discretisation
 from cablejax.effects import Hook
 from cablejax.effects.given import GivenEffect, check_hooks, with_effects
 from cablejax.effects.physics import Physics, nominal_physics
+from cablejax.limits import check
 
 
 class ObservedConfig(Protocol):
@@ -82,8 +83,8 @@ def check_effects(
 
 def check_camera(config) -> None:
     """Raises ValueError unless `keypoint_noise` and `keypoint_dropout` of a configuration make sense."""
-    name, noise, dropout = type(config).__name__, config.keypoint_noise, config.keypoint_dropout
-    if not (np.isfinite(noise) and noise >= 0):
-        raise ValueError(f"{name}.keypoint_noise is {noise}, expected a finite number >= 0 [m].")
-    if not 0 <= dropout < 1:
-        raise ValueError(f"{name}.keypoint_dropout is {dropout}, expected a number in [0, 1).")
+    check(config, keypoint_noise="noise")
+    if not 0 <= config.keypoint_dropout < 1:
+        raise ValueError(
+            f"{type(config).__name__}.keypoint_dropout is {config.keypoint_dropout}, expected a number in [0, 1)."
+        )

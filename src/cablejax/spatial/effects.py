@@ -25,13 +25,14 @@ from cablejax.cable import GRAVITY
 from cablejax.effects.effect import Effect, Parameter
 from cablejax.simulate.rod import RodPhysics
 
-PROFILE_KNOTS = 5
-CURVATURE_KNOTS = 5
-# Torsional over bending stiffness of a round cord with Poisson's ratio 0.45.
+PROFILE_KNOTS = CURVATURE_KNOTS = 5
+"""Places along the cable between which a profile and a rest curvature are interpolated."""
 TWIST_RATIO = 0.7
-# Two markers that sit 5 mm off the centreline on different sides, 30 mm apart, see a gripper turned by so much [rad].
-# It turns about the cable with the roll, which is not seen, and differs each time that the cable is gripped.
+"""Torsional over bending stiffness of a round cord with Poisson's ratio 0.45."""
 GRIP = 0.3
+"""Rotation [rad] of a gripper as two markers see it that sit 5 mm off the centreline on different sides, 30 mm apart.
+
+It turns about the cable with the roll, which is not observed, and differs each time that the cable is gripped."""
 # Almost inextensible: 1 m of cable that hangs by its end stretches by 0.2 mm.
 _STRETCH = 5e4
 

@@ -56,7 +56,11 @@ on synthetic cables of even seeds that have more than the law that is fitted (`e
 
 @dataclasses.dataclass(frozen=True)
 class Interval:
-    """A value and its 90 % interval."""
+    """A value and its 90 % interval.
+
+    Attributes:
+        value, low, high: estimate, 5 % and 95 % quantile, in its own unit.
+    """
 
     value: float
     low: float

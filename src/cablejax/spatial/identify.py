@@ -21,6 +21,7 @@ from cablejax.spatial.time_steps import TimeSteps, time_steps_for
 from cablejax.spatial.windows import Windows
 
 EDGES = 20
+"""Edges of the rod that is fitted."""
 _SELECTED = 24
 _TIMED = 8
 _REFITTED = 24

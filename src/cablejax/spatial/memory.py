@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import hashlib
 import json
@@ -14,10 +13,10 @@ import numpy as np
 
 from cablejax.bounded import Result
 from cablejax.diagnose.protocol import Explanation, Term
-from cablejax.json_file import read_json
 from cablejax.spatial.cable import SpatialCable
 from cablejax.spatial.effects import Layout
 from cablejax.spatial.search import Step
+from cablejax.text_file import read_json
 from cablejax.whole_file import whole_file
 
 
@@ -38,10 +37,16 @@ class Memory:
         self._held: dict[str, Any] = {"fingerprint": fingerprint}
         if path is not None and path.exists():
             # what cannot be read is found again
-            with contextlib.suppress(ValueError):
+            before = self._held
+            try:
                 found = read_json(path)
                 if isinstance(found, dict) and found.get("fingerprint") == fingerprint:
                     self._held = found
+                    self.finals()
+                    for name in found.keys() - {"fingerprint", "fits"}:
+                        self.steps(name)
+            except (ValueError, TypeError, KeyError, IndexError, AttributeError):
+                self._held = before
 
     def steps(self, name: str) -> list[Step]:
         """Steps of a search that was begun."""

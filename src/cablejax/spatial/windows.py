@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from cablejax.cable import GRAVITY
-from cablejax.cable_length import require_long_enough
+from cablejax.cable_length import require_fitting_length
 from cablejax.recordings.poses import rotated
 from cablejax.simulate.rod.clamps import frames_along
 from cablejax.types import GapLog
@@ -191,7 +191,7 @@ def _sample_interval(log: GapLog) -> float:
         raise ValueError(
             f"Samples are {intervals.min():.4g} to {intervals.max():.4g} s apart, expected one interval: resample."
         )
-    require_long_enough(
+    require_fitting_length(
         [np.asarray(p[:n], float) for p, n in zip(log.keypoints, log.episode_length, strict=True)],
         np.asarray(log.meta["keypoint_arclength_m"], float),
         "meta.keypoint_arclength_m",

@@ -27,6 +27,7 @@ class Balls(ConvexSet):
         return project_ball(y, jnp.asarray(self.radius, y.dtype)[..., None])
 
     restore = project
+    """The projection is in closed form, and so is this."""
 
     def quadrics(self, y: Float[Array, "..."]) -> Quadrics:
         """One quadratic per ball."""

@@ -29,6 +29,7 @@ class Box(ConvexSet):
         return jnp.clip(y, self.lower, self.upper)
 
     restore = project
+    """The projection is in closed form, and so is this."""
 
     def quadrics(self, y: Float[Array, "..."]) -> Quadrics:
         """Two linear functions per coordinate."""

@@ -43,16 +43,24 @@ _SMALL = 1e-6
 
 
 class ChainMatrices(NamedTuple):
-    """Constant matrices of one cable, NumPy or JAX arrays; n = LINKS, N keypoints, J = n - 1 joints."""
+    """Constant matrices of one cable, NumPy or JAX arrays; n = LINKS, N keypoints, J = n - 1 joints.
 
-    tangents_of_keypoints: Any  # [n, N], with the next: tangents at the nodes of the clamped cubic spline
-    tangents_of_ends: Any  # [n, 2]
-    keypoints_of_nodes: Any  # [N, n]
-    keypoints_of_tangents: Any  # [N, n]
-    link_lengths: Any  # [n]
-    node_offsets: Any  # [n]
-    arclengths: Any  # [N], of the keypoints, from 0 to 1
-    later: Any  # [J, J], the later one of two joints
+    Attributes:
+        tangents_of_keypoints, tangents_of_ends: tangents at the nodes of the clamped spline, shapes [n, N], [n, 2].
+        keypoints_of_nodes, keypoints_of_tangents: Hermite weights of nodes and of tangents [m], shape [N, n].
+        link_lengths, node_offsets: of the links [m], and from a link's start to its node [m], shape [n].
+        arclengths: of the keypoints, from 0 to 1, shape [N].
+        later: the later one of two joints, shape [J, J].
+    """
+
+    tangents_of_keypoints: Any
+    tangents_of_ends: Any
+    keypoints_of_nodes: Any
+    keypoints_of_tangents: Any
+    link_lengths: Any
+    node_offsets: Any
+    arclengths: Any
+    later: Any
 
 
 @functools.lru_cache(maxsize=32)

@@ -34,6 +34,7 @@ from cablejax.simulate.friction import drag_coefficient
 from cablejax.simulate.grasp import solve_held
 
 SLIP_DURATION = 0.1
+"""Time constant of a slip [s]."""
 
 
 @jax.tree_util.register_dataclass

@@ -6,12 +6,11 @@ import dataclasses
 import math
 from typing import get_args
 
-import numpy as np
-
 from cablejax.cable import Cable, Discretisation
 from cablejax.effects import Hook
 from cablejax.effects.given import GivenEffect
 from cablejax.effects.physics import Physics
+from cablejax.limits import check
 from cablejax.simulate.plant_config import check_camera, check_effects, plant_physics
 
 HOOKS: frozenset[Hook] = frozenset(get_args(Hook))
@@ -76,10 +75,7 @@ class PlantConfig:
             raise ValueError(
                 f"PlantConfig.discretisation.dimension is {self.discretisation.dimension}, expected 3, the plant's."
             )
-        for name in ("cone_ratio", "contact_time", "settle_time"):
-            value = getattr(self, name)
-            if not (np.isfinite(value) and value > 0):
-                raise ValueError(f"PlantConfig.{name} is {value}, expected a positive finite number.")
+        check(self, "seed", cone_ratio="positive", contact_time="positive", settle_time="positive")
         check_camera(self)
         object.__setattr__(self, "effects", tuple(self.effects))
         check_effects(self, HOOKS, {}, CHANGING)

@@ -27,6 +27,7 @@ class Plant(TablePlant):
     """The cable in C MuJoCo, with the calls of every `TablePlant`."""
 
     config: PlantConfig
+    """Cable, discretisation, effects and noise."""
 
     def __init__(self, config: PlantConfig | None = None):
         super().__init__(PlantConfig() if config is None else config)

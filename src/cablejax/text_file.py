@@ -1,0 +1,98 @@
+"""Reads and writes text, JSON and TOML files; writes are atomic, and errors name the file."""
+
+from __future__ import annotations
+
+import json
+import os
+import pathlib
+import tomllib
+from collections.abc import Mapping
+from typing import Any
+
+from cablejax.limits import require
+from cablejax.whole_file import whole_file
+
+
+def write_json(path: pathlib.Path, value: Mapping[str, Any]) -> None:
+    """Writes a JSON file whole or not at all.
+
+    Raises:
+        ValueError: a number is not finite, for which JSON has no word.
+    """
+    with whole_file(path) as stream:
+        stream.write((json.dumps(value, indent=2, allow_nan=False) + "\n").encode())
+
+
+def read_bytes(path: str | os.PathLike[str]) -> bytes:
+    """The content of a regular file that is not too large to be read at once.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: it is a folder, a device or the like, larger than the limit, or cannot be read.
+    """
+    path = pathlib.Path(path)
+    try:
+        # what is neither file nor folder may never end
+        if path.exists() and not path.is_file():
+            raise ValueError(f"{path} is {'a folder' if path.is_dir() else 'no regular file'}, expected a file.")
+        require(path.stat().st_size, "text_bytes", f"The size of {path}")
+        return path.read_bytes()
+    except FileNotFoundError:
+        raise FileNotFoundError(f"There is no file {path}.") from None
+    except OSError as error:
+        raise ValueError(f"{path} cannot be read: {error.strerror}.") from error
+
+
+def read_text(path: str | os.PathLike[str]) -> str:
+    """The content of a UTF-8 file, without a byte order mark, line breaks as they are.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: it is no text, or see `read_bytes`.
+    """
+    try:
+        return read_bytes(path).decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise ValueError(f"{path} is no text in UTF-8: {error.reason} at byte {error.start}.") from error
+
+
+def read_json(path: str | os.PathLike[str]) -> Any:
+    """Reads a JSON file.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: it is no JSON, nested too deep, or see `read_bytes`.
+    """
+    content = read_bytes(path)
+    try:
+        return parse_json(content)
+    except ValueError as error:
+        raise ValueError(f"{path} {error}") from error
+
+
+def parse_json(text: str | bytes) -> Any:
+    """Parses a JSON text.
+
+    Raises:
+        ValueError: "is no JSON" or "is nested too deep", to be put after what it is.
+    """
+    try:
+        return json.loads(text)
+    except RecursionError as error:
+        raise ValueError("is nested too deep for a JSON file.") from error
+    except ValueError as error:
+        raise ValueError(f"is no JSON: {error}") from error
+
+
+def read_toml(path: str | os.PathLike[str]) -> dict[str, Any]:
+    """Reads a TOML file.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: it is no TOML, nested too deep, or see `read_text`.
+    """
+    text = read_text(path)
+    try:
+        return tomllib.loads(text)
+    except (ValueError, RecursionError) as error:  # numbers of too many digits are plain ValueErrors
+        raise ValueError(f"{path} is no TOML: {error}") from error

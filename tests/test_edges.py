@@ -1,0 +1,386 @@
+"""Malformed inputs at every edge: each is answered by a result or a message of the package's own."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import json
+import os
+import pathlib
+import pickle
+import shutil
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from safetensors import safe_open
+from safetensors.numpy import save
+
+import edge_cases as edges
+import test_dataset_store as stores
+import test_perceive_recording as clouds
+import test_recordings_bags as bags
+import test_recordings_csv as tables
+from cablejax.cable import Cable
+from cablejax.cable_file import cable_text
+from cablejax.commands import diagnose, runs
+from cablejax.commands.resuming import Parts
+from cablejax.control.shaping import load_model
+from cablejax.control.targets import Target, load_target, make_target
+from cablejax.dataset import generate
+from cablejax.dataset.opening import open_or_create, open_store
+from cablejax.dataset.schema import digest_of_config
+from cablejax.diagnose.recording import prepare
+from cablejax.dynamics import run_folder
+from cablejax.perceive.cloud import padded
+from cablejax.perceive.recording import read_clouds
+from cablejax.recordings.bags import import_mcap
+from cablejax.spatial.windows import windows_of
+from cli_cases import made_up_run, small_model
+from edge_cases import Accepted, answer, command
+from recording_cases import swinging
+from test_log_geometry import log_of, motion
+
+
+@dataclasses.dataclass(frozen=True)
+class Edge:
+    """A place where a user's file or option is read.
+
+    Attributes:
+        inputs: malformed ones in a quick run.
+        edits: strategy of edits.
+        attempt: `(folder, edit)`: writes the edited input into a folder and reads it.
+    """
+
+    inputs: int
+    edits: st.SearchStrategy
+    attempt: Callable[[pathlib.Path, Any], Any]
+
+
+@functools.cache
+def log_arrays() -> dict[str, Any]:
+    log = log_of(*motion(samples=30))
+    arrays = {f.name: getattr(log, f.name) for f in dataclasses.fields(log) if f.name != "meta"}
+    return {**arrays, "meta": np.array(json.dumps(log.meta))}
+
+
+@functools.cache
+def original(name: str) -> pathlib.Path:
+    """A valid input, which nobody changes; made once."""
+    folder = pathlib.Path(_TEMPORARY) / name
+    folder.mkdir(parents=True)
+    if name == "model":
+        small_model(folder)
+    elif name == "store":
+        shutil.rmtree(folder)
+        stores.complete(open_or_create(folder, stores.SMALL))
+    elif name == "bag":
+        shutil.rmtree(folder)
+        poses = {
+            topic: (1000 + 0.01 * np.arange(40), np.tile([0, 0, 0, 1.0, 0, 0, 0], (40, 1)))
+            for topic in ("/left/pose", "/right/pose")
+        }
+        bags.write_bag(folder, swinging(40), poses, bags.StoragePlugin.MCAP)
+    return folder
+
+
+@functools.cache
+def target() -> Target:
+    return make_target("U")
+
+
+_TEMPORARY = ""
+
+
+@pytest.fixture(scope="module", autouse=True)
+def place(tmp_path_factory):
+    """Where valid inputs are, and stand-ins for the long part of each command."""
+    global _TEMPORARY
+    _TEMPORARY = str(tmp_path_factory.mktemp("original"))
+
+    def stop(*given, **named):
+        raise Accepted(*given)
+
+    def diagnosed(log, *_, **__):
+        raise Accepted(windows_of(log) if log.keypoints.shape[-1] == 3 else prepare(log))
+
+    from cablejax.dynamics import train
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(generate, "generate", stop)
+        patch.setattr(train, "train", lambda config, *_, **__: stop(config))
+        patch.setattr(runs, "shape_and_report", lambda job, *_, **__: stop(job.plant, job.targets, job.camera))
+        patch.setattr(diagnose, "diagnose_and_report", diagnosed)
+        # what is imported and compiled once is no part of an answer
+        load_model(str(original("model")))
+        diagnose_arrays(original("log"), [])
+        yield
+    original.cache_clear()
+
+
+def diagnose_arrays(folder, edit):
+    (folder / "log.npz").write_bytes(edges.edited_archive(log_arrays(), edit))
+    return command("diagnose", folder / "log.npz", "--out", folder / "out")
+
+
+def diagnose_meta(folder, edit):
+    meta = edges.edited_tree(json.loads(str(log_arrays()["meta"])), edit)
+    np.savez(folder / "log.npz", **{**log_arrays(), "meta": np.array(json.dumps(meta))})
+    return command("diagnose", folder / "log.npz", "--out", folder / "out")
+
+
+def diagnose_bytes(folder, edit):
+    np.savez(folder / "whole.npz", **log_arrays())
+    (folder / "log.npz").write_bytes(edges.edited_bytes((folder / "whole.npz").read_bytes(), edit))
+    return command("diagnose", folder / "log.npz", "--out", folder / "out")
+
+
+def cable_words(folder, edit):
+    (folder / "cable.toml").write_bytes(edges.edited_words(cable_text(Cable()), edit).encode("utf-8", "surrogatepass"))
+    return command("cable", "--from", folder / "cable.toml")
+
+
+def target_arrays(folder, edit):
+    content = edges.edited_archive({"keypoints": target().keypoints, "gripper_pose": target().gripper_pose}, edit)
+    (folder / "t.npz").write_bytes(content)
+    return answer(lambda: load_target(folder / "t.npz"))
+
+
+def target_json(folder, edit):
+    tree = {"keypoints": target().keypoints.tolist(), "gripper_pose": target().gripper_pose.tolist()}
+    (folder / "t.json").write_text(json.dumps(edges.edited_tree(tree, edit)))
+    return answer(lambda: load_target(folder / "t.json"))
+
+
+def target_csv(folder, edit):
+    text = "x,y\n" + "\n".join(f"{x},{y}" for x, y in target().keypoints)
+    (folder / "t.CSV").write_bytes(edges.edited_bytes(text.encode(), edit))
+    return answer(lambda: load_target(folder / "t.CSV"))
+
+
+def import_table(folder, edit):
+    which, changes = edit
+    table, layout = ((tables.in_space, tables.PAIRS), (tables.in_the_plane, tables.PLANAR))[which[1]]
+    path, other = tables.written(folder, table(), layout)
+    edited = (path, other)[which[0]]
+    edited.write_bytes(edges.edited_words(edited.read_text(), changes).encode("utf-8", "surrogatepass"))
+    done = command("import", "csv", path, "--layout", other, "--out", folder / "log.npz")
+    return done if done is None else command("diagnose", folder / "log.npz", "--out", folder / "out")
+
+
+def import_deform(folder, edit):
+    arrays = {"keypoints": swinging(60)[None], "dt": 0.01, "split": ["train"], "source_id": [1], "recording_guess": [1]}
+    (folder / "a.npz").write_bytes(edges.edited_archive(arrays, edit))
+    return command("import", "deform", folder / "a.npz", "--out", folder / "log.npz")
+
+
+def import_pickle(folder, edit):
+    content = pickle.dumps(swinging(30).transpose(0, 2, 1))
+    (folder / "1.pkl").write_bytes(edges.edited_bytes(content, edit))
+    return command("import", "deform", folder / "1.pkl", "--out", folder / "log.npz")
+
+
+def import_wires(folder, edit):
+    points = np.zeros((1, 2, 9, 3))
+    points[..., 0], points[..., 2] = np.linspace(0, 0.5, 9), 0.05 * np.sin(np.linspace(0, np.pi, 9))
+    arrays = {
+        "wire": ["red"],
+        "keypoints": points,
+        "length_m": 0.55,
+        "mass_per_length_kg_m": [0.02],
+        "EI_published_Nm2": [[1e-3, 1e-3]],
+    }
+    (folder / "w.npz").write_bytes(edges.edited_archive(arrays, edit))
+    return command("import", "wires", folder / "w.npz", "--out", folder / "log.npz")
+
+
+def import_bag(folder, edit):
+    shutil.copytree(original("bag"), folder / "bag")
+    file = sorted((folder / "bag").iterdir())[edit[0][1] % 2]
+    file.write_bytes(edges.edited_bytes(file.read_bytes(), edit))
+    (folder / "layout.toml").write_text(bags.LAYOUT)
+    return answer(lambda: import_mcap(folder / "bag", folder / "layout.toml"))
+
+
+def seen(path):
+    sequence = read_clouds(path)
+    return sequence.time, sequence.gripper_pose, [padded(cloud, 100).points for cloud in sequence.clouds]
+
+
+def cloud_arrays(folder, edit):
+    arrays = {"time": clouds.TIME, "gripper_pose": clouds.POSES, "points": clouds.POINTS, "count": np.array([4, 0, 3])}
+    (folder / "c.npz").write_bytes(edges.edited_archive(arrays, edit))
+    return answer(lambda: seen(folder / "c.npz"))
+
+
+def cloud_folder(folder, edit):
+    kind, changes = edit
+    clouds.folder(folder, kind)
+    file = sorted(folder.iterdir())[changes[0][0] % 4]
+    text = edges.edited_words(file.read_bytes().decode("latin1"), changes)
+    file.write_bytes(text.encode("latin1", "replace"))
+    return answer(lambda: seen(folder))
+
+
+def store_files(folder, edit):
+    """The files of a store, with a digest of its configuration that fits again."""
+    path = folder / "store"
+    shutil.copytree(original("store"), path)
+    which, tree, raw = edit
+    files = sorted(file for file in path.rglob("*") if file.is_file())
+    described = [file for file in files if file.name == "zarr.json"]
+    if raw is None:
+        file = described[which % len(described)]
+        content = edges.edited_tree(json.loads(file.read_text()), tree)
+        if isinstance(content, dict) and isinstance(content.get("attributes"), dict):
+            content["attributes"]["config_digest"] = digest_of_config(content["attributes"].get("config"))
+        file.write_text(json.dumps(content))
+    else:
+        file = files[which % len(files)]
+        file.write_bytes(edges.edited_bytes(file.read_bytes(), raw))
+    read = answer(lambda: open_store(path).read())
+    again = answer(lambda: stores.complete(open_or_create(path, stores.SMALL)))
+    if again is not None:  # the same generation mends what it does not refuse
+        assert open_store(path).info().complete and len(open_store(path).read()) == 7
+    return read
+
+
+def weights_file(folder, edit):
+    tree, raw = edit
+    file = original("model") / "weights.safetensors"
+    content = file.read_bytes()
+    if raw is None:
+        with safe_open(file, framework="numpy") as whole:
+            text = whole.metadata()["cablejax"]
+            tensors = {name: whole.get_tensor(name) for name in whole.keys()}  # noqa: SIM118
+        content = save(tensors, metadata={"cablejax": json.dumps(edges.edited_tree(json.loads(text), tree))})
+    else:
+        content = edges.edited_bytes(content, raw)
+    (folder / "w.safetensors").write_bytes(content)
+    answer(lambda: load_model(str(folder / "w.safetensors")).cable)
+
+
+VERDICT = {
+    "schema": "cablejax-verdict/1",
+    "verdict": "named",
+    "effects": [{"name": "bending_stiffness", "parameters": {"ratio": {"value": 2.0}}}],
+}
+
+
+def verdict_file(folder, edit):
+    (folder / "v.json").write_text(json.dumps(edges.edited_tree(VERDICT, edit)))
+    return command("simulate", "--engine", "chain", "--with", folder / "v.json", "--out", folder / "data")
+
+
+def kept_files(folder, edit):
+    """What an unfinished command kept is used, made again, or refused."""
+    which, raw = edit
+    settings_ = {"steps": 2}
+    parts = Parts(folder / "parts", settings_)
+    parts.begin()
+    parts.save("U-direct", made_up_run(target()))
+    run_folder.claim_folder(folder / "train", {"config": {}, "data": "a"}, resume=True, overwrite=False)
+    file = (parts.folder / "settings.json", parts.folder / "U-direct.run.npz", folder / "train" / "run.json")[which]
+    file.write_bytes(edges.edited_bytes(file.read_bytes(), raw))
+    answer(lambda: Parts(folder / "parts", settings_).match())
+    answer(lambda: parts.load("U-direct") and None)
+    answer(lambda: run_folder.claim_folder(folder / "train", {"config": {}, "data": "a"}, resume=True, overwrite=False))
+
+
+OPTIONS = {
+    "simulate": "--trajectories --steps --max-amplification --links --seed --stiffness-range --effect --cable --with "
+    "--out --process-count --process-index --device",
+    "train": "--lr --held-out --steps --batch --latent --message-passing --pretrain --seed --start-from",
+    "shape": "--steps --noise-mm --links --seed --target --weights --plant-effect --cable --solver",
+    "cable": "--from --out --seed",
+    "bench simulate": "--batch --seconds --rounds --threads --links",
+}
+WORDS = (
+    "0", "-1", "1", "99999999999999999999", "9" * 5000, "1e308", "-1e30", "1e-30", "nan", "inf", "", "x", "1.5",
+    "/dev/zero", "/", "a.npz", "a.toml", "none:", "bending_stiffness:ratio=1e308", "bending_stiffness:ratio=nan",
+    "bending_stiffness", ":=,", "\udc80", "cpu", "--",
+)  # fmt: skip
+
+
+def options(folder, edit):
+    which, chosen = edit
+    name = sorted(OPTIONS)[which]
+    names = OPTIONS[name].split()
+    arguments = []
+    for option, word, second in chosen:
+        flag = names[option % len(names)]
+        arguments += [flag, WORDS[word]] + ([WORDS[second]] if flag.endswith("-range") else [])
+    fixed: dict[str, list] = {
+        "train": ["--data", original("store"), "--out", folder / "out"],
+        "shape": ["--weights", original("model"), "--out", folder / "out"],
+        "bench simulate": ["--batch", "0"],
+    }
+    before = os.getcwd()
+    os.chdir(folder)
+    try:
+        return command(*name.split(), *fixed.get(name, []), *arguments)
+    finally:
+        os.chdir(before)
+
+
+pair = st.tuples
+EDGES = {
+    "log arrays": Edge(240, edges.ARRAYS, diagnose_arrays),
+    "log meta": Edge(200, edges.TREE, diagnose_meta),
+    "log bytes": Edge(80, edges.BYTES, diagnose_bytes),
+    "cable file": Edge(180, edges.WORDS, cable_words),
+    "target npz": Edge(120, edges.ARRAYS, target_arrays),
+    "target json": Edge(160, edges.TREE, target_json),
+    "target csv": Edge(60, edges.BYTES, target_csv),
+    "csv": Edge(160, pair(pair(st.integers(0, 1), st.integers(0, 1)), edges.WORDS), import_table),
+    "deform": Edge(80, edges.ARRAYS, import_deform),
+    "pickle": Edge(60, edges.BYTES, import_pickle),
+    "wires": Edge(60, edges.ARRAYS, import_wires),
+    "bag": Edge(30, edges.BYTES, import_bag),
+    "cloud npz": Edge(120, edges.ARRAYS, cloud_arrays),
+    "cloud folder": Edge(120, pair(st.sampled_from(("ascii", "binary")), edges.WORDS), cloud_folder),
+    "store": Edge(60, pair(st.integers(0, 100), edges.TREE, st.none() | edges.BYTES), store_files),
+    "weights": Edge(60, pair(edges.TREE, st.none() | edges.BYTES), weights_file),
+    "verdict": Edge(120, edges.TREE, verdict_file),
+    "kept": Edge(60, pair(st.integers(0, 2), edges.BYTES), kept_files),
+    "options": Edge(
+        120,
+        pair(
+            st.integers(0, len(OPTIONS) - 1),
+            st.lists(pair(st.integers(0, 8), *[st.integers(0, len(WORDS) - 1)] * 2), min_size=1, max_size=2),
+        ),
+        options,
+    ),
+}
+
+
+def fuzz(edge: Edge, inputs: int, folder: pathlib.Path) -> None:
+    @settings(
+        max_examples=inputs, deadline=None, database=None, derandomize=True, suppress_health_check=list(HealthCheck)
+    )
+    @given(edge.edits)
+    def attempt(edit):
+        shutil.rmtree(folder, ignore_errors=True)
+        folder.mkdir()
+        edge.attempt(folder, edit)
+
+    attempt()
+
+
+@pytest.mark.parametrize("name", EDGES)
+def test_malformed_input_is_answered(name, tmp_path):
+    fuzz(EDGES[name], EDGES[name].inputs, tmp_path / "input")
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(3600)
+@pytest.mark.parametrize("name", EDGES)
+def test_much_more_malformed_input_is_answered(name, tmp_path):
+    fuzz(EDGES[name], 10 * EDGES[name].inputs, tmp_path / "input")
+
+
+def test_two_thousand_inputs_are_tried():
+    assert sum(edge.inputs for edge in EDGES.values()) >= 2000
