@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from cablejax.cable import GRAVITY, Cable, Discretisation
-from cablejax.effects.given import GivenEffect
+from cablejax.effects.given import GivenEffect, parse_effect
 from cablejax.simulate.elastica import elastica
 from cablejax.simulate.plant import Plant, PlantConfig, plant_model
 
@@ -131,3 +131,40 @@ def test_a_plant_without_effects_moves_as_it_always_has():
     np.testing.assert_allclose(
         last.keypoints[[3, 6, 9]], expected, rtol=0, atol=1e-9
     )  # other processors round otherwise
+
+
+@pytest.mark.parametrize("text", ["bending_stiffness:ratio=3", "linear_density:ratio=3"])
+def test_an_effect_that_begins_later_changes_nothing_before_and_goes_on_from_the_same_state(text):
+    twist, pose = np.array([[0.03, 0.02, -0.2], [-0.03, 0.03, 0.3]]), ARCH
+    same = Plant(CONFIG)
+    changed = Plant(dataclasses.replace(CONFIG, effects=(parse_effect(f"{text},from_s=1"),)))
+    for _ in range(2):  # the second cable begins without the effect, as the first one did
+        np.testing.assert_array_equal(changed.reset(pose).keypoints, same.reset(pose).keypoints)
+        np.testing.assert_array_equal(changed.step(twist).keypoints, same.step(twist).keypoints)
+        at_once = changed.step(twist, 0.005).keypoints - same.step(twist, 0.005).keypoints
+        later = changed.step(twist, 2.0).keypoints - same.step(twist, 2.0).keypoints
+        assert np.abs(at_once).max() < 5e-5 < 2e-4 < np.abs(later).max()
+
+
+def test_a_push_moves_the_cable_and_ends():
+    push = parse_effect("gravity_tilt:angle_rad=0.5,direction_rad=1.57,from_s=1,until_s=1.5")
+    plant = Plant(dataclasses.replace(CONFIG, effects=(push,)))
+    start = plant.reset(ARCH).keypoints
+    assert np.abs(plant.step(STILL).keypoints - start).max() < 2e-4
+    pushed = plant.step(STILL, 0.5).keypoints
+    assert np.abs(pushed - start).max() > 1e-3
+    rested = plant.step(STILL, 2.0).keypoints
+    assert np.abs(plant.step(STILL, 2.0).keypoints - rested).max() < 5e-4
+
+
+@pytest.mark.parametrize(
+    ("texts", "message"),
+    [
+        (("axial_stretch:stiffness_n=30,from_s=1",), "cannot let axial_stretch begin or end .* contact plant can"),
+        (("bending_stiffness:ratio=2,from_s=2,until_s=1",), "expected 0 <= from_s < until_s"),
+        (("plasticity:yield_curvature_per_m=2", "bending_stiffness:ratio=2,from_s=2"), "memory of bends"),
+    ],
+)
+def test_what_cannot_begin_in_the_middle_of_a_run_is_refused(texts, message):
+    with pytest.raises(ValueError, match=message):
+        dataclasses.replace(CONFIG, effects=tuple(map(parse_effect, texts)))

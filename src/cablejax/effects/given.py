@@ -31,6 +31,8 @@ class GivenEffect:
     Attributes:
         name: of the effect.
         parameters: pairs of name and value, SI units.
+        from_s: when it begins [s]: a disturbance in the middle of a run, which the contact plant stages.
+        until_s: when it ends [s]; None = never.
 
     Raises:
         ValueError: there is no such effect or parameter, a parameter is missing, or a value is out of its bounds.
@@ -38,10 +40,16 @@ class GivenEffect:
 
     name: str
     parameters: tuple[tuple[str, float], ...]
+    from_s: float = 0.0
+    until_s: float | None = None
 
     def __post_init__(self):
         if not isinstance(self.name, str) or self.name not in EFFECTS:
             raise ValueError(f"There is no effect {shown(self.name)}. Expected one of: {', '.join(sorted(EFFECTS))}.")
+        if not 0 <= self.from_s < (math.inf if self.until_s is None else self.until_s):
+            raise ValueError(
+                f"{self.name}: from_s is {self.from_s}, until_s {self.until_s}; expected 0 <= from_s < until_s [s]."
+            )
         object.__setattr__(self, "parameters", tuple((str(n), v) for n, v in self.parameters))
         known, required = _parameter_names(self.effect)
         named = dict(self.parameters)
@@ -53,6 +61,15 @@ class GivenEffect:
         missing = [name for name in required if name not in named]
         if missing:
             raise ValueError(f"{self.name} lacks {', '.join(missing)}. Expected {example}.")
+
+    @property
+    def lasting(self) -> bool:
+        """Whether it acts all the time."""
+        return self.from_s == 0 and self.until_s is None
+
+    def acts_at(self, time: float) -> bool:
+        """Whether it acts at this time [s]."""
+        return self.from_s <= time and (self.until_s is None or time < self.until_s)
 
     @property
     def effect(self) -> CableEffect:
@@ -79,7 +96,12 @@ class GivenEffect:
 
     def __str__(self) -> str:
         """The effect as `parse_effect` reads it back, without loss."""
-        return f"{self.name}:{','.join(f'{name}={number_text(value)}' for name, value in self.parameters)}"
+        given = list(self.parameters)
+        if self.from_s > 0:
+            given.append(("from_s", self.from_s))
+        if self.until_s is not None:
+            given.append(("until_s", self.until_s))
+        return f"{self.name}:{','.join(f'{name}={number_text(value)}' for name, value in given)}"
 
 
 def with_effects(physics: Physics, effects: Iterable[GivenEffect], chain: Discretisation) -> Physics:
@@ -91,6 +113,8 @@ def with_effects(physics: Physics, effects: Iterable[GivenEffect], chain: Discre
 
 def parse_effect(text: str) -> GivenEffect:
     """An effect as written on a command line: `name:parameter=value,parameter=value`, SI units.
+
+    Among the parameters may be `from_s` and `until_s`, see `GivenEffect`.
 
     Raises:
         ValueError: the text is not of this form, or see `GivenEffect`.
@@ -106,7 +130,8 @@ def parse_effect(text: str) -> GivenEffect:
         if not math.isfinite(value):
             raise ValueError(f"Effect {shown(text)}: {shown(item)} is not of the form parameter=number.")
         parameters.append((key.strip(), value))
-    return GivenEffect(name.strip(), tuple(parameters))
+    times = {key: value for key, value in parameters if key in ("from_s", "until_s")}
+    return GivenEffect(name.strip(), tuple(pair for pair in parameters if pair[0] not in times), **times)
 
 
 def effects_of_verdict(path: str | os.PathLike[str]) -> tuple[GivenEffect, ...]:
@@ -134,7 +159,11 @@ def effects_of_verdict(path: str | os.PathLike[str]) -> tuple[GivenEffect, ...]:
 
 
 def check_hooks(
-    effects: Sequence[GivenEffect], hooks: frozenset[Hook], simulator: str, able: Mapping[str, Any]
+    effects: Sequence[GivenEffect],
+    hooks: frozenset[Hook],
+    simulator: str,
+    able: Mapping[str, Any],
+    changing: frozenset[Hook] = frozenset(),
 ) -> None:
     """Raises `ValueError` if an effect acts through a hook that a simulator does not honour.
 
@@ -143,8 +172,14 @@ def check_hooks(
         hooks: of the simulator.
         simulator: its name, for the message.
         able: other simulators by name with their hooks, for the message.
+        changing: hooks whose effects may begin and end in the middle of a run.
     """
     for effect in effects:
+        if not effect.lasting and effect.effect.hook not in changing:
+            raise ValueError(
+                f"The simulator {simulator} cannot let {effect.name} begin or end in the middle of a run (from_s, "
+                "until_s). The contact plant can, with effects on bending, mass and the table."
+            )
         if effect.effect.hook not in hooks:
             others = ", ".join(name for name, theirs in able.items() if effect.effect.hook in theirs) or "none"
             raise ValueError(

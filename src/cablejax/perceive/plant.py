@@ -14,6 +14,7 @@ from cablejax.perceive.frame import Status, Track, TrackerConfig, TrackState
 from cablejax.perceive.registration import RegistrationConfig
 from cablejax.perceive.tracker import Tracker
 from cablejax.simulate.plant import HOOKS, Plant, PlantConfig
+from cablejax.simulate.plant.config import CHANGING
 from cablejax.simulate.table_plant import Observation
 
 
@@ -40,7 +41,7 @@ class CloudPlant(Plant):
     ):
         super().__init__(config)
         # its keypoints come from a cloud, not from what a camera reports
-        check_hooks(self.config.effects, HOOKS - {"observation"}, "CloudPlant", {"Plant": HOOKS})
+        check_hooks(self.config.effects, HOOKS - {"observation"}, "CloudPlant", {"Plant": HOOKS}, CHANGING)
         cable = self.config.cable
         self.camera = DepthCamera(CameraConfig() if camera is None else camera, self.config.discretisation)
         self.tracker = Tracker(tracker_for(cable) if tracker is None else tracker)

@@ -61,20 +61,23 @@ def plant_physics(discretisation: Discretisation, effects: tuple[GivenEffect, ..
     return with_effects(nominal_physics(planar, np.float64), effects, planar)
 
 
-def check_effects(config, hooks: frozenset[Hook], able: Mapping[str, frozenset[Hook]]) -> None:
+def check_effects(
+    config, hooks: frozenset[Hook], able: Mapping[str, frozenset[Hook]], changing: frozenset[Hook] = frozenset()
+) -> None:
     """Raises ValueError unless a plant can stage the `effects` of its configuration.
 
     Args:
         config: with `effects`, a tuple, and `discretisation`.
         hooks: that the plant honours.
         able: other plants by name with their hooks, for the message.
+        changing: hooks whose effects may begin and end in the middle of a run.
     """
     for effect in config.effects:
         if not isinstance(effect, GivenEffect):
             raise ValueError(
                 f"{type(config).__name__}.effects has {effect!r}, expected GivenEffect objects: use parse_effect(...)."
             )
-    check_hooks(config.effects, hooks, type(config).__name__.removesuffix("Config"), able)
+    check_hooks(config.effects, hooks, type(config).__name__.removesuffix("Config"), able, changing)
     plant_physics(config.discretisation, config.effects)
 
 

@@ -51,9 +51,7 @@ class TablePlant(abc.ABC):
 
     def __init__(self, config: ObservedConfig):
         self.config = config
-        self._physics = config.physics
-        still = np.zeros(config.cable.n_keypoints)
-        self._unbiased = dataclasses.replace(config.physics, bias_along=still, bias_across=still)
+        self._take_on(config.physics)
         self._timestep = config.discretisation.timestep
         self._weights = hermite_weights(config.discretisation)
         self._pose = np.full((2, 3), np.nan)
@@ -61,6 +59,12 @@ class TablePlant(abc.ABC):
         self._seen: list[tuple[float, Float[np.ndarray, "N 2"]]] = []  # what a late camera has yet to report
         self._random = np.random.default_rng(config.seed)
         self._steps_done: int | None = None
+
+    def _take_on(self, physics: Physics) -> None:
+        """The physics from now on."""
+        still = np.zeros(self.config.cable.n_keypoints)
+        self._physics = physics
+        self._unbiased = dataclasses.replace(physics, bias_along=still, bias_across=still)
 
     @abc.abstractmethod
     def reset(

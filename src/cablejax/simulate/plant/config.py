@@ -15,6 +15,9 @@ from cablejax.simulate.plant_config import check_camera, check_effects, plant_ph
 HOOKS: frozenset[Hook] = frozenset(get_args(Hook))
 """Hooks of the effects that the contact plant can stage."""
 
+CHANGING: frozenset[Hook] = frozenset({"bending", "table", "mass"})
+"""Those whose effects may begin and end in the middle of a run: they change numbers of the model, not its parts."""
+
 
 @dataclasses.dataclass(frozen=True)
 class PlantConfig:
@@ -54,8 +57,17 @@ class PlantConfig:
 
     @property
     def physics(self) -> Physics:
-        """The cable with the effects, float64, each joint bending in the plane."""
-        return plant_physics(self.discretisation, self.effects)
+        """The cable with the effects that act from the beginning, float64, each joint bending in the plane."""
+        return plant_physics(self.discretisation, self.at(0.0).effects)
+
+    def at(self, time: float) -> PlantConfig:
+        """The configuration with the effects that act at this time [s], and no others."""
+        if all(effect.lasting for effect in self.effects):
+            return self
+        acting = [effect for effect in self.effects if effect.acts_at(time)]
+        return dataclasses.replace(
+            self, effects=tuple(dataclasses.replace(e, from_s=0.0, until_s=None) for e in acting)
+        )
 
     def __post_init__(self):
         if self.discretisation.dimension != 3:
@@ -65,7 +77,13 @@ class PlantConfig:
         check(self, "seed", cone_ratio="positive", contact_time="positive", settle_time="positive")
         check_camera(self)
         object.__setattr__(self, "effects", tuple(self.effects))
-        check_effects(self, HOOKS, {})
+        check_effects(self, HOOKS, {}, CHANGING)
+        remembered = [effect.name for effect in self.effects if effect.effect.hook == "memory"]
+        if remembered and not all(effect.lasting for effect in self.effects):
+            raise ValueError(
+                f"{remembered[0]} acts all the time and another effect does not: the plant's memory of bends would be "
+                "lost where that begins or ends. Leave out from_s and until_s, or this effect."
+            )
         radius, own = float(self.physics.obstacle_radius), self.cable.diameter / 2
         if 0 < radius <= own:
             raise ValueError(

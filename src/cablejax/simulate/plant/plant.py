@@ -31,28 +31,47 @@ class Plant(TablePlant):
 
     def __init__(self, config: PlantConfig | None = None):
         super().__init__(PlantConfig() if config is None else config)
-        self.model = plant_model(self.config)
+        self._height, self._acting = np.nan, False
+        self._assume(self.config.at(0.0))
+
+    def _assume(self, config: PlantConfig) -> None:
+        """Takes on the physics of a configuration whose effects last, in MuJoCo's initial state."""
+        self._assumed = config
+        self._take_on(config.physics)
+        self.model = plant_model(config)
         self._data = mujoco.MjData(self.model)
         names = (self.model.body(i).name for i in range(self.model.nbody))
         self._links = np.array([i for i, name in enumerate(names) if name.startswith("cable")])
         self._offsets = node_offsets(self.config.discretisation)[:, None]
         self._balls = self.model.jnt_qposadr[bending_joints(self.model)][:, None] + np.arange(4)
-        self._height = np.nan
         # The mocap bodies coincide with the frames of what they hold: the last link begins before the grasped end.
-        physics, h = self._physics, self.config.discretisation.link_length
+        physics, h = self._physics, config.discretisation.link_length
         self._inset = 0.0 if physics.rotation_compliance[1] > 0 else 0.5 * h
         remembers = physics.hysteresis_moment > 0 or physics.yield_curvature < NO_YIELD
         uneven = physics.patch_friction or physics.static_excess
-        self._memory = Memory(self.model, self._data, self.config) if remembers else None
-        self._friction = TableFriction(self.model, self._data, self._links, self.config) if uneven else None
-        self._extension = Extension(self.model, self._data, self.config) if extensible(physics) else None
-        self._acting = False
+        self._memory = Memory(self.model, self._data, config) if remembers else None
+        self._friction = TableFriction(self.model, self._data, self._links, config) if uneven else None
+        self._extension = Extension(self.model, self._data, config) if extensible(physics) else None
+
+    def _change(self) -> None:
+        """Begins and ends effects that are due, at the cable's present state."""
+        due = self.config.at(self.time)
+        if due.effects == self._assumed.effects:
+            return
+        before = self._data
+        self._assume(due)
+        for name in ("time", "qpos", "qvel", "qacc_warmstart", "mocap_pos", "mocap_quat"):
+            setattr(self._data, name, getattr(before, name))
+        self._set_friction(float(self._physics.friction))
+        mujoco.mj_forward(self.model, self._data)
 
     def reset(
         self, gripper_pose: Float[np.ndarray, "Q 3"], *, guess: Float[np.ndarray, "S 2"] | None = None
     ) -> Observation:
         """See `TablePlant.reset`."""
         pose = self._checked_start(gripper_pose)
+        if self._assumed.effects != self.config.at(0.0).effects:
+            self._assume(self.config.at(0.0))
         cable, data, physics = self.config.cable, self._data, self._physics
         held = pose + np.array([[0.0, 0.0, offset] for offset in physics.rotation_offset])
         # A chain's links follow the elastica's chords; only the held ones have the exact direction of the grippers.
@@ -82,7 +101,7 @@ class Plant(TablePlant):
 
     def _settle(self, still: np.ndarray, steps: int) -> None:
         """To rest, without friction. Effects may bend the cable into another shape, which takes longer."""
-        for _ in range(LONGEST_SETTLING if self.config.effects else 1):
+        for _ in range(LONGEST_SETTLING if self._assumed.effects else 1):
             before = self.nodes()[0]
             self._advance(still, steps)
             if np.abs(self.nodes()[0] - before).max() < RESTING:
@@ -125,6 +144,8 @@ class Plant(TablePlant):
 
     def _advance(self, twist: np.ndarray, steps: int) -> None:
         """`steps` time steps under one twist; the mocap bodies lead to the pose at the end of each."""
+        if self._acting:
+            self._change()
         model, data, dt = self.model, self._data, self.config.discretisation.timestep
         start, time = self._pose, self.time
         for step in range(1, steps + 1):
