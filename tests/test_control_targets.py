@@ -85,7 +85,7 @@ def test_unfit_targets_are_refused():
         target_from_keypoints("mine", points, CABLE, gripper_pose=straight_start(CABLE))
     with pytest.raises(ValueError, match="complex"):
         target_from_keypoints("mine", points + 0j, CABLE)
-    with pytest.raises(ValueError, match=r"1.4.*e.06 m from the origin"):
+    with pytest.raises(ValueError, match=r"1e.06 m from the origin"):
         target_from_keypoints("mine", points + 1e6, CABLE)
     with pytest.raises(ValueError, match="keypoints 11 and 12 1 m apart"):
         target_from_keypoints("mine", np.where(np.arange(13)[:, None] < 12, 0.0, [[1.0, 0.0]]), CABLE)

@@ -85,7 +85,7 @@ def test_features_are_those_of_the_graphs_row_by_row():
 def test_impossible_pretraining_is_refused():
     with pytest.raises(ValueError, match="steps is 0"):
         PretrainConfig(steps=0)
-    with pytest.raises(ValueError, match="learning rates"):
+    with pytest.raises(ValueError, match=r"lr_end is 0\.0, expected a number from"):
         PretrainConfig(lr_end=0.0)
     with pytest.raises(ValueError, match="another cable"):
         pretrain(TINY_TRAINING, trajectories(n=6), progress=False)

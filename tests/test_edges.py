@@ -316,12 +316,12 @@ def options(folder, edit):
     fixed: dict[str, list] = {
         "train": ["--data", original("store"), "--out", folder / "out"],
         "shape": ["--weights", original("model"), "--out", folder / "out"],
-        "bench simulate": ["--batch", "0"],
+        "bench simulate": ["--rounds", "0"],  # what is accepted would be timed
     }
     before = os.getcwd()
     os.chdir(folder)
     try:
-        return command(*name.split(), *fixed.get(name, []), *arguments)
+        return command(*name.split(), *arguments, *fixed.get(name, []))
     finally:
         os.chdir(before)
 

@@ -184,7 +184,7 @@ def save_cases(path: pathlib.Path, cases: Sequence[PlanningCase]) -> None:
 
 def load_cases(path: pathlib.Path) -> list[PlanningCase]:
     """Reads what `save_cases` wrote."""
-    columns = read_npz(path, [field.name for field in dataclasses.fields(PlanningCase)])
+    columns = read_npz(path, [field.name for field in dataclasses.fields(PlanningCase)], text=["name"])
     rows = zip(*columns.values(), strict=True)
     cases = [dict(zip(columns, row, strict=True)) for row in rows]
     return [PlanningCase(**(case | {"name": str(case["name"]), "radius": float(case["radius"])})) for case in cases]

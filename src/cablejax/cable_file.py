@@ -54,7 +54,7 @@ def read_cable(path: str | os.PathLike[str]) -> Cable:
     try:
         fields = read_toml(path)
     except (ValueError, OSError) as error:
-        raise ValueError(f"This is no cable file: {error} {_EXAMPLE}") from None
+        raise ValueError(f"The cable could not be read. {error} {_EXAMPLE}") from None
     return cable_from_fields(fields, str(path))
 
 

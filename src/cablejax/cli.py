@@ -27,6 +27,9 @@ from cablejax.whole_file import DRAFT
 USER_ERROR = 2
 """Exit code for input that cannot be used."""
 
+_LONGEST = 2000
+"""Characters of a message that are printed."""
+
 CLOSED = 141
 """Exit code where the reader of the output has gone, as shells have it."""
 
@@ -99,15 +102,15 @@ def _run(given: list[str]) -> int:
         raise
     except OSError as error:
         where = str(error.filename or "").removesuffix(DRAFT)
-        what = f"{where}: {error.strerror}." if where and error.strerror else error.strerror or f"{error}"
-        print(f"cablejax: {what}", file=sys.stderr)
-        return USER_ERROR
+        said = f"{where}: {error.strerror}." if where and error.strerror else error.strerror or f"{error}"
     except ValueError as error:
-        print(f"cablejax: {error}", file=sys.stderr)
-        return USER_ERROR
+        said = str(error)
     except MemoryError:
-        print("cablejax: There is not enough memory for this input: give a smaller one.", file=sys.stderr)
-        return USER_ERROR
+        said = "There is not enough memory for this input: give a smaller one."
     except KeyboardInterrupt as interrupt:
         raise KeyboardInterrupt(str(interrupt) or hint) from interrupt
-    return 0
+    else:
+        return 0
+    # the name of a file may be of any length
+    print(f"cablejax: {said if len(said) <= _LONGEST else f'{said[:_LONGEST]} ...'}", file=sys.stderr)
+    return USER_ERROR

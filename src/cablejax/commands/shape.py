@@ -52,7 +52,8 @@ class Shape(Command):
 
     plant_effect: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
     """An effect of the plant that the model may not know, as NAME:PARAMETER=VALUE,... in SI units; may be given several
-    times. By default bending_stiffness:ratio=2; `none` for no effect."""
+    times. By default bending_stiffness:ratio=2; `none` for no effect. With from_s=... and until_s=... it begins and
+    ends in the middle of the run."""
 
     perception: Literal["true", "cloud"] = "true"
     """true: the controller observes the simulated keypoints. cloud: it observes keypoints estimated from clouds of a

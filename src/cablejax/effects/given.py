@@ -32,7 +32,7 @@ class GivenEffect:
         name: of the effect.
         parameters: pairs of name and value, SI units.
         from_s: when it begins [s]: a disturbance in the middle of a run, which the contact plant stages.
-        until_s: when it ends [s].
+        until_s: when it ends [s]; None = never.
 
     Raises:
         ValueError: there is no such effect or parameter, a parameter is missing, or a value is out of its bounds.
@@ -41,12 +41,12 @@ class GivenEffect:
     name: str
     parameters: tuple[tuple[str, float], ...]
     from_s: float = 0.0
-    until_s: float = math.inf
+    until_s: float | None = None
 
     def __post_init__(self):
         if not isinstance(self.name, str) or self.name not in EFFECTS:
             raise ValueError(f"There is no effect {shown(self.name)}. Expected one of: {', '.join(sorted(EFFECTS))}.")
-        if not 0 <= self.from_s < self.until_s:
+        if not 0 <= self.from_s < (math.inf if self.until_s is None else self.until_s):
             raise ValueError(
                 f"{self.name}: from_s is {self.from_s}, until_s {self.until_s}; expected 0 <= from_s < until_s [s]."
             )
@@ -65,11 +65,11 @@ class GivenEffect:
     @property
     def lasting(self) -> bool:
         """Whether it acts all the time."""
-        return self.from_s == 0 and self.until_s == math.inf
+        return self.from_s == 0 and self.until_s is None
 
     def acts_at(self, time: float) -> bool:
         """Whether it acts at this time [s]."""
-        return self.from_s <= time < self.until_s
+        return self.from_s <= time and (self.until_s is None or time < self.until_s)
 
     @property
     def effect(self) -> CableEffect:
@@ -96,8 +96,11 @@ class GivenEffect:
 
     def __str__(self) -> str:
         """The effect as `parse_effect` reads it back, without loss."""
-        times = [("from_s", self.from_s, 0.0), ("until_s", self.until_s, math.inf)]
-        given = [*self.parameters, *((name, value) for name, value, usual in times if value != usual)]
+        given = list(self.parameters)
+        if self.from_s > 0:
+            given.append(("from_s", self.from_s))
+        if self.until_s is not None:
+            given.append(("until_s", self.until_s))
         return f"{self.name}:{','.join(f'{name}={number_text(value)}' for name, value in given)}"
 
 

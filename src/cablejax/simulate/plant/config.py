@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 from typing import get_args
 
 from cablejax.cable import Cable, Discretisation
@@ -59,15 +58,14 @@ class PlantConfig:
     @property
     def physics(self) -> Physics:
         """The cable with the effects that act from the beginning, float64, each joint bending in the plane."""
-        return plant_physics(self.discretisation, self.at(0.0).effects)
+        return plant_physics(self.discretisation, self.acting(0.0))
 
-    def at(self, time: float) -> PlantConfig:
-        """The configuration with the effects that act at this time [s], and no others."""
-        if all(effect.lasting for effect in self.effects):
-            return self
-        acting = [effect for effect in self.effects if effect.acts_at(time)]
-        return dataclasses.replace(
-            self, effects=tuple(dataclasses.replace(e, from_s=0.0, until_s=math.inf) for e in acting)
+    def acting(self, time: float) -> tuple[GivenEffect, ...]:
+        """The effects that act at this time [s], as lasting ones."""
+        return tuple(
+            effect if effect.lasting else dataclasses.replace(effect, from_s=0.0, until_s=None)
+            for effect in self.effects
+            if effect.acts_at(time)
         )
 
     def __post_init__(self):

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import mujoco
 import numpy as np
 from jaxtyping import Float
 
+from cablejax.effects.given import GivenEffect
 from cablejax.simulate.composite import node_offsets
 from cablejax.simulate.elastica import solve_elastica
 from cablejax.simulate.plant.config import PlantConfig
@@ -32,11 +35,11 @@ class Plant(TablePlant):
     def __init__(self, config: PlantConfig | None = None):
         super().__init__(PlantConfig() if config is None else config)
         self._height, self._acting = np.nan, False
-        self._assume(self.config.at(0.0))
+        self._assume(self.config.acting(0.0))
 
-    def _assume(self, config: PlantConfig) -> None:
-        """Takes on the physics of a configuration whose effects last, in MuJoCo's initial state."""
-        self._assumed = config
+    def _assume(self, effects: tuple[GivenEffect, ...]) -> None:
+        """Takes on the physics with these lasting effects, in MuJoCo's initial state."""
+        self._effects, config = effects, dataclasses.replace(self.config, effects=effects)
         self._take_on(config.physics)
         self.model = plant_model(config)
         self._data = mujoco.MjData(self.model)
@@ -55,8 +58,8 @@ class Plant(TablePlant):
 
     def _change(self) -> None:
         """Begins and ends effects that are due, at the cable's present state."""
-        due = self.config.at(self.time)
-        if due.effects == self._assumed.effects:
+        due = self.config.acting(self.time)
+        if due == self._effects:
             return
         before = self._data
         self._assume(due)
@@ -70,8 +73,8 @@ class Plant(TablePlant):
     ) -> Observation:
         """See `TablePlant.reset`."""
         pose = self._checked_start(gripper_pose)
-        if self._assumed.effects != self.config.at(0.0).effects:
-            self._assume(self.config.at(0.0))
+        if self._effects != self.config.acting(0.0):
+            self._assume(self.config.acting(0.0))
         cable, data, physics = self.config.cable, self._data, self._physics
         held = pose + np.array([[0.0, 0.0, offset] for offset in physics.rotation_offset])
         # A chain's links follow the elastica's chords; only the held ones have the exact direction of the grippers.
@@ -101,7 +104,7 @@ class Plant(TablePlant):
 
     def _settle(self, still: np.ndarray, steps: int) -> None:
         """To rest, without friction. Effects may bend the cable into another shape, which takes longer."""
-        for _ in range(LONGEST_SETTLING if self._assumed.effects else 1):
+        for _ in range(LONGEST_SETTLING if self._effects else 1):
             before = self.nodes()[0]
             self._advance(still, steps)
             if np.abs(self.nodes()[0] - before).max() < RESTING:
