@@ -38,9 +38,8 @@ class MPCConfig:
         min_reduction: predicted changes of the error below this say nothing about the model: the radius stays [m].
         hold_improvement: the grippers hold still if the plan lowers the error over the horizon, as a root mean square
             distance, by less than this compared with holding still [m].
-        settle_after: commands without a lower error after which the grippers go back to where it was lowest and rest.
+        settle_after: commands without a lower error after which the grippers rest, near the target.
         wake: rise of the error at rest [m] that counts as a disturbance: planning begins again.
-        arrived: way left [m] at which the grippers count as being there.
         restart_above: where the error stays above this [m], the cable is in another shape than the target's, between
             the same grippers or others. No plan of a few steps leads out: it is straightened, and shaped from there.
         restart_after: commands without a lower error after which it counts as staying; at once where no plan is better
@@ -69,7 +68,6 @@ class MPCConfig:
     hold_improvement: float = 2e-5
     settle_after: int = 8
     wake: float = 1e-3
-    arrived: float = 1e-4
     restart_above: float = 0.05
     restart_after: int = 12
     max_restarts: int = 3
@@ -95,7 +93,6 @@ class MPCConfig:
             "min_reduction",
             "hold_improvement",
             "wake",
-            "arrived",
             "restart_above",
         )
         scaled = {name: ratio * getattr(cls, name) for name in own}
@@ -114,7 +111,6 @@ class MPCConfig:
             hold_improvement="not_negative",
             settle_after="count",
             wake="positive",
-            arrived="positive",
             restart_above="positive",
             restart_after="count",
             max_restarts="count_from_zero",

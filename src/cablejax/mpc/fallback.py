@@ -1,4 +1,4 @@
-"""Fallbacks where no plan is better than holding still, or nothing gets better: hold, straighten, go back and rest."""
+"""Fallbacks where no plan is better than holding still, or nothing gets better: hold, straighten, rest."""
 
 from __future__ import annotations
 
@@ -15,6 +15,11 @@ from cablejax.mpc.plan import Plan
 from cablejax.mpc.problem import ShapingProblem
 from cablejax.mpc.state import Action, Progress
 from cablejax.mpc.warm_start import Starts
+
+RELAXES = 2
+"""Commands of a rest in which the error may change by itself."""
+ABOUT = 1.25
+"""An error of at most this ratio to the lowest counts as about as low."""
 
 
 class Decision(NamedTuple):
@@ -53,24 +58,23 @@ def plan_or_recover(
     decision: Decision,
     start: Starts,
 ) -> tuple[Decision, Progress]:
-    """The decision, or the next step of a way to poses that are known to be good; and the progress.
+    """The decision, the next step of the way to where the cable is straight, or rest; and the progress.
 
     Where no command has lowered the error for a while, none that the model can find will. There are two cases:
 
     - Far from the target. A cable has several shapes between the same grippers, and near another one than the target's
       every plan of a few steps makes the error worse before it makes it better. From the straight cable the target can
       be reached, so it is straightened.
-    - Near it. Stick and slip are of the size of what the model promises. The grippers go back to where the cable was
-      nearest to the target, and rest there until the error rises, as after a disturbance.
+    - Near it. Stick and slip are of the size of what the model promises. The grippers rest as soon as the error is
+      about as low as it has been, until it rises, as after a disturbance. They do not go back to where it was lower:
+      where friction holds it, a cable between the same grippers has another shape than it had.
     """
     plan, sound = decision.plan, _sound(decision.plan.result)
     held = decision.action == Action.HOLD
-    progress = _followed(config, progress, problem.history.gripper_pose, error, start, sound=sound, held=held)
+    progress = _followed(config, progress, error, start.straightening.length, sound=sound, held=held)
     mode = jnp.where(sound, progress.mode, Action.FOLLOW)
     motion = jnp.select(
-        [mode == Action.STRAIGHTEN, mode == Action.RETURN, mode == Action.HOLD],
-        [start.straightening.motion, start.back.motion, start.still],
-        plan.motion,
+        [mode == Action.STRAIGHTEN, mode == Action.HOLD], [start.straightening.motion, start.still], plan.motion
     )
     # a rollout that is needed in few calls
     value = jax.lax.cond(mode == Action.FOLLOW, lambda motion: plan.value, problem.value, motion)
@@ -81,44 +85,50 @@ def plan_or_recover(
 def _followed(
     config: MPCConfig,
     before: Progress,
-    pose: Float[Array, "Q 3"],
     error: Float[Array, ""],
-    start: Starts,
+    length: Float[Array, ""],
     *,
     sound: Bool[Array, ""],
     held: Bool[Array, ""],
 ) -> Progress:
-    """The progress after one more observation; `sound`: the plan may be carried out; `held`: it is to hold."""
+    """The progress after one more observation.
+
+    Args:
+        config: settings.
+        before: the progress so far.
+        error: the shape error now [m].
+        length: of the way to where the cable is straight [m].
+        sound: whether the plan may be carried out.
+        held: whether it is to hold.
+    """
     resting = before.mode == Action.HOLD
-    woken = resting & (error > before.rest_error + config.wake)
+    # what moved fast comes to rest a while after its grippers
+    calming = resting & (before.since < RELAXES)
+    woken = resting & ~calming & (error > before.rest_error + config.wake)
     planning = (before.mode == Action.FOLLOW) | woken
     best = jnp.where(woken, jnp.inf, before.best_error)
     better = planning & (error < 0.99 * best)
-    since = jnp.where(planning & ~better & ~woken, before.since_best + 1, 0)
+    since = jnp.where(better | woken, 0, before.since + 1)
 
     far = error > config.restart_above
     tired = planning & sound & ((far & held) | (since >= jnp.where(far, config.restart_after, config.settle_after)))
-    far_to_go = start.straightening.length > config.radius_max
+    far_to_go = length > config.radius_max
     straighten = tired & far & far_to_go & (before.restarts < config.max_restarts)
     straightening = straighten | (before.mode == Action.STRAIGHTEN)
-    returning = (tired & ~far) | (before.mode == Action.RETURN)
-    length = jnp.where(straightening, start.straightening.length, start.back.length)
+    rest = tired & ~far & ((error <= ABOUT * best) | (since >= 2 * config.settle_after))
     # half as many steps again as the way is long: the bounds on the grippers' distance may lead it round
     needed = jnp.ceil(1.5 * length / config.radius_max).astype(jnp.int32)
-    left = jnp.where(tired, needed, before.way_left - 1)
+    left = jnp.where(straighten, needed, before.way_left - 1)
     # from within a step of straight the planner goes on by itself
-    on_way = (left > 0) & (length > jnp.where(straightening, config.radius_max, config.arrived))
-    mode = jnp.where(straightening & on_way, Action.STRAIGHTEN, Action.FOLLOW)
-    mode = jnp.where(returning, jnp.where(on_way, Action.RETURN, Action.HOLD), mode)
-    mode = jnp.where(resting & ~woken, Action.HOLD, mode)
+    on_way = straightening & (left > 0) & far_to_go
+    mode = jnp.where(rest | (resting & ~woken), Action.HOLD, jnp.where(on_way, Action.STRAIGHTEN, Action.FOLLOW))
     return Progress(
         best_error=jnp.where(straightening, jnp.inf, jnp.where(better, error, best)).astype(error.dtype),
-        best_pose=jnp.where(better, pose, before.best_pose),
-        since_best=jnp.where(straightening, 0, since),
+        since=jnp.where(straightening | rest, 0, since),
         mode=mode.astype(jnp.int32),
         way_left=left,
         restarts=before.restarts + straighten,
-        rest_error=jnp.where(resting & ~woken, before.rest_error, error),
+        rest_error=jnp.where(resting & ~calming & ~woken, before.rest_error, error),
     )
 
 
