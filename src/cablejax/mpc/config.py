@@ -38,7 +38,8 @@ class MPCConfig:
         min_reduction: predicted changes of the error below this say nothing about the model: the radius stays [m].
         hold_improvement: the grippers hold still if the plan lowers the error over the horizon, as a root mean square
             distance, by less than this compared with holding still [m].
-        settle_after: commands without a lower error after which the grippers rest, near the target.
+        settle_after: commands without a lower error near the target after which the grippers rest.
+        arrived: way left to the best pose [m] at which the grippers count as being there.
         wake: rise of the error at rest [m] that counts as a disturbance: planning begins again.
         restart_above: where the error stays above this [m], the cable is in another shape than the target's, between
             the same grippers or others. No plan of a few steps leads out: it is straightened, and shaped from there.
@@ -68,6 +69,7 @@ class MPCConfig:
     hold_improvement: float = 2e-5
     settle_after: int = 8
     wake: float = 1e-3
+    arrived: float = 1e-4
     restart_above: float = 0.05
     restart_after: int = 12
     max_restarts: int = 3
@@ -93,6 +95,7 @@ class MPCConfig:
             "min_reduction",
             "hold_improvement",
             "wake",
+            "arrived",
             "restart_above",
         )
         scaled = {name: ratio * getattr(cls, name) for name in own}
@@ -111,6 +114,7 @@ class MPCConfig:
             hold_improvement="not_negative",
             settle_after="count",
             wake="positive",
+            arrived="positive",
             restart_above="positive",
             restart_after="count",
             max_restarts="count_from_zero",

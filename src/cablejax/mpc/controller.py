@@ -99,7 +99,7 @@ def _step(mpc: MPC, state: MPCState, measurement: Measurement) -> tuple[MPCState
     error = problem.shape_error(state.history.keypoints[-1])
     rho, radius = _update_radius(config, state, error, problem.shape_error(state.last.predicted))
     problem = dataclasses.replace(problem, feasible=dataclasses.replace(problem.feasible, radius=radius))
-    start = find_starts(config, problem, state.last.plan)
+    start = find_starts(config, problem, state.last.plan, state.progress.best_pose)
     decision = plan_or_hold(config, config.solver(problem, start.guess), start)
     decision, progress = plan_or_recover(config, state.progress, problem, error, decision, start)
     plan = decision.plan

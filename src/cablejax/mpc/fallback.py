@@ -1,4 +1,4 @@
-"""Fallbacks where no plan is better than holding still, or nothing gets better: hold, straighten, rest."""
+"""Fallbacks where no plan is better than holding still, or nothing gets better: hold, straighten, go back, rest."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def plan_or_recover(
     decision: Decision,
     start: Starts,
 ) -> tuple[Decision, Progress]:
-    """The decision, the next step of the way to where the cable is straight, or rest; and the progress.
+    """The decision, or the next step of a way to poses that are known to be good, or rest; and the progress.
 
     Where no command has lowered the error for a while, none that the model can find will. There are two cases:
 
@@ -66,15 +66,18 @@ def plan_or_recover(
       every plan of a few steps makes the error worse before it makes it better. From the straight cable the target can
       be reached, so it is straightened.
     - Near it. Stick and slip are of the size of what the model promises. The grippers rest as soon as the error is
-      about as low as it has been, until it rises, as after a disturbance. They do not go back to where it was lower:
-      where friction holds it, a cable between the same grippers has another shape than it had.
+      about as low as it has been, until it rises, as after a disturbance. Where the cable has got worse instead, they
+      go back to where it was best, and rest there, although friction may hold it in another shape than it had.
     """
     plan, sound = decision.plan, _sound(decision.plan.result)
     held = decision.action == Action.HOLD
-    progress = _followed(config, progress, error, start.straightening.length, sound=sound, held=held)
+    ways = start.straightening.length, start.back.length
+    progress = _followed(config, progress, problem.history.gripper_pose, error, ways, sound=sound, held=held)
     mode = jnp.where(sound, progress.mode, Action.FOLLOW)
     motion = jnp.select(
-        [mode == Action.STRAIGHTEN, mode == Action.HOLD], [start.straightening.motion, start.still], plan.motion
+        [mode == Action.STRAIGHTEN, mode == Action.RETURN, mode == Action.HOLD],
+        [start.straightening.motion, start.back.motion, start.still],
+        plan.motion,
     )
     # a rollout that is needed in few calls
     value = jax.lax.cond(mode == Action.FOLLOW, lambda motion: plan.value, problem.value, motion)
@@ -85,8 +88,9 @@ def plan_or_recover(
 def _followed(
     config: MPCConfig,
     before: Progress,
+    pose: Float[Array, "Q 3"],
     error: Float[Array, ""],
-    length: Float[Array, ""],
+    ways: tuple[Float[Array, ""], Float[Array, ""]],
     *,
     sound: Bool[Array, ""],
     held: Bool[Array, ""],
@@ -96,8 +100,9 @@ def _followed(
     Args:
         config: settings.
         before: the progress so far.
+        pose: of the grippers now.
         error: the shape error now [m].
-        length: of the way to where the cable is straight [m].
+        ways: lengths of those to where the cable is straight, and to where its shape was best [m].
         sound: whether the plan may be carried out.
         held: whether it is to hold.
     """
@@ -112,18 +117,24 @@ def _followed(
 
     far = error > config.restart_above
     tired = planning & sound & ((far & held) | (since >= jnp.where(far, config.restart_after, config.settle_after)))
-    far_to_go = length > config.radius_max
+    far_to_go = ways[0] > config.radius_max
     straighten = tired & far & far_to_go & (before.restarts < config.max_restarts)
     straightening = straighten | (before.mode == Action.STRAIGHTEN)
-    rest = tired & ~far & ((error <= ABOUT * best) | (since >= 2 * config.settle_after))
+    go_back = tired & ~far & (error > ABOUT * best)
+    returning = go_back | (before.mode == Action.RETURN)
+    length = jnp.where(straightening, *ways)
     # half as many steps again as the way is long: the bounds on the grippers' distance may lead it round
     needed = jnp.ceil(1.5 * length / config.radius_max).astype(jnp.int32)
-    left = jnp.where(straighten, needed, before.way_left - 1)
+    left = jnp.where(straighten | go_back, needed, before.way_left - 1)
     # from within a step of straight the planner goes on by itself
-    on_way = straightening & (left > 0) & far_to_go
-    mode = jnp.where(rest | (resting & ~woken), Action.HOLD, jnp.where(on_way, Action.STRAIGHTEN, Action.FOLLOW))
+    on_way = (left > 0) & (length > jnp.where(straightening, config.radius_max, config.arrived))
+    rest = (tired & ~far & ~go_back) | (returning & ~on_way)
+    mode = jnp.where(on_way & returning, Action.RETURN, Action.FOLLOW)
+    mode = jnp.where(on_way & straightening, Action.STRAIGHTEN, mode)
+    mode = jnp.where(rest | (resting & ~woken), Action.HOLD, mode)
     return Progress(
         best_error=jnp.where(straightening, jnp.inf, jnp.where(better, error, best)).astype(error.dtype),
+        best_pose=jnp.where(better, pose, before.best_pose),
         since=jnp.where(straightening | rest, 0, since),
         mode=mode.astype(jnp.int32),
         way_left=left,

@@ -25,6 +25,8 @@ class Action(enum.IntEnum):
     """The grippers hold, or brake as fast as they may: no plan is better, or none can be trusted (see the result)."""
     STRAIGHTEN = 2
     """The error stayed where it is, as in another shape between the same grippers: the cable is straightened first."""
+    RETURN = 3
+    """The error has risen near the target: the grippers go back to where it was lowest, and rest there."""
 
 
 class LastCommand(NamedTuple):
@@ -48,18 +50,20 @@ class LastCommand(NamedTuple):
 
 
 class Progress(NamedTuple):
-    """What decides when the cable is straightened to begin again, or rests; every field has shape [].
+    """What decides when the cable is straightened to begin again, or rests; every field but `best_pose` has shape [].
 
     Attributes:
         best_error: lowest shape error since the last restart or rest [m].
+        best_pose: gripper poses at which it was seen, shape [Q, 3].
         since: commands since it fell by a hundredth or more, or since the rest began.
-        mode: an `Action`: plans are followed, the cable is straightened, or the grippers rest (`HOLD`).
-        way_left: commands left for the way to where the cable is straight.
+        mode: an `Action`: plans are followed, the cable is straightened, the grippers go back, or rest (`HOLD`).
+        way_left: commands left for the way there or back.
         restarts: how often straightening was begun.
         rest_error: shape error at which the cable came to rest [m].
     """
 
     best_error: Float[Array, "*batch"]
+    best_pose: Float[Array, "*batch Q 3"]
     since: Int[Array, "*batch"]
     mode: Int[Array, "*batch"]
     way_left: Int[Array, "*batch"]
@@ -167,6 +171,7 @@ def initial_state(config: MPCConfig, history: History) -> MPCState:
         ),
         progress=Progress(
             best_error=jnp.asarray(jnp.inf, dtype),
+            best_pose=jnp.asarray(history.gripper_pose, dtype),
             since=zero,
             mode=zero,
             way_left=zero,

@@ -34,44 +34,51 @@ class Starts(NamedTuple):
         still: holding, or where motions may not change at once, braking [m], shape [T, Q, 3].
         value_still: its objective [m^2], shape [].
         straightening: the way to where the cable is straight, feasible.
+        back: the way to where the shape error was lowest, feasible.
     """
 
     guess: Rollout
     still: Float[Array, "T Q 3"]
     value_still: Float[Array, ""]
     straightening: StraightWay
+    back: StraightWay
 
 
-def find_starts(config: MPCConfig, problem: ShapingProblem, last: Float[Array, "T Q 3"]) -> Starts:
+def find_starts(
+    config: MPCConfig, problem: ShapingProblem, last: Float[Array, "T Q 3"], best_pose: Float[Array, "Q 3"]
+) -> Starts:
     """Candidates of a start, and their values.
 
     Args:
         config: settings.
         problem: of this step.
         last: the last plan, its first command executed [m].
+        best_pose: gripper poses at which the shape error was lowest.
     """
     radius, radius_max = problem.feasible.radius, jnp.asarray(config.radius_max, last.dtype)
     to_target = _straight_way(config, problem, target_pose(problem.target), radius)
     apart = straightened(problem.target, config.max_distance * config.cable_length)
     # what leads away from here does not rest on the model
     to_straight = _straight_way(config, problem, apart, radius_max)
+    to_best = _straight_way(config, problem, best_pose, radius_max)
     still = jnp.zeros_like(last)
     shifted = jnp.roll(last, -1, axis=0).at[-1].set(0.0)
-    wanted = jnp.stack([shifted, to_target.motion, to_straight.motion, still])
+    wanted = jnp.stack([shifted, to_target.motion, to_straight.motion, to_best.motion, still])
     # one after the other: vmap would run the interior-point method for all, and several calls would compile it for each
-    bounds = jnp.stack([radius, radius, radius_max, radius])
-    n = 4 if config.max_change is not None else 3
+    bounds = jnp.stack([radius, radius, radius_max, radius_max, radius])
+    n = 5 if config.max_change is not None else 4
     allowed = jax.lax.map(
         lambda pair: dataclasses.replace(problem.feasible, radius=pair[1]).project(pair[0]), (wanted[:n], bounds[:n])
     )
     if config.max_change is not None:
         # grippers that move brake first, as fast as they may
-        still = allowed[3]
+        still = allowed[4]
     rollouts = jax.vmap(problem.rollout)(jnp.stack([allowed[0], allowed[1], still]))
     values = jax.vmap(problem.value_of)(rollouts)
     best = jnp.argmin(jnp.where(jnp.isfinite(values[:2]), values[:2], jnp.inf))
     guess = jax.tree.map(lambda leaf: leaf[best], rollouts)
-    return Starts(guess, still, values[2], to_straight._replace(motion=allowed[2]))
+    straightening, back = to_straight._replace(motion=allowed[2]), to_best._replace(motion=allowed[3])
+    return Starts(guess, still, values[2], straightening, back)
 
 
 def _straight_way(
