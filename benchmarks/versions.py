@@ -3,7 +3,8 @@
     python benchmarks/versions.py --out docs/results/versions.md tests/test_simulate_engines.py ...
 
 `make matrix` names the tests. Each corner is an environment of its own in build/versions/, made by uv, which has to be
-on the path or in the environment of this Python.
+on the path or in the environment of this Python. Results are kept there: `--only 3 4` runs two corners, and the page
+has the others as they were last, each with its commit.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ import sys
 import xml.etree.ElementTree
 
 ROOT = pathlib.Path(__file__).parents[1]
+BUILD = ROOT / "build" / "versions"
 MUJOCO = "mujoco>=3.17,<4", "mujoco>=4,<5"
 # JAX 0.11 and newer need Python 3.12.
 CORNERS = tuple(
@@ -73,11 +75,16 @@ def record(out: pathlib.Path) -> None:
     out.write_text(json.dumps({"versions": shown, "motions": motions()}), encoding="utf-8")
 
 
-def run_corner(corner: tuple[str, str, str], tests: list[str], workers: int) -> dict:
-    """Makes an environment, runs the tests and the motions in it, and returns versions, counts and keypoints."""
+def results_of(corner: tuple[str, str, str]) -> pathlib.Path:
+    """Where the results of a corner are kept, in its environment."""
+    return BUILD / "-".join(part.split(",")[0].replace(">=", "") for part in corner) / "results"
+
+
+def run_corner(corner: tuple[str, str, str], tests: list[str], workers: int) -> None:
+    """Makes an environment, runs the tests and the motions in it, and keeps versions, counts and keypoints."""
     python, *packages = corner
-    folder = ROOT / "build" / "versions" / "-".join(part.split("<")[0].replace(">=", "") for part in corner)
-    inside, results = str(folder / "bin" / "python"), folder / "results"
+    results = results_of(corner)
+    folder, inside = results.parent, str(results.parent / "bin" / "python")
     uv = shutil.which(
         "uv", path=os.pathsep.join((os.environ.get("PATH", ""), str(pathlib.Path(sys.executable).parent)))
     )
@@ -97,7 +104,10 @@ def run_corner(corner: tuple[str, str, str], tests: list[str], workers: int) -> 
     suite = next(xml.etree.ElementTree.parse(report).getroot().iter("testsuite"))
     counts = {name: int(suite.get(name, 0)) for name in ("tests", "skipped", "failures", "errors")}
     written = json.loads((results / "motions.json").read_text(encoding="utf-8"))
-    return {"python": python, **counts, **written}
+    describe = ["git", "describe", "--always", "--dirty", "--exclude=*"]
+    commit = subprocess.run(describe, cwd=ROOT, stdout=subprocess.PIPE, text=True, check=True).stdout.strip()
+    summary = {"python": python, "commit": commit, **counts, **written}
+    (results / "corner.json").write_text(json.dumps(summary), encoding="utf-8")
 
 
 def furthest(one: list, other: list) -> float:
@@ -117,13 +127,15 @@ def page(corners: list[dict], tests: list[str]) -> str:
         "`pyproject.toml` allows. JAX 0.11 and newer need Python 3.12. MuJoCo 4 has no MJX of its own version; the "
         "newest MJX accepts it.",
         "",
+        f"{len(corners)} of {len(CORNERS)} corners have been run.",
+        "",
         f"## Tests of {len(tests)} files",
         "",
-        "| Python | MuJoCo | MJX | JAX | passed | skipped | failed |",
-        "| --- | --- | --- | --- | --- | --- | --- |",
+        "| Python | MuJoCo | MJX | JAX | passed | skipped | failed | commit |",
+        "| --- | --- | --- | --- | --- | --- | --- | --- |",
         *(
             f"| {c['python']} | {' | '.join(c['versions'][name] for name in SHOWN)} | "
-            f"{c['tests'] - c['skipped'] - bad} | {c['skipped']} | {bad} |"
+            f"{c['tests'] - c['skipped'] - bad} | {c['skipped']} | {bad} | {c['commit']} |"
             for c, bad in zip(corners, failed, strict=True)
         ),
         "",
@@ -149,13 +161,18 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("tests", nargs="*", help="files for pytest")
     parser.add_argument("--out", type=pathlib.Path, default=ROOT / "docs" / "results" / "versions.md")
     parser.add_argument("--workers", type=int, default=2, help="processes of pytest")
+    numbers = range(1, len(CORNERS) + 1)
+    parser.add_argument("--only", nargs="+", type=int, choices=numbers, default=numbers, help="corners to run")
     parser.add_argument("--record", type=pathlib.Path, help="only compute the motions here and write them to this file")
     options = parser.parse_args(arguments)
     if options.record is not None:
         return record(options.record)
     if not options.tests:
         parser.error("name the files that pytest runs")
-    corners = [run_corner(corner, options.tests, options.workers) for corner in CORNERS]
+    for number in options.only:
+        run_corner(CORNERS[number - 1], options.tests, options.workers)
+    kept = [results_of(corner) / "corner.json" for corner in CORNERS]
+    corners = [json.loads(path.read_text(encoding="utf-8")) for path in kept if path.exists()]
     options.out.write_text(page(corners, options.tests), encoding="utf-8")
     print(f"Written to {options.out}", file=sys.stderr)
     if any(corner["failures"] + corner["errors"] for corner in corners):
