@@ -102,8 +102,10 @@ def run_corner(corner: tuple[str, str, str], tests: list[str], workers: int) -> 
     subprocess.run(words, cwd=ROOT, env=own)
     subprocess.run([inside, __file__, "--record", str(results / "motions.json")], cwd=ROOT, env=own, check=True)
     suite = next(xml.etree.ElementTree.parse(report).getroot().iter("testsuite"))
-    counts = {name: int(suite.get(name, 0)) for name in ("tests", "skipped", "failures", "errors")}
+    counts: dict = {name: int(suite.get(name, 0)) for name in ("tests", "skipped", "failures", "errors")}
     written = json.loads((results / "motions.json").read_text(encoding="utf-8"))
+    broken = [case for case in suite.iter("testcase") if {"failure", "error"} & {entry.tag for entry in case}]
+    counts["broken"] = [f"{case.get('classname')}.{case.get('name')}" for case in broken]
     describe = ["git", "describe", "--always", "--dirty", "--exclude=*"]
     commit = subprocess.run(describe, cwd=ROOT, stdout=subprocess.PIPE, text=True, check=True).stdout.strip()
     summary = {"python": python, "commit": commit, **counts, **written}
@@ -139,6 +141,7 @@ def page(corners: list[dict], tests: list[str]) -> str:
             for c, bad in zip(corners, failed, strict=True)
         ),
         "",
+        *(f"Failed on {label}: `{name}`.\n" for label, c in zip(labels, corners, strict=True) for name in c["broken"]),
         "Skipped on MuJoCo 4: comparisons with MuJoCo 3's `<composite>` and its cable plugin, which MuJoCo 4 removed.",
         "",
         "## The same motion of three seconds",
