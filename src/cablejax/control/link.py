@@ -153,7 +153,8 @@ class RobotLink:
         length = np.linalg.norm(np.diff(self.target.keypoints, axis=0), axis=1).sum()
         # an absent pose can only be judged by the last one
         near = pose if np.isfinite(pose).all() or last is None else last.gripper_pose
-        keypoints[~(np.abs(keypoints) <= largest) | out_of_reach(keypoints, near[:, :2], length)[:, None]] = np.nan
+        keypoints[~(np.abs(keypoints) <= largest)] = np.nan
+        keypoints[out_of_reach(keypoints, near[:, :2], length)] = np.nan
         cleaned = dataclasses.replace(observation, keypoints=keypoints, gripper_pose=pose, time=stamp)
         unchanged = state.unchanged
         if unchanged is None or not np.array_equal(keypoints, unchanged.keypoints, equal_nan=True):

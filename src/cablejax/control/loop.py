@@ -102,4 +102,4 @@ def run_closed_loop(
             stopped = str(error)
             log.forget_command()
             break
-    return log.run(target, stopped, log.episodes(f"approach_{target.name.lower()}")[0])
+    return log.run(target, stopped)

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import bisect
 import math
-import os
-import pathlib
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
@@ -14,13 +12,18 @@ import numpy as np
 from cablejax.cable import Cable
 from cablejax.control.run import ClosedLoopRun, shape_error_cm
 from cablejax.control.targets import Target
-from cablejax.gaplog import Episode, gap_log_from_episodes, write_gap_log
+from cablejax.gaplog import Episode, gap_log_from_episodes
 from cablejax.limits import LIMITS
 from cablejax.types import GapLog
 
 if TYPE_CHECKING:
     from cablejax.control.link_state import Instant, Reply
     from cablejax.simulate.table_plant import Observation
+
+
+def motion(target: Target) -> str:
+    """What the grippers do, in the words of a gap log."""
+    return f"approach_{target.name.lower()}"
 
 
 class RunLog:
@@ -45,9 +48,8 @@ class RunLog:
 
     def add(self, reply: Reply) -> None:
         """Takes in what one step of the link has reported."""
-        self.counts["received"] += len(reply.accepted) + len(reply.refused)
-        self.counts["refused"] += len(reply.refused)
-        self.refused += reply.refused
+        self.counts["received"] += len(reply.accepted)
+        self.refuse(reply.refused)
         for observation in reply.accepted:
             self.counts["doubled"] += observation.time in self._samples
             self._samples.setdefault(observation.time, (observation, reply.settled))
@@ -59,26 +61,35 @@ class RunLog:
         if not self.events or self.events[-1][1:] != (reply.status, reply.reason):
             self.events.append((reply.since, str(reply.status), reply.reason))
 
+    def refuse(self, reasons: Sequence[str]) -> None:
+        """Takes note of messages that are no observations."""
+        self.counts["received"] += len(reasons)
+        self.counts["refused"] += len(reasons)
+        self.refused += reasons
+
     def forget_command(self) -> None:
         """Removes the last command, which was not carried out."""
         self.instants[-1] = self.instants[-1].without_command()
         since, _, twist = self._commands[-1]
         self._commands[-1] = (since, math.inf, np.zeros_like(twist))
 
-    def episodes(self, motion: str, *, longest_pause: float = math.inf) -> list[Episode]:
-        """The recording, in pieces without a longer pause than that between samples [s], none longer than a log's.
+    def episodes(self, name: str, *, longest_pause: float = math.inf) -> list[tuple[float, Episode]]:
+        """The recording in pieces without a longer pause between samples than that [s], none longer than a log's.
 
         A pose that was not measured is interpolated; a piece without any is left out.
+
+        Returns:
+            The time stamp at which each begins, and the episode.
         """
-        times = sorted(self._samples)
         pieces: list[list[float]] = []
-        for time in times:
+        for time in sorted(self._samples):
             if not pieces or time - pieces[-1][-1] > longest_pause or time - pieces[-1][0] > LIMITS["duration"].high:
                 pieces.append([])
             pieces[-1].append(time)
-        return [episode for piece in pieces if (episode := self._episode(motion, piece)) is not None]
+        made = [(piece[0], self._episode(name, piece)) for piece in pieces]
+        return [(start, episode) for start, episode in made if episode is not None]
 
-    def _episode(self, motion: str, times: Sequence[float]) -> Episode | None:
+    def _episode(self, name: str, times: Sequence[float]) -> Episode | None:
         samples = [self._samples[time][0] for time in times]
         poses = np.stack([sample.gripper_pose for sample in samples])
         known = np.isfinite(poses).all(axis=(1, 2))
@@ -89,7 +100,7 @@ class RunLog:
             missing = (~known, *column)
             poses[missing] = np.interp(stamps[~known], stamps[known], poses[(known, *column)])
         return Episode(
-            motion=motion,
+            motion=name,
             time=stamps - stamps[0],
             keypoints=np.stack([sample.keypoints for sample in samples]),
             gripper_pose=poses,
@@ -103,8 +114,8 @@ class RunLog:
         _, until, twist = self._commands[max(index, 0)]
         return twist if index >= 0 and time < until else np.zeros_like(twist)
 
-    def run(self, target: Target, stopped: str | None, episode: Episode) -> ClosedLoopRun:
-        """The closed-loop run that the control instants make.
+    def run(self, target: Target, stopped: str | None) -> ClosedLoopRun:
+        """The closed-loop run that the control instants make, and the whole recording as its episode.
 
         Raises:
             ValueError: there was no control instant.
@@ -129,21 +140,24 @@ class RunLog:
             unobserved=int(np.isnan(keypoints).any(axis=-1).sum()),
             stopped=stopped,
             observed_error_cm=shape_error_cm(keypoints, target.keypoints),
-            episode=episode,
+            episode=self.episodes(motion(target))[0][1],
         )
 
-    def gap_log(self, motion: str, cable: Cable, source: str) -> GapLog:
+    def gap_log(self, target: Target, cable: Cable, source: str) -> GapLog:
         """The recording as a gap log; a pause longer than a log's largest sample interval begins another episode.
 
-        `meta` has the field "robot_link" with the counts, the events and the first reasons of refusals.
+        `meta` has the field "robot_link": counts, the time stamps at which episodes begin, changes of the status, and
+        the first reasons of refusals.
 
         Raises:
             GapLogError: nothing was recorded, or the recording violates the format.
         """
-        report = {"counts": self.counts, "events": self.events, "refused": self.refused[:100]}
-        pieces = self.episodes(motion, longest_pause=LIMITS["sample_interval"].high)
-        return gap_log_from_episodes(pieces, cable, source=source, extra={"robot_link": report})
-
-    def write(self, path: str | os.PathLike, motion: str, cable: Cable, source: str) -> pathlib.Path:
-        """Writes the recording as a gap log, whole or not at all; returns its path. Raises as `gap_log`."""
-        return write_gap_log(path, self.gap_log(motion, cable, source))
+        pieces = self.episodes(motion(target), longest_pause=LIMITS["sample_interval"].high)
+        report = {
+            "counts": self.counts,
+            "starts_s": [start for start, _ in pieces],
+            "events": self.events,
+            "refused": self.refused[:100],
+        }
+        episodes = [episode for _, episode in pieces]
+        return gap_log_from_episodes(episodes, cable, source=source, extra={"robot_link": report})
