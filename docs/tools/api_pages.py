@@ -22,6 +22,7 @@ EXPLAINED = {
     "recordings": "[A recording of your own](../how_to/own_recording.md)",
     "report": "[Read a verdict](../how_to/read_a_verdict.md)",
     "residual": "[Correct](../concepts/correct.md)",
+    "robot": "[Use a robot](../how_to/robot.md)",
     "simulate": "[Simulate](../concepts/simulate.md), [Plants](../concepts/plants.md)",
     "spatial": "[Cables in space](../concepts/space.md)",
 }
