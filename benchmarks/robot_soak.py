@@ -30,7 +30,6 @@ from cablejax.control.link_state import LinkConfig
 from cablejax.control.targets import Shape, make_target, straight_start
 from cablejax.effects.given import parse_effect
 from cablejax.gaplog import read_gap_log
-from cablejax.mpc import MPC
 from cablejax.robot.server import TICK, observation_line, serve
 from cablejax.robot.session import RobotRun
 from cablejax.simulate.plant import Plant, PlantConfig
@@ -91,6 +90,21 @@ class Tour:
         twist = np.asarray(twist)
         self.cpu_ms.append(1e3 * (time.process_time() - began))
         return (count + 1, inner), twist, info
+
+
+@dataclasses.dataclass(frozen=True)
+class Drive:
+    """Both grippers straight to a target's poses: no model, so that a call is the link's own and the socket's."""
+
+    pose: np.ndarray
+
+    def init(self, history):
+        return ()
+
+    def step(self, state, measurement):
+        way = self.pose - measurement.gripper_pose
+        size = np.linalg.norm(way * [1.0, 1.0, 0.15], axis=1).max()
+        return state, way * min(1.0, 0.05 / max(size, 1e-9)), None
 
 
 class Robot:
@@ -355,6 +369,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--weights", default="gns-reference")
     parser.add_argument("--solver", default="two-trials")
+    parser.add_argument("--drive", action="store_true", help="no model: grippers that drive straight on")
     parser.add_argument(
         "--out", type=pathlib.Path, default=None, help="the page; without it, figures go to stdout alone"
     )
@@ -365,8 +380,14 @@ def main() -> None:
     keep_compiled_programs()
     model = load_model(options.weights)
     targets = [make_target(shape, model.cable) for shape in get_args(Shape)]
-    controllers = [make_controller(model, target, method="residual", solver=options.solver) for target in targets]
-    assert all(isinstance(controller, MPC) for controller in controllers)
+    if options.drive:
+        controllers, what = (
+            [Drive(target.gripper_pose) for target in targets],
+            "grippers that drive from shape to shape",
+        )
+    else:
+        controllers = [make_controller(model, target, method="residual", solver=options.solver) for target in targets]
+        what = f"{options.weights} with the residual and the solver {options.solver} commands each second"
     soak = Soak(steps=options.steps, real_time=options.real_time, seed=options.seed)
     with tempfile.TemporaryDirectory() as folder:
         record = soak_once(soak, Tour(tuple(controllers)), model.cable, pathlib.Path(folder) / "soak.npz")
@@ -377,7 +398,6 @@ def main() -> None:
     if options.out is not None:
         image = options.out.with_suffix(".png")
         draw(record, image)
-        what = f"{options.weights} with the residual and the solver {options.solver} commands each second"
         command = "python " + " ".join([os.path.relpath(sys.argv[0]), *sys.argv[1:]])
         options.out.write_text(page(soak, record, what, image.name, command))
 

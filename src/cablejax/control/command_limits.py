@@ -10,6 +10,7 @@ from jaxtyping import Float
 from cablejax.limits import check
 
 _SHARES = np.linspace(0.0, 1.0, 201)
+_ROUNDING = 1e-12
 
 
 @dataclasses.dataclass(frozen=True)
@@ -46,8 +47,8 @@ class CommandLimits:
                 )
 
     def shortened(
-        self, twist: Float[np.ndarray, "Q 3"], pose: Float[np.ndarray, "Q 3"], duration: float
-    ) -> Float[np.ndarray, "Q 3"]:
+        self, twist: Float[np.ndarray, "*B Q 3"], pose: Float[np.ndarray, "*B Q 3"], duration: float
+    ) -> Float[np.ndarray, "*B Q 3"]:
         """The twist, or the largest share of it (in steps of 0.5 %) that stays within all limits while it is held.
 
         Both grippers' twists are scaled by the same share. Grippers that start outside may move on as long as they do
@@ -58,26 +59,26 @@ class CommandLimits:
             pose: of both grippers when it begins [m, rad].
             duration: for which it is held at most [s].
         """
-        candidates = _SHARES[:, None, None] * np.asarray(twist, float)
-        broken = self._excess(candidates, pose, duration) > 0.0
+        twist, pose = np.asarray(twist, float), np.asarray(pose, float)
+        if not self._broken(twist, pose, duration).any():
+            return twist
         # the grippers pass through the end points of all smaller shares
-        return twist if not broken.any() else candidates[max(int(broken.argmax()) - 1, 0)]
+        shares = _SHARES.reshape(-1, *[1] * twist.ndim)
+        broken = self._broken(shares * twist, pose, duration)
+        last = np.where(broken.any(axis=0), broken.argmax(axis=0), len(_SHARES)) - 1
+        return _SHARES[np.maximum(last, 0)][..., None, None] * twist
 
-    def _excess(self, twists: np.ndarray, pose: np.ndarray, duration: float) -> np.ndarray:
-        """The worst excess of each twist [S, Q, 3] over the limits, or over how far outside the start is already."""
-        start = np.asarray(pose, float)[:, :2]
-        ends = start + duration * twists[..., :2]
-        distance, at_start = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=-1), np.linalg.norm(start[1] - start[0])
-        parts = [
-            (np.linalg.norm(twists[..., :2], axis=-1) - self.speed).max(axis=-1),
-            (np.abs(twists[..., 2]) - self.turn_rate).max(axis=-1),
-            distance - max(self.max_distance, at_start),
-            min(self.min_distance, at_start) - distance,
-        ]
+    def _broken(self, twist: np.ndarray, pose: np.ndarray, duration: float) -> np.ndarray:
+        """Which twists end outside of a limit, and farther out than they begin."""
+        start = pose[..., :2]
+        ends = start + duration * twist[..., :2]
+        apart, before = (np.linalg.norm(places[..., 1, :] - places[..., 0, :], axis=-1) for places in (ends, start))
+        broken = (np.linalg.norm(twist[..., :2], axis=-1) > self.speed + _ROUNDING).any(axis=-1)
+        broken |= (np.abs(twist[..., 2]) > self.turn_rate + _ROUNDING).any(axis=-1)
+        broken |= apart > np.maximum(self.max_distance, before) + _ROUNDING
+        broken |= apart < np.minimum(self.min_distance, before) - _ROUNDING
         if self.workspace is not None:
             low, high = np.asarray(self.workspace, float)
-            parts += [
-                (np.minimum(low, start) - ends).max(axis=(1, 2)),
-                (ends - np.maximum(high, start)).max(axis=(1, 2)),
-            ]
-        return np.max(parts, axis=0) - 1e-12
+            outside = (ends < np.minimum(low, start) - _ROUNDING) | (ends > np.maximum(high, start) + _ROUNDING)
+            broken |= outside.any(axis=(-2, -1))
+        return broken

@@ -174,7 +174,8 @@ class Cables:
         self.target[row], self.names[row] = chosen.keypoints, chosen.name
         self.gripper_pose[row] = np.asarray(self._start.gripper_pose[0])
         self.taken[row] = 0
-        self._observe(row, self._shown, random)
+        only = np.arange(len(self.taken)) == row
+        self._observe(only, np.broadcast_to(self._shown, self.keypoints.shape), [random] * len(only))
 
     def step(
         self,
@@ -198,25 +199,23 @@ class Cables:
         config = self.config
         scale = np.array([config.speed * config.cable.length] * 2 + [config.turn_rate])
         twists = scale * np.clip(np.nan_to_num(np.asarray(actions, float), posinf=0.0, neginf=0.0), -1.0, 1.0)
-        for row, twist in enumerate(twists):
-            allowed = config.limits.shortened(twist, self.gripper_pose[row], config.interval)
-            twists[row] = allowed if active[row] else 0.0
-        before = self._state
-        self._state, shown = self._engine.rollout(self._physics, before, twists[:, None], config.interval)
+        twists = config.limits.shortened(twists, self.gripper_pose, config.interval) * active[:, None, None]
+        self._state, shown = self._engine.rollout(self._physics, self._state, twists[:, None], config.interval)
         keypoints, poses = np.asarray(shown.keypoints[:, -1]), np.asarray(shown.gripper_pose[:, -1])
         diverged = ~np.isfinite(keypoints).all(axis=(1, 2))
-        for row in np.flatnonzero(active):
-            self.taken[row] += 1
-            if not diverged[row]:
-                self.gripper_pose[row] = poses[row]
-                self._observe(row, keypoints[row], randoms[row])
+        self.taken += active
+        seen = active & ~diverged
+        self.gripper_pose[seen] = poses[seen]
+        self._observe(seen, keypoints, randoms)
         done = (self.error <= config.tolerance) | diverged
         return -self.error, done, ~done & (self.taken >= config.steps)
 
-    def _observe(self, row: int, keypoints: np.ndarray, random: np.random.Generator) -> None:
+    def _observe(self, rows: np.ndarray, keypoints: np.ndarray, randoms: Sequence[np.random.Generator]) -> None:
+        """Takes in the true keypoints [B, N, 2] of some rows."""
         config = self.config
-        off = np.linalg.norm(keypoints - self.target[row], axis=-1)
-        self.error[row] = np.sqrt(np.mean(off**2)) / config.cable.length
-        self.keypoints[row] = keypoints
+        off = np.linalg.norm(keypoints[rows] - self.target[rows], axis=-1)
+        self.error[rows] = np.sqrt(np.mean(off**2, axis=-1)) / config.cable.length
+        self.keypoints[rows] = keypoints[rows]
         if config.keypoint_noise:
-            self.keypoints[row] += config.keypoint_noise * random.standard_normal(keypoints.shape)
+            for row in np.flatnonzero(rows):
+                self.keypoints[row] += config.keypoint_noise * randoms[row].standard_normal(keypoints.shape[1:])
