@@ -217,5 +217,5 @@ class Cables:
         self.error[rows] = np.sqrt(np.mean(off**2, axis=-1)) / config.cable.length
         self.keypoints[rows] = keypoints[rows]
         if config.keypoint_noise:
-            for row in np.flatnonzero(rows):
+            for row in np.flatnonzero(rows).tolist():
                 self.keypoints[row] += config.keypoint_noise * randoms[row].standard_normal(keypoints.shape[1:])

@@ -16,6 +16,9 @@ from gymnasium.vector.utils import batch_space
 
 from cablejax.environment.cables import Cables, ShapeCableConfig
 
+OBSERVED = ("keypoints", "gripper_pose", "target")
+"""Parts of an observation."""
+
 
 def _spaces(config: ShapeCableConfig) -> tuple[gymnasium.spaces.Dict, gymnasium.spaces.Box]:
     """What is observed, and the actions."""
@@ -24,7 +27,9 @@ def _spaces(config: ShapeCableConfig) -> tuple[gymnasium.spaces.Dict, gymnasium.
     pose = np.repeat(np.array([[3 * length, 3 * length, turns]], np.float32), 2, axis=0)
     # a metre of room for camera offsets and noise
     cable = gymnasium.spaces.Box(-3 * length - 1, 3 * length + 1, (points, 2), np.float32)
-    observed = {"keypoints": cable, "gripper_pose": gymnasium.spaces.Box(-pose, pose), "target": cable}
+    observed: dict[str, gymnasium.Space[Any]] = dict(
+        zip(OBSERVED, (cable, gymnasium.spaces.Box(-pose, pose), cable), strict=True)
+    )
     return gymnasium.spaces.Dict(observed), gymnasium.spaces.Box(-1.0, 1.0, (2, 3), np.float32)
 
 
@@ -57,7 +62,7 @@ class ShapeCableEnv(gymnasium.Env):
         return self._observation(), float(rewards[0]), bool(terminated[0]), bool(truncated[0]), self._info()
 
     def _observation(self) -> dict[str, np.ndarray]:
-        return {name: getattr(self.cables, name)[0].copy() for name in self.observation_space}
+        return {name: getattr(self.cables, name)[0].copy() for name in OBSERVED}
 
     def _info(self) -> dict[str, Any]:
         return {"error": float(self.cables.error[0]), "target_name": self.cables.names[0]}
@@ -98,14 +103,14 @@ class ShapeCableVectorEnv(gymnasium.vector.VectorEnv):
         """One action of each; those that ended before are reset instead, with a reward of 0."""
         ended = self._ended
         rewards, terminated, truncated = self.cables.step(actions, self._randoms, ~ended)
-        for row in np.flatnonzero(ended):
+        for row in np.flatnonzero(ended).tolist():
             self.cables.reset(row, self._randoms[row])
         terminated, truncated, rewards = terminated & ~ended, truncated & ~ended, np.where(ended, 0.0, rewards)
         self._ended = terminated | truncated
         return self._observation(), rewards, terminated, truncated, self._info()
 
     def _observation(self) -> dict[str, np.ndarray]:
-        return {name: getattr(self.cables, name).copy() for name in self.single_observation_space}
+        return {name: getattr(self.cables, name).copy() for name in OBSERVED}
 
     def _info(self) -> dict[str, Any]:
         return {"error": self.cables.error.copy(), "target_name": np.array(self.cables.names)}
