@@ -29,7 +29,7 @@ GOOD_FIT = 0.01
 """Error of a good fit [m]: unit of the residuals."""
 TWISTED = "intrinsic_curvature"
 """The effect that needs the material frame, whose derivatives take four times as long as all others together."""
-_CHUNK = 8
+_CHUNK = 4
 _COLUMNS = 8
 _ROBUST = Robust(distance=0.02, lost=1.0)
 _CORRELATION = 0.3  # [s]
@@ -193,7 +193,7 @@ def over_all_markers(error: Float[np.ndarray, "W"], windows: Windows) -> Float[n
 @functools.lru_cache(maxsize=8)
 def _compiled(rod: Rod, layout: Layout, interval: float):
     def one(values, position, frames, seen):
-        return rod.rollout(layout.physics(values), position, frames, seen, interval)
+        return rod.rollout(layout.physics(values), position, frames, seen, interval).points
 
     def batch(values, *inputs):
         return jax.vmap(one)(values, *inputs)
