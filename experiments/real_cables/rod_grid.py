@@ -63,7 +63,7 @@ def physics_of(case: Case) -> RodPhysics:
 
 
 def inputs_of(case: Case, seconds: float = SECONDS) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Clamp positions [T, 2, 3], gripper frames [T, 2, 3, 3], and the markers that the cable is let go from [2, N, 3]."""
+    """Clamp positions [T, 2, 3], gripper frames [T, 2, 3, 3], and the markers at the beginning [2, N, 3]."""
     time = INTERVAL * np.arange(round(seconds / INTERVAL))
     second = case.length * (np.array([_CHORD, 0.0, 0.0]) + _moved(case.motion, time))
     if case.motion == "jerk":
@@ -83,13 +83,13 @@ def rollouts(
     for begin in range(0, len(cases), batch):
         # one size of a batch, so that one compilation serves
         group = [*cases[begin : begin + batch]]
-        full = group + [group[0]] * (batch - len(group))
+        full, count = group + [group[0]] * (batch - len(group)), len(group)
         arguments = jax.tree.map(
             lambda *leaves: np.stack(leaves), *[(physics_of(c), *inputs_of(c, seconds)) for c in full]
         )
         with jax.enable_x64(True):
             found = run(*arguments)
-            parts.append(jax.tree.map(lambda leaf, n=len(group): np.asarray(leaf)[:n], found))
+            parts.append(jax.tree.map(lambda leaf, n=count: np.asarray(leaf)[:n], found))
     return jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
 
 

@@ -13,9 +13,9 @@ instead of three times as many rows (the Schur complement of Goldenthal et al., 
 cloth, 2007, with the geometric stiffness of Tournier et al., Stable constrained dynamics, 2015). A little compliance
 `eps` keeps the system regular where the clamps are further apart than the cable is long.
 
-Newton steps are damped by the natural monotonicity test (Deuflhard, Newton methods for nonlinear problems, 2004, section
-3.3): a step s is shortened until the correction that would follow it with the same matrices, s2, is shorter than s.
-Units and conditioning do not matter to that, s2 is an estimate in metres of what is still missing, and it costs two
+Newton steps are damped by the natural monotonicity test (Deuflhard, Newton methods for nonlinear problems, 2004,
+chapter 3): a step s is shortened until the correction that would follow it with the same matrices, s2, is shorter than
+s. The test does not depend on units or conditioning; s2 estimates in metres what is still missing, and costs two
 products. A full step is followed by s2 at once, which makes the order of convergence three per factorisation.
 
 Derivatives are those of the solution, by the implicit function theorem, in forward and in reverse mode.

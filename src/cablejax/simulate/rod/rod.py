@@ -35,7 +35,7 @@ from cablejax.simulate.rod.physics import RodPhysics
 from cablejax.simulate.rod.time_step import Motion, time_step
 
 LOCAL_ERROR = 0.04
-"""A step whose local error is larger is made again in shorter ones; in lengths of an edge (2 mm for 20 edges of 1 m)."""
+"""A step whose local error is larger is made again in shorter ones; in lengths of an edge (2 mm where 20 make 1 m)."""
 _HALVINGS = 5
 _WHOLE = 2**_HALVINGS
 # Every one of the shortest steps, and those that were too long; a step is tried twice as long as soon as it may be.
@@ -161,7 +161,11 @@ class Rod:
         motion = Motion(
             second, second - dt * velocity, velocity, velocity, slack, slack, *frames, jnp.asarray(dt, second.dtype)
         )
-        return jnp.stack([discrete.weights @ start + offsets, discrete.weights @ second + offsets]), motion, found & also
+        return (
+            jnp.stack([discrete.weights @ start + offsets, discrete.weights @ second + offsets]),
+            motion,
+            found & also,
+        )
 
     def _march(self, discrete: DiscreteRod, interval, progress: _Progress, window, index) -> _Progress:
         """Makes the time step of this index between two samples, in parts of 1, 1/2, ... 1/32 of it.

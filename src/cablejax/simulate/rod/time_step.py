@@ -54,8 +54,8 @@ def time_step(
     """The motion after a step of `dt` [s], whether the step was solved, and its local error [m].
 
     The difference quotient over steps of unequal length is x' = (a x - known) with a = (1 + 2 w) / (1 + w) / dt and w
-    the ratio of this step to the last one. What is stiff is implicit; damping by turning, quadratic drag, rest curvature
-    and twist are extrapolated from the last two steps.
+    the ratio of this step to the last one. What is stiff is implicit; damping by turning, quadratic drag, rest
+    curvature and twist are extrapolated from the last two steps.
 
     Args:
         discrete: the cable.
