@@ -24,6 +24,7 @@ Derivatives are those of the solution, by the implicit function theorem, in forw
 from __future__ import annotations
 
 import dataclasses
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -39,8 +40,9 @@ _MOST_ITERATIONS = 12
 _SHORTEST_SHARE = 2.0**-6
 # An edge must not turn over in one step: no node moves by more than this part of an edge.
 _LONGEST = 0.7
-# A guess is near once a step is so small a part of an edge.
-_NEAR = 1e-3
+# From far away: so many steps without compression first, and at most so many in all.
+_CONVEX = 8
+_MOST_FAR = 600
 
 
 def edges_of(nodes: Float[Array, "n 3"]) -> Float[Array, "e 3"]:
@@ -103,39 +105,9 @@ class Solution(NamedTuple):
     error: Float[Array, ""]
 
 
-def approached(
-    iterations: int,
-    chain: ElasticChain,
-    force: Float[Array, "f 3"],
-    held: Float[Array, "4 3"],
-    free: Float[Array, "f 3"],
-) -> tuple[Float[Array, "f 3"], Float[Array, "e"]]:
-    """A guess for `constrained` from nodes that may be far from the solution, such as a polygon through markers.
-
-    Compression is left out of the matrix: it would make it indefinite far from the solution, where it is pushed into a
-    wrong fold. No derivative passes through it.
-    """
-    chain, force, held, free = jax.lax.stop_gradient((chain, force, held, free))
-    stiffness = _matrix(chain)
-
-    def newton(at):
-        free, tension, _, count = at
-        edges, residual, violation = _residuals(chain, force, held, free, tension)
-        inverses = _inverses(chain, stiffness, edges, jnp.maximum(tension, 0.0))
-        step, change = _solve(*inverses, edges, residual, violation)
-        longest = _longest(step)
-        share = jnp.minimum(1.0, _LONGEST * chain.edge / longest)
-        return free + share * step, tension + change, longest, count + 1
-
-    start = (free, jnp.zeros(free.shape[0] + 1, free.dtype), jnp.asarray(jnp.inf, free.dtype), 0)
-    free, tension, *_ = jax.lax.while_loop(
-        lambda at: ~(at[2] <= _NEAR * chain.edge) & (at[3] < iterations), newton, start
-    )
-    return free, tension
-
-
-@jax.custom_jvp
+@partial(jax.custom_jvp, nondiff_argnums=(0,))
 def constrained(
+    far: bool,
     chain: ElasticChain,
     force: Float[Array, "f 3"],
     held: Float[Array, "4 3"],
@@ -144,14 +116,19 @@ def constrained(
 ) -> Solution:
     """Solves the system by Newton's method from `free` and `tension`.
 
+    Far from the solution, compression makes the matrix indefinite, and pushes the nodes into a wrong fold; a cable that
+    is pressed together along its length is near such a point. So the first steps leave it out of the matrix. They
+    converge slowly to a minimum of the energy; where Newton's method does not take over, twice as many follow.
+
     Args:
+        far: whether the guess may be far from the solution. A time step is rather made again in two halves.
         chain: A0, h and eps.
         force: b.
         held: the first two and the last two nodes [m].
         free: first guess of the free nodes [m]; no derivative passes through it.
         tension: first guess of lambda; no derivative passes through it.
     """
-    stiffness = _matrix(chain)
+    stiffness, most = _matrix(chain), _MOST_FAR if far else _MOST_ITERATIONS
     # tensions as lengths, in which a step is measured
     unit = chain.edge / jnp.mean(jnp.diagonal(stiffness))
 
@@ -159,46 +136,51 @@ def constrained(
         return jnp.sqrt(jnp.sum(step**2) + unit**2 * jnp.sum(change**2)) + 1e-30
 
     def newton(at):
-        free, tension, _, count = at
+        free, tension, _, count, left, run = at
+        convex = far & (left > 0)
         edges, residual, violation = _residuals(chain, force, held, free, tension)
-        inverses = _inverses(chain, stiffness, edges, tension)
-        step, change = _solve(*inverses, edges, residual, violation)
-        whole = size(step, change)
+        matrices = _inverses(chain, stiffness, edges, jnp.where(convex, jnp.maximum(tension, 0.0), tension))
+        step, change = _solve(*matrices, edges, residual, violation)
+        whole, longest = size(step, change), _longest(step)
 
         def trial(share):
             _, residual, violation = _residuals(chain, force, held, free + share * step, tension + share * change)
-            more = _solve(*inverses, edges, residual, violation)
+            more = _solve(*matrices, edges, residual, violation)
             return share, more, size(*more) / whole
 
         def rises(tried):
             share, _, ratio = tried
-            return ~(ratio <= 1 - 0.25 * share) & (share > _SHORTEST_SHARE) & (_longest(step) > TOLERANCE)
+            return ~(ratio <= 1 - 0.25 * share) & (share > _SHORTEST_SHARE) & (longest > TOLERANCE) & ~convex
 
-        begin = trial(jnp.minimum(1.0, _LONGEST * chain.edge / (_longest(step) + 1e-30)))
+        begin = trial(jnp.minimum(1.0, _LONGEST * chain.edge / (longest + 1e-30)))
         share, more, ratio = jax.lax.while_loop(rises, lambda tried: trial(0.5 * tried[0]), begin)
-        lower, full = ratio <= 1 - 0.25 * share, (share >= 1.0) & (ratio < 0.5)
-        moved = free + share * step + jnp.where(full, more[0], 0.0)
-        pulled = tension + share * change + jnp.where(full, more[1], 0.0)
         # of a step that is nothing but rounding, the correction is too
-        ended = _longest(step) <= TOLERANCE
-        lower |= ended
-        error = jnp.where(full | ended, jnp.minimum(_longest(more[0]), _longest(step)), jnp.inf)
-        # no share of the step lowers the error: the next iterations would do no better
-        count = jnp.where(lower, count + 1, _MOST_ITERATIONS)
-        return jnp.where(lower, moved, free), jnp.where(lower, pulled, tension), error, count
+        ended = ~convex & (longest <= TOLERANCE)
+        full = ~convex & (share >= 1.0) & (ratio < 0.5)
+        lower = convex | ended | (ratio <= 1 - 0.25 * share)
+        moved = free + share * step + jnp.where(full, more[0], 0.0)
+        pulled = tension + jnp.where(convex, 1.0, share) * change + jnp.where(full, more[1], 0.0)
+        error = jnp.where(full | ended, jnp.minimum(_longest(more[0]), longest), jnp.inf)
+        return (
+            jnp.where(lower, moved, free),
+            jnp.where(lower, pulled, tension),
+            error,
+            # no share of the step is an improvement: the next iterations would do no better
+            jnp.where(lower | far, count + 1, most),
+            jnp.where(convex, left - 1, jnp.where(lower, 0, run)),
+            jnp.where(lower, run, 2 * run),
+        )
 
-    start = (free, tension, jnp.asarray(jnp.inf, free.dtype), 0)
-    free, tension, error, _ = jax.lax.while_loop(
-        lambda at: ~(at[2] <= TOLERANCE) & (at[3] < _MOST_ITERATIONS), newton, start
-    )
+    start = (free, tension, jnp.asarray(jnp.inf, free.dtype), 0, _CONVEX, 2 * _CONVEX)
+    free, tension, error, *_ = jax.lax.while_loop(lambda at: ~(at[2] <= TOLERANCE) & (at[3] < most), newton, start)
     return Solution(free, tension, error)
 
 
 @constrained.defjvp
-def _constrained_jvp(primals, tangents):
+def _constrained_jvp(far, primals, tangents):
     chain, _, held, *_ = primals
     d_chain, d_force, d_held, *_ = tangents
-    solution = constrained(*primals)
+    solution = constrained(far, *primals)
     free = solution.free
     # where there is no solution there is no derivative; what stands in for it is finite, so that it can be left out
     tension = jnp.where(solution.error <= TOLERANCE, solution.tension, 0.0)

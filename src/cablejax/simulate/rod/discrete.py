@@ -16,7 +16,6 @@ from jaxtyping import Array, Bool, Float
 from cablejax.simulate.rod.constrained import (
     TOLERANCE,
     ElasticChain,
-    approached,
     bends_of,
     constrained,
     spread_bends,
@@ -27,8 +26,6 @@ from cablejax.simulate.rod.physics import RodPhysics
 
 # Weight of the observed markers when the first shape is drawn through them [1/s^2].
 _PIN = 3e4
-# Iterations towards that shape from a polygon through the markers.
-_APPROACH = 60
 
 
 def along_joints(values: Float[Array | np.ndarray, "J"], count: int) -> Float[Array, "count"]:
@@ -180,6 +177,5 @@ class DiscreteRod:
         pinned = ElasticChain(jnp.zeros(n - 4), self.bending, self.h, self.compliance, pins[:, 2:-2])
         at_ends = pins[:, :2] @ held[:2] + pins[:, -2:] @ held[2:]
         pull = pins[:, 2:-2].T @ (_PIN**0.5 * markers - at_ends) + self.physics.gravity
-        near = approached(_APPROACH, pinned, pull, held, guess)
-        free, _, error = constrained(pinned, pull, held, *near)
+        free, _, error = constrained(True, pinned, pull, held, *jax.lax.stop_gradient((guess, jnp.zeros(n - 3))))
         return with_held(free, held), error <= TOLERANCE

@@ -91,7 +91,7 @@ def time_step(
     )
     guess = x + dt * v + 0.5 * dt * w * (v - v_old)
     free, pulled, error = constrained(
-        chain, force, ends, *jax.lax.stop_gradient((guess[2:-2], tension + w * (tension - tension_old)))
+        False, chain, force, ends, *jax.lax.stop_gradient((guess[2:-2], tension + w * (tension - tension_old)))
     )
     new = with_held(free, ends)
     if twisting:
