@@ -16,9 +16,8 @@ import time
 import numpy as np
 
 from cablejax.report.provenance import machine, versions
-from cablejax.simulate.rod import RodResult
+from cablejax.simulate.rod import Rod, RodResult
 from cablejax.simulate.rod.constrained import TOLERANCE
-from cablejax.simulate.rod.rod import LOCAL_ERROR
 from pages import publish
 from real_cables.rod_grid import MOTIONS, STIFFNESS, every_case, rollouts
 
@@ -44,8 +43,8 @@ def main() -> None:
         "# The rod's time step over wide ranges",
         "",
         f"{len(cases)} motions of 5 s at 100 Hz: 3 lengths (0.3, 1, 3 m) and 3 damping times (0, 0.03, 1 s) in each "
-        f"row. Solved: every time step to {TOLERANCE:g} m, with a local error of at most {LOCAL_ERROR:g} of an edge. "
-        "Coarse: every step solved, but 1/32 of a step was somewhere too long for that. Unsolved: a step without a "
+        f"row. Solved: every time step to {TOLERANCE:g} m, with a local error of at most {Rod.local_error:g} of an "
+        "edge. Coarse: every step solved, but 1/32 of a step was somewhere too long for that. Unsolved: a step without a "
         "solution. Error: mean "
         f"distance of a marker's coordinate to the same simulation with {_FINER} steps a sample, as a share of the "
         "cable's length, over the first second and over all five; where a cable is chaotic the latter grows "
@@ -69,8 +68,8 @@ def main() -> None:
     lost = [int((result == RodResult.UNSOLVED).sum()) for result in (found.result, reference.result)]
     lines += [
         "",
-        f"Unsolved in all: {lost[0]} of {len(cases)}, and {lost[1]} of the references. Times are those of a "
-        "batch of four, over four.",
+        f"Unsolved in all: {lost[0]} of {len(cases)}, and {lost[1]} of the references. A batch holds the four "
+        "motions of one cable; times are its own, over four.",
         "",
         "---",
         "",

@@ -6,6 +6,7 @@ import dataclasses
 import functools
 import itertools
 from collections.abc import Sequence
+from typing import Any
 
 import jax
 import numpy as np
@@ -53,13 +54,14 @@ def every_case() -> list[Case]:
 def physics_of(case: Case) -> RodPhysics:
     """Parameters of the simulator, with a little drag."""
     arclength = np.linspace(0, case.length, MARKERS + 2)[1:-1]
-    return RodPhysics(
-        length=np.asarray(case.length), stiffness=np.full(1, case.stiffness), rest_curvature=np.zeros((1, 2)),
-        damping_time=np.asarray(case.damping_time), drag=np.asarray(0.1), quadratic_drag=np.zeros(()),
-        twist_stiffness=np.asarray(0.7 * case.stiffness), stretch=np.asarray(5e4), marker_mass=np.zeros(()),
-        clamp_rotation=np.zeros((2, 2)), clamp_offset=np.zeros((2, 3)), roll=np.zeros(()), arclength=arclength,
-        offset=np.zeros((MARKERS, 2)), gravity=np.array([0.0, 0.0, -9.81]),
-    )  # fmt: skip
+    values: dict[str, Any] = {
+        "length": case.length, "stiffness": np.full(1, case.stiffness), "rest_curvature": np.zeros((1, 2)),
+        "damping_time": case.damping_time, "drag": 0.1, "quadratic_drag": 0.0, "twist_stiffness": 0.7 * case.stiffness,
+        "stretch": 5e4, "marker_mass": 0.0, "clamp_rotation": np.zeros((2, 2)), "clamp_offset": np.zeros((2, 3)),
+        "roll": 0.0, "arclength": arclength, "offset": np.zeros((MARKERS, 2)), "gravity": np.array([0.0, 0.0, -9.81]),
+    }  # fmt: skip
+    # arrays of numpy keep double precision until they are simulated
+    return RodPhysics(**{name: np.asarray(value, float) for name, value in values.items()})
 
 
 def inputs_of(case: Case, seconds: float = SECONDS) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

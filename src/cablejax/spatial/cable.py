@@ -85,8 +85,10 @@ class SpatialCable(Simulator):
         return self.on(dataclasses.replace(self.windows, trust=trust(error)))
 
     def finer(self, factor: int) -> SpatialCable:
-        """With so many times as many time steps."""
-        return dataclasses.replace(self, rod=dataclasses.replace(self.rod, substeps=factor * self.rod.substeps))
+        """With time steps that are so many times shorter, those that are made where the motion is fast too."""
+        rod = self.rod
+        finer = dataclasses.replace(rod, substeps=factor * rod.substeps, local_error=rod.local_error / factor**3)
+        return dataclasses.replace(self, rod=finer)
 
     def own(self, one: Explanation) -> int:
         """Number of parameters of each recording alone: those of the grip."""

@@ -34,8 +34,6 @@ from cablejax.simulate.rod.discrete import DiscreteRod
 from cablejax.simulate.rod.physics import RodPhysics
 from cablejax.simulate.rod.time_step import Motion, time_step
 
-LOCAL_ERROR = 0.04
-"""A step whose local error is larger is made again in shorter ones; in lengths of an edge (2 mm where 20 make 1 m)."""
 _HALVINGS = 5
 _WHOLE = 2**_HALVINGS
 # Every one of the shortest steps, and those that were too long; a step is tried twice as long as soon as it may be.
@@ -46,7 +44,7 @@ class RodResult(enum.IntEnum):
     """How a rollout ended.
 
     Attributes:
-        SOLVED: every step was solved, with a local error of at most `LOCAL_ERROR`.
+        SOLVED: every step was solved, with a local error of at most `Rod.local_error`.
         COARSE: every step was solved; the shortest ones, 1/32, were too long somewhere for that local error.
         UNSOLVED: a step had no solution, however short. What came before is solved.
     """
@@ -92,11 +90,14 @@ class Rod:
         substeps: time steps between two samples.
         twisting: whether the material frame is followed. Without it rest curvature, twist and offsets across the cable
             have no effect, and a step costs half.
+        local_error: a step whose local error is larger is made again in shorter ones; in lengths of an edge, so that it
+            is 2 mm where 20 edges make 1 m.
     """
 
     n_edges: int = 20
     substeps: int = 1
     twisting: bool = True
+    local_error: float = 0.04
 
     def rollout(
         self,
@@ -156,10 +157,19 @@ class Rod:
             found &= again
         second, also = discrete.through(seen[1] - offsets, held[1], start[2:-2])
         velocity = (second - start) / interval
-        frames = discrete.first_frames(second, side[0]) if self.twisting else (jnp.zeros((n - 1, 3)),) * 2
+        none = jnp.zeros((n - 1, 3))
+        directors, tangents = discrete.first_frames(second, side[0]) if self.twisting else (none, none)
         dt, slack = interval / self.substeps, jnp.zeros(n - 3)
         motion = Motion(
-            second, second - dt * velocity, velocity, velocity, slack, slack, *frames, jnp.asarray(dt, second.dtype)
+            second,
+            second - dt * velocity,
+            velocity,
+            velocity,
+            slack,
+            slack,
+            directors,
+            tangents,
+            jnp.asarray(dt, second.dtype),
         )
         return (
             jnp.stack([discrete.weights @ start + offsets, discrete.weights @ second + offsets]),
@@ -181,7 +191,7 @@ class Rod:
             new, solved, error = time_step(
                 discrete, at.motion, dt * at.size / _WHOLE, ends, side, twisting=self.twisting
             )
-            ratio = jax.lax.stop_gradient(error / discrete.h) / LOCAL_ERROR
+            ratio = jax.lax.stop_gradient(error / discrete.h) / self.local_error
             fine, shortest = solved & (ratio <= 1.0), at.size == 1
             accepted = (fine | (shortest & solved)) & ~at.lost
             done = jnp.where(accepted, at.done + at.size, at.done)
