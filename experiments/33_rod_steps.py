@@ -44,8 +44,8 @@ def main() -> None:
         "",
         f"{len(cases)} motions of 5 s at 100 Hz: 3 lengths (0.3, 1, 3 m) and 3 damping times (0, 0.03, 1 s) in each "
         f"row. Solved: every time step to {TOLERANCE:g} m, with a local error of at most {Rod.local_error:g} of an "
-        "edge. Coarse: every step solved, but 1/32 of a step was somewhere too long for that. Unsolved: a step without a "
-        "solution. Error: mean "
+        "edge. Coarse: every step solved, but 1/32 of a step was somewhere too long for that. Unsolved: a step without "
+        "a solution. Error: mean "
         f"distance of a marker's coordinate to the same simulation with {_FINER} steps a sample, as a share of the "
         "cable's length, over the first second and over all five; where a cable is chaotic the latter grows "
         "whatever the step.",

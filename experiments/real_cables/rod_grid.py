@@ -61,7 +61,8 @@ def physics_of(case: Case) -> RodPhysics:
         "roll": 0.0, "arclength": arclength, "offset": np.zeros((MARKERS, 2)), "gravity": np.array([0.0, 0.0, -9.81]),
     }  # fmt: skip
     # arrays of numpy keep double precision until they are simulated
-    return RodPhysics(**{name: np.asarray(value, float) for name, value in values.items()})
+    fields: dict[str, Any] = {name: np.asarray(value, float) for name, value in values.items()}
+    return RodPhysics(**fields)
 
 
 def inputs_of(case: Case, seconds: float = SECONDS) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -97,9 +98,10 @@ def rollouts(
 
 @functools.cache
 def _compiled(rod: Rod):
-    return jax.jit(
-        jax.vmap(lambda physics, *inputs: rod.rollout(physics, *inputs, INTERVAL)), compiler_options=compiler_options()
-    )
+    def one(physics, position, frames, seen):
+        return rod.rollout(physics, position, frames, seen, INTERVAL)
+
+    return jax.jit(jax.vmap(one), compiler_options=compiler_options())
 
 
 def _moved(motion: str, time: Float[np.ndarray, "T"]) -> Float[np.ndarray, "T 3"]:
