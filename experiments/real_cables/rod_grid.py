@@ -61,8 +61,8 @@ def physics_of(case: Case) -> RodPhysics:
         "roll": 0.0, "arclength": arclength, "offset": np.zeros((MARKERS, 2)), "gravity": np.array([0.0, 0.0, -9.81]),
     }  # fmt: skip
     # arrays of numpy keep double precision until they are simulated
-    arrays: dict[str, Any] = {name: np.asarray(value, float) for name, value in values.items()}
-    return RodPhysics(**arrays)
+    fields: dict[str, Any] = {name: np.asarray(value, float) for name, value in values.items()}
+    return RodPhysics(**fields)
 
 
 def inputs_of(case: Case, seconds: float = SECONDS) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -98,10 +98,10 @@ def rollouts(
 
 @functools.cache
 def _compiled(rod: Rod):
-    def run(physics, position, frames, seen):
+    def one(physics, position, frames, seen):
         return rod.rollout(physics, position, frames, seen, INTERVAL)
 
-    return jax.jit(jax.vmap(run), compiler_options=compiler_options())
+    return jax.jit(jax.vmap(one), compiler_options=compiler_options())
 
 
 def _moved(motion: str, time: Float[np.ndarray, "T"]) -> Float[np.ndarray, "T 3"]:
