@@ -8,13 +8,14 @@ STAMP := $(VENV)/.stamp
 NPROC ?= 4
 export NPROC
 
-.PHONY: help demo tables quick test test-full lint docs dist clean
+.PHONY: help demo tables quick matrix test test-full lint docs dist clean
 .DEFAULT_GOAL := help
 
 help:
 	@echo "make demo       shape a cable into a U, an S and a Z; writes runs/demo/report.html"
 	@echo "make tables     the paper's tables at a small size; experiments/*.py --full is the rest"
 	@echo "make quick      the tests of the pipeline's spine, a minute and a half"
+	@echo "make matrix     the same on every corner of the supported versions; writes docs/results/versions.md"
 	@echo "make test       lint, types and the quick tests"
 	@echo "make test-full  lint, types and every test"
 	@echo "make lint       ruff and pyright"
@@ -52,6 +53,12 @@ SPINE := tests/test_simulate_engines.py tests/test_simulate_equilibrium.py tests
 
 quick: $(STAMP)
 	$(BIN)/python -m pytest -m "not slow" -n 2 --dist loadfile $(SPINE)
+
+# Downloads each corner's packages, and its Python where there is none, into build/versions.
+matrix: $(STAMP)
+	$(BIN)/python -m pip install --disable-pip-version-check --quiet 'uv>=0.9,<1'
+	$(BIN)/python benchmarks/versions.py $(SPINE) tests/test_simulate_composite.py tests/test_simulate_plant.py \
+		tests/test_perceive_camera.py
 
 test: lint
 	$(BIN)/python -m pytest -m "not slow" -n 2 --dist loadfile

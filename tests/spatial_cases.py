@@ -74,7 +74,7 @@ def recording(episodes: int = 4, regripped: int | None = None) -> GapLog:
     guess = position[:, 0, :1] * (1 - line) + position[:, 0, 1:] * line + sag
     with jax.enable_x64(True):
         run = jax.jit(
-            jax.vmap(lambda p, f, g: rod.rollout(physics(), p, f, np.ones((2, 1, 1)) * g, INTERVAL)),
+            jax.vmap(lambda p, f, g: rod.rollout(physics(), p, f, np.ones((2, 1, 1)) * g, INTERVAL).points),
             compiler_options=compiler_options(),
         )
         points = np.asarray(run(*still, guess))[:, 60:]

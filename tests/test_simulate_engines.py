@@ -13,7 +13,7 @@ import pytest
 from cablejax.cable import Cable, Discretisation
 from cablejax.effects.physics import nominal_physics
 from cablejax.simulate import MjxEngine, ThreadedEngine
-from cablejax.simulate.composite import build_grasped_chain, refuse_plugins
+from cablejax.simulate.composite import build_grasped_chain
 
 PLANAR = Discretisation(n_links=25)
 SPATIAL = Discretisation(Cable(bending_stiffness=0.05), n_links=13, dimension=3, timestep=0.01)
@@ -62,6 +62,7 @@ def test_mjx_follows_c_mujoco_within_a_hundredth_of_a_millimetre(config, pose, t
     np.testing.assert_allclose(trajectory.gripper_pose, reference.gripper_pose, atol=2e-6)
 
 
+@pytest.mark.skipif(mujoco.__version__ >= "4", reason="MuJoCo 4 has no cable plugin")
 def test_joint_springs_bend_like_the_cable_plugin():
     """A cantilever of 24 links with the elasticity plugin, and with `stiffness = EI / link_length`."""
     length, radius, count, bending_stiffness = 1.0, 0.005, 25, 0.02
@@ -92,23 +93,6 @@ def test_joint_springs_bend_like_the_cable_plugin():
     by_plugin, by_springs = settle(plugin, 0.0), settle("", bending_stiffness / link)
     assert np.abs(by_plugin[:, 1:]).max() > 0.05
     assert np.abs(by_plugin - by_springs).max() <= 1e-6
-
-
-def test_a_model_with_a_plugin_is_refused():
-    model = mujoco.MjModel.from_xml_string("""
-    <mujoco>
-      <extension><plugin plugin="mujoco.elasticity.cable"/></extension>
-      <worldbody>
-        <composite type="cable" prefix="c" curve="s" count="4 1 1" size="1 0 0">
-          <plugin plugin="mujoco.elasticity.cable">
-            <config key="twist" value="1e6"/><config key="bend" value="1e6"/>
-          </plugin>
-          <joint kind="main"/><geom type="capsule" size="0.005"/>
-        </composite>
-      </worldbody>
-    </mujoco>""")
-    with pytest.raises(ValueError, match="plugin instance"):
-        refuse_plugins(model)
 
 
 @pytest.mark.parametrize("engine", [ThreadedEngine, MjxEngine])

@@ -7,8 +7,15 @@ import pytest
 
 from cablejax.cable import Cable, Discretisation
 from cablejax.simulate import MjxEngine
+from cablejax.simulate.composite import link_lengths
 from cablejax.simulate.elastica import elastica, solve_elastica
-from cablejax.simulate.equilibrium import angles_of_keypoints, arch_angles, find_equilibrium
+from cablejax.simulate.equilibrium import (
+    angles_of_keypoints,
+    arch_angles,
+    beyond_joints,
+    find_equilibrium,
+    links_of,
+)
 
 POSE = np.array([[-0.3, 0.05, 1.2], [0.35, -0.02, -0.7]])
 
@@ -41,6 +48,27 @@ def test_equilibrium_is_a_minimum_and_stability_falls_towards_snap_through():
         stabilities.append(found.stability)
     assert all(s > 0 for s in stabilities)
     assert stabilities == sorted(stabilities, reverse=True)
+
+
+@pytest.mark.parametrize("n_links", [5, 13, 33])
+def test_a_settled_chain_meets_its_grippers_and_has_no_slope_left(n_links):
+    config = Discretisation(n_links=n_links)
+    lengths = link_lengths(config)
+    for pose in (
+        POSE,
+        np.array([[-0.4985, 0.0, 0.01], [0.4985, 0.0, -0.01]]),
+        np.array([[-0.3, 0, 0.9], [0.3, 0, 0.8]]),
+    ):
+        angles = find_equilibrium(config, pose, arch_angles(config, pose)).angles
+        theta, links = links_of(lengths, angles, pose[0, 2])
+        np.testing.assert_allclose(pose[0, :2] + links.sum(axis=0), pose[1, :2], atol=1e-8)
+        assert theta[-1] == pytest.approx(pose[1, 2], abs=1e-8)
+        # bending moments are balanced by a force and a moment on the far end
+        beyond = beyond_joints(links)
+        held = np.stack([-beyond[:, 1], beyond[:, 0], np.ones_like(angles)], axis=1)
+        moments = angles / config.link_length
+        balanced = held @ np.linalg.lstsq(held, moments, rcond=1e-9)[0]
+        np.testing.assert_allclose(moments, balanced, atol=1e-6 * np.abs(moments).max())
 
 
 def test_a_pose_out_of_reach_is_refused():

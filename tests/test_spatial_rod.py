@@ -12,7 +12,6 @@ from cablejax.cable import Cable, Discretisation
 from cablejax.simulate.compile import compiler_options
 from cablejax.simulate.composite import build_grasped_chain
 from cablejax.simulate.rod import Rod, RodPhysics
-from cablejax.simulate.rod import rod as rod_module
 
 _INTERVAL = 0.01
 
@@ -75,7 +74,9 @@ def _physics(arclength, **changes):
 
 
 def _run(rod, physics, position, frames, seen):
-    run = jax.jit(lambda p: rod.rollout(p, position, frames, seen, _INTERVAL), compiler_options=compiler_options())
+    run = jax.jit(
+        lambda p: rod.rollout(p, position, frames, seen, _INTERVAL).points, compiler_options=compiler_options()
+    )
     return np.asarray(run(physics))
 
 
@@ -108,7 +109,9 @@ def test_second_order_in_the_time_step():
     position, frames = _inputs(80, 0.1)
     seen = jnp.asarray(np.stack([np.stack([arclength, 0 * arclength, 0 * arclength], axis=1)] * 2))
     physics = _physics(arclength, drag=0.5)
-    runs = {k: _run(Rod(12, k, twisting=False), physics, position, frames, seen) for k in (1, 2, 4, 16)}
+    runs = {
+        k: _run(Rod(12, k, twisting=False, local_error=np.inf), physics, position, frames, seen) for k in (1, 2, 4, 16)
+    }
     off = {k: np.abs(run - runs[16]).mean() for k, run in runs.items()}
     # gravity sets in at once, with which no multistep method starts at its full order
     assert off[2] < 0.5 * off[1]
@@ -138,8 +141,10 @@ def test_a_cable_clamped_on_its_rest_shape_stays(axis):
     rest[:, axis] = 5.0 * np.exp(-(((np.linspace(0.0, 1.0, 41) - 0.3) / 0.1) ** 2))
     rod, moved = Rod(24), {}
     run = jax.jit(
-        lambda p: rod.rollout(
-            p, position, np.repeat(np.array(frames)[None], samples, 0), np.stack([marks] * 2), _INTERVAL
+        lambda p: (
+            rod.rollout(
+                p, position, np.repeat(np.array(frames)[None], samples, 0), np.stack([marks] * 2), _INTERVAL
+            ).points
         ),
         compiler_options=compiler_options(),
     )
@@ -180,25 +185,6 @@ def test_hangs_as_a_catenary_when_it_hardly_resists_bending():
     assert np.abs(found[-1] - catenary).max() < 2e-3
 
 
-def test_newton_has_converged_where_a_cable_swings_fast_at_a_sharply_turned_clamp(monkeypatch):
-    arclength, time = np.linspace(0.1, 0.9, 9), _INTERVAL * np.arange(200)
-    position = np.zeros((200, 2, 3))
-    position[:, 1, 0] = 0.5 + 0.15 * np.sin(3.0 * np.pi * time)
-    position[:, 1, 1] = 0.15 * np.sin(2.1 * np.pi * time)
-    position[:, 0, 2] = 0.15 * np.sin(3.9 * np.pi * time)
-    down, up = ([[0, 0, -1.0], [0, 1, 0], [1, 0, 0]], [[0, 0, 1.0], [0, 1, 0], [-1, 0, 0]])
-    frames = np.repeat(np.array([[down, up]]), 200, 0)
-    sag = np.stack([0.5 * arclength, 0 * arclength, -0.35 * np.sin(np.pi * arclength)], axis=1)
-    physics = _physics(
-        arclength, stiffness=np.full(1, 0.02), drag=0.1, clamp_rotation=np.array([[1.5, 0.4], [0.4, -0.1]])
-    )
-    found = _run(Rod(20, twisting=False), physics, position, frames, np.stack([sag, sag]))
-    monkeypatch.setattr(rod_module, "_NEWTON", 10)
-    exact = _run(Rod(20, twisting=False), physics, position, frames, np.stack([sag, sag]))
-    assert np.abs(found - exact).max() < 2e-4
-    assert np.ptp(exact, axis=0).max() > 0.2
-
-
 def test_derivatives_are_those_of_finite_differences():
     arclength = np.linspace(0.1, 0.9, 9)
     position, frames = _inputs(25, 0.1)
@@ -223,7 +209,7 @@ def test_derivatives_are_those_of_finite_differences():
 
     def last(scale):
         changed = jax.tree.map(lambda leaf, d: leaf + scale * d, physics, direction)
-        return rod.rollout(changed, position, frames, seen, _INTERVAL)[::10]
+        return rod.rollout(changed, position, frames, seen, _INTERVAL).points[::10]
 
     run = jax.jit(last, compiler_options=compiler_options())
     _, derivative = jax.jit(lambda s: jax.jvp(last, (s,), (jnp.ones(()),)), compiler_options=compiler_options())(

@@ -49,8 +49,9 @@ def test_fast_grippers_need_more(fast):
     assert found.substeps > 1
     effects = [_cable(windows).layout.named(name) for name in ("bending_damping", "viscous_drag")]
     damped = explanation(*((effect, 0, (effect.parameters[0].centre,)) for effect in effects))
-    once, chosen, exact = (_cable(windows).finer(substeps).motion(damped) for substeps in (1, found.substeps, 8))
-    assert np.abs(chosen - exact).mean() < 0.5 * np.abs(once - exact).mean()
+    once, chosen, exact = (_cable(windows).finer(substeps).motion(damped) for substeps in (1, found.substeps, 32))
+    # in the first half second: later it is torn, and snaps back one way or another
+    assert np.abs(chosen - exact)[:, :25].mean() < 0.5 * np.abs(once - exact)[:, :25].mean()
 
 
 def test_says_when_the_finest_are_too_coarse():

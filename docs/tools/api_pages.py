@@ -17,11 +17,13 @@ EXPLAINED = {
     "diagnose": "[Diagnose](../concepts/diagnose.md), [a simulator of your own](../how_to/own_simulator.md)",
     "dynamics": "[Learn](../concepts/learn.md), [a dynamics model of your own](../how_to/own_dynamics_model.md)",
     "effects": "[Diagnose](../concepts/diagnose.md), [an effect of your own](../how_to/own_effect.md)",
+    "environment": "[Train a policy](../how_to/environment.md)",
     "mpc": "[Control](../concepts/control.md), [Solvers](../concepts/solvers.md)",
     "perceive": "[Perceive](../concepts/perceive.md)",
     "recordings": "[A recording of your own](../how_to/own_recording.md)",
     "report": "[Read a verdict](../how_to/read_a_verdict.md)",
     "residual": "[Correct](../concepts/correct.md)",
+    "robot": "[Use a robot](../how_to/robot.md)",
     "simulate": "[Simulate](../concepts/simulate.md), [Plants](../concepts/plants.md)",
     "spatial": "[Cables in space](../concepts/space.md)",
 }

@@ -6,7 +6,7 @@ import dataclasses
 import functools
 from pathlib import Path
 
-from cablejax.control.loop import Controller
+from cablejax.control.link import Controller
 from cablejax.control.shaping import Model, load_model, make_controller
 from cablejax.control.targets import Target
 from cablejax.residual import PAPER, LearnerConfig

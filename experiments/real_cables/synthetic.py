@@ -181,7 +181,7 @@ def _program(twisting: bool):
     rod = Rod(2 * EDGES, 8, twisting=twisting)
 
     def one(physics, position, frames, seen):
-        return rod.rollout(physics, position, frames, seen, jnp.asarray(SAMPLE_INTERVAL))
+        return rod.rollout(physics, position, frames, seen, jnp.asarray(SAMPLE_INTERVAL)).points
 
     return jax.jit(jax.vmap(one, (0, 0, 0, None)), compiler_options=compiler_options())
 

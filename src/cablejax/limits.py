@@ -85,6 +85,8 @@ LIMITS: Mapping[str, Limit] = MappingProxyType(
         "coordinate": Limit(0.0, 1e4, "m or rad"),
         "speed": Limit(0.0, 1e3, "m/s or rad/s"),
         "duration": Limit(0.0, 1e4, "s"),
+        # since 1970 or since a start
+        "stamp": Limit(0.0, 1e10, "s"),
         # a target
         "target_angle": Limit(-4 * math.pi, 4 * math.pi, "rad"),
         "target_distance": Limit(0.0, 10.0, "lengths of the cable"),

@@ -30,12 +30,24 @@ def far_keypoint(
         grippers: positions [m].
         length: of the cable [m].
     """
-    offset = np.asarray(keypoints, float)[:, :, None] - np.asarray(grippers, float)[:, None]
-    distance = np.nan_to_num(np.linalg.norm(offset, axis=-1).min(axis=-1), nan=0.0)
+    distance = _distance(keypoints, grippers)
     sample, index = np.unravel_index(int(distance.argmax()), distance.shape)
     if distance[sample, index] <= REACH * length + 1.0:
         return None
     return int(sample), int(index), float(distance[sample, index])
+
+
+def out_of_reach(
+    keypoints: Float[np.ndarray, "*T N D"], grippers: Float[np.ndarray, "*T Q D"], length: float
+) -> np.ndarray:
+    """Which keypoints are out of the cable's reach; see `far_keypoint`."""
+    return _distance(keypoints, grippers) > REACH * length + 1.0
+
+
+def _distance(keypoints: np.ndarray, grippers: np.ndarray) -> np.ndarray:
+    """Of each keypoint from the nearer gripper [m]; 0 where either was not observed."""
+    offset = np.asarray(keypoints, float)[..., :, None, :] - np.asarray(grippers, float)[..., None, :, :]
+    return np.nan_to_num(np.linalg.norm(offset, axis=-1).min(axis=-1), nan=0.0)
 
 
 def geometry_fault(log: GapLog) -> str | None:

@@ -21,7 +21,7 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Float, Int
 
 from cablejax.cable import Discretisation
-from cablejax.control.loop import Controller
+from cablejax.control.link import Controller
 from cablejax.control.run import settling_time
 from cablejax.effects.physics import Physics, may_touch, nominal_physics, without_obstacle
 from cablejax.limits import check

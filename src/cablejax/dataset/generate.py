@@ -15,6 +15,7 @@ from collections.abc import Callable, Sequence
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 from tqdm import tqdm
 
 from cablejax.dataset.opening import open_or_create
@@ -63,18 +64,23 @@ class Draw:
 def draw(config: DatasetConfig, index: int, attempt: int = 0) -> Draw:
     """Everything random about trajectory `index`, from (seed, index, attempt) alone."""
     rng = np.random.default_rng(np.random.SeedSequence(config.seed, spawn_key=(index, attempt)))
-    ranges = config.randomisation
-    stiffness, friction, damping = (
-        1.0 if limits is None else float(np.exp(rng.uniform(*np.log(limits))))
-        for limits in (ranges.stiffness, ranges.friction, ranges.damping)
-    )
-    cable = config.cable
+    parameters = draw_parameters(config, rng)
     pose, twist = random_motion(rng, config.discretisation, config.n_steps, config.motion, config.interval)
     return Draw(
         gripper_pose=np.asarray(pose, np.float32),
         gripper_twist=np.asarray(twist, np.float32),
-        parameters=np.array([stiffness, friction * cable.friction_coefficient, damping * cable.damping_time]),
+        parameters=parameters,
     )
+
+
+def draw_parameters(config: DatasetConfig, rng: np.random.Generator) -> Float[np.ndarray, "3"]:
+    """The random parameters of one cable, the columns of `cablejax.dataset.schema.PARAMETERS`."""
+    ranges, cable = config.randomisation, config.cable
+    stiffness, friction, damping = (
+        1.0 if limits is None else float(np.exp(rng.uniform(*np.log(limits))))
+        for limits in (ranges.stiffness, ranges.friction, ranges.damping)
+    )
+    return np.array([stiffness, friction * cable.friction_coefficient, damping * cable.damping_time])
 
 
 def cable_params(config: DatasetConfig, parameters: np.ndarray) -> Physics:

@@ -1,7 +1,10 @@
-"""The cable as a MuJoCo composite: a chain of capsules, in the plane (z-hinges) or in space (ball joints).
+"""Builds the cable for MuJoCo: a chain of capsules, in the plane (z-hinges) or in space (ball joints).
 
-Bending stiffness is a joint spring, `EI / link_length`. The elasticity plugin of MuJoCo states the same law, but MJX
-drops plugins without a word, so a model that carries one is refused.
+The chain is made of plain bodies and joints, which MuJoCo 3 and 4 share. MuJoCo 3 compiles the same model from its
+`<composite type="cable">`, which MuJoCo 4 removed.
+
+Bending stiffness is a joint spring, `EI / link_length`. MuJoCo 3's elasticity plugin states the same law, but MJX drops
+plugins without a word.
 
 Two variants of the same chain are built:
 
@@ -29,7 +32,7 @@ _CONTACT = (0.99, 0.99, 0.001, 0.5, 2.0)
 
 def build_chain(config: Discretisation) -> mujoco.MjModel:
     """The free chain: root link free in the plane (x, y, theta) or in space, `n_links - 1` bending joints."""
-    return _chain_spec(config).compile()
+    return _chain_spec(config)[0].compile()
 
 
 def build_grasped_chain(config: Discretisation, obstacle: tuple[float, float, float] | None = None) -> mujoco.MjModel:
@@ -46,12 +49,11 @@ def build_grasped_chain(config: Discretisation, obstacle: tuple[float, float, fl
         config: the cable.
         obstacle: centre and radius of a fixed disc, to the cable's centreline [m]; None = nothing can be touched.
     """
-    spec = _chain_spec(config)
+    spec, links = _chain_spec(config)
     if obstacle is not None:
-        _add_obstacle(spec, obstacle, config.timestep)
+        _add_obstacle(spec, links, obstacle, config.timestep)
     # a simulation that diverges shall say so, not start again in silence
     spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
-    links = link_bodies(spec)
     for link in (links[0], links[-1]):
         link.mass = _HELD_MASS
         link.inertia = [_HELD_INERTIA] * 3
@@ -87,18 +89,20 @@ def build_grasped_chain(config: Discretisation, obstacle: tuple[float, float, fl
     return spec.compile()
 
 
-def _add_obstacle(spec: mujoco.MjSpec, obstacle: tuple[float, float, float], dt: float) -> None:
+def _add_obstacle(
+    spec: mujoco.MjSpec, links: list[mujoco.MjsBody], obstacle: tuple[float, float, float], dt: float
+) -> None:
     """Adds a sphere in the cable's plane, without friction.
 
     Sphere and links have half the radius each, so that it counts to the centreline. A contact is all but resolved
     within one step, like a grasp.
     """
     x, y, radius = obstacle
-    for link in link_bodies(spec):
-        for geom in link.geoms:
-            geom.contype, geom.conaffinity, geom.condim = 1, 0, 1
-            geom.size[0] = radius / 2
-            geom.solref, geom.solimp = [-1.0 / dt**2, -1.0 / dt], _CONTACT
+    for link in links:
+        geom = link.geoms[0]
+        geom.contype, geom.conaffinity, geom.condim = 1, 0, 1
+        geom.size[0] = radius / 2
+        geom.solref, geom.solimp = [-1.0 / dt**2, -1.0 / dt], _CONTACT
     spec.worldbody.add_geom(
         name="obstacle",
         type=mujoco.mjtGeom.mjGEOM_SPHERE,
@@ -112,15 +116,6 @@ def _add_obstacle(spec: mujoco.MjSpec, obstacle: tuple[float, float, float], dt:
     )
 
 
-def refuse_plugins(model: mujoco.MjModel) -> None:
-    """Raises `ValueError` if the model carries an engine plugin, which MJX would drop in silence."""
-    if model.nplugin:
-        raise ValueError(
-            f"The MuJoCo model has {model.nplugin} plugin instance(s). MJX ignores plugins, so the cable would have no "
-            "bending stiffness. Build it with `cablejax.simulate.composite`, which uses joint springs instead."
-        )
-
-
 def stable_damping_time(damping_time: Any, timestep: float) -> Any:
     """The Kelvin-Voigt time [s] that MuJoCo's step can integrate: at least half a time step.
 
@@ -130,9 +125,38 @@ def stable_damping_time(damping_time: Any, timestep: float) -> Any:
     return damping_time.__array_namespace__().maximum(damping_time, 0.5 * timestep)
 
 
-def link_bodies(spec: mujoco.MjSpec) -> list[mujoco.MjsBody]:
-    """The links of the cable in order of arc length."""
-    return [body for body in spec.bodies if body.name.startswith("cable")]
+def add_links(
+    spec: mujoco.MjSpec, lengths: np.ndarray, radius: float, *, dimension: int, **contact: Any
+) -> list[mujoco.MjsBody]:
+    """Adds a chain of capsules along x to the world: bodies whose names begin with "cable", in order of arc length.
+
+    The root moves freely, in the plane by the joints x, y and theta. Every other link turns about the end of the link
+    before: in space by a ball joint, in the plane by a hinge about z. Joints have neither springs nor dampers.
+
+    Args:
+        spec: where to add the chain.
+        lengths: length of each link [m], shape [n_links].
+        radius: of the capsules [m].
+        dimension: 2 for a chain in the plane, 3 for one in space.
+        contact: fields of every capsule, for example `contype`.
+    """
+    kind, links, parent = mujoco.mjtJoint, [], spec.worldbody
+    for k, (origin, length) in enumerate(zip([0.0, *lengths[:-1]], lengths, strict=True)):
+        link = parent.add_body(name=f"cable_{k}", pos=[origin, 0.0, 0.0])
+        link.add_geom(
+            type=mujoco.mjtGeom.mjGEOM_CAPSULE, fromto=[0, 0, 0, length, 0, 0], size=[radius, 0, 0], **contact
+        )
+        if dimension == 3:
+            link.add_joint(name=f"bend_{k}" if k else "root", type=kind.mjJNT_BALL if k else kind.mjJNT_FREE)
+        elif k:
+            link.add_joint(name=f"bend_{k}", type=kind.mjJNT_HINGE, axis=[0, 0, 1])
+        else:
+            link.add_joint(name="root_x", type=kind.mjJNT_SLIDE, axis=[1, 0, 0])
+            link.add_joint(name="root_y", type=kind.mjJNT_SLIDE, axis=[0, 1, 0])
+            link.add_joint(name="root_theta", type=kind.mjJNT_HINGE, axis=[0, 0, 1])
+        links.append(link)
+        parent = link
+    return links
 
 
 def link_lengths(config: Discretisation) -> np.ndarray:
@@ -152,24 +176,17 @@ def node_offsets(config: Discretisation) -> np.ndarray:
     return offsets
 
 
-def _chain_spec(config: Discretisation) -> mujoco.MjSpec:
+def _chain_spec(config: Discretisation) -> tuple[mujoco.MjSpec, list[mujoco.MjsBody]]:
+    """The bare chain and its links, in order of arc length."""
     lengths, offsets = link_lengths(config), node_offsets(config)
-    vertices = np.concatenate([[0.0], np.cumsum(lengths)])
-    gravity = 0.0 if config.dimension == 2 else -GRAVITY
-    spec = mujoco.MjSpec.from_string(f"""
-    <mujoco model="cable">
-      <option timestep="{config.timestep:.17g}" gravity="0 0 {gravity}" integrator="implicitfast"/>
-      <worldbody>
-        <composite type="cable" prefix="cable" initial="free" vertex="{" ".join(f"{v:.9g} 0 0" for v in vertices)}">
-          <joint kind="main"/>
-          <geom type="capsule" size="{config.cable.diameter / 2:.9g}" contype="0" conaffinity="0"/>
-        </composite>
-      </worldbody>
-    </mujoco>""")
+    spec = mujoco.MjSpec()
+    spec.modelname = "cable"
+    spec.option.timestep = config.timestep
+    spec.option.gravity = [0.0, 0.0, 0.0 if config.dimension == 2 else -GRAVITY]
+    spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     stiffness = config.cable.bending_stiffness / config.link_length
-    origins = np.concatenate([[0.0], vertices[1:-1] - vertices[:-2]])
-    for k, (link, length, offset, origin) in enumerate(zip(link_bodies(spec), lengths, offsets, origins, strict=True)):
-        link.pos = [origin, 0.0, 0.0]  # the composite keeps vertices in single precision
+    links = add_links(spec, lengths, config.cable.diameter / 2, dimension=config.dimension, contype=0, conaffinity=0)
+    for link, length, offset in zip(links, lengths, offsets, strict=True):
         link.explicitinertial = True
         link.mass = config.cable.linear_density * length
         link.ipos = [offset, 0.0, 0.0]
@@ -178,23 +195,8 @@ def _chain_spec(config: Discretisation) -> mujoco.MjSpec:
         transverse = link.mass * length**2 / 12
         roll = min(link.mass * config.cable.diameter**2 / 8, 1.999 * transverse)
         link.inertia = [roll, transverse, transverse]
-        if config.dimension == 2:
-            _make_planar(spec, link, k)
-        for joint in link.joints:
-            if k > 0:
-                # linear terms of polynomial laws
-                joint.stiffness = [stiffness, 0.0, 0.0]
-                joint.damping = [config.cable.damping_time * stiffness, 0.0, 0.0]
-    return spec
-
-
-def _make_planar(spec: mujoco.MjSpec, link: mujoco.MjsBody, k: int) -> None:
-    """Replaces the free joint of the root by slide, slide, hinge and every ball joint by a hinge about z."""
-    for joint in list(link.joints):
-        spec.delete(joint)
-    if k == 0:
-        for name, axis in (("root_x", (1, 0, 0)), ("root_y", (0, 1, 0))):
-            link.add_joint(name=name, type=mujoco.mjtJoint.mjJNT_SLIDE, axis=axis)
-        link.add_joint(name="root_theta", type=mujoco.mjtJoint.mjJNT_HINGE, axis=(0, 0, 1))
-    else:
-        link.add_joint(name=f"bend_{k}", type=mujoco.mjtJoint.mjJNT_HINGE, axis=(0, 0, 1))
+    for link in links[1:]:
+        # linear terms of polynomial laws
+        link.joints[0].stiffness = [stiffness, 0.0, 0.0]
+        link.joints[0].damping = [config.cable.damping_time * stiffness, 0.0, 0.0]
+    return spec, links

@@ -15,17 +15,13 @@ import numpy as np
 from jaxtyping import Float
 
 from cablejax.cable import Discretisation
+from cablejax.simulate.compiled_equilibrium import settle
 from cablejax.simulate.composite import link_lengths
 from cablejax.simulate.pose import wrapped
 from cablejax.types import CableState
 
 FEWEST_LINKS = 5
 """Links of a chain that both grippers' poses leave a joint to move: four joints against three conditions."""
-
-_MAX_ITERATIONS = 200
-_MAX_TURN = 0.2  # largest change of a joint angle in one iteration [rad]
-_MAX_STRETCH = 0.2  # largest correction of the far end in one iteration, relative to the length
-_TOLERANCE = 1e-10
 
 
 def links_of(lengths: Any, angles: Any, heading: Any) -> tuple[Any, Any]:
@@ -94,40 +90,17 @@ def find_equilibrium(
         )
     if span > config.cable.length * (1 - 1e-9):
         return _taut(config, pose)
-    h, lengths, joints = config.link_length, link_lengths(config), np.arange(config.n_joints)
-    later = np.maximum.outer(joints, joints)
-    angles = np.array(guess, np.float64)
     if config.n_links < FEWEST_LINKS:
         raise ValueError(
             f"A chain of {config.n_links} links has no freedom between two grippers, expected at least {FEWEST_LINKS}."
         )
-    error = np.full(3, np.inf)
-    for _ in range(_MAX_ITERATIONS):
-        theta, steps = links_of(lengths, angles, pose[0, 2])
-        tip = pose[0, :2] + steps.sum(axis=0)
-        beyond = beyond_joints(steps)
-        jacobian = np.stack([-beyond[:, 1], beyond[:, 0], np.ones_like(angles)])
-        error = np.array([*(pose[1, :2] - tip), pose[1, 2] - theta[-1]])
-        left, singular, right = np.linalg.svd(jacobian)
-        inverse = singular / (singular**2 + 1e-12 * singular[0] ** 2)
-        gradient = angles / h
-        multiplier = left @ (inverse * (right[:3] @ gradient))
-        hessian = with_tension(np.eye(len(angles)) / h, multiplier, beyond, later)
-        shrink = min(1.0, _MAX_STRETCH * config.cable.length / max(np.abs(error).max(), 1e-300))
-        correction = right[:3].T @ (inverse * (left.T @ (shrink * error)))
-        null = right[3:].T
-        values, vectors = np.linalg.eigh(null.T @ hessian @ null)
-        reduced = vectors.T @ (null.T @ (gradient + hessian @ correction))
-        step = correction - null @ (vectors @ (reduced / np.maximum(np.abs(values), 1e-6 / h)))
-        step *= min(1.0, _MAX_TURN / max(np.abs(step).max(), 1e-300))
-        angles += step
-        if np.abs(step).max() < _TOLERANCE and np.abs(error).max() < 1e-8:
-            return Equilibrium(angles=angles, stability=float(values[0] * config.cable.length))
-    raise ValueError(
-        f"No equilibrium found between gripper poses {pose.tolist()} in {_MAX_ITERATIONS} iterations: the remaining "
-        f"error of the far end is {np.abs(error).max():.2e}. Give a `guess` nearer to the shape, or poses further from "
-        "taut."
-    )
+    angles, stability, iterations, off = settle(link_lengths(config), pose, np.array(guess, np.float64))
+    if not iterations:
+        raise ValueError(
+            f"No equilibrium found between gripper poses {pose.tolist()}: the remaining error of the far end is "
+            f"{off:.2e}. Give a `guess` nearer to the shape, or poses further from taut."
+        )
+    return Equilibrium(angles=angles, stability=float(stability * config.cable.length))
 
 
 def _taut(config: Discretisation, pose: Float[np.ndarray, "2 3"]) -> Equilibrium:

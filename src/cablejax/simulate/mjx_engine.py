@@ -19,7 +19,7 @@ from cablejax.effects.base import Hook
 from cablejax.effects.camera import seen_by_camera
 from cablejax.effects.physics import Physics, may_touch, nominal_physics, normal_gravity
 from cablejax.simulate.compile import full_precision
-from cablejax.simulate.composite import build_chain, refuse_plugins, stable_damping_time
+from cablejax.simulate.composite import build_chain, stable_damping_time
 from cablejax.simulate.contact import obstacle_contact
 from cablejax.simulate.engine import Engine, compiled_rollout, finely_sampled
 from cablejax.simulate.equilibrium import equilibrium_state
@@ -53,9 +53,7 @@ class MjxEngine(Engine):
     @functools.cached_property
     def mj_model(self) -> mujoco.MjModel:
         """The MuJoCo model of the bare chain."""
-        model = build_chain(self.config)
-        refuse_plugins(model)
-        return model
+        return build_chain(self.config)
 
     def initial_state(self, gripper_pose, *, guess=None) -> CableState:
         """See `Engine`."""

@@ -22,6 +22,7 @@ from cablejax.diagnose.evidence import Evidence, Robust
 from cablejax.diagnose.protocol import Explanation, Plan, Simulator
 from cablejax.simulate.compile import compiler_options
 from cablejax.simulate.rod import Rod
+from cablejax.spatial.accidents import trust
 from cablejax.spatial.effects import GRIP, Layout
 from cablejax.spatial.windows import Windows
 
@@ -29,9 +30,12 @@ GOOD_FIT = 0.01
 """Error of a good fit [m]: unit of the residuals."""
 TWISTED = "intrinsic_curvature"
 """The effect that needs the material frame, whose derivatives take four times as long as all others together."""
-_CHUNK = 8
+_CHUNK = 4
 _COLUMNS = 8
-_ROBUST = Robust(distance=0.02, lost=1.0)
+# What a simulation has lost is off by this [m].
+_LOST = 1.0
+# In fits it counts for less: one lost window must not outweigh all others.
+_ROBUST = Robust(distance=0.02, lost=0.1)
 _CORRELATION = 0.3  # [s]
 # Samples that fits look at: every fourth, after the two that the simulation begins from.
 _FITTED = slice(2, None, 4)
@@ -76,9 +80,15 @@ class SpatialCable(Simulator):
         """The same cable in other windows."""
         return dataclasses.replace(self, windows=windows)
 
+    def trusting(self, error: Float[np.ndarray, "W"]) -> SpatialCable:
+        """The same cable in the same windows, those that are off by their errors [m] with little weight in fits."""
+        return self.on(dataclasses.replace(self.windows, trust=trust(error)))
+
     def finer(self, factor: int) -> SpatialCable:
-        """With so many times as many time steps."""
-        return dataclasses.replace(self, rod=dataclasses.replace(self.rod, substeps=factor * self.rod.substeps))
+        """With time steps that are so many times shorter, those that are made where the motion is fast too."""
+        rod = self.rod
+        finer = dataclasses.replace(rod, substeps=factor * rod.substeps, local_error=rod.local_error / factor**3)
+        return dataclasses.replace(self, rod=finer)
 
     def own(self, one: Explanation) -> int:
         """Number of parameters of each recording alone: those of the grip."""
@@ -89,7 +99,7 @@ class SpatialCable(Simulator):
         return dataclasses.replace(self, samples=slice(None)).predict([one], np.arange(len(self.windows)))[0]
 
     def predict(self, explanations, episodes) -> Float[np.ndarray, "X E T F 3"]:
-        """Free markers [m] at the samples that are compared; NaN where the simulation broke down."""
+        """Free markers [m] at the samples that are compared; NaN from where on the simulation was not solved."""
         parts = ((self._in_parallel(0, one, episodes, ())) for one in explanations)
         return np.stack([np.concatenate(part)[:, self.samples] for part in parts])
 
@@ -114,7 +124,7 @@ class SpatialCable(Simulator):
             observed=windows.observed[:, self.samples],
             nominal=np.zeros_like(windows.keypoints[:, self.samples]),
             noise=np.full((windows.keypoints.shape[2], 1), unit),
-            temper=np.ones(len(windows)),
+            temper=np.ones(len(windows)) if windows.trust is None else 1 / windows.trust,
             freedom=LEAST_SQUARES,
             motion=np.arange(len(windows)),
             robust=_ROBUST,
@@ -176,8 +186,7 @@ def mean_error(predicted: Float[np.ndarray, "W T F 3"], observed: Float[np.ndarr
 
 def bounded(off: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape"]:
     """Sizes of errors [m]; what a simulation has lost, NaN included, is off by a metre."""
-    lost = _ROBUST.lost
-    return np.minimum(np.nan_to_num(np.abs(off), nan=lost, posinf=lost), lost)
+    return np.minimum(np.nan_to_num(np.abs(off), nan=_LOST, posinf=_LOST), _LOST)
 
 
 def errors(predicted: Float[np.ndarray, "W T F 3"], windows: Windows) -> Float[np.ndarray, "W"]:
@@ -193,7 +202,9 @@ def over_all_markers(error: Float[np.ndarray, "W"], windows: Windows) -> Float[n
 @functools.lru_cache(maxsize=8)
 def _compiled(rod: Rod, layout: Layout, interval: float):
     def one(values, position, frames, seen):
-        return rod.rollout(layout.physics(values), position, frames, seen, interval)
+        found = rod.rollout(layout.physics(values), position, frames, seen, interval)
+        reached = jnp.arange(found.points.shape[0]) < found.solved
+        return jnp.where(reached[:, None, None], found.points, jnp.nan)
 
     def batch(values, *inputs):
         return jax.vmap(one)(values, *inputs)

@@ -15,6 +15,8 @@ from cablejax.diagnose.belief import Calibration
 from cablejax.diagnose.diagnosis import CableDiagnosis, Gap, Ranked, Verdict
 from cablejax.diagnose.judgement import judged, verdict_sentence
 from cablejax.diagnose.protocol import explanation
+from cablejax.spatial.accidents import accident_sentences, kept, moderated, off
+from cablejax.spatial.cable import errors
 from cablejax.spatial.clock import on_one_clock
 from cablejax.spatial.effects import GRIP
 from cablejax.spatial.estimate import estimate
@@ -80,7 +82,10 @@ def diagnose_space(
 
     before, after = found.cable.motion(explanation()), found.unseen()
     noise = noise_of(windows)
-    gap = gap_of(before, after, found.cable, noise)
+    lost = ~np.array([np.isfinite(part[valid]).all() for part, valid in zip(after, windows.valid, strict=True)])
+    error = errors(after, windows)
+    use = np.flatnonzero(kept(lost | off(error)))
+    gap = gap_of(before[use], after[use], found.cable.on(windows.chosen(use)), noise)
     verdict, equivalent = _verdict(gap, found), _equivalent(found)
     effects = ()
     if verdict not in ("none", "unknown"):
@@ -88,7 +93,7 @@ def diagnose_space(
         effects = named_effects(found, everything, cable["linear_density_kg_per_m"])
     first = [change.sentence for change in changes[:1]]
     nominal, explained = (in_log(log, windows, part) for part in (before, after))
-    where = where_of(log, windows, nominal, before, noise, changes)
+    where = where_of(log, windows.chosen(use), nominal, before[use], noise, changes)
     return SpatialDiagnosis(
         verdict=verdict,
         sentence=" ".join([verdict_sentence(verdict, effects, equivalent, (), gap.shrinkage or 0.0), *first]),
@@ -100,7 +105,7 @@ def diagnose_space(
         where=where,
         next_motion=None,
         baselines={},
-        caveats=(*repairs, *_caveats(log, windows, left_out, found)),
+        caveats=(*repairs, *accident_sentences(lost, error, windows), *_caveats(log, windows, left_out, found)),
         log=log,
         nominal=nominal,
         explained=explained,
@@ -134,13 +139,14 @@ def _equivalent(found: Identified) -> tuple[tuple[str, ...], ...]:
 
 def _ranking(found: Identified) -> tuple[Ranked, ...]:
     """Every effect tried, by the share of the nominal error that went when it came in, on unseen recordings."""
-    nominal, before, ranked = found.steps[0].error, found.steps[0].error, []
+    nominal, before, ranked = moderated(found.steps[0].error), moderated(found.steps[0].error), []
     for step in found.steps[1:]:
         name = step.effect.split(" ")[0]
-        gain = float((before**2).mean() - (step.error**2).mean()) / float((nominal**2).mean())
+        error = moderated(step.error)
+        gain = float((before**2).mean() - (error**2).mean()) / float((nominal**2).mean())
         # the share of resamples in which the error falls is no probability that the effect is there
-        ranked.append(Ranked(name, None, gain, 1e3 * float(step.error.mean())))
-        before = step.error if step.accepted else before
+        ranked.append(Ranked(name, None, gain, 1e3 * float(error.mean())))
+        before = error if step.accepted else before
     unique: dict[str, Ranked] = {}
     for entry in ranked:
         if entry.name not in unique or entry.held_out_shrinkage > unique[entry.name].held_out_shrinkage:

@@ -13,10 +13,11 @@ from cablejax.bounded import Result
 from cablejax.diagnose.fit import evaluate, improved
 from cablejax.diagnose.protocol import Explanation
 from cablejax.simulate.rod import Rod
+from cablejax.spatial.accidents import moderated
 from cablejax.spatial.cable import TWISTED, SpatialCable
 from cablejax.spatial.effects import Layout, effect_names, effects_of
 from cablejax.spatial.memory import Memory, fingerprint
-from cablejax.spatial.search import Step, accepted_effects, halves, search, tried_with, with_effect
+from cablejax.spatial.search import Step, accepted_effects, halves, search, tried_with, unseen_error, with_effect
 from cablejax.spatial.time_steps import TimeSteps, time_steps_for
 from cablejax.spatial.windows import Windows
 
@@ -34,7 +35,7 @@ class Identified:
     """Result of an identification.
 
     Attributes:
-        cable: the simulator, in the windows that it was found from.
+        cable: the simulator, in the windows that it was found from, and the weight of each in the fits.
         time_steps: that it makes between two samples.
         effects: that stayed, in the order in which they were found.
         tried: all effects that might have stayed.
@@ -139,6 +140,7 @@ def identify(
             memory.keep("twisted", found)
         steps += found
     last = [step for step in steps if step.accepted][-1]
+    cable = cable.trusting(unseen_error(cable, last.halves))
     finals = _final_fits(cable, last.halves, memory, progress)
     return Identified(
         cable=cable,
@@ -190,7 +192,7 @@ def _twisted(cable: SpatialCable, steps: Sequence[Step], progress) -> list[Step]
         effect = cable.layout.named(TWISTED)
         one, other = (with_effect(cable, base, effect, effect.null) for base in bases)
         trials.append(tried_with(cable, name, (one, other), before, progress))
-    best = min((t for t in trials if t.accepted), key=lambda t: t.error.mean(), default=None)
+    best = min((t for t in trials if t.accepted), key=lambda t: moderated(t.error).mean(), default=None)
     # the better one of the two stays, and comes last
     result = [dataclasses.replace(t, accepted=False) for t in trials if t is not best]
     if best is not None:

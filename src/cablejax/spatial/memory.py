@@ -57,6 +57,7 @@ class Memory:
                 (self._read(s["halves"][0]), self._read(s["halves"][1])),
                 np.array(s["error"]),
                 s["chance"],
+                s["counts"],
             )
             for s in self._held.get(name, [])
         ]

@@ -3,7 +3,8 @@
 Recordings are split into two halves. Both halves are fitted separately all along, and every window is scored with the
 fit of the other half. At each step the effect is tried with which unseen windows are simulated best
 from the start; it stays if the error on unseen recordings falls by more than a hundredth, and in more than 84 % of
-resamples of the recordings, one standard error. After two effects in a row that did not, the search ends.
+resamples of the recordings, one standard error. After two effects in a row that did not, the search ends. Windows that
+are lost or far off in every way are left out of that, and effects that lose many are no failures (`accidents`).
 
 Fits, priors, losses and what is a recording's own are those of every diagnosis. This search is not: that of
 `cablejax.diagnose.search` fits all candidates of a step and believes the likelihood of whole episodes with a
@@ -25,6 +26,7 @@ from cablejax.diagnose.evidence import Evidence
 from cablejax.diagnose.fit import evaluate, improved
 from cablejax.diagnose.protocol import Explanation, Simulator, Term, explanation
 from cablejax.diagnose.refits import dealt
+from cablejax.spatial.accidents import compared, moderated, off
 from cablejax.spatial.cable import SpatialCable, mean_error
 from cablejax.spatial.effects import SpatialEffect
 
@@ -44,6 +46,7 @@ class Step:
         halves: fits of both halves.
         error: mean absolute error of each window's free coordinates, from the fit that has not seen it [m], shape [W].
         chance: share of resamples of the recordings in which the error falls.
+        counts: whether the effect could be judged: it is no evidence against one that its simulations are lost.
     """
 
     effect: str
@@ -51,6 +54,7 @@ class Step:
     halves: tuple[Explanation, Explanation]
     error: Float[np.ndarray, "W"]
     chance: float
+    counts: bool = True
 
 
 def halves(group: Int[np.ndarray, "W"]) -> Bool[np.ndarray, "W"]:
@@ -61,8 +65,13 @@ def halves(group: Int[np.ndarray, "W"]) -> Bool[np.ndarray, "W"]:
 
 
 def falls(before: Float[np.ndarray, "W"], after: Float[np.ndarray, "W"], group) -> tuple[bool, float]:
-    """Whether an error falls beyond chance, and the share of resamples of the recordings in which it does."""
-    chance = float((_resampled(before - after, group) > 0).mean())
+    """Whether an error falls beyond chance, and the share of resamples of the recordings in which it does.
+
+    Few windows that are off before or after are left out.
+    """
+    use, _ = compared(before, after)
+    before, after = before[use], after[use]
+    chance = float((_resampled(before - after, np.asarray(group)[use]) > 0).mean())
     return bool(chance > _CHANCE and after.mean() < (1 - _LEAST) * before.mean()), chance
 
 
@@ -96,15 +105,17 @@ def search(
         null = explanation()
         error = unseen_error(cable, (null, null))
         steps = [Step("", True, (null, null), error, 0.0)]
-        progress(f"nominal simulator: {1e3 * error.mean():.1f} mm from the free markers")
+        progress(f"nominal simulator: {1e3 * moderated(error).mean():.1f} mm from the free markers")
     while True:
         last = [i for i, step in enumerate(steps) if step.accepted][-1]
         # what did not help before another effect came in may help now
         tried = [step.effect for step in steps[last + 1 :]]
         rest = [name for name in candidates if name not in [*accepted_effects(steps), *tried]]
-        if not rest or len(tried) == _FAILURES:
+        failures = sum(step.counts for step in steps[last + 1 :])
+        if not rest or failures == _FAILURES:
             return steps
-        starts = {name: _starts(cable, steps[last].halves, cable.layout.named(name)) for name in rest}
+        trusted = cable.trusting(steps[last].error)
+        starts = {name: _starts(trusted, steps[last].halves, cable.layout.named(name)) for name in rest}
         name = min(starts, key=lambda name: starts[name][1])
         steps.append(tried_with(cable, name, starts[name][0], steps[last], progress))
         save(steps)
@@ -127,15 +138,18 @@ def tried_with(
         progress: called with a line of text.
     """
     fits = []
-    for start, (seen, _, _) in zip(starts, _parts(cable), strict=True):
+    for start, (seen, _, _) in zip(starts, _parts(cable.trusting(before.error)), strict=True):
         (fit,) = improved(seen, evaluate(seen, [start]), cable.plan.last_steps)
         fits.append(fit.explanation)
     halves = fits[0], fits[1]
     error = unseen_error(cable, halves)
     accepted, chance = falls(before.error, error, cable.recording)
-    word = "stays" if accepted else "does not help"
-    progress(f"{name}: {1e3 * before.error.mean():.2f} -> {1e3 * error.mean():.2f} mm on unseen recordings, {word}")
-    return Step(name, accepted, halves, error, chance)
+    counts = compared(before.error, error)[1]
+    word = "stays" if accepted else "does not help" if counts else "is lost in many windows, and not judged"
+    accidents = f", {off(error).sum()} windows off" if off(error).any() else ""
+    was, now = (1e3 * moderated(e).mean() for e in (before.error, error))
+    progress(f"{name}: {was:.2f} -> {now:.2f} mm on unseen recordings{accidents}, {word}")
+    return Step(name, accepted, halves, error, chance, counts)
 
 
 def unseen_error(cable: SpatialCable, halves: tuple[Explanation, Explanation]) -> Float[np.ndarray, "W"]:
@@ -161,7 +175,7 @@ def _starts(
     found, total = [], 0.0
     for base, (seen, other, _) in zip(before, _parts(cable), strict=True):
         found.append(_start(seen, base, effect))
-        total += float(mean_error(other.predict([found[-1]])[0], other.observed).sum())
+        total += float(moderated(mean_error(other.predict([found[-1]])[0], other.observed)).sum())
     return (found[0], found[1]), total
 
 
@@ -191,7 +205,7 @@ def with_effect(cable: Simulator, base: Explanation, effect: SpatialEffect, valu
 def _best(seen: Evidence, trials: Sequence[Explanation]) -> Explanation:
     if len(trials) == 1:
         return trials[0]
-    found = [mean_error(part, seen.observed).mean() for part in seen.predict(trials)]
+    found = [moderated(mean_error(part, seen.observed)).mean() for part in seen.predict(trials)]
     return trials[int(np.argmin(found))]
 
 

@@ -39,6 +39,7 @@ class Windows:
         arclength: of the free markers and the second clamp, from the first clamp [m], shape [F + 1].
         n_keypoints: N.
         gravity: as the log states it [m/s^2].
+        trust: weight of each window in fits, shape [W]; None = 1.
     """
 
     keypoints: Float[np.ndarray, "W T F 3"]
@@ -55,6 +56,7 @@ class Windows:
     arclength: Float[np.ndarray, "F1"]
     n_keypoints: int
     gravity: tuple[float, ...] = (0.0, 0.0, -GRAVITY)
+    trust: Float[np.ndarray, "W"] | None = None
 
     def __len__(self) -> int:
         return len(self.keypoints)
@@ -74,6 +76,7 @@ class Windows:
                 for f in ("keypoints", "position", "frames", "valid", "episode", "begin", "group")
             },
             **{f: tuple(getattr(self, f)[i] for i in index) for f in ("split", "name")},
+            trust=None if self.trust is None else self.trust[index],
         )
 
 

@@ -17,14 +17,14 @@ import numpy as np
 from jaxtyping import Float
 
 from cablejax.effects.physics import Physics
-from cablejax.simulate.composite import link_bodies, link_lengths
+from cablejax.simulate.composite import add_links, link_lengths
 from cablejax.simulate.plant.config import PlantConfig
 
 GRASP_STIFFNESS = 100.0
 """Stiffness of the grasp in units of `1 / dt^2`: a held link trails a jump of the command's speed by dv dt / 100."""
 HELD_MASS, HELD_RADIUS = 10.0, 0.1
 """Sphere [kg, m] at each held link: a gripper is heavy, and the heavier the link the stiffer MuJoCo's grasp."""
-CONTACT_IMPEDANCE = "0.3 0.99 0.0003"
+CONTACT_IMPEDANCE = (0.3, 0.99, 0.0003)
 """MuJoCo's impedance of the table's contacts: at first touch, at depth, and the depth [m]. Contacts that are stiff from
 the first touch on chatter: the mean normal force then is up to three times the weight, and so is friction."""
 OBSTACLE_HEIGHT = 0.2
@@ -40,27 +40,21 @@ FRICTIONLESS = 1e-5
 
 
 def plant_model(config: PlantConfig) -> mujoco.MjModel:
-    """The MuJoCo model of the plant: table, composite cable, and one mocap body welded to each held link."""
+    """The MuJoCo model of the plant: table, chain of links, and one mocap body welded to each held link."""
     cable, physics = config.cable, config.physics
     h, dt = config.discretisation.link_length, config.discretisation.timestep
     lengths = link_lengths(config.discretisation)
-    vertices = np.concatenate([[0.0], np.cumsum(lengths)])
-    stiffness = cable.bending_stiffness / h
-    gravity = " ".join(map(str, gravity_of(physics)))
-    spec = mujoco.MjSpec.from_string(f"""
-        <mujoco>
-          <option timestep="{dt}" integrator="discrete" cone="elliptic" impratio="{config.cone_ratio}"
-                  gravity="{gravity}" tolerance="1e-8"/>
-          <worldbody>
-            <geom name="table" type="plane" size="5 5 0.1" contype="1" conaffinity="0" condim="3"/>
-            <composite type="cable" prefix="cable" initial="free" vertex="{" ".join(f"{s:.9g} 0 0" for s in vertices)}">
-              <joint kind="main" stiffness="{stiffness}" damping="{stiffness * cable.damping_time}"/>
-              <geom type="capsule" size="{cable.diameter / 2}" contype="0" conaffinity="1" condim="3" priority="1"
-                    solref="{config.contact_time} 1" solimp="{CONTACT_IMPEDANCE}"/>
-            </composite>
-          </worldbody>
-        </mujoco>""")
-    links = link_bodies(spec)
+    spec = mujoco.MjSpec()
+    spec.option.timestep, spec.option.gravity = dt, gravity_of(physics)
+    spec.option.integrator, spec.option.cone = mujoco.mjtIntegrator.mjINT_DISCRETE, mujoco.mjtCone.mjCONE_ELLIPTIC
+    spec.option.impratio, spec.option.tolerance = config.cone_ratio, 1e-8
+    spec.worldbody.add_geom(
+        name="table", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[5, 5, 0.1], contype=1, conaffinity=0, condim=3
+    )
+    links = add_links(
+        spec, lengths, cable.diameter / 2, dimension=3, contype=0, conaffinity=1, condim=3, priority=1,
+        solref=[config.contact_time, 1.0], solimp=[*CONTACT_IMPEDANCE, 0.5, 2.0],
+    )  # fmt: skip
     for link, mass in zip(links, np.asarray(physics.density) * lengths + physics.extra_mass, strict=True):
         link.geoms[0].mass = mass
     for gripper, (link, offset) in enumerate(((links[0], 0.0), (links[-1], h / 2))):
@@ -140,9 +134,6 @@ def _set_bending(model: mujoco.MjModel, config: PlantConfig) -> None:
         model.jnt_stiffness[joint] = own
         model.dof_damping[first : first + 3] = own * physics.damping_time
         model.qpos_spring[position : position + 4] = shape
-    # MuJoCo's composite has a spring at its root too, which is of no account where a grasp holds the root rigidly
-    if physics.rotation_compliance[0] > 0:
-        model.jnt_stiffness[model.jnt_type == mujoco.mjtJoint.mjJNT_FREE] = 0.0
 
 
 def _set_drag(model: mujoco.MjModel, link: int, coefficient: float) -> None:

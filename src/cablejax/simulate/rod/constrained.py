@@ -13,21 +13,36 @@ instead of three times as many rows (the Schur complement of Goldenthal et al., 
 cloth, 2007, with the geometric stiffness of Tournier et al., Stable constrained dynamics, 2015). A little compliance
 `eps` keeps the system regular where the clamps are further apart than the cable is long.
 
-Derivatives are those of the solution, by the implicit function theorem, in forward mode.
+Newton steps are damped by the natural monotonicity test (Deuflhard, Newton methods for nonlinear problems, 2004,
+chapter 3): a step s is shortened until the correction that would follow it with the same matrices, s2, is shorter than
+s. The test does not depend on units or conditioning; s2 estimates in metres what is still missing, and costs two
+products. A full step is followed by s2 at once, which makes the order of convergence three per factorisation.
+
+Derivatives are those of the solution, by the implicit function theorem, in forward and in reverse mode.
 """
 
 from __future__ import annotations
 
 import dataclasses
 from functools import partial
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-# Up to so many iterations the guess is taken to be near the solution.
-_NEAR = 4
+TOLERANCE = 1e-9
+"""The system is solved once no node is further than this from where the next correction would take it [m]. Edges then
+keep their length within twice this."""
+# Newton's method converges in two or three iterations or not at all; halving a time step is cheaper than more of them.
+_MOST_ITERATIONS = 12
+_SHORTEST_SHARE = 2.0**-6
+# An edge must not turn over in one step: no node moves by more than this part of an edge.
+_LONGEST = 0.7
+# From far away: so many steps without compression first, and at most so many in all.
+_CONVEX = 8
+_MOST_FAR = 600
 
 
 def edges_of(nodes: Float[Array, "n 3"]) -> Float[Array, "e 3"]:
@@ -75,48 +90,100 @@ def with_held(free: Float[Array, "f 3"], held: Float[Array, "4 3"]) -> Float[Arr
     return jnp.concatenate([held[:2], free, held[2:]])
 
 
+class Solution(NamedTuple):
+    """Of the system, or the last iterate where there is none.
+
+    Attributes:
+        free: nodes [m].
+        tension: lambda.
+        error: length of the longest correction of a node that the last iteration made [m]; the solution is found where
+            it is at most `TOLERANCE`. Has no derivative.
+    """
+
+    free: Float[Array, "f 3"]
+    tension: Float[Array, "e"]
+    error: Float[Array, ""]
+
+
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
 def constrained(
-    iterations: int,
+    far: bool,
     chain: ElasticChain,
     force: Float[Array, "f 3"],
     held: Float[Array, "4 3"],
     free: Float[Array, "f 3"],
     tension: Float[Array, "e"],
-) -> tuple[Float[Array, "f 3"], Float[Array, "e"]]:
-    """Newton's method from `free` and `tension`; returns both at the solution.
+) -> Solution:
+    """Solves the system by Newton's method from `free` and `tension`.
+
+    Far from the solution, compression makes the matrix indefinite, and pushes the nodes into a wrong fold; a cable that
+    is pressed together along its length is near such a point. So the first steps leave it out of the matrix. They
+    converge slowly to a minimum of the energy; where Newton's method does not take over, twice as many follow.
 
     Args:
-        iterations: of Newton's method.
+        far: whether the guess may be far from the solution. A time step is rather made again in two halves.
         chain: A0, h and eps.
         force: b.
         held: the first two and the last two nodes [m].
         free: first guess of the free nodes [m]; no derivative passes through it.
         tension: first guess of lambda; no derivative passes through it.
     """
-    stiffness = _matrix(chain)
+    stiffness, most = _matrix(chain), _MOST_FAR if far else _MOST_ITERATIONS
+    # tensions as lengths, in which a step is measured
+    unit = chain.edge / jnp.mean(jnp.diagonal(stiffness))
 
-    def newton(_, state):
-        free, tension = state
-        nodes = with_held(free, held)
-        edges = edges_of(nodes)
-        residual = _balance(chain, nodes, tension, edges) - force
-        violation = 0.5 * (jnp.sum(edges**2, axis=1) - chain.edge**2) - chain.compliance * tension
-        # compression would make the matrix indefinite far from the solution, where it is pushed into a wrong fold
-        held_up = jnp.maximum(tension, 0.0) if iterations > _NEAR else tension
-        step, change = _solve(*_inverses(chain, stiffness, edges, held_up), edges, residual, violation)
-        # far guesses are walked to, not jumped to: an edge must not turn over in one step
-        size = jnp.sqrt(jnp.max(jnp.sum(step**2, axis=1)) + 1e-30)
-        return free + step * jnp.minimum(1.0, 0.7 * chain.edge / size), tension + change
+    def size(step, change):
+        return jnp.sqrt(jnp.sum(step**2) + unit**2 * jnp.sum(change**2)) + 1e-30
 
-    return jax.lax.fori_loop(0, iterations, newton, (free, tension))
+    def newton(at):
+        free, tension, _, count, left, run = at
+        convex = far & (left > 0)
+        edges, residual, violation = _residuals(chain, force, held, free, tension)
+        matrices = _inverses(chain, stiffness, edges, jnp.where(convex, jnp.maximum(tension, 0.0), tension))
+        step, change = _solve(*matrices, edges, residual, violation)
+        whole, longest = size(step, change), _longest(step)
+
+        def trial(share):
+            _, residual, violation = _residuals(chain, force, held, free + share * step, tension + share * change)
+            more = _solve(*matrices, edges, residual, violation)
+            return share, more, size(*more) / whole
+
+        def rises(tried):
+            share, _, ratio = tried
+            return ~(ratio <= 1 - 0.25 * share) & (share > _SHORTEST_SHARE) & (longest > TOLERANCE) & ~convex
+
+        begin = trial(jnp.minimum(1.0, _LONGEST * chain.edge / (longest + 1e-30)))
+        share, more, ratio = jax.lax.while_loop(rises, lambda tried: trial(0.5 * tried[0]), begin)
+        # of a step that is nothing but rounding, the correction is too
+        ended = ~convex & (longest <= TOLERANCE)
+        full = ~convex & (share >= 1.0) & (ratio < 0.5)
+        lower = convex | ended | (ratio <= 1 - 0.25 * share)
+        moved = free + share * step + jnp.where(full, more[0], 0.0)
+        pulled = tension + jnp.where(convex, 1.0, share) * change + jnp.where(full, more[1], 0.0)
+        error = jnp.where(full | ended, jnp.minimum(_longest(more[0]), longest), jnp.inf)
+        return (
+            jnp.where(lower, moved, free),
+            jnp.where(lower, pulled, tension),
+            error,
+            # no share of the step is an improvement: the next iterations would do no better
+            jnp.where(lower | far, count + 1, most),
+            jnp.where(convex, left - 1, jnp.where(lower, 0, run)),
+            jnp.where(lower, run, 2 * run),
+        )
+
+    start = (free, tension, jnp.asarray(jnp.inf, free.dtype), 0, _CONVEX, 2 * _CONVEX)
+    free, tension, error, *_ = jax.lax.while_loop(lambda at: ~(at[2] <= TOLERANCE) & (at[3] < most), newton, start)
+    return Solution(free, tension, error)
 
 
 @constrained.defjvp
-def _constrained_jvp(iterations, primals, tangents):
+def _constrained_jvp(far, primals, tangents):
     chain, _, held, *_ = primals
     d_chain, d_force, d_held, *_ = tangents
-    free, tension = constrained(iterations, *primals)
+    solution = constrained(far, *primals)
+    free = solution.free
+    # where there is no solution there is no derivative; what stands in for it is finite, so that it can be left out
+    tension = jnp.where(solution.error <= TOLERANCE, solution.tension, 0.0)
     nodes, d_nodes = with_held(free, held), with_held(jnp.zeros_like(free), d_held)
     edges, d_edges = edges_of(nodes), edges_of(d_nodes)
     residual = (
@@ -129,7 +196,19 @@ def _constrained_jvp(iterations, primals, tangents):
     )
     violation = jnp.sum(edges * d_edges, axis=1) - chain.edge * d_chain.edge - d_chain.compliance * tension
     step, change = _solve(*_inverses(chain, _matrix(chain), edges, tension), edges, residual, violation)
-    return (free, tension), (step, change)
+    return solution, Solution(step, change, jnp.zeros_like(solution.error))
+
+
+def _longest(step: Float[Array, "f 3"]) -> Float[Array, ""]:
+    return jnp.sqrt(jnp.max(jnp.sum(step**2, axis=1)))
+
+
+def _residuals(chain, force, held, free, tension):
+    """Edges, what the forces lack of balance, and by how much edges are too long."""
+    nodes = with_held(free, held)
+    edges = edges_of(nodes)
+    violation = 0.5 * (jnp.sum(edges**2, axis=1) - chain.edge**2) - chain.compliance * tension
+    return edges, _balance(chain, nodes, tension, edges) - force, violation
 
 
 def _balance(chain, nodes, tension, edges):

@@ -11,13 +11,19 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
-from cablejax.simulate.rod.constrained import ElasticChain, bends_of, constrained, spread_bends, with_held
+from cablejax.simulate.rod.constrained import (
+    TOLERANCE,
+    ElasticChain,
+    bends_of,
+    constrained,
+    spread_bends,
+    with_held,
+)
 from cablejax.simulate.rod.material import joint_frames, transport, turned, twist, twist_matrix, unit
 from cablejax.simulate.rod.physics import RodPhysics
 
-_NEAR = 4
 # Weight of the observed markers when the first shape is drawn through them [1/s^2].
 _PIN = 3e4
 
@@ -158,20 +164,18 @@ class DiscreteRod:
         return offset[:, :1] * (mark @ a) + offset[:, 1:] * (mark @ b)
 
     def through(
-        self, markers: Float[Array, "N 3"], held: Float[Array, "4 3"], guess: Float[Array, "f 3"], iterations: int
-    ) -> Float[Array, "n 3"]:
-        """Nodes of the cable at rest that is drawn to observed markers.
+        self, markers: Float[Array, "N 3"], held: Float[Array, "4 3"], guess: Float[Array, "f 3"]
+    ) -> tuple[Float[Array, "n 3"], Bool[Array, ""]]:
+        """Nodes of the cable at rest that is drawn to observed markers, and whether they were found.
 
         Args:
             markers: where the centreline is to pass [m].
             held: the first two and the last two nodes [m].
             guess: free nodes to start from [m]; no derivative passes through it.
-            iterations: of Newton's method.
         """
         pins, n = _PIN**0.5 * self.weights, self.n
         pinned = ElasticChain(jnp.zeros(n - 4), self.bending, self.h, self.compliance, pins[:, 2:-2])
         at_ends = pins[:, :2] @ held[:2] + pins[:, -2:] @ held[2:]
         pull = pins[:, 2:-2].T @ (_PIN**0.5 * markers - at_ends) + self.physics.gravity
-        near = constrained(iterations, pinned, pull, held, guess, jnp.zeros(n - 3))
-        free, _ = constrained(_NEAR, pinned, pull, held, *jax.lax.stop_gradient(near))
-        return with_held(free, held)
+        free, _, error = constrained(True, pinned, pull, held, *jax.lax.stop_gradient((guess, jnp.zeros(n - 3))))
+        return with_held(free, held), error <= TOLERANCE

@@ -13,39 +13,72 @@ angle phi between two edges, phi (1 - phi^2/24): linear in the nodes. What is st
 is extrapolated to the end of the step to second order. See `constrained` for the solution of a step and its derivative.
 
 BDF2 is of second order, and damps what is slow hardly at all: at 10 ms a vibration of 1 Hz loses 2e-4 of its
-amplitude in a second, one of 5 Hz a tenth.
+amplitude in a second, one of 5 Hz a tenth. A step that is not solved, or whose local error is large, is made again in
+shorter ones (`_march`): a jerk of a clamp needs them, and what follows does not.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import enum
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from equinox.internal import unvmap_any
+from jaxtyping import Array, Bool, Float, Int
 
 from cablejax.simulate.rod.clamps import held_nodes
-from cablejax.simulate.rod.constrained import ElasticChain, bends_of, constrained, spread_bends, with_held
 from cablejax.simulate.rod.discrete import DiscreteRod
-from cablejax.simulate.rod.material import transport, unit
 from cablejax.simulate.rod.physics import RodPhysics
+from cablejax.simulate.rod.time_step import Motion, time_step
 
-# With two iterations a step may end off the solution and blow up, where a cable swings fast at a sharply turned clamp.
-_NEWTON = 3
+_HALVINGS = 5
+_WHOLE = 2**_HALVINGS
+# Every one of the shortest steps, and those that were too long; a step is tried twice as long as soon as it may be.
+_ATTEMPTS = 3 * _WHOLE
 
 
-class _Motion(NamedTuple):
-    """State of a rollout: nodes and velocities of the last two time steps, tensions, directors and tangents."""
+class RodResult(enum.IntEnum):
+    """How a rollout ended.
 
-    nodes: Float[Array, "n 3"]
-    nodes_before: Float[Array, "n 3"]
-    velocity: Float[Array, "n 3"]
-    velocity_before: Float[Array, "n 3"]
-    tension: Float[Array, "e"]
-    directors: Float[Array, "m 3"]
-    tangents: Float[Array, "m 3"]
+    Attributes:
+        SOLVED: every step was solved, with a local error of at most `Rod.local_error`.
+        COARSE: every step was solved; the shortest ones, 1/32, were too long somewhere for that local error.
+        UNSOLVED: a step had no solution, however short. What came before is solved.
+    """
+
+    SOLVED = 0
+    COARSE = 1
+    UNSOLVED = 2
+
+
+class Rollout(NamedTuple):
+    """A simulated motion.
+
+    Attributes:
+        points: free markers [m]. Where no step was solved any more, the last solved ones.
+        result: a `RodResult`.
+        solved: samples up to the first that was not reached.
+        steps: number of time steps that were tried.
+    """
+
+    points: Float[Array, "T N 3"]
+    result: Int[Array, ""]
+    solved: Int[Array, ""]
+    steps: Int[Array, ""]
+
+
+class _Progress(NamedTuple):
+    """Within one time step: what was reached, in parts of it, and the length of the next attempt."""
+
+    motion: Motion
+    done: Int[Array, ""]
+    size: Int[Array, ""]
+    lost: Bool[Array, ""]
+    coarse: Bool[Array, ""]
+    attempts: Int[Array, ""]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -57,11 +90,14 @@ class Rod:
         substeps: time steps between two samples.
         twisting: whether the material frame is followed. Without it rest curvature, twist and offsets across the cable
             have no effect, and a step costs half.
+        local_error: a step whose local error is larger is made again in shorter ones; in lengths of an edge, so that it
+            is 2 mm where 20 edges make 1 m.
     """
 
     n_edges: int = 20
     substeps: int = 1
     twisting: bool = True
+    local_error: float = 0.04
 
     def rollout(
         self,
@@ -70,8 +106,11 @@ class Rod:
         frames: Float[Array | np.ndarray, "T 2 3 3"],
         seen: Float[Array | np.ndarray, "2 N 3"],
         interval: Float[Array, ""] | float,
-    ) -> Float[Array, "T N 3"]:
-        """Free markers at every sample [m]; the first two are fits to `seen`, all others follow from the motion.
+    ) -> Rollout:
+        """Free markers at every sample; the first two are fits to `seen`, all others follow from the motion.
+
+        Differentiable in all arguments, in forward and in reverse mode, where the result is not `UNSOLVED`; the lengths
+        of time steps are chosen without derivative.
 
         Args:
             physics: of this cable.
@@ -80,85 +119,116 @@ class Rod:
             seen: free markers at the first two samples [m].
             interval: between samples [s].
         """
-        dt = interval / self.substeps
         position, frames, seen = jnp.asarray(position), jnp.asarray(frames), jnp.asarray(seen)
         discrete = DiscreteRod.of(jax.tree.map(jnp.asarray, physics), self.n_edges)
         held, side = held_nodes(discrete.physics, position, frames, discrete.h)
-        first_points, state = self._begin(discrete, held, side, seen, interval)
-        chain = ElasticChain(
-            weight=discrete.mass[:, 0],
-            bending=(1.0 + 1.5 / dt * discrete.physics.damping_time) * discrete.bending,
-            edge=discrete.h,
-            compliance=discrete.compliance,
-            pins=jnp.zeros((0, discrete.n - 4)),
-        )
+        first_points, motion, found = self._begin(discrete, held, side, seen, interval)
+        zero = jnp.zeros((), int)
+        start = _Progress(motion, zero, zero + _WHOLE, ~found, jnp.zeros((), bool), zero)
 
-        def sample(state, window):
-            if self.substeps == 1:
-                state = self._step(discrete, chain, dt, state, *(leaf[2] for leaf in window))
-            else:
-                state, _ = jax.lax.scan(
-                    lambda s, i: (
-                        self._step(
-                            discrete, chain, dt, s, *(_between(leaf, (i + 1) / self.substeps) for leaf in window)
-                        ),
-                        None,
-                    ),
-                    state,
-                    jnp.arange(self.substeps),
-                )
-            points = discrete.weights @ state.nodes
+        def sample(progress, window):
+            def step(progress, index):
+                return self._march(discrete, interval, progress, window, index), None
+
+            progress, _ = jax.lax.scan(step, progress, jnp.arange(self.substeps))
+            points = discrete.weights @ progress.motion.nodes
             if self.twisting:
-                points = points + discrete.marker_offsets(state.directors, state.tangents)
-            return state, points
+                points = points + discrete.marker_offsets(progress.motion.directors, progress.motion.tangents)
+            return progress, (points, progress.lost)
 
-        _, points = jax.lax.scan(sample, state, (_windows(held), _windows(side)))
-        return jnp.concatenate([first_points, points])
+        progress, (points, lost) = jax.lax.scan(sample, start, (_windows(held), _windows(side)))
+        result = jnp.where(progress.lost, RodResult.UNSOLVED, jnp.where(progress.coarse, RodResult.COARSE, 0))
+        solved = jnp.where(found, 2 + jnp.sum(~lost), 0)
+        return Rollout(jnp.concatenate([first_points, points]), result, solved, progress.attempts)
 
-    def _begin(self, discrete: DiscreteRod, held, side, seen, interval) -> tuple[Float[Array, "2 N 3"], _Motion]:
-        """The free markers at the first two samples, and the motion from there on."""
+    def _begin(
+        self, discrete: DiscreteRod, held, side, seen, interval
+    ) -> tuple[Float[Array, "2 N 3"], Motion, Bool[Array, ""]]:
+        """The free markers at the first two samples, the motion from there on, and whether that was found."""
         n, h = discrete.n, discrete.h
         nodes_s = (jnp.arange(n) - 0.5) * h
         arclength = discrete.physics.arclength
         guess = jnp.stack([jnp.interp(nodes_s, arclength, seen[0, :, k]) for k in range(3)], axis=1)[2:-2]
-        start = discrete.through(seen[0], held[0], guess, 20)
+        start, found = discrete.through(seen[0], held[0], guess)
         offsets = jnp.zeros_like(seen[0])
         if self.twisting:
             offsets = discrete.marker_offsets(*discrete.first_frames(start, side[0]))
-            start = discrete.through(seen[0] - offsets, held[0], start[2:-2], 8)
-        second = discrete.through(seen[1] - offsets, held[1], start[2:-2], 8)
+            start, again = discrete.through(seen[0] - offsets, held[0], start[2:-2])
+            found &= again
+        second, also = discrete.through(seen[1] - offsets, held[1], start[2:-2])
         velocity = (second - start) / interval
-        frames = discrete.first_frames(second, side[0]) if self.twisting else (jnp.zeros((n - 1, 3)),) * 2
-        dt = interval / self.substeps
-        motion = _Motion(second, second - dt * velocity, velocity, velocity, jnp.zeros(n - 3), *frames)
-        return jnp.stack([discrete.weights @ start + offsets, discrete.weights @ second + offsets]), motion
+        none = jnp.zeros((n - 1, 3))
+        directors, tangents = discrete.first_frames(second, side[0]) if self.twisting else (none, none)
+        dt, slack = interval / self.substeps, jnp.zeros(n - 3)
+        motion = Motion(
+            second,
+            second - dt * velocity,
+            velocity,
+            velocity,
+            slack,
+            slack,
+            directors,
+            tangents,
+            jnp.asarray(dt, second.dtype),
+        )
+        return (
+            jnp.stack([discrete.weights @ start + offsets, discrete.weights @ second + offsets]),
+            motion,
+            found & also,
+        )
 
-    def _step(self, discrete: DiscreteRod, chain: ElasticChain, dt, state: _Motion, ends, side) -> _Motion:
-        """One time step of BDF2, to where the held nodes are at `ends` and the held edges' directors are `side`.
+    def _march(self, discrete: DiscreteRod, interval, progress: _Progress, window, index) -> _Progress:
+        """Makes the time step of this index between two samples, in parts of 1, 1/2, ... 1/32 of it.
 
-        `chain` is that of a step but for the weights, which change with the drag.
+        A part that is not solved, or has too large a local error, is tried again with shorter ones; after one that was
+        easy the next is twice as long.
         """
-        physics, bending, mass = discrete.physics, discrete.bending, discrete.mass
-        x, x_old, v, v_old, tension, u, t = state
-        x_next, v_next = 2 * x - x_old, 2 * v - v_old
-        edges, turning = jnp.diff(x_next, axis=0), jnp.diff(v_next, axis=0)
-        spin = jnp.cross(edges, turning) / discrete.h**2
-        spin = 0.5 * (spin[1:] + spin[:-1])
-        objective = jnp.cross(spin, bends_of(x_next))
-        speed = jnp.sqrt(jnp.sum(v_next**2, axis=1, keepdims=True) + 1e-12)
-        known = (4 * x - x_old) / (2 * dt)
-        damped = (bending * physics.damping_time)[:, None] * (bends_of(known) + objective)
-        inertia = (3 * known / (2 * dt)) + (4 * v - v_old) / (2 * dt) + physics.gravity
-        drag = physics.drag + physics.quadratic_drag * speed[2:-2]
-        force = mass * inertia[2:-2] + drag * known[2:-2] + spread_bends(damped)
-        chain = dataclasses.replace(chain, weight=2.25 / dt**2 * mass[:, 0] + 1.5 / dt * drag[:, 0])
-        if self.twisting:
-            force = force + discrete.forces(x_next, transport(u, t, unit(edges)), unit(edges))
-        free, tension = constrained(_NEWTON, chain, force, ends, x_next[2:-2], tension)
-        new = with_held(free, ends)
-        if self.twisting:
-            u, t = discrete.followed(new, u, t, side)
-        return _Motion(new, x, (3 * new - 4 * x + x_old) / (2 * dt), v, tension, u, t)
+        dt = interval / self.substeps
+
+        def attempt(at: _Progress) -> _Progress:
+            share = (index + (at.done + at.size) / _WHOLE) / self.substeps
+            ends, side = (_between(leaf, share) for leaf in window)
+            new, solved, error = time_step(
+                discrete, at.motion, dt * at.size / _WHOLE, ends, side, twisting=self.twisting
+            )
+            ratio = jax.lax.stop_gradient(error / discrete.h) / self.local_error
+            fine, shortest = solved & (ratio <= 1.0), at.size == 1
+            accepted = (fine | (shortest & solved)) & ~at.lost
+            done = jnp.where(accepted, at.done + at.size, at.done)
+            # the local error falls with the third power of the step
+            halvings = jnp.where(solved, jnp.ceil(jnp.log2(jnp.maximum(ratio, 1.0) + 1e-9) / 3).clip(1, _HALVINGS), 2)
+            longer = fine & (8.0 * ratio < 1.0) & (done % (2 * at.size) == 0) & (at.size < _WHOLE)
+            size = jnp.where(
+                accepted,
+                jnp.where(longer, 2 * at.size, at.size),
+                jnp.maximum(at.size >> halvings.astype(at.size.dtype), 1),
+            )
+            lost = at.lost | (shortest & ~solved)
+            return _Progress(
+                jax.tree.map(lambda a, b: jnp.where(accepted, a, b), new, at.motion),
+                jnp.where(lost, _WHOLE, done),
+                size,
+                lost,
+                at.coarse | (accepted & ~fine),
+                at.attempts + ~at.lost,
+            )
+
+        def needed(at):
+            return at.done < _WHOLE
+
+        def one(at, _):
+            # a batch goes on while one of it has to
+            go = needed(at)
+            new = jax.lax.cond(unvmap_any(go), attempt, lambda at: at, at)
+            return jax.tree.map(lambda a, b: jnp.where(go, a, b), new, at), None
+
+        @jax.checkpoint
+        def more(at):
+            at, _ = jax.lax.scan(one, at, None, length=_ATTEMPTS)
+            return at._replace(lost=at.lost | needed(at))
+
+        at = attempt(progress._replace(done=jnp.zeros_like(progress.done)))
+        return jax.lax.cond(unvmap_any(needed(at)), more, lambda at: at, at)
 
 
 def _windows(leaf: Float[Array, "T *shape"]) -> Float[Array, "T2 4 *shape"]:

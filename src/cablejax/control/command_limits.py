@@ -1,0 +1,84 @@
+"""Limits of a command, independent of the controller that computed it."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+from jaxtyping import Float
+
+from cablejax.limits import check
+
+_SHARES = np.linspace(0.0, 1.0, 201)
+_ROUNDING = 1e-12
+
+
+@dataclasses.dataclass(frozen=True)
+class CommandLimits:
+    """What both grippers may do while a command holds: the last resort, whatever the controller's own bounds are.
+
+    Attributes:
+        speed: of each gripper at most [m/s].
+        turn_rate: of each gripper at most [rad/s].
+        min_distance: of the grippers from each other at least [m].
+        max_distance: of the grippers from each other at most [m]: below the cable's length, or it is pulled taut.
+        workspace: lowest and highest corner (x, y) of where the grippers may be [m]; None = anywhere.
+    """
+
+    speed: float = 0.1
+    turn_rate: float = 1.0
+    min_distance: float = 0.1
+    max_distance: float = 0.995
+    workspace: tuple[tuple[float, float], tuple[float, float]] | None = None
+
+    def __post_init__(self):
+        check(self, "speed", turn_rate="speed", min_distance="not_negative", max_distance="length")
+        if self.min_distance >= self.max_distance:
+            raise ValueError(
+                f"CommandLimits distances {self.min_distance} to {self.max_distance}: expected the first below the "
+                "second [m]."
+            )
+        if self.workspace is not None:
+            corners = np.asarray(self.workspace, float)
+            if corners.shape != (2, 2) or not (corners[0] < corners[1]).all():
+                raise ValueError(
+                    f"CommandLimits.workspace is {self.workspace}, expected ((x, y) of the lowest, (x, y) of the "
+                    "highest corner) [m]."
+                )
+
+    def shortened(
+        self, twist: Float[np.ndarray, "*B Q 3"], pose: Float[np.ndarray, "*B Q 3"], duration: float
+    ) -> Float[np.ndarray, "*B Q 3"]:
+        """The twist, or the largest share of it (in steps of 0.5 %) that stays within all limits while it is held.
+
+        Both grippers' twists are scaled by the same share. Grippers that start outside may move on as long as they do
+        not get farther out.
+
+        Args:
+            twist: [m/s, rad/s], finite.
+            pose: of both grippers when it begins [m, rad].
+            duration: for which it is held at most [s].
+        """
+        twist, pose = np.asarray(twist, float), np.asarray(pose, float)
+        if not self._broken(twist, pose, duration).any():
+            return twist
+        # the grippers pass through the end points of all smaller shares
+        shares = _SHARES.reshape(-1, *[1] * twist.ndim)
+        broken = self._broken(shares * twist, pose, duration)
+        last = np.where(broken.any(axis=0), broken.argmax(axis=0), len(_SHARES)) - 1
+        return _SHARES[np.maximum(last, 0)][..., None, None] * twist
+
+    def _broken(self, twist: np.ndarray, pose: np.ndarray, duration: float) -> np.ndarray:
+        """Which twists end outside of a limit, and farther out than they begin."""
+        start = pose[..., :2]
+        ends = start + duration * twist[..., :2]
+        apart, before = (np.linalg.norm(places[..., 1, :] - places[..., 0, :], axis=-1) for places in (ends, start))
+        broken = (np.linalg.norm(twist[..., :2], axis=-1) > self.speed + _ROUNDING).any(axis=-1)
+        broken |= (np.abs(twist[..., 2]) > self.turn_rate + _ROUNDING).any(axis=-1)
+        broken |= apart > np.maximum(self.max_distance, before) + _ROUNDING
+        broken |= apart < np.minimum(self.min_distance, before) - _ROUNDING
+        if self.workspace is not None:
+            low, high = np.asarray(self.workspace, float)
+            outside = (ends < np.minimum(low, start) - _ROUNDING) | (ends > np.maximum(high, start) + _ROUNDING)
+            broken |= outside.any(axis=(-2, -1))
+        return broken

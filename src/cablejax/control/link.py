@@ -1,0 +1,249 @@
+"""Runs a controller on a cable that sends observations and takes commands: a state machine without a transport.
+
+Simulated plants (`control.loop`), a socket (`robot.server`) and ROS (`robot.ros_node`) all drive this one.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import time
+from collections.abc import Sequence
+from typing import Any, Protocol
+
+import numpy as np
+from jaxtyping import Array, Float
+
+from cablejax.control.link_state import Instant, LinkConfig, LinkState, Reply, Status
+from cablejax.control.run import shape_error_cm
+from cablejax.control.targets import Target
+from cablejax.limits import LIMITS, require
+from cablejax.log_geometry import MOVED, out_of_reach
+from cablejax.simulate.table_plant import Observation
+from cablejax.types import History, Measurement
+
+RESTING_CM = 0.01
+"""Range of the error [cm] over `patience` commands in which nothing more is expected to happen."""
+EARLY = 0.02
+"""By how much an observation may come before a control instant and count as its own, in intervals."""
+DRIFT = 1e-3
+"""Rate at which the two clocks may drift apart; a delay that grows more slowly is not noticed."""
+
+
+class Controller(Protocol):
+    """A controller: an object with two pure functions. `mpc.MPC` is one.
+
+    For `control.batched` it is a pytree with a leaf `target` as well, the keypoints [N, 2] that it steers towards.
+    """
+
+    def init(self, history: History) -> Any:
+        """The state before the first step, a pytree, from the last observations of the cable."""
+        ...
+
+    def step(self, state: Any, measurement: Measurement) -> tuple[Any, Float[Array | np.ndarray, "Q 3"], Any]:
+        """The next state, the twist to hold until then [m/s, rad/s], and a report.
+
+        Of the report the fields `residual_share` and `radius` are recorded, where it has them.
+        """
+        ...
+
+
+_STILL = np.zeros((2, 3))
+
+
+@dataclasses.dataclass(frozen=True)
+class RobotLink:
+    """A controller's side of a robot: observations in, commands out, with a watchdog and limits.
+
+    `init` once, then `step` whenever observations have come, and often enough for the watchdog where none have. Both
+    are pure: the transport owns the state, and `RunLog` collects the replies. Observations may be lost, late, doubled,
+    out of order, not finite or nonsense. Time stamps are the robot's; its clock need not be the link's.
+
+    Attributes:
+        controller: what shapes the cable.
+        target: the wanted shape.
+        config: see `LinkConfig`.
+    """
+
+    controller: Controller
+    target: Target
+    config: LinkConfig = LinkConfig()
+
+    def warm_up(self, observation: Observation | None = None) -> None:
+        """Compiles the controller, half a minute or more, before anything moves.
+
+        Args:
+            observation: like those to come; by default the target itself.
+        """
+        seen = observation or Observation(self.target.keypoints, self.target.gripper_pose, 0.0)
+        self.controller.step(self._initial(seen), Measurement(seen.keypoints, seen.gripper_pose))
+
+    def init(self) -> LinkState:
+        """The state before the first observation."""
+        still = (_STILL, -math.inf, math.inf)
+        return LinkState(Status.WAITING, "", None, None, None, math.inf, -math.inf, -math.inf, still, 0, ())
+
+    def step(self, state: LinkState, now: float, observations: Sequence[Observation] = ()) -> tuple[LinkState, Reply]:
+        """Takes in observations and says what the grippers are to do.
+
+        Args:
+            state: from the last step.
+            now: the link's clock, which only goes forwards [s].
+            observations: that have come since the last step, in the order in which they came.
+
+        Raises:
+            ValueError: the controller refuses its first history; a controller that fails later stops the run.
+        """
+        settled = state.commands == 0
+        state = dataclasses.replace(state, now=now, offset=state.offset + DRIFT * max(now - state.now, 0.0))
+        accepted, refused = [], []
+        for observation in observations:
+            try:
+                state, cleaned = self._take(state, observation)
+                accepted.append(cleaned)
+            except (ValueError, TypeError, OverflowError) as error:
+                refused.append(str(error))
+        state, instant = self._decide(state)
+        twist, since, until = state.command
+        if now - state.offset >= until:
+            twist, since, until = _STILL, until, math.inf
+        reply = Reply(
+            twist,
+            since,
+            until,
+            state.status,
+            state.reason,
+            () if state.status == Status.WAITING else tuple(accepted),
+            tuple(refused),
+            settled,
+            instant,
+        )
+        return state, reply
+
+    def stop(self, state: LinkState, reason: str) -> LinkState:
+        """The state in which the grippers hold for good; an end that has come before stays."""
+        return state if state.status.ended else self._held(state, Status.STOPPED, reason)
+
+    def _held(self, state: LinkState, status: Status, reason: str) -> LinkState:
+        command = (_STILL, state.now - state.offset, math.inf)
+        return dataclasses.replace(state, status=status, reason=reason, command=command)
+
+    def _take(self, state: LinkState, observation: Observation) -> tuple[LinkState, Observation]:
+        """The state with an observation, and the observation as it is logged; raises where it cannot be used at all."""
+        stamp = float(observation.time)
+        require(stamp, "stamp", "The time stamp", "Is it in seconds?")
+        keypoints, pose = np.array(observation.keypoints, float), np.array(observation.gripper_pose, float)
+        shape = self.target.keypoints.shape
+        if keypoints.shape != shape or pose.shape != (2, 3):
+            raise ValueError(
+                f"An observation has keypoints of shape {keypoints.shape} and poses of shape {pose.shape}, expected "
+                f"{shape} as the target and (2, 3)."
+            )
+        offset = state.now - stamp
+        if math.isfinite(state.offset) and state.offset - offset > self.config.watchdog:
+            raise ValueError(
+                f"The time stamp {stamp:.9g} s is {state.offset - offset:.3g} s ahead of the robot's clock."
+            )
+        last = state.newest
+        largest = LIMITS["coordinate"].high
+        if not (np.abs(pose) <= largest).all():
+            pose[:] = np.nan
+        elif last is not None:  # readings of an angle may be wrapped
+            pose[:, 2] += 2 * np.pi * np.round((last.gripper_pose[:, 2] - pose[:, 2]) / (2 * np.pi))
+        length = np.linalg.norm(np.diff(self.target.keypoints, axis=0), axis=1).sum()
+        # an absent pose can only be judged by the last one
+        near = pose if np.isfinite(pose).all() or last is None else last.gripper_pose
+        keypoints[~(np.abs(keypoints) <= largest)] = np.nan
+        keypoints[out_of_reach(keypoints, near[:, :2], length)] = np.nan
+        cleaned = dataclasses.replace(observation, keypoints=keypoints, gripper_pose=pose, time=stamp)
+        unchanged = state.unchanged
+        if unchanged is None or not np.array_equal(keypoints, unchanged.keypoints, equal_nan=True):
+            unchanged = cleaned
+        elif np.linalg.norm((pose - unchanged.gripper_pose)[:, :2], axis=1).max() > MOVED * length:
+            # a tracker that has stopped repeats its last frame
+            cleaned = dataclasses.replace(cleaned, keypoints=np.full_like(keypoints, np.nan))
+        state = dataclasses.replace(state, offset=min(state.offset, offset), unchanged=unchanged)
+        share = np.isfinite(cleaned.keypoints).all(axis=1).mean()
+        newer = last is None or stamp > last.time
+        if newer and share >= self.config.min_seen and np.isfinite(pose).all():
+            state = dataclasses.replace(state, newest=cleaned)
+        return state, cleaned
+
+    def _decide(self, state: LinkState) -> tuple[LinkState, Instant | None]:
+        config, newest = self.config, state.newest
+        if state.status.ended or newest is None:
+            return state, None
+        age = state.now - state.offset - newest.time
+        if age > config.watchdog:
+            if state.commands == 0:  # the first time stamps may have been wrong
+                return dataclasses.replace(self.init(), now=state.now), None
+            if state.status == Status.PAUSED:
+                return state, None
+            return self._held(state, Status.PAUSED, f"No usable observation for {age:.2f} s."), None
+        if state.status in (Status.WAITING, Status.PAUSED):
+            state = dataclasses.replace(
+                self._held(state, Status.RESTING, ""), due=newest.time + config.rest, controller=None
+            )
+        if newest.time < state.due - EARLY * config.interval:
+            return state, None
+        if state.controller is None:  # what happened in a pause is not the model's error
+            state = dataclasses.replace(state, controller=self._initial(newest))
+        return self._command(dataclasses.replace(state, status=Status.SHAPING), newest)
+
+    def _command(self, state: LinkState, seen: Observation) -> tuple[LinkState, Instant]:
+        """A control instant."""
+        config, instant = self.config, Instant(seen)
+        if config.patience is not None:
+            error = float(shape_error_cm(seen.keypoints, self.target.keypoints))
+            state = dataclasses.replace(state, errors=(*state.errors, error)[-config.patience - 1 :])
+            if len(state.errors) > config.patience and np.ptp(state.errors) <= RESTING_CM:
+                return self._held(state, Status.DONE, "The error has come to rest."), instant
+        if state.commands == config.steps:
+            return self._held(state, Status.DONE, f"All {config.steps} commands were given."), instant
+        began = time.perf_counter()
+        try:
+            controller, twist, info = self.controller.step(
+                state.controller, Measurement(seen.keypoints, seen.gripper_pose)
+            )
+            twist = np.asarray(twist, float)  # waits for the result
+            if twist.shape != _STILL.shape or not np.isfinite(twist).all():
+                raise ValueError(f"The controller's command is not finite or not of shape (2, 3): {twist.tolist()}.")
+        except ValueError as error:
+            return self._held(state, Status.STOPPED, str(error)), instant
+        spent = 1e3 * (time.perf_counter() - began)
+        allowed = twist
+        if config.limits is not None:
+            allowed = config.limits.shortened(twist, seen.gripper_pose, config.interval + config.grace)
+        instant = Instant(
+            seen,
+            allowed,
+            float(getattr(info, "residual_share", math.nan)),
+            float(getattr(info, "radius", math.nan)),
+            spent,
+            limited=allowed is not twist,
+        )
+        state = dataclasses.replace(
+            state,
+            controller=controller,
+            due=seen.time + config.interval,
+            command=(allowed, seen.time, seen.time + config.interval + config.grace),
+            commands=state.commands + 1,
+        )
+        return state, instant
+
+    def _initial(self, seen: Observation) -> Any:
+        """The controller's state for a cable at rest, as it is seen now."""
+        history = History(
+            keypoints=np.repeat(_filled(seen.keypoints)[None], self.config.history_length, axis=0),  # pyright: ignore[reportArgumentType]
+            gripper_pose=seen.gripper_pose,  # pyright: ignore[reportArgumentType]
+        )
+        return self.controller.init(history)
+
+
+def _filled(keypoints: np.ndarray) -> np.ndarray:
+    """Keypoints with the ones not observed interpolated along the cable: a history has to start complete."""
+    seen = np.isfinite(keypoints).all(axis=1)
+    if not seen.any():
+        raise ValueError("No keypoint of the cable was observed at the start: check the camera.")
+    index = np.arange(len(keypoints))
+    return np.stack([np.interp(index, index[seen], keypoints[seen, axis]) for axis in range(2)], axis=1)

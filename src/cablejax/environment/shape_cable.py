@@ -1,0 +1,118 @@
+"""The environments: one cable as a `gymnasium.Env`, and many in one compiled call as a `gymnasium.vector.VectorEnv`.
+
+Both observe {"keypoints" [N, 2], "gripper_pose" [2, 3], "target" [N, 2]} in metres and radians, act with twists of both
+grippers [2, 3] in units of the largest ones, and are rewarded with minus the error in lengths of the cable.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium.utils.seeding import np_random
+from gymnasium.vector import AutoresetMode
+from gymnasium.vector.utils import batch_space
+
+from cablejax.environment.cables import Cables, ShapeCableConfig
+
+OBSERVED = ("keypoints", "gripper_pose", "target")
+"""Parts of an observation."""
+
+
+def _spaces(config: ShapeCableConfig) -> tuple[gymnasium.spaces.Dict, gymnasium.spaces.Box]:
+    """What is observed, and the actions."""
+    points, length = config.cable.n_keypoints, config.cable.length
+    turns = 2 * np.pi + config.steps * config.turn_rate * config.interval
+    pose = np.repeat(np.array([[3 * length, 3 * length, turns]], np.float32), 2, axis=0)
+    # a metre of room for camera offsets and noise
+    cable = gymnasium.spaces.Box(-3 * length - 1, 3 * length + 1, (points, 2), np.float32)
+    observed: dict[str, gymnasium.Space[Any]] = dict(
+        zip(OBSERVED, (cable, gymnasium.spaces.Box(-pose, pose), cable), strict=True)
+    )
+    return gymnasium.spaces.Dict(observed), gymnasium.spaces.Box(-1.0, 1.0, (2, 3), np.float32)
+
+
+class ShapeCableEnv(gymnasium.Env):
+    """`cablejax/ShapeCable-v0`: bring a cable on a table to a shape by moving both of its ends.
+
+    `info` has "error" [lengths of the cable] and "target_name". `reset` takes the options "target" and "effects".
+
+    Args:
+        config: see `ShapeCableConfig`.
+        render_mode: None; look at runs with `cablejax.report`.
+    """
+
+    metadata = {"render_modes": []}  # noqa: RUF012, as Gymnasium has it
+    """Gymnasium\'s description of the environment."""
+
+    def __init__(self, config: ShapeCableConfig = ShapeCableConfig(), render_mode: str | None = None):
+        self.config, self.render_mode = config, render_mode
+        self.observation_space, self.action_space = _spaces(config)
+        self.cables = Cables(config, 1)
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None):
+        """A new cable; see `Cables.reset` for the options."""
+        super().reset(seed=seed)
+        self.cables.reset(0, self.np_random, **(options or {}))
+        return self._observation(), self._info()
+
+    def step(self, action):
+        """One action; see `Cables.step`."""
+        rewards, terminated, truncated = self.cables.step(np.asarray(action)[None], [self.np_random], np.array([True]))
+        return self._observation(), float(rewards[0]), bool(terminated[0]), bool(truncated[0]), self._info()
+
+    def _observation(self) -> dict[str, np.ndarray]:
+        return {name: getattr(self.cables, name)[0].copy() for name in OBSERVED}
+
+    def _info(self) -> dict[str, Any]:
+        return {"error": float(self.cables.error[0]), "target_name": self.cables.names[0]}
+
+
+class ShapeCableVectorEnv(gymnasium.vector.VectorEnv):
+    """Many of `ShapeCableEnv` in one compiled call. An environment that has ended is reset by the next step.
+
+    Args:
+        num_envs: cables side by side.
+        config: see `ShapeCableConfig`.
+        render_mode: None.
+    """
+
+    metadata = {"render_modes": [], "autoreset_mode": AutoresetMode.NEXT_STEP}  # noqa: RUF012
+    """Gymnasium\'s description of the environment."""
+
+    def __init__(self, num_envs: int, config: ShapeCableConfig = ShapeCableConfig(), render_mode: str | None = None):
+        self.num_envs, self.config, self.render_mode = num_envs, config, render_mode
+        self.single_observation_space, self.single_action_space = _spaces(config)
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self.action_space = batch_space(self.single_action_space, num_envs)
+        self.cables = Cables(config, num_envs)
+        self._randoms = [np.random.default_rng(row) for row in range(num_envs)]
+        self._ended = np.zeros(num_envs, bool)
+
+    def reset(self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None):
+        """New cables everywhere; environment i has the seed `seed + i`. The options are those of `Cables.reset`."""
+        seeds = [seed + row for row in range(self.num_envs)] if isinstance(seed, int) else seed
+        for row, own in enumerate(seeds or []):
+            if own is not None:
+                self._randoms[row] = np_random(own)[0]
+        for row, random in enumerate(self._randoms):
+            self.cables.reset(row, random, **(options or {}))
+        self._ended[:] = False
+        return self._observation(), self._info()
+
+    def step(self, actions):
+        """One action of each; those that ended before are reset instead, with a reward of 0."""
+        ended = self._ended
+        rewards, terminated, truncated = self.cables.step(actions, self._randoms, ~ended)
+        for row in np.flatnonzero(ended).tolist():
+            self.cables.reset(row, self._randoms[row])
+        terminated, truncated, rewards = terminated & ~ended, truncated & ~ended, np.where(ended, 0.0, rewards)
+        self._ended = terminated | truncated
+        return self._observation(), rewards, terminated, truncated, self._info()
+
+    def _observation(self) -> dict[str, np.ndarray]:
+        return {name: getattr(self.cables, name).copy() for name in OBSERVED}
+
+    def _info(self) -> dict[str, Any]:
+        return {"error": self.cables.error.copy(), "target_name": np.array(self.cables.names)}

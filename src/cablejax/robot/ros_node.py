@@ -1,0 +1,91 @@
+"""A ROS 2 node around a run on a robot; needs rclpy, which comes with ROS and not from PyPI."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from cablejax.robot.session import RobotRun
+from cablejax.simulate.table_plant import Observation
+
+RATE_HZ = 20.0
+"""Rate at which the watchdog looks and the command is published."""
+
+
+def make_node(run: RobotRun, *, name: str = "cablejax", frame: str = "world") -> Any:
+    """A node for `rclpy.spin`, which raises SystemExit when the run has ended; then call `run.finish()`.
+
+    Subscribes to `~/keypoints` (geometry_msgs/PoseArray, the positions of all N in their order, NaN where not
+    observed) and `~/grippers` (geometry_msgs/PoseArray, both poses; the rotation about z is theta). Each message with
+    keypoints is one observation, with its own time stamp and the newest poses, if they are less than one tick older or
+    newer. Publishes `~/gripper_0/twist` and `~/gripper_1/twist` (geometry_msgs/TwistStamped) at 20 Hz, zero when a
+    command has ended, and `~/status` (std_msgs/String).
+
+    Args:
+        run: the run.
+        name: of the node.
+        frame: of all messages; others are refused.
+    """
+    from geometry_msgs.msg import PoseArray, TwistStamped  # pyright: ignore[reportMissingImports]
+    from rclpy.node import Node  # pyright: ignore[reportMissingImports]
+    from std_msgs.msg import String  # pyright: ignore[reportMissingImports]
+
+    class ShapeCable(Node):
+        """See `make_node`."""
+
+        def __init__(self):
+            super().__init__(name)
+            self._waiting: list[Observation] = []
+            self._grippers: tuple[float, np.ndarray] = (-math.inf, np.full((2, 3), np.nan))
+            self._twists = [self.create_publisher(TwistStamped, f"~/gripper_{q}/twist", 1) for q in (0, 1)]
+            self._status = self.create_publisher(String, "~/status", 1)
+            self.create_subscription(PoseArray, "~/keypoints", self.on_keypoints, 10)
+            self.create_subscription(PoseArray, "~/grippers", self.on_grippers, 10)
+            self.create_timer(1.0 / RATE_HZ, self.on_timer)
+
+        def on_grippers(self, message: Any) -> None:
+            if self._in_frame(message):
+                self._grippers = _stamp(message), np.array([_planar(pose) for pose in message.poses])
+
+        def on_keypoints(self, message: Any) -> None:
+            if not self._in_frame(message):
+                return
+            measured, pose = self._grippers
+            if abs(_stamp(message) - measured) > 1.0 / RATE_HZ:
+                pose = np.full((2, 3), np.nan)
+            keypoints = np.array([[pose.position.x, pose.position.y] for pose in message.poses])
+            self._waiting.append(Observation(keypoints, pose, _stamp(message)))
+
+        def _in_frame(self, message: Any) -> bool:
+            if message.header.frame_id != frame:
+                self.get_logger().warning(f"Poses in frame {message.header.frame_id!r}, expected {frame!r}.")
+            return message.header.frame_id == frame
+
+        def on_timer(self) -> None:
+            now = self.get_clock().now()
+            reply = run.exchange(1e-9 * now.nanoseconds, self._waiting)
+            self._waiting = []
+            for publisher, (vx, vy, omega) in zip(self._twists, reply.twist.tolist(), strict=True):
+                message = TwistStamped()
+                message.header.stamp, message.header.frame_id = now.to_msg(), frame
+                message.twist.linear.x, message.twist.linear.y, message.twist.angular.z = vx, vy, omega
+                publisher.publish(message)
+            self._status.publish(String(data=f"{reply.status}: {reply.reason}" if reply.reason else str(reply.status)))
+            for reason in reply.refused:
+                self.get_logger().warning(reason)
+            if reply.status.ended:
+                raise SystemExit
+
+    return ShapeCable()
+
+
+def _stamp(message: Any) -> float:
+    return message.header.stamp.sec + 1e-9 * message.header.stamp.nanosec
+
+
+def _planar(pose: Any) -> tuple[float, float, float]:
+    q = pose.orientation
+    theta = math.atan2(2.0 * (q.w * q.z + q.x * q.y), 1.0 - 2.0 * (q.y**2 + q.z**2))
+    return pose.position.x, pose.position.y, theta

@@ -1,0 +1,72 @@
+"""One run on a robot: the link, its state and its log, whatever carries the messages."""
+
+from __future__ import annotations
+
+import pathlib
+from collections.abc import Sequence
+
+from cablejax.cable import Cable
+from cablejax.control.link import RobotLink
+from cablejax.control.link_state import Reply, Status
+from cablejax.control.run import ClosedLoopRun
+from cablejax.control.run_log import RunLog
+from cablejax.gaplog import GapLogError, write_gap_log
+from cablejax.simulate.table_plant import Observation
+
+
+class RobotRun:
+    """Drives a link and records it; `finish` writes the gap log. The first step waits for the controller to compile.
+
+    Args:
+        link: the controller, its target and settings.
+        cable: as it is believed to be, for the log.
+        path: of the gap log, an `.npz` file that does not exist yet.
+        source: of the log, free text.
+
+    Raises:
+        ValueError: the controller does not fit its target.
+        FileExistsError: there is such a file.
+    """
+
+    def __init__(self, link: RobotLink, cable: Cable, path: pathlib.Path, source: str = "robot"):
+        if path.exists():
+            raise FileExistsError(f"{path} exists: give the log of this run another name.")
+        self.link, self.cable, self.path, self.source = link, cable, path, source
+        self.log = RunLog()
+        link.warm_up()
+        self._state = link.init()
+
+    def exchange(self, now: float, observations: Sequence[Observation] = ()) -> Reply:
+        """One step of the link. Before the first command the log so far is checked, so that it can be written later.
+
+        Args:
+            now: the link's clock [s].
+            observations: that have come since the last call.
+        """
+        first = self._state.commands == 0
+        self._state, reply = self.link.step(self._state, now, observations)
+        self.log.add(reply)
+        if first and reply.status == Status.SHAPING:
+            try:
+                self.log.gap_log(self.link.target, self.cable, self.source)
+            except GapLogError as error:
+                return self.stop(now, f"What was observed so far is no cable between these grippers: {error}")
+        return reply
+
+    def stop(self, now: float, reason: str) -> Reply:
+        """Holds the grippers for good."""
+        self._state = self.link.stop(self._state, reason)
+        return self.exchange(now)
+
+    def finish(self) -> pathlib.Path:
+        """Writes the gap log and returns its path.
+
+        Raises:
+            GapLogError: nothing usable was observed, or the recording violates the format.
+        """
+        return write_gap_log(self.path, self.log.gap_log(self.link.target, self.cable, self.source))
+
+    def result(self) -> ClosedLoopRun:
+        """The run for reports: its error and commands at the control instants. Raises ValueError without any."""
+        ended = self._state.reason if self._state.status == Status.STOPPED else None
+        return self.log.run(self.link.target, ended)

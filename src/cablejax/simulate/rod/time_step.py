@@ -1,0 +1,103 @@
+"""One time step of BDF2 of variable length, solved to a tolerance, with an estimate of its local error."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from cablejax.simulate.rod.constrained import (
+    TOLERANCE,
+    ElasticChain,
+    bends_of,
+    constrained,
+    spread_bends,
+    with_held,
+)
+from cablejax.simulate.rod.discrete import DiscreteRod
+from cablejax.simulate.rod.material import transport, unit
+
+
+class Motion(NamedTuple):
+    """A cable in motion: the last two time steps, of which no more is needed.
+
+    Attributes:
+        nodes, nodes_before: [m].
+        velocity, velocity_before: of the nodes [m/s].
+        tension, tension_before: of the edges.
+        directors, tangents: unit vectors across and along the edges.
+        last: duration of the last step [s].
+    """
+
+    nodes: Float[Array, "n 3"]
+    nodes_before: Float[Array, "n 3"]
+    velocity: Float[Array, "n 3"]
+    velocity_before: Float[Array, "n 3"]
+    tension: Float[Array, "e"]
+    tension_before: Float[Array, "e"]
+    directors: Float[Array, "m 3"]
+    tangents: Float[Array, "m 3"]
+    last: Float[Array, ""]
+
+
+def time_step(
+    discrete: DiscreteRod,
+    state: Motion,
+    dt: Float[Array, ""],
+    ends: Float[Array, "4 3"],
+    side: Float[Array, "2 3"],
+    *,
+    twisting: bool,
+) -> tuple[Motion, Bool[Array, ""], Float[Array, ""]]:
+    """The motion after a step of `dt` [s], whether the step was solved, and its local error [m].
+
+    The difference quotient over steps of unequal length is x' = (a x - known) with a = (1 + 2 w) / (1 + w) / dt and w
+    the ratio of this step to the last one. What is stiff is implicit; damping by turning, quadratic drag, rest
+    curvature and twist are extrapolated from the last two steps.
+
+    Args:
+        discrete: the cable.
+        state: before the step.
+        dt: duration of the step.
+        ends: the held nodes after the step [m].
+        side: the held edges' directors after the step.
+        twisting: whether the material frame is followed.
+    """
+    physics, bending, mass = discrete.physics, discrete.bending, discrete.mass
+    x, x_old, v, v_old, tension, tension_old, u, t, last = state
+    w = dt / last
+    lead, past = (1 + 2 * w) / (1 + w) / dt, w**2 / (1 + w)
+    known = ((1 + w) * x - past * x_old) / dt
+    x_next, v_next = x + w * (x - x_old), v + w * (v - v_old)
+    edges, turning = jnp.diff(x_next, axis=0), jnp.diff(v_next, axis=0)
+    spin = jnp.cross(edges, turning) / discrete.h**2
+    spin = 0.5 * (spin[1:] + spin[:-1])
+    objective = jnp.cross(spin, bends_of(x_next))
+    speed = jnp.sqrt(jnp.sum(v_next**2, axis=1, keepdims=True) + 1e-12)
+    damped = (bending * physics.damping_time)[:, None] * (bends_of(known) + objective)
+    inertia = lead * known + ((1 + w) * v - past * v_old) / dt + physics.gravity
+    drag = physics.drag + physics.quadratic_drag * speed[2:-2]
+    force = mass * inertia[2:-2] + drag * known[2:-2] + spread_bends(damped)
+    if twisting:
+        force = force + discrete.forces(x_next, transport(u, t, unit(edges)), unit(edges))
+    chain = ElasticChain(
+        weight=lead**2 * mass[:, 0] + lead * drag[:, 0],
+        bending=(1.0 + lead * physics.damping_time) * bending,
+        edge=discrete.h,
+        compliance=discrete.compliance,
+        pins=jnp.zeros((0, discrete.n - 4)),
+    )
+    guess = x + dt * v + 0.5 * dt * w * (v - v_old)
+    free, pulled, error = constrained(
+        False, chain, force, ends, *jax.lax.stop_gradient((guess[2:-2], tension + w * (tension - tension_old)))
+    )
+    new = with_held(free, ends)
+    if twisting:
+        u, t = discrete.followed(new, u, t, side)
+    speeds = lead * new - known
+    # of BDF2, by the velocity's distance from its extrapolation
+    off = (1 + w) / (3 * (1 + 2 * w)) * dt * (speeds - v_next)[2:-2]
+    local = jnp.sqrt(jnp.max(jnp.sum(off**2, axis=1)))
+    return Motion(new, x, speeds, v, pulled, tension, u, t, dt), error <= TOLERANCE, local

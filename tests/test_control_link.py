@@ -1,0 +1,282 @@
+"""The link between a controller and a robot: what it commands when messages fail."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+
+from cablejax.cable import Cable
+from cablejax.control.command_limits import CommandLimits
+from cablejax.control.link import RobotLink
+from cablejax.control.link_state import LinkConfig, Status
+from cablejax.control.run_log import RunLog
+from cablejax.control.targets import make_target, straight_start
+from cablejax.gaplog import GapLogError
+from cablejax.simulate.table_plant import Observation
+
+CABLE = Cable()
+TARGET = make_target("U", CABLE)
+START = straight_start(CABLE)
+KEYPOINTS = np.stack([np.linspace(-0.495, 0.495, CABLE.n_keypoints), np.zeros(CABLE.n_keypoints)], axis=1)
+
+
+@dataclasses.dataclass(frozen=True)
+class Inwards:
+    """Brings the grippers together at a constant speed; its state counts its calls."""
+
+    speed: float = 0.01
+    turn: float = 0.0
+
+    def init(self, history):
+        assert np.isfinite(history.keypoints).all()
+        return 0
+
+    def step(self, state, measurement):
+        return state + 1, np.array([[self.speed, 0.0, self.turn], [-self.speed, 0.0, -self.turn]]), None
+
+
+class Harness:
+    """A link on a perfect robot, whose messages a test spoils."""
+
+    def __init__(self, controller=Inwards(), **settings):
+        self.link = RobotLink(controller, TARGET, LinkConfig(**settings))
+        self.state, self.log, self.pose = self.link.init(), RunLog(), START.copy()
+
+    def seen(self, stamp, **changes):
+        # noise, so that no keypoint is frozen
+        keypoints = KEYPOINTS + 1e-4 * np.sin(100 * stamp + np.arange(KEYPOINTS.size)).reshape(KEYPOINTS.shape)
+        return dataclasses.replace(Observation(keypoints, self.pose.copy(), stamp), **changes)
+
+    def step(self, now, *observations):
+        self.state, reply = self.link.step(self.state, now, observations)
+        self.log.add(reply)
+        return reply
+
+    def run(self, until, begin=0.0, period=0.1):
+        """A perfect connection; the last reply."""
+        for k in range(round((until - begin) / period) + 1):
+            now = begin + k * period
+            reply = self.step(now, self.seen(now))
+            self.pose = self.pose + period * reply.twist
+        return reply
+
+
+def test_it_rests_then_commands_at_every_interval():
+    robot = Harness()
+    assert robot.run(0.9).status == Status.RESTING and not robot.log.instants
+    reply = robot.run(3.5, begin=1.0)
+    assert reply.status == Status.SHAPING and (reply.since, reply.until) == pytest.approx((3.0, 4.2))
+    assert [instant.observation.time for instant in robot.log.instants] == pytest.approx([1.0, 2.0, 3.0])
+    [(start, episode)] = robot.log.episodes("test")
+    assert start == 0.0 and len(episode.time) == 36 and episode.hold.sum() == 11
+    assert (episode.gripper_command[:10] == 0).all() and (episode.gripper_command[10:, 0, 0] == 0.01).all()
+
+
+def test_the_watchdog_holds_the_grippers_and_begins_from_rest():
+    robot = Harness()
+    robot.run(2.0)
+    assert robot.step(2.45).twist.any()
+    pause = robot.step(2.6)
+    assert pause.status == Status.PAUSED and not pause.twist.any() and "0.60 s" in pause.reason
+    assert robot.step(3.0).since == pause.since == pytest.approx(2.6, abs=1e-3)
+    assert robot.run(4.0, begin=3.1).status == Status.RESTING
+    assert robot.run(4.5, begin=4.1).status == Status.SHAPING
+    assert robot.state.controller == 1  # it began again
+    [(_, episode)] = robot.log.episodes("test")
+    moving = episode.gripper_command.any(axis=(1, 2))
+    np.testing.assert_array_equal(moving, (episode.time > 0.95) & (episode.time < 2.05) | (episode.time > 4.05))
+    assert [event[1] for event in robot.log.events] == ["resting", "shaping", "paused", "resting", "shaping"]
+
+
+def test_a_command_ends_by_itself_where_the_next_is_not_in_time():
+    robot = Harness(watchdog=5.0)
+    robot.run(1.9)
+    assert robot.step(2.19).twist.any()
+    reply = robot.step(2.21)
+    assert reply.status == Status.SHAPING and not reply.twist.any() and reply.since == pytest.approx(2.2)
+
+
+def test_old_news_do_not_feed_the_watchdog_but_are_logged_in_order():
+    robot = Harness()
+    robot.run(2.0)
+    late = robot.seen(1.85)
+    for now in (2.2, 2.4, 2.6):
+        reply = robot.step(now, late, robot.seen(0.1 * 19))
+    assert reply.status == Status.PAUSED
+    [(_, episode)] = robot.log.episodes("test")
+    assert 1.85 in episode.time and (np.diff(episode.time) > 0).all()
+    assert robot.log.counts["doubled"] == 2 + 3
+
+
+def test_a_slow_connection_is_told_from_a_slow_clock():
+    # the robot's clock runs 0.05 % slow and began a year ago: no pause
+    robot = Harness()
+    for k in range(3000):
+        reply = robot.step(0.1 * k, robot.seen(3e7 + 0.1 * k * 0.9995))
+    assert reply.status == Status.SHAPING and len([e for e in robot.log.events if e[1] == "paused"]) == 0
+    # its messages take longer and longer: a pause
+    robot = Harness()
+    replies = [robot.step(0.1 * k, robot.seen(0.08 * k)) for k in range(40)]
+    assert replies[-1].status == Status.PAUSED
+
+
+@pytest.mark.parametrize(
+    "spoiled",
+    [
+        {"keypoints": np.full_like(KEYPOINTS, np.nan)},
+        {"keypoints": np.full_like(KEYPOINTS, np.inf)},
+        {"keypoints": KEYPOINTS + 50.0},
+        {"keypoints": KEYPOINTS * 1e200},
+        {"gripper_pose": START * np.nan},
+        {"gripper_pose": START + np.array([[np.inf, 0, 0], [0, 0, 0]])},
+        {"keypoints": KEYPOINTS[1:]},
+        {"gripper_pose": START[:1]},
+        {"time": math.nan},
+        {"time": math.inf},
+        {"time": -5.0},
+        {"time": 1.7e18},
+        {"time": 4e3},
+        {"keypoints": "nonsense"},
+        {"time": None},
+    ],
+)
+def test_nonsense_is_no_observation(spoiled, tmp_path):
+    robot = Harness()
+    robot.run(2.0)
+    for k in range(1, 8):
+        reply = robot.step(2.0 + 0.1 * k, robot.seen(2.0 + 0.1 * k, **spoiled))
+    assert reply.status == Status.PAUSED and not reply.twist.any()
+    assert robot.run(4.5, begin=2.8).status == Status.SHAPING
+    log = robot.log.gap_log(TARGET, CABLE, "test")  # valid
+    counts = log.meta["robot_link"]["counts"]
+    assert counts["received"] == 21 + 7 + 18 and sum(log.episode_length) == counts["received"] - counts["refused"]
+
+
+def test_a_tracker_that_stopped_is_blind():
+    robot = Harness(Inwards(speed=0.05))
+    frozen = KEYPOINTS.copy()
+    for k in range(40):
+        reply = robot.step(0.1 * k, robot.seen(0.1 * k, keypoints=frozen))
+        robot.pose = robot.pose + 0.1 * reply.twist
+    assert reply.status == Status.PAUSED and np.abs(robot.pose - START).max() < 0.1
+
+
+def test_a_first_time_stamp_that_is_wrong_costs_half_a_second():
+    robot = Harness()
+    assert robot.step(0.0, robot.seen(9e8)).status == Status.RESTING
+    assert robot.run(1.0, begin=0.1).status == Status.RESTING
+    assert robot.run(2.0, begin=1.1).status == Status.SHAPING
+
+
+def test_wrapped_angles_are_continued():
+    robot = Harness()
+    robot.pose[:, 2] = 3.0
+    robot.run(0.5)
+    robot.pose[:, 2] = 3.2 - 2 * np.pi
+    robot.step(0.6, robot.seen(0.6))
+    np.testing.assert_allclose(robot.state.newest.gripper_pose[:, 2], 3.2)
+
+
+def test_a_missing_pose_is_interpolated_in_the_log():
+    robot = Harness()
+    robot.run(1.5)
+    robot.step(1.6, robot.seen(1.6, gripper_pose=START * np.nan))
+    robot.pose = robot.pose + 0.1 * robot.state.command[0]
+    robot.run(2.0, begin=1.7)
+    [(_, episode)] = robot.log.episodes("test")
+    np.testing.assert_allclose(episode.gripper_pose[16], episode.gripper_pose[[15, 17]].mean(axis=0))
+
+
+class Broken(Inwards):
+    def step(self, state, measurement):
+        if state == 2:
+            raise ValueError("the network is not finite")
+        state, twist, info = super().step(state, measurement)
+        return state, twist * (np.nan if self.turn and state == 2 else 1.0), info
+
+
+@pytest.mark.parametrize(("turn", "reason"), [(0.0, "network"), (0.1, "not finite or not of shape")])
+def test_a_controller_that_fails_stops_the_grippers(turn, reason):
+    robot = Harness(Broken(turn=turn))
+    reply = robot.run(5.0)
+    assert reply.status == Status.STOPPED and not reply.twist.any() and reason in reply.reason
+    assert robot.log.run(TARGET, reply.reason).stopped == reply.reason
+    assert robot.run(7.0, begin=5.1).status == Status.STOPPED
+
+
+def test_a_run_is_done_after_its_commands_or_at_rest():
+    reply = Harness(steps=2).run(5.0)
+    assert reply.status == Status.DONE and "All 2" in reply.reason
+    robot = Harness(Inwards(speed=0.0), patience=2)
+    reply = robot.run(8.0)
+    assert reply.status == Status.DONE and "rest" in reply.reason and len(robot.log.instants) == 3
+
+
+LIMITS = CommandLimits(speed=0.1, turn_rate=0.5, max_distance=1.0, workspace=((-0.6, -0.2), (0.6, 0.2)))
+
+
+@pytest.mark.parametrize(
+    ("twist", "share"),
+    [
+        ([[0.03, 0, 0.1], [-0.03, 0, 0]], 1.0),
+        ([[0.4, 0, 0], [0, 0, 0]], 0.25),
+        ([[0, 0, -2.0], [0, 0, 0]], 0.25),
+        ([[-0.05, 0, 0], [0.05, 0, 0]], 0.04),  # apart: 0.1 m in 1 s, and 4 mm are left
+        ([[0.0, 0.1, 0], [0.0, 0.1, 0]], 1.0),
+        ([[0.1, 0, 0], [0.1, 0, 0]], 1.0),  # 0.595 m
+    ],
+)
+def test_a_command_is_shortened_to_its_limits(twist, share):
+    pose = np.array([[-0.498, 0.05, 0.0], [0.498, 0.05, 0.0]])
+    shortened = LIMITS.shortened(np.array(twist, float), pose, 1.0)
+    np.testing.assert_allclose(shortened, share * np.array(twist), atol=1e-12)
+
+
+def test_from_outside_only_the_way_back_is_open():
+    pose = np.array([[-0.7, 0.0, 0.0], [0.1, 0.0, 0.0]])
+    back, out = np.array([[0.05, 0, 0], [0, 0, 0]]), np.array([[-0.05, 0, 0], [0, 0, 0]])
+    assert LIMITS.shortened(back, pose, 1.0) is back
+    assert not LIMITS.shortened(out, pose, 1.0).any()
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_commands_stay_within_all_limits(seed):
+    rng = np.random.default_rng(seed)
+    for _ in range(200):
+        pose = np.concatenate([rng.uniform(-0.2, 0.2, (2, 2)), rng.uniform(-3, 3, (2, 1))], axis=1)
+        pose[0, 0] -= 0.3
+        pose[1, 0] += 0.3
+        ended = pose + 1.2 * LIMITS.shortened(rng.normal(size=(2, 3)), pose, 1.2)
+        middle = (pose + ended) / 2
+        for at in (middle, ended):
+            assert 0.1 <= np.linalg.norm(at[1, :2] - at[0, :2]) <= 1.0
+            assert (np.abs(at[:, :2]) <= [0.6, 0.2]).all()
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"interval": 0.0},
+        {"watchdog": math.nan},
+        {"min_seen": 2.0},
+        {"steps": 0},
+        {"history_length": 0},
+        {"grace": -1.0},
+    ],
+)
+def test_settings_are_checked(settings):
+    with pytest.raises(ValueError, match=f"LinkConfig.{next(iter(settings))}"):
+        LinkConfig(**settings)
+
+
+def test_limits_are_checked():
+    with pytest.raises(ValueError, match="CommandLimits distances"):
+        CommandLimits(min_distance=1.0, max_distance=0.5)
+    with pytest.raises(ValueError, match="workspace"):
+        CommandLimits(workspace=((1.0, 1.0), (0.0, 0.0)))
+
+
+def test_nothing_recorded_is_no_log():
+    with pytest.raises(GapLogError, match="at least one episode"):
+        RunLog().gap_log(TARGET, CABLE, "test")

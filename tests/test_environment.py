@@ -1,0 +1,166 @@
+"""Gymnasium's environment: its rules, its randomisation, its vector form and a controller as its policy."""
+
+import dataclasses
+import warnings
+
+import numpy as np
+import pytest
+
+# ruff: noqa: E402
+gymnasium = pytest.importorskip("gymnasium", reason="needs Gymnasium: pip install 'cablejax[rl]'")
+
+from gymnasium.utils.env_checker import check_env
+
+from cablejax.cable import Cable, Discretisation
+from cablejax.control.targets import make_target
+from cablejax.dataset.schema import Randomisation
+from cablejax.environment import ENVIRONMENT, LinkPolicy, ShapeCableConfig, ShapeCableEnv, ShapeCableVectorEnv
+from cablejax.mpc import MPC, LevenbergMarquardt, MPCConfig
+from mpc_cases import relaxing_cable
+
+CONFIG = ShapeCableConfig(
+    discretisation=Discretisation(cable=Cable(n_keypoints=7), n_links=8, timestep=0.05),
+    randomisation=Randomisation(stiffness=(0.3, 3.0), friction=(0.5, 2.0)),
+    keypoint_noise=1e-3,
+    steps=4,
+)
+
+
+def clean(**changes):
+    return dataclasses.replace(CONFIG, keypoint_noise=0.0, randomisation=Randomisation(), **changes)
+
+
+def rollout(env, actions, **options):
+    first, _ = env.reset(seed=0, options=options)
+    return np.stack([first["keypoints"], *[env.step(action)[0]["keypoints"] for action in actions]])
+
+
+def random_actions(count, seed=0, envs=()):
+    return np.random.default_rng(seed).uniform(-1, 1, (count, *envs, 2, 3)).astype(np.float32)
+
+
+def test_it_follows_gymnasiums_rules():
+    env = gymnasium.make(ENVIRONMENT, config=CONFIG)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        check_env(env.unwrapped)
+
+
+def test_an_episode_ends_in_time_or_at_the_target():
+    env = ShapeCableEnv(CONFIG)
+    env.reset(seed=1)
+    ends = [env.step(action)[2:4] for action in random_actions(4)]
+    assert ends == [(False, False)] * 3 + [(False, True)]
+    near = ShapeCableEnv(dataclasses.replace(CONFIG, tolerance=0.9))
+    near.reset(seed=1)
+    _, reward, terminated, truncated, info = near.step(np.zeros((2, 3)))
+    assert terminated and not truncated and reward == -info["error"] < 0
+
+
+def test_the_same_seed_is_the_same_episode_and_another_is_not():
+    env = ShapeCableEnv(CONFIG)
+    runs = [rollout(env, random_actions(3)) for _ in range(2)]
+    np.testing.assert_array_equal(*runs)
+    other, _ = env.reset(seed=5)
+    assert np.abs(other["keypoints"] - runs[0][0]).max() > 1e-4
+    names = {env.reset()[1]["target_name"] for _ in range(20)}
+    assert names == {"U", "S", "Z"}
+
+
+def test_effects_targets_and_random_parameters_change_the_episode():
+    actions, env = np.full((4, 2, 3), [[1.0, 0.3, -1.0], [-1.0, 0.3, 1.0]]), ShapeCableEnv(clean())
+    plain = rollout(env, actions, target="S")
+    again = rollout(env, actions, target="S", effects=["bending_stiffness:ratio=0.1", "table_friction:coefficient=0.5"])
+    shift = np.abs(again - plain).max(axis=(1, 2))
+    assert shift[0] == 0.0 and shift[-1] > 1e-3
+    np.testing.assert_array_equal(env.reset(options={"target": "U"})[0]["target"].shape, (7, 2))
+    varied = ShapeCableEnv(dataclasses.replace(clean(), randomisation=Randomisation(stiffness=(0.1, 0.2))))
+    assert np.abs(rollout(varied, actions, target="S") - plain)[-1].max() > 1e-3
+
+
+def test_the_grippers_stay_within_their_limits():
+    env = ShapeCableEnv(clean(steps=30))
+    env.reset(seed=0)
+    for action in np.full((30, 2, 3), [[-1.0, 0.0, 0.0], [1.0, 0.0, 0.0]]):  # apart
+        observation, *_ = env.step(action)
+    distance = np.linalg.norm(np.diff(observation["gripper_pose"][:, :2], axis=0))
+    assert 0.99 <= distance <= 0.995
+    for action in np.full((30, 2, 3), [[1.0, 0.0, np.nan], [-1.0, 0.0, 0.0]]):  # together
+        observation, *_ = env.step(action)
+        assert env.observation_space.contains(observation)
+    assert 0.1 <= np.linalg.norm(np.diff(observation["gripper_pose"][:, :2], axis=0)) <= 0.11
+    observation, *_ = env.step(np.array([[0.0, 0.0, 0.5], [0.0, 0.0, 1e9]]))
+    np.testing.assert_allclose(observation["gripper_pose"][:, 2], [-0.01 + 0.5 / 3, 0.01 + 1 / 3], atol=1e-5)
+
+
+def test_the_vector_form_is_many_of_the_single_one():
+    actions = random_actions(6, envs=(3,))
+    many = gymnasium.make_vec(ENVIRONMENT, 3, vectorization_mode="vector_entry_point", config=CONFIG)
+    seen, _ = many.reset(seed=10)
+    singles = [ShapeCableEnv(CONFIG) for _ in range(3)]
+    first = [env.reset(seed=10 + row)[0] for row, env in enumerate(singles)]
+    np.testing.assert_array_equal(seen["keypoints"], [one["keypoints"] for one in first])
+    for step, action in enumerate(actions):
+        seen, rewards, terminated, truncated, info = many.step(action)
+        assert many.observation_space.contains(seen) and not terminated.any()
+        assert truncated.tolist() == [step == 3] * 3
+        if step == 4:  # they begin again
+            each = [env.reset() for env in singles]
+            np.testing.assert_array_equal(rewards, 0.0)
+        else:
+            each = [env.step(own) for env, own in zip(singles, action, strict=True)]
+            np.testing.assert_allclose(rewards, [one[1] for one in each], atol=1e-5)
+        np.testing.assert_allclose(seen["keypoints"], [one[0]["keypoints"] for one in each], atol=1e-4)
+        assert info["target_name"].tolist() == [one[-1]["target_name"] for one in each]
+
+
+def test_a_cable_that_diverges_ends_its_episode_alone():
+    many = ShapeCableVectorEnv(3, clean())
+    many.reset(seed=0)
+    many.cables._state.qpos[1] = np.nan
+    seen, _, terminated, _, _ = many.step(np.zeros((3, 2, 3)))
+    assert terminated.tolist() == [False, True, False] and many.observation_space.contains(seen)
+    seen, rewards, terminated, _, _ = many.step(np.zeros((3, 2, 3)))
+    assert not terminated.any() and rewards[1] == 0.0
+    seen, rewards, terminated, _, _ = many.step(np.zeros((3, 2, 3)))
+    assert not terminated.any() and rewards[1] < 0.0
+
+
+def test_the_controller_is_a_policy():
+    config = clean(steps=30, targets=("U",))
+    length = config.cable.length
+    env, target = ShapeCableEnv(config), make_target("U", config.cable)
+    solver = LevenbergMarquardt(max_iterations=1, trials_per_linearisation=1)
+    settings = MPCConfig.for_length(length, horizon=1, solver=solver)
+    policy = LinkPolicy(config, lambda goal: MPC(settings, relaxing_cable, 0.8, goal.keypoints), history_length=3)
+    observation, first = env.reset(seed=0)
+    policy.begin(target)
+    errors = [first["error"]]
+    for _ in range(30):
+        observation, _, terminated, _, info = env.step(policy(observation))
+        errors.append(info["error"])
+        if terminated:
+            break
+    assert min(errors) < 0.2 * errors[0]
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"effects": ("no_such_effect:ratio=2",)}, "no_such_effect"),
+        ({"effects": ("actuation_lag:time_s=0.1,delay_s=0.1",)}, "lag"),
+        ({"targets": ()}, "targets is empty"),
+        ({"steps": 0}, "ShapeCableConfig.steps"),
+        ({"speed": np.nan}, "ShapeCableConfig.speed"),
+    ],
+)
+def test_settings_that_cannot_be_are_refused(settings, message):
+    with pytest.raises(ValueError, match=message):
+        dataclasses.replace(CONFIG, **settings)
+
+
+def test_wrong_targets_are_refused():
+    with pytest.raises(ValueError, match=r"expected \(7, 2\) as the cable"):
+        ShapeCableEnv(dataclasses.replace(CONFIG, targets=(make_target("U"),)))
+    with pytest.raises(ValueError, match="no shape 'X'"):
+        ShapeCableEnv(CONFIG).reset(options={"target": "X"})

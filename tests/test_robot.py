@@ -1,0 +1,287 @@
+"""A robot over TCP and over ROS 2: the server in this process, the robot in a thread or a process of its own."""
+
+import dataclasses
+import json
+import pathlib
+import socket
+import sys
+import threading
+import time
+import types
+
+import numpy as np
+import pytest
+
+sys.path.insert(0, str(pathlib.Path(__file__).parents[1] / "benchmarks"))
+
+import robot_soak
+
+from cablejax.control.link import RobotLink
+from cablejax.control.link_state import LinkConfig
+from cablejax.control.targets import straight_start
+from cablejax.gaplog import read_gap_log
+from cablejax.robot import server
+from cablejax.robot.ros_node import make_node
+from cablejax.robot.session import RobotRun
+from test_control_link import CABLE, START, TARGET, Harness, Inwards
+
+
+def run_to(path, **settings):
+    return RobotRun(RobotLink(Inwards(), TARGET, LinkConfig(**settings)), CABLE, path)
+
+
+class Client:
+    """Serves a run in a thread and talks to it."""
+
+    def __init__(self, run, **settings):
+        ports: list[int] = []
+        self.ended: list = []
+        self.thread = threading.Thread(target=self._serve, args=(run, ports, settings))
+        self.thread.start()
+        while not ports and self.thread.is_alive():
+            time.sleep(0.005)
+        self.socket = socket.create_connection(("127.0.0.1", ports[0]), timeout=10)
+        self.lines = self.socket.makefile("rb")
+
+    def _serve(self, run, ports, settings):
+        try:
+            self.ended.append(server.serve(run, port=0, ready=ports.append, **settings))
+        except Exception as error:
+            self.ended.append(error)
+
+    def say(self, *lines: bytes):
+        self.socket.sendall(b"".join(lines))
+
+    def answer(self) -> dict:
+        return json.loads(self.lines.readline())
+
+    def leave(self):
+        self.lines.close()
+        self.socket.close()
+        self.thread.join(timeout=20)
+        return self.ended[0]
+
+
+def now(seconds: float) -> bytes:
+    return json.dumps({"now": seconds}).encode() + b"\n"
+
+
+def test_a_short_soak_over_a_bad_connection(tmp_path):
+    """The soak of `benchmarks/robot_soak.py` for 50 seconds, with grippers that drive to and fro."""
+    soak = robot_soak.Soak(steps=500, links=12, seed=3, outage_every=10.0)
+    tour = robot_soak.Tour((Inwards(0.02, 0.01), Inwards(-0.02, -0.01)), commands=8)
+    record = robot_soak.soak_once(soak, tour, CABLE, tmp_path / "log.npz")
+    assert all(record["sent"][fault] > 0 for fault in ("dropped", "late", "nan", "doubled"))
+    assert record["missed"] == record["outside"] == record["lost_in_log"] == 0
+    assert record["commands"] > 25 and record["logged"] > 400
+    assert record["counts"]["refused"] == record["sent"]["without a time stamp"]
+    robot_soak.draw(record, tmp_path / "soak.png")
+    page = robot_soak.page(soak, record, "a test", "soak.png", "a command")
+    assert "| missed watchdogs | 0 |" in page and (tmp_path / "soak.png").stat().st_size > 1000
+
+
+@dataclasses.dataclass(frozen=True)
+class Sideways(Inwards):
+    """Moves the whole cable to one side."""
+
+    def step(self, state, measurement):
+        return state, np.array([[0.0, self.speed, 0.0]] * 2), None
+
+
+def test_the_referee_of_the_soak_sees_what_goes_wrong(tmp_path, monkeypatch):
+    """A link without a watchdog, limits, or a log of late observations fails the soak."""
+    soak = robot_soak.Soak(steps=250, links=12, seed=3, outage_every=10.0)
+    broken = dataclasses.replace(robot_soak.LINK, watchdog=30.0, grace=30.0, limits=None)
+    add = robot_soak.RobotRun.exchange
+
+    def forgetful(self, at, observations=()):
+        newest = self._state.newest
+        return add(self, at, [o for o in observations if newest is None or o.time > newest.time])
+
+    monkeypatch.setattr(robot_soak.RobotRun, "exchange", forgetful)
+    monkeypatch.setattr(robot_soak, "RobotLink", lambda controller, target, _: RobotLink(controller, target, broken))
+    tour = robot_soak.Tour((Sideways(0.11), Sideways(-0.11)), commands=3)
+    record = robot_soak.soak_once(soak, tour, CABLE, tmp_path / "log.npz")
+    assert record["missed"] > 0 and record["outside"] > 50 and record["lost_in_log"] > 3
+
+
+def test_in_real_time_the_pause_comes_unasked(tmp_path):
+    robot, harness = Client(run_to(tmp_path / "log.npz", rest=0.0)), Harness()
+    for k in range(6):
+        robot.say(server.observation_line(harness.seen(5.0 + 0.05 * k)))
+        reply = robot.answer()
+        time.sleep(0.05)
+    assert reply["status"] == "shaping" and np.abs(reply["twist"]).max() == 0.01
+    began = time.monotonic()
+    while (reply := robot.answer())["status"] == "shaping":
+        pass
+    assert reply["status"] == "paused" and 0.3 < time.monotonic() - began < 1.5
+    assert robot.leave() == tmp_path / "log.npz"
+    assert read_gap_log(tmp_path / "log.npz").episode_length.tolist() == [6]
+
+
+NOISE = [
+    b"nonsense\n",
+    b"[1, 2]\n",
+    b'{"time": 0.5}\n',
+    b'{"time": "now", "keypoints": [], "gripper_pose": []}\n',
+    b'{"time": 0.5, "keypoints": [[0, 0], [1]], "gripper_pose": null}\n',
+    b'{"time": 0.5, "keypoints": {"a": 1}, "gripper_pose": [1' + b"0" * 400 + b"]}\n",
+    b"[" * 5000 + b"\n",
+    b"\xff\xfe\n",
+    b'{"time": 0.5, "keypoints": [[0, 0]], "gripper_pose": [[0, 0, 0], [0, 0, 0]]}\n',
+]
+
+
+@pytest.mark.parametrize("simulated", [True, False])
+def test_messages_that_are_none_are_answered_and_counted(tmp_path, simulated):
+    robot, harness = Client(run_to(tmp_path / "log.npz"), simulated_clock=simulated), Harness()
+    robot.say(server.observation_line(harness.seen(0.0)), now(0.0) if simulated else b"")
+    assert robot.answer()["status"] == "resting"
+    refused = []
+    for line in NOISE:
+        robot.say(line, now(0.1) if simulated else b"")
+        while not (reply := robot.answer())["refused"]:
+            pass
+        refused += reply["refused"]
+    assert len(refused) == len(NOISE)
+    if not simulated:  # a clock of its own is not to be set
+        robot.say(now(1e9))
+        assert "no object with" in robot.answer()["refused"][0]
+    robot.leave()
+    log = read_gap_log(tmp_path / "log.npz")
+    assert log.meta["robot_link"]["counts"]["refused"] == len(NOISE) + (not simulated)
+
+
+def test_half_lines_wait_for_their_end(tmp_path):
+    robot, harness = Client(run_to(tmp_path / "log.npz"), simulated_clock=True), Harness()
+    line = server.observation_line(harness.seen(0.0)) + now(0.0)
+    for byte in range(0, len(line), 100):
+        robot.say(line[byte : byte + 100])
+        time.sleep(0.001)
+    assert robot.answer()["status"] == "resting"
+    assert robot.leave() == tmp_path / "log.npz"
+
+
+def test_a_line_without_end_ends_the_run_and_keeps_the_log(tmp_path, monkeypatch):
+    monkeypatch.setattr(server, "LONGEST_LINE", 10_000)
+    robot, harness = Client(run_to(tmp_path / "log.npz"), simulated_clock=True), Harness()
+    robot.say(server.observation_line(harness.seen(0.0)), now(0.0))
+    robot.answer()
+    robot.say(b"x" * 50_000)
+    assert "longer than 10000 bytes" in str(robot.leave())
+    assert read_gap_log(tmp_path / "log.npz").episode_length.tolist() == [1]
+
+
+def test_grippers_that_point_backwards_are_found_before_anything_moves(tmp_path):
+    run, harness = run_to(tmp_path / "log.npz"), Harness()
+    harness.pose[:, 2] += np.pi
+    for k in range(12):
+        reply = run.exchange(0.1 * k, [harness.seen(0.1 * k)])
+        assert not reply.twist.any()
+    assert reply.status == "stopped" and "tangent" in reply.reason
+    assert run.result().stopped == reply.reason
+
+
+def test_a_log_is_not_overwritten(tmp_path):
+    (tmp_path / "log.npz").write_bytes(b"")
+    with pytest.raises(FileExistsError, match="another name"):
+        run_to(tmp_path / "log.npz")
+
+
+class Message(types.SimpleNamespace):
+    """Of any type: fields come into being when they are read."""
+
+    def __getattr__(self, name):
+        if name.startswith("_"):
+            raise AttributeError(name)
+        setattr(self, name, Message())
+        return getattr(self, name)
+
+
+class Node:
+    """Stands in for `rclpy.node.Node`: topics are lists, and time is set by hand."""
+
+    def __init__(self, name):
+        self.name, self.topics, self.callbacks, self.timers, self.now, self.warnings = name, {}, {}, [], 0.0, []
+
+    def create_publisher(self, kind, topic, depth):
+        return types.SimpleNamespace(publish=self.topics.setdefault(topic, []).append)
+
+    def create_subscription(self, kind, topic, callback, depth):
+        self.callbacks[topic] = callback
+
+    def create_timer(self, period, callback):
+        self.timers.append((period, callback))
+
+    def get_clock(self):
+        stamp = types.SimpleNamespace(nanoseconds=round(1e9 * self.now), to_msg=lambda: self.now)
+        return types.SimpleNamespace(now=lambda: stamp)
+
+    def get_logger(self):
+        return types.SimpleNamespace(warning=self.warnings.append)
+
+
+@pytest.fixture
+def ros(monkeypatch):
+    for name, contents in {
+        "rclpy": {},
+        "rclpy.node": {"Node": Node},
+        "geometry_msgs": {},
+        "geometry_msgs.msg": {"PoseArray": Message, "TwistStamped": Message},
+        "std_msgs": {},
+        "std_msgs.msg": {"String": Message},
+    }.items():
+        module = types.ModuleType(name)
+        vars(module).update(contents)
+        monkeypatch.setitem(sys.modules, name, module)
+
+
+def pose_array(stamp, places, angles=None, frame="world"):
+    header = Message(frame_id=frame, stamp=Message(sec=int(stamp), nanosec=round(1e9 * (stamp % 1))))
+    angles = np.zeros(len(places)) if angles is None else angles
+    poses = [
+        Message(position=Message(x=x, y=y), orientation=Message(w=np.cos(a / 2), x=0.0, y=0.0, z=np.sin(a / 2)))
+        for (x, y), a in zip(places, angles, strict=True)
+    ]
+    return Message(header=header, poses=poses)
+
+
+def test_a_ros_node_drives_the_same_run(tmp_path, ros):
+    run, harness = run_to(tmp_path / "log.npz", steps=2), Harness()
+    node = make_node(run)
+    [(period, timer)] = node.timers
+    assert period == 0.05
+    with pytest.raises(SystemExit):
+        for k in range(200):
+            node.now = 1.7e9 + 0.05 * k
+            if k % 2 == 0:
+                seen = harness.seen(node.now)
+                node.callbacks["~/grippers"](pose_array(node.now, seen.gripper_pose[:, :2], seen.gripper_pose[:, 2]))
+                node.callbacks["~/keypoints"](pose_array(node.now, seen.keypoints))
+            timer()
+            twists = [node.topics[f"~/gripper_{q}/twist"][-1].twist for q in (0, 1)]
+            twist = np.array([[t.linear.x, t.linear.y, t.angular.z] for t in twists])
+            harness.pose = harness.pose + 0.05 * twist
+    statuses = list(dict.fromkeys(message.data for message in node.topics["~/status"]))
+    assert statuses == ["resting", "shaping", "done: All 2 commands were given."] and not node.warnings
+    np.testing.assert_allclose(harness.pose[:, 0] - START[:, 0], [0.02, -0.02], atol=2e-3)
+    log = read_gap_log(run.finish())
+    assert log.episode_length.tolist() == [31] and run.result().stopped is None
+    np.testing.assert_allclose(log.gripper_pose[0, 0], straight_start(CABLE), atol=1e-6)
+
+
+def test_a_ros_node_without_fresh_poses_pauses(tmp_path, ros):
+    run, harness = run_to(tmp_path / "log.npz"), Harness()
+    node = make_node(run)
+    for k in range(60):
+        node.now = 100.0 + 0.05 * k
+        seen = harness.seen(node.now)
+        if k < 30:
+            node.callbacks["~/grippers"](pose_array(node.now, seen.gripper_pose[:, :2], seen.gripper_pose[:, 2]))
+        node.callbacks["~/grippers"](pose_array(node.now, START[:, :2], frame="camera"))
+        node.callbacks["~/keypoints"](pose_array(node.now, seen.keypoints))
+        node.timers[0][1]()
+    assert node.topics["~/status"][-1].data.startswith("paused")
+    assert not node.topics["~/gripper_0/twist"][-1].twist.linear.x
+    assert any("camera" in warning for warning in node.warnings)
