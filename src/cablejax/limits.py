@@ -7,6 +7,7 @@ import math
 import numbers
 from collections.abc import Mapping
 from types import MappingProxyType
+from typing import Any
 
 
 @dataclasses.dataclass(frozen=True)
@@ -132,6 +133,26 @@ def check(settings: object, *names: str, **others: str) -> None:
     """
     for field, limit in {**{name: name for name in names}, **others}.items():
         require(getattr(settings, field), limit, f"{type(settings).__name__}.{field}")
+
+
+def check_workspace(settings: Any) -> None:
+    """Rejects settings whose field `workspace` is neither None nor two corners of a rectangle, the lowest first.
+
+    Raises:
+        ValueError: names the field.
+    """
+    if settings.workspace is None:
+        return
+    try:
+        (left, bottom), (right, top) = settings.workspace
+        ordered = left < right and bottom < top
+    except (TypeError, ValueError):
+        ordered = False
+    if not ordered:
+        raise ValueError(
+            f"{type(settings).__name__}.workspace is {settings.workspace}, expected ((x, y) of the lowest, "
+            "(x, y) of the highest corner) [m]."
+        )
 
 
 def shown(value: object) -> str:

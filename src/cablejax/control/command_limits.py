@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 from jaxtyping import Float
 
-from cablejax.limits import check
+from cablejax.limits import check, check_workspace
 
 _SHARES = np.linspace(0.0, 1.0, 201)
 _ROUNDING = 1e-12
@@ -38,13 +38,7 @@ class CommandLimits:
                 f"CommandLimits distances {self.min_distance} to {self.max_distance}: expected the first below the "
                 "second [m]."
             )
-        if self.workspace is not None:
-            corners = np.asarray(self.workspace, float)
-            if corners.shape != (2, 2) or not (corners[0] < corners[1]).all():
-                raise ValueError(
-                    f"CommandLimits.workspace is {self.workspace}, expected ((x, y) of the lowest, (x, y) of the "
-                    "highest corner) [m]."
-                )
+        check_workspace(self)
 
     def shortened(
         self, twist: Float[np.ndarray, "*B Q 3"], pose: Float[np.ndarray, "*B Q 3"], duration: float

@@ -6,6 +6,7 @@ Simulated plants (`control.loop`), a socket (`robot.server`) and ROS (`robot.ros
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 import time
 from collections.abc import Sequence
@@ -68,6 +69,11 @@ class RobotLink:
     controller: Controller
     target: Target
     config: LinkConfig = LinkConfig()
+
+    @functools.cached_property
+    def _length(self) -> float:
+        """Of the polyline through the target's keypoints, for that of the cable [m]."""
+        return float(np.linalg.norm(np.diff(self.target.keypoints, axis=0), axis=1).sum())
 
     def warm_up(self, observation: Observation | None = None) -> None:
         """Compiles the controller, half a minute or more, before anything moves.
@@ -150,16 +156,15 @@ class RobotLink:
             pose[:] = np.nan
         elif last is not None:  # readings of an angle may be wrapped
             pose[:, 2] += 2 * np.pi * np.round((last.gripper_pose[:, 2] - pose[:, 2]) / (2 * np.pi))
-        length = np.linalg.norm(np.diff(self.target.keypoints, axis=0), axis=1).sum()
         # an absent pose can only be judged by the last one
         near = pose if np.isfinite(pose).all() or last is None else last.gripper_pose
         keypoints[~(np.abs(keypoints) <= largest)] = np.nan
-        keypoints[out_of_reach(keypoints, near[:, :2], length)] = np.nan
+        keypoints[out_of_reach(keypoints, near[:, :2], self._length)] = np.nan
         cleaned = dataclasses.replace(observation, keypoints=keypoints, gripper_pose=pose, time=stamp)
         unchanged = state.unchanged
         if unchanged is None or not np.array_equal(keypoints, unchanged.keypoints, equal_nan=True):
             unchanged = cleaned
-        elif np.linalg.norm((pose - unchanged.gripper_pose)[:, :2], axis=1).max() > MOVED * length:
+        elif np.linalg.norm((pose - unchanged.gripper_pose)[:, :2], axis=1).max() > MOVED * self._length:
             # a tracker that has stopped repeats its last frame
             cleaned = dataclasses.replace(cleaned, keypoints=np.full_like(keypoints, np.nan))
         state = dataclasses.replace(state, offset=min(state.offset, offset), unchanged=unchanged)

@@ -86,7 +86,9 @@ class ClosedLoopRun:
         )
 
 
-def shape_error_cm(keypoints: Float[np.ndarray, "*T N 2"], target: Float[np.ndarray, "N 2"]) -> Float[np.ndarray, "*T"]:
+def shape_error_cm(
+    keypoints: Float[np.ndarray, "*T N 2"], target: Float[np.ndarray, "*#T N 2"]
+) -> Float[np.ndarray, "*T"]:
     """Root mean square distance [cm] of the observed keypoints to the target's; NaN where none was observed."""
     squared = ((np.asarray(keypoints) - target) ** 2).sum(axis=-1)
     seen = np.isfinite(squared)

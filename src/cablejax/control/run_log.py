@@ -5,20 +5,17 @@ from __future__ import annotations
 import bisect
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from cablejax.cable import Cable
+from cablejax.control.link_state import Instant, Reply
 from cablejax.control.run import ClosedLoopRun, shape_error_cm
 from cablejax.control.targets import Target
 from cablejax.gaplog import Episode, gap_log_from_episodes
 from cablejax.limits import LIMITS
+from cablejax.simulate.table_plant import Observation
 from cablejax.types import GapLog
-
-if TYPE_CHECKING:
-    from cablejax.control.link_state import Instant, Reply
-    from cablejax.simulate.table_plant import Observation
 
 
 def motion(target: Target) -> str:

@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float
 
 from cablejax.cable import Cable, Discretisation
 from cablejax.control.command_limits import CommandLimits
+from cablejax.control.run import shape_error_cm
 from cablejax.control.targets import Shape, Target, make_target, straight_start
 from cablejax.dataset.generate import cable_params, draw_parameters
 from cablejax.dataset.schema import DatasetConfig, Randomisation
@@ -62,6 +63,11 @@ class ShapeCableConfig:
     def cable(self) -> Cable:
         """The nominal cable."""
         return self.discretisation.cable
+
+    @functools.cached_property
+    def scale(self) -> Float[np.ndarray, "3"]:
+        """The twist (vx, vy, omega) [m/s, rad/s] that an action of 1 asks for."""
+        return np.array([self.speed * self.cable.length] * 2 + [self.turn_rate])
 
     @functools.cached_property
     def limits(self) -> CommandLimits:
@@ -168,7 +174,8 @@ class Cables:
             whole[row] = leaf
             return whole
 
-        self._state = jax.tree.map(np.array, self._state)
+        # what a simulation returned is read-only: it is copied once, not for every cable that is reset after it
+        self._state = jax.tree.map(lambda leaf: np.require(leaf, requirements="W"), self._state)
         jax.tree.map(put, self._physics, physics)
         jax.tree.map(lambda whole, leaf: put(whole, leaf[0]), self._state, self._start)
         self.target[row], self.names[row] = chosen.keypoints, chosen.name
@@ -197,8 +204,7 @@ class Cables:
             time is up.
         """
         config = self.config
-        scale = np.array([config.speed * config.cable.length] * 2 + [config.turn_rate])
-        twists = scale * np.clip(np.nan_to_num(np.asarray(actions, float), posinf=0.0, neginf=0.0), -1.0, 1.0)
+        twists = config.scale * np.clip(np.nan_to_num(np.asarray(actions, float), posinf=0.0, neginf=0.0), -1.0, 1.0)
         twists = config.limits.shortened(twists, self.gripper_pose, config.interval) * active[:, None, None]
         self._state, shown = self._engine.rollout(self._physics, self._state, twists[:, None], config.interval)
         keypoints, poses = np.asarray(shown.keypoints[:, -1]), np.asarray(shown.gripper_pose[:, -1])
@@ -213,8 +219,7 @@ class Cables:
     def _observe(self, rows: np.ndarray, keypoints: np.ndarray, randoms: Sequence[np.random.Generator]) -> None:
         """Takes in the true keypoints [B, N, 2] of some rows."""
         config = self.config
-        off = np.linalg.norm(keypoints[rows] - self.target[rows], axis=-1)
-        self.error[rows] = np.sqrt(np.mean(off**2, axis=-1)) / config.cable.length
+        self.error[rows] = shape_error_cm(keypoints[rows], self.target[rows]) / (100.0 * config.cable.length)
         self.keypoints[rows] = keypoints[rows]
         if config.keypoint_noise:
             for row in np.flatnonzero(rows).tolist():

@@ -32,7 +32,6 @@ class LinkPolicy:
         self._settings = LinkConfig(
             interval=interval, rest=0.0, history_length=history_length, watchdog=interval, limits=None
         )
-        self._scale = np.array([config.speed * config.cable.length] * 2 + [config.turn_rate])
 
     def begin(self, target: Target) -> None:
         """Begins an episode with this target, the one whose keypoints the environment shows."""
@@ -51,4 +50,4 @@ class LinkPolicy:
         self._steps += 1
         if reply.reason:
             raise ValueError(reply.reason)
-        return np.clip(reply.twist / self._scale, -1.0, 1.0).astype(np.float32)
+        return np.clip(reply.twist / self._config.scale, -1.0, 1.0).astype(np.float32)

@@ -44,7 +44,7 @@ class ShapeCableEnv(gymnasium.Env):
     """
 
     metadata = {"render_modes": []}  # noqa: RUF012, as Gymnasium has it
-    """Gymnasium\'s description of the environment."""
+    """Gymnasium's description of the environment."""
 
     def __init__(self, config: ShapeCableConfig = ShapeCableConfig(), render_mode: str | None = None):
         self.config, self.render_mode = config, render_mode
@@ -79,7 +79,7 @@ class ShapeCableVectorEnv(gymnasium.vector.VectorEnv):
     """
 
     metadata = {"render_modes": [], "autoreset_mode": AutoresetMode.NEXT_STEP}  # noqa: RUF012
-    """Gymnasium\'s description of the environment."""
+    """Gymnasium's description of the environment."""
 
     def __init__(self, num_envs: int, config: ShapeCableConfig = ShapeCableConfig(), render_mode: str | None = None):
         self.num_envs, self.config, self.render_mode = num_envs, config, render_mode

@@ -6,10 +6,8 @@ import dataclasses
 from collections.abc import Hashable
 from typing import Any
 
-import numpy as np
-
 from cablejax.adaptation.belief import AdaptationConfig
-from cablejax.limits import check
+from cablejax.limits import check, check_workspace
 from cablejax.mpc.plan import Solver
 from cablejax.mpc.planners import LevenbergMarquardt
 from cablejax.mpc.problem import ObjectiveConfig
@@ -124,13 +122,7 @@ class MPCConfig:
                 f"MPCConfig distances {self.min_distance} to {self.max_distance}: expected 0 <= min_distance < "
                 "max_distance <= 1, relative to the cable's length."
             )
-        if self.workspace is not None:
-            corners = np.asarray(self.workspace, float)
-            if corners.shape != (2, 2) or not (corners[0] < corners[1]).all():
-                raise ValueError(
-                    f"MPCConfig.workspace is {self.workspace}, expected ((x, y) of the lowest, (x, y) of the highest "
-                    "corner) [m]."
-                )
+        check_workspace(self)
         if self.max_change is not None:
             check(self, max_change="positive")
         if not 0 < self.radius_min <= self.radius <= self.radius_max:

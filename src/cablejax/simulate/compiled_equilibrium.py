@@ -24,12 +24,12 @@ def settle(lengths, pose, guess):
 
     Returns:
         Joint angles [rad], shape [n - 1]; smallest eigenvalue of the energy's second derivative along the constraints
-        [1 / m], for EI = 1; iterations, 0 = not settled in 200; remaining error of the far end.
+        [1 / m], for EI = 1, NaN = not settled; remaining error of the far end.
     """
     h, length, n = lengths[1], lengths.sum(), len(guess)
     angles, off = guess.copy(), np.inf
     beyond, error = np.empty((n, 2)), np.empty(3)
-    for iteration in range(1, _MAX_ITERATIONS + 1):
+    for _ in range(_MAX_ITERATIONS):
         _far_end(lengths, pose, angles, beyond, error)
         off = np.abs(error).max()
         jacobian = np.empty((3, n))
@@ -65,8 +65,8 @@ def settle(lengths, pose, guess):
         largest = np.abs(step).max()
         angles += min(1.0, _MAX_TURN / max(largest, 1e-300)) * step
         if largest < _TOLERANCE and off < 1e-8:
-            return angles, np.linalg.eigh(free)[0][0], iteration, off
-    return angles, np.nan, 0, off
+            return angles, np.linalg.eigh(free)[0][0], off
+    return angles, np.nan, off
 
 
 @numba.njit(cache=True, nogil=True)

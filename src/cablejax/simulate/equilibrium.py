@@ -94,8 +94,8 @@ def find_equilibrium(
         raise ValueError(
             f"A chain of {config.n_links} links has no freedom between two grippers, expected at least {FEWEST_LINKS}."
         )
-    angles, stability, iterations, off = settle(link_lengths(config), pose, np.array(guess, np.float64))
-    if not iterations:
+    angles, stability, off = settle(link_lengths(config), pose, np.array(guess, np.float64))
+    if np.isnan(stability):
         raise ValueError(
             f"No equilibrium found between gripper poses {pose.tolist()}: the remaining error of the far end is "
             f"{off:.2e}. Give a `guess` nearer to the shape, or poses further from taut."
