@@ -11,7 +11,7 @@ import tyro
 from cablejax.commands.options import Command, UsageError, text_table
 from cablejax.solver_names import SolverName
 
-PLANT_EFFECT = "bending_stiffness:ratio=0.1"
+PLANT_EFFECT = "bending_stiffness:ratio=0.2"
 """The gap between model and plant, unless another one is asked for."""
 
 
@@ -52,7 +52,7 @@ class Shape(Command):
 
     plant_effect: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
     """An effect of the plant that the model may not know, as NAME:PARAMETER=VALUE,... in SI units; may be given several
-    times. By default bending_stiffness:ratio=0.1; `none` for no effect. With from_s=... and until_s=... it begins and
+    times. By default bending_stiffness:ratio=0.2; `none` for no effect. With from_s=... and until_s=... it begins and
     ends in the middle of the run."""
 
     perception: Literal["true", "cloud"] = "true"
