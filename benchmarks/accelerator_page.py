@@ -163,9 +163,9 @@ _TABLES: dict[str, tuple[str, str, list[str], Callable[[Record], list[str]]]] = 
     ),
     "data": (
         "Transitions to disk",
-        "The stages of `generate`, which runs them one after the other; trajectories of 200 commands. NumPy draws the "
-        "motions and\nsettles the starts, in one process. Simulation includes the copy to the host. The Zarr store is "
-        "on the local disk.",
+        "The stages of `generate`, which runs them one after the other; trajectories of 200 commands. Motions are "
+        "drawn and starts\nsettled on the processor, in one process. Simulation includes the copy to the host. The "
+        "Zarr store is on the local disk.",
         ["stage", "transitions per second", "seconds for 2 million"],
         lambda r: [r["stage"], _rate(r), _number(_TRANSITIONS / _median(r))],
     ),

@@ -112,9 +112,9 @@ class Train(Command):
             config, training, self.out, validation=concatenate(held_out), initial=initial, overwrite=self.overwrite
         )
         if not result.completed:
+            kept = f"; the checkpoint is in {self.out}" if result.steps else ", and nothing is lost"
             raise KeyboardInterrupt(
-                f"Stopped after step {result.steps} of {config.total_steps}; the checkpoint is in {self.out}. "
-                "Run the same command again to go on."
+                f"Stopped after step {result.steps} of {config.total_steps}{kept}. Run the same command again to go on."
             )
         info = self._info(config, stores, [len(part.gripper_twist) for part in held_out])
         save_weights(self.out / FILE_NAME, result.model, result.weights, info)
