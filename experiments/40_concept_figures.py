@@ -36,8 +36,8 @@ EFFECT = "stiffness_profile:centre_m=0.3,width_m=0.25,ratio=0.3"
 FRICTIONS = {0.1: "#56b4e9", 0.3: "#0072b2", 1.0: "#e69f00", 3.0: "#d55e00"}
 METHODS = {
     "direct": ("as trained", "#d55e00"),
-    "residual": ("with the residual", "#0072b2"),
-    "adapted residual": ("with residual and estimate of the cable", "#009e73"),
+    "learner": ("with the learner", "#0072b2"),
+    "adapted learner": ("with learner and estimate of the cable", "#009e73"),
 }
 
 
