@@ -13,8 +13,8 @@ from cablejax.commands.options import Command, say, text_table
 class Demo(Command):
     """Shape a cable into a U, an S and a Z with the released model, and make a page about it.
 
-    The cable is a fifth as stiff as the one the model was trained on and rubs on the table by another law. Each shape is
-    made with and without the online residual. Writes summary.json, log.npz, report.html and demo.gif, and ends by
+    The cable is a fifth as stiff as the one the model was trained on and rubs on the table by another law. Each shape
+    is made with and without the online residual. Writes summary.json, log.npz, report.html and demo.gif, and ends by
     diagnosing its own run: diagnosis/report.html names what the simulator lacks.
     """
 
