@@ -78,9 +78,9 @@ def recorded_task(seed: int) -> Task:
         try:
             other.reset(pose, guess=rest.position)
             keypoints = other.step(twist, float(_TOWARDS)).true_keypoints
+            target = target_from_keypoints(f"{RECORDED} {seed}", keypoints)
         except (ValueError, PlantError):
-            continue  # pulled taut, or no rest with these effects: another draw
-        target = target_from_keypoints(f"{RECORDED} {seed}", keypoints)
+            continue  # pulled taut, no rest with these effects, or bent too sharply for its keypoints: another draw
         task = straight_task(target.name, target, seed, PLANT_CHAIN)
         return dataclasses.replace(task, reachable_cm=nearest_rest(keypoints))
 
