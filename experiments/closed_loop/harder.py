@@ -77,7 +77,7 @@ def recorded_task(seed: int) -> Task:
         pose = np.array([[*rest.position[0], rest.angle[0]], [*rest.position[-1], rest.angle[-1]]])
         try:
             other.reset(pose, guess=rest.position)
-            keypoints = other.step(twist, float(_TOWARDS)).true_keypoints
+            keypoints = np.asarray(other.step(twist, float(_TOWARDS)).true_keypoints)
             target = target_from_keypoints(f"{RECORDED} {seed}", keypoints)
         except (ValueError, PlantError):
             continue  # pulled taut, no rest with these effects, or bent too sharply for its keypoints: another draw

@@ -124,7 +124,7 @@ def _step(mpc: MPC, state: MPCState, measurement: Measurement) -> tuple[MPCState
         residual_share=jnp.nan_to_num(size_online / jnp.maximum(size_offline + size_online, 1e-12)),
         condition=jnp.ones_like(error) if residual is None else residual.condition,
         unobserved=unobserved,
-        weights=None if state.learner is None else weights_of(config.residual, state.learner),
+        weights=_beliefs(config, state),
         belief=None if estimate is None else estimate.belief,
     )
     state = dataclasses.replace(
@@ -137,6 +137,13 @@ def _step(mpc: MPC, state: MPCState, measurement: Measurement) -> tuple[MPCState
         unobserved=state.unobserved + unobserved,
     )
     return state, twist, info
+
+
+def _beliefs(config: MPCConfig, state: MPCState) -> Float[Array, " K"] | None:
+    """How far each of the learner's candidates is believed; None without a learner."""
+    if config.residual is None or state.learner is None:
+        return None
+    return weights_of(config.residual, state.learner)
 
 
 def _displacement(
