@@ -81,7 +81,7 @@ def test_every_method_has_its_controller(tmp_path):
         if spec.weights is not None:
             controller = controller_of(spec, model, target)
             assert isinstance(controller, MPC)
-            assert (controller.config.residual is not None) == spec.residual
+            assert (controller.config.residual is not None) == (spec.learner is not None)
 
 
 def test_fine_tuning_records_the_cable_at_hand_and_changes_the_weights(tmp_path):
