@@ -133,8 +133,7 @@ def page(experiment: Experiment, trials: Sequence[Trial], command: str, picture:
         mine = [trial for trial in trials if trial.table == table]
         if not mine:
             continue
-        seeds = ", ".join(map(str, sorted({trial.seed for trial in mine})))
-        lines += ["", f"## Table {table}", "", f"Seeds: {seeds}.", ""]
+        lines += ["", f"## Table {table}", "", f"Seeds: {seeds_text({trial.seed for trial in mine})}.", ""]
         if table == LIANG_TABLE:
             lines += [interval_tables.success_table(mine, labels=LABEL)]
             continue
@@ -154,6 +153,13 @@ def page(experiment: Experiment, trials: Sequence[Trial], command: str, picture:
     if picture is not None:
         lines += ["", "## The runs that ended farthest off", "", f"![start, end and target of each]({picture})"]
     return page_of_results(experiment.title, f"`{command}`", lines)
+
+
+def seeds_text(seeds: set[int]) -> str:
+    """All seeds; more than ten in a row by the first and the last."""
+    first, last = min(seeds), max(seeds)
+    whole = len(seeds) > 10 and len(seeds) == last - first + 1
+    return f"{first} to {last}" if whole else ", ".join(map(str, sorted(seeds)))
 
 
 def least_times(experiment: Experiment, shown: set[tuple[str, str, float, int]]) -> str:
