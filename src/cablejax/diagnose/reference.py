@@ -11,13 +11,13 @@ import numpy as np
 from jaxtyping import Float
 
 from cablejax.diagnose.recording import Recording
+from cablejax.residual.learner import PAPER
 from cablejax.residual.ridge import RidgeConfig, apply, fit
 
 HORIZON = 5
 """Steps that the residual is carried on."""
 _STEP = 1.0
 _RIDGE = RidgeConfig()
-_WINDOW = 5
 
 
 @dataclasses.dataclass(frozen=True)
@@ -56,7 +56,7 @@ def predicted_ahead(
         pose = gripper_pose[e, samples]
         twist = np.diff(pose, axis=0) / (stride * float(interval[e]))
         delta = np.diff(error, axis=0)
-        window = _WINDOW
+        window = PAPER.window
         n_starts = len(delta) - window - HORIZON + 1
         if n_starts < 1:
             continue
