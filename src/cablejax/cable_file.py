@@ -5,7 +5,6 @@ The same keys describe the cable in trained weights, so that a cable has one wri
 
 from __future__ import annotations
 
-import difflib
 import os
 from collections.abc import Mapping
 from pathlib import Path
@@ -13,7 +12,7 @@ from typing import Any
 
 from cablejax.cable import Cable
 from cablejax.limits import LIMITS, require, shown
-from cablejax.text_file import read_toml
+from cablejax.text_file import read_toml, unknown_key
 from cablejax.whole_file import whole_file
 
 NUMBERS: Mapping[str, tuple[str, str]] = {
@@ -38,6 +37,7 @@ KEYS: Mapping[str, str] = {
 }
 """Key in the file of every field of `Cable`."""
 
+_UNITS = {**{key: LIMITS[name].unit for key, (name, _) in NUMBERS.items()}, **dict.fromkeys(OTHERS, "m")}
 _OPTIONAL = {"rest_curvature_per_m": 0.0}
 _EXAMPLE = "Write an example with `cablejax cable --out cable.toml`."
 
@@ -105,7 +105,7 @@ def cable_from_fields(fields: Mapping[str, Any], where: str) -> Cable:
     """
     for key in fields:
         if key not in NUMBERS and key not in OTHERS:
-            raise ValueError(f"{where} has {_unknown(key)}")
+            raise ValueError(f"{where} has {unknown_key(key, _UNITS)}")
     values: dict[str, Any] = {}
     for key, (name, what) in NUMBERS.items():
         if key not in fields and key not in _OPTIONAL:
@@ -145,13 +145,3 @@ def _keypoints(fields: Mapping[str, Any], where: str) -> dict[str, Any]:
     if not isinstance(marks, list) or not all(mark in LIMITS["not_negative"] for mark in marks):
         raise ValueError(f"{where}: keypoint_arclength_m is {shown(marks)}, expected a list of numbers [m].")
     return {"n_keypoints": len(marks), "marks": tuple(map(float, marks))}
-
-
-def _unknown(key: str) -> str:
-    """Says that a key is unknown, and which one may be meant."""
-    if bare := [known for known in (*NUMBERS, *OTHERS) if known.startswith(f"{key}_")]:
-        return f"{key} without its unit: write {bare[0]}, in {LIMITS[NUMBERS.get(bare[0], ('length',))[0]].unit}."
-    near = [known for known in NUMBERS if key and key in known]
-    near = near or difflib.get_close_matches(key, (*NUMBERS, *OTHERS), 1, 0.5)
-    known = f"Did you mean {near[0]}?" if near else f"Expected {', '.join((*NUMBERS, *OTHERS))}."
-    return f"the unknown key {shown(key)}. {known}"

@@ -88,6 +88,12 @@ LIMITS: Mapping[str, Limit] = MappingProxyType(
         "duration": Limit(0.0, 1e4, "s"),
         # since 1970 or since a start
         "stamp": Limit(0.0, 1e10, "s"),
+        # bounds of a motion
+        "place": Limit(-1e3, 1e3, "m"),
+        "gripper_speed": Limit(1e-4, 10.0, "m/s"),
+        "turn_rate": Limit(1e-3, 100.0, "rad/s"),
+        "bend_radius": Limit(1e-4, 10.0, "m"),
+        "motion_duration": Limit(5.0, 300.0, "s"),
         # a target
         "target_angle": Limit(-4 * math.pi, 4 * math.pi, "rad"),
         "target_distance": Limit(0.0, 10.0, "lengths of the cable"),

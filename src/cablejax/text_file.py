@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import json
 import os
 import pathlib
@@ -9,7 +10,7 @@ import tomllib
 from collections.abc import Mapping
 from typing import Any
 
-from cablejax.limits import require
+from cablejax.limits import require, shown
 from cablejax.whole_file import whole_file
 
 
@@ -96,3 +97,18 @@ def read_toml(path: str | os.PathLike[str]) -> dict[str, Any]:
         return tomllib.loads(text)
     except (ValueError, RecursionError) as error:  # numbers of too many digits are plain ValueErrors
         raise ValueError(f"{path} is no TOML: {error}") from error
+
+
+def unknown_key(key: str, units: Mapping[str, str]) -> str:
+    """Says that a file has a key that is unknown, and which one may be meant, to be put after "the file has".
+
+    Args:
+        key: that is unknown.
+        units: of every key that is known; keys of quantities end in their unit.
+    """
+    if bare := [known for known in units if known.startswith(f"{key}_")]:
+        return f"{key} without its unit: write {bare[0]}, in {units[bare[0]]}."
+    near = [known for known in units if key and key in known]
+    near = near or difflib.get_close_matches(key, units, 1, 0.5)
+    known = f"Did you mean {near[0]}?" if near else f"Expected {', '.join(units)}."
+    return f"the unknown key {shown(key)}. {known}"

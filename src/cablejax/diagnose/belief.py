@@ -31,6 +31,8 @@ from cablejax.diagnose.repeats import episodes_by_motion
 
 LEAST_SQUARES = 1e12
 """Degrees of freedom with which Student's distribution is a normal one."""
+# Each costs simulations of every motion that is considered.
+_MOST_IN_DOUBT = 5
 
 
 @dataclasses.dataclass(frozen=True)
@@ -151,6 +153,36 @@ def probabilities(scores: Float[np.ndarray, "F"]) -> Float[np.ndarray, "F"]:
     """Normalised exponentials."""
     weights = np.exp(scores - scores.max())
     return weights / weights.sum()
+
+
+def in_doubt(
+    fits: Sequence[Fit], scores: Float[np.ndarray, "F"], evidence: Evidence, calibration: Calibration
+) -> tuple[list[Fit], Float[np.ndarray, "K"]]:
+    """Explanations that a verdict leaves open, and their probabilities, sum 1.
+
+    Those whose odds against the best are not small. One with another effect in the place of one of the best's that
+    merely leaves as little counts as if its odds were the smallest of these: a likelihood is that sure only if every
+    law is exact.
+
+    Args:
+        fits: of different sets of effects, best first.
+        scores: their log posterior.
+        evidence: that was fitted.
+        calibration: of the judgement.
+    """
+    best, names = fits[0], set(effect_names(fits[0].explanation))
+    kept, odds = [], []
+    for fit, score in zip(fits, scores, strict=True):
+        own, chance = set(effect_names(fit.explanation)), float(np.exp(score - scores[0]))
+        in_place = len(own) == len(names) and len(own & names) >= len(names) - 1
+        if chance < calibration.set_odds and in_place and as_good(fit, best, evidence, calibration):
+            chance = calibration.set_odds
+        if chance >= calibration.set_odds:
+            kept.append(fit)
+            odds.append(chance)
+    order = np.argsort(-np.array(odds), kind="stable")[:_MOST_IN_DOUBT]
+    chances = np.array(odds)[order]
+    return [kept[i] for i in order], chances / chances.sum()
 
 
 def effect_names(explanation: Explanation) -> tuple[str, ...]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -14,6 +15,9 @@ if TYPE_CHECKING:
 
 Verdict = Literal["none", "named", "ambiguous", "named+unknown", "unknown"]
 """No gap; one cause; one of several; a part of the gap; no cause in the library."""
+
+SEPARABLE = 0.1
+"""A motion that is expected to remove less than this share of the doubt does not separate its explanations."""
 
 PLACES = ("along_cable_m", "time_s", "table_m")
 """Place of an effect, by the keys of the verdict."""
@@ -111,20 +115,49 @@ class Gap:
 
 @dataclasses.dataclass(frozen=True)
 class NextMotion:
-    """The motion that would best separate indistinguishable effects, or sharpen the named one.
+    """The motion that is expected to tell most about which explanation holds, or to sharpen the only one.
 
     Attributes:
-        motion: its name, from `cablejax.diagnose.next_motion`.
-        separates: the two explanations that it is meant to separate; empty if it sharpens a single one.
-        separation: root mean square difference between their predictions on that motion, in noise units, after each was
-            fitted to this log.
-        alternatives: the same number for every motion of the library.
+        motion: "designed", or its name among `cablejax.diagnose.safe_motions`.
+        separates: the explanations that the log leaves open, most probable first; empty if there is one only.
+        information: lower bound of what its recording is expected to tell about which of them holds [nats]; of a single
+            one, about its parameters.
+        doubt: entropy of their probabilities, which no motion can exceed [nats]; 0 for a single one.
+        alternatives: the information of every motion of the library that keeps all bounds, and of the designed one.
+        poses: of the grippers (x, y, theta) [m, rad], shape [T, 2, 3].
+        interval: between two of them [s].
+        shapes: keypoints as each explanation predicts them for that motion [m], shape [T, N, 2] each.
+        ended: of the design's search: "clear" (next to no doubt would be left), "settled" (no better motion came) or
+            "budget" (of simulations); None where nothing was designed.
     """
 
     motion: str
-    separates: tuple[str, str] | tuple[()]
-    separation: float
+    separates: tuple[str, ...]
+    information: float
+    doubt: float
     alternatives: dict[str, float]
+    poses: Float[np.ndarray, "T 2 3"]
+    interval: float
+    shapes: dict[str, Float[np.ndarray, "T N 2"]]
+    ended: str | None = None
+
+    @property
+    def designed(self) -> tuple[Float[np.ndarray, "T 2 3"], float] | None:
+        """Poses and interval of the motion where it was designed."""
+        return None if self.ended is None else (self.poses, self.interval)
+
+    @property
+    def certainty(self) -> float | None:
+        """Probability that the right explanation is expected to have after the recording, as a geometric mean.
+
+        None where there is one explanation only.
+        """
+        return math.exp(min(self.information - self.doubt, 0.0)) if self.separates else None
+
+    @property
+    def inseparable(self) -> bool:
+        """Whether no motion that was tried tells more than a small share of the doubt."""
+        return bool(self.separates) and self.information < SEPARABLE * self.doubt
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -20,6 +20,7 @@ Parameters are few and coordinates many, so every quantity comes from inner prod
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 
 import numpy as np
@@ -97,7 +98,7 @@ class _Products:
         rows = [means - means[:1], *spreads]
         ends = np.cumsum([len(row) for row in rows])
         every = np.concatenate(rows)
-        blocks = [slice(int(a), int(b)) for a, b in zip(ends[:-1], ends[1:], strict=True)]
+        blocks = [slice(int(a), int(b)) for a, b in itertools.pairwise(ends)]
         return cls(every @ every.T, len(means), blocks)
 
     def _difference(self, i: int, j: int) -> tuple[float, np.ndarray]:

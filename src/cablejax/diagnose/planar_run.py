@@ -17,7 +17,10 @@ from cablejax.diagnose.diagnosis import CableDiagnosis, Gap
 from cablejax.diagnose.evidence import Evidence
 from cablejax.diagnose.fit import evaluate
 from cablejax.diagnose.gap import held_out_predictions, measure_gap
-from cablejax.diagnose.next_motion import next_motion
+from cablejax.diagnose.motion_bounds import Bounds, BoundsError
+from cablejax.diagnose.motion_design import DesignConfig
+from cablejax.diagnose.motion_judge import Judge, Objective
+from cablejax.diagnose.next_motion import next_motion, require_some_motion
 from cablejax.diagnose.noise import SMALLEST
 from cablejax.diagnose.protocol import explanation
 from cablejax.diagnose.reference import ahead_of_observations
@@ -37,6 +40,8 @@ def diagnose(
     effects: Sequence[CableEffect] = LIBRARY,
     commissioning: Sequence[GapLog] = (),
     calibration: Calibration = Calibration(),
+    bounds: Bounds | None = None,
+    objective: Objective = "explanations",
     budget: float = math.inf,
     progress: Callable[[str], None] = _silent,
 ) -> CableDiagnosis:
@@ -47,33 +52,43 @@ def diagnose(
         effects: what to look for; `LIBRARY` and effects of your own.
         commissioning: logs known to have no effect: how far the simulator is off without any.
         calibration: constants of the judgement.
+        bounds: for a next motion that is designed; None = the best of the safe motions within the default bounds.
+        objective: what the next motion is to give information about.
         budget: seconds after which no larger set of effects is tried; what was fitted until then counts.
         progress: called with a line of text now and then.
 
     Raises:
         DiagnosisError: the log cannot be diagnosed; the message says why and what to do.
+        BoundsError: no motion of the cable keeps all bounds; says how many each bound excludes.
     """
     begin = time.perf_counter()
     if commissioning:
         calibration = dataclasses.replace(calibration, baseline=baseline_error(commissioning))
     case = Case.of(log, effects)
+    if bounds is not None:
+        require_some_motion(case.simulator.playback, case.noise.std, bounds)
     evidence = case.evidence(calibration)
     found, conclusion = explain(evidence, calibration, deadline=begin + budget, progress=progress)
     conclusion = with_arms(conclusion, case.arms, calibration)
 
     progress("fitting without each episode in turn")
     gap, reference, after = _measured(case, evidence, conclusion)
-    progress("looking for the next motion")
-    rivals = [fit.explanation for fit in found.fits if fit.explanation.terms][:2]
-    following = None
-    if conclusion.verdict != "none" and rivals:
-        following = next_motion(case.simulator.playback, rivals, case.noise.std)
+    following, none_kept = None, ()
+    if conclusion.verdict != "none":
+        progress("looking for the next motion" if bounds is None else "designing the next motion")
+        judge = Judge.of(
+            case.simulator.playback, found.fits, found.scores, evidence, calibration, bounds or Bounds(), objective
+        )
+        try:
+            following = next_motion(judge, None if bounds is None else DesignConfig())
+        except BoundsError as error:
+            none_kept = (f"There is no motion to record next under the explanations found. {error}",)
     repaired = case.recording.as_log(log.meta)
     return CableDiagnosis(
         **Examined(evidence, found, conclusion, reference, after, gap).fields(),
         where=localise(repaired, case.to_log(reference), case.noise.std),
         next_motion=following,
-        caveats=_caveats(case, calibration, commissioned=bool(commissioning)),
+        caveats=(*_caveats(case, calibration, commissioned=bool(commissioning)), *none_kept),
         log=repaired,
         nominal=case.to_log(reference),
         explained=None if conclusion.verdict == "none" else case.to_log(after),

@@ -7,25 +7,60 @@ distance keeps to its limits on the whole way.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Float
 from scipy.special import j0
 
 from cablejax.cable import Discretisation
+from cablejax.diagnose.motion_bounds import FARTHEST, NEAREST, Bounds
 from cablejax.simulate.motions import MotionConfig, admissible
 from cablejax.simulate.pose import wrapped
 
 INTERVAL = 0.1
 """Between two samples of a motion [s]."""
-LIMITS = MotionConfig(straight_slack=0.005, min_distance=0.15, max_step=0.05, rotation_weight=0.15)
-"""Bounds on the grippers: distance 0.15 to 0.995 of the length, 0.05 m/s with 0.15 m/rad."""
 _SLOW = 0.3
 _HOLD = 3.0
 _FAR, _NEAR, _OVERLOAD = 0.93, 0.6, 0.3
 _SHIFT = 0.2
 _SEGMENT_SAMPLES = 200
+# Of the largest speed: what is added up over the samples of a leg is exact only to rounding.
+_FULL = 1 - 1e-9
+
+
+@dataclasses.dataclass(frozen=True)
+class Way:
+    """A motion of both grippers by where it goes, in coordinates of the line between them.
+
+    Attributes:
+        places: middle (x, y) of the line [m], its heading [rad], its length [m], and the angle of either gripper to it
+            [rad]; the start comes first.
+        shares: of the largest speed, at which each leg is made.
+        holds: rest at each place [s].
+    """
+
+    places: Float[np.ndarray, "W 6"]
+    shares: Float[np.ndarray, "L"]
+    holds: Float[np.ndarray, "W"]
+
+    def played(self, n_samples: int, bounds: Bounds = Bounds(), *, rest: float = 0.0) -> Float[np.ndarray, "T 2 3"]:
+        """Poses (x, y, theta) every 0.1 s; each leg is as slow as its fastest gripper demands.
+
+        Args:
+            n_samples: of the motion. What is left of it after the last place is rest; what does not fit is cut off.
+            bounds: with the largest speed and turn rate, which together count as one: half of both may be used at once.
+            rest: at least so long the grippers stay where they are at the end [s].
+        """
+        times, vectors = [0.0, self.holds[0]], [self.places[0]] * 2
+        for target, share, hold in zip(self.places[1:], self.shares, self.holds[1:], strict=True):
+            way = vectors[-1] + np.linspace(0.0, 1.0, _SEGMENT_SAMPLES)[:, None] * (target - vectors[-1])
+            steps = np.diff(_poses(way), axis=0) / [bounds.speed, bounds.speed, bounds.turn_rate]
+            size = np.linalg.norm(steps, axis=-1).max()
+            arrival = times[-1] + size * (_SEGMENT_SAMPLES - 1) / (_FULL * share)
+            times += [arrival, arrival + hold]
+            vectors += [target, target]
+        grid = np.minimum(INTERVAL * np.arange(n_samples), INTERVAL * (n_samples - 1) - rest)
+        return _poses(np.stack([np.interp(grid, times, column) for column in np.array(vectors).T], axis=1))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -63,7 +98,7 @@ def starting_pose(gripper_pose: Float[np.ndarray, "E T 2 3"]) -> Float[np.ndarra
 
 
 def safe_motions(
-    config: Discretisation, first: Float[np.ndarray, "2 3"], n_samples: int = 300
+    config: Discretisation, first: Float[np.ndarray, "2 3"], n_samples: int = 300, bounds: Bounds = Bounds()
 ) -> dict[str, Float[np.ndarray, "T 2 3"]]:
     """Motions by name, as gripper poses (x, y, theta) every 0.1 s; the last pose is held to the end.
 
@@ -82,6 +117,23 @@ def safe_motions(
         first: gripper poses to start from; moved apart or together where they are beyond the limits.
         n_samples: of each motion. It is cut off there, which loses no more than a last hold from 300 samples on for a
             cable of 1 m.
+        bounds: on the grippers' speed and distance; the others are not looked at.
+
+    Raises:
+        ValueError: `first` is not two planar poses.
+    """
+    motions = {name: way.played(n_samples, bounds) for name, way in safe_ways(config, first, bounds).items()}
+    limits = MotionConfig(straight_slack=1 - FARTHEST, min_distance=NEAREST)
+    return {name: poses for name, poses in motions.items() if all(admissible(config, limits, p) for p in poses[::5])}
+
+
+def safe_ways(config: Discretisation, first: Float[np.ndarray, "2 3"], bounds: Bounds = Bounds()) -> dict[str, Way]:
+    """The ways of `safe_motions`, also of those that this cable would not bear.
+
+    Args:
+        config: the cable.
+        first: gripper poses to start from; moved apart or together where they are beyond the limits.
+        bounds: on the grippers' distance; the others are not looked at.
 
     Raises:
         ValueError: `first` is not two planar poses.
@@ -91,7 +143,7 @@ def safe_motions(
         raise ValueError(f"first has shape {first.shape}, expected two finite poses (x, y, theta).")
     length = config.cable.length
     given = _Pair.of(first)
-    low, high = LIMITS.min_distance, 1.0 - LIMITS.straight_slack
+    low, high = (distance / length for distance in bounds.distances(length))
     start = dataclasses.replace(given, distance=float(np.clip(given.distance, low * length, high * length)))
     side = -1.0 if given.angles[0] < given.angles[1] else 1.0
 
@@ -129,8 +181,14 @@ def safe_motions(
             (at(_NEAR, shift=_SHIFT), 1.0, _HOLD),
         ],
     }
-    motions = {name: _played(plan, n_samples) for name, plan in plans.items()}
-    return {name: poses for name, poses in motions.items() if all(admissible(config, LIMITS, p) for p in poses[::5])}
+    return {
+        name: Way(
+            places=np.stack([pair.vector for pair, _, _ in plan]),
+            shares=np.array([share for _, share, _ in plan[1:]]),
+            holds=np.array([hold for _, _, hold in plan]),
+        )
+        for name, plan in plans.items()
+    }
 
 
 def _free_angle(ratio: float) -> float:
@@ -140,20 +198,6 @@ def _free_angle(ratio: float) -> float:
     """
     angles = np.linspace(2.4, 0.0, 481)
     return float(np.interp(ratio, j0(angles), angles))
-
-
-def _played(plan: Sequence[tuple[_Pair, float, float]], n_samples: int) -> Float[np.ndarray, "T 2 3"]:
-    """Poses along the plan; each stretch is as slow as its fastest gripper demands."""
-    times, vectors = [0.0, plan[0][2]], [plan[0][0].vector] * 2
-    for target, share, hold in plan[1:]:
-        way = vectors[-1] + np.linspace(0.0, 1.0, _SEGMENT_SAMPLES)[:, None] * (target.vector - vectors[-1])
-        steps = np.diff(_poses(way), axis=0)
-        size = np.linalg.norm(steps * [1.0, 1.0, LIMITS.rotation_weight], axis=-1).max()
-        arrival = times[-1] + size * (_SEGMENT_SAMPLES - 1) / (share * LIMITS.max_step)
-        times += [arrival, arrival + hold]
-        vectors += [target.vector, target.vector]
-    grid = INTERVAL * np.arange(n_samples)
-    return _poses(np.stack([np.interp(grid, times, column) for column in np.array(vectors).T], axis=1))
 
 
 def _poses(vectors: Float[np.ndarray, "T 6"]) -> Float[np.ndarray, "T 2 3"]:

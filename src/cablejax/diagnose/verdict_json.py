@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from cablejax.diagnose.diagnosis import PLACES, Diagnosis, Gap, NamedEffect, Ranked
+from cablejax.diagnose.diagnosis import PLACES, Diagnosis, Gap, NamedEffect, NextMotion, Ranked
 from cablejax.effects.given import VERDICT_SCHEMA
 from cablejax.whole_file import whole_file
 
@@ -26,7 +26,9 @@ def verdict_json(diagnosis: Diagnosis) -> dict[str, Any]:
     explanation all the same. `ci90` is null for a choice, such as a gripper, and a list where the value is one. All
     `_mm` are null where observations are not in metres; `gap` has the sizes in their own unit too.
 
-    In addition to the fields of the format it has `sentence`, `baselines`, `leftover_p`, `caveats` and `seconds`; `gap`
+    In addition to the fields of the format it has `sentence`, `baselines`, `leftover_p`, `caveats`, `seconds` and
+    `next_motion_worth`: fields of `NextMotion`, those in nats with `_nats`, and whether no motion that was tried
+    separates the explanations. `next_motion` is recommended only where that is false. `gap`
     has also `unit`, `before_rmse`, `noise_floor`, `after_rmse`, `horizons`, `split`, `ahead_mm` and `best_shrinkage`,
     `ranking` also `leftover_mm`, and `where` also `sentences`, `per_horizon_mm` and `frames`.
     """
@@ -45,6 +47,7 @@ def verdict_json(diagnosis: Diagnosis) -> dict[str, Any]:
             "gap": _gap(gap, blamed=diagnosis.verdict != "unknown"),
             "where": None if diagnosis.where is None else _where(diagnosis.where),
             "next_motion": None if diagnosis.next_motion is None else diagnosis.next_motion.motion,
+            "next_motion_worth": None if diagnosis.next_motion is None else _worth(diagnosis.next_motion),
             "caveats": diagnosis.caveats,
             "seconds": diagnosis.seconds,
         }
@@ -105,6 +108,18 @@ def _gap(gap: Gap, *, blamed: bool) -> dict[str, Any]:
             for seconds, (before, after) in sorted(gap.horizons_mm.items())
         ],
         "split": gap.split,
+    }
+
+
+def _worth(following: NextMotion) -> dict[str, Any]:
+    return {
+        "separates": following.separates,
+        "information_nats": following.information,
+        "doubt_nats": following.doubt,
+        "certainty": following.certainty,
+        "inseparable": following.inseparable,
+        "alternatives_nats": following.alternatives,
+        "search_ended": following.ended,
     }
 
 
