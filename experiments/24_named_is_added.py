@@ -31,6 +31,7 @@ from cablejax.effects.physics import nominal_physics
 from cablejax.gaplog import Episode, gap_log_from_episodes
 from cablejax.simulate import ChainEngine
 from cablejax.simulate.plant import Plant, PlantConfig
+from cablejax.simulate.play import played
 from cablejax.types import GapLog
 from pages import markdown_table, page_of_results, publish
 from rows import Rows
@@ -75,20 +76,17 @@ def motions() -> tuple[list[Commands], list[Commands]]:
 
 def recorded(commands: Commands, effects: tuple[GivenEffect, ...], noise: np.random.Generator | None) -> Episode:
     """One motion of the plant; keypoints with noise unless `noise` is None."""
-    plant = Plant(PlantConfig(discretisation=PLANT, effects=effects))
-    # several shapes fit some starts; every motion begins with a gentle arch
-    seen = [plant.reset(commands.start, guess=arch(commands.start, ENGINE.cable.length, 2 * PLANT.n_links))]
-    seen += [plant.step(twist, INTERVAL) for twist in commands.twist[:-1]]
-    keypoints = np.stack([s.keypoints for s in seen])
-    if noise is not None:
-        keypoints = keypoints + NOISE * noise.standard_normal(keypoints.shape)
-    return Episode(
-        commands.motion,
-        INTERVAL * np.arange(len(seen)),
-        keypoints,
-        np.stack([s.gripper_pose for s in seen]),
+    return played(
+        Plant(PlantConfig(discretisation=PLANT, effects=effects)),
+        commands.start,
         commands.twist,
-        commands.hold,
+        INTERVAL,
+        motion=commands.motion,
+        hold=commands.hold,
+        # several shapes fit some starts; every motion begins with a gentle arch
+        guess=arch(commands.start, ENGINE.cable.length, 2 * PLANT.n_links),
+        noise=0.0 if noise is None else NOISE,
+        random=noise,
     )
 
 

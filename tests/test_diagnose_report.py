@@ -60,6 +60,26 @@ RANKING = (
 )
 
 
+def following(motion: str, separates: tuple[str, ...], information: float, ended: str | None = None) -> NextMotion:
+    """A made-up recommendation with two straight cables that move apart."""
+    pose = poses("approach")
+    shares = np.linspace(0.0, 1.0, POINTS)[:, None]
+    straight = pose[:, None, 0, :2] * (1 - shares) + pose[:, None, 1, :2] * shares
+    apart = 1e-3 * np.arange(len(pose))[:, None, None]
+    names = separates or ("plasticity",)
+    return NextMotion(
+        motion,
+        separates,
+        information,
+        float(np.log(max(len(separates), 1))),
+        {motion: information, "translation": 0.01},
+        pose,
+        0.1,
+        {name: straight + i * apart for i, name in enumerate(names)},
+        ended,
+    )
+
+
 def diagnosis(verdict="named", **changes) -> CableDiagnosis:
     """A made-up diagnosis of two episodes whose gap is 3 mm in the middle of the cable."""
     s = np.linspace(0.0, 1.0, POINTS)
@@ -89,9 +109,7 @@ def diagnosis(verdict="named", **changes) -> CableDiagnosis:
             split={"noise": 0.1, "named": 0.87, "learnable": 0.02, "unexplained": 0.01},
         ),
         "where": localise(log, nominal, np.full(POINTS, 1e-3)),
-        "next_motion": NextMotion(
-            "mirror", ("intrinsic_curvature", "gripper_rotation_offset + obstacle"), 3.4, {"mirror": 3.4, "taut": 0.2}
-        ),
+        "next_motion": following("mirror", ("intrinsic_curvature", "gripper_rotation_offset + obstacle"), 0.6),
         "baselines": {"lowest_cost": "plasticity", "bic": "intrinsic_curvature"},
         "caveats": ("No holds & <no> commissioning.",),
         "log": log,
@@ -119,12 +137,12 @@ NO_GAP = Gap(
 )
 ALIKE = (("intrinsic_curvature", "gripper_rotation_offset"),)
 THREE = (("intrinsic_curvature", "gripper_rotation_offset", "obstacle"),)
-FAINT = NextMotion("taut", ("bending_stiffness", "table_friction"), 0.03, {"taut": 0.03, "mirror": 0.01})
+FAINT = ("taut", ("bending_stiffness", "table_friction"), 0.03)
 CASES = {
     "named": (
         lambda: diagnosis(),
         "Cause named",
-        ["0.31 m (0.29 to 0.33)", "98 %", "95 % to 99 %", "Record <b>mirror"],
+        ["0.31 m (0.29 to 0.33)", "98 %", "95 % to 99 %", "Record <b>mirror", "probability of 91 %", "it has 50 % now"],
     ),
     "none": (
         lambda: diagnosis("none", effects=(), ranking=(), gap=NO_GAP, next_motion=None, explained=None, caveats=()),
@@ -132,9 +150,9 @@ CASES = {
         ["no effect is named", "No explanations are left to separate", "would have shown"],
     ),
     "ambiguous": (
-        lambda: diagnosis("ambiguous", equivalent=ALIKE, next_motion=FAINT),
+        lambda: diagnosis("ambiguous", equivalent=ALIKE, next_motion=following(*FAINT)),
         "Cause narrowed down",
-        ["intrinsic curvature or gripper rotation offset", "are indistinguishable", "No safe motion separates"],
+        ["intrinsic curvature or gripper rotation offset", "are indistinguishable", "No motion that was tried separates", "remove 4 % of the doubt"],
     ),
     "with one that is improbable": (
         lambda: diagnosis("ambiguous", equivalent=THREE),
@@ -151,9 +169,9 @@ CASES = {
         ["at keypoints 4 and 8", "x = 0.40 m", "-4.0 mm (-5.0 to -3.0)", "No motion of the library would help"],
     ),
     "unknown": (
-        lambda: diagnosis("unknown", effects=()),
+        lambda: diagnosis("unknown", effects=(), next_motion=following("designed", (), 2.0, "settled")),
         "Cause not in the library",
-        ["not in the library", "has no cause in the library", "closest: intrinsic curvature"],
+        ["not in the library", "has no cause in the library", "closest: intrinsic curvature", "Record the <b>designed motion"],
     ),
 }
 
@@ -242,6 +260,10 @@ def test_verdict_has_the_formats_effects():
     }
     assert verdict["ranking"][2]["held_out_shrinkage"] is None
     assert verdict["next_motion"] == "mirror" and verdict["seconds"] == 12.3
+    worth = verdict["next_motion_worth"]
+    assert worth["information_nats"] == 0.6 and worth["doubt_nats"] == pytest.approx(np.log(2), rel=1e-5)
+    assert worth["certainty"] == pytest.approx(0.5 * np.exp(0.6), rel=1e-5) and worth["inseparable"] is False
+    assert verdict_json(diagnosis(next_motion=following(*FAINT)))["next_motion_worth"]["inseparable"] is True
 
 
 @pytest.fixture(scope="module")

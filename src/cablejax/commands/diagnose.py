@@ -14,6 +14,7 @@ from cablejax.commands.options import Command, UsageError, say
 
 if TYPE_CHECKING:
     from cablejax.diagnose import CableDiagnosis
+    from cablejax.diagnose.motion_bounds import Bounds
     from cablejax.types import GapLog
 
 
@@ -40,6 +41,10 @@ class Diagnose(Command):
     """Names of the effects to look for; by default all; in space all but intrinsic_curvature, which takes four times as
     long as the others together."""
 
+    bounds: pathlib.Path | None = None
+    """Bounds of a motion, a TOML file: the motion to record next is designed within them, instead of taken from a few
+    safe ones. For planar logs only."""
+
     overwrite: bool = False
     """Replace a report that is there."""
 
@@ -47,6 +52,7 @@ class Diagnose(Command):
         """Diagnoses a log, on a table or in space, and writes its verdict and page."""
         from cablejax.commands.resuming import unfinished
         from cablejax.diagnose import verdict_json
+        from cablejax.diagnose.motion_bounds import read_bounds
         from cablejax.gaplog import read_gap_log
 
         log = read_gap_log(self.log)
@@ -54,14 +60,16 @@ class Diagnose(Command):
             self._check_space()
         else:
             self._check_plane()
+        bounds = None if self.bounds is None else read_bounds(self.bounds)
         commissioning = [read_gap_log(path) for path in self.commissioning]
         settings = {
             "diagnosis": [hashlib.sha256(path.read_bytes()).hexdigest() for path in (self.log, *self.commissioning)],
             "only": self.only,
+            "bounds": None if bounds is None else dataclasses.asdict(bounds),
         }
         with unfinished(self.out, settings, overwrite=self.overwrite) as parts:
             result, page = diagnose_and_report(
-                log, self.out, only=self.only, commissioning=commissioning, state=parts.state
+                log, self.out, only=self.only, commissioning=commissioning, bounds=bounds, state=parts.state
             )
         return {**verdict_json(result), "report": str(page)}, f"{result.verdict}: {result.sentence}\n{page}"
 
@@ -92,6 +100,10 @@ class Diagnose(Command):
                 f"--commissioning is given, but {self.log} is a log in space, where the gap is judged by recordings "
                 "that no fit has seen and commissioning logs are not used: leave it out."
             )
+        if self.bounds is not None:
+            raise UsageError(
+                f"--bounds is given, but {self.log} is a log in space, for which no motion is evaluated: leave it out."
+            )
 
 
 def diagnose_and_report(
@@ -100,21 +112,26 @@ def diagnose_and_report(
     *,
     only: Sequence[str] = (),
     commissioning: Sequence[GapLog] = (),
+    bounds: Bounds | None = None,
     state: pathlib.Path | None = None,
 ) -> tuple[CableDiagnosis, pathlib.Path]:
     """Diagnoses a log, reports progress, and writes verdict.json, report.html and the figures into an existing folder.
+
+    The motion to record next, where there is one, is written as next_motion.npz and next_motion.csv.
 
     Args:
         log: in the plane or in space.
         folder: that exists.
         only: names of the effects to look for; by default all.
         commissioning: logs known to have no effect; none for a log in space.
+        bounds: for a next motion that is designed; none for a log in space.
         state: file from which an interrupted diagnosis in space goes on.
 
     Returns:
         The diagnosis and its page.
     """
     from cablejax.diagnose import LIBRARY, diagnose, write_verdict
+    from cablejax.diagnose.motion_file import write_motion
     from cablejax.report.diagnosis_page import write_diagnosis_page
 
     if _in_space(log):
@@ -126,9 +143,11 @@ def diagnose_and_report(
         log,
         effects=[effect for effect in LIBRARY if effect.name in only] or LIBRARY,
         commissioning=commissioning,
+        bounds=bounds,
         progress=lambda text: say(f"{text} ..."),
     )
     write_verdict(folder / "verdict.json", result)
+    write_motion(folder, result.next_motion, result.log)
     return result, write_diagnosis_page(result, folder)
 
 

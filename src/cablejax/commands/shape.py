@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import dataclasses
 import pathlib
-from typing import ClassVar, Literal
+from typing import TYPE_CHECKING, ClassVar, Literal
 
 import tyro
 
-from cablejax.commands.options import Command, UsageError, text_table
+from cablejax.commands.options import Command, UsageError, output_folder, text_table
 from cablejax.solver_names import SolverName
+
+if TYPE_CHECKING:
+    from cablejax.effects.given import GivenEffect
 
 PLANT_EFFECT = "bending_stiffness:ratio=0.2"
 """The gap between model and plant, unless another one is asked for."""
@@ -59,6 +62,11 @@ class Shape(Command):
     """true: the controller observes the simulated keypoints. cloud: it observes keypoints estimated from clouds of a
     depth camera; the printed errors are still those of the true keypoints."""
 
+    motion: pathlib.Path | None = None
+    """Play this motion on the plant instead of shaping: a gap log with commands, such as the next_motion.npz of
+    `cablejax diagnose`. Writes log.npz only, of the cable in that log unless --cable is given; model, target and method
+    are not used."""
+
     noise_mm: float | None = None
     """Noise: standard deviation of the observed keypoints, per coordinate, or of the camera's range [mm]. By default 0
     for the first and 2 for the second."""
@@ -79,9 +87,13 @@ class Shape(Command):
 
         if "none" in self.plant_effect and len(self.plant_effect) > 1:
             raise UsageError("--plant-effect is none and an effect: give either.")
+        if self.motion is not None and self.perception == "cloud":
+            raise UsageError("--motion records the keypoints of the plant: leave --perception out.")
         texts = (PLANT_EFFECT,) if not self.plant_effect else () if "none" in self.plant_effect else self.plant_effect
         cloud = self.perception == "cloud"
         noise_mm = (2.0 if cloud else 0.0) if self.noise_mm is None else self.noise_mm
+        if self.motion is not None:
+            return self._play(self.motion, tuple(map(parse_effect, texts)))
         model = load_model(self.weights)
         cable = model.cable if self.cable is None else find_cable(self.cable)
         plant = plant_of(
@@ -115,3 +127,30 @@ class Shape(Command):
             summary = shape_and_report(job, self.out, parts, facts=facts)
         table = text_table(*table_of(summary))
         return summary, f"{table}\n\nLook at {self.out / 'report.html'}"
+
+    def _play(self, path: pathlib.Path, effects: tuple[GivenEffect, ...]):
+        """Plays a motion on the plant and writes the log of it."""
+        from cablejax.commands.cable import find_cable
+        from cablejax.commands.runs import plant_of
+        from cablejax.gaplog import read_gap_log, write_gap_log
+        from cablejax.limits import require
+        from cablejax.simulate.plant import Plant
+        from cablejax.simulate.play import play
+
+        noise = 1e-3 * (self.noise_mm or 0.0)
+        require(noise, "noise", "--noise-mm in metres")
+        commands, out = read_gap_log(path), output_folder(self.out, overwrite=self.overwrite)
+        plant = plant_of(
+            find_cable(path if self.cable is None else self.cable), effects, links=self.links, seed=self.seed
+        )
+        log = play(
+            Plant(plant),
+            commands,
+            source=f"contact plant, {', '.join(map(str, effects)) or 'no effect'}",
+            noise=noise,
+            seed=self.seed,
+        )
+        written = write_gap_log(out / "log.npz", log, overwrite=True)
+        seconds = float(sum(log.time[e, n - 1] for e, n in enumerate(log.episode_length)))
+        result = {"log": str(written), "episodes": len(log.episode_length), "seconds": seconds}
+        return result, f"{written}\n\nDiagnose it with `cablejax diagnose {written}`."

@@ -147,6 +147,11 @@ class NextMotion:
         return None if self.ended is None else (self.poses, self.interval)
 
     @property
+    def prior(self) -> float | None:
+        """Probability that the right explanation has now, as a geometric mean; None where there is only one."""
+        return math.exp(-self.doubt) if self.separates else None
+
+    @property
     def certainty(self) -> float | None:
         """Probability that the right explanation is expected to have after the recording, as a geometric mean.
 

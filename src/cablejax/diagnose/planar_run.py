@@ -19,7 +19,7 @@ from cablejax.diagnose.fit import evaluate
 from cablejax.diagnose.gap import held_out_predictions, measure_gap
 from cablejax.diagnose.motion_bounds import Bounds, BoundsError
 from cablejax.diagnose.motion_design import DesignConfig
-from cablejax.diagnose.motion_judge import Judge, Objective
+from cablejax.diagnose.motion_judge import MARGIN, Judge, Objective
 from cablejax.diagnose.next_motion import next_motion, require_some_motion
 from cablejax.diagnose.noise import SMALLEST
 from cablejax.diagnose.protocol import explanation
@@ -139,6 +139,14 @@ def _caveats(case: Case, calibration: Calibration, *, commissioned: bool) -> tup
             "No commissioning logs were given: the simulator's own error is not separated from the cable's gap; "
             f"{1e3 * calibration.baseline:.2g} mm of it is assumed."
         )
+    if case.recording.has_commands:
+        off = np.linalg.norm((case.recording.gripper_pose - case.arms.commanded)[..., :2], axis=-1).max(axis=(1, 2))
+        if off.max() > MARGIN:
+            caveats.append(
+                f"Motions were not executed as commanded: the grippers of episode {int(off.argmax())} are up to "
+                f"{1e3 * off.max():.0f} mm from their commands, more than the {1e3 * MARGIN:g} mm by which a designed "
+                "motion keeps its bounds. The diagnosis uses the measured poses."
+            )
     if case.noise.std.max() <= SMALLEST:
         caveats.append(f"The keypoints carry no noise to speak of; {1e3 * SMALLEST:g} mm is assumed.")
     return tuple(caveats)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 import pathlib
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import matplotlib
@@ -28,7 +29,8 @@ if TYPE_CHECKING:
     from cablejax.control.run import ClosedLoopRun
     from cablejax.control.shaping import Method, Runs
 
-_OVERSAMPLING = 3
+OVERSAMPLING = 3
+"""Pixels drawn for each one of the picture."""
 _HEADER = 44
 _TITLE = 34
 _FOOTER = 48
@@ -63,10 +65,30 @@ def write_gif(
     instants = end * np.linspace(0.0, 1.0, n_frames) ** 2
     scene = _Scene(pairs, common_window(runs, margin=0.1), width)
     frames = [scene.draw(t) for t in instants]
-    palette = _palette()
+    drawn = (LIGHT.ink, LIGHT.muted, LIGHT.gripper, LIGHT.target, LIGHT.residual, LIGHT.direct)
+    return save_frames(path, frames, drawn, frames_per_second=frames_per_second, hold_s=hold_s)
+
+
+def save_frames(
+    path: str | os.PathLike[str],
+    frames: list[Image.Image],
+    drawn: Sequence[str],
+    *,
+    frames_per_second: float,
+    hold_s: float,
+) -> int:
+    """Writes pictures as a GIF and returns its size in bytes.
+
+    Args:
+        path: the file to write.
+        frames: in order.
+        drawn: their colours.
+        frames_per_second: of the file.
+        hold_s: how long the last frame stands [s].
+    """
+    palette = _palette(drawn)
     indexed = [frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]
-    step_ms = round(1000.0 / frames_per_second)
-    durations = [step_ms] * (n_frames - 1) + [round(1000.0 * hold_s)]
+    durations = [round(1000.0 / frames_per_second)] * (len(frames) - 1) + [round(1000.0 * hold_s)]
     path = pathlib.Path(path)
     indexed[0].save(
         path, format="GIF", save_all=True, append_images=indexed[1:], duration=durations, loop=0, optimize=False
@@ -74,9 +96,8 @@ def write_gif(
     return path.stat().st_size
 
 
-def _palette(shades: int = 7) -> Image.Image:
+def _palette(drawn: Sequence[str], shades: int = 7) -> Image.Image:
     """Every colour drawn, in steps towards the background as its smoothed edges have them."""
-    drawn = (LIGHT.ink, LIGHT.muted, LIGHT.gripper, LIGHT.target, LIGHT.residual, LIGHT.direct)
     background = np.array(ImageColor.getrgb(LIGHT.background))
     colours = [background]
     for colour in drawn:
@@ -103,7 +124,7 @@ class _Scene:
     def draw(self, time: float) -> Image.Image:
         """The frame at one instant [s]; between samples the cable is interpolated."""
         image = self.background.copy()
-        canvas = _Canvas(image)
+        canvas = Canvas(image)
         canvas.text((self.size[0] - 16, 12), f"{time:.0f} s", LIGHT.ink, 18, anchor="ra", bold=True)
         for index, (shape, runs) in enumerate(self.pairs.items()):
             row = 0
@@ -129,8 +150,8 @@ class _Scene:
         return image.resize(self.size, Image.Resampling.BOX)
 
     def _static(self) -> Image.Image:
-        image = Image.new("RGB", (_OVERSAMPLING * self.size[0], _OVERSAMPLING * self.size[1]), LIGHT.background)
-        canvas = _Canvas(image)
+        image = Image.new("RGB", (OVERSAMPLING * self.size[0], OVERSAMPLING * self.size[1]), LIGHT.background)
+        canvas = Canvas(image)
         canvas.text((16, 12), "Two grippers shape a cable", LIGHT.ink, 18, bold=True)
         canvas.dashes(np.array([(318.0, 24.0), (352.0, 24.0)]), LIGHT.target, 3.0)
         canvas.text((360, 15), "target", LIGHT.muted, 14)
@@ -151,39 +172,44 @@ class _Scene:
         return np.stack([x, y], axis=1)
 
 
-class _Canvas:
+class Canvas:
     """Drawing in final pixels on an oversampled image."""
 
     def __init__(self, image: Image.Image):
         self.pen = ImageDraw.Draw(image)
 
     def line(self, points: np.ndarray, colour: str, width: float) -> None:
-        scaled = [tuple(p) for p in points * _OVERSAMPLING]
-        self.pen.line(scaled, fill=colour, width=round(width * _OVERSAMPLING), joint="curve")
+        """A line [pixels]."""
+        scaled = [tuple(p) for p in points * OVERSAMPLING]
+        self.pen.line(scaled, fill=colour, width=round(width * OVERSAMPLING), joint="curve")
         self.dots(points[[0, -1]], colour, width / 2)
 
     def dots(self, points: np.ndarray, colour: str, radius: float) -> None:
-        for x, y in points[np.isfinite(points).all(axis=1)] * _OVERSAMPLING:
-            r = radius * _OVERSAMPLING
+        """Dots of a radius [pixels], where points are finite."""
+        for x, y in points[np.isfinite(points).all(axis=1)] * OVERSAMPLING:
+            r = radius * OVERSAMPLING
             self.pen.ellipse((x - r, y - r, x + r, y + r), fill=colour)
 
     def polygon(self, points: np.ndarray, colour: str) -> None:
-        self.pen.polygon([tuple(p) for p in points * _OVERSAMPLING], fill=colour)
+        """A filled polygon [pixels]."""
+        self.pen.polygon([tuple(p) for p in points * OVERSAMPLING], fill=colour)
 
     def dashes(self, points: np.ndarray, colour: str, width: float, dash: float = 7.0, gap: float = 5.0) -> None:
+        """A dashed line [pixels]."""
         distance = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(points, axis=0).T))])
         for start in np.arange(0.0, distance[-1], dash + gap):
             along = np.linspace(start, min(start + dash, distance[-1]), 6)
             piece = np.stack([np.interp(along, distance, points[:, k]) for k in range(2)], axis=1)
-            scaled = [tuple(p) for p in piece * _OVERSAMPLING]
-            self.pen.line(scaled, fill=colour, width=round(width * _OVERSAMPLING), joint="curve")
+            scaled = [tuple(p) for p in piece * OVERSAMPLING]
+            self.pen.line(scaled, fill=colour, width=round(width * OVERSAMPLING), joint="curve")
 
     def text(self, place, words: str, colour: str, size: float, *, anchor: str = "la", bold: bool = False) -> None:
+        """Words at a place [pixels]."""
         name = "DejaVuSans-Bold.ttf" if bold else "DejaVuSans.ttf"
         file = pathlib.Path(matplotlib.get_data_path()) / "fonts" / "ttf" / name
-        font = ImageFont.truetype(str(file), round(size * _OVERSAMPLING))
+        font = ImageFont.truetype(str(file), round(size * OVERSAMPLING))
         x, y = place
-        self.pen.text((x * _OVERSAMPLING, y * _OVERSAMPLING), words, fill=colour, font=font, anchor=anchor)
+        self.pen.text((x * OVERSAMPLING, y * OVERSAMPLING), words, fill=colour, font=font, anchor=anchor)
 
 
 def _at(times: np.ndarray, values: np.ndarray, time: float) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Charts of a diagnosis: which effect causes the gap, how far it shrinks, and what to record next.
+"""Charts of a diagnosis: which effect causes the gap, and how far it shrinks.
 
 Each takes a `CableDiagnosis` and gives a `matplotlib.figure.Figure` that belongs to nobody else, or None if there is
 nothing to draw.
@@ -13,17 +13,12 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from cablejax.cable import Discretisation
 from cablejax.diagnose.diagnosis import CableDiagnosis
-from cablejax.diagnose.safe_motions import INTERVAL, safe_motions, starting_pose
 from cablejax.report.diagnosis_style import STYLE, explained_label
 from cablejax.report.effect_words import effect_title
-from cablejax.report.style import LIGHT, gripper_outline
-from cablejax.simulate.equilibrium import arch_angles, chain_nodes, find_equilibrium
-from cablejax.simulate.replay import config_of_log
+from cablejax.report.style import LIGHT
 
 _MAX_RANKED = 8
-_MAX_FRAMES = 5
 _LIGHT_BLUE = "#56b4e9"
 _SPLIT = (
     ("noise", "noise of the recording", LIGHT.faint),
@@ -105,35 +100,6 @@ def shrinkage_figure(diagnosis: CableDiagnosis) -> Figure:
     return figure
 
 
-def motion_figure(diagnosis: CableDiagnosis) -> Figure | None:
-    """The motion to record next, and how well each motion of the library separates the explanations."""
-    following = diagnosis.next_motion
-    if following is None:
-        return None
-    config = config_of_log(diagnosis.log)
-    poses = safe_motions(config, starting_pose(diagnosis.log.gripper_pose)).get(following.motion)
-    names = sorted(following.alternatives, key=lambda n: following.alternatives[n])
-    values = [following.alternatives[n] for n in names]
-    colours = [LIGHT.residual if n == following.motion else LIGHT.target for n in names]
-    with matplotlib.rc_context(STYLE):
-        figure = Figure(figsize=(10.0, 4.2), layout="constrained")
-        halves: Any = figure.subfigures(2, 1, height_ratios=[1.0, 1.15])
-        frames, bars = halves
-        if poses is not None:
-            _film(frames, config, poses)
-        ax = bars.subplots()
-        ax.barh(range(len(names)), values, color=colours, height=0.62)
-        for row, value in enumerate(values):
-            ax.text(value + 0.01 * max(values), row, f"{value:.2g}", va="center", fontsize=10)
-        ax.set_yticks(range(len(names)), [effect_title(n) for n in names])
-        ax.set(xticks=[], xlim=(0, 1.08 * max(values) or 1.0))
-        ax.spines[["bottom"]].set_visible(False)
-        ax.tick_params(length=0, labelcolor=LIGHT.ink)
-        what = "Difference of the two explanations" if following.separates else "Change of the prediction"
-        ax.set_title(f"{what} on each safe motion, in units of the noise")
-    return figure
-
-
 def _bars(ax: Axes, x: np.ndarray, heights: np.ndarray, width: float, colour: Any, label: str | None = None) -> None:
     """Bars with their heights written on top."""
     ax.bar(x, heights, width, color=colour, label=label)
@@ -168,38 +134,6 @@ def _split_bar(ax: Axes, split: dict[str, float | None]) -> None:
     ax.set_title("The squared error before consists of")
     if begin:
         ax.legend(loc="upper left", bbox_to_anchor=(0.0, 0.05), ncols=4, fontsize=9.5, handlelength=1.0, borderpad=0.0)
-
-
-def _film(figure: Any, config: Discretisation, poses: np.ndarray) -> None:
-    """The motion as a few frames: where it begins, and where the grippers turn or stop."""
-    speed = np.diff(poses, axis=0).reshape(len(poses) - 1, -1)
-    turns = 1 + np.flatnonzero(np.abs(np.diff(speed, axis=0)).max(axis=1) > 1e-3)
-    moving = np.flatnonzero(np.abs(speed).max(axis=1) > 1e-9)
-    stops = sorted({int(t) for t in turns if np.abs(speed[t - 1]).max() > 1e-9} | {int(m) + 1 for m in moving[-1:]})
-    apart = [0]
-    for sample in stops:
-        if np.abs(poses[sample] - poses[apart[-1]]).max() > 0.02:
-            apart.append(sample)
-    chosen = apart[:_MAX_FRAMES]
-    nodes, angles = [], arch_angles(config, poses[0])
-    for sample in chosen:
-        try:
-            angles = find_equilibrium(config, poses[sample], angles).angles
-            nodes.append(np.concatenate([chain_nodes(config, poses[sample], angles), poses[sample, 1:, :2]]))
-        except ValueError:
-            # a picture without its cable is better than none
-            nodes.append(np.full((1, 2), np.nan))
-    every = np.concatenate([poses[chosen, :, :2].reshape(-1, 2), *nodes])
-    low, high = np.nanmin(every, axis=0) - 0.1, np.nanmax(every, axis=0) + 0.1
-    for ax, sample, line in zip(figure.subplots(1, len(chosen), squeeze=False)[0], chosen, nodes, strict=True):
-        for gripper in range(2):
-            ax.plot(*poses[:, gripper, :2].T, color=LIGHT.faint, lw=1.5)
-            for polygon in gripper_outline(poses[sample, gripper], gripper):
-                ax.fill(*polygon.T, color=LIGHT.gripper, alpha=0.85, lw=0)
-        ax.plot(*line.T, color=LIGHT.residual, lw=2.2)
-        ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal", xticks=[], yticks=[])
-        ax.spines[:].set_visible(False)
-        ax.set_title(f"{INTERVAL * sample:.0f} s", fontsize=10)
 
 
 def _percent(value: float) -> str:

@@ -13,7 +13,7 @@ from cablejax.diagnose.diagnosis import CableDiagnosis, NamedEffect, Verdict
 from cablejax.diagnose.judgement import FAINT, look_alikes
 from cablejax.diagnose.verdict_json import write_verdict
 from cablejax.report import diagnosis_sections as sections
-from cablejax.report.diagnosis_charts import motion_figure, ranking_figure, shrinkage_figure
+from cablejax.report.diagnosis_charts import ranking_figure, shrinkage_figure
 from cablejax.report.diagnosis_figures import cable_figure, where_figure
 from cablejax.report.diagnosis_sections import in_space
 from cablejax.report.diagnosis_style import explained_label
@@ -29,6 +29,7 @@ from cablejax.report.effect_words import (
     share,
 )
 from cablejax.report.html import json_script, svg, write_html
+from cablejax.report.motion_figures import motion_figure, write_motion_gif
 from cablejax.report.spatial_figures import cable_still, files_figure, orbit_data
 
 PAGE = "report.html"
@@ -45,8 +46,6 @@ _SPACE_CAPTION = (
     "Five seconds from two observations on, in the files with the largest, middling and smallest gaps. Drag to turn, "
     "scroll to zoom. The solid line is a fit to recordings that this file is not part of."
 )
-SEPARABLE = 0.3
-"""A motion on which two explanations differ by less than this many noise units does not separate them."""
 _WHERE_CAPTION = (
     "Top: the gap of each keypoint over the whole log. Below: each episode over time; the darker, the further beyond "
     "the noise. Black bars mark holds. The cable's own gap fades towards the grippers that hold it."
@@ -61,7 +60,8 @@ _FILES_CAPTION = (
 def write_diagnosis_page(diagnosis: CableDiagnosis, out: str | os.PathLike[str]) -> pathlib.Path:
     """Writes `report.html`, `verdict.json` and the figures as PNG into a folder, and returns the page's path.
 
-    The figures are `cable.png`, `where.png`, `shrinkage.png`, and, where effects were tried, `ranking.png`.
+    The figures are `cable.png`, `where.png`, `shrinkage.png`, and, where effects were tried, `ranking.png`. Where there
+    is a motion to record next, `next_motion.gif` shows it.
     """
     out = pathlib.Path(out)
     out.mkdir(parents=True, exist_ok=True)
@@ -72,7 +72,7 @@ def write_diagnosis_page(diagnosis: CableDiagnosis, out: str | os.PathLike[str])
         "where": files_figure(diagnosis) if space else where_figure(diagnosis),
         "ranking": ranking_figure(diagnosis),
         "shrinkage": shrinkage_figure(diagnosis),
-        "motion": motion_figure(diagnosis),
+        "motion": motion_figure(diagnosis.next_motion),
     }
     inline = {}
     for name, figure in drawn.items():
@@ -83,6 +83,11 @@ def write_diagnosis_page(diagnosis: CableDiagnosis, out: str | os.PathLike[str])
         else:
             # none of an earlier diagnosis next to this page
             picture.unlink(missing_ok=True)
+    preview = out / "next_motion.gif"
+    if diagnosis.next_motion is None:
+        preview.unlink(missing_ok=True)
+    else:
+        write_motion_gif(preview, diagnosis.next_motion)
     kind, badge = _BADGES[diagnosis.verdict]
     following = diagnosis.next_motion
     path = out / PAGE
@@ -107,8 +112,7 @@ def write_diagnosis_page(diagnosis: CableDiagnosis, out: str | os.PathLike[str])
         far=sections.how_far(diagnosis),
         following=following,
         nothing_next=sections.nothing_next(diagnosis),
-        separable=SEPARABLE,
-        instruction="" if following is None else MOTIONS.get(following.motion, ""),
+        instruction="" if following is None else MOTIONS[following.motion],
         tables=sections.detail_tables(diagnosis),
         record=sections.record(diagnosis),
     )

@@ -66,6 +66,7 @@ _PARAMETERS: dict[str, str] = {
 }
 
 MOTIONS: dict[str, str] = {
+    "designed": "Its commands are next_motion.csv, for an arm, and next_motion.npz, for a simulated plant.",
     "mirror": "Start mirrored in the line between the grippers, close in, and go back.",
     "translation": "Move both grippers across the cable by 20 % of its length, hold, and go back.",
     "ramp_hold": "Close in fast, hold, go back, then the same at 30 % of the speed.",
@@ -73,7 +74,7 @@ MOTIONS: dict[str, str] = {
     "taut": "Pull the cable nearly straight, to 99.5 % of its length, hold, and go back.",
     "shifted_repeat": "Close in and go back; repeat it shifted across the table by 20 % of the cable's length.",
 }
-"""Instruction for each motion of `cablejax.diagnose.safe_motions`."""
+"""Instruction for each motion of `cablejax.diagnose.safe_motions`, and for a designed one."""
 
 
 def effect_title(name: str) -> str:

@@ -1,0 +1,133 @@
+"""Pictures of the motion to record next: where the explanations differ on it, and what each motion is worth."""
+
+from __future__ import annotations
+
+import os
+from typing import Any
+
+import matplotlib
+import numpy as np
+from jaxtyping import Float
+from matplotlib.figure import Figure
+from PIL import Image
+
+from cablejax.diagnose.diagnosis import NextMotion
+from cablejax.report.animation import OVERSAMPLING, Canvas, save_frames
+from cablejax.report.diagnosis_style import STYLE
+from cablejax.report.effect_words import effect_title, explanation_title
+from cablejax.report.style import LIGHT, cable_curve, gripper_outline
+
+_COLOURS = (LIGHT.residual, LIGHT.direct, "#009e73", "#cc79a7", "#e69f00")
+_MOMENTS = 5
+_MARGIN = 0.1
+_SPEED, _FRAMES_PER_SECOND, _HOLD_S = 5.0, 10.0, 1.5
+_HEADER, _LINE = 40, 20
+
+
+def motion_figure(following: NextMotion | None) -> Figure | None:
+    """The motion at a few moments, with the cable under each explanation, and the information of every motion.
+
+    The moments are those at which the explanations differ most. None without a motion.
+    """
+    if following is None:
+        return None
+    with matplotlib.rc_context(STYLE):
+        figure = Figure(figsize=(10.0, 4.6), layout="constrained")
+        halves: Any = figure.subfigures(2, 1, height_ratios=[1.25, 1.0])
+        _film(halves[0], following)
+        _worth(halves[1].subplots(), following)
+    return figure
+
+
+def write_motion_gif(path: str | os.PathLike[str], following: NextMotion, *, width: int = 640) -> int:
+    """Writes a preview of the motion, five times as fast, and returns its size in bytes.
+
+    Args:
+        path: the file to write.
+        following: the motion.
+        width: of the picture [pixels].
+    """
+    low, high = _window(following)
+    scale = width / (high[0] - low[0])
+    names = list(following.shapes)
+    top = _HEADER + _LINE * len(names)
+    size = (width, top + max(round((high[1] - low[1]) * scale), 1))
+    last, step = len(following.poses) - 1, _SPEED / _FRAMES_PER_SECOND / following.interval
+    frames = []
+    for sample in [*np.arange(0.0, last, step).round().astype(int), last]:
+        image = Image.new("RGB", (OVERSAMPLING * size[0], OVERSAMPLING * size[1]), LIGHT.background)
+        canvas = Canvas(image)
+        canvas.text((14, 10), "Record next", LIGHT.ink, 16, bold=True)
+        canvas.text((width - 14, 10), f"{following.interval * sample:.0f} s", LIGHT.ink, 16, anchor="ra", bold=True)
+        pose = following.poses[sample]
+
+        def pixels(points: Float[np.ndarray, "P 2"]) -> Float[np.ndarray, "P 2"]:
+            return np.stack([(points[:, 0] - low[0]) * scale, top + (high[1] - points[:, 1]) * scale], axis=1)
+
+        for end in range(2):
+            for polygon in gripper_outline(pose[end], end):
+                canvas.polygon(pixels(polygon), LIGHT.gripper)
+        for row, (name, colour) in enumerate(zip(names, _COLOURS, strict=False)):
+            canvas.line(pixels(cable_curve(following.shapes[name][sample])), colour, 2.5)
+            canvas.text((14, _HEADER + _LINE * row), explanation_title(name), colour, 13)
+        frames.append(image.resize(size, Image.Resampling.BOX))
+    drawn = (LIGHT.ink, LIGHT.gripper, *_COLOURS)
+    return save_frames(path, frames, drawn, frames_per_second=_FRAMES_PER_SECOND, hold_s=_HOLD_S)
+
+
+def _film(figure: Any, following: NextMotion) -> None:
+    moments, (low, high) = telling_moments(following), _window(following)
+    for ax, sample in zip(figure.subplots(1, len(moments), squeeze=False)[0], moments, strict=True):
+        for gripper in range(2):
+            ax.plot(*following.poses[:, gripper, :2].T, color=LIGHT.faint, lw=1.5)
+            for polygon in gripper_outline(following.poses[sample, gripper], gripper):
+                ax.fill(*polygon.T, color=LIGHT.gripper, alpha=0.85, lw=0)
+        for (name, points), colour in zip(following.shapes.items(), _COLOURS, strict=False):
+            ax.plot(*cable_curve(points[sample]).T, color=colour, lw=1.8, label=explanation_title(name))
+        ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal", xticks=[], yticks=[])
+        ax.spines[:].set_visible(False)
+        ax.set_title(f"{following.interval * sample:.0f} s", fontsize=10)
+    if len(following.shapes) > 1:
+        figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside upper left", ncols=5, fontsize=10)
+
+
+def telling_moments(following: NextMotion, count: int = _MOMENTS) -> list[int]:
+    """Samples at which the explanations differ most, an eighth of the motion apart; evenly spread without rivals."""
+    points = np.stack(list(following.shapes.values()))
+    samples = points.shape[1]
+    if len(points) < 2:
+        return np.linspace(0, samples - 1, count).round().astype(int).tolist()
+    differences = np.linalg.norm(points[:, None] - points[None], axis=-1).max(axis=(0, 1, 3))
+    chosen: list[int] = []
+    for sample in np.argsort(-differences, kind="stable"):
+        if len(chosen) < count and all(abs(sample - other) >= samples // 8 for other in chosen):
+            chosen.append(int(sample))
+    return sorted(chosen)
+
+
+def _worth(ax: Any, following: NextMotion) -> None:
+    """Bars of the information of every motion, and the doubt that there is."""
+    names = sorted(following.alternatives, key=lambda name: following.alternatives[name])
+    values = [following.alternatives[name] for name in names]
+    colours = [LIGHT.residual if name == following.motion else LIGHT.target for name in names]
+    widest = max(*values, following.doubt, 1e-9)
+    ax.barh(range(len(names)), values, color=colours, height=0.62)
+    for row, value in enumerate(values):
+        ax.text(value + 0.01 * widest, row, f"{value:.2g}", va="center", fontsize=10)
+    ax.set_yticks(range(len(names)), [effect_title(name) for name in names])
+    ax.set(xticks=[], xlim=(0, 1.1 * widest))
+    ax.spines[["bottom"]].set_visible(False)
+    ax.tick_params(length=0, labelcolor=LIGHT.ink)
+    if following.separates:
+        ax.axvline(following.doubt, color=LIGHT.ink, lw=1.2, ls=(0, (5, 3)))
+        ax.set_title(f"Information on which explanation holds [nats]; dashed: the doubt, {following.doubt:.2g}")
+    else:
+        ax.set_title("Information on the parameters [nats]")
+
+
+def _window(following: NextMotion) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2"]]:
+    """Lowest and highest corner of what is drawn [m]."""
+    every = np.concatenate(
+        [following.poses[..., :2].reshape(-1, 2), *(p.reshape(-1, 2) for p in following.shapes.values())]
+    )
+    return np.nanmin(every, axis=0) - _MARGIN, np.nanmax(every, axis=0) + _MARGIN
