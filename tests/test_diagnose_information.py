@@ -75,7 +75,7 @@ def test_reparametrisation_changes_nothing():
     turn = np.linalg.qr(np.random.default_rng(3).normal(size=(2, 2)))[0]
     turned = [turn @ spreads[0], -spreads[1], spreads[2]]
     assert mutual_information(means, turned, CHANCES) == pytest.approx(mutual_information(means, spreads, CHANCES))
-    assert parameter_information(turned[0]) == pytest.approx(parameter_information(spreads[0]))
+    assert parameter_information(turned[0], spreads[1]) == pytest.approx(parameter_information(spreads[0], spreads[1]))
     # coordinates of the recording, and an offset that all explanations share
     whole = np.linalg.qr(np.random.default_rng(4).normal(size=(5, 5)))[0]
     moved = mutual_information((means + 1e3) @ whole, [s @ whole for s in spreads], CHANCES)
@@ -84,8 +84,10 @@ def test_reparametrisation_changes_nothing():
 
 def test_information_about_parameters_is_that_of_a_linear_gaussian_model():
     spread = np.array([[3.0, 0.0, 4.0]])
-    assert parameter_information(spread) == pytest.approx(0.5 * np.log(26.0))
-    assert parameter_information(np.zeros((0, 3))) == 0.0
+    assert parameter_information(spread, np.zeros((0, 3))) == pytest.approx(0.5 * np.log(26.0))
+    assert parameter_information(np.zeros((0, 3)), spread) == 0.0
+    # what a nuisance may do as well says nothing: left are 4 of the 5 units across it
+    assert parameter_information(spread, 1e6 * np.eye(1, 3)) == pytest.approx(0.5 * np.log(17.0), rel=1e-6)
 
 
 def test_counts_have_to_agree():

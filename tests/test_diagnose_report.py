@@ -152,7 +152,12 @@ CASES = {
     "ambiguous": (
         lambda: diagnosis("ambiguous", equivalent=ALIKE, next_motion=following(*FAINT)),
         "Cause narrowed down",
-        ["intrinsic curvature or gripper rotation offset", "are indistinguishable", "No motion that was tried separates", "remove 4 % of the doubt"],
+        [
+            "intrinsic curvature or gripper rotation offset",
+            "are indistinguishable",
+            "No motion that was tried separates",
+            "remove 4 % of the doubt",
+        ],
     ),
     "with one that is improbable": (
         lambda: diagnosis("ambiguous", equivalent=THREE),
@@ -171,7 +176,12 @@ CASES = {
     "unknown": (
         lambda: diagnosis("unknown", effects=(), next_motion=following("designed", (), 2.0, "settled")),
         "Cause not in the library",
-        ["not in the library", "has no cause in the library", "closest: intrinsic curvature", "Record the <b>designed motion"],
+        [
+            "not in the library",
+            "has no cause in the library",
+            "closest: intrinsic curvature",
+            "Record the <b>designed motion",
+        ],
     ),
 }
 

@@ -13,7 +13,12 @@ pairwise distances),
     I(c; y) >= - sum_i p_i ln sum_j p_j exp(-B_ij),      I(c; y) <= - sum_i p_i ln sum_j p_j exp(-KL_ij),
 
 with B the Bhattacharyya distance and KL the Kullback-Leibler divergence. Both are 0 where all explanations predict the
-same, and the entropy of p where they predict quite different things.
+same, and the entropy of p where they predict quite different things. The lower bound is computed from less than B,
+
+    B_ij >= (mu_i - mu_j)' (I + A_i A_i' + A_j A_j')^-1 (mu_i - mu_j) / 8,
+
+in which explanations do not differ by their covariances alone: these rest on derivatives at two places, and wide
+posteriors of one and the same effect would seem to differ.
 
 Parameters are few and coordinates many, so every quantity comes from inner products of means and columns of A.
 """
@@ -31,7 +36,7 @@ def entropy(chances: Float[np.ndarray, "K"]) -> float:
     """Entropy of probabilities [nats]: the doubt about which explanation holds."""
     kept = np.asarray(chances, float)
     kept = kept[kept > 0]
-    return max(float(-(kept * np.log(kept)).sum()), 0.0)
+    return max(0.0, float(-(kept * np.log(kept)).sum()))
 
 
 def mutual_information(
@@ -63,7 +68,7 @@ def mutual_information(
     for i in range(count):
         for j in range(count):
             if i < j:
-                near[i, j] = near[j, i] = products.bhattacharyya(i, j)
+                near[i, j] = near[j, i] = products.separation(i, j)
             if i != j:
                 far[i, j] = products.divergence(i, j)
     doubt = entropy(p)
@@ -71,14 +76,18 @@ def mutual_information(
     return lower, upper
 
 
-def parameter_information(spread: Float[np.ndarray, "P M"]) -> float:
-    """Expected information about the parameters of one explanation, `1/2 ln det(I + A' A)` [nats].
+def parameter_information(spread: Float[np.ndarray, "P M"], nuisance: Float[np.ndarray, "Q M"]) -> float:
+    """Expected information about the parameters of one explanation [nats].
+
+    It is `1/2 ln det(I + A' S^-1 A)`, with S the covariance of noise and nuisances.
 
     Args:
         spread: as in `mutual_information`.
+        nuisance: rows as those of `spread`, for what else moves the prediction and is not asked for.
     """
-    spread = np.asarray(spread, float)
-    return 0.5 * _log_det(spread @ spread.T)
+    nuisance = np.asarray(nuisance, float)
+    both = np.concatenate([np.asarray(spread, float), nuisance])
+    return 0.5 * (_log_det(both @ both.T) - _log_det(nuisance @ nuisance.T))
 
 
 def _from_distances(distance: Float[np.ndarray, "K K"], p: Float[np.ndarray, "K"]) -> float:
@@ -106,15 +115,12 @@ class _Products:
         row = self._gram[i] - self._gram[j]
         return float(row[i] - row[j]), row
 
-    def bhattacharyya(self, i: int, j: int) -> float:
-        a, b = self._columns[i], self._columns[j]
+    def separation(self, i: int, j: int) -> float:
+        """Less than the Bhattacharyya distance: both explanations' parameters may make up for all of the difference."""
         square, row = self._difference(i, j)
-        both = np.r_[a, b]
-        half = 0.5 * self._gram[np.ix_(both, both)]
-        across = np.sqrt(0.5) * row[both]
-        distance = 0.125 * (square - across @ np.linalg.solve(np.eye(len(both)) + half, across))
-        spread = 0.5 * _log_det(half) - 0.25 * (_log_det(self._gram[a, a]) + _log_det(self._gram[b, b]))
-        return max(distance + spread, 0.0)
+        both = np.r_[self._columns[i], self._columns[j]]
+        inner = np.eye(len(both)) + self._gram[np.ix_(both, both)]
+        return max(0.125 * (square - row[both] @ np.linalg.solve(inner, row[both])), 0.0)
 
     def divergence(self, i: int, j: int) -> float:
         """KL divergence of the distribution under i from that under j."""

@@ -21,9 +21,12 @@ TURN_LENGTH = 0.15
 """Length that one radian counts for where motions of the grippers are added up [m/rad]."""
 NEAREST, FARTHEST, TIGHTEST = 0.15, 0.995, 0.03
 """Distances of the grippers and bend radius where none are given, in lengths of the cable."""
-AMPLIFICATION = 3.5
+AMPLIFICATION = 4.0
 """Movement of any point of the cable relative to what the grippers move, from which on the cable snaps through. Pulling
-a cable to 99.5 % of its length reaches 2.8; motions that snap through reach 5 to 15."""
+a cable to 99.5 % of its length reaches 3.6; motions that snap through reach 5 to 15."""
+STABILITY = 0.36
+"""Least stability of the frictionless cable on the way, see `Equilibrium.stability`, over the number of links: 0 where
+it snaps through, 0.7 for an arch. Near 0 a small error of a clamp or a law decides where the cable goes, and when."""
 _SPACING = 5
 # Grippers that moved within this time may still move a cable that friction held [samples].
 _RECENT = 10
@@ -148,7 +151,7 @@ def grippers_beyond(
     """By how much a motion of the grippers breaks each bound, relative to a size that matters; only those broken.
 
     It also breaks "reach", where the grippers' angles need more cable than there is, and "snap_through", where the
-    cable at rest, without friction, jumps to another shape on the way.
+    cable at rest, without friction, jumps to another shape on the way, or is close to that.
 
     Args:
         bounds: to keep.
@@ -173,8 +176,8 @@ def grippers_beyond(
         taken = [admissible(config, limits, pose) for pose in poses[::_SPACING]]
         if not all(taken):
             broken["reach"] = 1 - float(np.mean(taken)) + max(float(angles.max()) - limits.max_angle, 0.0)
-        elif (jump := _largest_jump(config, poses)) > AMPLIFICATION:
-            broken["snap_through"] = min(jump / AMPLIFICATION - 1, 10.0)
+        elif (jump := _near_snapping(config, poses)) > 0:
+            broken["snap_through"] = jump
     return broken
 
 
@@ -264,22 +267,26 @@ def _beyond_places(
     return found
 
 
-def _largest_jump(config: Discretisation, poses: Float[np.ndarray, "T 2 3"]) -> float:
-    """Largest movement of the frictionless cable at rest between a few samples, relative to that of the grippers."""
-    largest, before = 0.0, None
+def _near_snapping(config: Discretisation, poses: Float[np.ndarray, "T 2 3"]) -> float:
+    """How far the frictionless cable at rest moves beyond `AMPLIFICATION`, or falls below `STABILITY`, on the way.
+
+    Both are relative, and nothing above 10; 0 where neither happens.
+    """
+    most, least, before = 0.0, np.inf, None
     angles = arch_angles(config, poses[0])
     for pose in poses[::_SPACING]:
         try:
-            angles = find_equilibrium(config, pose, angles).angles
+            rest = find_equilibrium(config, pose, angles)
         except ValueError:
-            return np.inf
+            return 10.0
+        angles, least = rest.angles, min(least, rest.stability / config.n_links)
         nodes = chain_nodes(config, pose, angles)
         if before is not None:
             size = np.linalg.norm((pose - before[1]) * [1.0, 1.0, TURN_LENGTH], axis=-1).sum()
             moved = np.linalg.norm(nodes - before[0], axis=-1).max()
-            largest = max(largest, float(moved / max(size, 2 * _REST)))
+            most = max(most, float(moved / max(size, 2 * _REST)))
         before = nodes, pose
-    return largest
+    return min(max(most / AMPLIFICATION - 1, 1 - least / STABILITY, 0.0), 10.0)
 
 
 def _those_broken(found: Mapping[str, Any]) -> dict[str, float]:

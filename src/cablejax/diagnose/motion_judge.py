@@ -19,6 +19,12 @@ from cablejax.diagnose.playback import Playback
 from cablejax.diagnose.protocol import Explanation, explanation
 from cablejax.diagnose.safe_motions import INTERVAL
 
+CLAMP_ERROR = 5e-3
+"""Standard deviation of a clamp's angle to its gripper [rad]: on each recording it is another one, and near a
+snap-through it decides where the cable goes. Differences that it can make up for do not count."""
+STEADY_CLAMP, STEADY_PARAMETER = 0.015, 0.03
+"""Largest difference that a clamp turned by `CLAMP_ERROR`, or a parameter's step of forward differences, may make to a
+point of the cable, in its lengths. More of it is a snap-through that comes sooner or later, or not at all."""
 MARGIN = 0.01
 """Kept by simulated cables from the workspace's edge and from discs [m]: the real one lies elsewhere."""
 
@@ -108,8 +114,8 @@ class Judge:
 
     @property
     def simulations(self) -> int:
-        """Simulations for each motion: of every explanation and of each of its parameters, and without any effect."""
-        return 1 + sum(1 + len(one.z) + (_as_it_is(one) is not one) for one in self.explanations)
+        """Simulations for each motion: without any effect, of every explanation and parameter, and of either clamp."""
+        return 3 + sum(1 + len(one.z) + (_as_it_is(one) is not one) for one in self.explanations)
 
     def judged(self, motions: Sequence[Float[np.ndarray, "T 2 3"]]) -> list[Judged]:
         """Judges motions of one length; those whose grippers keep all bounds are simulated together."""
@@ -131,7 +137,7 @@ class Judge:
         return result
 
     def _simulated(self, playbacks: Sequence[Playback]) -> Float[np.ndarray, "C X T N 2"]:
-        """Keypoints [m] of every motion in the order of `_asked`."""
+        """Keypoints [m] of every motion in the order of `_asked`, then of the first explanation with a clamp turned."""
         together = Playback(
             config=self.playback.config,
             gripper_pose=np.concatenate([one.gripper_pose for one in playbacks]),
@@ -141,6 +147,11 @@ class Judge:
         )
         config, believed = self.playback.config, self.playback.believed
         physics = [physics_of(one, believed, config) for one in self._asked()]
+        first = physics[1]
+        physics += [
+            dataclasses.replace(first, rotation_offset=first.rotation_offset + turn)
+            for turn in CLAMP_ERROR * np.eye(2, dtype=np.float32)
+        ]
         return np.moveaxis(together.keypoints(physics), 0, 1)
 
     def _asked(self) -> list[Explanation]:
@@ -163,6 +174,12 @@ class Judge:
             begin = end + own
         seen, config = np.stack(means).astype(float), self.playback.config
         beyond = cable_beyond(self.bounds, config, poses, np.stack(real), margin=MARGIN)
+        length = config.cable.length
+        unsteady = np.abs(points[-2:] - points[1]).max() / (STEADY_CLAMP * length)
+        for there, mean in zip(moved, seen, strict=True):
+            unsteady = max(unsteady, np.abs(there - mean).max(initial=0.0) / (STEADY_PARAMETER * length))
+        if unsteady > 1:
+            beyond["snap_through"] = max(beyond.get("snap_through", 0.0), min(float(unsteady) - 1, 10.0))
         # a simulation that breaks down next door is as little to be relied upon
         if beyond or not np.isfinite(points).all():
             return Judged(poses, np.nan, beyond or {"snap_through": 10.0}, seen)
@@ -170,15 +187,17 @@ class Judge:
         noise = float(np.sqrt(np.mean(self.noise**2)))
         temper = float(self.calibration.temper(np.sqrt(self.chances @ gaps)[None], noise)[0])
         scale = 1.0 / (self.noise[:, None] * np.sqrt(temper))
+        clamps = ((points[-2:] - points[1]) * scale).reshape(2, -1).astype(float)
         spreads = []
         for one, root, mean, there in zip(self.explanations, self.roots, seen, moved, strict=True):
             slopes = (there - mean) * scale / one.differences.reshape(-1, 1, 1, 1)
             spreads.append(root.T @ slopes.reshape(len(there), mean.size))
         if self.about_parameters:
-            information = parameter_information(spreads[0])
+            information = parameter_information(spreads[0], clamps)
         else:
             whitened = ((seen - seen[:1]) * scale).reshape(len(seen), -1)
-            information = mutual_information(whitened, spreads, self.chances)[0]
+            every = [np.concatenate([spread, clamps]) for spread in spreads]
+            information = mutual_information(whitened, every, self.chances)[0]
         return Judged(poses, information, {}, seen)
 
 

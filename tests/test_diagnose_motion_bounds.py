@@ -1,0 +1,146 @@
+"""Bounds of a motion: their file, and what they find on grippers and on the cable."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from cablejax.cable import Cable, Discretisation
+from cablejax.diagnose.motion_bounds import Bounds, cable_beyond, curvature, grippers_beyond, read_bounds, refined
+from cablejax.diagnose.safe_motions import INTERVAL, safe_motions
+
+CONFIG = Discretisation(n_links=17)
+ARCH = np.array([[0.0, 0.0, 0.4], [0.85, 0.0, -0.4]])
+EVERY = """
+workspace_m = [[-0.5, -0.4], [1.5, 0.9]]
+keep_out_m = [[0.4, 0.6, 0.05], [0.1, -0.3, 0.1]]
+speed_m_per_s = 0.04
+turn_rate_rad_per_s = 0.2
+min_distance_m = 0.3
+max_distance_m = 0.9
+bend_radius_m = 0.05
+duration_s = 25
+"""
+
+
+def test_file_gives_the_bounds(tmp_path):
+    (tmp_path / "bounds.toml").write_text(EVERY)
+    assert read_bounds(tmp_path / "bounds.toml") == Bounds(
+        workspace=((-0.5, -0.4), (1.5, 0.9)),
+        keep_out=((0.4, 0.6, 0.05), (0.1, -0.3, 0.1)),
+        speed=0.04,
+        turn_rate=0.2,
+        min_distance=0.3,
+        max_distance=0.9,
+        bend_radius=0.05,
+        duration=25,
+    )
+    (tmp_path / "empty.toml").write_text("")
+    assert read_bounds(tmp_path / "empty.toml") == Bounds()
+
+
+@pytest.mark.parametrize(
+    ("line", "words"),
+    [
+        ("speed = 0.1", "speed without its unit: write speed_m_per_s, in m/s"),
+        ("bend_radius_mm = 30", "Did you mean bend_radius_m"),
+        ("colour = 1", "unknown key 'colour'. Expected workspace_m, keep_out_m"),
+        ("speed_m_per_s = -0.1", "speed_m_per_s is -0.1, expected a number from 0.0001 to 10 m/s"),
+        ("speed_m_per_s = 50", "expected a number from 0.0001 to 10 m/s"),
+        ("turn_rate_rad_per_s = 'fast'", "turn_rate_rad_per_s is 'fast'"),
+        ("bend_radius_m = nan", "bend_radius_m is nan"),
+        ("duration_s = 1e5", "expected a number from 5 to 300 s"),
+        ("workspace_m = [[1, 1], [0, 0]]", "expected"),
+        ("workspace_m = [0, 0, 1, 1]", r"expected [[x, y], [x, y]], the lowest and the highest corner, in metres"),
+        ("keep_out_m = [[0.1, 0.2]]", r"expected [[x, y, radius], ...], in metres"),
+        ("keep_out_m = [[0.1, 0.2, -0.1]]", "keep_out_m"),
+        ("keep_out_m = 3", "keep_out_m is 3"),
+        ("min_distance_m = 0.5\nmax_distance_m = 0.4", "expected the first below the second"),
+        ("speed_m_per_s =", "is no TOML"),
+    ],
+)
+def test_file_is_refused_with_what_is_wrong(tmp_path, line, words):
+    path = tmp_path / "bounds.toml"
+    path.write_text(line)
+    with pytest.raises(ValueError) as error:
+        read_bounds(path)
+    assert words in str(error.value) and str(path) in str(error.value)
+
+
+def test_file_that_is_not_there(tmp_path):
+    with pytest.raises(ValueError, match="could not be read"):
+        read_bounds(tmp_path / "none.toml")
+
+
+def test_safe_motions_keep_the_default_bounds():
+    for name, poses in safe_motions(CONFIG, ARCH).items():
+        assert grippers_beyond(Bounds(), CONFIG, poses, INTERVAL) == {}, name
+
+
+@pytest.mark.parametrize(
+    ("bounds", "name"),
+    [
+        (Bounds(workspace=((-1, -1), (1, 0.1))), "workspace"),
+        (Bounds(keep_out=((0.0, 0.15, 0.02),)), "keep_out"),
+        (Bounds(speed=0.02), "speed"),
+        (Bounds(turn_rate=0.01), "turn_rate"),
+        (Bounds(max_distance=0.8), "distance"),
+        (Bounds(min_distance=0.9), "distance"),
+        (Bounds(duration=20), "duration"),
+    ],
+)
+def test_each_bound_on_the_grippers_is_found(bounds, name):
+    moved = safe_motions(CONFIG, ARCH)["translation" if name != "turn_rate" else "ramp_hold"]
+    beyond = grippers_beyond(bounds, CONFIG, moved, INTERVAL)
+    assert list(beyond) == [name] and beyond[name] > 0
+
+
+def test_disc_between_the_grippers_is_free_for_them_and_not_for_the_cable():
+    still = np.repeat(ARCH[None], 20, axis=0)
+    straight = np.linspace(ARCH[0, :2], ARCH[1, :2], 13)[None, None].repeat(20, axis=1)
+    # between two keypoints, which are 7 cm apart
+    bounds = Bounds(keep_out=((0.46, 0.0, 0.02),))
+    assert grippers_beyond(bounds, CONFIG, still, INTERVAL) == {}
+    assert list(cable_beyond(bounds, CONFIG, still, straight)) == ["keep_out"]
+    away = Bounds(keep_out=((0.46, 0.035, 0.02),))
+    assert cable_beyond(away, CONFIG, still, straight) == {}
+    assert list(cable_beyond(away, CONFIG, still, straight, margin=0.02)) == ["keep_out"]
+
+
+def test_curvature_of_a_circle_and_its_bound():
+    angle = np.linspace(0, 2.5, 13)
+    circle = 0.2 * np.stack([np.sin(angle), 1 - np.cos(angle)], axis=1)
+    np.testing.assert_allclose(curvature(circle), 5.0, rtol=1e-6)
+    fine = refined(circle)
+    np.testing.assert_allclose(np.linalg.norm(fine - [0.0, 0.2], axis=1), 0.2, rtol=3e-4)
+    still, points = np.repeat(ARCH[None], 5, axis=0), np.repeat(circle[None, None], 5, axis=1)
+    assert cable_beyond(Bounds(bend_radius=0.19), CONFIG, still, points) == {}
+    assert list(cable_beyond(Bounds(bend_radius=0.21), CONFIG, still, points)) == ["bend_radius"]
+
+
+def test_cable_that_jumps_or_breaks_down_is_found():
+    still = np.repeat(ARCH[None], 20, axis=0)
+    points = np.linspace(ARCH[0, :2], ARCH[1, :2], 13)[None, None].repeat(20, axis=1)
+    points[:, 10:, 3:-3, 1] += 0.1
+    assert "snap_through" in cable_beyond(Bounds(), CONFIG, still, points)
+    points[:] = np.nan
+    assert list(cable_beyond(Bounds(), CONFIG, still, points)) == ["snap_through"]
+
+
+def test_way_through_a_snap_is_found():
+    # both grippers turn from one side to the other while they are close: the arch has to change sides
+    share = np.linspace(0, 1, 300)[:, None, None]
+    poses = ARCH * [0.8, 1, 1] * (1 - share) + ARCH * [0.8, 1, -3.5] * share
+    assert list(grippers_beyond(Bounds(), CONFIG, poses, INTERVAL)) == ["snap_through"]
+
+
+def test_angles_that_need_more_cable_are_out_of_reach():
+    poses = np.repeat(np.array([[[0.0, 0.0, 1.2], [0.97, 0.0, -1.2]]]), 20, axis=0)
+    assert list(grippers_beyond(Bounds(), CONFIG, poses, INTERVAL)) == ["reach"]
+
+
+def test_bounds_in_lengths_follow_the_cable():
+    short = Cable(length=0.6)
+    assert Bounds().distances(short.length) == pytest.approx((0.09, 0.597))
+    assert Bounds().radius(short.length) == pytest.approx(0.018)
+    assert Bounds(max_distance=5.0).distances(short.length)[1] == pytest.approx(0.597)
