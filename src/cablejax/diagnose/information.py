@@ -120,7 +120,7 @@ class _Products:
         square, row = self._difference(i, j)
         both = np.r_[self._columns[i], self._columns[j]]
         inner = np.eye(len(both)) + self._gram[np.ix_(both, both)]
-        return max(0.125 * (square - row[both] @ np.linalg.solve(inner, row[both])), 0.0)
+        return max(0.125 * float(square - row[both] @ np.linalg.solve(inner, row[both])), 0.0)
 
     def divergence(self, i: int, j: int) -> float:
         """KL divergence of the distribution under i from that under j."""
@@ -131,8 +131,8 @@ class _Products:
         trace = np.trace(self._gram[a, a]) - np.trace(
             np.linalg.solve(inner, self._gram[b, b] + across @ across.T)
         )  # of S_j^-1 S_i, less the number of coordinates
-        far = square - row[b] @ np.linalg.solve(inner, row[b])
-        return max(0.5 * (trace + far + _log_det(self._gram[b, b]) - _log_det(self._gram[a, a])), 0.0)
+        far = square - float(row[b] @ np.linalg.solve(inner, row[b]))
+        return max(0.5 * (float(trace) + far + _log_det(self._gram[b, b]) - _log_det(self._gram[a, a])), 0.0)
 
 
 def _log_det(gram: Float[np.ndarray, "P P"]) -> float:

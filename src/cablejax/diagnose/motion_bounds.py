@@ -70,7 +70,8 @@ class Bounds:
         check(self, speed="gripper_speed", turn_rate="turn_rate", duration="motion_duration")
         given = {"min_distance": "length", "max_distance": "length", "bend_radius": "bend_radius"}
         check(self, **{name: limit for name, limit in given.items() if getattr(self, name) is not None})
-        if None not in (self.min_distance, self.max_distance) and self.min_distance >= self.max_distance:  # pyright: ignore[reportOptionalOperand]
+        low, high = self.min_distance, self.max_distance
+        if low is not None and high is not None and low >= high:
             raise ValueError(
                 f"Bounds.min_distance is {self.min_distance}, Bounds.max_distance {self.max_distance}: expected the "
                 "first below the second [m]."
@@ -138,7 +139,7 @@ def read_bounds(path: str | os.PathLike[str]) -> Bounds:
 
 def _rows(value: Any, width: int, where: str) -> tuple[tuple[float, ...], ...]:
     """A list of rows of so many numbers."""
-    rows = value if isinstance(value, list) else [None]
+    rows: list[Any] = value if isinstance(value, list) else [None]
     if not all(isinstance(r, list) and len(r) == width and all(v in LIMITS["place"] for v in r) for r in rows):
         example = "[[x, y], [x, y]], the lowest and the highest corner" if width == 2 else "[[x, y, radius], ...]"
         raise ValueError(f"{where} is {shown(value)}, expected {example}, in metres.")

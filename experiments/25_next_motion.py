@@ -1,0 +1,202 @@
+"""The next motion designed, against Fisher-optimal and random safe ones, on effects that look alike.
+
+    python experiments/25_next_motion.py --rows ROWS.jsonl --seeds 20    # five minutes a seed; resumable
+    python experiments/25_next_motion.py --rows ROWS.jsonl --process 1 2    # every second row; 0 2 does the others
+    python experiments/25_next_motion.py --rows ROWS.jsonl --report docs/results/next_motion.md
+
+For every seed an effect is drawn from those that one log hardly separates, and staged in the contact plant. The first
+log has three motions; after its diagnosis one motion is added, and after the next another one. The arms differ by that
+motion only:
+
+- `designed`: most information about which explanation holds, within the bounds;
+- `fisher`: the same search for most information about the parameters of the most probable explanation;
+- `random`: one of the safe motions that keep the bounds, drawn at random: nothing clever.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import pathlib
+import time
+from collections.abc import Sequence
+from typing import Any
+
+os.environ.setdefault("NPROC", "4")
+
+import numpy as np
+from jaxtyping import Float
+
+from blind.motions import INTERVAL, draw_motion
+from blind.rod import arch
+from cablejax.cable import Discretisation
+from cablejax.diagnose import CableDiagnosis, diagnose
+from cablejax.diagnose.motion_bounds import Bounds, cable_beyond, grippers_beyond
+from cablejax.diagnose.motion_judge import Objective
+from cablejax.diagnose.safe_motions import safe_motions, starting_pose
+from cablejax.effects.given import parse_effect
+from cablejax.gaplog import Episode, gap_log_from_episodes
+from cablejax.simulate.plant import Plant, PlantConfig
+from cablejax.simulate.play import played
+from pages import markdown_table, page_of_results, publish
+from rows import Rows
+
+ARMS: dict[str, Objective | None] = {"designed": "explanations", "fisher": "parameters", "random": None}
+"""What the search maximises; None = no search."""
+FIRST = ("approach_u", "ramp_hold", "translation")
+"""Motions of the first log."""
+ADDED = 2
+"""Motions that are added one by one."""
+NOISE = 1e-3
+SEED = 25
+PLANT = Discretisation(n_links=24, dimension=3, timestep=0.005)
+CABLE = PLANT.cable
+BOUNDS = Bounds(workspace=((-0.5, -0.8), (1.4, 0.8)), keep_out=((0.45, -0.55, 0.08),))
+RANGES = {
+    "bending_stiffness:ratio": ((0.3, 0.6), (1.7, 3.0)),
+    "table_friction:coefficient": ((0.03, 0.06), (0.18, 0.4)),
+    "linear_density:ratio": ((0.35, 0.6), (1.7, 3.5)),
+    "viscous_drag:coefficient_n_s_per_m2": ((1.5, 6.0),),
+    "bending_damping:time_s": ((1.0, 4.0),),
+}
+"""Effects that look alike, and where their parameter is drawn from."""
+
+
+def staged(seed: int) -> str:
+    """The effect of a seed."""
+    rng = np.random.default_rng([SEED, seed])
+    name = list(RANGES)[seed % len(RANGES)]
+    low, high = RANGES[name][rng.integers(len(RANGES[name]))]
+    return f"{name}={np.exp(rng.uniform(np.log(low), np.log(high))):.3g}"
+
+
+class SetUp:
+    """One seed's plant, and the motions that have been recorded on it."""
+
+    def __init__(self, seed: int):
+        self.text, self._seed = staged(seed), seed
+        self._plant = Plant(PlantConfig(discretisation=PLANT, effects=(parse_effect(self.text),)))
+        self.episodes: list[Episode] = []
+        rng = np.random.default_rng([SEED, seed, 1])
+        for name in FIRST:
+            commands = draw_motion(rng, name, CABLE.length)
+            guess = arch(commands.start, CABLE.length, 2 * PLANT.n_links)
+            self._record(commands.start, commands.twist, name, guess=guess)
+
+    def add(self, poses: Float[np.ndarray, "T 2 3"], name: str) -> dict[str, float]:
+        """Records a motion; returns by how much its execution breaks each bound."""
+        twist = np.append(np.diff(poses, axis=0) / INTERVAL, np.zeros((1, 2, 3)), axis=0)
+        self._record(poses[0], twist, name)
+        done = self.episodes[-1]
+        planar = Discretisation(CABLE)
+        # what a camera sees with noise is taken without it
+        clean = self._clean[None]
+        return grippers_beyond(BOUNDS, planar, poses, INTERVAL) | cable_beyond(BOUNDS, planar, done.gripper_pose, clean)
+
+    def _record(self, start: np.ndarray, twist: np.ndarray, name: str, *, guess: np.ndarray | None = None) -> None:
+        episode = played(self._plant, start, twist, INTERVAL, motion=name, guess=guess)
+        noise = np.random.default_rng([SEED, self._seed, 2, len(self.episodes)])
+        self._clean = episode.keypoints
+        seen = episode.keypoints + NOISE * noise.standard_normal(episode.keypoints.shape)
+        self.episodes.append(
+            Episode(name, episode.time, seen, episode.gripper_pose, episode.gripper_command, episode.hold)
+        )
+
+    def diagnosed(self, objective: Objective | None) -> CableDiagnosis:
+        """The diagnosis of all that was recorded, with the next motion by this objective."""
+        log = gap_log_from_episodes(self.episodes, CABLE, source="contact plant")
+        return diagnose(log, bounds=None if objective is None else BOUNDS, objective=objective or "explanations")
+
+
+def examine(seed: int, arm: str) -> dict[str, Any]:
+    """The row of one seed and arm."""
+    case, rng = SetUp(seed), np.random.default_rng([SEED, seed, 3])
+    truth, logs, broken = case.text.partition(":")[0], [], []
+    for added in range(ADDED + 1):
+        begin = time.perf_counter()
+        found = case.diagnosed(ARMS[arm])
+        named = [effect.name for effect in found.effects]
+        following = found.next_motion
+        logs.append(
+            {
+                "verdict": found.verdict,
+                "named": named,
+                "set": sorted({*named, *(name for group in found.equivalent for name in group)}),
+                "next": None if following is None else following.motion,
+                "information": None if following is None else following.information,
+                "doubt": None if following is None else following.doubt,
+                "seconds": time.perf_counter() - begin,
+            }
+        )
+        if added == ADDED:
+            break
+        if ARMS[arm] is None or following is None:
+            first = starting_pose(found.log.gripper_pose)
+            safe = {
+                name: poses
+                for name, poses in safe_motions(Discretisation(CABLE), first, bounds=BOUNDS).items()
+                if not grippers_beyond(BOUNDS, Discretisation(CABLE), poses, INTERVAL)
+            }
+            name = str(rng.choice(sorted(safe)))
+            broken.append(case.add(safe[name], name))
+        else:
+            broken.append(case.add(following.poses, following.motion))
+    return {"effect": case.text, "truth": truth, "logs": logs, "broken": broken}
+
+
+def page(rows: Sequence[dict[str, Any]]) -> str:
+    """Set sizes and truth in the set by arm and number of added motions, over seeds that all arms have."""
+    arms = [arm for arm in ARMS if any(row["arm"] == arm for row in rows)]
+    common = set.intersection(*({row["seed"] for row in rows if row["arm"] == arm} for arm in arms)) if arms else set()
+    head = ["arm", "motions added", "set size, median (mean)", "truth in the set", "set is the truth alone"]
+    table = [head]
+    for arm in arms:
+        own = [row for row in rows if row["arm"] == arm and row["seed"] in common]
+        for added in range(ADDED + 1):
+            sets = [(row["logs"][added]["set"], row["truth"]) for row in own]
+            sizes = [len(names) for names, _ in sets]
+            hits, alone = [t in names for names, t in sets], [names == [t] for names, t in sets]
+            table.append(
+                [
+                    arm,
+                    str(added),
+                    f"{np.median(sizes):.1f} ({np.mean(sizes):.1f})",
+                    f"{sum(hits)} of {len(hits)}",
+                    f"{sum(alone)} of {len(alone)}",
+                ]
+            )
+    moved = [(row["arm"], broken) for row in rows if row["seed"] in common for broken in row["broken"]]
+    kept = {arm: [not broken for name, broken in moved if name == arm] for arm in arms}
+    bounds = ", ".join(f"{arm} {sum(k)} of {len(k)}" for arm, k in kept.items())
+    lines = [
+        f"{len(common)} seeds, {len(RANGES)} effects in turn, {1e3 * NOISE:g} mm noise; the first log has "
+        f"{len(FIRST)} motions. Motions that kept all bounds when the plant executed them: {bounds}.",
+        "",
+        *markdown_table(table),
+        "",
+        "Staged: "
+        + ", ".join(f"`{row['effect']}`" for row in rows if row["arm"] == arms[0] and row["seed"] in common)
+        + ".",
+    ]
+    return page_of_results("The next motion", "`python experiments/25_next_motion.py --rows ROWS --report FILE`", lines)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--rows", type=pathlib.Path, required=True, help="file of the finished rows")
+    parser.add_argument("--seeds", type=int, default=20, help="how many set-ups")
+    parser.add_argument("--arms", nargs="+", choices=list(ARMS), default=list(ARMS))
+    parser.add_argument("--process", type=int, nargs=2, default=(0, 1), metavar=("I", "N"), help="every N-th row")
+    parser.add_argument("--report", type=pathlib.Path, help="write the page of the finished rows, and run nothing")
+    parser.add_argument("--seconds", type=float, default=np.inf, help="begin no further row after this time")
+    options = parser.parse_args()
+    rows = Rows(options.rows, ("seed", "arm"))
+    if options.report is not None:
+        publish(page(rows.read()), options.report)
+        return
+    wanted = [(seed, arm) for seed in range(options.seeds) for arm in options.arms]
+    rows.run(rows.missing(wanted, tuple(options.process)), examine, seconds=options.seconds)
+
+
+if __name__ == "__main__":
+    main()
