@@ -9,7 +9,7 @@ import pytest
 import spatial_cases
 from cablejax.cli import main
 from cablejax.commands import diagnose
-from cablejax.gaplog import write_gap_log
+from cablejax.gaplog import read_gap_log, write_gap_log
 from diagnose_cases import record
 
 ONLY = ["--only", "gripper_rotation_offset", "bending_stiffness", "keypoint_bias"]
@@ -120,8 +120,9 @@ def test_unknown_effect_is_refused_with_the_known_ones(log, tmp_path, capsys):
         (["--only", "obstacle"], "'obstacle'"),
         (["--only", "viscous_drag", "actuation_lag"], "'actuation_lag'"),
         (["--commissioning", "LOG"], "leave it out"),
+        (["--bounds", "bounds.toml"], "leave it out"),
     ],
-    ids=["effect", "arms", "commissioning"],
+    ids=["effect", "arms", "commissioning", "bounds"],
 )
 def test_a_log_in_space_is_not_asked_for_what_only_the_plane_has(options, message, tmp_path, capsys):
     path = write_gap_log(tmp_path / "space.npz", spatial_cases.recording())
@@ -142,6 +143,42 @@ def test_a_log_in_space_is_searched_for_the_effects_of_space(tmp_path, monkeypat
     assert main(["diagnose", str(path), "--out", str(tmp_path / "a"), "--only", "quadratic_drag"]) == 2
     assert main(["diagnose", str(path), "--out", str(tmp_path / "b")]) == 2
     assert asked == [("quadratic_drag",), None]
+
+
+def test_motion_is_designed_within_bounds_and_played_on_the_plant(log, tmp_path):
+    bounds = tmp_path / "bounds.toml"
+    bounds.write_text("workspace_m = [[-0.4, -0.5], [1.3, 0.7]]\nduration_s = 26\n")
+    out, played = tmp_path / "report", tmp_path / "played"
+    assert main(["diagnose", str(log), "--bounds", str(bounds), "--out", str(out), *ONLY]) == 0
+    verdict = json.loads((out / "verdict.json").read_text())
+    worth = verdict["next_motion_worth"]
+    assert verdict["next_motion"] == "designed" and worth["search_ended"] in ("clear", "settled", "budget")
+    assert worth["information_nats"] == max(worth["alternatives_nats"].values()) > 0
+    assert "designed motion" in (out / "report.html").read_text() and (out / "next_motion.gif").stat().st_size > 1000
+    plant = ["--plant-effect", "none", "--links", "12", "--noise-mm", "0.5"]
+    arguments = ["shape", "--motion", str(out / "next_motion.npz"), *plant, "--out", str(played)]
+    assert main(arguments) == 0
+    done, asked = read_gap_log(played / "log.npz"), read_gap_log(out / "next_motion.npz")
+    assert done.meta["motion"] == ["designed"] and done.meta["cable"] == asked.meta["cable"]
+    np.testing.assert_allclose(done.gripper_pose, asked.gripper_pose, atol=2e-5)
+    assert np.isfinite(done.keypoints).all() and done.time[0, -1] <= 26
+    assert main(arguments) == 2, "what is there stays"
+
+
+def test_bounds_that_exclude_every_motion_are_refused(log, tmp_path, capsys):
+    bounds = tmp_path / "bounds.toml"
+    bounds.write_text("workspace_m = [[5, 5], [6, 6]]\n")
+    said = refused([log, "--bounds", bounds, "--out", tmp_path / "report"], capsys)
+    assert "workspace excludes" in said and "Relax the first" in said
+
+
+def test_motion_that_was_not_executed_as_commanded_is_reported(tmp_path):
+    moved = record(OFFSET)
+    moved.gripper_command[:, 30:60, 0, 1] += 0.02
+    path = write_gap_log(tmp_path / "moved.npz", moved)
+    assert main(["diagnose", str(path), "--out", str(tmp_path / "report"), *ONLY]) == 0
+    caveats = json.loads((tmp_path / "report" / "verdict.json").read_text())["caveats"]
+    assert any("not executed as commanded" in text and "60 mm" in text for text in caveats)
 
 
 def test_missing_file_is_refused(tmp_path, capsys):
