@@ -21,13 +21,15 @@ TURN_LENGTH = 0.15
 """Length that one radian counts for where motions of the grippers are added up [m/rad]."""
 NEAREST, FARTHEST, TIGHTEST = 0.15, 0.995, 0.03
 """Distances of the grippers and bend radius where none are given, in lengths of the cable."""
-AMPLIFICATION = 4.0
+AMPLIFICATION = 5.0
 """Movement of any point of the cable relative to what the grippers move, from which on the cable snaps through. Pulling
 a cable to 99.5 % of its length reaches 3.6; motions that snap through reach 5 to 15."""
 STABILITY = 0.36
 """Least stability of the frictionless cable on the way, see `Equilibrium.stability`, over the number of links: 0 where
 it snaps through, 0.7 for an arch. Near 0 a small error of a clamp or a law decides where the cable goes, and when."""
 _SPACING = 5
+# Of the amplification, of a motion that is planned: the real cable lies elsewhere.
+_PLANNED = 0.8
 # Grippers that moved within this time may still move a cable that friction held [samples].
 _RECENT = 10
 # So slow, in one sample, that it counts as rest [m].
@@ -198,13 +200,16 @@ def cable_beyond(
         poses: of the grippers at every sample.
         keypoints: true ones [m], by as many simulations as are to keep the bounds; NaN where one broke down, which
             counts as a snap-through.
-        margin: kept from the workspace's edge and from discs [m]; the bend radius is kept larger by a tenth with one.
+        margin: kept from the workspace's edge and from discs [m]; with one, the bend radius is kept larger by a tenth,
+            and the movement smaller by a fifth.
     """
     length = config.cable.length
     if not np.isfinite(keypoints).all():
         return {"snap_through": 10.0}
     lines = refined(keypoints)
-    least = bounds.radius(length) * (1.1 if margin > 0 else 1.0)
+    least, most = bounds.radius(length), AMPLIFICATION
+    if margin > 0:
+        least, most = least * 1.1, most * _PLANNED
     step = np.linalg.norm(np.diff(keypoints, axis=1), axis=-1).max(axis=-1)
     sizes = np.linalg.norm(np.diff(poses, axis=0) * [1.0, 1.0, TURN_LENGTH], axis=-1).sum(axis=-1)
     recent = np.lib.stride_tricks.sliding_window_view(np.pad(sizes, (_RECENT, 0)), _RECENT + 1).max(axis=-1)
@@ -213,7 +218,7 @@ def cable_beyond(
         {
             **_beyond_places(bounds, lines, margin + 0.5 * config.cable.diameter, length),
             "bend_radius": float(curvature(keypoints).max()) * least - 1,
-            "snap_through": min(jump / AMPLIFICATION - 1, 10.0),
+            "snap_through": min(jump / most - 1, 10.0),
         }
     )
 
@@ -269,7 +274,7 @@ def _beyond_places(
 
 
 def _near_snapping(config: Discretisation, poses: Float[np.ndarray, "T 2 3"]) -> float:
-    """How far the frictionless cable at rest moves beyond `AMPLIFICATION`, or falls below `STABILITY`, on the way.
+    """How far the frictionless cable at rest moves beyond a planned `AMPLIFICATION`, or falls below `STABILITY`.
 
     Both are relative, and nothing above 10; 0 where neither happens.
     """
@@ -287,7 +292,7 @@ def _near_snapping(config: Discretisation, poses: Float[np.ndarray, "T 2 3"]) ->
             moved = np.linalg.norm(nodes - before[0], axis=-1).max()
             most = max(most, float(moved / max(size, 2 * _REST)))
         before = nodes, pose
-    return min(max(most / AMPLIFICATION - 1, 1 - least / STABILITY, 0.0), 10.0)
+    return min(max(most / (_PLANNED * AMPLIFICATION) - 1, 1 - least / STABILITY, 0.0), 10.0)
 
 
 def _those_broken(found: Mapping[str, Any]) -> dict[str, float]:

@@ -21,7 +21,8 @@ from cablejax.diagnose.motion_judge import Judge, Judged
 from cablejax.diagnose.safe_motions import Way
 
 Ended = Literal["clear", "settled", "budget"]
-"""Why a search ended: next to no doubt would be left, no better motion came for some generations, or its budget."""
+"""Why a search ended: next to no doubt would be left, no better motion came for some generations from any start, or its
+budget of simulations."""
 
 LEGS = 4
 """Of a designed motion."""
@@ -31,7 +32,7 @@ _REST = 3.0
 _SCALES = np.array([0.06, 0.06, 0.2, 0.08, 0.3, 0.3])
 _SHARE_SCALE = 0.4
 # Bounds that the grippers break cost no simulation, but time.
-_MOST_GENERATIONS = 80
+_MOST_GENERATIONS = 150
 
 
 @dataclasses.dataclass(frozen=True)
@@ -45,16 +46,18 @@ class DesignConfig:
         clear: the search ends once no more than this share of the doubt would be left.
         tolerance: a generation counts as better if it lowers the doubt that would be left by this share, or, where the
             information is that about parameters, adds this to it [nats].
-        patience: the search ends after so many generations that were not better.
+        patience: the search from one motion ends after so many generations that were not better.
+        starts: motions to search from, one after the other, best first.
         seed: of the search.
     """
 
-    simulations: int = 6000
+    simulations: int = 8000
     population: int = 16
     step: float = 0.5
     clear: float = 0.002
     tolerance: float = 0.03
     patience: int = 8
+    starts: int = 4
     seed: int = 0
 
 
@@ -82,7 +85,7 @@ def design_motion(
     n_samples: int,
     config: DesignConfig = DesignConfig(),
 ) -> Design:
-    """Searches for the motion with the most information that keeps all bounds, from the best of given ones.
+    """Searches for the motion with the most information that keeps all bounds, from the best few of given ones.
 
     Args:
         judge: of motions.
@@ -94,28 +97,31 @@ def design_motion(
     Raises:
         BoundsError: no motion that was tried keeps all bounds; says how many each bound excludes.
     """
-    name = min(judged, key=lambda name: _rank(judged[name]))
-    genome = _Genome(ways[name], judge, n_samples)
-    strategy = _Strategy(genome.size, config)
-    best, tried, made = judged[name], list(judged.values()), 0
-    stale, ended, generations = 0, "budget", 0
-    while generations < _MOST_GENERATIONS:
-        if _left(judge, best) <= config.clear * judge.doubt:
-            ended = "clear"
-            break
-        generations += 1
-        points = strategy.ask()
-        every = judge.judged([genome.poses(point) for point in points])
-        tried += every
-        strategy.tell(points, sorted(range(len(every)), key=lambda i: _rank(every[i])))
-        found = min(every, key=_rank)
-        stale = 0 if _better(judge, found, best, config.tolerance) else stale + 1
-        best = min(best, found, key=_rank)
-        made += judge.simulations * sum(one.keypoints is not None for one in every)
-        if not best.beyond and stale >= config.patience:
-            ended = "settled"
-            break
-        if made >= config.simulations:
+    order = sorted(judged, key=lambda name: _rank(judged[name]))
+    best, tried, made, generations = judged[order[0]], list(judged.values()), 0, 0
+    ended: Ended = "settled"
+    for restart, name in enumerate(order[: config.starts]):
+        genome = _Genome(ways[name], judge, n_samples)
+        strategy = _Strategy(genome.size, config, restart)
+        leader, stale = judged[name], 0
+        while stale < config.patience or best.beyond:
+            if _left(judge, best) <= config.clear * judge.doubt:
+                ended = "clear"
+                break
+            if made >= config.simulations or generations >= _MOST_GENERATIONS:
+                ended = "budget"
+                break
+            generations += 1
+            points = strategy.ask()
+            every = judge.judged([genome.poses(point) for point in points])
+            tried += every
+            strategy.tell(points, sorted(range(len(every)), key=lambda i: _rank(every[i])))
+            found = min(every, key=_rank)
+            stale = 0 if _better(judge, found, leader, config.tolerance) else stale + 1
+            leader = min(leader, found, key=_rank)
+            best = min(best, found, key=_rank)
+            made += judge.simulations * sum(one.keypoints is not None for one in every)
+        if ended != "settled":
             break
     if best.beyond:
         raise BoundsError(excluded(tried))
@@ -166,8 +172,8 @@ class _Genome:
 class _Strategy:
     """CMA-ES with a diagonal covariance; constants and names as in its paper."""
 
-    def __init__(self, size: int, config: DesignConfig):
-        self._random = np.random.default_rng(config.seed)
+    def __init__(self, size: int, config: DesignConfig, restart: int):
+        self._random = np.random.default_rng([config.seed, restart])
         self._count, self._parents = config.population, config.population // 2
         weights = math.log(self._parents + 0.5) - np.log(np.arange(1, self._parents + 1))
         self._weights = weights / weights.sum()
