@@ -24,7 +24,7 @@ NEAREST, FARTHEST, TIGHTEST = 0.15, 0.995, 0.03
 AMPLIFICATION = 5.0
 """Movement of any point of the cable relative to what the grippers move, from which on the cable snaps through. Pulling
 a cable to 99.5 % of its length reaches 3.6; motions that snap through reach 5 to 15."""
-STABILITY = 0.36
+STABILITY = 0.45
 """Least stability of the frictionless cable on the way, see `Equilibrium.stability`, over the number of links: 0 where
 it snaps through, 0.7 for an arch. Near 0 a small error of a clamp or a law decides where the cable goes, and when."""
 _SPACING = 5

@@ -19,10 +19,10 @@ from cablejax.diagnose.playback import Playback
 from cablejax.diagnose.protocol import Explanation, explanation
 from cablejax.diagnose.safe_motions import INTERVAL
 
-CLAMP_ERROR = 5e-3
+CLAMP_ERROR = 0.02
 """Standard deviation of a clamp's angle to its gripper [rad]: on each recording it is another one, and near a
 snap-through it decides where the cable goes. Differences that it can make up for do not count."""
-STEADY_CLAMP, STEADY_PARAMETER = 0.015, 0.03
+STEADY_CLAMP, STEADY_PARAMETER = 0.06, 0.03
 """Largest difference that a clamp turned by `CLAMP_ERROR`, or a parameter's step of forward differences, may make to a
 point of the cable, in its lengths. More of it is a snap-through that comes sooner or later, or not at all."""
 MARGIN = 0.01
