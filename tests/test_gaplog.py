@@ -10,7 +10,16 @@ import numpy as np
 import pytest
 
 from cablejax.cable import Cable
-from cablejax.gaplog import Episode, GapLogError, gap_log_from_episodes, read_gap_log, validate, write_gap_log
+from cablejax.gaplog import (
+    Episode,
+    GapLogError,
+    gap_log_from_episodes,
+    joined,
+    read_gap_log,
+    recordings,
+    validate,
+    write_gap_log,
+)
 from cablejax.types import GapLog
 from file_cases import with_other_bytes
 
@@ -224,3 +233,59 @@ def test_keypoints_may_be_anywhere_and_further_fields_travel(tmp_path):
         gap_log_from_episodes([episode(4)], CABLE, source="test", keypoint_arclength=[0.0, 1.0])
     with pytest.raises(GapLogError, match="extra fields source are fields of the format"):
         gap_log_from_episodes([episode(4)], CABLE, source="test", extra={"source": "other"})
+
+
+class TestJoined:
+    """Several recordings of one set-up as one log."""
+
+    def _halves(self) -> dict[str, GapLog]:
+        one = gap_log_from_episodes([episode(8)], CABLE, source="test")
+        two = gap_log_from_episodes([episode(5, "mirror", seed=1)], CABLE, source="test")
+        return {"a.npz": one, "b.npz": two}
+
+    def test_the_parts_of_a_log_make_it_again(self, log):
+        whole = joined(self._halves())
+        for field in dataclasses.fields(GapLog):
+            if field.name != "meta":
+                np.testing.assert_array_equal(getattr(whole, field.name), getattr(log, field.name), err_msg=field.name)
+        parts = [{"name": "a.npz", "episodes": 1}, {"name": "b.npz", "episodes": 1}]
+        assert whole.meta == {**log.meta, "recordings": parts}
+
+    def test_joining_twice_keeps_the_names(self, log):
+        third = gap_log_from_episodes([episode(6)], CABLE, source="test")
+        again = joined({"ab.npz": joined(self._halves()), "c.npz": third})
+        assert [part["name"] for part in recordings(again)] == ["a.npz", "b.npz", "c.npz"]
+
+    def test_a_recording_without_holds(self):
+        logs = self._halves()
+        logs["b.npz"] = dataclasses.replace(logs["b.npz"], hold=None)
+        whole = joined(logs)
+        assert whole.hold[0].any() and not whole.hold[1].any()
+
+    @pytest.mark.parametrize(
+        ("cable", "field"),
+        [
+            (Cable(n_keypoints=5, bending_stiffness=0.01), "bending_stiffness_n_m2"),
+            (Cable(n_keypoints=5, friction_coefficient=0.2), "table"),
+        ],
+    )
+    def test_another_set_up_is_refused_by_the_field(self, cable, field):
+        logs = self._halves()
+        logs["b.npz"] = gap_log_from_episodes([episode(5, seed=1)], cable, source="test")
+        with pytest.raises(GapLogError, match=rf"b.npz is not of the set-up of a.npz: .*{field}.* Diagnose them apart"):
+            joined(logs)
+
+    def test_the_same_recording_counts_once(self, log):
+        with pytest.raises(GapLogError, match=r"a\.npz and copy\.npz are the same recording"):
+            joined({"a.npz": log, "copy.npz": log})
+
+    def test_nothing_is_no_log(self):
+        with pytest.raises(GapLogError, match="Nothing to join"):
+            joined({})
+
+    @pytest.mark.parametrize(
+        "parts", [3, [{"name": "a"}], [{"name": "a", "episodes": 1}], [{"name": 1, "episodes": 2}]]
+    )
+    def test_recordings_that_do_not_add_up(self, log, parts):
+        with pytest.raises(GapLogError, match=r"meta\.recordings"):
+            recordings(dataclasses.replace(log, meta={**log.meta, "recordings": parts}))

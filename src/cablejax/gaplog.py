@@ -17,6 +17,7 @@ from jaxtyping import Float
 
 from cablejax.cable import GRAVITY, Cable
 from cablejax.gaplog_check import DTYPES, META_FIELDS, SCHEMA, GapLogError, validate
+from cablejax.limits import shown
 from cablejax.npz import NpzError, read_npz
 from cablejax.text_file import parse_json
 from cablejax.types import GapLog
@@ -120,6 +121,114 @@ def gap_log_from_episodes(
     )
     validate(log)
     return log
+
+
+def joined(logs: Mapping[str, GapLog]) -> GapLog:
+    """One log of several recordings of one set-up, episodes in the order given.
+
+    Its `meta` has the field `recordings`: the name of each and how many episodes it has, by which a diagnosis says what
+    each one added. Extra fields of `meta` stay where all recordings have the same.
+
+    Args:
+        logs: by name, for example that of the file; at least one. One that was joined itself keeps its parts' names.
+
+    Raises:
+        GapLogError: recordings of different set-ups, or the same one twice; names both and what differs.
+    """
+    if not logs:
+        raise GapLogError("Nothing to join: expected at least one gap log.")
+    (first, *others), given = list(logs), list(logs.values())
+    for i, (name, log) in enumerate(logs.items()):
+        for other in list(logs)[:i]:
+            if _same_recording(log, logs[other]):
+                raise GapLogError(f"{other} and {name} are the same recording: name it once, or it would count twice.")
+    for name in others:
+        there_all, here_all = _set_up(given[0]), _set_up(logs[name])
+        for field in there_all | here_all:
+            if (here := here_all.get(field)) != (there := there_all.get(field)):
+                raise GapLogError(
+                    f"{name} is not of the set-up of {first}: '{field}' is {shown(here)}, and there {shown(there)}. "
+                    "Diagnose them apart, or correct the one that states it wrongly."
+                )
+    samples = max(log.keypoints.shape[1] for log in given)
+
+    def whole(name: str, fill) -> np.ndarray | None:
+        arrays = [getattr(log, name) for log in given]
+        if all(array is None for array in arrays):
+            return None
+        rows = []
+        for array, log in zip(arrays, given, strict=True):
+            array = np.zeros(log.time.shape, bool) if array is None else array
+            missing = [(0, 0), (0, samples - array.shape[1]), *[(0, 0)] * (array.ndim - 2)]
+            rows.append(
+                np.pad(array, missing, "edge") if fill is None else np.pad(array, missing, constant_values=fill)
+            )
+        return np.concatenate(rows)
+
+    extra = set.intersection(*(set(log.meta) for log in given)) - {*META_FIELDS, "recordings"}
+    log = dataclasses.replace(
+        given[0],
+        time=whole("time", None),
+        keypoints=whole("keypoints", np.nan),
+        gripper_pose=whole("gripper_pose", None),
+        gripper_command=whole("gripper_command", 0.0),
+        episode_length=np.concatenate([log.episode_length for log in given]),
+        hold=whole("hold", False),
+        meta={
+            **{name: given[0].meta[name] for name in META_FIELDS},
+            **{name: given[0].meta[name] for name in sorted(extra) if all(_same(name, log, given[0]) for log in given)},
+            "motion": [motion for log in given for motion in log.meta["motion"]],
+            "source": "; ".join(dict.fromkeys(log.meta["source"] for log in given)),
+            "recordings": [part for name, log in logs.items() for part in recordings(log, name)],
+        },
+    )
+    validate(log)
+    return log
+
+
+def recordings(log: GapLog, name: str = "the log") -> list[dict[str, Any]]:
+    """What a log was joined of, as `{"name", "episodes"}`; of one that was not joined, itself under this name.
+
+    Raises:
+        GapLogError: the field `recordings` of its `meta` does not add up to its episodes.
+    """
+    parts, episodes = log.meta.get("recordings"), len(log.episode_length)
+    if parts is None:
+        return [{"name": name, "episodes": episodes}]
+    try:
+        counts = [part["episodes"] for part in parts if isinstance(part["name"], str)]
+        fits = len(counts) == len(parts) and sum(counts) == episodes and all(type(n) is int and n > 0 for n in counts)
+    except (TypeError, KeyError, ValueError):
+        fits = False
+    if not fits:
+        raise GapLogError(
+            f"Field 'meta.recordings' is {shown(parts)}, expected names and numbers of episodes that add up to "
+            f"{episodes}, as `cablejax.gaplog.joined` writes them."
+        )
+    return parts
+
+
+def _set_up(log: GapLog) -> dict[str, Any]:
+    """What recordings of one set-up have in common, by the names of the format."""
+    meta = log.meta
+    return {
+        "dimension of the keypoints": log.keypoints.shape[3],
+        "number of keypoints": log.keypoints.shape[2],
+        "number of grippers": log.gripper_pose.shape[2],
+        "meta.cable.rest_curvature_per_m": 0.0,
+        **{f"meta.cable.{name}": value for name, value in meta["cable"].items()},
+        **{f"meta.{name}": meta[name] for name in ("table", "gravity_m_per_s2", "keypoint_arclength_m", "grasp")},
+    }
+
+
+def _same(name: str, log: GapLog, other: GapLog) -> bool:
+    return log.meta[name] == other.meta[name]
+
+
+def _same_recording(log: GapLog, other: GapLog) -> bool:
+    return all(
+        np.array_equal(getattr(log, name), getattr(other, name), equal_nan=True) for name in ("time", "keypoints")
+    )
 
 
 def write_gap_log(path: str | os.PathLike, log: GapLog, *, overwrite: bool = False) -> pathlib.Path:

@@ -27,8 +27,9 @@ class Diagnose(Command):
     its length, and goes on where it was if interrupted.
     """
 
-    log: Annotated[pathlib.Path, tyro.conf.Positional]
-    """The recorded run, an .npz file."""
+    logs: Annotated[tuple[pathlib.Path, ...], tyro.conf.Positional]
+    """The recorded run, an .npz file. Several of one set-up are diagnosed together, in the order in which they were
+    recorded, and the verdict says what each one added."""
 
     out: pathlib.Path = pathlib.Path("runs/diagnosis")
     """Folder of the report."""
@@ -53,9 +54,12 @@ class Diagnose(Command):
         from cablejax.commands.resuming import unfinished
         from cablejax.diagnose import verdict_json
         from cablejax.diagnose.motion_bounds import read_bounds
-        from cablejax.gaplog import read_gap_log
+        from cablejax.gaplog import joined, read_gap_log
 
-        log = read_gap_log(self.log)
+        if not self.logs:
+            raise UsageError("Nothing to diagnose: name a gap log, or several of one set-up.")
+        read = [read_gap_log(path) for path in self.logs]
+        log = read[0] if len(read) == 1 else joined(dict(zip(map(str, self.logs), read, strict=True)))
         if _in_space(log):
             self._check_space()
         else:
@@ -63,7 +67,7 @@ class Diagnose(Command):
         bounds = None if self.bounds is None else read_bounds(self.bounds)
         commissioning = [read_gap_log(path) for path in self.commissioning]
         settings = {
-            "diagnosis": [hashlib.sha256(path.read_bytes()).hexdigest() for path in (self.log, *self.commissioning)],
+            "diagnosis": [hashlib.sha256(path.read_bytes()).hexdigest() for path in (*self.logs, *self.commissioning)],
             "only": self.only,
             "bounds": None if bounds is None else dataclasses.asdict(bounds),
         }
@@ -92,17 +96,18 @@ class Diagnose(Command):
         for name in self.only:
             if name not in effect_names():
                 raise UsageError(
-                    f"--only names the effect {name!r}, but {self.log} is a log in space, which is searched for "
+                    f"--only names the effect {name!r}, but {self.logs[0]} is a log in space, which is searched for "
                     f"{', '.join(effect_names())}: name some of these."
                 )
         if self.commissioning:
             raise UsageError(
-                f"--commissioning is given, but {self.log} is a log in space, where the gap is judged by recordings "
-                "that no fit has seen and commissioning logs are not used: leave it out."
+                f"--commissioning is given, but {self.logs[0]} is a log in space, where the gap is judged by "
+                "recordings that no fit has seen and commissioning logs are not used: leave it out."
             )
         if self.bounds is not None:
             raise UsageError(
-                f"--bounds is given, but {self.log} is a log in space, for which no motion is evaluated: leave it out."
+                f"--bounds is given, but {self.logs[0]} is a log in space, for which no motion is evaluated: "
+                "leave it out."
             )
 
 

@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float, Int
 from cablejax.diagnose.belief import Calibration, probabilities
 from cablejax.diagnose.conclude import Conclusion
 from cablejax.diagnose.diagnosis import PLACES, NamedEffect, ParameterEstimate, Ranked, Verdict
-from cablejax.diagnose.evidence import student_log_likelihood
+from cablejax.diagnose.evidence import student_log_likelihoods
 from cablejax.diagnose.repeats import episodes_by_motion
 from cablejax.effects.arms import lagged
 
@@ -247,9 +247,9 @@ def _chances(arms: Actuation, calibration: Calibration) -> dict[tuple[str, ...],
     calibration = dataclasses.replace(calibration, baseline=_NEGLIGIBLE)
     temper = calibration.temper(arms.unseen[()], _ENCODER_NOISE)
     scores = [
-        student_log_likelihood(
+        student_log_likelihoods(
             arms.count * ((error / _ENCODER_NOISE) ** 2 - 1.0) / temper, calibration.freedom, arms.motion
-        )
+        ).sum()
         - calibration.term_cost * len(effects)
         for effects, error in arms.unseen.items()
     ]

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 if TYPE_CHECKING:
+    from cablejax.diagnose.rounds import Rounds
     from cablejax.diagnose.where import Where
     from cablejax.types import GapLog
 
@@ -212,6 +213,7 @@ class CableDiagnosis(Diagnosis):
     Attributes:
         where: along the cable, in time, by regime, by frame.
         log: what was diagnosed.
+        rounds: what each recording added; None where the log is one recording, and in space.
         nominal: keypoints of the nominal simulator [m], NaN beyond an episode's end, shape [E, T, N, D].
         explained: keypoints of the simulator with the named (or best) effects, each episode from a fit that left it
             out [m], shape [E, T, N, D]; None for the verdict "none".
@@ -225,3 +227,4 @@ class CableDiagnosis(Diagnosis):
     explained: Float[np.ndarray, "E T N D"] | None
     noise_mm: Float[np.ndarray, "N"]
     noise_correlation: Float[np.ndarray, "K"]
+    rounds: Rounds | None = None

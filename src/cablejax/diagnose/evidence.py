@@ -83,13 +83,18 @@ class Evidence:
         """Q of every episode: squared error above the noise, in units of what is to be expected."""
         return (sse - self.count) / self.temper
 
+    def log_likelihoods(self, sse: Float[np.ndarray, "E"]) -> Float[np.ndarray, "E"]:
+        """Of each episode's squared residuals, see `student_log_likelihoods`."""
+        return student_log_likelihoods(self.surprise(sse), self.freedom, self.motion)
+
     def log_likelihood(self, sse: Float[np.ndarray, "E"]) -> float:
-        """Of the squared residuals, see `student_log_likelihood`."""
-        return student_log_likelihood(self.surprise(sse), self.freedom, self.motion)
+        """Of all episodes' squared residuals."""
+        return float(self.log_likelihoods(sse).sum())
 
     def fit_log_likelihood(self, sse: Float[np.ndarray, "E"]) -> float:
         """The same as fits have it."""
-        return student_log_likelihood(self.surprise(sse), self.fit_freedom or self.freedom, self.motion)
+        each = student_log_likelihoods(self.surprise(sse), self.fit_freedom or self.freedom, self.motion)
+        return float(each.sum())
 
     def weight(self, sse: Float[np.ndarray, "E"]) -> Float[np.ndarray, "E"]:
         """Weight of each episode's squared residuals in the least squares problem that a fit solves in one step."""
@@ -102,8 +107,10 @@ class Evidence:
         return np.isfinite(self.observed).sum(axis=tuple(range(1, self.observed.ndim)))
 
 
-def student_log_likelihood(surprise: Float[np.ndarray, "E"], freedom: float, motion: Int[np.ndarray, "E"]) -> float:
-    """Student's log likelihood of all episodes up to a constant, see `belief`.
+def student_log_likelihoods(
+    surprise: Float[np.ndarray, "E"], freedom: float, motion: Int[np.ndarray, "E"]
+) -> Float[np.ndarray, "E"]:
+    """Student's log likelihood of every episode up to a constant, see `belief`; their sum is that of the recording.
 
     Below the noise floor it is its tangent there: the floor is an estimate, and a fit that comes out below it still has
     a best value.
@@ -115,4 +122,4 @@ def student_log_likelihood(surprise: Float[np.ndarray, "E"], freedom: float, mot
     """
     scaled = surprise / freedom
     each = np.where(scaled > 0, np.log1p(np.maximum(scaled, 0.0)), scaled)
-    return float(-0.5 * (freedom + 1) * (share_of_motion(motion) * each).sum())
+    return -0.5 * (freedom + 1) * share_of_motion(motion) * each

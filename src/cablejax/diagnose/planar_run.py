@@ -24,6 +24,7 @@ from cablejax.diagnose.next_motion import next_motion, require_some_motion
 from cablejax.diagnose.noise import SMALLEST
 from cablejax.diagnose.protocol import explanation
 from cablejax.diagnose.reference import ahead_of_observations
+from cablejax.diagnose.rounds import UNLIKELY, Rounds, rounds_of
 from cablejax.diagnose.run import Examined, explain, settings_of
 from cablejax.diagnose.where import localise
 from cablejax.effects import LIBRARY, CableEffect
@@ -84,16 +85,18 @@ def diagnose(
         except BoundsError as error:
             none_kept = (f"There is no motion to record next under the explanations found. {error}",)
     repaired = case.recording.as_log(log.meta)
+    rounds = rounds_of(log, found.fits, found.scores, evidence, calibration)
     return CableDiagnosis(
         **Examined(evidence, found, conclusion, reference, after, gap).fields(),
         where=localise(repaired, case.to_log(reference), case.noise.std),
         next_motion=following,
-        caveats=(*_caveats(case, calibration, commissioned=bool(commissioning)), *none_kept),
+        caveats=(*_contradictions(rounds), *_caveats(case, calibration, commissioned=bool(commissioning)), *none_kept),
         log=repaired,
         nominal=case.to_log(reference),
         explained=None if conclusion.verdict == "none" else case.to_log(after),
         noise_mm=1e3 * case.noise.std,
         noise_correlation=case.noise.correlation,
+        rounds=rounds,
         seconds=time.perf_counter() - begin,
         settings={**settings_of(case.simulator, calibration), "links": {"fit": FIT_LINKS, "nominal": FINE_LINKS}},
     )
@@ -130,6 +133,16 @@ def _measured(case: Case, evidence: Evidence, conclusion: Conclusion) -> tuple[G
         ahead_mm=ahead_mm,
     )
     return gap, reference, after
+
+
+def _contradictions(rounds: Rounds | None) -> tuple[str, ...]:
+    if rounds is None or not rounds.contradictory:
+        return ()
+    return (
+        f"The recordings contradict one another: {rounds.odd_one.name} is explained best with other parameters than "
+        f"the rest, and recordings of one set-up would differ as much in fewer than {UNLIKELY:g} of all cases. Check what "
+        "was changed between them, and diagnose each one alone.",
+    )
 
 
 def _caveats(case: Case, calibration: Calibration, *, commissioned: bool) -> tuple[str, ...]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import math
 import os
@@ -28,11 +29,12 @@ def verdict_json(diagnosis: Diagnosis) -> dict[str, Any]:
 
     In addition to the fields of the format it has `sentence`, `baselines`, `leftover_p`, `caveats`, `seconds` and
     `next_motion_worth`: fields of `NextMotion`, those in nats with `_nats`, and whether no motion that was tried
-    separates the explanations. `next_motion` is recommended only where that is false. `gap`
+    separates the explanations; of several recordings `rounds`, the fields of `Round`, and `rounds_contradict`.
+    `next_motion` is recommended only where that is false. `gap`
     has also `unit`, `before_rmse`, `noise_floor`, `after_rmse`, `horizons`, `split`, `ahead_mm` and `best_shrinkage`,
     `ranking` also `leftover_mm`, and `where` also `sentences`, `per_horizon_mm` and `frames`.
     """
-    gap = diagnosis.gap
+    gap, rounds = diagnosis.gap, getattr(diagnosis, "rounds", None)
     return _plain(
         {
             "schema": VERDICT_SCHEMA,
@@ -48,6 +50,8 @@ def verdict_json(diagnosis: Diagnosis) -> dict[str, Any]:
             "where": None if diagnosis.where is None else _where(diagnosis.where),
             "next_motion": None if diagnosis.next_motion is None else diagnosis.next_motion.motion,
             "next_motion_worth": None if diagnosis.next_motion is None else _worth(diagnosis.next_motion),
+            "rounds": None if rounds is None else [dataclasses.asdict(one) for one in rounds.rounds],
+            "rounds_contradict": None if rounds is None else rounds.contradictory,
             "caveats": diagnosis.caveats,
             "seconds": diagnosis.seconds,
         }

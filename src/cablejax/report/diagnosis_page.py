@@ -108,6 +108,7 @@ def write_diagnosis_page(diagnosis: CableDiagnosis, out: str | os.PathLike[str])
         alike=sections.alike(diagnosis),
         faint_below=FAINT,
         left=sections.what_is_left(diagnosis),
+        rounds=sections.rounds_table(diagnosis),
         ranking_note=sections.ranking_note(diagnosis),
         far=sections.how_far(diagnosis),
         following=following,

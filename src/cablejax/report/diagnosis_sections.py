@@ -13,6 +13,7 @@ from cablejax.report.effect_words import (
     between,
     effect_place,
     effect_title,
+    explanation_title,
     listed,
     millimetres,
     parameter_title,
@@ -127,6 +128,30 @@ def nothing_next(diagnosis: CableDiagnosis) -> str:
         return "No motion was evaluated: that is done for cables on a table only."
     settled = diagnosis.verdict in ("none", "named")
     return "No explanations are left to separate." if settled else "No motion of the library would help."
+
+
+def rounds_table(diagnosis: CableDiagnosis) -> Table | None:
+    """What each recording added, and what was believed after it; None of a single recording."""
+    if diagnosis.rounds is None:
+        return None
+    rounds = diagnosis.rounds.rounds
+    leader, *others = rounds[0].nats
+    head = (
+        "recording",
+        "episodes",
+        *(f"nats for {explanation_title(leader)}, against {explanation_title(name)}" for name in others),
+        *(f"probability of {explanation_title(name)} then" for name in (leader, *others)),
+    )
+    rows = [
+        (
+            one.name,
+            str(one.episodes),
+            *(f"{-one.nats[name]:+.1f}" for name in others),
+            *(share(one.probability[name]) for name in (leader, *others)),
+        )
+        for one in rounds
+    ]
+    return "What each recording added", head, rows
 
 
 def detail_tables(diagnosis: CableDiagnosis) -> list[Table]:

@@ -1,0 +1,130 @@
+"""What each of several recordings of one set-up adds to a diagnosis, and whether they contradict one another.
+
+The log likelihood of an explanation is a sum over episodes (see `belief`), so it is one over recordings too: each adds
+so many nats for one explanation against another, with the parameters that fit all of them.
+
+Recordings contradict one another where the best explanation would need other parameters for each. With the gradient g_k
+and the curvature H_k of recording k's part of the cost, weighed as in the fit, a recording's own parameters would gain
+
+    gain_k = g_k' (H_k + 1)^-1 g_k / 2  nats,
+
+and twice the sum over K recordings of one set-up has a chi-squared distribution of P (K - 1) degrees of freedom for P
+parameters: Rao's score test of their being constant. The unit matrix is the prior.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float
+from scipy.stats import chi2
+
+from cablejax.diagnose.belief import Calibration, effect_names, in_doubt, probabilities
+from cablejax.diagnose.evidence import Evidence
+from cablejax.diagnose.fit import Fit
+from cablejax.gaplog import recordings
+from cablejax.types import GapLog
+
+UNLIKELY = 1e-3
+"""Recordings contradict one another where chance alone would make them differ as much less often than this."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Round:
+    """What one recording added.
+
+    Attributes:
+        name: of the recording.
+        episodes: how many it has.
+        nats: by which it speaks for each explanation that the whole leaves open against the most probable one; that one
+            has 0. With what is believed beforehand and as calibrated, they add up to the logarithm of the odds.
+        probability: of these explanations after this recording and those before it, with the parameters that fit all.
+        own_gain: nats that parameters of its own would gain for the most probable explanation.
+    """
+
+    name: str
+    episodes: int
+    nats: dict[str, float]
+    probability: dict[str, float]
+    own_gain: float
+
+
+@dataclasses.dataclass(frozen=True)
+class Rounds:
+    """What every recording added, in the order given.
+
+    Attributes:
+        rounds: one for each recording.
+        contradiction: how likely recordings of one set-up differ as much by chance; None where the most probable
+            explanation has no parameters.
+    """
+
+    rounds: tuple[Round, ...]
+    contradiction: float | None
+
+    @property
+    def contradictory(self) -> bool:
+        """Whether the recordings contradict one another."""
+        return self.contradiction is not None and self.contradiction < UNLIKELY
+
+    @property
+    def odd_one(self) -> Round:
+        """The recording that would gain most by parameters of its own."""
+        return max(self.rounds, key=lambda one: one.own_gain)
+
+
+def rounds_of(
+    log: GapLog, fits: Sequence[Fit], scores: Float[np.ndarray, "F"], evidence: Evidence, calibration: Calibration
+) -> Rounds | None:
+    """What each recording of a joined log added; None of a log that is one recording.
+
+    Args:
+        log: as `cablejax.gaplog.joined` makes it.
+        fits: of different sets of effects to all of it, best first.
+        scores: their log posterior.
+        evidence: that they were fitted to, of all episodes.
+        calibration: of the judgement.
+
+    Raises:
+        GapLogError: what the log says of its recordings does not add up to its episodes.
+    """
+    parts = recordings(log)
+    if len(parts) < 2:
+        return None
+    kept, _ = in_doubt(fits, scores, evidence, calibration)
+    names = [" + ".join(effect_names(fit.explanation)) or "nominal" for fit in kept]
+    each = np.stack([evidence.log_likelihoods(fit.held_out_sse(evidence)) for fit in kept])
+    score = {id(fit): value for fit, value in zip(fits, scores, strict=True)}
+    believed = np.array([score[id(fit)] for fit in kept]) - each.sum(axis=1)
+    ends = np.cumsum([part["episodes"] for part in parts])
+    rows = [np.arange(end - part["episodes"], end) for part, end in zip(parts, ends, strict=True)]
+    gains = [_own_gain(kept[0], evidence, own) for own in rows]
+    rounds = []
+    for part, own, end, gain in zip(parts, rows, ends, gains, strict=True):
+        nats = each[:, own].sum(axis=1)
+        chances = probabilities(believed + each[:, :end].sum(axis=1))
+        rounds.append(
+            Round(
+                name=part["name"],
+                episodes=part["episodes"],
+                nats=dict(zip(names, (nats - nats[0]).tolist(), strict=True)),
+                probability=dict(zip(names, chances.tolist(), strict=True)),
+                own_gain=gain,
+            )
+        )
+    freedom = len(kept[0].explanation.z) * (len(parts) - 1)
+    chance = float(chi2.sf(2.0 * sum(gains), freedom)) if freedom else None
+    return Rounds(tuple(rounds), chance)
+
+
+def _own_gain(fit: Fit, evidence: Evidence, rows: np.ndarray) -> float:
+    """See the module's docstring."""
+    n = len(fit.explanation.z)
+    if n == 0:
+        return 0.0
+    weight = evidence.weight(fit.sse)[rows]
+    slope = fit.gradient[rows, :n].T @ weight
+    curvature = np.einsum("epq,e->pq", fit.curvature[rows, :n, :n], weight)
+    return 0.5 * float(slope @ np.linalg.solve(curvature + np.eye(n), slope))

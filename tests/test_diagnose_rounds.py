@@ -1,0 +1,76 @@
+"""Several recordings of one set-up: what each adds, and whether they contradict one another."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from cablejax.diagnose import Calibration
+from cablejax.diagnose.belief import log_scores
+from cablejax.diagnose.evidence import Evidence
+from cablejax.diagnose.fit import evaluate, improved
+from cablejax.diagnose.protocol import explanation
+from cablejax.diagnose.rounds import Rounds, rounds_of
+from cablejax.types import GapLog
+from diagnose_cases import clean, evidence_of, log_of, parts
+
+SOFT, DRAGGED = ("bending_stiffness", 0, (0.5,)), ("table_friction", 0, (0.25,))
+CALIBRATION = dataclasses.replace(Calibration(), set_odds=0.0)
+N_LINKS = 17
+
+
+def _mixed(*effects) -> Evidence:
+    """Two recordings of two episodes, each with its own effects."""
+    points = [clean(one, n_links=N_LINKS) for one in effects]
+    points = np.concatenate([points[0][:2], points[1][2:]])
+    return dataclasses.replace(evidence_of(points, n_links=N_LINKS), freedom=6.0, temper=np.full(4, 20.0))
+
+
+def _rounds(evidence: Evidence) -> tuple[Rounds, np.ndarray]:
+    """The rounds of two recordings, and the scores of the explanations, best first."""
+    starts = [explanation(*parts(one)) for one in (SOFT, DRAGGED)]
+    fits = improved(evidence, evaluate(evidence, [explanation(), *starts]), 12)
+    scores = log_scores(fits, evidence, CALIBRATION)
+    order = np.argsort(-scores)
+    log = log_of(np.nan_to_num(evidence.observed))
+    log = dataclasses.replace(
+        log, meta={**log.meta, "recordings": [{"name": "a", "episodes": 2}, {"name": "b", "episodes": 2}]}
+    )
+    fits, scores = [fits[i] for i in order], scores[order]
+    rounds = rounds_of(log, fits, scores, evidence, CALIBRATION)
+    assert rounds is not None
+    return rounds, scores
+
+
+@pytest.fixture(scope="module")
+def alike() -> tuple[Rounds, np.ndarray]:
+    return _rounds(_mixed(SOFT, SOFT))
+
+
+def test_nats_add_up_to_the_odds(alike):
+    rounds, scores = alike
+    assert len(rounds.rounds) == 2 and set(rounds.rounds[0].nats) == {"bending_stiffness", "table_friction", "nominal"}
+    last = rounds.rounds[-1].probability
+    expected = np.exp(scores - scores.max())
+    np.testing.assert_allclose(list(last.values()), expected / expected.sum(), atol=1e-9)
+    for name in ("table_friction", "nominal"):
+        cost = Calibration().term_cost if name == "nominal" else 0.0
+        added = sum(one.nats[name] for one in rounds.rounds)
+        leader = "bending_stiffness"
+        assert added + cost == pytest.approx(np.log(last[name] / last[leader]), abs=1e-6)
+
+
+def test_one_set_up_does_not_contradict_itself(alike):
+    rounds, _ = alike
+    assert next(iter(rounds.rounds[0].nats)) == "bending_stiffness"
+    assert not rounds.contradictory
+
+
+def test_a_cable_that_was_changed_between_two_recordings():
+    rounds, _ = _rounds(_mixed(SOFT, ("bending_stiffness", 0, (1.6,))))
+    assert rounds.contradictory and rounds.contradiction < 1e-4
+
+
+def test_a_log_that_was_not_joined_has_no_rounds():
+    log: GapLog = log_of(np.zeros((4, 100, 13, 2)))
+    assert rounds_of(log, [], np.zeros(0), _mixed(SOFT, SOFT), CALIBRATION) is None
