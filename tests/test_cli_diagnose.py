@@ -1,5 +1,6 @@
 """`cablejax diagnose` as a person or a script meets it."""
 
+import dataclasses
 import json
 import pathlib
 
@@ -71,6 +72,27 @@ def test_what_is_there_stays_by_default(log, tmp_path, capsys):
     said = capsys.readouterr().err
     assert "is not empty" in said and "--overwrite" in said
     assert [path.name for path in tmp_path.iterdir()] == ["mine.txt"]
+
+
+def test_recordings_of_one_set_up_are_diagnosed_together(log, report, tmp_path, capsys):
+    whole, halves = read_gap_log(log), []
+    for name, rows in (("first", slice(0, 2)), ("second", slice(2, 4))):
+        arrays = {
+            field.name: getattr(whole, field.name)[rows] for field in dataclasses.fields(whole) if field.name != "meta"
+        }
+        meta = {**whole.meta, "motion": whole.meta["motion"][rows]}
+        halves.append(str(write_gap_log(tmp_path / f"{name}.npz", type(whole)(meta=meta, **arrays))))
+    folder = tmp_path / "report"
+    assert main(["diagnose", *halves, "--out", str(folder), *ONLY]) == 0
+    together, alone = (json.loads((f / "verdict.json").read_text()) for f in (folder, report))
+    for field in ("verdict", "effects", "gap", "ranking"):
+        assert together[field] == alone[field], field
+    assert [one["name"] for one in together["rounds"]] == halves and not together["rounds_contradict"]
+    assert alone["rounds"] is None
+    assert "What each recording added" in (folder / "report.html").read_text()
+    capsys.readouterr()
+    assert main(["diagnose", halves[0], halves[0], "--out", str(tmp_path / "twice")]) == 2
+    assert "same recording" in capsys.readouterr().err
 
 
 @pytest.mark.slow

@@ -260,6 +260,7 @@ class TestJoined:
         logs = self._halves()
         logs["b.npz"] = dataclasses.replace(logs["b.npz"], hold=None)
         whole = joined(logs)
+        assert whole.hold is not None
         assert whole.hold[0].any() and not whole.hold[1].any()
 
     @pytest.mark.parametrize(

@@ -140,8 +140,8 @@ def _contradictions(rounds: Rounds | None) -> tuple[str, ...]:
         return ()
     return (
         f"The recordings contradict one another: {rounds.odd_one.name} is explained best with other parameters than "
-        f"the rest, and recordings of one set-up would differ as much in fewer than {UNLIKELY:g} of all cases. Check what "
-        "was changed between them, and diagnose each one alone.",
+        f"the rest, as recordings of one set-up would be in fewer than {UNLIKELY:g} of all cases. Check what was "
+        "changed between them, and diagnose each one alone.",
     )
 
 
