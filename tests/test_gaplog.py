@@ -238,13 +238,13 @@ def test_keypoints_may_be_anywhere_and_further_fields_travel(tmp_path):
 class TestJoined:
     """Several recordings of one set-up as one log."""
 
-    def _halves(self) -> dict[str, GapLog]:
+    def _halves(self) -> tuple[list[GapLog], list[str]]:
         one = gap_log_from_episodes([episode(8)], CABLE, source="test")
         two = gap_log_from_episodes([episode(5, "mirror", seed=1)], CABLE, source="test")
-        return {"a.npz": one, "b.npz": two}
+        return [one, two], ["a.npz", "b.npz"]
 
     def test_the_parts_of_a_log_make_it_again(self, log):
-        whole = joined(self._halves())
+        whole = joined(*self._halves())
         for field in dataclasses.fields(GapLog):
             if field.name != "meta":
                 np.testing.assert_array_equal(getattr(whole, field.name), getattr(log, field.name), err_msg=field.name)
@@ -253,13 +253,13 @@ class TestJoined:
 
     def test_joining_twice_keeps_the_names(self, log):
         third = gap_log_from_episodes([episode(6)], CABLE, source="test")
-        again = joined({"ab.npz": joined(self._halves()), "c.npz": third})
+        again = joined([joined(*self._halves()), third], ["ab.npz", "c.npz"])
         assert [part["name"] for part in recordings(again)] == ["a.npz", "b.npz", "c.npz"]
 
     def test_a_recording_without_holds(self):
-        logs = self._halves()
-        logs["b.npz"] = dataclasses.replace(logs["b.npz"], hold=None)
-        whole = joined(logs)
+        logs, names = self._halves()
+        logs[1] = dataclasses.replace(logs[1], hold=None)
+        whole = joined(logs, names)
         assert whole.hold is not None
         assert whole.hold[0].any() and not whole.hold[1].any()
 
@@ -271,18 +271,18 @@ class TestJoined:
         ],
     )
     def test_another_set_up_is_refused_by_the_field(self, cable, field):
-        logs = self._halves()
-        logs["b.npz"] = gap_log_from_episodes([episode(5, seed=1)], cable, source="test")
+        logs, names = self._halves()
+        logs[1] = gap_log_from_episodes([episode(5, seed=1)], cable, source="test")
         with pytest.raises(GapLogError, match=rf"b.npz is not of the set-up of a.npz: .*{field}.* Diagnose them apart"):
-            joined(logs)
+            joined(logs, names)
 
     def test_the_same_recording_counts_once(self, log):
         with pytest.raises(GapLogError, match=r"a\.npz and copy\.npz are the same recording"):
-            joined({"a.npz": log, "copy.npz": log})
+            joined([log, log], ["a.npz", "copy.npz"])
 
     def test_nothing_is_no_log(self):
         with pytest.raises(GapLogError, match="Nothing to join"):
-            joined({})
+            joined([], [])
 
     @pytest.mark.parametrize(
         "parts", [3, [{"name": "a"}], [{"name": "a", "episodes": 1}], [{"name": 1, "episodes": 2}]]

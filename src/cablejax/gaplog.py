@@ -123,41 +123,42 @@ def gap_log_from_episodes(
     return log
 
 
-def joined(logs: Mapping[str, GapLog]) -> GapLog:
+def joined(logs: Sequence[GapLog], names: Sequence[str]) -> GapLog:
     """One log of several recordings of one set-up, episodes in the order given.
 
     Its `meta` has the field `recordings`: the name of each and how many episodes it has, by which a diagnosis says what
     each one added. Extra fields of `meta` stay where all recordings have the same.
 
     Args:
-        logs: by name, for example that of the file; at least one. One that was joined itself keeps its parts' names.
+        logs: at least one.
+        names: of each, for example that of its file; one that was joined itself keeps its parts' names.
 
     Raises:
         GapLogError: recordings of different set-ups, or the same one twice; names both and what differs.
     """
     if not logs:
         raise GapLogError("Nothing to join: expected at least one gap log.")
-    (first, *others), given = list(logs), list(logs.values())
-    for i, (name, log) in enumerate(logs.items()):
-        for other in list(logs)[:i]:
-            if _same_recording(log, logs[other]):
-                raise GapLogError(f"{other} and {name} are the same recording: name it once, or it would count twice.")
-    for name in others:
-        there_all, here_all = _set_up(given[0]), _set_up(logs[name])
+    for i, (log, name) in enumerate(zip(logs, names, strict=True)):
+        for other, other_name in zip(logs[:i], names, strict=False):
+            if _same_recording(log, other):
+                raise GapLogError(
+                    f"{other_name} and {name} are the same recording: name it once, or it would count twice."
+                )
+        there_all, here_all = _set_up(logs[0]), _set_up(log)
         for field in there_all | here_all:
             if (here := here_all.get(field)) != (there := there_all.get(field)):
                 raise GapLogError(
-                    f"{name} is not of the set-up of {first}: '{field}' is {shown(here)}, and there {shown(there)}. "
+                    f"{name} is not of the set-up of {names[0]}: '{field}' is {shown(here)}, and there {shown(there)}. "
                     "Diagnose them apart, or correct the one that states it wrongly."
                 )
-    samples = max(log.keypoints.shape[1] for log in given)
+    samples = max(log.keypoints.shape[1] for log in logs)
 
     def whole(name: str, fill) -> np.ndarray | None:
-        arrays = [getattr(log, name) for log in given]
+        arrays = [getattr(log, name) for log in logs]
         if all(array is None for array in arrays):
             return None
         rows = []
-        for array, log in zip(arrays, given, strict=True):
+        for array, log in zip(arrays, logs, strict=True):
             array = np.zeros(log.time.shape, bool) if array is None else array
             missing = [(0, 0), (0, samples - array.shape[1]), *[(0, 0)] * (array.ndim - 2)]
             rows.append(
@@ -165,21 +166,21 @@ def joined(logs: Mapping[str, GapLog]) -> GapLog:
             )
         return np.concatenate(rows)
 
-    extra = set.intersection(*(set(log.meta) for log in given)) - {*META_FIELDS, "recordings"}
+    extra = set.intersection(*(set(log.meta) for log in logs)) - {*META_FIELDS, "recordings"}
     log = dataclasses.replace(
-        given[0],
+        logs[0],
         time=whole("time", None),
         keypoints=whole("keypoints", np.nan),
         gripper_pose=whole("gripper_pose", None),
         gripper_command=whole("gripper_command", 0.0),
-        episode_length=np.concatenate([log.episode_length for log in given]),
+        episode_length=np.concatenate([log.episode_length for log in logs]),
         hold=whole("hold", False),
         meta={
-            **{name: given[0].meta[name] for name in META_FIELDS},
-            **{name: given[0].meta[name] for name in sorted(extra) if all(_same(name, log, given[0]) for log in given)},
-            "motion": [motion for log in given for motion in log.meta["motion"]],
-            "source": "; ".join(dict.fromkeys(log.meta["source"] for log in given)),
-            "recordings": [part for name, log in logs.items() for part in recordings(log, name)],
+            **{name: logs[0].meta[name] for name in META_FIELDS},
+            **{name: logs[0].meta[name] for name in sorted(extra) if all(_same(name, log, logs[0]) for log in logs)},
+            "motion": [motion for log in logs for motion in log.meta["motion"]],
+            "source": "; ".join(dict.fromkeys(log.meta["source"] for log in logs)),
+            "recordings": [part for log, name in zip(logs, names, strict=True) for part in recordings(log, name)],
         },
     )
     validate(log)

@@ -59,7 +59,7 @@ class Diagnose(Command):
         if not self.logs:
             raise UsageError("Nothing to diagnose: name a gap log, or several of one set-up.")
         read = [read_gap_log(path) for path in self.logs]
-        log = read[0] if len(read) == 1 else joined(dict(zip(map(str, self.logs), read, strict=True)))
+        log = read[0] if len(read) == 1 else joined(read, [str(path) for path in self.logs])
         if _in_space(log):
             self._check_space()
         else:
