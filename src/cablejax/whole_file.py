@@ -33,8 +33,10 @@ def whole_file(path: pathlib.Path) -> Iterator[BinaryIO]:
             yield stream
             stream.flush()
             os.replace(draft, path)
-        except BaseException:
+        except BaseException as error:
             draft.unlink(missing_ok=True)
+            if isinstance(error, OSError) and error.errno and error.filename is None:
+                error.filename = os.fspath(path)  # a full disk does not say whose
             raise
 
 
