@@ -31,8 +31,16 @@ from diagnose_cases import record
 SERVER = multiprocessing.get_context("forkserver")
 # Imported once, before JAX starts its threads: a child is at work at once, so that kills hit the work.
 SERVER.set_forkserver_preload(
-    ["pytest", "hypothesis", "cablejax.dynamics.train", "cablejax.control.shaping", "cablejax.commands.diagnose"]
-    + ["cablejax.dataset.generate", "cablejax.diagnose", "cablejax.report.page", "cablejax.spatial.diagnose"]
+    [
+        *(
+            "pytest",
+            "hypothesis",
+            "cablejax.commands.diagnose",
+            "cablejax.control.shaping",
+            "cablejax.dataset.generate",
+        ),
+        *("cablejax.diagnose", "cablejax.dynamics.train", "cablejax.report.page", "cablejax.spatial.diagnose"),
+    ]
 )
 
 SHARDS = dataclasses.replace(stores.TINY, n_trajectories=16, n_steps=10)
