@@ -139,7 +139,7 @@ def check(wheel: pathlib.Path, python: str, commands: list[list[str]], home: pat
     """Installs the wheel with one Python and runs everything; exits at the first failure."""
     stranger = Stranger(home)
     inside = home / ".venv" / "bin"
-    stranger.run(interpreter(python), "-m", "venv", ".venv", shown=f"{python} -m venv .venv")
+    stranger.run(interpreter(python), "-m", "venv", ".venv", shown="python -m venv .venv")
     stranger.run(str(inside / "pip"), "install", str(wheel), shown="pip install cablejax")
     where = stranger.run(
         str(inside / "python"), "-c", "import cablejax; print(cablejax.__file__)", shown="import cablejax"
@@ -149,7 +149,7 @@ def check(wheel: pathlib.Path, python: str, commands: list[list[str]], home: pat
     stranger.run(str(inside / "pip"), "install", "pyright[nodejs]")
     checker, program = (str(inside / "pyright"), "--pythonpath", str(inside / "python")), home / "outside.py"
     program.write_text("# pyright: strict\n" + OUTSIDE)
-    if 'is "str"' not in (said := stranger.run(*checker, "outside.py")):
+    if 'is "str"' not in (said := stranger.run(*checker, "outside.py", shown="pyright outside.py")):
         sys.exit(f"{said}\nwheel: pyright does not see the types of the installed package.")
     program.write_text(program.read_text() + MISTAKE)
     if "reportArgumentType" not in (
@@ -196,10 +196,15 @@ def main(arguments: list[str] | None = None) -> None:
             results[python] = check(options.wheel.resolve(), python, commands, pathlib.Path(folder, "home"))
     print(f"Load when it began and ended: {load:.1f}, {os.getloadavg()[0]:.1f}; {os.cpu_count()} cores\n")
     print(f"{table(results)}\n\nWall-clock seconds, in brackets seconds of the processor.")
+    busy = max(load, os.getloadavg()[0]) > (os.cpu_count() or 1)
     for python, steps in results.items():
-        first = next(step.wall_s for step in steps if step.words == FIRST)
-        if first > FIRST_AT_MOST_S:
-            sys.exit(f"wheel: with {python} the {FIRST} took {first:.0f} s, expected at most {FIRST_AT_MOST_S:.0f} s.")
+        found = {step.words: step for step in steps}
+        # on a machine that others use, the processor time of the whole demo is the fairer bound
+        seconds = found["cablejax demo"].processor_s if busy else found[FIRST].wall_s
+        if seconds > FIRST_AT_MOST_S:
+            sys.exit(
+                f"wheel: with {python} the {FIRST} took {seconds:.0f} s, expected at most {FIRST_AT_MOST_S:.0f} s."
+            )
 
 
 if __name__ == "__main__":
