@@ -8,7 +8,7 @@ STAMP := $(VENV)/.stamp
 NPROC ?= 4
 export NPROC
 
-.PHONY: help demo tables quick matrix test test-full lint docs dist clean
+.PHONY: help demo tables quick matrix test test-full lint docs dist wheel-check clean
 .DEFAULT_GOAL := help
 
 help:
@@ -21,6 +21,7 @@ help:
 	@echo "make lint       ruff and pyright"
 	@echo "make docs       the documentation as a site, site/index.html"
 	@echo "make dist       wheel and source distribution, checked, in dist/"
+	@echo "make wheel-check  that wheel in clean environments, with README's commands and their times; half an hour"
 	@echo "make clean      remove .venv and caches (runs/ stays)"
 
 $(STAMP): pyproject.toml constraints.txt
@@ -78,6 +79,11 @@ dist: $(VENV)/.docs-stamp
 	rm -rf dist
 	$(BIN)/python -m build --outdir dist
 	$(BIN)/python -m twine check --strict dist/*
+
+# In folders of their own; downloads their packages, and a Python where there is none.
+wheel-check: dist
+	$(BIN)/python -m pip install --disable-pip-version-check --quiet 'uv>=0.9,<1'
+	$(BIN)/python benchmarks/wheel.py dist/cablejax-*.whl
 
 clean:
 	rm -rf $(VENV) build dist site .pytest_cache .ruff_cache .hypothesis

@@ -1,4 +1,4 @@
-"""Environment-steps per second of `cablejax/ShapeCable-v0`, and what the package's controller reaches in it.
+"""Environment-steps per second of `cablejax/ShapeCable-v0`, and of its form in JAX; errors of the package's controller.
 
 nice -n 10 python benchmarks/environment.py
 """
@@ -6,18 +6,21 @@ nice -n 10 python benchmarks/environment.py
 from __future__ import annotations
 
 import argparse
+import functools
 import json
 import os
 import time
 
 import gymnasium
+import jax
 import numpy as np
 
 from cablejax.compiled_programs import keep_compiled_programs
 from cablejax.control.shaping import load_model, make_controller
 from cablejax.control.targets import make_target
 from cablejax.dataset.schema import Randomisation
-from cablejax.environment import ENVIRONMENT, LinkPolicy, ShapeCableConfig
+from cablejax.environment import ENVIRONMENT, LinkPolicy, MjxShapeCable, ShapeCableConfig
+from cablejax.simulate.compile import compiler_options
 
 VARIED = Randomisation(stiffness=(0.3, 3.0), damping=(0.3, 3.0), friction=(0.5, 2.0))
 
@@ -33,6 +36,23 @@ def steps_per_second(size: int, steps: int) -> dict[str, float]:
     wall, cpu = time.perf_counter(), time.process_time()
     for action in actions:
         env.step(action)
+    wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
+    return {"per_second": size * steps / wall, "per_processor_second": size * steps / cpu}
+
+
+def pure_steps_per_second(size: int, steps: int) -> dict[str, float]:
+    """The same for the environment of JAX, without resets: many actions in one compiled call."""
+    env = MjxShapeCable(ShapeCableConfig(randomisation=VARIED))
+    states = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(0), size))
+    actions = np.random.default_rng(0).uniform(-1, 1, (steps, size, env.action_size)).astype(np.float32)
+
+    @functools.partial(jax.jit, compiler_options=compiler_options())
+    def run(states, actions):
+        return jax.lax.scan(lambda state, action: (jax.vmap(env.step)(state, action), None), states, actions)[0]
+
+    jax.block_until_ready(run(states, actions))
+    wall, cpu = time.perf_counter(), time.process_time()
+    jax.block_until_ready(run(states, actions))
     wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
     return {"per_second": size * steps / wall, "per_processor_second": size * steps / cpu}
 
@@ -64,7 +84,8 @@ def main() -> None:
     parser.add_argument("--solver", default="two-trials")
     options = parser.parse_args()
     keep_compiled_programs()
-    result = {"environments": options.envs, **steps_per_second(options.envs, options.steps)}
+    sizes = options.envs, options.steps
+    result = {"environments": options.envs, "gymnasium": steps_per_second(*sizes), "jax": pure_steps_per_second(*sizes)}
     result["load"] = os.getloadavg()
     print(json.dumps(result | {"baseline": baseline(options.weights, options.solver)}, indent=2))
 

@@ -199,11 +199,15 @@ def test_another_schema_version_is_refused(tmp_path):
     path = tmp_path / "data"
     open_or_create(path, SMALL)
     meta = json.loads((path / "zarr.json").read_text())
-    for version, words in ((9, "Read it with the version"), (1, r"attributes\.config.* cable file .*--links")):
+    for version, words in (
+        (9, "or older: a newer version"),
+        (1, "version 1 has the cable None"),
+        ("x", "another kind"),
+    ):
         meta["attributes"]["schema"] = f"cablejax-dataset/{version}"
         (path / "zarr.json").write_text(json.dumps(meta))
         for opens in (open_store, lambda path: open_or_create(path, SMALL)):
-            with pytest.raises(ValueError, match=rf"'cablejax-dataset/{version}', expected .*/2'\. .*{words}"):
+            with pytest.raises(ValueError, match=words):
                 opens(path)
 
 

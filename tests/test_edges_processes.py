@@ -20,8 +20,9 @@ from cablejax.commands.resuming import unfinished
 from cablejax.dataset import generate as generation
 from cablejax.dataset.opening import open_or_create, open_store
 from cablejax.dynamics.run_folder import claim_folder
-from cablejax.gaplog import write_gap_log
+from cablejax.gaplog import read_gap_log, write_gap_log
 from cablejax.whole_file import sole_writer, whole_file
+from cli_cases import small_model
 from diagnose_cases import record
 
 # a shell starts what it runs in the background deaf to Ctrl-C
@@ -102,6 +103,32 @@ def test_a_full_disk_costs_a_store_one_shard(tmp_path):
     with disk_with(0), pytest.raises(OSError, match="File too large"):
         open_or_create(tmp_path / "other", stores.SMALL)
     assert [path.name for path in tmp_path.iterdir()] == ["data"]
+
+
+@pytest.mark.parametrize("command", ["train", "shape"])
+def test_a_full_disk_is_reported_and_the_same_command_goes_on(command, store, tmp_path, capfd):
+    small = ["--preset", "smoke", "--latent", "8", "--message-passing", "1", "--steps", "4", "--held-out", "0.5"]
+    arguments, most = {
+        "train": (["train", "--data", str(store), *small], 40_000),
+        "shape": (["shape", "--weights", str(small_model(tmp_path / "model")), "--steps", "2", "--links", "8"], 6_000),
+    }[command]
+
+    def run(folder):
+        return main([*arguments, "--out", str(tmp_path / folder)])
+
+    def result(folder):
+        if command == "train":
+            return (tmp_path / folder / "weights.safetensors").read_bytes().partition(b"__metadata__")[2]
+        log = read_gap_log(tmp_path / folder / "log.npz")
+        return log.keypoints.tobytes() + log.gripper_command.tobytes()
+
+    assert run("whole") == 0  # and keeps what it compiled, which has its own place on the disk
+    capfd.readouterr()
+    with disk_with(most):
+        assert run("full") == 2
+    shown = capfd.readouterr().err
+    assert f"cablejax: {tmp_path}/full" in shown and "File too large" in shown and "Traceback" not in shown
+    assert run("full") == 0 and result("full") == result("whole")
 
 
 @pytest.mark.parametrize("command", ["cable", "simulate", "diagnose"])

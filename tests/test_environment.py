@@ -114,10 +114,11 @@ def test_the_vector_form_is_many_of_the_single_one():
         assert info["target_name"].tolist() == [one[-1]["target_name"] for one in each]
 
 
-def test_a_cable_that_diverges_ends_its_episode_alone():
+@pytest.mark.parametrize("value", [np.nan, 1e20])
+def test_a_cable_that_diverges_ends_its_episode_alone(value):
     many = ShapeCableVectorEnv(3, clean())
     many.reset(seed=0)
-    many.cables._state.qpos[1] = np.nan
+    many.cables._state.qpos[1] = value
     seen, _, terminated, _, _ = many.step(np.zeros((3, 2, 3)))
     assert terminated.tolist() == [False, True, False] and many.observation_space.contains(seen)
     seen, rewards, terminated, _, _ = many.step(np.zeros((3, 2, 3)))

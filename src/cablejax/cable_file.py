@@ -12,8 +12,12 @@ from typing import Any
 
 from cablejax.cable import Cable
 from cablejax.limits import LIMITS, require, shown
+from cablejax.schema_version import version_of
 from cablejax.text_file import read_toml, unknown_key
 from cablejax.whole_file import whole_file
+
+SCHEMA = "cablejax-cable/1"
+"""Name and version of the file's keys; a file without `schema` is of version 1."""
 
 NUMBERS: Mapping[str, tuple[str, str]] = {
     "length_m": ("length", "free length between the grippers"),
@@ -49,12 +53,14 @@ def read_cable(path: str | os.PathLike[str]) -> Cable:
         path: of a file with the keys of `NUMBERS`, and `keypoints` or `keypoint_arclength_m`.
 
     Raises:
-        ValueError: the file cannot be read, is no TOML, or does not describe a cable; says which key is wrong.
+        ValueError: the file cannot be read, is no TOML, is of a newer version, or does not describe a cable; says which
+            key is wrong.
     """
     try:
         fields = read_toml(path)
     except (ValueError, OSError) as error:
         raise ValueError(f"The cable could not be read. {error} {_EXAMPLE}") from None
+    version_of(fields.pop("schema", SCHEMA), SCHEMA, path)
     return cable_from_fields(fields, str(path))
 
 
@@ -79,7 +85,12 @@ def cable_text(cable: Cable) -> str:
     lines.append((f'grasp = ["{cable.grasp[0]}", "{cable.grasp[1]}"]', "how each gripper holds the cable"))
     width = max(len(text) for text, _ in lines if len(text) < 50)
     return "\n".join(
-        ["# A cable held by two grippers on a table. SI units.", *(f"{t:{width}}  # {c}" for t, c in lines), ""]
+        [
+            "# A cable held by two grippers on a table. SI units.",
+            f'schema = "{SCHEMA}"',
+            *(f"{t:{width}}  # {c}" for t, c in lines),
+            "",
+        ]
     )
 
 

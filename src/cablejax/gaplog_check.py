@@ -11,6 +11,7 @@ from jaxtyping import Float
 from cablejax.cable_file import NUMBERS, cable_from_fields
 from cablejax.limits import LIMITS, require, shown
 from cablejax.log_geometry import geometry_fault
+from cablejax.schema_version import version_of
 from cablejax.types import GapLog
 
 SCHEMA = "cablejax-gap-log/1"
@@ -125,8 +126,11 @@ def _validate_meta(log: GapLog) -> None:
     meta = log.meta
     if not isinstance(meta, dict):
         raise GapLogError(f"Field 'meta' is a {type(meta).__name__}, expected a JSON object.")
-    if "schema" in meta and meta["schema"] != SCHEMA:
-        raise GapLogError(f"Field 'meta.schema' is {shown(meta['schema'])}, expected {SCHEMA!r}.")
+    if "schema" in meta:
+        try:
+            version_of(meta["schema"], SCHEMA, "Field 'meta'")
+        except ValueError as error:
+            raise GapLogError(str(error)) from None
     for name in META_FIELDS:
         if name not in meta:
             raise GapLogError(f"Field 'meta.{name}' is missing.")

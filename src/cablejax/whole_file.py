@@ -25,17 +25,22 @@ def whole_file(path: pathlib.Path) -> Iterator[BinaryIO]:
         ValueError: another process is writing the file.
     """
     draft = path.with_name(f"{path.name}{DRAFT}")
-    # truncated only once it is known that nobody else writes it
-    with open(draft, "wb", opener=lambda name, _: os.open(name, os.O_WRONLY | os.O_CREAT, 0o666)) as stream:
-        _lock(stream.fileno(), path)
-        try:
-            stream.truncate()
-            yield stream
-            stream.flush()
-            os.replace(draft, path)
-        except BaseException:
-            draft.unlink(missing_ok=True)
-            raise
+    try:
+        # truncated only once it is known that nobody else writes it
+        with open(draft, "wb", opener=lambda name, _: os.open(name, os.O_WRONLY | os.O_CREAT, 0o666)) as stream:
+            _lock(stream.fileno(), path)
+            try:
+                stream.truncate()
+                yield stream
+                stream.flush()
+                os.replace(draft, path)
+            except BaseException:
+                draft.unlink(missing_ok=True)
+                raise
+    except OSError as error:
+        if error.errno and error.filename is None:  # a full disk does not say whose file it was
+            error.filename = os.fspath(path)
+        raise
 
 
 @contextlib.contextmanager

@@ -16,6 +16,7 @@ from cablejax.control.run import ClosedLoopRun
 from cablejax.control.targets import Target
 from cablejax.gaplog import Episode
 from cablejax.npz import read_npz
+from cablejax.schema_version import version_of
 from cablejax.text_file import parse_json, read_json, write_json
 from cablejax.whole_file import DRAFT, sole_writer, whole_file
 
@@ -53,7 +54,9 @@ class Parts:
             found = None
         except ValueError as error:
             raise UsageError(f"{error} Delete {self.folder} to start again.") from error
-        if not isinstance(found, dict) or found.get("schema") != SCHEMA:
+        if isinstance(found, dict) and str(found.get("schema")).startswith("cablejax-parts/"):
+            version_of(found["schema"], SCHEMA, self.folder / _SETTINGS)
+        else:
             raise UsageError(
                 f"{self.folder} was not made by this command, which needs a folder of that name for what is "
                 "unfinished. Move it elsewhere, or give another folder with --out."

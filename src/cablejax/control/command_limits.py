@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from cablejax.limits import check, check_workspace
 
@@ -41,38 +42,40 @@ class CommandLimits:
         check_workspace(self)
 
     def shortened(
-        self, twist: Float[np.ndarray, "*B Q 3"], pose: Float[np.ndarray, "*B Q 3"], duration: float
-    ) -> Float[np.ndarray, "*B Q 3"]:
+        self, twist: Float[Any, "*B Q 3"], pose: Float[Any, "*B Q 3"], duration: float
+    ) -> Float[Any, "*B Q 3"]:
         """The twist, or the largest share of it (in steps of 0.5 %) that stays within all limits while it is held.
 
         Both grippers' twists are scaled by the same share. Grippers that start outside may move on as long as they do
-        not get farther out.
+        not get farther out. NumPy in, NumPy out in double precision; JAX in, JAX out, also within `jit`.
 
         Args:
             twist: [m/s, rad/s], finite.
             pose: of both grippers when it begins [m, rad].
             duration: for which it is held at most [s].
         """
-        twist, pose = np.asarray(twist, float), np.asarray(pose, float)
-        if not self._broken(twist, pose, duration).any():
-            return twist
+        if isinstance(twist, np.ndarray):
+            twist, pose = np.asarray(twist, float), np.asarray(pose, float)
+            if not self._broken(twist, pose, duration).any():
+                return twist
+        xp = twist.__array_namespace__()
+        shares = xp.asarray(_SHARES, dtype=twist.dtype)
         # the grippers pass through the end points of all smaller shares
-        shares = _SHARES.reshape(-1, *[1] * twist.ndim)
-        broken = self._broken(shares * twist, pose, duration)
-        last = np.where(broken.any(axis=0), broken.argmax(axis=0), len(_SHARES)) - 1
-        return _SHARES[np.maximum(last, 0)][..., None, None] * twist
+        broken = self._broken(shares.reshape(-1, *[1] * twist.ndim) * twist, pose, duration)
+        last = xp.where(broken.any(axis=0), broken.argmax(axis=0), len(_SHARES)) - 1
+        return shares[xp.maximum(last, 0)][..., None, None] * twist
 
-    def _broken(self, twist: np.ndarray, pose: np.ndarray, duration: float) -> np.ndarray:
+    def _broken(self, twist: Any, pose: Any, duration: float) -> Bool[Any, "*B"]:
         """Which twists end outside of a limit, and farther out than they begin."""
-        start = pose[..., :2]
+        xp, start = twist.__array_namespace__(), pose[..., :2]
         ends = start + duration * twist[..., :2]
-        apart, before = (np.linalg.norm(places[..., 1, :] - places[..., 0, :], axis=-1) for places in (ends, start))
-        broken = (np.linalg.norm(twist[..., :2], axis=-1) > self.speed + _ROUNDING).any(axis=-1)
-        broken |= (np.abs(twist[..., 2]) > self.turn_rate + _ROUNDING).any(axis=-1)
-        broken |= apart > np.maximum(self.max_distance, before) + _ROUNDING
-        broken |= apart < np.minimum(self.min_distance, before) - _ROUNDING
+        apart, before = (xp.linalg.norm(places[..., 1, :] - places[..., 0, :], axis=-1) for places in (ends, start))
+        broken = (xp.linalg.norm(twist[..., :2], axis=-1) > self.speed + _ROUNDING).any(axis=-1)
+        broken |= (xp.abs(twist[..., 2]) > self.turn_rate + _ROUNDING).any(axis=-1)
+        broken |= apart > xp.maximum(self.max_distance, before) + _ROUNDING
+        broken |= apart < xp.minimum(self.min_distance, before) - _ROUNDING
         if self.workspace is not None:
-            low, high = np.asarray(self.workspace, float)
-            outside = (ends < np.minimum(low, start) - _ROUNDING) | (ends > np.maximum(high, start) + _ROUNDING)
+            low, high = (xp.asarray(corner, dtype=start.dtype) for corner in self.workspace)
+            outside = (ends < xp.minimum(low, start) - _ROUNDING) | (ends > xp.maximum(high, start) + _ROUNDING)
             broken |= outside.any(axis=(-2, -1))
         return broken

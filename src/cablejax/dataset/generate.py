@@ -11,6 +11,7 @@ import dataclasses
 import itertools
 import os
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -83,15 +84,15 @@ def draw_parameters(config: DatasetConfig, rng: np.random.Generator) -> Float[np
     return np.array([stiffness, friction * cable.friction_coefficient, damping * cable.damping_time])
 
 
-def cable_params(config: DatasetConfig, parameters: np.ndarray) -> Physics:
-    """The simulator's parameters of one trajectory: its row of the store's `parameters`, and the effects of all."""
-    stiffness, friction, damping = parameters
+def cable_params(config: DatasetConfig, parameters: Float[Any, "3"]) -> Physics:
+    """The simulator's parameters of one trajectory: its row of the store's `parameters`, and the effects of all.
+
+    NumPy in, NumPy out; JAX in, JAX out.
+    """
+    stiffness, friction, damping = parameters.astype(np.float32)
     nominal = nominal_physics(config.discretisation)
     drawn = dataclasses.replace(
-        nominal,
-        stiffness=nominal.stiffness * np.float32(stiffness),
-        friction=np.float32(friction),
-        damping_time=np.float32(damping),
+        nominal, stiffness=nominal.stiffness * stiffness, friction=friction, damping_time=damping
     )
     return with_effects(drawn, config.effects, config.discretisation)
 

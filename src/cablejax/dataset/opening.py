@@ -16,12 +16,14 @@ from cablejax.dataset.schema import (
     SCHEMA,
     DatasetConfig,
     config_from_json,
+    config_of_version_1,
     config_to_json,
     differences,
     digest_of_config,
 )
 from cablejax.dataset.store import Store
 from cablejax.limits import shown
+from cablejax.schema_version import version_of
 from cablejax.text_file import read_json
 
 PACKAGES = ("jax", "jaxlib", "mujoco", "mujoco-mjx", "numpy")
@@ -29,19 +31,12 @@ PACKAGES = ("jax", "jaxlib", "mujoco", "mujoco-mjx", "numpy")
 
 _DIGEST = ((32,), "uint8")
 
-_CHANGES = {
-    "cablejax-dataset/1": "It recorded the cable and its links as one; its options are in `attributes.config` of "
-    "its zarr.json. For `cablejax simulate` put them into a cable file (`cablejax cable --out cable.toml`), --links, "
-    "--trajectories, --steps and --seed. "
-}
-"""How to go on from stores of earlier schemas."""
-
 
 def open_store(path: str | os.PathLike[str], *, mode: Literal["r", "r+"] = "r") -> Store:
     """Opens a data set, complete or not, to read ("r") or also to write its shards ("r+").
 
     Raises:
-        ValueError: there is no data set, or one of another schema version.
+        ValueError: there is no data set, or one of a newer schema version; older ones are read.
     """
     store = _recorded(Path(path), mode)
     for name in _arrays(store.config):
@@ -62,18 +57,15 @@ def _recorded(path: Path, mode: Literal["r", "r+"]) -> Store:
         attributes: dict[str, Any] = dict(read_json(path / "zarr.json")["attributes"])
     except Exception as error:  # zarr raises what its parts raise
         raise ValueError(f"The data set {path} is damaged: {_reason(error)}. Generate it again elsewhere.") from error
-    if attributes.get("schema") != SCHEMA:
-        again = _CHANGES.get(str(attributes.get("schema")), "")
-        raise ValueError(
-            f"{path} has schema {shown(attributes.get('schema'))}, expected {SCHEMA!r}. {again}"
-            "Read it with the version of cablejax that wrote it, or generate it again in another folder."
-        )
+    version = version_of(attributes.get("schema"), SCHEMA, path)
     recorded = attributes.get("config", {})
     if attributes.get("config_digest") != digest_of_config(recorded):
         raise ValueError(
             f"The configuration recorded in {path} was altered: it no longer matches its digest. "
             "Restore its zarr.json, or generate the data set again elsewhere."
         )
+    if version == 1:
+        recorded = config_of_version_1(recorded)
     versions = attributes.get("versions")
     if not isinstance(versions, dict):
         raise ValueError(f"The data set {path} is damaged: its versions are {shown(versions)}. Generate it again.")
@@ -105,7 +97,7 @@ def open_or_create(path: str | os.PathLike[str], config: DatasetConfig) -> Store
     """Opens the data set of `config` to continue it, or creates it. Safe when several processes do so at once.
 
     Raises:
-        ValueError: the folder holds something else, another schema version, another configuration, or was begun by
+        ValueError: the folder holds something else, a newer schema version, another configuration, or was begun by
             other package versions. Damaged descriptions of arrays are mended.
     """
     path, versions = Path(path), package_versions()

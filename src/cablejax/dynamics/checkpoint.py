@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+import errno
+import os
+import tempfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import jax
 import orbax.checkpoint as ocp
+
+_OVERHEAD = 2**16
+"""Bytes that Orbax writes about a state."""
 
 
 class Checkpoints:
@@ -32,9 +38,24 @@ class Checkpoints:
         return self._manager.latest_step()
 
     def save(self, step: int, state: Any) -> None:
-        """Writes a pytree of arrays; a step that is already there is left alone."""
+        """Writes a pytree of arrays; a step that is already there is left alone.
+
+        Raises:
+            OSError: there is no room for it; the states that were there before stay.
+        """
         if step != self.latest():
+            self._reserve(sum(leaf.nbytes for leaf in jax.tree.leaves(state)))
             self._manager.save(step, args=ocp.args.StandardSave(state))
+
+    def _reserve(self, size: int) -> None:
+        """Raises unless there is room for a state: on a full disk Orbax leaves errors of its own threads."""
+        with tempfile.TemporaryFile(dir=self._folder.parent) as file:
+            try:
+                os.posix_fallocate(file.fileno(), 0, max(size + size // 8, 1) + _OVERHEAD)
+            except OSError as error:
+                if error.errno not in (errno.ENOSPC, errno.EFBIG, errno.EDQUOT):
+                    return  # a file system that cannot reserve
+                raise OSError(error.errno, os.strerror(error.errno), os.fspath(self._folder)) from None
 
     def restore(self, like: Any, *, report: Callable[[str], None] = lambda text: None) -> Any:
         """The newest state that can be read; newer ones, which are damaged, are deleted.

@@ -7,8 +7,12 @@ import shutil
 from pathlib import Path
 from typing import Any
 
+from cablejax.schema_version import version_of
 from cablejax.text_file import read_json, write_json
 from cablejax.whole_file import sole_writer
+
+SCHEMA = "cablejax-training/1"
+"""Name and version of the folder's layout; `run.json` without it is of version 1."""
 
 RUN, CHECKPOINTS, METRICS, BOARD = "run.json", "checkpoints", "metrics.csv", "tensorboard"
 """What a training's folder holds: its settings, checkpoints, errors by step, and curves for TensorBoard."""
@@ -33,7 +37,7 @@ def claim_folder(out_dir: Path, run: dict[str, Any], *, resume: bool, overwrite:
     if out_dir.exists() and not out_dir.is_dir():
         raise ValueError(f"{out_dir} is a file, expected a folder for the training. Name another one.")
     path = out_dir / RUN
-    run = json.loads(json.dumps(run))
+    run = {"schema": SCHEMA, **json.loads(json.dumps(run))}
     if path.exists():
         found = _read(path)
         if found == run:
@@ -80,6 +84,7 @@ def _read(path: Path) -> dict[str, Any]:
         ) from error
     if not isinstance(found, dict) or not {"config", "data"} <= found.keys():
         raise ValueError(f"{path} was not made by a training: choose another folder.")
+    version_of(found.setdefault("schema", SCHEMA), SCHEMA, path)
     return found
 
 

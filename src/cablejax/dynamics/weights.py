@@ -30,12 +30,12 @@ from cablejax.cable import Cable
 from cablejax.cable_file import cable_from_fields
 from cablejax.dynamics.config import ModelConfig, Normalisation
 from cablejax.dynamics.model import structure_of
-from cablejax.limits import shown
+from cablejax.schema_version import version_of
 from cablejax.text_file import parse_json
 from cablejax.whole_file import whole_file
 
 SCHEMA = "cablejax-weights/1"
-"""Name and version of the file's layout. A reader refuses any other."""
+"""Name and version of the file's layout."""
 
 FILE_NAME = "weights.safetensors"
 """Name of the file in a training's folder."""
@@ -178,12 +178,12 @@ def _open(source: str | os.PathLike[str]) -> tuple[Path, dict[str, Any]]:
         content = parse_json(metadata.get(_KEY, "null"))
     except (SafetensorError, OSError, ValueError) as error:
         raise WeightsError(f"{path} is no safetensors file, or a damaged one ({error}).") from error
-    schema = content.get("schema") if isinstance(content, dict) else None
-    if not isinstance(content, dict) or schema != SCHEMA or not isinstance(content.get("info"), dict):
-        raise WeightsError(
-            f"{path} has schema {shown(schema)}, expected {SCHEMA!r} with its config and info. Read it with the "
-            "version of cablejax that wrote it."
-        )
+    try:
+        version_of(content.get("schema") if isinstance(content, dict) else None, SCHEMA, path)
+    except ValueError as error:
+        raise WeightsError(str(error)) from error
+    if not isinstance(content.get("info"), dict):
+        raise WeightsError(f"{path} has schema {SCHEMA!r} without its info: the file is damaged. Save it again.")
     return path, content
 
 

@@ -15,6 +15,7 @@ from cablejax.effects import ARMS, LIBRARY
 from cablejax.effects.base import CableEffect, Hook
 from cablejax.effects.physics import Physics
 from cablejax.limits import require, shown
+from cablejax.schema_version import version_of
 from cablejax.text_file import read_json
 
 EFFECTS: Mapping[str, CableEffect] = {effect.name: effect for effect in (*LIBRARY, *ARMS)}
@@ -144,9 +145,7 @@ def effects_of_verdict(path: str | os.PathLike[str]) -> tuple[GivenEffect, ...]:
         verdict = read_json(path)
     except (OSError, ValueError) as error:
         raise ValueError(f"This is no verdict: {error} Expected a verdict.json of `diagnose`.") from error
-    if not isinstance(verdict, dict) or verdict.get("schema") != VERDICT_SCHEMA:
-        came = verdict.get("schema") if isinstance(verdict, dict) else None
-        raise ValueError(f"{path} has schema {shown(came)}, expected {VERDICT_SCHEMA!r}: a verdict.json of `diagnose`.")
+    version_of(verdict.get("schema") if isinstance(verdict, dict) else None, VERDICT_SCHEMA, path)
     named = verdict.get("effects")
     if not isinstance(named, list):
         raise ValueError(f"{path}: effects is {shown(named)}, expected a list.")

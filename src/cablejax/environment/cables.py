@@ -69,6 +69,12 @@ class ShapeCableConfig:
         """The twist (vx, vy, omega) [m/s, rad/s] that an action of 1 asks for."""
         return np.array([self.speed * self.cable.length] * 2 + [self.turn_rate])
 
+    @property
+    def room(self) -> float:
+        """Largest coordinate of an observed keypoint [m]; beyond it, or not finite, a simulation has diverged."""
+        # the grippers' square, a length of cable, and a metre for camera offsets and noise
+        return 3 * self.cable.length + 1
+
     @functools.cached_property
     def limits(self) -> CommandLimits:
         """Of every action: the grippers stay within a square of three lengths, and never pull the cable taut."""
@@ -208,7 +214,7 @@ class Cables:
         twists = config.limits.shortened(twists, self.gripper_pose, config.interval) * active[:, None, None]
         self._state, shown = self._engine.rollout(self._physics, self._state, twists[:, None], config.interval)
         keypoints, poses = np.asarray(shown.keypoints[:, -1]), np.asarray(shown.gripper_pose[:, -1])
-        diverged = ~np.isfinite(keypoints).all(axis=(1, 2))
+        diverged = ~(np.abs(keypoints) < config.room).all(axis=(1, 2))
         self.taken += active
         seen = active & ~diverged
         self.gripper_pose[seen] = poses[seen]

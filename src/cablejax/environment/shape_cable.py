@@ -25,8 +25,7 @@ def _spaces(config: ShapeCableConfig) -> tuple[gymnasium.spaces.Dict, gymnasium.
     points, length = config.cable.n_keypoints, config.cable.length
     turns = 2 * np.pi + config.steps * config.turn_rate * config.interval
     pose = np.repeat(np.array([[3 * length, 3 * length, turns]], np.float32), 2, axis=0)
-    # a metre of room for camera offsets and noise
-    cable = gymnasium.spaces.Box(-3 * length - 1, 3 * length + 1, (points, 2), np.float32)
+    cable = gymnasium.spaces.Box(-config.room, config.room, (points, 2), np.float32)
     observed: dict[str, gymnasium.Space[Any]] = dict(
         zip(OBSERVED, (cable, gymnasium.spaces.Box(-pose, pose), cable), strict=True)
     )

@@ -1,0 +1,126 @@
+"""Versions of file formats: files that earlier versions wrote are read, and those of later ones refused with advice."""
+
+import dataclasses
+import json
+import pathlib
+import zipfile
+
+import numpy as np
+import pytest
+
+from cablejax.cable import Cable
+from cablejax.cable_file import cable_text, read_cable
+from cablejax.commands.resuming import unfinished
+from cablejax.dataset.generate import draw
+from cablejax.dataset.opening import open_or_create, open_store
+from cablejax.dynamics.run_folder import claim_folder
+from cablejax.dynamics.weights import cable_of_weights, load_weights
+from cablejax.effects.given import effects_of_verdict
+from cablejax.gaplog import read_gap_log, write_gap_log
+from cablejax.schema_version import version_of
+
+# What was written by the last commit before schema 2 of the data sets.
+OLD = pathlib.Path(__file__).parent / "old_files"
+
+
+@pytest.fixture
+def old_store(tmp_path):
+    with zipfile.ZipFile(OLD / "dataset-1.zip") as archive:
+        archive.extractall(tmp_path / "data")
+    return tmp_path / "data"
+
+
+def test_a_data_set_of_version_1_is_read(old_store):
+    store = open_store(old_store)
+    config, rows = store.config, range(2)
+    assert (config.discretisation.n_links, config.cable, config.n_steps, config.seed) == (5, Cable(), 4, 3)
+    assert store.info().complete
+    block = store.read(rows)
+    assert block.keypoints.shape == (2, 5, 13, 2) and np.isfinite(block.keypoints).all()
+    for row in rows:  # the configuration means what it did
+        np.testing.assert_array_equal(draw(config, row).gripper_twist, block.gripper_twist[row])
+    with pytest.raises(ValueError, match="effects is 'absent' in the store"):
+        open_or_create(old_store, config)  # unfinished work is finished by the version that began it
+
+
+def test_weights_of_before_are_read():
+    config, _, _ = load_weights(OLD / "weights-1.safetensors")
+    assert (config.latent, config.message_passing) == (8, 1)
+    assert cable_of_weights(OLD / "weights-1.safetensors") == Cable()
+
+
+def test_a_log_of_before_is_read():
+    log = read_gap_log(OLD / "gap-log-1.npz")
+    assert log.keypoints.shape[2:] == (13, 2) and log.episode_length.tolist() == [log.time.shape[1]]
+
+
+def test_a_cable_file_and_a_training_without_version_are_of_version_1(tmp_path):
+    text = cable_text(Cable())
+    (tmp_path / "cable.toml").write_text("".join(line for line in text.splitlines(True) if "schema" not in line))
+    assert read_cable(tmp_path / "cable.toml") == Cable() and "cablejax-cable/1" in text
+    run = {"config": {"seed": 0}, "data": "a"}
+    (tmp_path / "run.json").write_text(json.dumps(run))
+    claim_folder(tmp_path, run, resume=True, overwrite=False)
+
+
+@pytest.mark.parametrize("file", ["data set", "weights", "log", "verdict", "cable", "training", "parts"])
+def test_a_newer_version_is_refused(file, tmp_path, old_store):
+    def store():
+        meta = json.loads((old_store / "zarr.json").read_text())
+        meta["attributes"]["schema"] = "cablejax-dataset/3"
+        (old_store / "zarr.json").write_text(json.dumps(meta))
+        open_store(old_store)
+
+    def weights():
+        content = (OLD / "weights-1.safetensors").read_bytes()
+        (tmp_path / "x.safetensors").write_bytes(content.replace(b"cablejax-weights/1", b"cablejax-weights/7"))
+        load_weights(tmp_path / "x.safetensors")
+
+    def log():
+        known = read_gap_log(OLD / "gap-log-1.npz")
+        write_gap_log(
+            tmp_path / "log.npz", dataclasses.replace(known, meta=known.meta | {"schema": "cablejax-gap-log/2"})
+        )
+
+    def verdict():
+        (tmp_path / "verdict.json").write_text(json.dumps({"schema": "cablejax-verdict/2", "effects": []}))
+        effects_of_verdict(tmp_path / "verdict.json")
+
+    def cable():
+        (tmp_path / "cable.toml").write_text(cable_text(Cable()).replace("cablejax-cable/1", "cablejax-cable/2"))
+        read_cable(tmp_path / "cable.toml")
+
+    def training():
+        run = {"config": {}, "data": "a"}
+        (tmp_path / "run.json").write_text(json.dumps({"schema": "cablejax-training/2", **run}))
+        claim_folder(tmp_path, run, resume=True, overwrite=True)
+
+    def parts():
+        (tmp_path / "parts").mkdir()
+        (tmp_path / "parts" / "settings.json").write_text(json.dumps({"schema": "cablejax-parts/2"}))
+        with unfinished(tmp_path, {}, overwrite=True):
+            pass
+
+    read = {
+        "data set": store,
+        "weights": weights,
+        "log": log,
+        "verdict": verdict,
+        "cable": cable,
+        "training": training,
+        "parts": parts,
+    }[file]
+    with pytest.raises(ValueError, match=r"has schema 'cablejax-.*expected 'cablejax-.*newer version of cablejax.*pip"):
+        read()
+
+
+@pytest.mark.parametrize(
+    "schema", [None, 3, "", "toy", "toy/", "toy/0", "toy/-1", "toy/1.5", "toy/٣", "other/1", "toy/1/2"]
+)
+def test_what_is_no_version_is_another_kind_of_file(schema):
+    with pytest.raises(ValueError, match=r"^x\.json has schema .*, expected 'toy/3': is it another kind of file"):
+        version_of(schema, "toy/3", "x.json")
+
+
+def test_versions_up_to_the_known_one_are_returned():
+    assert [version_of(f"toy/{number}", "toy/3", "x") for number in (1, 2, 3)] == [1, 2, 3]
