@@ -71,6 +71,43 @@ def gap_log_from_episodes(
     if taken := set(extra or {}) & set(META_FIELDS):
         raise GapLogError(f"The extra fields {', '.join(sorted(taken))} are fields of the format: choose other names.")
     arclength = cable.keypoint_arclength if keypoint_arclength is None else np.asarray(keypoint_arclength, float)
+    return stack_episodes(
+        episodes,
+        {
+            "schema": SCHEMA,
+            "cable": {
+                "length_m": cable.length,
+                "diameter_m": cable.diameter,
+                "linear_density_kg_per_m": cable.linear_density,
+                "bending_stiffness_n_m2": cable.bending_stiffness,
+                "bending_damping_s": cable.damping_time,
+                "rest_curvature_per_m": cable.rest_curvature,
+            },
+            # a cable in the plane lies on a table even where that is perfectly smooth
+            "table": {"friction_coefficient": cable.friction_coefficient}
+            if cable.friction_coefficient > 0 or episodes[0].keypoints.shape[-1] == 2
+            else None,
+            "gravity_m_per_s2": [0.0, 0.0, -GRAVITY],
+            "keypoint_arclength_m": arclength.tolist(),
+            "grasp": list(grasp),
+            "motion": [episode.motion for episode in episodes],
+            "source": source,
+            **(extra or {}),
+        },
+    )
+
+
+def stack_episodes(episodes: Sequence[Episode], meta: Mapping[str, Any], *, holds: bool = True) -> GapLog:
+    """Stacks episodes, padded to the longest, to a checked gap log: the inverse of `episodes_of`.
+
+    Args:
+        episodes: at least one.
+        meta: of the log, complete.
+        holds: whether the log says when the grippers rest.
+
+    Raises:
+        GapLogError: episodes that do not fit each other or the format.
+    """
     lengths = [len(episode.time) for episode in episodes]
 
     def padded(name: str, fill) -> np.ndarray:
@@ -95,31 +132,27 @@ def gap_log_from_episodes(
         gripper_pose=padded("gripper_pose", None),
         gripper_command=padded("gripper_command", 0.0),
         episode_length=np.array(lengths, np.int32),
-        hold=padded("hold", False),
-        meta={
-            "schema": SCHEMA,
-            "cable": {
-                "length_m": cable.length,
-                "diameter_m": cable.diameter,
-                "linear_density_kg_per_m": cable.linear_density,
-                "bending_stiffness_n_m2": cable.bending_stiffness,
-                "bending_damping_s": cable.damping_time,
-                "rest_curvature_per_m": cable.rest_curvature,
-            },
-            # a cable in the plane lies on a table even where that is perfectly smooth
-            "table": {"friction_coefficient": cable.friction_coefficient}
-            if cable.friction_coefficient > 0 or episodes[0].keypoints.shape[-1] == 2
-            else None,
-            "gravity_m_per_s2": [0.0, 0.0, -GRAVITY],
-            "keypoint_arclength_m": arclength.tolist(),
-            "grasp": list(grasp),
-            "motion": [episode.motion for episode in episodes],
-            "source": source,
-            **(extra or {}),
-        },
+        hold=padded("hold", False) if holds else None,
+        meta=dict(meta),
     )
     validate(log)
     return log
+
+
+def episodes_of(log: GapLog) -> list[Episode]:
+    """The episodes of a log without their padding; a log that does not say when the grippers rest has no holds."""
+    hold = np.zeros(log.time.shape, bool) if log.hold is None else log.hold
+    return [
+        Episode(
+            motion=motion,
+            time=log.time[e, :n],
+            keypoints=log.keypoints[e, :n],
+            gripper_pose=log.gripper_pose[e, :n],
+            gripper_command=log.gripper_command[e, :n],
+            hold=hold[e, :n],
+        )
+        for e, (motion, n) in enumerate(zip(log.meta["motion"], log.episode_length, strict=True))
+    ]
 
 
 def write_gap_log(path: str | os.PathLike, log: GapLog, *, overwrite: bool = False) -> pathlib.Path:
