@@ -22,6 +22,11 @@ from cablejax.text_file import parse_json
 from cablejax.types import GapLog
 from cablejax.whole_file import whole_file
 
+SIMULATED = ("nominal", "explained")
+"""Simulated keypoints that a diagnosis stores with its log: with the cable as believed, and with the named effects."""
+TARGETS = "target_m"
+"""Field of `meta` with the keypoints of each episode's target [m], where the run had one."""
+
 
 @dataclasses.dataclass(frozen=True)
 class Episode:
@@ -155,8 +160,20 @@ def episodes_of(log: GapLog) -> list[Episode]:
     ]
 
 
-def write_gap_log(path: str | os.PathLike, log: GapLog, *, overwrite: bool = False) -> pathlib.Path:
+def write_gap_log(
+    path: str | os.PathLike,
+    log: GapLog,
+    *,
+    overwrite: bool = False,
+    simulated: Mapping[str, Float[np.ndarray, "E T N D"]] | None = None,
+) -> pathlib.Path:
     """Writes a checked gap log, whole or not at all, and returns its path.
+
+    Args:
+        path: an `.npz` file.
+        log: to be written.
+        overwrite: whether a file that is there is replaced.
+        simulated: keypoints of simulators on this log [m], by the names in `SIMULATED`, for `read_simulated`.
 
     Raises:
         GapLogError: the log does not follow the format.
@@ -169,6 +186,7 @@ def write_gap_log(path: str | os.PathLike, log: GapLog, *, overwrite: bool = Fal
     if path.exists() and not overwrite:
         raise FileExistsError(f"{path} exists: choose another name, or pass overwrite=True to replace it.")
     arrays = {name: getattr(log, name) for name in DTYPES if getattr(log, name) is not None}
+    arrays |= {name: np.asarray(points, np.float32) for name, points in (simulated or {}).items()}
     path.parent.mkdir(parents=True, exist_ok=True)
     with whole_file(path) as stream:
         np.savez_compressed(stream, allow_pickle=False, meta=np.array(json.dumps(log.meta)), **arrays)
@@ -202,3 +220,35 @@ def read_gap_log(path: str | os.PathLike) -> GapLog:
     except GapLogError as error:
         raise GapLogError(f"{path}: {error}") from error
     return log
+
+
+def read_simulated(path: str | os.PathLike, log: GapLog) -> dict[str, Float[np.ndarray, "E T N D"]]:
+    """The simulated keypoints [m] that a diagnosis stored in the file of its log, by the names in `SIMULATED`.
+
+    Raises:
+        GapLogError: the file cannot be read, or its keypoints are not those of this log.
+        FileNotFoundError: there is no such file.
+    """
+    try:
+        found = read_npz(path, [], SIMULATED)
+    except NpzError as error:
+        raise GapLogError(str(error)) from error
+    for name, points in found.items():
+        if points.shape != log.keypoints.shape:
+            raise GapLogError(f"{path}: field '{name}' has shape {points.shape}, expected {log.keypoints.shape}.")
+    return found
+
+
+def targets_of(log: GapLog) -> list[Float[np.ndarray, "N D"] | None]:
+    """The target of each episode [m]; None where the log states none for its cable."""
+    stated = log.meta.get(TARGETS)
+    if not isinstance(stated, list) or len(stated) != len(log.episode_length):
+        return [None] * len(log.episode_length)
+    found: list[Float[np.ndarray, "N D"] | None] = []
+    for target in stated:
+        try:
+            points = np.array(target, float)
+        except (TypeError, ValueError, OverflowError):
+            points = np.empty(0)
+        found.append(points if points.shape == log.keypoints.shape[2:] and np.isfinite(points).all() else None)
+    return found

@@ -4,9 +4,9 @@
     data/chunk-000/file-000.parquet    one row per sample
     meta/cablejax.json                 the log's own `meta`, which LeRobot leaves alone
 
-`observation.state` has the grippers' poses, `observation.environment_state` the keypoints (NaN = not observed), `action`
-the commands, `task` what the grippers did, `timestamp` the log's own times, in float32; `time` has them in float64.
-Needs the library pyarrow: `pip install 'cablejax[recordings]'`.
+`observation.state` has the grippers' poses, `observation.environment_state` the keypoints (NaN = not observed),
+`action` the commands, `task` what the grippers did, `timestamp` the log's own times, in float32; `time` has them in
+float64. Needs the library pyarrow: `pip install 'cablejax[recordings]'`.
 """
 
 from __future__ import annotations
@@ -48,8 +48,8 @@ _ARRAYS = {
 def write_lerobot(folder: str | os.PathLike[str], log: GapLog) -> pathlib.Path:
     """Writes a gap log as a LeRobot data set into a new folder, whole or not at all, and returns its path.
 
-    The log's times are kept as they are. LeRobot's frame rate is that of the usual time between samples; where the clock
-    is uneven, its windows of several samples are by count, not by time.
+    The log's times are kept as they are. LeRobot's frame rate is that of the usual time between samples; where the
+    clock is uneven, its windows of several samples are by count, not by time.
 
     Raises:
         FileExistsError: there is such a folder or file.
@@ -96,8 +96,8 @@ def read_lerobot(folder: str | os.PathLike[str]) -> GapLog:
         raise GapLogError(f"{folder} has version {version!r}, expected {VERSION!r}. LeRobot converts older data sets.")
     if not (folder / _LOG).is_file():
         raise GapLogError(
-            f"{folder} was not written by `cablejax export lerobot` (no {_LOG}): a data set says neither which cable it "
-            "shows nor where its keypoints are. Import its recording as a csv or a bag, with a layout."
+            f"{folder} was not written by `cablejax export lerobot` (no {_LOG}): a data set says neither which cable "
+            "it shows nor where its keypoints are. Import its recording as a csv or a bag, with a layout."
         )
     meta = read_json(folder / _LOG)
     if not isinstance(meta, dict) or not isinstance(meta.get("motion"), list):
