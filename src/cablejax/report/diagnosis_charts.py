@@ -14,7 +14,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from cablejax.cable import Discretisation
-from cablejax.diagnose.diagnosis import CableDiagnosis
+from cablejax.diagnose.diagnosis import CableDiagnosis, Diagnosis
 from cablejax.diagnose.safe_motions import INTERVAL, safe_motions, starting_pose
 from cablejax.report.diagnosis_style import STYLE, explained_label
 from cablejax.report.effect_words import effect_title
@@ -33,7 +33,7 @@ _SPLIT = (
 )
 
 
-def ranking_figure(diagnosis: CableDiagnosis) -> Figure | None:
+def ranking_figure(diagnosis: Diagnosis) -> Figure | None:
     """Effects that were tried: how probable each is, where that was computed, and how much of the gap it takes away.
 
     None where none was tried.
