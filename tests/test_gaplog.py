@@ -20,6 +20,7 @@ from cablejax.gaplog import (
     validate,
     write_gap_log,
 )
+from cablejax.gaplog_join import joined, recordings
 from cablejax.types import GapLog
 from file_cases import with_other_bytes
 

@@ -1,4 +1,4 @@
-"""The command line: `cablejax demo | cable | simulate | train | shape | import | diagnose | bench`."""
+"""The command line: `cablejax demo | cable | simulate | train | shape | import | export | diagnose | view | bench`."""
 
 from __future__ import annotations
 
@@ -15,11 +15,13 @@ from cablejax.commands.bench import Bench
 from cablejax.commands.cable import CableFile
 from cablejax.commands.demo import Demo
 from cablejax.commands.diagnose import Diagnose
+from cablejax.commands.export import Export
 from cablejax.commands.import_recording import Import
 from cablejax.commands.options import Command
 from cablejax.commands.shape import Shape
 from cablejax.commands.simulate import Simulate
 from cablejax.commands.train import Train
+from cablejax.commands.view import View
 from cablejax.compiled_programs import keep_compiled_programs
 from cablejax.interrupts import INTERRUPTED, answered
 from cablejax.whole_file import DRAFT
@@ -40,15 +42,17 @@ _COMMANDS: Any = (
     | Annotated[Train, subcommand("train")]
     | Annotated[Shape, subcommand("shape")]
     | Annotated[Import, subcommand("import")]
+    | Annotated[Export, subcommand("export")]
     | Annotated[Diagnose, subcommand("diagnose")]
+    | Annotated[View, subcommand("view")]
     | Annotated[Bench, subcommand("bench")]
 )
 _DESCRIPTION = """Two robot grippers bring a cable to a shape.
 
 Start with `cablejax demo`: it needs nothing else and writes a page to look at. To make your own model: describe your
 `cable` in a file, `simulate` a data set, `train` on it, `shape` a cable with the result, and `diagnose` what the
-simulator lacks. A recording of a real cable is `import`ed first. `cablejax COMMAND --help` explains each one,
-`cablejax --version` says which this is."""
+simulator lacks. A recording of a real cable is `import`ed first; `view` shows what any of them has written, `export`
+takes it to other programs. `cablejax COMMAND --help` explains each one, `cablejax --version` says which this is."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

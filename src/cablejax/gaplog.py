@@ -17,11 +17,15 @@ from jaxtyping import Float
 
 from cablejax.cable import GRAVITY, Cable
 from cablejax.gaplog_check import DTYPES, META_FIELDS, SCHEMA, GapLogError, validate
-from cablejax.limits import shown
 from cablejax.npz import NpzError, read_npz
 from cablejax.text_file import parse_json
 from cablejax.types import GapLog
 from cablejax.whole_file import whole_file
+
+SIMULATED = ("nominal", "explained")
+"""Simulated keypoints that a diagnosis stores with its log: with the cable as believed, and with the named effects."""
+TARGETS = "target_m"
+"""Field of `meta` with the keypoints of each episode's target [m], where the run had one."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -72,6 +76,43 @@ def gap_log_from_episodes(
     if taken := set(extra or {}) & set(META_FIELDS):
         raise GapLogError(f"The extra fields {', '.join(sorted(taken))} are fields of the format: choose other names.")
     arclength = cable.keypoint_arclength if keypoint_arclength is None else np.asarray(keypoint_arclength, float)
+    return stack_episodes(
+        episodes,
+        {
+            "schema": SCHEMA,
+            "cable": {
+                "length_m": cable.length,
+                "diameter_m": cable.diameter,
+                "linear_density_kg_per_m": cable.linear_density,
+                "bending_stiffness_n_m2": cable.bending_stiffness,
+                "bending_damping_s": cable.damping_time,
+                "rest_curvature_per_m": cable.rest_curvature,
+            },
+            # a cable in the plane lies on a table even where that is perfectly smooth
+            "table": {"friction_coefficient": cable.friction_coefficient}
+            if cable.friction_coefficient > 0 or episodes[0].keypoints.shape[-1] == 2
+            else None,
+            "gravity_m_per_s2": [0.0, 0.0, -GRAVITY],
+            "keypoint_arclength_m": arclength.tolist(),
+            "grasp": list(grasp),
+            "motion": [episode.motion for episode in episodes],
+            "source": source,
+            **(extra or {}),
+        },
+    )
+
+
+def stack_episodes(episodes: Sequence[Episode], meta: Mapping[str, Any], *, holds: bool = True) -> GapLog:
+    """Stacks episodes, padded to the longest, to a checked gap log: the inverse of `episodes_of`.
+
+    Args:
+        episodes: at least one.
+        meta: of the log, complete.
+        holds: whether the log says when the grippers rest.
+
+    Raises:
+        GapLogError: episodes that do not fit each other or the format.
+    """
     lengths = [len(episode.time) for episode in episodes]
 
     def padded(name: str, fill) -> np.ndarray:
@@ -96,144 +137,43 @@ def gap_log_from_episodes(
         gripper_pose=padded("gripper_pose", None),
         gripper_command=padded("gripper_command", 0.0),
         episode_length=np.array(lengths, np.int32),
-        hold=padded("hold", False),
-        meta={
-            "schema": SCHEMA,
-            "cable": {
-                "length_m": cable.length,
-                "diameter_m": cable.diameter,
-                "linear_density_kg_per_m": cable.linear_density,
-                "bending_stiffness_n_m2": cable.bending_stiffness,
-                "bending_damping_s": cable.damping_time,
-                "rest_curvature_per_m": cable.rest_curvature,
-            },
-            # a cable in the plane lies on a table even where that is perfectly smooth
-            "table": {"friction_coefficient": cable.friction_coefficient}
-            if cable.friction_coefficient > 0 or episodes[0].keypoints.shape[-1] == 2
-            else None,
-            "gravity_m_per_s2": [0.0, 0.0, -GRAVITY],
-            "keypoint_arclength_m": arclength.tolist(),
-            "grasp": list(grasp),
-            "motion": [episode.motion for episode in episodes],
-            "source": source,
-            **(extra or {}),
-        },
+        hold=padded("hold", False) if holds else None,
+        meta=dict(meta),
     )
     validate(log)
     return log
 
 
-def joined(logs: Sequence[GapLog], names: Sequence[str]) -> GapLog:
-    """One log of several recordings of one set-up, episodes in the order given.
+def episodes_of(log: GapLog) -> list[Episode]:
+    """The episodes of a log without their padding; a log that does not say when the grippers rest has no holds."""
+    hold = np.zeros(log.time.shape, bool) if log.hold is None else log.hold
+    return [
+        Episode(
+            motion=motion,
+            time=log.time[e, :n],
+            keypoints=log.keypoints[e, :n],
+            gripper_pose=log.gripper_pose[e, :n],
+            gripper_command=log.gripper_command[e, :n],
+            hold=hold[e, :n],
+        )
+        for e, (motion, n) in enumerate(zip(log.meta["motion"], log.episode_length, strict=True))
+    ]
 
-    Its `meta` has the field `recordings`: the name of each and how many episodes it has, by which a diagnosis says what
-    each one added. Extra fields of `meta` stay where all recordings have the same.
+
+def write_gap_log(
+    path: str | os.PathLike,
+    log: GapLog,
+    *,
+    overwrite: bool = False,
+    simulated: Mapping[str, Float[np.ndarray, "E T N D"]] | None = None,
+) -> pathlib.Path:
+    """Writes a checked gap log, whole or not at all, and returns its path.
 
     Args:
-        logs: at least one.
-        names: of each, for example that of its file; one that was joined itself keeps its parts' names.
-
-    Raises:
-        GapLogError: recordings of different set-ups, or the same one twice; names both and what differs.
-    """
-    if not logs:
-        raise GapLogError("Nothing to join: expected at least one gap log.")
-    for i, (log, name) in enumerate(zip(logs, names, strict=True)):
-        for other, other_name in zip(logs[:i], names, strict=False):
-            if _same_recording(log, other):
-                raise GapLogError(
-                    f"{other_name} and {name} are the same recording: name it once, or it would count twice."
-                )
-        there_all, here_all = _set_up(logs[0]), _set_up(log)
-        for field in there_all | here_all:
-            if (here := here_all.get(field)) != (there := there_all.get(field)):
-                raise GapLogError(
-                    f"{name} is not of the set-up of {names[0]}: '{field}' is {shown(here)}, and there {shown(there)}. "
-                    "Diagnose them apart, or correct the one that states it wrongly."
-                )
-    samples = max(log.keypoints.shape[1] for log in logs)
-
-    def whole(name: str, fill) -> np.ndarray | None:
-        arrays = [getattr(log, name) for log in logs]
-        if all(array is None for array in arrays):
-            return None
-        rows = []
-        for array, log in zip(arrays, logs, strict=True):
-            array = np.zeros(log.time.shape, bool) if array is None else array
-            missing = [(0, 0), (0, samples - array.shape[1]), *[(0, 0)] * (array.ndim - 2)]
-            rows.append(
-                np.pad(array, missing, "edge") if fill is None else np.pad(array, missing, constant_values=fill)
-            )
-        return np.concatenate(rows)
-
-    extra = set.intersection(*(set(log.meta) for log in logs)) - {*META_FIELDS, "recordings"}
-    log = dataclasses.replace(
-        logs[0],
-        time=whole("time", None),
-        keypoints=whole("keypoints", np.nan),
-        gripper_pose=whole("gripper_pose", None),
-        gripper_command=whole("gripper_command", 0.0),
-        episode_length=np.concatenate([log.episode_length for log in logs]),
-        hold=whole("hold", False),
-        meta={
-            **{name: logs[0].meta[name] for name in META_FIELDS},
-            **{name: logs[0].meta[name] for name in sorted(extra) if all(_same(name, log, logs[0]) for log in logs)},
-            "motion": [motion for log in logs for motion in log.meta["motion"]],
-            "source": "; ".join(dict.fromkeys(log.meta["source"] for log in logs)),
-            "recordings": [part for log, name in zip(logs, names, strict=True) for part in recordings(log, name)],
-        },
-    )
-    validate(log)
-    return log
-
-
-def recordings(log: GapLog, name: str = "the log") -> list[dict[str, Any]]:
-    """What a log was joined of, as `{"name", "episodes"}`; of one that was not joined, itself under this name.
-
-    Raises:
-        GapLogError: the field `recordings` of its `meta` does not add up to its episodes.
-    """
-    parts, episodes = log.meta.get("recordings"), len(log.episode_length)
-    if parts is None:
-        return [{"name": name, "episodes": episodes}]
-    try:
-        counts = [part["episodes"] for part in parts if isinstance(part["name"], str)]
-        fits = len(counts) == len(parts) and sum(counts) == episodes and all(type(n) is int and n > 0 for n in counts)
-    except (TypeError, KeyError, ValueError):
-        fits = False
-    if not fits:
-        raise GapLogError(
-            f"Field 'meta.recordings' is {shown(parts)}, expected names and numbers of episodes that add up to "
-            f"{episodes}, as `cablejax.gaplog.joined` writes them."
-        )
-    return parts
-
-
-def _set_up(log: GapLog) -> dict[str, Any]:
-    """What recordings of one set-up have in common, by the names of the format."""
-    meta = log.meta
-    return {
-        "dimension of the keypoints": log.keypoints.shape[3],
-        "number of keypoints": log.keypoints.shape[2],
-        "number of grippers": log.gripper_pose.shape[2],
-        "meta.cable.rest_curvature_per_m": 0.0,
-        **{f"meta.cable.{name}": value for name, value in meta["cable"].items()},
-        **{f"meta.{name}": meta[name] for name in ("table", "gravity_m_per_s2", "keypoint_arclength_m", "grasp")},
-    }
-
-
-def _same(name: str, log: GapLog, other: GapLog) -> bool:
-    return log.meta[name] == other.meta[name]
-
-
-def _same_recording(log: GapLog, other: GapLog) -> bool:
-    return all(
-        np.array_equal(getattr(log, name), getattr(other, name), equal_nan=True) for name in ("time", "keypoints")
-    )
-
-
-def write_gap_log(path: str | os.PathLike, log: GapLog, *, overwrite: bool = False) -> pathlib.Path:
-    """Writes a checked gap log, whole or not at all, and returns its path.
+        path: an `.npz` file.
+        log: to be written.
+        overwrite: whether a file that is there is replaced.
+        simulated: keypoints of simulators on this log [m], by the names in `SIMULATED`, for `read_simulated`.
 
     Raises:
         GapLogError: the log does not follow the format.
@@ -246,6 +186,7 @@ def write_gap_log(path: str | os.PathLike, log: GapLog, *, overwrite: bool = Fal
     if path.exists() and not overwrite:
         raise FileExistsError(f"{path} exists: choose another name, or pass overwrite=True to replace it.")
     arrays = {name: getattr(log, name) for name in DTYPES if getattr(log, name) is not None}
+    arrays |= {name: np.asarray(points, np.float32) for name, points in (simulated or {}).items()}
     path.parent.mkdir(parents=True, exist_ok=True)
     with whole_file(path) as stream:
         np.savez_compressed(stream, allow_pickle=False, meta=np.array(json.dumps(log.meta)), **arrays)
@@ -279,3 +220,35 @@ def read_gap_log(path: str | os.PathLike) -> GapLog:
     except GapLogError as error:
         raise GapLogError(f"{path}: {error}") from error
     return log
+
+
+def read_simulated(path: str | os.PathLike, log: GapLog) -> dict[str, Float[np.ndarray, "E T N D"]]:
+    """The simulated keypoints [m] that a diagnosis stored in the file of its log, by the names in `SIMULATED`.
+
+    Raises:
+        GapLogError: the file cannot be read, or its keypoints are not those of this log.
+        FileNotFoundError: there is no such file.
+    """
+    try:
+        found = read_npz(path, [], SIMULATED)
+    except NpzError as error:
+        raise GapLogError(str(error)) from error
+    for name, points in found.items():
+        if points.shape != log.keypoints.shape:
+            raise GapLogError(f"{path}: field '{name}' has shape {points.shape}, expected {log.keypoints.shape}.")
+    return found
+
+
+def targets_of(log: GapLog) -> list[Float[np.ndarray, "N D"] | None]:
+    """The target of each episode [m]; None where the log states none for its cable."""
+    stated = log.meta.get(TARGETS)
+    if not isinstance(stated, list) or len(stated) != len(log.episode_length):
+        return [None] * len(log.episode_length)
+    found: list[Float[np.ndarray, "N D"] | None] = []
+    for target in stated:
+        try:
+            points = np.array(target, float)
+        except (TypeError, ValueError, OverflowError):
+            points = np.empty(0)
+        found.append(points if points.shape == log.keypoints.shape[2:] and np.isfinite(points).all() else None)
+    return found

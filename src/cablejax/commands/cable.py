@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
+from cablejax.commands.artefacts import kind_of
+from cablejax.commands.export import recorded
 from cablejax.commands.options import Command, UsageError
 
 if TYPE_CHECKING:
@@ -51,25 +53,24 @@ class CableFile(Command):
 
 
 def find_cable(source: str | pathlib.Path) -> Cable:
-    """The cable in a cable file (.toml), a gap log (.npz), a data set's folder or trained weights.
+    """The cable in a cable file, a gap log, a data set's folder, trained weights, or a run's folder with its log.
 
     Raises:
         ValueError: there is no such thing, or it cannot be read.
     """
-    path = pathlib.Path(source)
-    if path.suffix.lower() == ".toml":
+    kind, path = kind_of(source)
+    if kind == "cable":
         from cablejax.cable_file import read_cable
 
         return read_cable(path)
-    if path.suffix.lower() == ".npz":
-        from cablejax.gaplog import read_gap_log
-        from cablejax.simulate.replay import cable_of_log
-
-        return cable_of_log(read_gap_log(path))
-    if (path / "zarr.json").is_file():
+    if kind == "store":
         from cablejax.dataset.opening import open_store
 
         return open_store(path).config.cable
-    from cablejax.dynamics.weights import cable_of_weights
+    if kind == "weights":
+        from cablejax.dynamics.weights import cable_of_weights
 
-    return cable_of_weights(source)
+        return cable_of_weights(path)
+    from cablejax.simulate.replay import cable_of_log
+
+    return cable_of_log(recorded(path)[0])

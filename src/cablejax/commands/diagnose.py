@@ -54,7 +54,8 @@ class Diagnose(Command):
         from cablejax.commands.resuming import unfinished
         from cablejax.diagnose import verdict_json
         from cablejax.diagnose.motion_bounds import read_bounds
-        from cablejax.gaplog import joined, read_gap_log
+        from cablejax.gaplog import read_gap_log
+        from cablejax.gaplog_join import joined
 
         if not self.logs:
             raise UsageError("Nothing to diagnose: name a gap log, or several of one set-up.")

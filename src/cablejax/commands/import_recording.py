@@ -104,16 +104,33 @@ class Csv(_Import):
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Mcap(_Import):
-    """Import a ROS 2 bag or MCAP file with pose arrays; a small TOML file names its topics and units."""
+    """Import a ROS 2 bag or MCAP file with pose arrays; a small TOML file names its topics and units.
+
+    A log that `cablejax export mcap` wrote needs no such file.
+    """
 
     layout: pathlib.Path = pathlib.Path("layout.toml")
     """The TOML file; docs/how_to/own_recording.md has an example."""
 
     def logs(self):
-        """One log of the bag, and its repairs."""
+        """One log of the bag, and its repairs; an exported log as it was."""
         from cablejax.recordings.bags import import_mcap
+        from cablejax.recordings.mcap_log import read_mcap, written_here
 
+        if written_here(self.source):
+            return [(self.out, read_mcap(self.source), ())]
         return [(self.out, *import_mcap(self.source, self.layout))]
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class LeRobot(_Import):
+    """Import a LeRobot data set that `cablejax export lerobot` wrote."""
+
+    def logs(self):
+        """The log as it was exported; nothing is repaired."""
+        from cablejax.recordings.lerobot import read_lerobot
+
+        return [(self.out, read_lerobot(self.source), ())]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -125,6 +142,7 @@ class Import:
         | Annotated[Wires, subcommand("wires")]
         | Annotated[Csv, subcommand("csv")]
         | Annotated[Mcap, subcommand("mcap")]
+        | Annotated[LeRobot, subcommand("lerobot")]
     )
     """Format of the recording."""
 

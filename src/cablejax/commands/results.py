@@ -11,7 +11,7 @@ import numpy as np
 
 from cablejax.cable import Cable
 from cablejax.control.shaping import Runs
-from cablejax.gaplog import gap_log_from_episodes, write_gap_log
+from cablejax.gaplog import TARGETS, gap_log_from_episodes, write_gap_log
 from cablejax.report.animation import write_gif
 from cablejax.report.page import write_page
 from cablejax.report.provenance import machine, versions
@@ -79,7 +79,9 @@ def write_results(
     episodes = [
         dataclasses.replace(run.episode, motion=f"{run.episode.motion}_{method}") for (_, method), run in runs.items()
     ]
-    write_gap_log(out / "log.npz", gap_log_from_episodes(episodes, believed, source=about), overwrite=True)
+    targets = {TARGETS: [run.target.keypoints.tolist() for run in runs.values()]}
+    log = gap_log_from_episodes(episodes, believed, source=about, extra=targets)
+    write_gap_log(out / "log.npz", log, overwrite=True)
     write_gif(out / "demo.gif", runs)
     write_page(
         out / "report.html",

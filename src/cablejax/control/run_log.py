@@ -12,7 +12,7 @@ from cablejax.cable import Cable
 from cablejax.control.link_state import Instant, Reply
 from cablejax.control.run import ClosedLoopRun, shape_error_cm
 from cablejax.control.targets import Target
-from cablejax.gaplog import Episode, gap_log_from_episodes
+from cablejax.gaplog import TARGETS, Episode, gap_log_from_episodes
 from cablejax.limits import LIMITS
 from cablejax.simulate.table_plant import Observation
 from cablejax.types import GapLog
@@ -143,8 +143,8 @@ class RunLog:
     def gap_log(self, target: Target, cable: Cable, source: str) -> GapLog:
         """The recording as a gap log; a pause longer than a log's largest sample interval begins another episode.
 
-        `meta` has the field "robot_link": counts, the time stamps at which episodes begin, changes of the status, and
-        the first reasons of refusals.
+        `meta` has the target of each episode, and the field "robot_link": counts, the time stamps at which episodes
+        begin, changes of the status, and the first reasons of refusals.
 
         Raises:
             GapLogError: nothing was recorded, or the recording violates the format.
@@ -157,4 +157,5 @@ class RunLog:
             "refused": self.refused[:100],
         }
         episodes = [episode for _, episode in pieces]
-        return gap_log_from_episodes(episodes, cable, source=source, extra={"robot_link": report})
+        extra = {TARGETS: [target.keypoints.tolist()] * len(episodes), "robot_link": report}
+        return gap_log_from_episodes(episodes, cable, source=source, extra=extra)

@@ -21,7 +21,7 @@ from scipy.stats import chi2
 from cablejax.diagnose.belief import Calibration, effect_names, in_doubt, probabilities
 from cablejax.diagnose.evidence import Evidence
 from cablejax.diagnose.fit import Fit, evaluate, improved
-from cablejax.gaplog import recordings
+from cablejax.gaplog_join import recordings
 from cablejax.types import GapLog
 
 UNLIKELY = 1e-3
@@ -78,7 +78,7 @@ def rounds_of(
     """What each recording of a joined log added; None of a log that is one recording.
 
     Args:
-        log: as `cablejax.gaplog.joined` makes it.
+        log: as `cablejax.gaplog_join.joined` makes it.
         fits: of different sets of effects to all of it, best first.
         scores: their log posterior.
         evidence: that they were fitted to, of all episodes.

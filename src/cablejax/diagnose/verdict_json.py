@@ -12,8 +12,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from cablejax.diagnose.diagnosis import PLACES, Diagnosis, Gap, NamedEffect, NextMotion, Ranked
-from cablejax.effects.given import VERDICT_SCHEMA
+from cablejax.diagnose.diagnosis import PLACES, Diagnosis, Gap, NamedEffect, NextMotion, ParameterEstimate, Ranked
+from cablejax.effects.given import VERDICT_SCHEMA, read_verdict_json
+from cablejax.limits import shown
 from cablejax.whole_file import whole_file
 
 if TYPE_CHECKING:
@@ -66,6 +67,86 @@ def write_verdict(path: str | os.PathLike[str], diagnosis: Diagnosis) -> pathlib
     with whole_file(path) as stream:
         stream.write(text.encode())
     return path
+
+
+def read_verdict(path: str | os.PathLike[str]) -> Diagnosis:
+    """The diagnosis that a verdict's file describes: its effects, ranking and gap; without `where` and `next_motion`.
+
+    Raises:
+        ValueError: the file is no verdict, or a damaged one.
+    """
+    verdict = read_verdict_json(path)
+    try:
+        gap = verdict["gap"]
+        return Diagnosis(
+            verdict=verdict["verdict"],
+            sentence=str(verdict["sentence"]),
+            effects=tuple(_effect_of(effect) for effect in verdict["effects"]),
+            equivalent=tuple(tuple(map(str, group)) for group in verdict["equivalent"]),
+            ranking=tuple(
+                Ranked(
+                    str(r["name"]), _numbers(r["probability"]), _size(r["held_out_shrinkage"]), _size(r["leftover_mm"])
+                )
+                for r in verdict["ranking"]
+            ),
+            leftover_p=_numbers(verdict["leftover_p"]),
+            gap=Gap(
+                horizon_s=float(gap["horizon_s"]),
+                before_rmse_mm=_size(gap["before_rmse"], 1e3),
+                after_rmse_mm=_size(gap["after_rmse"], 1e3),
+                noise_floor_mm=_size(gap["noise_floor"], 1e3),
+                shrinkage=_numbers(gap["shrinkage"]),
+                shrinkage_ci90=_pair(gap["shrinkage_ci90"]),
+                ahead_mm=gap["ahead_mm"],
+                horizons_mm={
+                    h["horizon_s"]: (_size(h["before_rmse_mm"]), _size(h["after_rmse_mm"])) for h in gap["horizons"]
+                },
+                held_out_episodes=tuple(gap["held_out_episodes"]),
+                split=dict(gap["split"]),
+                unit=str(gap["unit"]),
+            ),
+            where=None,
+            next_motion=None,
+            baselines=dict(verdict["baselines"]),
+            caveats=tuple(map(str, verdict["caveats"])),
+            seconds=float(verdict["seconds"]),
+            settings={},
+        )
+    except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
+        reason = f"{type(error).__name__}: {error}"
+        raise ValueError(f"{path} is a damaged verdict ({reason}). Diagnose the log again.") from error
+
+
+def _effect_of(effect: Mapping[str, Any]) -> NamedEffect:
+    estimates = {
+        str(name): ParameterEstimate(_numbers(estimate["value"]), _numbers(estimate["ci90"]), str(estimate["unit"]))
+        for name, estimate in effect["parameters"].items()
+    }
+    location = {place: _numbers(effect["location"][place]) for place in PLACES}
+    for place in ("along_cable_m", "table_m"):
+        _pair(location[place])
+    return NamedEffect(str(effect["name"]), _numbers(effect["probability"]), estimates, location)
+
+
+def _numbers(value: Any) -> Any:
+    """The same value if it is a number, None, or a list of such. Raises TypeError otherwise."""
+    if isinstance(value, list):
+        return [_numbers(entry) for entry in value]
+    if value is None or (isinstance(value, (int, float)) and not isinstance(value, bool)):
+        return value
+    raise TypeError(f"{shown(value)} is no number")
+
+
+def _pair(value: Any) -> tuple[float, float] | None:
+    """Two numbers, or None. Raises TypeError or ValueError otherwise."""
+    if value is None:
+        return None
+    first, second = value
+    return float(first), float(second)
+
+
+def _size(value: float | None, scale: float = 1.0) -> float:
+    return math.nan if value is None else scale * float(value)
 
 
 def _effect(effect: NamedEffect) -> dict[str, Any]:

@@ -17,7 +17,7 @@ _POINTS = 12
 _CURVE = ("step", "phase", "learning_rate", "loss")
 
 
-def _network(config: ModelConfig) -> str:
+def network_words(config: ModelConfig) -> str:
     """Kind and size of the network, to begin a sentence with."""
     if config.network == "mlp":
         return f"A perceptron of {config.hidden_layers} hidden layers of {config.hidden}"
@@ -54,7 +54,7 @@ def write_card(
     lines = [
         f"# {name}",
         "",
-        f"{_network(config)} of the dynamics of a cable of {config.length:g} m held at both ends: "
+        f"{network_words(config)} of the dynamics of a cable of {config.length:g} m held at both ends: "
         f"{config.n_keypoints} keypoints, one step of {config.interval:g} s, {config.history} samples of history. It "
         f"corrects {'no' if config.prior == 'none' else f'the {config.prior}'} prior"
         + (", sees the cable in the world's frame" if config.frame == "world" else "")

@@ -115,6 +115,11 @@ def load_info(source: str | os.PathLike[str]) -> dict[str, Any]:
     return _open(source)[1]["info"]
 
 
+def weights_path(source: str | os.PathLike[str]) -> Path:
+    """The file of the weights; `source` as in `load_weights`."""
+    return _open(source)[0]
+
+
 def cable_of_weights(source: str | os.PathLike[str]) -> Cable:
     """The nominal cable of the data that a network was trained on; `source` as in `load_weights`.
 

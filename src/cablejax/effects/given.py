@@ -141,11 +141,7 @@ def effects_of_verdict(path: str | os.PathLike[str]) -> tuple[GivenEffect, ...]:
     Raises:
         ValueError: the file is no verdict, or it names no effect ("none" and "unknown").
     """
-    try:
-        verdict = read_json(path)
-    except (OSError, ValueError) as error:
-        raise ValueError(f"This is no verdict: {error} Expected a verdict.json of `diagnose`.") from error
-    version_of(verdict.get("schema") if isinstance(verdict, dict) else None, VERDICT_SCHEMA, path)
+    verdict = read_verdict_json(path)
     named = verdict.get("effects")
     if not isinstance(named, list):
         raise ValueError(f"{path}: effects is {shown(named)}, expected a list.")
@@ -155,6 +151,22 @@ def effects_of_verdict(path: str | os.PathLike[str]) -> tuple[GivenEffect, ...]:
             "Leave --with out, or give an effect with --effect."
         )
     return tuple(piece for effect in named for piece in _pieces(effect, path))
+
+
+def read_verdict_json(path: str | os.PathLike[str]) -> dict[str, Any]:
+    """A verdict's JSON object, of the schema that this version writes; its fields are not looked at.
+
+    Raises:
+        ValueError: the file is no verdict.
+    """
+    try:
+        verdict = read_json(path)
+    except (OSError, ValueError) as error:
+        raise ValueError(f"This is no verdict: {error} Expected a verdict.json of `diagnose`.") from error
+    if not isinstance(verdict, dict):
+        raise ValueError(f"{path} is {shown(verdict)}, expected {VERDICT_SCHEMA!r}: a verdict.json of `diagnose`.")
+    version_of(verdict.get("schema"), VERDICT_SCHEMA, path)
+    return verdict
 
 
 def check_hooks(

@@ -13,7 +13,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from cablejax.diagnose.diagnosis import CableDiagnosis
+from cablejax.diagnose.diagnosis import CableDiagnosis, Diagnosis
 from cablejax.report.diagnosis_style import STYLE, explained_label
 from cablejax.report.effect_words import effect_title
 from cablejax.report.style import LIGHT
@@ -28,7 +28,7 @@ _SPLIT = (
 )
 
 
-def ranking_figure(diagnosis: CableDiagnosis) -> Figure | None:
+def ranking_figure(diagnosis: Diagnosis) -> Figure | None:
     """Effects that were tried: how probable each is, where that was computed, and how much of the gap it takes away.
 
     None where none was tried.

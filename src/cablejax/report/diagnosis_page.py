@@ -12,6 +12,7 @@ from cablejax.diagnose.belief import Calibration
 from cablejax.diagnose.diagnosis import CableDiagnosis, NamedEffect, Verdict
 from cablejax.diagnose.judgement import FAINT, look_alikes
 from cablejax.diagnose.verdict_json import write_verdict
+from cablejax.gaplog import SIMULATED, write_gap_log
 from cablejax.report import diagnosis_sections as sections
 from cablejax.report.diagnosis_charts import ranking_figure, shrinkage_figure
 from cablejax.report.diagnosis_figures import cable_figure, where_figure
@@ -34,6 +35,8 @@ from cablejax.report.spatial_figures import cable_still, files_figure, orbit_dat
 
 PAGE = "report.html"
 """Name of the page in a diagnosis' folder."""
+SIMULATIONS = "simulated.npz"
+"""Name of the log with the simulated keypoints in a diagnosis' folder."""
 _BADGES: dict[Verdict, tuple[str, str]] = {
     "none": ("none", "No gap found"),
     "named": ("named", "Cause named"),
@@ -58,14 +61,21 @@ _FILES_CAPTION = (
 
 
 def write_diagnosis_page(diagnosis: CableDiagnosis, out: str | os.PathLike[str]) -> pathlib.Path:
-    """Writes `report.html`, `verdict.json` and the figures as PNG into a folder, and returns the page's path.
+    """Writes `report.html`, `verdict.json`, `simulated.npz` and the figures as PNG into a folder.
 
-    The figures are `cable.png`, `where.png`, `shrinkage.png`, and, where effects were tried, `ranking.png`. Where there
-    is a motion to record next, `next_motion.gif` shows it.
+    `simulated.npz` is the log with the simulated keypoints, see `read_simulated`. The figures are `cable.png`,
+    `where.png`, `shrinkage.png`, and, where effects were tried, `ranking.png`. Where there is a motion to record next,
+    `next_motion.gif` shows it.
+
+    Returns:
+        The page's path.
     """
     out = pathlib.Path(out)
     out.mkdir(parents=True, exist_ok=True)
     write_verdict(out / "verdict.json", diagnosis)
+    simulated = {name: getattr(diagnosis, name) for name in SIMULATED}
+    given = {name: points for name, points in simulated.items() if points is not None}
+    write_gap_log(out / SIMULATIONS, diagnosis.log, overwrite=True, simulated=given)
     space = in_space(diagnosis)
     drawn = {
         "cable": cable_still(diagnosis) if space else cable_figure(diagnosis),

@@ -6,7 +6,7 @@ import itertools
 import json
 from collections.abc import Sequence
 
-from cablejax.diagnose.diagnosis import CableDiagnosis, NamedEffect
+from cablejax.diagnose.diagnosis import CableDiagnosis, Diagnosis, NamedEffect
 from cablejax.diagnose.judgement import look_alikes
 from cablejax.report.effect_words import (
     EFFECTS,
@@ -39,7 +39,7 @@ def in_space(diagnosis: CableDiagnosis) -> bool:
     return diagnosis.log.keypoints.shape[-1] == 3
 
 
-def named_effects(diagnosis: CableDiagnosis) -> list[tuple[NamedEffect, str, list[tuple[str, str]]]]:
+def named_effects(diagnosis: Diagnosis) -> list[tuple[NamedEffect, str, list[tuple[str, str]]]]:
     """Each named effect, what and where it is, and its parameters with their estimates."""
     found = []
     for effect in diagnosis.effects:

@@ -6,6 +6,7 @@ import math
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 
@@ -51,3 +52,16 @@ def quaternion_of(rotation: Float[Array, "*B 3"]) -> Float[Array, "*B 4"]:
 def wrapped(angle):
     """The same angle within [-pi, pi) [rad]. NumPy in, NumPy out; JAX in, JAX out."""
     return (angle + math.pi) % (2 * math.pi) - math.pi
+
+
+def points_in_space(points: Float[np.ndarray, "*B D"]) -> Float[np.ndarray, "*B 3"]:
+    """Points of the plane as points in space with z = 0; those in space as they are. NumPy."""
+    return np.pad(points, [(0, 0)] * (points.ndim - 1) + [(0, 3 - points.shape[-1])])
+
+
+def pose_in_space(pose: Float[np.ndarray, "*B P"]) -> Float[np.ndarray, "*B 7"]:
+    """Poses (x, y, theta) as (x, y, 0, qw, 0, 0, qz); those in space as they are. NumPy."""
+    if pose.shape[-1] == 7:
+        return pose
+    half, none = 0.5 * pose[..., 2:], np.zeros_like(pose[..., 2:])
+    return np.concatenate([pose[..., :2], none, np.cos(half), none, none, np.sin(half)], axis=-1)

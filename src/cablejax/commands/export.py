@@ -1,0 +1,120 @@
+"""`cablejax export`: gap logs and runs in the formats of other programs."""
+
+from __future__ import annotations
+
+import dataclasses
+import pathlib
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import tyro
+
+from cablejax.commands.artefacts import Kind, kind_of
+from cablejax.commands.options import Command, UsageError
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from cablejax.types import GapLog
+
+_DEFAULTS = {"mcap": "log.mcap", "lerobot": "log-lerobot", "rerun": "run.rrd"}
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Export(Command):
+    """Export a gap log, a run or a diagnosis for other programs: `cablejax import` reads mcap and lerobot back.
+
+    mcap: an MCAP file with JSON messages, which Foxglove shows. lerobot: a LeRobot data set, version 3.0. rerun: a
+    Rerun recording with grippers, keypoints, target and errors; of a diagnosis also with the simulated cables.
+    """
+
+    format: Annotated[Literal["mcap", "lerobot", "rerun"], tyro.conf.Positional]
+    """What to write."""
+
+    source: Annotated[pathlib.Path, tyro.conf.Positional]
+    """A gap log, the folder of a run or of a diagnosis, or an exported log."""
+
+    out: pathlib.Path | None = None
+    """The file, or the data set's folder, to write. By default log.mcap, log-lerobot or run.rrd."""
+
+    overwrite: bool = False
+    """Replace a file that is there; a folder is never replaced."""
+
+    def execute(self):
+        """Reads the log, and writes it in the other format."""
+        out = pathlib.Path(_DEFAULTS[self.format]) if self.out is None else self.out
+        if out.is_dir() or (out.exists() and (self.format == "lerobot" or not self.overwrite)):
+            advice = ", or add --overwrite" if out.is_file() and self.format != "lerobot" else ""
+            raise UsageError(f"{out} exists. Give another {_noun(self.format)} with --out{advice}.")
+        log, simulated, about = recorded(self.source)
+        if self.format == "mcap":
+            from cablejax.recordings.mcap_log import write_mcap
+
+            write_mcap(out, log)
+        elif self.format == "lerobot":
+            from cablejax.recordings.lerobot import write_lerobot
+
+            write_lerobot(out, log)
+        else:
+            from cablejax.report.rerun_file import write_rerun
+
+            write_rerun(out, log, simulated=simulated, about=about)
+        samples = int(log.episode_length.sum())
+        result = {"out": str(out), "episodes": len(log.episode_length), "samples": samples, "simulated": [*simulated]}
+        return result, f"{out}: {len(log.episode_length)} episodes, {samples} samples."
+
+
+def recorded(source: pathlib.Path) -> tuple[GapLog, dict[str, np.ndarray], str]:
+    """The log of a file or folder, the simulated keypoints where there are any, and where it is from, in Markdown.
+
+    Raises:
+        ValueError: it holds no log, or one that cannot be read.
+    """
+    from cablejax.gaplog import read_simulated
+
+    kind, path = kind_of(source)
+    if source.is_dir() and kind in ("run", "verdict", "log"):
+        kind, path = "log", _log_of_run(source)
+    if kind not in ("log", "mcap", "lerobot"):
+        raise UsageError(f"{source} holds no recorded run, but a {kind}. Give a gap log, or the folder of a run.")
+    log = read_log(kind, path)
+    simulated = read_simulated(path, log) if kind == "log" else {}
+    verdict = path.with_name("verdict.json")
+    about = f"# {path.name}\n\n{log.meta['source']}\n"
+    if simulated and verdict.is_file():
+        from cablejax.diagnose.verdict_json import read_verdict
+
+        about += f"\n{read_verdict(verdict).sentence}\n"
+    return log, simulated, about
+
+
+def read_log(kind: Kind, path: pathlib.Path) -> GapLog:
+    """The gap log in a file of our own, an MCAP file or a LeRobot data set.
+
+    Raises:
+        ValueError: it cannot be read.
+    """
+    if kind == "mcap":
+        from cablejax.recordings.mcap_log import read_mcap
+
+        return read_mcap(path)
+    if kind == "lerobot":
+        from cablejax.recordings.lerobot import read_lerobot
+
+        return read_lerobot(path)
+    from cablejax.gaplog import read_gap_log
+
+    return read_gap_log(path)
+
+
+def _log_of_run(folder: pathlib.Path) -> pathlib.Path:
+    for name in ("log.npz", "simulated.npz"):
+        if (folder / name).is_file():
+            return folder / name
+    raise UsageError(
+        f"{folder} has neither log.npz nor simulated.npz: a diagnosis by an earlier version kept no log. Give the gap "
+        "log itself, or diagnose it again."
+    )
+
+
+def _noun(form: str) -> str:
+    return "folder" if form == "lerobot" else "file"

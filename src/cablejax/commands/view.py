@@ -1,0 +1,103 @@
+"""`cablejax view`: the page of anything that this package writes."""
+
+from __future__ import annotations
+
+import dataclasses
+import pathlib
+import shutil
+from typing import TYPE_CHECKING, Annotated
+
+import tyro
+
+from cablejax.commands.artefacts import PAGE, Kind, kind_of
+from cablejax.commands.options import Command, UsageError
+
+if TYPE_CHECKING:
+    from cablejax.report.sheet import Sheet
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class View(Command):
+    """Write the page of anything that cablejax has written, and print its path.
+
+    Takes a gap log, a data set, weights, a verdict, the folder of a run, or a cable file, and finds out by its content
+    which it is. Runs and diagnoses have their page already; for the others a page is written.
+    """
+
+    artefact: Annotated[pathlib.Path, tyro.conf.Positional]
+    """The file or folder, or a released model by name."""
+
+    out: pathlib.Path | None = None
+    """The page to write, an .html file. By default next to the file, with its name; a run's page stays where it is."""
+
+    overwrite: bool = False
+    """Replace a page that is there."""
+
+    browser: bool = False
+    """Also open the page in this machine's web browser."""
+
+    def execute(self):
+        """Finds out what it is, writes its page and prints the path."""
+        kind, path = kind_of(self.artefact)
+        page = self._page(kind, path)
+        if kind == "run" and self.out is None:
+            title = "The page of a run."
+        else:
+            if page.suffix.lower() not in (".html", ".htm"):
+                raise UsageError(f"--out is {page}, expected a file name that ends in .html.")
+            if page.exists() and not self.overwrite:
+                raise UsageError(f"{page} exists. Give another file with --out, or add --overwrite.")
+            title = self._write(kind, path, page)
+        if self.browser:
+            import webbrowser
+
+            if not webbrowser.open(page.resolve().as_uri()):
+                title = f"{title} No web browser was found here: copy the page to a machine that has one."
+        return {"kind": kind, "title": title, "page": str(page)}, f"{title}\n{page}"
+
+    def _page(self, kind: Kind, path: pathlib.Path) -> pathlib.Path:
+        if self.out is not None:
+            return self.out
+        if kind == "run":
+            return path / PAGE
+        named = path.resolve() if path.name in ("", "..") else path
+        return named.with_name(f"{named.stem}.html")
+
+    def _write(self, kind: Kind, path: pathlib.Path, page: pathlib.Path) -> str:
+        """Writes the page and returns its title."""
+        if kind == "run":
+            page.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(path / PAGE, page)
+            return "The page of a run."
+        from cablejax.report.sheet import write_sheet
+
+        sheet = sheet_of(kind, path)
+        write_sheet(page, sheet)
+        return f"{sheet.kind.capitalize()}: {sheet.title}"
+
+
+def sheet_of(kind: Kind, path: pathlib.Path) -> Sheet:
+    """The sheet of a file or folder of one kind.
+
+    Raises:
+        ValueError: it cannot be read.
+    """
+    from cablejax.report import log_sheet, made_sheets, sheet
+
+    if kind == "cable":
+        from cablejax.cable_file import read_cable
+
+        return sheet.cable_sheet(read_cable(path), str(path))
+    if kind == "store":
+        from cablejax.dataset.opening import open_store
+
+        return made_sheets.store_sheet(open_store(path), str(path))
+    if kind == "weights":
+        return made_sheets.weights_sheet(path, str(path))
+    if kind == "verdict":
+        from cablejax.diagnose.verdict_json import read_verdict
+
+        return made_sheets.verdict_sheet(read_verdict(path), str(path))
+    from cablejax.commands.export import read_log
+
+    return log_sheet.log_sheet(read_log(kind, path), str(path))

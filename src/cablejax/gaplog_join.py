@@ -1,0 +1,98 @@
+"""Joins recordings of one set-up to one gap log that knows what it was joined of."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from cablejax.gaplog import episodes_of, stack_episodes
+from cablejax.gaplog_check import META_FIELDS, GapLogError
+from cablejax.limits import shown
+from cablejax.types import GapLog
+
+
+def joined(logs: Sequence[GapLog], names: Sequence[str]) -> GapLog:
+    """One log of several recordings of one set-up, episodes in the order given.
+
+    Its `meta` has the field `recordings`: the name of each and how many episodes it has, by which a diagnosis says what
+    each one added. Extra fields of `meta` stay where all recordings have the same.
+
+    Args:
+        logs: at least one.
+        names: of each, for example that of its file; one that was joined itself keeps its parts' names.
+
+    Raises:
+        GapLogError: recordings of different set-ups, or the same one twice; names both and what differs.
+    """
+    if not logs:
+        raise GapLogError("Nothing to join: expected at least one gap log.")
+    for i, (log, name) in enumerate(zip(logs, names, strict=True)):
+        for other, other_name in zip(logs[:i], names, strict=False):
+            if _same_recording(log, other):
+                raise GapLogError(
+                    f"{other_name} and {name} are the same recording: name it once, or it would count twice."
+                )
+        there_all, here_all = _set_up(logs[0]), _set_up(log)
+        for field in there_all | here_all:
+            if (here := here_all.get(field)) != (there := there_all.get(field)):
+                raise GapLogError(
+                    f"{name} is not of the set-up of {names[0]}: '{field}' is {shown(here)}, and there {shown(there)}. "
+                    "Diagnose them apart, or correct the one that states it wrongly."
+                )
+    extra = set.intersection(*(set(log.meta) for log in logs)) - {*META_FIELDS, "recordings"}
+    shared = [*META_FIELDS, *(name for name in sorted(extra) if all(_same(name, log, logs[0]) for log in logs))]
+    meta = {
+        **{name: logs[0].meta[name] for name in shared},
+        "motion": [motion for log in logs for motion in log.meta["motion"]],
+        "source": "; ".join(dict.fromkeys(log.meta["source"] for log in logs)),
+        "recordings": [part for log, name in zip(logs, names, strict=True) for part in recordings(log, name)],
+    }
+    episodes = [episode for log in logs for episode in episodes_of(log)]
+    return stack_episodes(episodes, meta, holds=any(log.hold is not None for log in logs))
+
+
+def recordings(log: GapLog, name: str = "the log") -> list[dict[str, Any]]:
+    """What a log was joined of, as `{"name", "episodes"}`; of one that was not joined, itself under this name.
+
+    Raises:
+        GapLogError: the field `recordings` of its `meta` does not add up to its episodes.
+    """
+    parts, episodes = log.meta.get("recordings"), len(log.episode_length)
+    if parts is None:
+        return [{"name": name, "episodes": episodes}]
+    try:
+        counts = [part["episodes"] for part in parts if isinstance(part["name"], str)]
+        fits = len(counts) == len(parts) and sum(counts) == episodes and all(type(n) is int and n > 0 for n in counts)
+    except (TypeError, KeyError, ValueError):
+        fits = False
+    if not fits:
+        raise GapLogError(
+            f"Field 'meta.recordings' is {shown(parts)}, expected names and numbers of episodes that add up to "
+            f"{episodes}, as `cablejax.gaplog_join.joined` writes them."
+        )
+    return parts
+
+
+def _set_up(log: GapLog) -> dict[str, Any]:
+    """What recordings of one set-up have in common, by the names of the format."""
+    meta = log.meta
+    return {
+        "dimension of the keypoints": log.keypoints.shape[3],
+        "number of keypoints": log.keypoints.shape[2],
+        "number of grippers": log.gripper_pose.shape[2],
+        "meta.cable.rest_curvature_per_m": 0.0,
+        **{f"meta.cable.{name}": value for name, value in meta["cable"].items()},
+        **{f"meta.{name}": meta[name] for name in ("table", "gravity_m_per_s2", "keypoint_arclength_m", "grasp")},
+    }
+
+
+def _same(name: str, log: GapLog, other: GapLog) -> bool:
+    return log.meta[name] == other.meta[name]
+
+
+def _same_recording(log: GapLog, other: GapLog) -> bool:
+    return all(
+        np.array_equal(getattr(log, name), getattr(other, name), equal_nan=True) for name in ("time", "keypoints")
+    )
