@@ -40,6 +40,7 @@ class ChainEngine(Engine):
     config: Discretisation = Discretisation()
 
     name: ClassVar[str] = "chain"
+    data_timestep: ClassVar[float] = 0.05
     hooks: ClassVar[frozenset[Hook]] = frozenset(get_args(Hook))
 
     def __post_init__(self):
