@@ -65,8 +65,8 @@ def _dask(address: str) -> Iterator[concurrent.futures.Executor]:
         client = Client(address, timeout=SECONDS, set_as_default=False)
     except (OSError, TimeoutError, ValueError) as error:
         raise ExecutorError(
-            f"No Dask scheduler answers at {address} ({error or type(error).__name__}). Start one with `dask scheduler`, "
-            "or give a number of processes."
+            f"No Dask scheduler answers at {address} ({error or type(error).__name__}). Start one with "
+            "`dask scheduler`, or give a number of processes."
         ) from error
     with client:
         # a function inside another one travels whole, to workers that may not know this file yet

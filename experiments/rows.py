@@ -1,8 +1,9 @@
 """Rows of results in a file, one JSON object per line: appended when finished, so that an interrupted run goes on.
 
 A line is written by one call and flushed to the disk before the next row is computed, so that a run that was killed
-loses at most the row it was in: readers ignore a torn last line, and the next writer cuts it off. Rows may be computed by
-other processes or hosts (`executors`); the file is this process'. Several processes may still append to one file. Infinity and NaN, which JSON has no numbers for, are the strings "inf", "-inf" and "nan".
+loses at most the rows that were not finished: readers ignore a torn last line, and the next writer cuts it off. Other
+processes or hosts may compute rows (`executors`), and several processes may append to one file. Infinity and NaN, which
+JSON has no numbers for, are the strings "inf", "-inf" and "nan".
 """
 
 from __future__ import annotations

@@ -77,7 +77,7 @@ def test_what_is_no_executor_is_said_at_once(text):
         pass
 
 
-# --- Dask ---------------------------------------------------------------------------------------------------------------
+# --- Dask -------------------------------------------------------------------------------------------------------------
 
 
 def free_port() -> int:
@@ -91,8 +91,8 @@ def start(*words: str, folder: pathlib.Path) -> subprocess.Popen:
     command = [sys.executable, "-m", "distributed.cli." + words[0], *words[1:]]
     environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
     environment["PYTHONPATH"] = str(EXPERIMENTS.parent / "src")
-    log = (folder / f"{words[0]}-{time.time_ns()}.log").open("w")
-    return subprocess.Popen(command, cwd=folder, env=environment, stdout=log, stderr=log)
+    with (folder / f"{words[0]}-{time.time_ns()}.log").open("w") as log:
+        return subprocess.Popen(command, cwd=folder, env=environment, stdout=log, stderr=log)
 
 
 @pytest.fixture

@@ -29,7 +29,7 @@ class Simulate(Command):
     resume_hint: ClassVar[str] = "What was complete is kept; run the same command again to go on."
 
     out: pathlib.Path = pathlib.Path("runs/data.zarr")
-    """Folder of the data set (a Zarr v3 store)."""
+    """Folder of the data set (a Zarr v3 store), or its place in object storage, s3://BUCKET/PREFIX."""
 
     trajectories: int = 2000
     """How many trajectories to simulate."""
@@ -87,6 +87,7 @@ class Simulate(Command):
         """Generates what the store lacks and returns its size and digest."""
         import shutil
 
+        from cablejax.dataset.bucket import place_of
         from cablejax.dataset.generate import WRITER, generate
         from cablejax.dataset.opening import open_store
 
@@ -96,20 +97,21 @@ class Simulate(Command):
                 with sole_writer(writer):
                     pass
             shutil.rmtree(self.out)
-        say(f"{config.n_trajectories} trajectories of {config.n_steps} steps into {self.out}")
+        place = place_of(self.out)
+        say(f"{config.n_trajectories} trajectories of {config.n_steps} steps into {place}")
         begin = time.perf_counter()
-        info = generate(config, self.out, process_index=self.process_index, process_count=self.process_count)
+        info = generate(config, place, process_index=self.process_index, process_count=self.process_count)
         seconds = time.perf_counter() - begin
         result = {
-            "path": str(self.out),
+            "path": str(place),
             "trajectories": config.n_trajectories,
             "complete": info.n_complete,
             "digest": info.digest,
             "seconds": round(seconds, 3),
         }
         return result, (
-            f"{info.n_complete} of {config.n_trajectories} trajectories are in {self.out} ({seconds:.0f} s).\n"
-            f"Train on them: cablejax train --data {self.out}"
+            f"{info.n_complete} of {config.n_trajectories} trajectories are in {place} ({seconds:.0f} s).\n"
+            f"Train on them: cablejax train --data {place}"
         )
 
     def dataset_config(self) -> DatasetConfig:
