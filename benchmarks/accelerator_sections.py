@@ -273,7 +273,13 @@ def precision_cases(sizes: Sizes) -> list[Case]:
 
 def data_cases(sizes: Sizes) -> list[Case]:
     """Transitions into the store: each stage of `generate`, which runs them one after the other."""
-    config = DatasetConfig(n_trajectories=sizes.drawn, n_steps=sizes.commands, shard_size=sizes.drawn, engine="mjx")
+    config = DatasetConfig(
+        n_trajectories=sizes.drawn,
+        n_steps=sizes.commands,
+        discretisation=Discretisation(),
+        shard_size=sizes.drawn,
+        engine="mjx",
+    )
     shard = dataclasses.replace(config, n_trajectories=sizes.shard, shard_size=sizes.shard)
     engine = MjxEngine(config.discretisation)
 

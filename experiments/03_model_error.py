@@ -26,6 +26,7 @@ from cablejax.dataset.windows import concatenate, read_trajectories
 from cablejax.dynamics.error_report import MODEL, error_report
 from cablejax.dynamics.evaluate import SNAP_FACTOR, SNAP_MARGIN
 from cablejax.dynamics.weights import load_info, load_weights
+from cablejax.simulate import ThreadedEngine
 from cablejax.types import Trajectory
 from pages import page_of_results, publish
 
@@ -35,10 +36,11 @@ TOGETHER = 8
 def simulated(config: DatasetConfig, rows: range) -> Trajectory:
     """Some trajectories of a data set, generated again."""
     # The shard size does not change a trajectory: one each, so that any row can be made alone.
-    config = dataclasses.replace(config, engine="threaded", shard_size=1)
+    config = dataclasses.replace(config, shard_size=1)
     engine, parts = make_engine(config), []
-    for first in range(rows.start, rows.stop, TOGETHER):
-        blocks = simulate(config, engine, range(first, min(first + TOGETHER, rows.stop)))
+    together = TOGETHER if isinstance(engine, ThreadedEngine) else engine.shards_at_once
+    for first in range(rows.start, rows.stop, together):
+        blocks = simulate(config, engine, range(first, min(first + together, rows.stop)))
         parts += [Trajectory(block.keypoints, block.gripper_pose, block.gripper_twist) for block in blocks]
         print(f"{len(parts)} of {len(rows)} simulated", file=sys.stderr, flush=True)
     return concatenate(parts)

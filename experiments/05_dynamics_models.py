@@ -76,6 +76,7 @@ def source(name: str) -> str | Path:
 
 def simulated(config: DatasetConfig, count: int) -> Trajectory:
     """The last trajectories of a data set, generated again: those held out from training."""
+    # the networks' data are by C MuJoCo, whose trajectories do not depend on how many are simulated together
     config = dataclasses.replace(config, engine="threaded", shard_size=1)
     engine = make_engine(config)
     blocks = simulate(config, engine, range(config.n_trajectories - count, config.n_trajectories))

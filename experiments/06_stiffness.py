@@ -2,7 +2,8 @@
 
 python experiments/06_stiffness.py                    # one seed, three methods, one stiffness: some minutes
 python experiments/06_stiffness.py --full             # all of it, hours on two cores; resumable
-python experiments/06_stiffness.py --full --process 1 2 &     # the second half of it, at the same time as --process 0 2
+python experiments/06_stiffness.py --full --executor 2                     # in two processes
+python experiments/06_stiffness.py --full --executor tcp://HOST:8786       # on a Dask cluster
 python experiments/06_stiffness.py --full --report docs/results/stiffness.md    # the page, of what is done so far
 """
 

@@ -1,7 +1,7 @@
 """Tables IV and V of Wang et al., RA-L 2022: U and S by two cables of another simulator family, in place of real ones.
 
 python experiments/07_other_simulator.py                   # one seed, one cable, two methods: some minutes
-python experiments/07_other_simulator.py --full            # all of it; resumable, --process shares the work
+python experiments/07_other_simulator.py --full            # all of it; resumable, --executor shares the work
 python experiments/07_other_simulator.py --full --report docs/results/other_simulator.md
 """
 

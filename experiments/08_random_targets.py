@@ -1,7 +1,7 @@
 """The protocol of Liang et al. 2026: random targets from straight and from diverse starts, 50 each.
 
 python experiments/08_random_targets.py                    # two of each, one method: some minutes
-python experiments/08_random_targets.py --full             # all of it; resumable, --process shares the work
+python experiments/08_random_targets.py --full             # all of it; resumable, --executor shares the work
 python experiments/08_random_targets.py --full --report docs/results/random_targets.md
 python experiments/08_random_targets.py --full --seeds 2000:2050  # tasks that no choice was made on
 """

@@ -7,7 +7,7 @@ same objective and gradient from JAX, the same start, and on `--exact` of the pr
 
     python experiments/11_against_ipopt.py --draw                 # once, and done: the problems, some minutes
     python experiments/11_against_ipopt.py --n 20                 # the first 20 of them, resumable
-    python experiments/11_against_ipopt.py --n 1000 --process 1 2 &   # every second one; --process 0 2 does the others
+    python experiments/11_against_ipopt.py --n 1000 --executor 2      # in two processes, or tcp://...
     python experiments/11_against_ipopt.py --explain              # the exceptions
     python experiments/11_against_ipopt.py --kinks 10             # why the network's corners are rounded
     python experiments/11_against_ipopt.py --calls 60             # a control call, and IPOPT until it is as good
@@ -19,8 +19,10 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import functools
 import os
 import platform
+from concurrent.futures import Executor
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -59,6 +61,7 @@ from against_ipopt.referee import RefereeConfig
 from cablejax.control.shaping import Model, load_model
 from cablejax.mpc import SOLVERS
 from cablejax.report.provenance import machine, versions
+from executors import add_option, executor_of
 from pages import page_of_results, publish
 
 FOLDER = Path("docs") / "results" / "trials" / "against_ipopt"
@@ -86,27 +89,39 @@ def referees(exact: bool) -> list[RefereeConfig]:
     return [limited, RefereeConfig(exact=True, max_iterations=EXACT_ITERATIONS)] if exact else [limited]
 
 
-def run(
-    ours: Contestant, cases: list[PlanningCase], folder: Path, n_exact: int, process: tuple[int, int], seconds: float
-) -> None:
+def run(options: argparse.Namespace, cases: list[PlanningCase], folder: Path, executor: Executor | None) -> None:
     """Judges what has no row yet, until the time is up."""
-    rows, by_name = rows_of(folder), {case.name: case for case in cases}
-    exact = {case.name for case in cases[:n_exact]}
+    rows = rows_of(folder)
+    exact = frozenset(case.name for case in cases[: options.exact])
     # with the exact Hessian again where that was not asked for before
     short = {row["name"] for row in rows.read() if "exact" not in row} & exact
     wanted = [(case.name,) for case in cases]
     missing = set(rows.missing(wanted)) | {(name,) for name in short}
-    todo = [key for key in wanted[process[0] :: process[1]] if key in missing]
-    for flag in {name in exact for (name,) in todo}:
-        # Compiles, so that no clock below sees that.
-        few = [dataclasses.replace(config, max_iterations=2) for config in referees(flag)]
-        judge(ours, by_name[todo[0][0]], few, gradients=2)
+    make = functools.partial(judged, options.weights, options.folder.absolute(), exact)
+    rows.run([key for key in wanted if key in missing], make, executor=executor, seconds=options.seconds)
 
-    def judged(name: str) -> dict[str, Any]:
-        row = judge(ours, by_name[name], referees(name in exact))
-        return {**row, "machine": machine(), "threads": os.environ["NPROC"]}
 
-    rows.run(todo, judged, seconds=seconds)
+def judged(weights: str, folder: Path, exact: frozenset[str], name: str) -> dict[str, Any]:
+    """The row of one problem."""
+    cases, ours = compiled(weights, folder, name in exact)
+    row = judge(ours, cases[name], referees(name in exact))
+    return {**row, "machine": machine(), "threads": os.environ["NPROC"]}
+
+
+@functools.lru_cache
+def compiled(weights: str, folder: Path, exact: bool) -> tuple[dict[str, PlanningCase], Contestant]:
+    """The problems, and ours, which has solved one: no clock sees the compilation."""
+    jax.config.update("jax_enable_x64", True)
+    cases, ours = known(weights, folder)
+    few = [dataclasses.replace(config, max_iterations=2) for config in referees(exact)]
+    judge(ours, next(iter(cases.values())), few, gradients=2)
+    return cases, ours
+
+
+@functools.lru_cache
+def known(weights: str, folder: Path) -> tuple[dict[str, PlanningCase], Contestant]:
+    """The problems in a folder, and ours for one model."""
+    return {case.name: case for case in load_cases(folder / "cases.npz")}, contestant(load_model(weights))
 
 
 def explain_all(ours: Contestant, cases: list[PlanningCase], folder: Path, seconds: float) -> None:
@@ -182,7 +197,7 @@ def main() -> None:
     parser.add_argument("--n", type=int, default=20, help="judge the first so many")
     parser.add_argument("--exact", type=int, default=10, help="the first so many with the exact Hessian too")
     parser.add_argument("--seconds", type=float, default=float("inf"), help="begin no other problem after this time")
-    parser.add_argument("--process", nargs=2, type=int, default=(0, 1), metavar=("INDEX", "COUNT"))
+    add_option(parser)
     parser.add_argument("--weights", default=RELEASED, help="released model by name, or the folder of a training")
     parser.add_argument("--folder", type=Path, default=FOLDER, help="has the problems")
     parser.add_argument("--explain", action="store_true", help="explain the exceptions")
@@ -213,7 +228,8 @@ def main() -> None:
         measure_kinks(ours, cases, folder, options.kinks)
         return
     if options.report is None:
-        run(ours, cases[: options.n], folder, options.exact, tuple(options.process), options.seconds)
+        with executor_of(options.executor) as executor:
+            run(options, cases[: options.n], folder, executor)
     text = page(options, folder, len(cases))
     publish(text, options.report)
 

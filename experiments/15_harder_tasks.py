@@ -1,7 +1,7 @@
 """Targets that are recorded shapes of other cables, and runs that are disturbed in the middle: 100 of each.
 
 python experiments/15_harder_tasks.py                    # six of each, one method: some minutes
-python experiments/15_harder_tasks.py --full             # all of it; resumable, --process shares the work
+python experiments/15_harder_tasks.py --full             # all of it; resumable, --executor shares the work
 python experiments/15_harder_tasks.py --full --report docs/results/harder_tasks.md
 python experiments/15_harder_tasks.py --full --seeds 0:12    # tasks to choose on; those of the table are kept apart
 """

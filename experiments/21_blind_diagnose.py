@@ -1,7 +1,7 @@
 """Diagnoses blind cases: one row per log, without a look at any label.
 
 python experiments/21_blind_diagnose.py LOG_DIR --out VERDICTS.jsonl                  # resumable
-python experiments/21_blind_diagnose.py LOG_DIR --out VERDICTS.jsonl --process 0 2    # shares the work
+python experiments/21_blind_diagnose.py LOG_DIR --out VERDICTS.jsonl --executor 2     # in two processes, or tcp://...
 
 Uses nothing but `cablejax.diagnose.diagnose` as a user would call it on each log alone, without commissioning logs
 unless a folder of them is given; the verdict is then called `verdict_commissioned`. A log that is refused gets a row
@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import functools
 import os
 import pathlib
 from typing import Any
@@ -23,6 +24,7 @@ import jax
 from cablejax.diagnose import Calibration, DiagnosisError, diagnose, verdict_json
 from cablejax.diagnose.planar_run import baseline_error
 from cablejax.gaplog import read_gap_log
+from executors import add_option, executor_of
 from rows import Rows
 
 
@@ -31,28 +33,37 @@ def main() -> None:
     parser.add_argument("logs", type=pathlib.Path, help="folder of gap logs")
     parser.add_argument("--out", type=pathlib.Path, required=True, help="file of the verdicts")
     parser.add_argument("--commissioning", type=pathlib.Path, help="folder of logs without effect, of the same set-up")
-    parser.add_argument(
-        "--process", type=int, nargs=2, metavar=("I", "N"), default=(0, 1), help="this is process I of N"
-    )
+    add_option(parser)
     options = parser.parse_args()
-    # Logs of one length share compiled programs, from one process to the next too.
-    jax.config.update("jax_compilation_cache_dir", str(options.out.with_suffix(".compiled")))
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)
-    calibration, field = Calibration(), "verdict"
+    compiled, calibration, field = options.out.with_suffix(".compiled").absolute(), Calibration(), "verdict"
+    keep_programs(compiled)
     if options.commissioning:
         logs = [read_gap_log(path) for path in sorted(options.commissioning.glob("*.npz"))]
         calibration = dataclasses.replace(calibration, baseline=baseline_error(logs))
         field = "verdict_commissioned"
         print(f"baseline error of {len(logs)} commissioning logs: {1e3 * calibration.baseline:.3f} mm", flush=True)
 
-    def diagnosed(name: str) -> dict[str, Any]:
-        try:
-            return {field: verdict_json(diagnose(read_gap_log(options.logs / f"{name}.npz"), calibration=calibration))}
-        except DiagnosisError as error:
-            return {"refused": str(error)}
-
     rows, names = Rows(options.out, ("name",)), sorted(path.stem for path in options.logs.glob("*.npz"))
-    rows.run(rows.missing([(name,) for name in names], tuple(options.process)), diagnosed)
+    make = functools.partial(diagnosed, options.logs.absolute(), compiled, calibration, field)
+    with executor_of(options.executor) as executor:
+        rows.run(rows.missing([(name,) for name in names]), make, executor=executor)
+
+
+def keep_programs(folder: pathlib.Path) -> None:
+    """Logs of one length share compiled programs, from one process to the next too."""
+    jax.config.update("jax_compilation_cache_dir", str(folder))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)
+
+
+def diagnosed(
+    logs: pathlib.Path, compiled: pathlib.Path, calibration: Calibration, field: str, name: str
+) -> dict[str, Any]:
+    """The row of one log."""
+    keep_programs(compiled)
+    try:
+        return {field: verdict_json(diagnose(read_gap_log(logs / f"{name}.npz"), calibration=calibration))}
+    except DiagnosisError as error:
+        return {"refused": str(error)}
 
 
 if __name__ == "__main__":

@@ -1,8 +1,9 @@
 """Rows of results in a file, one JSON object per line: appended when finished, so that an interrupted run goes on.
 
 A line is written by one call and flushed to the disk before the next row is computed, so that a run that was killed
-loses at most the row it was in: readers ignore a torn last line, and the next writer cuts it off. Several processes may
-append to one file. Infinity and NaN, which JSON has no numbers for, are the strings "inf", "-inf" and "nan".
+loses at most the rows that were not finished: readers ignore a torn last line, and the next writer cuts it off. Other
+processes or hosts may compute rows (`executors`), and several processes may append to one file. Infinity and NaN, which
+JSON has no numbers for, are the strings "inf", "-inf" and "nan".
 """
 
 from __future__ import annotations
@@ -15,9 +16,12 @@ import os
 import pathlib
 import time
 from collections.abc import Callable, Iterable, Mapping
+from concurrent.futures import Executor
 from typing import Any
 
 from tqdm import tqdm
+
+from executors import results
 
 _NO_NUMBERS = ("inf", "-inf", "nan")
 
@@ -47,34 +51,39 @@ class Rows:
             rows[tuple(row[name] for name in self.key)] = row
         return list(rows.values())
 
-    def missing(self, wanted: Iterable[tuple], process: tuple[int, int] = (0, 1)) -> list[tuple]:
-        """The wanted keys that have no row yet; for process P of (P, count), of every `count`-th wanted key."""
+    def missing(self, wanted: Iterable[tuple]) -> list[tuple]:
+        """The wanted keys that have no row yet."""
         done = {tuple(row[name] for name in self.key) for row in self.read()}
-        return [key for key in list(wanted)[process[0] :: process[1]] if key not in done]
+        return [key for key in wanted if key not in done]
 
     def run(
         self,
         keys: Iterable[tuple],
-        make: Callable[..., Mapping[str, Any]],
+        make: Callable[..., Any],
         *,
+        executor: Executor | None = None,
+        keep: Callable[[Any], Mapping[str, Any]] = lambda made: made,
         seconds: float = math.inf,
         progress: bool = True,
     ) -> None:
-        """Makes rows one after the other and appends each once it is finished.
+        """Makes rows and appends each once it is finished.
 
         Args:
             keys: of the rows, in order.
-            make: called with a key's elements, returns the row's other fields.
+            make: called with a key's elements, returns the row's other fields. For an executor it can be pickled.
+            executor: where `make` is called; None = here, one row after the other.
+            keep: called here with what `make` returned, if that is not the row's other fields yet.
             seconds: no other row is begun after this time.
             progress: show a bar with the time left.
+
+        Raises:
+            ExecutorError: a process or the cluster was lost. The rows that were finished are kept.
         """
         began, keys = time.perf_counter(), list(keys)
         with tqdm(total=len(keys), unit="row", disable=not progress, dynamic_ncols=True) as bar:
-            for key in keys:
-                if time.perf_counter() - began > seconds:
-                    break
+            for key, made in results(executor, make, keys, going=lambda: time.perf_counter() - began <= seconds):
                 bar.set_postfix_str(" ".join(map(str, key)))
-                append_row(self.path, {**dict(zip(self.key, key, strict=True)), **make(*key)})
+                append_row(self.path, {**dict(zip(self.key, key, strict=True)), **keep(made)})
                 bar.update()
 
 

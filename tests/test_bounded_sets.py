@@ -175,22 +175,37 @@ _minimise = jax.jit(lambda h, g, s, y: minimise_quadratic(h, g, s, y))
 @jax.jit
 @jax.vmap
 def nearest_twice(matrix, offset, point):
-    """The violation of the nearest point, and how far that of a point a thousandth of the way back is from it."""
+    """The violation of the nearest point, how far that of a point a thousandth of the way back is, and convergence."""
     feasible = AffineBalls(matrix, offset, jnp.asarray([0.3, 0.25]))
     nearest = feasible.project(point)
     again = feasible.project(nearest + 1e-3 * (point - nearest))
-    return feasible.violation(nearest), jnp.abs(again - nearest).max()
+    found = minimise_quadratic(jnp.eye(point.size), jnp.zeros_like(point), feasible, point)
+    return feasible.violation(nearest), jnp.abs(again - nearest).max(), found.converged
 
 
-@pytest.mark.parametrize(("size", "apart"), [(10.0, 1e-7), (100.0, 1e-4)])
-def test_from_far_away_the_nearest_point_is_still_found(size, apart):
-    """Forty to four hundred times as far as the balls are wide, which meet at any angle."""
+@pytest.mark.parametrize("size", [0.1, 10.0, 100.0, 1000.0])
+def test_from_far_away_the_nearest_point_is_still_found(size):
+    """Forty to four thousand times as far as the balls are wide, which meet at any angle."""
     with jax.enable_x64(True):
         rng = np.random.default_rng(0)
         maps = rng.normal(size=(60, 2, 2, 6)), 0.1 * rng.normal(size=(60, 2, 2)), size * rng.normal(size=(60, 6))
-        violation, between = nearest_twice(*maps)
-        assert float(violation.max()) <= 1e-6
-        assert float(between.max()) <= apart
+        violation, between, converged = nearest_twice(*maps)
+        assert bool(converged.all())
+        assert float(violation.max()) <= 1e-10
+        assert float(between.max()) <= 1e-9 * max(size, 1.0)
+
+
+@pytest.mark.slow
+def test_derivatives_of_the_projection_from_far_away():
+    """A thousand times as far as the balls are wide: forward mode against central differences."""
+    with jax.enable_x64(True):
+        feasible, step = affine(), 1e-2
+        y = 500.0 * jnp.asarray(np.random.default_rng(8).normal(size=SHAPE))
+        forward = jax.jit(jax.jacfwd(lambda y: feasible.project(y)))(y).reshape(SIZE, SIZE)
+        moves = step * jnp.eye(SIZE).reshape(SIZE, *SHAPE)
+        both = jax.jit(jax.vmap(lambda m: feasible.project(y + m) - feasible.project(y - m)))(moves)
+        np.testing.assert_allclose(forward, both.reshape(SIZE, SIZE).T / (2 * step), atol=1e-7)
+        assert np.linalg.matrix_rank(forward, tol=1e-6) < SIZE, "some bound is active"
 
 
 @pytest.mark.parametrize("name", SETS)

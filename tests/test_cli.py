@@ -57,6 +57,8 @@ def test_help_is_fast_because_it_loads_neither_jax_nor_mujoco():
     ("arguments", "message"),
     [
         (["simulate", "--trajectories", "0"], "n_trajectories is 0"),
+        (["simulate", "--timestep", "0.03"], "expected a multiple of the time step, 0.03 s"),
+        (["simulate", "--timestep", "nan"], "timestep is nan"),
         (["simulate", "--links", "1"], "n_links is 1"),
         (["simulate", "--links", "3"], "n_links 3, expected at least 5"),
         (["simulate", "--links", "4"], "n_links 4, expected at least 5"),
@@ -74,7 +76,10 @@ def test_help_is_fast_because_it_loads_neither_jax_nor_mujoco():
         (["simulate", "--cable", "none.toml"], "There is no file none.toml"),
         (["simulate", "--effect", "magic:x=1"], "no effect 'magic'"),
         (["simulate", "--effect", "bending_stiffness:ratio=-1"], "ratio is -1"),
-        (["simulate", "--effect", "plasticity:yield_curvature_per_m=5"], "Simulators that have: chain"),
+        (
+            ["simulate", "--engine", "mjx", "--effect", "plasticity:yield_curvature_per_m=5"],
+            "Simulators that have: chain",
+        ),
         (["simulate", "--with", "none.json"], "There is no file none.json"),
         (["simulate", "--seed", "-1"], "--seed is -1"),
         (["train", "--data", "nowhere.zarr"], "holds no data set"),
@@ -148,10 +153,17 @@ def test_interrupting_a_long_simulation_tells_how_to_go_on(tmp_path):
 
 @pytest.mark.slow
 def test_bench_simulate_relates_the_engines(capsys):
-    assert main(["bench", "simulate", "--json", "--links", "5", "--batch", "4", "--rounds", "2"]) == 0
+    small = ["--links", "5", "--batch", "4", "--rounds", "2", "--trajectories", "3", "--steps", "4"]
+    assert main(["bench", "simulate", "--json", *small]) == 0
     result = json.loads(capsys.readouterr().out)
-    ratio = result["mjx_us_per_env_step"] / result["c_us_per_env_step"]
-    assert result["mjx_over_c"] == pytest.approx(ratio) and ratio > 0
+    micros, steps = result["us_per_simulated_second"], result["us_per_env_step"]
+    assert micros["chain"] == pytest.approx(20 * steps["chain"]) and micros["mjx"] == pytest.approx(50 * steps["mjx"])
+    assert result["relative_to_c"]["mjx"] == pytest.approx(micros["mjx"] / micros["c_one"])
+    for name in ("chain", "mjx", "threaded"):
+        assert 0 < result["accuracy"][name]["median_mm"] <= result["accuracy"][name]["largest_mm"] < 10
+        per_transition = sum(result["us_per_transition"][name].values())
+        assert result["transitions_per_second"][name] == pytest.approx(1e6 / per_transition)
+        assert result["two_million_transitions_min"][name] == pytest.approx(per_transition / 30)
     assert result["mjx_memory_per_env_bytes"] > 0 and result["mjx_compile_s"] > 0
 
 

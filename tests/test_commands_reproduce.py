@@ -31,7 +31,7 @@ LONG = Cable(length=1.5, linear_density=0.05, bending_stiffness=0.05, n_keypoint
         ),
         DatasetConfig(
             randomisation=Randomisation(stiffness=(0.1, 3.0)),
-            discretisation=Discretisation(LONG),
+            discretisation=Discretisation(LONG, timestep=0.1),
             motion=MotionConfig.for_length(1.5),
         ),
         DatasetConfig(
@@ -42,7 +42,7 @@ LONG = Cable(length=1.5, linear_density=0.05, bending_stiffness=0.05, n_keypoint
             ),
         ),
     ],
-    ids=["default", "random", "free", "mjx", "cable", "effects"],
+    ids=["default", "random", "free", "mjx", "cable and time step", "effects"],
 )
 def test_the_command_of_a_data_set_asks_for_that_data_set(config, tmp_path):
     write_cable(tmp_path / "cable.toml", config.cable)

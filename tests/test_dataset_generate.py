@@ -38,6 +38,7 @@ TINY = DatasetConfig(
     motion=MotionConfig(max_step=0.03, min_distance=0.6, max_angle=0.6, max_curvature=3.0),
     discretisation=Discretisation(Cable(n_keypoints=4), n_links=7, timestep=0.02),
     randomisation=Randomisation(stiffness=(0.1, 3.0), friction=(0.5, 2.0)),
+    engine="threaded",
 )
 
 STAGED = dataclasses.replace(

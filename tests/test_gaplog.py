@@ -14,9 +14,7 @@ from cablejax.gaplog import (
     Episode,
     GapLogError,
     gap_log_from_episodes,
-    joined,
     read_gap_log,
-    recordings,
     validate,
     write_gap_log,
 )

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+import executors
 from cablejax.control.shaping import Model
 from cablejax.dynamics.weights import FILE_NAME
 from cablejax.mpc import MPCConfig
@@ -79,22 +80,21 @@ def main(experiment: Experiment, arguments: Sequence[str] | None = None) -> None
     parser.add_argument("--out", type=pathlib.Path, help="folder for trials; a run goes on where it stopped")
     parser.add_argument("--methods", nargs="*", choices=tuple(METHODS), help="only these")
     parser.add_argument("--seeds", type=seed_range, metavar="FIRST:END", help="these instead of the table's own")
-    parser.add_argument(
-        "--process", nargs=2, type=int, default=(0, 1), metavar=("INDEX", "COUNT"), help="share of work"
-    )
+    executors.add_option(parser)
     parser.add_argument("--report", type=pathlib.Path, help="run nothing; write the page on what is done to this file")
     options = parser.parse_args(arguments)
     extent = experiment.full if options.full else experiment.small
     seeds = options.seeds or extent.seeds
     folder = options.out or pathlib.Path("runs") / (experiment.name if options.full else f"{experiment.name}-small")
     if options.report is None:
-        run_suite(
-            extent.cases(seeds),
-            [METHODS[name] for name in options.methods or extent.methods],
-            folder,
-            fine_tuned=functools.partial(fine_tuned_model, folder / "fine-tuned"),
-            process=tuple(options.process),
-        )
+        with executors.executor_of(options.executor) as executor:
+            run_suite(
+                extent.cases(seeds),
+                [METHODS[name] for name in options.methods or extent.methods],
+                folder,
+                fine_tuned=functools.partial(fine_tuned_model, (folder / "fine-tuned").absolute()),
+                executor=executor,
+            )
     everything, pictures = read_suite(folder)
     trials = [trial for trial in everything if trial.seed in seeds]
     shown = {trial.key for trial in trials}
@@ -118,7 +118,7 @@ def seed_range(text: str) -> range:
 
 
 def fine_tuned_model(folder: pathlib.Path, case: Case) -> Model:
-    """The model trained on a case's cable, made when it is first asked for. Two processes must not make the same."""
+    """The model trained on a case's cable, made when it is first asked for."""
     config, home = FineTuneConfig(), folder / case.cable
     if not (home / FILE_NAME).is_file():
         plant: Any = case.plant()

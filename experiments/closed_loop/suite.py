@@ -1,11 +1,13 @@
-"""Many trials, one after the other, resumable: every case by every method, each appended to a file once it is done."""
+"""Many trials, resumable: every case by every method, each appended to a file once it is done."""
 
 from __future__ import annotations
 
 import dataclasses
+import functools
 import pathlib
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Executor
 from typing import Any
 
 from cablejax.control.loop import run_closed_loop
@@ -71,7 +73,7 @@ def run_suite(
     folder: pathlib.Path,
     *,
     fine_tuned: Callable[[Case], Model],
-    process: tuple[int, int] = (0, 1),
+    executor: Executor | None = None,
     progress: bool = True,
 ) -> None:
     """Runs what the folder does not have yet. Seeds go first, so that an unfinished suite is balanced.
@@ -80,27 +82,40 @@ def run_suite(
         cases: of any tables.
         methods: each is tried on every case.
         folder: receives `trials.jsonl` and `snapshots.jsonl`; read them with `read_suite`.
-        fine_tuned: the model that was trained on a case's cable.
-        process: (index P, count): this process runs every `count`-th trial; all of them append to the same files.
+        fine_tuned: the model that was trained on a case's cable; made here before any trial that needs it.
+        executor: where trials run; None = here, one after the other.
         progress: show a bar with the time left.
     """
     pairs = [(case, method) for case in sorted(cases, key=lambda case: case.seed) for method in methods]
     wanted = {key_of(case, method): (case, method) for case, method in pairs}
 
-    def run(*key: Any) -> dict[str, Any]:
-        case, method = wanted[key]
-        model = None
-        if method.weights is not None:
-            model = fine_tuned(case) if method.fine_tuned else model_named(method.weights)
-        begin, task = time.perf_counter(), case.task()
-        finished = run_case(case, method, model, task)
-        names = dict(zip(KEY, key, strict=True))
-        trial = trial_of(finished, **names, wall_s=time.perf_counter() - begin, reachable_cm=task.reachable_cm)
-        append_snapshot(folder / SNAPSHOTS, snapshot_of(finished, trial.key))
-        return dataclasses.asdict(trial)
+    def keep(made: tuple[Trial, Snapshot]) -> dict[str, Any]:
+        append_snapshot(folder / SNAPSHOTS, made[1])
+        return dataclasses.asdict(made[0])
 
     rows = Rows(folder / TRIALS, KEY)
-    rows.run(rows.missing(wanted, process), run, progress=progress)
+    missing = rows.missing(wanted)
+    # two processes must not train the same model
+    tuned = {case.cable: case for case, method in (wanted[key] for key in missing) if method.fine_tuned}
+    for case in tuned.values():
+        fine_tuned(case)
+    make = functools.partial(_trial, {key: wanted[key] for key in missing}, fine_tuned)
+    rows.run(missing, make, executor=executor, keep=keep, progress=progress)
+
+
+def _trial(
+    wanted: Mapping[tuple, tuple[Case, MethodSpec]], fine_tuned: Callable[[Case], Model], *key: Any
+) -> tuple[Trial, Snapshot]:
+    """One trial, with its picture."""
+    case, method = wanted[key]
+    model = None
+    if method.weights is not None:
+        model = fine_tuned(case) if method.fine_tuned else model_named(method.weights)
+    begin, task = time.perf_counter(), case.task()
+    finished = run_case(case, method, model, task)
+    names = dict(zip(KEY, key, strict=True))
+    trial = trial_of(finished, **names, wall_s=time.perf_counter() - begin, reachable_cm=task.reachable_cm)
+    return trial, snapshot_of(finished, trial.key)
 
 
 def read_suite(folder: pathlib.Path) -> tuple[list[Trial], list[Snapshot]]:

@@ -3,105 +3,15 @@
 from __future__ import annotations
 
 import dataclasses
-import pathlib
 import time
 from typing import Annotated, get_args
 
 from tyro.conf import subcommand
 
+from cablejax.commands.bench_simulate import BenchSimulate
 from cablejax.commands.options import Command, UsageError, say, text_table
 from cablejax.limits import require
 from cablejax.solver_names import SolverName
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class BenchSimulate(Command):
-    """Time the simulators: the closed-form chain and MJX in a batch, C MuJoCo on one core and on several.
-
-    An environment-step is one time step of one cable. The engines take turns, and the median of the rounds counts.
-    """
-
-    batch: int = 256
-    """Cables that chain and MJX simulate at once; C simulates as many, one after the other."""
-
-    seconds: int = 1
-    """Simulated seconds per round."""
-
-    rounds: int = 5
-    """How often each engine takes its turn."""
-
-    threads: int = 2
-    """Threads of C MuJoCo to compare with one."""
-
-    links: int | None = None
-    """Links of the cable; by default the package's."""
-
-    cable: pathlib.Path | None = None
-    """A cable file, or a data set, weights or a log that holds a cable. By default the reference cable."""
-
-    def execute(self):
-        """Times the engines in turns and returns microseconds per environment-step."""
-        import jax
-        import numpy as np
-
-        from cablejax.cable import Cable, Discretisation
-        from cablejax.commands.cable import find_cable
-        from cablejax.commands.workloads import moving_arches, program_bytes, seconds_in_turns, setting
-        from cablejax.simulate import ChainEngine, MjxEngine, ThreadedEngine
-        from cablejax.simulate.engine import compiled_rollout
-
-        for name in ("batch", "seconds", "rounds", "threads"):
-            require(getattr(self, name), "count", f"--{name}")
-        cable = Cable() if self.cable is None else find_cable(self.cable)
-        config = Discretisation(cable, n_links=Discretisation.n_links if self.links is None else self.links)
-        mjx, chain = MjxEngine(config), ChainEngine(config)
-        one, many = ThreadedEngine(config, 1), ThreadedEngine(config, self.threads)
-        params, states, twist = moving_arches(config, self.batch, self.seconds, self.seed)
-        say(f"compiling the MJX engine for {self.batch} cables of {config.n_links} links ...")
-        begin = time.perf_counter()
-        compiled = compiled_rollout(mjx, params, 1, 1.0).lower(params, states, twist).compile()
-        compile_s = time.perf_counter() - begin
-        memory_bytes = program_bytes(compiled)
-
-        contestants = {
-            "chain": lambda: jax.block_until_ready(chain.rollout(params, states, twist, 1.0)),
-            "mjx": lambda: jax.block_until_ready(compiled(params, states, twist)),
-            "c_one": lambda: one.rollout(params, states, twist, 1.0),
-            "c_many": lambda: many.rollout(params, states, twist, 1.0),
-        }
-        steps = self.batch * self.seconds * mjx.substeps(1.0)
-        seconds = seconds_in_turns(contestants, self.rounds)
-        micros = {name: 1e6 * float(np.median(values)) / steps for name, values in seconds.items()}
-        result = {
-            "links": config.n_links,
-            "timestep_s": config.timestep,
-            "batch": self.batch,
-            "threads": self.threads,
-            "chain_us_per_env_step": micros["chain"],
-            "mjx_us_per_env_step": micros["mjx"],
-            "c_us_per_env_step": micros["c_one"],
-            "c_threads_us_per_env_step": micros["c_many"],
-            "chain_over_c": micros["chain"] / micros["c_one"],
-            "mjx_over_c": micros["mjx"] / micros["c_one"],
-            "threads_speedup": micros["c_one"] / micros["c_many"],
-            "mjx_memory_per_env_bytes": memory_bytes / self.batch,
-            "mjx_compile_s": compile_s,
-            **setting(),
-        }
-        labels = {
-            "chain": f"chain, batch {self.batch}",
-            "mjx": f"MJX, batch {self.batch}",
-            "c_one": "C MuJoCo, one core",
-            "c_many": f"C MuJoCo, {self.threads} threads",
-        }
-        text = text_table(
-            ["engine", "us per environment-step", "relative to C on one core"],
-            [[labels[name], f"{value:.2f}", f"{value / micros['c_one']:.2f}"] for name, value in micros.items()],
-        )
-        return result, (
-            f"{text}\n\nMJX: {memory_bytes / self.batch / 1024:.0f} KiB per environment, "
-            f"compiled in {compile_s:.1f} s, on {result['device']}."
-        )
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

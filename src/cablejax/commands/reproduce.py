@@ -12,6 +12,7 @@ from cablejax.commands.options import Command
 from cablejax.commands.simulate import Simulate
 from cablejax.dataset.schema import DatasetConfig
 from cablejax.effects.given import number_text
+from cablejax.simulate import ENGINES
 
 REPEATED = ("effect", "with_", "plant_effect")
 """Options that are given once for each of their values."""
@@ -54,6 +55,7 @@ def simulate_command(config: DatasetConfig, out: str, cable_file: str = "cable.t
         cable=None if config.cable == Cable() else pathlib.Path(cable_file),
         effect=tuple(map(str, config.effects)),
         links=config.discretisation.n_links,
+        timestep=config.discretisation.timestep,
         stiffness_range=config.randomisation.stiffness,
         damping_range=config.randomisation.damping,
         friction_range=config.randomisation.friction,
@@ -64,6 +66,8 @@ def simulate_command(config: DatasetConfig, out: str, cable_file: str = "cable.t
         return f"# {out}: cablejax.dataset.generate.generate with the configuration recorded in the weights file"
     if command.links == DatasetConfig().discretisation.n_links:
         command = dataclasses.replace(command, links=None)
+    if command.timestep == ENGINES[config.engine].data_timestep:
+        command = dataclasses.replace(command, timestep=None)
     return command_line(command, "simulate")
 
 

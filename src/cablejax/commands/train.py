@@ -28,7 +28,7 @@ class Train(Command):
     resume_hint: ClassVar[str] = "The last checkpoint is kept; run the same command again to go on."
 
     data: tuple[pathlib.Path, ...] = (pathlib.Path("runs/data.zarr"),)
-    """Folders of the data sets, in this order."""
+    """Folders of the data sets, or their places in object storage (s3://BUCKET/PREFIX), in this order."""
 
     out: pathlib.Path = pathlib.Path("runs/train")
     """Folder for what the training writes; one that holds the same training is resumed."""

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import pathlib
+import tempfile
 import time
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -18,6 +20,9 @@ from cablejax.commands.options import say
 from cablejax.control.batched import BatchRun, LoopConfig, shape_batch, varied_params
 from cablejax.control.shaping import Model, make_controller
 from cablejax.control.targets import make_target, straight_start
+from cablejax.dataset.generate import draw, generate, make_engine, simulate
+from cablejax.dataset.schema import DatasetConfig
+from cablejax.dynamics.evaluate import snapping
 from cablejax.effects.physics import Physics, nominal_physics
 from cablejax.mpc import MPC, MPCConfig
 from cablejax.perceive.synthetic import Clutter, scatter
@@ -26,7 +31,7 @@ from cablejax.simulate import MjxEngine
 from cablejax.simulate.elastica import solve_elastica
 from cablejax.simulate.equilibrium import equilibrium_state
 from cablejax.solver_names import SolverName
-from cablejax.types import CableState, History, Measurement
+from cablejax.types import CableState, History, Measurement, Trajectory
 
 ARCH = np.array([[0.0, 0.0, 0.6], [0.8, 0.0, -0.6]])
 """Gripper poses that bend a cable of 1 m into an arch, shape [Q, 3]."""
@@ -98,6 +103,45 @@ def moving_arches(
     pose = ARCH * [config.cable.length, config.cable.length, 1.0]
     params, states = repeated((nominal_physics(config), equilibrium_state(config, pose)), batch)
     return params, states, jnp.asarray(twist, float)
+
+
+def distance_from_fine(config: DatasetConfig, timestep: float = 0.002) -> Float[np.ndarray, "samples"]:
+    """Largest distance [m] of a keypoint from the chain at a fine time step, at every sample of a data set's motions.
+
+    Samples after a snap-through are left out: on which side of it a cable is says nothing of the time step.
+    """
+    fine = dataclasses.replace(
+        config,
+        engine="chain",
+        discretisation=dataclasses.replace(config.discretisation, timestep=timestep),
+        shard_size=config.n_trajectories,
+    )
+    config = dataclasses.replace(config, shard_size=config.n_trajectories)
+    truth, one = (simulate(made, make_engine(made), [0])[0] for made in (fine, config))
+    away = np.linalg.norm(one.keypoints - truth.keypoints, axis=-1).max(axis=-1)[:, 1:]
+    known = Trajectory(truth.keypoints, truth.gripper_pose, truth.gripper_twist)  # pyright: ignore[reportArgumentType]
+    snapped = snapping(known, steps=config.n_steps, stride=config.n_steps, interval=config.interval)
+    return away[~snapped & (one.attempts == truth.attempts)[:, None]]
+
+
+def data_seconds(config: DatasetConfig, rounds: int) -> dict[str, float]:
+    """Seconds that a data set takes, once compiled: drawing its motions, simulating them, and the checks and the store.
+
+    The last is what the whole takes beyond the others. Medians of the rounds.
+    """
+    engine, shards = make_engine(config), range(config.n_shards)
+
+    def store() -> None:
+        with tempfile.TemporaryDirectory() as folder:
+            generate(config, pathlib.Path(folder) / "data.zarr", progress=False, engine=engine)
+
+    contestants = {
+        "draw": lambda: [draw(config, i) for i in range(config.n_trajectories)],
+        "both": lambda: [simulate(config, engine, [shard]) for shard in shards],
+        "whole": store,
+    }
+    drawn, both, whole = (float(np.median(s)) for s in seconds_in_turns(contestants, rounds).values())
+    return {"drawing": drawn, "simulation": both - drawn, "store": max(whole - both, 0.0)}
 
 
 def repeated(tree: Any, size: int) -> Any:

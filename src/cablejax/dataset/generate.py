@@ -10,7 +10,7 @@ import contextlib
 import dataclasses
 import itertools
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import jax
@@ -19,10 +19,11 @@ import numpy as np
 from jaxtyping import Float
 from tqdm import tqdm
 
+from cablejax.dataset.bucket import Bucket
 from cablejax.dataset.opening import open_or_create
 from cablejax.dataset.parallel import DeviceParallel
 from cablejax.dataset.schema import Block, DatasetConfig
-from cablejax.dataset.store import DatasetInfo
+from cablejax.dataset.store import DatasetInfo, Store
 from cablejax.effects.given import with_effects
 from cablejax.effects.physics import Physics, nominal_physics
 from cablejax.simulate import ENGINES, Engine, ThreadedEngine
@@ -114,7 +115,7 @@ def generate(
 
     Args:
         config: what to make.
-        path: folder of the store, new, empty or begun earlier with the same configuration.
+        path: folder of the store, or `s3://BUCKET/PREFIX`: new, empty or begun earlier with the same configuration.
         resume: if False, refuse a store in which this process has shards already.
         process_index: p; by default JAX's.
         process_count: P; by default JAX's.
@@ -144,9 +145,10 @@ def generate(
     done: list[int] = []
     total = sum(len(config.shard_rows(shard)) for shard in mine)
     label = "trajectories" if count == 1 else f"trajectories ({index + 1}/{count})"
-    writer = store.path / f"{WRITER}{index}-of-{count}"
-    writer.mkdir(exist_ok=True)
-    with sole_writer(writer), tqdm(total=total, desc=label, unit="traj", disable=not progress) as bar:
+    with (
+        _sole_writer(store, f"{WRITER}{index}-of-{count}"),
+        tqdm(total=total, desc=label, unit="traj", disable=not progress) as bar,
+    ):
 
         def lacking(shard: int) -> bool:
             if store.status(shard) != "complete":
@@ -169,13 +171,25 @@ def generate(
                 f"kept in {path}. "
                 "Run the same generation again to go on from there."
             ) from None
-    with contextlib.suppress(OSError):
-        writer.rmdir()
     if distributed:
         from jax.experimental import multihost_utils
 
         multihost_utils.sync_global_devices("cablejax.dataset.generate")
     return store.info()
+
+
+@contextlib.contextmanager
+def _sole_writer(store: Store, name: str) -> Iterator[None]:
+    """Keeps other processes from the same share, in a folder; object storage has no locks."""
+    if isinstance(store.path, Bucket):
+        yield
+        return
+    writer = store.path / name
+    writer.mkdir(exist_ok=True)
+    with sole_writer(writer):
+        yield
+    with contextlib.suppress(OSError):
+        writer.rmdir()
 
 
 def simulate(

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import importlib.metadata
+import json
 import os
 import shutil
+import tempfile
 from pathlib import Path
 from typing import Any, Literal
 
 import zarr
 
 from cablejax import __version__
+from cablejax.dataset.bucket import Bucket, place_of
 from cablejax.dataset.schema import (
     PARAMETERS,
     SCHEMA,
@@ -38,7 +41,7 @@ def open_store(path: str | os.PathLike[str], *, mode: Literal["r", "r+"] = "r") 
     Raises:
         ValueError: there is no data set, or one of a newer schema version; older ones are read.
     """
-    store = _recorded(Path(path), mode)
+    store = _recorded(place_of(path), mode)
     for name in _arrays(store.config):
         if fault := _fault(store, name):
             raise ValueError(
@@ -48,13 +51,15 @@ def open_store(path: str | os.PathLike[str], *, mode: Literal["r", "r+"] = "r") 
     return store
 
 
-def _recorded(path: Path, mode: Literal["r", "r+"]) -> Store:
+def _recorded(path: Path | Bucket, mode: Literal["r", "r+"]) -> Store:
     """The data set that a folder says it holds, without a look at its arrays."""
-    if not (path / "zarr.json").is_file():
+    there = path.read("zarr.json") if isinstance(path, Bucket) else (path / "zarr.json").is_file() or None
+    if there is None:
         raise ValueError(f"{path} holds no data set (no zarr.json). Generate one there, or give another folder.")
     try:
-        group = zarr.open_group(path, mode=mode)
-        attributes: dict[str, Any] = dict(read_json(path / "zarr.json")["attributes"])
+        group = zarr.open_group(path.zarr(read_only=mode == "r") if isinstance(path, Bucket) else path, mode=mode)
+        described = json.loads(there) if isinstance(there, bytes) else read_json(path / "zarr.json")  # pyright: ignore[reportOperatorIssue]
+        attributes: dict[str, Any] = dict(described["attributes"])
     except Exception as error:  # zarr raises what its parts raise
         raise ValueError(f"The data set {path} is damaged: {_reason(error)}. Generate it again elsewhere.") from error
     version = version_of(attributes.get("schema"), SCHEMA, path)
@@ -81,9 +86,12 @@ def _fault(store: Store, name: str) -> str | None:
     """What is wrong with the description of an array, or None."""
     shape, dtype = _arrays(store.config)[name]
     try:
-        array = zarr.open_array(store.path / name, mode="r")
+        array = zarr.open_array(store.group.store, path=name, mode="r")
         came = (array.shape, str(array.dtype), (array.shards or array.chunks)[0], array.fill_value)
     except Exception as error:  # zarr raises what its parts raise
+        if isinstance(store.path, Bucket) and not isinstance(error, (FileNotFoundError, ValueError, KeyError)):
+            with store.path.reached():
+                raise
         return f"cannot be opened: {_reason(error)}"
     expected = ((store.config.n_trajectories, *shape), dtype, store.config.shard_size, 0)
     return None if came == expected else f"has (shape, type, shard, default) {came}, expected {expected}"
@@ -100,33 +108,42 @@ def open_or_create(path: str | os.PathLike[str], config: DatasetConfig) -> Store
         ValueError: the folder holds something else, a newer schema version, another configuration, or was begun by
             other package versions. Damaged descriptions of arrays are mended.
     """
-    path, versions = Path(path), package_versions()
-    if path.exists() and not path.is_dir():
-        raise ValueError(f"{path} is a file, expected a folder to write a data set to. Give another path.")
-    if path.is_dir() and any(path.iterdir()) and not (path / "zarr.json").is_file():
-        raise ValueError(f"{path} exists and holds no data set. Give an empty or new folder; nothing was changed.")
-    if not path.is_dir() or not any(path.iterdir()):
-        _create(path, config, versions)
-    store = _recorded(path, "r+")
+    place, versions = place_of(path), package_versions()
+    if isinstance(place, Bucket):
+        _create_in_bucket(place, config, versions)
+    elif place.exists() and not place.is_dir():
+        raise ValueError(f"{place} is a file, expected a folder to write a data set to. Give another place.")
+    elif place.is_dir() and any(place.iterdir()) and not (place / "zarr.json").is_file():
+        raise ValueError(f"{place} exists and holds no data set. Give an empty or new folder; nothing was changed.")
+    elif not place.is_dir() or not any(place.iterdir()):
+        _create(place, config, versions)
+    store = _recorded(place, "r+")
     changes = differences(store.recorded, config_to_json(config))
     if changes:
         raise ValueError(
-            f"{path} holds a data set of another configuration: {'; '.join(changes)}. "
+            f"{place} holds a data set of another configuration: {'; '.join(changes)}. "
             "Give another folder, or the configuration that the store was begun with. Nothing was changed."
         )
     changes = differences(store.versions, versions)
     if changes and not store.info().complete:
         raise ValueError(
-            f"{path} was begun with other packages: {'; '.join(changes)}. Trajectories of two versions are not mixed: "
+            f"{place} was begun with other packages: {'; '.join(changes)}. Trajectories of two versions are not mixed: "
             "install those versions, or generate in another folder. Nothing was changed."
         )
-    if faulty := [name for name in _arrays(config) if _fault(store, name)]:
-        draft = _draft(path, config, versions)
+    faulty = [name for name in _arrays(config) if _fault(store, name)]
+    if isinstance(place, Bucket):
+        if faulty:
+            descriptions = _descriptions(config, versions)
+            for name in faulty:
+                place.write(f"{name}/zarr.json", descriptions[f"{name}/zarr.json"])
+            store = _recorded(place, "r+")
+    elif faulty:
+        draft = _draft(place, config, versions)
         for name in faulty:  # the trajectories stay: each is checked against its digest
-            (path / name).mkdir(exist_ok=True)
-            os.replace(draft / name / "zarr.json", path / name / "zarr.json")
+            (place / name).mkdir(exist_ok=True)
+            os.replace(draft / name / "zarr.json", place / name / "zarr.json")
         shutil.rmtree(draft)
-        store = _recorded(path, "r+")
+        store = _recorded(place, "r+")
     return store
 
 
@@ -152,33 +169,60 @@ def _create(path: Path, config: DatasetConfig, versions: dict[str, str]) -> None
             raise
 
 
+def _create_in_bucket(bucket: Bucket, config: DatasetConfig, versions: dict[str, str]) -> None:
+    """Makes the empty store, unless there is one: its own description last, as it says that the others are there.
+
+    Of two processes that do so at once, the later one writes what the earlier one wrote.
+    """
+    if bucket.read("zarr.json") is not None:
+        return
+    if any(not name.endswith("/zarr.json") for name in bucket.names()):
+        raise ValueError(f"{bucket} holds something, but no data set. Give a new prefix; nothing was changed.")
+    descriptions = _descriptions(config, versions)
+    for name in sorted(descriptions, key=lambda name: name == "zarr.json"):
+        bucket.write(name, descriptions[name])
+
+
+def _descriptions(config: DatasetConfig, versions: dict[str, str]) -> dict[str, bytes]:
+    """The files of an empty store, by their names."""
+    with tempfile.TemporaryDirectory() as folder:
+        draft = Path(folder) / "draft"
+        _fill(draft, config, versions)
+        return {str(file.relative_to(draft)): file.read_bytes() for file in draft.rglob("zarr.json")}
+
+
 def _draft(path: Path, config: DatasetConfig, versions: dict[str, str]) -> Path:
     """An empty store next to the place where one is wanted."""
     path.parent.mkdir(parents=True, exist_ok=True)
     draft = path.parent / f".{path.name}.{os.getpid()}.draft"
     shutil.rmtree(draft, ignore_errors=True)
     try:
-        group = zarr.create_group(
-            draft,
-            attributes={
-                "schema": SCHEMA,
-                "config": config_to_json(config),
-                "config_digest": digest_of_config(config_to_json(config)),
-                "versions": versions,
-                "parameters": list(PARAMETERS),
-            },
-        )
-        for name, (shape, dtype) in _arrays(config).items():
-            per_trajectory = dtype == "float32"  # the small arrays are one plain chunk per shard
-            group.create_array(
-                name,
-                shape=(config.n_trajectories, *shape),
-                dtype=dtype,
-                chunks=(1 if per_trajectory else config.shard_size, *shape),
-                shards=(config.shard_size, *shape) if per_trajectory else None,
-                fill_value=0,
-            )
+        _fill(draft, config, versions)
     except BaseException:  # a full disk
         shutil.rmtree(draft, ignore_errors=True)
         raise
     return draft
+
+
+def _fill(folder: Path, config: DatasetConfig, versions: dict[str, str]) -> None:
+    """Writes an empty store into a new folder."""
+    group = zarr.create_group(
+        folder,
+        attributes={
+            "schema": SCHEMA,
+            "config": config_to_json(config),
+            "config_digest": digest_of_config(config_to_json(config)),
+            "versions": versions,
+            "parameters": list(PARAMETERS),
+        },
+    )
+    for name, (shape, dtype) in _arrays(config).items():
+        per_trajectory = dtype == "float32"  # the small arrays are one plain chunk per shard
+        group.create_array(
+            name,
+            shape=(config.n_trajectories, *shape),
+            dtype=dtype,
+            chunks=(1 if per_trajectory else config.shard_size, *shape),
+            shards=(config.shard_size, *shape) if per_trajectory else None,
+            fill_value=0,
+        )

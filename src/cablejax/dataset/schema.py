@@ -16,7 +16,7 @@ from cablejax.cable import Cable, Discretisation
 from cablejax.effects.given import GivenEffect, with_effects
 from cablejax.effects.physics import nominal_physics
 from cablejax.limits import LIMITS, check, shown
-from cablejax.simulate import ENGINES, check_effects
+from cablejax.simulate import ENGINES, ChainEngine, check_effects
 from cablejax.simulate.equilibrium import FEWEST_LINKS
 from cablejax.simulate.motions import MotionConfig
 
@@ -63,10 +63,10 @@ class DatasetConfig:
         interval: time each command is held [s].
         seed: trajectory i depends on (seed, i) only, never on who makes it or when.
         motion: where the grippers start and how they move.
-        discretisation: the simulated cable, its links and time step.
+        discretisation: the simulated cable, its links and time step; see `Engine.data_timestep`.
         randomisation: ranges of the physical parameters.
-        engine: "threaded", MuJoCo in threads on the CPU; "mjx", batched on the accelerator; or "chain", batched too,
-            which can simulate every effect.
+        engine: "chain", batched in JAX, the fastest, which can simulate every effect; "mjx", batched too; or
+            "threaded", C MuJoCo in threads on the CPU.
         shard_size: trajectories per shard: the unit that one process writes and that a kill can cost.
         effects: added to every cable after its parameters are drawn, in this order.
     """
@@ -76,9 +76,9 @@ class DatasetConfig:
     interval: float = 1.0
     seed: int = 0
     motion: MotionConfig = dataclasses.field(default_factory=MotionConfig)
-    discretisation: Discretisation = Discretisation()
+    discretisation: Discretisation = Discretisation(timestep=ChainEngine.data_timestep)
     randomisation: Randomisation = dataclasses.field(default_factory=Randomisation)
-    engine: Literal["threaded", "mjx", "chain"] = "threaded"
+    engine: Literal["chain", "mjx", "threaded"] = "chain"
     shard_size: int = 32
     effects: tuple[GivenEffect, ...] = ()
 
@@ -96,6 +96,7 @@ class DatasetConfig:
                 f"{FEWEST_LINKS}: with fewer the grippers' poses leave it no freedom."
             )
         check_effects(self.effects, self.engine)
+        ENGINES[self.engine](self.discretisation).substeps(self.interval)  # pyright: ignore[reportCallIssue]
         if self.effects:
             with_effects(nominal_physics(self.discretisation), self.effects, self.discretisation)
 

@@ -22,10 +22,8 @@ from typing import Any, Literal, cast
 import numpy as np
 import zarr
 
-from cablejax.dataset.schema import (
-    Block,
-    DatasetConfig,
-)
+from cablejax.dataset.bucket import Bucket, UnreachableError
+from cablejax.dataset.schema import Block, DatasetConfig
 
 
 class MissingShardError(ValueError):
@@ -37,7 +35,7 @@ class DatasetInfo:
     """Summary of a store.
 
     Attributes:
-        path: its folder.
+        path: its folder, or where it is in object storage.
         config: what was asked for.
         versions: package versions that made it.
         n_complete: trajectories on disk in complete shards.
@@ -45,7 +43,7 @@ class DatasetInfo:
         digest: SHA-256 over all trajectories, or None until all are there. It does not depend on the shard size.
     """
 
-    path: Path
+    path: Path | Bucket
     config: DatasetConfig
     versions: dict[str, str]
     n_complete: int
@@ -63,14 +61,14 @@ class Store:
     """An open data set. Made by `opening.open_store` or `opening.open_or_create`.
 
     Attributes:
-        path: its folder.
+        path: its folder, or where it is in object storage.
         config: what was asked for; `recorded` as an object.
         recorded: the configuration as it stands in the store.
         versions: package versions that began it.
         group: the Zarr group.
     """
 
-    path: Path
+    path: Path | Bucket
     config: DatasetConfig
     recorded: dict[str, Any]
     versions: dict[str, str]
@@ -82,6 +80,8 @@ class Store:
             self.read_shard(shard)
         except MissingShardError:
             return "missing"
+        except UnreachableError:
+            raise
         except ValueError:
             return "corrupt"
         return "complete"
@@ -100,9 +100,10 @@ class Store:
                     f"Shard {shard}: {name} is {array.dtype}{list(array.shape)}, expected {dtype}{list(expected)}."
                 )
         self._clear(shard)
-        for name in self.config.array_shapes():
-            self._array(name)[rows] = getattr(block, name)
-        self._array("digest")[rows] = block.digests()
+        with self._reached():
+            for name in self.config.array_shapes():
+                self._array(name)[rows] = getattr(block, name)
+            self._array("digest")[rows] = block.digests()
 
     def read_shard(self, shard: int) -> Block:
         """One shard, checked against its digests.
@@ -119,7 +120,7 @@ class Store:
                     "it."
                 )
             block = Block(**{name: self._load(name, rows) for name in self.config.array_shapes()})
-        except MissingShardError:
+        except (MissingShardError, UnreachableError):
             raise
         except Exception as error:  # a damaged file may fail in any codec
             raise ValueError(self._damaged(shard, f"cannot be decoded ({error})")) from error
@@ -153,9 +154,13 @@ class Store:
         digest = np.zeros((self.config.n_trajectories, 32), np.uint8)
         attempts = np.zeros(self.config.n_trajectories, np.int32)
         for shard in range(self.config.n_shards):
-            with contextlib.suppress(Exception):  # a damaged shard counts as not there
+            try:
                 rows = self._slice(shard)
                 attempts[rows], digest[rows] = self._load("attempts", rows), self._load("digest", rows)
+            except UnreachableError:
+                raise
+            except Exception:  # a damaged shard counts as not there
+                continue
         done = digest.any(axis=1)
         return DatasetInfo(
             path=self.path,
@@ -170,7 +175,11 @@ class Store:
         return cast(zarr.Array, self.group[name])
 
     def _load(self, name: str, rows: slice) -> np.ndarray:
-        return np.asarray(self._array(name)[rows])
+        with self._reached():
+            return np.asarray(self._array(name)[rows])
+
+    def _reached(self) -> contextlib.AbstractContextManager[None]:
+        return self.path.reached() if isinstance(self.path, Bucket) else contextlib.nullcontext()
 
     def _slice(self, shard: int) -> slice:
         if not 0 <= shard < self.config.n_shards:
@@ -181,6 +190,10 @@ class Store:
     def _clear(self, shard: int) -> None:
         """Removes a shard with whatever a killed writer left of it, the digests first."""
         for name in ("digest", *self.config.array_shapes()):
+            if isinstance(self.path, Bucket):
+                whole = f"{name}/c/{shard}"
+                self.path.remove([one for one in self.path.names(f"{name}/c") if f"{one}/".startswith(f"{whole}/")])
+                continue
             folder = self.path / name / "c" / str(shard)
             if folder.is_dir():
                 shutil.rmtree(folder)

@@ -36,11 +36,13 @@ class Engine(abc.ABC):
         config: the cable, its resolution and time step.
         name: of the engine in configurations and messages.
         hooks: through which effects act on this engine; other fields of `Physics` must be at their null values.
+        data_timestep: time step [s] at which it makes data; all are about as accurate at theirs.
     """
 
     config: Discretisation
     name: ClassVar[str]
     hooks: ClassVar[frozenset[Hook]]
+    data_timestep: ClassVar[float] = 0.02
 
     @abc.abstractmethod
     def initial_state(

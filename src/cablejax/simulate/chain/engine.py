@@ -15,7 +15,7 @@ from cablejax.effects.base import Hook
 from cablejax.effects.camera import seen_by_camera
 from cablejax.effects.physics import Physics, may_touch
 from cablejax.simulate.chain.replay import centreline_keypoints, follow
-from cablejax.simulate.chain.step import ChainState
+from cablejax.simulate.chain.state import ChainState
 from cablejax.simulate.compile import full_precision
 from cablejax.simulate.engine import Engine, compiled_rollout, finely_sampled
 from cablejax.simulate.equilibrium import equilibrium_state
@@ -40,6 +40,7 @@ class ChainEngine(Engine):
     config: Discretisation = Discretisation()
 
     name: ClassVar[str] = "chain"
+    data_timestep: ClassVar[float] = 0.05
     hooks: ClassVar[frozenset[Hook]] = frozenset(get_args(Hook))
 
     def __post_init__(self):
@@ -75,6 +76,8 @@ class ChainEngine(Engine):
         def interval_step(carry, twist):
             chain, pose, time = carry
             target = integrate_pose(pose, twist, interval)
+            # a command begins with a jump: the steps before it lead one to expect nothing
+            chain = dataclasses.replace(chain, expected=chain.velocity)
             chain = follow(
                 config, physics, chain, pose, target, interval / count, time, n_substeps=count, with_contact=contact
             )
@@ -105,10 +108,12 @@ class ChainEngine(Engine):
 
 def _chain_state(state: CableState) -> ChainState:
     assert state.memory is not None
+    velocity = jnp.append(state.qvel[2:], state.memory.stretch_rate)
     return ChainState(
         angles=state.qpos[2:],
         stretch=state.memory.stretch,
-        velocity=jnp.append(state.qvel[2:], state.memory.stretch_rate),
+        velocity=velocity,
+        expected=velocity,
         set_curvature=state.memory.set_curvature,
         friction_state=state.memory.friction_state,
         root_velocity=state.qvel[:2],

@@ -10,7 +10,8 @@ from jaxtyping import Array, Float
 
 from cablejax.cable import Discretisation
 from cablejax.effects.physics import Physics
-from cablejax.simulate.chain.step import ChainState, advance, chain_nodes, slipped
+from cablejax.simulate.chain.state import ChainState, chain_nodes
+from cablejax.simulate.chain.step import advance, slipped
 from cablejax.simulate.compile import full_precision
 from cablejax.simulate.keypoints import marked_keypoints
 
@@ -80,11 +81,12 @@ class Chain:
 
     def _settled(self, physics: Physics, angles: Float[Array, "n"], pose: Float[Array, "Q 3"]) -> ChainState:
         """The cable at rest at the first pose, with nothing locked in."""
-        zeros = jnp.zeros(self.config.n_joints, angles.dtype)
+        zeros, still = jnp.zeros(self.config.n_joints, angles.dtype), jnp.zeros(self.config.n_links + 1, angles.dtype)
         start = ChainState(
             angles=angles,
             stretch=jnp.zeros((), angles.dtype),
-            velocity=jnp.zeros(self.config.n_links + 1, angles.dtype),
+            velocity=still,
+            expected=still,
             set_curvature=zeros,
             friction_state=zeros,
             root_velocity=jnp.zeros(2, angles.dtype),
@@ -100,10 +102,10 @@ class Chain:
 
         def settle(state, _):
             state = advance(self.config, calm, state, pose, pose, _SETTLE_STEP, -1e3, with_contact=self.with_contact)
-            return state, None
+            return dataclasses.replace(state, expected=still), None
 
         start, _ = jax.lax.scan(settle, start, None, length=_SETTLE_STEPS)
-        return dataclasses.replace(start, velocity=jnp.zeros_like(start.velocity), friction_state=zeros)
+        return dataclasses.replace(start, velocity=still, friction_state=zeros)
 
 
 def follow(

@@ -1,0 +1,99 @@
+"""The state of the planar chain between two steps, and where that puts its links."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from cablejax.cable import Discretisation
+from cablejax.simulate.chain.geometry import chained, turned
+from cablejax.simulate.composite import link_lengths, node_offsets
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class ChainState:
+    """State of one cable between two steps.
+
+    Attributes:
+        angles: theta of the first link, then the joint angles [rad], shape [n].
+        stretch: relative change of the free length, shape [].
+        velocity: of both, shape [n + 1].
+        expected: the velocity halfway through the next step, as far as it is known before, shape [n + 1].
+        set_curvature: permanent part of the curvature of each joint [1/m], shape [J].
+        friction_state: internal friction of each joint, -1 to 1, shape [J].
+        root_velocity: of gripper 0 in the last step [m/s], shape [2].
+    """
+
+    angles: Float[Array, "n"]
+    stretch: Float[Array, ""]
+    velocity: Float[Array, "n1"]
+    expected: Float[Array, "n1"]
+    set_curvature: Float[Array, "J"]
+    friction_state: Float[Array, "J"]
+    root_velocity: Float[Array, "2"]
+
+
+class Frame(NamedTuple):
+    """Positions and velocities of the links, relative to gripper 0.
+
+    Attributes:
+        theta: angle of each link [rad], shape [n].
+        rate: its velocity [rad/s], shape [n].
+        scale: 1 + stretch, shape [].
+        along: direction of each link times the scale, shape [n, 2].
+        joints: where each link begins [m], shape [n, 2].
+        nodes: [m], shape [n, 2].
+        velocity: of the nodes in the world [m/s], shape [n, 2].
+        bias: accelerations of the nodes at constant rates [m/s^2], shape [n, 2].
+    """
+
+    theta: Array
+    rate: Array
+    scale: Array
+    along: Array
+    joints: Array
+    nodes: Array
+    velocity: Array
+    bias: Array
+
+
+def chain_nodes(
+    config: Discretisation, angles: Float[Array, "n"], stretch: Float[Array, ""]
+) -> tuple[Float[Array, "n 2"], Float[Array, "n 2"]]:
+    """Nodes relative to gripper 0 [m], and unit vectors along the links."""
+    lengths, offsets = (jnp.asarray(f(config), angles.dtype) for f in (link_lengths, node_offsets))
+    theta = jnp.cumsum(angles)
+    unit = jnp.stack([jnp.cos(theta), jnp.sin(theta)], axis=1)
+    along = (1.0 + stretch) * unit
+    return chained(lengths[:, None] * along) + offsets[:, None] * along, unit
+
+
+def halfway_state(state: ChainState, root_velocity: Float[Array, "2"], dt) -> ChainState:
+    """The state expected in the middle of the step."""
+    return dataclasses.replace(
+        state,
+        angles=state.angles + 0.5 * dt * state.expected[:-1],
+        stretch=state.stretch + 0.5 * dt * state.expected[-1],
+        velocity=state.expected,
+        root_velocity=root_velocity,
+    )
+
+
+def frame_of(config: Discretisation, state: ChainState) -> Frame:
+    """Where the links of a state are."""
+    lengths, offsets = (jnp.asarray(f(config), state.angles.dtype) for f in (link_lengths, node_offsets))
+    theta, rate = jnp.cumsum(state.angles), jnp.cumsum(state.velocity[:-1])
+    scale = 1.0 + state.stretch
+    along = scale * jnp.stack([jnp.cos(theta), jnp.sin(theta)], axis=1)
+    joints = chained(lengths[:, None] * along)
+    nodes = joints + offsets[:, None] * along
+    turning, pulling = rate[:, None] * turned(along), -(rate**2)[:, None] * along
+    velocity = chained(lengths[:, None] * turning) + offsets[:, None] * turning
+    velocity = state.root_velocity + velocity + nodes * (state.velocity[-1] / scale)
+    bias = chained(lengths[:, None] * pulling) + offsets[:, None] * pulling
+    return Frame(theta, rate, scale, along, joints, nodes, velocity, bias)
