@@ -34,14 +34,19 @@ from cablejax.dataset import generate
 from cablejax.dataset.opening import open_or_create, open_store
 from cablejax.dataset.schema import digest_of_config
 from cablejax.diagnose.recording import prepare
+from cablejax.diagnose.verdict_json import verdict_json
 from cablejax.dynamics import run_folder
+from cablejax.gaplog import TARGETS, read_gap_log
 from cablejax.perceive.cloud import padded
 from cablejax.perceive.recording import read_clouds
 from cablejax.recordings.bags import import_mcap
+from cablejax.recordings.lerobot import write_lerobot
+from cablejax.recordings.mcap_log import write_mcap
 from cablejax.spatial.windows import windows_of
 from cli_cases import made_up_run, small_model
 from edge_cases import Accepted, answer, command
 from recording_cases import swinging
+from test_diagnose_report import diagnosis
 from test_log_geometry import log_of, motion
 
 
@@ -275,6 +280,30 @@ def verdict_file(folder, edit):
     return command("simulate", "--engine", "chain", "--with", folder / "v.json", "--out", folder / "data")
 
 
+def view_verdict(folder, edit):
+    content = edges.edited_tree(verdict_json(diagnosis()), edit)
+    (folder / "v.json").write_text(json.dumps(content))
+    return command("view", folder / "v.json")
+
+
+def view_meta(folder, edit):
+    meta = edges.edited_tree(json.loads(str(log_arrays()["meta"])) | {TARGETS: [target().keypoints.tolist()] * 2}, edit)
+    np.savez(folder / "log.npz", **{**log_arrays(), "meta": np.array(json.dumps(meta))})
+    return command("view", folder / "log.npz")
+
+
+def import_exported(folder, edit):
+    """A damaged file of an exported log is refused, or its log is a log."""
+    which, raw = edit
+    write_mcap(folder / "log.mcap", read_gap_log(original("log") / "log.npz"))
+    write_lerobot(folder / "set", read_gap_log(original("log") / "log.npz"))
+    files = [folder / "log.mcap", *sorted(file for file in (folder / "set").rglob("*") if file.is_file())]
+    file = files[which % len(files)]
+    file.write_bytes(edges.edited_bytes(file.read_bytes(), raw))
+    form, source = ("mcap", file) if file == files[0] else ("lerobot", folder / "set")
+    return command("import", form, source, "--out", folder / "back.npz")
+
+
 def kept_files(folder, edit):
     """What an unfinished command kept is used, made again, or refused."""
     which, raw = edit
@@ -345,6 +374,9 @@ EDGES = {
     "store": Edge(60, pair(st.integers(0, 100), edges.TREE, st.none() | edges.BYTES), store_files),
     "weights": Edge(60, pair(edges.TREE, st.none() | edges.BYTES), weights_file),
     "verdict": Edge(120, edges.TREE, verdict_file),
+    "view verdict": Edge(30, edges.TREE, view_verdict),
+    "view log": Edge(30, edges.TREE, view_meta),
+    "exported": Edge(40, pair(st.integers(0, 100), edges.BYTES), import_exported),
     "kept": Edge(60, pair(st.integers(0, 2), edges.BYTES), kept_files),
     "options": Edge(
         120,

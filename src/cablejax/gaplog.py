@@ -17,6 +17,7 @@ from jaxtyping import Float
 
 from cablejax.cable import GRAVITY, Cable
 from cablejax.gaplog_check import DTYPES, META_FIELDS, SCHEMA, GapLogError, validate
+from cablejax.limits import LIMITS
 from cablejax.npz import NpzError, read_npz
 from cablejax.text_file import parse_json
 from cablejax.types import GapLog
@@ -250,5 +251,6 @@ def targets_of(log: GapLog) -> list[Float[np.ndarray, "N D"] | None]:
             points = np.array(target, float)
         except (TypeError, ValueError, OverflowError):
             points = np.empty(0)
-        found.append(points if points.shape == log.keypoints.shape[2:] and np.isfinite(points).all() else None)
+        known = points.shape == log.keypoints.shape[2:] and bool((np.abs(points) <= LIMITS["coordinate"].high).all())
+        found.append(points if known else None)
     return found

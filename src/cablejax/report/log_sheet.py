@@ -15,7 +15,7 @@ from cablejax.diagnose.noise import noise_floor
 from cablejax.gaplog import Episode, episodes_of, targets_of
 from cablejax.gaplog_check import META_FIELDS
 from cablejax.report.diagnosis_style import STYLE
-from cablejax.report.effect_words import millimetres, share
+from cablejax.report.effect_words import millimetres
 from cablejax.report.sheet import Sheet, cable_cards, cable_facts, span
 from cablejax.report.style import LIGHT, cable_curve
 from cablejax.simulate.replay import config_of_log
@@ -51,7 +51,7 @@ def log_sheet(log: GapLog, name: str) -> Sheet:
         cards=[
             ("Samples", f"{len(seen)}", f"{1 / np.median(steps):.4g} per second" if len(steps) else "one per episode"),
             ("Noise of a coordinate", noise, how),
-            ("Observed", share(float(seen.mean())), f"of {seen.shape[1]} keypoints in all samples"),
+            ("Observed", f"{100 * seen.mean():.4g} %", f"of {seen.shape[1]} keypoints in all samples"),
             ("Range of the keypoints [m]", ranges, ""),
             *cable_cards(cable, on_table=planar),
         ],
@@ -105,7 +105,7 @@ def _table(episodes: Sequence[Episode], targets: Sequence[np.ndarray | None]):
                 f"{index}: {episode.motion}",
                 f"{episode.time[-1] - episode.time[0]:.3g}",
                 f"{len(episode.time)}",
-                share(float(seen.mean())),
+                f"{100 * seen.mean():.4g} %",
                 f"{_speed(episode).max(initial=0.0):.3g}",
                 "" if error is None else f"{error[0]:.2f} to {error[-1]:.2f}",
             )
@@ -165,7 +165,7 @@ def _view(points: np.ndarray) -> list[int]:
 def _time_figure(episodes: Sequence[tuple[Episode, np.ndarray | None]]) -> Figure:
     """Speed of the grippers and error over time, a line for each episode."""
     stated = any(target is not None for _, target in episodes)
-    colours = matplotlib.colormaps["cividis"](np.linspace(0.0, 0.85, len(episodes)))
+    colours = matplotlib.colormaps["cividis"](np.linspace(0.35, 0.9, len(episodes)))
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(10.5, 4.6 if stated else 2.6), layout="constrained")
         axes = figure.subplots(1 + stated, 1, squeeze=False, sharex=True)[:, 0]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import math
 import os
@@ -15,7 +16,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from cablejax.dataset.schema import PARAMETERS, Block
-from cablejax.dataset.store import Store
+from cablejax.dataset.store import MissingShardError, Store
 from cablejax.diagnose.diagnosis import Diagnosis
 from cablejax.dynamics.card import network_words
 from cablejax.dynamics.weights import cable_of_weights, load_info, load_weights, weights_path
@@ -177,7 +178,7 @@ def _data_sets(info: Mapping[str, Any]) -> list[tuple[str, ...]]:
 def _first_shard(store: Store) -> Block | None:
     """The first complete shard; None where there is none yet."""
     for shard in range(store.config.n_shards):
-        if store.status(shard) == "complete":
+        with contextlib.suppress(MissingShardError):
             return store.read_shard(shard)
     return None
 
@@ -187,7 +188,7 @@ def _store_figure(block: Block) -> Figure:
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(10.5, 4.0), layout="constrained")
         table, histogram = figure.subplots(1, 2, width_ratios=[1.4, 1.0])
-        colours = matplotlib.colormaps["cividis"](np.linspace(0.0, 0.9, min(len(block), _SHOWN)))
+        colours = matplotlib.colormaps["cividis"](np.linspace(0.35, 0.9, min(len(block), _SHOWN)))
         for colour, points, pose in zip(colours, block.keypoints[:, -1], block.gripper_pose[:, -1], strict=False):
             table.plot(*cable_curve(points, pose).T, color=colour, lw=1.2)
         table.set(aspect="equal", xlabel="x [m]", ylabel="y [m]")
@@ -221,7 +222,7 @@ def _training_figure(metrics: pathlib.Path) -> Figure | None:
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(10.5, 3.2), layout="constrained")
         for ax, (title, lines) in zip(figure.subplots(1, len(shown), squeeze=False)[0], shown.items(), strict=True):
-            colours = matplotlib.colormaps["cividis"](np.linspace(0.0, 0.8, len(lines)))
+            colours = matplotlib.colormaps["cividis"](np.linspace(0.35, 0.9, len(lines)))
             for colour, (name, (x, y)) in zip(colours, lines.items(), strict=True):
                 label = name.removeprefix("open_loop_").removesuffix("_cm")
                 ax.plot(x, y, color=colour, lw=1.8, marker="o", ms=3, label=f"after {label} steps")
