@@ -100,7 +100,7 @@ def cable_params(config: DatasetConfig, parameters: Float[Any, "3"]) -> Physics:
 
 def generate(
     config: DatasetConfig,
-    path: str | os.PathLike[str],
+    path: str | os.PathLike[str] | Bucket,
     *,
     resume: bool = True,
     process_index: int | None = None,
