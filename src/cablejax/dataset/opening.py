@@ -101,7 +101,7 @@ def _reason(error: Exception) -> str:
     return shown(next(iter(str(error).splitlines()), repr(error)).rstrip("."))
 
 
-def open_or_create(path: str | os.PathLike[str], config: DatasetConfig) -> Store:
+def open_or_create(path: str | os.PathLike[str] | Bucket, config: DatasetConfig) -> Store:
     """Opens the data set of `config` to continue it, or creates it. Safe when several processes do so at once.
 
     Raises:
