@@ -1,7 +1,7 @@
 """The next motion designed, against Fisher-optimal and random safe ones, on effects that look alike.
 
     python experiments/25_next_motion.py --rows ROWS.jsonl --seeds 20    # five minutes a seed; resumable
-    python experiments/25_next_motion.py --rows ROWS.jsonl --process 1 2    # every second row; 0 2 does the others
+    python experiments/25_next_motion.py --rows ROWS.jsonl --executor 2    # the same in two processes
     python experiments/25_next_motion.py --rows ROWS.jsonl --report docs/results/next_motion.md
 
 For every seed an effect is drawn from those that one log hardly separates, and staged in the contact plant. The first
@@ -38,6 +38,7 @@ from cablejax.effects.given import parse_effect
 from cablejax.gaplog import Episode, gap_log_from_episodes
 from cablejax.simulate.plant import Plant, PlantConfig
 from cablejax.simulate.play import played
+from executors import add_option, executor_of
 from pages import markdown_table, page_of_results, publish
 from rows import Rows
 
@@ -185,7 +186,7 @@ def main() -> None:
     parser.add_argument("--rows", type=pathlib.Path, required=True, help="file of the finished rows")
     parser.add_argument("--seeds", type=int, default=20, help="how many set-ups")
     parser.add_argument("--arms", nargs="+", choices=list(ARMS), default=list(ARMS))
-    parser.add_argument("--process", type=int, nargs=2, default=(0, 1), metavar=("I", "N"), help="every N-th row")
+    add_option(parser)
     parser.add_argument("--report", type=pathlib.Path, help="write the page of the finished rows, and run nothing")
     parser.add_argument("--seconds", type=float, default=np.inf, help="begin no further row after this time")
     options = parser.parse_args()
@@ -194,7 +195,8 @@ def main() -> None:
         publish(page(rows.read()), options.report)
         return
     wanted = [(seed, arm) for seed in range(options.seeds) for arm in options.arms]
-    rows.run(rows.missing(wanted, tuple(options.process)), examine, seconds=options.seconds)
+    with executor_of(options.executor) as executor:
+        rows.run(rows.missing(wanted), examine, executor=executor, seconds=options.seconds)
 
 
 if __name__ == "__main__":
