@@ -14,7 +14,7 @@ import numpy as np
 
 from cablejax.diagnose.diagnosis import PLACES, Diagnosis, Gap, NamedEffect, NextMotion, ParameterEstimate, Ranked
 from cablejax.effects.given import VERDICT_SCHEMA, read_verdict_json
-from cablejax.limits import shown
+from cablejax.limits import LIMITS, shown
 from cablejax.whole_file import whole_file
 
 if TYPE_CHECKING:
@@ -85,17 +85,17 @@ def read_verdict(path: str | os.PathLike[str]) -> Diagnosis:
             equivalent=tuple(tuple(map(str, group)) for group in verdict["equivalent"]),
             ranking=tuple(
                 Ranked(
-                    str(r["name"]), _numbers(r["probability"]), _size(r["held_out_shrinkage"]), _size(r["leftover_mm"])
+                    str(r["name"]), _number(r["probability"]), _size(r["held_out_shrinkage"]), _size(r["leftover_mm"])
                 )
                 for r in verdict["ranking"]
             ),
-            leftover_p=_numbers(verdict["leftover_p"]),
+            leftover_p=_number(verdict["leftover_p"]),
             gap=Gap(
                 horizon_s=float(gap["horizon_s"]),
                 before_rmse_mm=_size(gap["before_rmse"], 1e3),
                 after_rmse_mm=_size(gap["after_rmse"], 1e3),
                 noise_floor_mm=_size(gap["noise_floor"], 1e3),
-                shrinkage=_numbers(gap["shrinkage"]),
+                shrinkage=_number(gap["shrinkage"]),
                 shrinkage_ci90=_pair(gap["shrinkage_ci90"]),
                 ahead_mm=gap["ahead_mm"],
                 horizons_mm={
@@ -118,23 +118,31 @@ def read_verdict(path: str | os.PathLike[str]) -> Diagnosis:
 
 
 def _effect_of(effect: Mapping[str, Any]) -> NamedEffect:
-    estimates = {
-        str(name): ParameterEstimate(_numbers(estimate["value"]), _numbers(estimate["ci90"]), str(estimate["unit"]))
-        for name, estimate in effect["parameters"].items()
+    place = effect["location"]
+    location = {
+        "along_cable_m": _pair(place["along_cable_m"]),
+        "time_s": _number(place["time_s"]),
+        "table_m": _pair(place["table_m"]),
     }
-    location = {place: _numbers(effect["location"][place]) for place in PLACES}
-    for place in ("along_cable_m", "table_m"):
-        _pair(location[place])
-    return NamedEffect(str(effect["name"]), _numbers(effect["probability"]), estimates, location)
+    estimates = {str(name): _estimate_of(estimate) for name, estimate in effect["parameters"].items()}
+    return NamedEffect(str(effect["name"]), _number(effect["probability"]), estimates, location)
 
 
-def _numbers(value: Any) -> Any:
-    """The same value if it is a number, None, or a list of such. Raises TypeError otherwise."""
-    if isinstance(value, list):
-        return [_numbers(entry) for entry in value]
-    if value is None or (isinstance(value, (int, float)) and not isinstance(value, bool)):
-        return value
-    raise TypeError(f"{shown(value)} is no number")
+def _estimate_of(estimate: Mapping[str, Any]) -> ParameterEstimate:
+    value, ci90, unit = estimate["value"], estimate["ci90"], str(estimate["unit"])
+    if not isinstance(value, list):
+        return ParameterEstimate(_number(value), _pair(ci90), unit)
+    intervals = None if ci90 is None else [interval for interval in map(_pair, ci90) if interval is not None]
+    if intervals is not None and len(intervals) != len(value):
+        raise ValueError(f"{len(value)} values have {len(intervals)} intervals")
+    return ParameterEstimate([_number(entry) for entry in value], intervals, unit)
+
+
+def _number(value: Any) -> Any:
+    """The same value if it is a sensible number, or None where it is null. Raises TypeError otherwise."""
+    if value is not None and value not in LIMITS["finite"]:
+        raise TypeError(f"{shown(value)} is no number that a diagnosis has")
+    return value
 
 
 def _pair(value: Any) -> tuple[float, float] | None:
@@ -142,11 +150,11 @@ def _pair(value: Any) -> tuple[float, float] | None:
     if value is None:
         return None
     first, second = value
-    return float(first), float(second)
+    return _size(first), _size(second)
 
 
 def _size(value: float | None, scale: float = 1.0) -> float:
-    return math.nan if value is None else scale * float(value)
+    return math.nan if _number(value) is None else scale * float(value)  # pyright: ignore[reportArgumentType]
 
 
 def _effect(effect: NamedEffect) -> dict[str, Any]:
