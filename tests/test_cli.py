@@ -73,7 +73,7 @@ def test_help_is_fast_because_it_loads_neither_jax_nor_mujoco():
         (["simulate", "--with", "/dev/zero"], "no regular file"),
         (["train", "--steps", "0"], "--steps is 0"),
         (["train", "--steps", "-1"], "--steps is -1"),
-        (["simulate", "--cable", "none.toml"], "There is no file none.toml"),
+        (["simulate", "--cable", "none.toml"], "There is no file or folder none.toml"),
         (["simulate", "--effect", "magic:x=1"], "no effect 'magic'"),
         (["simulate", "--effect", "bending_stiffness:ratio=-1"], "ratio is -1"),
         (

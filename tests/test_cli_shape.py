@@ -86,7 +86,7 @@ def test_results_are_not_overwritten_unasked(weights, tmp_path, capsys):
         (["--plant-effect", "bending_stiffness:ratio=-1"], "ratio is -1"),
         (["--plant-effect", "stiffness:ratio=2"], "no effect 'stiffness'"),
         (["--plant-effect", "none", "--plant-effect", "linear_density:ratio=2"], "give either"),
-        (["--cable", "missing.toml"], "There is no file missing.toml"),
+        (["--cable", "missing.toml"], "There is no file or folder missing.toml"),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else None,
 )

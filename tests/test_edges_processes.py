@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import json
 import os
 import resource
@@ -45,7 +46,7 @@ def store(tmp_path_factory):
 @pytest.mark.parametrize("seconds", [4.0, 10.0], ids=["at first", "later"])
 @pytest.mark.parametrize("command", ["simulate", "train", "diagnose"])
 def test_ctrl_c_is_answered_at_once(command, seconds, store, tmp_path):
-    log = write_gap_log(tmp_path / "log.npz", record())
+    log = write_gap_log(tmp_path / "log.npz", record(("gripper_rotation_offset", 0, (0.08,))))
     arguments = {
         "simulate": ["simulate", "--engine", "chain"],
         "train": ["train", "--preset", "released", "--data", str(store)],
@@ -177,7 +178,7 @@ def test_a_closed_pipe_is_no_error(arguments):
 
 def test_the_bar_moves_before_a_shard_is_done(monkeypatch):
     monkeypatch.setattr(os, "cpu_count", lambda: 1)
-    config = stores.SMALL
+    config = dataclasses.replace(stores.SMALL, engine="threaded")
     moved: list[int] = []
     generation.simulate(config, generation.make_engine(config), [0], moved.append)
     assert moved == [2, 1]

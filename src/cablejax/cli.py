@@ -1,4 +1,4 @@
-"""The command line: `cablejax demo | cable | simulate | train | shape | import | export | diagnose | view | bench`."""
+"""The command line: `cablejax COMMAND`."""
 
 from __future__ import annotations
 
@@ -20,6 +20,7 @@ from cablejax.commands.import_recording import Import
 from cablejax.commands.options import Command
 from cablejax.commands.shape import Shape
 from cablejax.commands.simulate import Simulate
+from cablejax.commands.study import Study
 from cablejax.commands.train import Train
 from cablejax.commands.view import View
 from cablejax.compiled_programs import keep_compiled_programs
@@ -44,6 +45,7 @@ _COMMANDS: Any = (
     | Annotated[Import, subcommand("import")]
     | Annotated[Export, subcommand("export")]
     | Annotated[Diagnose, subcommand("diagnose")]
+    | Annotated[Study, subcommand("study")]
     | Annotated[View, subcommand("view")]
     | Annotated[Bench, subcommand("bench")]
 )
@@ -51,8 +53,9 @@ _DESCRIPTION = """Two robot grippers bring a cable to a shape.
 
 Start with `cablejax demo`: it needs nothing else and writes a page to look at. To make your own model: describe your
 `cable` in a file, `simulate` a data set, `train` on it, `shape` a cable with the result, and `diagnose` what the
-simulator lacks. A recording of a real cable is `import`ed first; `view` shows what any of them has written, `export`
-takes it to other programs. `cablejax COMMAND --help` explains each one, `cablejax --version` says which this is."""
+simulator lacks; `study` does that in rounds on a simulated plant. A recording of a real cable is `import`ed first;
+`view` shows what any of them has written, `export` takes it to other programs. `cablejax COMMAND --help` explains each
+one, `cablejax --version` says which this is."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

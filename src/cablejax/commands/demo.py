@@ -45,14 +45,12 @@ class Demo(Command):
         """Shapes U, S and Z with and without the residual, reports, and diagnoses the run."""
         from cablejax.commands.results import table_of
         from cablejax.commands.resuming import unfinished
-        from cablejax.commands.runs import Job, plant_of, shape_and_report
-        from cablejax.commands.shape import PLANT_EFFECT
+        from cablejax.commands.runs import Job, plant_of, shape_and_report, staged_effects
         from cablejax.control.shaping import METHODS, load_model
         from cablejax.control.targets import make_target
-        from cablejax.effects.given import parse_effect
 
         model = load_model(self.weights)
-        plant = plant_of(model.cable, (parse_effect(PLANT_EFFECT),), links=self.links, seed=self.seed)
+        plant = plant_of(model.cable, staged_effects(()), links=self.links, seed=self.seed)
         job = Job(
             plant=plant,
             model=model,

@@ -5,20 +5,20 @@ from __future__ import annotations
 import dataclasses
 import pathlib
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from cablejax.cable import Cable, Discretisation
-from cablejax.commands.options import say
+from cablejax.commands.options import UsageError, say
 from cablejax.commands.results import summarise, write_results
 from cablejax.commands.resuming import Parts
 from cablejax.control.run import ClosedLoopRun
 from cablejax.control.shaping import Method, Model, check_fit, shape_once
 from cablejax.control.targets import Target
 from cablejax.dynamics.fingerprint import fingerprint
-from cablejax.effects.given import GivenEffect
+from cablejax.effects.given import GivenEffect, parse_effect
 from cablejax.effects.physics import nominal_physics
 from cablejax.limits import require
 from cablejax.perceive.camera import CameraConfig
@@ -112,6 +112,24 @@ def shape_and_report(job: Job, out: pathlib.Path, parts: Parts, *, facts: Mappin
     summary["total_s"] = round(time.perf_counter() - begin, 3)
     write_json(out / "summary.json", summary)
     return summary
+
+
+PLANT_EFFECT = "bending_stiffness:ratio=0.2"
+"""The gap between model and plant, unless another one is asked for."""
+
+
+def staged_effects(given: Sequence[str]) -> tuple[GivenEffect, ...]:
+    """The effects of a plant by `--plant-effect`: by default `PLANT_EFFECT`; `none` for none.
+
+    Raises:
+        UsageError: `none` stands beside an effect.
+        ValueError: a text is no effect.
+    """
+    if "none" in given and len(given) > 1:
+        raise UsageError("--plant-effect is none and an effect: give either.")
+    if "none" in given:
+        return ()
+    return tuple(parse_effect(text) for text in given or (PLANT_EFFECT,))
 
 
 def plant_of(

@@ -14,9 +14,6 @@ from cablejax.solver_names import SolverName
 if TYPE_CHECKING:
     from cablejax.effects.given import GivenEffect
 
-PLANT_EFFECT = "bending_stiffness:ratio=0.2"
-"""The gap between model and plant, unless another one is asked for."""
-
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Shape(Command):
@@ -79,26 +76,23 @@ class Shape(Command):
         from cablejax.commands.cable import find_cable
         from cablejax.commands.results import table_of
         from cablejax.commands.resuming import unfinished
-        from cablejax.commands.runs import Job, plant_of, shape_and_report
+        from cablejax.commands.runs import Job, plant_of, shape_and_report, staged_effects
         from cablejax.control.shaping import METHODS, load_model
         from cablejax.control.targets import load_target, make_target
-        from cablejax.effects.given import parse_effect
         from cablejax.perceive.camera import CameraConfig
 
-        if "none" in self.plant_effect and len(self.plant_effect) > 1:
-            raise UsageError("--plant-effect is none and an effect: give either.")
         if self.motion is not None and self.perception == "cloud":
             raise UsageError("--motion records the keypoints of the plant: leave --perception out.")
-        texts = (PLANT_EFFECT,) if not self.plant_effect else () if "none" in self.plant_effect else self.plant_effect
+        effects = staged_effects(self.plant_effect)
         cloud = self.perception == "cloud"
         noise_mm = (2.0 if cloud else 0.0) if self.noise_mm is None else self.noise_mm
         if self.motion is not None:
-            return self._play(self.motion, tuple(map(parse_effect, texts)))
+            return self._play(self.motion, effects)
         model = load_model(self.weights)
         cable = model.cable if self.cable is None else find_cable(self.cable)
         plant = plant_of(
             cable,
-            tuple(map(parse_effect, texts)),
+            effects,
             links=self.links,
             seed=self.seed,
             keypoint_noise=0.0 if cloud else 1e-3 * noise_mm,
@@ -122,7 +116,7 @@ class Shape(Command):
             for field in dataclasses.fields(self)
             if field.name not in ("json", "out", "overwrite", "device", "cable", "plant_effect")
         }
-        facts["plant effect"] = ", ".join(texts) or "none"
+        facts["plant effect"] = ", ".join(map(str, effects)) or "none"
         with unfinished(self.out, job.settings(), overwrite=self.overwrite) as parts:
             summary = shape_and_report(job, self.out, parts, facts=facts)
         table = text_table(*table_of(summary))

@@ -17,6 +17,8 @@ from cablejax.simulate.motions import MotionConfig, admissible
 from cablejax.simulate.pose import wrapped
 from cablejax.text_file import read_toml, unknown_key
 
+SNAP_THROUGH = "snap_through"
+"""Name of the bound that a motion breaks on which the cable jumps to another shape, or is close to that."""
 TURN_LENGTH = 0.15
 """Length that one radian counts for where motions of the grippers are added up [m/rad]."""
 NEAREST, FARTHEST, TIGHTEST = 0.15, 0.995, 0.03
@@ -180,7 +182,7 @@ def grippers_beyond(
         if not all(taken):
             broken["reach"] = 1 - float(np.mean(taken)) + max(float(angles.max()) - limits.max_angle, 0.0)
         elif (jump := _near_snapping(config, poses)) > 0:
-            broken["snap_through"] = jump
+            broken[SNAP_THROUGH] = jump
     return broken
 
 
@@ -205,7 +207,7 @@ def cable_beyond(
     """
     length = config.cable.length
     if not np.isfinite(keypoints).all():
-        return {"snap_through": 10.0}
+        return {SNAP_THROUGH: 10.0}
     lines = refined(keypoints)
     least, most = bounds.radius(length), AMPLIFICATION
     if margin > 0:
@@ -218,7 +220,7 @@ def cable_beyond(
         {
             **_beyond_places(bounds, lines, margin + 0.5 * config.cable.diameter, length),
             "bend_radius": float(curvature(keypoints).max()) * least - 1,
-            "snap_through": min(jump / most - 1, 10.0),
+            SNAP_THROUGH: min(jump / most - 1, 10.0),
         }
     )
 

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
 import pathlib
+from collections.abc import Mapping
 
 import numpy as np
+from jaxtyping import Float
 
+from cablejax.cable import Cable
 from cablejax.diagnose.diagnosis import NextMotion
-from cablejax.gaplog import write_gap_log
+from cablejax.gaplog import Episode, gap_log_from_episodes, write_gap_log
+from cablejax.simulate.replay import cable_of_log
 from cablejax.types import GapLog
 from cablejax.whole_file import whole_file
 
@@ -18,26 +23,34 @@ COLUMNS = ("time_s", *(f"gripper_{q}_{x}" for q in (0, 1) for x in ("x_m", "y_m"
 """Columns of the csv."""
 
 
-def motion_log(following: NextMotion, log: GapLog) -> GapLog:
-    """The motion as a gap log of one episode without keypoints: its commands, and poses as they are commanded.
+def commands_log(motions: Mapping[str, Float[np.ndarray, "T 2 3"]], interval: float, cable: Cable) -> GapLog:
+    """Motions as a gap log without keypoints, one episode each: commands, and the poses they are meant to reach.
 
     Args:
-        following: the motion.
-        log: that was diagnosed; of it the cable.
+        motions: gripper poses (x, y, theta) by the motion's name [m, rad].
+        interval: between two of them [s].
+        cable: that is believed to be moved.
     """
-    poses, samples = following.poses, len(following.poses)
-    points = log.keypoints.shape[2]
-    return GapLog(
-        time=following.interval * np.arange(samples)[None],
-        keypoints=np.full((1, samples, points, 2), np.nan, np.float32),
-        gripper_pose=poses[None].astype(np.float32),
-        gripper_command=np.append(np.diff(poses, axis=0) / following.interval, np.zeros((1, 2, 3)), axis=0)[
-            None
-        ].astype(np.float32),
-        episode_length=np.array([samples], np.int32),
-        hold=np.zeros((1, samples), bool),
-        meta={**log.meta, "motion": [following.motion], "source": "to be recorded next, by cablejax diagnose"},
-    )
+    episodes = [
+        Episode(
+            name,
+            interval * np.arange(len(poses)),
+            np.full((len(poses), cable.n_keypoints, 2), np.nan),
+            poses,
+            np.append(np.diff(poses, axis=0) / interval, np.zeros((1, 2, 3)), axis=0),
+            np.zeros(len(poses), bool),
+        )
+        for name, poses in motions.items()
+    ]
+    source = "commands, to be executed and recorded"
+    return gap_log_from_episodes(episodes, cable, source=source, grasp=cable.grasp)
+
+
+def motion_log(following: NextMotion, log: GapLog) -> GapLog:
+    """The next motion as a gap log without keypoints, of the cable in the log that was diagnosed."""
+    commands = commands_log({following.motion: following.poses}, following.interval, cable_of_log(log))
+    kept = {name: value for name, value in log.meta.items() if name not in ("motion", "source", "recordings")}
+    return dataclasses.replace(commands, meta={**commands.meta, **kept})
 
 
 def write_motion(folder: str | os.PathLike[str], following: NextMotion | None, log: GapLog) -> pathlib.Path | None:

@@ -13,7 +13,7 @@ from cablejax.diagnose.belief import Calibration, in_doubt
 from cablejax.diagnose.evidence import Evidence
 from cablejax.diagnose.fit import Fit
 from cablejax.diagnose.information import entropy, mutual_information, parameter_information
-from cablejax.diagnose.motion_bounds import Bounds, cable_beyond, grippers_beyond
+from cablejax.diagnose.motion_bounds import SNAP_THROUGH, Bounds, cable_beyond, grippers_beyond
 from cablejax.diagnose.planar import physics_of
 from cablejax.diagnose.playback import Playback
 from cablejax.diagnose.protocol import Explanation, explanation
@@ -179,10 +179,10 @@ class Judge:
         for there, mean in zip(moved, seen, strict=True):
             unsteady = max(unsteady, np.abs(there - mean).max(initial=0.0) / (STEADY_PARAMETER * length))
         if unsteady > 1:
-            beyond["snap_through"] = max(beyond.get("snap_through", 0.0), min(float(unsteady) - 1, 10.0))
+            beyond[SNAP_THROUGH] = max(beyond.get(SNAP_THROUGH, 0.0), min(float(unsteady) - 1, 10.0))
         # a simulation that breaks down next door is as little to be relied upon
         if beyond or not np.isfinite(points).all():
-            return Judged(poses, np.nan, beyond or {"snap_through": 10.0}, seen)
+            return Judged(poses, np.nan, beyond or {SNAP_THROUGH: 10.0}, seen)
         gaps = ((seen - points[0]) ** 2).mean(axis=(1, 2, 3))
         noise = float(np.sqrt(np.mean(self.noise**2)))
         temper = float(self.calibration.temper(np.sqrt(self.chances @ gaps)[None], noise)[0])

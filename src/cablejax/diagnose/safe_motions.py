@@ -97,6 +97,22 @@ def starting_pose(gripper_pose: Float[np.ndarray, "E T 2 3"]) -> Float[np.ndarra
     return first[np.argmax(np.linalg.norm(first[:, 1, :2] - first[:, 0, :2], axis=-1))]
 
 
+def there_and_back(
+    first: Float[np.ndarray, "2 3"], goal: Float[np.ndarray, "2 3"], n_samples: int = 300, bounds: Bounds = Bounds()
+) -> Float[np.ndarray, "T 2 3"]:
+    """Gripper poses every 0.1 s from one pose to another, with a rest there, and back.
+
+    Args:
+        first: (x, y, theta) of both grippers [m, rad].
+        goal: likewise.
+        n_samples: of the motion, which is cut off there.
+        bounds: on the grippers' speed; the others are not looked at.
+    """
+    start, there = _Pair.of(first).vector, _Pair.of(goal).vector
+    way = Way(np.stack([start, there, start]), np.ones(2), np.array([1.0, _HOLD, 2 * _HOLD]))
+    return way.played(n_samples, bounds)
+
+
 def safe_motions(
     config: Discretisation, first: Float[np.ndarray, "2 3"], n_samples: int = 300, bounds: Bounds = Bounds()
 ) -> dict[str, Float[np.ndarray, "T 2 3"]]:

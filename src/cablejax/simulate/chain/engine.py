@@ -15,7 +15,7 @@ from cablejax.effects.base import Hook
 from cablejax.effects.camera import seen_by_camera
 from cablejax.effects.physics import Physics, may_touch
 from cablejax.simulate.chain.replay import centreline_keypoints, follow
-from cablejax.simulate.chain.state import ChainState
+from cablejax.simulate.chain.state import ChainState, expecting_no_change
 from cablejax.simulate.compile import full_precision
 from cablejax.simulate.engine import Engine, compiled_rollout, finely_sampled
 from cablejax.simulate.equilibrium import equilibrium_state
@@ -77,7 +77,7 @@ class ChainEngine(Engine):
             chain, pose, time = carry
             target = integrate_pose(pose, twist, interval)
             # a command begins with a jump: the steps before it lead one to expect nothing
-            chain = dataclasses.replace(chain, expected=chain.velocity)
+            chain = expecting_no_change(chain)
             chain = follow(
                 config, physics, chain, pose, target, interval / count, time, n_substeps=count, with_contact=contact
             )
@@ -117,6 +117,7 @@ def _chain_state(state: CableState) -> ChainState:
         set_curvature=state.memory.set_curvature,
         friction_state=state.memory.friction_state,
         root_velocity=state.qvel[:2],
+        expected_root=state.qvel[:2],
     )
 
 

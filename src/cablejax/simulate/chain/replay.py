@@ -90,6 +90,7 @@ class Chain:
             set_curvature=zeros,
             friction_state=zeros,
             root_velocity=jnp.zeros(2, angles.dtype),
+            expected_root=jnp.zeros(2, angles.dtype),
         )
         calm = dataclasses.replace(
             physics,

@@ -27,6 +27,7 @@ class ChainState:
         set_curvature: permanent part of the curvature of each joint [1/m], shape [J].
         friction_state: internal friction of each joint, -1 to 1, shape [J].
         root_velocity: of gripper 0 in the last step [m/s], shape [2].
+        expected_root: its velocity in the next step, as `expected` is, shape [2].
     """
 
     angles: Float[Array, "n"]
@@ -36,6 +37,7 @@ class ChainState:
     set_curvature: Float[Array, "J"]
     friction_state: Float[Array, "J"]
     root_velocity: Float[Array, "2"]
+    expected_root: Float[Array, "2"]
 
 
 class Frame(NamedTuple):
@@ -73,14 +75,23 @@ def chain_nodes(
     return chained(lengths[:, None] * along) + offsets[:, None] * along, unit
 
 
-def halfway_state(state: ChainState, root_velocity: Float[Array, "2"], dt) -> ChainState:
-    """The state expected in the middle of the step."""
+def expecting_no_change(state: ChainState) -> ChainState:
+    """The state where only its velocities are known: not how they change."""
+    return dataclasses.replace(state, expected=state.velocity, expected_root=state.root_velocity)
+
+
+def halfway_state(state: ChainState, dt) -> ChainState:
+    """The state expected in the middle of the step.
+
+    Gripper 0 is expected to move on as all else is, although its motion is known: else it would seem to drag along a
+    cable that lies still.
+    """
     return dataclasses.replace(
         state,
         angles=state.angles + 0.5 * dt * state.expected[:-1],
         stretch=state.stretch + 0.5 * dt * state.expected[-1],
         velocity=state.expected,
-        root_velocity=root_velocity,
+        root_velocity=state.expected_root,
     )
 
 

@@ -81,7 +81,7 @@ def advance(
         with_contact: whether the obstacle can be touched. Looking for contacts is a quarter of a step's work.
     """
     root_velocity = (after[0, :2] - before[0, :2]) / dt
-    start, halfway = frame_of(config, state), frame_of(config, halfway_state(state, root_velocity, dt))
+    start, halfway = frame_of(config, state), frame_of(config, halfway_state(state, dt))
     load = _load(config, physics, start, halfway, before[0, :2], 0.5 * dt * root_velocity, with_contact)
     moment, joint_implicit = _joints(config, physics, state, dt)
     matrix = _matrix(halfway, load, config, joint_implicit, dt)
@@ -241,4 +241,5 @@ def _remembered(
         set_curvature=state.set_curvature + excess / (1.0 + physics.hardening),
         friction_state=rubbed,
         root_velocity=root_velocity,
+        expected_root=2.0 * root_velocity - state.root_velocity,
     )

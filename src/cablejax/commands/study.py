@@ -1,0 +1,124 @@
+"""`cablejax study`: rounds of recording and diagnosis on a simulated plant, until the answer is clear."""
+
+from __future__ import annotations
+
+import dataclasses
+import pathlib
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import tyro
+
+from cablejax.commands.options import Command, say
+
+if TYPE_CHECKING:
+    from cablejax.simulate.plant import Plant
+    from cablejax.types import GapLog
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Study(Command):
+    """Find out in rounds what a plant has that the simulator lacks.
+
+    Records the ways to a U, an S and a Z on the plant and diagnoses them. As long as several causes are left, designs
+    the motion that tells most about which of them holds, records it, and diagnoses all recordings together. Ends when
+    one answer is left, when no motion separates what is left, or after --rounds. Writes report.html, recording_1.npz,
+    ... and the diagnosis of each round in round_1, ... A round takes two minutes.
+    """
+
+    resume_hint: ClassVar[str] = "Run the same command again: finished rounds are kept and not repeated."
+
+    out: pathlib.Path = pathlib.Path("runs/study")
+    """Folder for the results."""
+
+    overwrite: bool = False
+    """Replace the results that are in the folder."""
+
+    cable: pathlib.Path | None = None
+    """The cable that the plant is believed to have: a cable file, or a data set, weights or a log that holds one. By
+    default the reference cable."""
+
+    plant_effect: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
+    """An effect of the plant that the diagnosis is not told, as NAME:PARAMETER=VALUE,... in SI units; may be given
+    several times. By default bending_stiffness:ratio=0.2; `none` for no effect."""
+
+    rounds: int = 3
+    """Recordings to make at most."""
+
+    bounds: pathlib.Path | None = None
+    """Bounds of the motions, a TOML file; by default those of the cable and a usual arm's speed."""
+
+    noise_mm: float = 1.0
+    """Noise: standard deviation of the recorded keypoints, per coordinate [mm]."""
+
+    links: int = 24
+    """Links of the plant's cable."""
+
+    def execute(self):
+        """Records and diagnoses round by round, keeps each as it ends, and reports."""
+        from cablejax.cable import Cable
+        from cablejax.commands.cable import find_cable
+        from cablejax.commands.diagnose import diagnose_and_report
+        from cablejax.commands.resuming import unfinished
+        from cablejax.commands.runs import plant_of, staged_effects
+        from cablejax.control.targets import make_target, straight_start
+        from cablejax.diagnose.motion_bounds import Bounds, read_bounds
+        from cablejax.diagnose.study import ENDED, ended, first_recording
+        from cablejax.effects.given import read_verdict_json
+        from cablejax.gaplog import read_gap_log, write_gap_log
+        from cablejax.gaplog_join import joined
+        from cablejax.limits import require
+        from cablejax.report.sheet import write_sheet
+        from cablejax.report.study_sheet import study_sheet
+        from cablejax.simulate.plant import Plant
+        from cablejax.text_file import read_json, write_json
+
+        require(self.rounds, "count", "--rounds")
+        require(1e-3 * self.noise_mm, "noise", "--noise-mm in metres")
+        cable = Cable() if self.cable is None else find_cable(self.cable)
+        bounds = Bounds() if self.bounds is None else read_bounds(self.bounds)
+        config = plant_of(cable, staged_effects(self.plant_effect), links=self.links, seed=self.seed)
+        goals = {f"to {letter}": make_target(letter, cable).gripper_pose for letter in ("U", "S", "Z")}
+        commands, plant = first_recording(cable, straight_start(cable), goals, bounds), Plant(config)
+        settings = {
+            "study": dataclasses.asdict(config),
+            "bounds": dataclasses.asdict(bounds),
+            "noise_mm": self.noise_mm,
+            "rounds": self.rounds,
+        }
+        verdicts: list[dict[str, Any]] = []
+        recordings: list[GapLog] = []
+        why = None
+        with unfinished(self.out, settings, overwrite=self.overwrite) as parts:
+            kept = read_json(parts.state)["rounds"] if parts.state.exists() else 0
+            while why is None:
+                number = len(verdicts) + 1
+                path, folder = self.out / f"recording_{number}.npz", self.out / f"round_{number}"
+                if number > kept:
+                    say(f"round {number}: recording {', '.join(commands.meta['motion'])} ...")
+                    write_gap_log(path, self._recorded(plant, commands, number), overwrite=True)
+                recordings.append(read_gap_log(path))
+                if number > kept:
+                    log = joined(recordings, [f"recording_{k}.npz" for k in range(1, number + 1)])
+                    folder.mkdir(exist_ok=True)
+                    result, _ = diagnose_and_report(log, folder, bounds=bounds)
+                    say(f"round {number}: {result.sentence}")
+                    write_json(parts.state, {"rounds": number})
+                verdicts.append(read_verdict_json(folder / "verdict.json"))
+                why = ended(verdicts[-1], rounds_left=self.rounds - number)
+                if why is None:
+                    commands = read_gap_log(folder / "next_motion.npz")
+            motions = [log.meta["motion"] for log in recordings]
+            staged = ", ".join(map(str, config.effects)) or "nothing"
+            page = write_sheet(self.out / "report.html", study_sheet(verdicts, motions, why, staged))
+            result = {
+                "ended": why,
+                "rounds": [{"motions": m, "verdict": v} for m, v in zip(motions, verdicts, strict=True)],
+                "report": str(page),
+            }
+            write_json(self.out / "summary.json", result)
+        return result, f"{verdicts[-1]['verdict']}: {verdicts[-1]['sentence']} {ENDED[why]}\n{page}"
+
+    def _recorded(self, plant: Plant, commands: GapLog, number: int) -> GapLog:
+        from cablejax.simulate.play import play
+
+        return play(plant, commands, source="contact plant", noise=1e-3 * self.noise_mm, seed=self.seed + number)

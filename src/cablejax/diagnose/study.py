@@ -1,0 +1,81 @@
+"""Rounds of diagnosis on one set-up: what is recorded first, and whether another recording is worth its time."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, Literal
+
+import numpy as np
+from jaxtyping import Float
+
+from cablejax.cable import Cable, Discretisation
+from cablejax.diagnose.motion_bounds import SNAP_THROUGH, Bounds, grippers_beyond
+from cablejax.diagnose.motion_file import commands_log
+from cablejax.diagnose.safe_motions import INTERVAL, there_and_back
+from cablejax.types import GapLog
+
+Ended = Literal["clear", "unknown", "inseparable", "rounds"]
+"""One answer is left; the cause is not in the library; no motion separates what is left; no rounds are left."""
+
+ENDED: dict[Ended, str] = {
+    "clear": "One answer is left.",
+    "unknown": "The library has no cause that explains all of the gap, which more of the same does not change.",
+    "inseparable": "No motion that was tried separates what is left: measure one of these causes by other means.",
+    "rounds": "No rounds are left: give more with --rounds.",
+}
+"""Why a study ended, in words."""
+
+
+def first_recording(
+    cable: Cable,
+    start: Float[np.ndarray, "2 3"],
+    goals: Mapping[str, Float[np.ndarray, "2 3"]],
+    bounds: Bounds = Bounds(),
+) -> GapLog:
+    """The commands of a study's first recording: to each goal and back, as a robot moves that shapes the cable.
+
+    Args:
+        cable: that is believed to be moved.
+        start: gripper poses (x, y, theta) of every motion [m, rad]; in a workspace start and goals are moved to the
+            middle of it.
+        goals: gripper poses by name. A motion that breaks the bounds on the grippers is left out; one that comes close
+            to a snap-through is not, since a robot that shapes a cable does that too.
+        bounds: to keep.
+
+    Raises:
+        ValueError: none keeps the bounds.
+    """
+    config = Discretisation(cable)
+    middle = np.zeros(3) if bounds.workspace is None else np.append(np.mean(bounds.workspace, axis=0), 0.0)
+    motions = {name: there_and_back(start + middle, goal + middle, bounds=bounds) for name, goal in goals.items()}
+    broken = {name: grippers_beyond(bounds, config, poses, INTERVAL).keys() for name, poses in motions.items()}
+    kept = {name: poses for name, poses in motions.items() if broken[name] <= {SNAP_THROUGH}}
+    if not kept:
+        raise ValueError(
+            f"No way to {', '.join(goals)}, by which a study begins, keeps the bounds. Make a first recording of your "
+            "own, and give it to `cablejax diagnose` with these bounds."
+        )
+    return commands_log(kept, INTERVAL, cable)
+
+
+def ended(verdict: Mapping[str, Any], *, rounds_left: int) -> Ended | None:
+    """Why no further recording follows a verdict; None where one does.
+
+    Args:
+        verdict: as `verdict_json` writes it.
+        rounds_left: how many recordings may still be made.
+    """
+    if verdict["verdict"] in ("unknown", "named+unknown"):
+        return "unknown"
+    if verdict["verdict"] != "ambiguous":
+        return "clear"
+    worth = verdict["next_motion_worth"]
+    if worth is None or worth["inseparable"]:
+        return "inseparable"
+    return None if rounds_left > 0 else "rounds"
+
+
+def left_open(verdict: Mapping[str, Any]) -> tuple[str, ...]:
+    """The effects that a verdict names or cannot tell from those."""
+    named = [effect["name"] for effect in verdict["effects"]]
+    return tuple(dict.fromkeys([*named, *(name for group in verdict["equivalent"] for name in group)]))
