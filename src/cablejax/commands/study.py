@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 import pathlib
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import tyro
 
 from cablejax.commands.options import Command, say
 
 if TYPE_CHECKING:
+    from cablejax.diagnose import Diagnosis
     from cablejax.simulate.plant import Plant
     from cablejax.types import GapLog
 
@@ -62,7 +63,8 @@ class Study(Command):
         from cablejax.commands.runs import plant_of, staged_effects
         from cablejax.control.targets import make_target, straight_start
         from cablejax.diagnose.motion_bounds import Bounds, read_bounds
-        from cablejax.diagnose.study import ENDED, ended, first_recording
+        from cablejax.diagnose.study import ENDED, ended, first_recording, left_open
+        from cablejax.diagnose.verdict_json import read_verdict
         from cablejax.effects.given import read_verdict_json
         from cablejax.gaplog import read_gap_log, write_gap_log
         from cablejax.gaplog_join import joined
@@ -85,13 +87,13 @@ class Study(Command):
             "noise_mm": self.noise_mm,
             "rounds": self.rounds,
         }
-        verdicts: list[dict[str, Any]] = []
+        found: list[Diagnosis] = []
         recordings: list[GapLog] = []
         why = None
         with unfinished(self.out, settings, overwrite=self.overwrite) as parts:
             kept = read_json(parts.state)["rounds"] if parts.state.exists() else 0
             while why is None:
-                number = len(verdicts) + 1
+                number = len(found) + 1
                 path, folder = self.out / f"recording_{number}.npz", self.out / f"round_{number}"
                 if number > kept:
                     say(f"round {number}: recording {', '.join(commands.meta['motion'])} ...")
@@ -103,20 +105,25 @@ class Study(Command):
                     result, _ = diagnose_and_report(log, folder, bounds=bounds)
                     say(f"round {number}: {result.sentence}")
                     write_json(parts.state, {"rounds": number})
-                verdicts.append(read_verdict_json(folder / "verdict.json"))
-                why = ended(verdicts[-1], rounds_left=self.rounds - number)
+                verdict = folder / "verdict.json"
+                found.append(read_verdict(verdict))
+                worth = read_verdict_json(verdict)["next_motion_worth"]
+                why = ended(found[-1], worth, rounds_left=self.rounds - number)
                 if why is None:
                     commands = read_gap_log(folder / "next_motion.npz")
             motions = [log.meta["motion"] for log in recordings]
-            staged = ", ".join(map(str, config.effects)) or "nothing"
-            page = write_sheet(self.out / "report.html", study_sheet(verdicts, motions, why, staged))
+            page = write_sheet(self.out / "report.html", study_sheet(found, motions, why, config.effects))
             result = {
                 "ended": why,
-                "rounds": [{"motions": m, "verdict": v} for m, v in zip(motions, verdicts, strict=True)],
+                "rounds": [
+                    {"motions": recorded, "verdict": one.verdict, "left_open": left_open(one)}
+                    for recorded, one in zip(motions, found, strict=True)
+                ],
+                "verdict": read_verdict_json(verdict),
                 "report": str(page),
             }
             write_json(self.out / "summary.json", result)
-        return result, f"{verdicts[-1]['verdict']}: {verdicts[-1]['sentence']} {ENDED[why]}\n{page}"
+        return result, f"{found[-1].verdict}: {found[-1].sentence} {ENDED[why]}\n{page}"
 
     def _recorded(self, plant: Plant, commands: GapLog, number: int) -> GapLog:
         from cablejax.simulate.play import play

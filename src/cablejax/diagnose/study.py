@@ -9,6 +9,8 @@ import numpy as np
 from jaxtyping import Float
 
 from cablejax.cable import Cable, Discretisation
+from cablejax.diagnose.diagnosis import Diagnosis
+from cablejax.diagnose.judgement import look_alikes
 from cablejax.diagnose.motion_bounds import SNAP_THROUGH, Bounds, grippers_beyond
 from cablejax.diagnose.motion_file import commands_log
 from cablejax.diagnose.safe_motions import INTERVAL, there_and_back
@@ -58,24 +60,25 @@ def first_recording(
     return commands_log(kept, INTERVAL, cable)
 
 
-def ended(verdict: Mapping[str, Any], *, rounds_left: int) -> Ended | None:
-    """Why no further recording follows a verdict; None where one does.
+def ended(found: Diagnosis, worth: Mapping[str, Any] | None, *, rounds_left: int) -> Ended | None:
+    """Why no further recording follows a diagnosis; None where one does.
 
     Args:
-        verdict: as `verdict_json` writes it.
+        found: of all recordings so far.
+        worth: of the next motion, as `verdict_json` writes it; None where there is none.
         rounds_left: how many recordings may still be made.
     """
-    if verdict["verdict"] in ("unknown", "named+unknown"):
+    if found.verdict in ("unknown", "named+unknown"):
         return "unknown"
-    if verdict["verdict"] != "ambiguous":
+    if found.verdict != "ambiguous" or len(left_open(found)) <= len(found.effects):
         return "clear"
-    worth = verdict["next_motion_worth"]
     if worth is None or worth["inseparable"]:
         return "inseparable"
     return None if rounds_left > 0 else "rounds"
 
 
-def left_open(verdict: Mapping[str, Any]) -> tuple[str, ...]:
-    """The effects that a verdict names or cannot tell from those."""
-    named = [effect["name"] for effect in verdict["effects"]]
-    return tuple(dict.fromkeys([*named, *(name for group in verdict["equivalent"] for name in group)]))
+def left_open(found: Diagnosis) -> tuple[str, ...]:
+    """The effects that a diagnosis names, and those in their place that are not improbable."""
+    named = [effect.name for effect in found.effects]
+    alike = [name for group in found.equivalent for name in look_alikes(group, found.effects, found.ranking)[0]]
+    return tuple(dict.fromkeys([*named, *alike]))

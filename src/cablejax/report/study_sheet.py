@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Sequence
 
 import matplotlib
 import numpy as np
 from markupsafe import Markup
 from matplotlib.figure import Figure
 
+from cablejax.diagnose.diagnosis import Diagnosis
 from cablejax.diagnose.study import ENDED, Ended, left_open
+from cablejax.effects.given import GivenEffect
 from cablejax.report.diagnosis_style import STYLE
-from cablejax.report.effect_words import effect_title, listed, share
+from cablejax.report.effect_words import effect_title, listed, millimetres, share
 from cablejax.report.sheet import Sheet
 from cablejax.report.style import LIGHT
 
@@ -27,73 +28,72 @@ _VERDICTS = {
 
 
 def study_sheet(
-    verdicts: Sequence[Mapping[str, Any]], motions: Sequence[Sequence[str]], why: Ended, staged: str
+    found: Sequence[Diagnosis], motions: Sequence[Sequence[str]], why: Ended, staged: Sequence[GivenEffect]
 ) -> Sheet:
     """The page of a study that has ended.
 
     Args:
-        verdicts: of each round, as `verdict_json` writes them.
+        found: the diagnosis of each round.
         motions: recorded in each round.
         why: it ended.
-        staged: effects of the plant, in words.
+        staged: effects of the plant.
     """
-    last, recordings = verdicts[-1], len(verdicts)
-    names = listed([effect_title(name) for name in left_open(last)], "or") or _VERDICTS[last["verdict"]]
-    seconds = sum(verdict["seconds"] for verdict in verdicts)
-    gap = last["gap"]
-    ranked = any(entry["probability"] is not None for verdict in verdicts for entry in verdict["ranking"])
+    last, rounds = found[-1], len(found)
+    names = listed([effect_title(name) for name in left_open(last)], "or") or _VERDICTS[last.verdict]
+    ranked = any(entry.probability is not None for one in found for entry in one.ranking)
+    pictures = [(_beliefs(found), "How probable each cause was after each round, by all recordings so far.")]
     return Sheet(
         kind="study",
-        title=f"After {recordings} recording{'s' if recordings > 1 else ''}: {names}",
-        lead=f"{ENDED[why]} {last['sentence']}",
+        title=f"After {rounds} recording{'s' if rounds > 1 else ''}: {names}",
+        lead=f"{ENDED[why]} {last.sentence}",
         cards=[
-            ("Verdict", _VERDICTS[last["verdict"]], names),
-            ("Recorded", f"{sum(map(len, motions))} motions", f"in {recordings} rounds"),
+            ("Verdict", _VERDICTS[last.verdict] if why != "clear" or last.verdict == "none" else "named", names),
+            ("Recorded", f"{sum(map(len, motions))} motions", f"in {rounds} round{'s' if rounds > 1 else ''}"),
+            ("Error", _error(last), "without and with what is named"),
             (
-                "Error",
-                f"{1e3 * gap['before_rmse']:.1f} → {1e3 * gap['after_rmse']:.1f} mm",
-                "without and with the cause",
+                "Staged in the plant",
+                listed([effect_title(effect.name) for effect in staged]) or "nothing",
+                f"{', '.join(map(str, staged))}. No diagnosis was told." if staged else "No diagnosis was told.",
             ),
-            ("Staged in the plant", staged, "which no diagnosis was told"),
         ],
-        figures=[(_beliefs(verdicts), "How probable each cause was after each round, all recordings together.")]
-        if ranked
-        else [],
+        figures=pictures if ranked else [],
         tables=[
             (
                 "Rounds",
-                ("round", "recorded", "verdict", "left open", "error without, with the cause", "page"),
-                [_row(k, verdict, done) for k, (verdict, done) in enumerate(zip(verdicts, motions, strict=True), 1)],
+                ("round", "recorded", "left open", "error without, with the cause", "page"),
+                [_row(k, one, done) for k, (one, done) in enumerate(zip(found, motions, strict=True), 1)],
             )
         ],
         following=(
-            f"Simulate with what was named: cablejax simulate --with round_{recordings}/verdict.json",
-            "See what each recording added: the page of the last round.",
+            f"Simulate with what was named: cablejax simulate --with round_{rounds}/verdict.json",
+            f"What each recording added: round_{rounds}/report.html",
         ),
-        facts={"time of the diagnoses": f"{seconds:.0f} s"},
+        facts={"time of the diagnoses": f"{sum(one.seconds for one in found):.0f} s"},
     )
 
 
-def _row(number: int, verdict: Mapping[str, Any], motions: Sequence[str]) -> tuple[str, ...]:
-    gap = verdict["gap"]
+def _error(found: Diagnosis) -> str:
+    return f"{found.gap.before_rmse_mm:.1f} → {millimetres(found.gap.after_rmse_mm)}"
+
+
+def _row(number: int, found: Diagnosis, motions: Sequence[str]) -> tuple[str, ...]:
     return (
         str(number),
         listed([name.replace("_", " ") for name in motions]),
-        _VERDICTS[verdict["verdict"]],
-        listed([effect_title(name) for name in left_open(verdict)]) or "nothing",
-        f"{1e3 * gap['before_rmse']:.1f}, {1e3 * gap['after_rmse']:.1f} mm",
+        listed([effect_title(name) for name in left_open(found)], "or") or _VERDICTS[found.verdict],
+        _error(found),
         Markup('<a href="round_{}/report.html">diagnosis</a>').format(number),
     )
 
 
-def _beliefs(verdicts: Sequence[Mapping[str, Any]]) -> Figure:
+def _beliefs(found: Sequence[Diagnosis]) -> Figure:
     """Bars of the probabilities of the causes by round."""
-    chances = [{entry["name"]: entry["probability"] or 0.0 for entry in v["ranking"]} for v in verdicts]
+    chances = [{entry.name: entry.probability or 0.0 for entry in one.ranking} for one in found]
     best = {name: max(c.get(name, 0.0) for c in chances) for name in set().union(*chances)}
-    names = sorted(best, key=lambda name: -best[name])[:_SHOWN]
+    names = sorted(best, key=lambda name: (-best[name], name))[:_SHOWN]
     with matplotlib.rc_context(STYLE):
-        figure = Figure(figsize=(9.0, 0.9 + 0.34 * len(names) * len(verdicts)), layout="constrained")
-        axes = np.atleast_1d(figure.subplots(len(verdicts), 1, sharex=True))
+        figure = Figure(figsize=(9.0, 0.9 + 0.34 * len(names) * len(found)), layout="constrained")
+        axes = np.atleast_1d(figure.subplots(len(found), 1, sharex=True))
         for number, (ax, chance) in enumerate(zip(axes, chances, strict=True), 1):
             values = [chance.get(name, 0.0) for name in names]
             ax.barh(range(len(names)), values, color=LIGHT.residual, height=0.65)

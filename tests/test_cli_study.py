@@ -1,0 +1,127 @@
+"""Rounds of recording and diagnosis on a plant: `cablejax study`."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from cablejax.cable import Cable
+from cablejax.cli import main
+from cablejax.control.targets import make_target, straight_start
+from cablejax.diagnose.diagnosis import Diagnosis, Gap, NamedEffect, Ranked
+from cablejax.diagnose.motion_bounds import Bounds
+from cablejax.diagnose.study import ended, first_recording
+from cablejax.diagnose.verdict_json import read_verdict
+from cablejax.gaplog import read_gap_log
+
+LONG = Cable(length=1.5, linear_density=0.05, bending_stiffness=0.05, n_keypoints=17)
+GOALS = {letter: make_target(letter, LONG).gripper_pose for letter in ("U", "S", "Z")}
+
+
+def found(name: str, alike: float | None = None) -> Diagnosis:
+    """A diagnosis that names friction, and leaves density with this probability in its place."""
+    effects = () if name in ("none", "unknown") else (NamedEffect("table_friction", 0.9, {}, {}),)
+    return Diagnosis(
+        verdict=name,  # pyright: ignore[reportArgumentType]
+        sentence="",
+        effects=effects,
+        equivalent=() if alike is None else (("table_friction", "linear_density"),),
+        ranking=(Ranked("table_friction", 0.9, 0.9, 0.1), Ranked("linear_density", alike, 0.9, 0.1)),
+        leftover_p=None,
+        gap=Gap(30.0, 5.0, 1.0, 1.0, 0.9, None, None, {}, (0,), {}),
+        where=None,
+        next_motion=None,
+        baselines={},
+        caveats=(),
+        seconds=1.0,
+        settings={},
+    )
+
+
+@pytest.mark.parametrize(
+    ("one", "inseparable", "rounds_left", "why"),
+    [
+        (found("none"), None, 2, "clear"),
+        (found("named"), False, 2, "clear"),
+        (found("unknown"), None, 2, "unknown"),
+        (found("named+unknown"), False, 2, "unknown"),
+        (found("ambiguous", 0.1), False, 2, None),
+        (found("ambiguous", 0.1), False, 0, "rounds"),
+        (found("ambiguous", 0.1), True, 2, "inseparable"),
+        (found("ambiguous", 0.1), None, 2, "inseparable"),
+        (found("ambiguous", 0.001), False, 2, "clear"),
+    ],
+)
+def test_a_study_goes_on_only_where_a_motion_can_tell_more(one, inseparable, rounds_left, why):
+    worth = None if inseparable is None else {"inseparable": inseparable}
+    assert ended(one, worth, rounds_left=rounds_left) == why
+
+
+def test_first_recording_goes_to_the_goals_and_back_in_the_middle_of_the_workspace():
+    bounds = Bounds(workspace=((1.0, 1.0), (3.4, 3.4)), speed=0.03)
+    log = first_recording(LONG, straight_start(LONG), GOALS, bounds)
+    assert log.meta["motion"] == ["U", "S", "Z"] and log.meta["cable"]["length_m"] == 1.5
+    speed = np.linalg.norm(np.diff(log.gripper_pose[..., :2], axis=1), axis=-1) / np.diff(log.time)[..., None]
+    assert speed.max() < 0.0301
+    for poses, goal in zip(log.gripper_pose, GOALS.values(), strict=True):
+        nearest = np.abs(poses - goal - [2.2, 2.2, 0.0])[..., :2].max(axis=(1, 2)).min()
+        assert nearest < 1e-3
+    np.testing.assert_allclose(log.gripper_pose[:, 0, :, :2].mean(axis=1), 2.2, atol=1e-6)
+
+
+def test_bounds_without_room_are_refused():
+    with pytest.raises(ValueError, match=r"No way to U, S, Z.*Make a first recording of your own"):
+        first_recording(LONG, straight_start(LONG), GOALS, Bounds(workspace=((0.0, 0.0), (0.5, 0.5))))
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--rounds", "0"], "--rounds is 0"),
+        (["--noise-mm", "1e6"], "--noise-mm in metres"),
+        (["--plant-effect", "magic:x=1"], "no effect 'magic'"),
+        (["--plant-effect", "none", "--plant-effect", "linear_density:ratio=2"], "give either"),
+        (["--bounds", "none.toml"], "none.toml"),
+    ],
+)
+def test_bad_input_is_refused_before_anything_is_recorded(options, message, tmp_path, capsys):
+    assert main(["study", *options, "--out", str(tmp_path / "study")]) == 2
+    assert message in capsys.readouterr().err and not (tmp_path / "study").exists()
+
+
+@pytest.mark.slow
+def test_a_study_ends_with_a_verdict_on_all_recordings_and_goes_on_after_a_kill(tmp_path, monkeypatch):
+    out = tmp_path / "study"
+    # a softer cable of 1 m: the first recording leaves several causes
+    arguments = ["study", "--plant-effect", "bending_damping:time_s=1", "--rounds", "2", "--out", str(out)]
+    diagnosed = []
+    from cablejax.commands import diagnose
+
+    real = diagnose.diagnose_and_report
+
+    def counted(log, folder, **options):
+        diagnosed.append(log.meta["motion"])
+        return real(log, folder, **options)
+
+    monkeypatch.setattr(diagnose, "diagnose_and_report", counted)
+
+    def killed(*_, **__):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr("cablejax.commands.study.Study._recorded", killed)
+        assert main(arguments) == 130
+    assert main(arguments) == 0 and len(diagnosed) >= 1
+    summary = json.loads((out / "summary.json").read_text())
+    rounds, worth = summary["rounds"], summary["verdict"]["next_motion_worth"]
+    last = read_verdict(out / f"round_{len(rounds)}" / "verdict.json")
+    assert summary["ended"] == ended(last, worth, rounds_left=2 - len(rounds))
+    assert "bending_damping" in rounds[-1]["left_open"]
+    assert diagnosed[-1] == [motion for one in rounds for motion in one["motions"]]
+    recorded = [read_gap_log(out / f"recording_{k}.npz") for k in range(1, len(rounds) + 1)]
+    assert [log.meta["motion"] for log in recorded] == [one["motions"] for one in rounds]
+    page = (out / "report.html").read_text()
+    assert f"round_{len(rounds)}/report.html" in page and "bending_damping" in page
+    assert main(arguments) == 2, "what is there stays"
