@@ -253,8 +253,7 @@ def curvature(points: Float[np.ndarray, "*B N 2"]) -> Float[np.ndarray, "*B N"]:
 
 
 def _heading(poses: Float[np.ndarray, "T 2 3"]) -> Float[np.ndarray, "T"]:
-    chord = poses[:, 1, :2] - poses[:, 0, :2]
-    return np.arctan2(chord[:, 1], chord[:, 0])
+    return np.arctan2(*(poses[:, 1, :2] - poses[:, 0, :2]).T[::-1])
 
 
 def _beyond_places(

@@ -104,7 +104,7 @@ def write_diagnosis_page(diagnosis: CableDiagnosis, out: str | os.PathLike[str])
     write_html(
         path,
         "diagnosis.html",
-        title=f"CableDiagnosis: {badge}",
+        title=f"Diagnosis: {badge}",
         kind=kind,
         badge=badge,
         diagnosis=diagnosis,
