@@ -69,6 +69,27 @@ def test_the_effects_of_a_verdict_are_added_to_those_given(tmp_path):
     assert tyro.cli(Simulate, args=words[2:], config=(tyro.conf.FlagCreatePairsOff,)).dataset_config() == parsed
 
 
+def test_a_verdicts_draws_are_dealt_out_to_the_trajectories(tmp_path):
+    def drawn(name, **values):
+        return [{"name": name, "parameters": values}]
+
+    fields = {"effects": [{"name": "linear_density", "parameters": {"ratio": {"value": 1.5}}}]}
+    draws = [drawn("linear_density", ratio=1.4), drawn("table_friction", coefficient=0.3)]
+    for name, posterior in (("one", draws), ("old", None), ("damaged", [[{"name": "linear_density"}]])):
+        verdict = {"schema": "cablejax-verdict/1", "verdict": "ambiguous", **fields, "posterior": posterior}
+        (tmp_path / f"{name}.json").write_text(json.dumps(verdict))
+    config = Simulate(with_=(tmp_path / "one.json", tmp_path / "old.json")).dataset_config()
+    assert config.effects == ()
+    assert [list(map(str, config.effects_of(i))) for i in range(3)] == [
+        ["linear_density:ratio=1.4", "linear_density:ratio=1.5"],
+        ["table_friction:coefficient=0.3", "linear_density:ratio=1.5"],
+        ["linear_density:ratio=1.4", "linear_density:ratio=1.5"],
+    ]
+    assert simulate_command(config, "name.zarr").startswith("# name.zarr: ")
+    with pytest.raises(ValueError, match=r"damaged\.json: posterior is not of the verdict's format"):
+        Simulate(with_=(tmp_path / "damaged.json",)).dataset_config()
+
+
 def test_a_data_set_beyond_the_options_says_so():
     config = DatasetConfig(interval=2.0)
     assert simulate_command(config, "name.zarr").startswith("# name.zarr: ")

@@ -186,6 +186,21 @@ def test_effects_travel_in_the_store(tmp_path):
         generate(dataclasses.replace(config, effects=effects[:1]), tmp_path / "data", progress=False)
 
 
+def test_each_trajectory_has_its_draw_of_a_posterior():
+    posterior = tuple((GivenEffect(name, VALUES[name]),) for name in ("stiffness_profile", "camera_similarity"))
+    config = dataclasses.replace(STAGED, n_trajectories=2, shard_size=2, posterior=posterior)
+    assert config_from_json(DatasetConfig, json.loads(json.dumps(config_to_json(config)))) == config
+    assert config.effects_shown == tuple(f"{one[0].name} (in 1 of 2 draws)" for one in posterior)
+    (block,) = simulate(config, make_engine(config), [0])
+    for index, effects in enumerate(posterior):
+        alone = dataclasses.replace(config, posterior=(), effects=effects)
+        (other,) = simulate(alone, make_engine(alone), [0])
+        np.testing.assert_array_equal(block.keypoints[index], other.keypoints[index])
+        assert np.abs(block.keypoints[1 - index] - other.keypoints[1 - index]).max() > 1e-3
+    with pytest.raises(ValueError, match="threaded cannot simulate camera_similarity"):
+        dataclasses.replace(config, engine="threaded")
+
+
 def test_effects_that_an_engine_cannot_simulate_are_refused():
     with pytest.raises(ValueError, match=r"threaded cannot simulate axial_stretch.*: chain\."):
         dataclasses.replace(TINY, effects=(GivenEffect("axial_stretch", VALUES["axial_stretch"]),))

@@ -167,6 +167,17 @@ def test_twice_the_noise_widens_the_reported_interval():
     assert widths[1] / widths[0] == pytest.approx(2.0, rel=0.15)
 
 
+def test_the_posterior_holds_what_is_named_as_uncertain_as_it_is():
+    result = plain(OFFSET, FEW)
+    (effect,) = result.effects
+    assert len(result.posterior) == 16 and {one.name for draw in result.posterior for one in draw} == {effect.name}
+    estimate = effect.parameters["angle_rad"]
+    drawn = np.array([one.parameters["angle_rad"] for (one,) in result.posterior])
+    low, high = estimate.ci90
+    assert np.sum((low <= drawn) & (drawn <= high)) >= 12 and len(set(drawn)) == 16
+    assert abs(drawn.mean() - estimate.value) < 0.5 * (high - low)
+
+
 # What must not matter.
 
 

@@ -140,6 +140,26 @@ def test_a_recording_without_noise_at_rest_is_no_gap():
     assert samples_of(parts) == [("a", 200)] and repairs == []
 
 
+def test_a_marker_that_jumps_is_not_observed_there():
+    right = swinging()
+    points = right.copy()
+    points[70:90, 4] += [0.0, 0.1, 0.05]
+    (one, *_), repairs = prepare((take(points), *others()), PAIRS)
+    assert np.isnan(one.keypoints[70:90, 4]).all()
+    assert np.isfinite(np.delete(one.keypoints, np.arange(70, 90), axis=0)).all()
+    np.testing.assert_array_equal(np.delete(one.keypoints, 4, axis=1), np.delete(right, 4, axis=1))
+    (sentence,) = repairs
+    assert sentence.startswith("Take a: keypoint 4 is farther") and "20 of 200 samples, from sample 70" in sentence
+
+
+def test_a_jerk_of_a_gripper_is_told_and_kept():
+    points = swinging()
+    points[100:] += 0.02
+    (one, *_), repairs = prepare((take(points), *others()), PAIRS)
+    assert len(one.time) == 200
+    assert [sentence.split(" is accelerated")[0] for sentence in repairs] == ["Take a: gripper 0", "Take a: gripper 1"]
+
+
 def test_a_gripper_never_seen_is_refused():
     points = swinging()
     points[:, 8] = np.nan

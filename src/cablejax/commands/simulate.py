@@ -60,7 +60,8 @@ class Simulate(Command):
     """An effect to add to every cable, as NAME:PARAMETER=VALUE,... in SI units; may be given several times."""
 
     with_: Annotated[tuple[pathlib.Path, ...], tyro.conf.arg(name="with"), tyro.conf.UseAppendAction] = ()
-    """A verdict.json of `cablejax diagnose`: the effects that it names are added; may be given several times."""
+    """A verdict.json of `cablejax diagnose`: the effects that it names are added, each trajectory with another draw of
+    what the verdict leaves open; may be given several times."""
 
     links: int | None = None
     """Links of the simulated cable; by default the resolution that the released model was trained on."""
@@ -122,11 +123,18 @@ class Simulate(Command):
         """
         from cablejax.cable import Cable
         from cablejax.commands.cable import find_cable
-        from cablejax.effects.given import effects_of_verdict, parse_effect
+        from cablejax.effects.given import parse_effect, posterior_of_verdict
 
-        effects = [parse_effect(text) for text in self.effect]
-        effects += [effect for path in self.with_ for effect in effects_of_verdict(path)]
-        return self.config_of(Cable() if self.cable is None else find_cable(self.cable), tuple(effects))
+        effects = tuple(parse_effect(text) for text in self.effect)
+        verdicts = [posterior_of_verdict(path) for path in self.with_]
+        together = tuple(
+            tuple(effect for posterior in verdicts for effect in posterior[i % len(posterior)])
+            for i in range(max(map(len, verdicts), default=1))
+        )
+        if len(together) == 1:
+            effects, together = effects + together[0], ()
+        config = self.config_of(Cable() if self.cable is None else find_cable(self.cable), effects)
+        return dataclasses.replace(config, posterior=together)
 
     def config_of(self, cable: Cable, effects: tuple[GivenEffect, ...]) -> DatasetConfig:
         """The data set of a cable with effects, in place of those that the options name.

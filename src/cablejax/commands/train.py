@@ -206,7 +206,7 @@ class Train(Command):
         del training["model"]  # the weights file has it, with the normalisation
         return {
             "cable": cable_to_fields(stores[0].config.cable),
-            "effects": list(dict.fromkeys(str(effect) for store in stores for effect in store.config.effects)),
+            "effects": list(dict.fromkeys(effect for store in stores for effect in store.config.effects_shown)),
             "data": [
                 {
                     "name": name,

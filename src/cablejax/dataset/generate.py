@@ -56,11 +56,13 @@ class Draw:
         gripper_pose: where the grippers start, float32, shape [Q, 3].
         gripper_twist: what they do, float32, shape [T, Q, 3].
         parameters: the columns of `cablejax.dataset.schema.PARAMETERS`, float64, shape [3].
+        index: of the trajectory, for `DatasetConfig.effects_of`.
     """
 
     gripper_pose: np.ndarray
     gripper_twist: np.ndarray
     parameters: np.ndarray
+    index: int
 
 
 def draw(config: DatasetConfig, index: int, attempt: int = 0) -> Draw:
@@ -72,6 +74,7 @@ def draw(config: DatasetConfig, index: int, attempt: int = 0) -> Draw:
         gripper_pose=np.asarray(pose, np.float32),
         gripper_twist=np.asarray(twist, np.float32),
         parameters=parameters,
+        index=index,
     )
 
 
@@ -85,8 +88,8 @@ def draw_parameters(config: DatasetConfig, rng: np.random.Generator) -> Float[np
     return np.array([stiffness, friction * cable.friction_coefficient, damping * cable.damping_time])
 
 
-def cable_params(config: DatasetConfig, parameters: Float[Any, "3"]) -> Physics:
-    """The simulator's parameters of one trajectory: its row of the store's `parameters`, and the effects of all.
+def cable_params(config: DatasetConfig, parameters: Float[Any, "3"], index: int = 0) -> Physics:
+    """The simulator's parameters of trajectory `index`: its row of the store's `parameters`, and its effects.
 
     NumPy in, NumPy out; JAX in, JAX out.
     """
@@ -95,7 +98,7 @@ def cable_params(config: DatasetConfig, parameters: Float[Any, "3"]) -> Physics:
     drawn = dataclasses.replace(
         nominal, stiffness=nominal.stiffness * stiffness, friction=friction, damping_time=damping
     )
-    return with_effects(drawn, config.effects, config.discretisation)
+    return with_effects(drawn, config.effects_of(index), config.discretisation)
 
 
 def generate(
@@ -245,7 +248,7 @@ def find_fault(config: DatasetConfig, one: Block) -> str | None:
     keypoints, grippers = one.keypoints, one.gripper_pose[..., :2]
     if not (np.isfinite(keypoints).all() and np.isfinite(one.gripper_pose).all()):
         return "the simulation diverged (not finite)"
-    hooks = {effect.effect.hook for effect in config.effects}
+    hooks = {effect.effect.hook for effects in (config.effects, *config.posterior) for effect in effects}
     if "observation" in hooks:
         return None
     gap = np.linalg.norm(keypoints[:, [0, -1]] - grippers, axis=-1).max()
@@ -270,6 +273,7 @@ def make_engine(config: DatasetConfig) -> Engine:
 
 def _rollout(config: DatasetConfig, engine: Engine, draws: Sequence[Draw]) -> Trajectory:
     state = engine.initial_state(jnp.stack([item.gripper_pose for item in draws]))
-    params = jax.tree.map(lambda *leaves: np.stack(leaves), *[cable_params(config, item.parameters) for item in draws])
+    cables = [cable_params(config, item.parameters, item.index) for item in draws]
+    params = jax.tree.map(lambda *leaves: np.stack(leaves), *cables)
     twist = jnp.stack([item.gripper_twist for item in draws])
     return engine.rollout(params, state, twist, config.interval)[1]

@@ -7,6 +7,7 @@ import hashlib
 import json
 import types
 import typing
+from collections import Counter
 from collections.abc import Mapping
 from typing import Any, Literal
 
@@ -69,6 +70,8 @@ class DatasetConfig:
             "threaded", C MuJoCo in threads on the CPU.
         shard_size: trajectories per shard: the unit that one process writes and that a kill can cost.
         effects: added to every cable after its parameters are drawn, in this order.
+        posterior: sets of effects, equally probable; after `effects`, trajectory i gets the one of number i modulo
+            their number. See `cablejax.effects.given.posterior_of_verdict`.
     """
 
     n_trajectories: int = 2000
@@ -81,6 +84,7 @@ class DatasetConfig:
     engine: Literal["chain", "mjx", "threaded"] = "chain"
     shard_size: int = 32
     effects: tuple[GivenEffect, ...] = ()
+    posterior: tuple[tuple[GivenEffect, ...], ...] = ()
 
     def __post_init__(self):
         check(self, "shard_size", "interval", "seed", n_trajectories="trajectories", n_steps="commands")
@@ -95,15 +99,26 @@ class DatasetConfig:
                 f"DatasetConfig.discretisation has n_links {self.discretisation.n_links}, expected at least "
                 f"{FEWEST_LINKS}: with fewer the grippers' poses leave it no freedom."
             )
-        check_effects(self.effects, self.engine)
+        check_effects([effect for effects in (self.effects, *self.posterior) for effect in effects], self.engine)
         ENGINES[self.engine](self.discretisation).substeps(self.interval)  # pyright: ignore[reportCallIssue]
-        if self.effects:
-            with_effects(nominal_physics(self.discretisation), self.effects, self.discretisation)
+        for index in range(len(self.posterior) or bool(self.effects)):
+            with_effects(nominal_physics(self.discretisation), self.effects_of(index), self.discretisation)
 
     @property
     def cable(self) -> Cable:
         """The simulated cable."""
         return self.discretisation.cable
+
+    def effects_of(self, index: int) -> tuple[GivenEffect, ...]:
+        """The effects of trajectory `index`."""
+        return self.effects + (self.posterior[index % len(self.posterior)] if self.posterior else ())
+
+    @property
+    def effects_shown(self) -> tuple[str, ...]:
+        """The effects for readers: those of all trajectories, and how often each stands in the posterior."""
+        drawn = Counter(name for one in self.posterior for name in {effect.name for effect in one})
+        often = (f"{name} (in {count} of {len(self.posterior)} draws)" for name, count in drawn.most_common())
+        return (*map(str, self.effects), *often)
 
     @property
     def n_shards(self) -> int:

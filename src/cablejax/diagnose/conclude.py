@@ -15,11 +15,12 @@ from cablejax.diagnose.belief import (
     effect_names,
     excess,
     explains_most_motions,
+    in_doubt,
     level,
     probabilities,
 )
 from cablejax.diagnose.conformal import leftover_p, leftover_score
-from cablejax.diagnose.diagnosis import PLACES, NamedEffect, ParameterEstimate, Ranked, Verdict
+from cablejax.diagnose.diagnosis import PLACES, EffectValues, NamedEffect, ParameterEstimate, Ranked, Verdict
 from cablejax.diagnose.evidence import Evidence
 from cablejax.diagnose.fit import Fit
 from cablejax.diagnose.gap import shrinkage
@@ -31,6 +32,8 @@ from cablejax.diagnose.search import Search
 _DRAWS = 400
 # These are not simulated, and Student's tails need more of them.
 _JACKKNIFE_DRAWS = 4000
+# Of the posterior that a verdict holds.
+_POSTERIOR = 16
 
 
 @dataclasses.dataclass(frozen=True)
@@ -45,6 +48,7 @@ class Conclusion:
         ranking: of single effects.
         explained: share of the squared gap that the best explanation takes away, on the episodes of the fit.
         leftover_p: of the test whether it leaves more than a right one does, see `conformal`; None without a gap.
+        posterior: see `Diagnosis`.
     """
 
     verdict: Verdict
@@ -54,6 +58,7 @@ class Conclusion:
     ranking: tuple[Ranked, ...]
     explained: float
     leftover_p: float | None = None
+    posterior: tuple[tuple[EffectValues, ...], ...] = ()
 
 
 def conclude(found: Search, evidence: Evidence, calibration: Calibration) -> Conclusion:
@@ -102,7 +107,8 @@ def conclude(found: Search, evidence: Evidence, calibration: Calibration) -> Con
         return Conclusion("unknown", best, (), (), ranking, explained, as_much)
     order = np.argsort([-e.probability for e in effects])
     named = tuple(effects[i] for i in order)
-    return Conclusion(verdict, best, named, tuple(equivalent), ranking, explained, as_much)
+    posterior = _posterior(found, evidence, calibration, draws)
+    return Conclusion(verdict, best, named, tuple(equivalent), ranking, explained, as_much, posterior)
 
 
 def _telling(best: Fit, null: Fit, explained: float, complete: bool, evidence, calibration: Calibration) -> bool:
@@ -129,6 +135,34 @@ def _draws(evidence: Evidence, fit: Fit, calibration: Calibration) -> Float[np.n
     normal = random.multivariate_normal(np.zeros(len(covariance)), covariance, _JACKKNIFE_DRAWS, method="cholesky")
     drawn = fit.explanation.z + normal * np.sqrt((parts - 1) / random.chisquare(parts - 1, (_JACKKNIFE_DRAWS, 1)))
     return np.clip(drawn, *fit.explanation.bounds.T)
+
+
+def _posterior(
+    found: Search, evidence: Evidence, calibration: Calibration, best: Float[np.ndarray, "D P"]
+) -> tuple[tuple[EffectValues, ...], ...]:
+    """Explanations that the verdict leaves open with their values, each as often as it is probable.
+
+    Args:
+        found: by the search.
+        evidence: that was fitted.
+        calibration: of the judgement.
+        best: draws of the best fit's coordinates, in no order.
+    """
+    fits, chances = in_doubt(found.fits, found.scores, evidence, calibration)
+    taken = np.searchsorted(np.cumsum(chances), (np.arange(_POSTERIOR) + 0.5) / _POSTERIOR)
+    posterior = []
+    for k in np.unique(np.minimum(taken, len(fits) - 1)):
+        draws = best if fits[k] is found.fits[0] else _draws(evidence, fits[k], calibration)
+        for z in draws[: int(np.sum(taken == k))]:
+            terms = fits[k].explanation.by_term(z)
+            reports = [(term, evidence.simulator.report(term, term.values(value))) for term, value in terms]
+            posterior.append(
+                tuple(
+                    EffectValues(term.effect.name, {key: value for key, (value, _) in report.parameters.items()})
+                    for term, report in reports
+                )
+            )
+    return tuple(posterior)
 
 
 def baselines(found: Search, evidence: Evidence) -> dict[str, str]:

@@ -58,6 +58,19 @@ class NamedEffect:
 
 
 @dataclasses.dataclass(frozen=True)
+class EffectValues:
+    """One effect of a draw from the posterior.
+
+    Attributes:
+        name: as in `NamedEffect`.
+        parameters: values by the names and in the units of `NamedEffect.parameters`.
+    """
+
+    name: str
+    parameters: dict[str, float]
+
+
+@dataclasses.dataclass(frozen=True)
 class Ranked:
     """One effect that was tried: alone, or in a forward search on top of those kept before it.
 
@@ -189,6 +202,8 @@ class Diagnosis:
         caveats: what the log did not allow, in words.
         seconds: run time.
         settings: versions and options, for the record.
+        posterior: sets of effects, equally probable: draws of which explanation holds and of its parameters; empty
+            where nothing is named.
     """
 
     verdict: Verdict
@@ -204,6 +219,7 @@ class Diagnosis:
     caveats: tuple[str, ...]
     seconds: float
     settings: dict[str, Any]
+    posterior: tuple[tuple[EffectValues, ...], ...] = ()
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

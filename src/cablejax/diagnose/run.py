@@ -118,6 +118,7 @@ class Examined:
             "equivalent": conclusion.equivalent,
             "ranking": conclusion.ranking,
             "leftover_p": conclusion.leftover_p,
+            "posterior": conclusion.posterior,
             "gap": self.gap,
             "baselines": baselines(self.found, self.evidence),
         }

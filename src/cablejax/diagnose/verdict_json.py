@@ -12,7 +12,16 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from cablejax.diagnose.diagnosis import PLACES, Diagnosis, Gap, NamedEffect, NextMotion, ParameterEstimate, Ranked
+from cablejax.diagnose.diagnosis import (
+    PLACES,
+    Diagnosis,
+    EffectValues,
+    Gap,
+    NamedEffect,
+    NextMotion,
+    ParameterEstimate,
+    Ranked,
+)
 from cablejax.effects.given import VERDICT_SCHEMA, read_verdict_json
 from cablejax.limits import LIMITS, shown
 from cablejax.whole_file import whole_file
@@ -28,12 +37,12 @@ def verdict_json(diagnosis: Diagnosis) -> dict[str, Any]:
     explanation all the same. `ci90` is null for a choice, such as a gripper, and a list where the value is one. All
     `_mm` are null where observations are not in metres; `gap` has the sizes in their own unit too.
 
-    In addition to the fields of the format it has `sentence`, `baselines`, `leftover_p`, `caveats`, `seconds` and
-    `next_motion_worth`: fields of `NextMotion`, those in nats with `_nats`, and whether no motion that was tried
-    separates the explanations; of several recordings `rounds`, the fields of `Round`, and `rounds_contradict`.
-    `next_motion` is recommended only where that is false. `gap`
-    has also `unit`, `before_rmse`, `noise_floor`, `after_rmse`, `horizons`, `split`, `ahead_mm` and `best_shrinkage`,
-    `ranking` also `leftover_mm`, and `where` also `sentences`, `per_horizon_mm` and `frames`.
+    In addition to the fields of the format it has `sentence`, `baselines`, `leftover_p`, `caveats`, `seconds`,
+    `posterior` (fields of `EffectValues`) and `next_motion_worth`: fields of `NextMotion`, those in nats with `_nats`,
+    and whether no motion that was tried separates the explanations; of several recordings `rounds`, the fields of
+    `Round`, and `rounds_contradict`. `next_motion` is recommended only where that is false. `gap` has also `unit`,
+    `before_rmse`, `noise_floor`, `after_rmse`, `horizons`, `split`, `ahead_mm` and `best_shrinkage`, `ranking` also
+    `leftover_mm`, and `where` also `sentences`, `per_horizon_mm` and `frames`.
     """
     gap, rounds = diagnosis.gap, getattr(diagnosis, "rounds", None)
     return _plain(
@@ -43,6 +52,7 @@ def verdict_json(diagnosis: Diagnosis) -> dict[str, Any]:
             "sentence": diagnosis.sentence,
             "effects": [_effect(effect) for effect in diagnosis.effects],
             "equivalent": diagnosis.equivalent,
+            "posterior": [[dataclasses.asdict(one) for one in draw] for draw in diagnosis.posterior],
             "baselines": diagnosis.baselines,
             "ranking": [_ranked(ranked, gap.unit) for ranked in diagnosis.ranking],
             "leftover_p": diagnosis.leftover_p,
@@ -111,6 +121,10 @@ def read_verdict(path: str | os.PathLike[str]) -> Diagnosis:
             caveats=tuple(map(str, verdict["caveats"])),
             seconds=float(verdict["seconds"]),
             settings={},
+            posterior=tuple(
+                tuple(EffectValues(str(one["name"]), dict(one["parameters"])) for one in draw)
+                for draw in verdict.get("posterior", ())
+            ),
         )
     except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
         reason = f"{type(error).__name__}: {error}"

@@ -153,6 +153,25 @@ def effects_of_verdict(path: str | os.PathLike[str]) -> tuple[GivenEffect, ...]:
     return tuple(piece for effect in named for piece in _pieces(effect, path))
 
 
+def posterior_of_verdict(path: str | os.PathLike[str]) -> tuple[tuple[GivenEffect, ...], ...]:
+    """Sets of effects, equally probable: which explanation holds, and its parameters, as uncertain as a verdict is.
+
+    Of a verdict of an older version, which holds no such draws, the effects that it names.
+
+    Raises:
+        ValueError: as `effects_of_verdict`.
+    """
+    named = effects_of_verdict(path)
+    posterior = read_verdict_json(path).get("posterior") or []
+    try:
+        drawn = tuple(
+            tuple(GivenEffect(one["name"], tuple(one["parameters"].items())) for one in draw) for draw in posterior
+        )
+    except (KeyError, TypeError, AttributeError) as error:
+        raise ValueError(f"{path}: posterior is not of the verdict's format ({error}).") from error
+    return drawn or (named,)
+
+
 def read_verdict_json(path: str | os.PathLike[str]) -> dict[str, Any]:
     """A verdict's JSON object, of the schema that this version writes; its fields are not looked at.
 

@@ -11,11 +11,18 @@ from cablejax.recordings.frames import Frame, into_frame, require_hanging, requi
 from cablejax.recordings.gaps import cut_at_gaps
 from cablejax.recordings.marker_order import restore_order
 from cablejax.recordings.poses import poses_from_markers
-from cablejax.recordings.take import Take, typical_spacing
+from cablejax.recordings.take import Take, spacing, typical_spacing
 from cablejax.recordings.units import METRES, metres_per, recognised_unit, require_metres
 
 _OUTLIER = 1.5
 """Distance of a keypoint from the median of its sample, in lengths of the cable, from which on it cannot be on it."""
+
+_TAUT = 1.3, 0.01
+"""A cable does not stretch: neighbouring keypoints farther apart than usual by this factor, and by more than this part
+of the cable's length, are not both on it."""
+
+_JERK = 50.0, 10.0
+"""Acceleration of a gripper [m/s^2] that is worth a word, and how many times its median in the take: noise has some."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -48,7 +55,8 @@ class Setup:
 def prepare(takes: tuple[Take, ...], setup: Setup) -> tuple[tuple[Take, ...], list[str]]:
     """Checks and repairs takes of one cable, and gives each the poses of both grippers.
 
-    In this order: the unit of length; the frame; the order of the markers; gaps in time; orientations against markers.
+    In this order: the unit of length; the frame; the order of the markers; jumps of single markers; gaps in time;
+    orientations against markers; jerks of the grippers, which are kept.
 
     Returns:
         The takes in metres, z up, right-handed, without gaps, each with gripper poses; and a sentence on each repair.
@@ -80,6 +88,7 @@ def prepare(takes: tuple[Take, ...], setup: Setup) -> tuple[tuple[Take, ...], li
     takes, outliers = _without_outliers(takes)
     takes = tuple(into_frame(take, setup.frame) for take in takes)
     takes, exchanged = restore_order(takes)
+    takes, jumps = _without_jumps(takes)
     if setup.hangs and takes[0].keypoints.shape[2] == 3:
         require_hanging(takes, setup.frame)
     last = takes[0].keypoints.shape[1] - 1
@@ -89,7 +98,7 @@ def prepare(takes: tuple[Take, ...], setup: Setup) -> tuple[tuple[Take, ...], li
         require_rigid(takes, pairs)
     if not measured:
         takes = tuple(_with_poses(take, pairs) for take in takes)
-    return takes, [*repairs, *outliers, *exchanged, *cut]
+    return takes, [*repairs, *outliers, *exchanged, *jumps, *cut, *_jerks(takes)]
 
 
 def _frozen(keypoints: np.ndarray) -> bool:
@@ -113,6 +122,49 @@ def _without_outliers(takes: tuple[Take, ...]) -> tuple[tuple[Take, ...], list[s
         f"{count} keypoint{'s' if count > 1 else ''} lay up to {farthest:.3g} m from the rest of the cable, which is "
         f"{length:.3g} m long: taken as not observed."
     ]
+
+
+def _without_jumps(takes: tuple[Take, ...]) -> tuple[tuple[Take, ...], list[str]]:
+    """Marks keypoints as not observed that are too far from both neighbours, where these are not from each other."""
+    usual = typical_spacing(takes)
+    factor, part = _TAUT
+    kept, reports = [], []
+
+    def apart(distance: np.ndarray, usual: np.ndarray, length: float) -> np.ndarray:
+        return np.nan_to_num(distance) > np.maximum(factor * usual, usual + part * length)
+
+    for take in takes:
+        far = apart(spacing(take.keypoints), usual, usual.sum())
+        across = np.linalg.norm(take.keypoints[:, 2:] - take.keypoints[:, :-2], axis=-1)
+        off = np.zeros(take.keypoints.shape[:2], bool)
+        off[:, 1:-1] = far[:, :-1] & far[:, 1:] & ~apart(across, usual[:-1] + usual[1:], usual.sum())
+        kept.append(dataclasses.replace(take, keypoints=np.where(off[..., None], np.nan, take.keypoints)))
+        for index in np.flatnonzero(off.any(axis=0)):
+            samples = np.flatnonzero(off[:, index])
+            reports.append(
+                f"Take {take.name}: keypoint {index} is farther from both neighbours than the cable reaches in "
+                f"{len(samples)} of {len(off)} samples, from sample {samples[0]}: taken as not observed."
+            )
+    return tuple(kept), reports
+
+
+def _jerks(takes: tuple[Take, ...]) -> list[str]:
+    """A sentence on each gripper that is jerked in a take."""
+    reports = []
+    for take in takes:
+        assert take.gripper_pose is not None
+        place = take.gripper_pose[..., : take.keypoints.shape[2]]
+        step = np.diff(take.time)[:, None, None]
+        change = np.linalg.norm(np.diff(np.diff(place, axis=0) / step, axis=0), axis=-1) / step[1:, :, 0]
+        least, ratio = _JERK
+        for gripper, most in enumerate(change.max(axis=0, initial=0.0)):
+            if most > max(least, ratio * np.median(change[:, gripper])):
+                when = take.time[int(np.argmax(change[:, gripper])) + 1]
+                reports.append(
+                    f"Take {take.name}: gripper {gripper} is accelerated by {most:.0f} m/s^2 at {when:.3g} s. Such a "
+                    "jerk is kept; if it was no motion of the arm, leave that part out."
+                )
+    return reports
 
 
 def _in_metres(takes: tuple[Take, ...], setup: Setup) -> tuple[tuple[Take, ...], list[str]]:

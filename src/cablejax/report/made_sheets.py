@@ -41,7 +41,7 @@ def store_sheet(store: Store, name: str) -> Sheet:
     block = _first_shard(store)
     seconds = config.n_steps * config.interval
     missing = "complete" if info.complete else f"{config.n_trajectories - info.n_complete} are missing"
-    effects = ", ".join(map(str, config.effects)) or "none"
+    effects = ", ".join(config.effects_shown) or "none"
     return Sheet(
         kind="data set",
         title=f"{info.n_complete} simulated motions of a cable of {config.cable.length:g} m, {seconds:g} s each",

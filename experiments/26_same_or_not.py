@@ -1,0 +1,113 @@
+"""Recordings of one set-up, and of two: how often the diagnosis says that they contradict one another.
+
+    python experiments/26_same_or_not.py --logs FOLDER --rows ROWS.jsonl    # a minute a pair; resumable
+    python experiments/26_same_or_not.py --rows ROWS.jsonl --report docs/results/same_or_not.md
+
+Every log is dealt out to two recordings, its odd and its even episodes. Two of one log agree, and a contradiction is a
+false alarm. The first of one log with the second of the next one, in the order of their names, are recordings of two
+set-ups that differ by their effects; where both have none, or the same one, there is nothing to find.
+"""
+
+from __future__ import annotations
+
+import argparse
+import functools
+import json
+import os
+import pathlib
+from collections.abc import Sequence
+from typing import Any
+
+os.environ.setdefault("NPROC", "4")
+
+import numpy as np
+
+from cablejax.diagnose import diagnose
+from cablejax.diagnose.rounds import UNLIKELY
+from cablejax.gaplog import episodes_of, read_gap_log, stack_episodes
+from cablejax.gaplog_join import joined
+from cablejax.types import GapLog
+from executors import add_option, executor_of
+from pages import markdown_table, page_of_results, publish
+from rows import Rows
+
+
+def half(log: GapLog, first: int) -> GapLog:
+    """Every other episode of a log, from number `first` on."""
+    meta = {**log.meta, "motion": log.meta["motion"][first::2]}
+    return stack_episodes(episodes_of(log)[first::2], meta, holds=log.hold is not None)
+
+
+def examine(folder: pathlib.Path, first: str, second: str) -> dict[str, Any]:
+    """The row of a pair of recordings."""
+    one, other = (half(read_gap_log(folder / f"{name}.npz"), k) for k, name in enumerate((first, second)))
+    found = diagnose(joined([one, other], names=("one", "other")))
+    rounds = found.rounds
+    return {
+        "verdict": found.verdict,
+        "effects": [effect.name for effect in found.effects],
+        "chance": None if rounds is None else rounds.contradiction,
+        "seconds": found.seconds,
+    }
+
+
+def truth_of(folder: pathlib.Path) -> dict[str, str]:
+    """The effects of labelled logs by name, as text."""
+    labels = json.loads((folder / "labels.json").read_text(encoding="utf-8"))
+    return {
+        name: json.dumps([(effect["name"], effect["parameters"]) for effect in label["effects"]], sort_keys=True)
+        for name, label in labels.items()
+    }
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--logs", type=pathlib.Path, help="folder of gap logs with labels.json")
+    parser.add_argument("--rows", type=pathlib.Path, required=True)
+    parser.add_argument("--report", type=pathlib.Path, help="run nothing; write the page on what is done to this file")
+    add_option(parser)
+    options = parser.parse_args()
+    rows = Rows(options.rows, ("first", "second"))
+    if options.report is not None:
+        publish(page(rows.read()), options.report)
+        return
+    if options.logs is None:
+        parser.error("--logs is missing: the folder of gap logs.")
+    truth = truth_of(options.logs)
+    names = sorted(name for name in truth if (options.logs / f"{name}.npz").exists())
+    pairs = [(name, name) for name in names]
+    pairs += [
+        (one, other) for one, other in zip(names, names[1:] + names[:1], strict=True) if truth[one] != truth[other]
+    ]
+    make = functools.partial(examine, options.logs.absolute())
+    with executor_of(options.executor) as executor:
+        rows.run(rows.missing(pairs), make, executor=executor)
+
+
+def page(rows: Sequence[dict[str, Any]]) -> str:
+    """The page of all rows."""
+    table = [("recordings", "pairs", "contradict one another", "no effect to compare", "median seconds")]
+    for title, same in (("of one set-up", True), ("of two set-ups", False)):
+        of = [row for row in rows if (row["first"] == row["second"]) == same]
+        judged = [row for row in of if row["chance"] is not None]
+        found = sum(row["chance"] < UNLIKELY for row in judged)
+        seconds = f"{np.median([row['seconds'] for row in of]):.0f}" if of else ""
+        table.append((title, f"{len(of)}", f"{found} of {len(judged)}", f"{len(of) - len(judged)}", seconds))
+    missed = [row for row in rows if row["first"] != row["second"] and (row["chance"] or 0.0) >= UNLIKELY]
+    lines = [
+        "Every labelled log of another program is dealt out to two recordings, its odd and its even episodes, which "
+        "agree. The first of each is joined with the second of the next log too, which is of another set-up. A chance "
+        f"below {UNLIKELY:g} that recordings of one set-up differ as much is a contradiction.",
+        "",
+        *markdown_table(table),
+        "",
+        "Recordings of two set-ups that were taken for one, by what the diagnosis says of them together: "
+        + ("; ".join(f"{row['verdict']} {' + '.join(row['effects'])}".strip() for row in missed) or "none")
+        + ".",
+    ]
+    made_by = "`python experiments/26_same_or_not.py --rows ROWS.jsonl --report docs/results/same_or_not.md`"
+    return page_of_results("Do recordings agree?", made_by, lines)
+
+
+if __name__ == "__main__":
+    main()
