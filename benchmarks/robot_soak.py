@@ -1,7 +1,6 @@
 """An hour of a robot at 10 Hz over a bad connection: the contact plant in one process, the controller in another.
 
-nice -n 10 python benchmarks/robot_soak.py --drive --out docs/results/robot_drive.md
-nice -n 10 python benchmarks/robot_soak.py --steps 3000 --out docs/results/robot_mpc.md
+python benchmarks/robot_soak.py --out docs/results/robot_soak.md
 """
 
 from __future__ import annotations
@@ -91,21 +90,6 @@ class Tour:
         twist = np.asarray(twist)
         self.cpu_ms.append(1e3 * (time.process_time() - began))
         return (count + 1, inner), twist, info
-
-
-@dataclasses.dataclass(frozen=True)
-class Drive:
-    """Both grippers straight to a target's poses: no model, so that a call is the link's own and the socket's."""
-
-    pose: np.ndarray
-
-    def init(self, history):
-        return ()
-
-    def step(self, state, measurement):
-        way = self.pose - measurement.gripper_pose
-        size = np.linalg.norm(way * [1.0, 1.0, 0.15], axis=1).max()
-        return state, way * min(1.0, 0.05 / max(size, 1e-9)), None
 
 
 class Robot:
@@ -370,7 +354,6 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--weights", default="gns-reference")
     parser.add_argument("--solver", default="two-trials")
-    parser.add_argument("--drive", action="store_true", help="no model: grippers that drive straight on")
     parser.add_argument(
         "--out", type=pathlib.Path, default=None, help="the page; without it, figures go to stdout alone"
     )
@@ -381,14 +364,8 @@ def main() -> None:
     keep_compiled_programs()
     model = load_model(options.weights)
     targets = [make_target(shape, model.cable) for shape in get_args(Shape)]
-    if options.drive:
-        controllers, what = (
-            [Drive(target.gripper_pose) for target in targets],
-            "grippers that drive from shape to shape",
-        )
-    else:
-        controllers = [make_controller(model, target, method="residual", solver=options.solver) for target in targets]
-        what = f"{options.weights} with the residual and the solver {options.solver} commands each second"
+    controllers = [make_controller(model, target, method="residual", solver=options.solver) for target in targets]
+    what = f"{options.weights} with the residual and the solver {options.solver} commands each second"
     soak = Soak(steps=options.steps, real_time=options.real_time, seed=options.seed)
     with tempfile.TemporaryDirectory() as folder:
         record = soak_once(soak, Tour(tuple(controllers)), model.cable, pathlib.Path(folder) / "soak.npz")

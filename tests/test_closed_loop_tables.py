@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from closed_loop.failures import Snapshot, append_snapshot, failure_figure, read_snapshots, worst
-from closed_loop.interval_tables import interval_table, paired_table, success_table
+from closed_loop.interval_tables import interval_table, learning_table, paired_table, success_table
 from closed_loop.tables import comparison_table, settling_table, stiffness_table
 from closed_loop_cases import course, small_table, trial
 from report_cases import arc
@@ -77,6 +77,23 @@ def test_pairs_show_the_difference_of_every_trial():
     assert rows[0][2:] == ["6", "0", "0", "-0.100", "-0.100 to -0.100", "6 / 0"]
     with pytest.raises(ValueError, match="no trial of 'fine-tuned'"):
         paired_table(small_table(), "III", "fine-tuned")
+
+
+def test_learning_is_compared_with_the_same_model_without_it():
+    runs = [
+        trial(method=method, stiffness=ratio, scenario=letter, seed=seed, errors_cm=(20.0,) + 12 * (error,))
+        for method, errors in (("direct", (1.0, 1.0)), ("residual", (0.5, 1.2)))
+        for ratio, error in zip((0.5, 2.0), errors, strict=True)
+        for letter in "US"
+        for seed in range(3)
+    ]
+    bases = {"residual": "direct", "learner": "direct"}
+    title, _, row = cells(learning_table(runs, "III", bases))
+    assert title[2:] == ["at 0.5", "at 2", "U", "S", "cells where its mean is worse"]
+    assert row == [
+        "GNS + online residual", "direct transfer", "6 / 0", "0 / 6", "3 / 3, p = 0.66", "3 / 3, p = 0.66",
+        "2 of 4: U at 2 +20 %, S at 2 +20 %",
+    ]  # fmt: skip
 
 
 def test_success_is_counted_at_the_end():

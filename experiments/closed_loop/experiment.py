@@ -19,10 +19,10 @@ from closed_loop import interval_tables, tables
 from closed_loop.failures import failure_figure, worst
 from closed_loop.fine_tuning import FineTuneConfig, fine_tune, record
 from closed_loop.harder import MARGIN_CM
-from closed_loop.methods import ADAPTED_LEARNER, LABEL, METHODS, model_named
+from closed_loop.methods import ADAPTED_LEARNER, LABEL, METHODS, WITHOUT_LEARNING, model_named
 from closed_loop.protocols import least_time
 from closed_loop.suite import Case, read_suite, run_suite
-from closed_loop.trials import LIANG_TABLE, Trial
+from closed_loop.trials import LATE, LIANG_TABLE, Trial
 from pages import page_of_results, publish
 
 WORST = 10
@@ -148,6 +148,14 @@ def page(experiment: Experiment, trials: Sequence[Trial], command: str, picture:
         lines += ["", "### How runs end", "", interval_tables.end_table(mine, table, labels=LABEL)]
         lines += ["", "### Intervals and failures", "", interval_tables.interval_table(mine, table, labels=LABEL)]
         methods = {trial.method for trial in mine}
+        if any({learning, base} <= methods for learning, base in WITHOUT_LEARNING.items()):
+            lines += [
+                "",
+                "### What learning online changes",
+                "",
+                f"Wins / losses in pairs, by means of the last {LATE} s.",
+            ]
+            lines += ["", interval_tables.learning_table(mine, table, WITHOUT_LEARNING, labels=LABEL)]
         if ADAPTED_LEARNER in methods and len(methods) > 1:
             lines += ["", "### In pairs", "", interval_tables.paired_table(mine, table, ADAPTED_LEARNER, labels=LABEL)]
     if picture is not None:

@@ -110,6 +110,53 @@ def paired_table(
     return markdown(title, rows)
 
 
+def learning_table(
+    trials: Iterable[Trial], table: str, bases: Mapping[str, str], *, labels: Mapping[str, str] = METHOD_LABEL
+) -> str:
+    """What learning online changes: each method against the same model without it, by stiffness, in the same trials.
+
+    Errors are means of the last `LATE` seconds. A cell is one letter and stiffness; p is of the one-sided sign test.
+
+    Args:
+        trials: of any tables.
+        table: whose rows count.
+        bases: the model without it, by method. Those that were not tried are left out.
+        labels: of methods.
+
+    Raises:
+        ValueError: there is no trial of this table.
+    """
+    mine = trials_of_table(trials, table)
+    late = {(t.method, t.scenario, t.stiffness, t.seed): float(t.late_errors_cm.mean()) for t in mine}
+    ratios, letters = sorted({t.stiffness for t in mine}), scenarios_of(mine)
+    rows = []
+    for method, base in bases.items():
+        pairs = [
+            (key, (value, late[base, *key[1:]]))
+            for key, value in late.items()
+            if key[0] == method and (base, *key[1:]) in late
+        ]
+        if not pairs:
+            continue
+        counts = []
+        for at, wanted in [(2, ratio) for ratio in ratios] + [(1, letter) for letter in letters]:
+            cell = [pair for key, pair in pairs if key[at] == wanted]
+            wins, losses = sum(ours < other for ours, other in cell), sum(ours > other for ours, other in cell)
+            p = binomtest(wins, wins + losses, alternative="greater").pvalue if wins + losses else 1.0
+            counts.append(f"{wins} / {losses}" + (f", p = {p:.2g}" if at == 1 else ""))
+        change = {}
+        for letter in letters:
+            for ratio in ratios:
+                cell = np.array([pair for key, pair in pairs if key[1:3] == (letter, ratio)])
+                if len(cell):
+                    change[f"{letter} at {ratio:g}"] = cell[:, 0].mean() / cell[:, 1].mean() - 1
+        worse = [f"{name} {100 * part:+.0f} %" for name, part in change.items() if part > 0]
+        told = f"{len(worse)} of {len(change)}" + (f": {', '.join(worse)}" if worse else "")
+        rows.append([label_of(method, labels), label_of(base, labels), *counts, told])
+    title = ["method", "against", *(f"at {ratio:g}" for ratio in ratios), *letters, "cells where its mean is worse"]
+    return markdown(title, rows)
+
+
 def reached_table(
     trials: Iterable[Trial], table: str, margin_cm: float, *, labels: Mapping[str, str] = METHOD_LABEL
 ) -> str:

@@ -35,6 +35,14 @@ LABEL = METHOD_LABEL | {
 }
 """Names for readers."""
 
+WITHOUT_LEARNING = {
+    RESIDUAL: DIRECT,
+    LEARNER: DIRECT,
+    PAPER_RESIDUAL: PAPER_DIRECT,
+    ADAPTED_LEARNER: ADAPTED,
+}
+"""The same model without what is learned online."""
+
 
 @dataclasses.dataclass(frozen=True)
 class MethodSpec:
