@@ -197,8 +197,9 @@ def test_each_trajectory_has_its_draw_of_a_posterior():
         (other,) = simulate(alone, make_engine(alone), [0])
         np.testing.assert_array_equal(block.keypoints[index], other.keypoints[index])
         assert np.abs(block.keypoints[1 - index] - other.keypoints[1 - index]).max() > 1e-3
-    with pytest.raises(ValueError, match="threaded cannot simulate camera_similarity"):
-        dataclasses.replace(config, engine="threaded")
+    stretched = (GivenEffect("axial_stretch", VALUES["axial_stretch"]),)
+    with pytest.raises(ValueError, match="threaded cannot simulate axial_stretch"):
+        dataclasses.replace(TINY, posterior=(*posterior, stretched))
 
 
 def test_effects_that_an_engine_cannot_simulate_are_refused():

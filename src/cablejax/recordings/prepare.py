@@ -23,6 +23,7 @@ of the cable's length, are not both on it."""
 
 _JERK = 50.0, 10.0
 """Acceleration of a gripper [m/s^2] that is worth a word, and how many times its median in the take: noise has some."""
+_TOLD = 5
 
 
 @dataclasses.dataclass(frozen=True)
@@ -149,8 +150,8 @@ def _without_jumps(takes: tuple[Take, ...]) -> tuple[tuple[Take, ...], list[str]
 
 
 def _jerks(takes: tuple[Take, ...]) -> list[str]:
-    """A sentence on each gripper that is jerked in a take."""
-    reports = []
+    """A sentence on the grippers' jerks, if there are any."""
+    found: list[tuple[float, str]] = []
     for take in takes:
         assert take.gripper_pose is not None
         place = take.gripper_pose[..., : take.keypoints.shape[2]]
@@ -160,11 +161,15 @@ def _jerks(takes: tuple[Take, ...]) -> list[str]:
         for gripper, most in enumerate(change.max(axis=0, initial=0.0)):
             if most > max(least, ratio * np.median(change[:, gripper])):
                 when = take.time[int(np.argmax(change[:, gripper])) + 1]
-                reports.append(
-                    f"Take {take.name}: gripper {gripper} is accelerated by {most:.0f} m/s^2 at {when:.3g} s. Such a "
-                    "jerk is kept; if it was no motion of the arm, leave that part out."
-                )
-    return reports
+                found.append((most, f"gripper {gripper} of take {take.name} by {most:.0f} m/s^2 at {when:.3g} s"))
+    if not found:
+        return []
+    strongest = [text for _, text in sorted(found, reverse=True)]
+    more = f", and {len(found) - _TOLD} more" if len(found) > _TOLD else ""
+    return [
+        f"Jerked were {', '.join(strongest[:_TOLD])}{more}. This was kept; if it was no motion of the arm, leave that "
+        "part out."
+    ]
 
 
 def _in_metres(takes: tuple[Take, ...], setup: Setup) -> tuple[tuple[Take, ...], list[str]]:
