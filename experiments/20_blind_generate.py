@@ -33,7 +33,7 @@ def main() -> None:
     parser.add_argument("--out", type=pathlib.Path, required=True, help="folder of the logs")
     parser.add_argument("--labels", type=pathlib.Path, required=True, help="file of the labels, not to be shown")
     parser.add_argument("--hashes", type=pathlib.Path, required=True, help="file of the set, which gets the hashes")
-    parser.add_argument("--family", default="ABC", help="letters of the families to make now")
+    parser.add_argument("--family", default="ABCD", help="letters of the families to make now")
     add_option(parser)
     parser.add_argument("--limit", type=int, help="stop after so many cases")
     parser.add_argument("--open-labels", action="store_true", help="also write labels.json beside the logs: not blind")

@@ -31,7 +31,7 @@ def main() -> None:
     parser.add_argument(
         "--replayed", type=pathlib.Path, help="only print how these verdicts differ from the stored ones"
     )
-    parser.add_argument("--family", default="ABC", help="letters of the families to score; the others are left out")
+    parser.add_argument("--family", default="ABCD", help="letters of the families to score; the others are left out")
     parser.add_argument(
         "--leftovers",
         action="store_true",

@@ -190,9 +190,9 @@ def test_a_case_is_the_same_again_and_its_label_is_locked(tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("family", ["B", "C"])
+@pytest.mark.parametrize("family", ["B", "C", "D"])
 def test_other_families_agree_without_effect_and_refuse_what_they_do_not_know(family, commands):
-    if family == "B":
+    if family in "BD":
         pytest.importorskip("elastica", reason="PyElastica is not installed: pip install pyelastica==1.0.0")
     from blind.families import FAMILIES as SIMULATORS
 

@@ -1,10 +1,15 @@
-"""Family B: a Cosserat rod of PyElastica on a table, with laws of its own for a part of the effects.
+"""Families B and D: a Cosserat rod of PyElastica on a table, with laws of its own for a part of the effects.
 
 PyElastica's compiled kernels give the internal forces of a rod that stretches, shears and bends; this file's compiled
 loop adds the table (Stribeck friction as an impulse that takes away speed, at most all of it), the grippers, an
 implicit bending damper and what is unmodelled. The two end elements are held and half as long as the others, so that
 the middles of the elements are evenly spread along the cable. A log of 6 episodes costs about seven seconds of one
 core.
+
+In family B the rod lies in the table's plane, and every point presses on it with its own weight. In family D the
+grippers hold the ends `RAISED` above where the cable lies: it sags, they carry a part of the weight, and it moves in
+space. The table stops whatever would go through it within a time step (an inelastic impulse), and friction takes away
+speed up to the coefficient times that impulse: Coulomb's law without any regularisation.
 """
 
 from __future__ import annotations
@@ -28,6 +33,8 @@ ELEMENTS = 26
 AXIAL_RATIO = 6e4
 """EA / EI [1/m^2]: at the usual loads of 10 to 20 EI / m^2 the cable stretches by less than 0.05 %."""
 SETTLE_TIME, SETTLE_RATE = 2.0, 15.0
+RAISED = 5e-4
+"""Height of the grippers in family D [m]. A cable of EI 0.02 N m^2 and 0.08 kg/m touches down 17 cm from them."""
 OBSTACLE_STIFFNESS, OBSTACLE_FRICTION = 1500.0, 0.15
 UNDERSTOOD = {
     "stiffness_patch", "curvature_patch", "static_excess", "stribeck_speed", "friction_patch", "drag", "tilt",
@@ -36,12 +43,23 @@ UNDERSTOOD = {
 
 (
     FRICTION, EXCESS, STRIBECK, PATCH_X, PATCH_Y, PATCH_R, PATCH_MU, DRAG, PULL_X, PULL_Y, LOAD,
-    OFFSET_0, OFFSET_1, OBSTACLE_X, OBSTACLE_Y, OBSTACLE_R, AXIAL_DASHPOT,
-) = range(17)  # fmt: skip
+    OFFSET_0, OFFSET_1, OBSTACLE_X, OBSTACLE_Y, OBSTACLE_R, AXIAL_DASHPOT, HEIGHT,
+) = range(18)  # fmt: skip
 
 
-def simulate(world: World, pose: np.ndarray, frame: float) -> Motion:
+def simulate_in_space(world: World, pose: np.ndarray, frame: float) -> Motion:
+    """One episode of family D; raises as `simulate`."""
+    return simulate(world, pose, frame, height=RAISED)
+
+
+def simulate(world: World, pose: np.ndarray, frame: float, *, height: float = 0.0) -> Motion:
     """One episode; see `rod.simulate`.
+
+    Args:
+        world: what is simulated.
+        pose: of the grippers at every frame.
+        frame: time between two [s].
+        height: of the grippers above where the cable lies [m]; 0 = all in the table's plane.
 
     Raises:
         ValueError: the world has something this family has no law for.
@@ -49,7 +67,7 @@ def simulate(world: World, pose: np.ndarray, frame: float) -> Motion:
     """
     unknown = world.unlike_nominal() - UNDERSTOOD
     if unknown:
-        raise ValueError(f"Family B has no law for {sorted(unknown)}.")
+        raise ValueError(f"PyElastica's families have no law for {sorted(unknown)}.")
     rod, h = _rod(world), world.length / (ELEMENTS - 1)
     wave = np.sqrt(AXIAL_RATIO * world.stiffness * 2.5 / world.linear_density)  # stiffest joint included
     substeps = int(np.ceil(frame / (0.7 * h / wave)))
@@ -63,7 +81,8 @@ def simulate(world: World, pose: np.ndarray, frame: float) -> Motion:
     if world.curvature_patch is not None:
         centre, width, curvature, edge = world.curvature_patch
         rod.rest_kappa[0] = curvature * bump(joints, centre, width, edge) * h / rod.rest_voronoi_lengths
-    p = np.zeros(17)
+    p = np.zeros(18)
+    p[HEIGHT] = height
     p[FRICTION], p[EXCESS], p[STRIBECK] = world.friction, world.static_excess, world.stribeck_speed
     if world.friction_patch is not None:
         p[PATCH_X : PATCH_MU + 1] = world.friction_patch
@@ -76,6 +95,7 @@ def simulate(world: World, pose: np.ndarray, frame: float) -> Motion:
     p[AXIAL_DASHPOT] = 0.1 * np.sqrt(AXIAL_RATIO * world.stiffness * world.linear_density)
     held = pose + np.stack([np.zeros(2), np.zeros(2), np.array(world.grasp_offset)], axis=1)
     _lay(rod, held[0], world.length)
+    rod.position_collection[2] = height
     damper = stiffness * world.damping_time / h
     out = np.empty((len(pose), ELEMENTS, 2))
     still = np.repeat(held[:1], 2, axis=0)
@@ -177,6 +197,7 @@ def _march(
             # Outer forces: downhill pull, a dashpot along the elements against axial waves, an obstacle.
             for i in range(n):
                 outer[0, i], outer[1, i] = mass[i] * p[PULL_X], mass[i] * p[PULL_Y]
+                outer[2, i] = -mass[i] * p[LOAD] if p[HEIGHT] > 0.0 else 0.0
             for e in range(elements):
                 tx, ty = tangents[0, e], tangents[1, e]
                 pull = p[AXIAL_DASHPOT] * ((v[0, e + 1] - v[0, e]) * tx + (v[1, e + 1] - v[1, e]) * ty)
@@ -206,30 +227,38 @@ def _march(
             _update_accelerations(a, force, outer, mass, alpha, inverse_inertia, torque, couple, dilatation)
             for i in range(2, n - 2):
                 vx, vy = keep * (v[0, i] + dt * a[0, i]), keep * (v[1, i] + dt * a[1, i])
+                vz, pressed = 0.0, dt * p[LOAD]
+                if p[HEIGHT] > 0.0:
+                    free = keep * (v[2, i] + dt * a[2, i])
+                    vz = max(free, -x[2, i] / dt)
+                    pressed = vz - free
                 if settling == 0.0:
                     speed = np.sqrt(vx * vx + vy * vy)
                     mu = p[FRICTION]
                     if p[PATCH_R] > 0.0:
                         far = np.sqrt((x[0, i] - p[PATCH_X]) ** 2 + (x[1, i] - p[PATCH_Y]) ** 2)
                         mu += (p[PATCH_MU] - mu) * 0.5 * (1.0 - np.tanh((far - p[PATCH_R]) / (p[PATCH_R] / 6)))
-                    loss = mu * p[LOAD] * dt * (1.0 + p[EXCESS] * np.exp(-((speed / p[STRIBECK]) ** 2)))
+                    loss = mu * pressed * (1.0 + p[EXCESS] * np.exp(-((speed / p[STRIBECK]) ** 2)))
                     left = 1.0 - loss / speed if speed > loss else 0.0
                     left /= 1.0 + dt * p[DRAG] / mass[i]
                     vx *= left
                     vy *= left
-                v[0, i], v[1, i], v[2, i] = vx, vy, 0.0
+                v[0, i], v[1, i], v[2, i] = vx, vy, vz
             for e in range(1, elements - 1):
                 omega[0, e] = keep * (omega[0, e] + dt * alpha[0, e])
-                omega[1, e], omega[2, e] = 0.0, 0.0
+                for k in range(1, 3):
+                    omega[k, e] = keep * (omega[k, e] + dt * alpha[k, e]) if p[HEIGHT] > 0.0 else 0.0
             # Dampers between neighbouring elements, implicitly; the ends are held.
             lower[0] = 0.0
             for e in range(1, elements - 1):
                 left_d, right_d = dt * damper[e - 1], dt * damper[e]
                 pivot = inertia[0, 0, e] + left_d + right_d - left_d * lower[e - 1]
                 lower[e] = right_d / pivot
-                omega[0, e] = (inertia[0, 0, e] * omega[0, e] + left_d * omega[0, e - 1]) / pivot
+                for k in range(3):
+                    omega[k, e] = (inertia[0, 0, e] * omega[k, e] + left_d * omega[k, e - 1]) / pivot
             for e in range(elements - 2, 0, -1):
-                omega[0, e] += lower[e] * omega[0, e + 1]
+                for k in range(3):
+                    omega[k, e] += lower[e] * omega[k, e + 1]
             overload_operator_kinematic_numba(0.5 * dt, x, q, v, omega)
         _grasp(x, v, q, omega, rest_lengths, pose[f + 1], rate)
         _middles(x, out[f + 1])

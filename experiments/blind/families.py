@@ -17,11 +17,18 @@ def _cosserat() -> Simulate:
     return simulate
 
 
+def _sagging() -> Simulate:
+    from .elastica_rod import simulate_in_space
+
+    return simulate_in_space
+
+
 def _contact() -> Simulate:
     from .composite import simulate
 
     return simulate
 
 
-FAMILIES: dict[str, Callable[[], Simulate]] = {"A": _rod, "B": _cosserat, "C": _contact}
-"""A: rod in node coordinates. B: PyElastica. C: MuJoCo with contact, only a cousin of the simulator that diagnoses."""
+FAMILIES: dict[str, Callable[[], Simulate]] = {"A": _rod, "B": _cosserat, "C": _contact, "D": _sagging}
+"""A: rod in node coordinates. B: PyElastica. C: MuJoCo with contact, only a cousin of the simulator that diagnoses.
+D: PyElastica in space, sagging, with friction that is not regularised."""

@@ -32,7 +32,7 @@ class Case:
     Attributes:
         index: in the plan; with the seed it determines everything.
         kind: "none", "single", "pair" or "unknown".
-        family: "A" (rod in node coordinates), "B" (PyElastica) or "C" (MuJoCo with contact, a cousin).
+        family: a letter of `families.FAMILIES`.
         effects: names.
         severity: wanted gap over noise; 0 without effect.
     """
@@ -112,12 +112,25 @@ def commissioning_plan(seed: int) -> list[Case]:
     return [Case(index, "none", family, (), 0) for index, family in enumerate("AABBCC")]
 
 
+def space_plan(seed: int) -> list[Case]:
+    """24 cases of family D, whose law of contact the diagnosis does not have: mostly friction and stiffness."""
+    rng = np.random.default_rng([seed, 4])
+    names = ["bending_stiffness", "table_friction"] * 4 + [
+        "linear_density", "viscous_drag", "bending_damping", "stiffness_profile", "intrinsic_curvature", "gravity_tilt",
+        "lumped_mass", "gripper_rotation_offset", "actuation_lag", "camera_similarity",
+    ]  # fmt: skip
+    rows: list[tuple[str, str, tuple[str, ...], int]] = [("none", "D", (), 0)] * 6
+    rows += [("single", "D", (name,), 8 if number % 3 == 2 else 4) for number, name in enumerate(names)]
+    return [Case(index, *rows[row]) for index, row in enumerate(rng.permutation(len(rows)))]
+
+
 PLANS = {
     "stored": stored_plan,
     "development": development_plan,
     "hard": hard_plan,
     "small": small_plan,
     "commissioning": commissioning_plan,
+    "space": space_plan,
 }
 
 

@@ -16,6 +16,7 @@ FAMILIES = {
     "A": "rod in node coordinates",
     "B": "PyElastica",
     "C": "MuJoCo with contact, a cousin of the diagnosing simulator",
+    "D": "PyElastica in space: the cable sags from the grippers, and friction is not regularised",
 }
 
 
