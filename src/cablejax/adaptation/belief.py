@@ -3,12 +3,12 @@
 A conditioned model predicts `f(X, R; c)` with `c = cable_descriptor(...)`. The error of one step corrects c: with
 H = df/dc at the estimate's mean,
 
-    Lambda' = phi Lambda + (1 - phi) Lambda_0                          c' = Lambda'^-1 phi Lambda c
+    Lambda' = phi Lambda + (1 - phi) Lambda_0    c' = Lambda'^-1 (phi Lambda c + (1 - phi) Lambda_0 c_0)
     Lambda <- Lambda' + w H'H / sigma^2                                c <- c' + Lambda^-1 w H' (dX - f') / sigma^2
 
-in information form, with phi = `memory` and the prior (0, Lambda_0): old evidence fades and the prior takes its place,
-so that a changed cable is followed (stabilised forgetting, Kulhavy and Zarrop 1993). In slow motion only the ratio of
-stiffness to friction is identifiable; in the other direction c stays at the prior's mean.
+in information form, with phi = `memory` and the prior (c_0, Lambda_0): old evidence fades and the prior takes its
+place, so that a changed cable is followed (stabilised forgetting, Kulhavy and Zarrop 1993). In slow motion only the
+ratio of stiffness to friction is identifiable; in the other direction c stays at the prior's mean.
 """
 
 from __future__ import annotations
@@ -26,7 +26,9 @@ class AdaptationConfig:
     """Settings of the filter; logarithms are natural.
 
     Attributes:
-        prior_std: standard deviation of the log ratios before anything was seen: a factor of e either way.
+        prior_mean: c_0, the log ratios of stiffness and friction before anything was seen: the nominal cable, or what
+            a diagnosis named.
+        prior_std: their standard deviation: a factor of e either way.
         error_std: standard deviation of a keypoint's coordinate that no cable explains [m]. Errors of neighbouring
             keypoints are alike, so this is above the error of one.
         memory: phi, the share of the information that one step leaves, in (0, 1].
@@ -36,6 +38,7 @@ class AdaptationConfig:
         limits: smallest and largest log ratio believed: what conditioned models are trained on.
     """
 
+    prior_mean: tuple[float, float] = (0.0, 0.0)
     prior_std: float = 1.0
     error_std: float = 3e-3
     memory: float = 0.95
@@ -52,6 +55,11 @@ class AdaptationConfig:
             raise ValueError(f"AdaptationConfig.memory is {self.memory}, expected a number in (0, 1].")
         if not self.limits[0] < 0 < self.limits[1]:
             raise ValueError(f"AdaptationConfig.limits are {self.limits}, expected one below and one above 0.")
+        if len(self.prior_mean) != 2 or not all(self.limits[0] <= mean <= self.limits[1] for mean in self.prior_mean):
+            raise ValueError(
+                f"AdaptationConfig.prior_mean is {self.prior_mean}, expected two log ratios from {self.limits[0]} to "
+                f"{self.limits[1]}: of stiffness and friction."
+            )
 
 
 @jax.tree_util.register_dataclass
@@ -74,8 +82,8 @@ class CableBelief:
 
 
 def prior_belief(config: AdaptationConfig) -> CableBelief:
-    """The reference cable, give or take."""
-    return CableBelief(mean=jnp.zeros(2), information=jnp.eye(2) / config.prior_std**2)
+    """What is believed before anything was seen."""
+    return CableBelief(mean=jnp.array(config.prior_mean), information=jnp.eye(2) / config.prior_std**2)
 
 
 def update(
@@ -101,11 +109,13 @@ def update(
     size = jnp.sum(innovation**2) / jnp.maximum(2 * jnp.sum(finite), 1)
     # Geman and McClure's: the pull of an error falls as its third power, so that no snap-through moves the belief
     weight = 1.0 / (1.0 + size / config.outlier**2) ** 2
-    faded = config.memory * belief.information + (1.0 - config.memory) * prior_belief(config).information
+    prior = prior_belief(config)
+    forgotten = (1.0 - config.memory) * prior.information
+    faded = config.memory * belief.information + forgotten
     information = faded + weight * rows.T @ rows
-    # what fades comes back as the prior, whose mean is zero: in a direction in which nothing is seen any more, the
-    # belief returns there instead of drifting
-    returning = jnp.linalg.solve(faded, config.memory * belief.information @ belief.mean) - belief.mean
+    # what fades comes back as the prior: in a direction in which nothing is seen any more, the belief returns there
+    # instead of drifting
+    returning = jnp.linalg.solve(faded, forgotten @ (prior.mean - belief.mean))
     step = returning + jnp.linalg.solve(information, weight * rows.T @ (innovation - rows @ returning))
     step = jnp.clip(step, -config.max_step, config.max_step)
     return CableBelief(mean=jnp.clip(belief.mean + step, *config.limits), information=information)

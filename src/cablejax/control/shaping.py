@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Literal, get_args
 
 import jax.numpy as jnp
@@ -12,20 +12,23 @@ from flax import nnx
 from jaxtyping import Array, Float
 
 from cablejax.adaptation.belief import AdaptationConfig
-from cablejax.cable import Cable
+from cablejax.cable import Cable, Discretisation
 from cablejax.control.loop import run_closed_loop
 from cablejax.control.run import ClosedLoopRun
 from cablejax.control.targets import Target, straight_start
 from cablejax.dynamics.bfloat16_slopes import with_bfloat16_slopes
 from cablejax.dynamics.config import ModelConfig
-from cablejax.dynamics.model import apply
+from cablejax.dynamics.model import apply, structure_of
 from cablejax.dynamics.weights import cable_of_weights, load_info, load_weights
+from cablejax.effects.given import GivenEffect, with_effects
+from cablejax.effects.physics import nominal_physics
 from cablejax.limits import shown
 from cablejax.mpc import MPC, SOLVERS, MPCConfig
 from cablejax.perceive.camera import CameraConfig
 from cablejax.perceive.plant import CloudPlant
 from cablejax.residual import Dynamics
 from cablejax.residual.jacobian import StepJacobian, reverse
+from cablejax.simulate.chain.statics import Statics, statics_with
 from cablejax.simulate.elastica import elastica
 from cablejax.simulate.plant import Plant, PlantConfig
 from cablejax.solver_names import SolverName
@@ -52,6 +55,9 @@ class Model:
         weights: its arrays.
         cable: nominal cable of the data that it was trained on.
         effects: effects in those data, as `parse_effect` reads them.
+        known: effects that the model was told of afterwards, see `knowing`.
+        believed: what these make of a conditioned model's inputs before anything was seen: log ratios of stiffness and
+            friction.
     """
 
     name: str
@@ -60,6 +66,8 @@ class Model:
     weights: nnx.State
     cable: Cable
     effects: tuple[str, ...] = ()
+    known: tuple[str, ...] = ()
+    believed: tuple[float, float] = (0.0, 0.0)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -101,6 +109,47 @@ def load_model(name: str) -> Model:
     return Model(name, config, NetworkDynamics(graphdef), weights, cable_of_weights(name), tuple(effects))
 
 
+def knowing(model: Model, effects: Sequence[GivenEffect]) -> Model:
+    """The model of a cable with these effects, without another training.
+
+    Its static prior rests as a cable with them does (`stiffness_profile`, `intrinsic_curvature`,
+    `gripper_rotation_offset`); a conditioned model begins with the ratios of stiffness and friction that they make
+    (`bending_stiffness`, `table_friction`, `linear_density`). What else they do is left to the network and to what is
+    learned online.
+
+    Raises:
+        ValueError: nothing of the effects enters the model; names the ways that remain.
+    """
+    cable = model.cable
+    statics = statics_with(effects, cable)
+    if model.config.prior != "static":
+        statics = Statics()
+    config = Discretisation(cable)
+    physics, nominal = (with_effects(nominal_physics(config, np.float64), some, config) for some in (effects, ()))
+    ratios = (
+        float(np.mean(physics.stiffness) / np.mean(nominal.stiffness)),
+        float(physics.friction * physics.density / max(nominal.friction * nominal.density, 1e-9)),
+    )
+    limits = AdaptationConfig().limits
+    believed = (0.0, 0.0)
+    if model.config.conditioned:
+        believed = tuple(float(np.clip(np.log(max(ratio, 1e-3)), *limits)) for ratio in ratios)
+    if effects and statics == Statics() and believed == (0.0, 0.0):
+        raise ValueError(
+            f"Nothing of {', '.join(map(str, effects))} enters the model {model.name}: neither the rest of its cable, "
+            "nor stiffness and friction of a conditioned model, such as gns-conditioned. Simulate data with it "
+            "(`cablejax simulate --with`) and train on them (`cablejax train --start-from`)."
+        )
+    config = dataclasses.replace(model.config, statics=statics)
+    return dataclasses.replace(
+        model,
+        config=config,
+        dynamics=NetworkDynamics(structure_of(config)[0]),
+        known=tuple(map(str, effects)),
+        believed=believed,
+    )
+
+
 def make_controller(model: Model, target: Target, *, method: Method, solver: SolverName) -> MPC:
     """The controller for one target, with or without the online residual; a conditioned model adapts in any case.
 
@@ -108,7 +157,7 @@ def make_controller(model: Model, target: Target, *, method: Method, solver: Sol
     """
     config = MPCConfig.for_length(
         model.config.length,
-        adaptation=AdaptationConfig() if model.config.conditioned else None,
+        adaptation=AdaptationConfig(prior_mean=model.believed) if model.config.conditioned else None,
         solver=SOLVERS[solver],
     )
     if method == "direct":

@@ -127,6 +127,8 @@ def _draws(evidence: Evidence, fit: Fit, calibration: Calibration) -> Float[np.n
     the distribution is Student's with a degree of freedom fewer than parts; else they follow profiles of the posterior.
     """
     random = np.random.default_rng(0)
+    if not len(fit.explanation.z):
+        return np.zeros((_DRAWS, 0))
     if fit.refits is None:
         return scaled_draws(evidence, fit, calibration.widening, _DRAWS, random)
     z = np.stack([one.z for one in fit.refits.explanations])

@@ -6,6 +6,7 @@ import dataclasses
 from typing import Literal
 
 from cablejax.limits import check
+from cablejax.simulate.chain.statics import Statics
 
 
 @dataclasses.dataclass(frozen=True)
@@ -58,6 +59,7 @@ class ModelConfig:
         symmetric: whether the graph network's weights are tied so that mirrored or reversed cables move alike, see
             `cablejax.dynamics.symmetry`.
         normalisation: scales of features and output.
+        statics: what the static prior knows of the cable beyond its length.
     """
 
     network: Literal["gns", "mlp", "lstm"] = "gns"
@@ -75,6 +77,7 @@ class ModelConfig:
     frame: Literal["grippers", "world"] = "grippers"
     symmetric: bool = False
     normalisation: Normalisation = Normalisation()
+    statics: Statics = Statics()
 
     def __post_init__(self):
         check(

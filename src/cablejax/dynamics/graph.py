@@ -32,7 +32,7 @@ from jaxtyping import Array, Float
 
 from cablejax.dynamics.config import ModelConfig
 from cablejax.dynamics.interpolation import rigid_interpolation
-from cablejax.simulate.chain.statics import resting_shapes
+from cablejax.simulate.chain.statics import clamped, resting_shapes
 from cablejax.types import History
 
 
@@ -113,7 +113,7 @@ def build_graph(history: History, twist: Float[Array, "2 3"], prior: Prior, conf
         config: of the model that reads the graph.
     """
     topology, scale = topology_of(config), config.normalisation
-    pose = history.gripper_pose
+    pose = clamped(history.gripper_pose, config.statics)
     origin, axes = frame_of(pose, config)
     past = (history.keypoints - origin) @ axes.T
     now = past[-1]
@@ -180,8 +180,8 @@ def prior_of(history: History, twist: Float[Array, "2 3"], config: ModelConfig) 
             history.gripper_pose, twist, n_keypoints=config.n_keypoints, length=config.length, interval=interval
         )
         return Prior(displacement=displacement, strain=jnp.zeros_like(now))
-    pose = history.gripper_pose
-    before, after = resting_shapes(now, pose, pose + interval * twist, length=config.length)
+    pose = clamped(history.gripper_pose, config.statics)
+    before, after = resting_shapes(now, pose, pose + interval * twist, length=config.length, statics=config.statics)
     # exact at the grasped nodes, where nothing is left to predict
     displacement = (after - now).at[0].set(interval * twist[0, :2]).at[-1].set(interval * twist[1, :2])
     return Prior(displacement=displacement, strain=now - before)

@@ -31,6 +31,7 @@ from cablejax.cable_file import cable_from_fields
 from cablejax.dynamics.config import ModelConfig, Normalisation
 from cablejax.dynamics.model import structure_of
 from cablejax.schema_version import version_of
+from cablejax.simulate.chain.statics import Statics
 from cablejax.text_file import parse_json
 from cablejax.whole_file import whole_file
 
@@ -196,6 +197,7 @@ def _config_of(content: dict[str, Any], path: Path) -> ModelConfig:
     try:
         recorded: dict[str, Any] = dict(content["config"])
         recorded["normalisation"] = Normalisation(**recorded["normalisation"])
+        recorded["statics"] = Statics(**recorded.get("statics", {}))
         return ModelConfig(**recorded)
     except (TypeError, KeyError, AttributeError) as error:
         raise WeightsError(

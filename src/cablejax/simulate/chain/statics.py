@@ -5,12 +5,15 @@ gripper poses and the branch it is on (up or down, S or mirrored S): not on its 
 finds that shape by a few Newton steps on a chain of rigid links, from the observed keypoints before a command to the
 poses after it. An error in the keypoints fades instead of adding up over a rollout, since they only choose the branch.
 
-What is left for the network is what this leaves out: friction, damping, snap-through.
+What is known of a cable that is not uniform, not straight, or held askew enters as `Statics`. What is left for the
+network is what this leaves out: friction, damping, snap-through.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import functools
+from collections.abc import Iterable
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -19,6 +22,8 @@ from jaxtyping import Array, Float
 from scipy.interpolate import CubicSpline
 
 from cablejax.cable import Cable, Discretisation
+from cablejax.effects.given import GivenEffect, with_effects
+from cablejax.effects.physics import nominal_physics
 from cablejax.simulate.composite import link_lengths, node_offsets
 from cablejax.simulate.equilibrium import beyond_joints, links_of, with_tension
 from cablejax.simulate.keypoints import hermite_weights
@@ -40,6 +45,48 @@ MAX_TURN = 0.2
 """Largest change of a joint angle in one Newton step [rad]."""
 
 _SMALL = 1e-6
+
+
+@dataclasses.dataclass(frozen=True)
+class Statics:
+    """What is known of a cable's rest beyond its length; the defaults are a uniform cable, straight when free.
+
+    Attributes:
+        stiffness: of each joint over their mean, J = LINKS - 1 of them; () = uniform. Only its course matters.
+        rest_curvature: of each joint when free [1/m]; () = straight.
+        rotation_offset: of the cable's clamp against either gripper's angle [rad].
+    """
+
+    stiffness: tuple[float, ...] = ()
+    rest_curvature: tuple[float, ...] = ()
+    rotation_offset: tuple[float, float] = (0.0, 0.0)
+
+    def __post_init__(self):
+        for name, count in (
+            ("stiffness", (0, LINKS - 1)),
+            ("rest_curvature", (0, LINKS - 1)),
+            ("rotation_offset", (2,)),
+        ):
+            values = tuple(getattr(self, name))
+            object.__setattr__(self, name, values)
+            if len(values) not in count or not np.isfinite(values).all():
+                raise ValueError(f"Statics.{name} is {values}, expected {' or '.join(map(str, count))} finite numbers.")
+        if self.stiffness and min(self.stiffness) <= 0:
+            raise ValueError(f"Statics.stiffness has {min(self.stiffness)}, expected positive numbers.")
+
+
+def statics_with(effects: Iterable[GivenEffect], cable: Cable) -> Statics:
+    """What effects change of a cable's rest. Those that act in other ways, such as friction, change nothing of it."""
+    config = Discretisation(cable, n_links=LINKS)
+    nominal = nominal_physics(config, np.float64)
+    physics = with_effects(nominal, effects, config)
+    stiffness = np.asarray(physics.stiffness, float) / np.asarray(nominal.stiffness, float)
+    curvature = np.asarray(physics.rest_curvature, float)
+    return Statics(
+        () if np.ptp(stiffness) == 0 else tuple((stiffness / stiffness.mean()).tolist()),
+        () if not curvature.any() else tuple(curvature.tolist()),
+        tuple(np.asarray(physics.rotation_offset, float).tolist()),
+    )
 
 
 class ChainMatrices(NamedTuple):
@@ -88,31 +135,50 @@ def chain(n_keypoints: int, length: float) -> ChainMatrices:
     )
 
 
-def resting_shapes(
-    keypoints: Float[Array, "N 2"], before: Float[Array, "2 3"], after: Float[Array, "2 3"], *, length: float
-) -> tuple[Float[Array, "N 2"], Float[Array, "N 2"]]:
-    """Frictionless resting shapes at the gripper poses before and after a command, on the branch of `keypoints`.
+def clamped(gripper_pose: Float[Array, "2 3"], statics: Statics) -> Float[Array, "2 3"]:
+    """Poses of the cable's clamps [m, rad] where the grippers have these."""
+    return gripper_pose + jnp.zeros((2, 3), gripper_pose.dtype).at[:, 2].set(jnp.array(statics.rotation_offset))
 
-    Turns and shifts with the cable, and does not depend on which end comes first. Exact at both grippers.
-    Differentiable in all three arrays.
+
+def resting_shapes(
+    keypoints: Float[Array, "N 2"],
+    before: Float[Array, "2 3"],
+    after: Float[Array, "2 3"],
+    *,
+    length: float,
+    statics: Statics = Statics(),
+) -> tuple[Float[Array, "N 2"], Float[Array, "N 2"]]:
+    """Frictionless resting shapes at the clamps' poses before and after a command, on the branch of `keypoints`.
+
+    Turns and shifts with the cable. For a uniform, straight cable it does not depend on which end comes first. Exact at
+    both clamps. Differentiable in all three arrays.
 
     Args:
         keypoints: observed positions [m], shape [N, 2].
-        before: (x, y, theta) of both grippers, theta the direction of the cable's tangent, shape [2, 3].
+        before: (x, y, theta) of both clamps, see `clamped`; theta the direction of the cable's tangent, shape [2, 3].
         after: the same after the command; theta continues that of `before`.
         length: free length of the cable [m].
+        statics: what else is known of the cable; its rotation offset is in the poses already.
     """
     constants = chain(len(keypoints), length)
     matrices = ChainMatrices(*(jnp.asarray(m, keypoints.dtype) for m in constants[:-1]), later=constants.later)
+    bending = _bending(statics, length, keypoints.dtype)
     angles = _observed_angles(matrices, keypoints, before)
     turn = jnp.sum(angles)
     for _ in range(SETTLING_STEPS):
-        angles = _newton_step(matrices, angles, before, turn, length)
+        angles = _newton_step(matrices, bending, angles, before, turn, length)
     resting = _chain_keypoints(matrices, angles, before, turn)
     turn = turn + (after[1, 2] - after[0, 2]) - (before[1, 2] - before[0, 2])
     for _ in range(FOLLOWING_STEPS):
-        angles = _newton_step(matrices, angles, after, turn, length)
+        angles = _newton_step(matrices, bending, angles, after, turn, length)
     return resting, _chain_keypoints(matrices, angles, after, turn)
+
+
+def _bending(statics: Statics, length: float, dtype: Any) -> tuple[Float[Array, "J"], Float[Array, "J"]]:
+    """Stiffness of each joint over the mean, and the angle at which it is free of moment [rad]."""
+    joints = LINKS - 1
+    stiffness = jnp.asarray(statics.stiffness or np.ones(joints), dtype)
+    return stiffness, jnp.asarray(statics.rest_curvature or np.zeros(joints), dtype) * (length / joints)
 
 
 def _observed_angles(matrices: ChainMatrices, keypoints: Array, pose: Array) -> Float[Array, "J"]:
@@ -131,10 +197,14 @@ def _heading(angles: Array, pose: Array, turn: Array) -> Float[Array, ""]:
     return pose[0, 2] + (turn - jnp.sum(angles)) / 2
 
 
-def _newton_step(matrices: ChainMatrices, angles: Array, pose: Array, turn: Array, length: float) -> Float[Array, "J"]:
-    """One step on `min sum angles^2 / 2h` with the far end at gripper 1's position and the angles' sum equal `turn`."""
+def _newton_step(
+    matrices: ChainMatrices, bending: tuple[Array, Array], angles: Array, pose: Array, turn: Array, length: float
+) -> Float[Array, "J"]:
+    """One step on `min sum stiffness (angles - free)^2 / 2h`, the far end at gripper 1, the angles' sum `turn`."""
     joints = len(angles)
     h = length / joints
+    stiffness, free = bending
+    moments = stiffness * (angles - free) / h
     _, links = links_of(matrices.link_lengths, angles, _heading(angles, pose, turn))
     beyond, chord = beyond_joints(links), jnp.sum(links, axis=0)
     # a joint turns what lies beyond it by half its angle, and what lies before it by as much the other way
@@ -144,13 +214,13 @@ def _newton_step(matrices: ChainMatrices, angles: Array, pose: Array, turn: Arra
     normal = jacobian @ jacobian.T
     # relative regularisation: the constraints of a straight cable are dependent
     normal = normal + _SMALL * jnp.trace(normal) * jnp.eye(3, dtype=angles.dtype)
-    tension = jnp.linalg.solve(normal, jacobian @ angles) / h
+    tension = jnp.linalg.solve(normal, jacobian @ moments)
     pulled = beyond @ tension[:2]
-    hessian = (1 / h + DAMPING / length) * jnp.eye(joints, dtype=angles.dtype)
+    hessian = jnp.diag(stiffness / h + DAMPING / length)
     hessian = with_tension(hessian, tension, beyond, matrices.later)
     hessian = hessian - (pulled[:, None] + pulled) / 2 + chord @ tension[:2] / 4
     system = jnp.block([[hessian, -jacobian.T], [-jacobian, -_SMALL * jnp.eye(3, dtype=angles.dtype)]])
-    step = jnp.linalg.solve(system, jnp.concatenate([jacobian.T @ tension - angles / h, -error]))[:joints]
+    step = jnp.linalg.solve(system, jnp.concatenate([jacobian.T @ tension - moments, -error]))[:joints]
     largest = jnp.sqrt(jnp.max(step**2) + 1e-20)
     return angles + step * jnp.minimum(1.0, MAX_TURN / largest)
 
