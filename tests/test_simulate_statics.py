@@ -5,10 +5,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from cablejax.cable import Discretisation
+from cablejax.cable import Cable, Discretisation
+from cablejax.dataset.generate import make_engine, simulate
+from cablejax.dataset.schema import DatasetConfig
 from cablejax.dynamics.config import ModelConfig
 from cablejax.dynamics.graph import prior_of
-from cablejax.simulate.chain.statics import resting_shapes
+from cablejax.effects.given import parse_effect
+from cablejax.simulate.chain.statics import LINKS, Statics, clamped, resting_shapes, statics_with
 from cablejax.simulate.composite import link_lengths, node_offsets
 from cablejax.simulate.equilibrium import arch_angles, find_equilibrium
 from cablejax.simulate.keypoints import hermite_weights
@@ -51,6 +54,42 @@ def test_the_shape_is_that_of_a_finer_chain_at_rest(name):
     assert np.linalg.norm(moved - shape, axis=1).max() >= 1e-2
 
 
+SLIPPERY = Cable(friction_coefficient=0.0, damping_time=0.3)
+AT_REST = (
+    "stiffness_profile:centre_m=0.3,width_m=0.25,ratio=0.2",
+    "intrinsic_curvature:centre_m=0.6,width_m=0.3,curvature_per_m=2",
+    "gripper_rotation_offset:gripper=1,angle_rad=0.15",
+)
+
+
+@pytest.mark.parametrize("text", AT_REST)
+def test_a_known_effect_is_in_the_resting_shape(text):
+    """Against the chain in motion, without friction and slow: it is at rest, up to what its inertia does."""
+    effects = (parse_effect(text),)
+    config = DatasetConfig(
+        n_trajectories=2, n_steps=12, discretisation=Discretisation(SLIPPERY, timestep=0.05), effects=effects
+    )
+    (block,) = simulate(config, make_engine(config), [0])
+    errors = {}
+    for name, statics in (("known", statics_with(effects, SLIPPERY)), ("not", Statics())):
+        found = jax.vmap(
+            lambda points, pose, statics=statics: resting_shapes(
+                points, clamped(pose, statics), clamped(pose, statics), length=1.0, statics=statics
+            )[1]
+        )(block.keypoints.reshape(-1, 13, 2), block.gripper_pose.reshape(-1, 2, 3))
+        errors[name] = np.median(np.linalg.norm(found - block.keypoints.reshape(-1, 13, 2), axis=-1).max(axis=-1))
+    assert errors["known"] < 3e-3 and errors["not"] > 5 * errors["known"]
+
+
+def test_effects_that_do_not_act_at_rest_change_nothing_there():
+    effects = tuple(map(parse_effect, ("bending_stiffness:ratio=0.3", "table_friction:coefficient=0.4")))
+    assert statics_with(effects, Cable()) == Statics()
+    with pytest.raises(ValueError, match=f"expected 0 or {LINKS - 1} finite numbers"):
+        Statics(stiffness=(1.0, 2.0))
+    with pytest.raises(ValueError, match="expected positive numbers"):
+        Statics(stiffness=(0.0,) * (LINKS - 1))
+
+
 def test_an_error_in_what_was_observed_fades():
     _, shape = equilibrium(POSES["arch"])
     noise = 3e-3 * np.random.default_rng(0).standard_normal(shape.shape) * np.r_[0, np.ones(11), 0][:, None]
@@ -85,15 +124,19 @@ def test_a_straight_cable_at_rest_stays_straight():
     np.testing.assert_allclose(expected.strain, 0.0, atol=1e-6)
 
 
-@pytest.mark.parametrize("where", ["arched", "straight"])
+@pytest.mark.parametrize("where", ["arched", "straight", "known"])
 def test_derivatives_against_central_differences(where):
+    effects = [parse_effect(text) for text in AT_REST] if where == "known" else []
+    statics = statics_with(effects, Cable())
     with jax.enable_x64(True):
-        history = arched_history(CONFIG) if where == "arched" else straight_history(CONFIG)
+        history = straight_history(CONFIG) if where == "straight" else arched_history(CONFIG)
         pose = history.gripper_pose
         # A straight cable cannot be pulled longer: move it as a whole command would, inwards.
-        twist = jnp.asarray(TWIST) if where == "arched" else jnp.zeros((2, 3))
+        twist = jnp.zeros((2, 3)) if where == "straight" else jnp.asarray(TWIST)
         check_derivatives(
-            lambda point: resting_shapes(point[0], point[1], point[1] + point[2], length=1.0),
+            lambda point: resting_shapes(
+                point[0], clamped(point[1], statics), clamped(point[1] + point[2], statics), length=1.0, statics=statics
+            ),
             (history.keypoints[-1], pose, twist),
-            step=1e-6 if where == "arched" else 1e-7,
+            step=1e-7 if where == "straight" else 1e-6,
         )

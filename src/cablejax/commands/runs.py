@@ -18,7 +18,7 @@ from cablejax.control.run import ClosedLoopRun
 from cablejax.control.shaping import Method, Model, check_fit, shape_once
 from cablejax.control.targets import Target
 from cablejax.dynamics.fingerprint import fingerprint
-from cablejax.effects.given import GivenEffect, parse_effect
+from cablejax.effects.given import GivenEffect, effects_of_verdict, parse_effect
 from cablejax.effects.physics import nominal_physics
 from cablejax.limits import require
 from cablejax.perceive.camera import CameraConfig
@@ -62,6 +62,7 @@ class Job:
                 "config": dataclasses.asdict(self.model.config),
                 "weights": fingerprint(self.model.weights),
                 "cable": dataclasses.asdict(self.model.cable),
+                "believed": self.model.believed,
             },
             "plant": dataclasses.asdict(self.plant),
             "camera": None if self.camera is None else dataclasses.asdict(self.camera),
@@ -132,6 +133,16 @@ def staged_effects(given: Sequence[str]) -> tuple[GivenEffect, ...]:
     return tuple(parse_effect(text) for text in given or (PLANT_EFFECT,))
 
 
+def told_of(given: Sequence[str], verdicts: Sequence[pathlib.Path]) -> tuple[GivenEffect, ...]:
+    """The effects of `--effect` and those that the verdicts of `--with` name.
+
+    Raises:
+        ValueError: a text is no effect, or a file is no verdict or names nothing.
+    """
+    named = [effect for path in verdicts for effect in effects_of_verdict(path)]
+    return (*map(parse_effect, given), *named)
+
+
 def plant_of(
     cable: Cable, effects: tuple[GivenEffect, ...], *, links: int, seed: int, keypoint_noise: float = 0.0
 ) -> PlantConfig:
@@ -167,6 +178,8 @@ def about(job: Job) -> str:
     ]
     if job.model.effects:
         sentences.append(f"Its training data hold {listed(job.model.effects)}.")
+    if job.model.known:
+        sentences.append(f"It was told of {listed(job.model.known)}.")
     changes = _changes(believed, plant)
     if changes:
         sentences.append(f"The plant has {listed(changes)}.")

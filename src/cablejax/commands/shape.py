@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import pathlib
-from typing import TYPE_CHECKING, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 import tyro
 
@@ -55,6 +55,14 @@ class Shape(Command):
     times. By default bending_stiffness:ratio=0.2; `none` for no effect. With from_s=... and until_s=... it begins and
     ends in the middle of the run."""
 
+    effect: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
+    """An effect that the model is told of, as for --plant-effect; may be given several times. What of it enters the
+    model: stiffness_profile, intrinsic_curvature and gripper_rotation_offset the rest of its cable; bending_stiffness,
+    table_friction and linear_density the first belief of a conditioned model."""
+
+    with_: Annotated[tuple[pathlib.Path, ...], tyro.conf.arg(name="with"), tyro.conf.UseAppendAction] = ()
+    """A verdict.json of `cablejax diagnose`: the model is told of the effects that it names, as by --effect."""
+
     perception: Literal["true", "cloud"] = "true"
     """true: the controller observes the simulated keypoints. cloud: it observes keypoints estimated from clouds of a
     depth camera; the printed errors are still those of the true keypoints."""
@@ -76,19 +84,23 @@ class Shape(Command):
         from cablejax.commands.cable import find_cable
         from cablejax.commands.results import table_of
         from cablejax.commands.resuming import unfinished
-        from cablejax.commands.runs import Job, plant_of, shape_and_report, staged_effects
-        from cablejax.control.shaping import METHODS, load_model
+        from cablejax.commands.runs import Job, plant_of, shape_and_report, staged_effects, told_of
+        from cablejax.control.shaping import METHODS, knowing, load_model
         from cablejax.control.targets import load_target, make_target
         from cablejax.perceive.camera import CameraConfig
 
         if self.motion is not None and self.perception == "cloud":
             raise UsageError("--motion records the keypoints of the plant: leave --perception out.")
+        if self.motion is not None and (self.effect or self.with_):
+            raise UsageError("--motion uses no model that could be told of --effect or --with: leave them out.")
         effects = staged_effects(self.plant_effect)
         cloud = self.perception == "cloud"
         noise_mm = (2.0 if cloud else 0.0) if self.noise_mm is None else self.noise_mm
         if self.motion is not None:
             return self._play(self.motion, effects)
         model = load_model(self.weights)
+        if told := told_of(self.effect, self.with_):
+            model = knowing(model, told)
         cable = model.cable if self.cable is None else find_cable(self.cable)
         plant = plant_of(
             cable,
@@ -114,8 +126,9 @@ class Shape(Command):
         facts = {
             field.name.replace("_", " "): str(getattr(self, field.name))
             for field in dataclasses.fields(self)
-            if field.name not in ("json", "out", "overwrite", "device", "cable", "plant_effect")
+            if field.name not in ("json", "out", "overwrite", "device", "cable", "plant_effect", "effect", "with_")
         }
+        facts["model knows of"] = ", ".join(model.known) or "nothing"
         facts["plant effect"] = ", ".join(map(str, effects)) or "none"
         with unfinished(self.out, job.settings(), overwrite=self.overwrite) as parts:
             summary = shape_and_report(job, self.out, parts, facts=facts)

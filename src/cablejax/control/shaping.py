@@ -120,20 +120,8 @@ def knowing(model: Model, effects: Sequence[GivenEffect]) -> Model:
     Raises:
         ValueError: nothing of the effects enters the model; names the ways that remain.
     """
-    cable = model.cable
-    statics = statics_with(effects, cable)
-    if model.config.prior != "static":
-        statics = Statics()
-    config = Discretisation(cable)
-    physics, nominal = (with_effects(nominal_physics(config, np.float64), some, config) for some in (effects, ()))
-    ratios = (
-        float(np.mean(physics.stiffness) / np.mean(nominal.stiffness)),
-        float(physics.friction * physics.density / max(nominal.friction * nominal.density, 1e-9)),
-    )
-    limits = AdaptationConfig().limits
-    believed = (0.0, 0.0)
-    if model.config.conditioned:
-        believed = tuple(float(np.clip(np.log(max(ratio, 1e-3)), *limits)) for ratio in ratios)
+    statics = statics_with(effects, model.cable) if model.config.prior == "static" else Statics()
+    believed = _believed(effects, model.cable) if model.config.conditioned else (0.0, 0.0)
     if effects and statics == Statics() and believed == (0.0, 0.0):
         raise ValueError(
             f"Nothing of {', '.join(map(str, effects))} enters the model {model.name}: neither the rest of its cable, "
@@ -148,6 +136,21 @@ def knowing(model: Model, effects: Sequence[GivenEffect]) -> Model:
         known=tuple(map(str, effects)),
         believed=believed,
     )
+
+
+def _believed(effects: Sequence[GivenEffect], cable: Cable) -> tuple[float, float]:
+    """Log ratios of stiffness and friction that effects make, within what conditioned models are trained on.
+
+    In slow motion only the ratio of both matters: what is beyond a bound of one is taken up by the other.
+    """
+    config = Discretisation(cable)
+    physics, nominal = (with_effects(nominal_physics(config, np.float64), some, config) for some in (effects, ()))
+    low, high = AdaptationConfig().limits
+    stiffness = np.log(np.mean(physics.stiffness) / np.mean(nominal.stiffness))
+    forces = (max(float(p.friction * p.density), 1e-6) for p in (physics, nominal))
+    friction = np.log(next(forces) / next(forces))
+    within = np.clip(friction, low, high)
+    return float(np.clip(stiffness - (friction - within), low, high)), float(within)
 
 
 def make_controller(model: Model, target: Target, *, method: Method, solver: SolverName) -> MPC:
