@@ -182,9 +182,9 @@ def page(out: pathlib.Path) -> str:
     seeds = sorted({trial.seed for trial in trials})
     lines = [
         "The plant has an effect that the model does not know, and the targets are the letters of the cable without "
-        "it, which a cable with another course of its stiffness or a curved one cannot take to a hair. A verdict on six "
-        f"runs ({6 * COMMANDS} s, 1 mm noise, seeds {', '.join(map(str, LOG_SEEDS))}) is told to the model; *recorded* is "
-        "trained on the same six runs instead. "
+        "it, which a cable with another course of its stiffness or a curved one cannot take to a hair. A verdict on "
+        f"six runs ({6 * COMMANDS} s, 1 mm noise, seeds {', '.join(map(str, LOG_SEEDS))}) is told to the model; "
+        "*recorded* is trained on the same six runs instead. "
         f"Errors are means of the last 10 s [cm], over {len(seeds)} seeds and at equal ones: mean, standard deviation, "
         "count.",
         "",

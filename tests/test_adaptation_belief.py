@@ -44,6 +44,18 @@ def test_what_is_not_seen_stays_where_the_prior_put_it():
         np.testing.assert_allclose(belief.mean.sum(), 0.0, atol=1e-9)
 
 
+def test_where_nothing_is_seen_a_belief_fades_to_its_prior():
+    config = AdaptationConfig(prior_mean=(-0.7, 0.4), memory=0.8)
+    belief = prior_belief(config)
+    np.testing.assert_allclose(belief.mean, [-0.7, 0.4], rtol=1e-6)
+    moved = type(belief)(belief.mean + 0.3, belief.information)
+    for _ in range(40):
+        moved = update(config, moved, jnp.zeros((13, 2, 2)), jnp.zeros((13, 2)), SEEN)
+    np.testing.assert_allclose(moved.mean, [-0.7, 0.4], atol=1e-3)
+    with pytest.raises(ValueError, match="prior_mean is"):
+        AdaptationConfig(prior_mean=(5.0, 0.0))
+
+
 def test_missing_keypoints_and_snap_throughs_say_nothing():
     sensitivity, _, truth = linear_world(2, [0.5, 0.5], steps=1)
     h, belief = jnp.asarray(sensitivity[0], jnp.float32), prior_belief(CONFIG)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections import Counter
 
 import numpy as np
 import pytest
@@ -85,6 +86,11 @@ def test_a_rival_that_leaves_as_little_is_a_look_alike():
     assert rival == "table_friction"
     strict = conclude(found, facts, Calibration(as_good=1.0))
     assert strict.equivalent == () and strict.effects[0].probability > 0.99
+    # draws of the posterior: each explanation as often as it is probable, none at all among them
+    posterior = conclude(Search((*fits, null), np.array([0.0, -0.4, -0.8]), {}), facts, Calibration()).posterior
+    counts = Counter(tuple(effect.name for effect in draw) for draw in posterior)
+    assert [counts[names] for names in (("bending_stiffness",), ("table_friction",), ())] == [8, 5, 3]
+    assert len({draw[0].parameters["ratio"] for draw in posterior[:8]}) == 8
 
 
 def test_a_motion_that_nothing_explains_does_not_hide_the_cause_of_the_others():

@@ -1,0 +1,78 @@
+"""A model that is told of effects: its cable rests as one with them does, and it begins with their belief."""
+
+import json
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from cablejax.cli import main
+from cablejax.control.shaping import knowing, load_model, make_controller
+from cablejax.control.targets import make_target
+from cablejax.dataset.generate import make_engine, simulate
+from cablejax.dataset.schema import DatasetConfig
+from cablejax.dynamics.evaluate import open_loop_error
+from cablejax.effects.given import parse_effect
+from cablejax.types import Trajectory
+
+CURVED = "intrinsic_curvature:centre_m=0.6,width_m=0.3,curvature_per_m=2"
+
+
+@pytest.fixture(scope="module")
+def model():
+    return load_model("gns-reference")
+
+
+def test_a_model_that_knows_the_cause_is_right_without_another_training(model):
+    effects = (parse_effect(CURVED),)
+    config = DatasetConfig(n_trajectories=2, n_steps=25, seed=5, effects=effects)
+    (block,) = simulate(config, make_engine(config), [0])
+    data = Trajectory(*(jnp.asarray(a) for a in (block.keypoints, block.gripper_pose, block.gripper_twist)))
+    plain, told = (
+        open_loop_error((one.dynamics.graphdef, one.weights), data, one.config, horizons=(20,), stride=5).median_cm[0]
+        for one in (model, knowing(model, effects))
+    )
+    assert told < 0.1 < 0.5 < plain
+
+
+def test_told_of_nothing_a_model_is_as_it_was(model):
+    same = knowing(model, ())
+    assert same.config == model.config and same.dynamics == model.dynamics and same.known == ()
+
+
+def test_a_conditioned_model_begins_with_what_it_was_told():
+    conditioned = load_model("gns-conditioned")
+    told = knowing(conditioned, tuple(map(parse_effect, ("bending_stiffness:ratio=0.5", "linear_density:ratio=2"))))
+    np.testing.assert_allclose(told.believed, np.log([0.5, 2.0]), rtol=1e-5)
+    mpc = make_controller(told, make_target("U", told.cable), method="direct", solver="levenberg-marquardt")
+    assert mpc.config.adaptation.prior_mean == told.believed
+    # only the ratio of both matters in slow motion: what is beyond the bound of one is taken up by the other
+    far = knowing(conditioned, (parse_effect("linear_density:ratio=8"),))
+    np.testing.assert_allclose(far.believed[1] - far.believed[0], np.log(8.0), rtol=1e-5)
+    assert far.believed[1] == mpc.config.adaptation.limits[1]
+
+
+def test_what_does_not_enter_a_model_is_refused_with_what_to_do(model, tmp_path, capsys):
+    with pytest.raises(ValueError, match=r"Nothing of camera_lag:time_s=0.3 enters.*simulate --with.*--start-from"):
+        knowing(model, (parse_effect("camera_lag:time_s=0.3"),))
+    words = ["shape", "--out", str(tmp_path / "run"), "--effect", "bending_stiffness:ratio=0.3", "--steps", "1"]
+    assert main(words) == 2
+    assert "such as gns-conditioned" in capsys.readouterr().err
+    assert main([*words, "--motion", "next.npz"]) == 2
+    assert "--motion uses no model" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_shape_with_a_verdict_tells_the_model(tmp_path, capsys):
+    parameters = {"centre_m": 0.6, "width_m": 0.3, "curvature_per_m": 2.0}
+    effect = {"name": "intrinsic_curvature", "parameters": {name: {"value": v} for name, v in parameters.items()}}
+    verdict = {"schema": "cablejax-verdict/1", "verdict": "named", "effects": [effect]}
+    (tmp_path / "verdict.json").write_text(json.dumps(verdict))
+    words = ["shape", "--target", "S", "--method", "direct", "--steps", "20", "--plant-effect", CURVED, "--json"]
+    errors = []
+    for name, more in (("plain", []), ("told", ["--with", str(tmp_path / "verdict.json")])):
+        assert main([*words, "--out", str(tmp_path / name), *more]) == 0
+        errors.append(json.loads(capsys.readouterr().out)["shapes"]["S"]["terminal_error_without_residual_cm"])
+    assert errors[1] < errors[0]
+    page = (tmp_path / "told" / "report.html").read_text()
+    assert "It was told of intrinsic_curvature" in page
