@@ -12,7 +12,7 @@ from flax import nnx
 from jaxtyping import Array, Float
 
 from cablejax.adaptation.belief import AdaptationConfig
-from cablejax.cable import Cable, Discretisation
+from cablejax.cable import GRAVITY, Cable, Discretisation
 from cablejax.control.loop import run_closed_loop
 from cablejax.control.run import ClosedLoopRun
 from cablejax.control.targets import Target, straight_start
@@ -32,7 +32,7 @@ from cablejax.simulate.chain.statics import Statics, statics_with
 from cablejax.simulate.elastica import elastica
 from cablejax.simulate.plant import Plant, PlantConfig
 from cablejax.solver_names import SolverName
-from cablejax.types import History
+from cablejax.types import History, cable_descriptor
 
 Method = Literal["residual", "direct"]
 """The learned model with the online residual, or as it was trained."""
@@ -56,8 +56,7 @@ class Model:
         cable: nominal cable of the data that it was trained on.
         effects: effects in those data, as `parse_effect` reads them.
         known: effects that the model was told of afterwards, see `knowing`.
-        believed: what these make of a conditioned model's inputs before anything was seen: log ratios of stiffness and
-            friction.
+        believed: descriptor of the cable before anything was seen, for a conditioned model: see `cable_descriptor`.
     """
 
     name: str
@@ -121,8 +120,8 @@ def knowing(model: Model, effects: Sequence[GivenEffect]) -> Model:
         ValueError: nothing of the effects enters the model; names the ways that remain.
     """
     statics = statics_with(effects, model.cable) if model.config.prior == "static" else Statics()
-    believed = _believed(effects, model.cable) if model.config.conditioned else (0.0, 0.0)
-    if effects and statics == Statics() and believed == (0.0, 0.0):
+    believed = _believed(effects, model.cable) if model.config.conditioned and effects else model.believed
+    if effects and statics == Statics() and np.allclose(believed, _believed((), model.cable), atol=1e-6):
         raise ValueError(
             f"Nothing of {', '.join(map(str, effects))} enters the model {model.name}: neither the rest of its cable, "
             "nor stiffness and friction of a conditioned model, such as gns-conditioned. Simulate data with it "
@@ -139,16 +138,16 @@ def knowing(model: Model, effects: Sequence[GivenEffect]) -> Model:
 
 
 def _believed(effects: Sequence[GivenEffect], cable: Cable) -> tuple[float, float]:
-    """Log ratios of stiffness and friction that effects make, within what conditioned models are trained on.
+    """The descriptor of a cable with effects, see `cable_descriptor`, within what conditioned models are trained on.
 
-    In slow motion only the ratio of both matters: what is beyond a bound of one is taken up by the other.
+    In slow motion only the ratio of stiffness and friction matters: what is beyond a bound of one is taken up by the
+    other.
     """
     config = Discretisation(cable)
-    physics, nominal = (with_effects(nominal_physics(config, np.float64), some, config) for some in (effects, ()))
+    physics = with_effects(nominal_physics(config, np.float64), effects, config)
+    force = np.asarray(physics.friction * physics.density * GRAVITY)
+    stiffness, friction = np.asarray(cable_descriptor(jnp.asarray(np.mean(physics.stiffness)), jnp.asarray(force)))
     low, high = AdaptationConfig().limits
-    stiffness = np.log(np.mean(physics.stiffness) / np.mean(nominal.stiffness))
-    forces = (max(float(p.friction * p.density), 1e-6) for p in (physics, nominal))
-    friction = np.log(next(forces) / next(forces))
     within = np.clip(friction, low, high)
     return float(np.clip(stiffness - (friction - within), low, high)), float(within)
 
