@@ -1,6 +1,6 @@
 """What a diagnosis is worth: name the cause, tell the model, shape the cable again.
 
-    python experiments/23_worth.py --out runs/worth     # seeds first, so that whatever is done is balanced; resumable
+    python experiments/23_worth.py --out runs/worth     # with a learner first, seed by seed; resumable
     python experiments/23_worth.py --out runs/worth --report docs/results/worth.md
 
 The plant is MuJoCo in space with contact, and an effect that the model does not know. Six runs without a learner, 180 s
@@ -18,6 +18,7 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import functools
+import itertools
 import json
 import os
 import pathlib
@@ -94,9 +95,10 @@ def main() -> None:
     if options.report is not None:
         publish(page(options.out), options.report)
         return
-    for seed in SEEDS[: options.seeds]:
-        for text in EFFECTS:
-            for spec in ARMS:
+    with_learner = [spec for spec in ARMS if spec.learner]
+    for arms in (with_learner, [spec for spec in ARMS if not spec.learner]):
+        for seed, text in itertools.product(SEEDS[: options.seeds], EFFECTS):
+            for spec in arms:
                 model = functools.partial(model_for, text, spec.name.removesuffix(ONLINE), options.out / slug(text))
                 run_suite(cases(text, [seed]), [spec], options.out / "trials", fine_tuned=model, progress=False)
             print(f"seed {seed}, {text}: done", flush=True)
