@@ -20,11 +20,10 @@ import argparse
 import dataclasses
 import functools
 import itertools
-import json
 import os
 import pathlib
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 os.environ.setdefault("NPROC", "4")
 
@@ -64,6 +63,11 @@ SHAPES = ("S", "Z")
 NOISE = 1e-3
 COMMANDS = 30
 """Of each run of the log, one a second."""
+VERDICT = "verdict.json"
+STEPS = 60
+"""Commands of a run, one a second."""
+NEAR = 0.5
+"""Of the target [cm]."""
 SETTLING = 8
 """Times that a letter is brought nearer to rest: more change it by less than a micrometre."""
 ONLINE = " + learner"
@@ -140,7 +144,7 @@ def cases(text: str, seeds: Sequence[int], shapes: Sequence[str] = SHAPES) -> li
             task=functools.partial(shown_letter, text, shape, seed),  # pyright: ignore[reportArgumentType]
             plant=functools.partial(plant_with, text),
             cable=text,
-            steps=60,
+            steps=STEPS,
         )
         for seed in seeds
         for shape in shapes
@@ -177,7 +181,7 @@ def log_of(text: str, home: pathlib.Path) -> GapLog:
 
 def verdict_of(text: str, home: pathlib.Path) -> pathlib.Path:
     """The verdict on the log."""
-    path = home / "verdict.json"
+    path = home / VERDICT
     if not path.exists():
         write_verdict(path, diagnose(log_of(text, home)))
     return path
@@ -201,82 +205,121 @@ def page(out: pathlib.Path) -> str:
         "The plant has an effect that the model does not know. A target is what the plant's cable makes of a letter: "
         "the keypoints that a person shows by hand. A verdict on "
         f"six runs ({6 * COMMANDS} s, 1 mm noise, seeds {', '.join(map(str, LOG_SEEDS))}) is told to the model; "
-        "*recorded* is trained on the same six runs instead. "
-        f"Errors are means of the last 10 s [cm], over {len(seeds)} seeds and at equal ones: mean, standard deviation, "
-        "count.",
+        f"*recorded* is trained on the same six runs instead. {len(seeds)} seeds.",
         "",
     ]
-    head = ["effect", "letter", *(spec.name for spec in ARMS)]
-    table = [row for text in EFFECTS for row in rows_of(trials, text)]
-    lines += [*markdown_table([head, *table]), ""]
-    lines += [
-        "In pairs, all with the online learner; negative = the first ends nearer, with a 95 % interval over seeds. The "
-        "share is of the oracle's gain, where its interval excludes 0.",
-        "",
-        *markdown_table([PAIRED_HEAD, *(row for text in EFFECTS if (row := paired_row(trials, text, out)))]),
-    ]
+    for title, measure in MEASURES.items():
+        table = [row for text in EFFECTS for row in rows_of(trials, text, measure)]
+        lines += [
+            f"## {title}",
+            "",
+            "Mean, standard deviation, count.",
+            "",
+            *markdown_table([["effect", "letter", *(spec.name for spec in ARMS)], *table]),
+            "",
+            "In pairs; negative = the first is nearer or sooner: mean difference, 95 % interval over seeds, runs "
+            "better / worse. The share is of the oracle's gain, where its interval excludes 0.",
+            "",
+            *markdown_table(
+                [
+                    PAIRED_HEAD,
+                    *(
+                        row
+                        for suffix in (ONLINE, "")
+                        for text in EFFECTS
+                        if (row := paired_row(trials, text, suffix, measure, out))
+                    ),
+                ]
+            ),
+            "",
+        ]
     command = "python experiments/23_worth.py --report docs/results/worth.md"
     return page_of_results("What a diagnosis is worth", f"`{command}`", lines)
 
 
 PAIRED_HEAD = (
     "effect",
-    "verdict",
+    "named",
+    "learner",
     "diagnosed less plain",
     "oracle less plain",
     "share",
     "diagnosed less recorded",
 )
 
+Values = Mapping[tuple[str, int], float]
+"""By letter and seed."""
 
-def late(trials: Sequence[Trial], text: str, name: str, shapes: Sequence[str] = SHAPES) -> dict[tuple[str, int], float]:
-    """Mean errors of the last 10 s by letter and seed [cm]."""
+
+def late(trial: Trial) -> float:
+    return float(trial.late_errors_cm.mean())
+
+
+def seconds_to_near(trial: Trial) -> float:
+    """When the error first is within `NEAR` [s]; the length of a run that never is there."""
+    errors = np.array(trial.errors_cm)
+    return float(np.argmax(errors < NEAR)) if (errors < NEAR).any() else float(STEPS)
+
+
+MEASURES = {
+    "Mean error of the last 10 s [cm]": late,
+    f"Time to within {NEAR} cm [s]": seconds_to_near,
+}
+
+
+def measured(
+    trials: Sequence[Trial],
+    text: str,
+    name: str,
+    measure: Callable[[Trial], float],
+    shapes: Sequence[str] = SHAPES,
+) -> Values:
     return {
-        (t.scenario, t.seed): float(t.late_errors_cm.mean())
+        (t.scenario, t.seed): measure(t)
         for t in trials
         if t.table == text and t.method == name and t.scenario in shapes
     }
 
 
-def rows_of(trials: Sequence[Trial], text: str) -> list[tuple[str, ...]]:
+def rows_of(trials: Sequence[Trial], text: str, measure: Callable[[Trial], float]) -> list[tuple[str, ...]]:
     """Rows of the table of all arms for one effect, by letter."""
     return [
         (
             f"`{text}`" if shape == SHAPES[0] else "",
             shape,
-            *(cell(late(trials, text, spec.name, shape)) for spec in ARMS),
+            *(cell(measured(trials, text, spec.name, measure, shape)) for spec in ARMS),
         )
         for shape in SHAPES
     ]
 
 
-def cell(values: Mapping[tuple[str, int], float]) -> str:
+def cell(values: Values) -> str:
     numbers = np.array(list(values.values()))
     return f"{numbers.mean():.2f} ± {numbers.std():.2f} ({len(numbers)})" if len(numbers) else ""
 
 
-def paired_row(trials: Sequence[Trial], text: str, out: pathlib.Path) -> tuple[str, ...] | None:
-    """One effect's row of paired differences; None before all arms have run."""
+def paired_row(
+    trials: Sequence[Trial], text: str, suffix: str, measure: Callable[[Trial], float], out: pathlib.Path
+) -> tuple[str, ...] | None:
+    """One effect's row of paired differences; None before its arms have run."""
     plain, diagnosed, oracle, recorded = (
-        late(trials, text, f"{kind}{ONLINE}") for kind in ("plain", "diagnosed", "oracle", "recorded")
+        measured(trials, text, f"{kind}{suffix}", measure) for kind in ("plain", "diagnosed", "oracle", "recorded")
     )
-    if not (plain and diagnosed and oracle and recorded):
+    if not (plain and diagnosed and oracle):
         return None
     ours, best = paired(diagnosed, plain), paired(oracle, plain)
-    share = f"{100 * ours.mean / best.mean:.0f} %" if best.interval.high < 0 else "no gain"
-    verdict = json.loads(verdict_of(text, out / slug(text)).read_text(encoding="utf-8"))
-    names = " + ".join(effect["name"] for effect in verdict["effects"])
     return (
         f"`{text}`",
-        f"{verdict['verdict']}: {names}",
+        ", ".join(f"`{effect}`" for effect in effects_of_verdict(out / slug(text) / VERDICT)),
+        "yes" if suffix else "no",
         difference_text(ours),
         difference_text(best),
-        share,
-        difference_text(paired(diagnosed, recorded)),
+        f"{100 * ours.mean / best.mean:.0f} %" if best.interval.high < 0 else "no gain",
+        difference_text(paired(diagnosed, recorded)) if recorded else "",
     )
 
 
-def paired(method: Mapping[tuple[str, int], float], reference: Mapping[tuple[str, int], float]) -> PairedDifference:
+def paired(method: Values, reference: Values) -> PairedDifference:
     return paired_difference(method, reference, cluster=lambda key: key[1])
 
 
