@@ -38,10 +38,17 @@ class BenchMpc(Command):
         import jax
         import numpy as np
 
-        from cablejax.commands.workloads import batched_control, controller_to_s, seconds_in_turns, setting
+        from cablejax.commands.workloads import (
+            batched_control,
+            controller_to_s,
+            cores_as_devices,
+            seconds_in_turns,
+            setting,
+        )
         from cablejax.control.shaping import initial_history, load_model
         from cablejax.mpc import time_control
 
+        cores_as_devices()
         least = min(self.repeats, *self.batches, self.horizon + 1)
         if not self.solvers or least < 1:
             raise UsageError(
@@ -166,9 +173,16 @@ class BenchLoop(Command):
         import numpy as np
 
         from cablejax.cable import Discretisation
-        from cablejax.commands.workloads import closed_loop, controller_to_s, seconds_in_turns, setting
+        from cablejax.commands.workloads import (
+            closed_loop,
+            controller_to_s,
+            cores_as_devices,
+            seconds_in_turns,
+            setting,
+        )
         from cablejax.control.shaping import load_model
 
+        cores_as_devices()
         if not self.batches:
             raise UsageError("--batches is empty, expected at least one size.")
         for name, value in (("steps", self.steps), ("rounds", self.rounds), *(("batches", n) for n in self.batches)):

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import functools
+import os
 import pathlib
 import tempfile
 import time
@@ -13,11 +15,12 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Float
 
 from cablejax.cable import Discretisation
 from cablejax.commands.options import say
-from cablejax.control.batched import BatchRun, LoopConfig, shape_batch, varied_params
+from cablejax.control.batched import AXIS, BatchRun, LoopConfig, for_each_cable, shape_batch, varied_params
 from cablejax.control.shaping import Model, make_controller
 from cablejax.control.targets import make_target, straight_start
 from cablejax.dataset.generate import draw, generate, make_engine, simulate
@@ -155,11 +158,23 @@ def controller_to_s(model: Model, solver: SolverName, horizon: int = MPCConfig.h
     return dataclasses.replace(controller, config=dataclasses.replace(controller.config, horizon=horizon))
 
 
+def cores_as_devices() -> None:
+    """Makes every core of a processor a device, over which cables can be spread, unless JAX has computed already."""
+    with contextlib.suppress(RuntimeError):
+        jax.config.update("jax_num_cpu_devices", os.cpu_count() or 1)
+
+
 def batched_control(controller: MPC, history: History, size: int) -> tuple[Callable[[], None], int]:
-    """A function that controls `size` cables for one step at each call, compiled, and its memory [bytes]."""
+    """A function that controls `size` cables for one step at each call, compiled, and its memory [bytes].
+
+    They are spread over as many devices as divide their number.
+    """
     measurement = Measurement(history.keypoints[-1], history.gripper_pose)
-    arguments = repeated((controller.init(history), measurement), size)
-    step = jax.jit(jax.vmap(controller.step)).lower(*arguments).compile()
+    devices = next(jax.devices()[:n] for n in range(len(jax.devices()), 0, -1) if size % n == 0)
+    spread = NamedSharding(Mesh(np.array(devices), (AXIS,)), PartitionSpec(AXIS))
+    arguments = jax.device_put(repeated((controller.init(history), measurement), size), spread)
+    steps = for_each_cable(lambda state, measurement: controller.step(state, measurement), devices)
+    step = jax.jit(steps).lower(*arguments).compile()
 
     def call() -> None:
         nonlocal arguments
@@ -182,7 +197,7 @@ def closed_loop(controller: MPC, history_length: int, steps: int, chain: Discret
 
     def run(size: int) -> BatchRun:
         params, state, goals = inputs(size)
-        batch = shape_batch(engine, params, state, controller, goals, config)
+        batch = shape_batch(engine, params, state, controller, goals, config, devices=jax.devices()[:size])
         return jax.block_until_ready(batch)
 
     return run

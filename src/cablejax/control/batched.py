@@ -1,16 +1,16 @@
 """The whole closed loop as one compiled call: many cables, each with its own target, shaped side by side.
 
-Plant (the MJX engine), camera, model, residual and controller are pure functions, so one trial is a `lax.scan` over
-its control steps and a table of trials is its `vmap`. It runs the same controllers as `control.loop.run_closed_loop`,
-but a batch of cables on an accelerator instead of one cable in Python. The plant is the planar simulator here; the
-contact plant in C MuJoCo, which the model has never seen, stays the reference.
+Plant (an engine in JAX), camera, model, residual and controller are pure functions, so a table of trials is a
+`lax.scan` over control steps of all of them. It runs the same controllers as `control.loop.run_closed_loop`, but a
+batch of cables in one call instead of one cable in Python. The plant is the planar simulator here; the contact plant in
+C MuJoCo, which the model has never seen, stays the reference.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -31,6 +31,11 @@ from cablejax.simulate.engine import refuse_lags
 from cablejax.simulate.mjx_engine import MjxEngine
 from cablejax.simulate.plant_config import check_camera
 from cablejax.types import CableState, History, Measurement
+
+AXIS = "cable"
+"""Of devices, by which a batch is spread."""
+REPORTED = ("residual_share", "radius")
+"""Fields of a controller's report that a run keeps."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -92,6 +97,41 @@ class BatchRun:
         return np.array([settling_time(times, error) for error in errors])
 
 
+def for_each_cable(
+    step: Callable[..., Any],
+    devices: Sequence[jax.Device] | None = None,  # pyright: ignore[reportInvalidTypeForm]
+) -> Callable[..., Any]:
+    """The function of many cables that a function of one, such as `MPC.step`, makes; to be compiled by `jax.jit`.
+
+    On an accelerator it is `jax.vmap`. A planner's loops then take as many iterations as the slowest cable needs, which
+    costs a processor more than the width gives it: there, each device takes one cable after the other.
+
+    Args:
+        step: pure function of arrays, or pytrees of them, of one cable.
+        devices: to spread the cables over, a multiple of their number; by default the one on which the arguments are. A
+            processor's cores are devices where `jax.config.jax_num_cpu_devices` says so.
+
+    Returns:
+        The same function where every argument and result has a leading axis of cables.
+    """
+    first = jax.devices()[0] if devices is None else devices[0]
+    one_by_one = first.platform == "cpu"
+    many = (lambda *arguments: jax.lax.map(lambda own: step(*own), arguments)) if one_by_one else jax.vmap(step)
+    return many if devices is None else _shared_out(many, tuple(devices), 0)
+
+
+def _shared_out(function: Callable[..., Any], devices: tuple[jax.Device, ...], whole: int) -> Callable[..., Any]:  # pyright: ignore[reportInvalidTypeForm]
+    """A function of a batch on several devices, each with its own share; all have the first `whole` arguments."""
+
+    def shared_out(*arguments):
+        specs = tuple(PartitionSpec() if i < whole else PartitionSpec(AXIS) for i in range(len(arguments)))
+        mesh = Mesh(np.array(devices), (AXIS,))
+        spread = jax.shard_map(function, mesh=mesh, in_specs=specs, out_specs=PartitionSpec(AXIS), check_vma=False)
+        return spread(*arguments)
+
+    return shared_out
+
+
 def shape_batch(
     engine: MjxEngine | ChainEngine,
     params: Physics,
@@ -139,7 +179,8 @@ def shape_batch(
         raise ValueError(f"The leading axes are {sorted(lengths)}, expected {size}, the number of targets, everywhere.")
     if devices is not None:
         batch, shared = _spread(batch, shared, size, devices)
-    run = _compiled_batch(engine, config, may_touch(params))(shared, *batch)
+    spread_over = None if devices is None else tuple(devices)
+    run = _compiled_batch(engine, config, may_touch(params), spread_over)(shared, *batch)
     return run if devices is None else jax.tree.map(lambda leaf: leaf[:size], run)
 
 
@@ -159,51 +200,74 @@ def _spread(batch, shared, size: int, devices: Sequence[jax.Device]):  # pyright
     """The batch in equal shares on all devices, padded by copies of its last trial, and what is shared on each."""
     width = -(-size // len(devices)) * len(devices)
     rows = np.minimum(np.arange(width), size - 1)
-    mesh = Mesh(np.array(devices), ("trial",))
-    split, whole = NamedSharding(mesh, PartitionSpec("trial")), NamedSharding(mesh, PartitionSpec())
+    mesh = Mesh(np.array(devices), (AXIS,))
+    split, whole = NamedSharding(mesh, PartitionSpec(AXIS)), NamedSharding(mesh, PartitionSpec())
     batch = jax.tree.map(lambda leaf: jax.device_put(np.asarray(leaf)[rows], split), batch)
     return batch, jax.tree.map(lambda leaf: jax.device_put(leaf, whole), shared)
 
 
 @functools.lru_cache(maxsize=16)
-def _compiled_batch(engine: MjxEngine | ChainEngine, config: LoopConfig, touching: bool):
-    def one(shared, params, state, own, seed):
+def _compiled_batch(engine: MjxEngine | ChainEngine, config: LoopConfig, touching: bool, devices: Any):
+    def trials(shared, params, state, own, seeds):
         params = params if touching else without_obstacle(params)
-        return _one_trial(engine, config, eqx.combine(own, shared), params, state, seed)
+        return _trials(engine, config, own, shared, params, state, seeds)
 
-    return jax.jit(jax.vmap(one, in_axes=(None, 0, 0, 0, 0)), compiler_options=compiler_options())
+    spread = trials if devices is None else _shared_out(trials, devices, 1)
+    return jax.jit(spread, compiler_options=compiler_options())
 
 
-def _one_trial(
+def _trials(
     engine: MjxEngine | ChainEngine,
     config: LoopConfig,
-    controller: Any,
+    own: Any,
+    shared: Any,
     params: Physics,
-    cable: CableState,
-    seed: Int[Array, ""],
+    cables: CableState,
+    seeds: Int[Array, " B"],
 ) -> BatchRun:
-    key = jax.random.key(seed)
-    still = jnp.zeros((config.rest, *cable.gripper_pose.shape), cable.qpos.dtype)
-    cable, shown = engine.unroll(params, cable, still, config.interval)
-    first = _noisy(config, jax.random.fold_in(key, config.steps), shown.keypoints[-1])
-    history = History(keypoints=jnp.repeat(first[None], config.history_length, axis=0), gripper_pose=cable.gripper_pose)
+    """All trials of a device; a controller is put together of what is its `own` and what is `shared`."""
+    keys = jax.vmap(jax.random.key)(seeds)
+
+    def moved(params, cable, twist):
+        cable, shown = engine.unroll(params, cable, twist, config.interval)
+        return cable, shown.keypoints[-1]
+
+    def seen(key, index, keypoints):
+        return _observed(config, jax.random.fold_in(key, index), keypoints)
+
+    def start(key, cable, keypoints):
+        first = _noisy(config, jax.random.fold_in(key, config.steps), keypoints)
+        repeated = jnp.repeat(first[None], config.history_length, axis=0)
+        return History(keypoints=repeated, gripper_pose=cable.gripper_pose)
+
+    still = jnp.zeros((len(seeds), config.rest, *cables.gripper_pose.shape[1:]), cables.qpos.dtype)
+    cables, keypoints = jax.vmap(moved)(params, cables, still)
+    histories = jax.vmap(start)(keys, cables, keypoints)
+    first = histories.keypoints[:, -1]
+    states = jax.vmap(lambda own, history: eqx.combine(own, shared).init(history))(own, histories)
+
+    def commanded(own, state, measurement):
+        state, twist, info = eqx.combine(own, shared).step(state, measurement)
+        return state, twist, [jnp.asarray(getattr(info, name, jnp.nan), twist.dtype) for name in REPORTED]
+
+    command = for_each_cable(commanded)
 
     def step(carry, index):
-        cable, state, keypoints = carry
-        state, twist, info = controller.step(state, Measurement(keypoints, cable.gripper_pose))
-        cable, shown = engine.unroll(params, cable, twist[None], config.interval)
-        keypoints = _observed(config, jax.random.fold_in(key, index), shown.keypoints[-1])
-        report = [jnp.asarray(getattr(info, name, jnp.nan), keypoints.dtype) for name in ("residual_share", "radius")]
-        return (cable, state, keypoints), (keypoints, cable.gripper_pose, twist, *report)
+        cables, states, keypoints = carry
+        states, twist, report = command(own, states, Measurement(keypoints, cables.gripper_pose))
+        cables, keypoints = jax.vmap(moved)(params, cables, twist[:, None])
+        keypoints = jax.vmap(seen, in_axes=(0, None, 0))(keys, index, keypoints)
+        return (cables, states, keypoints), (keypoints, cables.gripper_pose, twist, *report)
 
-    carry = (cable, controller.init(history), first)
-    _, (keypoints, pose, twist, share, radius) = jax.lax.scan(step, carry, jnp.arange(config.steps))
-    keypoints = jnp.concatenate([first[None], keypoints])
+    _, samples = jax.lax.scan(step, (cables, states, first), jnp.arange(config.steps))
+    later, pose, twist, share, radius = jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, 1), samples)
+    keypoints = jnp.concatenate([first[:, None], later], axis=1)
+    targets = jax.vmap(lambda own: eqx.combine(own, shared).target)(own)
     return BatchRun(
         keypoints=keypoints,
-        gripper_pose=jnp.concatenate([cable.gripper_pose[None], pose]),
+        gripper_pose=jnp.concatenate([cables.gripper_pose[:, None], pose], axis=1),
         twist=twist,
-        error_cm=_shape_error_cm(keypoints, controller.target),
+        error_cm=jax.vmap(_shape_error_cm)(keypoints, targets),
         residual_share=share,
         radius=radius,
     )

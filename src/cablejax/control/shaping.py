@@ -146,7 +146,9 @@ def _believed(effects: Sequence[GivenEffect], cable: Cable) -> tuple[float, floa
     config = Discretisation(cable)
     physics = with_effects(nominal_physics(config, np.float64), effects, config)
     force = np.asarray(physics.friction * physics.density * GRAVITY)
-    stiffness, friction = np.asarray(cable_descriptor(jnp.asarray(np.mean(physics.stiffness)), jnp.asarray(force)))
+    descriptor = cable_descriptor(jnp.asarray(np.mean(physics.stiffness)), jnp.asarray(force))
+    # before they are clipped: a bound in single precision may lie beyond itself
+    stiffness, friction = np.asarray(descriptor, float)
     low, high = AdaptationConfig().limits
     within = np.clip(friction, low, high)
     return float(np.clip(stiffness - (friction - within), low, high)), float(within)
