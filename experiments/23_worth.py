@@ -9,7 +9,7 @@ of every arm but the last is `gns-conditioned`, which estimates stiffness and fr
 it was told before (`cablejax shape --with verdict.json`), and by the online learner:
 
 - `plain`: nothing;
-- `diagnosed`: what the verdict on the log names;
+- `diagnosed`: what the verdict on the log names, where that enters a model;
 - `oracle`: the true effect;
 - `recorded`: `gns-reference`, trained on the log's own 180 transitions with their noise.
 """
@@ -156,8 +156,13 @@ def model_for(text: str, kind: str, home: pathlib.Path, case: Case) -> Model:
     del case
     if kind == "recorded":
         return fine_tune(transitions_of(log_of(text, home)), FineTuneConfig(), home / kind)
-    told = (parse_effect(text),) if kind == "oracle" else effects_of_verdict(verdict_of(text, home))
-    return knowing(load_model(MODEL), told)
+    model = load_model(MODEL)
+    if kind == "oracle":
+        return knowing(model, (parse_effect(text),))
+    try:
+        return knowing(model, effects_of_verdict(verdict_of(text, home)))
+    except ValueError:
+        return model  # nothing of what is named enters it
 
 
 def log_of(text: str, home: pathlib.Path) -> GapLog:
