@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from real_cables.benchmark import protocol_windows
-from real_cables.synthetic import MARKERS, SAMPLES, synthetic_recordings
+from real_cables.synthetic import MARKERS, SAMPLES, drawn_cable, synthetic_recordings
 
 RECORDINGS = 1
 
@@ -31,7 +31,7 @@ def test_a_seed_gives_one_recording_and_a_richer_law_another_one(fitted):
     cable, recordings = fitted
     again, same = synthetic_recordings(0, "as fitted", RECORDINGS)
     np.testing.assert_array_equal(same.keypoints, recordings.keypoints)
-    assert again.stiffness == cable.stiffness != synthetic_recordings(1, "as fitted", RECORDINGS)[0].stiffness
+    assert again.stiffness == cable.stiffness != drawn_cable(np.random.default_rng(1), RECORDINGS).stiffness
 
 
 def test_a_richer_law_moves_the_same_cable_otherwise(fitted):

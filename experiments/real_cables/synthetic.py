@@ -82,7 +82,7 @@ def synthetic_recordings(seed: int, law: Law, recordings: int = RECORDINGS) -> t
         FloatingPointError: the simulation of this cable broke down.
     """
     generator, more = np.random.default_rng(seed), np.random.default_rng((seed, 1))
-    cable = _drawn(generator, recordings)
+    cable = drawn_cable(generator, recordings)
     if law == "richer":
         cable = dataclasses.replace(
             cable,
@@ -106,7 +106,9 @@ def synthetic_recordings(seed: int, law: Law, recordings: int = RECORDINGS) -> t
     return cable, DeformRecordings(points, SAMPLE_INTERVAL, split, names, names, f"seed {seed}, {law}")
 
 
-def _drawn(generator: np.random.Generator, recordings: int) -> SyntheticCable:
+def drawn_cable(generator: np.random.Generator, recordings: int) -> SyntheticCable:
+    """A cable without the richer law, gripped anew in every recording."""
+
     def between(low, high):
         return float(np.exp(generator.uniform(np.log(low), np.log(high))))
 
