@@ -31,8 +31,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from cablejax.cable import Cable
+from cablejax.commands.runs import told_of
 from cablejax.control.loop import run_closed_loop
-from cablejax.control.shaping import Model, knowing, load_model, make_controller
+from cablejax.control.shaping import Model, enters, knowing, load_model, make_controller
 from cablejax.control.targets import Shape
 from cablejax.diagnose import diagnose, write_verdict
 from cablejax.effects.given import effects_of_verdict, parse_effect
@@ -159,10 +160,9 @@ def model_for(text: str, kind: str, home: pathlib.Path, case: Case) -> Model:
     model = load_model(MODEL)
     if kind == "oracle":
         return knowing(model, (parse_effect(text),))
-    try:
-        return knowing(model, effects_of_verdict(verdict_of(text, home)))
-    except ValueError:
-        return model  # nothing of what is named enters it
+    told = told_of(model, (), (verdict_of(text, home),))
+    # else nothing of what the verdict names enters it
+    return knowing(model, told) if enters(model, told) else model
 
 
 def log_of(text: str, home: pathlib.Path) -> GapLog:

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from cablejax.cli import main
-from cablejax.control.shaping import knowing, load_model, make_controller
+from cablejax.commands.runs import told_of
+from cablejax.control.shaping import enters, knowing, load_model, make_controller
 from cablejax.control.targets import make_target
 from cablejax.dataset.generate import make_engine, simulate
 from cablejax.dataset.schema import DatasetConfig
@@ -45,7 +46,7 @@ def test_a_conditioned_model_begins_with_what_it_was_told():
     told = knowing(conditioned, tuple(map(parse_effect, ("bending_stiffness:ratio=0.5", "linear_density:ratio=2"))))
     np.testing.assert_allclose(told.believed, np.log([0.5, 2.0]), rtol=1e-5)
     mpc = make_controller(told, make_target("U", told.cable), method="direct", solver="levenberg-marquardt")
-    assert mpc.config.adaptation.prior_mean == told.believed
+    assert mpc.config.adaptation is not None and mpc.config.adaptation.prior_mean == told.believed
     # only the ratio of both matters in slow motion: what is beyond the bound of one is taken up by the other
     far = knowing(conditioned, (parse_effect("linear_density:ratio=8"),))
     np.testing.assert_allclose(far.believed[1] - far.believed[0], np.log(8.0), rtol=1e-5)
@@ -61,6 +62,29 @@ def test_what_does_not_enter_a_model_is_refused_with_what_to_do(model, tmp_path,
     assert "such as gns-conditioned" in capsys.readouterr().err
     assert main([*words, "--motion", "next.npz"]) == 2
     assert "--motion uses no model" in capsys.readouterr().err
+
+
+def test_of_look_alikes_a_model_is_told_the_first_that_enters_it(tmp_path):
+    def written(effect):
+        name, parameters = effect.split(":")
+        return {
+            "name": name,
+            "parameters": {k: float(v) for k, v in (pair.split("=") for pair in parameters.split(","))},
+        }
+
+    patch, friction = "friction_patch:x_m=0,y_m=0,radius_m=0.4,coefficient=0.6", "table_friction:coefficient=0.6"
+    named = written(patch)
+    named["parameters"] = {name: {"value": value} for name, value in named["parameters"].items()}
+    verdict = {"schema": "cablejax-verdict/1", "verdict": "ambiguous", "effects": [named]}
+    verdict["posterior"] = [[written(patch)], [written(friction)]]
+    path = tmp_path / "verdict.json"
+    path.write_text(json.dumps(verdict))
+    conditioned = load_model("gns-conditioned")
+    assert not enters(conditioned, (parse_effect(patch),))
+    assert told_of(conditioned, (), (path,)) == (parse_effect(friction),)
+    # neither enters a model that knows no friction: the message is about what was named
+    with pytest.raises(ValueError, match="Nothing of friction_patch"):
+        knowing(load_model("gns-reference"), told_of(load_model("gns-reference"), (), (path,)))
 
 
 @pytest.mark.slow

@@ -15,10 +15,10 @@ from cablejax.commands.options import UsageError, say
 from cablejax.commands.results import summarise, write_results
 from cablejax.commands.resuming import Parts
 from cablejax.control.run import ClosedLoopRun
-from cablejax.control.shaping import Method, Model, check_fit, shape_once
+from cablejax.control.shaping import Method, Model, check_fit, enters, shape_once
 from cablejax.control.targets import Target
 from cablejax.dynamics.fingerprint import fingerprint
-from cablejax.effects.given import GivenEffect, effects_of_verdict, parse_effect
+from cablejax.effects.given import GivenEffect, effects_of_verdict, parse_effect, posterior_of_verdict
 from cablejax.effects.physics import nominal_physics
 from cablejax.limits import require
 from cablejax.perceive.camera import CameraConfig
@@ -133,14 +133,21 @@ def staged_effects(given: Sequence[str]) -> tuple[GivenEffect, ...]:
     return tuple(parse_effect(text) for text in given or (PLANT_EFFECT,))
 
 
-def told_of(given: Sequence[str], verdicts: Sequence[pathlib.Path]) -> tuple[GivenEffect, ...]:
-    """The effects of `--effect` and those that the verdicts of `--with` name.
+def told_of(model: Model, given: Sequence[str], verdicts: Sequence[pathlib.Path]) -> tuple[GivenEffect, ...]:
+    """What a model is told: the effects of `--effect` and those that the verdicts of `--with` name.
+
+    Where nothing of what a verdict names enters the model, the first of its look-alikes of which something does, as the
+    draws of its posterior have them.
 
     Raises:
         ValueError: a text is no effect, or a file is no verdict or names nothing.
     """
-    named = [effect for path in verdicts for effect in effects_of_verdict(path)]
-    return (*map(parse_effect, given), *named)
+    told = list(map(parse_effect, given))
+    for path in verdicts:
+        named = effects_of_verdict(path)
+        explanations = (named, *posterior_of_verdict(path))
+        told += next((effects for effects in explanations if enters(model, effects)), named)
+    return tuple(told)
 
 
 def plant_of(

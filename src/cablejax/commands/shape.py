@@ -61,7 +61,8 @@ class Shape(Command):
     table_friction and linear_density the first belief of a conditioned model."""
 
     with_: Annotated[tuple[pathlib.Path, ...], tyro.conf.arg(name="with"), tyro.conf.UseAppendAction] = ()
-    """A verdict.json of `cablejax diagnose`: the model is told of the effects that it names, as by --effect."""
+    """A verdict.json of `cablejax diagnose`: the model is told of the effects that it names, as by --effect; where
+    nothing of them enters it, of the first of their look-alikes that does."""
 
     perception: Literal["true", "cloud"] = "true"
     """true: the controller observes the simulated keypoints. cloud: it observes keypoints estimated from clouds of a
@@ -99,7 +100,7 @@ class Shape(Command):
         if self.motion is not None:
             return self._play(self.motion, effects)
         model = load_model(self.weights)
-        if told := told_of(self.effect, self.with_):
+        if told := told_of(model, self.effect, self.with_):
             model = knowing(model, told)
         cable = model.cable if self.cable is None else find_cable(self.cable)
         plant = plant_of(

@@ -119,14 +119,13 @@ def knowing(model: Model, effects: Sequence[GivenEffect]) -> Model:
     Raises:
         ValueError: nothing of the effects enters the model; names the ways that remain.
     """
-    statics = statics_with(effects, model.cable) if model.config.prior == "static" else Statics()
-    believed = _believed(effects, model.cable) if model.config.conditioned and effects else model.believed
-    if effects and statics == Statics() and np.allclose(believed, _believed((), model.cable), atol=1e-6):
+    if effects and not enters(model, effects):
         raise ValueError(
             f"Nothing of {', '.join(map(str, effects))} enters the model {model.name}: neither the rest of its cable, "
             "nor stiffness and friction of a conditioned model, such as gns-conditioned. Simulate data with it "
             "(`cablejax simulate --with`) and train on them (`cablejax train --start-from`)."
         )
+    statics, believed = _told(model, effects)
     config = dataclasses.replace(model.config, statics=statics)
     return dataclasses.replace(
         model,
@@ -135,6 +134,19 @@ def knowing(model: Model, effects: Sequence[GivenEffect]) -> Model:
         known=tuple(map(str, effects)),
         believed=believed,
     )
+
+
+def enters(model: Model, effects: Sequence[GivenEffect]) -> bool:
+    """Whether the model can be told anything of these effects, see `knowing`."""
+    statics, believed = _told(model, effects)
+    changed = model.config.conditioned and not np.allclose(believed, _believed((), model.cable), atol=1e-6)
+    return bool(effects) and (statics != Statics() or changed)
+
+
+def _told(model: Model, effects: Sequence[GivenEffect]) -> tuple[Statics, tuple[float, float]]:
+    """Statics and belief of a model that is told of effects."""
+    statics = statics_with(effects, model.cable) if model.config.prior == "static" else Statics()
+    return statics, _believed(effects, model.cable) if model.config.conditioned and effects else model.believed
 
 
 def _believed(effects: Sequence[GivenEffect], cable: Cable) -> tuple[float, float]:
