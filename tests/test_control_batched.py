@@ -13,7 +13,7 @@ import pytest
 
 from cablejax.bounded import Result
 from cablejax.cable import Cable, Discretisation
-from cablejax.control.batched import LoopConfig, shape_batch, varied_params
+from cablejax.control.batched import LoopConfig, for_each_cable, shape_batch, varied_params
 from cablejax.control.loop import run_closed_loop
 from cablejax.control.shaping import NetworkDynamics, load_model, make_controller
 from cablejax.control.targets import Target, make_target, straight_start
@@ -198,6 +198,20 @@ def test_the_batch_ends_where_the_contact_plant_ends():
         one = run_closed_loop(plant, controller, target, steps, start=straight_start(cable.cable), record_hz=1.0)
         assert np.abs(one.keypoints[:10] - run.keypoints[i, :10]).max() < 1.5e-3
         assert abs(one.terminal_error_cm - run.terminal_error_cm[i]) < 0.1
+
+
+def test_each_cable_is_stepped_as_alone():
+    """A loop that takes another number of rounds for every cable, as a planner's does."""
+
+    def step(state, measurement):
+        halved = jax.lax.while_loop(lambda x: x > measurement, lambda x: 0.5 * x, state)
+        return halved, {"twist": halved * jnp.ones(3)}
+
+    states, measurements = jnp.array([8.0, 1.0, 3.0]), jnp.array([1.5, 2.0, 0.1])
+    for devices in (None, jax.devices()[:1]):
+        after, command = jax.jit(for_each_cable(step, devices))(states, measurements)
+        np.testing.assert_array_equal(after, [1.0, 1.0, 0.09375])
+        np.testing.assert_array_equal(command["twist"], np.repeat(after[:, None], 3, axis=1))
 
 
 def test_wrong_requests_are_refused():
