@@ -32,6 +32,7 @@ EFFECTS = (
     "stiffness_profile:centre_m=0.3,width_m=0.25,ratio=0.2",
     "intrinsic_curvature:centre_m=0.6,width_m=0.3,curvature_per_m=2",
     "gripper_rotation_offset:gripper=1,angle_rad=0.15",
+    "gripper_compliance:gripper=1,stiffness_n_m_per_rad=0.15",
     "bending_stiffness:ratio=0.2",
     "table_friction:coefficient=0.3",
     "linear_density:ratio=3",
@@ -101,7 +102,7 @@ def main() -> None:
         *markdown_table(rows),
     ]
     publish(
-        page_of_results("A model that is told", f"`python experiments/27_told.py --out {options.out}`", lines),
+        page_of_results("A model that is told", "`python experiments/27_told.py --out docs/results/told.md`", lines),
         options.out,
     )
 

@@ -59,6 +59,7 @@ AT_REST = (
     "stiffness_profile:centre_m=0.3,width_m=0.25,ratio=0.2",
     "intrinsic_curvature:centre_m=0.6,width_m=0.3,curvature_per_m=2",
     "gripper_rotation_offset:gripper=1,angle_rad=0.15",
+    "gripper_compliance:gripper=1,stiffness_n_m_per_rad=0.15",
 )
 
 

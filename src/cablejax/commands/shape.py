@@ -57,8 +57,8 @@ class Shape(Command):
 
     effect: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
     """An effect that the model is told of, as for --plant-effect; may be given several times. What of it enters the
-    model: stiffness_profile, intrinsic_curvature and gripper_rotation_offset the rest of its cable; bending_stiffness,
-    table_friction and linear_density the first belief of a conditioned model."""
+    model: stiffness_profile, intrinsic_curvature, gripper_rotation_offset and gripper_compliance the rest of its cable;
+    bending_stiffness, table_friction and linear_density the first belief of a conditioned model."""
 
     with_: Annotated[tuple[pathlib.Path, ...], tyro.conf.arg(name="with"), tyro.conf.UseAppendAction] = ()
     """A verdict.json of `cablejax diagnose`: the model is told of the effects that it names, as by --effect; where

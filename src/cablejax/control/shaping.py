@@ -112,9 +112,9 @@ def knowing(model: Model, effects: Sequence[GivenEffect]) -> Model:
     """The model of a cable with these effects, without another training.
 
     Its static prior rests as a cable with them does (`stiffness_profile`, `intrinsic_curvature`,
-    `gripper_rotation_offset`); a conditioned model begins with the ratios of stiffness and friction that they make
-    (`bending_stiffness`, `table_friction`, `linear_density`). What else they do is left to the network and to what is
-    learned online.
+    `gripper_rotation_offset`, `gripper_compliance`); a conditioned model begins with the ratios of stiffness and
+    friction that they make (`bending_stiffness`, `table_friction`, `linear_density`). What else they do is left to the
+    network and to what is learned online.
 
     Raises:
         ValueError: nothing of the effects enters the model; names the ways that remain.

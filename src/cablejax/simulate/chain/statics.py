@@ -55,17 +55,21 @@ class Statics:
         stiffness: of each joint over their mean, J = LINKS - 1 of them; () = uniform. Only its course matters.
         rest_curvature: of each joint when free [1/m]; () = straight.
         rotation_offset: of the cable's clamp against either gripper's angle [rad].
+        yielding: share of the first and of the last joint's angle by which the clamp there turns: a clamp that yields
+            is a spring in series with the joint next to it, and `stiffness` has both.
     """
 
     stiffness: tuple[float, ...] = ()
     rest_curvature: tuple[float, ...] = ()
     rotation_offset: tuple[float, float] = (0.0, 0.0)
+    yielding: tuple[float, float] = (0.0, 0.0)
 
     def __post_init__(self):
         for name, count in (
             ("stiffness", (0, LINKS - 1)),
             ("rest_curvature", (0, LINKS - 1)),
             ("rotation_offset", (2,)),
+            ("yielding", (2,)),
         ):
             values = tuple(getattr(self, name))
             object.__setattr__(self, name, values)
@@ -73,6 +77,8 @@ class Statics:
                 raise ValueError(f"Statics.{name} is {values}, expected {' or '.join(map(str, count))} finite numbers.")
         if self.stiffness and min(self.stiffness) <= 0:
             raise ValueError(f"Statics.stiffness has {min(self.stiffness)}, expected positive numbers.")
+        if not all(0 <= share < 1 for share in self.yielding):
+            raise ValueError(f"Statics.yielding is {self.yielding}, expected shares from 0 to below 1.")
 
 
 def statics_with(effects: Iterable[GivenEffect], cable: Cable) -> Statics:
@@ -80,12 +86,16 @@ def statics_with(effects: Iterable[GivenEffect], cable: Cable) -> Statics:
     config = Discretisation(cable, n_links=LINKS)
     nominal = nominal_physics(config, np.float64)
     physics = with_effects(nominal, effects, config)
-    stiffness = np.asarray(physics.stiffness, float) / np.asarray(nominal.stiffness, float)
+    softness = 1 / np.asarray(physics.stiffness, float)
+    of_clamps = np.asarray(physics.rotation_compliance, float) * (LINKS - 1) / cable.length
+    softness[[0, -1]] += of_clamps
+    stiffness = 1 / (softness * np.asarray(nominal.stiffness, float))
     curvature = np.asarray(physics.rest_curvature, float)
     return Statics(
         () if np.ptp(stiffness) == 0 else tuple((stiffness / stiffness.mean()).tolist()),
         () if not curvature.any() else tuple(curvature.tolist()),
         tuple(np.asarray(physics.rotation_offset, float).tolist()),
+        tuple((of_clamps / softness[[0, -1]]).tolist()),
     )
 
 
@@ -167,18 +177,44 @@ def resting_shapes(
     turn = jnp.sum(angles)
     for _ in range(SETTLING_STEPS):
         angles = _newton_step(matrices, bending, angles, before, turn, length)
-    resting = _chain_keypoints(matrices, angles, before, turn)
+    resting = _chain_keypoints(matrices, bending, angles, before, turn)
     turn = turn + (after[1, 2] - after[0, 2]) - (before[1, 2] - before[0, 2])
     for _ in range(FOLLOWING_STEPS):
         angles = _newton_step(matrices, bending, angles, after, turn, length)
-    return resting, _chain_keypoints(matrices, angles, after, turn)
+    return resting, _chain_keypoints(matrices, bending, angles, after, turn)
 
 
-def _bending(statics: Statics, length: float, dtype: Any) -> tuple[Float[Array, "J"], Float[Array, "J"]]:
-    """Stiffness of each joint over the mean, and the angle at which it is free of moment [rad]."""
+class _Bending(NamedTuple):
+    """Stiffness of each joint over the mean, the angle at which it is free of moment [rad], `Statics.yielding`."""
+
+    stiffness: Float[Array, "J"]
+    free: Float[Array, "J"]
+    yielding: tuple[float, float]
+
+
+def _bending(statics: Statics, length: float, dtype: Any) -> _Bending:
     joints = LINKS - 1
     stiffness = jnp.asarray(statics.stiffness or np.ones(joints), dtype)
-    return stiffness, jnp.asarray(statics.rest_curvature or np.zeros(joints), dtype) * (length / joints)
+    free = jnp.asarray(statics.rest_curvature or np.zeros(joints), dtype) * (length / joints)
+    return _Bending(stiffness, free, statics.yielding)
+
+
+def _links(
+    matrices: ChainMatrices, bending: _Bending, angles: Array, pose: Array, turn: Array
+) -> tuple[Float[Array, "n"], Float[Array, "n 2"]]:
+    """Direction of every link [rad] and the vector along it [m]; where a clamp yields, its link turns with it."""
+    theta, links = links_of(matrices.link_lengths, angles, _heading(angles, pose, turn))
+    if not any(bending.yielding):
+        return theta, links
+    first, last = bending.yielding
+    theta = theta.at[0].add(first * (angles[0] - bending.free[0])).at[-1].add(-last * (angles[-1] - bending.free[-1]))
+    return theta, matrices.link_lengths[:, None] * jnp.stack([jnp.cos(theta), jnp.sin(theta)], axis=-1)
+
+
+def _beyond(bending: _Bending, links: Float[Array, "n 2"]) -> Float[Array, "J 2"]:
+    """What each joint's angle turns, as a vector to the far end [m]."""
+    first, last = bending.yielding
+    return beyond_joints(links).at[0].add(first * links[0]).at[-1].add(-last * links[-1])
 
 
 def _observed_angles(matrices: ChainMatrices, keypoints: Array, pose: Array) -> Float[Array, "J"]:
@@ -198,15 +234,14 @@ def _heading(angles: Array, pose: Array, turn: Array) -> Float[Array, ""]:
 
 
 def _newton_step(
-    matrices: ChainMatrices, bending: tuple[Array, Array], angles: Array, pose: Array, turn: Array, length: float
+    matrices: ChainMatrices, bending: _Bending, angles: Array, pose: Array, turn: Array, length: float
 ) -> Float[Array, "J"]:
     """One step on `min sum stiffness (angles - free)^2 / 2h`, the far end at gripper 1, the angles' sum `turn`."""
     joints = len(angles)
     h = length / joints
-    stiffness, free = bending
-    moments = stiffness * (angles - free) / h
-    _, links = links_of(matrices.link_lengths, angles, _heading(angles, pose, turn))
-    beyond, chord = beyond_joints(links), jnp.sum(links, axis=0)
+    moments = bending.stiffness * (angles - bending.free) / h
+    _, links = _links(matrices, bending, angles, pose, turn)
+    beyond, chord = _beyond(bending, links), jnp.sum(links, axis=0)
     # a joint turns what lies beyond it by half its angle, and what lies before it by as much the other way
     lever = beyond - chord / 2
     jacobian = jnp.stack([-lever[:, 1], lever[:, 0], jnp.full(joints, length, angles.dtype)])
@@ -216,7 +251,7 @@ def _newton_step(
     normal = normal + _SMALL * jnp.trace(normal) * jnp.eye(3, dtype=angles.dtype)
     tension = jnp.linalg.solve(normal, jacobian @ moments)
     pulled = beyond @ tension[:2]
-    hessian = jnp.diag(stiffness / h + DAMPING / length)
+    hessian = jnp.diag(bending.stiffness / h + DAMPING / length)
     hessian = with_tension(hessian, tension, beyond, matrices.later)
     hessian = hessian - (pulled[:, None] + pulled) / 2 + chord @ tension[:2] / 4
     system = jnp.block([[hessian, -jacobian.T], [-jacobian, -_SMALL * jnp.eye(3, dtype=angles.dtype)]])
@@ -225,9 +260,11 @@ def _newton_step(
     return angles + step * jnp.minimum(1.0, MAX_TURN / largest)
 
 
-def _chain_keypoints(matrices: ChainMatrices, angles: Array, pose: Array, turn: Array) -> Float[Array, "N 2"]:
+def _chain_keypoints(
+    matrices: ChainMatrices, bending: _Bending, angles: Array, pose: Array, turn: Array
+) -> Float[Array, "N 2"]:
     """Keypoints of the chain with these joint angles, what it misses gripper 1 by spread evenly along it."""
-    theta, links = links_of(matrices.link_lengths, angles, _heading(angles, pose, turn))
+    theta, links = _links(matrices, bending, angles, pose, turn)
     tangents = jnp.stack([jnp.cos(theta), jnp.sin(theta)], axis=-1)
     origins = pose[0, :2] + jnp.cumsum(jnp.concatenate([jnp.zeros((1, 2), angles.dtype), links[:-1]]), axis=0)
     nodes = origins + matrices.node_offsets[:, None] * tangents
