@@ -1,6 +1,6 @@
 """Environment-steps per second of `cablejax/ShapeCable-v0`, and of its form in JAX; errors of the package's controller.
 
-nice -n 10 python benchmarks/environment.py
+python benchmarks/environment.py
 """
 
 from __future__ import annotations
