@@ -167,6 +167,7 @@ def test_a_log_in_space_is_searched_for_the_effects_of_space(tmp_path, monkeypat
     assert asked == [("quadratic_drag",), None]
 
 
+@pytest.mark.slow
 def test_motion_is_designed_within_bounds_and_played_on_the_plant(log, tmp_path):
     bounds = tmp_path / "bounds.toml"
     bounds.write_text("workspace_m = [[-0.4, -0.5], [1.3, 0.7]]\nduration_s = 26\n")

@@ -186,7 +186,7 @@ def test_commands_take_buckets(wire, tmp_path, capsys):
     result = json.loads(capsys.readouterr().out)
     assert result["path"] == "s3://cables/cli.zarr" and result["complete"] == 4
     train = ["train", "--data", "s3://cables/cli.zarr", "--out", str(tmp_path / "train"), "--preset", "smoke"]
-    assert main([*train, "--steps", "2"]) == 0
+    assert main([*train, "--steps", "2", "--latent", "8", "--message-passing", "1"]) == 0
     assert "cablejax train --data cli.zarr" in (tmp_path / "train" / "card.md").read_text()
     wire.cut()
     capsys.readouterr()

@@ -106,6 +106,7 @@ def test_a_full_disk_costs_a_store_one_shard(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["data"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("command", ["train", "shape"])
 def test_a_full_disk_is_reported_and_the_same_command_goes_on(command, store, tmp_path, capfd):
     small = ["--preset", "smoke", "--latent", "8", "--message-passing", "1", "--steps", "4", "--held-out", "0.5"]

@@ -151,7 +151,8 @@ def wait_for_workers(address: str, count: int) -> None:
         client.wait_for_workers(count, timeout=120)
 
 
-def test_a_cluster_that_cannot_be_reached_is_a_message_at_the_start():
+def test_a_cluster_that_cannot_be_reached_is_a_message_at_the_start(monkeypatch):
     pytest.importorskip("distributed")
+    monkeypatch.setattr("executors.SECONDS", 1)
     with pytest.raises(ExecutorError, match="No Dask scheduler answers at tcp://127"):
         connect(f"tcp://127.0.0.1:{free_port()}")

@@ -8,6 +8,8 @@ import pytest
 from real_cables.benchmark import protocol_windows
 from real_cables.synthetic import MARKERS, SAMPLES, drawn_cable, synthetic_recordings
 
+pytestmark = pytest.mark.slow
+
 RECORDINGS = 1
 
 

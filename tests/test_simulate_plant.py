@@ -56,6 +56,18 @@ def test_a_new_cable_has_the_shape_of_the_elastica_whatever_its_stiffness(ratio)
     np.testing.assert_allclose(plant.reset(pose).keypoints, expected, atol=3e-3)
 
 
+@pytest.mark.parametrize("angle", [0.15, -0.2])
+def test_an_almost_straight_cable_that_is_gripped_askew_snaps_to_where_it_rests(angle):
+    """No shape near the guess is one at rest."""
+    askew = GivenEffect("gripper_rotation_offset", (("gripper", 1), ("angle_rad", angle)))
+    plant = Plant(dataclasses.replace(CONFIG, effects=(askew,)))
+    pose = np.array([[-0.4973, 0.0, 0.01], [0.4973, 0.0, -0.01]])
+    length, s = CABLE.cable.length, CABLE.cable.keypoint_arclength
+    guess = elastica(pose, length, np.linspace(0, length, 101))
+    expected = elastica(pose + [[0, 0, 0], [0, 0, angle]], length, s)
+    np.testing.assert_allclose(plant.reset(pose, guess=guess).keypoints, expected, atol=3e-3)
+
+
 def test_friction_of_a_sliding_cable_is_coulombs():
     # Dragged along, all of the free cable slides: every contact pushes back with mu times its load.
     plant = rubbing(0.1)

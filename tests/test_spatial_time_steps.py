@@ -33,19 +33,15 @@ def _found(windows: Windows):
     return time_steps_for(_cable(windows))
 
 
-@pytest.fixture(scope="module")
-def fast():
-    windows = _swung(3.0)
-    return windows, _found(windows)
-
-
 def test_a_step_for_every_sample_will_do_for_a_hand():
     found = _found(_swung(1.0))
     assert found.substeps == 1 and found.fine_enough and 0 < found.error < 0.005
 
 
-def test_fast_grippers_need_more(fast):
-    windows, found = fast
+@pytest.mark.slow
+def test_fast_grippers_need_more():
+    windows = _swung(3.0)
+    found = _found(windows)
     assert found.substeps > 1
     effects = [_cable(windows).layout.named(name) for name in ("bending_damping", "viscous_drag")]
     damped = explanation(*((effect, 0, (effect.parameters[0].centre,)) for effect in effects))
