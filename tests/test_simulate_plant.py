@@ -64,7 +64,7 @@ def test_an_almost_straight_cable_that_is_gripped_askew_snaps_to_where_it_rests(
     pose = np.array([[-0.4973, 0.0, 0.01], [0.4973, 0.0, -0.01]])
     length, s = CABLE.cable.length, CABLE.cable.keypoint_arclength
     guess = elastica(pose, length, np.linspace(0, length, 101))
-    expected = elastica(pose + [[0, 0, 0], [0, 0, angle]], length, s)
+    expected = elastica(np.add(pose, [[0, 0, 0], [0, 0, angle]]), length, s)
     np.testing.assert_allclose(plant.reset(pose, guess=guess).keypoints, expected, atol=3e-3)
 
 

@@ -78,7 +78,7 @@ class Plant(TablePlant):
         cable, data, physics = self.config.cable, self._data, self._physics
         held = pose + np.array([[0.0, 0.0, offset] for offset in physics.rotation_offset])
         # A chain's links follow the elastica's chords; only the held ones have the exact direction in the grippers, to
-        # which the others then settle: a cable that is gripped askew may snap over, and no shape near it would be found.
+        # which the others then settle: a cable that is gripped askew may snap over, with no shape near it at rest.
         shape = solve_elastica(pose, cable.length, guess=guess, n_samples=2 * self.config.discretisation.n_joints + 1)
         vertices = np.concatenate([shape.position[:1], shape.position[1:-1:2], shape.position[-1:]])
         chords = np.diff(vertices, axis=0)
