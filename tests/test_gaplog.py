@@ -13,8 +13,10 @@ from cablejax.cable import Cable
 from cablejax.gaplog import (
     Episode,
     GapLogError,
+    episodes_of,
     gap_log_from_episodes,
     read_gap_log,
+    until,
     validate,
     write_gap_log,
 )
@@ -58,6 +60,15 @@ def test_assembly_pads_short_episodes(log):
     assert log.meta["motion"] == ["approach", "mirror"]
     assert log.meta["cable"] == CABLE_META
     assert log.meta["keypoint_arclength_m"] == [0.0, 0.25, 0.5, 0.75, 1.0]
+
+
+def test_the_beginning_of_a_log(log):
+    short = until(log, 0.55)
+    validate(short)
+    assert short.episode_length.tolist() == [6, 5] and short.meta == log.meta
+    for one, whole in zip(episodes_of(short), episodes_of(log), strict=True):
+        assert (one.time < 0.55).all() and one.motion == whole.motion
+        np.testing.assert_array_equal(one.keypoints, whole.keypoints[: len(one.time)])
 
 
 def test_a_smooth_table_is_a_table():

@@ -313,6 +313,7 @@ def test_the_grippers_rest_at_a_good_moment_or_go_back_to_one():
     assert list(modes(tired)) == [follow, follow, follow, rest]
     assert list(modes([*tired, 0.005, 0.0055, 0.0058]))[-3:] == [rest, rest, rest], "the cable relaxes by itself"
     assert list(modes([*tired, 0.005, 0.005, 0.0065]))[-1] == follow, "and is disturbed"
+    assert list(modes([*tired, 0.1, 0.03, 0.03]))[-1] == follow, "as it may be while it relaxes"
     worse = [0.004, 0.003, 0.006, 0.006, 0.005, 0.0045, 0.0045]
     assert list(modes(worse, (0.08, 0.03, 0.0, 0.0)))[-4:] == [back, back, rest, rest]
 

@@ -161,6 +161,16 @@ def episodes_of(log: GapLog) -> list[Episode]:
     ]
 
 
+def until(log: GapLog, seconds: float) -> GapLog:
+    """The samples of every episode before a time [s]; episodes begin at 0, so a positive one leaves some of each."""
+    fields = ("time", "keypoints", "gripper_pose", "gripper_command", "hold")
+    episodes = [
+        dataclasses.replace(one, **{name: getattr(one, name)[one.time < seconds] for name in fields})
+        for one in episodes_of(log)
+    ]
+    return stack_episodes(episodes, log.meta, holds=log.hold is not None)
+
+
 def write_gap_log(
     path: str | os.PathLike,
     log: GapLog,

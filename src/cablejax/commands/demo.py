@@ -8,14 +8,20 @@ from typing import ClassVar, Literal
 
 from cablejax.commands.options import Command, say, text_table
 
+PUSHED_AT = 25.0
+"""When the cable is pushed [s]."""
+PUSH = f"gravity_tilt:angle_rad=0.6,direction_rad=1.6,from_s={PUSHED_AT:g},until_s={PUSHED_AT + 1.5:g}"
+"""Gravity seems tilted for a moment, so that the cable slides aside by a decimetre."""
+
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Demo(Command):
     """Shape a cable into a U, an S and a Z with the released model, and make a page about it.
 
     The cable is a fifth as stiff as the one the model was trained on and rubs on the table by another law. Each shape
-    is made with and without the online residual. Writes summary.json, log.npz, report.html and demo.gif, and ends by
-    diagnosing its own run: diagnosis/report.html names what the simulator lacks.
+    is made with and without the online residual, and after 25 s the cable is pushed aside. Writes summary.json,
+    log.npz, report.html and demo.gif, and ends by diagnosing its own run until the push: diagnosis/report.html names
+    what the simulator lacks.
     """
 
     resume_hint: ClassVar[str] = "Run the same command again: finished runs are kept and not repeated."
@@ -32,7 +38,7 @@ class Demo(Command):
     shapes: tuple[Literal["U", "S", "Z"], ...] = ("U", "S", "Z")
     """Which shapes to make."""
 
-    steps: int = 40
+    steps: int = 45
     """Commands per run, one second each."""
 
     links: int = 24
@@ -45,12 +51,12 @@ class Demo(Command):
         """Shapes U, S and Z with and without the residual, reports, and diagnoses the run."""
         from cablejax.commands.results import table_of
         from cablejax.commands.resuming import unfinished
-        from cablejax.commands.runs import Job, plant_of, shape_and_report, staged_effects
+        from cablejax.commands.runs import PLANT_EFFECT, Job, plant_of, shape_and_report, staged_effects
         from cablejax.control.shaping import METHODS, load_model
         from cablejax.control.targets import make_target
 
         model = load_model(self.weights)
-        plant = plant_of(model.cable, staged_effects(()), links=self.links, seed=self.seed)
+        plant = plant_of(model.cable, staged_effects((PLANT_EFFECT, PUSH)), links=self.links, seed=self.seed)
         job = Job(
             plant=plant,
             model=model,
@@ -75,15 +81,15 @@ class Demo(Command):
         }, text if gap is None else f"{text}\nThe gap: {gap['sentence']}\n{gap['report']}"
 
     def _diagnosed(self) -> dict[str, str] | None:
-        """Diagnosis of the gap between plant and simulator; None for a run that is too short."""
+        """Diagnosis of the gap between plant and simulator until the push; None for a run that is too short."""
         from cablejax.commands.diagnose import diagnose_and_report
         from cablejax.diagnose import DiagnosisError
-        from cablejax.gaplog import read_gap_log
+        from cablejax.gaplog import read_gap_log, until
 
         folder = self.out / "diagnosis"
         try:
             folder.mkdir(exist_ok=True)
-            result, page = diagnose_and_report(read_gap_log(self.out / "log.npz"), folder)
+            result, page = diagnose_and_report(until(read_gap_log(self.out / "log.npz"), PUSHED_AT), folder)
         except DiagnosisError as error:
             say(f"The gap was not diagnosed: {error}")
             return None

@@ -190,8 +190,10 @@ def about(job: Job) -> str:
     changes = _changes(believed, plant)
     if changes:
         sentences.append(f"The plant has {listed(changes)}.")
-    if plant.effects:
-        sentences.append(f"Staged in the plant: {listed([f'{EFFECTS[e.name]} ({e})' for e in plant.effects])}.")
+    always = [f"{EFFECTS[e.name]} ({e})" for e in plant.effects if e.lasting]
+    if always:
+        sentences.append(f"Staged in the plant: {listed(always)}.")
+    sentences += [f"{_when(e)}: {EFFECTS[e.name]} ({e})." for e in plant.effects if not e.lasting]
     if not changes and not plant.effects:
         sentences.append("The plant has the same cable.")
     sentences.append(
@@ -205,6 +207,11 @@ def about(job: Job) -> str:
     elif plant.keypoint_noise > 0:
         sentences.append(f"The keypoints are seen with {1e3 * plant.keypoint_noise:g} mm of noise.")
     return " ".join(sentences)
+
+
+def _when(effect: GivenEffect) -> str:
+    """When an effect acts, in words."""
+    return f"From {effect.from_s:g} s" + (" on" if effect.until_s is None else f" to {effect.until_s:g} s")
 
 
 _QUANTITIES = {

@@ -17,7 +17,9 @@ from cablejax.mpc.state import Action, Progress
 from cablejax.mpc.warm_start import Starts
 
 RELAXES = 2
-"""Commands of a rest in which the error may change by itself."""
+"""Commands of a rest in which the error may change by itself, to at most `RELAXED` times what it was in each."""
+RELAXED = 2.0
+"""Above that ratio something else has moved the cable."""
 ABOUT = 1.25
 """An error of at most this ratio to the lowest counts as about as low."""
 
@@ -108,6 +110,7 @@ def _followed(
     """
     resting = before.mode == Action.HOLD
     # what moved fast comes to rest a while after its grippers
+    relaxed = (before.since < RELAXES) & (error <= RELAXED * before.rest_error + config.wake)
     calming = resting & (before.since < RELAXES)
     woken = resting & ~calming & (error > before.rest_error + config.wake)
     planning = (before.mode == Action.FOLLOW) | woken
@@ -139,7 +142,7 @@ def _followed(
         mode=mode.astype(jnp.int32),
         way_left=left,
         restarts=before.restarts + straighten,
-        rest_error=jnp.where(resting & ~calming & ~woken, before.rest_error, error),
+        rest_error=jnp.where(resting & ~relaxed & ~woken, before.rest_error, error),
     )
 
 
