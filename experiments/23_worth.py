@@ -241,7 +241,7 @@ def page(out: pathlib.Path) -> str:
             ),
             "",
         ]
-    command = "python experiments/23_worth.py --report docs/results/worth.md"
+    command = "python experiments/23_worth.py --out docs/results/trials/worth --report docs/results/worth.md"
     return page_of_results("What a diagnosis is worth", f"`{command}`", lines)
 
 
