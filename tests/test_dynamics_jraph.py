@@ -10,7 +10,7 @@ from flax import nnx
 from cablejax.dynamics.config import ModelConfig
 from cablejax.dynamics.gns import GNS, MessagePassing
 from cablejax.dynamics.graph import build_graph, prior_of
-from cablejax.dynamics.weights import load_released
+from cablejax.dynamics.weights import load_weights
 from dynamics_cases import arched_history
 
 CONFIG = ModelConfig(n_keypoints=9, radius=0.3, latent=16, hidden=16, message_passing=3)
@@ -72,7 +72,7 @@ def test_the_order_of_the_edges_is_the_only_thing_the_kernel_takes_for_granted()
 
 
 def test_the_released_network_reads_its_graph_as_jraph_does():
-    config, graphdef, weights = load_released("gns-reference")
+    config, graphdef, weights = load_weights("gns-reference")
     network = nnx.merge(graphdef, weights)
     history = arched_history(config)
     graph = build_graph(history, TWIST, prior_of(history, TWIST, config), config)

@@ -17,7 +17,6 @@ from cablejax.dynamics.model import apply
 from cablejax.dynamics.weights import (
     WeightsError,
     load_info,
-    load_released,
     load_weights,
     released_names,
     save_weights,
@@ -131,14 +130,14 @@ def test_released_models_are_found_by_name(saved, monkeypatch):
     saved.parent.rename(folder)
     (folder / saved.name).rename(folder / "mine.safetensors")
     assert released_names() == ("mine",)
-    assert load_released("mine")[0] == load_weights("mine")[0] == CONFIG
+    assert load_weights("mine")[0] == CONFIG
     with pytest.raises(WeightsError, match=r"'other' \(released: mine\)"):
-        load_released("other")
+        load_weights("other")
 
 
 def test_whatever_this_package_releases_can_be_loaded():
     for name in released_names():
-        config, graphdef, weights = load_released(name)
+        config, graphdef, weights = load_weights(name)
         assert isinstance(config, ModelConfig)
         assert nnx.split(nnx.eval_shape(lambda config=config: GNS(config, nnx.Rngs(0))))[0] == graphdef
         assert {"data", "training", "versions", "machine"} <= load_info(name).keys()

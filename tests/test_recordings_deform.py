@@ -53,7 +53,6 @@ def test_a_folder_of_pickles_is_read_in_the_order_of_its_numbers(folder):
     assert recordings.split.tolist() == ["train", "eval", "train", "train"]
     assert recordings.recording.tolist() == [0, 0, 1, 2]
     assert recordings.dt == DT and recordings.name == "DLO9"
-    np.testing.assert_array_equal(recordings.gripper_markers, recordings.keypoints[:, :, [0, 1, 7, 8]])
 
 
 def test_an_archive_is_read_the_same(folder, archive):

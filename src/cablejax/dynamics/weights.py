@@ -100,17 +100,6 @@ def load_weights(
     return config, graphdef, nnx.from_flat_state(leaves)
 
 
-def load_released(
-    name: str = "gns-reference", *, expect: ModelConfig | None = None
-) -> tuple[ModelConfig, nnx.GraphDef, nnx.State]:
-    """The network released with this package under `name`.
-
-    Raises:
-        WeightsError: nothing is released under that name, or see `load_weights`.
-    """
-    return load_weights(_released(name), expect=expect)
-
-
 def load_info(source: str | os.PathLike[str]) -> dict[str, Any]:
     """The provenance of the weights, as given to `save_weights`; `source` as in `load_weights`."""
     return _open(source)[1]["info"]

@@ -72,11 +72,6 @@ class DeformRecordings:
                     f"block."
                 )
 
-    @property
-    def gripper_markers(self) -> Float[np.ndarray, "W T 4 3"]:
-        """The two pairs of markers on the grippers, outer 0, inner 0, inner 1, outer 1 [m]."""
-        return self.keypoints[:, :, GRIPPER_MARKERS]
-
 
 def read_deform(path: str | os.PathLike[str]) -> DeformRecordings:
     """Reads the recordings of one cable, in double precision and in the order of their numbers.
