@@ -28,9 +28,6 @@ from cablejax.types import GapLog
 SAMPLE_INTERVAL = 0.01
 """Seconds between two samples of the data set; its pickles hold no times."""
 
-GRIPPER_MARKERS = (0, 1, -2, -1)
-"""Markers on the two grippers: an outer and an inner one at each end of the cable."""
-
 ADJOINING = 0.05
 """Largest distance [m] of any marker from the last sample of a block to the first of the next, within a recording."""
 
