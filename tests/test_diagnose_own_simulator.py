@@ -299,8 +299,8 @@ def test_batches_are_of_one_size_and_pairs_in_place():
 
 
 GENERIC = (
-    "belief", "conclude", "conformal", "diagnosis", "evidence", "fit", "gap", "given_arrays", "judgement", "noise",
-    "profile", "protocol", "refits", "repeats", "run", "screen", "search",
+    "belief", "conclude", "conformal", "diagnosis", "evidence", "fit", "gap", "given_arrays", "judgement", "laws",
+    "noise", "posterior", "profile", "protocol", "refits", "repeats", "run", "screen", "search",
 )  # fmt: skip
 ALLOWED = {f"cablejax.diagnose.{name}" for name in GENERIC} | {"cablejax.bounded", "cablejax.effects.effect"}
 

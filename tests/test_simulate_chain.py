@@ -9,11 +9,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.optimize
 
 from cablejax.cable import Cable, Discretisation
 from cablejax.effects.given import EFFECTS, GivenEffect, parse_effect, with_effects
 from cablejax.effects.physics import Physics, nominal_physics
 from cablejax.simulate import ENGINES, ChainEngine, MjxEngine, check_effects
+from cablejax.simulate.friction import on_table
 
 POSE = np.array([[-0.45, 0.0, 0.5], [0.45, 0.0, -0.5]])
 GIVEN = tuple(
@@ -127,6 +129,42 @@ def test_effects_act_alike_in_every_engine_that_honours_them(nominal, name):
         assert np.abs(moved - expected).max() <= 0.05 * size + 2e-4, str(given)
 
 
+def test_grippers_carry_the_ends_as_they_would_a_beam_on_a_table():
+    """Against the least energy of a beam that a gripper holds level 1 mm above a table into which it may not sink."""
+    cable, height, count = Cable(), 1e-3, 200
+    weight, h = 9.81 * cable.linear_density, 0.5 * cable.length / count
+    # second differences of the heights, of which the first is the gripper's and mirrored about it
+    bend = np.eye(count, k=-2) - 2.0 * np.eye(count, k=-1) + np.eye(count)
+    bend[0, 0], held = np.sqrt(2.0), np.zeros(count)
+    held[0], held[1] = -np.sqrt(2.0) * height, height
+    hessian = cable.bending_stiffness / h**3 * bend.T @ bend
+    gradient = cable.bending_stiffness / h**3 * bend.T @ held + weight * h
+    root = np.linalg.cholesky(hessian).T
+    found = scipy.optimize.lsq_linear(root, -np.linalg.solve(root.T, gradient), (0.0, np.inf), method="bvls")
+    pressed = np.where(found.x > 0, 0.0, hessian @ found.x + gradient)
+    lands = h * (1 + np.argmax(pressed > 0))
+
+    config = Discretisation(cable, n_links=65)
+    physics = dataclasses.replace(nominal_physics(config, np.float64), grip_height=np.float64(height))
+    mass = np.full(config.n_links, cable.linear_density * config.link_length)
+    load = 9.81 * on_table(physics, mass, config.link_length)
+    np.testing.assert_allclose(load, load[::-1], atol=1e-12)
+    assert np.argmax(load > 0) * config.link_length == pytest.approx(lands, abs=config.link_length)
+    # either gripper has a held half link besides
+    hanging = 0.5 * (9.81 * mass[1:-1].sum() - load[1:-1].sum() + 9.81 * mass[0])
+    assert hanging == pytest.approx(0.5 * weight * (cable.length + h) - pressed.sum(), rel=0.01)
+
+
+def test_grippers_that_carry_the_ends_do_so_in_every_engine(nominal):
+    config, still = nominal
+    physics = dataclasses.replace(nominal_physics(config), grip_height=np.float32(2e-3))
+    expected = keypoints(ChainEngine(config), physics) - still["chain"]
+    assert 1e-4 < np.abs(expected).max() < 0.02
+    for name, engine in ENGINES.items():
+        moved = keypoints(engine(config), physics) - still[name]
+        assert np.abs(moved - expected).max() <= 0.05 * np.abs(expected).max() + 1e-5, name
+
+
 @pytest.mark.parametrize("name", ENGINES)
 def test_null_values_leave_a_rollout_as_it_is(nominal, name):
     config, still = nominal
@@ -214,7 +252,10 @@ SMOOTH = {
     "bending": ("stiffness", "rest_curvature", "damping_time"),
     "extension": ("axial_compliance", "slip", "slip_time"),
     "memory": ("yield_curvature", "hardening", "hysteresis_moment", "hysteresis_curvature"),
-    "table": ("friction", "static_excess", "patch_centre", "patch_radius", "patch_friction", "drag", "tilt", "gravity"),
+    "table": (
+        *("friction", "static_excess", "patch_centre", "patch_radius", "patch_friction", "drag", "tilt", "gravity"),
+        "grip_height",
+    ),
     "mass": ("density", "extra_mass"),
     "grasp": ("rotation_offset",),
     "compliance": ("rotation_compliance",),
@@ -243,6 +284,7 @@ def acting(dtype) -> Physics:
         "patch_friction": 0.1,
         "drag": 0.5,
         "tilt": np.array([0.2, -0.1]),
+        "grip_height": 1e-4,
         "extra_mass": np.linspace(0.0, 0.01, SMALL.n_links),
         "rotation_offset": np.array([0.03, -0.02]),
         "rotation_compliance": np.array([0.3, 0.1]),

@@ -74,7 +74,7 @@ class Calibration:
     telling: float = 0.6
     set_odds: float = 0.08
     as_good: float = 1.25
-    widening: float = 1.6
+    widening: float = 1.5
     max_terms: int = 3
 
     def temper(self, gap: Float[np.ndarray, "E"], noise: float) -> Float[np.ndarray, "E"]:

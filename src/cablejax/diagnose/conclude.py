@@ -15,25 +15,27 @@ from cablejax.diagnose.belief import (
     effect_names,
     excess,
     explains_most_motions,
-    in_doubt,
     level,
     probabilities,
 )
 from cablejax.diagnose.conformal import leftover_p, leftover_score
-from cablejax.diagnose.diagnosis import PLACES, EffectValues, NamedEffect, ParameterEstimate, Ranked, Verdict
+from cablejax.diagnose.diagnosis import (
+    PLACES,
+    EffectValues,
+    NamedEffect,
+    ParameterEstimate,
+    Ranked,
+    UnderLaw,
+    Verdict,
+)
 from cablejax.diagnose.evidence import Evidence
 from cablejax.diagnose.fit import Fit
 from cablejax.diagnose.gap import shrinkage
 from cablejax.diagnose.judgement import judged, verdict_sentence
-from cablejax.diagnose.profile import scaled_draws
+from cablejax.diagnose.laws import Law
+from cablejax.diagnose.posterior import draws, over_laws, posterior
 from cablejax.diagnose.protocol import Simulator
 from cablejax.diagnose.search import Search
-
-_DRAWS = 400
-# These are not simulated, and Student's tails need more of them.
-_JACKKNIFE_DRAWS = 4000
-# Of the posterior that a verdict holds.
-_POSTERIOR = 16
 
 
 @dataclasses.dataclass(frozen=True)
@@ -49,6 +51,7 @@ class Conclusion:
         explained: share of the squared gap that the best explanation takes away, on the episodes of the fit.
         leftover_p: of the test whether it leaves more than a right one does, see `conformal`; None without a gap.
         posterior: see `Diagnosis`.
+        under_laws: see `Diagnosis`.
     """
 
     verdict: Verdict
@@ -59,10 +62,18 @@ class Conclusion:
     explained: float
     leftover_p: float | None = None
     posterior: tuple[tuple[EffectValues, ...], ...] = ()
+    under_laws: tuple[UnderLaw, ...] = ()
 
 
-def conclude(found: Search, evidence: Evidence, calibration: Calibration) -> Conclusion:
-    """Probabilities, equivalence sets and the verdict."""
+def conclude(found: Search, evidence: Evidence, calibration: Calibration, laws: Sequence[Law] = ()) -> Conclusion:
+    """Probabilities, equivalence sets and the verdict.
+
+    Args:
+        found: by the search.
+        evidence: that was explained.
+        calibration: of the judgement.
+        laws: what was found by the simulator's other laws: the verdict is not theirs, but its intervals hold over all.
+    """
     chances = probabilities(found.scores)
     best = found.fits[0]
     null = next(fit for fit in found.fits if not fit.explanation.terms)
@@ -74,10 +85,11 @@ def conclude(found: Search, evidence: Evidence, calibration: Calibration) -> Con
     if gap <= smallest:
         return Conclusion("none", null, (), (), ranking, 0.0)
     as_much = leftover_p(leftover_score(left, gap, level(evidence), calibration), evidence.simulator.right_scores)
+    under = tuple(_under(law, calibration) for law in laws)
     if not best.explanation.terms:
-        return Conclusion("unknown", best, (), (), ranking, explained, as_much)
+        return Conclusion("unknown", best, (), (), ranking, explained, as_much, (), under)
 
-    draws = _draws(evidence, best, calibration)
+    drawn = over_laws(draws(evidence, best, calibration), best, laws, calibration)
     effects, equivalent = [], []
     for name in effect_names(best.explanation):
         rest = set(effect_names(best.explanation)) - {name}
@@ -99,16 +111,22 @@ def conclude(found: Search, evidence: Evidence, calibration: Calibration) -> Con
         )
         if len(alike) > 1:
             equivalent.append(tuple(alike))
-        effects.append(_named(name, best, odds[name] / total, draws, evidence.simulator))
+        effects.append(_named(name, best, odds[name] / total, drawn, evidence.simulator))
     complete = calibration.complete(left, gap, level(evidence))
     telling = _telling(best, null, explained, complete, evidence, calibration)
     verdict = judged(resolvable=True, telling=telling, complete=complete, alike=bool(equivalent))
     if verdict == "unknown":
-        return Conclusion("unknown", best, (), (), ranking, explained, as_much)
+        return Conclusion("unknown", best, (), (), ranking, explained, as_much, (), under)
     order = np.argsort([-e.probability for e in effects])
     named = tuple(effects[i] for i in order)
-    posterior = _posterior(found, evidence, calibration, draws)
-    return Conclusion(verdict, best, named, tuple(equivalent), ranking, explained, as_much, posterior)
+    likely = posterior(found, evidence, calibration, drawn)
+    return Conclusion(verdict, best, named, tuple(equivalent), ranking, explained, as_much, likely, under)
+
+
+def _under(law: Law, calibration: Calibration) -> UnderLaw:
+    """The verdict by another law alone."""
+    other = conclude(law.found, law.evidence, calibration)
+    return UnderLaw(law.assumes, law.probability, other.verdict, other.effects, other.equivalent)
 
 
 def _telling(best: Fit, null: Fit, explained: float, complete: bool, evidence, calibration: Calibration) -> bool:
@@ -118,53 +136,6 @@ def _telling(best: Fit, null: Fit, explained: float, complete: bool, evidence, c
     before, after = (fit.refits.sse - evidence.count for fit in (null, best) if fit.refits is not None)
     interval = shrinkage(before, after, evidence.motion)[1]
     return interval is not None and interval[0] > 0
-
-
-def _draws(evidence: Evidence, fit: Fit, calibration: Calibration) -> Float[np.ndarray, "D P"]:
-    """Coordinates as likely as the log says.
-
-    Where parts of the recordings were left out, how far that moves them (jackknife) adds to the posterior's width, and
-    the distribution is Student's with a degree of freedom fewer than parts; else they follow profiles of the posterior.
-    """
-    random = np.random.default_rng(0)
-    if not len(fit.explanation.z):
-        return np.zeros((_DRAWS, 0))
-    if fit.refits is None:
-        return scaled_draws(evidence, fit, calibration.widening, _DRAWS, random)
-    z = np.stack([one.z for one in fit.refits.explanations])
-    parts = len(z)
-    covariance = np.linalg.inv(fit.precision(evidence)) + (parts - 1) * np.cov(z.T, bias=True).reshape(2 * z.shape[1:])
-    normal = random.multivariate_normal(np.zeros(len(covariance)), covariance, _JACKKNIFE_DRAWS, method="cholesky")
-    drawn = fit.explanation.z + normal * np.sqrt((parts - 1) / random.chisquare(parts - 1, (_JACKKNIFE_DRAWS, 1)))
-    return np.clip(drawn, *fit.explanation.bounds.T)
-
-
-def _posterior(
-    found: Search, evidence: Evidence, calibration: Calibration, best: Float[np.ndarray, "D P"]
-) -> tuple[tuple[EffectValues, ...], ...]:
-    """Explanations that the verdict leaves open with their values, each as often as it is probable.
-
-    Args:
-        found: by the search.
-        evidence: that was fitted.
-        calibration: of the judgement.
-        best: draws of the best fit's coordinates, in no order.
-    """
-    fits, chances = in_doubt(found.fits, found.scores, evidence, calibration)
-    taken = np.searchsorted(np.cumsum(chances), (np.arange(_POSTERIOR) + 0.5) / _POSTERIOR)
-    posterior = []
-    for k in np.unique(np.minimum(taken, len(fits) - 1)):
-        draws = best if fits[k] is found.fits[0] else _draws(evidence, fits[k], calibration)
-        for z in draws[: int(np.sum(taken == k))]:
-            terms = fits[k].explanation.by_term(z)
-            reports = [(term, evidence.simulator.report(term, term.values(value))) for term, value in terms]
-            posterior.append(
-                tuple(
-                    EffectValues(term.effect.name, {key: value for key, (value, _) in report.parameters.items()})
-                    for term, report in reports
-                )
-            )
-    return tuple(posterior)
 
 
 def baselines(found: Search, evidence: Evidence) -> dict[str, str]:

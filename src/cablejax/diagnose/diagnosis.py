@@ -71,6 +71,23 @@ class EffectValues:
 
 
 @dataclasses.dataclass(frozen=True)
+class UnderLaw:
+    """What the verdict would be if the simulator assumed something else, of the explanations that it left open.
+
+    Attributes:
+        assumes: in words, as in "the grippers carry the cable's ends".
+        probability: of this law among all that were tried, the simulator's own included.
+        verdict, effects, equivalent: as in `Diagnosis`.
+    """
+
+    assumes: str
+    probability: float
+    verdict: Verdict
+    effects: tuple[NamedEffect, ...]
+    equivalent: tuple[tuple[str, ...], ...]
+
+
+@dataclasses.dataclass(frozen=True)
 class Ranked:
     """One effect that was tried: alone, or in a forward search on top of those kept before it.
 
@@ -204,6 +221,8 @@ class Diagnosis:
         settings: versions and options, for the record.
         posterior: sets of effects, equally probable: draws of which explanation holds and of its parameters; empty
             where nothing is named.
+        under_laws: what the verdict would be under other laws of the simulator; `effects` and `posterior` have their
+            intervals over all laws. Empty without a gap, and where the simulator offers none.
     """
 
     verdict: Verdict
@@ -220,6 +239,7 @@ class Diagnosis:
     seconds: float
     settings: dict[str, Any]
     posterior: tuple[tuple[EffectValues, ...], ...] = ()
+    under_laws: tuple[UnderLaw, ...] = ()
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

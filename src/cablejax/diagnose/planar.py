@@ -16,6 +16,12 @@ from cablejax.diagnose.protocol import Explanation, Report, Simulator
 from cablejax.effects.base import CableEffect, Context
 from cablejax.effects.physics import Physics
 
+OTHER_LAWS = {
+    "the grippers hold the cable's ends 1 mm above the table and carry their weight": {"grip_height": 1e-3},
+    "static friction exceeds the kinetic one by 30 %": {"static_excess": 0.3},
+}
+"""What a nominal law of contact leaves out, in words and in fields of `Physics`."""
+
 
 def physics_of(explanation: Explanation, nominal: Physics, config: Discretisation, z: Any = None) -> Physics:
     """The physics of a cable with all effects of an explanation.
@@ -52,6 +58,16 @@ class PlanarCable(Simulator):
     duration: float
     max_curvature: Float[np.ndarray, "E"]
     right_scores = SCORES
+
+    @property
+    def other_laws(self) -> dict[str, Simulator]:
+        """The same cable by each of `OTHER_LAWS`."""
+        believed, laws = self.playback.believed, {}
+        for assumes, changed in OTHER_LAWS.items():
+            values = {name: np.asarray(value, believed.friction.dtype) for name, value in changed.items()}
+            playback = dataclasses.replace(self.playback, believed=dataclasses.replace(believed, **values))
+            laws[assumes] = dataclasses.replace(self, playback=playback)
+        return laws
 
     def predict(self, explanations, episodes) -> Float[np.ndarray, "X E T N 2"]:
         """Keypoints [m] by the chain, in single precision; NaN where the simulation broke down."""

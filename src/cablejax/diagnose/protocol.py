@@ -22,7 +22,7 @@ from __future__ import annotations
 
 import abc
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -180,6 +180,11 @@ class Simulator(abc.ABC):
     plan: Plan = Plan()
     recording: Sequence[int] | Int[np.ndarray, "E"] = ()
     fits_unseen: bool = False
+
+    @property
+    def other_laws(self) -> Mapping[str, Simulator]:
+        """The same system by other laws that cannot be excluded, by what they assume in words; see `laws`."""
+        return {}
 
     def own(self, one: Explanation) -> int:
         """Number of parameters of each recording alone under an explanation, each with a standard normal prior."""

@@ -19,6 +19,7 @@ from cablejax.diagnose.evidence import Evidence
 from cablejax.diagnose.fit import Fit, evaluate, improved
 from cablejax.diagnose.gap import held_out_predictions, measure_gap
 from cablejax.diagnose.given_arrays import checked_nominal, recorded_arrays, spread_of
+from cablejax.diagnose.laws import by_other_laws
 from cablejax.diagnose.protocol import Simulator, explanation
 from cablejax.diagnose.refits import refitted
 from cablejax.diagnose.search import Search, search
@@ -119,6 +120,7 @@ class Examined:
             "ranking": conclusion.ranking,
             "leftover_p": conclusion.leftover_p,
             "posterior": conclusion.posterior,
+            "under_laws": conclusion.under_laws,
             "gap": self.gap,
             "baselines": baselines(self.found, self.evidence),
         }
@@ -205,9 +207,11 @@ def explain(
     (null,) = refitted(evidence, [_null(evidence)])
     if excess(float(null.sse.sum()), evidence) > calibration.smallest_gap(level(evidence)):
         found = search(evidence, null, calibration, deadline=deadline, progress=progress)
+        progress("fitting by other laws")
+        laws = by_other_laws(found, evidence, calibration)
     else:
-        found = Search((null,), np.zeros(1), {})
-    return found, conclude(found, evidence, calibration)
+        found, laws = Search((null,), np.zeros(1), {}), ()
+    return found, conclude(found, evidence, calibration, laws)
 
 
 def _null(evidence: Evidence) -> Fit:

@@ -21,6 +21,7 @@ from cablejax.diagnose.diagnosis import (
     NextMotion,
     ParameterEstimate,
     Ranked,
+    UnderLaw,
 )
 from cablejax.effects.given import VERDICT_SCHEMA, read_verdict_json
 from cablejax.limits import LIMITS, shown
@@ -38,11 +39,12 @@ def verdict_json(diagnosis: Diagnosis) -> dict[str, Any]:
     `_mm` are null where observations are not in metres; `gap` has the sizes in their own unit too.
 
     In addition to the fields of the format it has `sentence`, `baselines`, `leftover_p`, `caveats`, `seconds`,
-    `posterior` (fields of `EffectValues`) and `next_motion_worth`: fields of `NextMotion`, those in nats with `_nats`,
-    and whether no motion that was tried separates the explanations; of several recordings `rounds`, the fields of
-    `Round`, and `rounds_contradict`. `next_motion` is recommended only where that is false. `gap` has also `unit`,
-    `before_rmse`, `noise_floor`, `after_rmse`, `horizons`, `split`, `ahead_mm` and `best_shrinkage`, `ranking` also
-    `leftover_mm`, and `where` also `sentences`, `per_horizon_mm` and `frames`.
+    `posterior` (fields of `EffectValues`), `under_laws` (fields of `UnderLaw`) and `next_motion_worth`: fields of
+    `NextMotion`, those in nats with `_nats`, and whether no motion that was tried separates the explanations; of
+    several recordings `rounds`, the fields of `Round`, and `rounds_contradict`. `next_motion` is recommended only
+    where that is false. `gap` has also `unit`, `before_rmse`, `noise_floor`, `after_rmse`, `horizons`, `split`,
+    `ahead_mm` and `best_shrinkage`, `ranking` also `leftover_mm`, and `where` also `sentences`, `per_horizon_mm`
+    and `frames`.
     """
     gap, rounds = diagnosis.gap, getattr(diagnosis, "rounds", None)
     return _plain(
@@ -53,6 +55,16 @@ def verdict_json(diagnosis: Diagnosis) -> dict[str, Any]:
             "effects": [_effect(effect) for effect in diagnosis.effects],
             "equivalent": diagnosis.equivalent,
             "posterior": [[dataclasses.asdict(one) for one in draw] for draw in diagnosis.posterior],
+            "under_laws": [
+                {
+                    "assumes": law.assumes,
+                    "probability": law.probability,
+                    "verdict": law.verdict,
+                    "effects": [_effect(effect) for effect in law.effects],
+                    "equivalent": law.equivalent,
+                }
+                for law in diagnosis.under_laws
+            ],
             "baselines": diagnosis.baselines,
             "ranking": [_ranked(ranked, gap.unit) for ranked in diagnosis.ranking],
             "leftover_p": diagnosis.leftover_p,
@@ -124,6 +136,16 @@ def read_verdict(path: str | os.PathLike[str]) -> Diagnosis:
             posterior=tuple(
                 tuple(EffectValues(str(one["name"]), dict(one["parameters"])) for one in draw)
                 for draw in verdict.get("posterior", ())
+            ),
+            under_laws=tuple(
+                UnderLaw(
+                    str(law["assumes"]),
+                    float(law["probability"]),
+                    law["verdict"],
+                    tuple(_effect_of(effect) for effect in law["effects"]),
+                    tuple(tuple(map(str, group)) for group in law["equivalent"]),
+                )
+                for law in verdict.get("under_laws", ())
             ),
         )
     except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:

@@ -45,6 +45,8 @@ class Physics:
         tilt: in-plane part of the gravity [m/s^2], shape [2].
         density: mass per length [kg/m].
         extra_mass: mass added at each node [kg], shape [n].
+        grip_height: by which the grippers hold the cable's ends above where it lies on the table [m]; they carry its
+            weight up to where it comes down, see `cablejax.simulate.friction`.
         slip: change of the free length at either gripper [m], shape [2].
         slip_time: when it happens [s], in each episode.
         rotation_offset: of the cable's clamp against either gripper's angle [rad], shape [2].
@@ -80,6 +82,7 @@ class Physics:
     tilt: Float[Array, "*B 2"]
     density: Float[Array, "*B"]
     extra_mass: Float[Array, "*B n"]
+    grip_height: Float[Array, "*B"]
     slip: Float[Array, "*B 2"]
     slip_time: Float[Array, "*B"]
     rotation_offset: Float[Array, "*B 2"]
@@ -133,6 +136,7 @@ def nominal_physics(
         "tilt": np.asarray(gravity, float)[:2],
         "density": config.cable.linear_density,
         "extra_mass": np.zeros(links),
+        "grip_height": 0.0,
         "slip": np.zeros(2),
         "slip_time": 0.0,
         "rotation_offset": np.zeros(2),

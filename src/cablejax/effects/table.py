@@ -30,9 +30,10 @@ class TableFriction(CableEffect):
     amplitude, reversible = 0, True
 
     def apply(self, physics, values, variant, config):
-        """Multiplies the coefficient by the ratio; in variant 1 also adds the excess of static friction."""
+        """Multiplies the coefficient by the ratio; in variant 1 also sets the excess of static friction."""
         nominal = physics.friction + (_believed(config) if config.cable.friction_coefficient == 0 else 0.0)
-        return replace(physics, friction=nominal * values[0], static_excess=physics.static_excess + variant * values[1])
+        excess = physics.static_excess * (1 - variant) + variant * values[1]
+        return replace(physics, friction=nominal * values[0], static_excess=excess)
 
     def starts(self, context):
         """A table 2.5 times smoother and one 2.5 times rougher, in both variants."""

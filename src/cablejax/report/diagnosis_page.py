@@ -116,6 +116,7 @@ def write_diagnosis_page(diagnosis: CableDiagnosis, out: str | os.PathLike[str])
         where_caption=_FILES_CAPTION if space else _WHERE_CAPTION,
         effects=sections.named_effects(diagnosis),
         alike=sections.alike(diagnosis),
+        under_laws=sections.under_other_laws(diagnosis),
         faint_below=FAINT,
         left=sections.what_is_left(diagnosis),
         rounds=sections.rounds_table(diagnosis),

@@ -6,7 +6,7 @@ import itertools
 import json
 from collections.abc import Sequence
 
-from cablejax.diagnose.diagnosis import CableDiagnosis, Diagnosis, NamedEffect
+from cablejax.diagnose.diagnosis import CableDiagnosis, Diagnosis, NamedEffect, UnderLaw
 from cablejax.diagnose.judgement import look_alikes
 from cablejax.report.effect_words import (
     EFFECTS,
@@ -56,6 +56,36 @@ def alike(diagnosis: CableDiagnosis) -> list[tuple[list[str], list[str]]]:
     """Names of the effects that are indistinguishable on the log: those with a chance, and those without."""
     groups = (look_alikes(group, diagnosis.effects, diagnosis.ranking) for group in diagnosis.equivalent)
     return [(list(likely), list(faint)) for likely, faint in groups]
+
+
+def under_other_laws(diagnosis: Diagnosis) -> list[str]:
+    """What the verdict would be by each other law of the simulator, in words."""
+    return [
+        f"If {law.assumes}, {_verdict_under(law)}. Beside the simulator as believed, that law has a probability of "
+        f"{share(law.probability)} on this log; the intervals are over both."
+        for law in diagnosis.under_laws
+    ]
+
+
+def _verdict_under(law: UnderLaw) -> str:
+    if law.verdict == "none":
+        return "there is no gap that needs an effect"
+    if law.verdict == "unknown":
+        return "no effect of the library is enough"
+    named = []
+    for effect in law.effects:
+        # a place or a choice says less than how strong the effect is
+        estimates = (
+            f"{parameter_title(name)} {quantity(estimate.value, estimate.unit, estimate.ci90)}"
+            for name, estimate in effect.parameters.items()
+            if estimate.ci90 is not None
+        )
+        group = next((alike for alike in law.equivalent if effect.name in alike), (effect.name,))
+        others = [effect_title(name) for name in group if name != effect.name]
+        besides = f" or {listed(others, 'or')}" if others else ""
+        named.append(f"{effect_title(effect.name)} ({', '.join(estimates)}){besides}")
+    unknown = ", and something unknown" if law.verdict == "named+unknown" else ""
+    return f"the cause is {listed(named)}{unknown}"
 
 
 def what_is_left(diagnosis: CableDiagnosis) -> str:

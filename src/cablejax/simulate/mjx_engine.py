@@ -23,7 +23,7 @@ from cablejax.simulate.composite import build_chain, stable_damping_time
 from cablejax.simulate.contact import obstacle_contact
 from cablejax.simulate.engine import Engine, compiled_rollout, finely_sampled
 from cablejax.simulate.equilibrium import equilibrium_state
-from cablejax.simulate.friction import drag_coefficient, implicit_drag
+from cablejax.simulate.friction import drag_coefficient, implicit_drag, on_table
 from cablejax.simulate.grasp import constrained_acceleration
 from cablejax.simulate.keypoints import hermite_weights, marked_keypoints
 from cablejax.simulate.kinematics import chain_kinematics
@@ -176,10 +176,9 @@ class MjxEngine(Engine):
         """Velocity derivative and generalised force of the table on the free links."""
         config = self.config
         velocity = jnp.einsum("kid,i->kd", jacobian, qvel)
-        mass = physics.density * config.link_length + physics.extra_mass[1:-1]
-        drag = drag_coefficient(
-            physics, data.xipos[2:-1, :2], velocity, mass, config.link_length, config.friction_speed
-        )
+        h = config.link_length
+        mass = on_table(physics, physics.density * h + physics.extra_mass, h)[1:-1]
+        drag = drag_coefficient(physics, data.xipos[2:-1, :2], velocity, mass, h, config.friction_speed)
         return implicit_drag(jacobian, drag, velocity)
 
     def _obstacle(self, data, physics, jacobian, qvel):

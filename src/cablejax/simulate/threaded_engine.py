@@ -23,6 +23,7 @@ from cablejax.simulate.compiled_steps import advance
 from cablejax.simulate.composite import build_grasped_chain, stable_damping_time
 from cablejax.simulate.engine import Engine, finely_sampled
 from cablejax.simulate.equilibrium import equilibrium_state
+from cablejax.simulate.friction import on_table
 from cablejax.simulate.keypoints import hermite_weights, marked_keypoints
 from cablejax.types import CableState, Trajectory
 
@@ -165,7 +166,7 @@ class _Simulation:
         if self.config.dimension == 3:
             return np.zeros(7)
         normal = np.sqrt(max(float(physics.gravity) ** 2 - float(np.sum(physics.tilt**2)), 0.0))
-        weight = (float(physics.density) * h + np.asarray(physics.extra_mass)[1:-1]) * normal
+        weight = on_table(physics, float(physics.density) * h + np.asarray(physics.extra_mass), h)[1:-1] * normal
         whole = (physics.friction, physics.static_excess, *physics.patch_centre, physics.patch_radius)
         return np.array([*map(float, whole), float(physics.patch_friction), float(physics.drag) * h, *weight])
 

@@ -34,7 +34,7 @@ from cablejax.simulate.chain.geometry import beyond, cross, solve_lower, turned
 from cablejax.simulate.chain.state import ChainState, Frame, frame_of, halfway_state
 from cablejax.simulate.composite import link_lengths
 from cablejax.simulate.contact import obstacle_contact
-from cablejax.simulate.friction import drag_coefficient
+from cablejax.simulate.friction import drag_coefficient, on_table
 from cablejax.simulate.grasp import solve_held
 
 SLIP_DURATION = 0.1
@@ -106,7 +106,9 @@ def _load(
     free = jnp.ones(n, dtype).at[jnp.array([0, -1])].set(0.0)
     mass = physics.density * jnp.asarray(link_lengths(config), dtype) + physics.extra_mass
     rubbed = root + moved + halfway.nodes
-    drag = free * drag_coefficient(physics, rubbed, halfway.velocity, mass, h, config.friction_speed)
+    drag = free * drag_coefficient(
+        physics, rubbed, halfway.velocity, on_table(physics, mass, h), h, config.friction_speed
+    )
     force, contact = jnp.zeros_like(rubbed), jnp.zeros((n, 3), dtype)
     if with_contact:
         force, contact = obstacle_contact(physics, root + start.nodes, h * start.along)

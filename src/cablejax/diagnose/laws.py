@@ -1,0 +1,79 @@
+"""What the leading explanations come to under other laws of the simulator, which the recording may not exclude.
+
+A simulator assumes more than it can know: the planar chain, for example, that the table carries the whole cable. Where
+it offers another law (`Simulator.other_laws`), the explanations that the search left open, and the simulator without
+any effect, are fitted again by that law. All laws are equally likely beforehand; afterwards each is as probable as what
+was fitted by it, together. The verdict is that of the simulator's own law, by which a named effect is added; its
+intervals are over all laws, and it says what the verdict would be under each.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+
+from cablejax.diagnose.belief import Calibration, in_doubt, log_scores
+from cablejax.diagnose.evidence import Evidence
+from cablejax.diagnose.fit import Fit, evaluate, improved
+from cablejax.diagnose.protocol import Explanation, explanation
+from cablejax.diagnose.refits import refitted
+from cablejax.diagnose.search import Search
+
+
+@dataclasses.dataclass(frozen=True)
+class Law:
+    """The leading explanations, fitted by another law.
+
+    Attributes:
+        assumes: in words.
+        evidence: the same recording, predicted by this law.
+        found: fits by this law.
+        probability: of the law, among all.
+    """
+
+    assumes: str
+    evidence: Evidence
+    found: Search
+    probability: float
+
+    def fit_of(self, one: Explanation) -> Fit | None:
+        """The fit of the same terms by this law."""
+        return next((fit for fit in self.found.fits if fit.explanation.terms == one.terms), None)
+
+
+def by_other_laws(found: Search, evidence: Evidence, calibration: Calibration) -> tuple[Law, ...]:
+    """Fits what a search left open by each of the simulator's other laws.
+
+    Args:
+        found: by the simulator's own law.
+        evidence: that was explained.
+        calibration: of the judgement.
+    """
+    others = evidence.simulator.other_laws
+    if not others:
+        return ()
+    open_fits, _ = in_doubt(found.fits, found.scores, evidence, calibration)
+    leading = [fit.explanation for fit in open_fits if fit.explanation.terms]
+    searches, evidences = [], []
+    for simulator in others.values():
+        bare = dataclasses.replace(evidence, simulator=simulator)
+        other = dataclasses.replace(bare, nominal=bare.predict([explanation()])[0])
+        fits = improved(other, evaluate(other, leading), simulator.plan.last_steps)
+        searches.append(_ordered(refitted(other, [*fits, *evaluate(other, [explanation()])]), other, calibration))
+        evidences.append(other)
+    tried = [set(one.terms) for one in leading] + [set()]
+    own = [score for fit, score in zip(found.fits, found.scores, strict=True) if set(fit.explanation.terms) in tried]
+    totals = np.array([np.logaddexp.reduce(own), *(np.logaddexp.reduce(search.scores) for search in searches)])
+    chances = np.exp(totals - np.logaddexp.reduce(totals))[1:]
+    return tuple(
+        Law(assumes, other, search, float(chance))
+        for assumes, other, search, chance in zip(others, evidences, searches, chances, strict=True)
+    )
+
+
+def _ordered(fits: list[Fit], evidence: Evidence, calibration: Calibration) -> Search:
+    """Fits of one law, best first."""
+    scores = log_scores(fits, evidence, calibration)
+    order = np.argsort(-scores, kind="stable")
+    return Search(tuple(fits[i] for i in order), scores[order], {})
