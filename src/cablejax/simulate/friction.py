@@ -19,6 +19,7 @@ from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from cablejax.effects.physics import Physics, normal_gravity
@@ -56,7 +57,7 @@ def drag_coefficient(
     return coefficient * mass * normal_gravity(physics) / regularised + physics.drag * link_length
 
 
-def on_table(physics: Physics, mass: Float[Array, "n"], link_length: float) -> Float[Array, "n"]:
+def on_table(physics: Physics, mass: Float[Array, "n"] | Float[np.ndarray, "n"], link_length: float):
     """Mass that the table carries at each node [kg]: all of it, but for what hangs on the grippers.
 
     Differentiable; at a height of 0 the mass stays as it is, and its derivative by the height is 0 instead of infinite.
