@@ -72,7 +72,8 @@ def conclude(found: Search, evidence: Evidence, calibration: Calibration, laws: 
         found: by the search.
         evidence: that was explained.
         calibration: of the judgement.
-        laws: what was found by the simulator's other laws: the verdict is not theirs, but its intervals hold over all.
+        laws: what was found by the simulator's other laws: the verdict is not theirs, but its intervals hold over all,
+            and where the most probable one leaves no gap, no effect is named.
     """
     chances = probabilities(found.scores)
     best = found.fits[0]
@@ -86,6 +87,8 @@ def conclude(found: Search, evidence: Evidence, calibration: Calibration, laws: 
         return Conclusion("none", null, (), (), ranking, 0.0)
     as_much = leftover_p(leftover_score(left, gap, level(evidence), calibration), evidence.simulator.right_scores)
     under = tuple(_under(law, calibration) for law in laws)
+    if _excused(under):
+        return Conclusion("none", null, (), (), ranking, 0.0, None, (), under)
     if not best.explanation.terms:
         return Conclusion("unknown", best, (), (), ranking, explained, as_much, (), under)
 
@@ -121,6 +124,13 @@ def conclude(found: Search, evidence: Evidence, calibration: Calibration, laws: 
     named = tuple(effects[i] for i in order)
     likely = posterior(found, evidence, calibration, drawn)
     return Conclusion(verdict, best, named, tuple(equivalent), ranking, explained, as_much, likely, under)
+
+
+def _excused(under: Sequence[UnderLaw]) -> bool:
+    """Whether the gap is what a simulator by its own law is off by: there is none by a law that is more probable."""
+    own = 1.0 - sum(law.probability for law in under)
+    likeliest = max(under, key=lambda law: law.probability, default=None)
+    return likeliest is not None and likeliest.probability > own and likeliest.verdict == "none"
 
 
 def _under(law: Law, calibration: Calibration) -> UnderLaw:
@@ -241,6 +251,11 @@ def sentence(conclusion: Conclusion, shrinkage: float | None) -> str:
         conclusion: the verdict.
         shrinkage: on episodes left out of the fit; None where nothing could be, which leaves that of the fit.
     """
+    if conclusion.verdict == "none" and conclusion.under_laws:
+        law = max(conclusion.under_laws, key=lambda law: law.probability)
+        return (
+            f"There is no gap that needs an effect if {law.assumes}, which fits this log better than the nominal law."
+        )
     explained = conclusion.explained if shrinkage is None else shrinkage
     return verdict_sentence(
         conclusion.verdict, conclusion.effects, conclusion.equivalent, conclusion.ranking, explained
