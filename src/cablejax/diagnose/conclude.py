@@ -33,7 +33,7 @@ from cablejax.diagnose.fit import Fit
 from cablejax.diagnose.gap import shrinkage
 from cablejax.diagnose.judgement import judged, verdict_sentence
 from cablejax.diagnose.laws import Law
-from cablejax.diagnose.posterior import draws, over_laws, posterior
+from cablejax.diagnose.posterior import drawn_by, draws, over_laws, posterior
 from cablejax.diagnose.protocol import Simulator
 from cablejax.diagnose.search import Search
 
@@ -65,7 +65,13 @@ class Conclusion:
     under_laws: tuple[UnderLaw, ...] = ()
 
 
-def conclude(found: Search, evidence: Evidence, calibration: Calibration, laws: Sequence[Law] = ()) -> Conclusion:
+def conclude(
+    found: Search,
+    evidence: Evidence,
+    calibration: Calibration,
+    laws: Sequence[Law] = (),
+    drawn: Float[np.ndarray, "D P"] | None = None,
+) -> Conclusion:
     """Probabilities, equivalence sets and the verdict.
 
     Args:
@@ -74,6 +80,7 @@ def conclude(found: Search, evidence: Evidence, calibration: Calibration, laws: 
         calibration: of the judgement.
         laws: what was found by the simulator's other laws: the verdict is not theirs, but its intervals hold over all,
             and where the most probable one leaves no gap, no effect is named.
+        drawn: draws of the best fit's coordinates, where there are some.
     """
     chances = probabilities(found.scores)
     best = found.fits[0]
@@ -86,13 +93,15 @@ def conclude(found: Search, evidence: Evidence, calibration: Calibration, laws: 
     if gap <= smallest:
         return Conclusion("none", null, (), (), ranking, 0.0)
     as_much = leftover_p(leftover_score(left, gap, level(evidence), calibration), evidence.simulator.right_scores)
-    under = tuple(_under(law, calibration) for law in laws)
+    shared = [drawn_by(law, best, calibration) for law in laws]
+    under = tuple(_under(law, calibration, drawn) for law, drawn in zip(laws, shared, strict=True))
     if _excused(under):
         return Conclusion("none", null, (), (), ranking, 0.0, None, (), under)
     if not best.explanation.terms:
         return Conclusion("unknown", best, (), (), ranking, explained, as_much, (), under)
 
-    drawn = over_laws(draws(evidence, best, calibration), best, laws, calibration)
+    own = draws(evidence, best, calibration) if drawn is None else drawn
+    drawn = over_laws(own, [(law.probability, each[1]) for law, each in zip(laws, shared, strict=True) if each])
     effects, equivalent = [], []
     for name in effect_names(best.explanation):
         rest = set(effect_names(best.explanation)) - {name}
@@ -133,9 +142,10 @@ def _excused(under: Sequence[UnderLaw]) -> bool:
     return likeliest is not None and likeliest.probability > own and likeliest.verdict == "none"
 
 
-def _under(law: Law, calibration: Calibration) -> UnderLaw:
-    """The verdict by another law alone."""
-    other = conclude(law.found, law.evidence, calibration)
+def _under(law: Law, calibration: Calibration, shared: tuple[Fit, Float[np.ndarray, "D P"]] | None) -> UnderLaw:
+    """The verdict by another law alone; `shared` are a fit by it and draws of its coordinates."""
+    drawn = shared[1] if shared is not None and shared[0] is law.found.fits[0] else None
+    other = conclude(law.found, law.evidence, calibration, drawn=drawn)
     return UnderLaw(law.assumes, law.probability, other.verdict, other.effects, other.equivalent)
 
 

@@ -41,26 +41,28 @@ def draws(evidence: Evidence, fit: Fit, calibration: Calibration) -> Float[np.nd
     return np.clip(drawn, *fit.explanation.bounds.T)
 
 
+def drawn_by(law: Law, best: Fit, calibration: Calibration) -> tuple[Fit, Float[np.ndarray, "D P"]] | None:
+    """The fit of the same terms by another law, and draws of its coordinates; None where the law counts for nothing."""
+    same = law.fit_of(best.explanation)
+    if same is None or not same.explanation.terms or law.probability < 1.0 / _DRAWS:
+        return None
+    return same, draws(law.evidence, same, calibration)
+
+
 def over_laws(
-    by_own: Float[np.ndarray, "D P"], best: Fit, laws: Sequence[Law], calibration: Calibration
+    own: Float[np.ndarray, "D P"], others: Sequence[tuple[float, Float[np.ndarray, "D P"]]]
 ) -> Float[np.ndarray, "D P"]:
     """Draws of the same coordinates by every law, each law as often as it is probable.
 
     Args:
-        by_own: draws by the simulator's own law.
-        best: the fit that they belong to.
-        laws: the others, by which the same explanation was fitted.
-        calibration: of the judgement.
+        own: draws by the simulator's own law.
+        others: probability of each other law, and draws by it.
     """
-    count, parts = len(by_own), []
-    for law in laws:
-        share = round(count * law.probability)
-        same = law.fit_of(best.explanation)
-        if share and same is not None:
-            parts.append(draws(law.evidence, same, calibration)[:share])
-    rest = count - sum(map(len, parts))
-    mixed = np.concatenate([by_own[:rest], *parts])
-    return np.random.default_rng(0).permutation(mixed) if parts else by_own
+    if not others:
+        return own
+    parts = [drawn[: round(len(own) * probability)] for probability, drawn in others]
+    rest = len(own) - sum(map(len, parts))
+    return np.random.default_rng(0).permutation(np.concatenate([own[:rest], *parts]))
 
 
 def posterior(
