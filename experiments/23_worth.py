@@ -6,7 +6,7 @@
 The plant is MuJoCo in space with contact, and an effect that the model does not know. A target is what the plant's
 cable makes of a letter, as if a person had shown it. Six runs without a learner, 180 s in all, are the log. The model
 of every arm but the last is `gns-conditioned`, which estimates stiffness and friction online; the arms differ by what
-it was told before (`cablejax shape --with verdict.json`), and by the online learner:
+it was informed of before (`cablejax shape --with verdict.json`), and by the online learner:
 
 - `plain`: nothing;
 - `diagnosed`: what the verdict on the log names, where that enters a model;
@@ -31,7 +31,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from cablejax.cable import Cable
-from cablejax.commands.runs import told_of
+from cablejax.commands.runs import known_from
 from cablejax.control.loop import run_closed_loop
 from cablejax.control.shaping import Model, enters, knowing, load_model, make_controller
 from cablejax.control.targets import Shape
@@ -163,9 +163,9 @@ def model_for(text: str, kind: str, home: pathlib.Path, case: Case) -> Model:
     model = load_model(MODEL)
     if kind == "oracle":
         return knowing(model, (parse_effect(text),))
-    told = told_of(model, (), (verdict_of(text, home),))
+    informed = known_from(model, (), (verdict_of(text, home),))
     # else nothing of what the verdict names enters it
-    return knowing(model, told) if enters(model, told) else model
+    return knowing(model, informed) if enters(model, informed) else model
 
 
 def log_of(text: str, home: pathlib.Path) -> GapLog:
@@ -212,7 +212,7 @@ def page(out: pathlib.Path) -> str:
     lines = [
         "The plant has an effect that the model does not know. A target is what the plant's cable makes of a letter: "
         "the keypoints that a person shows by hand. A verdict on "
-        f"six runs ({6 * COMMANDS} s, 1 mm noise, seeds {', '.join(map(str, LOG_SEEDS))}) is told to the model; "
+        f"six runs ({6 * COMMANDS} s, 1 mm noise, seeds {', '.join(map(str, LOG_SEEDS))}) informs the model; "
         f"*recorded* is trained on the same six runs instead. {len(seeds)} seeds.",
         "",
     ]

@@ -1,4 +1,4 @@
-"""A model that is told of effects: its cable rests as one with them does, and it begins with their belief."""
+"""A model that is informed of effects: its cable rests as one with them does, and it begins with their belief."""
 
 import json
 
@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from cablejax.cli import main
-from cablejax.commands.runs import told_of
+from cablejax.commands.runs import known_from
 from cablejax.control.shaping import enters, knowing, load_model, make_controller
 from cablejax.control.targets import make_target
 from cablejax.dataset.generate import make_engine, simulate
@@ -29,24 +29,24 @@ def test_a_model_that_knows_the_cause_is_right_without_another_training(model):
     config = DatasetConfig(n_trajectories=2, n_steps=25, seed=5, effects=effects)
     (block,) = simulate(config, make_engine(config), [0])
     data = Trajectory(*(jnp.asarray(a) for a in (block.keypoints, block.gripper_pose, block.gripper_twist)))
-    plain, told = (
+    plain, informed = (
         open_loop_error((one.dynamics.graphdef, one.weights), data, one.config, horizons=(20,), stride=5).median_cm[0]
         for one in (model, knowing(model, effects))
     )
-    assert told < 0.1 < 0.5 < plain
+    assert informed < 0.1 < 0.5 < plain
 
 
-def test_told_of_nothing_a_model_is_as_it_was(model):
+def test_informed_of_nothing_a_model_is_as_it_was(model):
     same = knowing(model, ())
     assert same.config == model.config and same.dynamics == model.dynamics and same.known == ()
 
 
-def test_a_conditioned_model_begins_with_what_it_was_told():
+def test_a_conditioned_model_begins_with_what_it_is_informed_of():
     conditioned = load_model("gns-conditioned")
-    told = knowing(conditioned, tuple(map(parse_effect, ("bending_stiffness:ratio=0.5", "linear_density:ratio=2"))))
-    np.testing.assert_allclose(told.believed, np.log([0.5, 2.0]), rtol=1e-5)
-    mpc = make_controller(told, make_target("U", told.cable), method="direct", solver="levenberg-marquardt")
-    assert mpc.config.adaptation is not None and mpc.config.adaptation.prior_mean == told.believed
+    informed = knowing(conditioned, tuple(map(parse_effect, ("bending_stiffness:ratio=0.5", "linear_density:ratio=2"))))
+    np.testing.assert_allclose(informed.believed, np.log([0.5, 2.0]), rtol=1e-5)
+    mpc = make_controller(informed, make_target("U", informed.cable), method="direct", solver="levenberg-marquardt")
+    assert mpc.config.adaptation is not None and mpc.config.adaptation.prior_mean == informed.believed
     # only the ratio of both matters in slow motion: what is beyond the bound of one is taken up by the other
     far = knowing(conditioned, (parse_effect("linear_density:ratio=8"),))
     np.testing.assert_allclose(far.believed[1] - far.believed[0], np.log(8.0), rtol=1e-5)
@@ -64,7 +64,7 @@ def test_what_does_not_enter_a_model_is_refused_with_what_to_do(model, tmp_path,
     assert "--motion uses no model" in capsys.readouterr().err
 
 
-def test_of_look_alikes_a_model_is_told_the_first_that_enters_it(tmp_path):
+def test_of_look_alikes_a_model_is_informed_of_the_first_that_enters_it(tmp_path):
     def written(effect):
         name, parameters = effect.split(":")
         return {
@@ -81,10 +81,10 @@ def test_of_look_alikes_a_model_is_told_the_first_that_enters_it(tmp_path):
     path.write_text(json.dumps(verdict))
     conditioned = load_model("gns-conditioned")
     assert not enters(conditioned, (parse_effect(patch),))
-    assert told_of(conditioned, (), (path,)) == (parse_effect(friction),)
+    assert known_from(conditioned, (), (path,)) == (parse_effect(friction),)
     # neither enters a model that knows no friction: the message is about what was named
     with pytest.raises(ValueError, match="Nothing of friction_patch"):
-        knowing(load_model("gns-reference"), told_of(load_model("gns-reference"), (), (path,)))
+        knowing(load_model("gns-reference"), known_from(load_model("gns-reference"), (), (path,)))
 
 
 @pytest.mark.slow
@@ -95,9 +95,9 @@ def test_shape_with_a_verdict_tells_the_model(tmp_path, capsys):
     (tmp_path / "verdict.json").write_text(json.dumps(verdict))
     words = ["shape", "--target", "S", "--method", "direct", "--steps", "20", "--plant-effect", CURVED, "--json"]
     errors = []
-    for name, more in (("plain", []), ("told", ["--with", str(tmp_path / "verdict.json")])):
+    for name, more in (("plain", []), ("informed", ["--with", str(tmp_path / "verdict.json")])):
         assert main([*words, "--out", str(tmp_path / name), *more]) == 0
         errors.append(json.loads(capsys.readouterr().out)["shapes"]["S"]["terminal_error_without_residual_cm"])
     assert errors[1] < errors[0]
-    page = (tmp_path / "told" / "report.html").read_text()
-    assert "It was told of intrinsic_curvature" in page
+    page = (tmp_path / "informed" / "report.html").read_text()
+    assert "It was informed of intrinsic_curvature" in page

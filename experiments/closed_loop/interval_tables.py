@@ -151,8 +151,8 @@ def learning_table(
                 if len(cell):
                     change[f"{letter} at {ratio:g}"] = cell[:, 0].mean() / cell[:, 1].mean() - 1
         worse = [f"{name} {100 * part:+.0f} %" for name, part in change.items() if part > 0]
-        told = f"{len(worse)} of {len(change)}" + (f": {', '.join(worse)}" if worse else "")
-        rows.append([label_of(method, labels), label_of(base, labels), *counts, told])
+        text = f"{len(worse)} of {len(change)}" + (f": {', '.join(worse)}" if worse else "")
+        rows.append([label_of(method, labels), label_of(base, labels), *counts, text])
     title = ["method", "against", *(f"at {ratio:g}" for ratio in ratios), *letters, "cells where its mean is worse"]
     return markdown(title, rows)
 

@@ -107,7 +107,7 @@ def synthetic_recordings(seed: int, law: Law, recordings: int = RECORDINGS) -> t
 
 
 def drawn_cable(generator: np.random.Generator, recordings: int) -> SyntheticCable:
-    """A cable without the richer law, gripped anew in every recording."""
+    """A cable without the richer law, gripped again in every recording."""
 
     def between(low, high):
         return float(np.exp(generator.uniform(np.log(low), np.log(high))))

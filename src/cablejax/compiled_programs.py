@@ -22,8 +22,8 @@ def keep_compiled_programs() -> pathlib.Path | None:
     """Has JAX keep its compiled programs on disk, and take them from there in later runs.
 
     The folder is `$CABLEJAX_CACHE`, or `cablejax` in the user's cache folder, with a folder inside for each kind of
-    processor: code compiled for one may hold instructions that another lacks. JAX itself tells programs, versions and
-    compiler flags apart. What the user has set for JAX (`JAX_COMPILATION_CACHE_DIR` and others) is left as it is.
+    processor: code compiled for one may hold instructions that another lacks. JAX itself distinguishes programs,
+    versions and compiler flags. What the user has set for JAX, such as `JAX_COMPILATION_CACHE_DIR`, stays as it is.
 
     Returns:
         The folder; None where nothing is kept by this call: the user has decided, JAX has been imported and so belongs

@@ -123,7 +123,7 @@ def staged_effects(given: Sequence[str]) -> tuple[GivenEffect, ...]:
     """The effects of a plant by `--plant-effect`: by default `PLANT_EFFECT`; `none` for none.
 
     Raises:
-        UsageError: `none` stands beside an effect.
+        UsageError: `none` is given together with an effect.
         ValueError: a text is no effect.
     """
     if "none" in given and len(given) > 1:
@@ -133,8 +133,8 @@ def staged_effects(given: Sequence[str]) -> tuple[GivenEffect, ...]:
     return tuple(parse_effect(text) for text in given or (PLANT_EFFECT,))
 
 
-def told_of(model: Model, given: Sequence[str], verdicts: Sequence[pathlib.Path]) -> tuple[GivenEffect, ...]:
-    """What a model is told: the effects of `--effect` and those that the verdicts of `--with` name.
+def known_from(model: Model, given: Sequence[str], verdicts: Sequence[pathlib.Path]) -> tuple[GivenEffect, ...]:
+    """The effects that a model is informed of: those of `--effect` and those that the verdicts of `--with` name.
 
     Where nothing of what a verdict names enters the model, the first of its look-alikes of which something does, as the
     draws of its posterior have them.
@@ -142,12 +142,12 @@ def told_of(model: Model, given: Sequence[str], verdicts: Sequence[pathlib.Path]
     Raises:
         ValueError: a text is no effect, or a file is no verdict or names nothing.
     """
-    told = list(map(parse_effect, given))
+    known = list(map(parse_effect, given))
     for path in verdicts:
         named = effects_of_verdict(path)
         explanations = (named, *posterior_of_verdict(path))
-        told += next((effects for effects in explanations if enters(model, effects)), named)
-    return tuple(told)
+        known += next((effects for effects in explanations if enters(model, effects)), named)
+    return tuple(known)
 
 
 def plant_of(
@@ -186,7 +186,7 @@ def about(job: Job) -> str:
     if job.model.effects:
         sentences.append(f"Its training data hold {listed(job.model.effects)}.")
     if job.model.known:
-        sentences.append(f"It was told of {listed(job.model.known)}.")
+        sentences.append(f"It was informed of {listed(job.model.known)}.")
     changes = _changes(believed, plant)
     if changes:
         sentences.append(f"The plant has {listed(changes)}.")

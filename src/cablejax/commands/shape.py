@@ -56,12 +56,12 @@ class Shape(Command):
     ends in the middle of the run."""
 
     effect: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
-    """An effect that the model is told of, as for --plant-effect; may be given several times. What of it enters the
+    """An effect that the model is informed of, as for --plant-effect; may be given several times. What of it enters the
     model: stiffness_profile, intrinsic_curvature, gripper_rotation_offset and gripper_compliance the rest of its cable;
     bending_stiffness, table_friction and linear_density the first belief of a conditioned model."""
 
     with_: Annotated[tuple[pathlib.Path, ...], tyro.conf.arg(name="with"), tyro.conf.UseAppendAction] = ()
-    """A verdict.json of `cablejax diagnose`: the model is told of the effects that it names, as by --effect; where
+    """A verdict.json of `cablejax diagnose`: the model is informed of the effects that it names, as by --effect; where
     nothing of them enters it, of the first of their look-alikes that does."""
 
     perception: Literal["true", "cloud"] = "true"
@@ -85,7 +85,7 @@ class Shape(Command):
         from cablejax.commands.cable import find_cable
         from cablejax.commands.results import table_of
         from cablejax.commands.resuming import unfinished
-        from cablejax.commands.runs import Job, plant_of, shape_and_report, staged_effects, told_of
+        from cablejax.commands.runs import Job, known_from, plant_of, shape_and_report, staged_effects
         from cablejax.control.shaping import METHODS, knowing, load_model
         from cablejax.control.targets import load_target, make_target
         from cablejax.perceive.camera import CameraConfig
@@ -93,15 +93,15 @@ class Shape(Command):
         if self.motion is not None and self.perception == "cloud":
             raise UsageError("--motion records the keypoints of the plant: leave --perception out.")
         if self.motion is not None and (self.effect or self.with_):
-            raise UsageError("--motion uses no model that could be told of --effect or --with: leave them out.")
+            raise UsageError("--motion uses no model that could be informed by --effect or --with: leave them out.")
         effects = staged_effects(self.plant_effect)
         cloud = self.perception == "cloud"
         noise_mm = (2.0 if cloud else 0.0) if self.noise_mm is None else self.noise_mm
         if self.motion is not None:
             return self._play(self.motion, effects)
         model = load_model(self.weights)
-        if told := told_of(model, self.effect, self.with_):
-            model = knowing(model, told)
+        if known := known_from(model, self.effect, self.with_):
+            model = knowing(model, known)
         cable = model.cable if self.cable is None else find_cable(self.cable)
         plant = plant_of(
             cable,

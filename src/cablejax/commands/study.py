@@ -21,9 +21,9 @@ class Study(Command):
     """Find out in rounds what a plant has that the simulator lacks.
 
     Records the ways to a U, an S and a Z on the plant and diagnoses them. As long as several causes are left, designs
-    the motion that tells most about which of them holds, records it, and diagnoses all recordings together. Ends when
-    one answer is left, when no motion separates what is left, or after --rounds. Writes report.html, recording_1.npz,
-    ... and the diagnosis of each round in round_1, ... A round takes two minutes.
+    the motion that is most informative about which of them holds, records it, and diagnoses all recordings together.
+    Ends when one answer is left, when no motion separates what is left, or after --rounds. Writes report.html,
+    recording_1.npz, ... and the diagnosis of each round in round_1, ... A round takes two minutes.
     """
 
     resume_hint: ClassVar[str] = "Run the same command again: finished rounds are kept and not repeated."
@@ -39,7 +39,7 @@ class Study(Command):
     default the reference cable."""
 
     plant_effect: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
-    """An effect of the plant that the diagnosis is not told, as NAME:PARAMETER=VALUE,... in SI units; may be given
+    """An effect of the plant that the diagnosis does not know, as NAME:PARAMETER=VALUE,... in SI units; may be given
     several times. By default bending_stiffness:ratio=0.2; `none` for no effect."""
 
     rounds: int = 3

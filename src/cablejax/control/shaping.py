@@ -55,7 +55,7 @@ class Model:
         weights: its arrays.
         cable: nominal cable of the data that it was trained on.
         effects: effects in those data, as `parse_effect` reads them.
-        known: effects that the model was told of afterwards, see `knowing`.
+        known: effects that the model was informed of after its training, see `knowing`.
         believed: descriptor of the cable before anything was seen, for a conditioned model: see `cable_descriptor`.
     """
 
@@ -125,7 +125,7 @@ def knowing(model: Model, effects: Sequence[GivenEffect]) -> Model:
             "nor stiffness and friction of a conditioned model, such as gns-conditioned. Simulate data with it "
             "(`cablejax simulate --with`) and train on them (`cablejax train --start-from`)."
         )
-    statics, believed = _told(model, effects)
+    statics, believed = _informed(model, effects)
     config = dataclasses.replace(model.config, statics=statics)
     return dataclasses.replace(
         model,
@@ -137,14 +137,14 @@ def knowing(model: Model, effects: Sequence[GivenEffect]) -> Model:
 
 
 def enters(model: Model, effects: Sequence[GivenEffect]) -> bool:
-    """Whether the model can be told anything of these effects, see `knowing`."""
-    statics, believed = _told(model, effects)
+    """Whether anything of these effects enters the model, see `knowing`."""
+    statics, believed = _informed(model, effects)
     changed = model.config.conditioned and not np.allclose(believed, _believed((), model.cable), atol=1e-6)
     return bool(effects) and (statics != Statics() or changed)
 
 
-def _told(model: Model, effects: Sequence[GivenEffect]) -> tuple[Statics, tuple[float, float]]:
-    """Statics and belief of a model that is told of effects."""
+def _informed(model: Model, effects: Sequence[GivenEffect]) -> tuple[Statics, tuple[float, float]]:
+    """Statics and belief of a model that is informed of effects."""
     statics = statics_with(effects, model.cable) if model.config.prior == "static" else Statics()
     return statics, _believed(effects, model.cable) if model.config.conditioned and effects else model.believed
 

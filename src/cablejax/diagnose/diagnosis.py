@@ -192,7 +192,7 @@ class NextMotion:
 
     @property
     def inseparable(self) -> bool:
-        """Whether no motion that was tried tells more than a small share of the doubt."""
+        """Whether every motion that was tried would leave nearly all of the doubt."""
         return bool(self.separates) and self.information < SEPARABLE * self.doubt
 
 

@@ -53,7 +53,9 @@ def study_sheet(
             (
                 "Staged in the plant",
                 listed([effect_title(effect.name) for effect in staged]) or "nothing",
-                f"{', '.join(map(str, staged))}. No diagnosis was told." if staged else "No diagnosis was told.",
+                f"{', '.join(map(str, staged))}. The diagnosis did not know them."
+                if staged
+                else "The diagnosis did not know them.",
             ),
         ],
         figures=pictures if ranked else [],

@@ -1,9 +1,9 @@
-"""What a model gains from being told of an effect, open loop and without another training.
+"""What a model gains from being informed of an effect, open loop and without another training.
 
-    python experiments/27_told.py --out docs/results/told.md    # three minutes
+    python experiments/27_informed_models.py --out docs/results/informed_models.md    # three minutes
 
-For every effect, motions of the simulated cable with it; a model predicts them as it was trained, and once it was told
-(`cablejax.control.shaping.knowing`, `cablejax shape --with`).
+Simulates motions of a cable with each effect. A model predicts them as it was trained, and once it is informed of the
+effect (`cablejax.control.shaping.knowing`, `cablejax shape --with`).
 """
 
 from __future__ import annotations
@@ -66,8 +66,8 @@ def median_error(model: Model | None, data: Trajectory) -> float:
             shape = predict(no_motion, history, window.twist, config.interval)[-1]
         else:
             if config.conditioned:
-                told = jnp.asarray(model.believed, history.keypoints.dtype)
-                history = type(history)(history.keypoints, history.gripper_pose, told)
+                known = jnp.asarray(model.believed, history.keypoints.dtype)
+                history = type(history)(history.keypoints, history.gripper_pose, known)
             dynamics, weights = model.dynamics, model.weights
             shape = predict(lambda h, u: dynamics(weights, h, u), history, window.twist, config.interval)[-1]
         return jnp.sqrt(jnp.mean(jnp.sum((shape - window.future[-1]) ** 2, axis=-1)))
@@ -80,7 +80,9 @@ def main() -> None:
     parser.add_argument("--out", type=pathlib.Path, help="page to write")
     options = parser.parse_args()
     plain, conditioned = load_model("gns-reference"), load_model("gns-conditioned")
-    rows: list[tuple[str, ...]] = [("effect", "does not move", "gns-reference", "told", "gns-conditioned", "told")]
+    rows: list[tuple[str, ...]] = [
+        ("effect", "does not move", "gns-reference", "informed", "gns-conditioned", "informed")
+    ]
     for text in (None, *EFFECTS):
         effects = () if text is None else (parse_effect(text),)
         data, cells = recorded(effects), [f"`{text}`" if text else "none"]
@@ -95,14 +97,16 @@ def main() -> None:
         print(" | ".join(cells), flush=True)
     lines = [
         f"Median error after {STEPS} steps [cm], over windows of {MOTIONS} motions of {COMMANDS} s in the simulator "
-        "with the effect. *Told* is the same network: its prior of statics rests as the cable with the effect does, "
-        "and a conditioned network is given stiffness and friction. The conditioned one's online estimate is not used "
-        "here.",
+        "with the effect. *Informed* is the same network: its prior of statics rests as the cable with the effect "
+        "does, and a conditioned network is given stiffness and friction. The conditioned one's online estimate is not "
+        "used here.",
         "",
         *markdown_table(rows),
     ]
     publish(
-        page_of_results("A model that is told", "`python experiments/27_told.py --out docs/results/told.md`", lines),
+        page_of_results(
+            "Informed models", "`python experiments/27_informed_models.py --out docs/results/informed_models.md`", lines
+        ),
         options.out,
     )
 
