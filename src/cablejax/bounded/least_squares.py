@@ -11,11 +11,8 @@ import optimistix as optx
 from equinox import AbstractVar
 from jaxtyping import Array, Bool, Float, Int, PyTree, Scalar
 
-from cablejax.bounded.auxiliary import aux_at, chosen
 from cablejax.bounded.certificate import projected_gradient_size
-from cablejax.bounded.linearise import forward
-from cablejax.bounded.objective import value_of
-from cablejax.bounded.quadratic_model import promised_decrease, quadratic_info
+from cablejax.bounded.objective import aux_at, chosen, forward, promised_decrease, quadratic_info, value_of
 from cablejax.bounded.secant import secant_update
 
 

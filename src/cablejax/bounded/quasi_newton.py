@@ -12,11 +12,10 @@ import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Bool, Int, PyTree, Scalar
 
-from cablejax.bounded.auxiliary import chosen, nothing_yet
 from cablejax.bounded.certificate import projected_gradient_size
 from cablejax.bounded.gain_ratio import GainRatio
 from cablejax.bounded.levenberg_marquardt import DampedQuadratic
-from cablejax.bounded.quadratic_model import promised_decrease, quadratic_info
+from cablejax.bounded.objective import chosen, nothing_yet, promised_decrease, quadratic_info
 from cablejax.bounded.secant import positive_update, sized
 
 
