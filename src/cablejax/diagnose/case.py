@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from cablejax.cable import Discretisation
+from cablejax.cable_file import config_of_log
 from cablejax.diagnose.actuation import Actuation, actuation
 from cablejax.diagnose.belief import Calibration
 from cablejax.diagnose.evidence import Evidence
@@ -22,7 +23,6 @@ from cablejax.effects import LIBRARY, CableEffect
 from cablejax.effects.physics import nominal_physics
 from cablejax.simulate.chain.replay import FINE_STEP, LARGEST_STEP
 from cablejax.simulate.pose import wrapped
-from cablejax.simulate.replay import config_of_log
 from cablejax.types import GapLog
 
 FIT_LINKS = 33

@@ -10,6 +10,7 @@ import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
 
+from cablejax.cable_file import config_of_log
 from cablejax.control.run import shape_error_cm
 from cablejax.diagnose.noise import noise_floor
 from cablejax.gaplog import Episode, episodes_of, targets_of
@@ -18,7 +19,6 @@ from cablejax.report.diagnosis_style import STYLE
 from cablejax.report.effect_words import millimetres
 from cablejax.report.sheet import Sheet, cable_cards, cable_facts, span
 from cablejax.report.style import LIGHT, cable_curve
-from cablejax.simulate.replay import config_of_log
 from cablejax.types import GapLog
 
 _SHOWN = 6
