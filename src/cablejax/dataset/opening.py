@@ -35,13 +35,13 @@ PACKAGES = ("jax", "jaxlib", "mujoco", "mujoco-mjx", "numpy")
 _DIGEST = ((32,), "uint8")
 
 
-def open_store(path: str | os.PathLike[str], *, mode: Literal["r", "r+"] = "r") -> Store:
-    """Opens a data set, complete or not, to read ("r") or also to write its shards ("r+").
+def open_store(path: str | os.PathLike[str]) -> Store:
+    """Opens a data set, complete or not, to read it.
 
     Raises:
         ValueError: there is no data set, or one of a newer schema version; older ones are read.
     """
-    store = _recorded(place_of(path), mode)
+    store = _recorded(place_of(path), "r")
     for name in _arrays(store.config):
         if fault := _fault(store, name):
             raise ValueError(

@@ -113,11 +113,9 @@ def _step(mpc: MPC, state: MPCState, measurement: Measurement) -> tuple[MPCState
     size_offline, size_online = jnp.linalg.norm(offline), jnp.linalg.norm(online)
     info = MPCInfo(
         shape_error=error,
-        predicted_error=problem.shape_error(predicted),
         rho=rho,
         radius=radius,
         objective=plan.value,
-        objective_hold=start.value_still,
         evaluations=plan.evaluations,
         result=plan.result,
         action=decision.action,

@@ -21,7 +21,7 @@ _COLOURS = (LIGHT.residual, LIGHT.direct, "#009e73", "#cc79a7", "#e69f00")
 _MOMENTS = 5
 _MARGIN = 0.1
 _SPEED, _FRAMES_PER_SECOND, _HOLD_S = 5.0, 10.0, 1.5
-_HEADER, _LINE = 40, 20
+_WIDTH, _HEADER, _LINE = 640, 40, 20
 
 
 def motion_figure(following: NextMotion | None) -> Figure | None:
@@ -39,19 +39,18 @@ def motion_figure(following: NextMotion | None) -> Figure | None:
     return figure
 
 
-def write_motion_gif(path: str | os.PathLike[str], following: NextMotion, *, width: int = 640) -> int:
+def write_motion_gif(path: str | os.PathLike[str], following: NextMotion) -> int:
     """Writes a preview of the motion, five times as fast, and returns its size in bytes.
 
     Args:
         path: the file to write.
         following: the motion.
-        width: of the picture [pixels].
     """
     low, high = _window(following)
-    scale = width / (high[0] - low[0])
+    scale = _WIDTH / (high[0] - low[0])
     names = list(following.shapes)
     top = _HEADER + _LINE * len(names)
-    size = (width, top + max(round((high[1] - low[1]) * scale), 1))
+    size = (_WIDTH, top + max(round((high[1] - low[1]) * scale), 1))
     last, step = len(following.poses) - 1, _SPEED / _FRAMES_PER_SECOND / following.interval
     frames = []
     for sample in [*np.arange(0.0, last, step).round().astype(int), last]:
