@@ -85,6 +85,18 @@ def parse_json(text: str | bytes) -> Any:
         raise ValueError(f"is no JSON: {error}") from error
 
 
+def differences(*records: Mapping[str, Any], prefix: str = "") -> dict[str, list[Any]]:
+    """The leaves in which several JSON objects differ, as `outer.inner`, with each one's value or "absent"."""
+    found: dict[str, list[Any]] = {}
+    for key in sorted(set().union(*records)):
+        values = [record.get(key, "absent") for record in records]
+        if all(isinstance(value, Mapping) for value in values):
+            found |= differences(*values, prefix=f"{prefix}{key}.")
+        elif any(value != values[0] for value in values):
+            found[f"{prefix}{key}"] = values
+    return found
+
+
 def read_toml(path: str | os.PathLike[str]) -> dict[str, Any]:
     """Reads a TOML file.
 

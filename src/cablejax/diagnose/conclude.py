@@ -36,6 +36,7 @@ from cablejax.diagnose.laws import Law
 from cablejax.diagnose.posterior import drawn_by, draws, over_laws, posterior
 from cablejax.diagnose.protocol import Simulator
 from cablejax.diagnose.search import Search
+from cablejax.simulate.pose import wrapped
 
 
 @dataclasses.dataclass(frozen=True)
@@ -237,7 +238,7 @@ def _interval(value, column: Sequence[Any], unit: str):
     drawn = np.asarray(column, float)
     if unit == "rad":
         # angles near the turn of the circle
-        drawn = value + ((drawn - value + np.pi) % (2 * np.pi) - np.pi)
+        drawn = value + wrapped(drawn - value)
     low, high = np.quantile(drawn, (0.05, 0.95))
     return float(low), float(high)
 

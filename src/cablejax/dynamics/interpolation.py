@@ -5,6 +5,8 @@ from __future__ import annotations
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from cablejax.simulate.keypoints import hermite
+
 
 def rigid_interpolation(
     gripper_pose: Float[Array, "2 3"],
@@ -32,5 +34,4 @@ def rigid_interpolation(
     normal = jnp.stack([-jnp.sin(theta), jnp.cos(theta)], axis=-1)
     moved = interval * twist[:, :2]
     turned = length * interval * twist[:, 2:] * normal
-    blend = s * s * (3.0 - 2.0 * s)
-    return (1.0 - blend) * moved[0] + blend * moved[1] + s * (1.0 - s) ** 2 * turned[0] - s * s * (1.0 - s) * turned[1]
+    return hermite(s, moved, turned)

@@ -13,6 +13,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Rectangle
 
 from cablejax.diagnose.diagnosis import CableDiagnosis, NamedEffect
+from cablejax.gaplog import stretches
 from cablejax.report.diagnosis_style import STYLE, explained_label
 from cablejax.report.effect_words import effect_title
 from cablejax.report.style import LIGHT, cable_curve, gripper_outline
@@ -190,9 +191,8 @@ def _mark_holds(ax: Axes, diagnosis: CableDiagnosis, episode: int, top: float) -
     if not rests:
         return
     hold = np.any(rests, axis=0)
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], hold[episode, :length].astype(int), [0]])))
     time = diagnosis.log.time[episode]
-    for begin, end in edges.reshape(-1, 2):
+    for begin, end in stretches(hold[episode, :length]):
         ax.plot([time[begin], time[end - 1]], [top, top], color=LIGHT.ink, lw=3, solid_capstyle="butt", clip_on=False)
 
 

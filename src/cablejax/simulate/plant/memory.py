@@ -7,6 +7,7 @@ import numpy as np
 
 from cablejax.simulate.plant.config import PlantConfig
 from cablejax.simulate.plant.model import bending_joints, quaternions
+from cablejax.simulate.pose import wrapped
 
 
 class Memory:
@@ -44,7 +45,7 @@ class Memory:
         physics = self._physics
         rotation = self._data.qpos[self._position]
         curvature = 2.0 * np.arctan2(rotation[:, 3], rotation[:, 0])
-        curvature = ((curvature + np.pi) % (2 * np.pi) - np.pi) / self._h
+        curvature = wrapped(curvature) / self._h
         if self._curvature is not None:
             change = curvature - self._curvature
             sign = np.where(change < 0, -1.0, 1.0)
