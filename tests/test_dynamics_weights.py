@@ -12,8 +12,8 @@ from safetensors.numpy import save_file
 
 from cablejax.dynamics import weights as files
 from cablejax.dynamics.config import ModelConfig, Normalisation
-from cablejax.dynamics.gns import GNS
 from cablejax.dynamics.model import apply
+from cablejax.dynamics.networks import GNS
 from cablejax.dynamics.weights import (
     WeightsError,
     load_info,

@@ -15,8 +15,7 @@ import numpy as np
 
 from cablejax.cable import Cable, Discretisation
 from cablejax.limits import LIMITS, require, shown
-from cablejax.schema_version import version_of
-from cablejax.text_file import read_toml, unknown_key
+from cablejax.text_file import read_toml, unknown_key, version_of
 from cablejax.whole_file import whole_file
 
 if TYPE_CHECKING:

@@ -25,8 +25,7 @@ from cablejax.dataset.schema import (
 )
 from cablejax.dataset.store import Store
 from cablejax.limits import shown
-from cablejax.schema_version import version_of
-from cablejax.text_file import differences, read_json
+from cablejax.text_file import differences, read_json, version_of
 
 PACKAGES = ("jax", "jaxlib", "mujoco", "mujoco-mjx", "numpy")
 """Packages whose versions decide the content, besides cablejax itself: those that begin a store must complete it."""

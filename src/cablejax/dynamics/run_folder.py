@@ -7,8 +7,7 @@ import shutil
 from pathlib import Path
 from typing import Any
 
-from cablejax.schema_version import version_of
-from cablejax.text_file import differences, read_json, write_json
+from cablejax.text_file import differences, read_json, version_of, write_json
 from cablejax.whole_file import sole_writer
 
 SCHEMA = "cablejax-training/1"

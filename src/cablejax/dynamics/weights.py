@@ -30,9 +30,8 @@ from cablejax.cable import Cable
 from cablejax.cable_file import cable_from_fields
 from cablejax.dynamics.config import ModelConfig, Normalisation
 from cablejax.dynamics.model import structure_of
-from cablejax.schema_version import version_of
 from cablejax.simulate.chain.statics import Statics
-from cablejax.text_file import parse_json
+from cablejax.text_file import parse_json, version_of
 from cablejax.whole_file import whole_file
 
 SCHEMA = "cablejax-weights/1"

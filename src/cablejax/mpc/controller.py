@@ -19,8 +19,7 @@ from cablejax.mpc.problem import ShapingProblem
 from cablejax.mpc.state import CableEstimate, LastCommand, MPCInfo, MPCState, initial_state
 from cablejax.mpc.validation import check_history, check_measurement, check_target
 from cablejax.mpc.warm_start import find_starts
-from cablejax.residual.corrected import Corrected
-from cablejax.residual.jacobian import Dynamics
+from cablejax.residual.jacobian import Corrected, Dynamics
 from cablejax.residual.learner import Sample, learned, observe
 from cablejax.residual.learner import weights as weights_of
 from cablejax.residual.ridge import ResidualModel, apply

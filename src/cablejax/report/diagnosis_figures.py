@@ -14,9 +14,8 @@ from matplotlib.patches import Circle, Rectangle
 
 from cablejax.diagnose.diagnosis import CableDiagnosis, NamedEffect
 from cablejax.gaplog import stretches
-from cablejax.report.diagnosis_style import STYLE, explained_label
-from cablejax.report.effect_words import effect_title
-from cablejax.report.style import LIGHT, cable_curve, gripper_outline
+from cablejax.report.effect_words import effect_title, explained_label
+from cablejax.report.style import DIAGNOSIS_STYLE, LIGHT, cable_curve, gripper_outline
 
 # Transparent where there is no gap, so that it reads on a light and on a dark page.
 _HEAT = LinearSegmentedColormap.from_list(
@@ -55,7 +54,7 @@ def cable_figure(diagnosis: CableDiagnosis) -> Figure:
     reach = max(3.5 * float(np.linalg.norm(distance[furthest])), 0.02 * width)
     enlarged = reach < _LARGEST_ZOOM * width
     middle = nominal[furthest]
-    with matplotlib.rc_context(STYLE):
+    with matplotlib.rc_context(DIAGNOSIS_STYLE):
         figure = Figure(
             figsize=(10.0, 0.9 + (7.2 if enlarged else 9.6) * min(max(height / width, 0.3), 0.6)), layout="constrained"
         )
@@ -103,7 +102,7 @@ def where_figure(diagnosis: CableDiagnosis) -> Figure:
     rows = -(-len(episodes) // columns)
     smooth = [_smoothed(diagnosis, int(e)) for e in episodes]
     top = max(4.0, float(np.nanpercentile(np.concatenate([s.ravel() for s in smooth]), 99)))
-    with matplotlib.rc_context(STYLE):
+    with matplotlib.rc_context(DIAGNOSIS_STYLE):
         figure = Figure(figsize=(10.0, 1.5 + 1.55 * rows), layout="constrained")
         grid = figure.add_gridspec(1 + rows, columns, height_ratios=[0.8, *[1.25] * rows])
         _strip(figure.add_subplot(grid[0, :]), diagnosis, arclength)

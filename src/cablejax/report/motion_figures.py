@@ -13,9 +13,8 @@ from PIL import Image
 
 from cablejax.diagnose.diagnosis import NextMotion
 from cablejax.report.animation import OVERSAMPLING, Canvas, save_frames
-from cablejax.report.diagnosis_style import STYLE
 from cablejax.report.effect_words import effect_title, explanation_title
-from cablejax.report.style import LIGHT, cable_curve, gripper_outline
+from cablejax.report.style import DIAGNOSIS_STYLE, LIGHT, cable_curve, gripper_outline
 
 _COLOURS = (LIGHT.residual, LIGHT.direct, "#009e73", "#cc79a7", "#e69f00")
 _MOMENTS = 5
@@ -31,7 +30,7 @@ def motion_figure(following: NextMotion | None) -> Figure | None:
     """
     if following is None:
         return None
-    with matplotlib.rc_context(STYLE):
+    with matplotlib.rc_context(DIAGNOSIS_STYLE):
         figure = Figure(figsize=(10.0, 4.6), layout="constrained")
         halves: Any = figure.subfigures(2, 1, height_ratios=[1.25, 1.0])
         _film(halves[0], following)
