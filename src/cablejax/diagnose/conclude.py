@@ -15,10 +15,11 @@ from cablejax.diagnose.belief import (
     effect_names,
     excess,
     explains_most_motions,
+    leftover_p,
+    leftover_score,
     level,
     probabilities,
 )
-from cablejax.diagnose.conformal import leftover_p, leftover_score
 from cablejax.diagnose.diagnosis import (
     PLACES,
     EffectValues,

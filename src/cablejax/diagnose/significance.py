@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.stats import chi2
 
-from cablejax.diagnose.repeats import episodes_by_motion
+from cablejax.diagnose.evidence import episodes_by_motion
 from cablejax.gaplog import stretches
 from cablejax.types import GapLog
 
