@@ -52,28 +52,28 @@ class BoundedQuasiNewton(optx.AbstractMinimiser):
 
     Attributes:
         rtol, atol: relative and absolute tolerance on the projected gradient.
-        norm: always `optimistix.max_norm`.
-        descent, search: the step that is proposed, and what accepts it and sets its size.
+        damping: at the start, relative to the diagonal of the model's Hessian.
     """
 
-    rtol: float
-    atol: float
-    norm: Callable[[PyTree], Scalar]
-    descent: DampedQuadratic
-    search: optx.AbstractSearch
+    rtol: float = 0.0
+    atol: float = 1e-8
+    damping: float = 1e-3
 
-    def __init__(self, rtol: float = 0.0, atol: float = 1e-8, damping: float = 1e-3):
-        """Makes the solver.
+    @property
+    def norm(self) -> Callable[[PyTree], Scalar]:
+        """Always `optimistix.max_norm`."""
+        return optx.max_norm
 
-        Args:
-            rtol: relative tolerance on the projected gradient.
-            atol: absolute tolerance on it.
-            damping: at the start, relative to the diagonal of the model's Hessian.
-        """
-        self.rtol, self.atol, self.norm = rtol, atol, optx.max_norm
-        self.descent = DampedQuadratic(damping, secant=False)
+    @property
+    def descent(self) -> DampedQuadratic:
+        """The minimum of the damped model over the set."""
+        return DampedQuadratic(secant=False, damping=self.damping)
+
+    @property
+    def search(self) -> GainRatio:
+        """The damping follows the reductions."""
         # a model that is hardly damped any more gains nothing by less, and takes more trials to come back from it
-        self.search = GainRatio(largest=10.0)
+        return GainRatio(largest=10.0)
 
     def init(self, fn, y, args, options, f_struct, aux_struct, tags):
         """The state before the first step; `options["hessian"]`, where given, is the first model."""
