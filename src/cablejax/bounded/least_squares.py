@@ -114,17 +114,14 @@ class AbstractBoundedLeastSquares(optx.AbstractLeastSquaresSolver):
         rtol, atol: relative and absolute tolerance on the projected gradient.
         secant: whether the curvature of the residuals is learned.
         trials_per_linearisation: trial points of one step, the Jacobian being updated in between.
+        norm: `optimistix.max_norm`.
     """
 
     rtol: float = 0.0
     atol: float = 1e-8
     secant: bool = eqx.field(static=True, default=True)
     trials_per_linearisation: int = eqx.field(static=True, default=1)
-
-    @property
-    def norm(self) -> Callable[[PyTree], Scalar]:
-        """Always `optimistix.max_norm`."""
-        return optx.max_norm
+    norm: Callable[[PyTree], Scalar] = eqx.field(default=optx.max_norm)
 
     @property
     @abc.abstractmethod

@@ -53,16 +53,13 @@ class BoundedQuasiNewton(optx.AbstractMinimiser):
     Attributes:
         rtol, atol: relative and absolute tolerance on the projected gradient.
         damping: at the start, relative to the diagonal of the model's Hessian.
+        norm: `optimistix.max_norm`.
     """
 
     rtol: float = 0.0
     atol: float = 1e-8
     damping: float = 1e-3
-
-    @property
-    def norm(self) -> Callable[[PyTree], Scalar]:
-        """Always `optimistix.max_norm`."""
-        return optx.max_norm
+    norm: Callable[[PyTree], Scalar] = eqx.field(default=optx.max_norm)
 
     @property
     def descent(self) -> DampedQuadratic:

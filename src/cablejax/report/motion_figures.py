@@ -56,7 +56,7 @@ def write_motion_gif(path: str | os.PathLike[str], following: NextMotion) -> int
         image = Image.new("RGB", (OVERSAMPLING * size[0], OVERSAMPLING * size[1]), LIGHT.background)
         canvas = Canvas(image)
         canvas.text((14, 10), "Record next", LIGHT.ink, 16, bold=True)
-        canvas.text((width - 14, 10), f"{following.interval * sample:.0f} s", LIGHT.ink, 16, anchor="ra", bold=True)
+        canvas.text((_WIDTH - 14, 10), f"{following.interval * sample:.0f} s", LIGHT.ink, 16, anchor="ra", bold=True)
         pose = following.poses[sample]
 
         def pixels(points: Float[np.ndarray, "P 2"]) -> Float[np.ndarray, "P 2"]:
