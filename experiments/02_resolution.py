@@ -32,6 +32,7 @@ import mujoco
 import numpy as np
 
 from cablejax.cable import Discretisation
+from cablejax.cable_file import config_of_log
 from cablejax.commands.workloads import distance_from_fine, moving_arches
 from cablejax.dataset.generate import make_engine, simulate
 from cablejax.dataset.schema import DatasetConfig
@@ -44,9 +45,9 @@ from cablejax.simulate import ENGINES, Engine, ThreadedEngine
 from cablejax.simulate.elastica import elastica
 from cablejax.simulate.equilibrium import equilibrium_state
 from cablejax.simulate.motions import MotionConfig
-from cablejax.simulate.replay import config_of_log, replay_episode
 from cablejax.types import Trajectory
 from pages import page_of_results, publish
+from recorded_replay import replay_episode
 
 ROWS = (
     *(("threaded", n, 0.02) for n in (13, 17, 25, 33, 49)),

@@ -35,7 +35,7 @@ def main() -> None:
     parser.add_argument(
         "--leftovers",
         action="store_true",
-        help="print what right explanations of single effects leave, for cablejax.diagnose.conformal, and nothing else",
+        help="print what right explanations of single effects leave, for cablejax.diagnose.belief, and nothing else",
     )
     options = parser.parse_args()
     rows = read_cases(options.cases)

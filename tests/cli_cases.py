@@ -12,7 +12,7 @@ from cablejax.cable_file import cable_to_fields
 from cablejax.control.run import ClosedLoopRun, shape_error_cm
 from cablejax.control.targets import Target
 from cablejax.dynamics.config import ModelConfig
-from cablejax.dynamics.gns import GNS
+from cablejax.dynamics.networks import GNS
 from cablejax.dynamics.weights import FILE_NAME, save_weights
 from cablejax.gaplog import Episode
 

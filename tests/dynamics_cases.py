@@ -9,7 +9,7 @@ import pytest
 from flax import nnx
 
 from cablejax.dynamics.config import ModelConfig
-from cablejax.dynamics.gns import GNS
+from cablejax.dynamics.networks import GNS
 from cablejax.dynamics.train_config import Phase, TrainConfig
 from cablejax.types import History, Trajectory
 

@@ -127,3 +127,18 @@ def test_a_straight_drive_ends_at_the_goal_and_stays():
         keypoints = np.linspace(pose[0, :2], pose[1, :2], 13)
     np.testing.assert_allclose(pose[:, :2], goal[:, :2], atol=1e-3)
     assert np.abs(twist).max() < 1e-3
+
+
+@pytest.mark.parametrize(
+    ("error", "fraction", "expected"),
+    [
+        ([21, 9, 1.9, 1.3, 1.0, 1.0, 1.0], 0.05, 2.0),  # 5 % of 20 are 1.0
+        ([21, 9, 1.9, 1.3, 1.0, 1.0, 1.0], 0.02, 3.0),
+        ([21, 1.1, 1.9, 1.3, 1.0, 1.0, 1.0], 0.02, 3.0),
+        ([21, 9, 8, 7, 6], 0.02, np.inf),
+        ([21, 9, np.nan, 1.0, 1.0, 1.0], 0.02, 3.0),  # what was not seen was not near
+        ([21, 9, 1, np.nan], 0.02, np.inf),
+    ],
+)
+def test_settling_time_of_a_step_response(error, fraction, expected):
+    assert trial(errors_cm=tuple(error)).step_settling_time_s(fraction) == expected

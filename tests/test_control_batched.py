@@ -13,7 +13,8 @@ import pytest
 
 from cablejax.bounded import Result
 from cablejax.cable import Cable, Discretisation
-from cablejax.control.batched import LoopConfig, for_each_cable, shape_batch, varied_params
+from cablejax.commands.workloads import varied_params
+from cablejax.control.batched import LoopConfig, for_each_cable, shape_batch
 from cablejax.control.loop import run_closed_loop
 from cablejax.control.shaping import NetworkDynamics, load_model, make_controller
 from cablejax.control.targets import Target, make_target, straight_start

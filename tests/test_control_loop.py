@@ -7,7 +7,7 @@ import pytest
 
 from cablejax.cable import Discretisation
 from cablejax.control.loop import run_closed_loop
-from cablejax.control.run import settling_time, shape_error_cm, step_settling_time
+from cablejax.control.run import settling_time, shape_error_cm
 from cablejax.control.targets import Target, make_target, straight_start
 from cablejax.gaplog import gap_log_from_episodes, read_gap_log, write_gap_log
 from cablejax.simulate.plant import Plant, PlantConfig
@@ -152,19 +152,3 @@ def test_shape_error_is_the_root_mean_square_distance():
 )
 def test_settling_time(error, expected):
     assert settling_time(np.arange(len(error), dtype=float), np.array(error)) == expected
-
-
-@pytest.mark.parametrize(
-    ("error", "fraction", "expected"),
-    [
-        ([21, 9, 1.9, 1.3, 1.0, 1.0, 1.0], 0.05, 2.0),  # 5 % of 20 are 1.0
-        ([21, 9, 1.9, 1.3, 1.0, 1.0, 1.0], 0.02, 3.0),
-        ([21, 1.1, 1.9, 1.3, 1.0, 1.0, 1.0], 0.02, 3.0),
-        ([21, 9, 8, 7, 6], 0.02, np.inf),
-        ([21, 9, np.nan, 1.0, 1.0, 1.0], 0.02, 3.0),  # what was not seen was not near
-        ([21, 9, 1, np.nan], 0.02, np.inf),
-    ],
-)
-def test_settling_time_of_a_step_response(error, fraction, expected):
-    times = np.arange(len(error), dtype=float)
-    assert step_settling_time(times, np.array(error, float), fraction) == expected

@@ -11,7 +11,7 @@ from blind.measures import leftovers
 from blind.store import checked_labels, read_cases
 from blind.verdicts import scored
 from cablejax.diagnose import Calibration
-from cablejax.diagnose.conformal import SCORES, leftover_p, leftover_score
+from cablejax.diagnose.belief import SCORES, leftover_p, leftover_score
 
 SET = pathlib.Path(__file__).parents[1] / "docs" / "results" / "blind" / "20270404" / "cases.jsonl"
 

@@ -10,9 +10,16 @@ import pytest
 
 from cablejax.cable import Cable, Discretisation
 from cablejax.diagnose import LIBRARY, CableEffect, Calibration, Explanation, Parameter, explanation
-from cablejax.diagnose.belief import as_good, excess, explains_most_motions, level, log_scores
+from cablejax.diagnose.belief import (
+    as_good,
+    excess,
+    explains_most_motions,
+    leftover_p,
+    leftover_score,
+    level,
+    log_scores,
+)
 from cablejax.diagnose.conclude import conclude, sentence
-from cablejax.diagnose.conformal import leftover_p, leftover_score
 from cablejax.diagnose.evidence import Evidence
 from cablejax.diagnose.fit import Fit, evaluate, improve
 from cablejax.diagnose.playback import Playback

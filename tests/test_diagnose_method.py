@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import math
 
 import numpy as np
 import pytest
@@ -83,7 +82,7 @@ def test_noise_is_not_explained_by_an_effect():
     for seed in range(12):
         facts = dataclasses.replace(evidence(seed=seed), simulator=simulator(17, FEW))
         null = evaluate(facts, [explanation()])[0]
-        found = search(facts, null, EXACT, deadline=math.inf, progress=lambda _: None)
+        found = search(facts, null, EXACT, progress=lambda _: None)
         won += bool(found.fits[0].explanation.terms)
     assert won <= 2, f"an effect was preferred to none in {won} of 12 logs of pure noise"
 

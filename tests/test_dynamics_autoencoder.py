@@ -9,9 +9,9 @@ from flax import nnx
 
 from cablejax.dataset.windows import draw_windows
 from cablejax.dynamics.autoencoder import AutoEncoders, PretrainConfig, features, pretrain
-from cablejax.dynamics.gns import GNS
 from cablejax.dynamics.graph import build_graph, prior_of
 from cablejax.dynamics.model import apply
+from cablejax.dynamics.networks import GNS
 from cablejax.dynamics.normalisation import fit_normalisation
 from cablejax.dynamics.train import train
 from dynamics_cases import SMALL, TINY_TRAINING, arched_history, trajectories

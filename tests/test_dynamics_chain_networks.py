@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from flax import nnx
 
-from cablejax.dynamics.chain_networks import LSTM
 from cablejax.dynamics.graph import prior_of
 from cablejax.dynamics.model import apply, make_network
+from cablejax.dynamics.networks import LSTM
 from cablejax.dynamics.train import train
 from cablejax.dynamics.weights import load_weights, save_weights
 from dynamics_cases import (

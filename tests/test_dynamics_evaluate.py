@@ -17,7 +17,7 @@ from cablejax.dynamics.evaluate import (
     snapping,
     window_errors,
 )
-from cablejax.dynamics.interpolation import rigid_interpolation
+from cablejax.dynamics.graph import rigid_interpolation
 from cablejax.types import Trajectory
 from dynamics_cases import SMALL, network, trajectories
 

@@ -10,9 +10,9 @@ from flax import nnx
 
 from cablejax.dynamics.config import ModelConfig
 from cablejax.dynamics.evaluate import predict
-from cablejax.dynamics.gns import GNS, aggregate, gather
 from cablejax.dynamics.graph import cable_topology, prior_of
 from cablejax.dynamics.model import bind
+from cablejax.dynamics.networks import GNS, aggregate, gather
 from dynamics_cases import (
     SMALL,
     arched_history,

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from cablejax.dynamics.config import ModelConfig, Normalisation
-from cablejax.dynamics.graph import build_graph, cable_topology, frame_of, prior_of
-from cablejax.dynamics.interpolation import rigid_interpolation
+from cablejax.dynamics.graph import build_graph, cable_topology, frame_of, prior_of, rigid_interpolation
 from dynamics_cases import SMALL, arched_history, moved_rigidly, straight_history, turned_twist
 
 TWIST = jnp.array([[0.01, -0.02, 0.1], [-0.03, 0.005, -0.2]])

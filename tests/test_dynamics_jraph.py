@@ -8,8 +8,8 @@ import pytest
 from flax import nnx
 
 from cablejax.dynamics.config import ModelConfig
-from cablejax.dynamics.gns import GNS, MessagePassing
 from cablejax.dynamics.graph import build_graph, prior_of
+from cablejax.dynamics.networks import GNS, MessagePassing
 from cablejax.dynamics.weights import load_weights
 from dynamics_cases import arched_history
 

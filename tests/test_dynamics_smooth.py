@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from cablejax.dynamics.layers import rectified
 from cablejax.dynamics.model import apply
+from cablejax.dynamics.networks import rectified
 from cablejax.dynamics.smooth import smoothed
 from cablejax.types import History
 from dynamics_cases import SMALL, network, trajectories

@@ -18,10 +18,10 @@ import pytest
 from cablejax.dataset.windows import draw_windows
 from cablejax.dynamics.checkpoint import Checkpoints
 from cablejax.dynamics.evaluate import open_loop_error
-from cablejax.dynamics.gns import GNS
 from cablejax.dynamics.loss import random_walk_noise, rollout_loss
 from cablejax.dynamics.metrics import MetricsLog
 from cablejax.dynamics.model import bind
+from cablejax.dynamics.networks import GNS
 from cablejax.dynamics.normalisation import fit_normalisation
 from cablejax.dynamics.run_folder import claim_folder
 from cablejax.dynamics.train import DivergedError, train

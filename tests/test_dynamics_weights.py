@@ -12,8 +12,8 @@ from safetensors.numpy import save_file
 
 from cablejax.dynamics import weights as files
 from cablejax.dynamics.config import ModelConfig, Normalisation
-from cablejax.dynamics.gns import GNS
 from cablejax.dynamics.model import apply
+from cablejax.dynamics.networks import GNS
 from cablejax.dynamics.weights import (
     WeightsError,
     load_info,
@@ -46,7 +46,7 @@ def altered(path, tensors=lambda t: t, content=lambda c: c):
 def test_weights_survive_bit_for_bit(saved):
     graphdef, weights = network(CONFIG)
     for source in (saved, str(saved), saved.parent):
-        config, found_def, found = load_weights(source, expect=CONFIG)
+        config, found_def, found = load_weights(source)
         assert config == CONFIG and found_def == graphdef
         assert jax.tree.structure(found) == jax.tree.structure(weights)
         jax.tree.map(np.testing.assert_array_equal, found, weights)
@@ -55,15 +55,6 @@ def test_weights_survive_bit_for_bit(saved):
     predict = jax.jit(lambda weights: apply((graphdef, weights), history, twist))
     np.testing.assert_array_equal(predict(found), predict(weights))
     assert [file.name for file in saved.parent.iterdir()] == [saved.name], "nothing half-written is left"
-
-
-def test_a_model_for_another_graph_is_refused(saved):
-    assert load_weights(saved, expect=dataclasses.replace(CONFIG, normalisation=Normalisation()))[0] == CONFIG
-    asked = dataclasses.replace(CONFIG, n_keypoints=6, length=2.0, history=4)
-    with pytest.raises(WeightsError, match="weights for another graph") as refusal:
-        load_weights(saved, expect=asked)
-    for part in ("n_keypoints is 5, expected 6", "length is 1.0, expected 2.0", "history is 3, expected 4"):
-        assert part in str(refusal.value)
 
 
 @pytest.mark.parametrize(

@@ -37,8 +37,8 @@ from cablejax.diagnose.recording import prepare
 from cablejax.diagnose.verdict_json import verdict_json
 from cablejax.dynamics import run_folder
 from cablejax.gaplog import TARGETS, read_gap_log
-from cablejax.perceive.cloud import padded
 from cablejax.perceive.recording import read_clouds
+from cablejax.perceive.tracker import padded
 from cablejax.recordings.bags import import_mcap
 from cablejax.recordings.lerobot import write_lerobot
 from cablejax.recordings.mcap_log import write_mcap

@@ -19,7 +19,6 @@ from cablejax.mpc import (
     differentiable_plan,
     feasible_from,
     multi_start,
-    random_starts,
 )
 from mpc_cases import START, poses, problem
 
@@ -162,6 +161,15 @@ def test_sampling_knows_the_way_back_from_outside(solver):
     assert float(value) <= float(value_at(case, case.start(jnp.asarray(STILL)).motion))
     plan, _, _ = solved(solver, with_bounds(min_distance=1.2))
     assert Result(int(plan.result)) is Result.EMPTY_SET
+
+
+def random_starts(problem, n_commands, count, seed=0):
+    """Feasible plans at random: each gripper goes about straight on, at random speed."""
+    heading, noise = jax.random.split(jax.random.key(seed))
+    dtype = problem.target.dtype
+    way = jax.random.normal(heading, (count, 1, 2, 3), dtype)
+    motion = problem.feasible.radius * (way + 0.3 * jax.random.normal(noise, (count, n_commands, 2, 3), dtype)) / 2.0
+    return jax.vmap(problem.feasible.project)(motion)
 
 
 @pytest.mark.slow

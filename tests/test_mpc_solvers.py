@@ -143,7 +143,7 @@ def test_solves_many_problems_at_once(solver):
 def test_budgets_that_make_no_sense_are_refused():
     with pytest.raises(ValueError, match="at least 2 evaluations"):
         ProjectedGradient(max_evaluations=1)
-    with pytest.raises(ValueError, match="at least one"):
+    with pytest.raises(ValueError, match="max_iterations is 0, expected a whole number from 1"):
         LevenbergMarquardt(max_iterations=0)
     with pytest.raises(ValueError, match="tolerance"):
         LevenbergMarquardt(tolerance=0.0)

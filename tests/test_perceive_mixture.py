@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from cablejax.perceive.curve import carried, curve, keypoints_of, perpendicular
-from cablejax.perceive.mixture import ELONGATION, distance_to, expectation
-from cablejax.perceive.structure import embedding_stiffness
+from cablejax.perceive.mixture import ELONGATION, distance_to, embedding_stiffness, expectation
 from perceive_cases import ARCH, REGISTRATION, shape, start_angles
 
 MATRICES = REGISTRATION.matrices

@@ -17,7 +17,7 @@ from cablejax.dynamics.run_folder import claim_folder
 from cablejax.dynamics.weights import cable_of_weights, load_weights
 from cablejax.effects.given import effects_of_verdict
 from cablejax.gaplog import read_gap_log, write_gap_log
-from cablejax.schema_version import version_of
+from cablejax.text_file import version_of
 
 # What was written by the last commit before schema 2 of the data sets.
 OLD = pathlib.Path(__file__).parent / "old_files"

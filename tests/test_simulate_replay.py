@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 
 from cablejax.cable import Discretisation
+from cablejax.cable_file import config_of_log
 from cablejax.gaplog import read_gap_log
 from cablejax.simulate import MjxEngine, ThreadedEngine
-from cablejax.simulate.replay import config_of_log, replay_episode
+from recorded_replay import replay_episode
 
 FOLDER = Path(os.environ.get("CABLEJAX_DATA", "absent")).parent / "gap-dev"
 

@@ -5,7 +5,7 @@ import os
 import pytest
 from flax import nnx
 
-from cablejax.dynamics.gns import GNS
+from cablejax.dynamics.networks import GNS
 from cablejax.dynamics.weights import save_weights
 from cablejax.whole_file import whole_file
 from dynamics_cases import SMALL

@@ -26,7 +26,7 @@ from cablejax.mpc import MPC, MPCConfig, ObjectiveConfig, Plan, ShapingProblem, 
 from cablejax.mpc.feasible import feasible_from
 from cablejax.mpc.problem import Rollout
 from cablejax.npz import read_npz
-from cablejax.residual.corrected import Corrected
+from cablejax.residual.jacobian import Corrected
 from cablejax.residual.ridge import ResidualModel, zero_residual
 from cablejax.types import History
 from closed_loop.cases import PLANT_CHAIN, mujoco_plant

@@ -19,8 +19,7 @@ import optimistix as optx
 from jaxtyping import Array, Float
 
 from cablejax.bounded import AbstractSet
-from cablejax.bounded.linearise import squared_jacobian
-from cablejax.bounded.objective import value_of
+from cablejax.bounded.objective import squared_jacobian, value_of
 
 
 @dataclasses.dataclass(frozen=True)

@@ -9,8 +9,7 @@ from collections.abc import Callable, Iterable
 import numpy as np
 from scipy.stats import binomtest
 
-from cablejax.diagnose.belief import Calibration
-from cablejax.diagnose.conformal import leftover_score
+from cablejax.diagnose.belief import Calibration, leftover_score
 
 from .verdicts import Scored, coverages, place_error, shrinkage_ratio
 
@@ -211,7 +210,7 @@ def reliability(cases: list[Scored], edges=(0.0, 0.5, 0.7, 0.8, 0.9, 0.97, 1.000
 
 
 def leftovers(cases: list[Scored]) -> list[float]:
-    """Scores of `cablejax.diagnose.conformal`, sorted: of single effects of the library that the reported set has.
+    """Scores of `cablejax.diagnose.belief`, sorted: of single effects of the library that the reported set has.
 
     Effects of the arms show in the encoders and are left out.
     """

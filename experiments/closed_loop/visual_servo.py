@@ -28,9 +28,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from cablejax.limits import check
 from cablejax.mpc.feasible import feasible_from
 from cablejax.mpc.problem import ObjectiveConfig
-from cablejax.mpc.validation import check_history, check_measurement, check_positive, check_target
+from cablejax.mpc.validation import check_history, check_measurement, check_target
 from cablejax.types import History, Measurement
 
 
@@ -73,11 +74,8 @@ class ServoConfig:
     interval: float = 1.0
 
     def __post_init__(self):
-        check_positive(self, "cable_length", "radius", "damping", "regularisation", "outlier", "probe")
-        check_positive(self, "rotation_weight", "interval")
-        for name in ("gain", "forgetting"):
-            if not 0 < getattr(self, name) <= 1:
-                raise ValueError(f"ServoConfig.{name} is {getattr(self, name)}, expected a number in (0, 1].")
+        positive = ("cable_length", "radius", "damping", "regularisation", "outlier", "probe", "rotation_weight")
+        check(self, "interval", gain="share", forgetting="share", **dict.fromkeys(positive, "positive"))
         if not 0 <= self.min_distance < self.max_distance <= 1:
             raise ValueError(
                 f"ServoConfig distances {self.min_distance} to {self.max_distance}: expected 0 <= min_distance < "

@@ -2,9 +2,9 @@
 
 Nodes are the two clamps and the free markers as the rod has them, edges connect markers at most two apart. A node
 knows its simulated position, how it moved over the last 0.05 to 0.4 s, and its place along the cable; a clamp also its
-direction. What the clamps do reaches the markers by messages, as in `cablejax.dynamics.gns` (Sanchez-Gonzalez et al.,
-2020). The output is the correction of each free marker in the frame that moves with the clamps, so it predicts open
-loop as far as the rod does; a network that has learned nothing corrects nothing.
+direction. What the clamps do reaches the markers by messages, as in `cablejax.dynamics.networks` (Sanchez-Gonzalez et
+al., 2020). The output is the correction of each free marker in the frame that moves with the clamps, so it predicts
+open loop as far as the rod does; a network that has learned nothing corrects nothing.
 
 Size and number of rounds are those with the least error on recordings left out.
 """
@@ -25,8 +25,8 @@ from jaxtyping import Float
 
 from cablejax.diagnose.refits import dealt
 from cablejax.dynamics.config import ModelConfig
-from cablejax.dynamics.gns import EncodeProcessDecode
 from cablejax.dynamics.graph import topology_of
+from cablejax.dynamics.networks import EncodeProcessDecode
 from cablejax.simulate.compile import compiler_options
 from cablejax.spatial.windows import Windows
 from real_cables.features import earlier, in_frame, moving_frame

@@ -1,20 +1,27 @@
 """Reads and writes a cable as a TOML file whose keys name their units.
 
-The same keys describe the cable in trained weights, so that a cable has one written form.
+The same keys describe the cable in trained weights and in gap logs, so that a cable has one written form.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import os
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from cablejax.cable import Cable
+import numpy as np
+
+from cablejax.cable import Cable, Discretisation
 from cablejax.limits import LIMITS, require, shown
-from cablejax.schema_version import version_of
-from cablejax.text_file import read_toml, unknown_key
+from cablejax.text_file import read_toml, unknown_key, version_of
 from cablejax.whole_file import whole_file
+
+if TYPE_CHECKING:
+    from cablejax.types import GapLog
+
+_SLENDER = 0.01
 
 SCHEMA = "cablejax-cable/1"
 """Name and version of the file's keys; a file without `schema` is of version 1."""
@@ -156,3 +163,41 @@ def _keypoints(fields: Mapping[str, Any], where: str) -> dict[str, Any]:
     if not isinstance(marks, list) or not all(mark in LIMITS["not_negative"] for mark in marks):
         raise ValueError(f"{where}: keypoint_arclength_m is {shown(marks)}, expected a list of numbers [m].")
     return {"n_keypoints": len(marks), "marks": tuple(map(float, marks))}
+
+
+def config_of_log(log: GapLog, *, n_links: int | None = None, timestep: float | None = None) -> Discretisation:
+    """The simulator of the cable that a log states, by default at the default resolution.
+
+    In the plane the diameter hardly matters to the motion, and a cable thicker than a link is long gets a smaller one.
+    """
+    cable, table = log.meta["cable"], log.meta["table"]
+    dimension, chosen = log.keypoints.shape[-1], {"n_links": n_links, "timestep": timestep}
+    described = Cable(
+        length=cable["length_m"],
+        diameter=cable["diameter_m"] if dimension == 3 else min(cable["diameter_m"], _SLENDER * cable["length_m"]),
+        linear_density=cable["linear_density_kg_per_m"],
+        bending_stiffness=cable["bending_stiffness_n_m2"],
+        damping_time=cable["bending_damping_s"],
+        rest_curvature=cable.get("rest_curvature_per_m", 0.0),
+        friction_coefficient=0.0 if table is None else table["friction_coefficient"],
+        n_keypoints=log.keypoints.shape[-2],
+    )
+    return Discretisation(
+        described, dimension=dimension, **{name: value for name, value in chosen.items() if value is not None}
+    )
+
+
+def cable_of_log(log: GapLog) -> Cable:
+    """The cable that a log states, with its own diameter, marks and grasp.
+
+    Raises:
+        ValueError: it is not one that a simulator can take.
+    """
+    cable, marks = log.meta["cable"], np.asarray(log.meta["keypoint_arclength_m"], float)
+    uniform = np.allclose(marks, np.linspace(0.0, cable["length_m"], len(marks)), rtol=0, atol=1e-6 * cable["length_m"])
+    return dataclasses.replace(
+        config_of_log(log).cable,
+        diameter=cable["diameter_m"],
+        marks=None if uniform else tuple(marks.tolist()),
+        grasp=tuple(log.meta["grasp"]),
+    )

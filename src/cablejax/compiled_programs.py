@@ -52,9 +52,13 @@ def _user_cache() -> pathlib.Path:
     return named if named.is_absolute() else pathlib.Path("~/.cache")
 
 
+def processor_lines() -> list[str]:
+    """The system's description of its processors; empty where it has none."""
+    cpuinfo = pathlib.Path("/proc/cpuinfo")
+    return cpuinfo.read_text(encoding="utf-8", errors="replace").splitlines() if cpuinfo.is_file() else []
+
+
 def _processor() -> str:
     """A digest of the processor's model and instructions."""
-    cpuinfo = pathlib.Path("/proc/cpuinfo")
-    lines = cpuinfo.read_text(encoding="utf-8", errors="replace").splitlines() if cpuinfo.is_file() else []
-    telling = {line for line in lines if line.startswith(("model name", "flags", "Features", "CPU part"))}
+    telling = {line for line in processor_lines() if line.startswith(("model name", "flags", "Features", "CPU part"))}
     return hashlib.sha256("\n".join([platform.machine(), *sorted(telling)]).encode()).hexdigest()[:12]

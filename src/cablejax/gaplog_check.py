@@ -11,7 +11,7 @@ from jaxtyping import Float
 from cablejax.cable_file import NUMBERS, cable_from_fields
 from cablejax.limits import LIMITS, require, shown
 from cablejax.log_geometry import geometry_fault
-from cablejax.schema_version import version_of
+from cablejax.text_file import version_of
 from cablejax.types import GapLog
 
 SCHEMA = "cablejax-gap-log/1"

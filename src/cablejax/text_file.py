@@ -1,4 +1,4 @@
-"""Reads and writes text, JSON and TOML files; writes are atomic, and errors name the file."""
+"""Reads and writes text, JSON and TOML files; writes are atomic, and errors name the file; versions of schemas."""
 
 from __future__ import annotations
 
@@ -85,6 +85,18 @@ def parse_json(text: str | bytes) -> Any:
         raise ValueError(f"is no JSON: {error}") from error
 
 
+def differences(*records: Mapping[str, Any], prefix: str = "") -> dict[str, list[Any]]:
+    """The leaves in which several JSON objects differ, as `outer.inner`, with each one's value or "absent"."""
+    found: dict[str, list[Any]] = {}
+    for key in sorted(set().union(*records)):
+        values = [record.get(key, "absent") for record in records]
+        if all(isinstance(value, Mapping) for value in values):
+            found |= differences(*values, prefix=f"{prefix}{key}.")
+        elif any(value != values[0] for value in values):
+            found[f"{prefix}{key}"] = values
+    return found
+
+
 def read_toml(path: str | os.PathLike[str]) -> dict[str, Any]:
     """Reads a TOML file.
 
@@ -112,3 +124,26 @@ def unknown_key(key: str, units: Mapping[str, str]) -> str:
     near = near or difflib.get_close_matches(key, units, 1, 0.5)
     known = f"Did you mean {near[0]}?" if near else f"Expected {', '.join(units)}."
     return f"the unknown key {shown(key)}. {known}"
+
+
+def version_of(schema: object, known: str, where: object) -> int:
+    """The version of a file's schema, at most the known one; the caller migrates what is older.
+
+    Args:
+        schema: what the file says, such as "cablejax-weights/1".
+        known: name and newest version of the schema that is read.
+        where: the file, for messages.
+
+    Raises:
+        ValueError: the file has another schema, or a newer version of it.
+    """
+    name, _, newest = known.partition("/")
+    came, _, number = schema.partition("/") if isinstance(schema, str) else ("", "", "")
+    if came != name or not number.isascii() or not number.isdecimal() or not 0 < len(number) < 6 or int(number) < 1:
+        raise ValueError(f"{where} has schema {shown(schema)}, expected {known!r}: is it another kind of file?")
+    if int(number) > int(newest):
+        raise ValueError(
+            f"{where} has schema {shown(schema)}, expected {known!r} or older: a newer version of cablejax wrote it. "
+            "Read it with that version: `pip install --upgrade cablejax`."
+        )
+    return int(number)

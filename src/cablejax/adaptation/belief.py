@@ -14,11 +14,12 @@ ratio of stiffness to friction is identifiable; in the other direction c stays a
 from __future__ import annotations
 
 import dataclasses
-import math
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
+
+from cablejax.limits import check
 
 
 @dataclasses.dataclass(frozen=True)
@@ -47,12 +48,7 @@ class AdaptationConfig:
     limits: tuple[float, float] = (-2.4, 1.2)
 
     def __post_init__(self):
-        for name in ("prior_std", "error_std", "outlier", "max_step"):
-            value = getattr(self, name)
-            if not (math.isfinite(value) and value > 0):
-                raise ValueError(f"AdaptationConfig.{name} is {value}, expected a positive finite number.")
-        if not 0 < self.memory <= 1:
-            raise ValueError(f"AdaptationConfig.memory is {self.memory}, expected a number in (0, 1].")
+        check(self, prior_std="positive", error_std="positive", memory="share", outlier="positive", max_step="positive")
         if not self.limits[0] < 0 < self.limits[1]:
             raise ValueError(f"AdaptationConfig.limits are {self.limits}, expected one below and one above 0.")
         if len(self.prior_mean) != 2 or not all(self.limits[0] <= mean <= self.limits[1] for mean in self.prior_mean):

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Scalar
 
-from cablejax.bounded.quadratic_model import promised_decrease
+from cablejax.bounded.objective import promised_decrease
 
 
 class _GainState(eqx.Module):

@@ -2,37 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import equinox as eqx
 import jax.numpy as jnp
 import optimistix as optx
-from jaxtyping import Array, Float, PyTree, Scalar
+from jaxtyping import Array, Float
 
-from cablejax.bounded.least_squares import AbstractBoundedLeastSquares
-from cablejax.bounded.quadratic import minimise_quadratic
-from cablejax.bounded.secant import convex_part
-from cablejax.bounded.sets import ConvexSet
+from cablejax.bounded.least_squares import AbstractBoundedLeastSquares, ModelDescent
 
 
-class ConstrainedNewton(optx.AbstractDescent):
+class ConstrainedNewton(ModelDescent):
     """`step(s) = s d`, where d minimises `g'd + d'H d / 2` over the d with y + d feasible.
 
     On a convex set every step between 0 and 1 ends inside. Directions that H does not see are left alone.
-
-    Attributes:
-        secant: whether H may have negative eigenvalues; these are cut off.
-        feasible: the convex set; None until a solver has put in that of its options.
-        y: where the model is made, in the set's own shape; likewise.
     """
-
-    secant: bool = eqx.field(static=True)
-    feasible: ConvexSet | None = None
-    y: Array | None = None
-
-    def within(self, feasible: ConvexSet, y: Array) -> ConstrainedNewton:
-        """The same descent on a set, around a point."""
-        return ConstrainedNewton(self.secant, feasible, y)
 
     def init(self, y, f_info_struct):
         """A direction of zeros."""
@@ -41,10 +23,8 @@ class ConstrainedNewton(optx.AbstractDescent):
 
     def query(self, y, f_info, state):
         """The direction to the minimum of the model over the feasible set."""
-        del state
-        hessian = f_info.hessian.as_matrix()
-        regular = regularised(convex_part(hessian) if self.secant else hessian)
-        return minimise_quadratic(regular, f_info.grad, self.feasible, self.y).point - y  # pyright: ignore[reportArgumentType]
+        del y, state
+        return self.minimum(regularised(self.convex(f_info)), f_info.grad)
 
     def step(self, step_size, state):
         """The direction, shortened to `step_size` of it."""
@@ -57,28 +37,17 @@ class BoundedGaussNewton(AbstractBoundedLeastSquares):
     The fewest settings, and the fastest where the residuals are small and the Jacobian has full rank.
     """
 
-    rtol: float
-    atol: float
-    norm: Callable[[PyTree], Scalar]
-    descent: ConstrainedNewton
-    search: optx.AbstractSearch
-    secant: bool = eqx.field(static=True)
-    trials_per_linearisation: int = eqx.field(static=True)
+    secant: bool = eqx.field(static=True, default=False)
 
-    def __init__(self, rtol: float = 0.0, atol: float = 1e-8, secant: bool = False, trials_per_linearisation: int = 1):
-        """Makes the solver.
+    @property
+    def descent(self) -> ConstrainedNewton:
+        """The direction to the minimum of the model over the set."""
+        return ConstrainedNewton(self.secant)
 
-        Args:
-            rtol: relative tolerance on the projected gradient.
-            atol: absolute tolerance on it.
-            secant: whether the curvature of the residuals is learned.
-            trials_per_linearisation: trial points of one step, the Jacobian being updated in between.
-        """
-        self.rtol, self.atol, self.norm = rtol, atol, optx.max_norm
-        self.descent = ConstrainedNewton(secant)
-        self.search = optx.BacktrackingArmijo(slope=1e-4, decrease_factor=0.3)
-        self.secant = secant
-        self.trials_per_linearisation = trials_per_linearisation
+    @property
+    def search(self) -> optx.BacktrackingArmijo:
+        """Shortens a step until the function falls enough."""
+        return optx.BacktrackingArmijo(slope=1e-4, decrease_factor=0.3)
 
 
 def regularised(hessian: Float[Array, "P P"]) -> Float[Array, "P P"]:

@@ -1,22 +1,23 @@
 """Base of the bounded least squares solvers: one linearisation, one model, one trial point after the other."""
 
+from __future__ import annotations
+
+import abc
 import dataclasses
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Self
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import optimistix as optx
-from equinox import AbstractVar
 from jaxtyping import Array, Bool, Float, Int, PyTree, Scalar
 
-from cablejax.bounded.auxiliary import aux_at, chosen
 from cablejax.bounded.certificate import projected_gradient_size
-from cablejax.bounded.linearise import forward
-from cablejax.bounded.objective import value_of
-from cablejax.bounded.quadratic_model import promised_decrease, quadratic_info
-from cablejax.bounded.secant import secant_update
+from cablejax.bounded.objective import aux_at, chosen, forward, promised_decrease, quadratic_info, value_of
+from cablejax.bounded.quadratic import minimise_quadratic
+from cablejax.bounded.secant import convex_part, secant_update
+from cablejax.bounded.sets import ConvexSet
 
 
 class _Linearisation(eqx.Module):
@@ -61,6 +62,35 @@ class _State(eqx.Module):
     evaluations: Int[Array, ""]
 
 
+class ModelDescent(optx.AbstractDescent):
+    """Base of the descents that minimise a quadratic model over a convex set.
+
+    Attributes:
+        secant: whether the model's Hessian may have negative eigenvalues; these are cut off.
+        feasible: the convex set; None until a solver has put in that of its options.
+        y: where the model is made, in the set's own shape; likewise.
+    """
+
+    secant: bool = eqx.field(static=True)
+    feasible: ConvexSet | None = None
+    y: Array | None = None
+
+    def within(self, feasible: ConvexSet, y: Array) -> Self:
+        """The same descent on a set, around a point."""
+        return dataclasses.replace(self, feasible=feasible, y=y)
+
+    def convex(self, f_info: Any) -> Float[Array, "P P"]:
+        """The model's Hessian, positive semi-definite."""
+        hessian = f_info.hessian.as_matrix()
+        return convex_part(hessian) if self.secant else hessian
+
+    def minimum(self, hessian: Float[Array, "P P"], gradient: Float[Array, " P"]) -> Float[Array, " P"]:
+        """The step to the minimum of `g'd + d'H d / 2` over the set. Raises `ValueError` before `within`."""
+        if self.feasible is None or self.y is None:
+            raise ValueError("The descent has no set yet: call `within` first.")
+        return minimise_quadratic(hessian, gradient, self.feasible, self.y).point - self.y.ravel()
+
+
 class AbstractBoundedLeastSquares(optx.AbstractLeastSquaresSolver):
     """Base of the bounded least squares solvers; `y` is one array, `fn` gives one flat array of residuals.
 
@@ -82,19 +112,26 @@ class AbstractBoundedLeastSquares(optx.AbstractLeastSquaresSolver):
 
     Attributes:
         rtol, atol: relative and absolute tolerance on the projected gradient.
-        norm: always `optimistix.max_norm`.
-        descent, search: the step that is proposed, and what accepts it and sets its size.
         secant: whether the curvature of the residuals is learned.
-        trials_per_linearisation: trial points of one step.
+        trials_per_linearisation: trial points of one step, the Jacobian being updated in between.
+        norm: `optimistix.max_norm`.
     """
 
-    rtol: AbstractVar[float]
-    atol: AbstractVar[float]
-    norm: AbstractVar[Callable[[PyTree], Scalar]]
-    descent: AbstractVar[Any]
-    search: AbstractVar[optx.AbstractSearch]
-    secant: AbstractVar[bool]
-    trials_per_linearisation: AbstractVar[int]
+    rtol: float = 0.0
+    atol: float = 1e-8
+    secant: bool = eqx.field(static=True, default=True)
+    trials_per_linearisation: int = eqx.field(static=True, default=1)
+    norm: Callable[[PyTree], Scalar] = eqx.field(default=optx.max_norm)
+
+    @property
+    @abc.abstractmethod
+    def descent(self) -> ModelDescent:
+        """The step that is proposed."""
+
+    @property
+    @abc.abstractmethod
+    def search(self) -> optx.AbstractSearch:
+        """What accepts a step and sets its size."""
 
     def init(self, fn, y, args, options, f_struct, aux_struct, tags):
         """The state before the first step. Raises `ValueError` unless `fn` gives one flat array."""

@@ -10,11 +10,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from cablejax.bounded.interior_point import interior_point
+from cablejax.bounded.objective import derivative_along
 from cablejax.bounded.quadrics import Quadrics
-from cablejax.bounded.tangents import derivative_along
 
 if TYPE_CHECKING:
-    from cablejax.bounded.sets.base import ConvexSet
+    from cablejax.bounded.sets import ConvexSet
 
 
 class QuadraticMinimum(NamedTuple):

@@ -54,6 +54,13 @@ class Quadrics(eqx.Module):
         return self.matrix.T @ ((self.curvature * (multipliers @ self.groups))[:, None] * self.matrix)
 
 
+def linear_quadrics(matrix: Float[Array, "K P"], level: Float[Array, " K"]) -> Quadrics:
+    """`A x + e`."""
+    size, dtype = len(level), matrix.dtype
+    zeros, ones = jnp.zeros(size, dtype), jnp.ones(size, dtype)
+    return Quadrics(matrix, offset=zeros, curvature=zeros, slope=ones, level=level, groups=jnp.eye(size, dtype=dtype))
+
+
 def ball_quadrics(matrix: Float[Array, "K D P"], offset: Float[Array, "K D"], radius: Float[Array, " K"]) -> Quadrics:
     """`(|A_k x + b_k|^2 - r_k^2) / (2 r_k)`; a radius below rounding counts as that."""
     n_balls, width, size = matrix.shape

@@ -12,11 +12,10 @@ import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Bool, Int, PyTree, Scalar
 
-from cablejax.bounded.auxiliary import chosen, nothing_yet
 from cablejax.bounded.certificate import projected_gradient_size
 from cablejax.bounded.gain_ratio import GainRatio
 from cablejax.bounded.levenberg_marquardt import DampedQuadratic
-from cablejax.bounded.quadratic_model import promised_decrease, quadratic_info
+from cablejax.bounded.objective import chosen, nothing_yet, promised_decrease, quadratic_info
 from cablejax.bounded.secant import positive_update, sized
 
 
@@ -53,28 +52,25 @@ class BoundedQuasiNewton(optx.AbstractMinimiser):
 
     Attributes:
         rtol, atol: relative and absolute tolerance on the projected gradient.
-        norm: always `optimistix.max_norm`.
-        descent, search: the step that is proposed, and what accepts it and sets its size.
+        damping: at the start, relative to the diagonal of the model's Hessian.
+        norm: `optimistix.max_norm`.
     """
 
-    rtol: float
-    atol: float
-    norm: Callable[[PyTree], Scalar]
-    descent: DampedQuadratic
-    search: optx.AbstractSearch
+    rtol: float = 0.0
+    atol: float = 1e-8
+    damping: float = 1e-3
+    norm: Callable[[PyTree], Scalar] = eqx.field(default=optx.max_norm)
 
-    def __init__(self, rtol: float = 0.0, atol: float = 1e-8, damping: float = 1e-3):
-        """Makes the solver.
+    @property
+    def descent(self) -> DampedQuadratic:
+        """The minimum of the damped model over the set."""
+        return DampedQuadratic(secant=False, damping=self.damping)
 
-        Args:
-            rtol: relative tolerance on the projected gradient.
-            atol: absolute tolerance on it.
-            damping: at the start, relative to the diagonal of the model's Hessian.
-        """
-        self.rtol, self.atol, self.norm = rtol, atol, optx.max_norm
-        self.descent = DampedQuadratic(damping, secant=False)
+    @property
+    def search(self) -> GainRatio:
+        """The damping follows the reductions."""
         # a model that is hardly damped any more gains nothing by less, and takes more trials to come back from it
-        self.search = GainRatio(largest=10.0)
+        return GainRatio(largest=10.0)
 
     def init(self, fn, y, args, options, f_struct, aux_struct, tags):
         """The state before the first step; `options["hessian"]`, where given, is the first model."""

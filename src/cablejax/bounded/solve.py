@@ -12,11 +12,9 @@ from jax.core import Tracer
 from jaxtyping import Array, Bool
 
 from cablejax.bounded.implicit import FixedPointAdjoint
-from cablejax.bounded.linearise import forward, squared_jacobian
-from cablejax.bounded.objective import value_of
+from cablejax.bounded.objective import derivative_along, forward, squared_jacobian, value_of
 from cablejax.bounded.results import Result, Solution, Stats, result_of
 from cablejax.bounded.sets import AbstractSet
-from cablejax.bounded.tangents import derivative_along
 
 
 def minimise(

@@ -10,8 +10,8 @@ import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int, PyTree, Scalar
 
-from cablejax.bounded.auxiliary import chosen, nothing_yet
 from cablejax.bounded.certificate import projected_gradient_size
+from cablejax.bounded.objective import chosen, nothing_yet
 from cablejax.bounded.sets import ConvexSet
 
 

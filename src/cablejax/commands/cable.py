@@ -71,6 +71,6 @@ def find_cable(source: str | pathlib.Path) -> Cable:
         from cablejax.dynamics.weights import cable_of_weights
 
         return cable_of_weights(path)
-    from cablejax.simulate.replay import cable_of_log
+    from cablejax.cable_file import cable_of_log
 
     return cable_of_log(recorded(path)[0])

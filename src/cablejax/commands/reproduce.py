@@ -36,13 +36,14 @@ def command_line(command: Command, name: str) -> str:
     return shlex.join(words)
 
 
-def simulate_command(config: DatasetConfig, out: str, cable_file: str = "cable.toml") -> str:
+def simulate_command(config: DatasetConfig, out: str) -> str:
     """The `cablejax simulate` that makes a data set, or a comment that its options cannot.
+
+    A cable other than the reference is expected in `cable.toml`.
 
     Args:
         config: of the data set.
         out: its folder.
-        cable_file: where the command finds the cable, unless it is the reference cable.
     """
     command = Simulate(
         out=pathlib.Path(out),
@@ -52,7 +53,7 @@ def simulate_command(config: DatasetConfig, out: str, cable_file: str = "cable.t
         start=config.motion.start,
         max_amplification=config.motion.max_amplification,
         engine=config.engine,
-        cable=None if config.cable == Cable() else pathlib.Path(cable_file),
+        cable=None if config.cable == Cable() else pathlib.Path("cable.toml"),
         effect=tuple(map(str, config.effects)),
         links=config.discretisation.n_links,
         timestep=config.discretisation.timestep,

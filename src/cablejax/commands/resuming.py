@@ -16,8 +16,7 @@ from cablejax.control.run import ClosedLoopRun
 from cablejax.control.targets import Target
 from cablejax.gaplog import Episode
 from cablejax.npz import read_npz
-from cablejax.schema_version import version_of
-from cablejax.text_file import parse_json, read_json, write_json
+from cablejax.text_file import parse_json, read_json, version_of, write_json
 from cablejax.whole_file import DRAFT, sole_writer, whole_file
 
 SCHEMA = "cablejax-parts/1"

@@ -20,7 +20,7 @@ from jaxtyping import Array, Float
 
 from cablejax.cable import Discretisation
 from cablejax.commands.options import say
-from cablejax.control.batched import AXIS, BatchRun, LoopConfig, for_each_cable, shape_batch, varied_params
+from cablejax.control.batched import AXIS, BatchRun, LoopConfig, for_each_cable, shape_batch
 from cablejax.control.shaping import Model, make_controller
 from cablejax.control.targets import make_target, straight_start
 from cablejax.dataset.generate import draw, generate, make_engine, simulate
@@ -183,6 +183,13 @@ def batched_control(controller: MPC, history: History, size: int) -> tuple[Calla
         arguments = state, Measurement(state.last.predicted, pose)
 
     return call, program_bytes(step)
+
+
+def varied_params(config: Discretisation, stiffness_ratio: Float[np.ndarray, " B"]) -> Physics:
+    """The nominal parameters B times, with bending stiffnesses of given ratios to the nominal one."""
+    nominal = nominal_physics(config)
+    one = [dataclasses.replace(nominal, stiffness=nominal.stiffness * np.float32(r)) for r in stiffness_ratio]
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *one)
 
 
 def closed_loop(controller: MPC, history_length: int, steps: int, chain: Discretisation) -> Callable[[int], BatchRun]:

@@ -20,10 +20,9 @@ import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Float, Int
 
-from cablejax.cable import Discretisation
 from cablejax.control.link import Controller
 from cablejax.control.run import settling_time
-from cablejax.effects.physics import Physics, may_touch, nominal_physics, without_obstacle
+from cablejax.effects.physics import Physics, may_touch, without_obstacle
 from cablejax.limits import check
 from cablejax.simulate.chain.engine import ChainEngine
 from cablejax.simulate.compile import compiler_options
@@ -148,7 +147,7 @@ def shape_batch(
 
     Args:
         engine: the plant, planar.
-        params: of each cable, every leaf with a leading axis B; see `varied_params`.
+        params: of each cable, every leaf with a leading axis B.
         state: where each cable starts, likewise: `engine.initial_state` of stacked gripper poses.
         controller: a pytree with a leaf `target`, which is replaced by each trial's own; its other leaves are shared.
         targets: desired keypoints [m], shape [B, N, 2].
@@ -187,13 +186,6 @@ def shape_batch(
 def _with_target(controller: Any, target: Any) -> Any:
     """The same pytree with another leaf for its target."""
     return eqx.tree_at(lambda controller: controller.target, controller, target)
-
-
-def varied_params(config: Discretisation, stiffness_ratio: Float[np.ndarray, " B"]) -> Physics:
-    """The nominal parameters B times, with bending stiffnesses of given ratios to the nominal one."""
-    nominal = nominal_physics(config)
-    one = [dataclasses.replace(nominal, stiffness=nominal.stiffness * np.float32(r)) for r in stiffness_ratio]
-    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *one)
 
 
 def _spread(batch, shared, size: int, devices: Sequence[jax.Device]):  # pyright: ignore[reportInvalidTypeForm]

@@ -37,10 +37,11 @@ def run_closed_loop(
     interval: float = 1.0,
     record_hz: float = 10.0,
     history_length: int = 6,
-    rest: int = 1,
     patience: int | None = None,
 ) -> ClosedLoopRun:
     """Lays a new cable between the grippers and lets a controller shape it.
+
+    One interval without motion is recorded before the first command, for the noise floor.
 
     A controller or plant that fails ends the run early but loses nothing: what was recorded comes back with the reason.
 
@@ -53,7 +54,6 @@ def run_closed_loop(
         interval: time that each command is held [s].
         record_hz: samples per second of the recorded episode.
         history_length: samples H of the history that the controller starts from, all of them the cable at rest.
-        rest: intervals without motion recorded before the first command, for the noise floor.
         patience: end the run once the error has stayed within `RESTING_CM` for so many commands; None = never.
 
     Raises:
@@ -61,10 +61,10 @@ def run_closed_loop(
             keypoints than the plant shows, or the plant refuses `start`.
     """
     samples = round(interval * record_hz)
-    if steps < 1 or rest < 0 or samples < 1 or abs(samples - interval * record_hz) > 1e-9:
+    if steps < 1 or samples < 1 or abs(samples - interval * record_hz) > 1e-9:
         raise ValueError(
-            f"A run of {steps} steps after {rest} at rest, with {record_hz} samples per second in intervals of "
-            f"{interval} s, is not possible: give at least one step and a whole number of samples in an interval."
+            f"A run of {steps} steps with {record_hz} samples per second, in intervals of {interval} s, is not "
+            f"possible: give at least one step and a whole number of samples in an interval."
         )
     first = plant.reset(np.asarray(start, float))
     if first.keypoints.shape != target.keypoints.shape:
@@ -74,7 +74,7 @@ def run_closed_loop(
         )
     config = LinkConfig(
         interval=interval,
-        rest=rest * interval,
+        rest=interval,
         history_length=history_length,
         steps=steps,
         patience=patience,

@@ -105,23 +105,10 @@ def settling_time(times: Float[np.ndarray, " T"], error_cm: Float[np.ndarray, " 
     """
     error = np.asarray(error_cm)
     band = max(SETTLING_FRACTION * min(error[-1], abs(error[0] - error[-1])), SETTLING_FLOOR_CM)
-    return _time_in_band(times, error, band)
+    return time_in_band(times, error, band)
 
 
-def step_settling_time(
-    times: Float[np.ndarray, " T"], error_cm: Float[np.ndarray, " T"], fraction: float = 0.02
-) -> float:
-    """Settling time of a step response: from when on the error stays within a fraction of the way that it went.
-
-    This is the textbook's definition (Ogata, Modern Control Engineering, 5-3; 2 or 5 % there), with the error's change
-    over the run for the step. It is the milder one where a run ends near its target: 2 % of 25 cm are 5 mm. As in
-    `settling_time`, the last three samples must be in the band; infinite if they are not.
-    """
-    error = np.asarray(error_cm)
-    return _time_in_band(times, error, fraction * abs(error[0] - error[-1]))
-
-
-def _time_in_band(times: Float[np.ndarray, " T"], error: Float[np.ndarray, " T"], band: float) -> float:
+def time_in_band(times: Float[np.ndarray, " T"], error: Float[np.ndarray, " T"], band: float) -> float:
     """First time from which on the error differs from its last value by at most `band`; infinite if there is none."""
     if not np.isfinite(error[-1]):
         return float("inf")

@@ -7,6 +7,7 @@ import json
 import os
 import shutil
 import tempfile
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
 
@@ -21,13 +22,11 @@ from cablejax.dataset.schema import (
     config_from_json,
     config_of_version_1,
     config_to_json,
-    differences,
     digest_of_config,
 )
 from cablejax.dataset.store import Store
 from cablejax.limits import shown
-from cablejax.schema_version import version_of
-from cablejax.text_file import read_json
+from cablejax.text_file import differences, read_json, version_of
 
 PACKAGES = ("jax", "jaxlib", "mujoco", "mujoco-mjx", "numpy")
 """Packages whose versions decide the content, besides cablejax itself: those that begin a store must complete it."""
@@ -35,13 +34,13 @@ PACKAGES = ("jax", "jaxlib", "mujoco", "mujoco-mjx", "numpy")
 _DIGEST = ((32,), "uint8")
 
 
-def open_store(path: str | os.PathLike[str], *, mode: Literal["r", "r+"] = "r") -> Store:
-    """Opens a data set, complete or not, to read ("r") or also to write its shards ("r+").
+def open_store(path: str | os.PathLike[str]) -> Store:
+    """Opens a data set, complete or not, to read it.
 
     Raises:
         ValueError: there is no data set, or one of a newer schema version; older ones are read.
     """
-    store = _recorded(place_of(path), mode)
+    store = _recorded(place_of(path), "r")
     for name in _arrays(store.config):
         if fault := _fault(store, name):
             raise ValueError(
@@ -118,16 +117,16 @@ def open_or_create(path: str | os.PathLike[str] | Bucket, config: DatasetConfig)
     elif not place.is_dir() or not any(place.iterdir()):
         _create(place, config, versions)
     store = _recorded(place, "r+")
-    changes = differences(store.recorded, config_to_json(config))
+    changes = _changes(store.recorded, config_to_json(config))
     if changes:
         raise ValueError(
-            f"{place} holds a data set of another configuration: {'; '.join(changes)}. "
+            f"{place} holds a data set of another configuration: {changes}. "
             "Give another folder, or the configuration that the store was begun with. Nothing was changed."
         )
-    changes = differences(store.versions, versions)
+    changes = _changes(store.versions, versions)
     if changes and not store.info().complete:
         raise ValueError(
-            f"{place} was begun with other packages: {'; '.join(changes)}. Trajectories of two versions are not mixed: "
+            f"{place} was begun with other packages: {changes}. Trajectories of two versions are not mixed: "
             "install those versions, or generate in another folder. Nothing was changed."
         )
     faulty = [name for name in _arrays(config) if _fault(store, name)]
@@ -145,6 +144,11 @@ def open_or_create(path: str | os.PathLike[str] | Bucket, config: DatasetConfig)
         shutil.rmtree(draft)
         store = _recorded(place, "r+")
     return store
+
+
+def _changes(stored: Mapping[str, Any], asked: Mapping[str, Any]) -> str:
+    found = differences(stored, asked).items()
+    return "; ".join(f"{name} is {old!r} in the store and {new!r} here" for name, (old, new) in found)
 
 
 def package_versions() -> dict[str, str]:

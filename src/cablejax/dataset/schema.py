@@ -227,18 +227,6 @@ def _decode(hint: Any, value: Any) -> Any:
     return value
 
 
-def differences(stored: Mapping[str, Any], asked: Mapping[str, Any], prefix: str = "") -> list[str]:
-    """The leaves in which two JSON objects differ, as text."""
-    found = []
-    for key in sorted(set(stored) | set(asked)):
-        old, new = stored.get(key, "absent"), asked.get(key, "absent")
-        if isinstance(old, Mapping) and isinstance(new, Mapping):
-            found += differences(old, new, f"{prefix}{key}.")
-        elif old != new:
-            found.append(f"{prefix}{key} is {old!r} in the store and {new!r} here")
-    return found
-
-
 def digest_of_config(config: Mapping[str, Any]) -> str:
     """SHA-256 of a configuration's canonical JSON."""
     return hashlib.sha256(json.dumps(config, sort_keys=True).encode()).hexdigest()

@@ -16,8 +16,7 @@ from jaxtyping import Bool, Float, Int
 from cablejax.diagnose.belief import Calibration, probabilities
 from cablejax.diagnose.conclude import Conclusion
 from cablejax.diagnose.diagnosis import PLACES, NamedEffect, ParameterEstimate, Ranked, Verdict
-from cablejax.diagnose.evidence import student_log_likelihoods
-from cablejax.diagnose.repeats import episodes_by_motion
+from cablejax.diagnose.evidence import episodes_by_motion, student_log_likelihoods
 from cablejax.effects.arms import lagged
 
 # Poses are believed to this [m]; radians count for 0.15 m.

@@ -9,20 +9,19 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from cablejax.cable import Discretisation
+from cablejax.cable_file import config_of_log
 from cablejax.diagnose.actuation import Actuation, actuation
 from cablejax.diagnose.belief import Calibration
-from cablejax.diagnose.evidence import Evidence
+from cablejax.diagnose.evidence import Evidence, repeated_motions
 from cablejax.diagnose.noise import NoiseFloor, noise_floor
 from cablejax.diagnose.planar import PlanarCable
 from cablejax.diagnose.playback import Playback
 from cablejax.diagnose.recording import DiagnosisError, Recording, prepare
-from cablejax.diagnose.repeats import repeated_motions
 from cablejax.diagnose.run import weighed
 from cablejax.effects import LIBRARY, CableEffect
 from cablejax.effects.physics import nominal_physics
 from cablejax.simulate.chain.replay import FINE_STEP, LARGEST_STEP
 from cablejax.simulate.pose import wrapped
-from cablejax.simulate.replay import config_of_log
 from cablejax.types import GapLog
 
 FIT_LINKS = 33

@@ -15,10 +15,11 @@ from cablejax.diagnose.belief import (
     effect_names,
     excess,
     explains_most_motions,
+    leftover_p,
+    leftover_score,
     level,
     probabilities,
 )
-from cablejax.diagnose.conformal import leftover_p, leftover_score
 from cablejax.diagnose.diagnosis import (
     PLACES,
     EffectValues,
@@ -36,6 +37,7 @@ from cablejax.diagnose.laws import Law
 from cablejax.diagnose.posterior import drawn_by, draws, over_laws, posterior
 from cablejax.diagnose.protocol import Simulator
 from cablejax.diagnose.search import Search
+from cablejax.simulate.pose import wrapped
 
 
 @dataclasses.dataclass(frozen=True)
@@ -237,7 +239,7 @@ def _interval(value, column: Sequence[Any], unit: str):
     drawn = np.asarray(column, float)
     if unit == "rad":
         # angles near the turn of the circle
-        drawn = value + ((drawn - value + np.pi) % (2 * np.pi) - np.pi)
+        drawn = value + wrapped(drawn - value)
     low, high = np.quantile(drawn, (0.05, 0.95))
     return float(low), float(high)
 

@@ -13,9 +13,8 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from cablejax.bounded import BatchedGaussNewton, Linearised, Result, solve_arrow
-from cablejax.diagnose.evidence import Evidence
+from cablejax.diagnose.evidence import Evidence, episodes_by_motion
 from cablejax.diagnose.protocol import Explanation
-from cablejax.diagnose.repeats import episodes_by_motion
 
 # Largest change of one coordinate in one step, in prior standard deviations.
 _LARGEST_STEP = 1.5

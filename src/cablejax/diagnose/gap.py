@@ -7,9 +7,8 @@ from jaxtyping import Float, Int
 
 from cablejax.diagnose.belief import level
 from cablejax.diagnose.diagnosis import Gap
-from cablejax.diagnose.evidence import Evidence
+from cablejax.diagnose.evidence import Evidence, episodes_by_motion
 from cablejax.diagnose.fit import Fit, evaluate, improve
-from cablejax.diagnose.repeats import episodes_by_motion
 from cablejax.diagnose.search import without_one
 
 _HORIZONS = (1.0, 2.0, 5.0, 10.0)

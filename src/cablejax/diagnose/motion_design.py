@@ -61,30 +61,13 @@ class DesignConfig:
     seed: int = 0
 
 
-@dataclasses.dataclass(frozen=True)
-class Design:
-    """The best of all motions that were judged.
-
-    Attributes:
-        best: the motion.
-        ended: why the search ended.
-        generations: of the search.
-        tried: motions that were judged.
-    """
-
-    best: Judged
-    ended: Ended
-    generations: int
-    tried: int
-
-
 def design_motion(
     judge: Judge,
     ways: Mapping[str, Way],
     judged: Mapping[str, Judged],
     n_samples: int,
     config: DesignConfig = DesignConfig(),
-) -> Design:
+) -> tuple[Judged, Ended]:
     """Searches for the motion with the most information that keeps all bounds, from the best few of given ones.
 
     Args:
@@ -93,6 +76,9 @@ def design_motion(
         judged: their motions, by the same names.
         n_samples: of the motion.
         config: effort of the search.
+
+    Returns:
+        The best of all motions that were judged, and why the search ended.
 
     Raises:
         BoundsError: no motion that was tried keeps all bounds; says how many each bound excludes.
@@ -125,7 +111,7 @@ def design_motion(
             break
     if best.beyond:
         raise BoundsError(excluded(tried))
-    return Design(best, ended, generations, len(tried))
+    return best, ended
 
 
 def excluded(tried: list[Judged]) -> str:

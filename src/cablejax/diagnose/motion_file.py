@@ -11,9 +11,9 @@ import numpy as np
 from jaxtyping import Float
 
 from cablejax.cable import Cable
+from cablejax.cable_file import cable_of_log
 from cablejax.diagnose.diagnosis import NextMotion
 from cablejax.gaplog import Episode, gap_log_from_episodes, write_gap_log
-from cablejax.simulate.replay import cable_of_log
 from cablejax.types import GapLog
 from cablejax.whole_file import whole_file
 

@@ -42,8 +42,7 @@ def next_motion(judge: Judge, design: DesignConfig | None = None) -> NextMotion 
     kept = {name: one for name, one in judged.items() if not one.beyond}
     ended = None
     if design is not None:
-        found = design_motion(judge, ways, judged, n_samples, design)
-        kept[DESIGNED], ended = found.best, found.ended
+        kept[DESIGNED], ended = design_motion(judge, ways, judged, n_samples, design)
     if not kept:
         raise BoundsError(excluded(list(judged.values())))
     name = DESIGNED if design is not None else max(kept, key=lambda name: kept[name].information)

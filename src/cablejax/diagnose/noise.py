@@ -8,6 +8,8 @@ import math
 import numpy as np
 from jaxtyping import Float
 
+from cablejax.gaplog import stretches
+
 # Shortest hold that is used, in samples.
 _SHORTEST_HOLD = 10
 _LAGS = 5
@@ -94,8 +96,7 @@ def _held(keypoints, hold):
     n_points = keypoints.shape[2]
     squares, count, products = np.zeros(n_points), np.zeros(n_points), np.zeros((_LAGS, 2))
     for episode, flags in zip(keypoints, hold, strict=True):
-        edges = np.flatnonzero(np.diff(np.concatenate([[0], flags.astype(int), [0]])))
-        for begin, end in edges.reshape(-1, 2):
+        for begin, end in stretches(flags):
             if end - begin < _SHORTEST_HOLD:
                 continue
             for n in range(n_points):

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from cablejax.cable import Discretisation
-from cablejax.diagnose.conformal import SCORES
+from cablejax.diagnose.belief import SCORES
 from cablejax.diagnose.playback import Playback
 from cablejax.diagnose.protocol import Explanation, Report, Simulator
 from cablejax.effects.base import CableEffect, Context

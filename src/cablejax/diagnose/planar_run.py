@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 import time
 from collections.abc import Callable, Sequence
 
@@ -43,7 +42,6 @@ def diagnose(
     calibration: Calibration = Calibration(),
     bounds: Bounds | None = None,
     objective: Objective = "explanations",
-    budget: float = math.inf,
     progress: Callable[[str], None] = _silent,
 ) -> CableDiagnosis:
     """Says where the nominal simulator is wrong on this log, which effect causes it, how far the gap shrinks with it.
@@ -55,7 +53,6 @@ def diagnose(
         calibration: constants of the judgement.
         bounds: for a next motion that is designed; None = the best of the safe motions within the default bounds.
         objective: what the next motion is to give information about.
-        budget: seconds after which no larger set of effects is tried; what was fitted until then counts.
         progress: called with a line of text now and then.
 
     Raises:
@@ -69,7 +66,7 @@ def diagnose(
     if bounds is not None:
         require_some_motion(case.simulator.playback, case.noise.std, bounds)
     evidence = case.evidence(calibration)
-    found, conclusion = explain(evidence, calibration, deadline=begin + budget, progress=progress)
+    found, conclusion = explain(evidence, calibration, progress=progress)
     conclusion = with_arms(conclusion, case.arms, calibration)
 
     progress("fitting without each episode in turn")

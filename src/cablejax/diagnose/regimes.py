@@ -26,13 +26,11 @@ class Regimes:
         masks: by "what: class", shape [E, T] each; the classes of one "what" do not overlap.
         pairs: two regimes that are worth holding against each other, by the name of the first.
         hold: the grippers rest and the cable has settled, shape [E, T].
-        since_reversal: seconds since the grippers last reversed; NaN before the first time, shape [E, T].
     """
 
     masks: dict[str, Bool[np.ndarray, "E T"]]
     pairs: dict[str, tuple[Bool[np.ndarray, "E T"], Bool[np.ndarray, "E T"]]]
     hold: Bool[np.ndarray, "E T"]
-    since_reversal: Float[np.ndarray, "E T"]
 
 
 def regimes_of(log: GapLog, nominal: Float[np.ndarray, "E T N 2"], valid: Bool[np.ndarray, "E T"]) -> Regimes:
@@ -91,7 +89,7 @@ def regimes_of(log: GapLog, nominal: Float[np.ndarray, "E T N 2"], valid: Bool[n
     for name, other in (("curvature: high", "curvature: low"), ("gripper distance: short", "gripper distance: long")):
         if name in masks and other in masks:
             pairs[name] = masks[name], masks[other]
-    return Regimes(masks={k: m for k, m in masks.items() if m.any()}, pairs=pairs, hold=hold, since_reversal=since)
+    return Regimes(masks={k: m for k, m in masks.items() if m.any()}, pairs=pairs, hold=hold)
 
 
 def _velocity(pose: Float[np.ndarray, "T Q 3"], time: Float[np.ndarray, "T"]) -> Float[np.ndarray, "T Q 3"]:

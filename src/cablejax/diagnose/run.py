@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import importlib.metadata
-import math
 import time
 from collections.abc import Callable
 from typing import Any
@@ -40,7 +39,6 @@ def diagnose_simulator(
     noise: Float[ArrayLike, "*O"] | None = None,
     motion: Int[ArrayLike, "E"] | None = None,
     calibration: Calibration | None = None,
-    budget: float = math.inf,
     progress: Callable[[str], None] = _silent,
 ) -> Diagnosis:
     """Says which effect makes a simulator of your own wrong on a recording, and how far the gap shrinks with it.
@@ -54,7 +52,6 @@ def diagnose_simulator(
         motion: episodes with the same number repeat one another and share one vote; None = no two do.
         calibration: constants of the judgement; its `baseline` is the error of the simulator without any effect. By
             default a tenth of the noise is assumed.
-        budget: seconds after which no larger set of effects is tried; what was fitted until then counts.
         progress: called with a line of text now and then.
 
     Returns:
@@ -78,7 +75,7 @@ def diagnose_simulator(
             f"No calibration was given: the simulator's own error is taken to be {_BASELINE:g} times the noise."
         )
     evidence = weighed(simulator, observed, nominal, spread, motion, calibration)
-    examined = examine(evidence, interval, calibration, deadline=begin + budget, progress=progress)
+    examined = examine(evidence, interval, calibration, progress=progress)
     return Diagnosis(
         **examined.fields(),
         where=None,
@@ -131,7 +128,6 @@ def examine(
     interval: Float[np.ndarray, "E"],
     calibration: Calibration,
     *,
-    deadline: float,
     progress: Callable[[str], None],
 ) -> Examined:
     """Searches, judges, and measures the gap on what no fit has seen; see `explain` for the arguments.
@@ -140,10 +136,9 @@ def examine(
         evidence: to explain.
         interval: between samples of each episode [s].
         calibration: of the judgement.
-        deadline: on `time.perf_counter` [s].
         progress: called with a line of text before each stage.
     """
-    found, conclusion = explain(evidence, calibration, deadline=deadline, progress=progress)
+    found, conclusion = explain(evidence, calibration, progress=progress)
     progress("fitting without each episode in turn")
     null = next(fit for fit in found.fits if not fit.explanation.terms)
     before = evidence.nominal if null.refits is None else held_out_predictions(evidence, null)[0]
@@ -194,19 +189,18 @@ def weighed(
 
 
 def explain(
-    evidence: Evidence, calibration: Calibration, *, deadline: float, progress: Callable[[str], None]
+    evidence: Evidence, calibration: Calibration, *, progress: Callable[[str], None]
 ) -> tuple[Search, Conclusion]:
     """Searches for explanations where there is a gap, and judges them.
 
     Args:
         evidence: to explain.
         calibration: of the judgement.
-        deadline: on `time.perf_counter`; from then on no larger set of effects is begun [s].
         progress: called with a line of text before each stage.
     """
     (null,) = refitted(evidence, [_null(evidence)])
     if excess(float(null.sse.sum()), evidence) > calibration.smallest_gap(level(evidence)):
-        found = search(evidence, null, calibration, deadline=deadline, progress=progress)
+        found = search(evidence, null, calibration, progress=progress)
         progress("fitting by other laws")
         laws = by_other_laws(found, evidence, calibration)
     else:

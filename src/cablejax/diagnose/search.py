@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import time
 from collections.abc import Callable, Sequence
 
 import numpy as np
@@ -42,7 +41,6 @@ def search(
     null: Fit,
     calibration: Calibration,
     *,
-    deadline: float,
     progress: Callable[[str], None],
 ) -> Search:
     """Fits every effect alone, and sets of effects if none alone is an adequate explanation.
@@ -51,7 +49,6 @@ def search(
         evidence: to explain.
         null: the nominal simulator, evaluated.
         calibration: of the judgement.
-        deadline: on `time.perf_counter`; from then on no larger set is begun [s].
         progress: called with a line of text before each stage.
     """
     gap = excess(float(null.sse.sum()), evidence)
@@ -76,7 +73,7 @@ def search(
 
     bases = [fit for fit in fits if fit.explanation.terms][:_BASES]
     for size in range(2, calibration.max_terms + 1):
-        if adequate(fits[0]) or time.perf_counter() > deadline:
+        if adequate(fits[0]):
             break
         progress(f"fitting sets of {size} effects")
         grown = [fit for base in bases for fit in _grown(evidence, base.explanation)]
@@ -85,7 +82,7 @@ def search(
         if log_scores(fits[:1], evidence, calibration)[0] < best_before + 1.0:
             break
         bases = fits[:1]
-    if len(effect_names(fits[0].explanation)) > 1 and time.perf_counter() < deadline:
+    if len(effect_names(fits[0].explanation)) > 1:
         progress("exchanging the effects of the best set one by one")
         exchanged = [fit for rest in without_one(fits[0].explanation) for fit in _grown(evidence, rest)]
         fits = _best([*fits, *exchanged], evidence, calibration)

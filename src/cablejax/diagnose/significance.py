@@ -6,7 +6,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.stats import chi2
 
-from cablejax.diagnose.repeats import episodes_by_motion
+from cablejax.diagnose.evidence import episodes_by_motion
+from cablejax.gaplog import stretches
 from cablejax.types import GapLog
 
 NOISE_TOLERANCE = 1.15
@@ -26,7 +27,7 @@ def variance_inflation(whitened: Float[np.ndarray, "E T N 2"], log: GapLog, hold
     """
     products, count, samples = np.zeros(_LAGS + 1), 0, 0
     for e in range(len(whitened)):
-        for begin, end in _runs(hold[e]):
+        for begin, end in stretches(hold[e]):
             if end - begin < 2 * _LAGS:
                 continue
             piece = whitened[e, begin:end].reshape(end - begin, -1)
@@ -92,9 +93,3 @@ def contrast_p(values: Float[np.ndarray, "E C"], motion: Int[np.ndarray, "E"]) -
     statistics = np.abs((1 - 2 * bits) @ filled) / scale
     largest = statistics.max(axis=1)
     return (largest[:, None] >= statistics[0] - 1e-9).mean(axis=0)
-
-
-def _runs(flags: Bool[np.ndarray, "T"]) -> list[tuple[int, int]]:
-    """Begins and ends of the stretches in which a flag is set."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], flags.astype(int), [0]])))
-    return [(int(a), int(b)) for a, b in edges.reshape(-1, 2)]

@@ -18,8 +18,8 @@ import functools
 import numpy as np
 from jaxtyping import Bool, Float
 
+from cablejax.diagnose.evidence import repeated_motions
 from cablejax.diagnose.regimes import Regimes, regimes_of
-from cablejax.diagnose.repeats import repeated_motions
 from cablejax.diagnose.significance import (
     NOISE_TOLERANCE,
     contrast_p,

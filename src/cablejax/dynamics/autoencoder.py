@@ -20,9 +20,8 @@ from tqdm import tqdm
 
 from cablejax.dataset.windows import Window, draw_windows
 from cablejax.dynamics.config import ModelConfig
-from cablejax.dynamics.gns import GNS
 from cablejax.dynamics.graph import build_graph, prior_of
-from cablejax.dynamics.layers import MLP
+from cablejax.dynamics.networks import GNS, MLP
 from cablejax.dynamics.normalisation import check_trajectories, fit_normalisation
 from cablejax.dynamics.symmetry import initially_symmetric, symmetrised
 from cablejax.dynamics.train_config import TrainConfig

@@ -12,6 +12,7 @@ import numpy as np
 
 from cablejax.dynamics.config import ModelConfig
 from cablejax.dynamics.error_report import ErrorReport
+from cablejax.text_file import differences
 
 _POINTS = 12
 _CURVE = ("step", "phase", "learning_rate", "loss")
@@ -51,6 +52,7 @@ def write_card(
         f"{100 * share:.1f} % within {h}"
         for h, share in zip(report.errors["all windows"]["network"].horizons, report.snapping_fraction(), strict=True)
     )
+    changes = differences(*(d["config"] for d in info["data"]))
     lines = [
         f"# {name}",
         "",
@@ -72,7 +74,7 @@ def write_card(
         ),
         "",
         "Held out are the last trajectories of each. Differences between the data sets' configurations: "
-        + (_differences([d["config"] for d in info["data"]]) or "none")
+        + (", ".join(f"{name} ({', '.join(map(str, values))})" for name, values in changes.items()) or "none")
         + ".",
         "",
         "## Training",
@@ -117,15 +119,3 @@ def _curve(metrics: Path) -> list[str]:
     header = [column.replace("open_loop_", "after ").replace("_cm", "").replace("_", " ") for column in columns]
     lines = [header, ["---:"] * len(columns), *([scored[i][column] for column in columns] for i in pick)]
     return ["| " + " | ".join(line) + " |" for line in lines]
-
-
-def _differences(configs: Sequence[Mapping[str, Any]], prefix: str = "") -> str:
-    """The fields in which several configurations differ, with the values of each."""
-    found = []
-    for key in configs[0]:
-        values = [config[key] for config in configs]
-        if all(isinstance(value, Mapping) for value in values):
-            found.append(_differences(values, f"{prefix}{key}."))
-        elif any(value != values[0] for value in values):
-            found.append(f"{prefix}{key} ({', '.join(map(str, values))})")
-    return ", ".join(part for part in found if part)

@@ -117,8 +117,6 @@ def open_loop_error(
     *,
     horizons: Sequence[int] = HORIZONS,
     stride: int = 10,
-    batch: int = 64,
-    count: Bool[np.ndarray, "W K"] | None = None,
 ) -> OpenLoopError:
     """Rolls `model` from every `stride`-th sample of every trajectory and summarises the errors.
 
@@ -128,19 +126,16 @@ def open_loop_error(
         config: of the graph: history, keypoints, interval.
         horizons: steps after which errors are reported.
         stride: samples between start points.
-        batch: windows rolled out at once.
-        count: which windows to count after which step, as from `snapping`; all by default.
     """
     steps = max(horizons)
     windows = evaluation_windows(data, config, steps=steps, stride=stride)
-    error = window_errors(model, windows, config, batch=batch)
-    return summarise(error, windows, horizons=horizons, count=count)
+    return summarise(window_errors(model, windows, config), windows, horizons=horizons)
 
 
 def window_errors(
     model: OneStepModel | tuple[nnx.GraphDef, nnx.State], windows: Window, config: ModelConfig, *, batch: int = 64
 ) -> Float[np.ndarray, "W K"]:
-    """Error [m] of every window after every step; arguments as in `open_loop_error`."""
+    """Error [m] of every window after every step; `batch` windows are rolled out at once, see `open_loop_error`."""
     if isinstance(model, tuple):
         graphdef, weights = model
         errors, arguments = make_errors(lambda w: bind(graphdef, w), config.interval), (weights,)

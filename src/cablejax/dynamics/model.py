@@ -8,10 +8,9 @@ import jax.numpy as jnp
 from flax import nnx
 from jaxtyping import Array, Float
 
-from cablejax.dynamics.chain_networks import BiLSTM, FlatMLP
 from cablejax.dynamics.config import ModelConfig
-from cablejax.dynamics.gns import GNS
 from cablejax.dynamics.graph import build_graph, frame_of, prior_of
+from cablejax.dynamics.networks import GNS, BiLSTM, FlatMLP
 from cablejax.types import History
 
 OneStepModel = Callable[[History, Float[Array, "Q 3"]], Float[Array, "N 2"]]

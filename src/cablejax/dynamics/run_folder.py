@@ -7,8 +7,7 @@ import shutil
 from pathlib import Path
 from typing import Any
 
-from cablejax.schema_version import version_of
-from cablejax.text_file import read_json, write_json
+from cablejax.text_file import differences, read_json, version_of, write_json
 from cablejax.whole_file import sole_writer
 
 SCHEMA = "cablejax-training/1"
@@ -45,8 +44,9 @@ def claim_folder(out_dir: Path, run: dict[str, Any], *, resume: bool, overwrite:
                 raise ValueError(f"{out_dir} holds a training already. Choose another folder, or resume it.")
             return
         if not overwrite:
+            changes = ", ".join(f"{name} ({old}, now {new})" for name, (old, new) in differences(found, run).items())
             raise ValueError(
-                f"{out_dir} holds a training that differs in {', '.join(differences(found, run))}. Choose another "
+                f"{out_dir} holds a training that differs in {changes}. Choose another "
                 "folder, repeat it with the same configuration and data, or overwrite it (--overwrite)."
             )
         _discard(out_dir)
@@ -65,14 +65,6 @@ def claim_folder(out_dir: Path, run: dict[str, Any], *, resume: bool, overwrite:
         _discard(out_dir)
     out_dir.mkdir(parents=True, exist_ok=True)
     write_json(path, run)
-
-
-def differences(old: Any, new: Any, name: str = "") -> list[str]:
-    """Differences of two JSON trees, as `path (old, now new)`."""
-    if isinstance(old, dict) and isinstance(new, dict):
-        keys = sorted(old.keys() | new.keys())
-        return [d for k in keys for d in differences(old.get(k), new.get(k), f"{name}.{k}" if name else k)]
-    return [] if old == new else [f"{name} ({old}, now {new})"]
 
 
 def _read(path: Path) -> dict[str, Any]:

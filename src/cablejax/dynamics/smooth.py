@@ -11,7 +11,7 @@ import math
 
 from flax import nnx
 
-from cablejax.dynamics.layers import MLP
+from cablejax.dynamics.networks import MLP
 
 CORNER = 0.03
 """Half the width of a rounded corner, in units of the activations, whose size is about 1. Six steps of the released

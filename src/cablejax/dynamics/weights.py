@@ -30,9 +30,8 @@ from cablejax.cable import Cable
 from cablejax.cable_file import cable_from_fields
 from cablejax.dynamics.config import ModelConfig, Normalisation
 from cablejax.dynamics.model import structure_of
-from cablejax.schema_version import version_of
 from cablejax.simulate.chain.statics import Statics
-from cablejax.text_file import parse_json
+from cablejax.text_file import parse_json, version_of
 from cablejax.whole_file import whole_file
 
 SCHEMA = "cablejax-weights/1"
@@ -74,23 +73,18 @@ def save_weights(
         stream.write(data)
 
 
-def load_weights(
-    source: str | os.PathLike[str], *, expect: ModelConfig | None = None
-) -> tuple[ModelConfig, nnx.GraphDef, nnx.State]:
+def load_weights(source: str | os.PathLike[str]) -> tuple[ModelConfig, nnx.GraphDef, nnx.State]:
     """The network in a file, in a training's folder, or released under a name, as `apply` takes it.
 
     Args:
         source: a weights file, a folder that `cablejax train` wrote, or the name of a released model.
-        expect: refuse a network of any other configuration; its normalisation does not matter.
 
     Raises:
-        WeightsError: there is no such file, it is no weights file or one of another schema, its tensors do not fit its
-            configuration, or that is not the expected one.
+        WeightsError: there is no such file, it is no weights file or one of another schema, or its tensors do not fit
+            its configuration.
     """
     path, content = _open(source)
     config = _config_of(content, path)
-    if expect is not None:
-        _check_expected(config, expect, path)
     graphdef, expected = structure_of(config)
     with safe_open(path, framework="numpy") as file:
         tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
@@ -195,15 +189,6 @@ def _config_of(content: dict[str, Any], path: Path) -> ModelConfig:
         ) from error
     except ValueError as error:
         raise WeightsError(f"{path} records an impossible configuration: {error}") from error
-
-
-def _check_expected(config: ModelConfig, expect: ModelConfig, path: Path) -> None:
-    came, asked = (dataclasses.asdict(dataclasses.replace(c, normalisation=Normalisation())) for c in (config, expect))
-    other = [f"{name} is {came[name]}, expected {asked[name]}" for name in came if came[name] != asked[name]]
-    if other:
-        raise WeightsError(
-            f"{path} holds weights for another graph: {'; '.join(other)}. Train a model of this configuration."
-        )
 
 
 def _name(key: tuple[Any, ...]) -> str:

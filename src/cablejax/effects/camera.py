@@ -128,8 +128,12 @@ def seen_by_camera(physics: Physics, keypoints: Any, interval: Any) -> Any:
     back = xp.clip(np.arange(n) - physics.camera_lag / interval, 0.0, n - 1.0)
     before = xp.clip(xp.floor(back).astype(int), 0, n - 2)
     t = (back - before)[:, None, None].astype(keypoints.dtype)
-    late = (1 - t) * keypoints[before] + t * keypoints[before + 1]
+    return in_camera_frame(physics, (1 - t) * keypoints[before] + t * keypoints[before + 1])
+
+
+def in_camera_frame(physics: Physics, keypoints: Any) -> Any:
+    """Keypoints [..., 2] scaled and turned about the world's origin, then moved [m]; see `seen_by_camera`."""
+    xp, x, y = keypoints.__array_namespace__(), keypoints[..., 0], keypoints[..., 1]
     cosine, sine = xp.cos(physics.camera_angle), xp.sin(physics.camera_angle)
-    x, y = late[..., 0], late[..., 1]
     turned = xp.stack([cosine * x - sine * y, sine * x + cosine * y], axis=-1)
     return xp.asarray(physics.camera_scale * turned + physics.camera_offset)

@@ -15,8 +15,7 @@ from cablejax.effects import ARMS, LIBRARY
 from cablejax.effects.base import CableEffect, Hook
 from cablejax.effects.physics import Physics
 from cablejax.limits import require, shown
-from cablejax.schema_version import version_of
-from cablejax.text_file import read_json
+from cablejax.text_file import read_json, version_of
 
 EFFECTS: Mapping[str, CableEffect] = {effect.name: effect for effect in (*LIBRARY, *ARMS)}
 """Every effect by its name in the gap log's format."""

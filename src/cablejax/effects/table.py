@@ -10,6 +10,8 @@ from cablejax.cable import Discretisation
 from cablejax.effects.base import CableEffect, Context
 from cablejax.effects.effect import Parameter
 
+_DISC, _MOST_PLACES = 0.03, 10
+
 
 def _believed(config: Discretisation) -> float:
     """The nominal coefficient; a table believed to be smooth gets a small one to be a multiple of."""
@@ -177,14 +179,14 @@ class Obstacle(CableEffect):
 
     def starts(self, context):
         """A disc of 3 cm at the places from which the cable seems to be pushed."""
-        return [(0, (x, y, 0.03)) for x, y in _pushed(context)]
+        return [(0, (x, y, _DISC)) for x, y in _pushed(context)]
 
     def location(self, values, variant, config):
         """The disc's centre on the table [m]."""
         return {"table_m": [float(values[0]), float(values[1])]}
 
 
-def _pushed(context: Context, radius: float = 0.03, count: int = 10) -> list[tuple[float, float]]:
+def _pushed(context: Context) -> list[tuple[float, float]]:
     """Candidate places of a disc: next to the observed cable, on the side from which it is pushed, never inside it.
 
     The candidates are points a radius away from observed keypoints that deviate, against the deviation. An observed
@@ -200,7 +202,7 @@ def _pushed(context: Context, radius: float = 0.03, count: int = 10) -> list[tup
     chosen = usable & (deviation >= limit)
     at = observed[chosen]
     against = -context.residual[chosen] / deviation[chosen][:, None]
-    centres = at + radius * against
+    centres = at + _DISC * against
     squares, first, visits = np.unique(
         np.round(centres / 0.03).astype(int), axis=0, return_index=True, return_counts=True
     )
@@ -210,10 +212,10 @@ def _pushed(context: Context, radius: float = 0.03, count: int = 10) -> list[tup
     result = []
     for index in first[np.argsort(-visits)]:
         centre = centres[index]
-        clear = np.sqrt(((every - centre) ** 2).sum(axis=1).min()) > 0.5 * radius
+        clear = np.sqrt(((every - centre) ** 2).sum(axis=1).min()) > 0.5 * _DISC
         apart = all(np.hypot(*(centre - other)) > 0.05 for other in result)
         if clear and apart:
             result.append((float(centre[0]), float(centre[1])))
-        if len(result) == count:
+        if len(result) == _MOST_PLACES:
             break
     return result

@@ -3,7 +3,7 @@
 from cablejax.mpc.config import MPCConfig
 from cablejax.mpc.controller import MPC
 from cablejax.mpc.feasible import FeasibleSet, feasible_from, project_ball
-from cablejax.mpc.plan import Plan, Solver, differentiable_plan, multi_start, random_starts
+from cablejax.mpc.plan import Plan, Solver, differentiable_plan, multi_start
 from cablejax.mpc.planners import (
     SOLVERS,
     Accurate,
@@ -42,6 +42,5 @@ __all__ = [
     "feasible_from",
     "multi_start",
     "project_ball",
-    "random_starts",
     "time_control",
 ]

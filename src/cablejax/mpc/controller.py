@@ -19,8 +19,7 @@ from cablejax.mpc.problem import ShapingProblem
 from cablejax.mpc.state import CableEstimate, LastCommand, MPCInfo, MPCState, initial_state
 from cablejax.mpc.validation import check_history, check_measurement, check_target
 from cablejax.mpc.warm_start import find_starts
-from cablejax.residual.corrected import Corrected
-from cablejax.residual.jacobian import Dynamics
+from cablejax.residual.jacobian import Corrected, Dynamics
 from cablejax.residual.learner import Sample, learned, observe
 from cablejax.residual.learner import weights as weights_of
 from cablejax.residual.ridge import ResidualModel, apply
@@ -113,11 +112,9 @@ def _step(mpc: MPC, state: MPCState, measurement: Measurement) -> tuple[MPCState
     size_offline, size_online = jnp.linalg.norm(offline), jnp.linalg.norm(online)
     info = MPCInfo(
         shape_error=error,
-        predicted_error=problem.shape_error(predicted),
         rho=rho,
         radius=radius,
         objective=plan.value,
-        objective_hold=start.value_still,
         evaluations=plan.evaluations,
         result=plan.result,
         action=decision.action,

@@ -72,15 +72,6 @@ def multi_start(
     return jax.tree.map(lambda leaf: leaf[best], every), every, values
 
 
-def random_starts(problem: ShapingProblem, n_commands: int, count: int, seed: int = 0) -> Float[Array, "S T Q 3"]:
-    """Feasible plans at random: each gripper goes about straight on, at random speed."""
-    heading, noise = jax.random.split(jax.random.key(seed))
-    dtype = problem.target.dtype
-    way = jax.random.normal(heading, (count, 1, 2, 3), dtype)
-    motion = problem.feasible.radius * (way + 0.3 * jax.random.normal(noise, (count, n_commands, 2, 3), dtype)) / 2.0
-    return jax.vmap(problem.feasible.project)(motion)
-
-
 def differentiable_plan(problem: ShapingProblem, motion: Float[Array, "T Q 3"]) -> Float[Array, "T Q 3"]:
     """`motion` itself, with the derivatives that the minimum of the problem has in all arrays of `problem`.
 

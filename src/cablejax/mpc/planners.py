@@ -16,10 +16,10 @@ from cablejax.bounded.levenberg_marquardt import BoundedLevenbergMarquardt
 from cablejax.bounded.quasi_newton import BoundedQuasiNewton
 from cablejax.bounded.solve import least_squares, minimise
 from cablejax.bounded.spectral import SpectralProjectedGradient
+from cablejax.limits import check
 from cablejax.mpc.plan import Plan, Solver, plan_from
 from cablejax.mpc.problem import Rollout, ShapingProblem
 from cablejax.mpc.sampling import CrossEntropy, PathIntegral
-from cablejax.mpc.validation import check_budget, check_positive
 
 
 def bounded_plan(
@@ -57,9 +57,7 @@ class _LeastSquaresPlanner(abc.ABC):
     tolerance: float = 2e-5
 
     def __post_init__(self):
-        check_budget(self, "max_iterations")
-        check_budget(self, "trials_per_linearisation")
-        check_positive(self, "tolerance")
+        check(self, max_iterations="count", trials_per_linearisation="count", tolerance="positive")
 
     @abc.abstractmethod
     def bounded(self) -> AbstractBoundedLeastSquares:
@@ -83,7 +81,7 @@ class LevenbergMarquardt(_LeastSquaresPlanner):
 
     def __post_init__(self):
         super().__post_init__()
-        check_positive(self, "damping")
+        check(self, damping="positive")
 
     def bounded(self) -> AbstractBoundedLeastSquares:
         """The solver without a secant model: planning uses few steps."""
@@ -132,8 +130,7 @@ class Accurate:
     tolerance: float = 1e-10
 
     def __post_init__(self):
-        check_budget(self, "linearisations", "trials_per_linearisation", "gradients")
-        check_positive(self, "tolerance")
+        check(self, linearisations="count", trials_per_linearisation="count", gradients="count", tolerance="positive")
 
     def parts(self) -> tuple[BoundedLevenbergMarquardt, BoundedQuasiNewton]:
         """The solver that begins, and the one that goes on from there."""
@@ -173,12 +170,12 @@ class ProjectedGradient:
     memory: int = 1
 
     def __post_init__(self):
-        if self.max_evaluations < 2 or self.memory < 1:
+        check(self, max_evaluations="count", tolerance="positive", initial_step="positive", memory="count")
+        if self.max_evaluations < 2:
             raise ValueError(
-                f"ProjectedGradient(max_evaluations={self.max_evaluations}, memory={self.memory}): expected at least "
-                "2 evaluations (the guess and one step) and a memory of at least 1."
+                f"ProjectedGradient.max_evaluations is {self.max_evaluations}, expected at least 2 evaluations: of the "
+                "guess and of one step."
             )
-        check_positive(self, "tolerance", "initial_step")
 
     def __call__(self, problem: ShapingProblem, guess: Rollout) -> Plan:
         """Minimises the objective from `guess` and returns the plan."""

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from cablejax.limits import check
 from cablejax.mpc.feasible import FeasibleSet
 from cablejax.mpc.target_pose import continued, target_pose, total_turn, way_to
 from cablejax.residual.jacobian import Dynamics, step_jacobian
@@ -41,12 +42,8 @@ class ObjectiveConfig:
     arrival_margin: float = 0.05
 
     def __post_init__(self):
-        for name in ("terminal_weight", "motion_weight", "arrival_weight", "arrival_margin"):
-            if not getattr(self, name) >= 0:
-                raise ValueError(f"ObjectiveConfig.{name} is {getattr(self, name)}, expected a number >= 0.")
-        for name in ("rotation_weight", "interval"):
-            if not getattr(self, name) > 0:
-                raise ValueError(f"ObjectiveConfig.{name} is {getattr(self, name)}, expected a positive number.")
+        weights = ("terminal_weight", "motion_weight", "arrival_weight", "arrival_margin")
+        check(self, "interval", rotation_weight="positive", **dict.fromkeys(weights, "not_negative"))
 
     def to_twist(self, motion: Float[Array, "*batch 3"]) -> Float[Array, "*batch 3"]:
         """The twist (vx, vy, omega) that makes a motion (metres, see `feasible`) within one interval."""

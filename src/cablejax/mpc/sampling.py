@@ -10,9 +10,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from cablejax.bounded.results import Result
+from cablejax.limits import check
 from cablejax.mpc.plan import Plan
 from cablejax.mpc.problem import Rollout, ShapingProblem
-from cablejax.mpc.validation import check_budget, check_positive
 
 
 @dataclasses.dataclass(frozen=True)
@@ -38,8 +38,7 @@ class CrossEntropy:
     seed: int = 0
 
     def __post_init__(self):
-        check_budget(self, "samples", "elites", "iterations")
-        check_positive(self, "spread")
+        check(self, samples="count", elites="count", iterations="count", spread="positive")
         if self.elites > self.samples or not 0 <= self.smoothing < 1:
             raise ValueError(
                 f"CrossEntropy(elites={self.elites}, smoothing={self.smoothing}): expected no more elites than samples "
@@ -86,8 +85,7 @@ class PathIntegral:
     seed: int = 0
 
     def __post_init__(self):
-        check_budget(self, "samples", "iterations")
-        check_positive(self, "spread", "temperature")
+        check(self, samples="count", iterations="count", spread="positive", temperature="positive")
 
     def __call__(self, problem: ShapingProblem, guess: Rollout) -> Plan:
         """Draws plans around a mean, moves the mean to their weighted average, and returns the best plan."""

@@ -118,11 +118,9 @@ class MPCInfo:
 
     Attributes:
         shape_error: root mean square distance to the target now [m].
-        predicted_error: the same, expected after the command [m].
         rho: actual over predicted reduction of the error by the last command; 1 where it is not known.
         radius: bound on one step's motion that the command was planned with [m].
         objective: value of the plan that the command belongs to [m^2].
-        objective_hold: value of holding still [m^2].
         evaluations: rollouts that the solver spent on trial plans.
         result: a `bounded.Result`: how the solve ended; `NONFINITE` also where its plan is not finite.
         action: an `Action`.
@@ -134,11 +132,9 @@ class MPCInfo:
     """
 
     shape_error: Float[Array, "*batch"]
-    predicted_error: Float[Array, "*batch"]
     rho: Float[Array, "*batch"]
     radius: Float[Array, "*batch"]
     objective: Float[Array, "*batch"]
-    objective_hold: Float[Array, "*batch"]
     evaluations: Int[Array, "*batch"]
     result: Int[Array, "*batch"]
     action: Int[Array, "*batch"]

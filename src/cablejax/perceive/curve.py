@@ -16,7 +16,7 @@ from jaxtyping import Array, Float
 
 from cablejax.cable import Cable, Discretisation
 from cablejax.simulate.composite import link_lengths, node_offsets
-from cablejax.simulate.keypoints import hermite_weights
+from cablejax.simulate.keypoints import hermite, hermite_weights
 
 KERNEL_FLOOR = 1e-3
 """Added to the diagonal of the motion kernel, whose smallest eigenvalues are beyond floating point."""
@@ -128,8 +128,4 @@ def carried(
     heading = jnp.stack([jnp.cos(after[:, 2]), jnp.sin(after[:, 2])], axis=-1)
     moved = after[:, :2] - before[:, :2]
     turned = length * (heading - jnp.stack([jnp.cos(before[:, 2]), jnp.sin(before[:, 2])], axis=-1))
-    blend = s * s * (3.0 - 2.0 * s)
-    motion = (
-        (1.0 - blend) * moved[0] + blend * moved[1] + s * (1.0 - s) ** 2 * turned[0] - s * s * (1.0 - s) * turned[1]
-    )
-    return centre + motion
+    return centre + hermite(s, moved, turned)

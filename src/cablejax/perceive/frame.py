@@ -13,6 +13,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from cablejax.limits import check
 from cablejax.perceive.registration import CurveFit, RegistrationConfig, register
+from cablejax.simulate.pose import wrapped
 
 ROTATION_WEIGHT = 0.15
 """Metres that one radian of a gripper's motion counts for."""
@@ -132,7 +133,7 @@ def track(
     """
     settings = config.registration
     step = gripper_pose - state.gripper_pose
-    step = step.at[:, 2].set((step[:, 2] + jnp.pi) % (2 * jnp.pi) - jnp.pi)
+    step = step.at[:, 2].set(wrapped(step[:, 2]))
     pose = state.gripper_pose + step
     travel = state.travel + jnp.max(
         jnp.sqrt(jnp.sum(step[:, :2] ** 2, axis=-1) + (ROTATION_WEIGHT * step[:, 2]) ** 2 + 1e-16)

@@ -1,10 +1,16 @@
-"""The cloud as samples from a Gaussian mixture along the cable, with one uniform component for outliers.
+"""The terms that a registration weighs: how well the cloud fits the cable, and how well the cable keeps its structure.
 
-Wang et al., RA-L 2022, place one round Gaussian on each keypoint, all of the same weight and variance, and one uniform
+The cloud is taken as samples from a Gaussian mixture along the cable, with one uniform component for outliers. Wang et
+al., RA-L 2022, place one round Gaussian on each keypoint, all of the same weight and variance, and one uniform
 component of weight mu for noise and outliers. Round Gaussians pull their centres along the cable towards wherever
 points are dense, although a cloud says nothing about sliding along the cable. Here every link of a fine chain has a
 Gaussian of its own that is as long as the link and as wide as sigma, and its residual is the distance across the cable
 alone. Links of the same length have the same weight, as in the paper.
+
+Tang and Tomizuka, "Track deformable objects from point clouds with structure preserved registration", IJRR 2018, add
+two terms to the mixture's likelihood. The displacement since the last frame shall be smooth, as the norm of a coherent
+displacement field; and every point shall keep its place relative to its neighbours, as in local linear embedding.
+Neighbours here are neighbours along the cable, so that two parts of it may cross without being tied to each other.
 """
 
 from __future__ import annotations
@@ -13,12 +19,21 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from cablejax.perceive.curve import Curve, perpendicular
 
 ELONGATION = 0.4
 """Standard deviation of a Gaussian along its link, in lengths of the link."""
+NEIGHBOURS = 4
+"""Neighbours that each point is expressed by: two on either side, or the nearest four at the ends. In the plane three
+express any point; the fourth makes it a fit."""
+STRIDE = 3
+"""Links from one neighbour to the next: they are about as far apart as keypoints are. Direct neighbours would only feel
+wiggles from link to link."""
+RIDGE = 1e-5
+"""Ridge of the local fits, relative to the trace of their Gram matrices."""
 
 
 class Moments(NamedTuple):
@@ -99,3 +114,32 @@ def distance_to(points: Float[Array, "S 2"], shape: Curve, lengths: Any) -> Floa
     across = points @ normal.T - jnp.sum(shape.centre * normal, axis=-1) - 0.5 * shape.curvature * along**2
     excess = jax.nn.relu(jnp.abs(along) - half)
     return jnp.sqrt(jnp.min(across**2 + excess**2, axis=-1))
+
+
+def embedding_stiffness(centre: Float[Array, "n 2"]) -> Float[Array, "n n"]:
+    """`(I - W)' (I - W)`, with the weights W that best express each point by its neighbours and sum to one.
+
+    The energy `x' E x` is zero wherever the neighbourhoods keep their shape, up to a local affine map and the ridge.
+    Differentiable in `centre`.
+    """
+    n = centre.shape[0]
+    # int32 whether or not JAX is in 64-bit mode
+    index = np.array([_neighbours(k, n) for k in range(n)], dtype=np.int32)
+    arms = centre[index] - centre[:, None]
+    gram = arms @ jnp.swapaxes(arms, -1, -2)
+    trace = jnp.trace(gram, axis1=-2, axis2=-1)[:, None, None]
+    gram = gram + RIDGE * trace * jnp.eye(NEIGHBOURS, dtype=centre.dtype)
+    weight = _solve(gram / trace)
+    weight = weight / jnp.sum(weight, axis=-1, keepdims=True)
+    difference = jnp.eye(n, dtype=centre.dtype).at[np.arange(n, dtype=np.int32)[:, None], index].add(-weight)
+    return difference.T @ difference
+
+
+def _solve(gram: Float[Array, "n K K"]) -> Float[Array, "n K"]:
+    """Solves `gram w = 1` for all points at once."""
+    return jnp.linalg.solve(gram, jnp.ones((*gram.shape[:-1], 1), gram.dtype))[..., 0]
+
+
+def _neighbours(k: int, n: int) -> list[int]:
+    reachable = [j for j in range(k % STRIDE, n, STRIDE) if j != k]
+    return sorted(sorted(reachable, key=lambda j: abs(j - k))[:NEIGHBOURS])

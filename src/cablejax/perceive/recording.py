@@ -104,20 +104,6 @@ def read_clouds(path: str | os.PathLike[str]) -> CloudSequence:
     return CloudSequence(np.asarray(arrays["time"], float), clouds, np.asarray(arrays["gripper_pose"], float))
 
 
-def write_clouds(path: str | os.PathLike[str], sequence: CloudSequence) -> pathlib.Path:
-    """Writes a sequence as an `.npz` file that `read_clouds` reads, replacing a file of that name."""
-    path = pathlib.Path(path)
-    with path.open("wb") as file:  # NumPy would add a suffix to a mere name
-        np.savez_compressed(
-            file,
-            time=sequence.time,
-            gripper_pose=sequence.gripper_pose,
-            points=np.concatenate(sequence.clouds).astype(np.float32),
-            count=np.array([len(cloud) for cloud in sequence.clouds]),
-        )
-    return path
-
-
 def _read_folder(folder: pathlib.Path) -> CloudSequence:
     files = sorted(path for path in folder.iterdir() if path.suffix.lower() == ".pcd")
     poses = folder / POSES_FILE

@@ -21,8 +21,7 @@ from cablejax.perceive.curve import (
     keypoints_of,
     perpendicular,
 )
-from cablejax.perceive.mixture import Moments, distance_to, expectation
-from cablejax.perceive.structure import NEIGHBOURS, STRIDE, embedding_stiffness
+from cablejax.perceive.mixture import NEIGHBOURS, STRIDE, Moments, distance_to, embedding_stiffness, expectation
 from cablejax.simulate.grasp import constrained_acceleration
 
 COOLING = 0.9

@@ -13,6 +13,7 @@ import itertools
 import numpy as np
 from jaxtyping import Float
 
+from cablejax.gaplog import stretches
 from cablejax.recordings.take import Take, median_step
 
 FILLED = 0.05
@@ -123,8 +124,7 @@ def _without_repeats(take: Take, reports: list[str]) -> Take:
     if not same.any() or same.mean() > _HELD_PART:
         return take
     repeated = np.zeros(len(take.time), bool)
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], same, [False]]).astype(int)))
-    for a, b in edges.reshape(-1, 2):
+    for a, b in stretches(same):
         if b - a >= _HELD_SAMPLES:
             repeated[a + 1 : b + 1] = True
     if not repeated.any():
@@ -145,9 +145,8 @@ def _without_repeats(take: Take, reports: list[str]) -> Take:
 def _filled(take: Take, on_grippers: tuple[int, ...] | None) -> tuple[Take, int]:
     """Short gaps in what is known of the grippers, filled in; and how many samples that were."""
     known = _known(take, on_grippers)
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], ~known, [False]]).astype(int)))
     few = np.zeros(len(known), bool)
-    for a, b in edges.reshape(-1, 2):
+    for a, b in stretches(~known):
         if a > 0 and b < len(known) and take.time[b] - take.time[a - 1] <= FILLED + 1e-9:
             few[a:b] = True
     if not few.any():

@@ -31,20 +31,18 @@ if TYPE_CHECKING:
 
 OVERSAMPLING = 3
 """Pixels drawn for each one of the picture."""
+_SPEED = 5.0
+"""Seconds of the run per second of the animation."""
+_HOLD_S = 2.5
+"""How long the last frame stands [s]."""
+_SHADES = 7
+_DASH, _GAP = 7.0, 5.0
 _HEADER = 44
 _TITLE = 34
 _FOOTER = 48
 
 
-def write_gif(
-    path: str | os.PathLike[str],
-    runs: Runs,
-    *,
-    width: int = 960,
-    frames_per_second: float = 12.0,
-    speed: float = 5.0,
-    hold_s: float = 2.5,
-) -> int:
+def write_gif(path: str | os.PathLike[str], runs: Runs, *, width: int = 960, frames_per_second: float = 12.0) -> int:
     """Writes the animation and returns its size in bytes.
 
     Args:
@@ -52,8 +50,6 @@ def write_gif(
         runs: the runs; those of one shape share a panel.
         width: of the picture [pixels].
         frames_per_second: of the file.
-        speed: seconds of the run per second of the animation.
-        hold_s: how long the last frame stands [s].
 
     Raises:
         ValueError: if there is no run.
@@ -61,12 +57,12 @@ def write_gif(
     pairs = by_shape(runs)
     end = max(float(r.times[-1]) for r in runs.values())
     # The cable moves most at the start, so time runs slower there: frame times grow with the square.
-    n_frames = max(2, round(end / speed * frames_per_second))
+    n_frames = max(2, round(end / _SPEED * frames_per_second))
     instants = end * np.linspace(0.0, 1.0, n_frames) ** 2
     scene = _Scene(pairs, common_window(runs, margin=0.1), width)
     frames = [scene.draw(t) for t in instants]
     drawn = (LIGHT.ink, LIGHT.muted, LIGHT.gripper, LIGHT.target, LIGHT.residual, LIGHT.direct)
-    return save_frames(path, frames, drawn, frames_per_second=frames_per_second, hold_s=hold_s)
+    return save_frames(path, frames, drawn, frames_per_second=frames_per_second, hold_s=_HOLD_S)
 
 
 def save_frames(
@@ -96,12 +92,12 @@ def save_frames(
     return path.stat().st_size
 
 
-def _palette(drawn: Sequence[str], shades: int = 7) -> Image.Image:
+def _palette(drawn: Sequence[str]) -> Image.Image:
     """Every colour drawn, in steps towards the background as its smoothed edges have them."""
     background = np.array(ImageColor.getrgb(LIGHT.background))
     colours = [background]
     for colour in drawn:
-        for share in np.linspace(1.0 / shades, 1.0, shades):
+        for share in np.linspace(1.0 / _SHADES, 1.0, _SHADES):
             colours.append((1.0 - share) * background + share * np.array(ImageColor.getrgb(colour)))
     palette = Image.new("P", (1, 1))
     palette.putpalette(np.round(np.array(colours)).astype(np.uint8).ravel().tolist())
@@ -194,11 +190,11 @@ class Canvas:
         """A filled polygon [pixels]."""
         self.pen.polygon([tuple(p) for p in points * OVERSAMPLING], fill=colour)
 
-    def dashes(self, points: np.ndarray, colour: str, width: float, dash: float = 7.0, gap: float = 5.0) -> None:
+    def dashes(self, points: np.ndarray, colour: str, width: float) -> None:
         """A dashed line [pixels]."""
         distance = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(points, axis=0).T))])
-        for start in np.arange(0.0, distance[-1], dash + gap):
-            along = np.linspace(start, min(start + dash, distance[-1]), 6)
+        for start in np.arange(0.0, distance[-1], _DASH + _GAP):
+            along = np.linspace(start, min(start + _DASH, distance[-1]), 6)
             piece = np.stack([np.interp(along, distance, points[:, k]) for k in range(2)], axis=1)
             scaled = [tuple(p) for p in piece * OVERSAMPLING]
             self.pen.line(scaled, fill=colour, width=round(width * OVERSAMPLING), joint="curve")

@@ -14,9 +14,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from cablejax.diagnose.diagnosis import CableDiagnosis, Diagnosis
-from cablejax.report.diagnosis_style import STYLE, explained_label
-from cablejax.report.effect_words import effect_title
-from cablejax.report.style import LIGHT
+from cablejax.report.effect_words import effect_title, explained_label
+from cablejax.report.style import DIAGNOSIS_STYLE, LIGHT
 
 _MAX_RANKED = 8
 _LIGHT_BLUE = "#56b4e9"
@@ -46,7 +45,7 @@ def ranking_figure(diagnosis: Diagnosis) -> Figure | None:
     y = rows - 1 - np.arange(len(ranked))
     # were there no other causes than those of the library
     chance = "probability [%]" if diagnosis.effects else "probability, were it in the library [%]"
-    with matplotlib.rc_context(STYLE):
+    with matplotlib.rc_context(DIAGNOSIS_STYLE):
         figure = Figure(figsize=(10.0, 0.9 + 0.36 * rows), layout="constrained")
         panels = [([100 * r.held_out_shrinkage for r in ranked], "share of the gap that it takes away [%]")]
         if likely:
@@ -73,7 +72,7 @@ def shrinkage_figure(diagnosis: CableDiagnosis) -> Figure:
     gap = diagnosis.gap
     explained = diagnosis.explained is not None
     believed = LIGHT.target if diagnosis.verdict == "none" else LIGHT.direct
-    with matplotlib.rc_context(STYLE):
+    with matplotlib.rc_context(DIAGNOSIS_STYLE):
         figure = Figure(figsize=(10.0, 4.0), layout="constrained")
         grid = figure.add_gridspec(2, 2, height_ratios=[3.4, 0.5], width_ratios=[2.4, 1.0])
         ax = figure.add_subplot(grid[0, 0] if gap.ahead_mm else grid[0, :])

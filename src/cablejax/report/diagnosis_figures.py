@@ -13,9 +13,9 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Rectangle
 
 from cablejax.diagnose.diagnosis import CableDiagnosis, NamedEffect
-from cablejax.report.diagnosis_style import STYLE, explained_label
-from cablejax.report.effect_words import effect_title
-from cablejax.report.style import LIGHT, cable_curve, gripper_outline
+from cablejax.gaplog import stretches
+from cablejax.report.effect_words import effect_title, explained_label
+from cablejax.report.style import DIAGNOSIS_STYLE, LIGHT, cable_curve, gripper_outline
 
 # Transparent where there is no gap, so that it reads on a light and on a dark page.
 _HEAT = LinearSegmentedColormap.from_list(
@@ -54,7 +54,7 @@ def cable_figure(diagnosis: CableDiagnosis) -> Figure:
     reach = max(3.5 * float(np.linalg.norm(distance[furthest])), 0.02 * width)
     enlarged = reach < _LARGEST_ZOOM * width
     middle = nominal[furthest]
-    with matplotlib.rc_context(STYLE):
+    with matplotlib.rc_context(DIAGNOSIS_STYLE):
         figure = Figure(
             figsize=(10.0, 0.9 + (7.2 if enlarged else 9.6) * min(max(height / width, 0.3), 0.6)), layout="constrained"
         )
@@ -102,7 +102,7 @@ def where_figure(diagnosis: CableDiagnosis) -> Figure:
     rows = -(-len(episodes) // columns)
     smooth = [_smoothed(diagnosis, int(e)) for e in episodes]
     top = max(4.0, float(np.nanpercentile(np.concatenate([s.ravel() for s in smooth]), 99)))
-    with matplotlib.rc_context(STYLE):
+    with matplotlib.rc_context(DIAGNOSIS_STYLE):
         figure = Figure(figsize=(10.0, 1.5 + 1.55 * rows), layout="constrained")
         grid = figure.add_gridspec(1 + rows, columns, height_ratios=[0.8, *[1.25] * rows])
         _strip(figure.add_subplot(grid[0, :]), diagnosis, arclength)
@@ -190,9 +190,8 @@ def _mark_holds(ax: Axes, diagnosis: CableDiagnosis, episode: int, top: float) -
     if not rests:
         return
     hold = np.any(rests, axis=0)
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], hold[episode, :length].astype(int), [0]])))
     time = diagnosis.log.time[episode]
-    for begin, end in edges.reshape(-1, 2):
+    for begin, end in stretches(hold[episode, :length]):
         ax.plot([time[begin], time[end - 1]], [top, top], color=LIGHT.ink, lw=3, solid_capstyle="butt", clip_on=False)
 
 

@@ -17,12 +17,12 @@ from cablejax.report import diagnosis_sections as sections
 from cablejax.report.diagnosis_charts import ranking_figure, shrinkage_figure
 from cablejax.report.diagnosis_figures import cable_figure, where_figure
 from cablejax.report.diagnosis_sections import in_space
-from cablejax.report.diagnosis_style import explained_label
 from cablejax.report.effect_words import (
     MOTIONS,
     between,
     effect_place,
     effect_title,
+    explained_label,
     listed,
     millimetres,
     parameter_title,

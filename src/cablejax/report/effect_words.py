@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
-from cablejax.diagnose.diagnosis import NamedEffect
+from cablejax.diagnose.diagnosis import CableDiagnosis, NamedEffect
 
 EFFECTS: dict[str, str] = {
     "bending_stiffness": "the bending stiffness differs everywhere by one factor",
@@ -179,3 +179,11 @@ def _digits(numbers: Sequence[float]) -> int:
     size = 0.25 * abs(numbers[-1] - numbers[1]) if len(numbers) > 2 else 0.0
     size = size or 0.01 * abs(numbers[0])
     return int(min(max(math.ceil(-math.log10(size)), 0), 6)) if size > 0 else 1
+
+
+def explained_label(diagnosis: CableDiagnosis) -> str:
+    """Legend of the curve with the explanation."""
+    if not diagnosis.effects:
+        return "with the best explanation found, not named"
+    names = [effect_title(effect.name) for effect in diagnosis.effects]
+    return f"with {names[0]}" if len(names) == 1 else "with the named effects"

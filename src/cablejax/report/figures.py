@@ -32,6 +32,7 @@ if TYPE_CHECKING:
 
 _REST = 5e-4
 """Grippers that move by less than this in a step [m, rad] rest."""
+_GOAL_CM = 1.0
 
 _STYLE: dict[Any, Any] = FIGURE_STYLE | {
     "font.size": 10.0,
@@ -77,15 +78,13 @@ def final_shapes(runs: Runs) -> Figure:
     return figure
 
 
-def error_over_time(runs: Runs, goal_cm: float | None = 1.0) -> Figure:
-    """Shape error against time on a logarithmic axis, one panel per shape; `goal_cm` draws a line to stay under."""
+def error_over_time(runs: Runs) -> Figure:
+    """Shape error against time on a logarithmic axis, one panel per shape; a line marks the goal of 1 cm."""
     pairs = by_shape(runs)
     with matplotlib.rc_context(_STYLE):
         figure, axes = _row_of_panels(list(pairs), "shape error [cm]")
-        low = min(float(np.nanmin(r.error_cm)) for r in runs.values())
-        high = max(float(np.nanmax(r.error_cm)) for r in runs.values())
-        if goal_cm is not None:
-            low, high = min(low, goal_cm), max(high, goal_cm)
+        low = min(_GOAL_CM, *(float(np.nanmin(r.error_cm)) for r in runs.values()))
+        high = max(_GOAL_CM, *(float(np.nanmax(r.error_cm)) for r in runs.values()))
         for ax, (shape, pair) in zip(axes, pairs.items(), strict=True):
             for method in _present(pair):
                 run = pair[method]
@@ -96,11 +95,9 @@ def error_over_time(runs: Runs, goal_cm: float | None = 1.0) -> Figure:
             ax.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
             ax.minorticks_off()
             ax.set_yticks([t for t in (0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50) if low / 1.4 <= t <= high * 1.3])
-            if goal_cm is not None:
-                ax.axhline(goal_cm, color=LIGHT.target, lw=1.2, ls=(0, (5, 3)))
+            ax.axhline(_GOAL_CM, color=LIGHT.target, lw=1.2, ls=(0, (5, 3)))
             ax.set_title(shape, fontsize=13)
-        if goal_cm is not None:
-            axes[0].text(0.0, goal_cm / 1.08, f"{goal_cm:g} cm", ha="left", va="top", color=LIGHT.muted, fontsize=9)
+        axes[0].text(0.0, _GOAL_CM / 1.08, f"{_GOAL_CM:g} cm", ha="left", va="top", color=LIGHT.muted, fontsize=9)
         _method_legend(figure, runs)
     return figure
 

@@ -10,15 +10,14 @@ import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
 
+from cablejax.cable_file import config_of_log
 from cablejax.control.run import shape_error_cm
 from cablejax.diagnose.noise import noise_floor
 from cablejax.gaplog import Episode, episodes_of, targets_of
 from cablejax.gaplog_check import META_FIELDS
-from cablejax.report.diagnosis_style import STYLE
 from cablejax.report.effect_words import millimetres
 from cablejax.report.sheet import Sheet, cable_cards, cable_facts, span
-from cablejax.report.style import LIGHT, cable_curve
-from cablejax.simulate.replay import config_of_log
+from cablejax.report.style import DIAGNOSIS_STYLE, LIGHT, cable_curve
 from cablejax.types import GapLog
 
 _SHOWN = 6
@@ -131,7 +130,7 @@ def _shapes_figure(episodes: Sequence[tuple[Episode, np.ndarray | None]]) -> Fig
     """The cable at some moments of each episode, from above; in space from the side on which it extends farther."""
     columns = min(len(episodes), 3)
     rows = -(-len(episodes) // columns)
-    with matplotlib.rc_context(STYLE):
+    with matplotlib.rc_context(DIAGNOSIS_STYLE):
         figure = Figure(figsize=(10.5, 0.6 + 3.0 * rows), layout="constrained")
         axes = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True).ravel()
         for ax in axes[len(episodes) :]:
@@ -166,7 +165,7 @@ def _time_figure(episodes: Sequence[tuple[Episode, np.ndarray | None]]) -> Figur
     """Speed of the grippers and error over time, a line for each episode."""
     stated = any(target is not None for _, target in episodes)
     colours = matplotlib.colormaps["cividis"](np.linspace(0.35, 0.9, len(episodes)))
-    with matplotlib.rc_context(STYLE):
+    with matplotlib.rc_context(DIAGNOSIS_STYLE):
         figure = Figure(figsize=(10.5, 4.6 if stated else 2.6), layout="constrained")
         axes = figure.subplots(1 + stated, 1, squeeze=False, sharex=True)[:, 0]
         for colour, (episode, target) in zip(colours, episodes, strict=True):

@@ -22,10 +22,9 @@ from cablejax.dynamics.card import network_words
 from cablejax.dynamics.weights import cable_of_weights, load_info, load_weights, weights_path
 from cablejax.report.diagnosis_charts import ranking_figure
 from cablejax.report.diagnosis_sections import named_effects
-from cablejax.report.diagnosis_style import STYLE
 from cablejax.report.effect_words import between, effect_title, listed, parameter_title, share
 from cablejax.report.sheet import LETTERS_CAPTION, Sheet, cable_cards, cable_facts, letters_figure, span
-from cablejax.report.style import LIGHT, cable_curve
+from cablejax.report.style import DIAGNOSIS_STYLE, LIGHT, cable_curve
 from cablejax.text_file import read_text
 
 _SHOWN = 24
@@ -185,7 +184,7 @@ def _first_shard(store: Store) -> Block | None:
 
 def _store_figure(block: Block) -> Figure:
     moved = 100 * np.linalg.norm(np.diff(block.keypoints, axis=1), axis=-1).ravel()
-    with matplotlib.rc_context(STYLE):
+    with matplotlib.rc_context(DIAGNOSIS_STYLE):
         figure = Figure(figsize=(10.5, 4.0), layout="constrained")
         table, histogram = figure.subplots(1, 2, width_ratios=[1.4, 1.0])
         colours = matplotlib.colormaps["cividis"](np.linspace(0.35, 0.9, min(len(block), _SHOWN)))
@@ -219,7 +218,7 @@ def _training_figure(metrics: pathlib.Path) -> Figure | None:
     shown = {title: lines for title, lines in curves.items() if lines}
     if not shown:
         return None
-    with matplotlib.rc_context(STYLE):
+    with matplotlib.rc_context(DIAGNOSIS_STYLE):
         figure = Figure(figsize=(10.5, 3.2), layout="constrained")
         for ax, (title, lines) in zip(figure.subplots(1, len(shown), squeeze=False)[0], shown.items(), strict=True):
             colours = matplotlib.colormaps["cividis"](np.linspace(0.35, 0.9, len(lines)))

@@ -13,15 +13,14 @@ from PIL import Image
 
 from cablejax.diagnose.diagnosis import NextMotion
 from cablejax.report.animation import OVERSAMPLING, Canvas, save_frames
-from cablejax.report.diagnosis_style import STYLE
 from cablejax.report.effect_words import effect_title, explanation_title
-from cablejax.report.style import LIGHT, cable_curve, gripper_outline
+from cablejax.report.style import DIAGNOSIS_STYLE, LIGHT, cable_curve, gripper_outline
 
 _COLOURS = (LIGHT.residual, LIGHT.direct, "#009e73", "#cc79a7", "#e69f00")
 _MOMENTS = 5
 _MARGIN = 0.1
 _SPEED, _FRAMES_PER_SECOND, _HOLD_S = 5.0, 10.0, 1.5
-_HEADER, _LINE = 40, 20
+_WIDTH, _HEADER, _LINE = 640, 40, 20
 
 
 def motion_figure(following: NextMotion | None) -> Figure | None:
@@ -31,7 +30,7 @@ def motion_figure(following: NextMotion | None) -> Figure | None:
     """
     if following is None:
         return None
-    with matplotlib.rc_context(STYLE):
+    with matplotlib.rc_context(DIAGNOSIS_STYLE):
         figure = Figure(figsize=(10.0, 4.6), layout="constrained")
         halves: Any = figure.subfigures(2, 1, height_ratios=[1.25, 1.0])
         _film(halves[0], following)
@@ -39,26 +38,25 @@ def motion_figure(following: NextMotion | None) -> Figure | None:
     return figure
 
 
-def write_motion_gif(path: str | os.PathLike[str], following: NextMotion, *, width: int = 640) -> int:
+def write_motion_gif(path: str | os.PathLike[str], following: NextMotion) -> int:
     """Writes a preview of the motion, five times as fast, and returns its size in bytes.
 
     Args:
         path: the file to write.
         following: the motion.
-        width: of the picture [pixels].
     """
     low, high = _window(following)
-    scale = width / (high[0] - low[0])
+    scale = _WIDTH / (high[0] - low[0])
     names = list(following.shapes)
     top = _HEADER + _LINE * len(names)
-    size = (width, top + max(round((high[1] - low[1]) * scale), 1))
+    size = (_WIDTH, top + max(round((high[1] - low[1]) * scale), 1))
     last, step = len(following.poses) - 1, _SPEED / _FRAMES_PER_SECOND / following.interval
     frames = []
     for sample in [*np.arange(0.0, last, step).round().astype(int), last]:
         image = Image.new("RGB", (OVERSAMPLING * size[0], OVERSAMPLING * size[1]), LIGHT.background)
         canvas = Canvas(image)
         canvas.text((14, 10), "Record next", LIGHT.ink, 16, bold=True)
-        canvas.text((width - 14, 10), f"{following.interval * sample:.0f} s", LIGHT.ink, 16, anchor="ra", bold=True)
+        canvas.text((_WIDTH - 14, 10), f"{following.interval * sample:.0f} s", LIGHT.ink, 16, anchor="ra", bold=True)
         pose = following.poses[sample]
 
         def pixels(points: Float[np.ndarray, "P 2"]) -> Float[np.ndarray, "P 2"]:

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import importlib.metadata
 import os
-import pathlib
 import platform
 
 import cablejax
+from cablejax.compiled_programs import processor_lines
 
 _PACKAGES = ("jax", "jaxlib", "flax", "mujoco", "mujoco-mjx", "optimistix", "numpy")
 
@@ -20,12 +20,7 @@ def versions() -> str:
 
 def machine() -> str:
     """The processor, the number of cores this process may use, and the system, in words."""
-    model = platform.processor() or platform.machine()
-    cpuinfo = pathlib.Path("/proc/cpuinfo")
-    if cpuinfo.is_file():
-        for line in cpuinfo.read_text(encoding="utf-8", errors="replace").splitlines():
-            if line.startswith("model name"):
-                model = line.partition(":")[2].strip()
-                break
+    named = (line.partition(":")[2].strip() for line in processor_lines() if line.startswith("model name"))
+    model = next(named, platform.processor() or platform.machine())
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     return f"{model}, {cores} cores, {platform.system()}"

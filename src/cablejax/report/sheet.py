@@ -16,9 +16,8 @@ from cablejax.cable_file import NUMBERS, cable_to_fields
 from cablejax.control.targets import make_target
 from cablejax.limits import LIMITS
 from cablejax.report.diagnosis_sections import Table
-from cablejax.report.diagnosis_style import STYLE
 from cablejax.report.html import svg, write_html
-from cablejax.report.style import LIGHT, cable_curve
+from cablejax.report.style import DIAGNOSIS_STYLE, LIGHT, cable_curve
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -100,7 +99,7 @@ LETTERS_CAPTION = "This cable as a U, an S and a Z between two grippers, at rest
 
 def letters_figure(cable: Cable) -> Figure:
     """The cable at rest as a U, an S and a Z."""
-    with matplotlib.rc_context(STYLE):
+    with matplotlib.rc_context(DIAGNOSIS_STYLE):
         figure = Figure(figsize=(10.0, 3.2), layout="constrained")
         for ax, letter in zip(figure.subplots(1, 3, sharex=True, sharey=True), ("U", "S", "Z"), strict=True):
             target = make_target(letter, cable)

@@ -9,8 +9,8 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from cablejax.diagnose.diagnosis import CableDiagnosis
-from cablejax.report.diagnosis_style import STYLE, explained_label
-from cablejax.report.style import LIGHT
+from cablejax.report.effect_words import explained_label
+from cablejax.report.style import DIAGNOSIS_STYLE, LIGHT
 
 _FRAME = 0.04  # [s] between two pictures of the player
 _SHOWN = 4
@@ -34,7 +34,7 @@ def files_figure(diagnosis: CableDiagnosis) -> Figure:
     parts = [("simulator as believed", diagnosis.nominal)]
     if diagnosis.explained is not None and diagnosis.effects:
         parts.append((explained_label(diagnosis), diagnosis.explained))
-    with matplotlib.rc_context(STYLE):
+    with matplotlib.rc_context(DIAGNOSIS_STYLE):
         figure = Figure(figsize=(11.0, 2.4 * len(parts) + 0.8), layout="constrained")
         panels = np.atleast_1d(figure.subplots(len(parts), 1, sharex=True))
         maps = [error_per_file(diagnosis, predicted) for _, predicted in parts]
@@ -65,7 +65,7 @@ def cable_still(diagnosis: CableDiagnosis) -> Figure:
         "explained": {"color": LIGHT.residual, "lw": 2.5, "label": explained_label(diagnosis)},
         "observed": {"color": LIGHT.ink, "ls": "", "marker": "o", "ms": 5, "label": "recorded"},
     }
-    with matplotlib.rc_context(STYLE):
+    with matplotlib.rc_context(DIAGNOSIS_STYLE):
         figure = Figure(figsize=(11.0, 4.4), layout="constrained")
         axes = figure.subplots(1, 2, sharey=True)
         for ax, axis, name in zip(axes, (0, 1), "xy", strict=True):

@@ -12,10 +12,9 @@ from matplotlib.figure import Figure
 from cablejax.diagnose.diagnosis import Diagnosis
 from cablejax.diagnose.study import ENDED, Ended, left_open
 from cablejax.effects.given import GivenEffect
-from cablejax.report.diagnosis_style import STYLE
 from cablejax.report.effect_words import effect_title, listed, millimetres, share
 from cablejax.report.sheet import Sheet
-from cablejax.report.style import LIGHT
+from cablejax.report.style import DIAGNOSIS_STYLE, LIGHT
 
 _SHOWN = 5
 _VERDICTS = {
@@ -93,7 +92,7 @@ def _beliefs(found: Sequence[Diagnosis]) -> Figure:
     chances = [{entry.name: entry.probability or 0.0 for entry in one.ranking} for one in found]
     best = {name: max(c.get(name, 0.0) for c in chances) for name in set().union(*chances)}
     names = sorted(best, key=lambda name: (-best[name], name))[:_SHOWN]
-    with matplotlib.rc_context(STYLE):
+    with matplotlib.rc_context(DIAGNOSIS_STYLE):
         figure = Figure(figsize=(9.0, 0.9 + 0.34 * len(names) * len(found)), layout="constrained")
         axes = np.atleast_1d(figure.subplots(len(found), 1, sharex=True))
         for number, (ax, chance) in enumerate(zip(axes, chances, strict=True), 1):

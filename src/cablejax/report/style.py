@@ -103,6 +103,8 @@ FIGURE_STYLE: dict[Any, Any] = {
     "svg.fonttype": "none",
 }
 """Settings for `matplotlib.rc_context`, of every figure."""
+DIAGNOSIS_STYLE: dict[Any, Any] = FIGURE_STYLE | {"font.size": 11.0, "axes.titlesize": 11.0}
+"""The same for the smaller figures of diagnoses and of what `cablejax view` shows."""
 
 
 def cable_curve(

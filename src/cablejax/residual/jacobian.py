@@ -1,4 +1,4 @@
-"""Jacobian of one step of a dynamics model, from which a planner linearises a rollout."""
+"""One-step models: their interface, their derivatives, and their correction by a learned residual."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import jax
 from jaxtyping import Array, Float
 
+from cablejax.residual.ridge import ResidualModel, apply
 from cablejax.types import History
 
 Dynamics = Callable[[Any, History, Float[Array, "Q 3"]], Float[Array, "N 2"]]
@@ -51,3 +52,31 @@ def reverse(
         return displacement(dataclasses.replace(history, keypoints=keypoints, gripper_pose=gripper_pose), twist)
 
     return StepJacobian(*jax.jacrev(rows, argnums=(0, 1, 2))(history.keypoints, history.gripper_pose, twist))
+
+
+@dataclasses.dataclass(frozen=True)
+class Corrected:
+    """The dynamics `f(X, R) + R J + b` whose weights are the pair (weights of f, `ResidualModel`).
+
+    Differentiable in whatever `dynamics` is differentiable in, and in the residual. Equal if their models are equal.
+
+    Attributes:
+        dynamics: f.
+    """
+
+    dynamics: Dynamics
+
+    def __call__(
+        self, weights: tuple[Any, ResidualModel], history: History, twist: Float[Array, "Q 3"]
+    ) -> Float[Array, "N 2"]:
+        """Displacement by the offline model plus the residual [m], shape [N, 2]."""
+        offline, residual = weights
+        return self.dynamics(offline, history, twist) + apply(residual, twist)
+
+    def jacobian(
+        self, weights: tuple[Any, ResidualModel], history: History, twist: Float[Array, "Q 3"]
+    ) -> StepJacobian:
+        """F's own, and J."""
+        offline, residual = weights
+        of_f = step_jacobian(self.dynamics, offline, history, twist)
+        return of_f._replace(twist=of_f.twist + residual.gain.T.reshape(of_f.twist.shape))

@@ -19,6 +19,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from cablejax.limits import check
+
 
 @dataclasses.dataclass(frozen=True)
 class RidgeConfig:
@@ -49,14 +51,16 @@ class RidgeConfig:
     outlier: float = math.inf
 
     def __post_init__(self):
-        for name in ("regularisation", "motion_scale", "rotation_weight", "bias_scale"):
-            value = getattr(self, name)
-            if not (math.isfinite(value) and value > 0):
-                raise ValueError(f"RidgeConfig.{name} is {value}, expected a positive finite number.")
+        check(
+            self,
+            regularisation="positive",
+            motion_scale="positive",
+            rotation_weight="positive",
+            bias_scale="positive",
+            forgetting="share",
+        )
         if not self.outlier > 0:
             raise ValueError(f"RidgeConfig.outlier is {self.outlier}, expected a positive number [m], or infinity.")
-        if not 0 < self.forgetting <= 1:
-            raise ValueError(f"RidgeConfig.forgetting is {self.forgetting}, expected a number in (0, 1].")
 
     def scaled(self, ratio: float) -> RidgeConfig:
         """The settings for a cable so many times as long."""

@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
 
 from cablejax.cable import Discretisation
 from cablejax.effects.physics import Physics
@@ -55,6 +54,18 @@ def marked_keypoints(
     return points + physics.bias_across[:, None] * normal
 
 
+def hermite(s: Any, ends: Any, slopes: Any) -> Any:
+    """Cubic Hermite interpolation along the cable, from its ends. Differentiable in all arrays.
+
+    Args:
+        s: fraction of the arc length, shape [N, 1].
+        ends: values at both ends, shape [2, D].
+        slopes: derivatives by s there, shape [2, D].
+    """
+    blend = s * s * (3.0 - 2.0 * s)
+    return (1.0 - blend) * ends[0] + blend * ends[1] + s * (1.0 - s) ** 2 * slopes[0] - s * s * (1.0 - s) * slopes[1]
+
+
 def hermite_weights(config: Discretisation) -> tuple[np.ndarray, np.ndarray]:
     """Matrices that turn nodes into keypoints: `keypoints = positions_w @ nodes + tangents_w @ unit_tangents`.
 
@@ -76,10 +87,3 @@ def hermite_weights(config: Discretisation) -> tuple[np.ndarray, np.ndarray]:
     tangents_w[rows, segment] = h * (t - 2 * t**2 + t**3)
     tangents_w[rows, segment + 1] = h * (t**3 - t**2)
     return positions_w, tangents_w
-
-
-def camera_similarity(physics: Physics, keypoints: Float[np.ndarray, "N 2"]) -> Float[np.ndarray, "N 2"]:
-    """Keypoints scaled and turned about the world's origin, then moved, as the camera reports them [m]."""
-    cosine, sine = np.cos(physics.camera_angle), np.sin(physics.camera_angle)
-    turned = keypoints @ np.array([[cosine, sine], [-sine, cosine]])
-    return np.asarray(physics.camera_scale) * turned + np.asarray(physics.camera_offset)

@@ -12,9 +12,10 @@ import dataclasses
 import numpy as np
 from jaxtyping import Float
 
+from cablejax.effects.camera import in_camera_frame
 from cablejax.effects.physics import Physics
 from cablejax.simulate.arms import Arms
-from cablejax.simulate.keypoints import camera_similarity, hermite_weights, marked_keypoints
+from cablejax.simulate.keypoints import hermite_weights, marked_keypoints
 from cablejax.simulate.plant_config import ObservedConfig
 
 TAUT = 0.999
@@ -134,7 +135,7 @@ class TablePlant(abc.ABC):
         """Keypoints and gripper poses now, with the configured noise and gaps; every call draws them again."""
         config, random = self.config, self._random
         truth = self._true_keypoints()
-        keypoints = camera_similarity(self._physics, self._look())
+        keypoints = in_camera_frame(self._physics, self._look())
         if config.keypoint_noise:
             keypoints += config.keypoint_noise * random.standard_normal(keypoints.shape)
         if config.keypoint_dropout:

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import math
 import time
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -193,7 +192,7 @@ def diagnose_wire(photographs: Photographs, progress: Callable[[str], None] = la
     nominal = checked_nominal(wire, observed, spread)
     everyone = np.arange(len(observed))
     evidence = weighed(wire, observed, nominal, spread, everyone, calibration)
-    examined = examine(evidence, np.ones(len(observed)), calibration, deadline=math.inf, progress=progress)
+    examined = examine(evidence, np.ones(len(observed)), calibration, progress=progress)
     where = sizes_of(
         (observed - examined.before) ** 2,
         noise,

@@ -11,10 +11,8 @@ from jaxtyping import Float
 from cablejax.effects.given import GivenEffect
 from cablejax.simulate.composite import node_offsets
 from cablejax.simulate.elastica import solve_elastica
+from cablejax.simulate.plant.between_steps import Extension, Memory, TableFriction
 from cablejax.simulate.plant.config import PlantConfig
-from cablejax.simulate.plant.extension import Extension
-from cablejax.simulate.plant.friction import TableFriction
-from cablejax.simulate.plant.memory import Memory
 from cablejax.simulate.plant.model import FRICTIONLESS, bending_joints, extensible, plant_model, quaternions
 from cablejax.simulate.table_plant import Observation, TablePlant
 

@@ -1,0 +1,220 @@
+"""The networks: a graph network, and the perceptron and bidirectional LSTM that it is compared with.
+
+All see the same node features (`cablejax.dynamics.graph`), correct the same prior, and are trained alike. The graph
+network encodes, processes by message passing, and decodes:
+
+    encode     v_i = f_V(node features),  e_ij = f_E(edge features)
+    process    e_ij <- e_ij + f^k_e(e_ij, v_i, v_j),  v_j <- v_j + f^k_v(v_j, sum_i e'_ij)      k = 1, ..., K
+    decode     output_j = f_D(v_j)
+
+after Sanchez-Gonzalez et al., "Learning to Simulate Complex Physics with Graph Networks", ICML 2020, with the sizes of
+Wang et al., RA-L 2022. Every f is a ReLU network, followed by layer normalisation except in the decoder. Edge features
+are not for the other two: what they hold follows from the nodes' positions.
+"""
+
+from __future__ import annotations
+
+import itertools
+
+import jax
+import jax.numpy as jnp
+from flax import nnx
+from jaxtyping import Array, Float
+
+from cablejax.dynamics.config import ModelConfig
+from cablejax.dynamics.graph import topology_of
+
+
+class MLP(nnx.Module):
+    """ReLU network whose first layer takes the sum of several inputs, each with a weight matrix of its own.
+
+    That sum is the same as one matrix on the inputs' concatenation; written apart, an input that many rows share can
+    be multiplied before it is copied to them.
+
+    Attributes:
+        corner: half the width of the activations' rounded corners, see `rectified`.
+    """
+
+    corner: float = 0.0
+
+    def __init__(self, inputs: tuple[int, ...], output: int, config: ModelConfig, *, normalise: bool, rngs: nnx.Rngs):
+        share = nnx.initializers.variance_scaling(1.0 / len(inputs), "fan_in", "truncated_normal")
+        self.first = nnx.List(
+            [nnx.Linear(n, config.hidden, use_bias=i == 0, kernel_init=share, rngs=rngs) for i, n in enumerate(inputs)]
+        )
+        sizes = [config.hidden] * config.hidden_layers + [output]
+        self.rest = nnx.List([nnx.Linear(a, b, rngs=rngs) for a, b in itertools.pairwise(sizes)])
+        if not normalise:
+            # The decoder starts at zero: an untrained model is its prior.
+            self.rest[-1].kernel.set_value(jnp.zeros_like(self.rest[-1].kernel.get_value()))
+        self.norm = nnx.LayerNorm(output, epsilon=1e-5, rngs=rngs) if normalise else None
+
+    def after_first(self, x: Float[Array, "rows hidden"]) -> Float[Array, "rows output"]:
+        """The network from the first layer's sum on."""
+        for layer in self.rest:
+            x = layer(rectified(x, self.corner))
+        return x if self.norm is None else self.norm(x)
+
+    def __call__(self, *inputs: Float[Array, "rows _"]) -> Float[Array, "rows output"]:
+        """Applies the layers to the concatenation of the inputs, without concatenating them."""
+        first = sum(layer(x) for layer, x in zip(self.first[1:], inputs[1:], strict=True))
+        return self.after_first(self.first[0](inputs[0]) + first)
+
+
+def rectified(x: Float[Array, "*shape"], corner: float) -> Float[Array, "*shape"]:
+    """`max(x, 0)`, its corner rounded between -c and c by `(x + c)^3 (3 c - x) / 16 c^3`: twice differentiable.
+
+    It is at most 3 c / 16 above `max(x, 0)`, at 0, and the same beyond the corner.
+    """
+    if corner == 0:
+        return jax.nn.relu(x)
+    inside = jnp.clip(x, -corner, corner)
+    return jnp.where(x > corner, x, (inside + corner) ** 3 * (3 * corner - inside) / (16 * corner**3))
+
+
+class MessagePassing(nnx.Module):
+    """One step: every edge reads its two nodes, every node reads the sum of its incoming edges."""
+
+    def __init__(self, config: ModelConfig, rngs: nnx.Rngs):
+        n = config.latent
+        self.offsets = topology_of(config).offsets
+        self.edge = MLP((n, n, n), n, config, normalise=True, rngs=rngs)
+        self.node = MLP((n, n), n, config, normalise=True, rngs=rngs)
+
+    def __call__(
+        self, nodes: Float[Array, "N latent"], edges: Float[Array, "E latent"]
+    ) -> tuple[Float[Array, "N latent"], Float[Array, "E latent"]]:
+        """One round of messages: every edge, then every node, is updated by its residual network."""
+        own, sender, receiver = self.edge.first
+        shared = gather(sender(nodes), receiver(nodes), self.offsets)
+        message = self.edge.after_first(own(edges) + shared)
+        update = self.node(nodes, aggregate(message, self.offsets, nodes.shape[0]))
+        return nodes + update, edges + message
+
+
+def gather(
+    sent: Float[Array, "N latent"], received: Float[Array, "N latent"], offsets: tuple[int, ...]
+) -> Float[Array, "E latent"]:
+    """`sent[senders] + received[receivers]` for edges in a `Topology`'s order."""
+    n = sent.shape[0]
+    return jnp.concatenate(
+        [sent[max(0, -k) : n - max(0, k)] + received[max(0, k) : n - max(0, -k)] for k in offsets], axis=0
+    )
+
+
+def aggregate(messages: Float[Array, "E latent"], offsets: tuple[int, ...], n: int) -> Float[Array, "N latent"]:
+    """Sum of the incoming messages of every node, for edges in a `Topology`'s order."""
+    # the derivative of a split is a concatenation; that of slices would be a sum of padded copies
+    parts = jax.lax.split(messages, [n - abs(k) for k in offsets])
+    return sum(jnp.pad(part, ((max(0, k), max(0, -k)), (0, 0))) for k, part in zip(offsets, parts, strict=True))  # pyright: ignore[reportReturnType]
+
+
+class EncodeProcessDecode(nnx.Module):
+    """The network of `topology_of(config)`, from features of any kind to numbers of any kind.
+
+    Attributes:
+        config: sizes, and which nodes are connected.
+    """
+
+    def __init__(self, features: tuple[int, int], outputs: int, config: ModelConfig, rngs: nnx.Rngs):
+        """Draws the first weights.
+
+        Args:
+            features: numbers of features of a node and of an edge.
+            outputs: numbers predicted per node; all 0 before training.
+            config: sizes, and which nodes are connected.
+            rngs: of the first weights.
+        """
+        node, edge = features
+        self.config = config
+        self.node_encoder = MLP((node,), config.latent, config, normalise=True, rngs=rngs)
+        self.edge_encoder = MLP((edge,), config.latent, config, normalise=True, rngs=rngs)
+        self.processor = nnx.List([MessagePassing(config, rngs) for _ in range(config.message_passing)])
+        self.decoder = MLP((config.latent,), outputs, config, normalise=False, rngs=rngs)
+
+    def __call__(
+        self, node_features: Float[Array, "N node_features"], edge_features: Float[Array, "E edge_features"]
+    ) -> Float[Array, "N outputs"]:
+        """Encodes nodes and edges, passes messages, and decodes the nodes."""
+        nodes, edges = self.node_encoder(node_features), self.edge_encoder(edge_features)
+        for step in self.processor:
+            nodes, edges = step(nodes, edges)
+        return self.decoder(nodes)
+
+
+class GNS(EncodeProcessDecode):
+    """Predicts how the cable moves beyond its prior, in the grippers' frame and in units of its scale, shape [N, 2].
+
+    Reads the features of `cablejax.dynamics.graph`.
+    """
+
+    def __init__(self, config: ModelConfig, rngs: nnx.Rngs):
+        super().__init__((config.node_features, config.edge_features), 2, config, rngs)
+
+
+class FlatMLP(nnx.Module):
+    """All node features in one vector through `config.hidden_layers` layers of `config.hidden`.
+
+    With the defaults the two-layer perceptron of Wang et al., RA-L 2022, section V.C. It fits one number of keypoints.
+    """
+
+    def __init__(self, config: ModelConfig, rngs: nnx.Rngs):
+        self.config = config
+        n = config.n_keypoints
+        self.layers = MLP((n * config.node_features,), 2 * n, config, normalise=False, rngs=rngs)
+
+    def __call__(
+        self, node_features: Float[Array, "N node_features"], edge_features: Float[Array, "E edge_features"]
+    ) -> Float[Array, "N 2"]:
+        """Output of every keypoint from the node features of all; edge features are not used."""
+        return self.layers(node_features.reshape(1, -1)).reshape(-1, 2)
+
+
+class LSTM(nnx.Module):
+    """One long short-term memory along the cable, from keypoint 0 to N - 1 or back (Hochreiter, Schmidhuber 1997)."""
+
+    def __init__(self, inputs: int, size: int, *, backwards: bool, rngs: nnx.Rngs):
+        self.size, self.backwards = size, backwards
+        self.of_input = nnx.Linear(inputs, 4 * size, rngs=rngs)
+        self.of_state = nnx.Linear(size, 4 * size, use_bias=False, kernel_init=nnx.initializers.orthogonal(), rngs=rngs)
+
+    def __call__(self, along: Float[Array, "N inputs"]) -> Float[Array, "N size"]:
+        """Hidden state at every keypoint. `along` holds the inputs of the gates, before the recurrent part."""
+        kernel = self.of_state.kernel.get_value()
+
+        def cell(carry, given):
+            hidden, memory = carry
+            enter, forget, leave, new = jnp.split(given + hidden @ kernel, 4)
+            # a bias of 1: at first nothing is forgotten
+            memory = jax.nn.sigmoid(forget + 1.0) * memory + jax.nn.sigmoid(enter) * jnp.tanh(new)
+            hidden = jax.nn.sigmoid(leave) * jnp.tanh(memory)
+            return (hidden, memory), hidden
+
+        start = jnp.zeros(self.size, along.dtype)
+        return jax.lax.scan(cell, (start, start), self.of_input(along), reverse=self.backwards)[1]
+
+
+class BiLSTM(nnx.Module):
+    """Recurrent along the cable, in both directions: the same cell at every keypoint.
+
+    After Yan et al., "Self-Supervised Learning of State Estimation for Manipulating Deformable Linear Objects", RA-L
+    2020: an encoder at every node, `config.hidden_layers` bidirectional layers of `config.latent`, a decoder.
+    """
+
+    def __init__(self, config: ModelConfig, rngs: nnx.Rngs):
+        self.config = config
+        size = config.latent
+        self.encoder = MLP((config.node_features,), size, config, normalise=True, rngs=rngs)
+        inputs = [size] + [2 * size] * (config.hidden_layers - 1)
+        self.forwards = nnx.List([LSTM(n, size, backwards=False, rngs=rngs) for n in inputs])
+        self.backwards = nnx.List([LSTM(n, size, backwards=True, rngs=rngs) for n in inputs])
+        self.decoder = MLP((2 * size,), 2, config, normalise=False, rngs=rngs)
+
+    def __call__(
+        self, node_features: Float[Array, "N node_features"], edge_features: Float[Array, "E edge_features"]
+    ) -> Float[Array, "N 2"]:
+        """Output of every keypoint from both directions; edge features are not used."""
+        along = self.encoder(node_features)
+        for forwards, backwards in zip(self.forwards, self.backwards, strict=True):
+            along = jnp.concatenate([forwards(along), backwards(along)], axis=-1)
+        return self.decoder(along)
