@@ -34,7 +34,7 @@ from cablejax.spatial.estimate import UNMODELLED, Estimate, Interval, estimate, 
 from cablejax.spatial.identify import Identified, identify
 from cablejax.spatial.named import parameters_of
 from pages import markdown_table, publish
-from real_cables.benchmark import protocol_windows
+from real_cables.protocol import protocol_windows
 from real_cables.synthetic import RECORDINGS, SAMPLES, Law, SyntheticCable, synthetic_recordings
 from rows import Rows
 

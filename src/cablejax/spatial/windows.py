@@ -40,6 +40,7 @@ class Windows:
         n_keypoints: N.
         gravity: as the log states it [m/s^2].
         trust: weight of each window in fits, shape [W]; None = 1.
+        left_out: where the log has windows that do not begin with two samples of all keypoints, in words.
     """
 
     keypoints: Float[np.ndarray, "W T F 3"]
@@ -57,6 +58,7 @@ class Windows:
     n_keypoints: int
     gravity: tuple[float, ...] = (0.0, 0.0, -GRAVITY)
     trust: Float[np.ndarray, "W"] | None = None
+    left_out: tuple[str, ...] = ()
 
     def __len__(self) -> int:
         return len(self.keypoints)
@@ -113,12 +115,13 @@ def windows_of(log: GapLog, *, length: float = WINDOW) -> Windows:
             f"Keypoint {', '.join(map(str, unseen))} is never observed: leave it out of keypoints and of "
             "meta.keypoint_arclength_m."
         )
-    pieces = []
+    pieces, left_out = [], []
     for e, count in enumerate(log.episode_length):
         for begin in range(0, int(count), samples):
             size = min(samples, int(count) - begin)
-            if size * interval >= _SHORTEST and np.isfinite(points[e, begin : begin + 2, free]).all():
-                pieces.append((e, begin, size))
+            if size * interval >= _SHORTEST:
+                whole = np.isfinite(points[e, begin : begin + 2, free]).all()
+                (pieces if whole else left_out).append((e, begin, size))
     if not pieces:
         raise ValueError(f"No episode has {_SHORTEST:g} s that begin with two samples of all keypoints.")
 
@@ -145,6 +148,7 @@ def windows_of(log: GapLog, *, length: float = WINDOW) -> Windows:
         arclength=np.append(s[free], last) - first,
         n_keypoints=len(s),
         gravity=tuple(log.meta["gravity_m_per_s2"]),
+        left_out=tuple(f"file {files[e]} from {begin * interval:.3g} s" for e, begin, _ in left_out),
     )
 
 
