@@ -15,6 +15,7 @@ from cablejax.diagnose.belief import Calibration
 from cablejax.diagnose.diagnosis import CableDiagnosis, Gap, Ranked, Verdict
 from cablejax.diagnose.judgement import judged, verdict_sentence
 from cablejax.diagnose.protocol import explanation
+from cablejax.simulate.rod import RodResult
 from cablejax.spatial.accidents import accident_sentences, kept, moderated, off
 from cablejax.spatial.cable import errors
 from cablejax.spatial.clock import on_one_clock
@@ -80,11 +81,11 @@ def diagnose_space(
         progress(change.sentence)
     found = identify(windows, stiffness, only=only, state=state, progress=progress)
 
-    before, after = found.cable.motion(explanation()), found.unseen()
+    before, (after, results) = found.cable.motion(explanation()), found.unseen()
     noise = noise_of(windows)
     lost = ~np.array([np.isfinite(part[valid]).all() for part, valid in zip(after, windows.valid, strict=True)])
     error = errors(after, windows)
-    use = np.flatnonzero(kept(lost | off(error)))
+    use = np.flatnonzero(kept(lost | off(error) | windows.torn))
     gap = gap_of(before[use], after[use], found.cable.on(windows.chosen(use)), noise)
     verdict, equivalent = _verdict(gap, found), _equivalent(found)
     effects = ()
@@ -105,7 +106,11 @@ def diagnose_space(
         where=where,
         next_motion=None,
         baselines={},
-        caveats=(*repairs, *accident_sentences(lost, error, windows), *_caveats(log, windows, left_out, found)),
+        caveats=(
+            *repairs,
+            *accident_sentences(lost, error, windows, results == RodResult.COARSE),
+            *_caveats(log, windows, left_out, found),
+        ),
         log=log,
         nominal=nominal,
         explained=explained,

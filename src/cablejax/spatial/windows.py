@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from cablejax.cable import GRAVITY
-from cablejax.cable_length import require_fitting_length
+from cablejax.cable_length import TOLERANCE, require_fitting_length
 from cablejax.recordings.poses import rotated
 from cablejax.simulate.rod.clamps import frames_along
 from cablejax.types import GapLog
@@ -18,6 +18,8 @@ WINDOW = 5.0
 _SHORTEST = 1.0
 # A keypoint whose place in the gripper's frame stays within this is held by it [m].
 _HELD = 0.003
+# Weight in fits of a window in which the grippers are further apart than the cable is long.
+_TORN = 0.01
 
 
 @dataclasses.dataclass(frozen=True)
@@ -67,6 +69,17 @@ class Windows:
     def observed(self) -> Float[np.ndarray, "W T F 3"]:
         """The keypoints, NaN also where nothing is recorded."""
         return np.where(self.valid[:, :, None, None], self.keypoints, np.nan)
+
+    @property
+    def torn(self) -> Bool[np.ndarray, "W"]:
+        """Windows in which the grippers are further apart than the cable between them is long, beyond tolerance."""
+        return (self.apart > (1 + TOLERANCE) * self.arclength[-1]).any(axis=1)
+
+    @property
+    def apart(self) -> Float[np.ndarray, "W T"]:
+        """Distance of the two clamps [m], NaN where nothing is recorded."""
+        distance = np.linalg.norm(self.position[:, :, 1] - self.position[:, :, 0], axis=-1)
+        return np.where(self.valid, distance, np.nan)
 
     def chosen(self, index) -> Windows:
         """Some of the windows."""
@@ -133,7 +146,7 @@ def windows_of(log: GapLog, *, length: float = WINDOW) -> Windows:
         return np.stack(rows)
 
     mask = np.stack([np.arange(samples) < size for _, _, size in pieces])
-    return Windows(
+    windows = Windows(
         keypoints=cut(points[:, :, free]),
         position=cut(clamp),
         frames=cut(frames),
@@ -150,6 +163,7 @@ def windows_of(log: GapLog, *, length: float = WINDOW) -> Windows:
         gravity=tuple(log.meta["gravity_m_per_s2"]),
         left_out=tuple(f"file {files[e]} from {begin * interval:.3g} s" for e, begin, _ in left_out),
     )
+    return dataclasses.replace(windows, trust=np.where(windows.torn, _TORN, 1.0)) if windows.torn.any() else windows
 
 
 def labels(log: GapLog, *names: str, default: str | None = None) -> list[str]:
