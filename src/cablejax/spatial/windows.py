@@ -81,6 +81,12 @@ class Windows:
         distance = np.linalg.norm(self.position[:, :, 1] - self.position[:, :, 0], axis=-1)
         return np.where(self.valid, distance, np.nan)
 
+    @property
+    def speed(self) -> float:
+        """Root mean square speed of the free markers [m/s]."""
+        step = np.diff(self.observed, axis=1) / self.interval
+        return float(np.sqrt(np.nanmean((step**2).sum(axis=-1))))
+
     def chosen(self, index) -> Windows:
         """Some of the windows."""
         index = np.asarray(index, int)
