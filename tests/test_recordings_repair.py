@@ -322,6 +322,13 @@ def test_the_log_tells_of_repairs_and_carries_labels():
     np.testing.assert_array_equal(log.gripper_pose[0, :, 1, :3], log.keypoints[0, :, 8])
 
 
+def test_a_guess_is_kept_as_one():
+    takes, _ = prepare((take(swinging()),), PAIRS)
+    assert "guessed" not in gap_log_from_takes(takes, NOMINAL, source="").meta
+    guess = dataclasses.replace(NOMINAL, guessed=("linear_density_kg_per_m",))
+    assert gap_log_from_takes(takes, guess, source="").meta["guessed"] == ["linear_density_kg_per_m"]
+
+
 def test_the_arc_length_is_that_of_the_curve_and_not_of_its_chords():
     # The markers are on half a circle, at these arc lengths; straight lines between them are 0.3 % shorter.
     measured = measured_arclength((take(swinging()),))

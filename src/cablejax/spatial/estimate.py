@@ -44,7 +44,7 @@ UNMODELLED: Mapping[str, float] = MappingProxyType(
         "bending_damping": 0.13,
         "viscous_drag": 1.0,
         "quadratic_drag": 0.19,
-        "drag": 0.39,
+        "drag": 0.4,
         "stiffness_profile": 0.08,
         "gripper_rotation_offset": 0.06,
     }
