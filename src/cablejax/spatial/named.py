@@ -70,7 +70,7 @@ def quantities_of(found: Identified, estimate: Estimate, density: float | None) 
 
 
 def _narrow(parameter: ParameterEstimate) -> bool:
-    low, high = parameter.ci90 or (0.0, np.inf)
+    low, high = np.ravel(np.array(parameter.ci90))
     return bool(parameter.value / low <= IDENTIFIABLE and high / parameter.value <= IDENTIFIABLE)
 
 
