@@ -34,7 +34,7 @@ from cablejax.spatial.estimate import UNMODELLED, Estimate, Interval, estimate, 
 from cablejax.spatial.identify import Identified, identify
 from cablejax.spatial.named import parameters_of
 from pages import markdown_table, publish
-from real_cables.benchmark import protocol_windows
+from real_cables.protocol import protocol_windows
 from real_cables.synthetic import RECORDINGS, SAMPLES, Law, SyntheticCable, synthetic_recordings
 from rows import Rows
 
@@ -47,6 +47,8 @@ REPORTED = {
     "gripper_rotation_offset": "angle_rad",
 }
 """Other parameters whose intervals are judged; the true places of the markers (`keypoint_bias`) are not kept."""
+SPEED = 0.6
+"""Of the grippers of synthetic recordings, root mean square [m/s]."""
 LAWS: tuple[Law, ...] = ("as fitted", "richer")
 STIFFNESS = "bending_stiffness, ratio"
 CACHE = Path("docs") / "results" / "trials" / "interval_coverage.jsonl"
@@ -171,6 +173,9 @@ def main() -> None:
         rows = [row for row in done if calibrates(row) and row.law == "richer"]
         for name in (STIFFNESS, *rows[0].others):
             print(f"{name}: {besides([with_truth(row, name) for row in rows], angle=is_angle(name)):.3f}")
+        print(
+            f"drag, both at {SPEED:g} m/s, as if its own interval were nothing: {besides(list(map(drag_of, rows))):.3f}"
+        )
         return
     wanted = itertools.product(range(options.cables), LAWS)
     rows.run(rows.missing(wanted), lambda seed, law: dataclasses.asdict(trial(seed, law, options.cache)))
@@ -190,7 +195,14 @@ def with_truth(row: Row, name: str) -> list[float]:
     return [true_stiffness(row), *row.everything] if name == STIFFNESS else row.others[name]
 
 
-def besides(of: list[list[float]], *, angle: bool) -> float:
+def drag_of(row: Row) -> list[float]:
+    """True value and estimate of both drags together at the grippers' speed; the estimate for its interval too."""
+    parts = [row.others[f"{name}, {REPORTED[name]}"][:2] for name in ("viscous_drag", "quadratic_drag")]
+    true, value = (linear + SPEED * quadratic for linear, quadratic in zip(*parts, strict=True))
+    return [true, value, value, value]
+
+
+def besides(of: list[list[float]], *, angle: bool = False) -> float:
     """The least standard deviation to be added with which nine of ten intervals hold the true value."""
     true, value, low, high = (np.array(of) if angle else np.log(of)).T
     half = np.maximum(high - value, value - low)

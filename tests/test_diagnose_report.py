@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import html as html_module
 import html.parser
 import json
 import re
@@ -19,9 +18,10 @@ from cablejax.diagnose.where import localise
 from cablejax.report.diagnosis_charts import ranking_figure
 from cablejax.report.diagnosis_page import write_diagnosis_page
 from cablejax.report.effect_words import effect_place, quantity, share
+from cablejax.report.spatial_figures import recording_ends
 from cablejax.simulate.rod import Rod
 from cablejax.spatial.cable import SpatialCable
-from cablejax.spatial.gap import gap_of, noise_of
+from cablejax.spatial.gap import constant_offset, gap_of, noise_of
 from cablejax.spatial.identify import layout_of
 from cablejax.spatial.where import in_log, where_of
 from cablejax.spatial.windows import windows_of
@@ -280,6 +280,7 @@ def test_verdict_has_the_formats_effects():
 def space(tmp_path_factory):
     """A made-up diagnosis in space that a forward search came to, and its page."""
     log = spatial_cases.recording()
+    log = dataclasses.replace(log, meta={**log.meta, "recording": ["a", "a", "b", "c"]})
     windows = windows_of(log)
     cable = SpatialCable(Rod(16, twisting=False), layout_of(windows, spatial_cases.NOMINAL), windows)
     noise, along = noise_of(windows), np.sin(np.pi * np.linspace(0, 1, windows.keypoints.shape[2]))[:, None]
@@ -298,7 +299,15 @@ def space(tmp_path_factory):
             ),
         ),
         equivalent=(),
-        ranking=(Ranked("bending_stiffness", None, 0.9, 8.0), Ranked("quadratic_drag", None, -3.19, 30.0)),
+        ranking=(
+            Ranked("quadratic_drag", None, -3.19, 30.0, "did not help"),
+            Ranked("bending_stiffness", None, 0.9, 8.0, "kept"),
+            Ranked("lumped_mass", None, -0.5, 40.0, "not judged"),
+        ),
+        quantities={
+            "stiffness_over_density_m4_per_s2": stiffness,
+            "constant_offset_m": ParameterEstimate(constant_offset(after, windows), None, "m"),
+        },
         leftover_p=None,
         gap=gap_of(before, after, cable, noise),
         where=where_of(log, windows, nominal, before, noise, ()),
@@ -319,7 +328,7 @@ def space(tmp_path_factory):
 
 def test_in_space_what_was_not_computed_is_null_and_not_on_the_page(space):
     result, page, verdict = space
-    assert [entry["probability"] for entry in (*verdict["effects"], *verdict["ranking"])] == [None] * 3
+    assert [entry["probability"] for entry in (*verdict["effects"], *verdict["ranking"])] == [None] * 4
     assert verdict["next_motion"] is None and verdict["gap"]["split"]["learnable"] is None
     where = result.where
     assert (where.bend_per_m, where.episode_p, where.keypoint_p) == (None, None, None)
@@ -331,11 +340,19 @@ def test_in_space_the_page_describes_the_search_the_noise_and_the_units(space):
     result, page, verdict = space
     figure = ranking_figure(result)
     assert figure is not None and len(figure.axes) == 1
-    assert [text.get_text() for text in figure.axes[0].texts] == ["90", "-319"]
+    assert [text.get_text() for text in figure.axes[0].texts] == ["-319", "90", "-50"]
+    names = [label.get_text() for label in figure.axes[0].get_yticklabels()]
+    assert names == ["quadratic drag, did not help", "bending stiffness, kept", "lumped mass, not judged"]
+    assert page.index("<td>did not help") < page.index("<td>kept") < page.index("<td>not judged")
+    assert [entry["outcome"] for entry in verdict["ranking"]] == ["did not help", "kept", "not judged"]
     assert "forward search" in page and "Every effect alone" not in page and "tried alone" not in page
     assert "-319 %" in page
-    assert "without the markers' constant offsets" in html_module.unescape(page)
-    assert "0.060 m^4/s^2 (0.050 to 0.070)" in page
+    # 4 mm in each coordinate at the middle of the cable, always: root of the mean of (4 sin)^2 over six markers
+    assert "constant offsets of keypoints 2.6 mm" in page
+    assert page.count("0.060 m^4/s^2 (0.050 to 0.070)") == 2
+    assert verdict["quantities"]["stiffness_over_density_m4_per_s2"]["ci90"] == [0.05, 0.07]
+    assert recording_ends(result, np.arange(4)).tolist() == [2, 3]
+    assert recording_ends(result, np.array([0, 1])).tolist() == []
     # sizes without a test: no statement on which files deviate
     assert "It is largest in file" in page and "of 4 only" not in page
     assert verdict["where"]["along_cable_mm"][4] == pytest.approx(30, rel=0.1)

@@ -11,7 +11,7 @@ from cablejax.simulate.rod import Rod
 from cablejax.spatial.accidents import off
 from cablejax.spatial.cable import SpatialCable, errors
 from cablejax.spatial.identify import EDGES, layout_of
-from real_cables.benchmark import protocol_windows
+from real_cables.protocol import protocol_windows
 from recording_cases import DATA, needs_deform
 
 # EI/rho over the nominal one, damping time [s]; logarithm of the profile; rotation of either clamp [rad].

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from real_cables.benchmark import protocol_windows
+from real_cables.protocol import protocol_windows
 from real_cables.synthetic import MARKERS, SAMPLES, drawn_cable, synthetic_recordings
 
 pytestmark = pytest.mark.slow

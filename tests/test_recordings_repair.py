@@ -5,13 +5,15 @@ import dataclasses
 import numpy as np
 import pytest
 
+import recording_cases
 from cablejax.recordings.assemble import Nominal, gap_log_from_takes, measured_arclength
+from cablejax.recordings.deform import read_deform, takes_of
 from cablejax.recordings.frames import Frame
 from cablejax.recordings.gaps import cut_at_gaps
 from cablejax.recordings.marker_order import restore_order
 from cablejax.recordings.prepare import Setup, prepare
 from cablejax.recordings.take import Take
-from recording_cases import DT, SPACING, swinging, take
+from recording_cases import DATA, DT, SPACING, needs_deform, swinging, take
 
 HELD = (0, 1, 7, 8)
 PAIRS = Setup(unit="m", on_grippers="pairs")
@@ -76,6 +78,68 @@ def test_columns_in_a_wrong_order_are_refused():
     points = swinging()[:, [0, 4, 1, 5, 2, 6, 3, 7, 8]]
     with pytest.raises(ValueError, match=r"folds back .* 100 % of the samples: give the keypoints in their order"):
         restore_order((take(points),))
+
+
+def branched(seed: int = 0) -> np.ndarray:
+    """A parent of nine markers, and branches of three markers that leave it at its fourth, of two at its sixth."""
+    parent = swinging(seed=seed, phase=seed)
+    time = DT * np.arange(len(parent)) + seed
+    down = np.stack([0.3 * np.sin(4 * time), 0.3 * np.cos(3 * time), -np.ones_like(time)], axis=-1)[:, None]
+    down /= np.linalg.norm(down, axis=-1, keepdims=True)
+    first = parent[:, 3:4] + 0.08 * np.arange(1, 4)[:, None] * down
+    second = parent[:, 5:6] + 0.09 * np.arange(1, 3)[:, None] * (0.8 * down + 0.6 * np.array([0.0, 1.0, 0.0]))
+    return np.concatenate([parent, first, second], axis=1)
+
+
+def test_a_branched_cable_is_refused_by_that_name():
+    takes = tuple(take(branched(seed), str(seed)) for seed in range(3))
+    with pytest.raises(ValueError, match="This is a branched cable") as refused:
+        prepare(takes, PAIRS)
+    text = str(refused.value)
+    assert "give keypoints 0 to 8" in text and "keypoints 9 to 11 leave it at keypoint 3" in text
+    assert "keypoints 12 to 13 leave it at keypoint 5" in text and "leave out 9 to 13" in text
+    assert "lacks that of the branches" in text
+    parents = [dataclasses.replace(one, keypoints=one.keypoints[:, :9]) for one in takes]
+    assert len(prepare(tuple(parents), PAIRS)[0]) == 3
+
+
+def test_a_branch_may_begin_on_top_of_the_parent():
+    points = branched()
+    points = np.concatenate([points[:, :9], points[:, 3:4] + 0.002, points[:, 9:12]], axis=1)
+    with pytest.raises(ValueError, match="keypoints 9 to 12 leave it at keypoint 3"):
+        restore_order((take(points),))
+
+
+@pytest.mark.parametrize(
+    "order", [[0, 2, 4, 6, 8, 1, 3, 5, 7], [4, 5, 0, 1, 7, 8, 2, 3, 6], [3, 6, 2, 7, 1, 8, 0, 5, 4]]
+)
+def test_a_wrong_order_is_no_branch(order):
+    with pytest.raises(ValueError, match="folds back"):
+        restore_order((take(swinging()[:, order]),))
+
+
+def test_two_cables_in_one_folder_are_refused(monkeypatch):
+    first = others(4)
+    with monkeypatch.context() as patch:
+        patch.setattr(recording_cases, "SPACING", np.array([0.03, 0.11, 0.12, 0.1, 0.08, 0.1, 0.1, 0.04]))
+        second = tuple(take(swinging(seed=seed), name) for seed, name in ((7, "x"), (8, "y")))
+    with pytest.raises(ValueError, match=r"of 2 cables: in take x, y the keypoints .* other 4 .* Import each cable by"):
+        prepare((*first[:2], *second, *first[2:]), PAIRS)
+    assert len(prepare(first, PAIRS)[0]) == 4 and len(prepare(second, PAIRS)[0]) == 2
+    # a marker that slipped, and another grip, are still the same cable
+    slipped, gripped = swinging(seed=5), swinging(seed=6)
+    slipped[:, 4] += 0.15 * (slipped[:, 5] - slipped[:, 4])
+    gripped[:, 1] += 0.3 * (gripped[:, 0] - gripped[:, 1])
+    assert len(prepare((*first, take(slipped, "slipped"), take(gripped, "gripped")), PAIRS)[0]) == 6
+
+
+@needs_deform
+def test_two_of_the_real_cables_are_two():
+    both = [takes_of(read_deform(DATA / "deform" / f"DLO{k}.npz")) for k in (2, 3)]
+    for some in both:
+        assert len(prepare(some, Setup(unit=None))[0]) >= 70
+    with pytest.raises(ValueError, match="of 2 cables: in take"):
+        prepare((*both[0][:20], *both[1][:5]), Setup(unit=None))
 
 
 def samples_of(takes: tuple[Take, ...]) -> list[tuple[str, int]]:
@@ -256,6 +320,13 @@ def test_the_log_tells_of_repairs_and_carries_labels():
     own_x = np.stack([1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)], axis=-1)
     np.testing.assert_allclose(own_x, tangent / np.linalg.norm(tangent, axis=1, keepdims=True), atol=1e-4)
     np.testing.assert_array_equal(log.gripper_pose[0, :, 1, :3], log.keypoints[0, :, 8])
+
+
+def test_a_guess_is_kept_as_one():
+    takes, _ = prepare((take(swinging()),), PAIRS)
+    assert "guessed" not in gap_log_from_takes(takes, NOMINAL, source="").meta
+    guess = dataclasses.replace(NOMINAL, guessed=("linear_density_kg_per_m",))
+    assert gap_log_from_takes(takes, guess, source="").meta["guessed"] == ["linear_density_kg_per_m"]
 
 
 def test_the_arc_length_is_that_of_the_curve_and_not_of_its_chords():

@@ -8,12 +8,16 @@ import numpy as np
 import pytest
 
 import spatial_cases as cases
-from cablejax.diagnose.fit import evaluate
+from cablejax.bounded import Result
+from cablejax.diagnose.fit import evaluate, improved
 from cablejax.diagnose.protocol import explanation
-from cablejax.simulate.rod import Rod
+from cablejax.simulate.rod import Rod, RodResult
+from cablejax.spatial import identify
 from cablejax.spatial.accidents import accident_sentences, compared, kept, moderated, off, trust
 from cablejax.spatial.cable import SpatialCable, errors
-from cablejax.spatial.identify import layout_of
+from cablejax.spatial.diagnose import diagnose_space
+from cablejax.spatial.identify import begins_for_all, layout_of, selection
+from cablejax.spatial.memory import Memory
 from cablejax.spatial.search import Step, falls, search
 from cablejax.spatial.windows import windows_of
 
@@ -104,9 +108,95 @@ def test_the_reader_learns_which_windows_and_what_was_done_with_them(with_a_lost
     windows = with_a_lost_window[0].windows.chosen([0, 1, 2, 3] * 6)
     lost, error = np.zeros(24, bool), _USUAL.copy()
     lost[5], error[5], error[6] = True, 0.7, 0.3
-    first, second = accident_sentences(lost, error, windows)
+    none = np.zeros(24, bool)
+    first, second = accident_sentences(lost, error, windows, none)
     assert "1 of 24 windows could not be simulated" in first and "(700 mm)" in first and "left out" in first
     assert "1 of 24 windows are off" in second and "(300 mm)" in second
-    (many,) = accident_sentences(np.arange(24) < 8, _USUAL, windows)
+    (many,) = accident_sentences(np.arange(24) < 8, _USUAL, windows, none)
     assert "too many to be left out" in many and "and 3 more" in many
-    assert accident_sentences(np.zeros(24, bool), _USUAL, windows) == []
+    assert accident_sentences(none, _USUAL, windows, none) == []
+    (coarse,) = accident_sentences(none, _USUAL, windows, np.arange(24) == 4)
+    assert "1 of 24 windows were simulated with larger errors" in coarse and "file 0 from 0 s" in coarse
+
+
+def test_how_each_simulation_ended_is_known(with_a_lost_window):
+    _, broken = with_a_lost_window
+    one = explanation((broken.layout.named("bending_stiffness"), 0, (2.0,)))
+    points, results = broken.rollouts(one)
+    assert results[1] == RodResult.UNSOLVED and (np.delete(results, 1) == RodResult.SOLVED).all()
+    # no time step is short enough for such a local error
+    strict = dataclasses.replace(broken, rod=dataclasses.replace(broken.rod, local_error=1e-9))
+    found, results = strict.rollouts(one)
+    assert results[1] == RodResult.UNSOLVED and (np.delete(results, 1) == RodResult.COARSE).all()
+    assert np.isfinite(np.delete(found, 1, 0)).all() and not np.array_equal(found[0], points[0])
+
+
+def test_windows_that_do_not_begin_with_all_keypoints_are_counted():
+    log = cases.recording()
+    points = log.keypoints.copy()
+    points[2, 1, 4] = np.nan
+    windows = windows_of(dataclasses.replace(log, keypoints=points))
+    assert windows.name == ("0", "1", "3") and windows.left_out == ("file 2 from 0 s",)
+    error, none = np.full(3, 0.004), np.zeros(3, bool)
+    (sentence,) = accident_sentences(none, error, windows, none)
+    assert sentence.startswith("1 more windows do not begin") and "file 2 from 0 s." in sentence
+    assert windows_of(log).left_out == ()
+
+
+def torn(episodes: int = 4):
+    """A log whose gripper 1 is 0.6 m too far away in episode 1, from 0.8 s to 0.9 s."""
+    log = cases.recording(episodes)
+    points, pose = log.keypoints.copy(), log.gripper_pose.copy()
+    points[1, 40:45, -2:, 0] += 0.6
+    pose[1, 40:45, 1, 0] += 0.6
+    return dataclasses.replace(log, keypoints=points, gripper_pose=pose)
+
+
+def test_grippers_that_tear_the_cable_are_named():
+    windows = windows_of(torn())
+    assert windows.torn.tolist() == [False, True, False, False]
+    assert windows.trust is not None and windows.trust[1] < 0.02 and (np.delete(windows.trust, 1) == 1).all()
+    assert 1 not in selection(windows) and len(selection(windows)) == 3
+    cable = SpatialCable(Rod(8, 1, twisting=False), layout_of(windows, cases.NOMINAL), windows)
+    trusted = cable.trusting(np.full(4, 0.004)).windows.trust
+    assert trusted is not None and trusted[1] == windows.trust[1]
+    none = np.zeros(4, bool)
+    (sentence,) = accident_sentences(none, np.full(4, 0.004), windows, none)
+    assert sentence.startswith("1 of 4 windows have the grippers further apart than the 0.9 m")
+    assert "file 1 at 0.8" in sentence and "tear" in sentence
+    # as far apart as the cable is long is nothing
+    assert not windows_of(cases.recording()).torn.any() and windows_of(cases.recording()).trust is None
+
+
+@pytest.mark.slow
+def test_what_is_not_torn_is_diagnosed():
+    found = diagnose_space(torn(10), only=["bending_stiffness", "bending_damping"])
+    assert {effect.name for effect in found.effects} == {"bending_stiffness", "bending_damping"}
+    assert found.gap.shrinkage is not None and found.gap.shrinkage > 0.9
+    assert any("1 of 10 windows have the grippers further apart" in text for text in found.caveats)
+    assert 1 not in found.gap.held_out_episodes
+
+
+def test_the_fit_to_all_begins_where_its_cost_is_lowest(monkeypatch):
+    windows = windows_of(cases.recording())
+    cable = SpatialCable(Rod(8, 1, twisting=False), layout_of(windows, cases.NOMINAL), windows)
+    names = ("bending_stiffness", "bending_damping")
+
+    def one(*values):
+        return explanation(*((cable.layout.named(n), 0, (v,)) for n, v in zip(names, values, strict=True)))
+
+    good, stray = one(cases.TRUE_RATIO, cases.TRUE_DAMPING), one(0.02, 2.0)
+    costs = [fit.cost(cable.evidence()) for fit in evaluate(cable.evidence(), begins_for_all(stray, good))]
+    assert np.argmin(costs) == 2
+    memory = Memory(None, "", cable.layout)
+    memory.keep_finals([(stray, Result.CONVERGED), (good, Result.CONVERGED)])
+    begun = []
+
+    def spied(evidence, fits, steps):
+        begun.extend(fits)
+        return improved(evidence, fits, 1)
+
+    monkeypatch.setattr(identify, "improved", spied)
+    finals = identify._final_fits(cable, (stray, good), memory, lambda text: None)
+    assert len(finals) == 3
+    np.testing.assert_array_equal(begun[0].explanation.z, good.z)

@@ -16,7 +16,7 @@ from cablejax.simulate.rod import Rod
 from cablejax.spatial.cable import TWISTED, SpatialCable
 from cablejax.spatial.estimate import UNMODELLED, Interval, estimate
 from cablejax.spatial.identify import Identified, layout_of
-from cablejax.spatial.named import named_effects, parameters_of
+from cablejax.spatial.named import named_effects, parameters_of, quantities_of
 from cablejax.spatial.time_steps import TimeSteps
 from cablejax.spatial.windows import windows_of
 
@@ -92,6 +92,8 @@ def test_an_interval_grows_by_an_error_besides_and_no_less_to_its_wide_side():
 
 def test_what_is_told_is_wider_by_what_the_law_leaves_out(everything):
     for effect, more in UNMODELLED.items():
+        if effect == "drag":  # no effect by itself
+            continue
         told = parameters_of(effect, everything, 0.05)[0]
         plain = parameters_of(effect, everything, 0.05, unmodelled={})[0]
         for name, parameter in plain.items():
@@ -123,6 +125,37 @@ def test_tells_every_effect_with_its_interval(found, everything):
             if parameter.ci90 is not None:
                 low, high = np.reshape(parameter.ci90, (-1, 2)).T
                 assert (low <= np.ravel(parameter.value)).all() and (np.ravel(parameter.value) <= high).all()
+
+
+def test_ei_over_rho_is_always_told_and_ei_where_the_density_is_known(found, everything):
+    tried = dataclasses.replace(found, tried=tuple(e.name for e in found.cable.layout.effects))
+    known = quantities_of(tried, everything, 0.05)
+    ratio, stiffness = known["stiffness_over_density_m4_per_s2"], known["bending_stiffness_n_m2"]
+    assert (ratio.unit, stiffness.unit) == ("m^4/s^2", "N m^2")
+    assert ratio.ci90[0] < _TRUE_STIFFNESS < ratio.ci90[1]  # type: ignore[index]
+    assert stiffness.value == pytest.approx(0.05 * ratio.value)
+    np.testing.assert_allclose(np.array(stiffness.ci90), 0.05 * np.array(ratio.ci90))
+    assert "bending_stiffness_n_m2" not in quantities_of(tried, everything, None)
+    # nothing is known of what was not free
+    assert quantities_of(dataclasses.replace(found, tried=("bending_damping",)), everything, 0.05) == {}
+
+
+def test_drags_and_masses_are_told_as_far_as_motion_shows_them(found, everything):
+    windows, names = found.cable.windows, ("viscous_drag", "quadratic_drag", "lumped_mass")
+    tried = dataclasses.replace(found, effects=names, tried=tuple(e.name for e in found.cable.layout.effects))
+    linear, quadratic, mass = (effect.parameters for effect in named_effects(tried, everything, 0.05))
+    both = everything.drag_at(windows.speed)
+    expected = everything.positive("drag").value + windows.speed * everything.positive("quadratic_drag").value
+    assert both.value == pytest.approx(expected)
+    assert _width(both) < min(_width(everything.positive(name)) for name in ("drag", "quadratic_drag"))
+    assert linear == quadratic and set(linear) == {"drag_at_speed_per_s", "speed_m_per_s"}
+    assert linear["speed_m_per_s"].value == pytest.approx(windows.speed)
+    # there are no markers: their mass is what the prior says, and what counts is the stiffness per mass with them
+    assert set(mass) == {"centre_m", "stiffness_over_density_m4_per_s2"}
+    sure = dataclasses.replace(everything, moves=0.1 * everything.moves, shifts=0.1 * everything.shifts)
+    linear, quadratic, mass = (effect.parameters for effect in named_effects(tried, sure, 0.05))
+    assert "mass_kg" in mass and "coefficient_per_m" in quadratic and "stiffness_over_density_m4_per_s2" not in mass
+    assert "drag_at_speed_per_s" in quadratic and "coefficient_n_s_per_m2" not in linear
 
 
 def test_nothing_that_is_positive_may_be_negative(everything):

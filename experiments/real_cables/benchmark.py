@@ -1,8 +1,10 @@
-"""Real cables by the protocol of Chen et al. (2024): windows of 500 frames, split by file or by recording."""
+"""Scores real cables: split by recording, and on upstream's eval split where there is one."""
 
 from __future__ import annotations
 
 import dataclasses
+import hashlib
+import inspect
 import pathlib
 import time
 from collections.abc import Callable
@@ -11,86 +13,76 @@ import numpy as np
 from jaxtyping import Float
 
 from cablejax.diagnose.protocol import Explanation
-from cablejax.npz import read_npz
+from cablejax.npz import NpzError, read_npz
 from cablejax.recordings.deform import NOMINAL, DeformRecordings
-from cablejax.simulate.rod.clamps import frames_along
+from cablejax.spatial.accidents import moderated, off
 from cablejax.spatial.cable import errors, over_all_markers
 from cablejax.spatial.estimate import estimates_of_halves
 from cablejax.spatial.identify import Identified, identify
 from cablejax.spatial.windows import Windows
+from cablejax.whole_file import whole_file
+from real_cables import features, network, residual
 from real_cables.network import fit_network
+from real_cables.protocol import protocol_windows
 from real_cables.residual import fit_residual
 
-# Quantile of a spacing over all samples that is taken for the arc length between two markers: where it is straight.
-_STRAIGHT = 0.75
-_JUMP = 0.002
 _DRAWS = 5000
 _LEARNED = ("rod", "rod + ridge", "rod + graph network", "rod + graph network + ridge")
 
 
-def protocol_windows(recordings: DeformRecordings) -> Windows:
-    """Every block as one window. Swapped pairs are put right; samples after a jump in time are not fitted nor scored by
-    `Windows.valid`, but simulated through."""
-    points = recordings.keypoints.copy()
-    for outer, inner, third in ((0, 1, 2), (-1, -2, -3)):
-        near, far = (np.linalg.norm(points[:, :, k] - points[:, :, third], axis=-1) for k in (outer, inner))
-        swapped = (far > near)[:, :, None, None]
-        pair = [outer, inner]
-        points[:, :, pair] = np.where(swapped, points[:, :, pair[::-1]], points[:, :, pair])
-    step = np.median(np.linalg.norm(np.diff(points, axis=1), axis=-1), axis=2)
-    padded = np.pad(step, ((0, 0), (1, 1)))
-    jump = step > 2 * np.maximum(padded[:, :-2], padded[:, 2:]) + _JUMP
-    count = np.where(jump.any(axis=1), jump.argmax(axis=1) + 1, points.shape[1])
-    tangent = np.stack([points[:, :, 1] - points[:, :, 0], points[:, :, -1] - points[:, :, -2]], axis=2)
-    tangent = tangent / np.linalg.norm(tangent, axis=-1, keepdims=True)
-    spacing = np.linalg.norm(np.diff(points[recordings.split == "train"][:, ::5], axis=2), axis=-1)
-    lengths = np.quantile(spacing.reshape(-1, spacing.shape[-1]), _STRAIGHT, axis=0)[1:-1]
-    return Windows(
-        keypoints=points[:, :, 2:-2],
-        position=points[:, :, [1, -2]],
-        frames=np.stack([frames_along(tangent[:, :, q]) for q in range(2)], axis=2),
-        valid=np.arange(points.shape[1]) < count[:, None],
-        interval=recordings.dt,
-        episode=np.arange(len(points)),
-        begin=np.zeros(len(points), int),
-        group=recordings.recording,
-        split=tuple(recordings.split),
-        name=tuple(str(n) for n in recordings.source_id),
-        held=(2, 2),
-        arclength=np.cumsum(lengths),
-        n_keypoints=points.shape[2],
-    )
+@dataclasses.dataclass(frozen=True)
+class Errors:
+    """Of some windows: mean absolute error of a coordinate over all markers, held ones counted as 0.
+
+    Attributes:
+        mean: over windows, none counted as more than ten times the median (`accidents.moderated`) [mm].
+        plain: over windows as they are; what a simulation has lost is off by a metre [mm].
+        lost: number of windows that could not be simulated to their end.
+        off: number of windows that were lost or are off by more than ten times the median.
+        windows: their number.
+    """
+
+    mean: float
+    plain: float
+    lost: int
+    off: int
+    windows: int
 
 
 @dataclasses.dataclass(frozen=True)
 class CableScore:
-    """Errors of one cable, mean absolute coordinate error over all markers, held ones counted as 0 [mm].
+    """Errors of one cable. What is of upstream's eval split is None where the recordings have none.
 
     Attributes:
-        stages: of the search (name, on recordings of the train split that the fit has not seen, on the eval split);
-            both are means over the fits to either half of the recordings.
-        learned: (name, split by recording, on the eval split, 5 and 95 % quantile over random choices of as many of all
-            windows as eval has) of the rod with all effects and of what is learned on top of it.
+        stages: of the search (name, on recordings that the fit has not seen, on the eval split) [mm]; both are means
+            over the fits to either half of the recordings.
+        learned: (name, split by recording, on the eval split, 5 and 95 % quantile over draws with replacement of as
+            many of all windows as eval has [mm]) of the rod with all effects and of what is learned on top of it.
         without_own: the rod on the eval split, its recordings' own values left at what all recordings share.
         simulated: EI / rho that either half of the recordings is simulated with [m^4/s^2].
         estimated: EI / rho of either half as `estimate` reports it, with its 90 % interval [m^4/s^2].
-        seconds: of one 5 s rollout alone (median), and of a batch of all windows.
+        seconds: of one rollout alone (median), and of a batch of all windows.
+        length: of a window [s].
+        left_out: blocks that do not begin with two samples of all markers.
         effects: that were found.
-        networks: size and rounds that were chosen for the graph network of all, and of either half.
+        networks: size and rounds that were chosen for the graph network of all (where there is an eval split), and of
+            either half.
     """
 
-    stages: tuple[tuple[str, float, float], ...]
-    learned: tuple[tuple[str, float, float, float, float], ...]
-    without_own: float
+    stages: tuple[tuple[str, float, float | None], ...]
+    learned: tuple[tuple[str, Errors, Errors | None, tuple[float, float] | None], ...]
+    without_own: Errors | None
     simulated: tuple[float, ...]
     estimated: tuple[tuple[float, float, float], ...]
     seconds: tuple[float, float]
+    length: float
+    left_out: tuple[str, ...]
     effects: tuple[str, ...]
     networks: tuple[tuple[int, int], ...]
 
 
 def score_cable(recordings: DeformRecordings, *, state: pathlib.Path, progress: Callable[[str], None]) -> CableScore:
-    """Identifies a cable on upstream's train split and scores every stage, the eval split only at the very end.
+    """Identifies a cable on all but upstream's eval split and scores every stage, the eval split only at the very end.
 
     Args:
         recordings: of the cable.
@@ -98,58 +90,89 @@ def score_cable(recordings: DeformRecordings, *, state: pathlib.Path, progress: 
         progress: called with a line of text.
     """
     windows = protocol_windows(recordings)
-    split = np.array(windows.split)
-    train, kept = (windows.chosen(np.flatnonzero(split == name)) for name in ("train", "eval"))
+    is_eval = np.array(windows.split) == "eval"
+    is_eval &= not is_eval.all()
+    train = windows.chosen(np.flatnonzero(~is_eval))
     nominal = NOMINAL.bending_stiffness / NOMINAL.linear_density
     found = identify(train, nominal, state=state / f"{recordings.name}_search.json", progress=progress)
+    by_recording, networks = _by_recording(found, train, state / recordings.name, progress)
     # scored as published: every frame, whatever was lost in between
-    whole = dataclasses.replace(kept, valid=np.ones_like(kept.valid))
+    kept = windows.chosen(np.flatnonzero(is_eval))
+    kept = dataclasses.replace(kept, valid=np.ones_like(kept.valid)) if is_eval.any() else None
+    on_eval, without_own = {}, None
+    if kept is not None:
+        on_kept = found.cable.on(kept)
+        progress("learning corrections, all recordings")
+        path = state / f"{recordings.name}_all.npz"
+        simulated, final = found.cable.motion(found.everything), on_kept.motion(found.everything)
+        on_eval, chosen = _learned(simulated, train, final, kept, path, progress)
+        networks = [chosen, *networks]
+        without_own = errors_of(on_kept.motion(shared_only(found.everything)), kept)
 
-    by_recording = {name: np.zeros_like(train.keypoints) for name in _LEARNED}
-    networks = []
+    stages, share = [], train.keypoints.shape[2] / train.n_keypoints
+    for step in found.steps:
+        if step.accepted:
+            name = f"+ {step.effect}" if step.effect else "nominal"
+            scored = None
+            if kept is not None:
+                scored = float(np.mean([errors_of(found.cable.on(kept).motion(h), kept).mean for h in step.halves]))
+            stages.append((name, 1e3 * share * float(moderated(step.error).mean()), scored))
+    learned = []
+    for name in _LEARNED:
+        scored, spread = None, None
+        if kept is not None:
+            scored = errors_of(on_eval[name], kept)
+            spread = spread_of(np.append(_metric(by_recording[name], train), _metric(on_eval[name], kept)), len(kept))
+        learned.append((name, errors_of(by_recording[name], train), scored, spread))
+    return CableScore(
+        stages=tuple(stages),
+        learned=tuple(learned),
+        without_own=without_own,
+        simulated=tuple(found.stiffness(one) for one in found.halves),
+        estimated=tuple(dataclasses.astuple(half.stiffness) for half in estimates_of_halves(found, progress=progress)),
+        seconds=_seconds(found, windows),
+        length=windows.keypoints.shape[1] * windows.interval,
+        left_out=windows.left_out,
+        effects=found.effects,
+        networks=tuple(networks),
+    )
+
+
+def _by_recording(found: Identified, train: Windows, path: pathlib.Path, progress):
+    """Predictions of every window from the half of the recordings that it is not part of, by name, and networks."""
+    by_recording, networks = {name: np.zeros_like(train.keypoints) for name in _LEARNED}, []
     for k, one in enumerate(found.halves):
         half = found.first if k == 0 else ~found.first
         part, other = (train.chosen(np.flatnonzero(use)) for use in (half, ~half))
         # a recording that is not seen has no values of its own; nor have those that its corrections are learned from
         fitted, unseen = (found.cable.on(w).motion(shared_only(one)) for w in (part, other))
         progress(f"learning corrections, half {k + 1}")
-        path = state / f"{recordings.name}_half{k + 1}.npz"
-        corrected, network = _learned(fitted, part, unseen, other, path, progress)
-        networks.append(network)
+        file = path.with_name(f"{path.name}_half{k + 1}.npz")
+        corrected, chosen = _learned(fitted, part, unseen, other, file, progress)
+        networks.append(chosen)
         for name, predicted in corrected.items():
             by_recording[name][~half] = predicted
-    on_whole = found.cable.on(whole)
-    final = on_whole.motion(found.everything)
-    progress("learning corrections, all of train")
-    path = state / f"{recordings.name}_all.npz"
-    on_eval, network = _learned(found.cable.motion(found.everything), train, final, whole, path, progress)
+    return by_recording, networks
 
-    def metric(predicted, of) -> Float[np.ndarray, "W"]:
-        return 1e3 * over_all_markers(errors(predicted, of), of)
 
-    stages, share = [], train.keypoints.shape[2] / train.n_keypoints
-    for step in found.steps:
-        if step.accepted:
-            scored = [metric(on_whole.motion(one), whole).mean() for one in step.halves]
-            name = f"+ {step.effect}" if step.effect else "nominal"
-            stages.append((name, 1e3 * share * float(step.error.mean()), float(np.mean(scored))))
-    learned, draws = [], np.random.default_rng(0)
-    for name in _LEARNED:
-        unseen, scored = metric(by_recording[name], train), metric(on_eval[name], whole)
-        everything = np.concatenate([unseen, scored])
-        means = [draws.choice(everything, len(kept), replace=False).mean() for _ in range(_DRAWS)]
-        low, high = np.quantile(means, [0.05, 0.95])
-        learned.append((name, float(unseen.mean()), float(scored.mean()), float(low), float(high)))
-    return CableScore(
-        stages=tuple(stages),
-        learned=tuple(learned),
-        without_own=float(metric(on_whole.motion(shared_only(found.everything)), whole).mean()),
-        simulated=tuple(found.stiffness(one) for one in found.halves),
-        estimated=tuple(dataclasses.astuple(half.stiffness) for half in estimates_of_halves(found, progress=progress)),
-        seconds=_seconds(found, windows),
-        effects=found.effects,
-        networks=(network, *networks),
+def _metric(predicted: Float[np.ndarray, "W T F 3"], windows: Windows) -> Float[np.ndarray, "W"]:
+    return 1e3 * over_all_markers(errors(predicted, windows), windows)
+
+
+def errors_of(predicted: Float[np.ndarray, "W T F 3"], windows: Windows) -> Errors:
+    """Errors of predictions [m] of windows."""
+    each, seen = _metric(predicted, windows), np.isfinite(windows.observed)
+    lost = (seen & ~np.isfinite(predicted)).any(axis=(1, 2, 3))
+    return Errors(
+        float(moderated(each).mean()), float(each.mean()), int(lost.sum()), int((lost | off(each)).sum()), len(each)
     )
+
+
+def spread_of(each: Float[np.ndarray, "W"], count: int) -> tuple[float, float]:
+    """5 and 95 % quantile of the moderated mean over so many windows, drawn with replacement as upstream does."""
+    draws = np.random.default_rng(0).integers(len(each), size=(_DRAWS, count))
+    low, high = np.quantile(moderated(each)[draws].mean(axis=1), [0.05, 0.95])
+    return float(low), float(high)
 
 
 def shared_only(one: Explanation) -> Explanation:
@@ -159,22 +182,43 @@ def shared_only(one: Explanation) -> Explanation:
 
 def _learned(fitted, windows: Windows, simulated, others: Windows, path: pathlib.Path, progress):
     """Predictions of `others` with what is learned on `windows`, by name, and the network's size and rounds."""
-    if not path.exists():
-        network = fit_network(fitted, windows, progress=progress)
-        on_top = fit_residual(network.left_out, windows)
-        with_network = network.correct(simulated, others)
+    made_from = learned_from(fitted, windows, simulated, others)
+    kept = _kept(path)
+    if kept is None or str(kept["fingerprint"]) != made_from:
+        trained = fit_network(fitted, windows, progress=progress)
+        on_top = fit_residual(trained.left_out, windows)
+        with_network = trained.correct(simulated, others)
         arrays = (
             simulated,
             fit_residual(fitted, windows).correct(simulated, others),
             with_network,
             on_top.correct(with_network, others),
         )
+        kept = {"fingerprint": made_from, "network": np.array([trained.size, trained.rounds])}
+        kept |= dict(zip(_LEARNED, arrays, strict=True))
         path.parent.mkdir(parents=True, exist_ok=True)
-        partial = path.with_suffix(".partial.npz")
-        np.savez(partial, network=(network.size, network.rounds), **dict(zip(_LEARNED, arrays, strict=True)))
-        partial.replace(path)
-    kept = read_npz(path, ["network", *_LEARNED])
+        with whole_file(path) as stream:
+            np.savez(stream, **kept)
     return {name: kept[name] for name in _LEARNED}, (int(kept["network"][0]), int(kept["network"][1]))
+
+
+def _kept(path: pathlib.Path) -> dict[str, np.ndarray] | None:
+    """What was learned before; None if there is nothing, or nothing that says what it was made from."""
+    try:
+        return read_npz(path, ["fingerprint", "network", *_LEARNED], text=["fingerprint"])
+    except (NpzError, FileNotFoundError):
+        return None
+
+
+def learned_from(fitted, windows: Windows, simulated, others: Windows) -> str:
+    """Fingerprint of all that learned corrections depend on: the simulation, the recordings, and how is learned."""
+    digest = hashlib.sha256(repr((windows.interval, windows.held, windows.n_keypoints)).encode())
+    for module in (network, residual, features):
+        digest.update(inspect.getsource(module).encode())
+    parts = [getattr(w, f) for w in (windows, others) for f in ("keypoints", "position", "frames", "valid", "group")]
+    for array in (fitted, simulated, windows.arclength, *parts):
+        digest.update(repr((array.shape, array.dtype.str)).encode() + np.ascontiguousarray(array).tobytes())
+    return digest.hexdigest()
 
 
 def _seconds(found: Identified, windows: Windows) -> tuple[float, float]:

@@ -99,12 +99,14 @@ class Ranked:
             effect makes these worse.
         leftover_mm: gap above the noise that is left, root mean square per coordinate [mm, or thousandths of
             `Gap.unit`], on the episodes fitted; of a forward search, on those left out.
+        outcome: of a forward search: "kept", "did not help", or "not judged" where the simulation was lost with it.
     """
 
     name: str
     probability: float | None
     held_out_shrinkage: float
     leftover_mm: float
+    outcome: str | None = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -207,7 +209,7 @@ class Diagnosis:
         sentence: the verdict in words.
         effects: what is named as the cause; empty for "none" and "unknown".
         equivalent: sets of effects that are indistinguishable on this log.
-        ranking: every effect tried, most probable first; without probabilities, the largest shrinkage first.
+        ranking: every effect tried, most probable first; of a forward search, every trial in order.
         leftover_p: chance that a right explanation leaves as much as the best one does, see `conformal`; None without a
             gap, and where no labelled logs are like this one.
         gap: before and after.
@@ -221,6 +223,8 @@ class Diagnosis:
         settings: versions and options, for the record.
         posterior: sets of effects, equally probable: draws of which explanation holds and of its parameters; empty
             where nothing is named.
+        quantities: what the log shows of the system, whether an effect is named for it or not; empty where the adapter
+            has none.
         under_laws: what the verdict would be under other laws of the simulator; `effects` and `posterior` have their
             intervals over all laws. Empty without a gap, and where the simulator offers none.
     """
@@ -240,6 +244,7 @@ class Diagnosis:
     settings: dict[str, Any]
     posterior: tuple[tuple[EffectValues, ...], ...] = ()
     under_laws: tuple[UnderLaw, ...] = ()
+    quantities: dict[str, ParameterEstimate] = dataclasses.field(default_factory=dict)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

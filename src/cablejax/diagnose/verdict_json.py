@@ -39,12 +39,12 @@ def verdict_json(diagnosis: Diagnosis) -> dict[str, Any]:
     `_mm` are null where observations are not in metres; `gap` has the sizes in their own unit too.
 
     In addition to the fields of the format it has `sentence`, `baselines`, `leftover_p`, `caveats`, `seconds`,
-    `posterior` (fields of `EffectValues`), `under_laws` (fields of `UnderLaw`) and `next_motion_worth`: fields of
-    `NextMotion`, those in nats with `_nats`, and whether no motion that was tried separates the explanations; of
-    several recordings `rounds`, the fields of `Round`, and `rounds_contradict`. `next_motion` is recommended only
-    where that is false. `gap` has also `unit`, `before_rmse`, `noise_floor`, `after_rmse`, `horizons`, `split`,
-    `ahead_mm` and `best_shrinkage`, `ranking` also `leftover_mm`, and `where` also `sentences`, `per_horizon_mm`
-    and `frames`.
+    `quantities` (by name, like an effect's parameters), `posterior` (fields of `EffectValues`), `under_laws` (fields of
+    `UnderLaw`) and `next_motion_worth`: fields of `NextMotion`, those in nats with `_nats`, and whether no motion that
+    was tried separates the explanations; of several recordings `rounds`, the fields of `Round`, and
+    `rounds_contradict`. `next_motion` is recommended only where that is false. `gap` has also `unit`, `before_rmse`,
+    `noise_floor`, `after_rmse`, `horizons`, `split`, `ahead_mm` and `best_shrinkage`, `ranking` also `leftover_mm` and
+    `outcome`, and `where` also `sentences`, `per_horizon_mm` and `frames`.
     """
     gap, rounds = diagnosis.gap, getattr(diagnosis, "rounds", None)
     return _plain(
@@ -53,6 +53,7 @@ def verdict_json(diagnosis: Diagnosis) -> dict[str, Any]:
             "verdict": diagnosis.verdict,
             "sentence": diagnosis.sentence,
             "effects": [_effect(effect) for effect in diagnosis.effects],
+            "quantities": _estimates(diagnosis.quantities),
             "equivalent": diagnosis.equivalent,
             "posterior": [[dataclasses.asdict(one) for one in draw] for draw in diagnosis.posterior],
             "under_laws": [
@@ -107,7 +108,11 @@ def read_verdict(path: str | os.PathLike[str]) -> Diagnosis:
             equivalent=tuple(tuple(map(str, group)) for group in verdict["equivalent"]),
             ranking=tuple(
                 Ranked(
-                    str(r["name"]), _number(r["probability"]), _size(r["held_out_shrinkage"]), _size(r["leftover_mm"])
+                    str(r["name"]),
+                    _number(r["probability"]),
+                    _size(r["held_out_shrinkage"]),
+                    _size(r["leftover_mm"]),
+                    r.get("outcome"),
                 )
                 for r in verdict["ranking"]
             ),
@@ -147,6 +152,7 @@ def read_verdict(path: str | os.PathLike[str]) -> Diagnosis:
                 )
                 for law in verdict.get("under_laws", ())
             ),
+            quantities={str(name): _estimate_of(one) for name, one in verdict.get("quantities", {}).items()},
         )
     except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
         reason = f"{type(error).__name__}: {error}"
@@ -197,12 +203,13 @@ def _effect(effect: NamedEffect) -> dict[str, Any]:
     return {
         "name": effect.name,
         "probability": effect.probability,
-        "parameters": {
-            name: {"value": estimate.value, "ci90": estimate.ci90, "unit": estimate.unit}
-            for name, estimate in effect.parameters.items()
-        },
+        "parameters": _estimates(effect.parameters),
         "location": {place: effect.location.get(place) for place in PLACES},
     }
+
+
+def _estimates(estimates: Mapping[str, ParameterEstimate]) -> dict[str, Any]:
+    return {name: dataclasses.asdict(estimate) for name, estimate in estimates.items()}
 
 
 def _ranked(ranked: Ranked, unit: str) -> dict[str, Any]:
@@ -211,6 +218,7 @@ def _ranked(ranked: Ranked, unit: str) -> dict[str, Any]:
         "probability": ranked.probability,
         "held_out_shrinkage": ranked.held_out_shrinkage,
         "leftover_mm": ranked.leftover_mm if unit == "m" else None,
+        "outcome": ranked.outcome,
     }
 
 

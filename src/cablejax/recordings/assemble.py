@@ -32,6 +32,7 @@ class Nominal:
         damping_time: [s].
         friction_coefficient: of the table; None = the cable hangs free.
         arclength: of each keypoint [m], starting at 0, shape [N]; None = measured along the keypoints.
+        guessed: which of the values are guesses, by their names in the log's `cable`; kept in its `meta`.
     """
 
     diameter: float
@@ -40,6 +41,7 @@ class Nominal:
     damping_time: float = 0.0
     friction_coefficient: float | None = None
     arclength: tuple[float, ...] | None = None
+    guessed: tuple[str, ...] = ()
 
 
 def gap_log_from_takes(takes: Sequence[Take], nominal: Nominal, *, source: str, repairs: Sequence[str] = ()) -> GapLog:
@@ -95,6 +97,7 @@ def gap_log_from_takes(takes: Sequence[Take], nominal: Nominal, *, source: str, 
         keypoint_arclength=arclength.tolist(),
         extra={
             "take": [take.name for take in takes],
+            **({"guessed": list(nominal.guessed)} if nominal.guessed else {}),
             **{name: [take.labels[name] for take in takes] for name in names},
         },
     )

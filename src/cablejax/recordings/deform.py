@@ -171,6 +171,7 @@ NOMINAL = Nominal(
     diameter=_DIAMETER,
     linear_density=1300.0 * np.pi * _DIAMETER**2 / 4,
     bending_stiffness=_TEXTBOOK_MODULUS * np.pi * _DIAMETER**4 / 64,
+    guessed=("diameter_m", "linear_density_kg_per_m", "bending_stiffness_n_m2"),
 )
 """A solid round cord of soft PVC or rubber, 6 mm thick: 10 MPa and 1300 kg/m^3 from tables. All of it is guessed.
 Motion under prescribed ends shows only EI per mass and length, here 0.017 m^4/s^2; neither of the two by itself."""

@@ -122,6 +122,10 @@ def read_layout(path: str | os.PathLike[str], place: str) -> Layout:
     arclength = cable.take("keypoint_arclength_m", list, "a list of numbers", None)
     if arclength is not None and not all(s in LIMITS["not_negative"] for s in arclength):
         raise ValueError(f"{path}: [cable] keypoint_arclength_m is {shown(arclength)}, expected a list of numbers.")
+    known = ("diameter_m", "linear_density_kg_per_m", "bending_stiffness_n_m2", "bending_damping_s")
+    guessed = cable.take("guessed", list, "a list of names", [])
+    if not all(name in known for name in guessed):
+        raise ValueError(f"{path}: [cable] guessed is {shown(guessed)}, expected some of {', '.join(known)}.")
     nominal = Nominal(
         diameter=cable.number("diameter_m", "diameter"),
         linear_density=cable.number("linear_density_kg_per_m", "linear_density"),
@@ -129,6 +133,7 @@ def read_layout(path: str | os.PathLike[str], place: str) -> Layout:
         damping_time=cable.number("bending_damping_s", "damping_time", 0.0),
         friction_coefficient=None if table is None else table.number("friction_coefficient", "friction_coefficient"),
         arclength=None if arclength is None else tuple(map(float, arclength)),
+        guessed=tuple(guessed),
     )
     try:
         setup = Setup(

@@ -25,6 +25,11 @@ STRETCHED = 1.6
 CLEARLY = 0.25
 """Another order must shorten the steps of the markers to this, where the cable does not fold back either way."""
 
+_BREAK, _TOUCHES, _BETWEEN = 2.0, 1.6, 1.15
+"""Where a chain goes on at a branch, the next keypoint is this many usual spacings away, another one at most the second
+number, and it does not lie between that one and a neighbour: the way by it is longer by more than the third factor."""
+_MOSTLY = 0.95
+
 # Spacings of a take that differ by more than the first factor from the usual ones, and read from the other end by less
 # than the second, are in reverse.
 _OTHER, _SAME = np.log(1.25), np.log(1.1)
@@ -40,9 +45,18 @@ def restore_order(takes: tuple[Take, ...]) -> tuple[tuple[Take, ...], list[str]]
         The takes, and one sentence for each that was changed.
 
     Raises:
-        ValueError: in most samples the cable folds back: the keypoints are not in the order of the cable.
+        ValueError: the cable is branched; or in most samples it folds back: the keypoints are not in the order of the
+            cable.
     """
     usual = typical_spacing(takes)
+    if branches := _branches(np.concatenate([take.keypoints for take in takes]), usual):
+        parent = branches[0][0]
+        where = "; ".join(f"keypoints {first} to {last} leave it at keypoint {at}" for first, last, at in branches)
+        raise ValueError(
+            f"This is a branched cable: after keypoint {parent - 1} the chain goes on beside one of its own ({where}). "
+            "Only a cable without branches is simulated. To diagnose the parent alone, give keypoints 0 to "
+            f"{parent - 1} and leave out {parent} to {branches[-1][1]}; its mass then lacks that of the branches."
+        )
     folded = np.concatenate([_worst_turn(take.keypoints) < FOLDED for take in takes])
     if folded.mean() > 0.5:
         raise ValueError(
@@ -67,6 +81,39 @@ def restore_order(takes: tuple[Take, ...]) -> tuple[tuple[Take, ...], list[str]]
             take = dataclasses.replace(take, keypoints=points)
         restored.append(take)
     return tuple(restored), repairs
+
+
+def _branches(points: Float[np.ndarray, "T N D"], usual: Float[np.ndarray, " M"]) -> list[tuple[int, int, int]]:
+    """First and last keypoint of each branch, and the one that it leaves the chain at; none where the order is wrong.
+
+    A branch begins where the chain breaks off and goes on next to an earlier keypoint that is not an end of the parent.
+    """
+    base = float(np.median(usual))
+    # twice as many as needed; the rest of a long recording adds nothing
+    points = points[:: max(1, len(points) // 2000)]
+
+    def mostly(one: int, other: int, quantile: float) -> float:
+        distance = np.linalg.norm(points[:, one] - points[:, other], axis=-1)
+        seen = np.isfinite(distance)
+        return float(np.quantile(distance[seen], quantile)) if seen.any() else np.inf
+
+    ends = np.flatnonzero(usual > _BREAK * base).tolist()
+    found: list[tuple[int, int, int]] = []
+    for end, last in zip(ends, [*ends, len(usual)][1:], strict=True):
+        first, inner = end + 1, [j for j in range(1, end) if j != ends[0]]
+        near = {j: mostly(j, first, _MOSTLY) for j in inner}
+        at = min(near, key=lambda j: near[j], default=None)
+        if at is None or near[at] > _TOUCHES * base:
+            return []
+        between = (
+            mostly(at, first, 0.5) + mostly(first, side, 0.5) < _BETWEEN * mostly(at, side, 0.5)
+            for side in (at - 1, at + 1)
+        )
+        # a first keypoint on top of that of the parent shows no direction
+        if mostly(at, first, 0.5) > (_BETWEEN - 1) * base and any(between):
+            return []
+        found.append((first, last, at))
+    return found
 
 
 def _worst_turn(points: Float[np.ndarray, "*B N D"]) -> Float[np.ndarray, "*B"]:

@@ -6,6 +6,7 @@ import dataclasses
 from typing import Literal
 
 import numpy as np
+from scipy.cluster.hierarchy import fcluster, linkage
 
 from cablejax.recordings.frames import Frame, into_frame, require_hanging, require_rigid
 from cablejax.recordings.gaps import cut_at_gaps
@@ -24,6 +25,11 @@ of the cable's length, are not both on it."""
 _JERK = 50.0, 10.0
 """Acceleration of a gripper [m/s^2] that is worth a word, and how many times its median in the take: noise has some."""
 _TOLD = 5
+_NAMED = 20
+
+_OTHER_CABLE, _DIFFERS, _LEAST = 0.05, 0.02, 3
+"""Takes are of two cables if the logarithms of their spacings differ by the first number (root mean square), and at
+least the third number of them by the second: bending moves them by 0.01 to 0.03, a marker that slipped moves two."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -56,8 +62,8 @@ class Setup:
 def prepare(takes: tuple[Take, ...], setup: Setup) -> tuple[tuple[Take, ...], list[str]]:
     """Checks and repairs takes of one cable, and gives each the poses of both grippers.
 
-    In this order: the unit of length; the frame; the order of the markers; jumps of single markers; gaps in time;
-    orientations against markers; jerks of the grippers, which are kept.
+    In this order: the unit of length; the frame; branches and the order of the markers; whether it is one cable; jumps
+    of single markers; gaps in time; orientations against markers; jerks of the grippers, which are kept.
 
     Returns:
         The takes in metres, z up, right-handed, without gaps, each with gripper poses; and a sentence on each repair.
@@ -89,6 +95,7 @@ def prepare(takes: tuple[Take, ...], setup: Setup) -> tuple[tuple[Take, ...], li
     takes, outliers = _without_outliers(takes)
     takes = tuple(into_frame(take, setup.frame) for take in takes)
     takes, exchanged = restore_order(takes)
+    _require_one_cable(takes, setup)
     takes, jumps = _without_jumps(takes)
     if setup.hangs and takes[0].keypoints.shape[2] == 3:
         require_hanging(takes, setup.frame)
@@ -123,6 +130,40 @@ def _without_outliers(takes: tuple[Take, ...]) -> tuple[tuple[Take, ...], list[s
         f"{count} keypoint{'s' if count > 1 else ''} lay up to {farthest:.3g} m from the rest of the cable, which is "
         f"{length:.3g} m long: taken as not observed."
     ]
+
+
+def _require_one_cable(takes: tuple[Take, ...], setup: Setup) -> None:
+    """Refuses takes whose keypoints sit at clearly other distances; grips, which differ, are not looked at."""
+    ends = 2 if setup.on_grippers == "pairs" else 1
+    every = [spacing(take.keypoints)[:, ends:-ends] for take in takes]
+    if len(takes) < 2 or every[0].shape[1] < _LEAST:
+        return
+    rows = np.full((len(takes), every[0].shape[1]), np.nan)
+    for row, distances in zip(rows, every, strict=True):
+        seen = np.isfinite(distances).any(axis=0)
+        row[seen] = np.log(np.nanmedian(distances[:, seen], axis=0))
+
+    def apart(one: np.ndarray, other: np.ndarray) -> float:
+        off = (one - other)[np.isfinite(one - other)]
+        differ = len(off) and (np.abs(off) > _DIFFERS).sum() >= _LEAST
+        return float(np.sqrt((off**2).mean())) if differ else 0.0
+
+    # condensed, as pdist makes it
+    distances = [apart(rows[i], rows[j]) for i in range(len(rows)) for j in range(i + 1, len(rows))]
+    cable = fcluster(linkage(distances, "single"), _OTHER_CABLE, "distance")
+    names, counts = np.unique(cable, return_counts=True)
+    if len(names) == 1:
+        return
+    usual = cable == names[counts.argmax()]
+    others = [take.name for take, same in zip(takes, usual, strict=True) if not same]
+    more = f" and {len(others) - _NAMED} more" if len(others) > _NAMED else ""
+    here, there = (np.exp(np.nanmedian(rows[part], axis=0)) for part in (~usual, usual))
+    k = int(np.nanargmax(np.abs(np.log(here / there))))
+    raise ValueError(
+        f"The takes are of {len(names)} cables: in take {', '.join(others[:_NAMED])}{more} the keypoints sit at other "
+        f"distances than in the other {usual.sum()} (keypoints {k + ends} and {k + ends + 1}: {1e3 * here[k]:.1f} mm "
+        f"instead of {1e3 * there[k]:.1f} mm). Import each cable by itself."
+    )
 
 
 def _without_jumps(takes: tuple[Take, ...]) -> tuple[tuple[Take, ...], list[str]]:

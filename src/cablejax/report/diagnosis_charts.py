@@ -34,7 +34,7 @@ def ranking_figure(diagnosis: Diagnosis) -> Figure | None:
     """
     likely = all(r.probability is not None for r in diagnosis.ranking)
     ranked = [r for r in diagnosis.ranking if not likely or max(r.probability or 0.0, r.held_out_shrinkage) >= 5e-3]
-    ranked = (ranked if len(ranked) >= 3 else list(diagnosis.ranking))[:_MAX_RANKED]
+    ranked = (ranked if len(ranked) >= 3 else list(diagnosis.ranking))[: _MAX_RANKED if likely else None]
     if not ranked:
         return None
     named = {effect.name for effect in diagnosis.effects}
@@ -59,7 +59,7 @@ def ranking_figure(diagnosis: Diagnosis) -> Figure | None:
             ax.spines[["bottom"]].set_visible(False)
             ax.set_title(title)
             ax.tick_params(length=0)
-        axes[0].set_yticks(y, [effect_title(r.name) for r in ranked])
+        axes[0].set_yticks(y, [f"{effect_title(r.name)}{f', {r.outcome}' if r.outcome else ''}" for r in ranked])
         axes[0].tick_params(labelcolor=LIGHT.ink)
     return figure
 

@@ -54,9 +54,8 @@ _WHERE_CAPTION = (
     "the noise. Black bars mark holds. The cable's own gap fades towards the grippers that hold it."
 )
 _FILES_CAPTION = (
-    "Each column is a file, each row a keypoint. The cable's own gap fades towards the grippers that hold it; a "
-    "file that "
-    "differs from its neighbours was recorded with something changed."
+    "Each column is a file, each row a keypoint; white lines separate recordings. The cable's own gap fades towards "
+    "the grippers that hold it; a file that differs from its neighbours was recorded with something changed."
 )
 
 
@@ -115,6 +114,7 @@ def write_diagnosis_page(diagnosis: CableDiagnosis, out: str | os.PathLike[str])
         cable_caption=_SPACE_CAPTION if space else _cable_caption(diagnosis),
         where_caption=_FILES_CAPTION if space else _WHERE_CAPTION,
         effects=sections.named_effects(diagnosis),
+        quantities=sections.quantities(diagnosis),
         alike=sections.alike(diagnosis),
         under_laws=sections.under_other_laws(diagnosis),
         faint_below=FAINT,
@@ -162,7 +162,7 @@ def _cards(diagnosis: CableDiagnosis) -> Iterator[tuple[str, str, str]]:
     elif diagnosis.verdict == "none":
         yield ("Cause", "none needed", f"a gap of {millimetres(_least(diagnosis))} would have shown")
     else:
-        best = diagnosis.ranking[0] if diagnosis.ranking else None
+        best = max(diagnosis.ranking, key=lambda r: (r.probability or 0.0, r.held_out_shrinkage), default=None)
         note = "" if best is None else f"closest: {effect_title(best.name)}, which is not enough"
         yield ("Cause", "not in the library", note)
         yield ("Place of the cause", "unknown", _peak(diagnosis))
@@ -180,7 +180,8 @@ def _cards(diagnosis: CableDiagnosis) -> Iterator[tuple[str, str, str]]:
 
 def _noise(diagnosis: CableDiagnosis) -> str:
     """The noise, and what it leaves out: in space it is only what changes between samples."""
-    besides = ", without the markers' constant offsets" if in_space(diagnosis) else ""
+    offset = diagnosis.quantities.get("constant_offset_m")
+    besides = "" if offset is None else f", constant offsets of keypoints {millimetres(1e3 * offset.value)}"
     return f"noise {millimetres(diagnosis.gap.noise_floor_mm)}{besides}"
 
 

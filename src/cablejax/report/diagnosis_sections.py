@@ -52,6 +52,13 @@ def named_effects(diagnosis: Diagnosis) -> list[tuple[NamedEffect, str, list[tup
     return found
 
 
+def quantities(diagnosis: Diagnosis) -> list[tuple[str, str]]:
+    """What the log shows of the cable, whether an effect is named for it or not."""
+    return [
+        (parameter_title(name), quantity(one.value, one.unit, one.ci90)) for name, one in diagnosis.quantities.items()
+    ]
+
+
 def alike(diagnosis: CableDiagnosis) -> list[tuple[list[str], list[str]]]:
     """Names of the effects that are indistinguishable on the log: those with a chance, and those without."""
     groups = (look_alikes(group, diagnosis.effects, diagnosis.ranking) for group in diagnosis.equivalent)
@@ -105,8 +112,9 @@ def ranking_note(diagnosis: CableDiagnosis) -> str:
     """What the figure of the effects that were tried shows."""
     if any(ranked.probability is None for ranked in diagnosis.ranking):
         return (
-            "Every effect tried in the forward search: what it takes away on unseen recordings when it joins those "
-            "kept before it, as a share of the squared error without any effect. Negative: it makes them worse."
+            "Every effect tried in the forward search, in that order: what it takes away on unseen recordings when it "
+            "joins those kept before it, as a share of the squared error without any effect. Negative: it makes them "
+            "worse. Not judged: its simulations were lost in many windows."
         )
     note = "Every effect alone, the most probable first."
     if len(diagnosis.effects) > 1:
@@ -193,6 +201,7 @@ def detail_tables(diagnosis: CableDiagnosis) -> list[Table]:
             effect_title(r.name),
             EFFECTS.get(r.name, ""),
             *([share(r.probability)] if alone and r.probability is not None else []),
+            *([] if alone else [r.outcome or ""]),
             share(r.held_out_shrinkage),
             millimetres(r.leftover_mm),
         )
@@ -205,8 +214,8 @@ def detail_tables(diagnosis: CableDiagnosis) -> list[Table]:
     ]
     tables: list[Table] = [
         (
-            f"All effects tried{' alone' if alone else ', each on top of those kept before it'}",
-            ("effect", "what it is", *(["probability"] if alone else []), "share taken away", "left"),
+            f"All effects tried{' alone' if alone else ', in order, each on top of those kept before it'}",
+            ("effect", "what it is", "probability" if alone else "outcome", "share taken away", "left"),
             tried,
         ),
         ("Gap above the noise by regime", ("regime", "gap"), regimes),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from typing import Any
 
 import matplotlib
@@ -29,6 +30,15 @@ def _names(diagnosis: CableDiagnosis) -> list[str]:
     return [str(n) for n in meta.get("file", meta.get("take", range(len(diagnosis.log.episode_length))))]
 
 
+def recording_ends(diagnosis: CableDiagnosis, episodes: np.ndarray) -> np.ndarray:
+    """Of some episodes in order, the places of those that begin another recording than the one before."""
+    of = diagnosis.log.meta.get("recording")
+    if not isinstance(of, list) or len(of) != len(diagnosis.log.episode_length):
+        return np.zeros(0, int)
+    names = [str(of[e]) for e in episodes]
+    return 1 + np.flatnonzero([one != other for one, other in itertools.pairwise(names)])
+
+
 def files_figure(diagnosis: CableDiagnosis) -> Figure:
     """The error of every keypoint in every file, before and after."""
     parts = [("simulator as believed", diagnosis.nominal)]
@@ -46,6 +56,8 @@ def files_figure(diagnosis: CableDiagnosis) -> Figure:
             image = ax.imshow(error[used].T, aspect="auto", origin="lower", cmap="cividis", vmin=0, vmax=top)
             ax.set_title(f"Error, {label}")
             ax.set_ylabel("keypoint")
+            for column in recording_ends(diagnosis, used):
+                ax.axvline(column - 0.5, color="white", lw=1.5)
         every = max(1, len(used) // 20)
         panels[-1].set_xticks(range(0, len(used), every), [names[e] for e in used[::every]])
         panels[-1].set_xlabel("file")

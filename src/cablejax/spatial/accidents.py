@@ -49,33 +49,70 @@ def compared(before: Float[np.ndarray, "W"], after: Float[np.ndarray, "W"]) -> t
     return kept(off(before) | off(after)), bool(kept(broken)[broken].sum() == 0)
 
 
-def accident_sentences(lost: Bool[np.ndarray, "W"], error: Float[np.ndarray, "W"], windows: Windows) -> list[str]:
-    """Windows that are off, for a reader.
+def accident_sentences(
+    lost: Bool[np.ndarray, "W"], error: Float[np.ndarray, "W"], windows: Windows, coarse: Bool[np.ndarray, "W"]
+) -> list[str]:
+    """Windows that are off, or not simulated as they should be, for a reader.
 
     Args:
         lost: those with samples that the simulation did not reach.
         error: of every window, as the best explanation leaves it [m].
         windows: these.
+        coarse: those that were simulated with larger errors of the time steps than these may have.
     """
-    result, without = [], kept(lost | off(error))
+    result, torn = [], windows.torn
+    few = kept(lost | off(error) | torn)
     treated = (
         "They have little weight in fits, and are left out of the gap and of comparisons."
-        if not without[lost | off(error)].any()
+        if not few[lost | off(error) | torn].any()
         else "They are too many to be left out, and count in all figures."
     )
-    for which, words in (
-        (lost, "could not be simulated to their end: the equations of motion have no solution there"),
-        (off(error) & ~lost, f"are off by more than {_TIMES:g} times the median with every effect that was found"),
+    look = "Look for jerks of the grippers and jumps of keypoints there."
+    longest = f"{windows.arclength[-1]:.3g} m"
+    for which, words, advice in (
+        (
+            torn,
+            f"have the grippers further apart than the {longest} of cable between them: it would tear. Leave those "
+            "parts out, or correct the arc lengths",
+            treated,
+        ),
+        (
+            lost & ~torn,
+            "could not be simulated to their end: the equations of motion have no solution there",
+            f"{treated} {look}",
+        ),
+        (
+            off(error) & ~lost & ~torn,
+            f"are off by more than {_TIMES:g} times the median with every effect that was found",
+            f"{treated} {look}",
+        ),
+        (
+            coarse & ~lost & ~torn,
+            "were simulated with larger errors of the time steps than these may have, since the shortest are still too "
+            "long there",
+            "They count in all figures. " + look,
+        ),
     ):
         if which.any():
             index = np.flatnonzero(which)
-            shown = ", ".join(
-                f"{windows.name[i]} from {windows.begin[i] * windows.interval:.3g} s ({1e3 * error[i]:.0f} mm)"
-                for i in index[:_SHOWN]
-            )
+            shown = ", ".join(_window(windows, i, error[i], torn=bool(torn[i])) for i in index[:_SHOWN])
             more = f" and {len(index) - _SHOWN} more" if len(index) > _SHOWN else ""
-            result.append(
-                f"{len(index)} of {len(windows)} windows {words}: file {shown}{more}. {treated} Look for jerks of the "
-                "grippers and jumps of keypoints there."
-            )
+            result.append(f"{len(index)} of {len(windows)} windows {words}: file {shown}{more}. {advice}")
+    if windows.left_out:
+        count = len(windows.left_out)
+        more = f" and {count - _SHOWN} more" if count > _SHOWN else ""
+        result.append(
+            f"{count} more windows do not begin with two samples of all keypoints, and were left out of everything: "
+            f"{', '.join(windows.left_out[:_SHOWN])}{more}."
+        )
     return result
+
+
+def _window(windows: Windows, index: int, error: float, *, torn: bool) -> str:
+    """File and time of a window, and how far it is off, or the grippers apart at their furthest."""
+    begin = windows.begin[index] * windows.interval
+    if not torn:
+        return f"{windows.name[index]} from {begin:.3g} s ({1e3 * error:.0f} mm)"
+    apart = np.nan_to_num(windows.apart[index])
+    at = int(apart.argmax())
+    return f"{windows.name[index]} at {begin + at * windows.interval:.3g} s ({apart[at]:.3g} m)"

@@ -81,8 +81,9 @@ class SpatialCable(Simulator):
         return dataclasses.replace(self, windows=windows)
 
     def trusting(self, error: Float[np.ndarray, "W"]) -> SpatialCable:
-        """The same cable in the same windows, those that are off by their errors [m] with little weight in fits."""
-        return self.on(dataclasses.replace(self.windows, trust=trust(error)))
+        """The same cable in the same windows, those that are off by their errors [m] with less weight in fits."""
+        before = 1.0 if self.windows.trust is None else self.windows.trust
+        return self.on(dataclasses.replace(self.windows, trust=before * trust(error)))
 
     def finer(self, factor: int) -> SpatialCable:
         """With time steps that are so many times shorter, those that are made where the motion is fast too."""
@@ -95,13 +96,19 @@ class SpatialCable(Simulator):
         return sum(len(e.null) for e in self.layout.effects if e.own and e.name in one.names)
 
     def motion(self, one: Explanation) -> Float[np.ndarray, "W T F 3"]:
-        """Free markers at every sample [m]."""
-        return dataclasses.replace(self, samples=slice(None)).predict([one], np.arange(len(self.windows)))[0]
+        """Free markers at every sample [m]; NaN from where on the simulation was not solved."""
+        return self.rollouts(one)[0]
+
+    def rollouts(self, one: Explanation) -> tuple[Float[np.ndarray, "W T F 3"], Int[np.ndarray, "W"]]:
+        """The same, and how the simulation of each window ended: a `RodResult`."""
+        parts = self._in_parallel(0, one, np.arange(len(self.windows)), ())
+        points, results = zip(*parts, strict=True)
+        return np.concatenate(points), np.concatenate(results)
 
     def predict(self, explanations, episodes) -> Float[np.ndarray, "X E T F 3"]:
         """Free markers [m] at the samples that are compared; NaN from where on the simulation was not solved."""
         parts = ((self._in_parallel(0, one, episodes, ())) for one in explanations)
-        return np.stack([np.concatenate(part)[:, self.samples] for part in parts])
+        return np.stack([np.concatenate([points for points, _ in part])[:, self.samples] for part in parts])
 
     def linearise(self, explanations, episodes):
         """Forward derivatives, exact."""
@@ -204,14 +211,14 @@ def _compiled(rod: Rod, layout: Layout, interval: float):
     def one(values, position, frames, seen):
         found = rod.rollout(layout.physics(values), position, frames, seen, interval)
         reached = jnp.arange(found.points.shape[0]) < found.solved
-        return jnp.where(reached[:, None, None], found.points, jnp.nan)
+        return jnp.where(reached[:, None, None], found.points, jnp.nan), found.result
 
     def batch(values, *inputs):
         return jax.vmap(one)(values, *inputs)
 
     def both(values, directions, *inputs):
         def tangent(direction):
-            return jax.jvp(lambda v: batch(v, *inputs), (values,), (jnp.broadcast_to(direction, values.shape),))
+            return jax.jvp(lambda v: batch(v, *inputs)[0], (values,), (jnp.broadcast_to(direction, values.shape),))
 
         predicted, derivative = jax.vmap(tangent, out_axes=(None, 1))(directions)
         return predicted, derivative

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import pathlib
 import time
 from collections.abc import Callable, Sequence
@@ -12,18 +13,19 @@ import numpy as np
 
 from cablejax.bounded import Result
 from cablejax.diagnose.belief import Calibration
-from cablejax.diagnose.diagnosis import CableDiagnosis, Gap, Ranked, Verdict
+from cablejax.diagnose.diagnosis import CableDiagnosis, Gap, ParameterEstimate, Ranked, Verdict
 from cablejax.diagnose.judgement import judged, verdict_sentence
 from cablejax.diagnose.protocol import explanation
+from cablejax.simulate.rod import RodResult
 from cablejax.spatial.accidents import accident_sentences, kept, moderated, off
 from cablejax.spatial.cable import errors
 from cablejax.spatial.clock import on_one_clock
 from cablejax.spatial.effects import GRIP
 from cablejax.spatial.estimate import estimate
-from cablejax.spatial.gap import RESOLVABLE, gap_of, noise_of
+from cablejax.spatial.gap import RESOLVABLE, constant_offset, gap_of, noise_of
 from cablejax.spatial.geometry import LocalChange, local_changes
 from cablejax.spatial.identify import EDGES, Identified, identify
-from cablejax.spatial.named import named_effects
+from cablejax.spatial.named import named_effects, quantities_of
 from cablejax.spatial.where import in_log, where_of
 from cablejax.spatial.windows import WINDOW, windows_of
 from cablejax.types import GapLog
@@ -80,17 +82,17 @@ def diagnose_space(
         progress(change.sentence)
     found = identify(windows, stiffness, only=only, state=state, progress=progress)
 
-    before, after = found.cable.motion(explanation()), found.unseen()
+    before, (after, results) = found.cable.motion(explanation()), found.unseen()
     noise = noise_of(windows)
     lost = ~np.array([np.isfinite(part[valid]).all() for part, valid in zip(after, windows.valid, strict=True)])
     error = errors(after, windows)
-    use = np.flatnonzero(kept(lost | off(error)))
+    use = np.flatnonzero(kept(lost | off(error) | windows.torn))
     gap = gap_of(before[use], after[use], found.cable.on(windows.chosen(use)), noise)
     verdict, equivalent = _verdict(gap, found), _equivalent(found)
-    effects = ()
-    if verdict not in ("none", "unknown"):
-        everything = estimate(found, found.everything, found.cable, progress=progress)
-        effects = named_effects(found, everything, cable["linear_density_kg_per_m"])
+    density, guessed = cable["linear_density_kg_per_m"], "linear_density_kg_per_m" in log.meta.get("guessed", ())
+    everything = estimate(found, found.everything, found.cable, progress=progress)
+    effects = () if verdict in ("none", "unknown") else named_effects(found, everything, density)
+    offset = ParameterEstimate(constant_offset(after[use], windows.chosen(use)), None, "m")
     first = [change.sentence for change in changes[:1]]
     nominal, explained = (in_log(log, windows, part) for part in (before, after))
     where = where_of(log, windows.chosen(use), nominal, before[use], noise, changes)
@@ -99,13 +101,18 @@ def diagnose_space(
         sentence=" ".join([verdict_sentence(verdict, effects, equivalent, (), gap.shrinkage or 0.0), *first]),
         effects=effects,
         equivalent=equivalent,
+        quantities=quantities_of(found, everything, None if guessed else density) | {"constant_offset_m": offset},
         ranking=_ranking(found),
         leftover_p=None,
         gap=gap,
         where=where,
         next_motion=None,
         baselines={},
-        caveats=(*repairs, *accident_sentences(lost, error, windows), *_caveats(log, windows, left_out, found)),
+        caveats=(
+            *repairs,
+            *accident_sentences(lost, error, windows, results == RodResult.COARSE),
+            *_caveats(log, windows, left_out, found),
+        ),
         log=log,
         nominal=nominal,
         explained=explained,
@@ -138,20 +145,18 @@ def _equivalent(found: Identified) -> tuple[tuple[str, ...], ...]:
 
 
 def _ranking(found: Identified) -> tuple[Ranked, ...]:
-    """Every effect tried, by the share of the nominal error that went when it came in, on unseen recordings."""
+    """Every trial in order, by the share of the nominal error that went when it came in, on unseen recordings."""
     nominal, before, ranked = moderated(found.steps[0].error), moderated(found.steps[0].error), []
-    for step in found.steps[1:]:
-        name = step.effect.split(" ")[0]
+    for last, step in itertools.pairwise(found.steps):
+        if np.array_equal(last.error, step.error) and last.accepted:
+            continue  # a second name of the same step
         error = moderated(step.error)
         gain = float((before**2).mean() - (error**2).mean()) / float((nominal**2).mean())
+        outcome = "kept" if step.accepted else "did not help" if step.counts else "not judged"
         # the share of resamples in which the error falls is no probability that the effect is there
-        ranked.append(Ranked(name, None, gain, 1e3 * float(error.mean())))
+        ranked.append(Ranked(step.effect.split(" ")[0], None, gain, 1e3 * float(error.mean()), outcome))
         before = error if step.accepted else before
-    unique: dict[str, Ranked] = {}
-    for entry in ranked:
-        if entry.name not in unique or entry.held_out_shrinkage > unique[entry.name].held_out_shrinkage:
-            unique[entry.name] = entry
-    return tuple(sorted(unique.values(), key=lambda r: -r.held_out_shrinkage))
+    return tuple(ranked)
 
 
 def _caveats(log, windows, left_out, found) -> tuple[str, ...]:
@@ -163,7 +168,7 @@ def _caveats(log, windows, left_out, found) -> tuple[str, ...]:
         "cannot be seen.",
         "The noise is what markers scatter by from one sample to the next. A marker that sits off the cable's "
         "centreline, or off its stated place along the cable, is off all the time; that error is not part of the "
-        "noise.",
+        "noise, but of the constant offsets, as is what the simulator has wrong at rest.",
         "Roll of the grippers about the cable is not observed; it is taken as the least turn from their mean "
         "direction.",
         "Parameters are those of a fit in which everything that was tried is free. Predictions are made with the named "

@@ -44,6 +44,7 @@ UNMODELLED: Mapping[str, float] = MappingProxyType(
         "bending_damping": 0.13,
         "viscous_drag": 1.0,
         "quadratic_drag": 0.19,
+        "drag": 0.4,
         "stiffness_profile": 0.08,
         "gripper_rotation_offset": 0.06,
     }
@@ -51,7 +52,7 @@ UNMODELLED: Mapping[str, float] = MappingProxyType(
 """By how much an effect's parameter is off besides, in all recordings alike, where neither jackknife nor priors show
 it: standard deviation of its logarithm, of an angle in rad. It is what makes nine of ten intervals hold the true value
 on synthetic cables of even seeds that have more than the law that is fitted (`experiments/32_interval_coverage.py
---calibrate`). Intervals of the markers' mass were wide enough."""
+--calibrate`). Intervals of the markers' mass were wide enough. "drag" is both drags at the grippers' speed."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -117,6 +118,15 @@ class Estimate:
         def log(values):
             value = jnp.log(values[where])
             return value - jnp.log(self.layout.laden(values)) if field in _PER_MASS else value
+
+        return self.ratio(log)
+
+    def drag_at(self, speed: float) -> Interval:
+        """Linear and quadratic drag together at a speed [m/s], per mass of the laden cable [1/s]."""
+        linear, quadratic = (self.layout.slices[name].start for name in ("drag", "quadratic_drag"))
+
+        def log(values):
+            return jnp.log(values[linear] + speed * values[quadratic]) - jnp.log(self.layout.laden(values))
 
         return self.ratio(log)
 

@@ -23,6 +23,21 @@ def noise_of(windows: Windows) -> float:
     return float(np.sqrt((noise_floor(windows.observed, None, order=4).std ** 2).mean()))
 
 
+def constant_offset(predicted: Float[np.ndarray, "W T F 3"], windows: Windows) -> float:
+    """What markers are off by all the time [m]: root mean square over coordinates of their mean error in a recording.
+
+    Markers that sit off the centreline, or off their stated places, are part of it, and so is what the simulator has
+    wrong at rest; the noise has none of it.
+    """
+    off = np.where(np.isfinite(windows.observed), windows.observed - predicted, np.nan)
+    means = []
+    for group in np.unique(windows.group):
+        part = off[windows.group == group].reshape(-1, *off.shape[2:])
+        seen = np.isfinite(part)
+        means.append((np.where(seen, part, 0.0).sum(axis=0) / np.maximum(seen.sum(axis=0), 1))[seen.any(axis=0)])
+    return float(np.sqrt((np.concatenate(means) ** 2).mean()))
+
+
 def squares(predicted: Float[np.ndarray, "W T F 3"], windows: Windows) -> Float[np.ndarray, "W T F 3"]:
     """Squared errors of free coordinates, bounded by a metre, NaN where nothing was recorded."""
     observed = windows.observed

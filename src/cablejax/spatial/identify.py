@@ -61,10 +61,13 @@ class Identified:
         layout = self.cable.layout
         return float(layout.nominal_stiffness * np.exp(layout.log_stiffness(one.vector(layout.effects))))
 
-    def unseen(self) -> Float[np.ndarray, "W T F 3"]:
-        """Predictions of all windows, each from the half of the recordings that it is not part of [m]."""
-        one, other = (self.cable.motion(half) for half in self.halves)
-        return np.where(self.first[:, None, None, None], other, one)
+    def unseen(self) -> tuple[Float[np.ndarray, "W T F 3"], Int[np.ndarray, "W"]]:
+        """Predictions of all windows, each from the half of the recordings that it is not part of [m].
+
+        And how the simulation of each ended: a `RodResult`.
+        """
+        (one, ended), (other, other_ended) = (self.cable.rollouts(half) for half in self.halves)
+        return np.where(self.first[:, None, None, None], other, one), np.where(self.first, other_ended, ended)
 
 
 def layout_of(windows: Windows, nominal_stiffness: float) -> Layout:
@@ -78,8 +81,8 @@ def layout_of(windows: Windows, nominal_stiffness: float) -> Layout:
 
 
 def selection(windows: Windows, count: int = _SELECTED) -> Int[np.ndarray, "S"]:
-    """Windows for the search: whole ones, spread evenly over the recordings."""
-    whole = np.flatnonzero(windows.valid.mean(axis=1) >= _SHORTEST)
+    """Windows for the search: whole ones that can be simulated, spread evenly over the recordings."""
+    whole = np.flatnonzero((windows.valid.mean(axis=1) >= _SHORTEST) & ~windows.torn)
     if not len(whole):
         whole = np.arange(len(windows))
     return whole[np.unique(np.linspace(0, len(whole) - 1, count).astype(int))]
@@ -156,21 +159,33 @@ def identify(
 
 
 def _final_fits(cable: SpatialCable, start: tuple[Explanation, Explanation], memory: Memory, progress):
-    """Explanation and result of the fits to either half of the recordings and to all, from those of the search."""
+    """Explanation and result of the fits to either half of the recordings, from those of the search, and to all."""
     windows, finals = cable.windows, memory.finals()
     first = halves(windows.group)
     use = [part & affordable(start[0], windows) for part in (first, ~first, np.ones(len(windows), bool))]
-    begins, words = (*start, mean_of(*start)), ("one half", "the other half", "all")
-    for part, begin, word in list(zip(use, begins, words, strict=True))[len(finals) :]:
+    words = ("one half", "the other half", "all")
+    for part, word in list(zip(use, words, strict=True))[len(finals) :]:
         progress(f"fitting {word}: {int(part.sum())} windows")
         evidence = cable.on(windows.chosen(np.flatnonzero(part))).evidence()
+        begins = begins_for_all(finals[0][0], finals[1][0]) if len(finals) == 2 else [start[len(finals)]]
         # what another part of the recordings was fitted with says nothing here
-        kept = np.isin(np.arange(len(begin.own)), windows.group[part])[:, None]
-        begin = begin.moved(begin.z, np.where(kept, begin.own, 0.0))
-        (fit,) = improved(evidence, evaluate(evidence, [begin]), evidence.simulator.plan.last_steps)
+        kept = np.isin(np.arange(len(begins[0].own)), windows.group[part])[:, None]
+        begins = [begin.moved(begin.z, np.where(kept, begin.own, 0.0)) for begin in begins]
+        best = min(evaluate(evidence, begins), key=lambda fit: fit.cost(evidence))
+        (fit,) = improved(evidence, [best], evidence.simulator.plan.last_steps)
         finals.append((fit.explanation, fit.result))
         memory.keep_finals(finals)
     return finals
+
+
+def begins_for_all(one: Explanation, other: Explanation) -> list[Explanation]:
+    """Where a fit to all recordings may begin: the mean of the fits to both halves, and either of them.
+
+    The mean of two fits that went to different places may be worse than both. Each recording keeps what the fit to its
+    own half found for it.
+    """
+    mean = mean_of(one, other)
+    return [mean, mean.moved(one.z, mean.own), mean.moved(other.z, mean.own)]
 
 
 def mean_of(one: Explanation, other: Explanation) -> Explanation:

@@ -13,8 +13,12 @@ from cablejax.spatial.effects import CURVATURE_KNOTS, PROFILE_KNOTS
 from cablejax.spatial.estimate import UNMODELLED, Estimate, Interval
 from cablejax.spatial.identify import Identified
 
+IDENTIFIABLE = 2.0
+"""A drag alone, or the markers' mass, is reported where its interval reaches to at most this factor to either side."""
+_COMBINED = {"viscous_drag": "coefficient_n_s_per_m2", "quadratic_drag": "coefficient_per_m", "lumped_mass": "mass_kg"}
 # A marker that is this near to its nominal place is not reported as displaced [m].
 _PLACED = 1e-3
+_STIFFNESS = "stiffness_over_density_m4_per_s2"
 
 
 def named_effects(found: Identified, estimate: Estimate, density: float) -> tuple[NamedEffect, ...]:
@@ -25,12 +29,49 @@ def named_effects(found: Identified, estimate: Estimate, density: float) -> tupl
         estimate: from the same windows. Reported values are its own, not those that predictions are made with.
         density: mass per length, with the markers, that is believed true [kg/m], for what is known per mass only.
     """
-    named = []
+    named, known = [], quantities_of(found, estimate, None)
     for name in found.effects:
         parameters, along = parameters_of(name, estimate, density, first_marker=found.cable.windows.held[0])
+        alone = _COMBINED.get(name, "")
+        if alone and not _narrow(parameters[alone]):
+            del parameters[alone]
+        # what motion shows of the drags is their sum at its speed, of the markers' mass what slows the cable down
+        if name in ("viscous_drag", "quadratic_drag"):
+            parameters |= {key: known[key] for key in ("drag_at_speed_per_s", "speed_m_per_s")}
+        elif alone and alone not in parameters and _STIFFNESS in known:
+            parameters[_STIFFNESS] = known[_STIFFNESS]
         location = {"along_cable_m": along, "time_s": None, "table_m": None}
         named.append(NamedEffect(name, None, parameters, location))
     return tuple(named)
+
+
+def quantities_of(found: Identified, estimate: Estimate, density: float | None) -> dict[str, ParameterEstimate]:
+    """What motion shows of the cable, whether an effect is named for it or not, with 90 % intervals.
+
+    EI / rho, where the stiffness was free; both drags together at the recording's speed, where one was; and EI, where
+    the mass per length is known.
+
+    Args:
+        found: by `identify`.
+        estimate: from the same windows.
+        density: mass per length, with the markers [kg/m]; None = a guess.
+    """
+    known = {}
+    if "bending_stiffness" in found.tried:
+        stiffness = estimate.stiffness.wider_by_factor(UNMODELLED["bending_stiffness"])
+        known[_STIFFNESS] = _told(stiffness, "m^4/s^2")
+        if density is not None:
+            known["bending_stiffness_n_m2"] = _told(stiffness, "N m^2", times=density)
+    if {"viscous_drag", "quadratic_drag"} & set(found.tried):
+        speed = found.cable.windows.speed
+        known["drag_at_speed_per_s"] = _told(estimate.drag_at(speed).wider_by_factor(UNMODELLED["drag"]), "1/s")
+        known["speed_m_per_s"] = _choice(speed, "m/s")
+    return known
+
+
+def _narrow(parameter: ParameterEstimate) -> bool:
+    low, high = np.ravel(np.array(parameter.ci90))
+    return bool(parameter.value / low <= IDENTIFIABLE and high / parameter.value <= IDENTIFIABLE)
 
 
 def parameters_of(

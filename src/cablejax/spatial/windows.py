@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from cablejax.cable import GRAVITY
-from cablejax.cable_length import require_fitting_length
+from cablejax.cable_length import TOLERANCE, require_fitting_length
 from cablejax.recordings.poses import rotated
 from cablejax.simulate.rod.clamps import frames_along
 from cablejax.types import GapLog
@@ -18,6 +18,8 @@ WINDOW = 5.0
 _SHORTEST = 1.0
 # A keypoint whose place in the gripper's frame stays within this is held by it [m].
 _HELD = 0.003
+# Weight in fits of a window in which the grippers are further apart than the cable is long.
+_TORN = 0.01
 
 
 @dataclasses.dataclass(frozen=True)
@@ -40,6 +42,7 @@ class Windows:
         n_keypoints: N.
         gravity: as the log states it [m/s^2].
         trust: weight of each window in fits, shape [W]; None = 1.
+        left_out: where the log has windows that do not begin with two samples of all keypoints, in words.
     """
 
     keypoints: Float[np.ndarray, "W T F 3"]
@@ -57,6 +60,7 @@ class Windows:
     n_keypoints: int
     gravity: tuple[float, ...] = (0.0, 0.0, -GRAVITY)
     trust: Float[np.ndarray, "W"] | None = None
+    left_out: tuple[str, ...] = ()
 
     def __len__(self) -> int:
         return len(self.keypoints)
@@ -65,6 +69,23 @@ class Windows:
     def observed(self) -> Float[np.ndarray, "W T F 3"]:
         """The keypoints, NaN also where nothing is recorded."""
         return np.where(self.valid[:, :, None, None], self.keypoints, np.nan)
+
+    @property
+    def torn(self) -> Bool[np.ndarray, "W"]:
+        """Windows in which the grippers are further apart than the cable between them is long, beyond tolerance."""
+        return (self.apart > (1 + TOLERANCE) * self.arclength[-1]).any(axis=1)
+
+    @property
+    def apart(self) -> Float[np.ndarray, "W T"]:
+        """Distance of the two clamps [m], NaN where nothing is recorded."""
+        distance = np.linalg.norm(self.position[:, :, 1] - self.position[:, :, 0], axis=-1)
+        return np.where(self.valid, distance, np.nan)
+
+    @property
+    def speed(self) -> float:
+        """Root mean square speed of the free markers [m/s]."""
+        step = np.diff(self.observed, axis=1) / self.interval
+        return float(np.sqrt(np.nanmean((step**2).sum(axis=-1))))
 
     def chosen(self, index) -> Windows:
         """Some of the windows."""
@@ -113,12 +134,13 @@ def windows_of(log: GapLog, *, length: float = WINDOW) -> Windows:
             f"Keypoint {', '.join(map(str, unseen))} is never observed: leave it out of keypoints and of "
             "meta.keypoint_arclength_m."
         )
-    pieces = []
+    pieces, left_out = [], []
     for e, count in enumerate(log.episode_length):
         for begin in range(0, int(count), samples):
             size = min(samples, int(count) - begin)
-            if size * interval >= _SHORTEST and np.isfinite(points[e, begin : begin + 2, free]).all():
-                pieces.append((e, begin, size))
+            if size * interval >= _SHORTEST:
+                whole = np.isfinite(points[e, begin : begin + 2, free]).all()
+                (pieces if whole else left_out).append((e, begin, size))
     if not pieces:
         raise ValueError(f"No episode has {_SHORTEST:g} s that begin with two samples of all keypoints.")
 
@@ -130,7 +152,7 @@ def windows_of(log: GapLog, *, length: float = WINDOW) -> Windows:
         return np.stack(rows)
 
     mask = np.stack([np.arange(samples) < size for _, _, size in pieces])
-    return Windows(
+    windows = Windows(
         keypoints=cut(points[:, :, free]),
         position=cut(clamp),
         frames=cut(frames),
@@ -145,7 +167,9 @@ def windows_of(log: GapLog, *, length: float = WINDOW) -> Windows:
         arclength=np.append(s[free], last) - first,
         n_keypoints=len(s),
         gravity=tuple(log.meta["gravity_m_per_s2"]),
+        left_out=tuple(f"file {files[e]} from {begin * interval:.3g} s" for e, begin, _ in left_out),
     )
+    return dataclasses.replace(windows, trust=np.where(windows.torn, _TORN, 1.0)) if windows.torn.any() else windows
 
 
 def labels(log: GapLog, *names: str, default: str | None = None) -> list[str]:
