@@ -7,6 +7,7 @@ import json
 import os
 import shutil
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -147,10 +148,10 @@ def open_or_create(path: str | os.PathLike[str] | Bucket, config: DatasetConfig)
     return store
 
 
-def package_versions() -> dict[str, str]:
-    """Versions of the packages that decide the content."""
+def package_versions(packages: Sequence[str] = PACKAGES) -> dict[str, str]:
+    """Versions of cablejax and of some packages, by default those that decide the content of a data set."""
     versions = {"cablejax": __version__}
-    for name in PACKAGES:
+    for name in packages:
         try:
             versions[name] = importlib.metadata.version(name)
         except importlib.metadata.PackageNotFoundError:
