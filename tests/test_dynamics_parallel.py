@@ -54,16 +54,39 @@ def compare_gradients():
                 np.testing.assert_allclose(b, a, rtol=0, atol=10 * tolerance * size)
 
 
-def train_in(folder: str, validated: str = ""):
-    """Trains in a folder with all devices, and prints hashes of the state that it starts from and of the weights."""
-    began = "nothing"
-    if (pathlib.Path(folder) / CHECKPOINTS).exists():
-        with Checkpoints(pathlib.Path(folder) / CHECKPOINTS) as checkpoints:
-            began = fingerprint(checkpoints.restore(_like()))
-    result = train(SHARED, DATA, pathlib.Path(folder), validation=DATA if validated else None, progress=False)
+def train_on(count: int, folder: pathlib.Path) -> np.ndarray:
+    """The weights of a training on some devices, as one array, once it has ended."""
+    result = train(SHARED, DATA, folder, validation=DATA, devices=jax.devices()[:count], progress=False)
     assert result.completed and all(len(leaf.devices()) == 1 for leaf in jax.tree.leaves(result.weights))
-    np.save(f"{folder}.npy", np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(result.weights)]))
-    print(jax.local_device_count(), began, fingerprint(result.weights))
+    return np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(result.weights)])
+
+
+def saved_in(folder: pathlib.Path) -> tuple[list[int], str]:
+    """Steps of the checkpoints, and the hash of the newest one."""
+    with Checkpoints(folder / CHECKPOINTS) as checkpoints:
+        state = fingerprint(checkpoints.restore(_like()))
+    return sorted(int(path.name) for path in (folder / CHECKPOINTS).glob("[0-9]*")), state
+
+
+def go_on_with_other_devices(place: str):
+    """Trains on two devices, then from their last but one checkpoint on one, two and eight."""
+    whole = pathlib.Path(place) / "two"
+    expected, (steps, ended) = train_on(2, whole), saved_in(whole)
+    assert steps == [6, 8]
+    shutil.rmtree(whole / CHECKPOINTS / "8")
+    made = {}
+    for count in (1, 2, 8):
+        folder = whole.with_name(f"on {count}")
+        shutil.copytree(whole, folder)
+        made[count] = train_on(count, folder), saved_in(folder)[1]
+    assert made[2][1] == ended, "as many devices end in the same bits"
+    np.testing.assert_array_equal(made[2][0], expected)
+    for count in (1, 8):
+        difference = np.abs(made[count][0] - expected).max()
+        assert difference < 1e-6, f"{difference} on {count} devices"
+    for count in (1, 8):  # what two devices saved at the end, read by others, is what they ended with
+        shutil.copytree(whole.with_name("on 2"), whole.with_name(f"read on {count}"))
+        np.testing.assert_array_equal(train_on(count, whole.with_name(f"read on {count}")), expected)
 
 
 def _like() -> TrainState:
@@ -71,12 +94,12 @@ def _like() -> TrainState:
     return TrainState(weights, weights, SHARED.optimiser().init(weights), jnp.zeros((), jnp.int32))
 
 
-def on_devices(count: int, call: str) -> list[str]:
-    """What a call of this file's functions prints in a process that has `count` devices."""
+def on_eight_devices(call: str) -> None:
+    """Calls one of this file's functions in a process that has eight devices."""
     code = f"import sys; sys.path.insert(0, {os.fspath(pathlib.Path(__file__).parent)!r})\n"
-    done = run_on_devices(count, [sys.executable, "-c", f"{code}from test_dynamics_parallel import *\n{call}"])
-    assert done.returncode == 0, done.stderr
-    return done.stdout.splitlines()[-1].split()
+    code += f"from test_dynamics_parallel import *\n{call}\nprint(jax.device_count())"
+    done = run_on_devices(8, [sys.executable, "-c", code])
+    assert done.returncode == 0 and done.stdout.split()[-1] == "8", done.stderr
 
 
 def run_on_devices(count: int, command: list[str]) -> subprocess.CompletedProcess:
@@ -86,34 +109,23 @@ def run_on_devices(count: int, command: list[str]) -> subprocess.CompletedProces
 
 
 def test_two_and_eight_devices_have_the_gradient_of_one():
-    assert on_devices(8, "compare_gradients(); print(jax.device_count())") == ["8"]
+    on_eight_devices("compare_gradients()")
 
 
 def test_a_training_goes_on_with_another_number_of_devices(tmp_path):
-    whole = tmp_path / "two"
-    count, began, trained = on_devices(2, f"train_in({os.fspath(whole)!r}, 'validated')")
-    assert (count, began) == ("2", "nothing")
-    steps = sorted(int(path.name) for path in (whole / CHECKPOINTS).glob("[0-9]*"))
-    assert steps == [6, 8]
-    shutil.rmtree(whole / CHECKPOINTS / "8")
-    ended, starts = {}, set()
-    for devices in (1, 2, 8):
-        folder = tmp_path / f"on {devices}"
-        shutil.copytree(whole, folder)
-        count, began, ended[devices] = on_devices(devices, f"train_in({os.fspath(folder)!r})")
-        assert count == str(devices) and began != "nothing"
-        starts.add(began)
-    assert len(starts) == 1, "all go on from the same bits"
-    assert ended[2] == trained, "the same number of devices ends in the same bits"
-    expected = np.load(f"{whole}.npy")
-    for devices in (1, 8):
-        np.testing.assert_allclose(np.load(tmp_path / f"on {devices}.npy"), expected, rtol=0, atol=1e-6)
+    on_eight_devices(f"go_on_with_other_devices({os.fspath(tmp_path)!r})")
 
 
 def test_a_batch_that_devices_cannot_share_is_refused_before_anything_is_written(tmp_path):
     with pytest.raises(ValueError, match=r"Phase 1 .* batches of 16 windows, which 3 devices cannot share .*--batch"):
         train(SHARED, DATA, tmp_path / "run", devices=3 * jax.devices()[:1], progress=False)
     assert not (tmp_path / "run").exists()
+
+
+def test_processes_of_jax_distributed_are_refused(monkeypatch):
+    monkeypatch.setattr("jax.process_count", lambda: 4)
+    with pytest.raises(ValueError, match=r"one of 4 processes .* a training is one process"):
+        training_mesh(SHARED)
 
 
 @pytest.mark.slow

@@ -24,15 +24,20 @@ def training_mesh(
     config: TrainConfig,
     devices: Sequence[jax.Device] | None = None,  # pyright: ignore[reportInvalidTypeForm]
 ) -> Mesh | None:
-    """The devices that share the batches of a training, as a mesh of one axis; None for a single device.
+    """The devices that share the batches of a training, as a mesh of one axis; None for the default device alone.
 
     Args:
         config: whose batches are shared.
         devices: of this process; all that JAX sees by default.
 
     Raises:
-        ValueError: the batch of a phase cannot be shared equally.
+        ValueError: the batch of a phase cannot be shared equally, or `jax.distributed` has several processes.
     """
+    if (count := jax.process_count()) > 1:
+        raise ValueError(
+            f"This is one of {count} processes of jax.distributed, but a training is one process, which uses its own "
+            "devices. Start it alone, without jax.distributed."
+        )
     devices = jax.local_devices() if devices is None else list(devices)
     for number, phase in enumerate(config.phases, start=1):
         if phase.batch % len(devices):
@@ -41,7 +46,7 @@ def training_mesh(
                 f"cannot share equally. Give a batch that is a multiple of {len(devices)} (--batch), or let JAX see "
                 "another number of devices (CUDA_VISIBLE_DEVICES on GPUs, JAX_NUM_CPU_DEVICES on processors)."
             )
-    return None if len(devices) == 1 else Mesh(np.array(devices), (AXIS,))
+    return None if devices == jax.local_devices()[:1] else Mesh(np.array(devices), (AXIS,))
 
 
 def on_all_devices(tree: _Tree, mesh: Mesh | None) -> _Tree:

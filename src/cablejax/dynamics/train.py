@@ -121,15 +121,8 @@ def train(
     """
     mesh = training_mesh(config, devices)
     check_trajectories(data, config.model, steps=config.longest_rollout, what="training data")
-    scales = fit_normalisation(data, config.model) if initial is None else initial[0].normalisation
-    model_config = dataclasses.replace(config.model, normalisation=scales)
-    if initial is not None and initial[0] != model_config:
-        raise ValueError(
-            f"The model to start from is {initial[0]}, but {model_config} is to be trained: "
-            "use `cablejax.dynamics.fine_tune.starting_from`."
-        )
-    config = dataclasses.replace(config, model=model_config)
-    out_dir = Path(out_dir)
+    model_config = _with_scales(config.model, data, initial)
+    config, out_dir = dataclasses.replace(config, model=model_config), Path(out_dir)
     run = {"config": dataclasses.asdict(config), "data": fingerprint((data, initial and initial[1]))}
     report = functools.partial(tqdm.write, file=sys.stderr)
     claim_folder(out_dir, run, resume=resume, overwrite=overwrite, report=report)
@@ -174,6 +167,18 @@ def train(
                     checkpoints.save(step, on_one_device(state, mesh))
     average = symmetrised(on_one_device(state.average, mesh), model_config)
     return TrainResult(model_config, graphdef, average, step, step == total, scores)
+
+
+def _with_scales(model: ModelConfig, data: Trajectory, initial: tuple[ModelConfig, nnx.State] | None) -> ModelConfig:
+    """The configuration with the scales of the data, or of the model to start from."""
+    scales = fit_normalisation(data, model) if initial is None else initial[0].normalisation
+    model = dataclasses.replace(model, normalisation=scales)
+    if initial is not None and initial[0] != model:
+        raise ValueError(
+            f"The model to start from is {initial[0]}, but {model} is to be trained: "
+            "use `cablejax.dynamics.fine_tune.starting_from`."
+        )
+    return model
 
 
 @functools.lru_cache(maxsize=8)
