@@ -8,7 +8,11 @@ STAMP := $(VENV)/.stamp
 NPROC ?= 4
 export NPROC
 
-.PHONY: help demo tables quick matrix test test-full lint docs dist wheel-check clean
+# Tests on object storage find moto's S3 server here, where `make moto` has installed it.
+MOTO := $(CURDIR)/build/moto
+export PATH := $(PATH):$(MOTO)/bin
+
+.PHONY: help demo tables quick matrix moto test test-full lint docs dist wheel-check clean
 .DEFAULT_GOAL := help
 
 help:
@@ -16,6 +20,7 @@ help:
 	@echo "make tables     the paper's tables at a small size; experiments/*.py --full is the rest"
 	@echo "make quick      the tests of the pipeline's spine, a minute and a half"
 	@echo "make matrix     the same on every corner of the supported versions; writes docs/results/versions.md"
+	@echo "make moto       moto's S3 server into build/moto, without which the tests on object storage skip"
 	@echo "make test       lint, types and the quick tests"
 	@echo "make test-full  lint, types and every test"
 	@echo "make lint       ruff and pyright"
@@ -60,6 +65,13 @@ matrix: $(STAMP)
 	$(BIN)/python -m pip install --disable-pip-version-check --quiet 'uv>=0.9,<1'
 	$(BIN)/python benchmarks/versions.py $(SPINE) tests/test_simulate_composite.py tests/test_simulate_plant.py \
 		tests/test_perceive_camera.py
+
+# In an environment of its own: its requirements contradict ours.
+moto: $(MOTO)/bin/moto_server
+
+$(MOTO)/bin/moto_server:
+	$(PYTHON) -m venv $(MOTO)
+	$(MOTO)/bin/python -m pip install --disable-pip-version-check --quiet 'moto[server]>=5,<6'
 
 test: lint
 	$(BIN)/python -m pytest -m "not slow" -n 2 --dist loadfile

@@ -49,6 +49,7 @@ from closed_loop.protocols import Task, letter_task
 from closed_loop.statistics import PairedDifference, paired_difference
 from closed_loop.suite import Case, read_suite, run_suite
 from closed_loop.trials import Trial
+from executors import add_option, executor_of
 from pages import markdown_table, page_of_results, publish
 
 EFFECTS = (
@@ -104,18 +105,22 @@ def main() -> None:
     parser.add_argument("--out", type=pathlib.Path, default=pathlib.Path("runs/worth"))
     parser.add_argument("--seeds", type=int, default=len(SEEDS), help="so many of the table's seeds")
     parser.add_argument("--report", type=pathlib.Path, help="run nothing; write the page on what is done to this file")
+    add_option(parser)
     options = parser.parse_args()
     if options.report is not None:
         publish(page(options.out), options.report)
         return
     with_learner = [spec for spec in ARMS if spec.learner]
     without = [spec for spec in ARMS if not spec.learner]
-    for arms, effects in itertools.product((with_learner, without), (EFFECTS, LEARNED)):
-        for seed, text in itertools.product(SEEDS[: options.seeds], effects):
-            for spec in arms:
-                model = functools.partial(model_for, text, spec.name.removesuffix(ONLINE), options.out / slug(text))
-                run_suite(cases(text, [seed]), [spec], options.out / "trials", fine_tuned=model, progress=False)
-            print(f"seed {seed}, {text}: done", flush=True)
+    trials, groups = options.out / "trials", itertools.product((with_learner, without), (EFFECTS, LEARNED))
+    with executor_of(options.executor) as executor:
+        for arms, effects in groups:
+            for seed, text in itertools.product(SEEDS[: options.seeds], effects):
+                for spec in arms:
+                    model = functools.partial(model_for, text, spec.name.removesuffix(ONLINE), options.out / slug(text))
+                    own = cases(text, [seed])
+                    run_suite(own, [spec], trials, fine_tuned=model, executor=executor, progress=False)
+                print(f"seed {seed}, {text}: done", flush=True)
 
 
 def slug(text: str) -> str:

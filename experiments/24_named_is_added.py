@@ -33,6 +33,7 @@ from cablejax.simulate import ChainEngine
 from cablejax.simulate.plant import Plant, PlantConfig
 from cablejax.simulate.play import played
 from cablejax.types import GapLog
+from executors import add_option, executor_of
 from pages import markdown_table, page_of_results, publish
 from rows import Rows
 from staged import EFFECTS
@@ -174,12 +175,15 @@ def main() -> None:
     parser.add_argument("--rows", type=pathlib.Path, required=True, help="file of the finished rows")
     parser.add_argument("--report", type=pathlib.Path, help="write the page of the finished rows, and run nothing")
     parser.add_argument("--seconds", type=float, default=np.inf, help="begin no further row after this time")
+    add_option(parser)
     options = parser.parse_args()
     rows = Rows(options.rows, ("effect",))
     if options.report is not None:
         publish(page(rows.read()), options.report)
         return
-    rows.run(rows.missing([(text,) for text in ("none", *EFFECTS)]), examine, seconds=options.seconds)
+    wanted = [(text,) for text in ("none", *EFFECTS)]
+    with executor_of(options.executor) as executor:
+        rows.run(rows.missing(wanted), examine, executor=executor, seconds=options.seconds)
 
 
 if __name__ == "__main__":

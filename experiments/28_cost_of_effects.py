@@ -33,6 +33,7 @@ from closed_loop.methods import MethodSpec
 from closed_loop.protocols import Task, letter_task
 from closed_loop.suite import Case, read_suite, run_suite
 from closed_loop.trials import Trial
+from executors import add_option, executor_of
 from pages import markdown_table, page_of_results, publish
 from staged import EFFECTS
 
@@ -53,11 +54,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=pathlib.Path, default=pathlib.Path("runs/cost"))
     parser.add_argument("--report", type=pathlib.Path, help="run nothing; write the page on what is done to this file")
+    add_option(parser)
     options = parser.parse_args()
     if options.report is not None:
         publish(page(read_suite(options.out)[0]), options.report)
         return
-    run_suite(cases(), METHODS, options.out, fine_tuned=_never)
+    with executor_of(options.executor) as executor:
+        run_suite(cases(), METHODS, options.out, fine_tuned=_never, executor=executor)
 
 
 def _never(case: Case):

@@ -2,7 +2,11 @@
 
 import argparse
 import functools
+import multiprocessing
 import re
+import signal
+import threading
+import time
 
 import jax
 import numpy as np
@@ -25,7 +29,7 @@ from closed_loop.paper import VISUAL_SERVO
 from closed_loop.protocols import LaidOut, letter_task
 from closed_loop.suite import Case, key_of, read_suite, run_suite
 from closed_loop.visual_servo import VisualServo
-from executors import executor_of
+from executors import ExecutorError, executor_of
 
 CABLE = Discretisation(n_links=12, dimension=3, timestep=0.005)
 SERVO = METHODS[VISUAL_SERVO]
@@ -62,6 +66,32 @@ def test_a_suite_is_shared_resumed_and_read_whole(tmp_path):
     assert "| online visual servo | 2 |" in text and "Table IV" not in text and "Seeds: 0, 1." in text
     assert "### How runs end" in text and "| online visual servo | U | 2 |" in text
     assert re.search(r"takes, on average: U [789]\.\d s\.", text)
+
+
+@pytest.mark.slow
+def test_a_suite_that_loses_one_of_four_processes_ends_as_alone(tmp_path):
+    cases, killed, lines = [case(seed) for seed in range(8)], [], tmp_path / "shared" / "trials.jsonl"
+
+    def kill_one():
+        while not lines.exists():  # until the first row
+            time.sleep(0.01)
+        killed.append(multiprocessing.active_children()[0])
+        killed[0].kill()
+
+    with executor_of("4") as executor:
+        watcher = threading.Thread(target=kill_one, daemon=True)
+        watcher.start()
+        with pytest.raises(ExecutorError, match="run the same command to go on"):
+            run_suite(cases, [SERVO], lines.parent, fine_tuned=no_model, executor=executor, progress=False)
+        watcher.join()
+    kept = lines.read_text()
+    assert killed[0].exitcode == -signal.SIGKILL and 1 <= kept.count("\n") < len(cases)
+    with executor_of("4") as executor:
+        run_suite(cases, [SERVO], lines.parent, fine_tuned=no_model, executor=executor, progress=False)
+    assert lines.read_text().startswith(kept), "nothing is lost"
+    run_suite(cases, [SERVO], tmp_path / "alone", fine_tuned=no_model, progress=False)
+    shared, alone = ({t.key: t.errors_cm for t in read_suite(tmp_path / f)[0]} for f in ("shared", "alone"))
+    assert shared == alone and lines.read_text().count("\n") == len(cases), "nothing is doubled"
 
 
 def test_cases_are_those_of_the_paper():

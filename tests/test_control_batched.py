@@ -152,7 +152,7 @@ def test_the_controller_in_a_batch_equals_the_controller_alone():
 
 
 @pytest.mark.slow
-def test_two_devices_shape_as_one(tmp_path):
+def test_two_and_eight_devices_shape_as_one(tmp_path):
     code = """
 import sys; sys.path.insert(0, {folder!r})
 import jax, numpy as np
@@ -162,7 +162,7 @@ run = shape_batch(*arguments("USU"), controller, shapes("USU"), LoopConfig(steps
 print(jax.device_count()); np.save({path!r}, run.keypoints)
 """
     results = []
-    for count in (1, 2):
+    for count in (1, 2, 8):
         path = str(tmp_path / f"{count}.npy")
         flags = f"--xla_force_host_platform_device_count={count}"
         done = subprocess.run(
@@ -172,8 +172,9 @@ print(jax.device_count()); np.save({path!r}, run.keypoints)
         assert done.returncode == 0, done.stderr
         assert done.stdout.split()[-1] == str(count)
         results.append(np.load(path))
-    assert results[1].shape == (3, 4, 5, 2)  # the copy that fills the second device's share is not shown
-    np.testing.assert_allclose(results[1], results[0], atol=1e-6)
+    for shared in results[1:]:
+        assert shared.shape == (3, 4, 5, 2)  # copies that fill the other devices' shares are not shown
+        np.testing.assert_allclose(shared, results[0], atol=1e-6)
 
 
 @pytest.mark.slow
@@ -213,6 +214,8 @@ def test_each_cable_is_stepped_as_alone():
         after, command = jax.jit(for_each_cable(step, devices))(states, measurements)
         np.testing.assert_array_equal(after, [1.0, 1.0, 0.09375])
         np.testing.assert_array_equal(command["twist"], np.repeat(after[:, None], 3, axis=1))
+    with pytest.raises(ValueError, match="2 devices cannot share 3 cables equally, expected a multiple of 2"):
+        jax.jit(for_each_cable(step, 2 * jax.devices()[:1]))(states, measurements)
 
 
 def test_wrong_requests_are_refused():

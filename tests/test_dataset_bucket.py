@@ -84,7 +84,7 @@ def server(tmp_path_factory):
     """The port of moto's S3 server, which lives in an environment of its own: its pins are not ours."""
     program = shutil.which("moto_server")
     if program is None:
-        pytest.skip("needs moto_server on the path: pipx install 'moto[server]'")
+        pytest.skip("needs moto_server on the path: make moto")
     pytest.importorskip("obstore")
     with socket.create_server(("127.0.0.1", 0)) as place:
         port = place.getsockname()[1]

@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import os
+import shutil
 import signal
 import socket
 import subprocess
@@ -97,7 +98,7 @@ def child(code: str, config: DatasetConfig, path: Path, *arguments: str, **envir
 
 
 def finish(process: subprocess.Popen) -> str:
-    output, _ = process.communicate(timeout=300)
+    output, _ = process.communicate(timeout=900)
     assert process.returncode == 0, output
     return output
 
@@ -225,6 +226,24 @@ def test_shares_of_two_processes_make_the_same_store(reference, tmp_path):
         generate(TINY, tmp_path / "data", process_index=2, process_count=2)
 
 
+def test_a_disk_with_too_little_room_is_refused_before_anything_is_simulated(reference, tmp_path, monkeypatch):
+    path, size = tmp_path / "data", 8 * (4 * 4 * 2 + 4 * 2 * 3 + 3 * 2 * 3) * 4  # float32 of the eight trajectories
+    generate(TINY, path, progress=False, process_index=0, process_count=2)
+    before = tree(path)
+
+    def left(free):
+        monkeypatch.setattr("shutil.disk_usage", lambda place: shutil._ntuple_diskusage(10**9, 10**9 - free, free))
+
+    left(size // 3)
+    with pytest.raises(ValueError, match=r"4 trajectories are missing in .*data, .* Make room"):
+        generate(TINY, path, progress=False)
+    assert tree(path) == before
+    left(size)  # a store needs somewhat more than these arrays, but half of them are there
+    assert generate(TINY, path, progress=False).complete and tree(path) == tree(reference)
+    left(0)
+    assert generate(TINY, path, progress=False).complete, "nothing is missing"
+
+
 @pytest.mark.slow
 def test_sigkill_and_resume_bit_for_bit(tmp_path):
     config = dataclasses.replace(TINY, n_trajectories=60, n_steps=20)
@@ -327,33 +346,55 @@ def test_faults_are_distinguished(reference):
 
 
 @pytest.mark.slow
-def test_two_processes_of_jax_distributed_on_loopback(reference, tmp_path):
+def test_four_processes_of_which_one_is_killed_and_started_again(tmp_path):
+    config = dataclasses.replace(TINY, n_trajectories=64, n_steps=20)
+    code = "generate(config, path, progress=False, process_index=int(sys.argv[3]), process_count=4)"
+    path, killed = tmp_path / "data", 2
+    processes = [child(code, config, path, str(p)) for p in range(4)]
+    deadline = time.monotonic() + 900
+    while not any((path / "digest" / "c" / str(shard) / "0").exists() for shard in range(killed, 32, 4)):
+        assert processes[killed].poll() is None and time.monotonic() < deadline
+        time.sleep(0.002)
+    processes[killed].kill()
+    processes[killed].communicate()
+    made = sum(status == "complete" for status in map(open_store(path).status, range(killed, 32, 4)))
+    assert 1 <= made < 8, "it was killed on its way"
+    for process in [one for one in processes if one is not processes[killed]]:
+        finish(process)
+    assert open_store(path).info().n_complete == 48 + 2 * made
+    finish(child(code, config, path, str(killed)))
+    generate(config, tmp_path / "alone", progress=False)
+    assert tree(path) == tree(tmp_path / "alone")
+
+
+@pytest.mark.slow
+def test_four_processes_of_jax_distributed_on_loopback(reference, tmp_path):
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         address = f"127.0.0.1:{probe.getsockname()[1]}"
     code = (
         "import jax\n"
-        "jax.distributed.initialize(sys.argv[3], num_processes=2, process_id=int(sys.argv[4]))\n"
+        "jax.distributed.initialize(sys.argv[3], num_processes=4, process_id=int(sys.argv[4]))\n"
         "info = generate(config, path, progress=False)\n"
         "print(jax.process_index(), jax.process_count(), info.complete, info.digest)\n"
     )
-    processes = [child(code, TINY, tmp_path / "data", address, str(p), JAX_PLATFORMS="cpu") for p in range(2)]
+    processes = [child(code, TINY, tmp_path / "data", address, str(p), JAX_PLATFORMS="cpu") for p in range(4)]
     outputs = [finish(process) for process in processes]
     digest = open_store(reference).info().digest
     for p, output in enumerate(outputs):
-        assert f"{p} 2 True {digest}" in output
+        assert f"{p} 4 True {digest}" in output
     assert tree(tmp_path / "data") == tree(reference)
 
 
 @pytest.mark.slow
-def test_two_devices_make_the_bytes_of_one(tmp_path):
+def test_two_and_eight_devices_make_the_bytes_of_one(tmp_path):
     config = dataclasses.replace(TINY, engine="mjx", n_trajectories=7)
     code = "import jax\nprint(jax.local_device_count(), generate(config, path, progress=False).complete)\n"
-    for count in (1, 2):
+    for count in (1, 2, 8):
         flags = f"--xla_force_host_platform_device_count={count}"
         output = finish(child(code, config, tmp_path / str(count), XLA_FLAGS=flags, JAX_PLATFORMS="cpu"))
         assert f"{count} True" in output
-    assert tree(tmp_path / "1") == tree(tmp_path / "2")
+    assert tree(tmp_path / "1") == tree(tmp_path / "2") == tree(tmp_path / "8")
     # and they are the trajectories of the other engine
     here = open_store(tmp_path / "1").read()
     block = simulate(config, ThreadedEngine(config.discretisation), range(config.n_shards))

@@ -124,6 +124,26 @@ def test_a_training_is_overwritten_on_request_and_nothing_else(tmp_path):
     assert {name: stored[name] for name in second} == second
 
 
+def test_a_training_that_goes_on_with_other_packages_says_so(tmp_path):
+    run, lines = {"config": {"seed": 0}, "data": "a"}, []
+
+    def claim():
+        claim_folder(tmp_path, run, resume=True, overwrite=False, report=lines.append)
+
+    claim(), claim()
+    stored = json.loads((tmp_path / "run.json").read_text())
+    assert not lines and stored["versions"]["jax"] == jax.__version__ and "optax" in stored["versions"]
+    stored["versions"]["jax"] = "0.1.0"
+    (tmp_path / "run.json").write_text(json.dumps(stored))
+    claim()
+    (line,) = lines
+    assert f"begun with other packages: jax (0.1.0, now {jax.__version__}). The training goes on" in line
+    del stored["versions"]  # as trainings were before they recorded them
+    (tmp_path / "run.json").write_text(json.dumps(stored))
+    claim()
+    assert lines == [line]
+
+
 @pytest.mark.parametrize(
     ("file", "text", "overwrite", "message"),
     [
@@ -166,7 +186,7 @@ def test_a_damaged_checkpoint_is_reported_and_the_one_before_it_used(tmp_path):
 
 
 def test_a_training_that_diverges_says_what_to_change(tmp_path, monkeypatch):
-    def diverging(config, phase, graphdef, steps):
+    def diverging(config, phase, graphdef, steps, mesh):
         lost = {"loss": np.full(steps, np.nan), "gradient_norm": np.full(steps, np.nan)}
         return lambda state, data: (dataclasses.replace(state, step=state.step + steps), lost)
 

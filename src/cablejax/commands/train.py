@@ -22,7 +22,8 @@ class Train(Command):
     """Train a model of the cable's dynamics on data sets made by `cablejax simulate`.
 
     Writes checkpoints, metrics (CSV and TensorBoard), weights.safetensors, a model card, and the error on held-out
-    trajectories. A training that was interrupted goes on with the same command and ends in the very same weights.
+    trajectories. A training that was interrupted goes on with the same command and ends in the very same weights. All
+    devices that JAX sees share each batch; a training may go on with another number of them.
     """
 
     resume_hint: ClassVar[str] = "The last checkpoint is kept; run the same command again to go on."
@@ -86,6 +87,7 @@ class Train(Command):
         from cablejax.dynamics.autoencoder import PretrainConfig, pretrain
         from cablejax.dynamics.error_report import error_report
         from cablejax.dynamics.fine_tune import starting_from
+        from cablejax.dynamics.parallel import training_mesh
         from cablejax.dynamics.train import train
         from cablejax.dynamics.weights import FILE_NAME, save_weights
 
@@ -99,6 +101,7 @@ class Train(Command):
         stores = [open_store(path) for path in self.data]
         self._check_cables(stores)
         config = self._config(stores[0])
+        training_mesh(config)  # refuses a batch that the devices cannot share, before anything is read
         training, held_out = read_split(stores, self.held_out)
         count = sum(len(part.gripper_twist) for part in held_out)
         say(f"{len(training.gripper_twist)} trajectories to train on, {count} held out; {config.total_steps} steps")

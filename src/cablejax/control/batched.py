@@ -107,8 +107,9 @@ def for_each_cable(
 
     Args:
         step: pure function of arrays, or pytrees of them, of one cable.
-        devices: to spread the cables over, a multiple of their number; by default the one on which the arguments are. A
-            processor's cores are devices where `jax.config.jax_num_cpu_devices` says so.
+        devices: to spread the cables over; a call with a number of cables that they cannot share equally raises
+            `ValueError`. By default the one on which the arguments are. A processor's cores are devices where
+            `jax.config.jax_num_cpu_devices` says so.
 
     Returns:
         The same function where every argument and result has a leading axis of cables.
@@ -123,6 +124,8 @@ def _shared_out(function: Callable[..., Any], devices: tuple[jax.Device, ...], w
     """A function of a batch on several devices, each with its own share; all have the first `whole` arguments."""
 
     def shared_out(*arguments):
+        if (size := len(jax.tree.leaves(arguments[whole:])[0])) % (n := len(devices)):
+            raise ValueError(f"{n} devices cannot share {size} cables equally, expected a multiple of {n} cables.")
         specs = tuple(PartitionSpec() if i < whole else PartitionSpec(AXIS) for i in range(len(arguments)))
         mesh = Mesh(np.array(devices), (AXIS,))
         spread = jax.shard_map(function, mesh=mesh, in_specs=specs, out_specs=PartitionSpec(AXIS), check_vma=False)

@@ -9,7 +9,9 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import itertools
+import math
 import os
+import shutil
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
@@ -36,6 +38,9 @@ MAX_ATTEMPTS = 10
 
 GRASP_TOLERANCE = 1e-2
 """Largest distance of an end keypoint from its gripper [m]: a cable that snaps through pulls its ends off a bit."""
+
+COMPRESSED = 0.9
+"""Size of random motions in a store, relative to their arrays."""
 
 WRITER = ".writer-"
 """A folder of this name in the store, with its share after it, is locked by each process that writes there."""
@@ -129,8 +134,8 @@ def generate(
         What is on disk afterwards; under `jax.distributed`, once every process has finished.
 
     Raises:
-        ValueError: the folder holds something else (see `open_or_create`), or a trajectory failed its checks
-            `MAX_ATTEMPTS` times.
+        ValueError: the folder holds something else (see `open_or_create`), its disk has too little room for what is
+            missing, or a trajectory failed its checks `MAX_ATTEMPTS` times.
         GenerationInterrupted: Ctrl-C. Complete shards are kept.
     """
     distributed = process_index is None and process_count is None and jax.process_count() > 1
@@ -139,6 +144,7 @@ def generate(
     if not 0 <= index < count:
         raise ValueError(f"process_index is {index} and process_count {count}, expected 0 <= index < count.")
     store = open_or_create(path, config)
+    _check_room(store)
     mine = range(index, config.n_shards, count)
     if not resume and any(store.status(shard) != "missing" for shard in mine):
         raise ValueError(f"{path} exists and holds trajectories. Allow resuming, or give a new folder.")
@@ -179,6 +185,21 @@ def generate(
 
         multihost_utils.sync_global_devices("cablejax.dataset.generate")
     return store.info()
+
+
+def _check_room(store: Store) -> None:
+    """Raises `ValueError` if the missing trajectories, of all processes, do not fit on the disk of a folder."""
+    if isinstance(store.path, Bucket):
+        return
+    config = store.config
+    one = sum(np.dtype(dtype).itemsize * math.prod(shape) for shape, dtype in config.array_shapes().values())
+    missing = config.n_trajectories - store.info().n_complete
+    needed, free = COMPRESSED * one * missing, shutil.disk_usage(store.path).free
+    if needed > free:
+        raise ValueError(
+            f"{missing} trajectories are missing in {store.path}, which need about {needed / 1e9:.3g} GB, but its disk "
+            f"has {free / 1e9:.3g} GB left. Make room, or give a folder on another disk; what is there is kept."
+        )
 
 
 @contextlib.contextmanager

@@ -7,7 +7,7 @@ import json
 import os
 import shutil
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -151,10 +151,10 @@ def _changes(stored: Mapping[str, Any], asked: Mapping[str, Any]) -> str:
     return "; ".join(f"{name} is {old!r} in the store and {new!r} here" for name, (old, new) in found)
 
 
-def package_versions() -> dict[str, str]:
-    """Versions of the packages that decide the content."""
+def package_versions(packages: Sequence[str] = PACKAGES) -> dict[str, str]:
+    """Versions of cablejax and of some packages, by default those that decide the content of a data set."""
     versions = {"cablejax": __version__}
-    for name in PACKAGES:
+    for name in packages:
         try:
             versions[name] = importlib.metadata.version(name)
         except importlib.metadata.PackageNotFoundError:

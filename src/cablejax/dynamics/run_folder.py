@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import json
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from cablejax.dataset.opening import package_versions
 from cablejax.text_file import differences, read_json, version_of, write_json
 from cablejax.whole_file import sole_writer
 
@@ -16,12 +18,22 @@ SCHEMA = "cablejax-training/1"
 RUN, CHECKPOINTS, METRICS, BOARD = "run.json", "checkpoints", "metrics.csv", "tensorboard"
 """What a training's folder holds: its settings, checkpoints, errors by step, and curves for TensorBoard."""
 
+PACKAGES = ("jax", "jaxlib", "flax", "optax")
+"""Packages whose versions decide the weights, besides cablejax itself."""
+
 # What `cablejax train` adds in the end.
 _RESULTS = ("weights.safetensors", "card.md", "summary.json")
 
 
-def claim_folder(out_dir: Path, run: dict[str, Any], *, resume: bool, overwrite: bool) -> None:
-    """Writes `run.json` into a fresh folder, or into one that is taken over.
+def claim_folder(
+    out_dir: Path,
+    run: dict[str, Any],
+    *,
+    resume: bool,
+    overwrite: bool,
+    report: Callable[[str], object] = lambda text: None,
+) -> None:
+    """Writes `run.json`, with the versions of the packages, into a fresh folder or one that is taken over.
 
     Args:
         out_dir: the folder.
@@ -29,6 +41,7 @@ def claim_folder(out_dir: Path, run: dict[str, Any], *, resume: bool, overwrite:
         resume: whether the folder may hold this very training.
         overwrite: whether another training, or files of something else, may be there. The training is deleted; of the
             other files those are replaced that have the names of its own.
+        report: called with a line of text if other versions of the packages began this very training.
 
     Raises:
         ValueError: the folder holds another run, any run without `resume`, or something else without `overwrite`.
@@ -36,12 +49,19 @@ def claim_folder(out_dir: Path, run: dict[str, Any], *, resume: bool, overwrite:
     if out_dir.exists() and not out_dir.is_dir():
         raise ValueError(f"{out_dir} is a file, expected a folder for the training. Name another one.")
     path = out_dir / RUN
-    run = {"schema": SCHEMA, **json.loads(json.dumps(run))}
+    run, versions = {"schema": SCHEMA, **json.loads(json.dumps(run))}, package_versions(PACKAGES)
     if path.exists():
         found = _read(path)
+        began = found.pop("versions", versions)  # earlier trainings recorded none
         if found == run:
             if not resume:
                 raise ValueError(f"{out_dir} holds a training already. Choose another folder, or resume it.")
+            if others := differences(began, versions):
+                changes = ", ".join(f"{name} ({old}, now {new})" for name, (old, new) in others.items())
+                report(
+                    f"{out_dir} was begun with other packages: {changes}. The training goes on, but its "
+                    "weights may differ by rounding from those of one version; install the former to repeat them."
+                )
             return
         if not overwrite:
             changes = ", ".join(f"{name} ({old}, now {new})" for name, (old, new) in differences(found, run).items())
@@ -64,7 +84,7 @@ def claim_folder(out_dir: Path, run: dict[str, Any], *, resume: bool, overwrite:
                 )
         _discard(out_dir)
     out_dir.mkdir(parents=True, exist_ok=True)
-    write_json(path, run)
+    write_json(path, {**run, "versions": versions})
 
 
 def _read(path: Path) -> dict[str, Any]:

@@ -1,7 +1,8 @@
 """Training a graph network simulator on trajectories, resumable to the bit.
 
 Many optimiser steps run in one compiled call. What a step sees depends on `(seed, step)` alone, a checkpoint holds the
-whole state, so a training that was killed and resumed ends in the same weights as one that ran through.
+whole state, so a training that was killed and resumed ends in the same weights as one that ran through. All devices of
+the process share each batch (`dynamics.parallel`); checkpoints do not depend on their number.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -22,6 +23,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 from flax import nnx
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array
 from tqdm import tqdm
 
@@ -34,6 +36,7 @@ from cablejax.dynamics.loss import random_walk_noise, rollout_loss
 from cablejax.dynamics.metrics import MetricsLog
 from cablejax.dynamics.model import bind, make_network
 from cablejax.dynamics.normalisation import check_trajectories, fit_normalisation
+from cablejax.dynamics.parallel import loss_and_gradient, on_all_devices, on_one_device, training_mesh
 from cablejax.dynamics.run_folder import CHECKPOINTS, claim_folder
 from cablejax.dynamics.symmetry import initially_symmetric, symmetrised
 from cablejax.dynamics.train_config import Phase, TrainConfig
@@ -95,6 +98,7 @@ def train(
     resume: bool = True,
     overwrite: bool = False,
     progress: bool = True,
+    devices: Sequence[jax.Device] | None = None,  # pyright: ignore[reportInvalidTypeForm]
 ) -> TrainResult:
     """Trains from scratch, or goes on from the last checkpoint in `out_dir`.
 
@@ -108,43 +112,40 @@ def train(
         resume: false refuses a folder that holds this run already.
         overwrite: another run in the folder is deleted, and other files there may be replaced.
         progress: show a progress bar with remaining time.
+        devices: of this process, which share each batch; all that JAX sees by default.
 
     Raises:
-        ValueError: bad data, or `out_dir` holds a run of another configuration or data, or something else, or another
-            process trains there.
+        ValueError: bad data, a batch that the devices cannot share equally, or `out_dir` holds a run of another
+            configuration or data, or something else, or another process trains there.
         DivergedError: the loss is no longer finite.
     """
+    mesh = training_mesh(config, devices)
     check_trajectories(data, config.model, steps=config.longest_rollout, what="training data")
-    scales = fit_normalisation(data, config.model) if initial is None else initial[0].normalisation
-    model_config = dataclasses.replace(config.model, normalisation=scales)
-    if initial is not None and initial[0] != model_config:
-        raise ValueError(
-            f"The model to start from is {initial[0]}, but {model_config} is to be trained: "
-            "use `cablejax.dynamics.fine_tune.starting_from`."
-        )
-    config = dataclasses.replace(config, model=model_config)
-    out_dir = Path(out_dir)
+    model_config = _with_scales(config.model, data, initial)
+    config, out_dir = dataclasses.replace(config, model=model_config), Path(out_dir)
     run = {"config": dataclasses.asdict(config), "data": fingerprint((data, initial and initial[1]))}
-    claim_folder(out_dir, run, resume=resume, overwrite=overwrite)
+    report = functools.partial(tqdm.write, file=sys.stderr)
+    claim_folder(out_dir, run, resume=resume, overwrite=overwrite, report=report)
 
     graphdef, weights = nnx.split(make_network(model_config, nnx.Rngs(config.seed)))
     weights = initially_symmetric(weights, model_config) if initial is None else initial[1]
     optimiser = config.optimiser()
     state = TrainState(weights, weights, optimiser.init(weights), jnp.zeros((), jnp.int32))
-    device_data = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), data)
+    device_data = on_all_devices(jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), data), mesh)
     evaluate = None if validation is None else Validation(validation, graphdef, config)
     columns = ("phase", "learning_rate", "loss", "gradient_norm", *(f"open_loop_{h}_cm" for h in HORIZONS), "seconds")
 
     scores: dict[int, float] = {}
     with sole_writer(out_dir), Checkpoints(out_dir / CHECKPOINTS) as checkpoints, interrupt_flag() as interrupted:
         if checkpoints.latest() is not None:
-            state = checkpoints.restore(state, report=functools.partial(tqdm.write, file=sys.stderr))
+            state = checkpoints.restore(state, report=report)
         step, total = int(state.step), config.total_steps
+        state = on_all_devices(state, mesh)
         bar = tqdm(total=total, initial=step, unit="step", disable=not progress, dynamic_ncols=True)
         with MetricsLog(out_dir, columns, step) as log, bar:
             while step < total and not interrupted.is_set():
                 index, end = config.phase_at(step)
-                update = chunk_update(config, index, graphdef, min(config.chunk, end - step))
+                update = chunk_update(config, index, graphdef, min(config.chunk, end - step), mesh)
                 began, current = time.perf_counter(), state
                 made = unless(interrupted, lambda: jax.block_until_ready(update(current, device_data)))  # noqa: B023
                 if made is None:
@@ -154,29 +155,48 @@ def train(
                 row = {"phase": index, "seconds": seconds} | chunk_metrics(config, step, losses, out_dir)
                 chunks = -(-step // config.chunk)
                 if evaluate is not None and (chunks % config.evaluate_every == 0 or step == total):
-                    scores = evaluate(state.average)
+                    scores = evaluate(on_one_device(state.average, mesh))
                     row |= {f"open_loop_{h}_cm": score for h, score in scores.items()}
                 log.write(step, row)
                 if chunks % config.checkpoint_every == 0 or step == total:
-                    checkpoints.save(step, state)
+                    checkpoints.save(step, on_one_device(state, mesh))
                 bar.update(done)
                 bar.set_postfix({"loss": f"{row['loss']:.2e}"} | {f"e{h}_cm": f"{s:.3f}" for h, s in scores.items()})
             if interrupted.is_set() and step:
                 with saving():
-                    checkpoints.save(step, state)
-    return TrainResult(model_config, graphdef, symmetrised(state.average, model_config), step, step == total, scores)
+                    checkpoints.save(step, on_one_device(state, mesh))
+    average = symmetrised(on_one_device(state.average, mesh), model_config)
+    return TrainResult(model_config, graphdef, average, step, step == total, scores)
+
+
+def _with_scales(model: ModelConfig, data: Trajectory, initial: tuple[ModelConfig, nnx.State] | None) -> ModelConfig:
+    """The configuration with the scales of the data, or of the model to start from."""
+    scales = fit_normalisation(data, model) if initial is None else initial[0].normalisation
+    model = dataclasses.replace(model, normalisation=scales)
+    if initial is not None and initial[0] != model:
+        raise ValueError(
+            f"The model to start from is {initial[0]}, but {model} is to be trained: "
+            "use `cablejax.dynamics.fine_tune.starting_from`."
+        )
+    return model
 
 
 @functools.lru_cache(maxsize=8)
-def chunk_update(config: TrainConfig, phase_index: int, graphdef: nnx.GraphDef, steps: int):
-    """Compiled `(state, data) -> (state, {"loss", "gradient_norm"} each [steps])` for `steps` optimiser steps."""
+def chunk_update(config: TrainConfig, phase_index: int, graphdef: nnx.GraphDef, steps: int, mesh: Mesh | None = None):
+    """Compiled `(state, data) -> (state, {"loss", "gradient_norm"} each [steps])` for `steps` optimiser steps.
+
+    With a mesh, from `training_mesh`, its devices share each batch; state and data are whole on all of them.
+    """
     phase, model, optimiser = config.phases[phase_index], config.model, config.optimiser()
+
+    def loss_of(weights: nnx.State, windows: Window):
+        return batch_loss(weights, graphdef, windows, phase, model)
 
     def update(state: TrainState, data: Trajectory):
         def one(state: TrainState, _):
             key = jax.random.fold_in(jax.random.key(config.seed), state.step)
             windows = noisy_windows(key, data, phase, model.history)
-            loss, gradient = jax.value_and_grad(batch_loss)(state.weights, graphdef, windows, phase, model)
+            loss, gradient = loss_and_gradient(loss_of, state.weights, windows, mesh)
             change, inner = optimiser.update(symmetrised(gradient, model), state.optimiser, state.weights)
             weights = optax.apply_updates(state.weights, change)
             # A short memory at first, so that the average does not remember the random start.
@@ -187,7 +207,7 @@ def chunk_update(config: TrainConfig, phase_index: int, graphdef: nnx.GraphDef, 
 
         return jax.lax.scan(one, state, length=steps)
 
-    return jax.jit(update)
+    return jax.jit(update, out_shardings=None if mesh is None else NamedSharding(mesh, PartitionSpec()))
 
 
 def chunk_metrics(config: TrainConfig, step: int, losses: dict[str, Array], out_dir: Path) -> dict[str, float]:
