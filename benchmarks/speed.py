@@ -1,4 +1,4 @@
-"""Runs both benchmarks of the command line and writes their numbers as one Markdown page.
+"""Runs the benchmarks of the command line and writes their numbers as one Markdown page.
 
 python benchmarks/speed.py --out docs/results/speed.md
 """
@@ -18,14 +18,35 @@ def measure(*words: str) -> dict:
     return json.loads(run.stdout)
 
 
+def waiting(start: dict) -> list[str]:
+    """The section about what one waits for."""
+    verdict = f"a verdict, median of {len(start['verdict']['logs'])} logs"
+    rows = [("`import cablejax`", start["import"]), ("`cablejax --help`", start["help"])]
+    for name, part in (("first control call", start["control"]), (verdict, start["verdict"])):
+        rows += [(f"{name}, first run", part["empty"]), (f"{name}, later run", part["filled"])]
+    return [
+        "## Start-up, first control call and verdict",
+        "",
+        "Each in a process of its own; compiled programs are kept from the first run on. Processor time is that of all",
+        "cores together.",
+        "",
+        "| | wall time [s] | processor time [s] |",
+        "| --- | ---: | ---: |",
+        *(f"| {name} | {seconds['wall_s']:.2f} | {seconds['cpu_s']:.2f} |" for name, seconds in rows),
+        "",
+    ]
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=pathlib.Path, default=pathlib.Path("docs/results/speed.md"))
     parser.add_argument("--weights", default="gns-reference")
+    parser.add_argument("--logs", nargs="*", default=[], help="gap logs to diagnose; by default a staged one")
     options = parser.parse_args()
 
     simulate = measure("bench", "simulate")
     mpc = measure("bench", "mpc", "--weights", options.weights)
+    start = measure("bench", "start", *options.logs, "--weights", options.weights)
     lines = [
         "# Speed",
         "",
@@ -80,6 +101,7 @@ def main() -> None:
         "| --- | --- | --- |",
         *(f"| {size} | {b['ms']:.1f} | {b['plans_per_second']:.1f} |" for size, b in mpc["batched"].items()),
         "",
+        *waiting(start),
     ]
     options.out.parent.mkdir(parents=True, exist_ok=True)
     options.out.write_text("\n".join(lines), encoding="utf-8")

@@ -22,13 +22,15 @@ from cablejax.diagnose.belief import (
 from cablejax.diagnose.conclude import conclude, sentence
 from cablejax.diagnose.evidence import Evidence
 from cablejax.diagnose.fit import Fit, evaluate, improve
+from cablejax.diagnose.gap import held_out_predictions
+from cablejax.diagnose.planar import physics_of
 from cablejax.diagnose.playback import Playback
 from cablejax.diagnose.protocol import Term
 from cablejax.diagnose.screen import screen, shortlist
-from cablejax.diagnose.search import Search
+from cablejax.diagnose.search import Search, without_one
 from cablejax.effects import BendingStiffness
 from cablejax.simulate.chain.replay import LARGEST_STEP
-from diagnose_cases import BY_NAME, INTERVAL, evidence, parts
+from diagnose_cases import BY_NAME, INTERVAL, SAMPLES, clean, evidence, evidence_of, parts, playback
 
 LOOK_ALIKES = (("bending_stiffness", (0.3,)), ("table_friction", (0.3, 0.0)))
 NOTHING = explanation()
@@ -299,3 +301,40 @@ def test_the_headline_lists_no_cause_whose_probability_is_below_one_per_cent():
         conclusion, ranking=tuple(dataclasses.replace(ranked, probability=0.5) for ranked in conclusion.ranking)
     )
     assert "cannot tell apart: bending stiffness or table friction." in sentence(even, 0.9)
+
+
+def test_padding_is_not_simulated_and_changes_nothing():
+    """Episodes of other lengths than their arrays: the same keypoints up to their end, the last ones from there on."""
+    player = playback(17)
+    believed, length = player.believed, np.array([60, 100, 41, 60])
+    stiff = dataclasses.replace(believed, stiffness=2 * believed.stiffness)
+    lagging = dataclasses.replace(believed, camera_lag=np.float32(0.25))
+    obstacle = physics_of(explanation(*parts(("obstacle", (0.3, 0.2, 0.03)))), believed, player.config)
+    physics = [believed, obstacle, stiff, lagging]
+    whole, cut = (p.keypoints(physics) for p in (player, dataclasses.replace(player, length=length)))
+    for e, n in enumerate(length):
+        np.testing.assert_allclose(cut[:, e, :n], whole[:, e, :n], rtol=0, atol=1e-6)
+    # a batch runs as long as its longest episode, here all of one
+    alone = dataclasses.replace(player, length=length, rows=2).keypoints([believed, stiff], [2, 0])
+    np.testing.assert_allclose(alone[:, 0, :41], whole[::2, 2, :41], rtol=0, atol=1e-6)
+    np.testing.assert_array_equal(alone[:, 0, 41:], np.repeat(alone[:, 0, 40:41], SAMPLES - 41, axis=1))
+    assert np.abs(whole[:, 2, 41:] - whole[:, 2, 40:41]).max() > 1e-3
+
+
+def test_held_out_predictions_are_those_of_fits_without_each_motion():
+    """An effect that one motion alone shows is left out there; what the others show is fitted without it."""
+    stiff, bias = ("bending_stiffness", (0.5,)), ("keypoint_bias", 4, (0.004,))
+    points = clean(stiff, n_links=17).copy()
+    points[2] = clean(stiff, bias, n_links=17)[2]
+    facts = evidence_of(points)
+    (best,) = improve(facts, evaluate(facts, [explanation(*parts(stiff, bias))]), max_iterations=10)
+    predicted, held_out = held_out_predictions(facts, best)
+    assert held_out == (0, 1, 2, 3)
+    for e in range(4):
+        rest = facts.restricted([i for i in range(4) if i != e])
+        starts = evaluate(rest, [best.explanation, *without_one(best.explanation)])
+        (fit,) = improve(rest, starts[:1], max_iterations=2)
+        simpler = min(starts[1:], key=lambda one: one.cost(rest))
+        assert (simpler.cost(rest) < starts[0].cost(rest) + 2.0) == (e == 2)
+        expected = (simpler if e == 2 else fit).explanation
+        np.testing.assert_allclose(predicted[e], facts.predict([expected])[0, e], rtol=0, atol=1e-5)

@@ -77,6 +77,15 @@ def test_what_another_law_makes_is_no_effect(monkeypatch):
     assert alone.verdict != "none"
 
 
+def test_a_law_costs_one_verdict_and_no_posterior(monkeypatch):
+    """What a verdict would be under a law is stated without draws from all that is left open there."""
+    drawn = []
+    monkeypatch.setattr("cablejax.diagnose.conclude.posterior", lambda found, *_: drawn.append(found) or ())
+    conclusion, laws = concluded(recorded(FRICTION, carried=False))
+    assert len(conclusion.under_laws) == len(laws) == 2 and all(under.effects for under in conclusion.under_laws)
+    assert len(drawn) == 1 and not any(drawn[0] is law.found for law in laws)
+
+
 def covers(estimate: ParameterEstimate, truth: float) -> bool:
     low, high = np.asarray(estimate.ci90, float)
     return bool(low <= truth <= high)

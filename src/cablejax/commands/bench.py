@@ -1,4 +1,4 @@
-"""`cablejax bench simulate | mpc | loop | perception`: times simulators, controller and tracker on this machine."""
+"""`cablejax bench simulate | mpc | loop | perception | start`: times the package on this machine."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from typing import Annotated, get_args
 from tyro.conf import subcommand
 
 from cablejax.commands.bench_simulate import BenchSimulate
+from cablejax.commands.bench_start import BenchStart
 from cablejax.commands.options import Command, UsageError, say, text_table
 from cablejax.limits import require
 from cablejax.solver_names import SolverName
@@ -214,5 +215,6 @@ class Bench:
         | Annotated[BenchMpc, subcommand("mpc")]
         | Annotated[BenchLoop, subcommand("loop")]
         | Annotated[BenchPerception, subcommand("perception")]
+        | Annotated[BenchStart, subcommand("start")]
     )
     """What is measured."""

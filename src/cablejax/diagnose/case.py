@@ -82,9 +82,12 @@ class Case:
             of_links = dataclasses.replace(config, n_links=n_links)
             believed = nominal_physics(of_links, gravity=log.meta["gravity_m_per_s2"], arclength=marks)
             try:
-                return Playback.of_motion(of_links, pose, first, recording.interval, step, believed=believed)
+                made = Playback.of_motion(of_links, pose, first, recording.interval, step, believed=believed)
             except ValueError as error:
                 raise DiagnosisError(f"The nominal cable has no settled shape at a first pose: {error}") from error
+            # the fine cable is replayed once or twice, by a program of its own
+            rows = made.rows if n_links == FIT_LINKS else min(made.rows, len(pose))
+            return dataclasses.replace(made, length=recording.length, rows=rows)
 
         def run(playback):
             return playback.keypoints([playback.believed])[0].astype(np.float64)

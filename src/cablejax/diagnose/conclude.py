@@ -67,13 +67,7 @@ class Conclusion:
     under_laws: tuple[UnderLaw, ...] = ()
 
 
-def conclude(
-    found: Search,
-    evidence: Evidence,
-    calibration: Calibration,
-    laws: Sequence[Law] = (),
-    drawn: Float[np.ndarray, "D P"] | None = None,
-) -> Conclusion:
+def conclude(found: Search, evidence: Evidence, calibration: Calibration, laws: Sequence[Law] = ()) -> Conclusion:
     """Probabilities, equivalence sets and the verdict.
 
     Args:
@@ -82,8 +76,25 @@ def conclude(
         calibration: of the judgement.
         laws: what was found by the simulator's other laws: the verdict is not theirs, but its intervals hold over all,
             and where the most probable one leaves no gap, no effect is named.
-        drawn: draws of the best fit's coordinates, where there are some.
     """
+    conclusion, drawn = _concluded(found, evidence, calibration, laws)
+    if not conclusion.effects:
+        return conclusion
+    return dataclasses.replace(conclusion, posterior=posterior(found, evidence, calibration, drawn))
+
+
+def _concluded(
+    found: Search,
+    evidence: Evidence,
+    calibration: Calibration,
+    laws: Sequence[Law] = (),
+    drawn: Float[np.ndarray, "D P"] | None = None,
+) -> tuple[Conclusion, Float[np.ndarray, "D P"]]:
+    """The conclusion without its posterior, and draws of the best fit's coordinates over all laws.
+
+    `drawn` are draws by the simulator's own law, where there are some.
+    """
+    nothing = np.zeros((0, 0))
     chances = probabilities(found.scores)
     best = found.fits[0]
     null = next(fit for fit in found.fits if not fit.explanation.terms)
@@ -93,14 +104,14 @@ def conclude(
     ranking = _ranking(found, evidence, calibration)
     smallest = calibration.smallest_gap(level(evidence))
     if gap <= smallest:
-        return Conclusion("none", null, (), (), ranking, 0.0)
+        return Conclusion("none", null, (), (), ranking, 0.0), nothing
     as_much = leftover_p(leftover_score(left, gap, level(evidence), calibration), evidence.simulator.right_scores)
     shared = [drawn_by(law, best, calibration) for law in laws]
     under = tuple(_under(law, calibration, drawn) for law, drawn in zip(laws, shared, strict=True))
     if _excused(under):
-        return Conclusion("none", null, (), (), ranking, 0.0, None, (), under)
+        return Conclusion("none", null, (), (), ranking, 0.0, None, (), under), nothing
     if not best.explanation.terms:
-        return Conclusion("unknown", best, (), (), ranking, explained, as_much, (), under)
+        return Conclusion("unknown", best, (), (), ranking, explained, as_much, (), under), nothing
 
     own = draws(evidence, best, calibration) if drawn is None else drawn
     drawn = over_laws(own, [(law.probability, each[1]) for law, each in zip(laws, shared, strict=True) if each])
@@ -130,11 +141,10 @@ def conclude(
     telling = _telling(best, null, explained, complete, evidence, calibration)
     verdict = judged(resolvable=True, telling=telling, complete=complete, alike=bool(equivalent))
     if verdict == "unknown":
-        return Conclusion("unknown", best, (), (), ranking, explained, as_much, (), under)
+        return Conclusion("unknown", best, (), (), ranking, explained, as_much, (), under), nothing
     order = np.argsort([-e.probability for e in effects])
     named = tuple(effects[i] for i in order)
-    likely = posterior(found, evidence, calibration, drawn)
-    return Conclusion(verdict, best, named, tuple(equivalent), ranking, explained, as_much, likely, under)
+    return Conclusion(verdict, best, named, tuple(equivalent), ranking, explained, as_much, (), under), drawn
 
 
 def _excused(under: Sequence[UnderLaw]) -> bool:
@@ -147,7 +157,7 @@ def _excused(under: Sequence[UnderLaw]) -> bool:
 def _under(law: Law, calibration: Calibration, shared: tuple[Fit, Float[np.ndarray, "D P"]] | None) -> UnderLaw:
     """The verdict by another law alone; `shared` are a fit by it and draws of its coordinates."""
     drawn = shared[1] if shared is not None and shared[0] is law.found.fits[0] else None
-    other = conclude(law.found, law.evidence, calibration, drawn=drawn)
+    other, _ = _concluded(law.found, law.evidence, calibration, drawn=drawn)
     return UnderLaw(law.assumes, law.probability, other.verdict, other.effects, other.equivalent)
 
 

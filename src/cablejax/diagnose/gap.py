@@ -35,15 +35,18 @@ def held_out_predictions(evidence: Evidence, best: Fit) -> tuple[Float[np.ndarra
         return evidence.predict([best.explanation])[0], tuple(range(n_episodes)) if len(motions) > 1 else ()
     folds = np.array_split(np.arange(len(motions)), min(len(motions), _FOLDS))
     groups = [sorted(int(e) for i in fold for e in motions[i]) for fold in folds]
-    result = np.empty_like(evidence.nominal)
+    # the sums of a fit are those of its episodes: what is left out needs no simulation of its own
+    simpler, chosen = evaluate(evidence, without_one(best.explanation)), []
     for group in groups:
-        rest = evidence.restricted([e for e in range(n_episodes) if e not in group])
-        fits = evaluate(rest, [best.explanation, *without_one(best.explanation)])
-        fit = improve(rest, fits[:1], max_iterations=_FOLD_STEPS)[0]
-        simpler = min(fits[1:], key=lambda other: other.cost(rest))
-        if simpler.cost(rest) < fits[0].cost(rest) + _WORTH:
-            fit = simpler
-        result[group] = evidence.restricted(group).predict([fit.explanation])[0]
+        rows = np.array([e for e in range(n_episodes) if e not in group])
+        rest, whole = evidence.restricted(rows), best.restricted(rows)
+        (fit,) = improve(rest, [whole], max_iterations=_FOLD_STEPS)
+        least = min((other.restricted(rows) for other in simpler), key=lambda other: other.cost(rest))
+        chosen.append(least if least.cost(rest) < whole.cost(rest) + _WORTH else fit)
+    every = evidence.predict([fit.explanation for fit in chosen])
+    result = np.empty_like(evidence.nominal)
+    for group, predicted in zip(groups, every, strict=True):
+        result[group] = predicted[group]
     return result, tuple(range(n_episodes))
 
 

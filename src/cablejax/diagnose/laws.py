@@ -59,8 +59,9 @@ def by_other_laws(found: Search, evidence: Evidence, calibration: Calibration) -
     for simulator in others.values():
         bare = dataclasses.replace(evidence, simulator=simulator)
         other = dataclasses.replace(bare, nominal=bare.predict([explanation()])[0])
-        fits = improved(other, evaluate(other, leading), simulator.plan.last_steps)
-        searches.append(_ordered(refitted(other, [*fits, *evaluate(other, [explanation()])]), other, calibration))
+        *starts, null = evaluate(other, [*leading, explanation()])
+        fits = improved(other, starts, simulator.plan.last_steps)
+        searches.append(_ordered(refitted(other, [*fits, null]), other, calibration))
         evidences.append(other)
     tried = [set(one.terms) for one in leading] + [set()]
     own = [score for fit, score in zip(found.fits, found.scores, strict=True) if set(fit.explanation.terms) in tried]

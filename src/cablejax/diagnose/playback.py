@@ -11,7 +11,7 @@ from collections.abc import Sequence
 
 import jax
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from cablejax.cable import Cable, Discretisation
 from cablejax.effects.camera import seen_by_camera
@@ -20,7 +20,7 @@ from cablejax.simulate.chain.replay import LARGEST_STEP, Chain
 from cablejax.simulate.compile import compiler_options
 from cablejax.simulate.equilibrium import equilibrium_state
 
-# Cables that one compiled call replays at once.
+# Cables that one compiled call replays at once, at most.
 _ROWS = 24
 
 
@@ -35,6 +35,9 @@ class Playback:
         interval: between samples [s], shape [E].
         believed: physics of the cable without any effect.
         largest_step: longest time step [s].
+        length: samples of each episode without the padding, over which the last keypoints are repeated, shape [E];
+            None = there is no padding.
+        rows: cables that one compiled call replays at once; fewer for few replays by a program of their own.
     """
 
     config: Discretisation
@@ -43,6 +46,8 @@ class Playback:
     interval: Float[np.ndarray, "E"]
     believed: Physics
     largest_step: float = LARGEST_STEP
+    length: Int[np.ndarray, "E"] | None = None
+    rows: int = _ROWS
 
     @classmethod
     def of_motion(
@@ -85,6 +90,7 @@ class Playback:
         """
         chosen = np.arange(len(self.gripper_pose)) if episodes is None else np.asarray(episodes, int)
         n_physics, n_samples = len(physics), self.gripper_pose.shape[1]
+        length = np.full(len(self.gripper_pose), n_samples) if self.length is None else self.length
         stacked = jax.tree.map(lambda *leaves: np.stack([np.asarray(leaf, np.float32) for leaf in leaves]), *physics)
         substeps = max(1, math.ceil(float(self.interval.max()) / self.largest_step - 1e-6))
         geometry = Discretisation(
@@ -99,22 +105,23 @@ class Playback:
         points = np.empty((n_physics, len(chosen), n_samples, self.config.cable.n_keypoints, 2), np.float32)
 
         def one_chunk(rows: np.ndarray, with_contact: bool) -> None:
-            full = np.concatenate([rows, np.broadcast_to(rows[:1], (_ROWS - len(rows), 2))])
+            full = np.concatenate([rows, np.broadcast_to(rows[:1], (self.rows - len(rows), 2))])
             p, e = full[:, 0], chosen[full[:, 1]]
             batch = jax.tree.map(lambda leaf: leaf[p], stacked)
             replay = _compiled(Chain(geometry, with_contact), substeps)
-            result = replay(batch, self.angles[e], self.gripper_pose[e], self.interval[e])
+            result = replay(batch, self.angles[e], self.gripper_pose[e], self.interval[e], length[e].max())
             points[rows[:, 0], rows[:, 1]] = np.asarray(result)[: len(rows)]
 
-        touching = stacked.obstacle_radius > 0
+        touching, longest_first = stacked.obstacle_radius > 0, np.argsort(-length[chosen], kind="stable")
         with concurrent.futures.ThreadPoolExecutor(max_workers=_workers()) as pool:
             tasks = []
             for with_contact in (False, True):
                 which = np.flatnonzero(touching == with_contact)
-                rows = np.stack(np.meshgrid(which, np.arange(len(chosen)), indexing="ij"), axis=-1).reshape(-1, 2)
+                # episodes of one length together: a call takes as long as its longest
+                rows = np.stack(np.meshgrid(longest_first, which, indexing="ij")[::-1], axis=-1).reshape(-1, 2)
                 tasks += [
-                    pool.submit(one_chunk, rows[begin : begin + _ROWS], with_contact)
-                    for begin in range(0, len(rows), _ROWS)
+                    pool.submit(one_chunk, rows[begin : begin + self.rows], with_contact)
+                    for begin in range(0, len(rows), self.rows)
                 ]
             for task in tasks:
                 task.result()
@@ -127,10 +134,10 @@ def _workers() -> int:
 
 @functools.lru_cache(maxsize=16)
 def _compiled(chain: Chain, n_substeps: int):
-    def one(physics, angles, pose, interval):
-        points = chain.rollout(physics, angles, pose, interval, n_substeps=n_substeps)
+    def one(physics, angles, pose, interval, n_samples):
+        points = chain.rollout(physics, angles, pose, interval, n_substeps=n_substeps, n_samples=n_samples)
         return seen_by_camera(physics, points, interval)
 
     # runs far longer than it compiles: worth LLVM's optimisations where XLA_FLAGS go without them
     optimised = {"xla_backend_optimization_level": 3}
-    return jax.jit(jax.vmap(one), compiler_options=compiler_options() | optimised)
+    return jax.jit(jax.vmap(one, in_axes=(0, 0, 0, 0, None)), compiler_options=compiler_options() | optimised)

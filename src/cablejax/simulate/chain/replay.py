@@ -6,7 +6,7 @@ import dataclasses
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from cablejax.cable import Discretisation
 from cablejax.effects.physics import Physics
@@ -44,11 +44,12 @@ class Chain:
         interval: Float[Array, ""],
         *,
         n_substeps: int,
+        n_samples: Int[Array, ""] | int | None = None,
     ) -> Float[Array, "T N 2"]:
         """Keypoints on the centreline, as the physics has them: before any camera.
 
         The cable first settles, without friction, from `angles` at the first pose. Differentiable in everything but
-        `n_substeps`.
+        `n_substeps` and `n_samples`.
 
         Args:
             physics: of this cable.
@@ -56,12 +57,14 @@ class Chain:
             gripper_pose: (x, y, theta) at every sample, theta continuous.
             interval: between two samples [s].
             n_substeps: time steps between two samples.
+            n_samples: of the poses; the keypoints of the last one are repeated over the others, which takes no time as
+                long as all cables of a batch share this number. None = all.
         """
         config, first, zero = self.config, gripper_pose[0], jnp.zeros((), angles.dtype)
         start = self._settled(physics, angles, first)
 
-        def sample(carry, target):
-            state, pose, time = carry
+        def move(carry, target):
+            state, pose, time, _ = carry
             state = follow(
                 config,
                 physics,
@@ -74,10 +77,20 @@ class Chain:
                 with_contact=self.with_contact,
             )
             time = time + interval
-            return (state, target, time), centreline_keypoints(config, physics, state, target[0, :2], time)
+            return state, target, time, centreline_keypoints(config, physics, state, target[0, :2], time)
 
-        _, moved = jax.lax.scan(sample, (start, first, zero), gripper_pose[1:])
-        return jnp.concatenate([centreline_keypoints(config, physics, start, first[0, :2], zero)[None], moved])
+        def sample(carry, item):
+            index, target = item
+            if n_samples is None:
+                carry = move(carry, target)
+            else:
+                carry = jax.lax.cond(index < n_samples, move, lambda carry, _: carry, carry, target)
+            return carry, carry[-1]
+
+        points = centreline_keypoints(config, physics, start, first[0, :2], zero)
+        items = jnp.arange(1, len(gripper_pose)), gripper_pose[1:]
+        _, moved = jax.lax.scan(sample, (start, first, zero, points), items)
+        return jnp.concatenate([points[None], moved])
 
     def _settled(self, physics: Physics, angles: Float[Array, "n"], pose: Float[Array, "Q 3"]) -> ChainState:
         """The cable at rest at the first pose, with nothing locked in."""

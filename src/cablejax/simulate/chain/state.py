@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from cablejax.cable import Discretisation
-from cablejax.simulate.chain.geometry import chained, turned
+from cablejax.simulate.chain.geometry import chained, summed, turned
 from cablejax.simulate.composite import link_lengths, node_offsets
 
 
@@ -69,7 +69,7 @@ def chain_nodes(
 ) -> tuple[Float[Array, "n 2"], Float[Array, "n 2"]]:
     """Nodes relative to gripper 0 [m], and unit vectors along the links."""
     lengths, offsets = (jnp.asarray(f(config), angles.dtype) for f in (link_lengths, node_offsets))
-    theta = jnp.cumsum(angles)
+    theta = summed(angles)
     unit = jnp.stack([jnp.cos(theta), jnp.sin(theta)], axis=1)
     along = (1.0 + stretch) * unit
     return chained(lengths[:, None] * along) + offsets[:, None] * along, unit
@@ -98,7 +98,7 @@ def halfway_state(state: ChainState, dt) -> ChainState:
 def frame_of(config: Discretisation, state: ChainState) -> Frame:
     """Where the links of a state are."""
     lengths, offsets = (jnp.asarray(f(config), state.angles.dtype) for f in (link_lengths, node_offsets))
-    theta, rate = jnp.cumsum(state.angles), jnp.cumsum(state.velocity[:-1])
+    theta, rate = summed(state.angles), summed(state.velocity[:-1])
     scale = 1.0 + state.stretch
     along = scale * jnp.stack([jnp.cos(theta), jnp.sin(theta)], axis=1)
     joints = chained(lengths[:, None] * along)

@@ -143,18 +143,19 @@ def _matrix(frame: Frame, load: Load, config: Discretisation, joint_implicit, dt
     sums = jnp.stack([xx, xy, yy, *first_moment.T, second_moment + _inertia(config, load.mass)], axis=1)
     sxx, sxy, syy, sx, sy, s2 = beyond(sums).T
     ax, ay = joints.T
-    left = jnp.stack([sxx * ax + sxy * ay - sx, sxy * ax + syy * ay - sy], axis=1)
-    matrix = (s2 - ax * sx - ay * sy)[:, None] + left @ joints.T
-    matrix = matrix + jnp.diag(jnp.concatenate([jnp.full(1, 1e-9, dtype), joint_implicit]))
     weighted = beyond(weight[:, None] * nodes)
     coupling = -cross(joints, weighted) / frame.scale
     corner = jnp.sum(weight[:, None] * nodes**2) / frame.scale**2 + 1e-9
-    return jnp.concatenate(
-        [
-            jnp.concatenate([matrix, jnp.zeros((n, 1), dtype)], axis=1),
-            jnp.concatenate([coupling, corner[None]])[None],
-        ]
+    # entry by entry, in one loop; the last row is the stretch's
+    column, across_x, across_y, ax, ay = jnp.pad(
+        jnp.stack([s2 - ax * sx - ay * sy, sxx * ax + sxy * ay - sx, sxy * ax + syy * ay - sy, ax, ay]),
+        [(0, 0), (0, 1)],
     )
+    row = jnp.arange(n + 1)[:, None]
+    matrix = column[:, None] + across_x[:, None] * ax + across_y[:, None] * ay
+    matrix = jnp.where(row == n, jnp.append(coupling, corner), matrix)
+    diagonal = jnp.concatenate([jnp.full(1, 1e-9, dtype), joint_implicit, jnp.zeros(1, dtype)])
+    return matrix + jnp.where(row == jnp.arange(n + 1), diagonal, 0.0)
 
 
 def _impulses(

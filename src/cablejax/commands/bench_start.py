@@ -1,0 +1,202 @@
+"""`cablejax bench start`: times what one waits for: start-up, the first control call, and a verdict by command."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import pathlib
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterable, Sequence
+from typing import Annotated, Any, Literal, get_args
+
+import tyro
+
+from cablejax.commands.options import Command, UsageError, say, text_table
+from cablejax.compiled_programs import FOLDER, keep_compiled_programs
+from cablejax.limits import require
+
+Part = Literal["import", "help", "control", "verdict"]
+"""What is timed."""
+
+EFFECT = "bending_stiffness:ratio=0.2"
+"""Staged where no log is given."""
+# A first control call in a process of its own.
+_CONTROL = "import sys; from cablejax.commands.bench_start import first_call; first_call(sys.argv[1], int(sys.argv[2]))"
+_CACHE = ("JAX_COMPILATION_CACHE", "JAX_PERSISTENT_CACHE")
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class BenchStart(Command):
+    """Time start-up, the first control call and a verdict, each in a process of its own.
+
+    Each runs with an empty folder for compiled programs, then with the folder as the first run has left it. Processor
+    time, of all cores together, is stated beside wall time: on a busy machine only that can be compared.
+    """
+
+    logs: Annotated[tuple[pathlib.Path, ...], tyro.conf.Positional] = ()
+    """Gap logs to diagnose; by default one of a cable that is too soft, staged with the contact plant."""
+
+    parts: tuple[Part, ...] = get_args(Part)
+    """What to time: `import cablejax`, `cablejax --help`, a first control call, `cablejax diagnose LOG`."""
+
+    weights: str = "gns-reference"
+    """Released model by name, or the folder of a training by `cablejax train`, of the control call."""
+
+    horizon: int = 5
+    """Steps that the control call's plan looks ahead, beyond the next one."""
+
+    repeats: int = 5
+    """How often `import` and `--help` are run; the median counts."""
+
+    def execute(self):
+        """Runs every part with an empty and a filled folder and returns seconds of both kinds."""
+        from cablejax.commands.workloads import setting
+        from cablejax.gaplog import read_gap_log
+
+        require(self.repeats, "count", "--repeats")
+        if not self.parts or self.horizon < 0:
+            raise UsageError(
+                f"--parts {self.parts}, --horizon {self.horizon}: expected some of {', '.join(get_args(Part))}, and a "
+                "horizon of at least 0."
+            )
+        for log in self.logs:
+            read_gap_log(log)  # what cannot be read is said before anything is timed
+        result: dict[str, Any] = {}
+        with tempfile.TemporaryDirectory() as scratch:
+            folder = pathlib.Path(scratch)
+            if "import" in self.parts:
+                result["import"] = self._started(["-c", "import cablejax"])
+            if "help" in self.parts:
+                result["help"] = self._started(["-m", "cablejax", "--help"])
+            if "control" in self.parts:
+                say("a first control call ...")
+                words = ["-c", _CONTROL, os.path.expanduser(self.weights), str(self.horizon)]
+                result["control"] = twice(words, folder / "control", own=True)
+            if "verdict" in self.parts:
+                result["verdict"] = self._verdicts(folder)
+        rows = [[name, f"{s['wall_s']:.2f}", f"{s['cpu_s']:.2f}"] for name, s in self._rows(result)]
+        return {**result, **setting()}, text_table(["", "wall time [s]", "processor time [s]"], rows)
+
+    def _started(self, words: Sequence[str]) -> dict[str, float]:
+        say(f"{' '.join(words)} ...")
+        return median(seconds_of(words)[0] for _ in range(self.repeats))
+
+    def _verdicts(self, folder: pathlib.Path) -> dict[str, Any]:
+        """Of every log, and the medians over them."""
+        logs = self.logs or (staged_log(folder / "staged.npz", self.seed),)
+        each = {}
+        for k, log in enumerate(logs):
+            say(f"the verdict of {log.name} ...")
+            words = ["-m", "cablejax", "diagnose", str(log), "--out", str(folder / f"report_{k}"), "--overwrite"]
+            each[log.stem] = twice(words, folder / f"programs_{k}")
+        return {"logs": each, **{state: median(one[state] for one in each.values()) for state in ("empty", "filled")}}
+
+    def _rows(self, result: dict[str, Any]) -> list[tuple[str, dict[str, float]]]:
+        words = {"import": "import cablejax", "help": "cablejax --help"}
+        rows = [(words[part], result[part]) for part in words if part in result]
+        for part, name in (("control", "first control call"), ("verdict", "verdict, median over the logs")):
+            rows += [
+                (f"{name}, {state} folder", result[part][state]) for state in ("empty", "filled") if part in result
+            ]
+        return rows
+
+
+def seconds_of(words: Sequence[str], programs: pathlib.Path | None = None) -> tuple[dict[str, float], str]:
+    """Wall and processor time [s] of a Python process, and what it printed.
+
+    Args:
+        words: after the interpreter on its command line.
+        programs: folder for compiled programs; None = none are kept.
+
+    Raises:
+        UsageError: the process failed; says with which message.
+    """
+    environment = {name: value for name, value in os.environ.items() if not name.startswith(_CACHE)}
+    environment[FOLDER] = "" if programs is None else str(programs)
+    before, begin = os.times(), time.perf_counter()
+    done = subprocess.run([sys.executable, *words], env=environment, capture_output=True, text=True)
+    wall, after = time.perf_counter() - begin, os.times()
+    if done.returncode != 0:
+        raise UsageError(f"`python {' '.join(words)}` failed and cannot be timed. {done.stderr.strip()}")
+    cpu = after.children_user + after.children_system - before.children_user - before.children_system
+    return {"wall_s": wall, "cpu_s": cpu}, done.stdout
+
+
+def twice(words: Sequence[str], programs: pathlib.Path, *, own: bool = False) -> dict[str, dict[str, float]]:
+    """Times of a Python process with an empty folder for compiled programs, and with what that run left there.
+
+    Args:
+        words: after the interpreter on its command line.
+        programs: the folder, which does not exist yet.
+        own: the process prints its times as JSON: these are taken, and not those of all of it.
+    """
+    result = {}
+    for state in ("empty", "filled"):
+        whole, printed = seconds_of(words, programs)
+        result[state] = json.loads(printed) if own else whole
+    return result
+
+
+def median(times: Iterable[dict[str, float]]) -> dict[str, float]:
+    """The median of each kind of time."""
+    import numpy as np
+
+    every = list(times)
+    return {kind: float(np.median([one[kind] for one in every])) for kind in every[0]}
+
+
+def first_call(weights: str, horizon: int) -> None:
+    """Prints the times of a first control call with the default solver, from the observation to the command, as JSON.
+
+    Args:
+        weights: of the model; see `BenchStart`.
+        horizon: of the plan.
+    """
+    keep_compiled_programs()
+    import jax
+    import numpy as np
+
+    from cablejax.commands.workloads import controller_to_s
+    from cablejax.control.shaping import initial_history, load_model
+    from cablejax.types import Measurement
+
+    model = load_model(weights)
+    history = initial_history(model.cable, model.config)
+    controller = controller_to_s(model, "levenberg-marquardt", horizon)
+    state = controller.init(history)
+    measurement = Measurement(np.asarray(history.keypoints[-1]), np.asarray(history.gripper_pose))
+    begin, before = time.perf_counter(), time.process_time()
+    jax.block_until_ready(controller.step(state, measurement))
+    print(json.dumps({"wall_s": time.perf_counter() - begin, "cpu_s": time.process_time() - before}))
+
+
+def staged_log(path: pathlib.Path, seed: int) -> pathlib.Path:
+    """Writes a gap log of a cable that is too soft, as `cablejax study` records it first.
+
+    Args:
+        path: of the file.
+        seed: of plant and noise.
+
+    Returns:
+        The path.
+    """
+    from cablejax.cable import Cable
+    from cablejax.commands.runs import plant_of, staged_effects
+    from cablejax.control.targets import make_target, straight_start
+    from cablejax.diagnose.study import first_recording
+    from cablejax.gaplog import write_gap_log
+    from cablejax.simulate.plant import Plant
+    from cablejax.simulate.play import play
+
+    say(f"staging {EFFECT} in the contact plant ...")
+    cable = Cable()
+    goals = {f"to {letter}": make_target(letter, cable).gripper_pose for letter in ("U", "S", "Z")}
+    plant = Plant(plant_of(cable, staged_effects((EFFECT,)), links=24, seed=seed))
+    log = play(
+        plant, first_recording(cable, straight_start(cable), goals), source="contact plant", noise=1e-3, seed=seed
+    )
+    return write_gap_log(path, log)
