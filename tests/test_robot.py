@@ -182,7 +182,7 @@ import pathlib, signal, sys
 signal.signal(signal.SIGINT, signal.default_int_handler)
 from cablejax.robot import server
 from test_robot import run_to
-server.serve(run_to(pathlib.Path(sys.argv[1])), port=0, ready=lambda port: print(port, flush=True))
+server.serve(run_to(pathlib.Path(sys.argv[1])), port=0, ready=lambda port: print("port", port, flush=True))
 """
 
 
@@ -193,7 +193,9 @@ def test_ctrl_c_ends_the_server_and_keeps_the_log(tmp_path):
         [sys.executable, "-c", SERVED, str(tmp_path / "log.npz")], stdout=subprocess.PIPE, env=environment, text=True
     )
     try:
-        with socket.create_connection(("127.0.0.1", int(process.stdout.readline())), timeout=60) as robot:
+        # what is imported may print too
+        port = next(line.split()[1] for line in process.stdout if line.startswith("port"))
+        with socket.create_connection(("127.0.0.1", int(port)), timeout=60) as robot:
             harness, lines = Harness(), robot.makefile("rb")
             for k in range(3):
                 robot.sendall(server.observation_line(harness.seen(0.1 * k)))
@@ -204,6 +206,7 @@ def test_ctrl_c_ends_the_server_and_keeps_the_log(tmp_path):
             took = time.monotonic() - began
     finally:
         process.kill()
+        process.wait()
         process.stdout.close()
     assert process.returncode == -signal.SIGINT, "the interrupt goes on to whoever started the server"
     assert read_gap_log(tmp_path / "log.npz").episode_length.tolist() == [3]
