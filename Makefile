@@ -12,7 +12,7 @@ export NPROC
 MOTO := $(CURDIR)/build/moto
 export PATH := $(PATH):$(MOTO)/bin
 
-.PHONY: help demo tables quick matrix moto test test-full lint docs dist wheel-check clean
+.PHONY: help demo tables quick matrix moto test test-full lint notebooks docs dist wheel-check clean
 .DEFAULT_GOAL := help
 
 help:
@@ -24,6 +24,7 @@ help:
 	@echo "make test       lint, types and the quick tests"
 	@echo "make test-full  lint, types and every test"
 	@echo "make lint       ruff and pyright"
+	@echo "make notebooks  executes the notebooks as they are and prints their times"
 	@echo "make docs       the documentation as a site, site/index.html"
 	@echo "make dist       wheel and source distribution, checked, in dist/"
 	@echo "make wheel-check  that wheel in clean environments, with README's commands and their times; half an hour"
@@ -78,6 +79,9 @@ test: lint
 
 test-full: lint
 	$(BIN)/python -m pytest
+
+notebooks: $(STAMP)
+	$(BIN)/python benchmarks/notebooks.py
 
 $(VENV)/.docs-stamp: $(STAMP)
 	$(BIN)/python -m pip install --disable-pip-version-check --quiet -c constraints.txt -e '.[docs]'

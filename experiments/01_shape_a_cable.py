@@ -2,7 +2,7 @@
 
     python experiments/01_shape_a_cable.py --out runs/01_shape_a_cable
 
-The plant's cable is twice as stiff as the one the model was trained on. Prints how the error fell and writes the
+The plant's cable is a fifth as stiff as the one the model was trained on. Prints how the error fell and writes the
 figures. `--steps` and `--links` make it smaller.
 """
 
@@ -29,7 +29,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--weights", default="gns-reference")
     options = parser.parse_args(arguments)
 
-    plant = PlantConfig(effects=(GivenEffect("bending_stiffness", (("ratio", 2.0),)),))
+    plant = PlantConfig(effects=(GivenEffect("bending_stiffness", (("ratio", 0.2),)),))
     plant = dataclasses.replace(plant, discretisation=dataclasses.replace(plant.discretisation, n_links=options.links))
     model = load_model(options.weights)
     target = make_target(options.shape, plant.cable)

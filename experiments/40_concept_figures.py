@@ -1,6 +1,6 @@
 """Figures of the documentation that no table draws, and the log of its example of a diagnosis.
 
-python experiments/40_concept_figures.py                      # a minute; docs/images/simulate.png, correct.png
+python experiments/40_concept_figures.py                      # a minute; simulate, correct, plants.png in docs/images
 python experiments/40_concept_figures.py --demo runs/demo     # control.png too, from the run of `cablejax demo`
 python experiments/40_concept_figures.py --log example.npz    # a soft section staged in the contact plant, to diagnose
 """
@@ -30,6 +30,7 @@ from cablejax.report.style import LIGHT, cable_curve
 from cablejax.simulate import ChainEngine
 from cablejax.simulate.elastica import elastica
 from cablejax.types import GapLog
+from closed_loop.rod_plant import RodPlantConfig
 
 IMAGES = pathlib.Path("docs/images")
 EFFECT = "stiffness_profile:centre_m=0.3,width_m=0.25,ratio=0.3"
@@ -89,6 +90,25 @@ def corrections(trials: pathlib.Path = pathlib.Path("docs/results/trials/stiffne
     return figure
 
 
+def friction_laws() -> Figure:
+    """Friction over weight and kinetic coefficient by speed, of the rod's table and of the training simulator."""
+    rod, slow = RodPlantConfig(), Discretisation().friction_speed
+    speed = np.geomspace(1e-5, 0.1, 400)
+    stribeck = 1.0 + (rod.static_ratio - 1.0) * np.exp(-((speed / rod.stribeck_speed) ** 2))
+    laws = {
+        f"rod: Stribeck, static {rod.static_ratio:g} times kinetic": (stribeck, "#d55e00"),
+        f"training simulator: Coulomb, viscous below {1e3 * slow:g} mm/s": (speed / np.hypot(speed, slow), "#0072b2"),
+    }
+    figure, ax = plt.subplots(figsize=(7.2, 3.0), layout="constrained")
+    for label, (friction, colour) in laws.items():
+        ax.plot(1e3 * speed, friction, color=colour, lw=2.2, label=label)
+    ax.set(xscale="log", xlabel="speed [mm/s]", ylabel="friction / (w mu_k)", ylim=(0.0, 1.4))
+    ax.grid(color=LIGHT.faint, lw=0.6)
+    ax.spines[["top", "right"]].set_visible(False)
+    figure.legend(loc="outside lower center", ncols=2, frameon=False, fontsize="small")
+    return figure
+
+
 def run_of_demo(folder: pathlib.Path) -> Figure:
     """Cable and grippers at every fourth command of the demo's way to an S."""
     log = read_gap_log(folder / "log.npz")
@@ -131,7 +151,7 @@ def main() -> None:
     if options.log:
         write_gap_log(options.log, staged_log(), overwrite=True)
         return
-    figures = {"simulate": frictions, "correct": corrections}
+    figures = {"simulate": frictions, "correct": corrections, "plants": friction_laws}
     if options.demo:
         figures["control"] = lambda: run_of_demo(options.demo)
     for name, draw in figures.items():

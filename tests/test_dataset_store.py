@@ -183,6 +183,18 @@ def test_a_damaged_description_is_refused_and_mended(tmp_path, damage):
     assert open_store(path).info().digest == digest and [file.name for file in tmp_path.iterdir()] == ["data"]
 
 
+@pytest.mark.parametrize("attributes", [[], None, "x", 1])
+def test_root_attributes_that_are_no_object_are_refused_and_left_alone(tmp_path, attributes):
+    path = tmp_path / "data"
+    complete(open_or_create(path, SMALL))
+    edit_json(path / "zarr.json", attributes=attributes)
+    before = tree(path)
+    for opens in (open_store, lambda path: open_or_create(path, SMALL)):
+        with pytest.raises(ValueError, match=r"data.*(damaged|no data set|attributes)"):
+            opens(path)
+    assert tree(path) == before
+
+
 def test_another_configuration_is_refused_with_the_difference(tmp_path):
     path = tmp_path / "data"
     complete(open_or_create(path, SMALL))

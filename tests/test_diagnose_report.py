@@ -12,9 +12,11 @@ import pytest
 from PIL import Image
 
 import spatial_cases
+from cablejax.commands.cable import find_cable
 from cablejax.diagnose.diagnosis import CableDiagnosis, Gap, NamedEffect, NextMotion, ParameterEstimate, Ranked
 from cablejax.diagnose.verdict_json import verdict_json, write_verdict
 from cablejax.diagnose.where import localise
+from cablejax.gaplog import write_gap_log
 from cablejax.report.diagnosis_charts import ranking_figure
 from cablejax.report.diagnosis_page import write_diagnosis_page
 from cablejax.report.effect_words import effect_place, quantity, share
@@ -212,6 +214,25 @@ def test_page_says_the_verdict_and_what_belongs_to_it(written):
     assert badge in page
     for word in words:
         assert word in page, word
+
+
+WORKS = {
+    "named": "the gap shrinks by 98 % on episodes that no fit has seen. 1 limit of this verdict",
+    "none": "The simulator moves as the recorded cable does",
+    "unknown": "Not on this log",
+}
+
+
+def test_page_answers_a_strangers_questions_below_the_cards(written, tmp_path):
+    result, folder, page, _, _ = written
+    first = page.split("<svg")[0]
+    for words in ("What is this?", "Does it work?", "On my cable?", "cablejax import csv", "cablejax diagnose log.npz"):
+        assert words in first.split('class="cards"')[1]
+    assert WORKS.get(result.verdict, "shrinks by") in first
+    command = "cablejax simulate --cable simulated.npz --with verdict.json"
+    assert (command in first) == bool(result.effects)
+    # the file that the command names is there, and has the log's cable
+    assert find_cable(folder / "simulated.npz") == find_cable(write_gap_log(tmp_path / "log.npz", result.log))
 
 
 def test_page_needs_nothing_else(written):

@@ -106,6 +106,15 @@ def test_a_file_that_is_something_else_is_refused(tmp_path, saved):
         load_weights(tmp_path / "run")
 
 
+def test_a_file_that_is_too_large_is_refused_before_it_is_read(tmp_path):
+    path = tmp_path / "w.safetensors"
+    with path.open("wb") as file:
+        file.truncate(2**32 + 1)  # takes no place on the disk
+    for read in (load_weights, load_info):
+        with pytest.raises(WeightsError, match=r"The size of .*w\.safetensors is 4294967297, expected .* bytes"):
+            read(path)
+
+
 def test_weights_of_another_network_are_not_saved(tmp_path):
     other = network(dataclasses.replace(CONFIG, latent=4))[1]
     with pytest.raises(WeightsError, match="expected float32"):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import functools
 import json
@@ -9,6 +10,8 @@ import os
 import pathlib
 import pickle
 import shutil
+import socket
+import tempfile
 from collections.abc import Callable
 from typing import Any
 
@@ -24,10 +27,13 @@ import test_dataset_store as stores
 import test_perceive_recording as clouds
 import test_recordings_bags as bags
 import test_recordings_csv as tables
+import test_robot as robots
+from cablejax import cli
 from cablejax.cable import Cable
 from cablejax.cable_file import cable_text
 from cablejax.commands import diagnose, runs
 from cablejax.commands.resuming import Parts
+from cablejax.control.link_state import Status
 from cablejax.control.shaping import load_model
 from cablejax.control.targets import Target, load_target, make_target
 from cablejax.dataset import generate
@@ -42,10 +48,13 @@ from cablejax.perceive.tracker import padded
 from cablejax.recordings.bags import import_mcap
 from cablejax.recordings.lerobot import write_lerobot
 from cablejax.recordings.mcap_log import write_mcap
+from cablejax.robot.server import observation_line
+from cablejax.simulate import play
 from cablejax.spatial.windows import windows_of
 from cli_cases import made_up_run, small_model
 from edge_cases import Accepted, answer, command
 from recording_cases import swinging
+from test_control_link import Harness
 from test_diagnose_report import diagnosis
 from test_log_geometry import log_of, motion
 
@@ -109,8 +118,13 @@ def place(tmp_path_factory):
     def stop(*given, **named):
         raise Accepted(*given)
 
-    def diagnosed(log, *_, **__):
-        raise Accepted(windows_of(log) if log.keypoints.shape[-1] == 3 else prepare(log))
+    def diagnosed(log, *_, bounds=None, **__):
+        raise Accepted(windows_of(log) if log.keypoints.shape[-1] == 3 else prepare(log), bounds)
+
+    played = play.played
+
+    def begun(plant, start, twist, interval, **named):
+        raise Accepted(played(plant, start, twist[:2], interval, **named))
 
     from cablejax.dynamics import train
 
@@ -119,9 +133,13 @@ def place(tmp_path_factory):
         patch.setattr(train, "train", lambda config, *_, **__: stop(config))
         patch.setattr(runs, "shape_and_report", lambda job, *_, **__: stop(job.plant, job.targets, job.camera))
         patch.setattr(diagnose, "diagnose_and_report", diagnosed)
+        patch.setattr(play, "played", begun)
         # what is imported and compiled once is no part of an answer
         load_model(str(original("model")))
         diagnose_arrays(original("log"), [])
+        motion_arrays(original("motion"), [])
+        with tempfile.TemporaryDirectory() as out, contextlib.suppress(Accepted):
+            cli.main(["study", "--out", f"{out}/study"])
         yield
     original.cache_clear()
 
@@ -272,12 +290,88 @@ VERDICT = {
     "schema": "cablejax-verdict/1",
     "verdict": "named",
     "effects": [{"name": "bending_stiffness", "parameters": {"ratio": {"value": 2.0}}}],
+    "posterior": [
+        [{"name": "bending_stiffness", "parameters": {"ratio": 1.8}}],
+        [{"name": "table_friction", "parameters": {"ratio": 0.5}}, {"name": "viscous_drag", "parameters": {}}],
+    ],
 }
 
 
 def verdict_file(folder, edit):
     (folder / "v.json").write_text(json.dumps(edges.edited_tree(VERDICT, edit)))
     return command("simulate", "--engine", "chain", "--with", folder / "v.json", "--out", folder / "data")
+
+
+BOUNDS = """
+workspace_m = [[-1.0, -1.0], [1.0, 1.0]]
+keep_out_m = [[0.0, 0.8, 0.1]]
+speed_m_per_s = 0.05
+turn_rate_rad_per_s = 0.3
+min_distance_m = 0.2
+max_distance_m = 0.9
+bend_radius_m = 0.04
+duration_s = 20
+"""
+
+
+def bounds_words(folder, edit):
+    (folder / "b.toml").write_bytes(edges.edited_words(BOUNDS, edit).encode("utf-8", "surrogatepass"))
+    log = original("log") / "log.npz"
+    return command("diagnose", log, "--bounds", folder / "b.toml", "--out", folder / "out")
+
+
+def motion_arrays(folder, edit):
+    """Lays the cable out and plays the first command of each motion that is accepted."""
+    (folder / "motion.npz").write_bytes(edges.edited_archive(log_arrays(), edit))
+    return command("shape", "--motion", folder / "motion.npz", "--links", "8", "--out", folder / "out")
+
+
+def diagnose_two(folder, edit):
+    tree, arrays = edit
+    meta = edges.edited_tree(json.loads(str(log_arrays()["meta"])), tree)
+    later = {**log_arrays(), "keypoints": log_arrays()["keypoints"] + np.float32(1e-3)}
+    (folder / "b.npz").write_bytes(edges.edited_archive({**later, "meta": np.array(json.dumps(meta))}, arrays))
+    return command("diagnose", original("log") / "log.npz", folder / "b.npz", "--out", folder / "out")
+
+
+def robot_lines(folder, edit):
+    """A robot with a damaged message gets replies within the limits, and a log or a reason."""
+    which, tree, raw = edit
+    harness, lines = Harness(), []
+    for k in range(20):
+        lines += [observation_line(harness.seen(0.1 * k)), json.dumps({"now": 0.1 * k}).encode() + b"\n"]
+    line = lines[which % len(lines)]
+    damaged = json.dumps(edges.edited_tree(json.loads(line), tree)).encode() + b"\n"
+    lines[which % len(lines)] = damaged if raw is None else edges.edited_bytes(line, raw)
+
+    def talk():
+        robot = robots.Client(robots.run_to(folder / "log.npz", rest=0.5), simulated_clock=True)
+        with contextlib.suppress(ConnectionError):  # the server may have left
+            robot.say(*lines)
+            robot.socket.shutdown(socket.SHUT_WR)
+            for reply in map(json.loads, robot.lines):
+                assert np.abs(reply["twist"]).max() <= 0.011 and reply["status"] in list(Status)
+                assert all(10 < len(reason) < 3000 for reason in reply["refused"])
+        ended = robot.leave()
+        if isinstance(ended, Exception):
+            raise ended
+        read_gap_log(ended)
+
+    answer(talk)
+
+
+def view_files(folder, edit):
+    """The page of anything whose bytes are damaged."""
+    which, raw = edit
+    files = {
+        "cable.toml": lambda: cable_text(Cable()).encode(),
+        "log.npz": lambda: (original("log") / "log.npz").read_bytes(),
+        "w.safetensors": lambda: (original("model") / "weights.safetensors").read_bytes(),
+        "v.json": lambda: json.dumps(verdict_json(diagnosis())).encode(),
+    }
+    name = sorted(files)[which]
+    (folder / name).write_bytes(edges.edited_bytes(files[name](), raw))
+    return command("view", folder / name)
 
 
 def view_verdict(folder, edit):
@@ -326,11 +420,14 @@ OPTIONS = {
     "shape": "--steps --noise-mm --links --seed --target --weights --plant-effect --cable --solver",
     "cable": "--from --out --seed",
     "bench simulate": "--batch --seconds --rounds --threads --links",
+    "diagnose": "--out --commissioning --only --bounds --device --seed",
+    "study": "--rounds --noise-mm --links --bounds --cable --plant-effect --out --seed",
+    "view": "--out",
 }
 WORDS = (
     "0", "-1", "1", "99999999999999999999", "9" * 5000, "1e308", "-1e30", "1e-30", "nan", "inf", "", "x", "1.5",
-    "/dev/zero", "/", "a.npz", "a.toml", "none:", "bending_stiffness:ratio=1e308", "bending_stiffness:ratio=nan",
-    "bending_stiffness", ":=,", "\udc80", "cpu", "--",
+    "/dev/zero", "/", "a.npz", "a.toml", "a.html", "none:", "bending_stiffness:ratio=1e308",
+    "bending_stiffness:ratio=nan", "bending_stiffness", ":=,", "\udc80", "cpu", "--",
 )  # fmt: skip
 
 
@@ -346,6 +443,8 @@ def options(folder, edit):
         "train": ["--data", original("store"), "--out", folder / "out"],
         "shape": ["--weights", original("model"), "--out", folder / "out"],
         "bench simulate": ["--rounds", "0"],  # what is accepted would be timed
+        "diagnose": [original("log") / "log.npz"],
+        "view": [original("log") / "log.npz"],
     }
     before = os.getcwd()
     os.chdir(folder)
@@ -374,12 +473,17 @@ EDGES = {
     "store": Edge(60, pair(st.integers(0, 100), edges.TREE, st.none() | edges.BYTES), store_files),
     "weights": Edge(60, pair(edges.TREE, st.none() | edges.BYTES), weights_file),
     "verdict": Edge(120, edges.TREE, verdict_file),
+    "bounds": Edge(100, edges.WORDS, bounds_words),
+    "motion": Edge(60, edges.ARRAYS, motion_arrays),
+    "two logs": Edge(60, pair(edges.TREE, st.just([]) | edges.ARRAYS), diagnose_two),
+    "robot lines": Edge(100, pair(st.integers(0, 39), edges.TREE, st.none() | edges.BYTES), robot_lines),
+    "view files": Edge(40, pair(st.integers(0, 3), edges.BYTES), view_files),
     "view verdict": Edge(30, edges.TREE, view_verdict),
     "view log": Edge(30, edges.TREE, view_meta),
     "exported": Edge(40, pair(st.integers(0, 100), edges.BYTES), import_exported),
     "kept": Edge(60, pair(st.integers(0, 2), edges.BYTES), kept_files),
     "options": Edge(
-        120,
+        200,
         pair(
             st.integers(0, len(OPTIONS) - 1),
             st.lists(pair(st.integers(0, 8), *[st.integers(0, len(WORDS) - 1)] * 2), min_size=1, max_size=2),

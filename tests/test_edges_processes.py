@@ -12,6 +12,7 @@ import subprocess
 import sys
 import time
 
+import numpy as np
 import pytest
 
 import test_dataset_store as stores
@@ -31,6 +32,7 @@ LISTENING = """
 import signal, sys
 signal.signal(signal.SIGINT, signal.default_int_handler)
 from cablejax.cli import main
+print("ready", flush=True)
 sys.exit(main())
 """
 
@@ -42,23 +44,47 @@ def store(tmp_path_factory):
     return path
 
 
+def long_table(folder):
+    """A recording that takes a while to be read."""
+    table = {name: np.tile(np.asarray(column), 400) for name, column in tables.in_space().items()}
+    return tables.written(folder, table | {"t": 1000 * tables.DT * np.arange(len(table["t"]))}, tables.PAIRS)
+
+
+INTERRUPTED = {
+    "simulate": lambda folder, store: ["simulate", "--engine", "chain"],
+    "train": lambda folder, store: ["train", "--preset", "released", "--data", str(store)],
+    "shape": lambda folder, store: ["shape", "--target", "S"],
+    "demo": lambda folder, store: ["demo"],
+    "study": lambda folder, store: ["study"],
+    "diagnose": lambda folder, store: [
+        "diagnose",
+        str(write_gap_log(folder / "log.npz", record(("gripper_rotation_offset", 0, (0.08,))))),
+    ],
+    "bench": lambda folder, store: ["bench", "simulate", "--rounds", "1000"],
+}
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("seconds", [4.0, 10.0], ids=["at first", "later"])
-@pytest.mark.parametrize("command", ["simulate", "train", "diagnose"])
+@pytest.mark.parametrize(
+    ("command", "seconds"), [(name, seconds) for name in INTERRUPTED for seconds in (4.0, 10.0)] + [("import", 0.5)]
+)
 def test_ctrl_c_is_answered_at_once(command, seconds, store, tmp_path):
-    log = write_gap_log(tmp_path / "log.npz", record(("gripper_rotation_offset", 0, (0.08,))))
-    arguments = {
-        "simulate": ["simulate", "--engine", "chain"],
-        "train": ["train", "--preset", "released", "--data", str(store)],
-        "diagnose": ["diagnose", str(log)],
-    }[command]
+    if command == "import":
+        table, layout = long_table(tmp_path)
+        arguments = ["import", "csv", str(table), "--layout", str(layout)]
+    else:
+        arguments = INTERRUPTED[command](tmp_path, store)
+    if command != "bench":  # which writes nothing
+        arguments += ["--out", str(tmp_path / ("out.npz" if command == "import" else "out"))]
     environment = {name: value for name, value in os.environ.items() if name != "JAX_COMPILATION_CACHE_DIR"}
     process = subprocess.Popen(
-        [sys.executable, "-c", LISTENING, *arguments, "--out", str(tmp_path / "out")],
+        [sys.executable, "-c", LISTENING, *arguments],
+        stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         env=environment | {"CABLEJAX_CACHE": str(tmp_path / "cache")},
     )
     try:
+        assert process.stdout is not None and process.stdout.readline() == b"ready\n"
         time.sleep(seconds)
         began = time.monotonic()
         process.send_signal(signal.SIGINT)
@@ -68,6 +94,8 @@ def test_ctrl_c_is_answered_at_once(command, seconds, store, tmp_path):
         process.kill()
     assert process.returncode == 130 and b"again" in said and b"Traceback" not in said
     assert took < 3, f"answered after {took:.1f} s, expected two on an idle machine"
+    if command == "import":
+        assert not (tmp_path / "out.npz").exists()
 
 
 @contextlib.contextmanager
@@ -168,6 +196,41 @@ def test_a_second_writer_is_refused_and_the_first_loses_nothing(tmp_path, store,
     with sole_writer(tmp_path / "train"), pytest.raises(ValueError, match="Another process"):
         claim_folder(tmp_path / "train", {"config": {}, "data": "b"}, resume=True, overwrite=True)
     assert (tmp_path / "train" / "run.json").exists()
+
+
+OFFLINE = """
+import os, sys
+
+def refuse(event, given):
+    if event in ("socket.connect", "socket.getaddrinfo", "socket.gethostbyname", "socket.sendto"):
+        print(event, given[1:], file=sys.stderr, flush=True)
+        os._exit(7)
+
+sys.addaudithook(refuse)
+"""
+ONLINE = "import socket; socket.create_connection(('localhost', 9))"
+COMMANDS = "import json; from cablejax.cli import main; sys.exit(max(map(main, json.loads(sys.argv[1]))))"
+
+
+def test_no_command_uses_the_network(tmp_path):
+    """An audit hook, which no import can get around, ends the process at the first look-up of a name or connection."""
+    table, layout = tables.written(tmp_path, tables.in_space(), tables.PAIRS)
+    cable, data, log = (str(tmp_path / name) for name in ("cable.toml", "data", "log.npz"))
+    small = ["--trajectories", "2", "--steps", "2", "--links", "13"]
+    words = [
+        ["cable", "--out", cable],
+        ["simulate", "--cable", cable, "--engine", "chain", "--out", data, *small],
+        ["import", "csv", str(table), "--layout", str(layout), "--out", log],
+        *(["view", made] for made in (cable, data, log)),
+    ]
+
+    def run(program, *arguments):
+        return subprocess.run([sys.executable, "-c", OFFLINE + program, *arguments], capture_output=True, text=True)
+
+    offline = run(COMMANDS, json.dumps(words))
+    assert offline.returncode == 0, offline.stderr
+    assert all((tmp_path / f"{name}.html").exists() for name in ("cable", "data", "log"))
+    assert run(ONLINE).returncode == 7, "this test has to notice what uses the network"
 
 
 @pytest.mark.parametrize("arguments", ["diagnose --help", "cable"])

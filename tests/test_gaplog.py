@@ -148,6 +148,7 @@ def test_a_missing_meta_field_is_named(log, name):
         ({"table": {"friction_coefficient": -0.1}}, "friction_coefficient is -0.1, expected"),
         ({"cable": CABLE_META | {"linear_density_kg_per_m": 100}}, "which no material exceeds"),
         ({"gravity_m_per_s2": [0.0, 0.0, 0.0]}, "is 0.0, expected a number from 1 to 30"),
+        ({"gravity_m_per_s2": [0.0, 0.0, -1e20]}, r"is 1e\+20, expected a number from 1 to 30"),
         ({"gravity_m_per_s2": [0.0, 0.0, 9.81]}, "off the table"),
         ({"gravity_m_per_s2": [0.0, -9.81]}, r"meta\.gravity_m_per_s2"),
         ({"keypoint_arclength_m": [0.0, 0.5, 1.0]}, r"meta\.keypoint_arclength_m"),
@@ -179,6 +180,30 @@ def test_wrong_arrays_are_named(log):
         gap_log_from_episodes([], CABLE, source="test")
     with pytest.raises(GapLogError, match="gripper_pose has shape"):
         gap_log_from_episodes([dataclasses.replace(episode(4), gripper_pose=np.zeros((3, 2, 3)))], CABLE, source="test")
+
+
+@pytest.mark.parametrize(
+    ("time", "message"),
+    [
+        (
+            np.append(0.1 * np.arange(7), 1e9),
+            r"first to the last sample of episode 0 is .*, expected a number from 0 to",
+        ),
+        (0.1 * np.arange(8) + 1e3 * (np.arange(8) > 4), "pause of 1000 s after sample 4 of episode 0, where 0.1 s"),
+        (1e-9 * np.arange(8), r"usual time between samples of episode 0 is 1e-09, expected a number from 0\.0001"),
+    ],
+    ids=["a jump of 1e9 s", "a jump of 1000 s", "steps of 1e-9 s"],
+)
+def test_a_clock_that_no_recording_has_is_refused(tmp_path, log, time, message):
+    times = log.time.copy()
+    times[0] = time
+    broken = dataclasses.replace(log, time=times)
+    with pytest.raises(GapLogError, match=message):
+        validate(broken)
+    arrays = {field.name: getattr(broken, field.name) for field in dataclasses.fields(broken) if field.name != "meta"}
+    np.savez(tmp_path / "run.npz", **arrays, meta=np.array(json.dumps(broken.meta)))
+    with pytest.raises(GapLogError, match=message):
+        read_gap_log(tmp_path / "run.npz")
 
 
 def test_nothing_is_unpickled(tmp_path, log):

@@ -113,6 +113,32 @@ def diagnosed(folder):
     return {name: value for name, value in verdict.items() if name != "seconds"}
 
 
+def ended(folder):
+    return (folder / "summary.json").exists() and not (folder / "parts" / "settings.json").exists()
+
+
+def demo(folder):
+    if not ended(folder):
+        model, words = folder.parent / "model", ["--shapes", "U", "--steps", "3", "--links", "8"]
+        end(["demo", "--weights", str(model), "--out", str(folder), *words])
+
+
+def study(folder):
+    if not ended(folder):
+        end(["study", "--rounds", "1", "--links", "8", "--out", str(folder)])
+
+
+def kept_rounds(folder):
+    state = folder / "parts" / "state.json"
+    return 2 if ended(folder) else json.loads(state.read_text())["rounds"] if state.exists() else 0
+
+
+def studied(folder):
+    log, summary = read_gap_log(folder / "recording_1.npz"), json.loads((folder / "summary.json").read_text())
+    verdict = {name: value for name, value in summary["verdict"].items() if name != "seconds"}
+    return log.keypoints.tobytes(), summary["ended"], summary["rounds"], verdict, (folder / "report.html").exists()
+
+
 def closed_loops(folder):
     cases = [suites.case(seed) for seed in range(4)]
     run_suite(cases, [suites.SERVO], folder, fine_tuned=suites.no_model, progress=False)
@@ -129,10 +155,14 @@ COMMANDS = {
     "train": Command(run_training, latest_checkpoint, trained),
     "shape": Command(shape, kept_runs, shaped),
     "diagnose": Command(diagnose, lambda folder: 0, diagnosed),
+    "demo": Command(demo, kept_runs, shaped),
+    "study": Command(study, kept_rounds, studied),
     "closed loops": Command(closed_loops, lambda folder: len(read_suite(folder)[0]), trials),
 }
+KILLS = {"study": 5}
+"""Of those commands that take minutes."""
 CHEAP = ["simulate", "closed loops"]
-PREPARED = ["shape", "diagnose"]
+PREPARED = ["shape", "diagnose", "demo"]
 
 
 def run(command: Command, folder: pathlib.Path, moment: float | None = None) -> bool:
@@ -156,7 +186,8 @@ def prepared(folder: pathlib.Path) -> None:
 @pytest.mark.timeout(3000)
 @pytest.mark.parametrize(
     ("name", "kills"),
-    [(name, 1) for name in CHEAP] + [pytest.param(name, 20, marks=pytest.mark.slow) for name in COMMANDS],
+    [(name, 1) for name in CHEAP]
+    + [pytest.param(name, KILLS.get(name, 20), marks=pytest.mark.slow) for name in COMMANDS],
 )
 def test_a_killed_command_loses_nothing_and_ends_in_the_same(name, kills, tmp_path):
     command, rng = COMMANDS[name], np.random.default_rng(0)

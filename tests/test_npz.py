@@ -2,6 +2,7 @@
 
 import contextlib
 import json
+import zipfile
 
 import numpy as np
 import pytest
@@ -35,6 +36,17 @@ def test_named_arrays_come_back_and_others_are_not_looked_at(tmp_path):
         read_npz(tmp_path / "a.npz", ["objects"])
     with pytest.raises(FileNotFoundError, match="There is no file"):
         read_npz(tmp_path / "b.npz", ["a"])
+
+
+@pytest.mark.parametrize("content", [b"", b"garbage", b"\x93NUMPY"])
+def test_a_member_that_is_no_array_is_refused(tmp_path, content):
+    np.savez(tmp_path / "a.npz", a=np.arange(3))
+    for name in ("b", "b.npy"):
+        with zipfile.ZipFile(tmp_path / "a.npz") as whole, zipfile.ZipFile(tmp_path / f"{name}.npz", "w") as other:
+            other.writestr("a.npy", whole.read("a.npy"))
+            other.writestr(name, content)
+        with pytest.raises(NpzError, match=rf"{name}\.npz (holds no array under b|could not be read)"):
+            read_npz(tmp_path / f"{name}.npz", ["a", "b"])
 
 
 def test_a_file_cut_off_anywhere_is_refused(archive):

@@ -12,6 +12,7 @@ rosbags = pytest.importorskip("rosbags", reason="rosbags is not installed: pip i
 from rosbags.rosbag2 import StoragePlugin, Writer  # noqa: E402
 from rosbags.typesys import Stores, get_typestore  # noqa: E402
 
+from cablejax import limits  # noqa: E402
 from cablejax.gaplog import validate  # noqa: E402
 from cablejax.recordings.bags import import_mcap  # noqa: E402
 from cablejax.recordings.poses import poses_from_markers, rotated  # noqa: E402
@@ -158,6 +159,23 @@ def test_messages_that_change_their_size_are_reported(tmp_path):
     text = LAYOUT.replace('grippers = ["/left/pose", "/right/pose"]', "")
     with pytest.raises(ValueError, match="have 8 to 9 poses, expected the same number"):
         import_mcap(tmp_path / "bag", layout(tmp_path, text))
+
+
+def test_a_bag_that_is_too_large_is_refused_before_it_is_read(tmp_path, monkeypatch):
+    bag = write_bag(tmp_path / "bag", swinging(60), {}, StoragePlugin.MCAP)
+    text = LAYOUT.replace('grippers = ["/left/pose", "/right/pose"]', "")
+    file = next(bag.glob("*.mcap"))
+    whole = file.stat().st_size
+    for name, high, message in (
+        ("bag_bytes", whole - 1, "The size of .*bag.* is .*, expected a whole number from 0 to"),
+        ("array_bytes", 5_000, "The size of the messages on /cable/keypoints is .* from 0 to 5000 bytes"),
+    ):
+        with monkeypatch.context() as patch:
+            patch.setattr(limits, "LIMITS", {**limits.LIMITS, name: limits.Limit(0, high, "bytes", whole=True)})
+            for path in (bag, file):
+                with pytest.raises(ValueError, match=message):
+                    import_mcap(path, layout(tmp_path, text))
+    assert import_mcap(bag, layout(tmp_path, text))[1] == []
 
 
 def test_what_is_no_bag_is_reported(tmp_path):

@@ -167,6 +167,20 @@ def test_page_says_the_numbers(page):
     assert "$" not in re.sub(r"<script>.*?</script>", "", page, flags=re.DOTALL)
 
 
+def test_page_answers_a_strangers_questions_before_the_player(page):
+    first = page.split('id="player"')[0]
+    ends = [one.terminal_error_cm for (_, method), one in demo_runs().items() if method == "residual"]
+    reached = f"{sum(end <= 1.0 for end in ends)} of {len(ends)} with online residual"
+    for words in (
+        "What is this?",
+        "Does it work?",
+        "On my cable?",
+        reached,
+        "cablejax shape --target Z --weights model",
+    ):
+        assert words in first
+
+
 def test_pages_ids_are_unique(page):
     ids = re.findall(r'\bid="([^"]+)"', page)
     assert len(ids) == len(set(ids))

@@ -1,9 +1,13 @@
 """A robot over TCP and over ROS 2: the server in this process, the robot in a thread or a process of its own."""
 
 import dataclasses
+import functools
 import json
+import os
 import pathlib
+import signal
 import socket
+import subprocess
 import sys
 import threading
 import time
@@ -173,6 +177,39 @@ def test_a_line_without_end_ends_the_run_and_keeps_the_log(tmp_path, monkeypatch
     assert read_gap_log(tmp_path / "log.npz").episode_length.tolist() == [1]
 
 
+SERVED = """
+import pathlib, signal, sys
+signal.signal(signal.SIGINT, signal.default_int_handler)
+from cablejax.robot import server
+from test_robot import run_to
+server.serve(run_to(pathlib.Path(sys.argv[1])), port=0, ready=lambda port: print("port", port, flush=True))
+"""
+
+
+def test_ctrl_c_ends_the_server_and_keeps_the_log(tmp_path):
+    tests = str(pathlib.Path(__file__).parent)
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join([*sys.path, tests])}
+    process = subprocess.Popen(
+        [sys.executable, "-c", SERVED, str(tmp_path / "log.npz")], stdout=subprocess.PIPE, env=environment, text=True
+    )
+    try:
+        # what is imported may print too
+        port = next(line.split()[1] for line in process.stdout if line.startswith("port"))
+        with socket.create_connection(("127.0.0.1", int(port)), timeout=60) as robot, robot.makefile("rb") as lines:
+            harness = Harness()
+            for k in range(3):
+                robot.sendall(server.observation_line(harness.seen(0.1 * k)))
+                assert json.loads(lines.readline())["status"] == "resting"
+            process.send_signal(signal.SIGINT)
+            process.wait(timeout=60)
+    finally:
+        process.kill()
+        process.wait()
+        process.stdout.close()
+    assert process.returncode == -signal.SIGINT, "the interrupt goes on to whoever started the server"
+    assert read_gap_log(tmp_path / "log.npz").episode_length.tolist() == [3]
+
+
 def test_grippers_that_point_backwards_are_found_before_anything_moves(tmp_path):
     run, harness = run_to(tmp_path / "log.npz"), Harness()
     harness.pose[:, 2] += np.pi
@@ -189,33 +226,89 @@ def test_a_log_is_not_overwritten(tmp_path):
         run_to(tmp_path / "log.npz")
 
 
-class Message(types.SimpleNamespace):
-    """Of any type: fields come into being when they are read."""
+BASES = {"float64": (float, 0.0), "string": (str, ""), "int32": (int, 0), "uint32": (int, 0)}
+"""Python type and default of ROS's basic types that the node's messages have."""
 
-    def __getattr__(self, name):
-        if name.startswith("_"):
-            raise AttributeError(name)
-        setattr(self, name, Message())
-        return getattr(self, name)
+
+@functools.cache
+def typestore():
+    typesys = pytest.importorskip("rosbags.typesys")
+    return typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
+
+
+@functools.cache
+def message_type(name: str) -> type:
+    """A message class of ROS 2 Humble from its definition, as strict as those that rosidl generates.
+
+    Its fields have defaults and are given by keyword; a field of another name or type is an error.
+    """
+    fields = dict(typestore().fielddefs[name][1])
+
+    def default(kind, of):
+        if kind.name == "BASE":
+            return BASES[of[0]][1]
+        return [] if kind.name == "SEQUENCE" else message_type(of)()
+
+    def expected(kind, of):
+        return BASES[of[0]][0] if kind.name == "BASE" else message_type(of)
+
+    class Message:
+        __slots__ = tuple(fields)
+
+        def __init__(self, **given):
+            assert set(given) <= set(fields), f"{name} has no field {set(given) - set(fields)}"
+            for field, definition in fields.items():
+                setattr(self, field, given[field] if field in given else default(*definition))
+
+        def __setattr__(self, field, value):
+            if field not in fields:
+                raise AttributeError(f"{name} has no field {field!r}")
+            kind, of = fields[field]
+            values, wanted = (value, expected(*of[0])) if kind.name == "SEQUENCE" else ([value], expected(kind, of))
+            assert all(isinstance(one, wanted) for one in values), f"{name}.{field} is {value!r}, expected {wanted}"
+            object.__setattr__(self, field, value)
+
+    Message.__name__ = name
+    return Message
+
+
+def sent(message, name):
+    """What a subscriber gets: the message through the middleware's encoding and back."""
+    store = typestore()
+
+    def stored(value):
+        if isinstance(value, list):
+            return [stored(one) for one in value]
+        if not hasattr(value, "__slots__"):
+            return value
+        return store.types[type(value).__name__](**{field: stored(getattr(value, field)) for field in value.__slots__})
+
+    return store.deserialize_cdr(store.serialize_cdr(stored(message), name), name)
 
 
 class Node:
-    """Stands in for `rclpy.node.Node`: topics are lists, and time is set by hand."""
+    """Stands in for `rclpy.node.Node`: topics are lists of what is received, and time is set by hand."""
 
     def __init__(self, name):
         self.name, self.topics, self.callbacks, self.timers, self.now, self.warnings = name, {}, {}, [], 0.0, []
 
     def create_publisher(self, kind, topic, depth):
-        return types.SimpleNamespace(publish=self.topics.setdefault(topic, []).append)
+        received = self.topics.setdefault(topic, [])
+
+        def publish(message):
+            assert type(message) is kind
+            received.append(sent(message, kind.__name__))
+
+        return types.SimpleNamespace(publish=publish)
 
     def create_subscription(self, kind, topic, callback, depth):
-        self.callbacks[topic] = callback
+        self.callbacks[topic] = lambda message: callback(sent(message, kind.__name__))
 
     def create_timer(self, period, callback):
         self.timers.append((period, callback))
 
     def get_clock(self):
-        stamp = types.SimpleNamespace(nanoseconds=round(1e9 * self.now), to_msg=lambda: self.now)
+        stamp = types.SimpleNamespace(nanoseconds=round(1e9 * self.now), to_msg=lambda: time_of(self.now))
         return types.SimpleNamespace(now=lambda: stamp)
 
     def get_logger(self):
@@ -228,23 +321,49 @@ def ros(monkeypatch):
         "rclpy": {},
         "rclpy.node": {"Node": Node},
         "geometry_msgs": {},
-        "geometry_msgs.msg": {"PoseArray": Message, "TwistStamped": Message},
+        "geometry_msgs.msg": {
+            name: message_type(f"geometry_msgs/msg/{name}") for name in ("PoseArray", "TwistStamped")
+        },
         "std_msgs": {},
-        "std_msgs.msg": {"String": Message},
+        "std_msgs.msg": {"String": message_type("std_msgs/msg/String")},
     }.items():
         module = types.ModuleType(name)
         vars(module).update(contents)
         monkeypatch.setitem(sys.modules, name, module)
 
 
+def time_of(seconds):
+    whole, rest = divmod(round(1e9 * seconds), 10**9)
+    return message_type("builtin_interfaces/msg/Time")(sec=whole, nanosec=rest)
+
+
 def pose_array(stamp, places, angles=None, frame="world"):
-    header = Message(frame_id=frame, stamp=Message(sec=int(stamp), nanosec=round(1e9 * (stamp % 1))))
+    point, quaternion, pose, array = (
+        message_type(f"geometry_msgs/msg/{name}") for name in ("Point", "Quaternion", "Pose", "PoseArray")
+    )
     angles = np.zeros(len(places)) if angles is None else angles
     poses = [
-        Message(position=Message(x=x, y=y), orientation=Message(w=np.cos(a / 2), x=0.0, y=0.0, z=np.sin(a / 2)))
-        for (x, y), a in zip(places, angles, strict=True)
+        pose(position=point(x=x, y=y), orientation=quaternion(w=np.cos(a / 2), z=np.sin(a / 2)))
+        for (x, y), a in zip(np.asarray(places, float), angles, strict=True)
     ]
-    return Message(header=header, poses=poses)
+    return array(header=message_type("std_msgs/msg/Header")(frame_id=frame, stamp=time_of(stamp)), poses=poses)
+
+
+def test_the_messages_are_as_strict_as_rosidls(ros):
+    from geometry_msgs.msg import TwistStamped
+
+    message = TwistStamped()
+    for change in (
+        lambda: setattr(message, "twists", None),
+        lambda: setattr(message.twist.linear, "x", 1),
+        lambda: setattr(message.header, "stamp", 1.5),
+        lambda: TwistStamped(1.0),
+        lambda: TwistStamped(frame="world"),
+    ):
+        with pytest.raises((AttributeError, AssertionError, TypeError)):
+            change()
+    message.twist.linear.x = np.float64(0.5)
+    assert sent(message, "geometry_msgs/msg/TwistStamped").twist.linear.x == 0.5
 
 
 def test_a_ros_node_drives_the_same_run(tmp_path, ros):
@@ -263,6 +382,8 @@ def test_a_ros_node_drives_the_same_run(tmp_path, ros):
             twists = [node.topics[f"~/gripper_{q}/twist"][-1].twist for q in (0, 1)]
             twist = np.array([[t.linear.x, t.linear.y, t.angular.z] for t in twists])
             harness.pose = harness.pose + 0.05 * twist
+    last = node.topics["~/gripper_0/twist"][-1].header
+    assert last.frame_id == "world" and last.stamp.sec + 1e-9 * last.stamp.nanosec == pytest.approx(node.now)
     statuses = list(dict.fromkeys(message.data for message in node.topics["~/status"]))
     assert statuses == ["resting", "shaping", "done: All 2 commands were given."] and not node.warnings
     np.testing.assert_allclose(harness.pose[:, 0] - START[:, 0], [0.02, -0.02], atol=2e-3)

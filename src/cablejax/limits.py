@@ -105,6 +105,8 @@ LIMITS: Mapping[str, Limit] = MappingProxyType(
         # files: text is read into memory as it is, arrays as they are when decompressed
         "text_bytes": Limit(0, 2**28, "bytes", whole=True),
         "array_bytes": Limit(0, 2**32, "bytes", whole=True),
+        # of a bag, whose images are not read
+        "bag_bytes": Limit(0, 2**40, "bytes", whole=True),
     }
 )
 """Every limit by the name of its quantity. A value outside is a mistake, mostly in its unit."""

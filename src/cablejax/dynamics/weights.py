@@ -30,6 +30,7 @@ from cablejax.cable import Cable
 from cablejax.cable_file import cable_from_fields
 from cablejax.dynamics.config import ModelConfig, Normalisation
 from cablejax.dynamics.model import structure_of
+from cablejax.limits import require
 from cablejax.simulate.chain.statics import Statics
 from cablejax.text_file import parse_json, version_of
 from cablejax.whole_file import whole_file
@@ -161,6 +162,10 @@ def _open(source: str | os.PathLike[str]) -> tuple[Path, dict[str, Any]]:
         if path.suffix or len(path.parts) != 1:
             raise WeightsError(f"There is no weights file {path}. Train one with `cablejax train`.")
         path = _released(str(source))
+    try:
+        require(path.stat().st_size, "array_bytes", f"The size of {path}", "Are these the weights that are meant?")
+    except ValueError as error:
+        raise WeightsError(str(error)) from None
     try:
         with safe_open(path, framework="numpy") as file:
             metadata = file.metadata() or {}

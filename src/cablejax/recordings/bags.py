@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from cablejax.limits import require
 from cablejax.recordings.assemble import gap_log_from_takes
 from cablejax.recordings.layout import Fields, Layout, read_layout
 from cablejax.recordings.prepare import prepare
@@ -84,13 +85,18 @@ def _messages(path: pathlib.Path, wanted: dict[str, str]) -> dict[str, list[tupl
         raise ValueError(
             f"{path} does not exist, expected a bag: a folder with metadata.yaml, an .mcap or a .db3 file."
         )
+    files = [file for file in path.rglob("*") if file.is_file()] if path.is_dir() else [path]
+    require(sum(file.stat().st_size for file in files), "bag_bytes", f"The size of {path}", "Cut the recording.")
     found: dict[str, list[tuple[float, np.ndarray]]] = {topic: [] for topic in wanted}
+    size = 0
     try:
         # Bags of older releases hold no message definitions; these messages have been the same in all of them.
         with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as bag:
             _require_topics(path, {c.topic: c.msgtype for c in bag.connections}, wanted)
             connections = [c for c in bag.connections if c.topic in wanted]
             for connection, _, data in bag.messages(connections=connections):
+                size += len(data)
+                require(size, "array_bytes", f"The size of the messages on {', '.join(wanted)}", "Cut the recording.")
                 message: Any = bag.deserialize(data, connection.msgtype)
                 stamp = message.header.stamp
                 poses = message.poses if wanted[connection.topic] == POSE_ARRAY else [message.pose]

@@ -109,6 +109,7 @@ def write_diagnosis_page(diagnosis: CableDiagnosis, out: str | os.PathLike[str])
         diagnosis=diagnosis,
         lead=_lead(diagnosis),
         cards=_cards(diagnosis),
+        works=_works(diagnosis),
         pictures=inline,
         orbit=_orbit(diagnosis) if space else None,
         cable_caption=_SPACE_CAPTION if space else _cable_caption(diagnosis),
@@ -147,6 +148,21 @@ def _lead(diagnosis: CableDiagnosis) -> str:
         f"The simulator misses the recorded cable by {millimetres(gap.before_rmse_mm)}; the recording's own "
         f"{_noise(diagnosis)}."
     )
+
+
+def _works(diagnosis: CableDiagnosis) -> str:
+    """What shows that the verdict holds, or what it lacks, in a sentence or two."""
+    gap, limits = diagnosis.gap, len(diagnosis.caveats)
+    if diagnosis.verdict == "none":
+        said = "The simulator moves as the recorded cable does, within the noise and its own error."
+    elif diagnosis.effects and gap.shrinkage is not None:
+        said = f"With the cause, the gap shrinks by {share(gap.shrinkage)} on episodes that no fit has seen."
+    elif diagnosis.effects:
+        said = "Nothing was held out from the fit, so this log does not show it: record a second motion."
+    else:
+        said = "Not on this log: no effect of the library explains enough of the gap, so none is named."
+    noun = "limit" if limits == 1 else "limits"
+    return f"{said} {limits} {noun} of this verdict: see the end of the page." if limits else said
 
 
 def _cards(diagnosis: CableDiagnosis) -> Iterator[tuple[str, str, str]]:

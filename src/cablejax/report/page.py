@@ -91,6 +91,7 @@ def write_page(
         start=start,
         methods=ends,
         about=about,
+        reached=_reached(pairs),
         css=_CSS_CLASS,
         label=METHOD_LABEL,
         shapes=pairs,
@@ -121,6 +122,16 @@ def headline(pairs: Mapping[str, Mapping[Method, ClosedLoopRun]]) -> tuple[str, 
         for method in METHOD_ORDER[::-1]
     }
     return ", but ".join(parts), f"It starts {start} cm away.", {m: listed(e) for m, e in errors.items() if e}
+
+
+def _reached(pairs: Mapping[str, Mapping[Method, ClosedLoopRun]]) -> str:
+    """How many targets were reached by each method, in a sentence."""
+    counts = []
+    for method in METHOD_ORDER[::-1]:
+        ends = [runs[method].terminal_error_cm for runs in pairs.values() if method in runs]
+        if ends:
+            counts.append(f"{sum(end <= REACHED_CM for end in ends)} of {len(ends)} {METHOD_LABEL[method]}")
+    return f"Targets reached to within {REACHED_CM:g} cm: {listed(counts)}. Every figure is below."
 
 
 def animation_data(runs: Runs) -> dict[str, Any]:
