@@ -7,7 +7,7 @@ import pytest
 
 from cablejax.bounded import Result
 from cablejax.mpc import MPC, Action, LevenbergMarquardt, MPCConfig, ProjectedGradient, time_control
-from cablejax.mpc.fallback import ABOUT, _followed
+from cablejax.mpc.fallback import ABOUT, RETURNS, _followed, radius_after
 from cablejax.mpc.state import initial_state
 from cablejax.mpc.target_pose import straightened
 from cablejax.types import History, Measurement
@@ -298,24 +298,46 @@ def test_where_nothing_gets_better_the_grippers_rest_until_it_is_disturbed():
     assert info.shape_error[-1] < info.shape_error[47] and np.isfinite(info.objective).all()
 
 
-def test_the_grippers_rest_at_a_good_moment_or_go_back_to_one():
-    config, pose, yes = MPCConfig(settle_after=2), jnp.asarray(START), jnp.asarray(True)
+def courses(config, errors, ways_back=()):
+    """The progress after each of these errors [m], with the ways back [m] at the last ones."""
+    pose, yes = jnp.asarray(START), jnp.asarray(True)
+    progress = initial_state(config, at_rest(pose)).progress
+    for k, error in enumerate(errors):
+        ways = jnp.asarray(0.1), jnp.asarray(([0.08] * (len(errors) - len(ways_back)) + [*ways_back])[k])
+        progress = _followed(config, progress, pose, jnp.asarray(error), ways, sound=yes, held=~yes)
+        yield progress
 
-    def modes(errors, ways_back=()):
-        progress = initial_state(config, at_rest(pose)).progress
-        for k, error in enumerate(errors):
-            ways = jnp.asarray(0.1), jnp.asarray(([0.08] * (len(errors) - len(ways_back)) + [*ways_back])[k])
-            progress = _followed(config, progress, pose, jnp.asarray(error), ways, sound=yes, held=~yes)
-            yield Action(int(progress.mode))
 
-    follow, rest, back = Action.FOLLOW, Action.HOLD, Action.RETURN
+def test_the_grippers_rest_at_a_good_moment():
+    def modes(errors):
+        return [Action(int(progress.mode)) for progress in courses(MPCConfig(settle_after=2), errors)]
+
+    follow, rest = Action.FOLLOW, Action.HOLD
     tired = [0.004, 0.003, 0.003, 0.003]
     assert list(modes(tired)) == [follow, follow, follow, rest]
     assert list(modes([*tired, 0.005, 0.0055, 0.0058]))[-3:] == [rest, rest, rest], "the cable relaxes by itself"
     assert list(modes([*tired, 0.005, 0.005, 0.0065]))[-1] == follow, "and is disturbed"
     assert list(modes([*tired, 0.1, 0.03, 0.03]))[-1] == follow, "as it may be while it relaxes"
-    worse = [0.004, 0.003, 0.006, 0.006, 0.005, 0.0045, 0.0045]
-    assert list(modes(worse, (0.08, 0.03, 0.0, 0.0)))[-4:] == [back, back, rest, rest]
+
+
+def test_what_makes_the_error_worse_is_taken_back_and_tried_again_with_smaller_motions():
+    config, follow, rest, back = MPCConfig(), Action.FOLLOW, Action.HOLD, Action.RETURN
+    worse = [0.006, 0.006, 0.0045]
+    course = list(courses(config, [0.004, 0.003, *worse], (0.08, 0.03, 0.0)))
+    assert [int(progress.mode) for progress in course[2:]] == [follow, back, follow]
+    assert float(course[-1].best_error) == pytest.approx(0.0045), "friction may hold the cable in another shape there"
+    little = list(courses(config, [0.004, 0.003, 0.0037, 0.0036, 0.0037]))
+    assert all(int(progress.mode) == follow for progress in little), "about as low"
+    again = list(courses(config, [0.004, *[0.003, *worse] * (RETURNS + 1)], [0.08, 0.08, 0.03, 0.0] * (RETURNS + 1)))
+    assert [int(progress.mode) for progress in again].count(back) == RETURNS
+    assert int(again[-1].mode) == rest
+
+    radius = jnp.asarray(config.radius)
+    assert float(radius_after(config, course[2], course[3], radius)) == pytest.approx(config.radius / 2)
+    assert float(radius_after(config, course[3], course[4], radius / 2)) == pytest.approx(config.radius / 2)
+    pushed = course[-1]._replace(mode=jnp.asarray(rest, jnp.int32))
+    assert float(radius_after(config, pushed, course[-1], radius / 16)) == pytest.approx(config.radius)
+    assert float(radius_after(config, course[2], course[3], radius / 24)) == pytest.approx(config.radius_min)
 
 
 @pytest.mark.slow

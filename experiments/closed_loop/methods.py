@@ -17,6 +17,8 @@ from closed_loop.visual_servo import ServoConfig, VisualServo
 ADAPTED = "adapted"
 LEARNER = "learner"
 ADAPTED_LEARNER = "adapted learner"
+NO_PRIOR = "no prior"
+NO_PRIOR_LEARNER = "no prior learner"
 DRIVE = "straight drive"
 STATICS = "statics"
 PAPER_DIRECT = "paper network"
@@ -27,6 +29,8 @@ LABEL = METHOD_LABEL | {
     ADAPTED: "conditioned GNS + online estimate",
     LEARNER: "GNS + online learner",
     ADAPTED_LEARNER: "conditioned GNS + estimate + learner",
+    NO_PRIOR: "conditioned GNS without statics + estimate",
+    NO_PRIOR_LEARNER: "conditioned GNS without statics + estimate + learner",
     DRIVE: "straight drive to the goal, no model",
     STATICS: "statics alone",
     PAPER_DIRECT: "GNS without statics, world's frame, direct",
@@ -40,6 +44,7 @@ WITHOUT_LEARNING = {
     LEARNER: DIRECT,
     PAPER_RESIDUAL: PAPER_DIRECT,
     ADAPTED_LEARNER: ADAPTED,
+    NO_PRIOR_LEARNER: NO_PRIOR,
 }
 """The same model without what is learned online."""
 
@@ -72,6 +77,8 @@ METHODS: dict[str, MethodSpec] = {
         MethodSpec(LEARNER, "gns-reference", learner=LearnerConfig()),
         MethodSpec(ADAPTED, "gns-conditioned"),
         MethodSpec(ADAPTED_LEARNER, "gns-conditioned", learner=LearnerConfig()),
+        MethodSpec(NO_PRIOR, "gns-no-prior"),
+        MethodSpec(NO_PRIOR_LEARNER, "gns-no-prior", learner=LearnerConfig()),
         MethodSpec(DRIVE, None),
         MethodSpec(STATICS, STATICS),
         MethodSpec(PAPER_DIRECT, "gns-none-world"),

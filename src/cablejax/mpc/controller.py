@@ -13,7 +13,7 @@ from jaxtyping import Array, Float, Int
 
 from cablejax.adaptation.belief import update
 from cablejax.mpc.config import MPCConfig
-from cablejax.mpc.fallback import plan_or_hold, plan_or_recover
+from cablejax.mpc.fallback import plan_or_hold, plan_or_recover, radius_after
 from cablejax.mpc.feasible import FeasibleSet, feasible_from
 from cablejax.mpc.problem import ShapingProblem
 from cablejax.mpc.state import CableEstimate, LastCommand, MPCInfo, MPCState, initial_state
@@ -101,6 +101,7 @@ def _step(mpc: MPC, state: MPCState, measurement: Measurement) -> tuple[MPCState
     start = find_starts(config, problem, state.last.plan, state.progress.best_pose)
     decision = plan_or_hold(config, config.solver(problem, start.guess), start)
     decision, progress = plan_or_recover(config, state.progress, problem, error, decision, start)
+    next_radius = radius_after(config, state.progress, progress, radius)
     plan = decision.plan
 
     twist = config.objective.to_twist(plan.motion[0])
@@ -129,7 +130,7 @@ def _step(mpc: MPC, state: MPCState, measurement: Measurement) -> tuple[MPCState
         last=LastCommand(plan.motion, twist, offline, drift, predicted, error),
         progress=progress,
         estimate=estimate,
-        radius=radius,
+        radius=next_radius,
         steps=state.steps + 1,
         unobserved=state.unobserved + unobserved,
     )

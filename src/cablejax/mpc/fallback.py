@@ -22,6 +22,10 @@ RELAXED = 2.0
 """Above that ratio something else has moved the cable."""
 ABOUT = 1.25
 """An error of at most this ratio to the lowest counts as about as low."""
+WORSE_AFTER = 2
+"""Commands without a lower error after which an error that is not about as low is taken back."""
+RETURNS = 4
+"""How often commands are taken back, before the grippers rest where they are back."""
 
 
 class Decision(NamedTuple):
@@ -68,8 +72,9 @@ def plan_or_recover(
       every plan of a few steps makes the error worse before it makes it better. From the straight cable the target can
       be reached, so it is straightened.
     - Near it. Stick and slip are of the size of what the model promises. The grippers rest as soon as the error is
-      about as low as it has been, until it rises, as after a disturbance. Where the cable has got worse instead, they
-      go back to where it was best, and rest there, although friction may hold it in another shape than it had.
+      about as low as it has been, until it rises, as after a disturbance. Where the cable gets worse instead, they go
+      back to where it was best before friction holds it in another shape, and plan again with half the bound on their
+      motion (`radius_after`): a trust region's rejected step. They rest there after `RETURNS` ways back.
     """
     plan, sound = decision.plan, _sound(decision.plan.result)
     held = decision.action == Action.HOLD
@@ -123,7 +128,9 @@ def _followed(
     far_to_go = ways[0] > config.radius_max
     straighten = tired & far & far_to_go & (before.restarts < config.max_restarts)
     straightening = straighten | (before.mode == Action.STRAIGHTEN)
-    go_back = tired & ~far & (error > ABOUT * best)
+    # a tenth of a millimetre is no change for the worse
+    worse = (since >= WORSE_AFTER) & (error > ABOUT * best + config.min_reduction)
+    go_back = planning & sound & ~far & worse
     returning = go_back | (before.mode == Action.RETURN)
     length = jnp.where(straightening, *ways)
     # half as many steps again as the way is long: the bounds on the grippers' distance may lead it round
@@ -131,19 +138,31 @@ def _followed(
     left = jnp.where(straighten | go_back, needed, before.way_left - 1)
     # from within a step of straight the planner goes on by itself
     on_way = (left > 0) & (length > jnp.where(straightening, config.radius_max, config.arrived))
-    rest = (tired & ~far & ~go_back) | (returning & ~on_way)
+    arrived = returning & ~on_way
+    again = arrived & (before.returns + go_back < RETURNS)
+    rest = (tired & ~far & ~go_back) | (arrived & ~again)
     mode = jnp.where(on_way & returning, Action.RETURN, Action.FOLLOW)
     mode = jnp.where(on_way & straightening, Action.STRAIGHTEN, mode)
     mode = jnp.where(rest | (resting & ~woken), Action.HOLD, mode)
     return Progress(
-        best_error=jnp.where(straightening, jnp.inf, jnp.where(better, error, best)).astype(error.dtype),
+        # the cable may lie otherwise than it did, where the grippers are back
+        best_error=jnp.where(straightening, jnp.inf, jnp.where(better | again, error, best)).astype(error.dtype),
         best_pose=jnp.where(better, pose, before.best_pose),
-        since=jnp.where(straightening | rest, 0, since),
+        since=jnp.where(straightening | rest | again, 0, since),
         mode=mode.astype(jnp.int32),
         way_left=left,
         restarts=before.restarts + straighten,
+        returns=jnp.where(woken | straightening, 0, before.returns + go_back).astype(jnp.int32),
         rest_error=jnp.where(resting & ~relaxed & ~woken, before.rest_error, error),
     )
+
+
+def radius_after(config: MPCConfig, before: Progress, after: Progress, radius: Float[Array, ""]) -> Float[Array, ""]:
+    """The bound on the next motion [m]: half of it where commands are taken back, the first one after a disturbance."""
+    began = after.returns > before.returns
+    woken = (before.mode == Action.HOLD) & (after.mode != Action.HOLD)
+    radius = jnp.where(began, jnp.maximum(radius / 2.0, config.radius_min), radius)
+    return jnp.where(woken, jnp.asarray(config.radius, radius.dtype), radius)
 
 
 def _sound(result: Int[Array, ""]) -> Bool[Array, ""]:

@@ -26,7 +26,7 @@ class Action(enum.IntEnum):
     STRAIGHTEN = 2
     """The error stayed where it is, as in another shape between the same grippers: the cable is straightened first."""
     RETURN = 3
-    """The error has risen near the target: the grippers go back to where it was lowest, and rest there."""
+    """The error has risen near the target: the grippers go back to where it was lowest."""
 
 
 class LastCommand(NamedTuple):
@@ -59,6 +59,7 @@ class Progress(NamedTuple):
         mode: an `Action`: plans are followed, the cable is straightened, the grippers go back, or rest (`HOLD`).
         way_left: commands left for the way there or back.
         restarts: how often straightening was begun.
+        returns: how often the grippers went back since the last restart or rest.
         rest_error: shape error at which the cable came to rest [m].
     """
 
@@ -68,6 +69,7 @@ class Progress(NamedTuple):
     mode: Int[Array, "*batch"]
     way_left: Int[Array, "*batch"]
     restarts: Int[Array, "*batch"]
+    returns: Int[Array, "*batch"]
     rest_error: Float[Array, "*batch"]
 
 
@@ -172,6 +174,7 @@ def initial_state(config: MPCConfig, history: History) -> MPCState:
             mode=zero,
             way_left=zero,
             restarts=zero,
+            returns=zero,
             rest_error=jnp.zeros((), dtype),
         ),
         estimate=estimate,
