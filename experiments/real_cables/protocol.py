@@ -107,7 +107,7 @@ def _put_right(points: Float[np.ndarray, "W T N 3"]) -> Float[np.ndarray, "W T N
 def _followed(held: Float[np.ndarray, "W T 4 3"], dt: float) -> tuple[np.ndarray, np.ndarray]:
     """The markers on the grippers at every sample, and how many samples of each window these are known."""
     samples, most = np.arange(held.shape[1]), round(_GAP / dt)
-    seen = np.isfinite(held).all(axis=(2, 3))
+    seen = np.asarray(np.isfinite(held).all(axis=(2, 3)))
     since = samples - np.maximum.accumulate(np.where(seen, samples, -1), axis=1)
     last = np.where(seen, samples, -1).max(axis=1)
     lost = since > most

@@ -95,7 +95,7 @@ def accident_sentences(
     ):
         if which.any():
             index = np.flatnonzero(which)
-            shown = ", ".join(_window(windows, i, error[i], torn=bool(torn[i])) for i in index[:_SHOWN])
+            shown = ", ".join(_window(windows, i, float(error[i]), torn=bool(torn[i])) for i in index[:_SHOWN])
             more = f" and {len(index) - _SHOWN} more" if len(index) > _SHOWN else ""
             result.append(f"{len(index)} of {len(windows)} windows {words}: file {shown}{more}. {advice}")
     if windows.left_out:
