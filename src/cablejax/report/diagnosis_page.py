@@ -88,6 +88,8 @@ def write_diagnosis_page(diagnosis: CableDiagnosis, out: str | os.PathLike[str])
         inline[name] = "" if figure is None else svg(figure, name)
         picture = out / f"{name}.png"
         if figure is not None and name != "motion":
+            # laid out already: to find room for all words takes longer than to draw them
+            figure.set_layout_engine("none")
             figure.savefig(picture, dpi=_DPI)
         else:
             # none of an earlier diagnosis next to this page
