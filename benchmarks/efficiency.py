@@ -146,7 +146,8 @@ def at_work(name: str, contestant: Contestant, options: argparse.Namespace):
         for process in processes:
             print("go", file=process.stdin, flush=True)
         for process in processes:
-            if process.stdout is None or process.stdout.readline() != "done\n":
+            # libraries print lines of their own
+            if process.stdout is None or "done\n" not in iter(process.stdout.readline, ""):
                 raise RuntimeError(f"A process failed at {name}: see its error above.")
 
     try:
