@@ -116,6 +116,11 @@ class LearnerConfig:
 PAPER = LearnerConfig(candidates=(Candidate(ridge=RidgeConfig(bias=False)),))
 """The residual of Wang et al., RA-L 2022: ridge regression on the last five commands, without a bias."""
 
+DRIFT = LearnerConfig(candidates=(Candidate(), Candidate(drift=True)))
+"""For a model without a prior that estimates its cable: the share of its drift alone. There the regression fits five
+samples of what the estimate leaves, a few millimetres, and the planner follows its errors: some runs on soft cables end
+centimetres away."""
+
 
 class Sample(NamedTuple):
     """One step, or with a leading axis W the last ones, oldest first.
