@@ -117,7 +117,7 @@ def test_the_cable_is_found_in_stores_and_weights(tmp_path):
 
 
 def test_released_weights_name_the_reference_cable():
-    for name in ("gns-reference", "gns-conditioned", "gns-randomised"):
+    for name in ("gns-reference", "gns-conditioned", "gns-randomised", "gns-no-prior"):
         assert cable_of_weights(name) == Cable()
 
 
