@@ -299,10 +299,14 @@ def test_batches_are_of_one_size_and_pairs_in_place():
 
 
 GENERIC = (
-    "belief", "conclude", "conformal", "diagnosis", "evidence", "fit", "gap", "given_arrays", "judgement", "laws",
-    "noise", "posterior", "profile", "protocol", "refits", "repeats", "run", "screen", "search",
+    "belief", "conclude", "diagnosis", "evidence", "fit", "gap", "given_arrays", "judgement", "laws",
+    "noise", "posterior", "profile", "protocol", "refits", "run", "screen", "search",
 )  # fmt: skip
-ALLOWED = {f"cablejax.diagnose.{name}" for name in GENERIC} | {"cablejax.bounded", "cablejax.effects.effect"}
+ALLOWED = {f"cablejax.diagnose.{name}" for name in GENERIC} | {
+    "cablejax.arrays",
+    "cablejax.bounded",
+    "cablejax.effects.effect",
+}
 
 
 @pytest.mark.parametrize("name", GENERIC)

@@ -13,7 +13,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float
 
 from cablejax.cable import GRAVITY, Cable
 from cablejax.gaplog_check import DTYPES, META_FIELDS, SCHEMA, GapLogError, validate
@@ -159,11 +159,6 @@ def episodes_of(log: GapLog) -> list[Episode]:
         )
         for e, (motion, n) in enumerate(zip(log.meta["motion"], log.episode_length, strict=True))
     ]
-
-
-def stretches(flags: Bool[np.ndarray, " T"]) -> Int[np.ndarray, "S 2"]:
-    """First sample of each stretch in which a flag is set, and the first after it."""
-    return np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(int))).reshape(-1, 2)
 
 
 def until(log: GapLog, seconds: float) -> GapLog:

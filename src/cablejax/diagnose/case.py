@@ -8,6 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float, Int
 
+from cablejax.arrays import wrapped
 from cablejax.cable import Discretisation
 from cablejax.cable_file import config_of_log
 from cablejax.diagnose.actuation import Actuation, actuation
@@ -21,7 +22,6 @@ from cablejax.diagnose.run import weighed
 from cablejax.effects import LIBRARY, CableEffect
 from cablejax.effects.physics import nominal_physics
 from cablejax.simulate.chain.replay import FINE_STEP, LARGEST_STEP
-from cablejax.simulate.pose import wrapped
 from cablejax.types import GapLog
 
 FIT_LINKS = 33

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from cablejax.arrays import wrapped
 from cablejax.diagnose.belief import (
     Calibration,
     as_good,
@@ -37,7 +38,6 @@ from cablejax.diagnose.laws import Law
 from cablejax.diagnose.posterior import drawn_by, draws, over_laws, posterior
 from cablejax.diagnose.protocol import Simulator
 from cablejax.diagnose.search import Search
-from cablejax.simulate.pose import wrapped
 
 
 @dataclasses.dataclass(frozen=True)

@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from cablejax.arrays import wrapped
 from cablejax.cable import Discretisation
 from cablejax.limits import LIMITS, check, check_workspace, require, shown
 from cablejax.simulate.equilibrium import arch_angles, chain_nodes, find_equilibrium
 from cablejax.simulate.motions import MotionConfig, admissible
-from cablejax.simulate.pose import wrapped
 from cablejax.text_file import read_toml, unknown_key
 
 SNAP_THROUGH = "snap_through"

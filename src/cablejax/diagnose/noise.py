@@ -8,7 +8,7 @@ import math
 import numpy as np
 from jaxtyping import Float
 
-from cablejax.gaplog import stretches
+from cablejax.arrays import stretches
 
 # Shortest hold that is used, in samples.
 _SHORTEST_HOLD = 10

@@ -8,7 +8,7 @@ import itertools
 import numpy as np
 from jaxtyping import Bool, Float
 
-from cablejax.simulate.pose import wrapped
+from cablejax.arrays import wrapped
 from cablejax.types import GapLog
 
 _METRES_PER_RADIAN = 0.15

@@ -12,10 +12,10 @@ import numpy as np
 from jaxtyping import Float
 from scipy.special import j0
 
+from cablejax.arrays import wrapped
 from cablejax.cable import Discretisation
 from cablejax.diagnose.motion_bounds import FARTHEST, NEAREST, Bounds
 from cablejax.simulate.motions import MotionConfig, admissible
-from cablejax.simulate.pose import wrapped
 
 INTERVAL = 0.1
 """Between two samples of a motion [s]."""

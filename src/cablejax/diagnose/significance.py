@@ -6,8 +6,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.stats import chi2
 
+from cablejax.arrays import stretches
 from cablejax.diagnose.evidence import episodes_by_motion
-from cablejax.gaplog import stretches
 from cablejax.types import GapLog
 
 NOISE_TOLERANCE = 1.15

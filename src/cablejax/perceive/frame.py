@@ -11,9 +11,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from cablejax.arrays import wrapped
 from cablejax.limits import check
 from cablejax.perceive.registration import CurveFit, RegistrationConfig, register
-from cablejax.simulate.pose import wrapped
 
 ROTATION_WEIGHT = 0.15
 """Metres that one radian of a gripper's motion counts for."""

@@ -19,8 +19,8 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import KDTree
 
+from cablejax.arrays import wrapped
 from cablejax.perceive.registration import CurveFit, RegistrationConfig, register
-from cablejax.simulate.pose import wrapped
 
 CELL = 0.01
 """Side of the cells that a cloud is thinned to, in lengths of the cable."""

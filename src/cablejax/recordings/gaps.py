@@ -13,7 +13,7 @@ import itertools
 import numpy as np
 from jaxtyping import Float
 
-from cablejax.gaplog import stretches
+from cablejax.arrays import stretches
 from cablejax.recordings.take import Take, median_step
 
 FILLED = 0.05

@@ -12,7 +12,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float
 
-from cablejax.simulate.pose import wrapped
+from cablejax.arrays import wrapped
 
 _X = np.array([1.0, 0.0, 0.0])
 

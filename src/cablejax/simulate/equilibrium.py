@@ -14,10 +14,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from cablejax.arrays import wrapped
 from cablejax.cable import Discretisation
 from cablejax.simulate.compiled_equilibrium import settle
 from cablejax.simulate.composite import link_lengths
-from cablejax.simulate.pose import wrapped
 from cablejax.types import CableState
 
 FEWEST_LINKS = 5

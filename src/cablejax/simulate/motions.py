@@ -8,10 +8,10 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float
 
+from cablejax.arrays import wrapped
 from cablejax.cable import Cable, Discretisation
 from cablejax.limits import check
 from cablejax.simulate.equilibrium import arch_angles, chain_nodes, find_equilibrium
-from cablejax.simulate.pose import wrapped
 
 _MAX_REDRAWS = 50
 _COARSE_LINKS = 13

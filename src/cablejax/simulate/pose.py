@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -47,11 +45,6 @@ def quaternion_of(rotation: Float[Array, "*B 3"]) -> Float[Array, "*B 4"]:
     sinc = jnp.where(small, 1 - squared / 6 + squared**2 / 120, jnp.sin(half) / half)
     cosine = jnp.where(small, 1 - squared / 2 + squared**2 / 24, jnp.cos(half))
     return jax.lax.concatenate([cosine, sinc * 0.5 * rotation], cosine.ndim - 1)
-
-
-def wrapped(angle):
-    """The same angle within [-pi, pi) [rad]. NumPy in, NumPy out; JAX in, JAX out."""
-    return (angle + math.pi) % (2 * math.pi) - math.pi
 
 
 def points_in_space(points: Float[np.ndarray, "*B D"]) -> Float[np.ndarray, "*B 3"]:

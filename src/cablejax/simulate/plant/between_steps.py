@@ -10,11 +10,11 @@ import mujoco
 import numpy as np
 from jaxtyping import Float
 
+from cablejax.arrays import wrapped
 from cablejax.simulate.chain.step import SLIP_DURATION
 from cablejax.simulate.friction import PATCH_EDGE, STRIBECK_SPEED
 from cablejax.simulate.plant.config import PlantConfig
 from cablejax.simulate.plant.model import FRICTIONLESS, bending_joints, quaternions
-from cablejax.simulate.pose import wrapped
 
 
 class Extension:
