@@ -10,4 +10,4 @@ import os
 if len(os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else range(os.cpu_count() or 1)) < 4:
     os.environ.setdefault("NPROC", "4")
 
-__version__ = "0.1.0"
+__version__ = "1.0.0"
