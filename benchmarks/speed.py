@@ -44,9 +44,9 @@ def main() -> None:
     parser.add_argument("--logs", nargs="*", default=[], help="gap logs to diagnose; by default a staged one")
     options = parser.parse_args()
 
-    simulate = measure("bench", "simulate")
-    mpc = measure("bench", "mpc", "--weights", options.weights)
     start = measure("bench", "start", *options.logs, "--weights", options.weights)
+    mpc = measure("bench", "mpc", "--weights", options.weights)
+    simulate = measure("bench", "simulate")
     lines = [
         "# Speed",
         "",
