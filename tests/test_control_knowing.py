@@ -14,7 +14,7 @@ from cablejax.dataset.generate import make_engine, simulate
 from cablejax.dataset.schema import DatasetConfig
 from cablejax.dynamics.evaluate import open_loop_error
 from cablejax.effects.given import parse_effect
-from cablejax.residual import DRIFT, LearnerConfig
+from cablejax.residual import LearnerConfig
 from cablejax.types import Trajectory
 
 CURVED = "intrinsic_curvature:centre_m=0.6,width_m=0.3,curvature_per_m=2"
@@ -55,17 +55,16 @@ def test_a_conditioned_model_begins_with_what_it_is_informed_of():
     make_controller(far, make_target("U", far.cable), method="direct", solver="levenberg-marquardt")
 
 
-def test_a_model_without_prior_can_be_informed_of_stiffness_alone_and_learns_its_drift_alone():
+def test_a_model_without_prior_can_be_informed_of_stiffness_alone():
     model = load_model("gns-no-prior")
     informed = knowing(model, (parse_effect("bending_stiffness:ratio=0.5"),))
     np.testing.assert_allclose(informed.believed, [np.log(0.5), 0.0], atol=1e-5)
     with pytest.raises(ValueError, match="Nothing of intrinsic_curvature"):
         knowing(model, (parse_effect(CURVED),))
-    for one, learner in ((model, DRIFT), (load_model("gns-conditioned"), LearnerConfig())):
-        mpc = make_controller(one, make_target("S", one.cable), method="residual", solver="levenberg-marquardt")
-        assert mpc.config.residual == learner
-        mpc = make_controller(one, make_target("S", one.cable), method="direct", solver="levenberg-marquardt")
-        assert mpc.config.residual is None and mpc.config.adaptation is not None
+    target = make_target("S", model.cable)
+    mpc = make_controller(model, target, method="residual", solver="levenberg-marquardt")
+    assert mpc.config.residual == LearnerConfig().scaled(model.config.length) and mpc.config.adaptation is not None
+    assert make_controller(model, target, method="direct", solver="levenberg-marquardt").config.residual is None
 
 
 def test_what_does_not_enter_a_model_is_refused_with_what_to_do(model, tmp_path, capsys):

@@ -9,7 +9,7 @@ from pathlib import Path
 from cablejax.control.link import Controller
 from cablejax.control.shaping import Model, load_model, make_controller
 from cablejax.control.targets import Target
-from cablejax.residual import DRIFT, PAPER, LearnerConfig
+from cablejax.residual import PAPER, LearnerConfig
 from closed_loop.baselines import StraightDrive, statics_model
 from closed_loop.paper import DIRECT, FINE_TUNED, METHOD_LABEL, RANDOMISED, RESIDUAL, VISUAL_SERVO
 from closed_loop.visual_servo import ServoConfig, VisualServo
@@ -78,7 +78,7 @@ METHODS: dict[str, MethodSpec] = {
         MethodSpec(ADAPTED, "gns-conditioned"),
         MethodSpec(ADAPTED_LEARNER, "gns-conditioned", learner=LearnerConfig()),
         MethodSpec(NO_PRIOR, "gns-no-prior"),
-        MethodSpec(NO_PRIOR_LEARNER, "gns-no-prior", learner=DRIFT),
+        MethodSpec(NO_PRIOR_LEARNER, "gns-no-prior", learner=LearnerConfig()),
         MethodSpec(DRIVE, None),
         MethodSpec(STATICS, STATICS),
         MethodSpec(PAPER_DIRECT, "gns-none-world"),
