@@ -14,7 +14,7 @@ import os
 
 os.environ.setdefault("NPROC", "4")
 
-from closed_loop.cases import STIFFNESS_RATIOS, stiffness_cases
+from closed_loop.cases import NEARBY, STIFFNESS_RATIOS, nearby_cases, stiffness_cases
 from closed_loop.experiment import Experiment, Extent, main
 from closed_loop.methods import LEARNER, METHODS, NO_PRIOR_LEARNER
 from closed_loop.paper import DIRECT, RESIDUAL
@@ -42,10 +42,10 @@ if __name__ == "__main__":
                 methods=(DIRECT, RESIDUAL, LEARNER, NO_PRIOR_LEARNER),
             ),
             full=Extent(
-                functools.partial(stiffness_cases, ("U", "S", "Z"), STIFFNESS_RATIOS),
+                lambda seeds: stiffness_cases(("U", "S", "Z"), STIFFNESS_RATIOS, seeds) + nearby_cases(seeds),
                 seeds=range(5),
                 methods=tuple(METHODS),
             ),
-            tables=("III",),
+            tables=("III", NEARBY),
         )
     )

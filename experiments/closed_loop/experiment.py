@@ -16,6 +16,7 @@ from cablejax.control.shaping import Model
 from cablejax.dynamics.weights import FILE_NAME
 from cablejax.mpc import MPCConfig
 from closed_loop import interval_tables, tables
+from closed_loop.cases import NEARBY, NEARBY_RATIOS
 from closed_loop.failures import failure_figure, worst
 from closed_loop.fine_tuning import FineTuneConfig, fine_tune, record
 from closed_loop.harder import MARGIN_CM
@@ -132,6 +133,11 @@ def page(experiment: Experiment, trials: Sequence[Trial], command: str, picture:
     for table in experiment.tables:
         mine = [trial for trial in trials if trial.table == table]
         if not mine:
+            continue
+        if table == NEARBY:
+            ends = f"stiffness {NEARBY_RATIOS[0]:g} to {NEARBY_RATIOS[-1]:g}, mean error of the last {LATE} s"
+            lines += ["", "## Ten plants next to one another", "", f"Z from one start, {ends}.", ""]
+            lines += [interval_tables.nearby_table(mine, table, labels=LABEL)]
             continue
         lines += ["", f"## Table {table}", "", f"Seeds: {seeds_text({trial.seed for trial in mine})}.", ""]
         if table == LIANG_TABLE:

@@ -277,6 +277,20 @@ def end_table(
     return markdown(title, rows)
 
 
+def nearby_table(trials: Iterable[Trial], table: str, *, labels: Mapping[str, str] = METHOD_LABEL) -> str:
+    """Best, median and worst of runs that differ by next to nothing, in the mean of the last `LATE` seconds.
+
+    Raises:
+        ValueError: there is no trial of this table.
+    """
+    mine, rows = trials_of_table(trials, table), []
+    for method in methods_of(mine, None):
+        late = [float(trial.late_errors_cm.mean()) for trial in mine if trial.method == method]
+        numbers = min(late), float(np.median(late)), max(late), max(late) / min(late)
+        rows.append([label_of(method, labels), str(len(late)), *map(number_text, numbers)])
+    return markdown(["method", "plants", "best [cm]", "median [cm]", "worst [cm]", "worst over best"], rows)
+
+
 def _seed_interval(cell: Sequence[Trial], measure: Measure) -> Interval:
     """Bootstrap interval of the mean of the trials that did not fail, seeds resampled."""
     by_seed: dict[int, list[float]] = {}

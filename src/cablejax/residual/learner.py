@@ -48,8 +48,8 @@ class Candidate:
 
 
 _REGRESSION = RidgeConfig(regularisation=100.0, bias=False, forgetting=0.5, outlier=0.02)
-"""Ten times the paper's penalty. A planner goes where the corrected model promises most, so that it finds the errors of a
-regression on five samples; where they are shrunk too little, some runs on soft cables end centimetres away."""
+"""Ten times the paper's penalty. A planner goes where the corrected model promises most, so that it finds the errors of
+a regression on five samples; where they are shrunk too little, some runs on soft cables end centimetres away."""
 
 
 @dataclasses.dataclass(frozen=True)
