@@ -5,8 +5,9 @@ import math
 import numpy as np
 import pytest
 
+from closed_loop.cases import NEARBY, NEARBY_RATIOS, nearby_cases
 from closed_loop.failures import Snapshot, append_snapshot, failure_figure, read_snapshots, worst
-from closed_loop.interval_tables import interval_table, learning_table, paired_table, success_table
+from closed_loop.interval_tables import interval_table, learning_table, nearby_table, paired_table, success_table
 from closed_loop.tables import comparison_table, settling_table, stiffness_table
 from closed_loop_cases import course, small_table, trial
 from report_cases import arc
@@ -109,6 +110,15 @@ def test_success_is_counted_at_the_end():
     ]  # fmt: skip
     assert rows[1][1:3] == ["diverse", "1/1"]
     assert [row[2] for row in rows[2:4]] == ["*47/50*", "*43/50*"]
+
+
+def test_plants_next_to_one_another_show_what_a_run_owes_to_luck():
+    cases = nearby_cases(range(3, 5))
+    assert [case.stiffness for case in cases] == list(NEARBY_RATIOS) and {case.seed for case in cases} == {3}
+    assert {(case.table, case.scenario) for case in cases} == {(NEARBY, "Z")}
+    errors = zip(NEARBY_RATIOS, (0.1, 0.2, 0.4), strict=False)
+    runs = [trial(table=NEARBY, scenario="Z", stiffness=r, errors_cm=(9.0, *[e] * 12)) for r, e in errors]
+    assert cells(nearby_table(runs, NEARBY))[2] == ["GNS + online residual", "3", "0.10", "0.20", "0.40", "4.00"]
 
 
 def snapshot(seed: int, error: float, final: np.ndarray) -> Snapshot:
