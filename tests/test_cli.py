@@ -167,6 +167,11 @@ def test_bench_simulate_relates_the_engines(capsys):
     assert result["mjx_memory_per_env_bytes"] > 0 and result["mjx_compile_s"] > 0
 
 
+def test_importing_the_simulators_prints_nothing():
+    words = [sys.executable, "-c", "import cablejax.control.shaping, cablejax.environment"]
+    assert subprocess.run(words, capture_output=True, text=True, check=True).stdout == ""
+
+
 def test_text_table_lines_up():
     text = options.text_table(["shape", "error"], [["U", "0.5"], ["long name", "12.25"]])
     assert text.splitlines()[1:] == ["---------  -----", "U            0.5", "long name  12.25"]

@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import abc
-import contextlib
 import dataclasses
-import importlib
-import io
 import json as json_format
 import pathlib
 import sys
@@ -44,9 +41,6 @@ class Command(abc.ABC):
         """Chooses the device, does the work and prints the result."""
         require(self.seed, "seed", "--seed")
         choose_device(self.device)
-        # MJX prints that Warp is missing, which nothing here needs.
-        with contextlib.redirect_stdout(io.StringIO()):
-            importlib.import_module("mujoco.mjx")
         result, text = self.execute()
         print(json_format.dumps(result, indent=2, allow_nan=False) if self.json else text)
 

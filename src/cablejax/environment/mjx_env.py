@@ -15,7 +15,6 @@ import mujoco
 import numpy as np
 from flax import struct
 from jaxtyping import Array, Float
-from mujoco import mjx
 
 from cablejax.control.targets import straight_start
 from cablejax.dataset.generate import cable_params, draw_parameters
@@ -23,6 +22,7 @@ from cablejax.dataset.schema import Randomisation
 from cablejax.effects.physics import Physics, may_touch, without_obstacle
 from cablejax.environment.cables import ShapeCableConfig
 from cablejax.simulate.chain.engine import ChainEngine
+from cablejax.simulate.mjx import mjx
 from cablejax.simulate.mjx_engine import MjxEngine
 from cablejax.types import CableState
 

@@ -10,10 +10,10 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
-from mujoco import mjx
 
 from cablejax.cable import Discretisation
 from cablejax.simulate.composite import link_lengths, node_offsets
+from cablejax.simulate.mjx import mjx
 from cablejax.simulate.pose import quaternion_product
 
 

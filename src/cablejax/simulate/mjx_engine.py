@@ -11,7 +11,6 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 from jaxtyping import Array, Float
-from mujoco import mjx
 
 from cablejax.cable import Discretisation
 from cablejax.effects.arms import executed_twist
@@ -27,6 +26,7 @@ from cablejax.simulate.friction import drag_coefficient, implicit_drag, on_table
 from cablejax.simulate.grasp import constrained_acceleration
 from cablejax.simulate.keypoints import hermite_weights, marked_keypoints
 from cablejax.simulate.kinematics import chain_kinematics
+from cablejax.simulate.mjx import mjx
 from cablejax.simulate.pose import integrate_pose, pose_velocity, quaternion_of, quaternion_product
 from cablejax.types import CableState, Trajectory
 
