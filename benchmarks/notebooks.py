@@ -41,7 +41,9 @@ def execute(path: pathlib.Path, *, keep: bool) -> tuple[float, float]:
     before, began = resource.getrusage(resource.RUSAGE_CHILDREN), time.monotonic()
     with tempfile.TemporaryDirectory() as folder:
         resources = {"metadata": {"path": folder}}
-        NotebookClient(notebook, timeout=3600, kernel_name="python3", resources=resources).execute()
+        NotebookClient(
+            notebook, timeout=3600, kernel_name="python3", coalesce_streams=True, resources=resources
+        ).execute()
     wall, after = time.monotonic() - began, resource.getrusage(resource.RUSAGE_CHILDREN)
     if keep:
         for cell in notebook.cells:

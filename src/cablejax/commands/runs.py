@@ -17,12 +17,13 @@ from cablejax.commands.resuming import Parts
 from cablejax.control.run import ClosedLoopRun
 from cablejax.control.shaping import Method, Model, check_fit, enters, shape_once
 from cablejax.control.targets import Target
+from cablejax.diagnose.judgement import listed
 from cablejax.dynamics.fingerprint import fingerprint
 from cablejax.effects.given import GivenEffect, effects_of_verdict, parse_effect, posterior_of_verdict
 from cablejax.effects.physics import nominal_physics
 from cablejax.limits import require
 from cablejax.perceive.camera import CameraConfig
-from cablejax.report.effect_words import EFFECTS, listed
+from cablejax.report.effect_words import EFFECTS
 from cablejax.report.style import METHOD_LABEL
 from cablejax.simulate.plant import PlantConfig
 from cablejax.solver_names import SolverName

@@ -62,22 +62,28 @@ def verdict_sentence(
         explained: share of the squared gap that the best explanation takes away; a negative one reads as none.
     """
     share = f"{100 * max(explained, 0.0):.0f} %"
-    names = " and ".join(_words(e.name) for e in effects)
+    names = listed([_words(e.name) for e in effects])
     split = [look_alikes(group, effects, ranking) for group in equivalent]
-    alike = "; ".join(" or ".join(map(_words, likely)) for likely, _ in split if len(likely) > 1)
-    faint = " and ".join(_words(name) for _, members in split for name in members)
+    alike = "; ".join(listed([*map(_words, likely)], "or") for likely, _ in split if len(likely) > 1)
+    faint = listed([_words(name) for _, members in split for name in members])
+    explains = "which explains" if len(effects) == 1 else "which together explain"
     rivals = f" (this log cannot tell apart: {alike})" if alike else ""
     too = f" {faint[:1].upper()}{faint[1:]} would leave as little, at a probability below 1 %." if faint else ""
     either = f" or a look-alike, which this log cannot tell apart: {alike}" if alike else ""
     return {
         "none": "The simulator explains this log within what the noise and its own resolution allow.",
-        "named": f"The gap comes from {names}, which explains {share} of it.",
+        "named": f"The gap comes from {names}, {explains} {share} of it.",
         "ambiguous": f"The gap comes from {names}{either}.{too}",
         "named+unknown": (
             f"Part of the gap, {share}, is explained by {names}{rivals}; the rest by no effect of the library.{too}"
         ),
         "unknown": f"The gap has a cause that is not in the library: the best explanation takes away {share} of it.",
     }[verdict]
+
+
+def listed(words: Sequence[str], last: str = "and") -> str:
+    """Joins words as in "a, b and c"."""
+    return "" if not words else words[0] if len(words) == 1 else f"{', '.join(words[:-1])} {last} {words[-1]}"
 
 
 def _words(name: str) -> str:

@@ -10,7 +10,7 @@ import numpy as np
 
 from cablejax.diagnose.belief import Calibration
 from cablejax.diagnose.diagnosis import CableDiagnosis, NamedEffect, Verdict
-from cablejax.diagnose.judgement import FAINT, look_alikes
+from cablejax.diagnose.judgement import FAINT, listed, look_alikes
 from cablejax.diagnose.verdict_json import write_verdict
 from cablejax.gaplog import SIMULATED, write_gap_log
 from cablejax.report import diagnosis_sections as sections
@@ -23,7 +23,6 @@ from cablejax.report.effect_words import (
     effect_place,
     effect_title,
     explained_label,
-    listed,
     millimetres,
     parameter_title,
     quantity,

@@ -7,14 +7,13 @@ import json
 from collections.abc import Sequence
 
 from cablejax.diagnose.diagnosis import CableDiagnosis, Diagnosis, NamedEffect, UnderLaw
-from cablejax.diagnose.judgement import look_alikes
+from cablejax.diagnose.judgement import listed, look_alikes
 from cablejax.report.effect_words import (
     EFFECTS,
     between,
     effect_place,
     effect_title,
     explanation_title,
-    listed,
     millimetres,
     parameter_title,
     quantity,

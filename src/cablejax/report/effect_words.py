@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from cablejax.diagnose.diagnosis import CableDiagnosis, NamedEffect
+from cablejax.diagnose.judgement import listed
 
 EFFECTS: dict[str, str] = {
     "bending_stiffness": "the bending stiffness differs everywhere by one factor",
@@ -146,11 +147,6 @@ def _place(location: dict[str, Any], gripper: Any = None) -> str:
     if time is not None:
         parts.append(f"{time:.1f} s into the episode")
     return ", ".join(parts)
-
-
-def listed(words: Sequence[str], last: str = "and") -> str:
-    """Joins words as in "a, b and c"."""
-    return "" if not words else words[0] if len(words) == 1 else f"{', '.join(words[:-1])} {last} {words[-1]}"
 
 
 def effect_place(effect: NamedEffect) -> str:

@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from matplotlib.figure import Figure
 
+from cablejax.diagnose.judgement import listed
 from cablejax.report import figures
-from cablejax.report.effect_words import listed
 from cablejax.report.html import json_script, svg, write_html
 from cablejax.report.style import (
     METHOD_LABEL,
