@@ -53,13 +53,15 @@ lint: $(STAMP)
 	$(BIN)/pyright
 
 # One file per stage of the pipeline, from the simulator to the verdict.
+# Each file in one process. Files of few tests, which are the slow ones, do not come last.
+IN_TWO := -n 2 --dist loadfile --no-loadscope-reorder
 SPINE := tests/test_simulate_engines.py tests/test_simulate_equilibrium.py tests/test_dataset_store.py \
 	tests/test_dynamics_graph.py tests/test_dynamics_jraph.py tests/test_residual_ridge.py tests/test_bounded_sets.py \
 	tests/test_mpc_feasible.py tests/test_control_targets.py tests/test_perceive_mixture.py tests/test_gaplog.py \
 	tests/test_diagnose_noise.py tests/test_cli.py
 
 quick: $(STAMP)
-	$(BIN)/python -m pytest -m "not slow" -n 2 --dist loadfile $(SPINE)
+	$(BIN)/python -m pytest -m "not slow" $(IN_TWO) $(SPINE)
 
 # Downloads each corner's packages, and its Python where there is none, into build/versions.
 matrix: $(STAMP)
@@ -75,7 +77,7 @@ $(MOTO)/bin/moto_server:
 	$(MOTO)/bin/python -m pip install --disable-pip-version-check --quiet 'moto[server]>=5,<6'
 
 test: lint
-	$(BIN)/python -m pytest -m "not slow" -n 2 --dist loadfile
+	$(BIN)/python -m pytest -m "not slow" $(IN_TWO)
 
 test-full: lint
 	$(BIN)/python -m pytest

@@ -36,9 +36,9 @@ IMAGES = pathlib.Path("docs/images")
 EFFECT = "stiffness_profile:centre_m=0.3,width_m=0.25,ratio=0.3"
 FRICTIONS = {0.1: "#56b4e9", 0.3: "#0072b2", 1.0: "#e69f00", 3.0: "#d55e00"}
 METHODS = {
-    "direct": ("as trained", "#d55e00"),
-    "learner": ("with the learner", "#0072b2"),
-    "adapted learner": ("with learner and estimate of the cable", "#009e73"),
+    "direct": ("gns-reference as trained", "#d55e00"),
+    "learner": ("gns-reference with the learner", "#0072b2"),
+    "no prior learner": ("gns-no-prior with estimate and learner", "#009e73"),
 }
 
 
@@ -76,7 +76,8 @@ def corrections(trials: pathlib.Path = pathlib.Path("docs/results/trials/stiffne
     figure, axes = plt.subplots(1, 3, figsize=(8.4, 3.2), sharey=True, layout="constrained")
     for ax, shape in zip(axes, ("U", "S", "Z"), strict=True):
         for method, (label, colour) in METHODS.items():
-            runs = [row["errors_cm"] for row in rows if (row["method"], row["scenario"]) == (method, shape)]
+            wanted = ("III", method, shape)
+            runs = [row["errors_cm"] for row in rows if (row["table"], row["method"], row["scenario"]) == wanted]
             length = max(len(run) for run in runs)
             # a run that came to rest stays where it is
             errors = np.array([run + [run[-1]] * (length - len(run)) for run in runs])
