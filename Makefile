@@ -52,9 +52,9 @@ lint: $(STAMP)
 	$(BIN)/ruff check .
 	$(BIN)/pyright
 
-# One file per stage of the pipeline, from the simulator to the verdict.
 # Each file in one process. Files of few tests, which are the slow ones, do not come last.
 IN_TWO := -n 2 --dist loadfile --no-loadscope-reorder
+# One file per stage of the pipeline, from the simulator to the verdict.
 SPINE := tests/test_simulate_engines.py tests/test_simulate_equilibrium.py tests/test_dataset_store.py \
 	tests/test_dynamics_graph.py tests/test_dynamics_jraph.py tests/test_residual_ridge.py tests/test_bounded_sets.py \
 	tests/test_mpc_feasible.py tests/test_control_targets.py tests/test_perceive_mixture.py tests/test_gaplog.py \
