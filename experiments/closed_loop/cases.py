@@ -34,7 +34,7 @@ def nearby_cases(seeds: Sequence[int]) -> list[Case]:
 def stiffness_cases(
     shapes: Sequence[Shape], ratios: Sequence[float], seeds: Sequence[int], steps: int = 60, table: str = "III"
 ) -> list[Case]:
-    """Table III: letters from straight starts, by cables of other stiffness."""
+    """Letters from straight starts, by cables of other stiffness; Table III of the paper."""
     return [
         Case(
             table=table,

@@ -135,8 +135,8 @@ def page(experiment: Experiment, trials: Sequence[Trial], command: str, picture:
         if not mine:
             continue
         if table == NEARBY:
-            ends = f"stiffness {NEARBY_RATIOS[0]:g} to {NEARBY_RATIOS[-1]:g}, mean error of the last {LATE} s"
-            lines += ["", "## Ten plants next to one another", "", f"Z from one start, {ends}.", ""]
+            ratios = f"{NEARBY_RATIOS[0]:g} to {NEARBY_RATIOS[-1]:g} times as stiff as the trained cable"
+            lines += ["", "## Ten plants next to one another", "", f"Z from one start, {ratios}: last {LATE} s.", ""]
             lines += [interval_tables.nearby_table(mine, table, labels=LABEL)]
             continue
         lines += ["", f"## Table {table}", "", f"Seeds: {seeds_text({trial.seed for trial in mine})}.", ""]

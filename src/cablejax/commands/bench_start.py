@@ -132,13 +132,12 @@ def twice(words: Sequence[str], programs: pathlib.Path, *, own: bool = False) ->
     Args:
         words: after the interpreter on its command line.
         programs: the folder, which does not exist yet.
-        own: the process prints its times as JSON on its last line: these are taken, and not those of all of it. Lines
-            before it are of the packages that it imports.
+        own: the process prints its times as JSON: these are taken, and not those of all of it.
     """
     result = {}
     for state in ("empty", "filled"):
         whole, printed = seconds_of(words, programs)
-        result[state] = json.loads(printed.splitlines()[-1]) if own else whole
+        result[state] = json.loads(printed) if own else whole
     return result
 
 
