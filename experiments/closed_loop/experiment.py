@@ -136,7 +136,8 @@ def page(experiment: Experiment, trials: Sequence[Trial], command: str, picture:
             continue
         if table == NEARBY:
             ratios = f"{NEARBY_RATIOS[0]:g} to {NEARBY_RATIOS[-1]:g} times as stiff as the trained cable"
-            lines += ["", "## Ten plants next to one another", "", f"Z from one start, {ratios}: last {LATE} s.", ""]
+            about = f"Z from one start, {ratios}; mean error of the last {LATE} s."
+            lines += ["", "## Ten plants next to one another", "", about, ""]
             lines += [interval_tables.nearby_table(mine, table, labels=LABEL)]
             continue
         lines += ["", f"## Table {table}", "", f"Seeds: {seeds_text({trial.seed for trial in mine})}.", ""]
