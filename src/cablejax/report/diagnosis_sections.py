@@ -88,8 +88,7 @@ def _verdict_under(law: UnderLaw) -> str:
         )
         group = next((alike for alike in law.equivalent if effect.name in alike), (effect.name,))
         others = [effect_title(name) for name in group if name != effect.name]
-        besides = f" or {listed(others, 'or')}" if others else ""
-        named.append(f"{effect_title(effect.name)} ({', '.join(estimates)}){besides}")
+        named.append(listed([f"{effect_title(effect.name)} ({', '.join(estimates)})", *others], "or"))
     unknown = ", and something unknown" if law.verdict == "named+unknown" else ""
     return f"the cause is {listed(named)}{unknown}"
 
