@@ -82,8 +82,8 @@ def main() -> None:
         [
             f"Held-out trajectories: {sizes}; a window starts at every {options.stride}. sample. The model sees "
             f"{config.history} samples and then only the commands. The error of a shape is the root mean square "
-            "distance of its keypoints from the simulated ones; the columns are its root mean square, median and "
-            "percentiles over windows, and its root mean square over that of the distance that the cable moved.",
+            "distance of its keypoints from the simulated ones; the columns are its root mean square, mean, median "
+            "and percentiles over windows, and its root mean square over that of the distance that the cable moved.",
             "",
             "Predictors: the network; the static prior that it corrects, alone; the rigid interpolation of the "
             "grippers' motion; and the expectation that nothing moves.",

@@ -24,8 +24,8 @@ import numpy as np
 
 from cablejax.diagnose import diagnose
 from cablejax.diagnose.rounds import UNLIKELY
-from cablejax.gaplog import episodes_of, read_gap_log, stack_episodes
-from cablejax.gaplog_join import joined
+from cablejax.gaplog import read_gap_log
+from cablejax.gaplog_join import chosen, joined
 from cablejax.types import GapLog
 from executors import add_option, executor_of
 from pages import markdown_table, page_of_results, publish
@@ -34,8 +34,7 @@ from rows import Rows
 
 def half(log: GapLog, first: int) -> GapLog:
     """Every other episode of a log, from number `first` on."""
-    meta = {**log.meta, "motion": log.meta["motion"][first::2]}
-    return stack_episodes(episodes_of(log)[first::2], meta, holds=log.hold is not None)
+    return chosen(log, range(first, len(log.episode_length), 2))
 
 
 def examine(folder: pathlib.Path, first: str, second: str) -> dict[str, Any]:

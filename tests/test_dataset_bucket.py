@@ -20,7 +20,7 @@ from cablejax.dataset.bucket import Bucket, UnreachableError, place_of
 from cablejax.dataset.generate import generate
 from cablejax.dataset.opening import open_or_create, open_store
 from cablejax.dataset.schema import DatasetConfig
-from cablejax.dataset.windows import read_split
+from cablejax.dataset.split import read_split
 from cablejax.simulate.motions import MotionConfig
 
 TINY = DatasetConfig(

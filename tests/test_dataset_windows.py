@@ -1,24 +1,15 @@
 """Windows are what the trajectories say, at the first sample and at the last, in a mirror and from the other end."""
 
-import dataclasses
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from cablejax.cable import Cable, Discretisation
-from cablejax.dataset.opening import open_or_create
-from cablejax.dataset.schema import Block, DatasetConfig
 from cablejax.dataset.windows import (
     Window,
-    concatenate,
     draw_windows,
     mirrored,
-    read_split,
-    read_trajectories,
     reversed_ends,
-    split,
     window_at,
 )
 from cablejax.types import Trajectory, advance
@@ -100,59 +91,3 @@ def test_from_the_other_end_the_tangent_points_the_other_way(trajectory):
     np.testing.assert_array_equal(other.twist[:, 0], window.twist[:, 1])
     np.testing.assert_allclose(other.history.gripper_pose[:, 2], window.history.gripper_pose[::-1, 2] + np.pi)
     np.testing.assert_array_equal(other.history.keypoints[-1, [0, -1]], other.history.gripper_pose[:, :2])
-
-
-@pytest.mark.parametrize(("count", "held_out"), [(2, 0.05), (2, 0.99), (20, 0.05), (1000, 0.05), (7, 0.5)])
-def test_split_is_a_partition_with_both_parts(count, held_out):
-    train, rest = split(count, held_out)
-    np.testing.assert_array_equal(np.concatenate([train, rest]), np.arange(count))
-    assert len(train) >= 1 and len(rest) >= 1
-    assert len(rest) <= max(1, held_out * count) and len(rest) > held_out * count - 1
-
-
-def test_split_of_the_released_models_data():
-    assert [len(split(count)[1]) for count in (896, 704, 320)] == [44, 35, 16]
-
-
-def test_split_refuses_what_it_cannot_do():
-    with pytest.raises(ValueError, match="held_out is 1"):
-        split(10, 1.0)
-    with pytest.raises(ValueError, match="1 trajectories"):
-        split(1)
-
-
-def filled(path, config: DatasetConfig, shards: int | None = None):
-    """A store whose first shards hold random numbers."""
-    store, rng = open_or_create(path, config), np.random.default_rng(config.seed)
-    for shard in range(config.n_shards if shards is None else shards):
-        size = len(config.shard_rows(shard))
-        content = {n: rng.standard_normal((size, *s)).astype(d) for n, (s, d) in config.array_shapes().items()}
-        store.write_shard(shard, Block(**content))
-    return store
-
-
-CONFIG = DatasetConfig(
-    n_trajectories=4, n_steps=2, shard_size=2, discretisation=Discretisation(Cable(n_keypoints=4), n_links=5)
-)
-
-
-def test_several_stores_are_split_each_and_trained_on_one_after_the_other(tmp_path):
-    stores = [filled(tmp_path / str(k), dataclasses.replace(CONFIG, seed=k)) for k in range(2)]
-    training, held_out = read_split([tmp_path / "0", stores[1]], 0.3)
-    expected = concatenate([read_trajectories(store, range(3)) for store in stores])
-    jax.tree.map(np.testing.assert_array_equal, training, expected)
-    assert len(held_out) == 2
-    for part, store in zip(held_out, stores, strict=True):
-        jax.tree.map(np.testing.assert_array_equal, part, read_trajectories(store, [3]))
-
-
-def test_stores_that_do_not_belong_together_are_refused(tmp_path):
-    filled(tmp_path / "a", CONFIG)
-    filled(tmp_path / "short", dataclasses.replace(CONFIG, n_steps=3))
-    filled(tmp_path / "half", CONFIG, shards=1)
-    with pytest.raises(ValueError, match="same cable and protocol"):
-        read_split([tmp_path / "a", tmp_path / "short"])
-    with pytest.raises(ValueError, match="holds 2 of 4 trajectories"):
-        read_split([tmp_path / "half"])
-    with pytest.raises(ValueError, match="No data set given"):
-        read_split([])

@@ -41,6 +41,8 @@ def test_who_expects_no_motion_is_off_by_the_motion():
     shift = DATA.keypoints[:, [4, 7]] - DATA.keypoints[:, [0, 3]]
     expected = 100 * np.sqrt(np.mean(np.sum(shift**2, axis=-1)))
     assert found.rmse_cm[1] == pytest.approx(expected, rel=1e-5)
+    mean = 100 * np.mean(np.sqrt(np.mean(np.sum(shift**2, axis=-1), axis=-1)))
+    assert found.mean_cm[1] == pytest.approx(mean, rel=1e-5)
     assert found.starts == (6, 6) and found.horizons == SHORT
     assert found.median_cm[0] < found.p90_cm[0] < found.p95_cm[0] < found.p99_cm[0]
 

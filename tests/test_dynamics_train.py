@@ -5,6 +5,7 @@ import dataclasses
 import json
 import os
 import pathlib
+import shutil
 import signal
 import subprocess
 import sys
@@ -15,9 +16,16 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from cablejax.cable import Cable, Discretisation
+from cablejax.dataset.opening import open_or_create
+from cablejax.dataset.schema import Block, DatasetConfig
+from cablejax.dataset.split import read_split
+from cablejax.dataset.store import Store
+from cablejax.dataset.streaming import StreamedData
 from cablejax.dataset.windows import draw_windows
 from cablejax.dynamics.checkpoint import Checkpoints
 from cablejax.dynamics.evaluate import open_loop_error
+from cablejax.dynamics.fingerprint import fingerprint
 from cablejax.dynamics.loss import random_walk_noise, rollout_loss
 from cablejax.dynamics.metrics import MetricsLog
 from cablejax.dynamics.model import bind
@@ -75,7 +83,7 @@ def test_killed_and_resumed_ends_in_the_same_bits(tmp_path):
     assert resumed.completed and resumed.steps == whole.steps == LONG.total_steps
     same(resumed.weights, whole.weights)
     with (folder / "metrics.csv").open() as first, (tmp_path / "whole" / "metrics.csv").open() as second:
-        rows = [[row | {"seconds": ""} for row in csv.DictReader(file)] for file in (first, second)]
+        rows = [[row | {"seconds": "", "waited": ""} for row in csv.DictReader(file)] for file in (first, second)]
     assert rows[0] == rows[1]
 
 
@@ -92,6 +100,37 @@ def test_a_complete_training_is_not_repeated_and_learns(tmp_path):
     again = run(config, tmp_path / "run", validation=DATA)
     assert again.completed and (tmp_path / "run" / "metrics.csv").read_text() == before
     same(again.weights, result.weights)
+
+
+def stored(folder: pathlib.Path) -> Store:
+    """Twelve trajectories in shards of two."""
+    cable = Discretisation(Cable(n_keypoints=5), n_links=5)
+    store = open_or_create(folder, DatasetConfig(n_trajectories=12, n_steps=8, shard_size=2, discretisation=cable))
+    for shard in range(6):
+        one = trajectories(m=2, seed=shard)
+        arrays = [np.asarray(a) for a in (one.keypoints, one.gripper_pose, one.gripper_twist)]
+        store.write_shard(shard, Block(*arrays, parameters=np.ones((2, 3)), attempts=np.zeros(2, np.int32)))
+    return store
+
+
+def test_a_streamed_training_goes_on_where_it_was_and_another_buffer_is_another_training(tmp_path):
+    store = stored(tmp_path / "data.zarr")
+    streamed, _ = read_split([store], 0.2, buffer=4)
+    assert isinstance(streamed, StreamedData)
+    whole = train(TINY_TRAINING, streamed, tmp_path / "whole", progress=False)
+    with (tmp_path / "whole" / "metrics.csv").open() as file:
+        rows = [*csv.DictReader(file)]
+    assert [int(row["step"]) for row in rows] == [2, 4, 6, 7]
+    assert [TINY_TRAINING.calls_before(step) for step in (0, 2, 4, 6, 7)] == [0, 1, 2, 3, 4]
+    shutil.copytree(tmp_path / "whole", tmp_path / "again")
+    shutil.rmtree(tmp_path / "again" / "checkpoints" / "7")
+    with pytest.raises(ValueError, match=r"differs in .*data"):
+        train(TINY_TRAINING, dataclasses.replace(streamed, buffer=3), tmp_path / "again", progress=False)
+    resumed = train(TINY_TRAINING, streamed, tmp_path / "again", progress=False)
+    same(resumed.weights, whole.weights)
+    first = train(TINY_TRAINING, streamed.at(0), tmp_path / "first", progress=False)
+    assert first.model == whole.model, "scales are those of the first buffer"
+    assert fingerprint(first.weights) != fingerprint(whole.weights)
 
 
 @pytest.mark.slow

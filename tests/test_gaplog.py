@@ -20,7 +20,7 @@ from cablejax.gaplog import (
     validate,
     write_gap_log,
 )
-from cablejax.gaplog_join import joined, recordings
+from cablejax.gaplog_join import chosen, joined, recordings
 from cablejax.types import GapLog
 from file_cases import with_other_bytes
 
@@ -314,6 +314,23 @@ class TestJoined:
     def test_the_same_recording_counts_once(self, log):
         with pytest.raises(GapLogError, match=r"a\.npz and copy\.npz are the same recording"):
             joined([log, log], ["a.npz", "copy.npz"])
+
+    def test_what_was_joined_is_taken_apart(self):
+        logs, names = self._halves()
+        whole = joined(logs, names)
+        whole.meta["split"] = ["train", "eval"]
+        second = chosen(whole, [1])
+        for field in dataclasses.fields(GapLog):
+            if field.name != "meta":
+                np.testing.assert_array_equal(getattr(second, field.name), getattr(logs[1], field.name))
+        parts = [{"name": "b.npz", "episodes": 1}]
+        assert second.meta == {**logs[1].meta, "split": ["eval"], "recordings": parts}
+        assert chosen(whole, range(2)).meta == whole.meta
+
+    @pytest.mark.parametrize("episodes", [[], [2], [-1], [1, 0], [0, 0]])
+    def test_episodes_that_are_not_there(self, log, episodes):
+        with pytest.raises(GapLogError, match="expected increasing numbers below 2"):
+            chosen(log, episodes)
 
     def test_nothing_is_no_log(self):
         with pytest.raises(GapLogError, match="Nothing to join"):

@@ -76,7 +76,7 @@ def trained(folder):
     result = train(trainings.LONG, trainings.DATA, folder, progress=False)
     assert result.steps == trainings.LONG.total_steps
     with (folder / METRICS).open() as file:
-        curve = [row | {"seconds": ""} for row in csv.DictReader(file)]
+        curve = [row | {"seconds": "", "waited": ""} for row in csv.DictReader(file)]
     return [np.asarray(leaf).tobytes() for leaf in trainings.jax.tree.leaves(result.weights)], curve
 
 

@@ -1,4 +1,4 @@
-"""Joins recordings of one set-up to one gap log that knows what it was joined of."""
+"""Joins recordings of one set-up to one gap log that knows what it was joined of, and takes episodes out of one."""
 
 from __future__ import annotations
 
@@ -51,6 +51,35 @@ def joined(logs: Sequence[GapLog], names: Sequence[str]) -> GapLog:
     }
     episodes = [episode for log in logs for episode in episodes_of(log)]
     return stack_episodes(episodes, meta, holds=any(log.hold is not None for log in logs))
+
+
+def chosen(log: GapLog, episodes: Sequence[int]) -> GapLog:
+    """Some episodes of a log, for example without one that went wrong.
+
+    Lists in `meta` beyond the format's own that have one entry per episode are of the episodes, and are shortened with
+    them.
+
+    Args:
+        log: in the plane or in space.
+        episodes: their numbers, increasing, at least one.
+
+    Raises:
+        GapLogError: numbers that the log does not have, or in another order.
+    """
+    total, numbers = len(log.episode_length), [int(episode) for episode in episodes]
+    if not numbers or numbers != sorted({*numbers} & {*range(total)}):
+        raise GapLogError(f"The episodes {shown(numbers)} were asked for, expected increasing numbers below {total}.")
+    meta = dict(log.meta)
+    for name, value in log.meta.items():
+        if name == "motion" or (name not in META_FIELDS and isinstance(value, list) and len(value) == total):
+            meta[name] = [value[number] for number in numbers]
+    if "recordings" in log.meta:
+        parts = recordings(log)
+        owner = np.repeat(np.arange(len(parts)), [part["episodes"] for part in parts])[numbers]
+        counts = np.bincount(owner, minlength=len(parts))
+        meta["recordings"] = [part | {"episodes": int(n)} for part, n in zip(parts, counts, strict=True) if n]
+    every = episodes_of(log)
+    return stack_episodes([every[number] for number in numbers], meta, holds=log.hold is not None)
 
 
 def recordings(log: GapLog, name: str = "the log") -> list[dict[str, Any]]:

@@ -68,6 +68,10 @@ class Train(Command):
     held_out: float = 0.05
     """Fraction of each data set kept away from training to measure the error on."""
 
+    buffer: int | None = None
+    """Trajectories to train on that are in memory at a time, for data sets larger than that; by default all. One shard
+    gives way to another every 50 steps."""
+
     steps: int | None = None
     """Optimiser steps in all; by default those of the preset. Its phases keep their proportions."""
 
@@ -83,7 +87,9 @@ class Train(Command):
     def execute(self):
         """Trains, from a checkpoint where there is one, and reports the open-loop error."""
         from cablejax.dataset.opening import open_store
-        from cablejax.dataset.windows import concatenate, read_split
+        from cablejax.dataset.split import read_split
+        from cablejax.dataset.streaming import StreamedData
+        from cablejax.dataset.windows import concatenate
         from cablejax.dynamics.autoencoder import PretrainConfig, pretrain
         from cablejax.dynamics.error_report import error_report
         from cablejax.dynamics.fine_tune import starting_from
@@ -102,12 +108,14 @@ class Train(Command):
         self._check_cables(stores)
         config = self._config(stores[0])
         training_mesh(config)  # refuses a batch that the devices cannot share, before anything is read
-        training, held_out = read_split(stores, self.held_out)
+        training, held_out = read_split(stores, self.held_out, buffer=self.buffer, seed=self.seed)
+        streamed = isinstance(training, StreamedData)
         count = sum(len(part.gripper_twist) for part in held_out)
-        say(f"{len(training.gripper_twist)} trajectories to train on, {count} held out; {config.total_steps} steps")
+        total = sum(store.config.n_trajectories for store in stores) - count
+        say(f"{total} trajectories to train on, {count} held out; {config.total_steps} steps")
         initial = None
         if self.pretrain:
-            pretrained = pretrain(config, training, PretrainConfig(steps=self.pretrain))
+            pretrained = pretrain(config, training.at(0) if streamed else training, PretrainConfig(steps=self.pretrain))
             initial = pretrained.model, pretrained.weights
         if self.start_from is not None:
             initial = starting_from(self.start_from, config.model)

@@ -1,8 +1,7 @@
 """Training windows from trajectories: a history, the commands that follow, and the true future.
 
-`read_trajectories` loads into memory, `split` sets rows aside, `read_split` does both for several stores, and
-`draw_windows` draws and augments inside jit. A draw depends on its key alone, so a training whose keys are counted, not
-carried along, sees after a kill what it would have seen without.
+`read_trajectories` loads into memory, and `draw_windows` draws and augments inside jit. A draw depends on its key
+alone, so a training whose keys are counted, not carried along, sees after a kill what it would have seen without.
 """
 
 from __future__ import annotations
@@ -41,55 +40,6 @@ def read_trajectories(
         gripper_twist=block.gripper_twist,  # pyright: ignore[reportArgumentType]
         cable=np.asarray(known, np.float32),  # pyright: ignore[reportArgumentType]
     )
-
-
-def split(n_trajectories: int, held_out: float = 0.05) -> tuple[np.ndarray, np.ndarray]:
-    """Rows to train on and rows held out: the last `held_out` of them, rounded down, but at least one of each.
-
-    Raises:
-        ValueError: `held_out` is not a fraction in (0, 1), or there are fewer than two trajectories.
-    """
-    if not 0 < held_out < 1:
-        raise ValueError(f"held_out is {held_out}, expected a fraction between 0 and 1.")
-    if n_trajectories < 2:
-        raise ValueError(f"{n_trajectories} trajectories cannot be split: generate at least 2.")
-    first = n_trajectories - min(max(1, int(held_out * n_trajectories)), n_trajectories - 1)
-    return np.arange(first), np.arange(first, n_trajectories)
-
-
-def read_split(
-    sources: Sequence[str | os.PathLike[str] | Store], held_out: float = 0.05
-) -> tuple[Trajectory, list[Trajectory]]:
-    """Trajectories to train on, of all stores one after the other, and those that `split` holds out of each store.
-
-    Raises:
-        ValueError: a store is not complete or damaged, or they differ in keypoints, length of trajectories, interval or
-            length of the cable.
-    """
-    stores = [source if isinstance(source, Store) else open_store(source) for source in sources]
-    if not stores:
-        raise ValueError("No data set given: expected at least one.")
-    first = stores[0].config
-    for store in stores:
-        info, cable = store.info(), store.config.cable
-        if not info.complete:
-            raise ValueError(
-                f"{store.path} holds {info.n_complete} of {store.config.n_trajectories} trajectories. "
-                "Complete it first: run the command that began it again."
-            )
-        came = (cable.n_keypoints, cable.length, store.config.n_steps, store.config.interval)
-        expected = (first.cable.n_keypoints, first.cable.length, first.n_steps, first.interval)
-        if came != expected:
-            raise ValueError(
-                f"{store.path} has (keypoints, cable length [m], commands, interval [s]) = {came}, but "
-                f"{stores[0].path} has {expected}: only data sets of the same cable and protocol can be used together."
-            )
-    training, rest = [], []
-    for store in stores:
-        rows = split(store.config.n_trajectories, held_out)
-        training.append(read_trajectories(store, rows[0]))
-        rest.append(read_trajectories(store, rows[1]))
-    return concatenate(training), rest
 
 
 def concatenate(parts: Sequence[Trajectory]) -> Trajectory:

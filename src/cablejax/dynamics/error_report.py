@@ -120,11 +120,11 @@ def error_report(
     )
 
 
-_COLUMNS = ["steps", "windows", "RMSE [cm]", "median [cm]", "90 %", "95 %", "99 %", "RMSE / motion"]
+_COLUMNS = ["steps", "windows", "RMSE [cm]", "mean [cm]", "median [cm]", "90 %", "95 %", "99 %", "RMSE / motion"]
 
 
 def _row(error: OpenLoopError, k: int) -> list[str]:
-    numbers = [getattr(error, f"{name}_cm")[k] for name in ("rmse", "median", "p90", "p95", "p99")]
+    numbers = [getattr(error, f"{name}_cm")[k] for name in ("rmse", "mean", "median", "p90", "p95", "p99")]
     shown = [_number(value) for value in (*numbers, error.relative[k])]
     return [str(error.horizons[k]), str(error.starts[k]), *shown]
 

@@ -39,6 +39,7 @@ class OpenLoopError:
         horizons: steps k after the start.
         starts: number of start points that count, per horizon. Where there is none, the rest is NaN.
         rmse_cm: root of the mean over start points of the squared error, per horizon.
+        mean_cm: mean over start points.
         median_cm: median over start points.
         p90_cm: 90th percentile over start points.
         p95_cm: 95th percentile.
@@ -49,6 +50,7 @@ class OpenLoopError:
     horizons: tuple[int, ...]
     starts: tuple[int, ...]
     rmse_cm: tuple[float, ...]
+    mean_cm: tuple[float, ...]
     median_cm: tuple[float, ...]
     p90_cm: tuple[float, ...]
     p95_cm: tuple[float, ...]
@@ -163,10 +165,10 @@ def summarise(
     def column(h: int) -> tuple[float, ...]:
         mine = count[:, h - 1]
         if not mine.any():
-            return (0, *[np.nan] * 6)
+            return (0, *[np.nan] * 7)
         e, m = 100 * error[mine, h - 1], 100 * moved[mine, h - 1]
         quantiles = np.percentile(e, [50, 90, 95, 99])
-        return (mine.sum(), np.sqrt(np.mean(e**2)), *quantiles, np.sqrt(np.mean(m**2)))
+        return (mine.sum(), np.sqrt(np.mean(e**2)), float(np.mean(e)), *quantiles, np.sqrt(np.mean(m**2)))
 
     starts, *rest = zip(*(column(h) for h in horizons), strict=True)
     return OpenLoopError(

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import itertools
 import signal
 import sys
 import threading
@@ -27,6 +28,7 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array
 from tqdm import tqdm
 
+from cablejax.dataset.streaming import StreamedData
 from cablejax.dataset.windows import Window, draw_windows
 from cablejax.dynamics.checkpoint import Checkpoints
 from cablejax.dynamics.config import ModelConfig
@@ -90,7 +92,7 @@ class TrainResult:
 
 def train(
     config: TrainConfig,
-    data: Trajectory,
+    data: Trajectory | StreamedData,
     out_dir: Path,
     *,
     validation: Trajectory | None = None,
@@ -104,7 +106,8 @@ def train(
 
     Args:
         config: decides the outcome, together with `data` and `initial`.
-        data: training trajectories, arrays [M, T + 1, N, 2], [M, T + 1, 2, 3], [M, T, 2, 3].
+        data: training trajectories, arrays [M, T + 1, N, 2], [M, T + 1, 2, 3], [M, T, 2, 3]; or a data set that is
+            streamed, one turn of its buffer per compiled call. Scales are then measured on its first buffer.
         out_dir: receives `run.json`, `metrics.csv`, `tensorboard/`, `checkpoints/`.
         validation: held-out trajectories, evaluated open loop every `config.evaluate_every` chunks.
         initial: a model to start from instead of random weights. Its scales stay, since its weights mean nothing
@@ -120,10 +123,12 @@ def train(
         DivergedError: the loss is no longer finite.
     """
     mesh = training_mesh(config, devices)
-    check_trajectories(data, config.model, steps=config.longest_rollout, what="training data")
-    model_config = _with_scales(config.model, data, initial)
+    first = data.at(0) if isinstance(data, StreamedData) else data
+    check_trajectories(first, config.model, steps=config.longest_rollout, what="training data")
+    model_config = _with_scales(config.model, first, initial)
     config, out_dir = dataclasses.replace(config, model=model_config), Path(out_dir)
-    run = {"config": dataclasses.asdict(config), "data": fingerprint((data, initial and initial[1]))}
+    identity = data.identity if isinstance(data, StreamedData) else data
+    run = {"config": dataclasses.asdict(config), "data": fingerprint((identity, initial and initial[1]))}
     report = functools.partial(tqdm.write, file=sys.stderr)
     claim_folder(out_dir, run, resume=resume, overwrite=overwrite, report=report)
 
@@ -131,9 +136,9 @@ def train(
     weights = initially_symmetric(weights, model_config) if initial is None else initial[1]
     optimiser = config.optimiser()
     state = TrainState(weights, weights, optimiser.init(weights), jnp.zeros((), jnp.int32))
-    device_data = on_all_devices(jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), data), mesh)
     evaluate = None if validation is None else Validation(validation, graphdef, config)
-    columns = ("phase", "learning_rate", "loss", "gradient_norm", *(f"open_loop_{h}_cm" for h in HORIZONS), "seconds")
+    columns = ("phase", "learning_rate", "loss", "gradient_norm", *(f"open_loop_{h}_cm" for h in HORIZONS))
+    columns += ("seconds", "waited")
 
     scores: dict[int, float] = {}
     with sole_writer(out_dir), Checkpoints(out_dir / CHECKPOINTS) as checkpoints, interrupt_flag() as interrupted:
@@ -141,18 +146,22 @@ def train(
             state = checkpoints.restore(state, report=report)
         step, total = int(state.step), config.total_steps
         state = on_all_devices(state, mesh)
+        buffers = _buffers(data, config.calls_before(step), mesh)
         bar = tqdm(total=total, initial=step, unit="step", disable=not progress, dynamic_ncols=True)
         with MetricsLog(out_dir, columns, step) as log, bar:
             while step < total and not interrupted.is_set():
                 index, end = config.phase_at(step)
                 update = chunk_update(config, index, graphdef, min(config.chunk, end - step), mesh)
+                asked, buffer = time.perf_counter(), jax.block_until_ready(next(buffers))
                 began, current = time.perf_counter(), state
-                made = unless(interrupted, lambda: jax.block_until_ready(update(current, device_data)))  # noqa: B023
+                made = unless(interrupted, lambda: jax.block_until_ready(update(current, buffer)))  # noqa: B023
                 if made is None:
                     break
                 state, losses = made
                 seconds, done, step = time.perf_counter() - began, int(state.step) - step, int(state.step)
-                row = {"phase": index, "seconds": seconds} | chunk_metrics(config, step, losses, out_dir)
+                row = {"phase": index, "seconds": seconds, "waited": began - asked} | chunk_metrics(
+                    config, step, losses, out_dir
+                )
                 chunks = -(-step // config.chunk)
                 if evaluate is not None and (chunks % config.evaluate_every == 0 or step == total):
                     scores = evaluate(on_one_device(state.average, mesh))
@@ -167,6 +176,15 @@ def train(
                     checkpoints.save(step, on_one_device(state, mesh))
     average = symmetrised(on_one_device(state.average, mesh), model_config)
     return TrainResult(model_config, graphdef, average, step, step == total, scores)
+
+
+def _buffers(data: Trajectory | StreamedData, calls: int, mesh: Mesh | None) -> Iterator[Trajectory]:
+    """What each compiled call draws its windows from, after so many calls."""
+
+    def on_devices(part: Trajectory) -> Trajectory:
+        return on_all_devices(jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), part), mesh)
+
+    return data.turns(calls, on_devices) if isinstance(data, StreamedData) else itertools.repeat(on_devices(data))
 
 
 def _with_scales(model: ModelConfig, data: Trajectory, initial: tuple[ModelConfig, nnx.State] | None) -> ModelConfig:

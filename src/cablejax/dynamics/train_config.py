@@ -110,6 +110,14 @@ class TrainConfig:
                 return index, end
         return len(self.phases) - 1, end
 
+    def calls_before(self, step: int) -> int:
+        """Compiled calls that end at optimiser step `step` or before; a call ends with its phase at the latest."""
+        calls = 0
+        for phase in self.phases:
+            calls += -(-min(step, phase.steps) // self.chunk)
+            step -= min(step, phase.steps)
+        return calls
+
     def learning_rate(self) -> optax.Schedule:
         """Learning rate as a function of the optimiser step."""
         parts, ends, end = [], [], 0

@@ -1,30 +1,39 @@
-"""The loop over time steps of C MuJoCo, compiled by numba: it calls MuJoCo's C functions without Python in between."""
+"""The loop over time steps of C MuJoCo, compiled by numba: it calls MuJoCo's C functions without Python in between.
+
+Compiled code is kept on disk as long as this file stays as it is, so that nothing here may depend on another file's
+constants: they are arguments.
+"""
 
 from __future__ import annotations
 
-import ctypes
 import pathlib
 
+import llvmlite.binding
 import mujoco
 import numba
 import numpy as np
-
-from cablejax.simulate.friction import PATCH_EDGE, STRIBECK_SPEED
-
-
-def _c_function(name: str):
-    """A C function `void f(const mjModel*, mjData*)` of the very library that the Python bindings have loaded."""
-    folder = pathlib.Path(mujoco.__file__).parent
-    library = next(path for path in sorted(folder.iterdir()) if path.name.startswith(("libmujoco.", "mujoco.dll")))
-    function = getattr(ctypes.CDLL(str(library)), name)
-    function.argtypes, function.restype = (ctypes.c_void_p, ctypes.c_void_p), None
-    return function
+from numba.core import types
 
 
+def _c_function(name: str) -> types.ExternalFunction:
+    """A C function `void f(const mjModel*, mjData*)`, by its name, so that numba can keep what it compiled on disk."""
+    return types.ExternalFunction(name, types.void(types.uint64, types.uint64))
+
+
+# The very library that the Python bindings have loaded: from here on its functions are found by their names.
+llvmlite.binding.load_library_permanently(
+    str(
+        next(
+            path
+            for path in sorted(pathlib.Path(mujoco.__file__).parent.iterdir())
+            if path.name.startswith(("libmujoco.", "mujoco.dll"))
+        )
+    )
+)
 _step1, _step2, _kinematics = (_c_function(name) for name in ("mj_step1", "mj_step2", "mj_kinematics"))
 
 
-@numba.njit(nogil=True, cache=False)
+@numba.njit(nogil=True, cache=True)
 def advance(
     addresses,
     mocap_pos,
@@ -40,7 +49,6 @@ def advance(
     count,
     dt,
     table,
-    friction_speed,
     nodes,
     tangents,
     poses,
@@ -64,7 +72,7 @@ def advance(
                 if uneven:
                     link = links[k + 1]
                     coefficient = friction_there(table, xipos[link, 0], xipos[link, 1], squared)
-                drag = coefficient * table[7 + k] / np.sqrt(squared + friction_speed * friction_speed) + table[6]
+                drag = coefficient * table[10 + k] / np.sqrt(squared + table[7] * table[7]) + table[6]
                 actuator_biasprm[2 * k, 2] = -drag
                 actuator_biasprm[2 * k + 1, 2] = -drag
             _step2(model, data)
@@ -72,15 +80,15 @@ def advance(
         poses[t + 1] = pose
 
 
-@numba.njit(nogil=True, cache=False)
+@numba.njit(nogil=True, cache=True)
 def friction_there(table, x, y, squared_speed):
     """Coefficient of friction at one place and speed, see `friction.drag_coefficient`."""
     distance = np.sqrt((x - table[2]) ** 2 + (y - table[3]) ** 2)
-    coefficient = table[0] + table[5] / (1.0 + np.exp(-(table[4] - distance) / PATCH_EDGE))
-    return coefficient * (1.0 + table[1] * np.exp(-squared_speed / STRIBECK_SPEED**2))
+    coefficient = table[0] + table[5] / (1.0 + np.exp(-(table[4] - distance) / table[8]))
+    return coefficient * (1.0 + table[1] * np.exp(-squared_speed / table[9] ** 2))
 
 
-@numba.njit(nogil=True, cache=False)
+@numba.njit(nogil=True, cache=True)
 def _sample(model, data, xipos, xmat, links, nodes, tangents):
     _kinematics(model, data)
     for k in range(links.shape[0]):
@@ -89,7 +97,7 @@ def _sample(model, data, xipos, xmat, links, nodes, tangents):
             tangents[k, axis] = xmat[links[k], 3 * axis]
 
 
-@numba.njit(nogil=True, cache=False)
+@numba.njit(nogil=True, cache=True)
 def _integrate(start, twist, duration, pose):
     """`pose.integrate_pose` in place."""
     if start.shape[1] == 3:
@@ -108,7 +116,7 @@ def _integrate(start, twist, duration, pose):
         pose[q, 6] = w * d + x * c - y * b + z * a
 
 
-@numba.njit(nogil=True, cache=False)
+@numba.njit(nogil=True, cache=True)
 def _set_mocap(pose, rotation_offset, mocap_pos, mocap_quat):
     for q in range(pose.shape[0]):
         if pose.shape[1] == 3:

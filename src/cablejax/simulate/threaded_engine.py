@@ -23,7 +23,7 @@ from cablejax.simulate.compiled_steps import advance
 from cablejax.simulate.composite import build_grasped_chain, stable_damping_time
 from cablejax.simulate.engine import Engine, finely_sampled
 from cablejax.simulate.equilibrium import equilibrium_state
-from cablejax.simulate.friction import on_table
+from cablejax.simulate.friction import PATCH_EDGE, STRIBECK_SPEED, on_table
 from cablejax.simulate.keypoints import hermite_weights, marked_keypoints
 from cablejax.types import CableState, Trajectory
 
@@ -139,7 +139,6 @@ class _Simulation:
             count,
             config.timestep,
             self._table(physics),
-            config.friction_speed,
             nodes,
             tangents,
             poses,
@@ -161,14 +160,16 @@ class _Simulation:
             self.data = mujoco.MjData(self.model)
 
     def _table(self, physics: Physics) -> np.ndarray:
-        """The table of `compiled_steps.advance`: seven values, then the weight of each free node [N]."""
+        """The table of `compiled_steps.advance`: ten values, then the weight of each free node [N]."""
         h = self.config.link_length
         if self.config.dimension == 3:
-            return np.zeros(7)
+            return np.zeros(10)
         normal = np.sqrt(max(float(physics.gravity) ** 2 - float(np.sum(physics.tilt**2)), 0.0))
         weight = on_table(physics, float(physics.density) * h + np.asarray(physics.extra_mass), h)[1:-1] * normal
-        whole = (physics.friction, physics.static_excess, *physics.patch_centre, physics.patch_radius)
-        return np.array([*map(float, whole), float(physics.patch_friction), float(physics.drag) * h, *weight])
+        friction = (physics.friction, physics.static_excess, *physics.patch_centre, physics.patch_radius)
+        speeds = (self.config.friction_speed, PATCH_EDGE, STRIBECK_SPEED)
+        whole = [*map(float, friction), float(physics.patch_friction), float(physics.drag) * h, *speeds]
+        return np.array([*whole, *weight])
 
     def _write(self, physics: Physics) -> None:
         """Puts the parameters into the model."""

@@ -1,0 +1,81 @@
+"""Which trajectories of data sets are trained on and which are held out, and both read, or the first streamed."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+
+import numpy as np
+
+from cablejax.dataset.opening import open_store
+from cablejax.dataset.store import Store
+from cablejax.dataset.streaming import StreamedData, blocks_of
+from cablejax.dataset.windows import concatenate, read_trajectories
+from cablejax.types import Trajectory
+
+
+def split(n_trajectories: int, held_out: float = 0.05) -> tuple[np.ndarray, np.ndarray]:
+    """Rows to train on and rows held out: the last `held_out` of them, rounded down, but at least one of each.
+
+    Raises:
+        ValueError: `held_out` is not a fraction in (0, 1), or there are fewer than two trajectories.
+    """
+    if not 0 < held_out < 1:
+        raise ValueError(f"held_out is {held_out}, expected a fraction between 0 and 1.")
+    if n_trajectories < 2:
+        raise ValueError(f"{n_trajectories} trajectories cannot be split: generate at least 2.")
+    first = n_trajectories - min(max(1, int(held_out * n_trajectories)), n_trajectories - 1)
+    return np.arange(first), np.arange(first, n_trajectories)
+
+
+def read_split(
+    sources: Sequence[str | os.PathLike[str] | Store],
+    held_out: float = 0.05,
+    *,
+    buffer: int | None = None,
+    seed: int = 0,
+) -> tuple[Trajectory | StreamedData, list[Trajectory]]:
+    """Trajectories to train on, of all stores one after the other, and those that `split` holds out of each store.
+
+    Args:
+        sources: stores, or where they are.
+        held_out: fraction of each.
+        buffer: trajectories to train on that are in memory at a time, rounded down to whole blocks of the size of the
+            smallest shard; None reads all of them, and so does a buffer with room for all.
+        seed: of the order in which they come, where not all are read.
+
+    Raises:
+        ValueError: a store is not complete or damaged, they differ in keypoints, length of trajectories, interval or
+            length of the cable, or the buffer holds less than two blocks.
+    """
+    stores = [source if isinstance(source, Store) else open_store(source) for source in sources]
+    if not stores:
+        raise ValueError("No data set given: expected at least one.")
+    first = stores[0].config
+    for store in stores:
+        info, cable = store.info(), store.config.cable
+        if not info.complete:
+            raise ValueError(
+                f"{store.path} holds {info.n_complete} of {store.config.n_trajectories} trajectories. "
+                "Complete it first: run the command that began it again."
+            )
+        came = (cable.n_keypoints, cable.length, store.config.n_steps, store.config.interval)
+        expected = (first.cable.n_keypoints, first.cable.length, first.n_steps, first.interval)
+        if came != expected:
+            raise ValueError(
+                f"{store.path} has (keypoints, cable length [m], commands, interval [s]) = {came}, but "
+                f"{stores[0].path} has {expected}: only data sets of the same cable and protocol can be used together."
+            )
+    rows = [split(store.config.n_trajectories, held_out) for store in stores]
+    rest = [read_trajectories(store, last) for store, (_, last) in zip(stores, rows, strict=True)]
+    training = [first for first, _ in rows]
+    if buffer is not None and buffer < sum(map(len, training)):
+        size = min(store.config.shard_size for store in stores)
+        size = min(size, *map(len, training))
+        if buffer < 2 * size:
+            raise ValueError(
+                f"A buffer of {buffer} trajectories is too small: data come in blocks of {size}, the size of a shard, "
+                f"and at least two are in memory. Give at least {2 * size}."
+            )
+        return StreamedData(tuple(stores), blocks_of(training, size), buffer // size, seed), rest
+    return concatenate([read_trajectories(store, mine) for store, mine in zip(stores, training, strict=True)]), rest
