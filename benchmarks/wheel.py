@@ -76,7 +76,9 @@ class Step:
 
 def readme_commands(text: str) -> list[list[str]]:
     """Words after `cablejax` of every command in README's shell blocks, in order, shortened for a quick try."""
-    marked = [line.removeprefix("cablejax ") for line in text.splitlines() if line.startswith("cablejax ")]
+    marked = [
+        line.removeprefix("cablejax ") for line in text.replace("\\\n", "").splitlines() if line.startswith("cablejax ")
+    ]
     commands = [shlex.split(words, comments=True) for words in marked]
     return [[*words, *QUICK.get(words[0], [])] for words in commands]
 
