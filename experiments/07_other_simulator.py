@@ -14,7 +14,7 @@ os.environ.setdefault("NPROC", "4")
 
 from closed_loop.cases import real_cable_cases
 from closed_loop.experiment import Experiment, Extent, main
-from closed_loop.methods import ADAPTED_LEARNER, METHODS
+from closed_loop.methods import METHODS, NO_PRIOR_LEARNER
 from closed_loop.paper import DIRECT
 
 if __name__ == "__main__":
@@ -32,7 +32,7 @@ if __name__ == "__main__":
             small=Extent(
                 functools.partial(real_cable_cases, ("U", "S"), tables=("IV",)),
                 seeds=range(1),
-                methods=(DIRECT, ADAPTED_LEARNER),
+                methods=(DIRECT, NO_PRIOR_LEARNER),
             ),
             full=Extent(functools.partial(real_cable_cases, ("U", "S")), seeds=range(5), methods=tuple(METHODS)),
             tables=("IV", "V"),

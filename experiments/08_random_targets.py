@@ -14,7 +14,7 @@ os.environ.setdefault("NPROC", "4")
 
 from closed_loop.cases import random_cases
 from closed_loop.experiment import Experiment, Extent, main
-from closed_loop.methods import ADAPTED_LEARNER, LEARNER
+from closed_loop.methods import LEARNER, NO_PRIOR_LEARNER
 from closed_loop.paper import DIRECT, RESIDUAL
 from closed_loop.trials import LIANG_TABLE
 
@@ -31,8 +31,8 @@ if __name__ == "__main__":
                 "friction cones, twice as stiff as the one trained on. The published figures are on Liang et al.'s "
                 "own tasks and simulator: for scale, not in competition."
             ),
-            small=Extent(random_cases, seeds=range(2), methods=(ADAPTED_LEARNER,)),
-            full=Extent(random_cases, seeds=range(50), methods=(DIRECT, RESIDUAL, LEARNER, ADAPTED_LEARNER)),
+            small=Extent(random_cases, seeds=range(2), methods=(NO_PRIOR_LEARNER,)),
+            full=Extent(random_cases, seeds=range(50), methods=(DIRECT, RESIDUAL, LEARNER, NO_PRIOR_LEARNER)),
             tables=(LIANG_TABLE,),
         )
     )

@@ -39,7 +39,7 @@ from cablejax.report.style import LIGHT
 from cablejax.simulate import ThreadedEngine
 from cablejax.simulate.motions import random_motion
 from closed_loop.cases import mujoco_plant, stiffness_cases
-from closed_loop.methods import ADAPTED_LEARNER, METHODS
+from closed_loop.methods import METHODS, NO_PRIOR_LEARNER
 from closed_loop.suite import released, run_case
 from pages import markdown_table, page_of_results, publish
 from rows import Rows
@@ -164,7 +164,7 @@ def speed(frames: int = 100) -> dict[str, float]:
 def loop(target_name: Shape, perception: str, seed: int) -> dict[str, Any]:
     """One target on the plant, by our method of the tables, with clouds or with true keypoints."""
     case = stiffness_cases((target_name,), (LOOP_STIFFNESS,), (seed,), steps=LOOP_STEPS)[0]
-    spec, plant = METHODS[ADAPTED_LEARNER], mujoco_plant(LOOP_STIFFNESS)
+    spec, plant = METHODS[NO_PRIOR_LEARNER], mujoco_plant(LOOP_STIFFNESS)
     if perception == "cloud":
         plant = CloudPlant(plant.config, camera=CameraConfig(seed=seed))
     run = run_case(dataclasses.replace(case, plant=lambda: plant), spec, released(str(spec.weights)))

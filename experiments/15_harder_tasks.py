@@ -14,7 +14,7 @@ os.environ.setdefault("NPROC", "4")
 
 from closed_loop.experiment import Experiment, Extent, main
 from closed_loop.harder import DISTURBED, HELD_OUT, RECORDED, harder_cases
-from closed_loop.methods import ADAPTED, ADAPTED_LEARNER, DRIVE, LEARNER
+from closed_loop.methods import DRIVE, LEARNER, NO_PRIOR, NO_PRIOR_LEARNER
 from closed_loop.paper import DIRECT
 
 if __name__ == "__main__":
@@ -32,11 +32,11 @@ if __name__ == "__main__":
                 "the time; the cable is half, once or twice as stiff. A run is judged by the mean error of its last "
                 "ten seconds. Tasks: `experiments/closed_loop/harder.py`."
             ),
-            small=Extent(harder_cases, seeds=range(6), methods=(ADAPTED_LEARNER,)),
+            small=Extent(harder_cases, seeds=range(6), methods=(NO_PRIOR_LEARNER,)),
             full=Extent(
                 harder_cases,
                 seeds=range(HELD_OUT, HELD_OUT + 100),
-                methods=(DRIVE, DIRECT, LEARNER, ADAPTED, ADAPTED_LEARNER),
+                methods=(DRIVE, DIRECT, LEARNER, NO_PRIOR, NO_PRIOR_LEARNER),
             ),
             tables=(RECORDED, DISTURBED),
         )

@@ -20,7 +20,7 @@ from closed_loop.cases import NEARBY, NEARBY_RATIOS
 from closed_loop.failures import failure_figure, worst
 from closed_loop.fine_tuning import FineTuneConfig, fine_tune, record
 from closed_loop.harder import MARGIN_CM
-from closed_loop.methods import ADAPTED_LEARNER, LABEL, METHODS, NO_PRIOR_LEARNER, WITHOUT_LEARNING, model_named
+from closed_loop.methods import LABEL, METHODS, NO_PRIOR_LEARNER, WITHOUT_LEARNING, model_named
 from closed_loop.protocols import least_time
 from closed_loop.suite import Case, read_suite, run_suite
 from closed_loop.trials import LATE, LIANG_TABLE, Trial
@@ -163,9 +163,8 @@ def page(experiment: Experiment, trials: Sequence[Trial], command: str, picture:
                 f"Wins / losses in pairs, by means of the last {LATE} s.",
             ]
             lines += ["", interval_tables.learning_table(mine, table, WITHOUT_LEARNING, labels=LABEL)]
-        ours = NO_PRIOR_LEARNER if NO_PRIOR_LEARNER in methods else ADAPTED_LEARNER
-        if ours in methods and len(methods) > 1:
-            lines += ["", "### In pairs", "", interval_tables.paired_table(mine, table, ours, labels=LABEL)]
+        if NO_PRIOR_LEARNER in methods and len(methods) > 1:
+            lines += ["", "### In pairs", "", interval_tables.paired_table(mine, table, NO_PRIOR_LEARNER, labels=LABEL)]
     if picture is not None:
         lines += ["", "## The runs that ended farthest off", "", f"![start, end and target of each]({picture})"]
     return page_of_results(experiment.title, f"`{command}`", lines)

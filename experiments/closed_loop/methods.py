@@ -14,9 +14,7 @@ from closed_loop.baselines import StraightDrive, statics_model
 from closed_loop.paper import DIRECT, FINE_TUNED, METHOD_LABEL, RANDOMISED, RESIDUAL, VISUAL_SERVO
 from closed_loop.visual_servo import ServoConfig, VisualServo
 
-ADAPTED = "adapted"
 LEARNER = "learner"
-ADAPTED_LEARNER = "adapted learner"
 NO_PRIOR = "no prior"
 NO_PRIOR_LEARNER = "no prior learner"
 DRIVE = "straight drive"
@@ -26,9 +24,7 @@ PAPER_RESIDUAL = "paper network residual"
 RECURRENT_RESIDUAL = "recurrent residual"
 
 LABEL = METHOD_LABEL | {
-    ADAPTED: "conditioned GNS + online estimate",
     LEARNER: "GNS + online learner",
-    ADAPTED_LEARNER: "conditioned GNS + estimate + learner",
     NO_PRIOR: "conditioned GNS without statics + estimate",
     NO_PRIOR_LEARNER: "conditioned GNS without statics + estimate + learner",
     DRIVE: "straight drive to the goal, no model",
@@ -43,7 +39,6 @@ WITHOUT_LEARNING = {
     RESIDUAL: DIRECT,
     LEARNER: DIRECT,
     PAPER_RESIDUAL: PAPER_DIRECT,
-    ADAPTED_LEARNER: ADAPTED,
     NO_PRIOR_LEARNER: NO_PRIOR,
 }
 """The same model without what is learned online."""
@@ -75,8 +70,6 @@ METHODS: dict[str, MethodSpec] = {
         MethodSpec(FINE_TUNED, "gns-reference", fine_tuned=True),
         MethodSpec(RESIDUAL, "gns-reference", learner=PAPER),
         MethodSpec(LEARNER, "gns-reference", learner=LearnerConfig()),
-        MethodSpec(ADAPTED, "gns-conditioned"),
-        MethodSpec(ADAPTED_LEARNER, "gns-conditioned", learner=LearnerConfig()),
         MethodSpec(NO_PRIOR, "gns-no-prior"),
         MethodSpec(NO_PRIOR_LEARNER, "gns-no-prior", learner=LearnerConfig()),
         MethodSpec(DRIVE, None),

@@ -87,6 +87,28 @@ def unless(event: threading.Event, compute: Callable[[], _T]) -> _T | None:
 
 
 @contextlib.contextmanager
+def interrupt_flag() -> Iterator[threading.Event]:
+    """An event that Ctrl-C or SIGTERM sets, once; a second Ctrl-C ends the program at once."""
+    flag = threading.Event()
+    if threading.current_thread() is not threading.main_thread():
+        yield flag
+        return
+    before = {s: signal.getsignal(s) for s in (signal.SIGINT, signal.SIGTERM)}
+
+    def handle(number, frame):
+        flag.set()
+        signal.signal(number, before[number])
+
+    for s in before:
+        signal.signal(s, handle)
+    try:
+        yield flag
+    finally:
+        for s, handler in before.items():
+            signal.signal(s, handler)
+
+
+@contextlib.contextmanager
 def saving() -> Iterator[None]:
     """Gives the block `SAVING` seconds after Ctrl-C."""
     _saving.set()

@@ -10,12 +10,9 @@ from __future__ import annotations
 import dataclasses
 import functools
 import itertools
-import signal
 import sys
-import threading
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -42,7 +39,7 @@ from cablejax.dynamics.parallel import loss_and_gradient, on_all_devices, on_one
 from cablejax.dynamics.run_folder import CHECKPOINTS, claim_folder
 from cablejax.dynamics.symmetry import initially_symmetric, symmetrised
 from cablejax.dynamics.train_config import Phase, TrainConfig
-from cablejax.interrupts import saving, unless
+from cablejax.interrupts import interrupt_flag, saving, unless
 from cablejax.types import Trajectory
 from cablejax.whole_file import sole_writer
 
@@ -287,25 +284,3 @@ class Validation:
         """Median error over the validation windows by horizon [cm]."""
         error = np.asarray(self.errors((weights,), self.windows), np.float64)
         return {h: float(100 * np.median(error[:, h - 1])) for h in self.horizons}
-
-
-@contextmanager
-def interrupt_flag() -> Iterator[threading.Event]:
-    """An event that Ctrl-C or SIGTERM sets, once; a second Ctrl-C ends the program at once."""
-    flag = threading.Event()
-    if threading.current_thread() is not threading.main_thread():
-        yield flag
-        return
-    before = {s: signal.getsignal(s) for s in (signal.SIGINT, signal.SIGTERM)}
-
-    def handle(number, frame):
-        flag.set()
-        signal.signal(number, before[number])
-
-    for s in before:
-        signal.signal(s, handle)
-    try:
-        yield flag
-    finally:
-        for s, handler in before.items():
-            signal.signal(s, handler)
