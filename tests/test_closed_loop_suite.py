@@ -3,6 +3,7 @@
 import argparse
 import functools
 import multiprocessing
+import pickle
 import re
 import signal
 import threading
@@ -21,9 +22,10 @@ from cablejax.effects.given import GivenEffect
 from cablejax.mpc import MPC
 from cablejax.simulate.plant import Plant, PlantConfig
 from cli_cases import small_model
-from closed_loop.cases import mujoco_plant, random_cases, stiffness_cases
+from closed_loop.cases import mujoco_plant, nearby_cases, random_cases, stiffness_cases
 from closed_loop.experiment import Experiment, Extent, page, seed_range
 from closed_loop.fine_tuning import FineTuneConfig, fine_tune, record
+from closed_loop.harder import harder_cases
 from closed_loop.methods import LABEL, METHODS, controller_of
 from closed_loop.paper import VISUAL_SERVO
 from closed_loop.protocols import LaidOut, letter_task
@@ -66,6 +68,13 @@ def test_a_suite_is_shared_resumed_and_read_whole(tmp_path):
     assert "| online visual servo | 2 |" in text and "Table IV" not in text and "Seeds: 0, 1." in text
     assert "### How runs end" in text and "| online visual servo | U | 2 |" in text
     assert re.search(r"takes, on average: U [789]\.\d s\.", text)
+
+
+@pytest.mark.parametrize("cases", [nearby_cases, random_cases, harder_cases])
+def test_cases_can_be_sent_to_another_process(cases):
+    made = cases([3])
+    again = pickle.loads(pickle.dumps(made))
+    assert [key_of(one, SERVO) for one in again] == [key_of(one, SERVO) for one in made]
 
 
 @pytest.mark.slow

@@ -62,6 +62,7 @@ DISTURBANCES: dict[str, tuple[str, ...]] = {
 """What happens, as effects of the plant."""
 
 
+@functools.lru_cache(maxsize=2)
 def recorded_task(seed: int) -> Task:
     """A straight start and the recorded shape of another cable; the same for all who ask."""
     rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(7,)))
@@ -154,12 +155,11 @@ def harder_cases(seeds: Sequence[int]) -> list[Case]:
     def case(table: str, scenario: str, seed: int, task: Callable[[], Task], plant: Callable[[], Plant]) -> Case:
         return Case(table, scenario, 1.0, seed, task, plant, f"{table} {seed}", STEPS, patience=None)
 
-    recorded = functools.lru_cache(maxsize=2)(recorded_task)
     return [
         made
         for seed in seeds
         for made in (
-            case(RECORDED, RECORDED, seed, functools.partial(recorded, seed), recorded_plant),
+            case(RECORDED, RECORDED, seed, functools.partial(recorded_task, seed), recorded_plant),
             case(
                 DISTURBED, disturbance_of(seed), seed, functools.partial(disturbed_task, seed),
                 functools.partial(disturbed_plant, seed),
