@@ -340,6 +340,27 @@ def test_what_makes_the_error_worse_is_taken_back_and_tried_again_with_smaller_m
     assert float(radius_after(config, course[2], course[3], radius / 24)) == pytest.approx(config.radius_min)
 
 
+@pytest.mark.parametrize("turns", [0, 1, -2])
+def test_the_way_back_is_short_whatever_whole_turns_a_gripper_has(turns):
+    class Slipping(Cable):
+        """It gets worse for some steps once it is near the target, which is no fault of the commands."""
+
+        count = 0
+
+        def step(self, twist):
+            self.count += 1
+            if 12 <= self.count < 16:
+                self.sag[:, 1] += 0.006 * np.sin(np.linspace(0, 2 * np.pi, N))
+            super().step(twist)
+
+    pose = np.array(START, float)
+    pose[1, 2] += 2 * np.pi * turns
+    _state, twists, info = run(controller("S"), Slipping(rate=1.0, pose=pose), 24)
+    back = info.action == Action.RETURN
+    assert back.any() and np.abs(twists[back][:, :, 2]).max() < 0.1
+    assert info.shape_error[12:].max() < 0.04
+
+
 @pytest.mark.slow
 def test_many_cables_in_one_call_are_the_same_as_one_by_one():
     control = controller()

@@ -14,6 +14,7 @@ from cablejax.mpc.config import MPCConfig
 from cablejax.mpc.plan import Plan
 from cablejax.mpc.problem import ShapingProblem
 from cablejax.mpc.state import Action, Progress
+from cablejax.mpc.target_pose import continued
 from cablejax.mpc.warm_start import Starts
 
 RELAXES = 2
@@ -79,7 +80,9 @@ def plan_or_recover(
     plan, sound = decision.plan, _sound(decision.plan.result)
     held = decision.action == Action.HOLD
     ways = start.straightening.length, start.back.length
-    progress = _followed(config, progress, problem.history.gripper_pose, error, ways, sound=sound, held=held)
+    # as the way back is measured, whatever whole turns the grippers' angles have
+    pose = continued(problem.history.gripper_pose, problem.history.keypoints[-1])
+    progress = _followed(config, progress, pose, error, ways, sound=sound, held=held)
     mode = jnp.where(sound, progress.mode, Action.FOLLOW)
     motion = jnp.select(
         [mode == Action.STRAIGHTEN, mode == Action.RETURN, mode == Action.HOLD],
@@ -107,7 +110,7 @@ def _followed(
     Args:
         config: settings.
         before: the progress so far.
-        pose: of the grippers now.
+        pose: of the grippers now, `continued` along the cable.
         error: the shape error now [m].
         ways: lengths of those to where the cable is straight, and to where its shape was best [m].
         sound: whether the plan may be carried out.
