@@ -43,6 +43,16 @@ from cablejax.interrupts import interrupt_flag, saving, unless
 from cablejax.types import Trajectory
 from cablejax.whole_file import sole_writer
 
+_COLUMNS = (
+    "phase",
+    "learning_rate",
+    "loss",
+    "gradient_norm",
+    *(f"open_loop_{h}_cm" for h in HORIZONS),
+    "seconds",
+    "waited",
+)
+
 
 class DivergedError(ValueError):
     """A training whose loss is no longer finite: says what to change."""
@@ -120,22 +130,17 @@ def train(
         DivergedError: the loss is no longer finite.
     """
     mesh = training_mesh(config, devices)
-    first = data.at(0) if isinstance(data, StreamedData) else data
-    check_trajectories(first, config.model, steps=config.longest_rollout, what="training data")
-    model_config = _with_scales(config.model, first, initial)
-    config, out_dir = dataclasses.replace(config, model=model_config), Path(out_dir)
-    identity = data.identity if isinstance(data, StreamedData) else data
+    config = dataclasses.replace(config, model=_with_scales(config, data, initial))
+    identity, out_dir = data.identity if isinstance(data, StreamedData) else data, Path(out_dir)
     run = {"config": dataclasses.asdict(config), "data": fingerprint((identity, initial and initial[1]))}
     report = functools.partial(tqdm.write, file=sys.stderr)
     claim_folder(out_dir, run, resume=resume, overwrite=overwrite, report=report)
 
-    graphdef, weights = nnx.split(make_network(model_config, nnx.Rngs(config.seed)))
-    weights = initially_symmetric(weights, model_config) if initial is None else initial[1]
+    graphdef, weights = nnx.split(make_network(config.model, nnx.Rngs(config.seed)))
+    weights = initially_symmetric(weights, config.model) if initial is None else initial[1]
     optimiser = config.optimiser()
     state = TrainState(weights, weights, optimiser.init(weights), jnp.zeros((), jnp.int32))
     evaluate = None if validation is None else Validation(validation, graphdef, config)
-    columns = ("phase", "learning_rate", "loss", "gradient_norm", *(f"open_loop_{h}_cm" for h in HORIZONS))
-    columns += ("seconds", "waited")
 
     scores: dict[int, float] = {}
     with sole_writer(out_dir), Checkpoints(out_dir / CHECKPOINTS) as checkpoints, interrupt_flag() as interrupted:
@@ -145,7 +150,7 @@ def train(
         state = on_all_devices(state, mesh)
         buffers = _buffers(data, config.calls_before(step), mesh)
         bar = tqdm(total=total, initial=step, unit="step", disable=not progress, dynamic_ncols=True)
-        with MetricsLog(out_dir, columns, step) as log, bar:
+        with MetricsLog(out_dir, _COLUMNS, step) as log, bar:
             while step < total and not interrupted.is_set():
                 index, end = config.phase_at(step)
                 update = chunk_update(config, index, graphdef, min(config.chunk, end - step), mesh)
@@ -156,9 +161,8 @@ def train(
                     break
                 state, losses = made
                 seconds, done, step = time.perf_counter() - began, int(state.step) - step, int(state.step)
-                row = {"phase": index, "seconds": seconds, "waited": began - asked} | chunk_metrics(
-                    config, step, losses, out_dir
-                )
+                row = {"phase": index, "seconds": seconds, "waited": began - asked}
+                row |= chunk_metrics(config, step, losses, out_dir)
                 chunks = -(-step // config.chunk)
                 if evaluate is not None and (chunks % config.evaluate_every == 0 or step == total):
                     scores = evaluate(on_one_device(state.average, mesh))
@@ -171,8 +175,8 @@ def train(
             if interrupted.is_set() and step:
                 with saving():
                     checkpoints.save(step, on_one_device(state, mesh))
-    average = symmetrised(on_one_device(state.average, mesh), model_config)
-    return TrainResult(model_config, graphdef, average, step, step == total, scores)
+    average = symmetrised(on_one_device(state.average, mesh), config.model)
+    return TrainResult(config.model, graphdef, average, step, step == total, scores)
 
 
 def _buffers(data: Trajectory | StreamedData, calls: int, mesh: Mesh | None) -> Iterator[Trajectory]:
@@ -184,9 +188,13 @@ def _buffers(data: Trajectory | StreamedData, calls: int, mesh: Mesh | None) -> 
     return data.turns(calls, on_devices) if isinstance(data, StreamedData) else itertools.repeat(on_devices(data))
 
 
-def _with_scales(model: ModelConfig, data: Trajectory, initial: tuple[ModelConfig, nnx.State] | None) -> ModelConfig:
-    """The configuration with the scales of the data, or of the model to start from."""
-    scales = fit_normalisation(data, model) if initial is None else initial[0].normalisation
+def _with_scales(
+    config: TrainConfig, data: Trajectory | StreamedData, initial: tuple[ModelConfig, nnx.State] | None
+) -> ModelConfig:
+    """The network's configuration with the scales of the data, which are checked, or of the model to start from."""
+    model, first = config.model, data.at(0) if isinstance(data, StreamedData) else data
+    check_trajectories(first, model, steps=config.longest_rollout, what="training data")
+    scales = fit_normalisation(first, model) if initial is None else initial[0].normalisation
     model = dataclasses.replace(model, normalisation=scales)
     if initial is not None and initial[0] != model:
         raise ValueError(
