@@ -167,8 +167,8 @@ class _Simulation:
         normal = np.sqrt(max(float(physics.gravity) ** 2 - float(np.sum(physics.tilt**2)), 0.0))
         weight = on_table(physics, float(physics.density) * h + np.asarray(physics.extra_mass), h)[1:-1] * normal
         friction = (physics.friction, physics.static_excess, *physics.patch_centre, physics.patch_radius)
-        speeds = (self.config.friction_speed, PATCH_EDGE, STRIBECK_SPEED)
-        whole = [*map(float, friction), float(physics.patch_friction), float(physics.drag) * h, *speeds]
+        widths = (self.config.friction_speed, PATCH_EDGE, STRIBECK_SPEED)
+        whole = [*map(float, friction), float(physics.patch_friction), float(physics.drag) * h, *widths]
         return np.array([*whole, *weight])
 
     def _write(self, physics: Physics) -> None:
