@@ -220,7 +220,7 @@ def test_a_model_that_yields_nan_makes_the_grippers_hold_still_and_says_so():
 
 def test_where_bounds_contradict_each_other_the_grippers_hold_still():
     """Too far apart and outside the workspace, which cannot both be mended as fast as is asked: no straightening."""
-    config = dataclasses.replace(WITHOUT, workspace=((-3.0, -1.0), (-1.0, 3.0)), restart_after=1)
+    config = dataclasses.replace(WITHOUT, workspace=((-3.0, -1.0), (-1.0, 3.0)), settle_after=1)
     cable = Cable(pose=[[0.0, 0.0, 1.57], [0.0, 1.5, 1.57]])
     state, twists, info = run(controller(config=config), cable, 3)
     assert (info.result == Result.EMPTY_SET).all()
@@ -272,7 +272,8 @@ def test_a_cable_that_comes_no_nearer_is_straightened_as_often_as_allowed():
     state, twists, info = run(controller("U", WITHOUT), stuck, 60, restarts=last)
     begun = np.diff(np.asarray(info.action == Action.STRAIGHTEN).astype(int), prepend=0) == 1
     assert begun.sum() == 1 and int(state.progress.restarts) == WITHOUT.max_restarts
-    assert np.flatnonzero(begun)[0] >= WITHOUT.restart_after and np.isfinite(info.objective).all()
+    assert np.flatnonzero(begun)[0] >= WITHOUT.settle_after and np.isfinite(info.objective).all()
+    assert (twists[-5:] == 0).all() and (info.action[-5:] == Action.HOLD).all(), "and rests there"
     assert (np.linalg.norm(twists * [1, 1, 0.15], axis=-1) <= 0.05 * (1 + 1e-5)).all()
 
 
@@ -416,7 +417,7 @@ def test_times_a_control_call():
         ({"workspace": ((0.0, 1.0), (1.0, 0.0))}, "workspace"),
         ({"max_change": 0.0}, "max_change"),
         ({"max_restarts": 1.5}, "max_restarts"),
-        ({"restart_after": 2.5}, "restart_after"),
+        ({"settle_after": 2.5}, "settle_after"),
         ({"solver": "levenberg-marquardt"}, r"solver is 'levenberg-marquardt', expected a solver such as"),
         ({"solver": LevenbergMarquardt}, "expected a solver such as"),
         ({"objective": None}, "objective is None, expected ObjectiveConfig"),

@@ -19,10 +19,10 @@ from cablejax.mpc.problem import ShapingProblem
 from cablejax.mpc.state import CableEstimate, LastCommand, MPCInfo, MPCState, initial_state
 from cablejax.mpc.validation import check_history, check_measurement, check_target
 from cablejax.mpc.warm_start import find_starts
-from cablejax.residual.jacobian import Corrected, Dynamics
+from cablejax.residual.jacobian import Corrected, Dynamics, linearised
 from cablejax.residual.learner import Sample, learned, observe
 from cablejax.residual.learner import weights as weights_of
-from cablejax.residual.ridge import ResidualModel, apply
+from cablejax.residual.ridge import apply
 from cablejax.types import History, Measurement
 
 
@@ -83,10 +83,10 @@ def _step(mpc: MPC, state: MPCState, measurement: Measurement) -> tuple[MPCState
     """See `MPC.step`."""
     config, dynamics, weights = mpc.config, mpc.dynamics, mpc.weights
     state, unobserved = _observe(config, state, measurement)
-    drift = jnp.zeros_like(state.last.drift)
-    if config.residual is not None:
-        drift = dynamics(weights, state.history, jnp.zeros_like(state.last.twist))
-    residual = _learned(config, state, drift)
+    model, residual = state.last.model, None
+    if config.residual is not None and state.learner is not None:
+        model = linearised(dynamics, weights, state.history)
+        residual = learned(config.residual, state.learner, model)
     problem = ShapingProblem(
         dynamics=dynamics if residual is None else Corrected(dynamics),
         weights=weights if residual is None else (weights, residual),
@@ -127,7 +127,7 @@ def _step(mpc: MPC, state: MPCState, measurement: Measurement) -> tuple[MPCState
     )
     state = dataclasses.replace(
         state,
-        last=LastCommand(plan.motion, twist, offline, drift, predicted, error),
+        last=LastCommand(plan.motion, twist, offline, model, predicted, error),
         progress=progress,
         estimate=estimate,
         radius=next_radius,
@@ -181,7 +181,7 @@ def _observe(config: MPCConfig, state: MPCState, measurement: Measurement) -> tu
     valid = observed & state.observed & jnp.isfinite(error).all(axis=-1) & ~first
     learner = state.learner
     if config.residual is not None and learner is not None:
-        learner = observe(config.residual, learner, Sample(error, last.twist, valid, last.drift))
+        learner = observe(config.residual, learner, Sample(error, last.twist, valid, last.model))
     estimate, cable = state.estimate, state.history.cable
     if config.adaptation is not None and estimate is not None:
         belief = update(config.adaptation, estimate.belief, estimate.sensitivity, error, valid)
@@ -194,12 +194,6 @@ def _observe(config: MPCConfig, state: MPCState, measurement: Measurement) -> tu
         estimate=estimate,
     )
     return state, jnp.sum(~observed, dtype=jnp.int32)
-
-
-def _learned(config: MPCConfig, state: MPCState, drift: Float[Array, "N 2"]) -> ResidualModel | None:
-    if config.residual is None or state.learner is None:
-        return None
-    return learned(config.residual, state.learner, drift)
 
 
 def _feasible_set(config: MPCConfig, state: MPCState) -> FeasibleSet:

@@ -12,6 +12,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from cablejax.adaptation.belief import CableBelief, prior_belief
 from cablejax.mpc.config import MPCConfig
+from cablejax.residual.jacobian import Linearised
 from cablejax.residual.learner import LearnerState, initial_learner
 from cablejax.types import History
 
@@ -36,7 +37,7 @@ class LastCommand(NamedTuple):
         plan: the plan whose first command it is [m], shape [T, Q, 3].
         twist: the command, shape [Q, 3].
         displacement: the offline model's, of this command [m], shape [N, 2].
-        drift: the same, of no command.
+        model: the offline model about no command, when it was given; zero without a learner.
         predicted: keypoints that model and residual expect after it [m], shape [N, 2].
         shape_error: root mean square distance to the target before it [m], shape [].
     """
@@ -44,7 +45,7 @@ class LastCommand(NamedTuple):
     plan: Float[Array, "*batch T Q 3"]
     twist: Float[Array, "*batch Q 3"]
     displacement: Float[Array, "*batch N 2"]
-    drift: Float[Array, "*batch N 2"]
+    model: Linearised
     predicted: Float[Array, "*batch N 2"]
     shape_error: Float[Array, "*batch"]
 
@@ -163,7 +164,7 @@ def initial_state(config: MPCConfig, history: History) -> MPCState:
             plan=jnp.zeros((config.n_commands, n_grippers, 3), dtype),
             twist=jnp.zeros((n_grippers, 3), dtype),
             displacement=jnp.zeros((n_keypoints, 2), dtype),
-            drift=jnp.zeros((n_keypoints, 2), dtype),
+            model=Linearised(jnp.zeros((n_keypoints, 2), dtype), jnp.zeros((n_keypoints, 2, n_grippers, 3), dtype)),
             predicted=history.keypoints[-1],
             shape_error=jnp.zeros((), dtype),
         ),

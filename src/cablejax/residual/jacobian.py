@@ -7,6 +7,7 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from cablejax.residual.ridge import ResidualModel, apply
@@ -14,6 +15,29 @@ from cablejax.types import History
 
 Dynamics = Callable[[Any, History, Float[Array, "Q 3"]], Float[Array, "N 2"]]
 """A one-step model `(weights, history, twist) -> X(t + 1) - X(t)` [m]; `weights` is any pytree of arrays."""
+
+
+class Linearised(NamedTuple):
+    """A one-step model about no command, `f(X, R) ~ drift + gain R`; with a leading axis W for several steps.
+
+    Attributes:
+        drift: its displacement without a command, f(X, 0) [m], shape [N, 2].
+        gain: its derivative by the command, there [m / (m/s)] and [m / (rad/s)], shape [N, 2, Q, 3].
+    """
+
+    drift: Float[Array, "*batch N 2"]
+    gain: Float[Array, "*batch N 2 Q 3"]
+
+
+def linearised(dynamics: Dynamics, weights: Any, history: History) -> Linearised:
+    """The model about no command: 3Q tangents in one batch, in forward mode."""
+
+    def twice(twist: Float[Array, "Q 3"]):
+        displacement = dynamics(weights, history, twist)
+        return displacement, displacement
+
+    gain, drift = jax.jacfwd(twice, has_aux=True)(jnp.zeros_like(history.gripper_pose))
+    return Linearised(drift, gain)
 
 
 class StepJacobian(NamedTuple):

@@ -12,13 +12,17 @@ millimetre says much about a cable at rest, and little about one that moves by d
 the command, so that their mixture is again one affine correction, and its squared error is at most the candidates'
 weighted mean (Jensen's inequality).
 
-The candidates are made of two parts:
+The candidates are made of these parts:
 
-- Ridge regression on the command (`residual.ridge`, the paper's).
 - The share of the model's drift that does not take place. A model in whose data a cable relaxes predicts motion at
   rest; where friction holds the actual one, that is an error f(X, 0) of known direction and one unknown number, the
   share alpha in [0, 1] that all keypoints have in common. The correction is -alpha f(X, 0): with a share of 1, the
   corrected model predicts no motion without a command.
+- The share of the model's response to the command that does not take place. Where friction holds the middle of a cable,
+  its ends move with the grippers and it does not: one number beta_i for each keypoint. The correction is
+  `-beta_i (df_i/dR) R`, with the derivative about no command. A regression on the command alone has six numbers for
+  each coordinate, and where the grippers creep five samples cannot tell them.
+- Ridge regression on the command (`residual.ridge`, the paper's), which is no candidate by default.
 """
 
 from __future__ import annotations
@@ -31,6 +35,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from cablejax.limits import check
+from cablejax.residual.jacobian import Linearised
 from cablejax.residual.ridge import ResidualModel, RidgeConfig, apply, fit, zero_residual
 
 
@@ -40,16 +45,13 @@ class Candidate:
 
     Attributes:
         drift: whether it removes the share of the model's drift at rest that has not taken place.
+        response: whether it removes each keypoint's share of the response to the command that has not taken place.
         ridge: regression of what is left on the command; None = no regression.
     """
 
     drift: bool = False
+    response: bool = False
     ridge: RidgeConfig | None = None
-
-
-_REGRESSION = RidgeConfig(regularisation=100.0, bias=False, forgetting=0.5, outlier=0.02)
-"""Ten times the paper's penalty. A planner goes where the corrected model promises most, so that it finds the errors of
-a regression on five samples; where they are shrunk too little, some runs on soft cables end centimetres away."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -59,8 +61,9 @@ class LearnerConfig:
     Attributes:
         candidates: what is weighed; a single one is always believed.
         window: samples W that they are fitted to.
-        forgetting: weight ratio of a sample and the next newer one where the share of the drift is fitted, in (0, 1].
+        forgetting: weight ratio of a sample and the next newer one where shares are fitted, in (0, 1].
         drift_floor: root mean square drift [m] below which its share is not learned: the error is noise there.
+        response_floor: the same of a keypoint's response in all samples together, in units of s(t).
         memory: phi, by which evidence fades in one step, in (0, 1].
         error_std: s, root mean square error of a good prediction at rest [m].
         error_ratio: r, the same relative to the grippers' motion.
@@ -73,12 +76,13 @@ class LearnerConfig:
     candidates: tuple[Candidate, ...] = (
         Candidate(),
         Candidate(drift=True),
-        Candidate(ridge=_REGRESSION),
-        Candidate(drift=True, ridge=_REGRESSION),
+        Candidate(response=True),
+        Candidate(drift=True, response=True),
     )
     window: int = 5
     forgetting: float = 0.8
     drift_floor: float = 2e-4
+    response_floor: float = 2.0
     memory: float = 0.8
     error_std: float = 2e-4
     error_ratio: float = 0.1
@@ -95,6 +99,7 @@ class LearnerConfig:
             forgetting="share",
             memory="share",
             drift_floor="length_scale",
+            response_floor="positive",
             error_std="length_scale",
             error_ratio="positive",
             rotation_weight="positive",
@@ -126,13 +131,13 @@ class Sample(NamedTuple):
         error: observed displacement minus the offline model's [m], shape [N, 2].
         twist: the command [m/s, rad/s], shape [Q, 3].
         valid: keypoints whose error was observed, shape [N].
-        drift: displacement that the offline model predicted without a command [m], shape [N, 2].
+        model: the offline model about no command, where the step began.
     """
 
     error: Float[Array, "*batch N 2"]
     twist: Float[Array, "*batch Q 3"]
     valid: Bool[Array, "*batch N"]
-    drift: Float[Array, "*batch N 2"]
+    model: Linearised
 
 
 class LearnerState(NamedTuple):
@@ -163,7 +168,7 @@ def initial_learner(config: LearnerConfig, n_keypoints: int, n_grippers: int, dt
         error=jnp.zeros((*shape, 2), dtype),
         twist=jnp.zeros((config.window, n_grippers, 3), dtype),
         valid=jnp.zeros(shape, bool),
-        drift=jnp.zeros((*shape, 2), dtype),
+        model=Linearised(jnp.zeros((*shape, 2), dtype), jnp.zeros((*shape, 2, n_grippers, 3), dtype)),
     )
     return LearnerState(window, jnp.zeros(n, dtype), jnp.zeros((), dtype), jnp.zeros(n + 1, dtype))
 
@@ -171,11 +176,11 @@ def initial_learner(config: LearnerConfig, n_keypoints: int, n_grippers: int, dt
 def observe(config: LearnerConfig, state: LearnerState, sample: Sample) -> LearnerState:
     """The state with one more sample: the candidates are judged by it first, and fitted to it then.
 
-    Values of `sample.error` where it is not valid are ignored, NaN included; a drift that is not finite counts as none.
+    Values of `sample.error` where it is not valid are ignored, NaN included, as is what is not finite of the model.
     """
-    sample = sample._replace(drift=jnp.nan_to_num(sample.drift, posinf=0.0, neginf=0.0))
+    sample = sample._replace(model=jax.tree.map(lambda x: jnp.nan_to_num(x, posinf=0.0, neginf=0.0), sample.model))
     window = jax.tree.map(lambda old, new: jnp.concatenate([old, new[None]])[1:], state.window, sample)
-    models = _candidates(config, state.window, sample.drift)
+    models = _candidates(config, state.window, sample.model)
     mixture = _mixed(models, weights(config, state))
     error = jnp.where(sample.valid[:, None], sample.error, 0.0)
     predicted = jnp.stack([*(apply(model, sample.twist) for model in models), apply(mixture, sample.twist)])
@@ -208,38 +213,63 @@ def _expected(config: LearnerConfig, twist: Float[Array, "*batch Q 3"]) -> Float
     return config.error_std**2 + config.error_ratio**2 * motion
 
 
-def learned(config: LearnerConfig, state: LearnerState, drift: Float[Array, "N 2"]) -> ResidualModel:
-    """The correction to plan with. Differentiable in `drift` and the samples' errors and commands.
+def learned(config: LearnerConfig, state: LearnerState, model: Linearised) -> ResidualModel:
+    """The correction to plan with. Differentiable in `model` and the samples' errors and commands.
 
     Args:
         config: settings.
         state: after the newest sample.
-        drift: displacement that the offline model predicts now without a command [m], shape [N, 2].
+        model: the offline model about no command, now.
     """
-    return _mixed(_candidates(config, state.window, drift), weights(config, state))
+    return _mixed(_candidates(config, state.window, model), weights(config, state))
 
 
-def _candidates(config: LearnerConfig, window: Sample, drift: Float[Array, "N 2"]) -> list[ResidualModel]:
-    share, models = _drift_share(config, window), []
+def _candidates(config: LearnerConfig, window: Sample, now: Linearised) -> list[ResidualModel]:
+    n_keypoints, n_grippers = now.gain.shape[0], now.gain.shape[2]
+    zero = jax.tree.map(lambda x: x.astype(now.drift.dtype), zero_residual(n_keypoints, n_grippers))
+    at_rest, models = _drift_share(config, window), []
     for candidate in config.candidates:
-        model = jax.tree.map(lambda x: x.astype(drift.dtype), zero_residual(len(drift), window.twist.shape[1]))
-        removed = share if candidate.drift else jnp.zeros_like(share)
+        model, removed = zero, at_rest if candidate.drift else jnp.zeros_like(at_rest)
+        left = window.error + removed * window.model.drift
+        if candidate.response:
+            response = jnp.einsum("wncqk,wqk->wnc", window.model.gain, window.twist)
+            held = _response_share(config, window, left, response)
+            left += held[:, None] * response
+            gain = -(held[:, None, None, None] * now.gain).reshape(2 * n_keypoints, -1).T
+            model = dataclasses.replace(model, gain=gain)
         if candidate.ridge is not None:
-            left = window.error + removed * window.drift
-            model = fit(left, window.twist, window.valid, candidate.ridge)
-        models.append(dataclasses.replace(model, bias=model.bias - removed * drift.ravel()))
+            fitted = fit(left, window.twist, window.valid, candidate.ridge)
+            model = dataclasses.replace(fitted, gain=model.gain + fitted.gain)
+        models.append(dataclasses.replace(model, bias=model.bias - removed * now.drift.ravel()))
     return models
+
+
+def _trust(config: LearnerConfig, window: Sample) -> Float[Array, "W N 1"]:
+    """The samples' weights where shares are fitted: by age, motion, and what was seen."""
+    age = jnp.arange(config.window - 1, -1, -1)
+    trust = (config.forgetting**age).astype(window.error.dtype) / _expected(config, window.twist)
+    return trust[:, None, None] * window.valid[..., None]
 
 
 def _drift_share(config: LearnerConfig, window: Sample) -> Float[Array, ""]:
     """Share alpha of the model's drift that has not taken place, in [0, 1]: least squares, shrunk towards 0."""
-    age = jnp.arange(config.window - 1, -1, -1)
-    trust = (config.forgetting**age).astype(window.drift.dtype) / _expected(config, window.twist)
-    weight = trust[:, None, None] * window.valid[..., None]
+    weight, drift = _trust(config, window), window.model.drift
     error = jnp.where(window.valid[..., None], window.error, 0.0)
-    size = jnp.sum(weight * window.drift**2)
-    floor = (config.drift_floor / config.error_std) ** 2 * window.drift.shape[1]
-    return jnp.clip(-jnp.sum(weight * error * window.drift) / (size + floor), 0.0, 1.0)
+    floor = (config.drift_floor / config.error_std) ** 2 * drift.shape[1]
+    return jnp.clip(-jnp.sum(weight * error * drift) / (jnp.sum(weight * drift**2) + floor), 0.0, 1.0)
+
+
+def _response_share(
+    config: LearnerConfig, window: Sample, error: Float[Array, "W N 2"], response: Float[Array, "W N 2"]
+) -> Float[Array, " N"]:
+    """Share beta of each keypoint's response that has not taken place, in [-1, 1]: below 0, it moves farther.
+
+    Least squares, shrunk towards 0.
+    """
+    weight = _trust(config, window)
+    error = jnp.where(window.valid[..., None], error, 0.0)
+    size = jnp.sum(weight * response**2, axis=(0, 2)) + config.response_floor**2
+    return jnp.clip(-jnp.sum(weight * error * response, axis=(0, 2)) / size, -1.0, 1.0)
 
 
 def _mixed(models: list[ResidualModel], weight: Float[Array, " K"]) -> ResidualModel:
