@@ -14,7 +14,6 @@ from cablejax.mpc.config import MPCConfig
 from cablejax.mpc.plan import Plan
 from cablejax.mpc.problem import ShapingProblem
 from cablejax.mpc.state import Action, Progress
-from cablejax.mpc.target_pose import continued
 from cablejax.mpc.warm_start import Starts
 
 RELAXES = 2
@@ -80,9 +79,7 @@ def plan_or_recover(
     plan, sound = decision.plan, _sound(decision.plan.result)
     held = decision.action == Action.HOLD
     ways = start.straightening.length, start.back.length
-    # as the way back is measured, whatever whole turns the grippers' angles have
-    pose = continued(problem.history.gripper_pose, problem.history.keypoints[-1])
-    progress = _followed(config, progress, pose, error, ways, sound=sound, held=held)
+    progress = _followed(config, progress, problem.pose, error, ways, sound=sound, held=held)
     mode = jnp.where(sound, progress.mode, Action.FOLLOW)
     motion = jnp.select(
         [mode == Action.STRAIGHTEN, mode == Action.RETURN, mode == Action.HOLD],

@@ -103,6 +103,11 @@ class ShapingProblem:
     feasible: FeasibleSet
     objective: ObjectiveConfig = dataclasses.field(default=ObjectiveConfig(), metadata={"static": True})
 
+    @property
+    def pose(self) -> Float[Array, "Q 3"]:
+        """Gripper poses now, their angles continued along the cable (`target_pose.continued`) [m, rad]."""
+        return continued(self.history.gripper_pose, self.history.keypoints[-1])
+
     def start(self, motion: Float[Array, "T Q 3"]) -> Rollout:
         """The start of a solver from a plan: the nearest feasible one, rolled out."""
         return self.rollout(self.feasible.project(motion))
@@ -194,7 +199,7 @@ class ShapingProblem:
 
     def _of_grippers(self, motion: Float[Array, "T Q 3"]) -> Float[Array, " T+Q"]:
         """Residuals of the grippers' poses: winding after every step, weighted distance after the last one [m]."""
-        pose, weight = continued(self.history.gripper_pose, self.history.keypoints[-1]), self.objective.rotation_weight
+        pose, weight = self.pose, self.objective.rotation_weight
         turn = pose[1, 2] - pose[0, 2] + jnp.cumsum(motion[:, 1, 2] - motion[:, 0, 2]) / weight
         wound = weight * jnp.maximum(jnp.abs(turn - total_turn(self.target)) - jnp.pi, 0.0)
         way = way_to(pose, target_pose(self.target), weight) - motion.sum(axis=0)

@@ -128,7 +128,7 @@ class MPCInfo:
         result: a `bounded.Result`: how the solve ended; `NONFINITE` also where its plan is not finite.
         action: an `Action`.
         residual_share: |residual's displacement| / (|model's| + |residual's|) of the command, in [0, 1].
-        condition: condition number of the ridge system.
+        condition: condition number of the ridge system; 1 where no ridge is fitted.
         unobserved: keypoints not observed now, replaced by their prediction.
         weights: how far each of the learner's candidates is believed, shape [K]; None without a learner.
         belief: what is believed of the cable now, None without adaptation.

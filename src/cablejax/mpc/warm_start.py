@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 
 from cablejax.mpc.config import MPCConfig
 from cablejax.mpc.problem import Rollout, ShapingProblem
-from cablejax.mpc.target_pose import continued, straight_plan, straightened, target_pose, way_to
+from cablejax.mpc.target_pose import straight_plan, straightened, target_pose, way_to
 
 
 class StraightWay(NamedTuple):
@@ -85,7 +85,6 @@ def _straight_way(
     config: MPCConfig, problem: ShapingProblem, to: Float[Array, "2 3"], radius: Float[Array, ""]
 ) -> StraightWay:
     """Motions from the grippers' present poses to a pair of poses, within this bound on a step [m] and no other."""
-    pose = continued(problem.history.gripper_pose, problem.history.keypoints[-1])
     weight = config.objective.rotation_weight
-    motion = straight_plan(pose, to, radius, weight, config.n_commands)
-    return StraightWay(motion, jnp.linalg.norm(way_to(pose, to, weight), axis=1).max())
+    motion = straight_plan(problem.pose, to, radius, weight, config.n_commands)
+    return StraightWay(motion, jnp.linalg.norm(way_to(problem.pose, to, weight), axis=1).max())

@@ -1,4 +1,4 @@
-"""Online correction of a learned model: ridge regression of its error on the command, and the composition of both."""
+"""Online correction of a learned model by what its last errors say, and the composition of both."""
 
 from cablejax.residual.jacobian import Corrected, Dynamics
 from cablejax.residual.learner import PAPER, Candidate, LearnerConfig
