@@ -10,7 +10,6 @@ from cablejax.mpc import MPC, Action, LevenbergMarquardt, MPCConfig, ProjectedGr
 from cablejax.mpc.fallback import ABOUT, RETURNS, _followed, radius_after
 from cablejax.mpc.state import initial_state
 from cablejax.mpc.target_pose import straightened
-from cablejax.residual import PAPER
 from cablejax.types import History, Measurement
 from mpc_cases import START, TARGETS, at_rest, hermite_shape, relaxing_cable
 
@@ -118,12 +117,8 @@ def test_residual_removes_most_of_what_the_model_gets_wrong(target):
     assert info.shape_error[-1] < 0.7 * without.shape_error[-1]
     assert (without.residual_share == 0).all() and (without.condition == 1).all()
     assert (info.residual_share[2:20] > 0).all() and (info.residual_share <= 1).all()
+    assert (info.condition[2:6] > 1).all() and (info.condition >= 1).all()
     np.testing.assert_allclose(info.weights.sum(axis=1), 1.0, rtol=1e-5)
-
-
-def test_the_papers_ridge_reports_how_its_system_is_conditioned():
-    _, _, info = run(controller(config=dataclasses.replace(CONFIG, residual=PAPER)), Cable(), 6)
-    assert (info.condition[2:] > 1).all() and (info.condition >= 1).all() and (info.weights == 1).all()
 
 
 def test_commands_respect_every_bound():
@@ -225,7 +220,7 @@ def test_a_model_that_yields_nan_makes_the_grippers_hold_still_and_says_so():
 
 def test_where_bounds_contradict_each_other_the_grippers_hold_still():
     """Too far apart and outside the workspace, which cannot both be mended as fast as is asked: no straightening."""
-    config = dataclasses.replace(WITHOUT, workspace=((-3.0, -1.0), (-1.0, 3.0)), settle_after=1)
+    config = dataclasses.replace(WITHOUT, workspace=((-3.0, -1.0), (-1.0, 3.0)), restart_after=1)
     cable = Cable(pose=[[0.0, 0.0, 1.57], [0.0, 1.5, 1.57]])
     state, twists, info = run(controller(config=config), cable, 3)
     assert (info.result == Result.EMPTY_SET).all()
@@ -274,11 +269,10 @@ def test_where_no_plan_helps_the_cable_is_straightened():
 
 def test_a_cable_that_comes_no_nearer_is_straightened_as_often_as_allowed():
     stuck, last = Cable(rate=0.0, sag=0.0), WITHOUT.max_restarts - 1
-    state, twists, info = run(controller("U", WITHOUT), stuck, 75, restarts=last)
+    state, twists, info = run(controller("U", WITHOUT), stuck, 60, restarts=last)
     begun = np.diff(np.asarray(info.action == Action.STRAIGHTEN).astype(int), prepend=0) == 1
     assert begun.sum() == 1 and int(state.progress.restarts) == WITHOUT.max_restarts
-    assert np.flatnonzero(begun)[0] >= WITHOUT.settle_after and np.isfinite(info.objective).all()
-    assert (twists[-5:] == 0).all() and (info.action[-5:] == Action.HOLD).all(), "and rests there"
+    assert np.flatnonzero(begun)[0] >= WITHOUT.restart_after and np.isfinite(info.objective).all()
     assert (np.linalg.norm(twists * [1, 1, 0.15], axis=-1) <= 0.05 * (1 + 1e-5)).all()
 
 
@@ -290,7 +284,7 @@ def test_where_nothing_gets_better_the_grippers_rest_until_it_is_disturbed():
 
         def step(self, twist):
             self.count += 1
-            jump = 0.008 if self.count > 45 else 0.0
+            jump = 0.02 if self.count > 45 else 0.0
             self.sag[:, 1] = (0.02 + jump + 3e-4 * np.sin(self.count)) * np.sin(np.linspace(0, np.pi, N))
             super().step(twist)
 
@@ -422,7 +416,7 @@ def test_times_a_control_call():
         ({"workspace": ((0.0, 1.0), (1.0, 0.0))}, "workspace"),
         ({"max_change": 0.0}, "max_change"),
         ({"max_restarts": 1.5}, "max_restarts"),
-        ({"settle_after": 2.5}, "settle_after"),
+        ({"restart_after": 2.5}, "restart_after"),
         ({"solver": "levenberg-marquardt"}, r"solver is 'levenberg-marquardt', expected a solver such as"),
         ({"solver": LevenbergMarquardt}, "expected a solver such as"),
         ({"objective": None}, "objective is None, expected ObjectiveConfig"),

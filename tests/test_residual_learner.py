@@ -11,7 +11,7 @@ from cablejax.residual.learner import Sample, initial_learner, learned, observe,
 
 N, Q = 13, 2
 CONFIG = LearnerConfig()
-NONE, DRIFT, RESPONSE, BOTH = range(4)
+NONE, DRIFT, RIDGE, DRIFT_RIDGE, RESPONSE, BOTH = range(6)
 
 
 def steps(kind, n=40, seed=0):
@@ -54,7 +54,12 @@ def after(samples, config=CONFIG):
 
 @pytest.mark.parametrize(
     ("kind", "believed", "share"),
-    [("nothing", (NONE, DRIFT), 0.45), ("drift", (DRIFT, BOTH), 0.99), ("response", (RESPONSE, BOTH), 0.99)],
+    [
+        ("nothing", (NONE, DRIFT, RESPONSE, BOTH), 0.65),
+        ("drift", (DRIFT, DRIFT_RIDGE, BOTH), 0.99),
+        ("gain", (RIDGE, DRIFT_RIDGE), 0.95),
+        ("response", (RESPONSE, BOTH), 0.99),
+    ],
 )
 def test_what_has_predicted_well_is_believed_and_the_mixture_is_never_much_worse_than_the_best(kind, believed, share):
     state = after(steps(kind))

@@ -36,13 +36,13 @@ class MPCConfig:
         min_reduction: predicted changes of the error below this say nothing about the model: the radius stays [m].
         hold_improvement: the grippers hold still if the plan lowers the error over the horizon, as a root mean square
             distance, by less than this compared with holding still [m].
-        settle_after: commands without a lower error after which no more is expected of plans: near the target the
-            grippers rest.
+        settle_after: commands without a lower error near the target after which the grippers rest.
         arrived: way left to the best pose [m] at which the grippers count as being there.
         wake: rise of the error at rest [m] that counts as a disturbance: planning begins again.
-        restart_above: where the error stays above this [m], for `settle_after` commands or because no plan is better
-            than holding still, the cable is in another shape than the target's, between the same grippers or others, or
-            held in one by friction. No plan of a few steps leads out: it is straightened, and shaped from there.
+        restart_above: where the error stays above this [m], the cable is in another shape than the target's, between
+            the same grippers or others. No plan of a few steps leads out: it is straightened, and shaped from there.
+        restart_after: commands without a lower error after which it counts as staying; at once where no plan is better
+            than holding still.
         max_restarts: how often that may happen; a shape that is fallen into again and again is the model's.
         objective: weights and units of the planning problem.
         residual: settings of the online learner of its errors; None = trust the offline model.
@@ -68,7 +68,8 @@ class MPCConfig:
     settle_after: int = 8
     wake: float = 1e-3
     arrived: float = 1e-4
-    restart_above: float = 0.01
+    restart_above: float = 0.05
+    restart_after: int = 12
     max_restarts: int = 3
     objective: ObjectiveConfig = ObjectiveConfig()
     residual: LearnerConfig | None = LearnerConfig()
@@ -113,6 +114,7 @@ class MPCConfig:
             wake="positive",
             arrived="positive",
             restart_above="positive",
+            restart_after="count",
             max_restarts="count_from_zero",
         )
         if not 0 <= self.min_distance < self.max_distance <= 1:

@@ -70,7 +70,7 @@ def plan_or_recover(
 
     - Far from the target. A cable has several shapes between the same grippers, and near another one than the target's
       every plan of a few steps makes the error worse before it makes it better. From the straight cable the target can
-      be reached, so it is straightened. After `max_restarts` of that the grippers rest.
+      be reached, so it is straightened.
     - Near it. Stick and slip are of the size of what the model promises. The grippers rest as soon as the error is
       about as low as it has been, until it rises, as after a disturbance. Where the cable gets worse instead, they go
       back to where it was best before friction holds it in another shape, and plan again with half the bound on their
@@ -124,7 +124,7 @@ def _followed(
     since = jnp.where(better | woken, 0, before.since + 1)
 
     far = error > config.restart_above
-    tired = planning & sound & ((far & held) | (since >= config.settle_after))
+    tired = planning & sound & ((far & held) | (since >= jnp.where(far, config.restart_after, config.settle_after)))
     far_to_go = ways[0] > config.radius_max
     straighten = tired & far & far_to_go & (before.restarts < config.max_restarts)
     straightening = straighten | (before.mode == Action.STRAIGHTEN)
@@ -140,8 +140,7 @@ def _followed(
     on_way = (left > 0) & (length > jnp.where(straightening, config.radius_max, config.arrived))
     arrived = returning & ~on_way
     again = arrived & (before.returns + go_back < RETURNS)
-    spent = before.restarts >= config.max_restarts
-    rest = (tired & (~far | spent) & ~go_back) | (arrived & ~again)
+    rest = (tired & ~far & ~go_back) | (arrived & ~again)
     mode = jnp.where(on_way & returning, Action.RETURN, Action.FOLLOW)
     mode = jnp.where(on_way & straightening, Action.STRAIGHTEN, mode)
     mode = jnp.where(rest | (resting & ~woken), Action.HOLD, mode)
