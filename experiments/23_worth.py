@@ -38,7 +38,7 @@ from cablejax.control.targets import Shape
 from cablejax.diagnose import diagnose, write_verdict
 from cablejax.effects.given import effects_of_verdict, parse_effect
 from cablejax.gaplog import gap_log_from_episodes, read_gap_log, write_gap_log
-from cablejax.residual import LearnerConfig
+from cablejax.residual import STATIC
 from cablejax.simulate.chain.statics import clamped, resting_shapes, statics_with
 from cablejax.simulate.plant import Plant, PlantConfig
 from cablejax.types import GapLog, Trajectory
@@ -80,7 +80,7 @@ MODEL = "gns-conditioned"
 
 def arm(name: str) -> MethodSpec:
     """The method of an arm."""
-    learner = LearnerConfig() if name.endswith(ONLINE) else None
+    learner = STATIC if name.endswith(ONLINE) else None
     return MethodSpec(name, MODEL, learner=learner, fine_tuned=not name.startswith("plain"))
 
 

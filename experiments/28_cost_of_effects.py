@@ -25,7 +25,7 @@ from cablejax.control.targets import Shape, straight_start
 from cablejax.diagnose.motion_bounds import Bounds
 from cablejax.diagnose.safe_motions import there_and_back
 from cablejax.effects.given import parse_effect
-from cablejax.residual import LearnerConfig
+from cablejax.residual import STATIC
 from cablejax.simulate.plant import Plant, PlantConfig
 from cablejax.simulate.play import played
 from closed_loop.cases import PLANT_CHAIN
@@ -46,7 +46,7 @@ INTERVAL = 0.1
 """Between samples of the motion that shows a letter [s]."""
 METHODS = (
     MethodSpec("no learner", "gns-conditioned"),
-    MethodSpec("learner", "gns-conditioned", learner=LearnerConfig()),
+    MethodSpec("learner", "gns-conditioned", learner=STATIC),
 )
 
 

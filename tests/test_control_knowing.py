@@ -14,7 +14,7 @@ from cablejax.dataset.generate import make_engine, simulate
 from cablejax.dataset.schema import DatasetConfig
 from cablejax.dynamics.evaluate import open_loop_error
 from cablejax.effects.given import parse_effect
-from cablejax.residual import LearnerConfig
+from cablejax.residual import STATIC, LearnerConfig
 from cablejax.types import Trajectory
 
 CURVED = "intrinsic_curvature:centre_m=0.6,width_m=0.3,curvature_per_m=2"
@@ -65,6 +65,14 @@ def test_a_model_without_prior_can_be_informed_of_stiffness_alone():
     mpc = make_controller(model, target, method="residual", solver="levenberg-marquardt")
     assert mpc.config.residual == LearnerConfig().scaled(model.config.length) and mpc.config.adaptation is not None
     assert make_controller(model, target, method="direct", solver="levenberg-marquardt").config.residual is None
+
+
+def test_the_learner_scales_responses_only_of_a_model_without_static_prior(model):
+    target = make_target("S", model.cable)
+    learner = make_controller(model, target, method="residual", solver="levenberg-marquardt").config.residual
+    assert learner == STATIC.scaled(model.config.length)
+    assert not any(candidate.response for candidate in STATIC.candidates)
+    assert LearnerConfig().candidates[: len(STATIC.candidates)] == STATIC.candidates
 
 
 def test_what_does_not_enter_a_model_is_refused_with_what_to_do(model, tmp_path, capsys):

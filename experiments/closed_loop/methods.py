@@ -9,7 +9,7 @@ from pathlib import Path
 from cablejax.control.link import Controller
 from cablejax.control.shaping import Model, load_model, make_controller
 from cablejax.control.targets import Target
-from cablejax.residual import PAPER, LearnerConfig
+from cablejax.residual import PAPER, STATIC, LearnerConfig
 from closed_loop.baselines import StraightDrive, statics_model
 from closed_loop.paper import DIRECT, FINE_TUNED, METHOD_LABEL, RANDOMISED, RESIDUAL, VISUAL_SERVO
 from closed_loop.visual_servo import ServoConfig, VisualServo
@@ -69,7 +69,7 @@ METHODS: dict[str, MethodSpec] = {
         MethodSpec(RANDOMISED, "gns-randomised"),
         MethodSpec(FINE_TUNED, "gns-reference", fine_tuned=True),
         MethodSpec(RESIDUAL, "gns-reference", learner=PAPER),
-        MethodSpec(LEARNER, "gns-reference", learner=LearnerConfig()),
+        MethodSpec(LEARNER, "gns-reference", learner=STATIC),
         MethodSpec(NO_PRIOR, "gns-no-prior"),
         MethodSpec(NO_PRIOR_LEARNER, "gns-no-prior", learner=LearnerConfig()),
         MethodSpec(DRIVE, None),

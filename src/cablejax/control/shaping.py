@@ -26,7 +26,7 @@ from cablejax.limits import shown
 from cablejax.mpc import MPC, SOLVERS, MPCConfig
 from cablejax.perceive.camera import CameraConfig
 from cablejax.perceive.plant import CloudPlant
-from cablejax.residual import Dynamics, LearnerConfig
+from cablejax.residual import STATIC, Dynamics, LearnerConfig
 from cablejax.residual.jacobian import StepJacobian, reverse
 from cablejax.simulate.chain.statics import Statics, statics_with
 from cablejax.simulate.elastica import elastica
@@ -171,9 +171,10 @@ def make_controller(model: Model, target: Target, *, method: Method, solver: Sol
 
     Bounds on motions scale with the cable's length, see `MPCConfig.for_length`.
     """
+    learner = STATIC if model.config.prior == "static" else LearnerConfig()
     config = MPCConfig.for_length(
         model.config.length,
-        residual=LearnerConfig().scaled(model.config.length) if method == "residual" else None,
+        residual=learner.scaled(model.config.length) if method == "residual" else None,
         adaptation=AdaptationConfig(prior_mean=model.believed) if model.config.conditioned else None,
         solver=SOLVERS[solver],
     )

@@ -1,11 +1,12 @@
 """Online correction of a learned model by what its last errors say, and the composition of both."""
 
 from cablejax.residual.jacobian import Corrected, Dynamics
-from cablejax.residual.learner import PAPER, Candidate, LearnerConfig
+from cablejax.residual.learner import PAPER, STATIC, Candidate, LearnerConfig
 from cablejax.residual.ridge import ResidualModel, RidgeConfig, apply, fit, zero_residual
 
 __all__ = [
     "PAPER",
+    "STATIC",
     "Candidate",
     "Corrected",
     "Dynamics",

@@ -128,6 +128,9 @@ class LearnerConfig:
         return dataclasses.replace(self, candidates=tuple(map(of, self.candidates)), **lengths)
 
 
+STATIC = LearnerConfig(candidates=LearnerConfig().candidates[:4])
+"""For a model with the static prior: no response. Such a model predicts where the cable will lie, and not how far a
+command moves it; with shares of that derivative among the candidates, S ends farther off."""
 PAPER = LearnerConfig(candidates=(Candidate(ridge=RidgeConfig(bias=False)),))
 """The residual of Wang et al., RA-L 2022: ridge regression on the last five commands, without a bias."""
 
