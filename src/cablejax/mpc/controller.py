@@ -85,7 +85,7 @@ def _step(mpc: MPC, state: MPCState, measurement: Measurement) -> tuple[MPCState
     state, unobserved = _observe(config, state, measurement)
     model, residual = state.last.model, None
     if config.residual is not None and state.learner is not None:
-        model = linearised(dynamics, weights, state.history)
+        model = linearised(dynamics, weights, state.history, with_gain=config.residual.needs_gain)
         residual = learned(config.residual, state.learner, model)
     problem = ShapingProblem(
         dynamics=dynamics if residual is None else Corrected(dynamics),

@@ -29,15 +29,26 @@ class Linearised(NamedTuple):
     gain: Float[Array, "*batch N 2 Q 3"]
 
 
-def linearised(dynamics: Dynamics, weights: Any, history: History) -> Linearised:
-    """The model about no command: 3Q tangents in one batch, in forward mode."""
+def linearised(dynamics: Dynamics, weights: Any, history: History, *, with_gain: bool) -> Linearised:
+    """The model about no command: one evaluation, and for the gain 3Q tangents in one batch, in forward mode.
+
+    Args:
+        dynamics: the model.
+        weights: its arrays.
+        history: where it is evaluated.
+        with_gain: whether the gain is needed; it is zero otherwise.
+    """
+    rest = jnp.zeros_like(history.gripper_pose)
 
     def twice(twist: Float[Array, "Q 3"]):
         displacement = dynamics(weights, history, twist)
         return displacement, displacement
 
-    gain, drift = jax.jacfwd(twice, has_aux=True)(jnp.zeros_like(history.gripper_pose))
-    return Linearised(drift, gain)
+    if with_gain:
+        gain, drift = jax.jacfwd(twice, has_aux=True)(rest)
+        return Linearised(drift, gain)
+    drift = dynamics(weights, history, rest)
+    return Linearised(drift, jnp.zeros((*drift.shape, *rest.shape), drift.dtype))
 
 
 class StepJacobian(NamedTuple):

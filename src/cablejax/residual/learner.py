@@ -115,6 +115,11 @@ class LearnerConfig:
             dimensions="positive",
         )
 
+    @property
+    def needs_gain(self) -> bool:
+        """Whether a candidate asks for the model's derivative by the command."""
+        return any(candidate.response for candidate in self.candidates)
+
     def scaled(self, ratio: float) -> LearnerConfig:
         """The settings for a cable so many times as long."""
 
@@ -128,7 +133,7 @@ class LearnerConfig:
         return dataclasses.replace(self, candidates=tuple(map(of, self.candidates)), **lengths)
 
 
-STATIC = LearnerConfig(candidates=LearnerConfig().candidates[:4])
+STATIC = LearnerConfig(candidates=tuple(one for one in LearnerConfig().candidates if not one.response))
 """For a model with the static prior: no response. Such a model predicts where the cable will lie, and not how far a
 command moves it; with shares of that derivative among the candidates, S ends farther off."""
 PAPER = LearnerConfig(candidates=(Candidate(ridge=RidgeConfig(bias=False)),))
