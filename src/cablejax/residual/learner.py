@@ -135,7 +135,7 @@ class LearnerConfig:
 
 STATIC = LearnerConfig(candidates=tuple(one for one in LearnerConfig().candidates if not one.response))
 """For a model with the static prior: no response. Such a model predicts where the cable will lie, and not how far a
-command moves it; with shares of that derivative among the candidates, S ends farther off."""
+command moves it: shares of that derivative say little about friction."""
 PAPER = LearnerConfig(candidates=(Candidate(ridge=RidgeConfig(bias=False)),))
 """The residual of Wang et al., RA-L 2022: ridge regression on the last five commands, without a bias."""
 
