@@ -24,13 +24,14 @@ if __name__ == "__main__":
             script="15_harder_tasks.py",
             title="Shapes of other cables, and disturbances",
             about=(
-                "The plant is C MuJoCo in space with contact and friction cones; 60 commands of one second from a "
-                "straight start. Keypoints only: the target is the shape in which another cable, of random stiffness, "
-                "friction and bend at rest, was left by friction; the cable that is shaped is twice as stiff as the "
-                "one trained on, and the best that it could do is the nearest shape in which it rests without "
-                "friction. Disturbed: U, S or Z, and after 29 s something happens, or the observation is poor all "
-                "the time; the cable is half, once or twice as stiff. A run is judged by the mean error of its last "
-                "ten seconds. Tasks: `experiments/closed_loop/harder.py`."
+                "The plant is C MuJoCo in space with contact and friction cones; commands of one second from a "
+                "straight start. Keypoints only, 90 commands: the target is the shape in which another cable, of "
+                "random stiffness, friction and bend at rest, was left by friction; the cable that is shaped is twice "
+                "as stiff as the one trained on, and the best that it could do is the nearest shape in which it rests "
+                "without friction, its grippers as far apart as the controller's bounds ask for, which the straight "
+                "drive does not keep. Disturbed, 60 commands: U, S or Z, and after 29 s something happens, or the "
+                "observation is poor all the time; the cable is half, once or twice as stiff. A run is judged by the "
+                "mean error of its last ten seconds. Tasks: `experiments/closed_loop/harder.py`."
             ),
             small=Extent(harder_cases, seeds=range(6), methods=(NO_PRIOR_LEARNER,)),
             full=Extent(

@@ -30,23 +30,14 @@ from scipy.stats import binomtest, norm
 from cablejax.diagnose.fit import evaluate
 from cablejax.recordings.deform import NOMINAL, SAMPLE_INTERVAL
 from cablejax.report.provenance import machine, versions
-from cablejax.spatial.estimate import UNMODELLED, Estimate, Interval, estimate, estimate_at, estimates_of_halves
+from cablejax.spatial.estimate import UNMODELLED, Interval, estimate, estimate_at, estimates_of_halves
 from cablejax.spatial.identify import Identified, identify
-from cablejax.spatial.named import parameters_of
 from pages import markdown_table, publish
+from real_cables.known import REPORTED, beside_truth
 from real_cables.protocol import protocol_windows
-from real_cables.synthetic import RECORDINGS, SAMPLES, Law, SyntheticCable, synthetic_recordings
+from real_cables.synthetic import RECORDINGS, SAMPLES, Law, synthetic_recordings
 from rows import Rows
 
-REPORTED = {
-    "bending_damping": "time_s",
-    "viscous_drag": "coefficient_n_s_per_m2",
-    "quadratic_drag": "coefficient_per_m",
-    "lumped_mass": "mass_kg",
-    "stiffness_profile": "ratio",
-    "gripper_rotation_offset": "angle_rad",
-}
-"""Other parameters whose intervals are judged; the true places of the markers (`keypoint_bias`) are not kept."""
 SPEED = 0.6
 """Of the grippers of synthetic recordings, root mean square [m/s]."""
 LAWS: tuple[Law, ...] = ("as fitted", "richer")
@@ -104,7 +95,7 @@ def trial(seed: int, law: Law, cache: Path | None) -> Row:
         truth={k: v for k, v in dataclasses.asdict(cable).items() if isinstance(v, float)} | {"laden": cable.laden},
         halves=[reported(half.stiffness) for half in estimates_of_halves(found)],
         everything=reported(everything.stiffness),
-        others=others(cable, everything),
+        others=beside_truth(cable, everything, unmodelled={}),
         chosen=[jackknifed(found, half) for half in range(2)],
         effects=list(found.effects),
         error_mm=[1e3 * float(step.error.mean()) for step in (accepted[0], accepted[-1])],
@@ -119,31 +110,6 @@ def true_stiffness(row: Row) -> float:
 
 def reported(interval: Interval) -> list[float]:
     return list(dataclasses.astuple(interval))
-
-
-def others(cable: SyntheticCable, everything: Estimate) -> dict[str, list[float]]:
-    """Of the other effects, as if each of them were named; the true value first."""
-    part = {effect: parameters_of(effect, everything, density=1.0, unmodelled={})[0] for effect in REPORTED}
-    knots = len(cable.profile)
-    knot = round(part["stiffness_profile"]["centre_m"].value / everything.layout.arclength[-1] * (knots - 1))
-    # the mean over these recordings, which is what a diagnosis speaks of
-    angles = np.linalg.norm(cable.grips.mean(axis=0), axis=-1)
-    truths = {
-        "bending_damping": cable.damping_time,
-        "viscous_drag": cable.drag / cable.laden,
-        "quadratic_drag": cable.quadratic_drag / cable.laden,
-        "lumped_mass": cable.marker_mass / cable.laden,
-        "stiffness_profile": float(np.exp(cable.profile[knot] - np.delete(cable.profile, knot).mean())),
-        "gripper_rotation_offset": [float(angle) for angle in angles],
-    }
-    rows = {}
-    for effect, parameter in REPORTED.items():
-        one = part[effect][parameter]
-        true, value, ends = np.ravel(truths[effect]), np.ravel(one.value), np.reshape(np.array(one.ci90), (-1, 2))
-        for k in range(len(true)):
-            name = f"{effect}, {parameter}" + (f", gripper {k}" if len(true) > 1 else "")
-            rows[name] = [float(x) for x in (true[k], value[k], *ends[k])]
-    return rows
 
 
 def jackknifed(found: Identified, half: int) -> list[float]:

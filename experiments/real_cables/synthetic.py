@@ -10,6 +10,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import math
+from collections.abc import Sequence
 from typing import Any, Literal
 
 import jax
@@ -17,24 +18,29 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from cablejax.recordings.deform import SAMPLE_INTERVAL, DeformRecordings
+from cablejax.recordings.deform import NOMINAL, SAMPLE_INTERVAL, DeformRecordings
 from cablejax.simulate.compile import compiler_options
 from cablejax.simulate.rod import Rod, RodPhysics
 from cablejax.simulate.rod.clamps import frames_along
 from cablejax.spatial.effects import CURVATURE_KNOTS, PROFILE_KNOTS, TWIST_RATIO
 from cablejax.spatial.identify import EDGES
+from real_cables import composite
 
 RECORDINGS, SAMPLES, MARKERS = 16, 100, 6
 # The cable swings in before the recording begins, so that it does not start at rest or at a guess.
 _LEAD = 80
 _REACH = 0.028  # from a gripper's outer to its inner marker [m]
 _SLOW, _CORRELATION = 3e-4, 0.3  # slow error of a marker: standard deviation [m], correlation time [s]
+_DISTINCT, _SOFTER = 1.3, 0.3  # least ratio of stiffness to the believed one, chance that it is the other way round
+_UNEVEN = 0.3  # least difference of the stiffness somewhere from its mean along the cable
 # A marker that moves further between two samples than a hand moves a cable: the simulation has broken down [m].
 _BROKEN = 0.1
 
-Law = Literal["as fitted", "richer"]
+Law = Literal["as fitted", "richer", "composite"]
 """Whether the true cable obeys the simulator that is fitted, or has a rest curvature, markers off its centreline and
-grippers that roll besides."""
+grippers that roll besides, or is one of MuJoCo's."""
+EFFECTS = ("bending_stiffness", "bending_damping", "drag", "stiffness_profile", "gripper_rotation_offset")
+"""What a cable may have, by the names of the gap log; drag of either law is one, for motion hardly tells them apart."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -75,14 +81,24 @@ class SyntheticCable:
         return 1.0 + self.marker_mass * (len(self.offset) + 1) / self.length
 
 
-def synthetic_recordings(seed: int, law: Law, recordings: int = RECORDINGS) -> tuple[SyntheticCable, DeformRecordings]:
+def synthetic_recordings(
+    seed: int, law: Law, recordings: int = RECORDINGS, *, present: Sequence[str] | None = None
+) -> tuple[SyntheticCable, DeformRecordings]:
     """A cable and what motion capture saw of it, in so many recordings of `SAMPLES` samples.
+
+    Args:
+        seed: of all draws.
+        law: that the cable obeys.
+        recordings: how many.
+        present: which of `EFFECTS` it has, each of a size that shows; None = all, of any size.
 
     Raises:
         FloatingPointError: the simulation of this cable broke down.
     """
     generator, more = np.random.default_rng(seed), np.random.default_rng((seed, 1))
     cable = drawn_cable(generator, recordings)
+    if present is not None:
+        cable = with_effects(cable, present, np.random.default_rng((seed, 2)))
     if law == "richer":
         cable = dataclasses.replace(
             cable,
@@ -93,7 +109,11 @@ def synthetic_recordings(seed: int, law: Law, recordings: int = RECORDINGS) -> t
     position, direction = _motion(generator, recordings)
     roll = cable.roll * _vibrations(more, (recordings, 1, 2))
     s = np.linspace(0, cable.length, MARKERS + 2)[1:-1] + 0.003 * generator.normal(size=MARKERS)
-    free = _simulated(cable, s, position, _rolled(direction, roll))
+    frames = _rolled(direction, roll)
+    if law == "composite":
+        free = composite.simulated(cable, s, position, frames, SAMPLE_INTERVAL)[:, _LEAD:]
+    else:
+        free = _simulated(cable, s, position, frames)
     if not np.isfinite(free).all() or np.abs(np.diff(free, axis=1)).max() > _BROKEN:
         raise FloatingPointError(f"The simulation of cable {seed} ({law}) broke down.")
     outer = position + np.array([-1.0, 1.0])[:, None] * _REACH * direction
@@ -127,6 +147,36 @@ def drawn_cable(generator: np.random.Generator, recordings: int) -> SyntheticCab
         offset=np.zeros((MARKERS, 2)),
         roll=0.0,
     )
+
+
+def with_effects(cable: SyntheticCable, present: Sequence[str], generator: np.random.Generator) -> SyntheticCable:
+    """The cable with some of `EFFECTS`, each of a size that shows, and with none of the others.
+
+    Without `bending_stiffness` EI / rho is what is believed, rho with the markers.
+    """
+    believed = NOMINAL.bending_stiffness / NOMINAL.linear_density
+    ratio = np.exp(generator.uniform(np.log(_DISTINCT), np.log(10.0)))
+    if generator.random() < _SOFTER:
+        ratio = 1 / np.exp(generator.uniform(np.log(_DISTINCT), np.log(2.0)))
+    shares, uneven = generator.dirichlet([1.0, 1.0]), np.abs(np.expm1(cable.profile)).max()
+    strength = generator.uniform(0.2, 0.8)
+    fast = 0.6  # of the grippers [m/s]
+    changes: dict[str, dict[str, Any]] = {
+        "bending_damping": {"damping_time": 0.0},
+        "drag": {"drag": 0.0, "quadratic_drag": 0.0},
+        "stiffness_profile": {"profile": np.zeros_like(cable.profile)},
+        "gripper_rotation_offset": {"grips": np.zeros_like(cable.grips)},
+    }
+    nulls = {
+        field: null for effect, fields in changes.items() if effect not in present for field, null in fields.items()
+    }
+    drags = {"drag": shares[0] * strength, "quadratic_drag": shares[1] * strength / fast}
+    wanted: dict[str, Any] = {
+        "stiffness": cable.laden * believed * (ratio if "bending_stiffness" in present else 1.0),
+        "profile": cable.profile * max(1.0, _UNEVEN / uneven),
+        **drags,
+    }
+    return dataclasses.replace(cable, **{**wanted, **nulls})
 
 
 def _motion(generator: np.random.Generator, recordings: int) -> tuple[np.ndarray, np.ndarray]:

@@ -1,0 +1,59 @@
+"""What is reported of a synthetic cable beside what is true of it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+
+import numpy as np
+
+from cablejax.spatial.estimate import UNMODELLED, Estimate
+from cablejax.spatial.named import parameters_of
+from real_cables.synthetic import SyntheticCable
+
+REPORTED = {
+    "bending_damping": "time_s",
+    "viscous_drag": "coefficient_n_s_per_m2",
+    "quadratic_drag": "coefficient_per_m",
+    "lumped_mass": "mass_kg",
+    "stiffness_profile": "ratio",
+    "gripper_rotation_offset": "angle_rad",
+}
+"""Parameters whose intervals are judged; the true places of the markers (`keypoint_bias`) are not kept."""
+
+
+def beside_truth(
+    cable: SyntheticCable,
+    everything: Estimate,
+    effects: Iterable[str] = tuple(REPORTED),
+    *,
+    unmodelled: Mapping[str, float] = UNMODELLED,
+) -> dict[str, list[float]]:
+    """True value, estimate, low and high of the parameters of these effects, as if each of them were named.
+
+    All is per mass of the cable with its markers. The ratio of a stiffness profile is that of the place where the
+    estimate differs most; the angle in a gripper is the mean over the recordings.
+    """
+    rows = {}
+    for effect in effects:
+        one = parameters_of(effect, everything, density=1.0, unmodelled=unmodelled)[0]
+        knots, true = len(cable.profile), np.zeros(0)
+        match effect:
+            case "bending_damping":
+                true = cable.damping_time
+            case "viscous_drag":
+                true = cable.drag / cable.laden
+            case "quadratic_drag":
+                true = cable.quadratic_drag / cable.laden
+            case "lumped_mass":
+                true = cable.marker_mass / cable.laden
+            case "stiffness_profile":
+                knot = round(one["centre_m"].value / everything.layout.arclength[-1] * (knots - 1))
+                true = float(np.exp(cable.profile[knot] - np.delete(cable.profile, knot).mean()))
+            case "gripper_rotation_offset":
+                true = np.linalg.norm(cable.grips.mean(axis=0), axis=-1)
+        told = one[REPORTED[effect]]
+        true, value, ends = np.ravel(true), np.ravel(told.value), np.reshape(np.array(told.ci90), (-1, 2))
+        for k in range(len(true)):
+            name = f"{effect}, {REPORTED[effect]}" + (f", gripper {k}" if len(true) > 1 else "")
+            rows[name] = [float(x) for x in (true[k], value[k], *ends[k])]
+    return rows
