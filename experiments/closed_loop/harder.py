@@ -104,9 +104,10 @@ def nearest_rest(keypoints: Float[np.ndarray, "N 2"]) -> float:
         branch, values, error = wanted, start + np.array([0.0, 0.0, 0.0, 0.0, turned, -turned]), np.inf
         for _ in range(_PASSES):
             values = least_squares(
-                lambda values, branch=branch: np.asarray(_away(values, branch, wanted)),
+                # where a cable finds no rest it is as good as a metre off
+                lambda values, branch=branch: np.nan_to_num(_away(values, branch, wanted), nan=1.0),
                 values,
-                jac=lambda values, branch=branch: np.asarray(_slope(values, branch, wanted)),  # pyright: ignore[reportArgumentType]
+                jac=lambda values, branch=branch: np.nan_to_num(_slope(values, branch, wanted)),  # pyright: ignore[reportArgumentType]
                 bounds=bounds,
             ).x
             branch, before = _at_rest(_poses(jnp.asarray(values)), branch), error

@@ -24,7 +24,8 @@ _STEP = 5e-4
 """Time step [s]: springs are explicit in MuJoCo, and the stiffest of these cables needs that."""
 _DENSITY = 0.05
 """Mass per length [kg/m]; a hanging cable's motion does not depend on it."""
-_RADIUS = 0.004
+_RADIUS = 0.008
+"""Of the links [m]: thinner ones turn about themselves faster than the time step can follow."""
 _SETTLE, _SETTLE_DRAG = 1.0, 8.0
 """Time before the grippers move in which the cable comes to rest [s], and the drag that brings it there [1/s]."""
 _WELD = "0.0015 1"

@@ -32,6 +32,7 @@ _LEAD = 80
 _REACH = 0.028  # from a gripper's outer to its inner marker [m]
 _SLOW, _CORRELATION = 3e-4, 0.3  # slow error of a marker: standard deviation [m], correlation time [s]
 _DISTINCT, _SOFTER = 1.3, 0.3  # least ratio of stiffness to the believed one, chance that it is the other way round
+_UNDAMPED = 1e-3  # no cable is without any damping, and this does not show [s]
 _UNEVEN = 0.3  # least difference of the stiffness somewhere from its mean along the cable
 # A marker that moves further between two samples than a hand moves a cable: the simulation has broken down [m].
 _BROKEN = 0.1
@@ -162,7 +163,7 @@ def with_effects(cable: SyntheticCable, present: Sequence[str], generator: np.ra
     strength = generator.uniform(0.2, 0.8)
     fast = 0.6  # of the grippers [m/s]
     changes: dict[str, dict[str, Any]] = {
-        "bending_damping": {"damping_time": 0.0},
+        "bending_damping": {"damping_time": _UNDAMPED},
         "drag": {"drag": 0.0, "quadratic_drag": 0.0},
         "stiffness_profile": {"profile": np.zeros_like(cable.profile)},
         "gripper_rotation_offset": {"grips": np.zeros_like(cable.grips)},
