@@ -150,8 +150,8 @@ def page(rows: list[dict[str, Any]]) -> str:
         "one half, and then of a size that shows: EI/rho off the believed one by a factor of 1.3 or more, damping of "
         "0.01 to 0.1 s, drag of 0.2 to 0.8 1/s at the grippers' speed by either law, EI somewhere off its mean by "
         "30 % or more, grips turned by 0.2 rad. Naming nothing would be right on none of the first column and all of "
-        "the second. Either law of drag counts for both, and the mass of the markers is not judged: motion hardly shows "
-        "them apart.",
+        "the second. Either law of drag counts for both. The mass of the markers is not judged, since motion hardly "
+        "shows it apart from the cable's own.",
         "",
         *named_table(rows),
         "",

@@ -2,11 +2,24 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 
+from cablejax.recordings.deform import NOMINAL, SAMPLE_INTERVAL
+from real_cables import composite
 from real_cables.protocol import protocol_windows
-from real_cables.synthetic import MARKERS, SAMPLES, drawn_cable, synthetic_recordings
+from real_cables.synthetic import (
+    MARKERS,
+    SAMPLES,
+    _motion,
+    _rolled,
+    _simulated,
+    drawn_cable,
+    synthetic_recordings,
+    with_effects,
+)
 
 pytestmark = pytest.mark.slow
 
@@ -34,6 +47,32 @@ def test_a_seed_gives_one_recording_and_a_richer_law_another_one(fitted):
     again, same = synthetic_recordings(0, "as fitted", RECORDINGS)
     np.testing.assert_array_equal(same.keypoints, recordings.keypoints)
     assert again.stiffness == cable.stiffness != drawn_cable(np.random.default_rng(1), RECORDINGS).stiffness
+
+
+def test_two_simulators_move_a_cable_alike():
+    # so much drag that what the cable did before the recording is forgotten
+    generator = np.random.default_rng(1)
+    cable = dataclasses.replace(drawn_cable(generator, RECORDINGS), drag=8.0)
+    position, direction = _motion(generator, RECORDINGS)
+    frames = _rolled(direction, np.zeros(direction.shape[:3]))
+    arclength = np.linspace(0.0, cable.length, MARKERS + 2)[1:-1]
+    rod = _simulated(cable, arclength, position, frames)
+    links = composite.simulated(cable, arclength, position, frames, SAMPLE_INTERVAL)[:, -SAMPLES:]
+    moved = np.linalg.norm(rod - rod[:, :1], axis=-1).mean()
+    assert np.linalg.norm(links - rod, axis=-1).mean() < 0.05 * moved
+
+
+@pytest.mark.parametrize("present", [[], ["drag"], ["bending_stiffness", "stiffness_profile"]])
+def test_a_cable_has_the_effects_that_it_is_given_and_no_others(present):
+    cable = with_effects(drawn_cable(np.random.default_rng(2), 3), present, np.random.default_rng(3))
+    believed = NOMINAL.bending_stiffness / NOMINAL.linear_density
+    factor = abs(np.log(cable.stiffness / cable.laden / believed))
+    assert (factor > np.log(1.29)) if "bending_stiffness" in present else (factor < 1e-9)
+    uneven = np.abs(np.expm1(cable.profile)).max()
+    assert (uneven > 0.25) if "stiffness_profile" in present else (uneven == 0)
+    strength = cable.drag + 0.6 * cable.quadratic_drag
+    assert (0.2 <= strength <= 0.8) if "drag" in present else (strength == 0)
+    assert not cable.grips.any() and cable.damping_time <= 1e-3
 
 
 def test_a_richer_law_moves_the_same_cable_otherwise(fitted):

@@ -136,6 +136,10 @@ def test_ei_over_rho_is_always_told_and_ei_where_the_density_is_known(found, eve
     assert stiffness.value == pytest.approx(0.05 * ratio.value)
     np.testing.assert_allclose(np.array(stiffness.ci90), 0.05 * np.array(ratio.ci90))
     assert "bending_stiffness_n_m2" not in quantities_of(tried, everything, None)
+    # where no drag is named there may be none
+    for effects, nothing in ((("bending_stiffness",), True), (("viscous_drag",), False)):
+        drag = quantities_of(dataclasses.replace(tried, effects=effects), everything, None)["drag_at_speed_per_s"]
+        assert (drag.ci90[0] == 0.0) == nothing and drag.ci90[1] > drag.value  # type: ignore[index]
     # nothing is known of what was not free
     assert quantities_of(dataclasses.replace(found, tried=("bending_damping",)), everything, 0.05) == {}
 

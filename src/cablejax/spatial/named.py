@@ -48,8 +48,8 @@ def named_effects(found: Identified, estimate: Estimate, density: float) -> tupl
 def quantities_of(found: Identified, estimate: Estimate, density: float | None) -> dict[str, ParameterEstimate]:
     """What motion shows of the cable, whether an effect is named for it or not, with 90 % intervals.
 
-    EI / rho, where the stiffness was free; both drags together at the recording's speed, where one was; and EI, where
-    the mass per length is known.
+    EI / rho, where the stiffness was free; both drags together at the recording's speed, where one was, with an
+    interval from 0 where neither is named; and EI, where the mass per length is known.
 
     Args:
         found: by `identify`.
@@ -64,7 +64,11 @@ def quantities_of(found: Identified, estimate: Estimate, density: float | None) 
             known["bending_stiffness_n_m2"] = _told(stiffness, "N m^2", times=density)
     if {"viscous_drag", "quadratic_drag"} & set(found.tried):
         speed = found.cable.windows.speed
-        known["drag_at_speed_per_s"] = _told(estimate.drag_at(speed).wider_by_factor(UNMODELLED["drag"]), "1/s")
+        drag = estimate.drag_at(speed).wider_by_factor(UNMODELLED["drag"])
+        if not {"viscous_drag", "quadratic_drag"} & set(found.effects):
+            # what is found by its logarithm is never nothing, and here there may be nothing
+            drag = dataclasses.replace(drag, low=0.0)
+        known["drag_at_speed_per_s"] = _told(drag, "1/s")
         known["speed_m_per_s"] = _choice(speed, "m/s")
     return known
 
