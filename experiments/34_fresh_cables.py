@@ -95,6 +95,7 @@ def trial(seed: int, cache: Path | None = None) -> dict[str, Any]:
         "halves": [half.stiffness.value for half in estimates_of_halves(found)],
         "windows": [len(windows), int((lost | off(errors(points, windows))).sum())],
         "error_mm": [1e3 * float(step.error.mean()) for step in (steps[0], steps[-1])],
+        "steps": [[s.effect, s.accepted, s.chance, 1e3 * float(s.error.mean())] for s in found.steps],
         "seconds": time.perf_counter() - begun,
     }
 
