@@ -144,6 +144,21 @@ def test_ei_over_rho_is_always_told_and_ei_where_the_density_is_known(found, eve
     assert quantities_of(dataclasses.replace(found, tried=("bending_damping",)), everything, 0.05) == {}
 
 
+def test_a_profile_that_took_the_place_of_another_stiffness_is_named_as_what_it_is(found, everything):
+    tried = tuple(effect.name for effect in found.cable.layout.effects)
+
+    def names(*effects, tried=tried):
+        one = dataclasses.replace(found, effects=effects, tried=tried)
+        return [effect.name for effect in named_effects(one, everything, 0.05)]
+
+    # the cable is stiffer than believed, and everywhere alike
+    assert names("bending_damping", "stiffness_profile", "viscous_drag") == [
+        "bending_damping", "bending_stiffness", "viscous_drag",
+    ]  # fmt: skip
+    assert names("stiffness_profile", "bending_stiffness") == ["stiffness_profile", "bending_stiffness"]
+    assert names("stiffness_profile", tried=("stiffness_profile",)) == ["stiffness_profile"]
+
+
 def test_drags_and_masses_are_told_as_far_as_motion_shows_them(found, everything):
     windows, names = found.cable.windows, ("viscous_drag", "quadratic_drag", "lumped_mass")
     tried = dataclasses.replace(found, effects=names, tried=tuple(e.name for e in found.cable.layout.effects))

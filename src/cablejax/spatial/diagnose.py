@@ -88,10 +88,13 @@ def diagnose_space(
     error = errors(after, windows)
     use = np.flatnonzero(kept(lost | off(error) | windows.torn))
     gap = gap_of(before[use], after[use], found.cable.on(windows.chosen(use)), noise)
-    verdict, equivalent = _verdict(gap, found), _equivalent(found)
     density, guessed = cable["linear_density_kg_per_m"], "linear_density_kg_per_m" in log.meta.get("guessed", ())
     everything = estimate(found, found.everything, found.cable, progress=progress)
-    effects = () if verdict in ("none", "unknown") else named_effects(found, everything, density)
+    effects = named_effects(found, everything, density)
+    equivalent = _equivalent(found, [effect.name for effect in effects])
+    verdict = _verdict(gap, found, equivalent)
+    if verdict in ("none", "unknown"):
+        effects = ()
     offset = ParameterEstimate(constant_offset(after[use], windows.chosen(use)), None, "m")
     first = [change.sentence for change in changes[:1]]
     nominal, explained = (in_log(log, windows, part) for part in (before, after))
@@ -125,23 +128,23 @@ def diagnose_space(
     )
 
 
-def _verdict(gap: Gap, found: Identified) -> Verdict:
+def _verdict(gap: Gap, found: Identified, equivalent: tuple[tuple[str, ...], ...]) -> Verdict:
     allowed = max(_CALIBRATION.adequate * gap.before_rmse_mm, RESOLVABLE * gap.noise_floor_mm)
     return judged(
         resolvable=gap.shrinkage is not None,
         telling=bool(found.effects) and gap.shrinkage_ci90 is not None and gap.shrinkage_ci90[0] > 0,
         complete=gap.after_rmse_mm <= allowed,
-        alike=bool(_equivalent(found)),
+        alike=bool(equivalent),
     )
 
 
-def _equivalent(found: Identified) -> tuple[tuple[str, ...], ...]:
+def _equivalent(found: Identified, named: Sequence[str]) -> tuple[tuple[str, ...], ...]:
     """Rest curvature and a stiffness profile that take each other's place equally well."""
     swap = next((s for s in found.steps if s.effect == "intrinsic_curvature for stiffness_profile"), None)
     kept = [s for s in found.steps if s.accepted and s.effect != "intrinsic_curvature"]
     if swap is None or swap.accepted or not kept or swap.chance < 0.05:
         return ()
-    return (("stiffness_profile", "intrinsic_curvature"),) if "stiffness_profile" in found.effects else ()
+    return (("stiffness_profile", "intrinsic_curvature"),) if "stiffness_profile" in named else ()
 
 
 def _ranking(found: Identified) -> tuple[Ranked, ...]:

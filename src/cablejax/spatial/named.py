@@ -24,13 +24,15 @@ _STIFFNESS = "stiffness_over_density_m4_per_s2"
 def named_effects(found: Identified, estimate: Estimate, density: float) -> tuple[NamedEffect, ...]:
     """The effects that stayed in the search, with parameters and 90 % intervals.
 
+    A stiffness profile that stayed is two things, how stiff the cable is and how that differs along it (`_parted`).
+
     Args:
         found: by `identify`.
         estimate: from the same windows. Reported values are its own, not those that predictions are made with.
         density: mass per length, with the markers, that is believed true [kg/m], for what is known per mass only.
     """
     named, known = [], quantities_of(found, estimate, None)
-    for name in found.effects:
+    for name in _parted(found, estimate):
         parameters, along = parameters_of(name, estimate, density, first_marker=found.cable.windows.held[0])
         alone = _COMBINED.get(name, "")
         if alone and not _narrow(parameters[alone]):
@@ -43,6 +45,24 @@ def named_effects(found: Identified, estimate: Estimate, density: float) -> tupl
         location = {"along_cable_m": along, "time_s": None, "table_m": None}
         named.append(NamedEffect(name, None, parameters, location))
     return tuple(named)
+
+
+def _parted(found: Identified, estimate: Estimate) -> tuple[str, ...]:
+    """The effects with a stiffness profile in its parts, each where its interval leaves no other choice.
+
+    The profile is free at every knot, so it takes the place of another stiffness of the whole cable, which the search
+    then has no reason to add. Without that name, whoever adds what is named has the cable too soft or too stiff.
+    """
+    profile, whole, effects = "stiffness_profile", "bending_stiffness", found.effects
+    if profile not in effects or whole in effects or whole not in found.tried:
+        return effects
+    both = {
+        whole: estimate.ratio(estimate.layout.log_stiffness).wider_by_factor(UNMODELLED[whole]),
+        profile: _section(estimate)[1].wider_by_factor(UNMODELLED[profile]),
+    }
+    parts = [name for name, ratio in both.items() if not ratio.low <= 1.0 <= ratio.high]
+    place = effects.index(profile)
+    return (*effects[:place], *(parts or [profile]), *effects[place + 1 :])
 
 
 def quantities_of(found: Identified, estimate: Estimate, density: float | None) -> dict[str, ParameterEstimate]:
