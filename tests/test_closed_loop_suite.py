@@ -10,6 +10,7 @@ import threading
 import time
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -19,19 +20,21 @@ from cablejax.control.shaping import load_model
 from cablejax.control.targets import make_target
 from cablejax.dynamics.train_config import Phase
 from cablejax.effects.given import GivenEffect
-from cablejax.mpc import MPC
+from cablejax.mpc import MPC, MPCConfig
+from cablejax.simulate.chain.statics import resting_shapes
 from cablejax.simulate.plant import Plant, PlantConfig
 from cli_cases import small_model
-from closed_loop.cases import mujoco_plant, nearby_cases, random_cases, stiffness_cases
+from closed_loop.cases import PLANT_CHAIN, mujoco_plant, nearby_cases, random_cases, stiffness_cases
 from closed_loop.experiment import Experiment, Extent, page, seed_range
 from closed_loop.fine_tuning import FineTuneConfig, fine_tune, record
-from closed_loop.harder import harder_cases
+from closed_loop.harder import harder_cases, nearest_rest
 from closed_loop.methods import LABEL, METHODS, controller_of
 from closed_loop.paper import VISUAL_SERVO
 from closed_loop.protocols import LaidOut, letter_task
 from closed_loop.suite import Case, key_of, read_suite, run_suite
 from closed_loop.visual_servo import VisualServo
 from executors import ExecutorError, executor_of
+from mpc_cases import hermite_shape
 
 CABLE = Discretisation(n_links=12, dimension=3, timestep=0.005)
 SERVO = METHODS[VISUAL_SERVO]
@@ -101,6 +104,26 @@ def test_a_suite_that_loses_one_of_four_processes_ends_as_alone(tmp_path):
     run_suite(cases, [SERVO], tmp_path / "alone", fine_tuned=no_model, progress=False)
     shared, alone = ({t.key: t.errors_cm for t in read_suite(tmp_path / f)[0]} for f in ("shared", "alone"))
     assert shared == alone and lines.read_text().count("\n") == len(cases), "nothing is doubled"
+
+
+@pytest.mark.slow
+def test_the_best_of_a_recorded_shape_keeps_to_the_bounds_on_the_grippers():
+    def best(distance):
+        pose = np.array([[0.0, 0.0, 1.2], [distance, 0.0, -1.2]])
+        return nearest_rest(np.asarray(arch_between(pose)))
+
+    allowed = MPCConfig.min_distance * PLANT_CHAIN.cable.length
+    assert best(2 * allowed) < 0.02, "a shape in which the cable rests"
+    # each gripper is at least so far off as the bound is from the target's distance, the two ends of 13 keypoints
+    assert best(allowed / 2) > 100 * allowed / 4 * np.sqrt(2 / 13)
+
+
+def arch_between(pose):
+    """Keypoints of the cable at rest between these grippers, from an arch on."""
+    arch = hermite_shape(jnp.asarray(pose), 13)
+    for _ in range(6):
+        arch = resting_shapes(arch, jnp.asarray(pose), jnp.asarray(pose), length=PLANT_CHAIN.cable.length)[1]
+    return arch
 
 
 def test_cases_are_those_of_the_paper():
