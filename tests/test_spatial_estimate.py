@@ -144,7 +144,7 @@ def test_ei_over_rho_is_always_told_and_ei_where_the_density_is_known(found, eve
     assert quantities_of(dataclasses.replace(found, tried=("bending_damping",)), everything, 0.05) == {}
 
 
-def test_a_profile_that_took_the_place_of_another_stiffness_is_named_as_what_it_is(found, everything):
+def test_what_took_the_place_of_another_stiffness_is_named_as_what_it_is(found, everything):
     tried = tuple(effect.name for effect in found.cable.layout.effects)
 
     def names(*effects, tried=tried):
@@ -155,6 +155,7 @@ def test_a_profile_that_took_the_place_of_another_stiffness_is_named_as_what_it_
     assert names("bending_damping", "stiffness_profile", "viscous_drag") == [
         "bending_damping", "bending_stiffness", "viscous_drag",
     ]  # fmt: skip
+    assert names("lumped_mass", "bending_damping", "stiffness_profile") == ["bending_stiffness", "bending_damping"]
     assert names("stiffness_profile", "bending_stiffness") == ["stiffness_profile", "bending_stiffness"]
     assert names("stiffness_profile", tried=("stiffness_profile",)) == ["stiffness_profile"]
 

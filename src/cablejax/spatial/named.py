@@ -18,13 +18,13 @@ IDENTIFIABLE = 2.0
 _COMBINED = {"viscous_drag": "coefficient_n_s_per_m2", "quadratic_drag": "coefficient_per_m", "lumped_mass": "mass_kg"}
 # A marker that is this near to its nominal place is not reported as displaced [m].
 _PLACED = 1e-3
-_STIFFNESS = "stiffness_over_density_m4_per_s2"
+_WHOLE, _STIFFNESS = "bending_stiffness", "stiffness_over_density_m4_per_s2"
 
 
 def named_effects(found: Identified, estimate: Estimate, density: float) -> tuple[NamedEffect, ...]:
     """The effects that stayed in the search, with parameters and 90 % intervals.
 
-    A stiffness profile that stayed is two things, how stiff the cable is and how that differs along it (`_parted`).
+    What may stand for another stiffness of the whole cable is named as what it is (`_parted`).
 
     Args:
         found: by `identify`.
@@ -48,21 +48,31 @@ def named_effects(found: Identified, estimate: Estimate, density: float) -> tupl
 
 
 def _parted(found: Identified, estimate: Estimate) -> tuple[str, ...]:
-    """The effects with a stiffness profile in its parts, each where its interval leaves no other choice.
+    """The effects that stayed, with those that take the place of another stiffness named as what the estimate shows.
 
-    The profile is free at every knot, so it takes the place of another stiffness of the whole cable, which the search
-    then has no reason to add. Without that name, whoever adds what is named has the cable too soft or too stiff.
+    A stiffness profile is free at every knot, and markers all along a cable slow it down as if it were softer. Either
+    may come in for another stiffness of the whole cable, which the search then has no reason to add. Without that name,
+    whoever adds what is named has the cable too soft or too stiff.
     """
-    profile, whole, effects = "stiffness_profile", "bending_stiffness", found.effects
-    if profile not in effects or whole in effects or whole not in found.tried:
+    effects, stand_ins = found.effects, [name for name in ("stiffness_profile", "lumped_mass") if name in found.effects]
+    if not stand_ins or _WHOLE in effects or _WHOLE not in found.tried:
         return effects
-    both = {
-        whole: estimate.ratio(estimate.layout.log_stiffness).wider_by_factor(UNMODELLED[whole]),
-        profile: _section(estimate)[1].wider_by_factor(UNMODELLED[profile]),
+    shown = {
+        _WHOLE: _differs(estimate.ratio(estimate.layout.log_stiffness).wider_by_factor(UNMODELLED[_WHOLE])),
+        "stiffness_profile": _differs(_section(estimate)[1].wider_by_factor(UNMODELLED["stiffness_profile"])),
+        "lumped_mass": _narrow(parameters_of("lumped_mass", estimate, 1.0)[0][_COMBINED["lumped_mass"]]),
     }
-    parts = [name for name, ratio in both.items() if not ratio.low <= 1.0 <= ratio.high]
-    place = effects.index(profile)
-    return (*effects[:place], *(parts or [profile]), *effects[place + 1 :])
+    parts = [name for name in (_WHOLE, *stand_ins) if shown[name]] or stand_ins
+    place = effects.index(stand_ins[0])
+    return (
+        *(name for name in effects[:place] if name not in stand_ins),
+        *parts,
+        *(name for name in effects[place:] if name not in stand_ins),
+    )
+
+
+def _differs(ratio: Interval) -> bool:
+    return not ratio.low <= 1.0 <= ratio.high
 
 
 def quantities_of(found: Identified, estimate: Estimate, density: float | None) -> dict[str, ParameterEstimate]:
@@ -77,8 +87,8 @@ def quantities_of(found: Identified, estimate: Estimate, density: float | None) 
         density: mass per length, with the markers [kg/m]; None = a guess.
     """
     known = {}
-    if "bending_stiffness" in found.tried:
-        stiffness = estimate.stiffness.wider_by_factor(UNMODELLED["bending_stiffness"])
+    if _WHOLE in found.tried:
+        stiffness = estimate.stiffness.wider_by_factor(UNMODELLED[_WHOLE])
         known[_STIFFNESS] = _told(stiffness, "m^4/s^2")
         if density is not None:
             known["bending_stiffness_n_m2"] = _told(stiffness, "N m^2", times=density)
