@@ -54,7 +54,8 @@ def _parted(found: Identified, estimate: Estimate) -> tuple[str, ...]:
     may come in for another stiffness of the whole cable, which the search then has no reason to add. Without that name,
     whoever adds what is named has the cable too soft or too stiff.
     """
-    effects, stand_ins = found.effects, [name for name in ("stiffness_profile", "lumped_mass") if name in found.effects]
+    effects = found.effects
+    stand_ins = [name for name in effects if name in ("stiffness_profile", "lumped_mass")]
     if not stand_ins or _WHOLE in effects or _WHOLE not in found.tried:
         return effects
     shown = {
@@ -64,11 +65,7 @@ def _parted(found: Identified, estimate: Estimate) -> tuple[str, ...]:
     }
     parts = [name for name in (_WHOLE, *stand_ins) if shown[name]] or stand_ins
     place = effects.index(stand_ins[0])
-    return (
-        *(name for name in effects[:place] if name not in stand_ins),
-        *parts,
-        *(name for name in effects[place:] if name not in stand_ins),
-    )
+    return (*effects[:place], *parts, *(name for name in effects[place:] if name not in stand_ins))
 
 
 def _differs(ratio: Interval) -> bool:
