@@ -161,9 +161,9 @@ def test_what_took_the_place_of_another_stiffness_is_named_as_what_it_is(found, 
 
 
 def test_drags_and_masses_are_told_as_far_as_motion_shows_them(found, everything):
-    windows, names = found.cable.windows, ("viscous_drag", "quadratic_drag", "lumped_mass")
+    windows, names = found.cable.windows, ("bending_stiffness", "viscous_drag", "quadratic_drag", "lumped_mass")
     tried = dataclasses.replace(found, effects=names, tried=tuple(e.name for e in found.cable.layout.effects))
-    linear, quadratic, mass = (effect.parameters for effect in named_effects(tried, everything, 0.05))
+    _whole, linear, quadratic, mass = (effect.parameters for effect in named_effects(tried, everything, 0.05))
     both = everything.drag_at(windows.speed)
     expected = everything.positive("drag").value + windows.speed * everything.positive("quadratic_drag").value
     assert both.value == pytest.approx(expected)
@@ -173,7 +173,7 @@ def test_drags_and_masses_are_told_as_far_as_motion_shows_them(found, everything
     # there are no markers: their mass is what the prior says, and what counts is the stiffness per mass with them
     assert set(mass) == {"centre_m", "stiffness_over_density_m4_per_s2"}
     sure = dataclasses.replace(everything, moves=0.1 * everything.moves, shifts=0.1 * everything.shifts)
-    linear, quadratic, mass = (effect.parameters for effect in named_effects(tried, sure, 0.05))
+    _whole, linear, quadratic, mass = (effect.parameters for effect in named_effects(tried, sure, 0.05))
     assert "mass_kg" in mass and "coefficient_per_m" in quadratic and "stiffness_over_density_m4_per_s2" not in mass
     assert "drag_at_speed_per_s" in quadratic and "coefficient_n_s_per_m2" not in linear
 
