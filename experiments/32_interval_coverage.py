@@ -25,25 +25,22 @@ from pathlib import Path
 os.environ.setdefault("NPROC", "4")
 
 import numpy as np
-from scipy.stats import binomtest, norm
+from scipy.stats import norm
 
 from cablejax.diagnose.fit import evaluate
 from cablejax.recordings.deform import NOMINAL, SAMPLE_INTERVAL
 from cablejax.report.provenance import machine, versions
 from cablejax.spatial.estimate import UNMODELLED, Interval, estimate, estimate_at, estimates_of_halves
 from cablejax.spatial.identify import Identified, identify
-from pages import markdown_table, publish
-from real_cables.known import REPORTED, beside_truth
+from pages import markdown_table, publish, share
+from real_cables.known import REPORTED, with_true_values
 from real_cables.protocol import protocol_windows
-from real_cables.synthetic import RECORDINGS, SAMPLES, Law, synthetic_recordings
+from real_cables.synthetic import RECORDINGS, SAMPLES, SPEED, Law, synthetic_recordings
 from rows import Rows
 
-SPEED = 0.6
-"""Of the grippers of synthetic recordings, root mean square [m/s]."""
 LAWS: tuple[Law, ...] = ("as fitted", "richer")
 STIFFNESS = "bending_stiffness, ratio"
 CACHE = Path("docs") / "results" / "trials" / "interval_coverage.jsonl"
-NOMINAL_STIFFNESS = NOMINAL.bending_stiffness / NOMINAL.linear_density
 
 
 @dataclasses.dataclass(frozen=True)
@@ -83,7 +80,7 @@ def trial(seed: int, law: Law, cache: Path | None) -> Row:
     windows = protocol_windows(recordings)
     found = identify(
         windows,
-        NOMINAL_STIFFNESS,
+        NOMINAL.stiffness_over_density,
         state=None if cache is None else cache / f"{seed} {law}.json",
         progress=lambda text: print(f"cable {seed}, {law}: {text}", file=sys.stderr, flush=True),
     )
@@ -95,7 +92,7 @@ def trial(seed: int, law: Law, cache: Path | None) -> Row:
         truth={k: v for k, v in dataclasses.asdict(cable).items() if isinstance(v, float)} | {"laden": cable.laden},
         halves=[reported(half.stiffness) for half in estimates_of_halves(found)],
         everything=reported(everything.stiffness),
-        others=beside_truth(cable, everything, unmodelled={}),
+        others=with_true_values(cable, everything, unmodelled={}),
         chosen=[jackknifed(found, half) for half in range(2)],
         effects=list(found.effects),
         error_mm=[1e3 * float(step.error.mean()) for step in (accepted[0], accepted[-1])],
@@ -189,14 +186,11 @@ def coverage(name: str, true: list[float], intervals: list[list[float]], *, logs
     """One line of a table; errors and widths are of logarithms, or in the parameter's unit."""
     values = np.column_stack([true, intervals])
     truth, value, low, high = (np.log(values) if logs else values).T
-    held = int(((low <= truth) & (truth <= high)).sum())
-    bounds = binomtest(held, len(true)).proportion_ci()
     error = value - truth
     reported = (lambda x, sign="": f"{100 * x:{sign}.0f} %") if logs else (lambda x, sign="": f"{x:{sign}.2f}")
     return [
         name,
-        f"{held} of {len(true)}",
-        f"{100 * held / len(true):.0f} % ({100 * bounds.low:.0f} to {100 * bounds.high:.0f})",
+        *share((low <= truth) & (truth <= high)),
         reported(np.median(high - low) / 2),
         reported(np.sqrt(np.mean(error**2))),
         reported(error.mean(), "+"),
@@ -305,9 +299,10 @@ def page(rows: list[Row]) -> str:
         *section(richer),
         "## What was drawn",
         "",
-        f"EI/rho 0.01 to 0.2 m^4/s^2 (believed: {NOMINAL_STIFFNESS:.3f}), damping time 0.01 to 0.1 s and mass of a "
-        "marker 2 to 40 mm of cable, uniform in the logarithm; linear drag up to 0.8 1/s, quadratic drag up to 0.3 1/m "
-        "and length 0.85 to 1 m, uniform; log EI at five knots along the cable with standard deviation 0.25 about its "
+        f"EI/rho 0.01 to 0.2 m^4/s^2 (believed: {NOMINAL.stiffness_over_density:.3f}), damping time 0.01 to 0.1 s and "
+        "mass of a marker 2 to 40 mm of cable, uniform in the logarithm; linear drag up to 0.8 1/s, quadratic drag up "
+        "to 0.3 1/m and length 0.85 to 1 m, uniform; log EI at five knots along the cable with standard deviation 0.25 "
+        "about its "
         "mean; rotation between gripper and cable with standard deviation 0.2 rad for all recordings and 0.2 rad more "
         "for each. Grippers move by sums of vibrations of 0.3 to 1.5 Hz, 0.6 m/s root mean square. The true cable is a "
         "rod with twice the edges of the fitted one and eight time steps to one of the search's. Every marker, held "

@@ -5,6 +5,9 @@ from __future__ import annotations
 import pathlib
 from collections.abc import Sequence
 
+import numpy as np
+from scipy.stats import binomtest
+
 from cablejax.report.provenance import machine, versions
 
 
@@ -12,6 +15,14 @@ def markdown_table(rows: Sequence[Sequence[str]]) -> list[str]:
     """Lines of a table; the first row is its title."""
     title, *rest = ["| " + " | ".join(row) + " |" for row in rows]
     return [title, "|" + " --- |" * len(rows[0]), *rest]
+
+
+def share(of: Sequence[bool]) -> list[str]:
+    """Cells of a table: how many of how many, and the share with its exact 95 % interval."""
+    if not len(of):
+        return ["0 of 0", ""]
+    low, high = binomtest(int(np.sum(of)), len(of)).proportion_ci()
+    return [f"{np.sum(of)} of {len(of)}", f"{100 * np.mean(of):.0f} % ({100 * low:.0f} to {100 * high:.0f})"]
 
 
 def page_of_results(title: str, made_by: str, lines: Sequence[str], *, made_on: str | None = None) -> str:

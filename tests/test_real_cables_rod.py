@@ -26,7 +26,7 @@ _EFFECTS = ("bending_stiffness", "bending_damping", "stiffness_profile", "grippe
 @pytest.mark.parametrize("values", _VALUES)
 def test_file_67_of_dlo1_is_not_lost(values):
     windows = protocol_windows(read_deform(DATA / "deform" / "DLO1.npz"))
-    layout = layout_of(windows, NOMINAL.bending_stiffness / NOMINAL.linear_density)
+    layout = layout_of(windows, NOMINAL.stiffness_over_density)
     one = explanation(*((layout.named(name), 0, value) for name, value in zip(_EFFECTS, values, strict=True)))
     near = [i for i in range(len(windows)) if windows.name[i] in ("65", "66", "67", "68")]
     some = windows.chosen(near)

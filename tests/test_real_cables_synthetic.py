@@ -13,6 +13,7 @@ from real_cables.protocol import protocol_windows
 from real_cables.synthetic import (
     MARKERS,
     SAMPLES,
+    SPEED,
     _motion,
     _rolled,
     _simulated,
@@ -65,12 +66,12 @@ def test_two_simulators_move_a_cable_alike():
 @pytest.mark.parametrize("present", [[], ["drag"], ["bending_stiffness", "stiffness_profile"]])
 def test_a_cable_has_the_effects_that_it_is_given_and_no_others(present):
     cable = with_effects(drawn_cable(np.random.default_rng(2), 3), present, np.random.default_rng(3))
-    believed = NOMINAL.bending_stiffness / NOMINAL.linear_density
+    believed = NOMINAL.stiffness_over_density
     factor = abs(np.log(cable.stiffness / cable.laden / believed))
     assert (factor > np.log(1.29)) if "bending_stiffness" in present else (factor < 1e-9)
     uneven = np.abs(np.expm1(cable.profile)).max()
     assert (uneven > 0.25) if "stiffness_profile" in present else (uneven == 0)
-    strength = cable.drag + 0.6 * cable.quadratic_drag
+    strength = cable.drag + SPEED * cable.quadratic_drag
     assert (0.2 <= strength <= 0.8) if "drag" in present else (strength == 0)
     assert not cable.grips.any() and cable.damping_time <= 1e-3
 

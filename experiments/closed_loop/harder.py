@@ -93,29 +93,33 @@ def recorded_task(seed: int) -> Task:
 def nearest_rest(keypoints: Float[np.ndarray, "N 2"]) -> float:
     """How near a frictionless cable at rest comes to these keypoints [cm], at the best gripper poses that are allowed.
 
-    Grippers are as far apart as the controller's bounds ask for.
+    The distance of the grippers stays within the controller's bounds.
     """
-    wanted, length = jnp.asarray(keypoints), PLANT_CHAIN.cable.length
+    length, free = PLANT_CHAIN.cable.length, (-np.inf, np.inf)
     distance = MPCConfig.min_distance * length, MPCConfig.max_distance * length
-    free = [(-np.inf, np.inf)] * 3
-    bounds = np.array([*free, distance, *free[:2]]).T
-    best, start = np.inf, np.clip(_held_as(np.asarray(target_pose(wanted), float)), *bounds)
-    for turned in _TURNED:
-        branch, values, error = wanted, start + np.array([0.0, 0.0, 0.0, 0.0, turned, -turned]), np.inf
-        for _ in range(_PASSES):
-            values = least_squares(
-                # where a cable finds no rest it is as good as a metre off
-                lambda values, branch=branch: np.nan_to_num(_away(values, branch, wanted), nan=1.0),
-                values,
-                jac=lambda values, branch=branch: np.nan_to_num(_slope(values, branch, wanted)),  # pyright: ignore[reportArgumentType]
-                bounds=bounds,
-            ).x
-            branch, before = _at_rest(_poses(jnp.asarray(values)), branch), error
-            error = 100 * float(np.sqrt(np.mean(np.sum((np.asarray(branch) - keypoints) ** 2, axis=1))))
-            if before - error < 1e-3:
-                break
-        best = min(best, error)
-    return best
+    bounds = np.array([free, free, free, distance, free, free]).T
+    start = np.clip(_held_as(np.asarray(target_pose(jnp.asarray(keypoints)), float)), *bounds)
+    turn = np.array([0.0, 0.0, 0.0, 0.0, 1.0, -1.0])
+    return min(_nearest_from(start + angle * turn, keypoints, bounds) for angle in _TURNED)
+
+
+def _nearest_from(values: Float[np.ndarray, "6"], keypoints: Float[np.ndarray, "N 2"], bounds) -> float:
+    """The same from one place on, see `_held_as`, along the branch of shapes that the keypoints are on."""
+    wanted = branch = jnp.asarray(keypoints)
+    error = np.inf
+    for _ in range(_PASSES):
+        values = least_squares(
+            # where a cable finds no rest it is as good as a metre off
+            lambda values, branch=branch: np.nan_to_num(_away(values, branch, wanted), nan=1.0),
+            values,
+            jac=lambda values, branch=branch: np.nan_to_num(_slope(values, branch, wanted)),  # pyright: ignore[reportArgumentType]
+            bounds=bounds,
+        ).x
+        branch, before = _at_rest(_poses(jnp.asarray(values)), branch), error
+        error = 100 * float(np.sqrt(np.mean(np.sum((np.asarray(branch) - keypoints) ** 2, axis=1))))
+        if before - error < 1e-3:
+            break
+    return error
 
 
 def _held_as(pose: Float[np.ndarray, "2 3"]) -> Float[np.ndarray, "6"]:

@@ -93,7 +93,7 @@ def score_cable(recordings: DeformRecordings, *, state: pathlib.Path, progress: 
     is_eval = np.array(windows.split) == "eval"
     is_eval &= not is_eval.all()
     train = windows.chosen(np.flatnonzero(~is_eval))
-    nominal = NOMINAL.bending_stiffness / NOMINAL.linear_density
+    nominal = NOMINAL.stiffness_over_density
     found = identify(train, nominal, state=state / f"{recordings.name}_search.json", progress=progress)
     by_recording, networks = _by_recording(found, train, state / recordings.name, progress)
     # scored as published: every frame, whatever was lost in between

@@ -50,17 +50,16 @@ def simulated(
         position, frames: of the grippers; rows of a frame are its axes in the world.
         interval: between samples [s].
     """
+    model = mujoco.MjModel.from_xml_string(_xml(cable, arclength))
     every = [_ends(*motion) for motion in zip(position, frames, cable.grips, strict=True)]
-    return np.stack([_recording(cable, arclength, ends, interval) for ends in every])
+    return np.stack([_recording(model, cable, arclength, ends, interval) for ends in every])
 
 
-def _recording(cable, arclength, ends: list[Ends], interval: float) -> Float[np.ndarray, "T N 3"]:
+def _recording(model, cable, arclength, ends: list[Ends], interval: float) -> Float[np.ndarray, "T N 3"]:
     """One recording."""
     edge = cable.length / EDGES
-    bend = _bend_between(cable.length, ends[0])
-    model = mujoco.MjModel.from_xml_string(_xml(cable, arclength))
     data = mujoco.MjData(model)
-    data.qpos[:] = _standing(bend, ends[0], edge)
+    data.qpos[:] = _standing(_bend_between(cable.length, ends[0]), ends[0], edge)
     begin = _first(data, model, edge)
     links = slice(model.body("link0").id, model.body("link0").id + EDGES + 1)
     weight = _DENSITY * edge

@@ -1,4 +1,4 @@
-"""What is reported of a synthetic cable beside what is true of it."""
+"""Compares the reported parameters of a synthetic cable with the true ones."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from collections.abc import Iterable, Mapping
 
 import numpy as np
 
+from cablejax.diagnose.diagnosis import ParameterEstimate
 from cablejax.spatial.estimate import UNMODELLED, Estimate
 from cablejax.spatial.named import parameters_of
 from real_cables.synthetic import SyntheticCable
@@ -21,7 +22,7 @@ REPORTED = {
 """Parameters whose intervals are judged; the true places of the markers (`keypoint_bias`) are not kept."""
 
 
-def beside_truth(
+def with_true_values(
     cable: SyntheticCable,
     everything: Estimate,
     effects: Iterable[str] = tuple(REPORTED),
@@ -35,25 +36,29 @@ def beside_truth(
     """
     rows = {}
     for effect in effects:
-        one = parameters_of(effect, everything, density=1.0, unmodelled=unmodelled)[0]
-        knots, true = len(cable.profile), np.zeros(0)
-        match effect:
-            case "bending_damping":
-                true = cable.damping_time
-            case "viscous_drag":
-                true = cable.drag / cable.laden
-            case "quadratic_drag":
-                true = cable.quadratic_drag / cable.laden
-            case "lumped_mass":
-                true = cable.marker_mass / cable.laden
-            case "stiffness_profile":
-                knot = round(one["centre_m"].value / everything.layout.arclength[-1] * (knots - 1))
-                true = float(np.exp(cable.profile[knot] - np.delete(cable.profile, knot).mean()))
-            case "gripper_rotation_offset":
-                true = np.linalg.norm(cable.grips.mean(axis=0), axis=-1)
-        told = one[REPORTED[effect]]
-        true, value, ends = np.ravel(true), np.ravel(told.value), np.reshape(np.array(told.ci90), (-1, 2))
+        parameters = parameters_of(effect, everything, density=1.0, unmodelled=unmodelled)[0]
+        reported = parameters[REPORTED[effect]]
+        true = np.ravel(_true_value(cable, effect, parameters, everything.layout.arclength[-1]))
+        value, ends = np.ravel(reported.value), np.reshape(np.array(reported.ci90), (-1, 2))
         for k in range(len(true)):
             name = f"{effect}, {REPORTED[effect]}" + (f", gripper {k}" if len(true) > 1 else "")
             rows[name] = [float(x) for x in (true[k], value[k], *ends[k])]
     return rows
+
+
+def _true_value(cable: SyntheticCable, effect: str, parameters: Mapping[str, ParameterEstimate], length: float):
+    match effect:
+        case "bending_damping":
+            return cable.damping_time
+        case "viscous_drag":
+            return cable.drag / cable.laden
+        case "quadratic_drag":
+            return cable.quadratic_drag / cable.laden
+        case "lumped_mass":
+            return cable.marker_mass / cable.laden
+        case "stiffness_profile":
+            knot = round(parameters["centre_m"].value / length * (len(cable.profile) - 1))
+            return np.exp(cable.profile[knot] - np.delete(cable.profile, knot).mean())
+        case "gripper_rotation_offset":
+            return np.linalg.norm(cable.grips.mean(axis=0), axis=-1)
+    raise ValueError(f"The effect is {effect!r}, expected one of {', '.join(REPORTED)}.")

@@ -27,12 +27,15 @@ from cablejax.spatial.identify import EDGES
 from real_cables import composite
 
 RECORDINGS, SAMPLES, MARKERS = 16, 100, 6
+SPEED = 0.6
+"""Of the grippers, root mean square [m/s]."""
 # The cable swings in before the recording begins, so that it does not start at rest or at a guess.
 _LEAD = 80
 _REACH = 0.028  # from a gripper's outer to its inner marker [m]
 _SLOW, _CORRELATION = 3e-4, 0.3  # slow error of a marker: standard deviation [m], correlation time [s]
 _DISTINCT, _SOFTER = 1.3, 0.3  # least ratio of stiffness to the believed one, chance that it is the other way round
 _UNDAMPED = 1e-3  # no cable is without any damping, and this does not show [s]
+_DRAG = 0.2, 0.8  # range of both drags together at the grippers' speed [1/s]
 _UNEVEN = 0.3  # least difference of the stiffness somewhere from its mean along the cable
 # A marker that moves further between two samples than a hand moves a cable: the simulation has broken down [m].
 _BROKEN = 0.1
@@ -91,7 +94,7 @@ def synthetic_recordings(
         seed: of all draws.
         law: that the cable obeys.
         recordings: how many.
-        present: which of `EFFECTS` it has, each of a size that shows; None = all, of any size.
+        present: which of `EFFECTS` it has, see `with_effects`; None = all, of any size.
 
     Raises:
         FloatingPointError: the simulation of this cable broke down.
@@ -151,33 +154,25 @@ def drawn_cable(generator: np.random.Generator, recordings: int) -> SyntheticCab
 
 
 def with_effects(cable: SyntheticCable, present: Sequence[str], generator: np.random.Generator) -> SyntheticCable:
-    """The cable with some of `EFFECTS`, each of a size that shows, and with none of the others.
+    """The cable with some of `EFFECTS`, all but the grips large enough to show, and none of the others.
 
     Without `bending_stiffness` EI / rho is what is believed, rho with the markers.
     """
-    believed = NOMINAL.bending_stiffness / NOMINAL.linear_density
     ratio = np.exp(generator.uniform(np.log(_DISTINCT), np.log(10.0)))
     if generator.random() < _SOFTER:
         ratio = 1 / np.exp(generator.uniform(np.log(_DISTINCT), np.log(2.0)))
-    shares, uneven = generator.dirichlet([1.0, 1.0]), np.abs(np.expm1(cable.profile)).max()
-    strength = generator.uniform(0.2, 0.8)
-    fast = 0.6  # of the grippers [m/s]
-    changes: dict[str, dict[str, Any]] = {
-        "bending_damping": {"damping_time": _UNDAMPED},
-        "drag": {"drag": 0.0, "quadratic_drag": 0.0},
-        "stiffness_profile": {"profile": np.zeros_like(cable.profile)},
-        "gripper_rotation_offset": {"grips": np.zeros_like(cable.grips)},
-    }
-    nulls = {
-        field: null for effect, fields in changes.items() if effect not in present for field, null in fields.items()
-    }
-    drags = {"drag": shares[0] * strength, "quadratic_drag": shares[1] * strength / fast}
-    wanted: dict[str, Any] = {
-        "stiffness": cable.laden * believed * (ratio if "bending_stiffness" in present else 1.0),
-        "profile": cable.profile * max(1.0, _UNEVEN / uneven),
-        **drags,
-    }
-    return dataclasses.replace(cable, **{**wanted, **nulls})
+    linear, quadratic = generator.dirichlet([1.0, 1.0]) * generator.uniform(*_DRAG)
+    uneven = np.abs(np.expm1(cable.profile)).max()
+    has = {effect: effect in present for effect in EFFECTS}
+    return dataclasses.replace(
+        cable,
+        stiffness=cable.laden * NOMINAL.stiffness_over_density * (ratio if has["bending_stiffness"] else 1.0),
+        damping_time=cable.damping_time if has["bending_damping"] else _UNDAMPED,
+        drag=linear * has["drag"],
+        quadratic_drag=quadratic / SPEED * has["drag"],
+        profile=cable.profile * max(1.0, _UNEVEN / uneven) * has["stiffness_profile"],
+        grips=cable.grips * has["gripper_rotation_offset"],
+    )
 
 
 def _motion(generator: np.random.Generator, recordings: int) -> tuple[np.ndarray, np.ndarray]:

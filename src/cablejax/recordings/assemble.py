@@ -43,6 +43,11 @@ class Nominal:
     arclength: tuple[float, ...] | None = None
     guessed: tuple[str, ...] = ()
 
+    @property
+    def stiffness_over_density(self) -> float:
+        """EI / rho [m^4/s^2], all that the motion of a hanging cable depends on."""
+        return self.bending_stiffness / self.linear_density
+
 
 def gap_log_from_takes(takes: Sequence[Take], nominal: Nominal, *, source: str, repairs: Sequence[str] = ()) -> GapLog:
     """One gap log with an episode per take, with the labels of the takes as further fields of `meta`.

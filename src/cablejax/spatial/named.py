@@ -18,13 +18,15 @@ IDENTIFIABLE = 2.0
 _COMBINED = {"viscous_drag": "coefficient_n_s_per_m2", "quadratic_drag": "coefficient_per_m", "lumped_mass": "mass_kg"}
 # A marker that is this near to its nominal place is not reported as displaced [m].
 _PLACED = 1e-3
+_DRAGS = {"viscous_drag", "quadratic_drag"}
 _WHOLE, _STIFFNESS = "bending_stiffness", "stiffness_over_density_m4_per_s2"
 
 
 def named_effects(found: Identified, estimate: Estimate, density: float) -> tuple[NamedEffect, ...]:
     """The effects that stayed in the search, with parameters and 90 % intervals.
 
-    What may stand for another stiffness of the whole cable is named as what it is (`_parted`).
+    A stiffness profile or markers' mass that replaces a change of the overall stiffness is reported as that
+    (`_names_of`).
 
     Args:
         found: by `identify`.
@@ -32,13 +34,13 @@ def named_effects(found: Identified, estimate: Estimate, density: float) -> tupl
         density: mass per length, with the markers, that is believed true [kg/m], for what is known per mass only.
     """
     named, known = [], quantities_of(found, estimate, None)
-    for name in _parted(found, estimate):
+    for name in _names_of(found, estimate):
         parameters, along = parameters_of(name, estimate, density, first_marker=found.cable.windows.held[0])
         alone = _COMBINED.get(name, "")
         if alone and not _narrow(parameters[alone]):
             del parameters[alone]
         # what motion shows of the drags is their sum at its speed, of the markers' mass what slows the cable down
-        if name in ("viscous_drag", "quadratic_drag"):
+        if name in _DRAGS:
             parameters |= {key: known[key] for key in ("drag_at_speed_per_s", "speed_m_per_s")}
         elif alone and alone not in parameters and _STIFFNESS in known:
             parameters[_STIFFNESS] = known[_STIFFNESS]
@@ -47,12 +49,12 @@ def named_effects(found: Identified, estimate: Estimate, density: float) -> tupl
     return tuple(named)
 
 
-def _parted(found: Identified, estimate: Estimate) -> tuple[str, ...]:
-    """The effects that stayed, with those that take the place of another stiffness named as what the estimate shows.
+def _names_of(found: Identified, estimate: Estimate) -> tuple[str, ...]:
+    """Names of the effects that stayed; a change of the overall stiffness is among them where the estimate shows one.
 
-    A stiffness profile is free at every knot, and markers all along a cable slow it down as if it were softer. Either
-    may come in for another stiffness of the whole cable, which the search then has no reason to add. Without that name,
-    whoever adds what is named has the cable too soft or too stiff.
+    A stiffness profile is free at every knot, and markers along the cable slow it down as if it were softer. Where the
+    search adds either of them, it has no reason to add the overall stiffness, and a simulator with the named effects
+    alone would be too soft or too stiff.
     """
     effects = found.effects
     stand_ins = [name for name in effects if name in ("stiffness_profile", "lumped_mass")]
@@ -89,11 +91,11 @@ def quantities_of(found: Identified, estimate: Estimate, density: float | None) 
         known[_STIFFNESS] = _told(stiffness, "m^4/s^2")
         if density is not None:
             known["bending_stiffness_n_m2"] = _told(stiffness, "N m^2", times=density)
-    if {"viscous_drag", "quadratic_drag"} & set(found.tried):
+    if _DRAGS & set(found.tried):
         speed = found.cable.windows.speed
         drag = estimate.drag_at(speed).wider_by_factor(UNMODELLED["drag"])
-        if not {"viscous_drag", "quadratic_drag"} & set(found.effects):
-            # what is found by its logarithm is never nothing, and here there may be nothing
+        if not _DRAGS & set(found.effects):
+            # an estimate by its logarithm is never 0, and here there may be no drag
             drag = dataclasses.replace(drag, low=0.0)
         known["drag_at_speed_per_s"] = _told(drag, "1/s")
         known["speed_m_per_s"] = _choice(speed, "m/s")
