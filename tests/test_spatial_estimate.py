@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -68,16 +69,35 @@ def test_is_wider_the_more_may_be_true_and_holds_the_true_value(estimated):
 
 
 @pytest.mark.slow
-def test_stiffness_is_per_mass_with_the_markers_since_motion_does_not_tell_theirs_from_the_cables(estimated):
-    without, found_with = estimated("viscous_drag").stiffness, estimated("viscous_drag", "lumped_mass")
-    where = found_with.layout.slices
-    bare = found_with.ratio(lambda values: jnp.log(values[where["ratio"].start]))
-    assert _width(found_with.stiffness) < 1.2 * _width(without) < 0.4 * _width(bare)
-    laden, spacing = float(found_with.layout.laden(found_with.shared)), cases.LENGTH / (len(cases.MARKS) + 1)
-    assert laden == pytest.approx(1 + found_with.shared[where["marker_mass"]].item() / spacing, rel=1e-3)
-    drag, mass = (found_with.positive(field).value for field in ("drag", "marker_mass"))
-    assert drag * laden == pytest.approx(found_with.shared[where["drag"]].item())
-    assert mass * laden == pytest.approx(found_with.shared[where["marker_mass"]].item())
+def test_stiffness_and_drag_are_as_certain_with_the_markers_mass_free(estimated):
+    without, found_with = estimated("viscous_drag"), estimated("viscous_drag", "lumped_mass")
+    assert _width(found_with.stiffness) < 1.2 * _width(without.stiffness)
+    assert _width(found_with.positive("drag")) < 1.2 * _width(without.positive("drag"))
+    # as if they were per mass of the bare cable
+    layout = found_with.layout
+    bare = found_with.ratio(lambda values: layout.log_stiffness(values) + jnp.log(layout.laden(values)))
+    assert _width(bare) > 2 * _width(without.stiffness)
+    laden, spacing = float(layout.laden(found_with.shared)), cases.LENGTH / (len(cases.MARKS) + 1)
+    mass = found_with.shared[layout.slices["marker_mass"]].item()
+    assert laden == pytest.approx(1 + mass / spacing, rel=1e-3)
+    assert found_with.marker_mass.value * laden == pytest.approx(mass)
+
+
+def test_no_effect_takes_the_place_of_another_stiffness_of_the_whole_cable(found):
+    layout = found.cable.layout
+    plain = layout.physics(layout.null)
+    values = layout.null.copy()
+    values[layout.slices["log_profile"]] = 0.7
+    jax.tree.map(np.testing.assert_array_equal, layout.physics(values), plain)
+    values[layout.slices["log_profile"]] = [0.5, -0.1, 0.3, 0.0, -0.4]
+    assert np.log(layout.physics(values).stiffness).mean() == pytest.approx(np.log(plain.stiffness).mean())
+    # the mass of the markers leaves EI and drag over the mass of all as they are
+    values = layout.null.copy()
+    values[layout.slices["drag"]], values[layout.slices["marker_mass"]] = 0.5, 0.03
+    loaded, laden = layout.physics(values), layout.laden(values)
+    assert laden > 1.1 and loaded.drag / laden == pytest.approx(0.5)
+    np.testing.assert_allclose(loaded.stiffness / laden, plain.stiffness)
+    np.testing.assert_allclose(loaded.twist_stiffness / laden, plain.twist_stiffness)
 
 
 def test_an_interval_grows_by_an_error_besides_and_no_less_to_its_wide_side():
@@ -144,20 +164,19 @@ def test_ei_over_rho_is_always_told_and_ei_where_the_density_is_known(found, eve
     assert quantities_of(dataclasses.replace(found, tried=("bending_damping",)), everything, 0.05) == {}
 
 
-def test_what_took_the_place_of_another_stiffness_is_named_as_what_it_is(found, everything):
+def test_names_only_what_the_estimate_shows(found, everything):
     tried = tuple(effect.name for effect in found.cable.layout.effects)
-
-    def names(*effects, tried=tried):
-        one = dataclasses.replace(found, effects=effects, tried=tried)
-        return [effect.name for effect in named_effects(one, everything, 0.05)]
-
-    # the cable is stiffer than believed, and everywhere alike
-    assert names("bending_damping", "stiffness_profile", "viscous_drag") == [
-        "bending_damping", "bending_stiffness", "viscous_drag",
-    ]  # fmt: skip
-    assert names("lumped_mass", "bending_damping", "stiffness_profile") == ["bending_stiffness", "bending_damping"]
-    assert names("stiffness_profile", "bending_stiffness") == ["stiffness_profile", "bending_stiffness"]
-    assert names("stiffness_profile", tried=("stiffness_profile",)) == ["stiffness_profile"]
+    one = dataclasses.replace(found, effects=tried[:-1], tried=tried)
+    # of a cable that is stiffer than believed, everywhere alike, and has some damping
+    assert not {"stiffness_profile", "gripper_rotation_offset", "keypoint_bias"} & {
+        effect.name for effect in named_effects(one, everything, 0.05)
+    }
+    assert {"bending_stiffness", "bending_damping"} <= {e.name for e in named_effects(one, everything, 0.05)}
+    # an estimate of a softer middle that is held on both sides
+    values, where = everything.shared.copy(), everything.layout.slices["log_profile"]
+    values[where] += [0.0, 0.0, 1.5, 0.0, 0.0]
+    softer = dataclasses.replace(everything, shared=values)
+    assert "stiffness_profile" in {effect.name for effect in named_effects(one, softer, 0.05)}
 
 
 def test_drags_and_masses_are_told_as_far_as_motion_shows_them(found, everything):

@@ -114,7 +114,7 @@ def diagnose_space(
         caveats=(
             *repairs,
             *accident_sentences(lost, error, windows, results == RodResult.COARSE),
-            *_caveats(log, windows, left_out, found),
+            *_caveats(log, windows, left_out, found, everything),
         ),
         log=log,
         nominal=nominal,
@@ -162,7 +162,7 @@ def _ranking(found: Identified) -> tuple[Ranked, ...]:
     return tuple(ranked)
 
 
-def _caveats(log, windows, left_out, found) -> tuple[str, ...]:
+def _caveats(log, windows, left_out, found, everything) -> tuple[str, ...]:
     result = [
         "The motion of a hanging cable does not depend on its weight: stiffness, drag and added masses are known "
         "relative to the linear density only, that of the cable with its markers, and a wrong density "
@@ -190,6 +190,11 @@ def _caveats(log, windows, left_out, found) -> tuple[str, ...]:
         result.append(
             f"The grippers move too fast for the finest time steps of the simulation: half of them would change it by "
             f"{1e3 * found.time_steps.error:.1f} mm. Gaps of that size may be its own."
+        )
+    if not everything.settled:
+        result.append(
+            "The parameters still changed when predictions were last corrected for the length of the simulator's edges "
+            "and time steps: they may be off by more than their intervals."
         )
     parts = ("one half of the recordings", "the other half", "all recordings")
     for part, ended in zip(parts, found.results, strict=False):

@@ -5,10 +5,11 @@ All effects sit side by side in one vector of physical values that the simulator
 one fits. Two are not among them: `quadratic_drag`, air drag with the square of the speed, and `twist_stiffness` does
 not appear at all: it is a nuisance of `intrinsic_curvature`, without which it is hardly seen.
 
-Weight is no effect here: a cable that hangs free moves the same whatever its density. Only ratios to it are found. In
-the vector they are ratios to the mass of the bare cable, as the simulator needs them. Reports are per mass of the cable
-as it was recorded, markers included (`Layout.laden`): markers all along a cable slow it down as if it were softer, and
-motion hardly shows how much of its mass is theirs.
+Weight is no effect here: a cable that hangs free moves the same whatever its density. Only ratios to it are found. They
+are per mass of the cable as it was recorded, markers included (`Layout.laden`): markers all along a cable slow it down
+as if it were softer, and motion hardly shows how much of its mass is theirs. So each effect does one thing: the mass of
+the markers moves mass along the cable and adds none, and a stiffness profile moves stiffness and leaves the mean of its
+logarithm as it is. Otherwise either could take the place of another stiffness of the whole cable.
 """
 
 from __future__ import annotations
@@ -79,7 +80,7 @@ def _positive(
 def effects_of(n_markers: int) -> tuple[SpatialEffect, ...]:
     """All effects of a cable with so many free markers."""
     return (
-        _positive("bending_stiffness", "ratio", 1.0, (math.exp(-1), math.exp(1), math.exp(2)), null=1.0),
+        _positive("bending_stiffness", "ratio", 1.0, (math.exp(-1), 1.0, math.exp(1), math.exp(2)), null=1.0),
         _positive("bending_damping", "damping_time", 0.03, (0.01, 0.03, 0.1)),
         _positive("viscous_drag", "drag", 0.3, (0.2, 0.8)),
         _positive("quadratic_drag", "quadratic_drag", 0.05, (0.05, 0.3)),
@@ -148,26 +149,25 @@ class Layout:
         return 1.0 + jnp.asarray(values)[self.slices["marker_mass"].start] / spacing
 
     def log_stiffness(self, values: Float[Array, "P"] | np.ndarray) -> Float[Array, ""]:
-        """Logarithm of EI / rho over the nominal one, mean along the cable, rho with the markers; differentiable."""
-        where, values = self.slices, jnp.asarray(values)
-        bare = jnp.log(values[where["ratio"].start]) + values[where["log_profile"]].mean()
-        return bare - jnp.log(self.laden(values))
+        """Logarithm of EI / rho over the nominal one, mean along the cable; differentiable in `values`."""
+        return jnp.log(jnp.asarray(values)[self.slices["ratio"].start])
 
     def physics(self, values: Float[Array, "P"] | np.ndarray) -> RodPhysics:
-        """Parameters of the simulator; differentiable in `values`."""
+        """Parameters of the simulator, which are per mass of the bare cable; differentiable in `values`."""
         part: Mapping[str, Array] = {name: jnp.asarray(values)[where] for name, where in self.slices.items()}
         arclength = jnp.asarray(self.arclength) + part["along"]
-        stiffness = self.nominal_stiffness * part["ratio"] * jnp.exp(part["log_profile"])
-        twist = part["ratio"][0] * jnp.exp(part["log_twist"][0])
+        laden = self.laden(values)
+        stiffness = self.nominal_stiffness * laden * part["ratio"]
+        profile = jnp.exp(part["log_profile"] - part["log_profile"].mean())
         points = len(self.arclength) - 1
         return RodPhysics(
             length=arclength[-1],
-            stiffness=stiffness,
+            stiffness=stiffness * profile,
             rest_curvature=part["rest_curvature"].reshape(-1, 2),
             damping_time=part["damping_time"][0],
-            drag=part["drag"][0],
-            quadratic_drag=part["quadratic_drag"][0],
-            twist_stiffness=TWIST_RATIO * self.nominal_stiffness * twist,
+            drag=laden * part["drag"][0],
+            quadratic_drag=laden * part["quadratic_drag"][0],
+            twist_stiffness=TWIST_RATIO * stiffness[0] * jnp.exp(part["log_twist"][0]),
             stretch=jnp.asarray(_STRETCH),
             marker_mass=part["marker_mass"][0],
             clamp_rotation=part["clamp_rotation"].reshape(2, 2),

@@ -23,21 +23,23 @@ from scipy.stats import norm, t
 
 from cablejax.bounded import solve_arrow
 from cablejax.diagnose.evidence import Evidence
-from cablejax.diagnose.fit import Fit, evaluate, improved
+from cablejax.diagnose.fit import Fit, evaluate, improve
 from cablejax.diagnose.protocol import Explanation, explanation
 from cablejax.spatial.cable import SpatialCable
 from cablejax.spatial.effects import Layout
 from cablejax.spatial.identify import Identified, affordable
 
-# Predictions may be off by what a time step does; values are not to make up for it. The fit ends with time steps that
-# are so much shorter.
-_FINER = 4
+# Predictions may be off by what edges and time steps of finite length do; values are not to make up for it. The fit is
+# made again with predictions corrected at its result until no value moves by this share of its prior standard
+# deviation, but not more often than this.
+_SETTLED, _CORRECTIONS = 0.01, 6
+# Nats: the fit ends once a step promises less. Those of the search end sooner, for predictions change little by then.
+_TOLERANCE = 0.02
 _TAIL = 0.95
 _LARGEST_STEP = 1.0
 
 Quantity = Callable[[Float[Array, "P"]], Float[Array, ""]]
 """Something that follows from the values of all effects, differentiably."""
-_PER_MASS = ("drag", "quadratic_drag", "marker_mass")
 UNMODELLED: Mapping[str, float] = MappingProxyType(
     {
         "bending_stiffness": 0.05,
@@ -91,12 +93,14 @@ class Estimate:
         shared: values that all recordings share, shape [P].
         moves: what leaving out each recording does to them, see `jackknife`, shape [R, P].
         shifts: what moving each prior by its standard deviation does to them, see `estimate_at`, shape [K, P].
+        settled: whether the fit stayed where it was when its predictions were last corrected.
     """
 
     layout: Layout
     shared: Float[np.ndarray, "P"]
     moves: Float[np.ndarray, "R P"]
     shifts: Float[np.ndarray, "K P"]
+    settled: bool = True
 
     def of(self, quantity: Quantity) -> Interval:
         """A quantity, its interval by its slope at the fitted values."""
@@ -112,27 +116,24 @@ class Estimate:
         return Interval(*np.exp(dataclasses.astuple(self.of(log))).tolist())
 
     def positive(self, field: str) -> Interval:
-        """A positive value, by the name of its field in `effects`; what is per mass is per that of the laden cable."""
+        """A positive value, by the name of its field in `effects`."""
         where = self.layout.slices[field].start
-
-        def log(values):
-            value = jnp.log(values[where])
-            return value - jnp.log(self.layout.laden(values)) if field in _PER_MASS else value
-
-        return self.ratio(log)
+        return self.ratio(lambda values: jnp.log(values[where]))
 
     def drag_at(self, speed: float) -> Interval:
-        """Linear and quadratic drag together at a speed [m/s], per mass of the laden cable [1/s]."""
+        """Linear and quadratic drag together at a speed [m/s], per mass [1/s]."""
         linear, quadratic = (self.layout.slices[name].start for name in ("drag", "quadratic_drag"))
+        return self.ratio(lambda values: jnp.log(values[linear] + speed * values[quadratic]))
 
-        def log(values):
-            return jnp.log(values[linear] + speed * values[quadratic]) - jnp.log(self.layout.laden(values))
-
-        return self.ratio(log)
+    @property
+    def marker_mass(self) -> Interval:
+        """Mass of a marker, as length of the cable with its markers of the same mass [m]."""
+        where, laden = self.layout.slices["marker_mass"].start, self.layout.laden
+        return self.ratio(lambda values: jnp.log(values[where]) - jnp.log(laden(values)))
 
     @property
     def stiffness(self) -> Interval:
-        """EI / rho, geometric mean along the cable, rho with the markers [m^4/s^2]."""
+        """EI / rho, geometric mean along the cable [m^4/s^2]."""
         ratio, nominal = self.ratio(self.layout.log_stiffness), self.layout.nominal_stiffness
         return Interval(nominal * ratio.value, nominal * ratio.low, nominal * ratio.high)
 
@@ -159,13 +160,22 @@ def estimate(
     windows = cable.windows
     cable = cable.on(windows.chosen(np.flatnonzero(affordable(start, windows))))
     progress(f"all effects free: {len(cable.windows)} windows")
-    for name, finer in (("", cable), (f"the same with time steps of 1/{_FINER}", cable.finer(_FINER))):
-        if name:
-            progress(name)
-        evidence = finer.evidence()
-        (fit,) = improved(evidence, evaluate(evidence, [start]), finer.plan.last_steps)
-        start = fit.explanation
-    return estimate_at(evidence, fit)
+    (fit, evidence), moved = _fitted(cable, start), np.inf
+    for _ in range(_CORRECTIONS):
+        before = fit.explanation
+        fit, evidence = _fitted(cable.corrected(before), before)
+        moved = float(np.abs(fit.explanation.z - before.z).max(initial=0.0))
+        progress(f"corrected for finite edges and time steps: values move by {moved:.3f} prior standard deviations")
+        if moved < _SETTLED:
+            break
+    return dataclasses.replace(estimate_at(evidence, fit), settled=moved < _SETTLED)
+
+
+def _fitted(cable: SpatialCable, start: Explanation) -> tuple[Fit, Evidence]:
+    evidence = cable.evidence()
+    most = cable.plan.last_steps
+    (fit,) = improve(evidence, evaluate(evidence, [start]), max_iterations=most, tolerance=_TOLERANCE)
+    return fit, evidence
 
 
 def estimate_at(evidence: Evidence, fit: Fit) -> Estimate:

@@ -57,7 +57,7 @@ class Identified:
     results: tuple[Result, ...] = ()
 
     def stiffness(self, one: Explanation) -> float:
-        """EI / rho, geometric mean along the cable, rho with the markers [m^4/s^2]."""
+        """EI / rho, geometric mean along the cable [m^4/s^2]."""
         layout = self.cable.layout
         return float(layout.nominal_stiffness * np.exp(layout.log_stiffness(one.vector(layout.effects))))
 

@@ -9,6 +9,7 @@ import pathlib
 from collections.abc import Sequence
 from typing import Any
 
+import jax
 import numpy as np
 
 from cablejax.bounded import Result
@@ -24,7 +25,9 @@ def fingerprint(cable: SpatialCable, names: Sequence[str]) -> str:
     """Inputs that a stored state must have been made from."""
     layout, windows = cable.layout, cable.windows
     digest = hashlib.sha256(repr((cable.rod, layout.nominal_stiffness, list(names), windows.name)).encode())
-    for array in (windows.keypoints, windows.position, windows.valid, windows.group):
+    # what values mean is among the inputs: those of another version may mean something else
+    meaning = [np.asarray(part, np.float32) for part in jax.tree.leaves(layout.physics(layout.null + 0.5))]
+    for array in (windows.keypoints, windows.position, windows.valid, windows.group, *meaning):
         digest.update(np.ascontiguousarray(array).tobytes())
     return digest.hexdigest()
 

@@ -18,15 +18,20 @@ IDENTIFIABLE = 2.0
 _COMBINED = {"viscous_drag": "coefficient_n_s_per_m2", "quadratic_drag": "coefficient_per_m", "lumped_mass": "mass_kg"}
 # A marker that is this near to its nominal place is not reported as displaced [m].
 _PLACED = 1e-3
+_ABSENT = {
+    "bending_stiffness": ("ratio", 1.0),
+    "stiffness_profile": ("ratio", 1.0),
+    "gripper_rotation_offset": ("angle_rad", 0.0),
+    "keypoint_bias": ("offset_m", 0.0),
+    "intrinsic_curvature": ("curvature_per_m", 0.0),
+}
+"""A parameter that says how far an effect is from its absence, and its value there."""
 _DRAGS = {"viscous_drag", "quadratic_drag"}
 _WHOLE, _STIFFNESS = "bending_stiffness", "stiffness_over_density_m4_per_s2"
 
 
 def named_effects(found: Identified, estimate: Estimate, density: float) -> tuple[NamedEffect, ...]:
-    """The effects that stayed in the search, with parameters and 90 % intervals.
-
-    A stiffness profile or markers' mass that replaces a change of the overall stiffness is reported as that
-    (`_names_of`).
+    """The effects that stayed in the search and that the estimate shows, with parameters and 90 % intervals.
 
     Args:
         found: by `identify`.
@@ -34,8 +39,10 @@ def named_effects(found: Identified, estimate: Estimate, density: float) -> tupl
         density: mass per length, with the markers, that is believed true [kg/m], for what is known per mass only.
     """
     named, known = [], quantities_of(found, estimate, None)
-    for name in _names_of(found, estimate):
+    for name in found.effects:
         parameters, along = parameters_of(name, estimate, density, first_marker=found.cable.windows.held[0])
+        if not _shown(name, parameters):
+            continue
         alone = _COMBINED.get(name, "")
         if alone and not _narrow(parameters[alone]):
             del parameters[alone]
@@ -47,31 +54,6 @@ def named_effects(found: Identified, estimate: Estimate, density: float) -> tupl
         location = {"along_cable_m": along, "time_s": None, "table_m": None}
         named.append(NamedEffect(name, None, parameters, location))
     return tuple(named)
-
-
-def _names_of(found: Identified, estimate: Estimate) -> tuple[str, ...]:
-    """Names of the effects that stayed; a change of the overall stiffness is among them where the estimate shows one.
-
-    A stiffness profile is free at every knot, and markers along the cable slow it down as if it were softer. Where the
-    search adds either of them, it has no reason to add the overall stiffness, and a simulator with the named effects
-    alone would be too soft or too stiff.
-    """
-    effects = found.effects
-    stand_ins = [name for name in effects if name in ("stiffness_profile", "lumped_mass")]
-    if not stand_ins or _WHOLE in effects or _WHOLE not in found.tried:
-        return effects
-    shown = {
-        _WHOLE: _differs(estimate.ratio(estimate.layout.log_stiffness).wider_by_factor(UNMODELLED[_WHOLE])),
-        "stiffness_profile": _differs(_section(estimate)[1].wider_by_factor(UNMODELLED["stiffness_profile"])),
-        "lumped_mass": _narrow(parameters_of("lumped_mass", estimate, 1.0)[0][_COMBINED["lumped_mass"]]),
-    }
-    parts = [name for name in (_WHOLE, *stand_ins) if shown[name]] or stand_ins
-    place = effects.index(stand_ins[0])
-    return (*effects[:place], *parts, *(name for name in effects[place:] if name not in stand_ins))
-
-
-def _differs(ratio: Interval) -> bool:
-    return not ratio.low <= 1.0 <= ratio.high
 
 
 def quantities_of(found: Identified, estimate: Estimate, density: float | None) -> dict[str, ParameterEstimate]:
@@ -100,6 +82,19 @@ def quantities_of(found: Identified, estimate: Estimate, density: float | None) 
         known["drag_at_speed_per_s"] = _told(drag, "1/s")
         known["speed_m_per_s"] = _choice(speed, "m/s")
     return known
+
+
+def _shown(effect: str, parameters: Mapping[str, ParameterEstimate]) -> bool:
+    """Whether an interval leaves out that the effect is absent.
+
+    An effect with many free values, some for each recording, may help to simulate what it is not there for. What is
+    estimated by its logarithm is never absent: there, the search alone says.
+    """
+    if effect not in _ABSENT:
+        return True
+    name, absent = _ABSENT[effect]
+    low, high = np.reshape(np.array(parameters[name].ci90, float), (-1, 2)).T
+    return bool(((absent < low) | (high < absent)).any())
 
 
 def _narrow(parameter: ParameterEstimate) -> bool:
@@ -167,7 +162,7 @@ def parameters_of(
         case "lumped_mass":
             parameters = {
                 "centre_m": _choice([float(s) for s in estimate.layout.arclength[:-1]], "m"),
-                "mass_kg": _told(positive("marker_mass"), "kg", times=density),
+                "mass_kg": _told(estimate.marker_mass.wider_by_factor(besides), "kg", times=density),
             }
         case "gripper_rotation_offset":
             angles = [size("clamp_rotation", 2 * gripper) for gripper in range(2)]
