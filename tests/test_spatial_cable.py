@@ -70,6 +70,21 @@ def test_derivatives_are_those_of_finite_differences(cable):
     np.testing.assert_allclose(along, central, atol=1e-5 * np.abs(central).max())
 
 
+def test_a_corrected_cable_is_a_finer_rod_at_one_place_and_moves_as_before(cable):
+    one, episodes = at(cable, seed=1), np.array([0, 3])
+    corrected = cable.corrected(one)
+    finer = dataclasses.replace(cable, rod=Rod(26, 8, twisting=False, local_error=1.6 * cable.rod.local_error))
+    ((here, slopes),), ((_, plain),) = (c.linearise([one], episodes) for c in (corrected, cable))
+    np.testing.assert_array_equal(slopes, plain)
+    for predicted in (here, corrected.predict([one], episodes)[0]):
+        np.testing.assert_allclose(predicted, finer.predict([one], episodes)[0], atol=1e-12)
+    # it says what is missing, not what was missing before, and nothing about other windows
+    once, twice = corrected.correction, corrected.corrected(one).correction
+    assert once is not None and twice is not None and 1e-4 < np.abs(once).max() < 0.05
+    np.testing.assert_allclose(twice, once, atol=1e-12)
+    assert corrected.on(cable.windows).correction is None
+
+
 def test_the_loss_is_the_pseudo_huber_one_and_its_derivatives_are(cable):
     evidence, trial = cable.evidence(), at(cable, seed=3)
     (fit,) = evaluate(evidence, [trial])

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import spatial_cases as cases
-from cablejax.diagnose.fit import evaluate, improved
+from cablejax.diagnose.fit import evaluate, improve, improved
 from cablejax.diagnose.protocol import explanation
 from cablejax.simulate.rod import Rod
 from cablejax.spatial.cable import TWISTED, SpatialCable
@@ -162,6 +162,18 @@ def test_ei_over_rho_is_always_told_and_ei_where_the_density_is_known(found, eve
         assert (drag.ci90[0] == 0.0) == nothing and drag.ci90[1] > drag.value  # type: ignore[index]
     # nothing is known of what was not free
     assert quantities_of(dataclasses.replace(found, tried=("bending_damping",)), everything, 0.05) == {}
+
+
+def test_few_edges_and_long_steps_do_not_pass_for_another_stiffness(found):
+    finer = dataclasses.replace(found.cable, rod=Rod(26, 8, twisting=False))
+    windows = dataclasses.replace(found.cable.windows, keypoints=finer.motion(found.everything))
+    coarse = found.cable.on(windows)
+    evidence = coarse.evidence()
+    (fit,) = improve(evidence, evaluate(evidence, [found.everything]), max_iterations=40, tolerance=0.02)
+    told = estimate(found, found.everything, coarse)
+    true = found.stiffness(found.everything)
+    assert told.settled and told.stiffness.value == pytest.approx(true, rel=3e-3)
+    assert abs(found.stiffness(fit.explanation) / true - 1) > 0.02
 
 
 def test_names_only_what_the_estimate_shows(found, everything):

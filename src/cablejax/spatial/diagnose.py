@@ -91,7 +91,8 @@ def diagnose_space(
     density, guessed = cable["linear_density_kg_per_m"], "linear_density_kg_per_m" in log.meta.get("guessed", ())
     everything = estimate(found, found.everything, found.cable, progress=progress)
     effects = named_effects(found, everything, density)
-    equivalent = _equivalent(found, [effect.name for effect in effects])
+    named = [effect.name for effect in effects]
+    equivalent = _equivalent(found, named)
     verdict = _verdict(gap, found, equivalent)
     if verdict in ("none", "unknown"):
         effects = ()
@@ -115,6 +116,7 @@ def diagnose_space(
             *repairs,
             *accident_sentences(lost, error, windows, results == RodResult.COARSE),
             *_caveats(log, windows, left_out, found, everything),
+            *_not_shown(found, named),
         ),
         log=log,
         nominal=nominal,
@@ -160,6 +162,16 @@ def _ranking(found: Identified) -> tuple[Ranked, ...]:
         ranked.append(Ranked(step.effect.split(" ")[0], None, gain, 1e3 * float(error.mean()), outcome))
         before = error if step.accepted else before
     return tuple(ranked)
+
+
+def _not_shown(found: Identified, named: Sequence[str]) -> tuple[str, ...]:
+    missing = [name for name in found.effects if name not in named]
+    if not missing:
+        return ()
+    return (
+        f"With {', '.join(missing)} other recordings are simulated better, but the interval holds a cable without: not "
+        "named.",
+    )
 
 
 def _caveats(log, windows, left_out, found, everything) -> tuple[str, ...]:
