@@ -64,7 +64,10 @@ def named_in(effects: list[str]) -> set[str]:
 def trial(seed: int, cache: Path | None = None) -> dict[str, Any]:
     """One cable through the protocol of the real recordings."""
     begun, present = time.perf_counter(), present_in(seed)
-    cable, recordings = synthetic_recordings(seed, law_of(seed), present=present)
+    try:
+        cable, recordings = synthetic_recordings(seed, law_of(seed), present=present)
+    except FloatingPointError as broken:
+        return {"broken": str(broken)}
     windows = protocol_windows(recordings)
     state = None if cache is None else cache / f"{seed}.json"
     found = identify(windows, NOMINAL.stiffness_over_density, state=state)
@@ -127,12 +130,13 @@ def interval_table(rows: list[dict[str, Any]]) -> list[str]:
 
 def page(rows: list[dict[str, Any]]) -> str:
     """The page of these cables."""
-    rows = sorted(rows, key=lambda row: row["seed"])
+    broken = sum("broken" in row for row in rows)
+    rows = sorted((row for row in rows if "broken" not in row), key=lambda row: row["seed"])
     ratio = [max(row["halves"]) / min(row["halves"]) - 1 for row in rows]
     windows, lost = np.sum([row["windows"] for row in rows], axis=0)
     lines = [
-        f"{len(rows)} of the {len(HELD_OUT)} cables of seeds {HELD_OUT[0]} to {HELD_OUT[-1]}, those that are done, "
-        f"each with {RECORDINGS} recordings of {SAMPLES * SAMPLE_INTERVAL:g} s at {1 / SAMPLE_INTERVAL:g} Hz, through "
+        f"{len(rows)} of the {len(HELD_OUT)} cables of seeds {HELD_OUT[0]} to {HELD_OUT[-1]}, those that are done "
+        f"({broken} more could not be recorded, their own simulation broke down), each with {RECORDINGS} recordings of {SAMPLES * SAMPLE_INTERVAL:g} s at {1 / SAMPLE_INTERVAL:g} Hz, through "
         "the protocol of the [real recordings](real_cables.md). Odd seeds are simulated by a rod with twice the edges "
         "of the fitted one, and with a rest curvature, markers off the centreline and grippers that roll, which are "
         "not tried; even seeds by links on ball joints in MuJoCo, which share no code with the fit. Each effect is "
