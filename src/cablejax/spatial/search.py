@@ -3,7 +3,7 @@
 Recordings are split into two halves. Both halves are fitted separately all along, and every window is scored with the
 fit of the other half. At each step the effect is tried with which unseen windows are simulated best
 from the start; it stays if the error on unseen recordings falls by more than a fiftieth, and in more than 84 % of
-resamples of the recordings, one standard error. After two effects in a row that did not, the search ends. Windows that
+resamples of the recordings, one standard error. After four effects in a row that did not, the search ends. Windows that
 are lost or far off in every way are left out of that, and effects that lose many are no failures (`accidents`).
 
 Fits, priors, losses and what is a recording's own are those of every diagnosis. This search is not: that of
@@ -30,7 +30,7 @@ from cablejax.spatial.accidents import compared, moderated, off
 from cablejax.spatial.cable import SpatialCable, mean_error
 from cablejax.spatial.effects import SpatialEffect
 
-_FAILURES = 2
+_FAILURES = 4
 _LEAST = 0.02
 _CHANCE = 0.84
 _DAMPING, _LARGEST_STEP = 1e-3, 1.0
