@@ -136,7 +136,7 @@ def page(rows: list[dict[str, Any]]) -> str:
     windows, lost = np.sum([row["windows"] for row in rows], axis=0)
     lines = [
         f"{len(rows)} of the {len(HELD_OUT)} cables of seeds {HELD_OUT[0]} to {HELD_OUT[-1]}, those that are done "
-        f"({broken} more could not be recorded, their own simulation broke down), "
+        f"({broken} left out, whose recordings could not be simulated), "
         f"each with {RECORDINGS} recordings of {SAMPLES * SAMPLE_INTERVAL:g} s at {1 / SAMPLE_INTERVAL:g} Hz, through "
         "the protocol of the [real recordings](real_cables.md). Odd seeds are simulated by a rod with twice the edges "
         "of the fitted one, and with a rest curvature, markers off the centreline and grippers that roll, which are "

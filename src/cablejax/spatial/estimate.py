@@ -33,8 +33,9 @@ from cablejax.spatial.identify import Identified, affordable
 # made again with predictions corrected at its result until no value moves by this share of its prior standard
 # deviation, but not more often than this.
 _SETTLED, _CORRECTIONS = 0.01, 6
-# Nats: the fit ends once a step promises less. Those of the search end sooner, for predictions change little by then.
-_TOLERANCE = 0.02
+# Nats per window: the fit ends once a step promises less. Those of the search end sooner, for predictions change little
+# by then.
+_TOLERANCE = 0.01
 _TAIL = 0.95
 _LARGEST_STEP = 1.0
 
@@ -173,8 +174,8 @@ def estimate(
 
 def _fitted(cable: SpatialCable, start: Explanation) -> tuple[Fit, Evidence]:
     evidence = cable.evidence()
-    most = cable.plan.last_steps
-    (fit,) = improve(evidence, evaluate(evidence, [start]), max_iterations=most, tolerance=_TOLERANCE)
+    most, tolerance = cable.plan.last_steps, _TOLERANCE * len(cable.windows)
+    (fit,) = improve(evidence, evaluate(evidence, [start]), max_iterations=most, tolerance=tolerance)
     return fit, evidence
 
 
