@@ -61,7 +61,7 @@ def test_trust_is_full_but_for_few_windows_that_are_off():
 def test_the_budget_of_failures_counts_what_could_be_judged(monkeypatch, counts):
     windows = windows_of(cases.recording())
     cable = SpatialCable(Rod(8, 1, twisting=False), layout_of(windows, cases.NOMINAL), windows)
-    names = [effect.name for effect in cable.effects[:4]]
+    names = [effect.name for effect in cable.effects[:6]]
     null = explanation()
     begun = [Step("", True, (null, null), np.full(len(windows), 0.01), 0.0)]
     monkeypatch.setattr("cablejax.spatial.search._starts", lambda cable, halves, effect: ((null, null), 0.0))
@@ -69,7 +69,7 @@ def test_the_budget_of_failures_counts_what_could_be_judged(monkeypatch, counts)
         "cablejax.spatial.search.tried_with",
         lambda cable, name, starts, before, progress: Step(name, False, (null, null), before.error, 0.0, counts),
     )
-    assert len(search(cable, names, begun=begun)) == 1 + (2 if counts else 4)
+    assert len(search(cable, names, begun=begun)) == 1 + (4 if counts else 6)
 
 
 @pytest.fixture(scope="module")

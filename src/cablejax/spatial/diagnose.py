@@ -91,8 +91,7 @@ def diagnose_space(
     density, guessed = cable["linear_density_kg_per_m"], "linear_density_kg_per_m" in log.meta.get("guessed", ())
     everything = estimate(found, found.everything, found.cable, progress=progress)
     effects = named_effects(found, everything, density)
-    named = [effect.name for effect in effects]
-    equivalent = _equivalent(found, named)
+    equivalent = _equivalent(found, named := [effect.name for effect in effects])
     verdict = _verdict(gap, found, equivalent)
     if verdict in ("none", "unknown"):
         effects = ()
@@ -115,8 +114,7 @@ def diagnose_space(
         caveats=(
             *repairs,
             *accident_sentences(lost, error, windows, results == RodResult.COARSE),
-            *_caveats(log, windows, left_out, found, everything),
-            *_not_shown(found, named),
+            *_caveats(log, windows, left_out, found, everything, named),
         ),
         log=log,
         nominal=nominal,
@@ -164,17 +162,7 @@ def _ranking(found: Identified) -> tuple[Ranked, ...]:
     return tuple(ranked)
 
 
-def _not_shown(found: Identified, named: Sequence[str]) -> tuple[str, ...]:
-    missing = [name for name in found.effects if name not in named]
-    if not missing:
-        return ()
-    return (
-        f"With {', '.join(missing)} other recordings are simulated better, but the interval holds a cable without: not "
-        "named.",
-    )
-
-
-def _caveats(log, windows, left_out, found, everything) -> tuple[str, ...]:
+def _caveats(log, windows, left_out, found, everything, named) -> tuple[str, ...]:
     result = [
         "The motion of a hanging cable does not depend on its weight: stiffness, drag and added masses are known "
         "relative to the linear density only, that of the cable with its markers, and a wrong density "
@@ -202,6 +190,11 @@ def _caveats(log, windows, left_out, found, everything) -> tuple[str, ...]:
         result.append(
             f"The grippers move too fast for the finest time steps of the simulation: half of them would change it by "
             f"{1e3 * found.time_steps.error:.1f} mm. Gaps of that size may be its own."
+        )
+    if missing := [name for name in found.effects if name not in named]:
+        result.append(
+            f"With {', '.join(missing)} other recordings are simulated better, but the interval holds a cable without: "
+            "not named."
         )
     if not everything.settled:
         result.append(
