@@ -40,7 +40,7 @@ _CORRELATION = 0.3  # [s]
 # Samples that fits look at: every fourth, after the two that the simulation begins from.
 _FITTED = slice(2, None, 4)
 # The rod that predictions are corrected by has so many edges for each of this one, and so many time steps. With more
-# than 32 edges it would take five times as long: from there on XLA shares its products among threads.
+# than 32 edges XLA shares its small products among threads, which costs more time than the edges.
 _MORE_EDGES, _FINER = 1.6, 8
 # Nats per window: a step that promises less is not worth the simulations that it takes.
 _TOLERANCE = 0.1

@@ -193,8 +193,8 @@ def _caveats(log, windows, left_out, found, everything, named) -> tuple[str, ...
         )
     if missing := [name for name in found.effects if name not in named]:
         result.append(
-            f"With {', '.join(missing)} other recordings are simulated better, but the interval holds a cable without: "
-            "not named."
+            f"Recordings that no fit has seen are simulated better with {', '.join(missing)}, but the 90 % interval "
+            "includes a cable without it. It is not named."
         )
     if not everything.settled:
         result.append(
