@@ -73,7 +73,7 @@ def test_derivatives_are_those_of_finite_differences(cable):
 def test_a_corrected_cable_is_a_finer_rod_at_one_place_and_moves_as_before(cable):
     one, episodes = at(cable, seed=1), np.array([0, 3])
     corrected = cable.corrected(one)
-    finer = dataclasses.replace(cable, rod=Rod(26, 8, twisting=False, local_error=1.6 * cable.rod.local_error))
+    finer = dataclasses.replace(cable, rod=Rod(26, 4, twisting=False, local_error=1.6 * cable.rod.local_error))
     ((here, slopes),), ((_, plain),) = (c.linearise([one], episodes) for c in (corrected, cable))
     np.testing.assert_array_equal(slopes, plain)
     for predicted in (here, corrected.predict([one], episodes)[0]):

@@ -41,7 +41,7 @@ _CORRELATION = 0.3  # [s]
 _FITTED = slice(2, None, 4)
 # The rod that predictions are corrected by has so many edges for each of this one, and so many time steps. With more
 # than 32 edges XLA shares its small products among threads, which costs more time than the edges.
-_MORE_EDGES, _FINER = 1.6, 8
+_MORE_EDGES, _FINER = 1.6, 4
 # Nats per window: a step that promises less is not worth the simulations that it takes.
 _TOLERANCE = 0.1
 # Steps end by the tolerance. This is for fits that creep.

@@ -21,7 +21,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from scipy.stats import norm, t
 
-from cablejax.bounded import solve_arrow
+from cablejax.bounded import Result, solve_arrow
 from cablejax.diagnose.evidence import Evidence
 from cablejax.diagnose.fit import Fit, evaluate, improve
 from cablejax.diagnose.protocol import Explanation, explanation
@@ -29,12 +29,12 @@ from cablejax.spatial.cable import SpatialCable
 from cablejax.spatial.effects import Layout
 from cablejax.spatial.identify import Identified, affordable
 
-# Predictions may be off by what edges and time steps of finite length do; values are not to make up for it. The fit is
-# made again with predictions corrected at its result until no value moves by this share of its prior standard
-# deviation, but not more often than this.
-_SETTLED, _CORRECTIONS = 0.01, 6
-# Nats per window: the fit ends once a step promises less. Those of the search end sooner, for predictions change little
-# by then.
+# Predictions may be off by what edges and time steps of finite length do; values are not to make up for it. Fits are
+# made in rounds of so many steps at most, predictions corrected before each, until no value moves by this share of its
+# standard error, but not more often than this. Closer than that, a cable that snaps over in one of the windows keeps
+# them moving.
+_SETTLED, _ROUNDS, _STEPS = 0.3, 5, 4
+# Nats per window: a step that promises less is not made.
 _TOLERANCE = 0.01
 _TAIL = 0.95
 _LARGEST_STEP = 1.0
@@ -93,8 +93,9 @@ class Estimate:
         layout: of the values.
         shared: values that all recordings share, shape [P].
         moves: what leaving out each recording does to them, see `jackknife`, shape [R, P].
-        shifts: what moving each prior by its standard deviation does to them, see `estimate_at`, shape [K, P].
-        settled: whether the fit stayed where it was when its predictions were last corrected.
+        shifts: what moving each prior by its standard deviation does to them, shape [K, P].
+        settled: whether no value moved by more than a small part of its standard error when predictions were last
+            corrected for finite edges and time steps.
     """
 
     layout: Layout
@@ -146,7 +147,7 @@ def estimate(
     *,
     progress: Callable[[str], None] = lambda text: None,
 ) -> Estimate:
-    """Fits everything that was tried.
+    """Fits everything that was tried, in rounds, with predictions corrected at the result of the round before.
 
     Args:
         found: what was tried.
@@ -161,37 +162,39 @@ def estimate(
     windows = cable.windows
     cable = cable.on(windows.chosen(np.flatnonzero(affordable(start, windows))))
     progress(f"all effects free: {len(cable.windows)} windows")
-    (fit, evidence), moved = _fitted(cable, start), np.inf
-    for _ in range(_CORRECTIONS):
-        before = fit.explanation
-        fit, evidence = _fitted(cable.corrected(before), before)
-        moved = float(np.abs(fit.explanation.z - before.z).max(initial=0.0))
-        progress(f"corrected for finite edges and time steps: values move by {moved:.3f} prior standard deviations")
-        if moved < _SETTLED:
-            break
-    return dataclasses.replace(estimate_at(evidence, fit), settled=moved < _SETTLED)
-
-
-def _fitted(cable: SpatialCable, start: Explanation) -> tuple[Fit, Evidence]:
-    evidence = cable.evidence()
-    most, tolerance = cable.plan.last_steps, _TOLERANCE * len(cable.windows)
-    (fit,) = improve(evidence, evaluate(evidence, [start]), max_iterations=most, tolerance=tolerance)
-    return fit, evidence
+    tolerance, rounds = _TOLERANCE * len(cable.windows), 0
+    while True:
+        rounds += 1
+        evidence = cable.corrected(start).evidence()
+        (fit,) = improve(evidence, evaluate(evidence, [start]), max_iterations=_STEPS, tolerance=tolerance)
+        error = np.hypot(*(np.linalg.norm(rows, axis=0) for rows in _rows(evidence, fit)))
+        moved = float((np.abs(fit.explanation.z - start.z) / error).max(initial=0.0))
+        progress(f"corrected for finite edges and time steps: values move by up to {moved:.2f} standard errors")
+        # a round of steps that were all too long says nothing
+        settled = bool(moved < _SETTLED and (moved > 0 or fit.result is not Result.STEP_LIMIT))
+        if settled or rounds == _ROUNDS:
+            return dataclasses.replace(estimate_at(evidence, fit), settled=settled)
+        start = fit.explanation
 
 
 def estimate_at(evidence: Evidence, fit: Fit) -> Estimate:
-    """The estimate that a fit of a cable's windows amounts to.
+    """The estimate that a fit of a cable's windows amounts to."""
+    cable, one = evidence.simulator, fit.explanation
+    assert isinstance(cable, SpatialCable)
+    # of the vector by the coordinates
+    slopes = cable.directions(one)[0][: len(one.z)]
+    moves, shifts = _rows(evidence, fit)
+    return Estimate(cable.layout, one.vector(cable.effects), moves @ slopes, shifts @ slopes)
+
+
+def _rows(evidence: Evidence, fit: Fit) -> tuple[Float[np.ndarray, "R K"], Float[np.ndarray, "K K"]]:
+    """What leaving out each recording, and what moving each prior, does to the coordinates.
 
     With S the curvature of the cost in prior standard deviations, the recordings' own values eliminated, the fit is off
     the true values by -S^-1 times these, were there no errors in the data: it is drawn towards the prior. On average
     over the prior the square of that, for anything linear in the values, is the sum of its squares over rows.
     """
-    cable, one = evidence.simulator, fit.explanation
-    assert isinstance(cable, SpatialCable)
-    # of the vector by the coordinates
-    slopes = cable.directions(one)[0][: len(one.z)]
-    shifts = np.linalg.inv(fit.precision(evidence))
-    return Estimate(cable.layout, one.vector(cable.effects), jackknife(evidence, fit) @ slopes, shifts @ slopes)
+    return jackknife(evidence, fit), np.linalg.inv(fit.precision(evidence))
 
 
 def jackknife(evidence: Evidence, fit: Fit) -> Float[np.ndarray, "R K"]:

@@ -34,6 +34,8 @@ _FAILURES = 4
 _LEAST = 0.02
 _CHANCE = 0.84
 _DAMPING, _LARGEST_STEP = 1e-3, 1.0
+# Windows of either half that effects are ordered by: what is tried next shows in a few.
+_PROMISED = 6
 
 
 @dataclasses.dataclass(frozen=True)
@@ -112,13 +114,18 @@ def search(
         tried = [step.effect for step in steps[last + 1 :]]
         rest = [name for name in candidates if name not in [*accepted_effects(steps), *tried]]
         failures = sum(step.counts for step in steps[last + 1 :])
-        if not rest or failures == _FAILURES:
-            return steps
         trusted = cable.trusting(steps[last].error)
         starts = {name: _starts(trusted, steps[last].halves, cable.layout.named(name)) for name in rest}
-        name = min(starts, key=lambda name: starts[name][1])
-        steps.append(tried_with(cable, name, starts[name][0], steps[last], progress))
-        save(steps)
+        for name in sorted(rest, key=lambda name: starts[name][1]):
+            if failures == _FAILURES:
+                return steps
+            steps.append(tried_with(cable, name, starts[name][0], steps[last], progress))
+            save(steps)
+            if steps[-1].accepted:
+                break
+            failures += steps[-1].counts
+        else:
+            return steps
 
 
 def tried_with(
@@ -171,28 +178,48 @@ def _parts(cable: SpatialCable) -> list[tuple[Evidence, Evidence, Int[np.ndarray
 def _starts(
     cable: SpatialCable, before: tuple[Explanation, Explanation], effect: SpatialEffect
 ) -> tuple[tuple[Explanation, Explanation], float]:
-    """Where fits with one more effect may begin, per half, and the error on what each has not seen."""
+    """Where fits with one more effect may begin, per half, and the error on what each has not seen.
+
+    Seen in few windows: this says what to try first, and the fits correct it.
+    """
     found, total = [], 0.0
-    for base, (seen, other, _) in zip(before, _parts(cable), strict=True):
+    for base, parts in zip(before, _parts(cable), strict=True):
+        seen, other = (_few(part) for part in parts[:2])
         found.append(_start(seen, base, effect))
-        total += float(moderated(mean_error(other.predict([found[-1]])[0], other.observed)).sum())
+        total += _off(other, found[-1])
     return (found[0], found[1]), total
 
 
+def _few(evidence: Evidence) -> Evidence:
+    cable = evidence.simulator
+    assert isinstance(cable, SpatialCable)
+    index = np.unique(np.linspace(0, len(cable.windows) - 1, _PROMISED).astype(int))
+    return cable.on(cable.windows.chosen(index)).evidence()
+
+
 def _start(seen: Evidence, base: Explanation, effect: SpatialEffect) -> Explanation:
-    """The best of the effect's starts, and of parts of the step that the quadratic model promises from there.
+    """The best of the effect's starts, moved by the step that the quadratic model promises from there, or part of it.
 
     Far from the solution the model says little.
     """
     trials = [with_effect(seen.simulator, base, effect, values) for _, values in effect.starts(None)]
-    (fit,) = evaluate(seen, [_best(seen, trials)])
+    errors = [_off(seen, trial) for trial in trials]
+    (fit,) = evaluate(seen, [trials[int(np.argmin(errors))]])
     model = fit.model(seen.weight(fit.sse), 0.0)
     step = -solve_arrow(
         model.curvature + _DAMPING * np.diag(np.diagonal(model.curvature)), model.gradient, model.blocks
     )
     step *= min(1.0, _LARGEST_STEP / max(np.abs(step).max(initial=0.0), 1e-12))
-    moved = [fit.at(np.clip(model.point + share * step, model.lower, model.upper)) for share in (1.0, 0.4)]
-    return _best(seen, [fit.explanation, *moved])
+    for share in (1.0, 0.4):
+        moved = fit.at(np.clip(model.point + share * step, model.lower, model.upper))
+        if _off(seen, moved) < min(errors):
+            return moved
+    return fit.explanation
+
+
+def _off(evidence: Evidence, one: Explanation) -> float:
+    """Mean error [m]."""
+    return float(moderated(mean_error(evidence.predict([one])[0], evidence.observed)).mean())
 
 
 def with_effect(cable: Simulator, base: Explanation, effect: SpatialEffect, values: Sequence[float]) -> Explanation:
@@ -200,13 +227,6 @@ def with_effect(cable: Simulator, base: Explanation, effect: SpatialEffect, valu
     added = explanation((effect, 0, values))
     both = Explanation((*base.terms, Term(effect, 0)), np.append(base.z, added.z), base.own)
     return cable.with_own(both)
-
-
-def _best(seen: Evidence, trials: Sequence[Explanation]) -> Explanation:
-    if len(trials) == 1:
-        return trials[0]
-    found = [moderated(mean_error(part, seen.observed)).mean() for part in seen.predict(trials)]
-    return trials[int(np.argmin(found))]
 
 
 def _resampled(
