@@ -23,8 +23,8 @@ class Diagnose(Command):
     """Diagnose the gap between the simulator and a recorded run: where it lies, what causes it, how far it shrinks.
 
     Reads a gap log (`cablejax-gap-log/1`, as `cablejax shape` writes it) and writes report.html, verdict.json and the
-    figures. A log of six episodes on a table takes about half a minute; a log in space takes minutes, the more
-    the longer it is, and goes on where it was if interrupted.
+    figures. A log of six episodes on a table takes about half a minute; a log in space takes some minutes and
+    goes on where it was if interrupted.
     """
 
     logs: Annotated[tuple[pathlib.Path, ...], tyro.conf.Positional]

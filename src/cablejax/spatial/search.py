@@ -114,18 +114,16 @@ def search(
         tried = [step.effect for step in steps[last + 1 :]]
         rest = [name for name in candidates if name not in [*accepted_effects(steps), *tried]]
         failures = sum(step.counts for step in steps[last + 1 :])
+        if not rest or failures == _FAILURES:
+            return steps
         trusted = cable.trusting(steps[last].error)
         starts = {name: _starts(trusted, steps[last].halves, cable.layout.named(name)) for name in rest}
         for name in sorted(rest, key=lambda name: starts[name][1]):
-            if failures == _FAILURES:
-                return steps
             steps.append(tried_with(cable, name, starts[name][0], steps[last], progress))
             save(steps)
-            if steps[-1].accepted:
-                break
             failures += steps[-1].counts
-        else:
-            return steps
+            if steps[-1].accepted or failures == _FAILURES:
+                break
 
 
 def tried_with(
@@ -186,7 +184,7 @@ def _starts(
     for base, parts in zip(before, _parts(cable), strict=True):
         seen, other = (_few(part) for part in parts[:2])
         found.append(_start(seen, base, effect))
-        total += _off(other, found[-1])
+        total += _mean_error(other, found[-1])
     return (found[0], found[1]), total
 
 
@@ -203,7 +201,7 @@ def _start(seen: Evidence, base: Explanation, effect: SpatialEffect) -> Explanat
     Far from the solution the model says little.
     """
     trials = [with_effect(seen.simulator, base, effect, values) for _, values in effect.starts(None)]
-    errors = [_off(seen, trial) for trial in trials]
+    errors = [_mean_error(seen, trial) for trial in trials]
     (fit,) = evaluate(seen, [trials[int(np.argmin(errors))]])
     model = fit.model(seen.weight(fit.sse), 0.0)
     step = -solve_arrow(
@@ -212,13 +210,13 @@ def _start(seen: Evidence, base: Explanation, effect: SpatialEffect) -> Explanat
     step *= min(1.0, _LARGEST_STEP / max(np.abs(step).max(initial=0.0), 1e-12))
     for share in (1.0, 0.4):
         moved = fit.at(np.clip(model.point + share * step, model.lower, model.upper))
-        if _off(seen, moved) < min(errors):
+        if _mean_error(seen, moved) < min(errors):
             return moved
     return fit.explanation
 
 
-def _off(evidence: Evidence, one: Explanation) -> float:
-    """Mean error [m]."""
+def _mean_error(evidence: Evidence, one: Explanation) -> float:
+    """Mean over windows, none of which counts for more than ten times the median [m]."""
     return float(moderated(mean_error(evidence.predict([one])[0], evidence.observed)).mean())
 
 
