@@ -1,7 +1,8 @@
 """Fresh synthetic cables in space: is what they have named, and do the reported intervals hold?
 
-    python experiments/34_fresh_cables.py                   # cables 0 to 3, to choose on; some minutes each
-    python experiments/34_fresh_cables.py --cables 1100:1140 --executor 2   # those of the page; resumable
+    python experiments/34_fresh_cables.py --cables 0:40 --executor 2   # to choose on; resumable, a minute each
+    python experiments/34_fresh_cables.py --calibrate       # what those make `spatial.estimate.UNMODELLED`
+    python experiments/34_fresh_cables.py --cables 1100:1140 --executor 2   # those of the page
     python experiments/34_fresh_cables.py --report docs/results/fresh_cables.md
 
 Every cable has each of five effects with a chance of one half. It is simulated by a rod that has more than is fitted
@@ -12,7 +13,9 @@ real recordings: windows, search, fits to both halves of the recordings, estimat
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import functools
+import math
 import os
 import time
 from pathlib import Path
@@ -21,6 +24,7 @@ from typing import Any
 os.environ.setdefault("NPROC", "4")
 
 import numpy as np
+from scipy.stats import norm
 
 from cablejax.recordings.deform import NOMINAL, SAMPLE_INTERVAL
 from cablejax.spatial.estimate import estimate, estimates_of_halves
@@ -40,6 +44,8 @@ TRIALS = Path("docs") / "results" / "trials" / "fresh_cables.jsonl"
 NEAR = 0.1
 """Ratio beyond one by which EI / rho of the two halves may differ."""
 DRAGS = ("viscous_drag", "quadratic_drag")
+EI, DRAG = "stiffness_over_density_m4_per_s2", "drag_at_speed_per_s"
+"""Quantities that are reported of every cable, by their names in a verdict."""
 UNJUDGED = ("lumped_mass", "keypoint_bias")
 """Every cable carries markers, whose mass its motion hardly shows apart from the cable's own, and whose places along it
 are read off the recording, some millimetres wrong."""
@@ -77,8 +83,8 @@ def trial(seed: int, cache: Path | None = None) -> dict[str, Any]:
     reported = with_true_values(cable, everything, judged)
     known, speed = quantities_of(found, everything, None), windows.speed
     truth = {
-        "stiffness_over_density_m4_per_s2": cable.stiffness / cable.laden,
-        "drag_at_speed_per_s": (cable.drag + speed * cable.quadratic_drag) / cable.laden,
+        EI: cable.stiffness / cable.laden,
+        DRAG: (cable.drag + speed * cable.quadratic_drag) / cable.laden,
     }
     for name, true in truth.items():
         reported[name] = [
@@ -93,12 +99,44 @@ def trial(seed: int, cache: Path | None = None) -> dict[str, Any]:
         "present": present,
         "effects": effects,
         "reported": reported,
+        # of all effects, there or not, named or not, without `UNMODELLED`
+        "plain": with_true_values(cable, everything, unmodelled={})
+        | {
+            EI: [truth[EI], *dataclasses.astuple(everything.stiffness)],
+            DRAG: [truth[DRAG], *dataclasses.astuple(everything.drag_at(speed))],
+        },
         "halves": [half.stiffness.value for half in estimates_of_halves(found)],
         "windows": [unseen.windows, unseen.off],
         "error_mm": [1e3 * float(step.error.mean()) for step in (steps[0], steps[-1])],
         "steps": [[s.effect, s.accepted, s.chance, 1e3 * float(s.error.mean())] for s in found.steps],
         "seconds": time.perf_counter() - begun,
     }
+
+
+def has(row: dict[str, Any], name: str) -> bool:
+    """Whether the cable has what a reported number tells of."""
+    effect = name.split(",")[0]
+    there = [*row["present"], *UNJUDGED, EI]
+    return effect in there or (effect in (*DRAGS, DRAG) and "drag" in there)
+
+
+def besides(of: list[list[float]], *, angle: bool) -> float:
+    """The least standard deviation to be added with which nine of ten intervals hold the true value."""
+    true, value, low, high = (np.array(of) if angle else np.log(of)).T
+    half = np.maximum(high - value, value - low)
+    missing = np.sort(np.sqrt(np.maximum((value - true) ** 2 - half**2, 0.0)))
+    return float(missing[math.ceil(0.9 * len(missing)) - 1] / norm.ppf(0.95))
+
+
+def calibration(rows: list[dict[str, Any]]) -> list[str]:
+    """By how much each parameter is off besides its own interval, one line for each."""
+    lines = []
+    for name in sorted({name for row in rows for name in row["plain"]}):
+        of = [row["plain"][name] for row in rows if has(row, name)]
+        held = sum(low <= true <= high for true, _, low, high in of)
+        more = besides(of, angle=name.startswith("gripper_rotation_offset"))
+        lines.append(f"{name}: {more:.3f} ({held} of {len(of)} hold the true value without it)")
+    return lines
 
 
 def named_table(rows: list[dict[str, Any]]) -> list[str]:
@@ -198,6 +236,7 @@ def page(rows: list[dict[str, Any]]) -> str:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--cables", default="0:4", help="seeds FIRST:LAST, without the last")
+    parser.add_argument("--calibrate", action="store_true", help="print what the cables to choose on make UNMODELLED")
     parser.add_argument("--trials", type=Path, default=TRIALS, help="one line per cable")
     parser.add_argument("--cache", type=Path, help="folder that keeps searches and fits")
     add_option(parser)
@@ -206,6 +245,10 @@ def main() -> None:
     rows = Rows(options.trials, ("seed",))
     if options.report:
         publish(page([row for row in rows.read() if row["seed"] in HELD_OUT]), options.report)
+        return
+    if options.calibrate:
+        chosen_on = [row for row in rows.read() if row["seed"] < HELD_OUT.start and "broken" not in row]
+        print("\n".join(calibration(chosen_on)))
         return
     wanted = [(seed,) for seed in range(*map(int, options.cables.split(":")))]
     with executor_of(options.executor) as executor:

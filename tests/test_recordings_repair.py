@@ -61,6 +61,32 @@ def test_exchanged_markers_are_reported_by_number_and_sample():
     ]
 
 
+def torn() -> np.ndarray:
+    """One end is pulled off from the middle of the take on, slowly."""
+    points = swinging()
+    points[:, -2:, 0] += np.clip(np.arange(len(points)) - 100, 0, None)[:, None] * 0.005
+    return points
+
+
+def test_no_order_mends_a_cable_that_is_torn():
+    points = torn()
+    restored, repairs = restore_order((take(points), *others()))
+    np.testing.assert_array_equal(restored[0].keypoints, points)
+    assert repairs == []
+
+
+def test_a_take_in_which_the_cable_is_torn_is_left_out():
+    takes, repairs = prepare((take(torn(), "torn"), *others(5)), PAIRS)
+    assert [one.name for one in takes] == [one.name for one in others(5)]
+    assert len(repairs) == 1 and repairs[0].startswith("Take torn: along the keypoints the cable measures up to ")
+    assert repairs[0].endswith("left out. Was it torn, or had a marker come off?")
+
+
+def test_where_many_takes_stretch_the_cause_is_another_and_all_stay():
+    takes, repairs = prepare((take(torn(), "torn"), *others(2)), PAIRS)
+    assert len(takes) == 3 and not any("left out" in line for line in repairs)
+
+
 def test_missing_markers_do_not_hinder():
     right = swinging()
     right[np.random.default_rng(0).random(right.shape[:2]) < 0.05] = np.nan

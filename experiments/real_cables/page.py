@@ -204,10 +204,10 @@ def _about_stiffness() -> list[str]:
     return [
         "rho is the mass per length of the cable with its markers. The values with which a half is simulated are not "
         "estimates of the cable: where an effect did not stay in the search, EI/rho compensates for it. The estimate "
-        "of the cable is the one with every effect free ([coverage](interval_coverage.md) on synthetic cables, of "
-        "both). The halves are different recordings of one cable: if both intervals are right, the estimates differ by "
-        f"less than {_NINETY:g} standard errors on nine cables of ten. An error that both halves share does not show "
-        "here; the intervals of a diagnosis are wider, by the effects of a cable beyond the fitted law."
+        "of the cable is the one with every effect free ([coverage](fresh_cables.md) on synthetic cables). The halves "
+        "are different recordings of one cable: if both intervals are right, the estimates differ by less than "
+        f"{_NINETY:g} standard errors on nine cables of ten. An error that both halves share does not show here; the "
+        "intervals of a diagnosis are wider, by the effects of a cable beyond the fitted law."
     ]
 
 

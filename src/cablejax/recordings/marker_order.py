@@ -187,4 +187,6 @@ def _best(here, before, current, swaps, usual) -> np.ndarray:
         return orders[np.argmin(spacing(here[orders]).sum(axis=-1))]
     moved = np.linalg.norm(here[orders] - before, axis=-1).max(axis=-1)
     best = int(np.argmin(moved))
-    return orders[best] if broken_now or moved[best] < CLEARLY * now else current
+    # a cable that is torn is broken too, and no order mends it: markers would have to cross it
+    mends = moved[best] < max(now, STRETCHED * usual.max()) if broken_now else moved[best] < CLEARLY * now
+    return orders[best] if mends else current

@@ -8,6 +8,7 @@ from typing import Literal
 import numpy as np
 from scipy.cluster.hierarchy import fcluster, linkage
 
+from cablejax.cable_length import STRETCH
 from cablejax.recordings.frames import Frame, into_frame, require_hanging, require_rigid
 from cablejax.recordings.gaps import cut_at_gaps
 from cablejax.recordings.marker_order import restore_order
@@ -21,6 +22,9 @@ _OUTLIER = 1.5
 _TAUT = 1.3, 0.01
 """A cable does not stretch: neighbouring keypoints farther apart than usual by this factor, and by more than this part
 of the cable's length, are not both on it."""
+
+_FEW_STRETCHED = 0.2
+"""Up to this part of the takes is left out where the cable stretches; more have a cause that needs another mend."""
 
 _JERK = 50.0, 10.0
 """Acceleration of a gripper [m/s^2] that is worth a word, and how many times its median in the take: noise has some."""
@@ -63,7 +67,8 @@ def prepare(takes: tuple[Take, ...], setup: Setup) -> tuple[tuple[Take, ...], li
     """Checks and repairs takes of one cable, and gives each the poses of both grippers.
 
     In this order: the unit of length; the frame; branches and the order of the markers; whether it is one cable; jumps
-    of single markers; gaps in time; orientations against markers; jerks of the grippers, which are kept.
+    of single markers; takes in which the cable stretches, which are left out; gaps in time; orientations against
+    markers; jerks of the grippers, which are kept.
 
     Returns:
         The takes in metres, z up, right-handed, without gaps, each with gripper poses; and a sentence on each repair.
@@ -97,6 +102,7 @@ def prepare(takes: tuple[Take, ...], setup: Setup) -> tuple[tuple[Take, ...], li
     takes, exchanged = restore_order(takes)
     _require_one_cable(takes, setup)
     takes, jumps = _without_jumps(takes)
+    takes, stretched = _without_stretched(takes)
     if setup.hangs and takes[0].keypoints.shape[2] == 3:
         require_hanging(takes, setup.frame)
     last = takes[0].keypoints.shape[1] - 1
@@ -106,7 +112,7 @@ def prepare(takes: tuple[Take, ...], setup: Setup) -> tuple[tuple[Take, ...], li
         require_rigid(takes, pairs)
     if not measured:
         takes = tuple(_with_poses(take, pairs) for take in takes)
-    return takes, [*repairs, *outliers, *exchanged, *jumps, *cut, *_jerks(takes)]
+    return takes, [*repairs, *outliers, *exchanged, *jumps, *stretched, *cut, *_jerks(takes)]
 
 
 def _frozen(keypoints: np.ndarray) -> bool:
@@ -188,6 +194,22 @@ def _without_jumps(takes: tuple[Take, ...]) -> tuple[tuple[Take, ...], list[str]
                 f"{len(samples)} of {len(off)} samples, from sample {samples[0]}: taken as not observed."
             )
     return tuple(kept), reports
+
+
+def _without_stretched(takes: tuple[Take, ...]) -> tuple[tuple[Take, ...], list[str]]:
+    """Leaves out a few takes in which the keypoints are farther apart than the cable is long."""
+    usual = float(typical_spacing(takes).sum())
+    whole = [spacing(take.keypoints).sum(axis=1) for take in takes]
+    longest = np.array([np.quantile(seen, 0.95) if len(seen) else 0.0 for seen in (w[np.isfinite(w)] for w in whole)])
+    long = longest > (1 + STRETCH) * usual
+    if not 0 < long.sum() <= _FEW_STRETCHED * len(takes):
+        return takes, []
+    return tuple(take for take, is_long in zip(takes, long, strict=True) if not is_long), [
+        f"Take {take.name}: along the keypoints the cable measures up to {length:.3g} m, usually {usual:.3g} m, and a "
+        "cable does not stretch so far: left out. Was it torn, or had a marker come off?"
+        for take, length in zip(takes, longest, strict=True)
+        if length > (1 + STRETCH) * usual
+    ]
 
 
 def _jerks(takes: tuple[Take, ...]) -> list[str]:
