@@ -189,6 +189,11 @@ def test_names_only_what_the_estimate_shows(found, everything):
     values[where] += [0.0, 0.0, 1.5, 0.0, 0.0]
     softer = dataclasses.replace(everything, shared=values)
     assert "stiffness_profile" in {effect.name for effect in named_effects(one, softer, 0.05)}
+    # damping that the integrator's own could be
+    hidden, step = everything.shared.copy(), found.cable.windows.interval / found.cable.rod.substeps
+    hidden[everything.layout.slices["damping_time"]] = 0.25 * step
+    undamped = dataclasses.replace(everything, shared=hidden)
+    assert "bending_damping" not in {effect.name for effect in named_effects(one, undamped, 0.05)}
 
 
 def test_drags_and_masses_are_told_as_far_as_motion_shows_them(found, everything):

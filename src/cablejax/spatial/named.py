@@ -26,6 +26,9 @@ _ABSENT = {
     "intrinsic_curvature": ("curvature_per_m", 0.0),
 }
 """A parameter that says how far an effect is from its absence, and its value there."""
+# A damping time shorter than this part of a time step is not told from the integrator: BDF2 damps a vibration as one of
+# up to 0.15 time steps would, most at five steps in a period.
+_HIDDEN = 0.25
 _DRAGS = {"viscous_drag", "quadratic_drag"}
 _WHOLE, _STIFFNESS = "bending_stiffness", "stiffness_over_density_m4_per_s2"
 
@@ -38,10 +41,10 @@ def named_effects(found: Identified, estimate: Estimate, density: float) -> tupl
         estimate: from the same windows. Reported values are its own, not those that predictions are made with.
         density: mass per length, with the markers, that is believed true [kg/m], for what is known per mass only.
     """
-    named, known = [], quantities_of(found, estimate, None)
+    named, known, cable = [], quantities_of(found, estimate, None), found.cable
     for name in found.effects:
-        parameters, along = parameters_of(name, estimate, density, first_marker=found.cable.windows.held[0])
-        if not _shown(name, parameters):
+        parameters, along = parameters_of(name, estimate, density, first_marker=cable.windows.held[0])
+        if not _shown(name, parameters, cable.windows.interval / cable.rod.substeps):
             continue
         alone = _COMBINED.get(name, "")
         if alone and not _narrow(parameters[alone]):
@@ -84,12 +87,14 @@ def quantities_of(found: Identified, estimate: Estimate, density: float | None) 
     return known
 
 
-def _shown(effect: str, parameters: Mapping[str, ParameterEstimate]) -> bool:
-    """Whether an interval leaves out that the effect is absent.
+def _shown(effect: str, parameters: Mapping[str, ParameterEstimate], time_step: float) -> bool:
+    """Whether an interval leaves out that the effect is absent, or shorter than time steps [s] show.
 
-    An effect with many free values, some for each recording, may help to simulate what it is not there for. What is
-    estimated by its logarithm is never absent: there, the search alone says.
+    An effect with many free values, some for each recording, may help to simulate what it is not there for. Of drags
+    and the markers' mass, which are estimated by their logarithms and so never absent, the search alone says.
     """
+    if effect == "bending_damping":
+        return bool(np.min(np.array(parameters["time_s"].ci90, float)) > _HIDDEN * time_step)
     if effect not in _ABSENT:
         return True
     name, absent = _ABSENT[effect]
