@@ -114,9 +114,9 @@ def trial(seed: int, cache: Path | None = None) -> dict[str, Any]:
 
 
 def has(row: dict[str, Any], name: str) -> bool:
-    """Whether the cable has what a reported number tells of."""
+    """Whether the cable has what a reported number tells of; of an angle or a ratio, absence is a value too."""
     effect = name.split(",")[0]
-    there = [*row["present"], *UNJUDGED, EI]
+    there = [*row["present"], *UNJUDGED, EI, "gripper_rotation_offset", "stiffness_profile"]
     return effect in there or (effect in (*DRAGS, DRAG) and "drag" in there)
 
 

@@ -46,13 +46,13 @@ Quantity = Callable[[Float[Array, "P"]], Float[Array, ""]]
 """Something that follows from the values of all effects, differentiably."""
 UNMODELLED: Mapping[str, float] = MappingProxyType(
     {
-        "bending_stiffness": 0.05,
-        "bending_damping": 0.13,
-        "viscous_drag": 1.0,
-        "quadratic_drag": 0.19,
-        "drag": 0.4,
-        "stiffness_profile": 0.08,
-        "gripper_rotation_offset": 0.06,
+        "bending_stiffness": 0.04,
+        "bending_damping": 0.14,
+        "viscous_drag": 1.45,
+        "quadratic_drag": 0.83,
+        "drag": 0.07,
+        "stiffness_profile": 0.16,
+        "gripper_rotation_offset": 0.04,
     }
 )
 """By how much an effect's parameter is off besides, in all recordings alike, where neither jackknife nor priors show
