@@ -1,8 +1,7 @@
 """The next motion designed, against Fisher-optimal and random safe ones, on effects that look alike.
 
-    python experiments/25_next_motion.py --rows ROWS.jsonl --seeds 20    # seven minutes a seed; resumable
-    python experiments/25_next_motion.py --rows ROWS.jsonl --executor 2    # the same in two processes
-    python experiments/25_next_motion.py --rows ROWS.jsonl --report docs/results/next_motion.md
+    python experiments/25_next_motion.py --seeds 20 --executor 2    # seven minutes a seed; resumable
+    python experiments/25_next_motion.py --report docs/results/next_motion.md
 
 For every seed an effect is drawn from those that one log hardly separates, and staged in the contact plant (MuJoCo in
 space) or in the rod of the blind check, which shares no code with the package, five seeds each in turn. The first log
@@ -57,6 +56,7 @@ FIRST = ("approach_s", "mirror_approach_s", "overload_return")
 """Motions of the first log."""
 ADDED = 2
 """Motions that are added one by one."""
+ROWS = pathlib.Path("docs") / "results" / "trials" / "next_motion.jsonl"
 NOISE = 1e-3
 SEED = 25
 PLANT = Discretisation(n_links=24, dimension=3, timestep=0.005)
@@ -224,12 +224,13 @@ def page(rows: Sequence[dict[str, Any]]) -> str:
         + ", ".join(f"`{row['effect']}`" for row in rows if row["arm"] == arms[0] and row["seed"] in common)
         + ".",
     ]
-    return page_of_results("The next motion", "`python experiments/25_next_motion.py --rows ROWS --report FILE`", lines)
+    made_by = "`python experiments/25_next_motion.py --seeds 20` and `--report docs/results/next_motion.md`"
+    return page_of_results("The next motion", made_by, lines)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--rows", type=pathlib.Path, required=True, help="file of the finished rows")
+    parser.add_argument("--rows", type=pathlib.Path, default=ROWS, help="file of the finished rows")
     parser.add_argument("--seeds", type=int, default=20, help="how many set-ups")
     parser.add_argument("--arms", nargs="+", choices=list(ARMS), default=list(ARMS))
     add_option(parser)
