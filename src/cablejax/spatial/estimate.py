@@ -34,9 +34,6 @@ from cablejax.spatial.identify import Identified, affordable
 # standard error, but not more often than this. Closer than that, a cable that snaps over in one of the windows keeps
 # them moving.
 _SETTLED, _ROUNDS, _STEPS = 0.3, 5, 4
-# The first round sees every fourth window, the second every other, where at least so many are left: from the priors'
-# medians the way is long, and a few windows show it.
-_FEWEST = 12
 # Nats per window: a step that promises less is not made.
 _TOLERANCE = 0.01
 _TAIL = 0.95
@@ -166,20 +163,19 @@ def estimate(
     windows = cable.windows
     cable = cable.on(windows.chosen(np.flatnonzero(affordable(start, windows))))
     progress(f"all effects free: {len(cable.windows)} windows")
-    rounds, every = 0, min(4, max(1, len(cable.windows) // _FEWEST))
+    tolerance, rounds = _TOLERANCE * len(cable.windows), 0
     while True:
         rounds += 1
-        part = cable.on(cable.windows.chosen(np.arange(0, len(cable.windows), every)))
-        evidence, tolerance = part.corrected(start).evidence(), _TOLERANCE * len(part.windows)
+        evidence = cable.corrected(start).evidence()
         (fit,) = improve(evidence, evaluate(evidence, [start]), max_iterations=_STEPS, tolerance=tolerance)
         error = np.hypot(*(np.linalg.norm(rows, axis=0) for rows in _rows(evidence, fit)))
         moved = float((np.abs(fit.explanation.z - start.z) / error).max(initial=0.0))
         progress(f"corrected for finite edges and time steps: values move by up to {moved:.2f} standard errors")
         # a round of steps that were all too long says nothing
-        settled = bool(every == 1 and moved < _SETTLED and (moved > 0 or fit.result is not Result.STEP_LIMIT))
+        settled = bool(moved < _SETTLED and (moved > 0 or fit.result is not Result.STEP_LIMIT))
         if settled or rounds == _ROUNDS:
             return dataclasses.replace(estimate_at(evidence, fit), settled=settled)
-        start, every = fit.explanation, max(1, every // 2)
+        start = fit.explanation
 
 
 def estimate_at(evidence: Evidence, fit: Fit) -> Estimate:
