@@ -210,8 +210,9 @@ def test_drags_and_masses_are_told_as_far_as_motion_shows_them(found, everything
     assert set(mass) == {"centre_m", "stiffness_over_density_m4_per_s2"}
     sure = dataclasses.replace(everything, moves=0.1 * everything.moves, shifts=0.1 * everything.shifts)
     _whole, linear, quadratic, mass = (effect.parameters for effect in named_effects(tried, sure, 0.05))
-    assert "mass_kg" in mass and "coefficient_per_m" in quadratic and "stiffness_over_density_m4_per_s2" not in mass
-    assert "drag_at_speed_per_s" in quadratic and "coefficient_n_s_per_m2" not in linear
+    assert "mass_kg" in mass and "stiffness_over_density_m4_per_s2" not in mass
+    # one drag stands in for the other, however sure the recordings are
+    assert linear == quadratic and set(linear) == {"drag_at_speed_per_s", "speed_m_per_s"}
 
 
 def test_nothing_that_is_positive_may_be_negative(everything):
