@@ -199,17 +199,18 @@ def _without_jumps(takes: tuple[Take, ...]) -> tuple[tuple[Take, ...], list[str]
 def _without_stretched(takes: tuple[Take, ...]) -> tuple[tuple[Take, ...], list[str]]:
     """Leaves out a few takes in which the keypoints are farther apart than the cable is long."""
     usual = float(typical_spacing(takes).sum())
-    whole = [spacing(take.keypoints).sum(axis=1) for take in takes]
-    longest = np.array([np.quantile(seen, 0.95) if len(seen) else 0.0 for seen in (w[np.isfinite(w)] for w in whole)])
-    long = longest > (1 + STRETCH) * usual
-    if not 0 < long.sum() <= _FEW_STRETCHED * len(takes):
-        return takes, []
-    return tuple(take for take, is_long in zip(takes, long, strict=True) if not is_long), [
-        f"Take {take.name}: along the keypoints the cable measures up to {length:.3g} m, usually {usual:.3g} m, and a "
-        "cable does not stretch so far: left out. Was it torn, or had a marker come off?"
-        for take, length in zip(takes, longest, strict=True)
-        if length > (1 + STRETCH) * usual
-    ]
+    kept, reports = [], []
+    for take in takes:
+        whole = spacing(take.keypoints).sum(axis=1)
+        longest = float(np.nanquantile(whole, 0.95)) if np.isfinite(whole).any() else 0.0
+        if longest <= (1 + STRETCH) * usual:
+            kept.append(take)
+            continue
+        reports.append(
+            f"Take {take.name}: along the keypoints the cable measures up to {longest:.3g} m, usually {usual:.3g} m, "
+            "and a cable does not stretch so far: left out. Was it torn, or had a marker come off?"
+        )
+    return (tuple(kept), reports) if len(reports) <= _FEW_STRETCHED * len(takes) else (takes, [])
 
 
 def _jerks(takes: tuple[Take, ...]) -> list[str]:
