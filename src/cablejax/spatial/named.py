@@ -14,8 +14,8 @@ from cablejax.spatial.estimate import UNMODELLED, Estimate, Interval
 from cablejax.spatial.identify import Identified
 
 IDENTIFIABLE = 2.0
-"""A drag alone, or the markers' mass, is reported where its interval reaches to at most this factor to either side."""
-_COMBINED = {"viscous_drag": "coefficient_n_s_per_m2", "quadratic_drag": "coefficient_per_m", "lumped_mass": "mass_kg"}
+"""The markers' mass is reported where its interval reaches to at most this factor to either side. That of either drag
+alone never does: `UNMODELLED` is wider."""
 # A marker that is this near to its nominal place is not reported as displaced [m].
 _PLACED = 1e-3
 _ABSENT = {
@@ -46,14 +46,13 @@ def named_effects(found: Identified, estimate: Estimate, density: float) -> tupl
         parameters, along = parameters_of(name, estimate, density, first_marker=cable.windows.held[0])
         if not _shown(name, parameters, cable.windows.interval / cable.rod.substeps):
             continue
-        alone = _COMBINED.get(name, "")
-        if alone and not _narrow(parameters[alone]):
-            del parameters[alone]
         # what motion shows of the drags is their sum at its speed, of the markers' mass what slows the cable down
         if name in _DRAGS:
-            parameters |= {key: known[key] for key in ("drag_at_speed_per_s", "speed_m_per_s")}
-        elif alone and alone not in parameters and _STIFFNESS in known:
-            parameters[_STIFFNESS] = known[_STIFFNESS]
+            parameters = {key: known[key] for key in ("drag_at_speed_per_s", "speed_m_per_s")}
+        elif name == "lumped_mass" and not _narrow(parameters["mass_kg"]):
+            del parameters["mass_kg"]
+            if _STIFFNESS in known:
+                parameters[_STIFFNESS] = known[_STIFFNESS]
         location = {"along_cable_m": along, "time_s": None, "table_m": None}
         named.append(NamedEffect(name, None, parameters, location))
     return tuple(named)
