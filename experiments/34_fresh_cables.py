@@ -46,6 +46,8 @@ NEAR = 0.1
 DRAGS = ("viscous_drag", "quadratic_drag")
 EI, DRAG = "stiffness_over_density_m4_per_s2", "drag_at_speed_per_s"
 """Quantities that are reported of every cable, by their names in a verdict."""
+FACTORS = (EI, "stiffness_profile", "bending_damping")
+"""Parameters whose error is one of their logarithm."""
 UNJUDGED = ("lumped_mass", "keypoint_bias")
 """Every cable carries markers, whose mass its motion hardly shows apart from the cable's own, and whose places along it
 are read off the recording, some millimetres wrong."""
@@ -81,10 +83,10 @@ def trial(seed: int, cache: Path | None = None) -> dict[str, Any]:
     effects = [effect.name for effect in named_effects(found, everything, density=1.0)]
     judged = [name for name in effects if name in REPORTED and name in (*present, *UNJUDGED)]
     reported = with_true_values(cable, everything, judged)
-    known, speed = quantities_of(found, everything, None), windows.speed
+    known = quantities_of(found, everything, None)
     truth = {
         EI: cable.stiffness / cable.laden,
-        DRAG: (cable.drag + speed * cable.quadratic_drag) / cable.laden,
+        DRAG: (cable.drag + windows.speed * cable.quadratic_drag) / cable.laden,
     }
     for name, true in truth.items():
         reported[name] = [
@@ -103,7 +105,7 @@ def trial(seed: int, cache: Path | None = None) -> dict[str, Any]:
         "plain": with_true_values(cable, everything, unmodelled={})
         | {
             EI: [truth[EI], *dataclasses.astuple(everything.stiffness)],
-            DRAG: [truth[DRAG], *dataclasses.astuple(everything.drag_at(speed))],
+            DRAG: [truth[DRAG], *dataclasses.astuple(everything.drag)],
         },
         "halves": [half.stiffness.value for half in estimates_of_halves(found)],
         "windows": [unseen.windows, unseen.off],
@@ -114,15 +116,13 @@ def trial(seed: int, cache: Path | None = None) -> dict[str, Any]:
 
 
 def has(row: dict[str, Any], name: str) -> bool:
-    """Whether the cable has what a reported number tells of; of an angle or a ratio, absence is a value too."""
-    effect = name.split(",")[0]
-    there = [*row["present"], *UNJUDGED, EI, "gripper_rotation_offset", "stiffness_profile"]
-    return effect in there or (effect in (*DRAGS, DRAG) and "drag" in there)
+    """Whether the cable has what a reported number tells of; of all but a damping, absence is a value too."""
+    return not name.startswith("bending_damping") or "bending_damping" in row["present"]
 
 
-def besides(of: list[list[float]], *, angle: bool) -> float:
+def besides(of: list[list[float]], *, factor: bool) -> float:
     """The least standard deviation to be added with which nine of ten intervals hold the true value."""
-    true, value, low, high = (np.array(of) if angle else np.log(of)).T
+    true, value, low, high = (np.log(of) if factor else np.array(of)).T
     half = np.maximum(high - value, value - low)
     missing = np.sort(np.sqrt(np.maximum((value - true) ** 2 - half**2, 0.0)))
     return float(missing[math.ceil(0.9 * len(missing)) - 1] / norm.ppf(0.95))
@@ -134,7 +134,7 @@ def calibration(rows: list[dict[str, Any]]) -> list[str]:
     for name in sorted({name for row in rows for name in row["plain"]}):
         of = [row["plain"][name] for row in rows if has(row, name)]
         held = sum(low <= true <= high for true, _, low, high in of)
-        more = besides(of, angle=name.startswith("gripper_rotation_offset"))
+        more = besides(of, factor=name.startswith(FACTORS))
         lines.append(f"{name}: {more:.3f} ({held} of {len(of)} hold the true value without it)")
     return lines
 

@@ -43,8 +43,8 @@ def test_fast_grippers_need_more():
     windows = _swung(3.0)
     found = _found(windows)
     assert found.substeps > 1
-    effects = [_cable(windows).layout.named(name) for name in ("bending_damping", "viscous_drag")]
-    damped = explanation(*((effect, 0, (effect.parameters[0].centre,)) for effect in effects))
+    layout = _cable(windows).layout
+    damped = explanation((layout.named("bending_damping"), 0, [0.03]), (layout.named("viscous_drag"), 0, [0.3]))
     once, chosen, exact = (_cable(windows).finer(substeps).motion(damped) for substeps in (1, found.substeps, 32))
     # in the first half second: later it is torn, and snaps back one way or another
     assert np.abs(chosen - exact)[:, :25].mean() < 0.5 * np.abs(once - exact)[:, :25].mean()

@@ -13,8 +13,6 @@ from real_cables.synthetic import SyntheticCable
 
 REPORTED = {
     "bending_damping": "time_s",
-    "viscous_drag": "coefficient_n_s_per_m2",
-    "quadratic_drag": "coefficient_per_m",
     "lumped_mass": "mass_kg",
     "stiffness_profile": "ratio",
     "gripper_rotation_offset": "angle_rad",
@@ -50,10 +48,6 @@ def _true_value(cable: SyntheticCable, effect: str, parameters: Mapping[str, Par
     match effect:
         case "bending_damping":
             return cable.damping_time
-        case "viscous_drag":
-            return cable.drag / cable.laden
-        case "quadratic_drag":
-            return cable.quadratic_drag / cable.laden
         case "lumped_mass":
             return cable.marker_mass / cable.laden
         case "stiffness_profile":

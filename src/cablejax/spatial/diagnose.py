@@ -14,7 +14,7 @@ import numpy as np
 from cablejax.bounded import Result
 from cablejax.diagnose.belief import Calibration
 from cablejax.diagnose.diagnosis import CableDiagnosis, Gap, ParameterEstimate, Ranked, Verdict
-from cablejax.diagnose.judgement import judged, verdict_sentence
+from cablejax.diagnose.judgement import judged, listed, verdict_sentence
 from cablejax.diagnose.protocol import explanation
 from cablejax.simulate.rod import RodResult
 from cablejax.spatial.accidents import accident_sentences, kept, moderated, off
@@ -92,7 +92,7 @@ def diagnose_space(
     everything = estimate(found, found.everything, found.cable, progress=progress)
     effects = named_effects(found, everything, density)
     equivalent = _equivalent(found, named := [effect.name for effect in effects])
-    verdict = _verdict(gap, found, equivalent)
+    verdict = _verdict(gap, named, equivalent)
     if verdict in ("none", "unknown"):
         effects = ()
     offset = ParameterEstimate(constant_offset(after[use], windows.chosen(use)), None, "m")
@@ -128,11 +128,11 @@ def diagnose_space(
     )
 
 
-def _verdict(gap: Gap, found: Identified, equivalent: tuple[tuple[str, ...], ...]) -> Verdict:
+def _verdict(gap: Gap, named: Sequence[str], equivalent: tuple[tuple[str, ...], ...]) -> Verdict:
     allowed = max(_CALIBRATION.adequate * gap.before_rmse_mm, RESOLVABLE * gap.noise_floor_mm)
     return judged(
         resolvable=gap.shrinkage is not None,
-        telling=bool(found.effects) and gap.shrinkage_ci90 is not None and gap.shrinkage_ci90[0] > 0,
+        telling=bool(named) and gap.shrinkage_ci90 is not None and gap.shrinkage_ci90[0] > 0,
         complete=gap.after_rmse_mm <= allowed,
         alike=bool(equivalent),
     )
@@ -174,15 +174,16 @@ def _caveats(log, windows, left_out, found, everything, named) -> tuple[str, ...
         "noise, but of the constant offsets, as is what the simulator has wrong at rest.",
         "Roll of the grippers about the cable is not observed; it is taken as the least turn from their mean "
         "direction.",
-        "Parameters are those of a fit in which everything that was tried is free. Predictions are made with the named "
-        "effects alone, whose values differ from these where something that was not named is there nevertheless.",
+        "Parameters are those of a fit in which everything that was tried is free. Predictions, and the gap after, are "
+        f"made with {listed(found.effects) or 'no effect'} alone, with which recordings that no fit has seen are "
+        "simulated better.",
     ]
     if "gripper_rotation_offset" in found.effects:
         own = GRIP * found.everything.own[np.unique(windows.group)]
         result.append(
             "How the cable sits in the grippers is fitted for each recording: it differs by "
-            f"{np.sqrt((own**2).mean()):.2f} rad (root mean square) from the mean that is named. Recordings that no "
-            "fit has seen are predicted with the mean."
+            f"{np.sqrt((own**2).mean()):.2f} rad (root mean square) from the mean. Recordings that no fit has seen are "
+            "predicted with the mean."
         )
     if left_out:
         result.append(f"{left_out} windows are labelled eval; nothing was fitted to or scored on them.")
@@ -193,8 +194,13 @@ def _caveats(log, windows, left_out, found, everything, named) -> tuple[str, ...
         )
     if missing := [name for name in found.effects if name not in named]:
         result.append(
-            f"Recordings that no fit has seen are simulated better with {', '.join(missing)}, but the 90 % interval "
+            f"Recordings that no fit has seen are simulated better with {listed(missing)}, but the 90 % interval "
             "includes a cable without it. It is not named."
+        )
+    if useless := [name for name in named if name not in found.effects]:
+        result.append(
+            f"The 90 % interval of {listed(useless)} leaves out a cable without it, but recordings that no fit has seen "
+            "are not simulated better with it."
         )
     if not everything.settled:
         result.append(

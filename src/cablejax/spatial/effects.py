@@ -77,17 +77,23 @@ def _positive(
     return SpatialEffect(name=name, parameters=(parameter,), null=(null,), fields=((field, 1),), templates=templates)
 
 
+def _from_zero(name: str, field: str, scale: float, templates: tuple[float, ...]) -> SpatialEffect:
+    """A value that is 0 where the effect is absent and positive where it is not, with its prior standard deviation."""
+    parameter = Parameter(field, "", 0.0, 1e3 * scale, 0.0, scale)
+    return SpatialEffect(name=name, parameters=(parameter,), null=(0.0,), fields=((field, 1),), templates=templates)
+
+
 def effects_of(n_markers: int) -> tuple[SpatialEffect, ...]:
     """All effects of a cable with so many free markers."""
     return (
         _positive("bending_stiffness", "ratio", 1.0, (math.exp(-1), 1.0, math.exp(1), math.exp(2)), null=1.0),
         _positive("bending_damping", "damping_time", 0.03, (0.01, 0.03, 0.1)),
-        _positive("viscous_drag", "drag", 0.3, (0.2, 0.8)),
-        _positive("quadratic_drag", "quadratic_drag", 0.05, (0.05, 0.3)),
+        _from_zero("viscous_drag", "drag", 0.5, (0.2, 0.8)),
+        _from_zero("quadratic_drag", "quadratic_drag", 0.2, (0.05, 0.3)),
         _linear("stiffness_profile", ("log_profile", PROFILE_KNOTS, 0.5)),
         _linear("gripper_rotation_offset", ("clamp_rotation", 4, GRIP), own=True),
         _linear("keypoint_bias", ("along", n_markers + 1, 0.005)),
-        _positive("lumped_mass", "marker_mass", 0.01, (0.01, 0.04)),
+        _from_zero("lumped_mass", "marker_mass", 0.02, (0.01, 0.04)),
         _linear("intrinsic_curvature", ("rest_curvature", 2 * CURVATURE_KNOTS, 1.0), ("log_twist", 1, 1.0)),
     )
 

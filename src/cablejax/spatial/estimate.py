@@ -45,18 +45,16 @@ UNMODELLED: Mapping[str, float] = MappingProxyType(
     {
         "bending_stiffness": 0.04,
         "bending_damping": 0.14,
-        "viscous_drag": 1.45,
-        "quadratic_drag": 0.83,
         "drag": 0.07,
         "stiffness_profile": 0.16,
         "gripper_rotation_offset": 0.04,
     }
 )
 """By how much an effect's parameter is off besides, in all recordings alike, where neither jackknife nor priors show
-it: standard deviation of its logarithm, of an angle in rad. It is what makes nine of ten intervals hold the true value
-on synthetic cables to choose on, of two simulators that have more than the law that is fitted
-(`experiments/34_fresh_cables.py --calibrate`). Intervals of the markers' mass were wide enough. "drag" is both drags at
-the grippers' speed."""
+it: standard deviation of its logarithm; of an angle in rad, of "drag", both drags at the recording's speed, in 1/s. It
+is what makes nine of ten intervals hold the true value on synthetic cables to choose on, of two simulators that have
+more than the law that is fitted (`experiments/34_fresh_cables.py --calibrate`). Intervals of the markers' mass were
+wide enough."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -80,6 +78,12 @@ class Interval:
             self.value + float(np.hypot(self.high - self.value, more)),
         )
 
+    def among(self, count: int) -> Interval:
+        """One of so many intervals that hold their true values together in nine of ten cases (Bonferroni)."""
+        times = float(norm.ppf(1 - (1 - _TAIL) / count) / norm.ppf(_TAIL))
+        low, high = self.value - times * (self.value - self.low), self.value + times * (self.high - self.value)
+        return Interval(self.value, low, high)
+
     def wider_by_factor(self, deviation: float) -> Interval:
         """The same of a positive value and its logarithm."""
         log = Interval(*np.log(dataclasses.astuple(self))).wider(deviation)
@@ -95,6 +99,7 @@ class Estimate:
         shared: values that all recordings share, shape [P].
         moves: what leaving out each recording does to them, see `jackknife`, shape [R, P].
         shifts: what moving each prior by its standard deviation does to them, shape [K, P].
+        speed: of the keypoints, root mean square [m/s].
         settled: whether no value moved by more than a small part of its standard error when predictions were last
             corrected for finite edges and time steps.
     """
@@ -103,6 +108,7 @@ class Estimate:
     shared: Float[np.ndarray, "P"]
     moves: Float[np.ndarray, "R P"]
     shifts: Float[np.ndarray, "K P"]
+    speed: float
     settled: bool = True
 
     def of(self, quantity: Quantity) -> Interval:
@@ -123,16 +129,17 @@ class Estimate:
         where = self.layout.slices[field].start
         return self.ratio(lambda values: jnp.log(values[where]))
 
-    def drag_at(self, speed: float) -> Interval:
-        """Linear and quadratic drag together at a speed [m/s], per mass [1/s]."""
+    @property
+    def drag(self) -> Interval:
+        """Linear and quadratic drag together at the speed, per mass [1/s]; the interval may begin below 0."""
         linear, quadratic = (self.layout.slices[name].start for name in ("drag", "quadratic_drag"))
-        return self.ratio(lambda values: jnp.log(values[linear] + speed * values[quadratic]))
+        return self.of(lambda values: values[linear] + self.speed * values[quadratic])
 
     @property
     def marker_mass(self) -> Interval:
-        """Mass of a marker, as length of the cable with its markers of the same mass [m]."""
+        """Mass of a marker, as length of the cable with its markers of the same mass [m]; may begin below 0."""
         where, laden = self.layout.slices["marker_mass"].start, self.layout.laden
-        return self.ratio(lambda values: jnp.log(values[where]) - jnp.log(laden(values)))
+        return self.of(lambda values: values[where] / laden(values))
 
     @property
     def stiffness(self) -> Interval:
@@ -157,7 +164,6 @@ def estimate(
         progress: called with a line of text.
     """
     more = [effect for effect in cable.layout.effects if effect.name in found.tried and effect.name not in start.names]
-    # a positive value that is absent starts at its prior's median: the logarithm of nothing leads nowhere
     added = explanation(*((effect, 0, [p.centre for p in effect.parameters]) for effect in more))
     start = Explanation((*start.terms, *added.terms), np.append(start.z, added.z), start.own)
     windows = cable.windows
@@ -185,7 +191,7 @@ def estimate_at(evidence: Evidence, fit: Fit) -> Estimate:
     # of the vector by the coordinates
     slopes = cable.directions(one)[0][: len(one.z)]
     moves, shifts = _rows(evidence, fit)
-    return Estimate(cable.layout, one.vector(cable.effects), moves @ slopes, shifts @ slopes)
+    return Estimate(cable.layout, one.vector(cable.effects), moves @ slopes, shifts @ slopes, cable.windows.speed)
 
 
 def _rows(evidence: Evidence, fit: Fit) -> tuple[Float[np.ndarray, "R K"], Float[np.ndarray, "K K"]]:

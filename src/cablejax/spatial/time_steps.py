@@ -19,6 +19,7 @@ _FINEST = 4
 # Errors of the time steps may be so large a part of what a good fit leaves, on half of the windows. The others may hold
 # a cable that snaps through, as the believed one often does where the true one is stiffer: there any error grows.
 _SHARE = 0.5
+_ORDINARY = {"bending_damping": 0.03, "viscous_drag": 0.3}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -46,7 +47,7 @@ def time_steps_for(cable: SpatialCable) -> TimeSteps:
     Args:
         cable: with one step between two samples, in windows whose motion is to be simulated.
     """
-    ordinary = [(e, 0, (e.parameters[0].centre,)) for e in map(cable.layout.named, ("bending_damping", "viscous_drag"))]
+    ordinary = [(cable.layout.named(name), 0, (value,)) for name, value in _ORDINARY.items()]
 
     def predicted(substeps):
         return cable.finer(substeps).motion(explanation(*ordinary))
