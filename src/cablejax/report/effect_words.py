@@ -56,7 +56,6 @@ _PARAMETERS: dict[str, str] = {
     "hardening": "hardening beyond the yield",
     "radius_m": "radius",
     "coefficient_n_s_per_m2": "drag per length and speed",
-    "coefficient_per_m": "drag per mass and squared speed",
     "angle_rad": "angle",
     "direction_rad": "direction on the table",
     "mass_kg": "mass",

@@ -227,11 +227,6 @@ def errors(predicted: Float[np.ndarray, "W T F 3"], windows: Windows) -> Float[n
     return mean_error(predicted[:, 2:], windows.observed[:, 2:])
 
 
-def over_all_markers(error: Float[np.ndarray, "W"], windows: Windows) -> Float[np.ndarray, "W"]:
-    """The same with the held markers counted as predicted without error, as Chen et al. (2024) count [m]."""
-    return error * windows.keypoints.shape[2] / windows.n_keypoints
-
-
 @functools.lru_cache(maxsize=8)
 def _compiled(rod: Rod, layout: Layout, interval: float):
     def one(values, position, frames, seen):

@@ -194,13 +194,13 @@ def _caveats(log, windows, left_out, found, everything, named) -> tuple[str, ...
         )
     if missing := [name for name in found.effects if name not in named]:
         result.append(
-            f"Recordings that no fit has seen are simulated better with {listed(missing)}, but the 90 % interval "
-            "includes a cable without it. It is not named."
+            f"Recordings that no fit has seen are simulated better with {listed(missing)}, but its parameters "
+            "do not exclude a cable without it. It is not named."
         )
     if useless := [name for name in named if name not in found.effects]:
         result.append(
-            f"The 90 % interval of {listed(useless)} leaves out a cable without it, but recordings that no fit has seen "
-            "are not simulated better with it."
+            f"Parameters of {listed(useless)} exclude a cable without it, but recordings that no fit has seen are not "
+            "simulated better with it."
         )
     if not everything.settled:
         result.append(

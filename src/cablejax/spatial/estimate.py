@@ -44,10 +44,10 @@ Quantity = Callable[[Float[Array, "P"]], Float[Array, ""]]
 UNMODELLED: Mapping[str, float] = MappingProxyType(
     {
         "bending_stiffness": 0.04,
-        "bending_damping": 0.14,
-        "drag": 0.07,
-        "stiffness_profile": 0.16,
-        "gripper_rotation_offset": 0.04,
+        "bending_damping": 0.09,
+        "drag": 0.03,
+        "stiffness_profile": 0.15,
+        "gripper_rotation_offset": 0.035,
     }
 )
 """By how much an effect's parameter is off besides, in all recordings alike, where neither jackknife nor priors show
