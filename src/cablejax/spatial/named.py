@@ -118,9 +118,6 @@ def parameters_of(
     besides = unmodelled.get("drag" if effect in _DRAGS else effect, 0.0)
     where, length = estimate.layout.slices, estimate.layout.arclength[-1]
 
-    def part(field):
-        return estimate.shared[where[field]]
-
     def size(field, first):
         """Of two values as a vector; its interval is as wide as that of the less certain one."""
         slots = [where[field].start + first, where[field].start + first + 1]
@@ -173,7 +170,8 @@ def parameters_of(
                 "offset_m": _all_told([each[i] for i in off], "m"),
             }
         case "intrinsic_curvature":
-            knot = int(np.linalg.norm(part("rest_curvature").reshape(-1, 2), axis=1).argmax())
+            curvature = estimate.shared[where["rest_curvature"]].reshape(-1, 2)
+            knot = int(np.linalg.norm(curvature, axis=1).argmax())
             parameters, along = place(knot, CURVATURE_KNOTS)
             parameters["curvature_per_m"] = _told(from_zero(size("rest_curvature", 2 * knot)), "1/m")
         case _:
