@@ -201,8 +201,9 @@ def page(rows: list[dict[str, Any]]) -> str:
         "Nine of ten should hold the true value. Judged are EI/rho and the drag at the grippers' speed of every cable, "
         "and the parameters of effects that are named and there. All are wider than jackknife and priors give, by "
         "`UNMODELLED`, which is calibrated on seeds 0 to 39; how sure a name must be was chosen there too. Seeds 1100 "
-        "to 1139 were those of this page for the version before, whose rows led to today's rule for a name; those of "
-        "today had not been run before.",
+        "to 1139 were those of this page for the version before, whose rows led to today's rule for a name. Those of "
+        "today had been run once, by the same method but for `UNMODELLED`, when the grippers of MuJoCo's cables still "
+        "followed the recorded ones 3 ms late, which made up for drag.",
         "",
         *interval_table(rows),
         "",
