@@ -202,6 +202,9 @@ def test_of_the_drags_their_sum_is_told_by_the_name_of_the_larger_one(found, eve
         (drag,) = (effect for effect in named_effects(one, dragged, 0.05) if "drag" in effect.name)
         assert drag.name == name and set(drag.parameters) == {"drag_at_speed_per_s", "speed_m_per_s"}
         assert drag.parameters["drag_at_speed_per_s"].value == pytest.approx(linear + 0.5 * dragged.speed)
+        # what stayed in the search keeps its name
+        stayed = dataclasses.replace(one, effects=("viscous_drag",))
+        assert [e.name for e in named_effects(stayed, dragged, 0.05) if "drag" in e.name] == ["viscous_drag"]
     assert everything.speed == pytest.approx(found.cable.windows.speed)
 
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from cablejax.bounded import Result
 from cablejax.diagnose.belief import Calibration
-from cablejax.diagnose.diagnosis import CableDiagnosis, Gap, ParameterEstimate, Ranked, Verdict
+from cablejax.diagnose.diagnosis import CableDiagnosis, Gap, NamedEffect, ParameterEstimate, Ranked, Verdict
 from cablejax.diagnose.judgement import judged, listed, verdict_sentence
 from cablejax.diagnose.protocol import explanation
 from cablejax.simulate.rod import RodResult
@@ -101,7 +101,7 @@ def diagnose_space(
     where = where_of(log, windows.chosen(use), nominal, before[use], noise, changes)
     return SpatialDiagnosis(
         verdict=verdict,
-        sentence=" ".join([verdict_sentence(verdict, effects, equivalent, (), gap.shrinkage or 0.0), *first]),
+        sentence=" ".join([_sentence(verdict, effects, equivalent, gap, found), *first]),
         effects=effects,
         equivalent=equivalent,
         quantities=quantities_of(found, everything, None if guessed else density) | {"constant_offset_m": offset},
@@ -126,6 +126,14 @@ def diagnose_space(
         changes=changes,
         identified=found,
     )
+
+
+def _sentence(verdict: Verdict, effects: Sequence[NamedEffect], equivalent, gap: Gap, found: Identified) -> str:
+    """The verdict in words; the gap shrinks by the effects that predictions are made with."""
+    used = [effect for effect in effects if effect.name in found.effects]
+    others = [effect.name.replace("_", " ") for effect in effects if effect.name not in found.effects]
+    sentence = verdict_sentence(verdict, used or effects, equivalent, (), gap.shrinkage or 0.0)
+    return f"{sentence} The parameters show besides: {listed(others)}." if used and others else sentence
 
 
 def _verdict(gap: Gap, named: Sequence[str], equivalent: tuple[tuple[str, ...], ...]) -> Verdict:
@@ -199,8 +207,8 @@ def _caveats(log, windows, left_out, found, everything, named) -> tuple[str, ...
         )
     if useless := [name for name in named if name not in found.effects]:
         result.append(
-            f"Parameters of {listed(useless)} exclude a cable without it, but recordings that no fit has seen are not "
-            "simulated better with it."
+            f"Named because the parameters exclude a cable without it, but not part of predictions, because recordings "
+            f"that no fit has seen are not simulated better with it: {listed(useless)}."
         )
     if not everything.settled:
         result.append(

@@ -48,9 +48,10 @@ def named_effects(found: Identified, estimate: Estimate, density: float) -> tupl
         density: mass per length, with the markers, that is believed true [kg/m], for what is known per mass only.
     """
     named, windows = [], found.cable.windows
+    # motion shows the drags' sum: it goes by the names that stayed in the search, or by that of the larger one
+    drags = [name for name in found.effects if name in _DRAGS] or [_main_drag(estimate)]
     for name in dict.fromkeys((*found.effects, *found.tried)):
-        # motion shows the drags' sum: it goes by the name of the one that has more of it
-        if name in _DRAGS and name != _main_drag(estimate):
+        if name in _DRAGS and name not in drags:
             continue
         parameters, along = parameters_of(name, estimate, density, first_marker=windows.held[0])
         if _shown(name, parameters[_TELLING[name]], windows.interval / found.cable.rod.substeps):
