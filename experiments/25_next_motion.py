@@ -13,7 +13,7 @@ motion only:
 - `random`: one of the safe motions that keep the bounds, drawn at random: nothing clever.
 
 Constants of the search were chosen on seed 0; the table has the seeds from 1 on. Densities and drags were made larger
-after those of seeds 2, 3 and 8 had made no gap.
+after those of seeds 2, 3 and 8 had made no gap, or hardly one.
 """
 
 from __future__ import annotations

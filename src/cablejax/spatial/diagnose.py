@@ -202,12 +202,12 @@ def _caveats(log, windows, left_out, found, everything, named) -> tuple[str, ...
         )
     if missing := [name for name in found.effects if name not in named]:
         result.append(
-            f"Recordings that no fit has seen are simulated better with {listed(missing)}, but its parameters "
-            "do not exclude a cable without it. It is not named."
+            "Part of predictions, because recordings that no fit has seen are simulated better with it, but not named, "
+            f"because the parameters do not exclude a cable without it: {listed(missing)}."
         )
     if useless := [name for name in named if name not in found.effects]:
         result.append(
-            f"Named because the parameters exclude a cable without it, but not part of predictions, because recordings "
+            "Named, because the parameters exclude a cable without it, but not part of predictions, because recordings "
             f"that no fit has seen are not simulated better with it: {listed(useless)}."
         )
     if not everything.settled:

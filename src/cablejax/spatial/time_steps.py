@@ -19,6 +19,7 @@ _FINEST = 4
 # Errors of the time steps may be so large a part of what a good fit leaves, on half of the windows. The others may hold
 # a cable that snaps through, as the believed one often does where the true one is stiffer: there any error grows.
 _SHARE = 0.5
+# A damping time [s] and a drag [1/s] as cables have them.
 _ORDINARY = {"bending_damping": 0.03, "viscous_drag": 0.3}
 
 
