@@ -60,7 +60,7 @@ def test_two_simulators_move_a_cable_alike():
     rod = _simulated(cable, arclength, position, frames)
     links = composite.simulated(cable, arclength, position, frames, SAMPLE_INTERVAL)[:, -SAMPLES:]
     moved = np.linalg.norm(rod - rod[:, :1], axis=-1).mean()
-    assert np.linalg.norm(links - rod, axis=-1).mean() < 0.05 * moved
+    assert np.linalg.norm(links - rod, axis=-1).mean() < 0.02 * moved
 
 
 @pytest.mark.parametrize("present", [[], ["drag"], ["bending_stiffness", "stiffness_profile"]])

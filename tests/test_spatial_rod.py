@@ -7,11 +7,13 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from cablejax.cable import Cable, Discretisation
 from cablejax.simulate.compile import compiler_options
 from cablejax.simulate.composite import build_grasped_chain
 from cablejax.simulate.rod import Rod, RodPhysics
+from cablejax.simulate.rod.material import spin_of_joints
 
 _INTERVAL = 0.01
 
@@ -219,3 +221,33 @@ def test_derivatives_are_those_of_finite_differences():
     difference = (run(step) - run(-step)) / (2 * step)
     assert np.abs(difference).max() > 1e-4
     np.testing.assert_allclose(derivative, difference, atol=2e-3 * float(np.abs(difference).max()))
+
+
+@pytest.mark.parametrize("twisting", [False, True])
+def test_damping_does_not_resist_a_cable_that_turns_as_a_whole(twisting):
+    # both grippers are carried around the vertical and turn with it, and soon the cable does too
+    arclength = np.linspace(0.1, 0.9, 7)
+    time = _INTERVAL * np.arange(300)
+    angle = 1.5 * (time + np.exp(-3 * time) / 3)
+    turn = Rotation.from_rotvec(angle[:, None] * [0.0, 0.0, 1.0]).as_matrix()
+    # the cable leaves one gripper downwards and comes up to the other
+    down = np.array([[0.0, 0.0, -1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]])
+    up = down * np.array([-1.0, 1.0, -1.0])[:, None]
+    frames = np.einsum("tij,qkj->tqki", turn, np.stack([down, up]))
+    position = np.einsum("tij,qj->tqi", turn, np.array([[-0.2, 0.0, 0.0], [0.2, 0.0, 0.0]]))
+    sagging = np.stack([0.4 * arclength - 0.2, 0 * arclength, -0.4 * np.sin(np.pi * arclength)], axis=1)
+    seen = jnp.asarray(sagging @ turn[:2].transpose(0, 2, 1))
+    rod = Rod(n_edges=16, twisting=twisting)
+    little, much = (
+        _run(rod, _physics(arclength, damping_time=tau, drag=0.5), position, frames, seen)[-1] for tau in (0.02, 0.3)
+    )
+    assert np.linalg.norm(little - much, axis=1).max() < 1e-4
+
+
+def test_material_turns_with_a_body_that_turns_as_a_whole():
+    rng = np.random.default_rng(0)
+    edges = 0.05 * np.stack([np.cos(np.linspace(0, 3, 12)), np.sin(np.linspace(0, 3, 12)), np.linspace(0, 1, 12)], 1)
+    spin = rng.normal(size=3)
+    tangents = edges / np.linalg.norm(edges, axis=1, keepdims=True)
+    found = spin_of_joints(edges, np.cross(spin, edges), tangents[[0, -1]] @ spin)
+    np.testing.assert_allclose(found, np.broadcast_to(spin, found.shape), atol=1e-12)

@@ -6,7 +6,6 @@ torsion, drag acts on the middle of every link, and both ends are welded to grip
 
 from __future__ import annotations
 
-import itertools
 from typing import TYPE_CHECKING
 
 import mujoco
@@ -30,6 +29,8 @@ _SETTLE, _SETTLE_DRAG = 1.0, 8.0
 """Time before the grippers move in which the cable comes to rest [s], and the drag that brings it there [1/s]."""
 _WELD = "0.0015 1"
 """Time constant [s] and damping ratio of a grip."""
+_LAG = 3e-3
+"""By which a link that is welded to a moving body follows it late [s]: two time constants."""
 
 Ends = list[tuple[np.ndarray, np.ndarray]]
 """Position and quaternion of both grippers."""
@@ -66,10 +67,14 @@ def _recording(model, cable, arclength, ends: list[Ends], interval: float) -> Fl
 
     def advance(samples: list[Ends], seconds: float, extra: float):
         steps = round(seconds / _STEP)
-        for before, after in itertools.pairwise(samples):
+        for i in range(len(samples) - 1):
             for k in range(steps):
+                # the grips are where they are recorded
+                place = min(i + (k + 1) / steps + _LAG / seconds, len(samples) - 1)
+                first = min(int(place), len(samples) - 2)
+                before, after = samples[first : first + 2]
                 for q in range(2):
-                    data.mocap_pos[q], data.mocap_quat[q] = _between(before[q], after[q], (k + 1) / steps)
+                    data.mocap_pos[q], data.mocap_quat[q] = _between(before[q], after[q], place - first)
                 axes = data.xmat[links].reshape(-1, 3, 3)
                 middle = data.xpos[links] + 0.5 * edge * axes[:, :, 0]
                 # MuJoCo gives the velocity of the body's point at the tree's centre of mass

@@ -32,6 +32,31 @@ def transport(u: Float[Array, "*B 3"], before: Float[Array, "*B 3"], after: Floa
     return cosine * u + jnp.cross(axis, u) + axis * along / jnp.maximum(1.0 + cosine, 1e-3)
 
 
+def spin_of_joints(
+    edges: Float[Array, "m 3"], rate: Float[Array, "m 3"], roll_rate: Float[Array, "2"]
+) -> Float[Array, "m1 3"]:
+    """Angular velocity of the material at every joint, the mean of both edges' [rad/s].
+
+    An edge's motion shows how it turns, except about itself. There it turns as its neighbours do, for twist spreads at
+    once: by so much that the twist grows alike at all joints.
+
+    Args:
+        edges: between neighbouring nodes [m].
+        rate: of change of `edges` [m/s].
+        roll_rate: of the first and the last edge about themselves [rad/s].
+    """
+    tangents = unit(edges)
+    across = jnp.cross(edges, rate) / jnp.sum(edges**2, axis=1, keepdims=True)
+    before, after = tangents[:-1], tangents[1:]
+    # of the edge after each joint against that before it, where their twist stays as it is
+    step = jnp.sum(across[:-1] * after - across[1:] * before, axis=1)
+    step = step / jnp.maximum(1.0 + jnp.sum(before * after, axis=1), 1e-3)
+    free = roll_rate[0] + jnp.concatenate([jnp.zeros(1), jnp.cumsum(step)])
+    about = free + jnp.linspace(0.0, 1.0, len(edges)) * (roll_rate[1] - free[-1])
+    spin = across + about[:, None] * tangents
+    return 0.5 * (spin[1:] + spin[:-1])
+
+
 def twist(tangents: Float[Array, "m 3"], directors: Float[Array, "m 3"]) -> Float[Array, "m1"]:
     """Angle of each director against that of the edge before it [rad]."""
     before = transport(directors[:-1], tangents[:-1], tangents[1:])

@@ -8,9 +8,10 @@ the other end. With D1, D2 the first and second differences,
     |D1 x| = h,
 
 where B = EI/rho [m^4/s^2], k the rest curvature turned with the material, tau the Kelvin-Voigt time, w the angular
-velocity, c and q linear and quadratic drag and t the forces of twist. The bending moment is 2 sin(phi/2) instead of the
-angle phi between two edges, phi (1 - phi^2/24): linear in the nodes. What is stiff is implicit; the rest (w, q, k, t)
-is extrapolated to the end of the step to second order. See `constrained` for the solution of a step and its derivative.
+velocity of the material, c and q linear and quadratic drag and t the forces of twist. The bending moment is
+2 sin(phi/2) instead of the angle phi between two edges, phi (1 - phi^2/24): linear in the nodes. What is stiff is
+implicit; the rest (w, q, k, t) is extrapolated to the end of the step to second order. See `constrained` for the
+solution of a step and its derivative.
 
 BDF2 is of second order, and damps what is slow hardly at all: at 10 ms a vibration of 1 Hz loses 2e-4 of its
 amplitude in a second, one of 5 Hz a tenth. A step that is not solved, or whose local error is large, is made again in
@@ -31,6 +32,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from cablejax.simulate.rod.clamps import held_nodes
 from cablejax.simulate.rod.discrete import DiscreteRod
+from cablejax.simulate.rod.material import unit
 from cablejax.simulate.rod.physics import RodPhysics
 from cablejax.simulate.rod.time_step import Motion, time_step
 
@@ -188,8 +190,10 @@ class Rod:
         def attempt(at: _Progress) -> _Progress:
             share = (index + (at.done + at.size) / _WHOLE) / self.substeps
             ends, side = (_between(leaf, share) for leaf in window)
+            _, turning = jax.jvp(lambda w: _between(window[1], w), (share,), (jnp.ones_like(share),))
+            roll_rate = _roll_rate(ends, side, turning / interval)
             new, solved, error = time_step(
-                discrete, at.motion, dt * at.size / _WHOLE, ends, side, twisting=self.twisting
+                discrete, at.motion, dt * at.size / _WHOLE, ends, side, roll_rate, twisting=self.twisting
             )
             ratio = jax.lax.stop_gradient(error / discrete.h) / self.local_error
             fine, shortest = solved & (ratio <= 1.0), at.size == 1
@@ -229,6 +233,12 @@ class Rod:
 
         at = attempt(progress._replace(done=jnp.zeros_like(progress.done)))
         return jax.lax.cond(unvmap_any(needed(at)), more, lambda at: at, at)
+
+
+def _roll_rate(ends: Float[Array, "4 3"], side: Float[Array, "2 3"], rate: Float[Array, "2 3"]) -> Float[Array, "2"]:
+    """By which the held edges turn about themselves [rad/s], from their directors and how fast those change [1/s]."""
+    along = unit(ends[1::2] - ends[::2])
+    return jnp.sum(jnp.cross(side, rate) * along, axis=1) / jnp.sum(side**2, axis=1)
 
 
 def _windows(leaf: Float[Array, "T *shape"]) -> Float[Array, "T2 4 *shape"]:

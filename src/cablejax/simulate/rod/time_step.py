@@ -17,7 +17,7 @@ from cablejax.simulate.rod.constrained import (
     with_held,
 )
 from cablejax.simulate.rod.discrete import DiscreteRod
-from cablejax.simulate.rod.material import transport, unit
+from cablejax.simulate.rod.material import spin_of_joints, transport, unit
 
 
 class Motion(NamedTuple):
@@ -48,6 +48,7 @@ def time_step(
     dt: Float[Array, ""],
     ends: Float[Array, "4 3"],
     side: Float[Array, "2 3"],
+    roll_rate: Float[Array, "2"],
     *,
     twisting: bool,
 ) -> tuple[Motion, Bool[Array, ""], Float[Array, ""]]:
@@ -63,6 +64,7 @@ def time_step(
         dt: duration of the step.
         ends: the held nodes after the step [m].
         side: the held edges' directors after the step.
+        roll_rate: of the held edges about themselves after the step [rad/s].
         twisting: whether the material frame is followed.
     """
     physics, bending, mass = discrete.physics, discrete.bending, discrete.mass
@@ -71,10 +73,8 @@ def time_step(
     lead, past = (1 + 2 * w) / (1 + w) / dt, w**2 / (1 + w)
     known = ((1 + w) * x - past * x_old) / dt
     x_next, v_next = x + w * (x - x_old), v + w * (v - v_old)
-    edges, turning = jnp.diff(x_next, axis=0), jnp.diff(v_next, axis=0)
-    spin = jnp.cross(edges, turning) / discrete.h**2
-    spin = 0.5 * (spin[1:] + spin[:-1])
-    objective = jnp.cross(spin, bends_of(x_next))
+    edges = jnp.diff(x_next, axis=0)
+    objective = jnp.cross(spin_of_joints(edges, jnp.diff(v_next, axis=0), roll_rate), bends_of(x_next))
     speed = jnp.sqrt(jnp.sum(v_next**2, axis=1, keepdims=True) + 1e-12)
     damped = (bending * physics.damping_time)[:, None] * (bends_of(known) + objective)
     inertia = lead * known + ((1 + w) * v - past * v_old) / dt + physics.gravity
