@@ -12,12 +12,13 @@ import pytest
 import spatial_cases as cases
 from cablejax.bounded import Result
 from cablejax.diagnose import explanation, verdict_json
+from cablejax.diagnose.diagnosis import Gap, NamedEffect
 from cablejax.diagnose.fit import evaluate, improved
 from cablejax.report.diagnosis_page import write_diagnosis_page
 from cablejax.simulate.rod import Rod
 from cablejax.spatial.cable import SpatialCable, errors
 from cablejax.spatial.clock import on_one_clock
-from cablejax.spatial.diagnose import diagnose_space
+from cablejax.spatial.diagnose import _named_or_used, _sentence, diagnose_space
 from cablejax.spatial.gap import noise_of
 from cablejax.spatial.geometry import local_changes
 from cablejax.spatial.identify import layout_of
@@ -156,3 +157,30 @@ def test_names_the_cause_and_goes_on_where_it_was(tmp_path):
     verdict = json.loads((tmp_path / "report" / "verdict.json").read_text())
     assert verdict == json.loads(json.dumps(verdict_json(result)))
     assert len(verdict["where"]["per_episode_mm"]) == 6
+
+
+def _effect(name: str) -> NamedEffect:
+    return NamedEffect(name, None, {}, {"along_cable_m": None, "time_s": None, "table_m": None})
+
+
+@pytest.mark.parametrize(
+    ("named", "used", "besides"),
+    [
+        (["bending_damping"], ["bending_damping"], None),
+        (["bending_damping", "viscous_drag", "lumped_mass"], ["bending_damping"], "viscous drag and lumped mass"),
+    ],
+)
+def test_the_sentence_tells_what_shrinks_the_gap_from_what_else_is_named(named, used, besides):
+    gap = Gap(5.0, 9.0, 4.0, 0.1, 0.8, (0.7, 0.9), None, {}, (0,), {})
+    sentence = _sentence("named", [_effect(name) for name in named], (), gap, used)
+    shrinking, _, rest = sentence.partition(" The parameters show besides: ")
+    assert "80 %" in shrinking
+    assert rest == ("" if besides is None else f"{besides}.")
+    assert "bending damping" in shrinking and "drag" not in shrinking
+
+
+def test_caveats_say_which_effects_are_named_and_not_used_and_the_other_way_round():
+    assert _named_or_used(["bending_damping"], ["bending_damping"]) == []
+    missing, useless = _named_or_used(["bending_damping", "viscous_drag"], ["bending_damping", "lumped_mass"])
+    assert missing.startswith("Part of predictions") and missing.endswith("without it: viscous_drag.")
+    assert useless.startswith("Named") and useless.endswith("with it: lumped_mass.")

@@ -101,7 +101,7 @@ def diagnose_space(
     where = where_of(log, windows.chosen(use), nominal, before[use], noise, changes)
     return SpatialDiagnosis(
         verdict=verdict,
-        sentence=" ".join([_sentence(verdict, effects, equivalent, gap, found), *first]),
+        sentence=" ".join([_sentence(verdict, effects, equivalent, gap, found.effects), *first]),
         effects=effects,
         equivalent=equivalent,
         quantities=quantities_of(found, everything, None if guessed else density) | {"constant_offset_m": offset},
@@ -128,12 +128,12 @@ def diagnose_space(
     )
 
 
-def _sentence(verdict: Verdict, effects: Sequence[NamedEffect], equivalent, gap: Gap, found: Identified) -> str:
-    """The verdict in words; the gap shrinks by the effects that predictions are made with."""
-    used = [effect for effect in effects if effect.name in found.effects]
-    others = [effect.name.replace("_", " ") for effect in effects if effect.name not in found.effects]
-    sentence = verdict_sentence(verdict, used or effects, equivalent, (), gap.shrinkage or 0.0)
-    return f"{sentence} The parameters show besides: {listed(others)}." if used and others else sentence
+def _sentence(verdict: Verdict, effects: Sequence[NamedEffect], equivalent, gap: Gap, used: Sequence[str]) -> str:
+    """The verdict in words; the gap shrinks by the effects that predictions are made with, whose names are `used`."""
+    shrinking = [effect for effect in effects if effect.name in used]
+    others = [effect.name.replace("_", " ") for effect in effects if effect.name not in used]
+    sentence = verdict_sentence(verdict, shrinking or effects, equivalent, (), gap.shrinkage or 0.0)
+    return f"{sentence} The parameters show besides: {listed(others)}." if shrinking and others else sentence
 
 
 def _verdict(gap: Gap, named: Sequence[str], equivalent: tuple[tuple[str, ...], ...]) -> Verdict:
@@ -200,16 +200,7 @@ def _caveats(log, windows, left_out, found, everything, named) -> tuple[str, ...
             f"The grippers move too fast for the finest time steps of the simulation: half of them would change it by "
             f"{1e3 * found.time_steps.error:.1f} mm. Gaps of that size may be its own."
         )
-    if missing := [name for name in found.effects if name not in named]:
-        result.append(
-            "Part of predictions, because recordings that no fit has seen are simulated better with it, but not named, "
-            f"because the parameters do not exclude a cable without it: {listed(missing)}."
-        )
-    if useless := [name for name in named if name not in found.effects]:
-        result.append(
-            "Named, because the parameters exclude a cable without it, but not part of predictions, because recordings "
-            f"that no fit has seen are not simulated better with it: {listed(useless)}."
-        )
+    result += _named_or_used(found.effects, named)
     if not everything.settled:
         result.append(
             "The parameters still changed when predictions were last corrected for the length of the simulator's edges "
@@ -225,3 +216,19 @@ def _caveats(log, windows, left_out, found, everything, named) -> tuple[str, ...
     if groups < 6:
         result.append(f"Only {groups} recordings: intervals over recordings are rough.")
     return tuple(result)
+
+
+def _named_or_used(used: Sequence[str], named: Sequence[str]) -> list[str]:
+    """Caveats on effects that predictions are made with and that are not named, and the other way round."""
+    result = []
+    if missing := [name for name in used if name not in named]:
+        result.append(
+            "Part of predictions, because recordings that no fit has seen are simulated better with it, but not named, "
+            f"because the parameters do not exclude a cable without it: {listed(missing)}."
+        )
+    if useless := [name for name in named if name not in used]:
+        result.append(
+            "Named, because the parameters exclude a cable without it, but not part of predictions, because recordings "
+            f"that no fit has seen are not simulated better with it: {listed(useless)}."
+        )
+    return result
