@@ -63,9 +63,7 @@ NOISE = 1e-3
 SEED = 25
 PLANT = Discretisation(n_links=24, dimension=3, timestep=0.005)
 CABLE = PLANT.cable
-BOUNDS = Bounds(
-    workspace=((-0.5, -0.8), (1.4, 0.8)), keep_out=((0.45, -0.55, 0.08),), max_distance=0.99 * CABLE.length
-)
+BOUNDS = Bounds(workspace=((-0.5, -0.8), (1.4, 0.8)), keep_out=((0.45, -0.55, 0.08),), max_distance=0.99 * CABLE.length)
 RANGES = {
     "table_friction:coefficient": (0.25, 0.5),
     "bending_stiffness:ratio": (0.15, 0.4),
@@ -200,6 +198,7 @@ def page(rows: Sequence[dict[str, Any]]) -> str:
         "without those below 1 %: size, median (mean)",
         "truth among them",
         "the truth alone",
+        "several, called inseparable",
     ]
     table = [head]
     for arm in arms:
@@ -211,7 +210,11 @@ def page(rows: Sequence[dict[str, Any]]) -> str:
                 sizes, hits = [len(names) for names, _ in sets], [truth in names for names, truth in sets]
                 cells += [f"{np.median(sizes):.1f} ({np.mean(sizes):.1f})", f"{sum(hits)} of {len(hits)}"]
             alone = [row["logs"][added]["open"] == [row["truth"]] for row in own]
-            table.append([*cells, f"{sum(alone)} of {len(alone)}"])
+            called = ""
+            if ARMS[arm] == "explanations":
+                several = [row["logs"][added] for row in own if len(row["logs"][added]["open"]) > 1]
+                called = f"{sum(bool(log['inseparable']) for log in several)} of {len(several)}"
+            table.append([*cells, f"{sum(alone)} of {len(alone)}", called])
     made = Counter(family(seed) for seed in common)
     moved = [(row["arm"], broken) for row in rows if row["seed"] in common for broken in row["broken"]]
     kept = {arm: [not broken for name, broken in moved if name == arm] for arm in arms}
@@ -222,13 +225,20 @@ def page(rows: Sequence[dict[str, Any]]) -> str:
         + f", {1e3 * NOISE:g} mm noise; the first log has "
         f"{len(FIRST)} motions. Motions that kept all bounds when the plant executed them: {bounds}.",
         "",
+        "`designed` is the motion that the package recommends, `fisher` the same search for the parameters of the most "
+        "probable explanation, `random` any safe motion. A uniform cable in slow motion shows only the ratio of "
+        "stiffness to density and friction: a set of stiffness and density cannot become smaller.",
+        "",
         *markdown_table(table),
         "",
         "Staged: "
         + ", ".join(f"`{row['effect']}`" for row in rows if row["arm"] == arms[0] and row["seed"] in common)
         + ".",
     ]
-    made_by = "`python experiments/25_next_motion.py --seeds 20` and `--report docs/results/next_motion.md`"
+    made_by = (
+        f"`python experiments/25_next_motion.py --seeds {max(common, default=0)}` and "
+        "`--report docs/results/next_motion.md`"
+    )
     return page_of_results("The next motion", made_by, lines)
 
 
