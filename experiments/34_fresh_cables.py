@@ -178,8 +178,7 @@ def page(rows: list[dict[str, Any]]) -> str:
         f"each with {RECORDINGS} recordings of {SAMPLES * SAMPLE_INTERVAL:g} s at {1 / SAMPLE_INTERVAL:g} Hz, through "
         "the protocol of the [real recordings](real_cables.md). Odd seeds are simulated by a rod with twice the edges "
         "of the fitted one, and with a rest curvature, markers off the centreline and grippers that roll, which are "
-        "not tried; even seeds by links on ball joints in MuJoCo, which share no code with the fit, and whose "
-        "grips follow the recorded ones 3 ms late. Each effect is "
+        "not tried; even seeds by links on ball joints in MuJoCo, which share no code with the fit. Each effect is "
         "there with a chance of one half: EI/rho off the believed one by a factor of 1.3 or more, damping of 0.01 to "
         "0.1 s, drag of 0.2 to 0.8 1/s at the grippers' speed, shared at random by both laws, EI somewhere off its "
         "mean by 30 % or more, grips turned with a standard deviation of 0.2 rad in all recordings and 0.2 rad more in "
@@ -201,9 +200,9 @@ def page(rows: list[dict[str, Any]]) -> str:
         "",
         "Nine of ten should hold the true value. Judged are EI/rho and the drag at the grippers' speed of every cable, "
         "and the parameters of effects that are named and there. All are wider than jackknife and priors give, by "
-        "`UNMODELLED`, which is calibrated on seeds 0 to 39; how sure a name must be was chosen there too. Seeds 1100 "
-        "to 1139 were those of this page for the version before, whose rows led to today's rule for a name; those of "
-        "today had not been run before.",
+        "`UNMODELLED`, which is calibrated on seeds 0 to 39; how sure a name must be was chosen there too. Seeds 1200 "
+        "to 1239 were those of this page for the version before, on whose MuJoCo cables drag and damping came out too "
+        "small: the rod's damping resisted swings as well. Those of today had not been run before.",
         "",
         *interval_table(rows),
         "",
