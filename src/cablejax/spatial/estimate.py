@@ -43,11 +43,11 @@ Quantity = Callable[[Float[Array, "P"]], Float[Array, ""]]
 """Something that follows from the values of all effects, differentiably."""
 UNMODELLED: Mapping[str, float] = MappingProxyType(
     {
-        "bending_stiffness": 0.04,
-        "bending_damping": 0.09,
+        "bending_stiffness": 0.03,
+        "bending_damping": 0.035,
         "drag": 0.03,
-        "stiffness_profile": 0.15,
-        "gripper_rotation_offset": 0.035,
+        "stiffness_profile": 0.12,
+        "gripper_rotation_offset": 0.025,
     }
 )
 """By how much an effect's parameter is off besides, in all recordings alike, where neither jackknife nor priors show
