@@ -249,5 +249,6 @@ def test_material_turns_with_a_body_that_turns_as_a_whole():
     edges = 0.05 * np.stack([np.cos(np.linspace(0, 3, 12)), np.sin(np.linspace(0, 3, 12)), np.linspace(0, 1, 12)], 1)
     spin = rng.normal(size=3)
     tangents = edges / np.linalg.norm(edges, axis=1, keepdims=True)
-    found = spin_of_joints(edges, np.cross(spin, edges), tangents[[0, -1]] @ spin)
+    rate = np.cross(spin, edges)
+    found = spin_of_joints(edges, rate, rate, tangents[[0, -1]] @ spin)
     np.testing.assert_allclose(found, np.broadcast_to(spin, found.shape), atol=1e-12)

@@ -56,7 +56,7 @@ def time_step(
 
     The difference quotient over steps of unequal length is x' = (a x - known) with a = (1 + 2 w) / (1 + w) / dt and w
     the ratio of this step to the last one. What is stiff is implicit; damping by turning, quadratic drag, rest
-    curvature and twist are extrapolated from the last two steps.
+    curvature and twist are extrapolated from the last two steps, what turns about the cable itself is of the last one.
 
     Args:
         discrete: the cable.
@@ -74,7 +74,9 @@ def time_step(
     known = ((1 + w) * x - past * x_old) / dt
     x_next, v_next = x + w * (x - x_old), v + w * (v - v_old)
     edges = jnp.diff(x_next, axis=0)
-    objective = jnp.cross(spin_of_joints(edges, jnp.diff(v_next, axis=0), roll_rate), bends_of(x_next))
+    # what turns about the cable depends on all of it: extrapolated, it makes tight loops unstable that are overdamped
+    spin = spin_of_joints(edges, jnp.diff(v_next, axis=0), jnp.diff(v, axis=0), roll_rate)
+    objective = jnp.cross(spin, bends_of(x_next))
     speed = jnp.sqrt(jnp.sum(v_next**2, axis=1, keepdims=True) + 1e-12)
     damped = (bending * physics.damping_time)[:, None] * (bends_of(known) + objective)
     inertia = lead * known + ((1 + w) * v - past * v_old) / dt + physics.gravity
