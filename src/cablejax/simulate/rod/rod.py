@@ -11,8 +11,7 @@ where B = EI/rho [m^4/s^2], k the rest curvature turned with the material, tau t
 velocity of the material, c and q linear and quadratic drag and t the forces of twist. The bending moment is
 2 sin(phi/2) instead of the angle phi between two edges, phi (1 - phi^2/24): linear in the nodes. What is stiff is
 implicit; the rest (w, q, k, t) is extrapolated to the end of the step to second order, but for the part of w about the
-cable itself, which is of the last step. See `constrained` for the
-solution of a step and its derivative.
+cable itself, which is of the last step. See `constrained` for the solution of a step and its derivative.
 
 BDF2 is of second order, and damps what is slow hardly at all: at 10 ms a vibration of 1 Hz loses 2e-4 of its
 amplitude in a second, one of 5 Hz a tenth. A step that is not solved, or whose local error is large, is made again in
