@@ -250,5 +250,5 @@ def test_material_turns_with_a_body_that_turns_as_a_whole():
     spin = rng.normal(size=3)
     tangents = edges / np.linalg.norm(edges, axis=1, keepdims=True)
     rate = np.cross(spin, edges)
-    found = spin_of_joints(*map(jnp.asarray, (edges, rate, rate, tangents[[0, -1]] @ spin)))
+    found = spin_of_joints(*map(jnp.asarray, (edges, rate, tangents[[0, -1]] @ spin)))
     np.testing.assert_allclose(found, np.broadcast_to(spin, found.shape), atol=1e-12)

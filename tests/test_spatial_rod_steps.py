@@ -29,6 +29,7 @@ _GRID = [
     Case(0.0003, 3.0, 0.0, "loop"),
     Case(0.3, 0.3, 0.0, "jerk"),
     Case(0.3, 0.3, 0.03, "loop"),
+    Case(0.03, 0.3, 1.0, "loop"),
     Case(0.3, 0.3, 1.0, "loop"),
     Case(0.3, 3.0, 1.0, "taut"),
     Case(0.03, 1.0, 0.03, "jerk"),
@@ -39,13 +40,12 @@ _GRID = [
 def test_solved_over_the_ranges_and_near_a_thirtysecond_of_the_step():
     found = rollouts(_GRID, seconds=1.3, edges=16)
     reference = rollouts(_GRID, substeps=32, seconds=1.3, edges=16)
-    assert (found.result == RodResult.SOLVED).all() and (found.solved == 130).all()
+    for one in (found, reference):
+        assert (one.result == RodResult.SOLVED).all() and (one.solved == 130).all()
     off = np.abs(found.points - reference.points).mean(axis=(1, 2, 3))
     moved = np.ptp(reference.points, axis=1).mean(axis=(1, 2))
     # BDF2 takes energy out of what vibrates at 20 Hz, as this one does and nothing else damps
-    # what turns about the cable is of the step before, and counts most in a tight loop that is overdamped
-    shares = {Case(0.3, 0.3, 0.0, "jerk"): 0.1, Case(0.3, 0.3, 1.0, "loop"): 0.03}
-    share = [shares.get(case, 0.02) for case in _GRID]
+    share = [0.1 if case == Case(0.3, 0.3, 0.0, "jerk") else 0.02 for case in _GRID]
     assert (off < share * moved).all(), off / moved
 
 

@@ -35,7 +35,6 @@ def transport(u: Float[Array, "*B 3"], before: Float[Array, "*B 3"], after: Floa
 def spin_of_joints(
     edges: Float[Array, "m 3"],
     rate: Float[Array, "m 3"],
-    earlier: Float[Array, "m 3"],
     roll_rate: Float[Array, "2"],
 ) -> Float[Array, "m1 3"]:
     """Angular velocity of the material at every joint, the mean of both edges' [rad/s].
@@ -45,22 +44,17 @@ def spin_of_joints(
 
     Args:
         edges: between neighbouring nodes [m].
-        rate: of change of `edges`, for how they turn across themselves [m/s].
-        earlier: the same, for how they turn about themselves.
+        rate: of change of `edges` [m/s].
         roll_rate: of the first and the last edge about themselves [rad/s].
     """
-
-    def across(rate):
-        return jnp.cross(edges, rate) / jnp.sum(edges**2, axis=1, keepdims=True)
-
-    tangents, turning = unit(edges), across(earlier)
+    tangents, turning = unit(edges), jnp.cross(edges, rate) / jnp.sum(edges**2, axis=1, keepdims=True)
     before, after = tangents[:-1], tangents[1:]
     # of the edge after each joint against that before it, where their twist stays as it is
     step = jnp.sum(turning[:-1] * after - turning[1:] * before, axis=1)
     step = step / jnp.maximum(1.0 + jnp.sum(before * after, axis=1), 1e-3)
     free = roll_rate[0] + jnp.concatenate([jnp.zeros(1), jnp.cumsum(step)])
     about = free + jnp.linspace(0.0, 1.0, len(edges)) * (roll_rate[1] - free[-1])
-    spin = across(rate) + about[:, None] * tangents
+    spin = turning + about[:, None] * tangents
     return 0.5 * (spin[1:] + spin[:-1])
 
 

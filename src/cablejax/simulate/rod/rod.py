@@ -4,14 +4,14 @@ All quantities are per mass: the motion of a freely hanging cable does not depen
 lengths (j - 1/2) h, so that a clamp at s = 0 sits in the middle of the first edge and holds nodes 0 and 1; the same at
 the other end. With D1, D2 the first and second differences,
 
-    a_j + c v_j + q |v_j| v_j + h^-4 [D2' B (D2 x - h^2 k + tau (D2 v - w x D2 x))]_j = g + t_j - [D1' lambda D1 x]_j,
-    |D1 x| = h,
+    a_j + c v_j + q |v_j| v_j + h^-4 [D2' B (D2 x - h^2 k) + C' tau B C v]_j = g + t_j - [D1' lambda D1 x]_j,
+    C v = D2 v - w x D2 x,        |D1 x| = h,
 
 where B = EI/rho [m^4/s^2], k the rest curvature turned with the material, tau the Kelvin-Voigt time, w the angular
-velocity of the material, c and q linear and quadratic drag and t the forces of twist. The bending moment is
-2 sin(phi/2) instead of the angle phi between two edges, phi (1 - phi^2/24): linear in the nodes. What is stiff is
-implicit; the rest (w, q, k, t) is extrapolated to the end of the step to second order, but for the part of w about the
-cable itself, which is of the last step. See `constrained` for the solution of a step and its derivative.
+velocity of the material, linear in v, c and q linear and quadratic drag and t the forces of twist. The bending moment
+is 2 sin(phi/2) instead of the angle phi between two edges, phi (1 - phi^2/24): linear in the nodes. What is stiff is
+implicit; the rest (q, k, t and how w couples x, y and z) is extrapolated to the end of the step to second order. See
+`constrained` for the solution of a step and its derivative.
 
 BDF2 is of second order, and damps what is slow hardly at all: at 10 ms a vibration of 1 Hz loses 2e-4 of its
 amplitude in a second, one of 5 Hz a tenth. A step that is not solved, or whose local error is large, is made again in
