@@ -24,6 +24,7 @@ def _double():
 
 # Corners of the ranges, and a cable as they are recorded.
 _GRID = [
+    Case(0.0003, 0.3, 0.03, "jerk"),
     Case(0.0003, 0.3, 1.0, "jerk"),
     Case(0.0003, 1.0, 0.0, "hand"),
     Case(0.0003, 3.0, 0.0, "loop"),
