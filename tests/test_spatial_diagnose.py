@@ -179,6 +179,12 @@ def test_the_sentence_tells_what_shrinks_the_gap_from_what_else_is_named(named, 
     assert "bending damping" in shrinking and "drag" not in shrinking
 
 
+def test_the_sentence_claims_no_share_of_the_gap_for_what_predictions_do_not_use():
+    gap = Gap(5.0, 9.0, 4.0, 0.1, 0.8, (0.7, 0.9), None, {}, (0,), {})
+    sentence = _sentence("named", [_effect("bending_stiffness")], (), gap, ["stiffness_profile"])
+    assert "bending stiffness" in sentence and "without" in sentence and "%" not in sentence
+
+
 def test_caveats_say_which_effects_are_named_and_not_used_and_the_other_way_round():
     assert _named_or_used(["bending_damping"], ["bending_damping"]) == []
     missing, useless = _named_or_used(["bending_damping", "viscous_drag"], ["bending_damping", "lumped_mass"])

@@ -131,9 +131,11 @@ def diagnose_space(
 def _sentence(verdict: Verdict, effects: Sequence[NamedEffect], equivalent, gap: Gap, used: Sequence[str]) -> str:
     """The verdict in words; the gap shrinks by the effects that predictions are made with, whose names are `used`."""
     shrinking = [effect for effect in effects if effect.name in used]
-    others = [effect.name.replace("_", " ") for effect in effects if effect.name not in used]
-    sentence = verdict_sentence(verdict, shrinking or effects, equivalent, (), gap.shrinkage or 0.0)
-    return f"{sentence} The parameters show besides: {listed(others)}." if shrinking and others else sentence
+    others = listed([effect.name.replace("_", " ") for effect in effects if effect.name not in used])
+    if others and not shrinking:
+        return f"The parameters show {others}; predictions are made without, so what that explains is not known."
+    sentence = verdict_sentence(verdict, shrinking, equivalent, (), gap.shrinkage or 0.0)
+    return f"{sentence} The parameters show besides: {others}." if others else sentence
 
 
 def _verdict(gap: Gap, named: Sequence[str], equivalent: tuple[tuple[str, ...], ...]) -> Verdict:
