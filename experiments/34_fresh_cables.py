@@ -202,8 +202,8 @@ def page(rows: list[dict[str, Any]]) -> str:
         "and the parameters of effects that are named and there. All are wider than jackknife and priors give, by "
         "`UNMODELLED`, which is calibrated on seeds 0 to 39; how sure a name must be was chosen there too. Seeds 1200 "
         "to 1239 were those of this page for the version before, on whose MuJoCo cables drag and damping came out too "
-        "small: the rod's damping resisted swings as well. Of today's, 1300 to 1320 were run once before, when only part "
-        "of that was mended; nothing was chosen on them.",
+        "small: the rod's damping resisted swings as well. Of today's, 1300 to 1320 were run once before, when only "
+        "part of that was mended; nothing was chosen on them.",
         "",
         *interval_table(rows),
         "",
