@@ -29,12 +29,13 @@ class Robust:
     Attributes:
         distance: d, in the unit of the observations.
         lost: distance at which a point counts whose prediction broke down.
-        steepest: derivative by a coordinate from which on it has broken down.
+        steepest: derivative by a coordinate, per prior standard deviation, from which on it counts as broken down: a
+            prediction that a hundredth of that throws elsewhere is chaotic, and its derivatives block every fit.
     """
 
     distance: float
     lost: float
-    steepest: float = 1e3
+    steepest: float
 
 
 @dataclasses.dataclass(frozen=True)

@@ -35,7 +35,7 @@ _COLUMNS = 8
 # What a simulation has lost is off by this [m].
 _LOST = 1.0
 # In fits it counts for less: one lost window must not outweigh all others.
-_ROBUST = Robust(distance=0.02, lost=0.1)
+_ROBUST = Robust(distance=0.02, lost=0.1, steepest=10.0)
 _CORRELATION = 0.3  # [s]
 # Samples that fits look at: every fourth, after the two that the simulation begins from.
 _FITTED = slice(2, None, 4)
