@@ -103,6 +103,25 @@ def test_the_loss_is_the_pseudo_huber_one_and_its_derivatives_are(cable):
     np.testing.assert_allclose(gone.sse, 2 * loss.distance * loss.lost * points / evidence.noise[0, 0] ** 2)
 
 
+def test_a_chaotic_window_counts_as_lost_and_leaves_the_fit_to_the_others(cable):
+    evidence, trial = cable.evidence(), at(cable, seed=3)
+    (usual,) = evaluate(evidence, [trial])
+    ((predicted, slopes),) = cable.linearise([trial], evidence.episodes)
+    loss = evidence.robust
+    assert loss is not None and np.abs(slopes).max() < loss.steepest
+    slopes = slopes.copy()
+    slopes[0, 1] = 40.0
+    chaotic = dataclasses.replace(cable)
+    object.__setattr__(chaotic, "linearise", lambda explanations, episodes: [(predicted, slopes)])
+    (fit,) = evaluate(dataclasses.replace(evidence, simulator=chaotic), [trial])
+    others = np.arange(len(fit.sse)) != 1
+    points = np.isfinite(evidence.observed[1]).all(axis=-1).sum()
+    np.testing.assert_allclose(fit.sse[1], 2 * loss.distance * loss.lost * points / evidence.noise[0, 0] ** 2)
+    assert not fit.gradient[1].any() and not fit.curvature[1].any()
+    np.testing.assert_array_equal(fit.sse[others], usual.sse[others])
+    np.testing.assert_array_equal(fit.gradient[others], usual.gradient[others])
+
+
 def test_elimination_solves_the_whole_system(cable):
     random, group = np.random.default_rng(0), np.array([0, 0, 2, 3, 3])
     trial, n, m = at(cable, seed=4), 6, 4

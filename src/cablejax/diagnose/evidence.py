@@ -29,8 +29,8 @@ class Robust:
     Attributes:
         distance: d, in the unit of the observations.
         lost: distance at which a point counts whose prediction broke down.
-        steepest: derivative by a coordinate, per prior standard deviation, from which on it counts as broken down: a
-            prediction that a hundredth of that throws elsewhere is chaotic, and its derivatives block every fit.
+        steepest: largest derivative of a point by a coordinate, per prior standard deviation. A steeper point counts as
+            lost: its simulation is chaotic, no step is short enough for its linear model, and it would block the fit.
     """
 
     distance: float

@@ -133,7 +133,10 @@ def _sentence(verdict: Verdict, effects: Sequence[NamedEffect], equivalent, gap:
     shrinking = [effect for effect in effects if effect.name in used]
     others = listed([effect.name.replace("_", " ") for effect in effects if effect.name not in used])
     if others and not shrinking:
-        return f"The parameters show {others}; predictions are made without, so what that explains is not known."
+        return (
+            f"The parameters show {others}. Predictions are made without, so the share of the gap that this explains "
+            "is not known."
+        )
     sentence = verdict_sentence(verdict, shrinking, equivalent, (), gap.shrinkage or 0.0)
     return f"{sentence} The parameters show besides: {others}." if others else sentence
 

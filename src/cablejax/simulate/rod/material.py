@@ -51,7 +51,7 @@ def spin_of_joints(
     before, after = tangents[:-1], tangents[1:]
     # of the edge after each joint against that before it, where their twist stays as it is
     step = jnp.sum(turning[:-1] * after - turning[1:] * before, axis=1)
-    # beyond 120 degrees between two edges the fold is not resolved, and what it would transport has no bound
+    # edges that turn by more than 120 degrees do not resolve the fold, and the transported turn would have no bound
     step = step / jnp.maximum(1.0 + jnp.sum(before * after, axis=1), 0.5)
     free = roll_rate[0] + jnp.concatenate([jnp.zeros(1), jnp.cumsum(step)])
     about = free + jnp.linspace(0.0, 1.0, len(edges)) * (roll_rate[1] - free[-1])

@@ -19,8 +19,9 @@ from cablejax.simulate.rod.constrained import (
 from cablejax.simulate.rod.discrete import DiscreteRod
 from cablejax.simulate.rod.material import spin_of_joints, transport, unit
 
-# Damping couples x, y and z through the turning of the material. This much of its part that does not is implicit, the
-# rest of it all extrapolated: with BDF2 stable at any stiffness as long as no motion is damped 4/3 of that.
+# The turning of the material couples x, y and z in the damping force, which is therefore extrapolated. For stability,
+# the damping of bends that do not turn is added implicitly, times this, and taken off extrapolated. BDF2 is then stable
+# at any damping as long as no motion is damped by more than 4/3 of the implicit part, twice what it is without turning.
 _IMPLICIT = 1.5
 
 
@@ -81,10 +82,10 @@ def time_step(
     resistance, bends = (bending * physics.damping_time)[:, None], bends_of(x_next)
 
     def bend_rates(speeds):
-        """Of the bends, as the material sees them that turns with the cable."""
+        """Rates of change of the bends in the frame of the material."""
         return bends_of(speeds) - jnp.cross(spin_of_joints(edges, jnp.diff(speeds, axis=0), roll_rate), bends)
 
-    # force and rate are each other's transposes, so that it dissipates in whatever motion
+    # the force is the transpose of the rate, so that damping dissipates in every motion
     rate, transposed = jax.vjp(bend_rates, v_next)
     (resisted,) = transposed(resistance * rate)
     uncoupled = _IMPLICIT * resistance * (bends_of(known) + bends_of(v_next))
