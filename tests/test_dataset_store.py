@@ -160,6 +160,11 @@ def edit_json(file: Path, **changes) -> None:
     file.write_text(json.dumps({**json.loads(file.read_text()), **changes}))
 
 
+def edit_codec(file: Path, **changes) -> None:
+    (codec,) = json.loads(file.read_text())["codecs"]
+    edit_json(file, codecs=[{**codec, "configuration": {**codec["configuration"], **changes}}])
+
+
 @pytest.mark.parametrize(
     "damage",
     [
@@ -168,8 +173,10 @@ def edit_json(file: Path, **changes) -> None:
         lambda path: (path / "attempts" / "zarr.json").write_text("{"),
         lambda path: edit_json(path / "attempts" / "zarr.json", shape=[0]),
         lambda path: edit_json(path / "keypoints" / "zarr.json", data_type="float64"),
+        lambda path: edit_codec(path / "keypoints" / "zarr.json", index_codecs=[]),
+        lambda path: edit_codec(path / "keypoints" / "zarr.json", codecs=[]),
     ],
-    ids=["no keypoints", "no digest", "cut", "shape", "type"],
+    ids=["no keypoints", "no digest", "cut", "shape", "type", "index codecs", "codecs"],
 )
 def test_a_damaged_description_is_refused_and_mended(tmp_path, damage):
     path = tmp_path / "data"

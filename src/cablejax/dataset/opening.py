@@ -11,7 +11,10 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
 import zarr
+from zarr.buffer import default_buffer_prototype
+from zarr.storage import MemoryStore
 
 from cablejax import __version__
 from cablejax.dataset.bucket import Bucket, place_of
@@ -87,13 +90,26 @@ def _fault(store: Store, name: str) -> str | None:
     try:
         array = zarr.open_array(store.group.store, path=name, mode="r")
         came = (array.shape, str(array.dtype), (array.shards or array.chunks)[0], array.fill_value)
+        expected = ((store.config.n_trajectories, *shape), dtype, store.config.shard_size, 0)
+        if came != expected:
+            return f"has (shape, type, shard, default) {came}, expected {expected}"
+        return None if _keeps(array) else "is encoded in a way that does not give back what is written"
     except Exception as error:  # zarr raises what its parts raise
         if isinstance(store.path, Bucket) and not isinstance(error, (FileNotFoundError, ValueError, KeyError)):
             with store.path.reached():
                 raise
-        return f"cannot be opened: {_reason(error)}"
-    expected = ((store.config.n_trajectories, *shape), dtype, store.config.shard_size, 0)
-    return None if came == expected else f"has (shape, type, shard, default) {came}, expected {expected}"
+        return f"cannot be used: {_reason(error)}"
+
+
+def _keeps(array: zarr.Array[Any]) -> bool:
+    """Whether an array that is described like this one gives back what is written. Raises what its codecs raise.
+
+    Descriptions are not compared with new ones, for versions of zarr word the same codecs differently.
+    """
+    described = array.metadata.to_buffer_dict(default_buffer_prototype())
+    like = zarr.open_array(MemoryStore(dict(described)), mode="r+")
+    like[0] = 1
+    return bool(np.all(like[0] == 1))
 
 
 def _reason(error: Exception) -> str:
