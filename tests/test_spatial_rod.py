@@ -13,7 +13,7 @@ from cablejax.cable import Cable, Discretisation
 from cablejax.simulate.compile import compiler_options
 from cablejax.simulate.composite import build_grasped_chain
 from cablejax.simulate.rod import Rod, RodPhysics
-from cablejax.simulate.rod.material import spin_of_joints
+from cablejax.simulate.rod.material import forces_of_torques, spin_of_joints
 
 _INTERVAL = 0.01
 
@@ -252,3 +252,15 @@ def test_material_turns_with_a_body_that_turns_as_a_whole():
     rate = np.cross(spin, edges)
     found = spin_of_joints(*map(jnp.asarray, (edges, rate, tangents[[0, -1]] @ spin)))
     np.testing.assert_allclose(found, np.broadcast_to(spin, found.shape), atol=1e-12)
+
+
+def test_forces_of_torques_have_the_power_of_the_torques():
+    rng = np.random.default_rng(0)
+    edges = 0.05 * (np.array([1.0, 0.0, 0.0]) + 0.4 * rng.normal(size=(12, 3)))
+    edges[5] = [-0.05, 0.01, 0.0]  # a fold that is not resolved
+    torque, rate = rng.normal(size=(11, 3)), rng.normal(size=(12, 3))
+    edges, torque, rate, still = map(jnp.asarray, (edges, torque, rate, np.zeros(2)))
+    spin, transposed = jax.vjp(lambda rate: spin_of_joints(edges, rate, still), rate)
+    force = forces_of_torques(edges, torque)
+    np.testing.assert_allclose(force, transposed(torque)[0], rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(jnp.vdot(force, rate), jnp.vdot(torque, spin), rtol=1e-12)

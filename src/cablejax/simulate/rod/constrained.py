@@ -15,8 +15,9 @@ cloth, 2007, with the geometric stiffness of Tournier et al., Stable constrained
 
 Newton steps are damped by the natural monotonicity test (Deuflhard, Newton methods for nonlinear problems, 2004,
 chapter 3): a step s is shortened until the correction that would follow it with the same matrices, s2, is shorter than
-s. The test does not depend on units or conditioning; s2 estimates in metres what is still missing, and costs two
-products. A full step is followed by s2 at once, which makes the order of convergence three per factorisation.
+s. The test does not depend on units or conditioning; s2 estimates in metres what is still missing, and costs a few
+products. A full step is followed by s2 and by further corrections with the same matrices (the simplified Newton method,
+chapter 2 there) for as long as each is much shorter than the last: factors cost as much as several of them.
 
 Derivatives are those of the solution, by the implicit function theorem, in forward and in reverse mode.
 """
@@ -38,6 +39,8 @@ keep their length within twice this."""
 # Newton's method converges in two or three iterations or not at all; halving a time step is cheaper than more of them.
 _MOST_ITERATIONS = 12
 _SHORTEST_SHARE = 2.0**-6
+# Corrections with the same matrices follow each other while each is at most this part of the last.
+_SHRINKS = 0.1
 # An edge must not turn over in one step: no node moves by more than this part of an edge.
 _LONGEST = 0.7
 # From far away: so many steps without compression first, and at most so many in all.
@@ -129,11 +132,8 @@ def constrained(
         tension: first guess of lambda; no derivative passes through it.
     """
     stiffness, most = _matrix(chain), _MOST_FAR if far else _MOST_ITERATIONS
-    # tensions as lengths, in which a step is measured
-    unit = chain.edge / jnp.mean(jnp.diagonal(stiffness))
-
-    def size(step, change):
-        return jnp.sqrt(jnp.sum(step**2) + unit**2 * jnp.sum(change**2)) + 1e-30
+    # a step is measured in lengths, tensions too
+    size = partial(_size, chain.edge / jnp.mean(jnp.diagonal(stiffness)))
 
     def newton(at):
         free, tension, _, count, left, run = at
@@ -158,9 +158,23 @@ def constrained(
         ended = ~convex & (longest <= TOLERANCE)
         full = ~convex & (share >= 1.0) & (ratio < 0.5)
         lower = convex | ended | (ratio <= 1 - 0.25 * share)
-        moved = free + share * step + jnp.where(full, more[0], 0.0)
-        pulled = tension + jnp.where(convex, 1.0, share) * change + jnp.where(full, more[1], 0.0)
-        error = jnp.where(full | ended, jnp.minimum(_longest(more[0]), longest), jnp.inf)
+
+        def again(at):
+            """Makes the correction, and finds the next."""
+            free, tension, more, *_ = at
+            free, tension = free + more[0], tension + more[1]
+            _, residual, violation = _residuals(chain, force, held, free, tension)
+            following = _solve(*matrices, edges, residual, violation)
+            return free, tension, following, _longest(more[0]), size(*following) / size(*more)
+
+        def missing(at):
+            *_, last, ratio = at
+            return full & (last > TOLERANCE) & (ratio <= _SHRINKS)
+
+        stepped = (free + share * step, tension + jnp.where(convex, 1.0, share) * change)
+        # the first correction is made in any case
+        moved, pulled, _, last, _ = jax.lax.while_loop(missing, again, (*stepped, more, longest, jnp.zeros_like(ratio)))
+        error = jnp.where(full | ended, last, jnp.inf)
         return (
             jnp.where(lower, moved, free),
             jnp.where(lower, pulled, tension),
@@ -197,6 +211,10 @@ def _constrained_jvp(far, primals, tangents):
     violation = jnp.sum(edges * d_edges, axis=1) - chain.edge * d_chain.edge - d_chain.compliance * tension
     step, change = _solve(*_inverses(chain, _matrix(chain), edges, tension), edges, residual, violation)
     return solution, Solution(step, change, jnp.zeros_like(solution.error))
+
+
+def _size(unit, step, change):
+    return jnp.sqrt(jnp.sum(step**2) + unit**2 * jnp.sum(change**2)) + 1e-30
 
 
 def _longest(step: Float[Array, "f 3"]) -> Float[Array, ""]:

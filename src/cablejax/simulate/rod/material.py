@@ -47,16 +47,47 @@ def spin_of_joints(
         rate: of change of `edges` [m/s].
         roll_rate: of the first and the last edge about themselves [rad/s].
     """
-    tangents, turning = unit(edges), jnp.cross(edges, rate) / jnp.sum(edges**2, axis=1, keepdims=True)
-    before, after = tangents[:-1], tangents[1:]
+    length, tangents, curvature = _binormals(edges)
+    rate = rate / length
     # of the edge after each joint against that before it, where their twist stays as it is
-    step = jnp.sum(turning[:-1] * after - turning[1:] * before, axis=1)
-    # edges that turn by more than 120 degrees do not resolve the fold, and the transported turn would have no bound
-    step = step / jnp.maximum(1.0 + jnp.sum(before * after, axis=1), 0.5)
-    free = roll_rate[0] + jnp.concatenate([jnp.zeros(1), jnp.cumsum(step)])
-    about = free + jnp.linspace(0.0, 1.0, len(edges)) * (roll_rate[1] - free[-1])
-    spin = turning + about[:, None] * tangents
+    step = -0.5 * jnp.sum(curvature * (rate[1:] + rate[:-1]), axis=1)
+    about = np.linspace([1.0, 0.0], [0.0, 1.0], len(edges)) @ roll_rate + _evened(len(edges)) @ step
+    spin = jnp.cross(tangents, rate) + about[:, None] * tangents
     return 0.5 * (spin[1:] + spin[:-1])
+
+
+def forces_of_torques(edges: Float[Array, "m 3"], torque: Float[Array, "m1 3"]) -> Float[Array, "m 3"]:
+    """On the edges, of torques at the joints: the transpose of `spin_of_joints` in `rate`, so that power is the same.
+
+    Args:
+        edges: between neighbouring nodes [m].
+        torque: at every joint.
+    """
+    length, tangents, curvature = _binormals(edges)
+    torque = _shared(torque)
+    bent = curvature * (_evened(len(edges)).T @ jnp.sum(torque * tangents, axis=1))[:, None]
+    return (jnp.cross(torque, tangents) - _shared(bent)) / length
+
+
+def _shared(joints: Float[Array, "m1 3"]) -> Float[Array, "m 3"]:
+    """Half of what acts at each joint for either of its edges."""
+    zero = jnp.zeros_like(joints[:1])
+    return 0.5 * (jnp.concatenate([zero, joints]) + jnp.concatenate([joints, zero]))
+
+
+def _binormals(edges: Float[Array, "m 3"]) -> tuple[Float[Array, "m 1"], Float[Array, "m 3"], Float[Array, "m1 3"]]:
+    """Lengths of the edges, their directions, and the curvature binormals at the joints (Bergou et al.)."""
+    length = jnp.sqrt(jnp.sum(edges**2, axis=1, keepdims=True))
+    tangents = edges / length
+    before, after = tangents[:-1], tangents[1:]
+    # edges that turn by more than 120 degrees do not resolve the fold, and the binormal would have no bound
+    bound = jnp.maximum(1.0 + jnp.sum(before * after, axis=1, keepdims=True), 0.5)
+    return length, tangents, 2.0 * jnp.cross(before, after) / bound
+
+
+def _evened(count: int) -> Float[np.ndarray, "m m1"]:
+    """How steps from edge to edge add up from the first edge on, less as much from each as takes the last one to 0."""
+    return np.tri(count, count - 1, -1) - np.linspace(0.0, 1.0, count)[:, None]
 
 
 def twist(tangents: Float[Array, "m 3"], directors: Float[Array, "m 3"]) -> Float[Array, "m1"]:

@@ -138,7 +138,8 @@ class Rod:
                 points = points + discrete.marker_offsets(progress.motion.directors, progress.motion.tangents)
             return progress, (points, progress.lost)
 
-        progress, (points, lost) = jax.lax.scan(sample, start, (_windows(held), _windows(side)))
+        grippers = _windows(jnp.concatenate([held, side], axis=1))
+        progress, (points, lost) = jax.lax.scan(sample, start, grippers)
         result = jnp.where(progress.lost, RodResult.UNSOLVED, jnp.where(progress.coarse, RodResult.COARSE, 0))
         solved = jnp.where(found, 2 + jnp.sum(~lost), 0)
         return Rollout(jnp.concatenate([first_points, points]), result, solved, progress.attempts)
@@ -189,9 +190,9 @@ class Rod:
 
         def attempt(at: _Progress) -> _Progress:
             share = (index + (at.done + at.size) / _WHOLE) / self.substeps
-            ends, side = (_between(leaf, share) for leaf in window)
-            _, turning = jax.jvp(lambda w: _between(window[1], w), (share,), (jnp.ones_like(share),))
-            roll_rate = _roll_rate(ends, side, turning / interval)
+            grippers, rates = _between(window, share)
+            ends, side = grippers[:4], grippers[4:]
+            roll_rate = _roll_rate(ends, side, rates[4:] / interval)
             new, solved, error = time_step(
                 discrete, at.motion, dt * at.size / _WHOLE, ends, side, roll_rate, twisting=self.twisting
             )
@@ -247,9 +248,12 @@ def _windows(leaf: Float[Array, "T *shape"]) -> Float[Array, "T2 4 *shape"]:
     return jnp.stack([padded[:-3], padded[1:-2], padded[2:-1], padded[3:]], axis=1)
 
 
-def _between(leaf: Float[Array, "4 *shape"], w: Float[Array, ""]) -> Float[Array, "*shape"]:
-    """Cubic through four samples at `w` between the middle two: a broken line of poses would shake the cable."""
-    weight = jnp.stack(
-        [-w * (1 - w) * (2 - w) / 6, (1 - w * w) * (2 - w) / 2, w * (1 + w) * (2 - w) / 2, -w * (1 - w * w) / 6]
-    )
-    return jnp.tensordot(weight, leaf, axes=1)
+def _between(leaf: Float[Array, "4 *shape"], w: Float[Array, ""]) -> Float[Array, "2 *shape"]:
+    """Cubic through four samples at `w` between the middle two, and its rate: a broken line of poses would shake it."""
+
+    def weights(w):
+        return jnp.stack(
+            [-w * (1 - w) * (2 - w) / 6, (1 - w * w) * (2 - w) / 2, w * (1 + w) * (2 - w) / 2, -w * (1 - w * w) / 6]
+        )
+
+    return jnp.tensordot(jnp.stack(jax.jvp(weights, (w,), (jnp.ones_like(w),))), leaf, axes=1)

@@ -17,7 +17,7 @@ from cablejax.simulate.rod.constrained import (
     with_held,
 )
 from cablejax.simulate.rod.discrete import DiscreteRod
-from cablejax.simulate.rod.material import spin_of_joints, transport, unit
+from cablejax.simulate.rod.material import forces_of_torques, spin_of_joints, transport, unit
 
 # The turning of the material couples x, y and z in the damping force, which is therefore extrapolated. For stability,
 # the damping of bends that do not turn is added implicitly, times this, and taken off extrapolated. BDF2 is then stable
@@ -81,18 +81,18 @@ def time_step(
     edges = jnp.diff(x_next, axis=0)
     resistance, bends = (bending * physics.damping_time)[:, None], bends_of(x_next)
 
-    def bend_rates(speeds):
-        """Rates of change of the bends in the frame of the material."""
-        return bends_of(speeds) - jnp.cross(spin_of_joints(edges, jnp.diff(speeds, axis=0), roll_rate), bends)
-
-    # the force is the transpose of the rate, so that damping dissipates in every motion
-    rate, transposed = jax.vjp(bend_rates, v_next)
-    (resisted,) = transposed(resistance * rate)
+    # rate of change of the bends in the frame of the material, and the force that opposes it. That is the transpose of
+    # the rate, so that damping dissipates in every motion
+    spin = spin_of_joints(edges, jnp.diff(v_next, axis=0), roll_rate)
+    resisted = resistance * (bends_of(v_next) - jnp.cross(spin, bends))
+    coupled = forces_of_torques(edges, jnp.cross(bends, resisted))
     uncoupled = _IMPLICIT * resistance * (bends_of(known) + bends_of(v_next))
     speed = jnp.sqrt(jnp.sum(v_next**2, axis=1, keepdims=True) + 1e-12)
     inertia = lead * known + ((1 + w) * v - past * v_old) / dt + physics.gravity
     drag = physics.drag + physics.quadratic_drag * speed[2:-2]
-    force = mass * inertia[2:-2] + drag * known[2:-2] + spread_bends(uncoupled) - resisted[2:-2]
+    force = (
+        mass * inertia[2:-2] + drag * known[2:-2] + spread_bends(uncoupled - resisted) + coupled[1:-2] - coupled[2:-1]
+    )
     if twisting:
         force = force + discrete.forces(x_next, transport(u, t, unit(edges)), unit(edges))
     chain = ElasticChain(
