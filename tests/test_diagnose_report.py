@@ -159,7 +159,13 @@ CASES = {
             "are indistinguishable",
             "No motion that was tried separates",
             "remove 4 % of the doubt",
+            "A designed one may",
         ],
+    ),
+    "inseparable": (
+        lambda: diagnosis("ambiguous", equivalent=ALIKE, next_motion=following(*FAINT, "settled")),
+        "Cause narrowed down",
+        ["the best, the <b>designed motion", "Measure one of them by other means"],
     ),
     "with one that is improbable": (
         lambda: diagnosis("ambiguous", equivalent=THREE),
@@ -294,7 +300,9 @@ def test_verdict_has_the_formats_effects():
     worth = verdict["next_motion_worth"]
     assert worth["information_nats"] == 0.6 and worth["doubt_nats"] == pytest.approx(np.log(2), rel=1e-5)
     assert worth["certainty"] == pytest.approx(0.5 * np.exp(0.6), rel=1e-5) and worth["inseparable"] is False
-    assert verdict_json(diagnosis(next_motion=following(*FAINT)))["next_motion_worth"]["inseparable"] is True
+    assert verdict_json(diagnosis(next_motion=following(*FAINT)))["next_motion_worth"]["inseparable"] is False
+    searched = diagnosis(next_motion=following(*FAINT, "settled"))
+    assert verdict_json(searched)["next_motion_worth"]["inseparable"] is True
 
 
 @pytest.fixture(scope="module")

@@ -193,9 +193,14 @@ class NextMotion:
         return math.exp(min(self.information - self.doubt, 0.0)) if self.separates else None
 
     @property
-    def inseparable(self) -> bool:
-        """Whether every motion that was tried would leave nearly all of the doubt."""
+    def faint(self) -> bool:
+        """Whether it would leave nearly all of the doubt."""
         return bool(self.separates) and self.information < SEPARABLE * self.doubt
+
+    @property
+    def inseparable(self) -> bool:
+        """Whether a search for a motion found none that would not: the library alone does not show that."""
+        return self.faint and self.ended is not None
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
