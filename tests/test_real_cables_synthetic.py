@@ -63,6 +63,12 @@ def test_two_simulators_move_a_cable_alike():
     assert np.linalg.norm(links - rod, axis=-1).mean() < 0.02 * moved
 
 
+@pytest.mark.slow
+def test_links_that_break_down_are_simulated_in_shorter_steps():
+    cable, recordings = synthetic_recordings(1320, "composite", present=["gripper_rotation_offset"])
+    assert np.isfinite(recordings.keypoints).all() and cable.grips.any()
+
+
 @pytest.mark.parametrize("present", [[], ["drag"], ["bending_stiffness", "stiffness_profile"]])
 def test_a_cable_has_the_effects_that_it_is_given_and_no_others(present):
     cable = with_effects(drawn_cable(np.random.default_rng(2), 3), present, np.random.default_rng(3))

@@ -19,12 +19,14 @@ if TYPE_CHECKING:
 
 EDGES = 32
 """Links of the cable's length: one more, for half a link at each end is in a gripper."""
-_STEP = 5e-4
-"""Time step [s]: springs are explicit in MuJoCo, and the stiffest of these cables needs that."""
+_STEPS = (5e-4, 2.5e-4)
+"""Time step [s], and a shorter one where that breaks down: springs are explicit in MuJoCo."""
 _DENSITY = 0.05
 """Mass per length [kg/m]; a hanging cable's motion does not depend on it."""
 _RADIUS = 0.008
 """Of the links [m]: thinner ones turn about themselves faster than the time step can follow."""
+_JUMP = 0.1
+"""No hand moves a marker so far from one sample to the next [m]."""
 _SETTLE, _SETTLE_DRAG = 1.0, 8.0
 """Time before the grippers move in which the cable comes to rest [s], and the drag that brings it there [1/s]."""
 _WELD = "0.0015 1"
@@ -53,7 +55,18 @@ def simulated(
     """
     model = mujoco.MjModel.from_xml_string(_xml(cable, arclength))
     every = [_ends(*motion) for motion in zip(position, frames, cable.grips, strict=True)]
-    return np.stack([_recording(model, cable, arclength, ends, interval) for ends in every])
+    found = np.zeros(0)
+    for step in _STEPS:
+        model.opt.timestep = step
+        found = np.stack([_recording(model, cable, arclength, ends, interval) for ends in every])
+        if not broken(found):
+            break
+    return found
+
+
+def broken(markers: Float[np.ndarray, "R T N 3"]) -> bool:
+    """Whether a simulation broke down: MuJoCo begins anew where it becomes unstable."""
+    return not np.isfinite(markers).all() or np.abs(np.diff(markers, axis=1)).max() > _JUMP
 
 
 def _recording(model, cable, arclength, ends: list[Ends], interval: float) -> Float[np.ndarray, "T N 3"]:
@@ -66,7 +79,7 @@ def _recording(model, cable, arclength, ends: list[Ends], interval: float) -> Fl
     weight = _DENSITY * edge
 
     def advance(samples: list[Ends], seconds: float, extra: float):
-        steps = round(seconds / _STEP)
+        steps = round(seconds / model.opt.timestep)
         for i in range(len(samples) - 1):
             for k in range(steps):
                 # the grips are where they are recorded
@@ -121,7 +134,7 @@ def _xml(cable, arclength) -> str:
         for q, link in enumerate((0, EDGES))
     ]
     return (
-        f'<mujoco><option timestep="{_STEP}" integrator="implicitfast"><flag contact="disable"/></option><worldbody>'
+        '<mujoco><option integrator="implicitfast"><flag contact="disable"/></option><worldbody>'
         + '<body name="grip0" mocap="true"/><body name="grip1" mocap="true"/>'
         + "".join([*text, *end])
         + f"</worldbody><equality>{''.join(welds)}</equality></mujoco>"

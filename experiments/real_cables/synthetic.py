@@ -37,8 +37,6 @@ _DISTINCT, _SOFTER = 1.3, 0.3  # least ratio of stiffness to the believed one, c
 _UNDAMPED = 1e-3  # no cable is without any damping, and this does not show [s]
 _DRAG = 0.2, 0.8  # range of both drags together at the grippers' speed [1/s]
 _UNEVEN = 0.3  # least difference of the stiffness somewhere from its mean along the cable
-# A marker that moves further between two samples than a hand moves a cable: the simulation has broken down [m].
-_BROKEN = 0.1
 
 Law = Literal["as fitted", "richer", "composite"]
 """Whether the true cable obeys the simulator that is fitted, or has a rest curvature, markers off its centreline and
@@ -118,7 +116,7 @@ def synthetic_recordings(
         free = composite.simulated(cable, s, position, frames, SAMPLE_INTERVAL)[:, _LEAD:]
     else:
         free = _simulated(cable, s, position, frames)
-    if not np.isfinite(free).all() or np.abs(np.diff(free, axis=1)).max() > _BROKEN:
+    if composite.broken(free):
         raise FloatingPointError(f"The simulation of cable {seed} ({law}) broke down.")
     outer = position + np.array([-1.0, 1.0])[:, None] * _REACH * direction
     ends = [part[:, _LEAD:] for part in (outer[:, :, :1], position[:, :, :1], position[:, :, 1:], outer[:, :, 1:])]
