@@ -44,9 +44,9 @@ Quantity = Callable[[Float[Array, "P"]], Float[Array, ""]]
 UNMODELLED: Mapping[str, float] = MappingProxyType(
     {
         "bending_stiffness": 0.03,
-        "bending_damping": 0.035,
-        "drag": 0.03,
-        "stiffness_profile": 0.12,
+        "bending_damping": 0.04,
+        "drag": 0.02,
+        "stiffness_profile": 0.09,
         "gripper_rotation_offset": 0.025,
     }
 )
@@ -169,19 +169,25 @@ def estimate(
     windows = cable.windows
     cable = cable.on(windows.chosen(np.flatnonzero(affordable(start, windows))))
     progress(f"all effects free: {len(cable.windows)} windows")
-    tolerance, rounds = _TOLERANCE * len(cable.windows), 0
+    tolerance, rounds, steps = _TOLERANCE * len(cable.windows), 0, _STEPS
+    # the search may have left what is a recording's own in a bad minimum, which a fit from 0 need not end in
+    starts = [start, start.moved(start.z, np.zeros_like(start.own))] if start.own.any() else [start]
     while True:
         rounds += 1
         evidence = cable.corrected(start).evidence()
-        (fit,) = improve(evidence, evaluate(evidence, [start]), max_iterations=_STEPS, tolerance=tolerance)
+        fits = improve(evidence, evaluate(evidence, starts), max_iterations=steps, tolerance=tolerance)
+        fit = min(fits, key=lambda fit: fit.cost(evidence))
         error = np.hypot(*(np.linalg.norm(rows, axis=0) for rows in _rows(evidence, fit)))
         moved = float((np.abs(fit.explanation.z - start.z) / error).max(initial=0.0))
         progress(f"corrected for finite edges and time steps: values move by up to {moved:.2f} standard errors")
-        # a round of steps that were all too long says nothing
-        settled = bool(moved < _SETTLED and (moved > 0 or fit.result is not Result.STEP_LIMIT))
+        # a round of steps that were all too long says nothing, and the next one needs more of them
+        stuck = moved == 0 and fit.result is Result.STEP_LIMIT
+        steps = 2 * steps if stuck else _STEPS
+        settled = moved < _SETTLED and not stuck
         if settled or rounds == _ROUNDS:
             return dataclasses.replace(estimate_at(evidence, fit), settled=settled)
         start = fit.explanation
+        starts = [start]
 
 
 def estimate_at(evidence: Evidence, fit: Fit) -> Estimate:
