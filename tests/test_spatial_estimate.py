@@ -18,6 +18,7 @@ from cablejax.spatial.cable import TWISTED, SpatialCable
 from cablejax.spatial.estimate import UNMODELLED, Interval, estimate
 from cablejax.spatial.identify import Identified, layout_of
 from cablejax.spatial.named import named_effects, parameters_of, quantities_of
+from cablejax.spatial.search import with_effect
 from cablejax.spatial.time_steps import TimeSteps
 from cablejax.spatial.windows import windows_of
 
@@ -175,6 +176,18 @@ def test_few_edges_and_long_steps_do_not_pass_for_another_stiffness(found):
     true = found.stiffness(found.everything)
     assert told.settled and told.stiffness.value == pytest.approx(true, rel=3e-3)
     assert abs(found.stiffness(fit.explanation) / true - 1) > 0.02
+
+
+@pytest.mark.slow
+def test_does_not_stay_where_a_search_took_the_grips_astray(found):
+    grips = found.cable.layout.named("gripper_rotation_offset")
+    start = with_effect(found.cable, found.everything, grips, grips.null)
+    astray, said = start.moved(start.z, start.own + 8.0), []
+    told = estimate(found, astray, found.cable, progress=said.append)
+    assert told.settled and told.stiffness.value == pytest.approx(_TRUE_STIFFNESS, rel=0.02)
+    # from there alone the second round still moves by 40 standard errors
+    moves = [float(text.split()[-3]) for text in said if "standard errors" in text]
+    assert moves[1] < 5
 
 
 def test_names_only_what_the_estimate_shows(found, everything):
