@@ -39,11 +39,13 @@ def execute(path: pathlib.Path, *, keep: bool) -> tuple[float, float]:
     """Wall-clock and processor time [s] of a notebook, in a kernel and a folder of its own."""
     notebook = nbformat.read(path, as_version=4)
     before, began = resource.getrusage(resource.RUSAGE_CHILDREN), time.monotonic()
+    # notebooks find `experiments/` from their own folder, which this is not
+    environment = {**os.environ, "PYTHONPATH": str(path.resolve().parents[1] / "experiments")}
     with tempfile.TemporaryDirectory() as folder:
         resources = {"metadata": {"path": folder}}
         NotebookClient(
             notebook, timeout=3600, kernel_name="python3", coalesce_streams=True, resources=resources
-        ).execute()
+        ).execute(env=environment)
     wall, after = time.monotonic() - began, resource.getrusage(resource.RUSAGE_CHILDREN)
     if keep:
         for cell in notebook.cells:
