@@ -40,7 +40,8 @@ def execute(path: pathlib.Path, *, keep: bool) -> tuple[float, float]:
     notebook = nbformat.read(path, as_version=4)
     before, began = resource.getrusage(resource.RUSAGE_CHILDREN), time.monotonic()
     # notebooks find `experiments/` from their own folder, which this is not
-    environment = {**os.environ, "PYTHONPATH": str(path.resolve().parents[1] / "experiments")}
+    places = [str(FOLDER.with_name("experiments")), *filter(None, [os.environ.get("PYTHONPATH")])]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(places)}
     with tempfile.TemporaryDirectory() as folder:
         resources = {"metadata": {"path": folder}}
         NotebookClient(
