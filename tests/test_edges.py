@@ -84,6 +84,7 @@ def log_arrays() -> dict[str, Any]:
 @functools.cache
 def original(name: str) -> pathlib.Path:
     """A valid input, which nobody changes; made once."""
+    assert _TEMPORARY, "outside a test these would be left in the working folder"
     folder = pathlib.Path(_TEMPORARY) / name
     folder.mkdir(parents=True)
     if name == "model":

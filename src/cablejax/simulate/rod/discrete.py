@@ -24,15 +24,15 @@ from cablejax.simulate.rod.constrained import (
 from cablejax.simulate.rod.material import joint_frames, transport, turned, twist, twist_matrix, unit
 from cablejax.simulate.rod.physics import RodPhysics
 
-# Weight of the observed markers when the first shape is drawn through them [1/s^2].
-_PIN = 3e4
+# Pull of an observed marker on the first shape, over the mass of a length of cable [m/s^2 per m].
+_PIN = 1.5e3
 
 
 def along_joints(values: Float[Array | np.ndarray, "J"], count: int) -> Float[Array, "count"]:
-    """Linear interpolation of evenly spaced values to the joints."""
+    """Linear interpolation of evenly spaced values to the joints, half an edge from either end."""
     if values.shape[0] == 1:
         return jnp.broadcast_to(values, (count,))
-    return jnp.interp(jnp.linspace(0.0, 1.0, count), jnp.linspace(0.0, 1.0, values.shape[0]), values)
+    return jnp.interp((np.arange(count) + 0.5) / count, jnp.linspace(0.0, 1.0, values.shape[0]), values)
 
 
 def cubic_weights(s: Float[Array | np.ndarray, "N"], h: Float[Array | np.ndarray, ""], n: int) -> Float[Array, "N n"]:
@@ -173,9 +173,9 @@ class DiscreteRod:
             held: the first two and the last two nodes [m].
             guess: free nodes to start from [m]; no derivative passes through it.
         """
-        pins, n = _PIN**0.5 * self.weights, self.n
+        pins, n = jnp.sqrt(_PIN / self.h) * self.weights, self.n
         pinned = ElasticChain(jnp.zeros(n - 4), self.bending, self.h, self.compliance, pins[:, 2:-2])
         at_ends = pins[:, :2] @ held[:2] + pins[:, -2:] @ held[2:]
-        pull = pins[:, 2:-2].T @ (_PIN**0.5 * markers - at_ends) + self.physics.gravity
+        pull = pins[:, 2:-2].T @ (jnp.sqrt(_PIN / self.h) * markers - at_ends) + self.physics.gravity
         free, _, error = constrained(True, pinned, pull, held, *jax.lax.stop_gradient((guess, jnp.zeros(n - 3))))
         return with_held(free, held), error <= TOLERANCE
