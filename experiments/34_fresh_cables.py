@@ -211,8 +211,8 @@ def page(rows: list[dict[str, Any]]) -> str:
         "",
         "Nine of ten should hold the true value. Judged are EI/rho and the drag at the grippers' speed of every cable, "
         "and the parameters of effects that are named and there. All are wider than jackknife and priors give, by "
-        "`UNMODELLED`, which is calibrated on the other cables that are kept; how sure a name must be was chosen on seeds "
-        "0 to 39.",
+        "`UNMODELLED`, which is calibrated on the other cables that are kept; how sure a name must be was chosen on "
+        "seeds 0 to 39.",
         "",
         *interval_table(rows),
         "",
