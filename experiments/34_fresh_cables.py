@@ -41,6 +41,8 @@ from rows import Rows
 HELD_OUT = range(1440, 1480)
 """Seeds of the page: nothing is chosen on these cables."""
 TRIALS = Path("docs") / "results" / "trials" / "fresh_cables.jsonl"
+LAWS: tuple[tuple[Law, str], ...] = (("richer", "the rod"), ("composite", "MuJoCo"))
+"""The two simulators, and their names on the page."""
 LEVELS = (0.9, 0.95)
 """Of the intervals that are reported, and of those by which an effect is named."""
 NEAR = 0.1
@@ -177,6 +179,13 @@ def interval_table(rows: list[dict[str, Any]]) -> list[str]:
     return markdown_table([*table, ["all", *share(every)]])
 
 
+def bias(rows: list[dict[str, Any]], law: Law, word: str) -> str:
+    """By how much EI / rho is too high on average."""
+    off = np.array([math.log(row["plain"][EI][1] / row["plain"][EI][0]) for row in rows if row["law"] == law])
+    error = off.std(ddof=1) / math.sqrt(len(off)) if len(off) > 1 else math.nan
+    return f"{100 * off.mean():+.1f} ± {100 * error:.1f} % on {word}'s cables"
+
+
 def page(rows: list[dict[str, Any]]) -> str:
     """The page of these cables."""
     broken = sum("broken" in row for row in rows)
@@ -201,10 +210,10 @@ def page(rows: list[dict[str, Any]]) -> str:
         *named_table(rows),
         "",
     ]
-    for law, word in (("richer", "The rod"), ("composite", "MuJoCo")):
+    for law, word in LAWS:
         of = [row for row in rows if row["law"] == law]
         if of:
-            lines += [f"{word} alone:", "", *named_table(of), ""]
+            lines += [f"Cables of {word} alone:", "", *named_table(of), ""]
     near = share([r <= NEAR for r in ratio])
     lines += [
         "## Intervals",
@@ -215,6 +224,10 @@ def page(rows: list[dict[str, Any]]) -> str:
         "seeds 0 to 39.",
         "",
         *interval_table(rows),
+        "",
+        "Estimates of EI/rho differ from the true value on average by "
+        + " and ".join(bias(rows, law, word) for law, word in LAWS)
+        + ", with its standard error.",
         "",
         f"EI/rho from the two halves of the recordings is within {100 * NEAR:.0f} % on {near[0]} cables, {near[1]}. "
         f"Windows lost or off by ten times the median: {lost} of {windows}. A cable takes "
