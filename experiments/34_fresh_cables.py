@@ -179,11 +179,11 @@ def interval_table(rows: list[dict[str, Any]]) -> list[str]:
     return markdown_table([*table, ["all", *share(every)]])
 
 
-def bias(rows: list[dict[str, Any]], law: Law, word: str) -> str:
-    """By how much EI / rho is too high on average."""
-    off = np.array([math.log(row["plain"][EI][1] / row["plain"][EI][0]) for row in rows if row["law"] == law])
+def bias(rows: list[dict[str, Any]]) -> str:
+    """By how much EI / rho is too high on average, and the standard error of that."""
+    off = np.array([math.log(row["plain"][EI][1] / row["plain"][EI][0]) for row in rows])
     error = off.std(ddof=1) / math.sqrt(len(off)) if len(off) > 1 else math.nan
-    return f"{100 * off.mean():+.1f} ± {100 * error:.1f} % on {word}'s cables"
+    return f"{100 * off.mean():+.1f} ± {100 * error:.1f} %"
 
 
 def page(rows: list[dict[str, Any]]) -> str:
@@ -210,10 +210,9 @@ def page(rows: list[dict[str, Any]]) -> str:
         *named_table(rows),
         "",
     ]
-    for law, word in LAWS:
-        of = [row for row in rows if row["law"] == law]
-        if of:
-            lines += [f"Cables of {word} alone:", "", *named_table(of), ""]
+    groups = {word: of for law, word in LAWS if (of := [row for row in rows if row["law"] == law])}
+    for word, of in groups.items():
+        lines += [f"Cables of {word} alone:", "", *named_table(of), ""]
     near = share([r <= NEAR for r in ratio])
     lines += [
         "## Intervals",
@@ -225,9 +224,9 @@ def page(rows: list[dict[str, Any]]) -> str:
         "",
         *interval_table(rows),
         "",
-        "Estimates of EI/rho differ from the true value on average by "
-        + " and ".join(bias(rows, law, word) for law, word in LAWS)
-        + ", with its standard error.",
+        "On average, estimates of EI/rho are off the true value by "
+        + " and ".join(f"{bias(of)} on cables of {word}" for word, of in groups.items())
+        + " (± standard error).",
         "",
         f"EI/rho from the two halves of the recordings is within {100 * NEAR:.0f} % on {near[0]} cables, {near[1]}. "
         f"Windows lost or off by ten times the median: {lost} of {windows}. A cable takes "

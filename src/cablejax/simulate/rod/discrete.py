@@ -173,9 +173,10 @@ class DiscreteRod:
             held: the first two and the last two nodes [m].
             guess: free nodes to start from [m]; no derivative passes through it.
         """
-        pins, n = jnp.sqrt(_PIN / self.h) * self.weights, self.n
+        root, n = jnp.sqrt(_PIN / self.h), self.n
+        pins = root * self.weights
         pinned = ElasticChain(jnp.zeros(n - 4), self.bending, self.h, self.compliance, pins[:, 2:-2])
         at_ends = pins[:, :2] @ held[:2] + pins[:, -2:] @ held[2:]
-        pull = pins[:, 2:-2].T @ (jnp.sqrt(_PIN / self.h) * markers - at_ends) + self.physics.gravity
+        pull = pins[:, 2:-2].T @ (root * markers - at_ends) + self.physics.gravity
         free, _, error = constrained(True, pinned, pull, held, *jax.lax.stop_gradient((guess, jnp.zeros(n - 3))))
         return with_held(free, held), error <= TOLERANCE
