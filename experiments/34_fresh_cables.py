@@ -2,7 +2,7 @@
 
     python experiments/34_fresh_cables.py --cables 0:40 --executor 2   # to choose on; resumable, a minute each
     python experiments/34_fresh_cables.py --calibrate       # what those make `spatial.estimate.UNMODELLED`
-    python experiments/34_fresh_cables.py --cables 1440:1480 --executor 2   # those of the page
+    python experiments/34_fresh_cables.py --cables 1480:1520 --executor 2   # those of the page
     python experiments/34_fresh_cables.py --report docs/results/fresh_cables.md
 
 Every cable has each of five effects with a chance of one half. It is simulated by a rod that has more than is fitted
@@ -27,7 +27,6 @@ import numpy as np
 from scipy.stats import norm
 
 from cablejax.recordings.deform import NOMINAL, SAMPLE_INTERVAL
-from cablejax.spatial.estimate import estimate, estimates_of_halves
 from cablejax.spatial.identify import identify
 from cablejax.spatial.named import named_effects, quantities_of
 from executors import add_option, executor_of
@@ -38,7 +37,7 @@ from real_cables.protocol import protocol_windows
 from real_cables.synthetic import EFFECTS, RECORDINGS, SAMPLES, Law, synthetic_recordings
 from rows import Rows
 
-HELD_OUT = range(1440, 1480)
+HELD_OUT = range(1480, 1520)
 """Seeds of the page: nothing is chosen on these cables."""
 TRIALS = Path("docs") / "results" / "trials" / "fresh_cables.jsonl"
 LAWS: tuple[tuple[Law, str], ...] = (("richer", "the rod"), ("composite", "MuJoCo"))
@@ -83,11 +82,11 @@ def trial(seed: int, cache: Path | None = None) -> dict[str, Any]:
     windows = protocol_windows(recordings)
     state = None if cache is None else cache / f"{seed}.json"
     found = identify(windows, NOMINAL.stiffness_over_density, state=state)
-    everything = estimate(found, found.everything, found.cable)
-    effects = [effect.name for effect in named_effects(found, everything, density=1.0)]
+    everything = found.everything
+    effects = [effect.name for effect in named_effects(found, density=1.0)]
     judged = [name for name in effects if name in REPORTED and name in (*present, *UNJUDGED)]
     reported = with_true_values(cable, everything, judged)
-    known = quantities_of(found, everything, None)
+    known = quantities_of(found, None)
     truth = {
         EI: cable.stiffness / cable.laden,
         DRAG: (cable.drag + windows.speed * cable.quadratic_drag) / cable.laden,
@@ -111,7 +110,7 @@ def trial(seed: int, cache: Path | None = None) -> dict[str, Any]:
             EI: [truth[EI], *dataclasses.astuple(everything.stiffness)],
             DRAG: [truth[DRAG], *dataclasses.astuple(everything.drag)],
         },
-        "halves": [half.stiffness.value for half in estimates_of_halves(found)],
+        "halves": [half.stiffness.value for half in found.halves],
         "windows": [unseen.windows, unseen.off],
         "error_mm": [1e3 * float(step.error.mean()) for step in (steps[0], steps[-1])],
         "steps": [[s.effect, s.accepted, s.chance, 1e3 * float(s.error.mean())] for s in found.steps],
@@ -231,7 +230,7 @@ def page(rows: list[dict[str, Any]]) -> str:
         f"EI/rho from the two halves of the recordings is within {100 * NEAR:.0f} % on {near[0]} cables, {near[1]}. "
         f"Windows lost or off by ten times the median: {lost} of {windows}. A cable takes "
         f"{np.median([row['seconds'] for row in rows]):.0f} s (median, its simulation and the estimates of the halves "
-        f"included). The named effects take the median error on unseen recordings from "
+        f"included). The search takes the median error on unseen recordings from "
         "{:.1f} to {:.1f} mm.".format(*np.median([row["error_mm"] for row in rows], axis=0)),
         "",
         "## Every cable",

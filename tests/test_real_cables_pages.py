@@ -112,7 +112,7 @@ def score(evaluated: bool) -> dict:
     return {
         "stages": [("nominal", 20.0, 18.0 if evaluated else None)],
         "learned": [("rod", errors | {"mean": 5.0}, on_eval, (1.0, 2.0)), ("rod + ridge", errors, on_eval, (2.5, 3.5))],
-        "without_own": on_eval, "simulated": (0.02, 0.021), "estimated": ((0.02, 0.018, 0.022),) * 2,
+        "without_own": on_eval, "estimated": ((0.02, 0.018, 0.022),) * 2,
         "seconds": (0.03, 1.0), "length": 5.0, "left_out": () if evaluated else ("file 7",), "effects": (),
         "networks": ((16, 3),) * 2,
     }  # fmt: skip

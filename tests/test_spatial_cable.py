@@ -14,8 +14,8 @@ from cablejax.diagnose.fit import Fit, evaluate, improved
 from cablejax.diagnose.protocol import Explanation, explanation
 from cablejax.simulate.rod import Rod
 from cablejax.spatial.cable import SpatialCable
-from cablejax.spatial.estimate import estimate_at, jackknife
-from cablejax.spatial.identify import layout_of, mean_of
+from cablejax.spatial.estimate import Estimate, estimate_at, jackknife, starts_from
+from cablejax.spatial.identify import layout_of
 from cablejax.spatial.memory import Memory
 from cablejax.spatial.search import Step
 from cablejax.spatial.windows import windows_of
@@ -50,7 +50,7 @@ def test_a_recording_that_was_not_fitted_has_what_all_share(cable):
     bare = cable.with_own(one.without("gripper_rotation_offset"))
     assert bare.own.size == 0 and cable.with_own(dataclasses.replace(one, own=bare.own)).own.shape == (4, 4)
     other = one.moved(one.z + 1.0, np.array([[0.1] * 4, [0.2] * 4]))
-    mean = mean_of(one, other)
+    mean = starts_from(one, other)[0]
     np.testing.assert_allclose(mean.z, one.z + 0.5)
     np.testing.assert_allclose(mean.own[:, 0], [0.3, 0.2, -1.0, 0.0])
 
@@ -177,11 +177,16 @@ def test_what_was_done_is_read_back(cable, tmp_path):
     step = Step("bending_damping", True, (one, explanation()), np.array([0.1, 0.2]), 0.9)
     memory = Memory(path, "mark", cable.layout)
     memory.keep("search", [step])
-    memory.keep_finals([(one, Result.CONVERGED)])
+    size = cable.layout.size
+    told = Estimate(cable.layout, one, np.arange(size), np.ones((3, size)), np.zeros((0, size)), 0.7, settled=False)
+    memory.keep_estimates([told])
     again = Memory(path, "mark", cable.layout)
-    (read,), ((final, result),) = again.steps("search"), again.finals()
-    assert (read.effect, read.accepted, read.chance, result) == ("bending_damping", True, 0.9, Result.CONVERGED)
-    for kept in (read.halves[0], final):
+    (read,), (estimated,) = again.steps("search"), again.estimates()
+    assert (read.effect, read.accepted, read.chance) == ("bending_damping", True, 0.9)
+    assert (estimated.speed, estimated.settled) == (0.7, False)
+    for name in ("shared", "moves", "shifts"):
+        np.testing.assert_array_equal(getattr(estimated, name), getattr(told, name))
+    for kept in (read.halves[0], estimated.explanation):
         assert kept.terms == one.terms
         np.testing.assert_array_equal(kept.z, one.z)
         np.testing.assert_array_equal(kept.own, one.own)

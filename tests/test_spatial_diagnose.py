@@ -12,13 +12,12 @@ import pytest
 import spatial_cases as cases
 from cablejax.bounded import Result
 from cablejax.diagnose import explanation, verdict_json
-from cablejax.diagnose.diagnosis import Gap, NamedEffect
 from cablejax.diagnose.fit import evaluate, improved
 from cablejax.report.diagnosis_page import write_diagnosis_page
 from cablejax.simulate.rod import Rod
 from cablejax.spatial.cable import SpatialCable, errors
 from cablejax.spatial.clock import on_one_clock
-from cablejax.spatial.diagnose import _named_or_used, _sentence, diagnose_space
+from cablejax.spatial.diagnose import diagnose_space
 from cablejax.spatial.gap import noise_of
 from cablejax.spatial.geometry import local_changes
 from cablejax.spatial.identify import layout_of
@@ -144,6 +143,9 @@ def test_names_the_cause_and_goes_on_where_it_was(tmp_path):
     only = ["bending_stiffness", "bending_damping", "viscous_drag"]
     result = diagnose_space(log, only=only, state=state, progress=said.append)
     assert {e.name for e in result.effects} == {"bending_stiffness", "bending_damping"}
+    found = result.identified
+    assert "viscous_drag" not in found.effects
+    assert all(set(one.explanation.names) == set(only) and one.settled for one in (found.everything, *found.halves))
     assert result.verdict in ("named", "named+unknown")
     assert result.gap.shrinkage is not None and result.gap.shrinkage > 0.9
     interval = next(e for e in result.effects if e.name == "bending_damping").parameters["time_s"].ci90
@@ -151,42 +153,9 @@ def test_names_the_cause_and_goes_on_where_it_was(tmp_path):
     assert interval[0] < 1.1 * cases.TRUE_DAMPING and interval[1] > 0.9 * cases.TRUE_DAMPING  # type: ignore[operator]
     assert "gripper 0" in result.sentence
     again = diagnose_space(log, only=only, state=state)
-    np.testing.assert_array_equal(again.identified.everything.z, result.identified.everything.z)
+    np.testing.assert_array_equal(again.identified.everything.explanation.z, result.identified.everything.explanation.z)
     page = write_diagnosis_page(result, tmp_path / "report").read_text()
     assert 'id="orbit"' in page and "http://" not in page.replace("http://www.w3.org", "")
     verdict = json.loads((tmp_path / "report" / "verdict.json").read_text())
     assert verdict == json.loads(json.dumps(verdict_json(result)))
     assert len(verdict["where"]["per_episode_mm"]) == 6
-
-
-def _effect(name: str) -> NamedEffect:
-    return NamedEffect(name, None, {}, {"along_cable_m": None, "time_s": None, "table_m": None})
-
-
-@pytest.mark.parametrize(
-    ("named", "used", "besides"),
-    [
-        (["bending_damping"], ["bending_damping"], None),
-        (["bending_damping", "viscous_drag", "lumped_mass"], ["bending_damping"], "viscous drag and lumped mass"),
-    ],
-)
-def test_the_sentence_tells_what_shrinks_the_gap_from_what_else_is_named(named, used, besides):
-    gap = Gap(5.0, 9.0, 4.0, 0.1, 0.8, (0.7, 0.9), None, {}, (0,), {})
-    sentence = _sentence("named", [_effect(name) for name in named], (), gap, used)
-    shrinking, _, rest = sentence.partition(" The parameters show besides: ")
-    assert "80 %" in shrinking
-    assert rest == ("" if besides is None else f"{besides}.")
-    assert "bending damping" in shrinking and "drag" not in shrinking
-
-
-def test_the_sentence_claims_no_share_of_the_gap_for_what_predictions_do_not_use():
-    gap = Gap(5.0, 9.0, 4.0, 0.1, 0.8, (0.7, 0.9), None, {}, (0,), {})
-    sentence = _sentence("named", [_effect("bending_stiffness")], (), gap, ["stiffness_profile"])
-    assert "bending stiffness" in sentence and "without" in sentence and "%" not in sentence
-
-
-def test_caveats_say_which_effects_are_named_and_not_used_and_the_other_way_round():
-    assert _named_or_used(["bending_damping"], ["bending_damping"]) == []
-    missing, useless = _named_or_used(["bending_damping", "viscous_drag"], ["bending_damping", "lumped_mass"])
-    assert missing.startswith("Part of predictions") and missing.endswith("without it: viscous_drag.")
-    assert useless.startswith("Named") and useless.endswith("with it: lumped_mass.")

@@ -17,7 +17,6 @@ from cablejax.npz import NpzError, read_npz
 from cablejax.recordings.deform import NOMINAL, DeformRecordings
 from cablejax.spatial.accidents import moderated, off
 from cablejax.spatial.cable import errors
-from cablejax.spatial.estimate import estimates_of_halves
 from cablejax.spatial.identify import Identified, identify
 from cablejax.spatial.windows import Windows
 from cablejax.whole_file import whole_file
@@ -59,8 +58,7 @@ class CableScore:
         learned: (name, split by recording, on the eval split, 5 and 95 % quantile over draws with replacement of as
             many of all windows as eval has [mm]) of the rod with all effects and of what is learned on top of it.
         without_own: the rod on the eval split, its recordings' own values left at what all recordings share.
-        simulated: EI / rho that either half of the recordings is simulated with [m^4/s^2].
-        estimated: EI / rho of either half as `estimate` reports it, with its 90 % interval [m^4/s^2].
+        estimated: EI / rho from either half of the recordings, with its 90 % interval [m^4/s^2].
         seconds: of one rollout alone (median), and of a batch of all windows.
         length: of a window [s].
         left_out: blocks that do not begin with two samples of all markers.
@@ -72,7 +70,6 @@ class CableScore:
     stages: tuple[tuple[str, float, float | None], ...]
     learned: tuple[tuple[str, Errors, Errors | None, tuple[float, float] | None], ...]
     without_own: Errors | None
-    simulated: tuple[float, ...]
     estimated: tuple[tuple[float, float, float], ...]
     seconds: tuple[float, float]
     length: float
@@ -104,10 +101,11 @@ def score_cable(recordings: DeformRecordings, *, state: pathlib.Path, progress: 
         on_kept = found.cable.on(kept)
         progress("learning corrections, all recordings")
         path = state / f"{recordings.name}_all.npz"
-        simulated, final = found.cable.motion(found.everything), on_kept.motion(found.everything)
+        everything = found.everything.explanation
+        simulated, final = found.cable.motion(everything), on_kept.motion(everything)
         on_eval, chosen = _learned(simulated, train, final, kept, path, progress)
         networks = [chosen, *networks]
-        without_own = errors_of(on_kept.motion(shared_only(found.everything)), kept)
+        without_own = errors_of(on_kept.motion(shared_only(everything)), kept)
 
     stages, share = [], train.keypoints.shape[2] / train.n_keypoints
     for step in found.steps:
@@ -128,8 +126,7 @@ def score_cable(recordings: DeformRecordings, *, state: pathlib.Path, progress: 
         stages=tuple(stages),
         learned=tuple(learned),
         without_own=without_own,
-        simulated=tuple(found.stiffness(one) for one in found.halves),
-        estimated=tuple(dataclasses.astuple(half.stiffness) for half in estimates_of_halves(found, progress=progress)),
+        estimated=tuple(dataclasses.astuple(half.stiffness) for half in found.halves),
         seconds=_seconds(found, windows),
         length=windows.keypoints.shape[1] * windows.interval,
         left_out=windows.left_out,
@@ -141,9 +138,10 @@ def score_cable(recordings: DeformRecordings, *, state: pathlib.Path, progress: 
 def _by_recording(found: Identified, train: Windows, path: pathlib.Path, progress):
     """Predictions of every window from the half of the recordings that it is not part of, by name, and networks."""
     by_recording, networks = {name: np.zeros_like(train.keypoints) for name in _LEARNED}, []
-    for k, one in enumerate(found.halves):
-        half = found.first if k == 0 else ~found.first
-        part, other = (train.chosen(np.flatnonzero(use)) for use in (half, ~half))
+    for k, half in enumerate(found.halves):
+        seen = found.first if k == 0 else ~found.first
+        part, other = (train.chosen(np.flatnonzero(use)) for use in (seen, ~seen))
+        one = half.explanation
         # a recording that is not seen has no values of its own; nor have those that its corrections are learned from
         fitted, unseen = (found.cable.on(w).motion(shared_only(one)) for w in (part, other))
         progress(f"learning corrections, half {k + 1}")
@@ -151,7 +149,7 @@ def _by_recording(found: Identified, train: Windows, path: pathlib.Path, progres
         corrected, chosen = _learned(fitted, part, unseen, other, file, progress)
         networks.append(chosen)
         for name, predicted in corrected.items():
-            by_recording[name][~half] = predicted
+            by_recording[name][~seen] = predicted
     return by_recording, networks
 
 
@@ -229,7 +227,7 @@ def _seconds(found: Identified, windows: Windows) -> tuple[float, float]:
         repeats = []
         for _ in range(5):
             begun = time.perf_counter()
-            found.cable.on(part).motion(found.everything)
+            found.cable.on(part).motion(found.everything.explanation)
             repeats.append(time.perf_counter() - begun)
         times.append(float(np.median(repeats)))
     return times[0], times[1]

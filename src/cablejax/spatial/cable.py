@@ -22,7 +22,7 @@ from cablejax.diagnose.evidence import Evidence, Robust
 from cablejax.diagnose.protocol import Explanation, Plan, Simulator
 from cablejax.simulate.compile import compiler_options
 from cablejax.simulate.rod import Rod
-from cablejax.spatial.accidents import trust
+from cablejax.spatial.accidents import moderated, trust
 from cablejax.spatial.effects import GRIP, Layout
 from cablejax.spatial.windows import Windows
 
@@ -96,6 +96,14 @@ class SpatialCable(Simulator):
         finer = dataclasses.replace(rod, substeps=factor * rod.substeps, local_error=rod.local_error / factor**3)
         return dataclasses.replace(self, rod=finer)
 
+    def with_more_edges(self) -> SpatialCable:
+        """With as many edges as what values are estimated for, without correction."""
+        # the longest local error stays the same length
+        rod = dataclasses.replace(
+            self.rod, n_edges=round(_MORE_EDGES * self.rod.n_edges), local_error=_MORE_EDGES * self.rod.local_error
+        )
+        return dataclasses.replace(self, rod=rod, correction=None)
+
     def corrected(self, one: Explanation) -> SpatialCable:
         """A cable that is predicted as by a finer rod at these values, and moves with them as this rod does.
 
@@ -103,15 +111,10 @@ class SpatialCable(Simulator):
         difference taken anew at its result until that stays where it is, the residuals are those of the finer rod,
         at the price of this one's derivatives.
         """
-        # the longest local error stays the same length
-        rod = dataclasses.replace(
-            self.rod,
-            n_edges=round(_MORE_EDGES * self.rod.n_edges),
-            substeps=_FINER * self.rod.substeps,
-            local_error=_MORE_EDGES * self.rod.local_error,
-        )
+        finer = self.with_more_edges()
+        finer = dataclasses.replace(finer, rod=dataclasses.replace(finer.rod, substeps=_FINER * self.rod.substeps))
         plain, every = dataclasses.replace(self, correction=None), np.arange(len(self.windows))
-        exact, coarse = (cable.predict([one], every)[0] for cable in (dataclasses.replace(plain, rod=rod), plain))
+        exact, coarse = (cable.predict([one], every)[0] for cable in (finer, plain))
         return dataclasses.replace(self, correction=exact - coarse)
 
     def own(self, one: Explanation) -> int:
@@ -215,6 +218,11 @@ def mean_error(predicted: Float[np.ndarray, "W T F 3"], observed: Float[np.ndarr
     seen = np.isfinite(observed)
     off = np.where(seen, bounded(predicted - observed), 0.0)
     return off.sum(axis=(1, 2, 3)) / seen.sum(axis=(1, 2, 3))
+
+
+def typical_error(evidence: Evidence, one: Explanation) -> float:
+    """Mean over windows of what `mean_error` says, none of which counts for more than ten times the median [m]."""
+    return float(moderated(mean_error(evidence.predict([one])[0], evidence.observed)).mean())
 
 
 def bounded(off: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape"]:

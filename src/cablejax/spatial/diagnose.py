@@ -11,9 +11,8 @@ from collections.abc import Callable, Sequence
 import jax
 import numpy as np
 
-from cablejax.bounded import Result
 from cablejax.diagnose.belief import Calibration
-from cablejax.diagnose.diagnosis import CableDiagnosis, Gap, NamedEffect, ParameterEstimate, Ranked, Verdict
+from cablejax.diagnose.diagnosis import CableDiagnosis, Gap, ParameterEstimate, Ranked, Verdict
 from cablejax.diagnose.judgement import judged, listed, verdict_sentence
 from cablejax.diagnose.protocol import explanation
 from cablejax.simulate.rod import RodResult
@@ -21,10 +20,9 @@ from cablejax.spatial.accidents import accident_sentences, kept, moderated, off
 from cablejax.spatial.cable import errors
 from cablejax.spatial.clock import on_one_clock
 from cablejax.spatial.effects import GRIP
-from cablejax.spatial.estimate import estimate
 from cablejax.spatial.gap import RESOLVABLE, constant_offset, gap_of, noise_of
 from cablejax.spatial.geometry import LocalChange, local_changes
-from cablejax.spatial.identify import EDGES, Identified, identify
+from cablejax.spatial.identify import Identified, identify
 from cablejax.spatial.named import named_effects, quantities_of
 from cablejax.spatial.where import in_log, where_of
 from cablejax.spatial.windows import WINDOW, windows_of
@@ -89,8 +87,7 @@ def diagnose_space(
     use = np.flatnonzero(kept(lost | off(error) | windows.torn))
     gap = gap_of(before[use], after[use], found.cable.on(windows.chosen(use)), noise)
     density, guessed = cable["linear_density_kg_per_m"], "linear_density_kg_per_m" in log.meta.get("guessed", ())
-    everything = estimate(found, found.everything, found.cable, progress=progress)
-    effects = named_effects(found, everything, density)
+    effects = named_effects(found, density)
     equivalent = _equivalent(found, named := [effect.name for effect in effects])
     verdict = _verdict(gap, named, equivalent)
     if verdict in ("none", "unknown"):
@@ -101,10 +98,10 @@ def diagnose_space(
     where = where_of(log, windows.chosen(use), nominal, before[use], noise, changes)
     return SpatialDiagnosis(
         verdict=verdict,
-        sentence=" ".join([_sentence(verdict, effects, equivalent, gap, found.effects), *first]),
+        sentence=" ".join([verdict_sentence(verdict, effects, equivalent, (), gap.shrinkage or 0.0), *first]),
         effects=effects,
         equivalent=equivalent,
-        quantities=quantities_of(found, everything, None if guessed else density) | {"constant_offset_m": offset},
+        quantities=quantities_of(found, None if guessed else density) | {"constant_offset_m": offset},
         ranking=_ranking(found),
         leftover_p=None,
         gap=gap,
@@ -114,7 +111,7 @@ def diagnose_space(
         caveats=(
             *repairs,
             *accident_sentences(lost, error, windows, results == RodResult.COARSE),
-            *_caveats(log, windows, left_out, found, everything, named),
+            *_caveats(log, windows, left_out, found),
         ),
         log=log,
         nominal=nominal,
@@ -122,23 +119,15 @@ def diagnose_space(
         noise_mm=np.full(windows.n_keypoints, 1e3 * noise),
         noise_correlation=np.zeros(0),
         seconds=time.perf_counter() - begun,
-        settings={"edges": EDGES, "window_s": WINDOW, "jax": jax.__version__, "devices": jax.default_backend()},
+        settings={
+            "edges": found.cable.rod.n_edges,
+            "window_s": WINDOW,
+            "jax": jax.__version__,
+            "devices": jax.default_backend(),
+        },
         changes=changes,
         identified=found,
     )
-
-
-def _sentence(verdict: Verdict, effects: Sequence[NamedEffect], equivalent, gap: Gap, used: Sequence[str]) -> str:
-    """The verdict in words; the gap shrinks by the effects that predictions are made with, whose names are `used`."""
-    shrinking = [effect for effect in effects if effect.name in used]
-    others = listed([effect.name.replace("_", " ") for effect in effects if effect.name not in used])
-    if others and not shrinking:
-        return (
-            f"The parameters show {others}. Predictions are made without, so the share of the gap that this explains "
-            "is not known."
-        )
-    sentence = verdict_sentence(verdict, shrinking, equivalent, (), gap.shrinkage or 0.0)
-    return f"{sentence} The parameters show besides: {others}." if others else sentence
 
 
 def _verdict(gap: Gap, named: Sequence[str], equivalent: tuple[tuple[str, ...], ...]) -> Verdict:
@@ -175,7 +164,7 @@ def _ranking(found: Identified) -> tuple[Ranked, ...]:
     return tuple(ranked)
 
 
-def _caveats(log, windows, left_out, found, everything, named) -> tuple[str, ...]:
+def _caveats(log, windows, left_out, found) -> tuple[str, ...]:
     result = [
         "The motion of a hanging cable does not depend on its weight: stiffness, drag and added masses are known "
         "relative to the linear density only, that of the cable with its markers, and a wrong density "
@@ -187,12 +176,12 @@ def _caveats(log, windows, left_out, found, everything, named) -> tuple[str, ...
         "noise, but of the constant offsets, as is what the simulator has wrong at rest.",
         "Roll of the grippers about the cable is not observed; it is taken as the least turn from their mean "
         "direction.",
-        "Parameters are those of a fit in which everything that was tried is free. Predictions, and the gap after, are "
-        f"made with {listed(found.effects) or 'no effect'} alone, with which recordings that no fit has seen are "
-        "simulated better.",
+        "All effects that were tried are fitted together, and the gap after is what all of them leave on recordings "
+        "that no fit has seen: also those that are not named, because their intervals hold the value of a cable "
+        "without them.",
     ]
-    if "gripper_rotation_offset" in found.effects:
-        own = GRIP * found.everything.own[np.unique(windows.group)]
+    if "gripper_rotation_offset" in found.tried:
+        own = GRIP * found.everything.explanation.own[np.unique(windows.group)]
         result.append(
             "How the cable sits in the grippers is fitted for each recording: it differs by "
             f"{np.sqrt((own**2).mean()):.2f} rad (root mean square) from the mean. Recordings that no fit has seen are "
@@ -205,35 +194,13 @@ def _caveats(log, windows, left_out, found, everything, named) -> tuple[str, ...
             f"The grippers move too fast for the finest time steps of the simulation: half of them would change it by "
             f"{1e3 * found.time_steps.error:.1f} mm. Gaps of that size may be its own."
         )
-    result += _named_or_used(found.effects, named)
-    if not everything.settled:
-        result.append(
-            "The parameters still changed when predictions were last corrected for the length of the simulator's edges "
-            "and time steps: they may be off by more than their intervals."
-        )
     parts = ("one half of the recordings", "the other half", "all recordings")
-    for part, ended in zip(parts, found.results, strict=False):
-        if ended not in (Result.CONVERGED, Result.STALLED):
-            result.append(
-                f"The fit to {part} had not converged when it ended ({ended.name.lower().replace('_', ' ')})."
-            )
+    if moving := [part for part, one in zip(parts, (*found.halves, found.everything), strict=True) if not one.settled]:
+        result.append(
+            f"The parameters of the fit to {listed(moving)} still changed when predictions were last corrected for the "
+            "length of the simulator's edges and time steps: they may be off by more than their intervals."
+        )
     groups = len(np.unique(windows.group))
     if groups < 6:
         result.append(f"Only {groups} recordings: intervals over recordings are rough.")
     return tuple(result)
-
-
-def _named_or_used(used: Sequence[str], named: Sequence[str]) -> list[str]:
-    """Caveats on effects that predictions are made with and that are not named, and the other way round."""
-    result = []
-    if missing := [name for name in used if name not in named]:
-        result.append(
-            "Part of predictions, because recordings that no fit has seen are simulated better with it, but not named, "
-            f"because the parameters do not exclude a cable without it: {listed(missing)}."
-        )
-    if useless := [name for name in named if name not in used]:
-        result.append(
-            "Named, because the parameters exclude a cable without it, but not part of predictions, because recordings "
-            f"that no fit has seen are not simulated better with it: {listed(useless)}."
-        )
-    return result

@@ -12,31 +12,33 @@ fitted shows in neither; what is reported of an effect (`named`) is wider by wha
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 from scipy.stats import norm, t
 
 from cablejax.bounded import Result, solve_arrow
 from cablejax.diagnose.evidence import Evidence
 from cablejax.diagnose.fit import Fit, evaluate, improve
 from cablejax.diagnose.protocol import Explanation, explanation
-from cablejax.spatial.cable import SpatialCable
+from cablejax.spatial.cable import TWISTED, SpatialCable, typical_error
 from cablejax.spatial.effects import Layout
-from cablejax.spatial.identify import Identified, affordable
+from cablejax.spatial.windows import Windows
 
 # Predictions may be off by what edges and time steps of finite length do; values are not to make up for it. Fits are
 # made in rounds of so many steps at most, predictions corrected before each, until no value moves by this share of its
-# standard error, but not more often than this. Closer than that, a cable that snaps over in one of the windows keeps
-# them moving.
-_SETTLED, _ROUNDS, _STEPS = 0.3, 5, 4
+# standard error, but not more often than this. A cable that snaps over in one of the windows keeps them moving closer
+# than that: the last round is one after which they move by more than this share of what the one before moved them by.
+_SETTLED, _ROUNDS, _STEPS, _STALLED = 0.3, 5, 4, 0.9
 # Nats per window: a step that promises less is not made.
 _TOLERANCE = 0.01
 _TAIL = 0.95
+# Windows that are fitted where the material frame is followed.
+_TWISTED_WINDOWS = 24
 _LARGEST_STEP = 1.0
 
 Quantity = Callable[[Float[Array, "P"]], Float[Array, ""]]
@@ -96,6 +98,7 @@ class Estimate:
 
     Attributes:
         layout: of the values.
+        explanation: that was fitted.
         shared: values that all recordings share, shape [P].
         moves: what leaving out each recording does to them, see `jackknife`, shape [R, P].
         shifts: what moving each prior by its standard deviation does to them, shape [K, P].
@@ -105,6 +108,7 @@ class Estimate:
     """
 
     layout: Layout
+    explanation: Explanation
     shared: Float[np.ndarray, "P"]
     moves: Float[np.ndarray, "R P"]
     shifts: Float[np.ndarray, "K P"]
@@ -149,29 +153,28 @@ class Estimate:
 
 
 def estimate(
-    found: Identified,
-    start: Explanation,
     cable: SpatialCable,
+    starts: Sequence[Explanation],
+    tried: Sequence[str],
     *,
     progress: Callable[[str], None] = lambda text: None,
 ) -> Estimate:
     """Fits everything that was tried, in rounds, with predictions corrected at the result of the round before.
 
     Args:
-        found: what was tried.
-        start: explanation to start from, fitted to the same windows with the effects that stayed.
         cable: in the windows to fit.
+        starts: explanations to start from, with some of the effects; the one that simulates the windows best is taken.
+        tried: names of the effects that are free.
         progress: called with a line of text.
     """
-    more = [effect for effect in cable.layout.effects if effect.name in found.tried and effect.name not in start.names]
-    added = explanation(*((effect, 0, [p.centre for p in effect.parameters]) for effect in more))
-    start = Explanation((*start.terms, *added.terms), np.append(start.z, added.z), start.own)
-    windows = cable.windows
-    cable = cable.on(windows.chosen(np.flatnonzero(affordable(start, windows))))
+    starts = [_with_all(start, cable, tried) for start in starts]
+    cable = cable.on(cable.windows.chosen(np.flatnonzero(affordable(tried, cable.windows))))
     progress(f"all effects free: {len(cable.windows)} windows")
-    tolerance, rounds, steps = _TOLERANCE * len(cable.windows), 0, _STEPS
+    tolerance, rounds, steps, evidence = _TOLERANCE * len(cable.windows), 0, _STEPS, cable.evidence()
+    start, before = min(starts, key=lambda one: typical_error(evidence, one)), np.inf
     # the search may have left what is a recording's own in a bad minimum, which a fit from 0 need not end in
-    starts = [start, start.moved(start.z, np.zeros_like(start.own))] if start.own.any() else [start]
+    alone = len(starts) == 1 and start.own.any()
+    starts = [start, start.moved(start.z, np.zeros_like(start.own))] if alone else [start]
     while True:
         rounds += 1
         evidence = cable.corrected(start).evidence()
@@ -184,10 +187,37 @@ def estimate(
         stuck = moved == 0 and fit.result is Result.STEP_LIMIT
         steps = 2 * steps if stuck else _STEPS
         settled = moved < _SETTLED and not stuck
-        if settled or rounds == _ROUNDS:
+        stalled = _STALLED * before < moved < 1 and not stuck
+        if settled or stalled or rounds == _ROUNDS:
             return dataclasses.replace(estimate_at(evidence, fit), settled=settled)
-        start = fit.explanation
+        start, before = fit.explanation, moved
         starts = [start]
+
+
+def starts_from(one: Explanation, other: Explanation) -> list[Explanation]:
+    """Where a fit to all recordings may begin: the mean of the fits to both halves, and either of them.
+
+    The mean of two fits that went to different places may be worse than both. Each recording keeps what the fit to its
+    own half found for it.
+    """
+    rows = max(len(one.own), len(other.own))
+    both = [np.pad(part.own, ((0, rows - len(part.own)), (0, 0))) for part in (one, other)]
+    found = (both[0] != 0).astype(int) + (both[1] != 0)
+    own = (both[0] + both[1]) / np.maximum(found, 1)
+    return [one.moved(z, own) for z in ((one.z + other.z) / 2, one.z, other.z)]
+
+
+def affordable(tried: Sequence[str], windows: Windows) -> Bool[np.ndarray, "W"]:
+    """Windows that values are fitted to: all, unless the material frame is followed, at four times the cost."""
+    every = np.arange(len(windows))
+    return np.isin(every, windows.whole(_TWISTED_WINDOWS) if TWISTED in tried else every)
+
+
+def _with_all(start: Explanation, cable: SpatialCable, tried: Sequence[str]) -> Explanation:
+    """With the effects that it lacks as they are where nothing is known of them."""
+    more = [effect for effect in cable.layout.effects if effect.name in tried and effect.name not in start.names]
+    added = explanation(*((effect, 0, [p.centre for p in effect.parameters]) for effect in more))
+    return cable.with_own(Explanation((*start.terms, *added.terms), np.append(start.z, added.z), start.own))
 
 
 def estimate_at(evidence: Evidence, fit: Fit) -> Estimate:
@@ -197,7 +227,8 @@ def estimate_at(evidence: Evidence, fit: Fit) -> Estimate:
     # of the vector by the coordinates
     slopes = cable.directions(one)[0][: len(one.z)]
     moves, shifts = _rows(evidence, fit)
-    return Estimate(cable.layout, one.vector(cable.effects), moves @ slopes, shifts @ slopes, cable.windows.speed)
+    shared = one.vector(cable.effects)
+    return Estimate(cable.layout, one, shared, moves @ slopes, shifts @ slopes, cable.windows.speed)
 
 
 def _rows(evidence: Evidence, fit: Fit) -> tuple[Float[np.ndarray, "R K"], Float[np.ndarray, "K K"]]:
@@ -226,19 +257,3 @@ def jackknife(evidence: Evidence, fit: Fit) -> Float[np.ndarray, "R K"]:
 
     full = step(np.ones(len(label), bool))
     return np.sqrt((len(names) - 1) / len(names)) * np.array([step(label != name) - full for name in names])
-
-
-def estimates_of_halves(
-    found: Identified, *, progress: Callable[[str], None] = lambda text: None
-) -> tuple[Estimate, Estimate]:
-    """`estimate` from either half of the recordings, as the search split them.
-
-    Args:
-        found: by `identify`.
-        progress: called with a line of text.
-    """
-    one, other = (
-        estimate(found, start, found.cable.on(found.cable.windows.chosen(np.flatnonzero(half))), progress=progress)
-        for start, half in zip(found.halves, (found.first, ~found.first), strict=True)
-    )
-    return one, other

@@ -1,4 +1,10 @@
-"""Identifies a cable in space from windows of recordings: effects, values, and held-out predictions."""
+"""Identifies a cable in space from windows of recordings: effects, values, and held-out predictions.
+
+A search adds effects one by one, which leads fits to the right minimum and shows what each is worth (`search`). From
+where it ends, everything that was tried is fitted together (`estimate`): what the cable is, and what it is simulated
+with. The search's choice alone would not do for either: what it leaves out near its threshold depends on accidents, and
+pulls the values of what it keeps.
+"""
 
 from __future__ import annotations
 
@@ -9,13 +15,11 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from cablejax.bounded import Result
-from cablejax.diagnose.fit import evaluate, improved
-from cablejax.diagnose.protocol import Explanation
 from cablejax.simulate.rod import Rod
 from cablejax.spatial.accidents import moderated
 from cablejax.spatial.cable import TWISTED, SpatialCable
 from cablejax.spatial.effects import Layout, effect_names, effects_of
+from cablejax.spatial.estimate import Estimate, estimate, starts_from
 from cablejax.spatial.memory import Memory, fingerprint
 from cablejax.spatial.search import Step, accepted_effects, halves, search, tried_with, unseen_error, with_effect
 from cablejax.spatial.time_steps import TimeSteps, time_steps_for
@@ -23,10 +27,8 @@ from cablejax.spatial.windows import Windows
 
 EDGES = 20
 """Edges of the rod that is fitted."""
-_SELECTED = 24
+_SEARCHED = 24
 _TIMED = 8
-_REFITTED = 24
-_SHORTEST = 0.8
 _RIVAL = "stiffness_profile"
 
 
@@ -35,15 +37,14 @@ class Identified:
     """Result of an identification.
 
     Attributes:
-        cable: the simulator, in the windows that it was found from, and the weight of each in the fits.
+        cable: the simulator of what was found, in the windows that it was found from, and the weight of each in fits.
         time_steps: that it makes between two samples.
-        effects: that stayed, in the order in which they were found.
-        tried: all effects that might have stayed.
+        effects: that stayed in the search, in the order in which they were found.
+        tried: all effects that might have stayed; estimates have them all.
         steps: of the search.
         everything: fitted to all windows.
         halves: fitted to either half of the recordings.
         first: windows of the first half, shape [W].
-        results: how the fits to the two halves and to all windows ended.
     """
 
     cable: SpatialCable
@@ -51,22 +52,16 @@ class Identified:
     effects: tuple[str, ...]
     tried: tuple[str, ...]
     steps: tuple[Step, ...]
-    everything: Explanation
-    halves: tuple[Explanation, Explanation]
+    everything: Estimate
+    halves: tuple[Estimate, Estimate]
     first: Bool[np.ndarray, "W"]
-    results: tuple[Result, ...] = ()
-
-    def stiffness(self, one: Explanation) -> float:
-        """EI / rho, geometric mean along the cable [m^4/s^2]."""
-        layout = self.cable.layout
-        return float(layout.nominal_stiffness * np.exp(layout.log_stiffness(one.vector(layout.effects))))
 
     def unseen(self) -> tuple[Float[np.ndarray, "W T F 3"], Int[np.ndarray, "W"]]:
         """Predictions of all windows, each from the half of the recordings that it is not part of [m].
 
         And how the simulation of each ended: a `RodResult`.
         """
-        (one, ended), (other, other_ended) = (self.cable.rollouts(half) for half in self.halves)
+        (one, ended), (other, other_ended) = (self.cable.rollouts(half.explanation) for half in self.halves)
         return np.where(self.first[:, None, None, None], other, one), np.where(self.first, other_ended, ended)
 
 
@@ -80,20 +75,6 @@ def layout_of(windows: Windows, nominal_stiffness: float) -> Layout:
     )
 
 
-def selection(windows: Windows, count: int = _SELECTED) -> Int[np.ndarray, "S"]:
-    """Windows for the search: whole ones that can be simulated, spread evenly over the recordings."""
-    whole = np.flatnonzero((windows.valid.mean(axis=1) >= _SHORTEST) & ~windows.torn)
-    if not len(whole):
-        whole = np.arange(len(windows))
-    return whole[np.unique(np.linspace(0, len(whole) - 1, count).astype(int))]
-
-
-def affordable(one: Explanation, windows: Windows) -> Bool[np.ndarray, "W"]:
-    """Windows that values are fitted to: all, unless the material frame is followed, at four times the cost."""
-    every = np.arange(len(windows))
-    return np.isin(every, selection(windows, _REFITTED) if TWISTED in one.names else every)
-
-
 def identify(
     windows: Windows,
     nominal_stiffness: float,
@@ -102,7 +83,7 @@ def identify(
     state: pathlib.Path | None = None,
     progress: Callable[[str], None] = lambda text: None,
 ) -> Identified:
-    """Searches for effects, fits them to all windows and to both halves of the recordings.
+    """Searches for effects, and fits all of them to both halves of the recordings and to all windows.
 
     Args:
         windows: to explain; all of them may be fitted.
@@ -120,13 +101,13 @@ def identify(
     names = [name for name in effect_names() if (name != TWISTED if only is None else name in only)]
     layout = layout_of(windows, nominal_stiffness)
     cable = SpatialCable(Rod(EDGES, 1, twisting=False), layout, windows)
-    time_steps = time_steps_for(cable.on(windows.chosen(selection(windows, _TIMED))))
+    time_steps = time_steps_for(cable.on(windows.chosen(windows.whole(_TIMED))))
     progress(
         f"time steps of {1e3 * windows.interval / time_steps.substeps:.3g} ms; half of that changes the motion by "
         f"{1e3 * time_steps.error:.1f} mm"
     )
     cable = cable.finer(time_steps.substeps)
-    picked = cable.on(windows.chosen(selection(windows)))
+    picked = cable.on(windows.chosen(windows.whole(_SEARCHED)))
     memory = Memory(state, fingerprint(cable, names), layout)
     steps = search(
         picked,
@@ -144,56 +125,30 @@ def identify(
         steps += found
     last = [step for step in steps if step.accepted][-1]
     cable = cable.trusting(unseen_error(cable, last.halves))
-    finals = _final_fits(cable, last.halves, memory, progress)
+    one, other, everything = _estimates(cable, last.halves, names, memory, progress)
     return Identified(
-        cable=cable,
+        cable=cable.with_more_edges(),
         time_steps=time_steps,
         effects=tuple(name for name in accepted_effects(steps) if name in last.halves[0].names),
         tried=tuple(names),
         steps=tuple(steps),
-        everything=finals[2][0],
-        halves=(finals[0][0], finals[1][0]),
+        everything=everything,
+        halves=(one, other),
         first=halves(windows.group),
-        results=tuple(result for _, result in finals),
     )
 
 
-def _final_fits(cable: SpatialCable, start: tuple[Explanation, Explanation], memory: Memory, progress):
-    """Explanation and result of the fits to either half of the recordings, from those of the search, and to all."""
-    windows, finals = cable.windows, memory.finals()
+def _estimates(cable: SpatialCable, begun, tried, memory: Memory, progress) -> list[Estimate]:
+    """Of either half of the recordings, from the fits of the search, and of all."""
+    windows, done = cable.windows, memory.estimates()
     first = halves(windows.group)
-    use = [part & affordable(start[0], windows) for part in (first, ~first, np.ones(len(windows), bool))]
-    words = ("one half", "the other half", "all")
-    for part, word in list(zip(use, words, strict=True))[len(finals) :]:
-        progress(f"fitting {word}: {int(part.sum())} windows")
-        evidence = cable.on(windows.chosen(np.flatnonzero(part))).evidence()
-        begins = begins_for_all(finals[0][0], finals[1][0]) if len(finals) == 2 else [start[len(finals)]]
-        # what another part of the recordings was fitted with says nothing here
-        kept = np.isin(np.arange(len(begins[0].own)), windows.group[part])[:, None]
-        begins = [begin.moved(begin.z, np.where(kept, begin.own, 0.0)) for begin in begins]
-        best = min(evaluate(evidence, begins), key=lambda fit: fit.cost(evidence))
-        (fit,) = improved(evidence, [best], evidence.simulator.plan.last_steps)
-        finals.append((fit.explanation, fit.result))
-        memory.keep_finals(finals)
-    return finals
-
-
-def begins_for_all(one: Explanation, other: Explanation) -> list[Explanation]:
-    """Where a fit to all recordings may begin: the mean of the fits to both halves, and either of them.
-
-    The mean of two fits that went to different places may be worse than both. Each recording keeps what the fit to its
-    own half found for it.
-    """
-    mean = mean_of(one, other)
-    return [mean, mean.moved(one.z, mean.own), mean.moved(other.z, mean.own)]
-
-
-def mean_of(one: Explanation, other: Explanation) -> Explanation:
-    """Of fits to two parts of the same recordings: mean of what is shared, and of what was found for a recording."""
-    rows = max(len(one.own), len(other.own))
-    both = [np.pad(part.own, ((0, rows - len(part.own)), (0, 0))) for part in (one, other)]
-    found = (both[0] != 0).astype(int) + (both[1] != 0)
-    return one.moved((one.z + other.z) / 2, (both[0] + both[1]) / np.maximum(found, 1))
+    parts = ((first, "one half"), (~first, "the other half"), (np.ones(len(windows), bool), "all recordings"))
+    for part, word in parts[len(done) :]:
+        progress(f"fitting {word}")
+        starts = [begun[len(done)]] if len(done) < 2 else starts_from(*(half.explanation for half in done))
+        done.append(estimate(cable.on(windows.chosen(np.flatnonzero(part))), starts, tried, progress=progress))
+        memory.keep_estimates(done)
+    return done
 
 
 def _twisted(cable: SpatialCable, steps: Sequence[Step], progress) -> list[Step]:

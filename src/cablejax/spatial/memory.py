@@ -12,10 +12,10 @@ from typing import Any
 import jax
 import numpy as np
 
-from cablejax.bounded import Result
 from cablejax.diagnose.protocol import Explanation, Term
 from cablejax.spatial.cable import SpatialCable
 from cablejax.spatial.effects import Layout
+from cablejax.spatial.estimate import Estimate
 from cablejax.spatial.search import Step
 from cablejax.text_file import read_json
 from cablejax.whole_file import whole_file
@@ -47,8 +47,8 @@ class Memory:
                 found = read_json(path)
                 if isinstance(found, dict) and found.get("fingerprint") == fingerprint:
                     self._held = found
-                    self.finals()
-                    for name in found.keys() - {"fingerprint", "fits"}:
+                    self.estimates()
+                    for name in found.keys() - {"fingerprint", "estimates"}:
                         self.steps(name)
             except (ValueError, TypeError, KeyError, IndexError, AttributeError):
                 self._held = before
@@ -79,13 +79,34 @@ class Memory:
         ]
         self._write(name, plain)
 
-    def finals(self) -> list[tuple[Explanation, Result]]:
-        """Last fits that are done."""
-        return [(self._read(kept), Result(kept["result"])) for kept in self._held.get("fits", [])]
+    def estimates(self) -> list[Estimate]:
+        """Estimates that are done."""
+        return [
+            Estimate(
+                self._layout,
+                self._read(e["explanation"]),
+                shared=np.array(e["shared"]),
+                # of so many rows, also where there are none
+                moves=np.array(e["moves"]).reshape(-1, len(e["shared"])),
+                shifts=np.array(e["shifts"]).reshape(-1, len(e["shared"])),
+                speed=e["speed"],
+                settled=e["settled"],
+            )
+            for e in self._held.get("estimates", [])
+        ]
 
-    def keep_finals(self, finals: Sequence[tuple[Explanation, Result]]) -> None:
-        """Keeps the last fits."""
-        self._write("fits", [{**_plain(one), "result": int(result)} for one, result in finals])
+    def keep_estimates(self, estimates: Sequence[Estimate]) -> None:
+        """Keeps the estimates."""
+        plain = [
+            {
+                "explanation": _plain(e.explanation),
+                **{name: getattr(e, name).tolist() for name in ("shared", "moves", "shifts")},
+                "speed": e.speed,
+                "settled": e.settled,
+            }
+            for e in estimates
+        ]
+        self._write("estimates", plain)
 
     def _read(self, kept: dict[str, Any]) -> Explanation:
         own = np.array(kept["own"], float)

@@ -37,17 +37,16 @@ _TELLING = {
 """The parameter that says how far an effect is from its absence: from 1 where it is a ratio, from 0 otherwise."""
 
 
-def named_effects(found: Identified, estimate: Estimate, density: float) -> tuple[NamedEffect, ...]:
+def named_effects(found: Identified, density: float) -> tuple[NamedEffect, ...]:
     """The effects that the estimate shows, with parameters and 90 % intervals: those that stayed in the search first.
 
     That an effect does not help to simulate other recordings, which the search asks, does not mean that it is absent.
 
     Args:
         found: by `identify`.
-        estimate: from the same windows. Reported values are its own, not those that predictions are made with.
         density: mass per length, with the markers, that is believed true [kg/m], for what is known per mass only.
     """
-    named, windows = [], found.cable.windows
+    named, windows, estimate = [], found.cable.windows, found.everything
     # motion shows the drags' sum: it goes by the names that stayed in the search, or by that of the larger one
     drags = [name for name in found.effects if name in _DRAGS] or [_main_drag(estimate)]
     for name in dict.fromkeys((*found.effects, *found.tried)):
@@ -59,7 +58,7 @@ def named_effects(found: Identified, estimate: Estimate, density: float) -> tupl
     return tuple(named)
 
 
-def quantities_of(found: Identified, estimate: Estimate, density: float | None) -> dict[str, ParameterEstimate]:
+def quantities_of(found: Identified, density: float | None) -> dict[str, ParameterEstimate]:
     """What motion shows of the cable, whether an effect is named for it or not, with 90 % intervals.
 
     EI / rho, where the stiffness was free; both drags together at the recording's speed, where one was; and EI, where
@@ -67,10 +66,9 @@ def quantities_of(found: Identified, estimate: Estimate, density: float | None) 
 
     Args:
         found: by `identify`.
-        estimate: from the same windows.
         density: mass per length, with the markers [kg/m]; None = a guess.
     """
-    known = {}
+    known, estimate = {}, found.everything
     if _WHOLE in found.tried:
         stiffness = estimate.stiffness.wider_by_factor(UNMODELLED[_WHOLE])
         known[_STIFFNESS] = _told(stiffness, "m^4/s^2")

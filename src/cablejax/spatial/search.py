@@ -27,7 +27,7 @@ from cablejax.diagnose.fit import evaluate, improved
 from cablejax.diagnose.protocol import Explanation, Simulator, Term, explanation
 from cablejax.diagnose.refits import dealt
 from cablejax.spatial.accidents import compared, moderated, off
-from cablejax.spatial.cable import SpatialCable, mean_error
+from cablejax.spatial.cable import SpatialCable, mean_error, typical_error
 from cablejax.spatial.effects import SpatialEffect
 
 _FAILURES = 4
@@ -184,15 +184,14 @@ def _starts(
     for base, parts in zip(before, _parts(cable), strict=True):
         seen, other = (_few(part) for part in parts[:2])
         found.append(_start(seen, base, effect))
-        total += _mean_error(other, found[-1])
+        total += typical_error(other, found[-1])
     return (found[0], found[1]), total
 
 
 def _few(evidence: Evidence) -> Evidence:
     cable = evidence.simulator
     assert isinstance(cable, SpatialCable)
-    index = np.unique(np.linspace(0, len(cable.windows) - 1, _PROMISED).astype(int))
-    return cable.on(cable.windows.chosen(index)).evidence()
+    return cable.on(cable.windows.chosen(cable.windows.whole(_PROMISED))).evidence()
 
 
 def _start(seen: Evidence, base: Explanation, effect: SpatialEffect) -> Explanation:
@@ -201,7 +200,7 @@ def _start(seen: Evidence, base: Explanation, effect: SpatialEffect) -> Explanat
     Far from the solution the model says little.
     """
     trials = [with_effect(seen.simulator, base, effect, values) for _, values in effect.starts(None)]
-    errors = [_mean_error(seen, trial) for trial in trials]
+    errors = [typical_error(seen, trial) for trial in trials]
     (fit,) = evaluate(seen, [trials[int(np.argmin(errors))]])
     model = fit.model(seen.weight(fit.sse), 0.0)
     step = -solve_arrow(
@@ -210,14 +209,9 @@ def _start(seen: Evidence, base: Explanation, effect: SpatialEffect) -> Explanat
     step *= min(1.0, _LARGEST_STEP / max(np.abs(step).max(initial=0.0), 1e-12))
     for share in (1.0, 0.4):
         moved = fit.at(np.clip(model.point + share * step, model.lower, model.upper))
-        if _mean_error(seen, moved) < min(errors):
+        if typical_error(seen, moved) < min(errors):
             return moved
     return fit.explanation
-
-
-def _mean_error(evidence: Evidence, one: Explanation) -> float:
-    """Mean over windows, none of which counts for more than ten times the median [m]."""
-    return float(moderated(mean_error(evidence.predict([one])[0], evidence.observed)).mean())
 
 
 def with_effect(cable: Simulator, base: Explanation, effect: SpatialEffect, values: Sequence[float]) -> Explanation:

@@ -18,6 +18,8 @@ WINDOW = 5.0
 _SHORTEST = 1.0
 # A keypoint whose place in the gripper's frame stays within this is held by it [m].
 _HELD = 0.003
+# Part of a window that must be recorded for it to be a whole one.
+_WHOLE = 0.8
 # Weight in fits of a window in which the grippers are further apart than the cable is long.
 _TORN = 0.01
 
@@ -64,6 +66,13 @@ class Windows:
 
     def __len__(self) -> int:
         return len(self.keypoints)
+
+    def whole(self, count: int) -> Int[np.ndarray, "S"]:
+        """So many whole windows that can be simulated, spread evenly over the recordings; any, where there are none."""
+        whole = np.flatnonzero((self.valid.mean(axis=1) >= _WHOLE) & ~self.torn)
+        if not len(whole):
+            whole = np.arange(len(self))
+        return whole[np.unique(np.linspace(0, len(whole) - 1, count).astype(int))]
 
     @property
     def observed(self) -> Float[np.ndarray, "W T F 3"]:
