@@ -198,10 +198,10 @@ def _by_recording(scores: Mapping[str, Any], learned: Sequence[str], best: int) 
 
 def _about_stiffness() -> list[str]:
     return [
-        "rho is the mass per length of the cable with its markers. EI/rho is estimated together with every other effect "
-        "([coverage](fresh_cables.md) on synthetic cables). The halves are different recordings of one cable: if both "
-        f"intervals are right, the estimates differ by less than {_NINETY:g} standard errors on nine cables of ten. An "
-        "error that both halves share does not show here; the intervals of a diagnosis are wider, by the effects of a "
+        "rho is the mass per length of the cable with its markers. EI/rho is estimated together with every other "
+        "effect ([coverage](fresh_cables.md) on synthetic cables). The halves are different recordings of one cable: "
+        f"if both intervals are right, the estimates differ by less than {_NINETY:g} standard errors on nine cables "
+        "of ten. An error that both halves share does not show here; the intervals of a diagnosis are wider, by the effects of a "
         "cable beyond the fitted law."
     ]
 
