@@ -201,8 +201,8 @@ def _about_stiffness() -> list[str]:
         "rho is the mass per length of the cable with its markers. EI/rho is estimated together with every other "
         "effect ([coverage](fresh_cables.md) on synthetic cables). The halves are different recordings of one cable: "
         f"if both intervals are right, the estimates differ by less than {_NINETY:g} standard errors on nine cables "
-        "of ten. An error that both halves share does not show here; the intervals of a diagnosis are wider, by the effects of a "
-        "cable beyond the fitted law."
+        "of ten. An error that both halves share does not show here; the intervals of a diagnosis are wider, by the "
+        "effects of a cable beyond the fitted law."
     ]
 
 
