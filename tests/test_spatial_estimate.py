@@ -125,14 +125,13 @@ def test_an_interval_grows_by_an_error_besides_and_no_less_to_its_wide_side():
 
 def test_what_is_told_is_wider_by_what_the_law_leaves_out(everything):
     for name, more in UNMODELLED.items():
-        effect = "viscous_drag" if name == "drag" else name
-        told = parameters_of(effect, everything, 0.05)[0]
-        plain = parameters_of(effect, everything, 0.05, unmodelled={})[0]
-        for name, parameter in plain.items():
+        told = parameters_of(name, everything, 0.05)[0]
+        plain = parameters_of(name, everything, 0.05, unmodelled={})[0]
+        for key, parameter in plain.items():
             if parameter.ci90 is not None:
-                wide, narrow = (np.ptp(np.reshape(np.array(p.ci90), (-1, 2)), axis=1) for p in (told[name], parameter))
+                wide, narrow = (np.ptp(np.reshape(np.array(p.ci90), (-1, 2)), axis=1) for p in (told[key], parameter))
                 assert (wide > narrow).all() and more > 0
-                assert told[name].value == parameter.value
+                assert told[key].value == parameter.value
 
 
 def test_says_more_from_more_recordings(fitted, estimated):

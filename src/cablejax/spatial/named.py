@@ -19,9 +19,10 @@ _PLACED = 1e-3
 # A damping time shorter than this part of a time step is not told from the integrator: BDF2 damps a vibration as one of
 # up to 0.15 time steps would, most at five steps in a period.
 _HIDDEN = 0.25
-# An effect is named where an interval that holds its value in 95 % of cases leaves its absence out: by the 90 % that
-# are reported too many were named that the cables to choose on of `34_fresh_cables.py` do not have.
-_SURE = float(norm.ppf(0.975) / norm.ppf(0.95))
+SURE = 0.95
+"""An effect is named where an interval that holds its value in this share of cases leaves its absence out. By the 90 %
+that are reported too many were named that the cables to choose on of `34_fresh_cables.py` do not have."""
+_WIDER = float(norm.ppf(0.5 + 0.5 * SURE) / norm.ppf(0.95))
 _DRAGS = ("viscous_drag", "quadratic_drag")
 _WHOLE, _STIFFNESS, _DRAG = "bending_stiffness", "stiffness_over_density_m4_per_s2", "drag_at_speed_per_s"
 _TELLING = {
@@ -93,7 +94,7 @@ def _shown(effect: str, parameter: ParameterEstimate, time_step: float) -> bool:
     elif _TELLING[effect] == "ratio":
         ends = np.log(ends)
     value, low, high = ends
-    above, below = value - _SURE * (value - low) > 0, value + _SURE * (high - value) < 0
+    above, below = value - _WIDER * (value - low) > 0, value + _WIDER * (high - value) < 0
     return bool(above.any() or (below.any() and not damping))
 
 
@@ -114,7 +115,7 @@ def parameters_of(
         first_marker: index of the first free marker among all keypoints.
         unmodelled: error of an effect's parameter besides, see `UNMODELLED`.
     """
-    besides = unmodelled.get("drag" if effect in _DRAGS else effect, 0.0)
+    besides = unmodelled.get(effect, 0.0)
     where, length = estimate.layout.slices, estimate.layout.arclength[-1]
 
     def size(field, first):
