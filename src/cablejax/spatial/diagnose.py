@@ -80,7 +80,7 @@ def diagnose_space(
         progress(change.sentence)
     found = identify(windows, stiffness, only=only, state=state, progress=progress)
 
-    before, (after, results) = found.cable.motion(explanation()), found.unseen()
+    before, (after, results), edges = found.cable.motion(explanation()), found.unseen(), found.cable.rod.n_edges
     noise = noise_of(windows)
     lost = ~np.array([np.isfinite(part[valid]).all() for part, valid in zip(after, windows.valid, strict=True)])
     error = errors(after, windows)
@@ -119,12 +119,7 @@ def diagnose_space(
         noise_mm=np.full(windows.n_keypoints, 1e3 * noise),
         noise_correlation=np.zeros(0),
         seconds=time.perf_counter() - begun,
-        settings={
-            "edges": found.cable.rod.n_edges,
-            "window_s": WINDOW,
-            "jax": jax.__version__,
-            "devices": jax.default_backend(),
-        },
+        settings={"edges": edges, "window_s": WINDOW, "jax": jax.__version__, "devices": jax.default_backend()},
         changes=changes,
         identified=found,
     )
