@@ -17,7 +17,7 @@ from cablejax.simulate.rod import Rod
 from cablejax.spatial.cable import TWISTED, SpatialCable
 from cablejax.spatial.estimate import UNMODELLED, Interval, estimate
 from cablejax.spatial.identify import Identified, layout_of
-from cablejax.spatial.named import named_effects, parameters_of, quantities_of
+from cablejax.spatial.named import named_effects, parameters_of, quantities_of, told_by
 from cablejax.spatial.search import with_effect
 from cablejax.spatial.time_steps import TimeSteps
 from cablejax.spatial.windows import windows_of
@@ -221,6 +221,22 @@ def test_names_only_what_the_estimate_shows(found, everything):
     hidden, step = everything.shared.copy(), found.cable.windows.interval / found.cable.rod.substeps
     hidden[everything.layout.slices["damping_time"]] = 0.25 * step
     assert "bending_damping" not in _named(found, hidden)
+
+
+def test_what_is_predicted_with_the_named_effects_alone_has_no_other(found, everything):
+    alone, with_all = found.unseen(_FOUND)[0], found.unseen()[0]
+    fitted = everything.explanation
+    assert set(fitted.names) > set(_FOUND)
+    values = dict(zip(fitted.names, fitted.values(), strict=True))
+    only = explanation(*((found.cable.layout.named(name), 0, values[name]) for name in _FOUND))
+    np.testing.assert_allclose(alone, found.cable.motion(only), atol=1e-9)
+    np.testing.assert_array_equal(with_all, found.cable.motion(fitted))
+    # there is no other effect, so the two are near
+    assert 0 < np.abs(alone - with_all).max() < 5e-3
+    assert np.array_equal(found.unseen(())[0], found.cable.motion(explanation()))
+    # of a drag, motion shows the sum of both laws
+    assert told_by(["viscous_drag", "lumped_mass"]) == {"viscous_drag", "quadratic_drag", "lumped_mass"}
+    assert told_by(_FOUND) == set(_FOUND)
 
 
 def test_of_the_drags_their_sum_is_told_by_the_name_of_the_larger_one(found, everything):

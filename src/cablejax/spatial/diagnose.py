@@ -23,7 +23,7 @@ from cablejax.spatial.effects import GRIP
 from cablejax.spatial.gap import RESOLVABLE, constant_offset, gap_of, noise_of
 from cablejax.spatial.geometry import LocalChange, local_changes
 from cablejax.spatial.identify import Identified, identify
-from cablejax.spatial.named import named_effects, quantities_of
+from cablejax.spatial.named import named_effects, quantities_of, told_by
 from cablejax.spatial.where import in_log, where_of
 from cablejax.spatial.windows import WINDOW, windows_of
 from cablejax.types import GapLog
@@ -80,15 +80,16 @@ def diagnose_space(
         progress(change.sentence)
     found = identify(windows, stiffness, only=only, state=state, progress=progress)
 
-    before, (after, results), edges = found.cable.motion(explanation()), found.unseen(), found.cable.rod.n_edges
+    density, guessed = cable["linear_density_kg_per_m"], "linear_density_kg_per_m" in log.meta.get("guessed", ())
+    effects = named_effects(found, density)
+    named, edges = [effect.name for effect in effects], found.cable.rod.n_edges
+    before, (after, results) = found.cable.motion(explanation()), found.unseen(told_by(named))
     noise = noise_of(windows)
     lost = ~np.array([np.isfinite(part[valid]).all() for part, valid in zip(after, windows.valid, strict=True)])
     error = errors(after, windows)
     use = np.flatnonzero(kept(lost | off(error) | windows.torn))
     gap = gap_of(before[use], after[use], found.cable.on(windows.chosen(use)), noise)
-    density, guessed = cable["linear_density_kg_per_m"], "linear_density_kg_per_m" in log.meta.get("guessed", ())
-    effects = named_effects(found, density)
-    equivalent = _equivalent(found, named := [effect.name for effect in effects])
+    equivalent = _equivalent(found, named)
     verdict = _verdict(gap, named, equivalent)
     if verdict in ("none", "unknown"):
         effects = ()
@@ -171,9 +172,8 @@ def _caveats(log, windows, left_out, found) -> tuple[str, ...]:
         "noise, but of the constant offsets, as is what the simulator has wrong at rest.",
         "Roll of the grippers about the cable is not observed; it is taken as the least turn from their mean "
         "direction.",
-        "All effects that were tried are fitted together, and the gap after is what all of them leave on recordings "
-        "that no fit has seen: also those that are not named, because their intervals hold the value of a cable "
-        "without them.",
+        "All effects that were tried are fitted together. The gap after is what the named ones leave, with their "
+        "values from that fit, on recordings that no fit has seen.",
     ]
     if "gripper_rotation_offset" in found.tried:
         own = GRIP * found.everything.explanation.own[np.unique(windows.group)]

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 import pathlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -56,12 +56,24 @@ class Identified:
     halves: tuple[Estimate, Estimate]
     first: Bool[np.ndarray, "W"]
 
-    def unseen(self) -> tuple[Float[np.ndarray, "W T F 3"], Int[np.ndarray, "W"]]:
+    def unseen(
+        self, effects: Collection[str] | None = None
+    ) -> tuple[Float[np.ndarray, "W T F 3"], Int[np.ndarray, "W"]]:
         """Predictions of all windows, each from the half of the recordings that it is not part of [m].
 
         And how the simulation of each ended: a `RodResult`.
+
+        Args:
+            effects: that are simulated, with their values from the fit of all; None = all.
         """
-        (one, ended), (other, other_ended) = (self.cable.rollouts(half.explanation) for half in self.halves)
+
+        def simulated(half):
+            one = half.explanation
+            for name in one.names if effects is not None else ():
+                one = one if name in effects else one.without(name)
+            return self.cable.rollouts(one)
+
+        (one, ended), (other, other_ended) = map(simulated, self.halves)
         return np.where(self.first[:, None, None, None], other, one), np.where(self.first, other_ended, ended)
 
 

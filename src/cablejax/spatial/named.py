@@ -59,6 +59,11 @@ def named_effects(found: Identified, density: float) -> tuple[NamedEffect, ...]:
     return tuple(named)
 
 
+def told_by(named: Sequence[str]) -> set[str]:
+    """Effects whose values named ones tell: of a drag, that by either law, since motion shows their sum."""
+    return {*named, *(_DRAGS if set(_DRAGS) & set(named) else ())}
+
+
 def quantities_of(found: Identified, density: float | None) -> dict[str, ParameterEstimate]:
     """What motion shows of the cable, whether an effect is named for it or not, with 90 % intervals.
 
