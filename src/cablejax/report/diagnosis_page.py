@@ -22,6 +22,7 @@ from cablejax.report.effect_words import (
     between,
     effect_place,
     effect_title,
+    error_falls,
     explained_label,
     millimetres,
     parameter_title,
@@ -186,11 +187,7 @@ def _cards(diagnosis: CableDiagnosis) -> Iterator[tuple[str, str, str]]:
     if gap.shrinkage is not None and diagnosis.explained is not None:
         interval = "" if gap.shrinkage_ci90 is None else f"90 % interval {between(*gap.shrinkage_ci90)}, "
         yield ("The gap shrinks by", share(gap.shrinkage), f"{interval}on episodes that no fit has seen")
-        yield (
-            "Error",
-            f"{gap.before_rmse_mm:.1f} → {millimetres(gap.after_rmse_mm)}",
-            _noise(diagnosis),
-        )
+        yield ("Error", error_falls(gap), _noise(diagnosis))
     else:
         yield ("Error", millimetres(gap.before_rmse_mm), _noise(diagnosis))
 

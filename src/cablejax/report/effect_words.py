@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
-from cablejax.diagnose.diagnosis import CableDiagnosis, NamedEffect
+from cablejax.diagnose.diagnosis import CableDiagnosis, Gap, NamedEffect
 from cablejax.diagnose.judgement import listed
 
 EFFECTS: dict[str, str] = {
@@ -121,6 +121,11 @@ def quantity(value: Any, unit: str, ci90: Any = None, *, interval: bool = True) 
 def millimetres(value: float) -> str:
     """A length in millimetres to two digits, at least whole tenths below ten: "0.04 mm", "1.3 mm", "27 mm"."""
     return f"{_short(value)} mm"
+
+
+def error_falls(gap: Gap) -> str:
+    """The error before and after, as in "77 → 12 mm"."""
+    return f"{_short(gap.before_rmse_mm)} → {millimetres(gap.after_rmse_mm)}"
 
 
 def _short(value: float) -> str:

@@ -13,7 +13,7 @@ from cablejax.diagnose.diagnosis import Diagnosis
 from cablejax.diagnose.judgement import listed
 from cablejax.diagnose.study import ENDED, Ended, left_open
 from cablejax.effects.given import GivenEffect
-from cablejax.report.effect_words import effect_title, millimetres, share
+from cablejax.report.effect_words import effect_title, error_falls, share
 from cablejax.report.sheet import Sheet
 from cablejax.report.style import DIAGNOSIS_STYLE, LIGHT
 
@@ -49,7 +49,7 @@ def study_sheet(
         cards=[
             ("Verdict", _VERDICTS[last.verdict] if why != "clear" or last.verdict == "none" else "named", names),
             ("Recorded", f"{sum(map(len, motions))} motions", f"in {rounds} round{'s' if rounds > 1 else ''}"),
-            ("Error", _error(last), "without and with what is named"),
+            ("Error", error_falls(last.gap), "without and with what is named"),
             (
                 "Staged in the plant",
                 listed([effect_title(effect.name) for effect in staged]) or "nothing",
@@ -74,16 +74,12 @@ def study_sheet(
     )
 
 
-def _error(found: Diagnosis) -> str:
-    return f"{found.gap.before_rmse_mm:.1f} → {millimetres(found.gap.after_rmse_mm)}"
-
-
 def _row(number: int, found: Diagnosis, motions: Sequence[str]) -> tuple[str, ...]:
     return (
         str(number),
         listed([name.replace("_", " ") for name in motions]),
         listed([effect_title(name) for name in left_open(found)], "or") or _VERDICTS[found.verdict],
-        _error(found),
+        error_falls(found.gap),
         Markup('<a href="round_{}/report.html">diagnosis</a>').format(number),
     )
 
