@@ -5,8 +5,8 @@
 
 For every seed an effect is drawn from those that one log hardly separates, and staged in the contact plant (MuJoCo in
 space) or in the rod of the blind check, which shares no code with the package, five seeds each in turn. The first log
-has three motions; after its diagnosis one motion is added, and after the next another one. The arms differ by that
-motion only:
+has three motions; after its diagnosis one motion is added, and after the next another one, as long as `cablejax study`
+would go on. The arms differ by that motion only:
 
 - `designed`: most information about which explanation holds, within the bounds;
 - `fisher`: the same search for most information about the parameters of the most probable explanation;
@@ -43,7 +43,7 @@ from cablejax.diagnose import CableDiagnosis, diagnose
 from cablejax.diagnose.motion_bounds import Bounds, cable_beyond, grippers_beyond
 from cablejax.diagnose.motion_judge import Objective
 from cablejax.diagnose.safe_motions import safe_motions, starting_pose
-from cablejax.diagnose.study import left_open
+from cablejax.diagnose.study import ended, left_open
 from cablejax.effects.given import parse_effect
 from cablejax.gaplog import Episode, gap_log_from_episodes
 from cablejax.simulate.plant import Plant, PlantConfig
@@ -157,6 +157,7 @@ def examine(seed: int, arm: str) -> dict[str, Any]:
         found = case.diagnosed(ARMS[arm])
         named = [effect.name for effect in found.effects]
         following = found.next_motion
+        separates = following is not None and ARMS[arm] == "explanations"
         logs.append(
             {
                 "verdict": found.verdict,
@@ -168,9 +169,11 @@ def examine(seed: int, arm: str) -> dict[str, Any]:
                 "information": None if following is None else following.information,
                 "doubt": None if following is None else following.doubt,
                 "seconds": time.perf_counter() - begin,
+                # only the motion that the package recommends is judged for what it separates
+                "ended": ended(found, {"inseparable": separates and following.inseparable}, rounds_left=ADDED - added),
             }
         )
-        if added == ADDED:
+        if logs[-1]["ended"]:
             break
         if ARMS[arm] is None or following is None:
             first = starting_pose(found.log.gripper_pose)
@@ -186,13 +189,24 @@ def examine(seed: int, arm: str) -> dict[str, Any]:
     return {"effect": case.text, "family": family(seed), "truth": truth, "logs": logs, "broken": broken}
 
 
+def after(row: dict[str, Any], added: int) -> dict[str, Any]:
+    """What is known when so many motions may be added at most."""
+    return row["logs"][min(added, made_in(row))]
+
+
+def made_in(row: dict[str, Any]) -> int:
+    """Motions that are added until the study ends. Rows of before go on after that."""
+    return next(k for k, log in enumerate(row["logs"]) if log["ended"])
+
+
 def page(rows: Sequence[dict[str, Any]]) -> str:
     """Set sizes and truth in the set by arm and number of added motions, over seeds that all arms have."""
     arms = [arm for arm in ARMS if any(row["arm"] == arm for row in rows)]
     common = set.intersection(*({row["seed"] for row in rows if row["arm"] == arm} for arm in arms)) if arms else set()
     head = [
         "arm",
-        "motions added",
+        "motions at most",
+        "made, mean",
         "set size, median (mean)",
         "truth in the set",
         "without those below 1 %: size, median (mean)",
@@ -204,30 +218,32 @@ def page(rows: Sequence[dict[str, Any]]) -> str:
     for arm in arms:
         own = [row for row in rows if row["arm"] == arm and row["seed"] in common]
         for added in range(ADDED + 1):
-            cells = [f"{arm}", f"{added}"]
+            made = np.mean([min(added, made_in(row)) for row in own])
+            cells = [f"{arm}", f"{added}", f"{made:.1f}"]
             for kind in ("set", "open"):
-                sets = [(row["logs"][added][kind], row["truth"]) for row in own]
+                sets = [(after(row, added)[kind], row["truth"]) for row in own]
                 sizes, hits = [len(names) for names, _ in sets], [truth in names for names, truth in sets]
                 cells += [f"{np.median(sizes):.1f} ({np.mean(sizes):.1f})", f"{sum(hits)} of {len(hits)}"]
-            alone = [row["logs"][added]["open"] == [row["truth"]] for row in own]
+            alone = [after(row, added)["open"] == [row["truth"]] for row in own]
             called = ""
             if ARMS[arm] == "explanations":
-                several = [row["logs"][added] for row in own if len(row["logs"][added]["open"]) > 1]
+                several = [log for log in (after(row, added) for row in own) if len(log["open"]) > 1]
                 called = f"{sum(bool(log['inseparable']) for log in several)} of {len(several)}"
             table.append([*cells, f"{sum(alone)} of {len(alone)}", called])
-    made = Counter(family(seed) for seed in common)
+    families = Counter(family(seed) for seed in common)
     moved = [(row["arm"], broken) for row in rows if row["seed"] in common for broken in row["broken"]]
     kept = {arm: [not broken for name, broken in moved if name == arm] for arm in arms}
     bounds = ", ".join(f"{arm} {sum(k)} of {len(k)}" for arm, k in kept.items())
     lines = [
         f"{len(common)} seeds, {len(RANGES)} effects in turn, by "
-        + " and ".join(f"{count} of the {name}" for name, count in sorted(made.items()))
+        + " and ".join(f"{count} of the {name}" for name, count in sorted(families.items()))
         + f", {1e3 * NOISE:g} mm noise; the first log has "
         f"{len(FIRST)} motions. Motions that kept all bounds when the plant executed them: {bounds}.",
         "",
         "`designed` is the motion that the package recommends, `fisher` the same search for the parameters of the most "
-        "probable explanation, `random` any safe motion. A uniform cable in slow motion shows only the ratio of "
-        "stiffness to density and friction: a set of stiffness and density cannot become smaller.",
+        "probable explanation, `random` any safe motion. No motion is added once the answer is clear, or the package "
+        "calls what is left inseparable, as `cablejax study` ends. A uniform cable in slow motion shows only the ratio "
+        "of stiffness to density and friction: a set of stiffness and density cannot become smaller.",
         "",
         *markdown_table(table),
         "",
