@@ -234,6 +234,9 @@ def page(rows: Sequence[dict[str, Any]]) -> str:
     moved = [(row["arm"], broken) for row in rows if row["seed"] in common for broken in row["broken"]]
     kept = {arm: [not broken for name, broken in moved if name == arm] for arm in arms}
     bounds = ", ".join(f"{arm} {sum(k)} of {len(k)}" for arm, k in kept.items())
+    on = [row for row in rows if row["seed"] in common and len(row["logs"]) > 1 + made_in(row)]
+    on = [row["logs"][made_in(row) :] for row in on if row["logs"][made_in(row)]["ended"] == "clear"]
+    undone = sum(any(log["open"] != first["open"] for log in more) for first, *more in on)
     lines = [
         f"{len(common)} seeds, {len(RANGES)} effects in turn, by "
         + " and ".join(f"{count} of the {name}" for name, count in sorted(families.items()))
@@ -246,6 +249,9 @@ def page(rows: Sequence[dict[str, Any]]) -> str:
         "of stiffness to density and friction: a set of stiffness and density cannot become smaller.",
         "",
         *markdown_table(table),
+        "",
+        f"In {len(on)} rows of before, motions went on after a clear answer: in {undone} of them it did not last, with "
+        "one motion more or with two.",
         "",
         "Staged: "
         + ", ".join(f"`{row['effect']}`" for row in rows if row["arm"] == arms[0] and row["seed"] in common)
