@@ -171,8 +171,8 @@ def estimate(
     progress(f"all effects free: {len(cable.windows)} windows")
     tolerance, rounds, steps, evidence = _TOLERANCE * len(cable.windows), 0, _STEPS, cable.evidence()
     start, before = min(starts, key=lambda one: typical_error(evidence, one)), np.inf
-    # the search may have left what is a recording's own in a bad minimum, which a fit from 0 need not end in; where there
-    # are several starts, they come from fits that began so
+    # the search may have left what is a recording's own in a bad minimum, which a fit from 0 need not end in; several
+    # starts come from fits that began so
     alone = len(starts) == 1 and start.own.any()
     starts = [start, start.moved(start.z, np.zeros_like(start.own))] if alone else [start]
     while True:
