@@ -195,7 +195,7 @@ def after(row: dict[str, Any], added: int) -> dict[str, Any]:
 
 
 def made_in(row: dict[str, Any]) -> int:
-    """Motions that are added until the study ends. Rows of before go on after that."""
+    """Motions that are added until the study ends. Older rows go on after that."""
     return next(k for k, log in enumerate(row["logs"]) if log["ended"])
 
 
@@ -234,9 +234,9 @@ def page(rows: Sequence[dict[str, Any]]) -> str:
     moved = [(row["arm"], broken) for row in rows if row["seed"] in common for broken in row["broken"]]
     kept = {arm: [not broken for name, broken in moved if name == arm] for arm in arms}
     bounds = ", ".join(f"{arm} {sum(k)} of {len(k)}" for arm, k in kept.items())
-    on = [row for row in rows if row["seed"] in common and len(row["logs"]) > 1 + made_in(row)]
-    on = [row["logs"][made_in(row) :] for row in on if row["logs"][made_in(row)]["ended"] == "clear"]
-    undone = sum(any(log["open"] != first["open"] for log in more) for first, *more in on)
+    beyond = [row["logs"][made_in(row) :] for row in rows if row["seed"] in common]
+    beyond = [(first["open"], more) for first, *more in beyond if more and first["ended"] == "clear"]
+    undone = sum(any(log["open"] != answer for log in more) for answer, more in beyond)
     lines = [
         f"{len(common)} seeds, {len(RANGES)} effects in turn, by "
         + " and ".join(f"{count} of the {name}" for name, count in sorted(families.items()))
@@ -250,8 +250,8 @@ def page(rows: Sequence[dict[str, Any]]) -> str:
         "",
         *markdown_table(table),
         "",
-        f"In {len(on)} rows of before, motions went on after a clear answer: in {undone} of them it did not last, with "
-        "one motion more or with two.",
+        f"In {len(beyond)} older rows motions went on after a clear answer, one more or two: {undone} of these answers "
+        "did not last.",
         "",
         "Staged: "
         + ", ".join(f"`{row['effect']}`" for row in rows if row["arm"] == arms[0] and row["seed"] in common)

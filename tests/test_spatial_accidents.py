@@ -15,7 +15,7 @@ from cablejax.simulate.rod import Rod, RodResult
 from cablejax.spatial.accidents import accident_sentences, compared, kept, moderated, off, trust
 from cablejax.spatial.cable import SpatialCable, errors, typical_error
 from cablejax.spatial.diagnose import diagnose_space
-from cablejax.spatial.estimate import starts_from
+from cablejax.spatial.estimate import best_start, starts_from
 from cablejax.spatial.identify import layout_of
 from cablejax.spatial.search import Step, falls, search
 from cablejax.spatial.windows import windows_of
@@ -193,7 +193,7 @@ def test_the_fit_to_all_begins_where_it_is_simulated_best(monkeypatch):
         return improve(evidence, fits, **options)
 
     monkeypatch.setattr(estimates, "improve", spied)
-    estimates.estimate(cable, starts, names)
+    estimates.estimate(cable, [best_start(cable, stray, good)], names)
     np.testing.assert_array_equal(begun[0].explanation.z, good.z)
 
 

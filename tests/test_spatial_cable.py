@@ -178,7 +178,7 @@ def test_what_was_done_is_read_back(cable, tmp_path):
     memory = Memory(path, "mark", cable.layout)
     memory.keep("search", [step])
     size = cable.layout.size
-    told = Estimate(cable.layout, one, np.arange(size), np.ones((3, size)), np.zeros((0, size)), 0.7, settled=False)
+    told = Estimate(cable.layout, one, np.ones((3, size)), np.zeros((0, size)), 0.7, settled=False)
     memory.keep_estimates([told])
     again = Memory(path, "mark", cable.layout)
     (read,), (estimated,) = again.steps("search"), again.estimates()

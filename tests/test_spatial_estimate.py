@@ -15,7 +15,7 @@ from cablejax.diagnose.fit import evaluate, improve, improved
 from cablejax.diagnose.protocol import explanation
 from cablejax.simulate.rod import Rod
 from cablejax.spatial.cable import TWISTED, SpatialCable
-from cablejax.spatial.estimate import UNMODELLED, Interval, estimate
+from cablejax.spatial.estimate import UNMODELLED, Interval, estimate, restarts
 from cablejax.spatial.identify import Identified, layout_of
 from cablejax.spatial.named import named_effects, parameters_of, quantities_of, told_by
 from cablejax.spatial.search import with_effect
@@ -192,7 +192,7 @@ def test_does_not_stay_where_a_search_took_the_grips_astray(fitted):
     grips, said = cable.layout.named("gripper_rotation_offset"), []
     start = with_effect(cable, best, grips, grips.null)
     astray = start.moved(start.z, start.own + 8.0)
-    told = estimate(cable, [astray], (*_FOUND, grips.name), progress=said.append)
+    told = estimate(cable, restarts(astray), (*_FOUND, grips.name), progress=said.append)
     assert told.settled and told.stiffness.value == pytest.approx(_TRUE_STIFFNESS, rel=0.02)
     # from there alone the second round still moves by 40 standard errors
     moves = [float(text.split()[-3]) for text in said if "standard errors" in text]
@@ -205,7 +205,14 @@ def _named(found, values):
 
 
 def _at(found, values):
-    return dataclasses.replace(found, everything=dataclasses.replace(found.everything, shared=values))
+    return dataclasses.replace(found, everything=_valued(found.everything, values))
+
+
+def _valued(everything, values):
+    """The estimate with these values."""
+    one, layout = everything.explanation, everything.layout
+    other = explanation(*((term.effect, term.variant, values[layout.slots(term.effect.name)]) for term in one.terms))
+    return dataclasses.replace(everything, explanation=one.moved(other.z))
 
 
 def test_names_only_what_the_estimate_shows(found, everything):
@@ -272,7 +279,7 @@ def test_many_intervals_hold_together(everything):
 def test_a_mass_is_told_per_density(everything):
     values = everything.shared.copy()
     values[everything.layout.slices["marker_mass"]] = 0.01
-    heavy = dataclasses.replace(everything, shared=values)
+    heavy = _valued(everything, values)
     one, other = (parameters_of("lumped_mass", heavy, density)[0]["mass_kg"] for density in (0.05, 0.1))
     assert other.value == pytest.approx(2 * one.value)
     np.testing.assert_allclose(np.array(other.ci90), 2 * np.array(one.ci90))

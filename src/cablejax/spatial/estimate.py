@@ -18,7 +18,7 @@ from types import MappingProxyType
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 from scipy.stats import norm, t
 
 from cablejax.bounded import Result, solve_arrow
@@ -27,7 +27,6 @@ from cablejax.diagnose.fit import Fit, evaluate, improve
 from cablejax.diagnose.protocol import Explanation, explanation
 from cablejax.spatial.cable import TWISTED, SpatialCable, typical_error
 from cablejax.spatial.effects import Layout
-from cablejax.spatial.windows import Windows
 
 # Predictions may be off by what edges and time steps of finite length do; values are not to make up for it. Fits are
 # made in rounds of so many steps at most, predictions corrected before each, until no value moves by this share of its
@@ -98,8 +97,7 @@ class Estimate:
     Attributes:
         layout: of the values.
         explanation: that was fitted.
-        shared: values that all recordings share, shape [P].
-        moves: what leaving out each recording does to them, see `jackknife`, shape [R, P].
+        moves: what leaving out each recording does to the shared values, see `jackknife`, shape [R, P].
         shifts: what moving each prior by its standard deviation does to them, shape [K, P].
         speed: of the keypoints, root mean square [m/s].
         settled: whether no value moved by more than a small part of its standard error when predictions were last
@@ -108,11 +106,15 @@ class Estimate:
 
     layout: Layout
     explanation: Explanation
-    shared: Float[np.ndarray, "P"]
     moves: Float[np.ndarray, "R P"]
     shifts: Float[np.ndarray, "K P"]
     speed: float
     settled: bool = True
+
+    @property
+    def shared(self) -> Float[np.ndarray, "P"]:
+        """Values that all recordings share."""
+        return self.explanation.vector(self.layout.effects)
 
     def of(self, quantity: Quantity) -> Interval:
         """A quantity, its interval by its slope at the fitted values."""
@@ -162,19 +164,17 @@ def estimate(
 
     Args:
         cable: in the windows to fit.
-        starts: explanations to start from, with some of the effects; the one that simulates the windows best is taken.
+        starts: explanations to start from, with some of the effects; the first round goes on from each.
         tried: names of the effects that are free.
         progress: called with a line of text.
     """
     starts = [_with_all(start, cable, tried) for start in starts]
-    cable = cable.on(cable.windows.chosen(np.flatnonzero(affordable(tried, cable.windows))))
+    if TWISTED in tried:
+        # four times the cost
+        cable = cable.on(cable.windows.chosen(cable.windows.whole(_TWISTED_WINDOWS)))
     progress(f"all effects free: {len(cable.windows)} windows")
-    tolerance, rounds, steps, evidence = _TOLERANCE * len(cable.windows), 0, _STEPS, cable.evidence()
-    start, before = min(starts, key=lambda one: typical_error(evidence, one)), np.inf
-    # the search may have left what is a recording's own in a bad minimum, which a fit from 0 need not end in; several
-    # starts come from fits that began so
-    alone = len(starts) == 1 and start.own.any()
-    starts = [start, start.moved(start.z, np.zeros_like(start.own))] if alone else [start]
+    tolerance, rounds, steps = _TOLERANCE * len(cable.windows), 0, _STEPS
+    start, before = starts[0], np.inf
     while True:
         rounds += 1
         evidence = cable.corrected(start).evidence()
@@ -194,6 +194,20 @@ def estimate(
         starts = [start]
 
 
+def restarts(one: Explanation) -> list[Explanation]:
+    """A fit, and the same from 0 in what is a recording's own.
+
+    The search may have left that in a bad minimum, which a fit from 0 need not end in.
+    """
+    return [one, one.moved(one.z, np.zeros_like(one.own))] if one.own.any() else [one]
+
+
+def best_start(cable: SpatialCable, one: Explanation, other: Explanation) -> Explanation:
+    """That of `starts_from` which simulates the cable's windows best."""
+    evidence = cable.evidence()
+    return min(starts_from(one, other), key=lambda start: typical_error(evidence, start))
+
+
 def starts_from(one: Explanation, other: Explanation) -> list[Explanation]:
     """Where a fit to all recordings may begin: the mean of the fits to both halves, and either of them.
 
@@ -205,12 +219,6 @@ def starts_from(one: Explanation, other: Explanation) -> list[Explanation]:
     found = (both[0] != 0).astype(int) + (both[1] != 0)
     own = (both[0] + both[1]) / np.maximum(found, 1)
     return [one.moved(z, own) for z in ((one.z + other.z) / 2, one.z, other.z)]
-
-
-def affordable(tried: Sequence[str], windows: Windows) -> Bool[np.ndarray, "W"]:
-    """Windows that values are fitted to: all, unless the material frame is followed, at four times the cost."""
-    every = np.arange(len(windows))
-    return np.isin(every, windows.whole(_TWISTED_WINDOWS) if TWISTED in tried else every)
 
 
 def _with_all(start: Explanation, cable: SpatialCable, tried: Sequence[str]) -> Explanation:
@@ -227,8 +235,7 @@ def estimate_at(evidence: Evidence, fit: Fit) -> Estimate:
     # of the vector by the coordinates
     slopes = cable.directions(one)[0][: len(one.z)]
     moves, shifts = _rows(evidence, fit)
-    shared = one.vector(cable.effects)
-    return Estimate(cable.layout, one, shared, moves @ slopes, shifts @ slopes, cable.windows.speed)
+    return Estimate(cable.layout, one, moves @ slopes, shifts @ slopes, cable.windows.speed)
 
 
 def _rows(evidence: Evidence, fit: Fit) -> tuple[Float[np.ndarray, "R K"], Float[np.ndarray, "K K"]]:

@@ -19,7 +19,7 @@ from cablejax.simulate.rod import Rod
 from cablejax.spatial.accidents import moderated
 from cablejax.spatial.cable import TWISTED, SpatialCable
 from cablejax.spatial.effects import Layout, effect_names, effects_of
-from cablejax.spatial.estimate import Estimate, estimate, starts_from
+from cablejax.spatial.estimate import Estimate, best_start, estimate, restarts
 from cablejax.spatial.memory import Memory, fingerprint
 from cablejax.spatial.search import Step, accepted_effects, halves, search, tried_with, unseen_error, with_effect
 from cablejax.spatial.time_steps import TimeSteps, time_steps_for
@@ -69,8 +69,8 @@ class Identified:
 
         def simulated(half):
             one = half.explanation
-            for name in one.names if effects is not None else ():
-                one = one if name in effects else one.without(name)
+            for name in set(one.names) - set(one.names if effects is None else effects):
+                one = one.without(name)
             return self.cable.rollouts(one)
 
         (one, ended), (other, other_ended) = map(simulated, self.halves)
@@ -137,7 +137,8 @@ def identify(
         steps += found
     last = [step for step in steps if step.accepted][-1]
     cable = cable.trusting(unseen_error(cable, last.halves))
-    one, other, everything = _estimates(cable, last.halves, names, memory, progress)
+    first = halves(windows.group)
+    one, other, everything = _estimates(cable, first, last.halves, names, memory, progress)
     return Identified(
         cable=cable.with_more_edges(),
         time_steps=time_steps,
@@ -146,19 +147,22 @@ def identify(
         steps=tuple(steps),
         everything=everything,
         halves=(one, other),
-        first=halves(windows.group),
+        first=first,
     )
 
 
-def _estimates(cable: SpatialCable, begun, tried, memory: Memory, progress) -> list[Estimate]:
+def _estimates(cable: SpatialCable, first, begun, tried, memory: Memory, progress) -> list[Estimate]:
     """Of either half of the recordings, from the fits of the search, and of all."""
     windows, done = cable.windows, memory.estimates()
-    first = halves(windows.group)
     parts = ((first, "one half"), (~first, "the other half"), (np.ones(len(windows), bool), "all recordings"))
     for part, word in parts[len(done) :]:
         progress(f"fitting {word}")
-        starts = [begun[len(done)]] if len(done) < 2 else starts_from(*(half.explanation for half in done))
-        done.append(estimate(cable.on(windows.chosen(np.flatnonzero(part))), starts, tried, progress=progress))
+        own = cable.on(windows.chosen(np.flatnonzero(part)))
+        if len(done) < 2:
+            starts = restarts(begun[len(done)])
+        else:
+            starts = [best_start(own, done[0].explanation, done[1].explanation)]
+        done.append(estimate(own, starts, tried, progress=progress))
         memory.keep_estimates(done)
     return done
 

@@ -85,10 +85,9 @@ class Memory:
             Estimate(
                 self._layout,
                 self._read(e["explanation"]),
-                shared=np.array(e["shared"]),
-                # of so many rows, also where there are none
-                moves=np.array(e["moves"]).reshape(-1, len(e["shared"])),
-                shifts=np.array(e["shifts"]).reshape(-1, len(e["shared"])),
+                # of so many columns, also where there are no rows
+                moves=np.array(e["moves"]).reshape(-1, self._layout.size),
+                shifts=np.array(e["shifts"]).reshape(-1, self._layout.size),
                 speed=e["speed"],
                 settled=e["settled"],
             )
@@ -100,7 +99,8 @@ class Memory:
         plain = [
             {
                 "explanation": _plain(e.explanation),
-                **{name: getattr(e, name).tolist() for name in ("shared", "moves", "shifts")},
+                "moves": e.moves.tolist(),
+                "shifts": e.shifts.tolist(),
                 "speed": e.speed,
                 "settled": e.settled,
             }
