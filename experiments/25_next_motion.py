@@ -190,12 +190,12 @@ def examine(seed: int, arm: str) -> dict[str, Any]:
 
 
 def after(row: dict[str, Any], added: int) -> dict[str, Any]:
-    """What is known when so many motions may be added at most."""
+    """Result of a row after at most so many added motions."""
     return row["logs"][min(added, made_in(row))]
 
 
 def made_in(row: dict[str, Any]) -> int:
-    """Motions that are added until the study ends. Older rows go on after that."""
+    """Number of motions that are added until the study ends. Older rows continue after that."""
     return next(k for k, log in enumerate(row["logs"]) if log["ended"])
 
 
@@ -250,7 +250,7 @@ def page(rows: Sequence[dict[str, Any]]) -> str:
         "",
         *markdown_table(table),
         "",
-        f"In {len(beyond)} older rows motions went on after a clear answer, one more or two: {undone} of these answers "
+        f"In {len(beyond)} older rows one or two more motions followed a clear answer: {undone} of these answers "
         "did not last.",
         "",
         "Staged: "

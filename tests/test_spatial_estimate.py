@@ -17,7 +17,7 @@ from cablejax.simulate.rod import Rod
 from cablejax.spatial.cable import TWISTED, SpatialCable
 from cablejax.spatial.estimate import UNMODELLED, Interval, estimate, restarts
 from cablejax.spatial.identify import Identified, layout_of
-from cablejax.spatial.named import named_effects, parameters_of, quantities_of, told_by
+from cablejax.spatial.named import named_effects, parameters_of, quantities_of, with_both_drags
 from cablejax.spatial.search import with_effect
 from cablejax.spatial.time_steps import TimeSteps
 from cablejax.spatial.windows import windows_of
@@ -242,8 +242,8 @@ def test_what_is_predicted_with_the_named_effects_alone_has_no_other(found, ever
     assert 0 < np.abs(alone - with_all).max() < 5e-3
     assert np.array_equal(found.unseen(())[0], found.cable.motion(explanation()))
     # of a drag, motion shows the sum of both laws
-    assert told_by(["viscous_drag", "lumped_mass"]) == {"viscous_drag", "quadratic_drag", "lumped_mass"}
-    assert told_by(_FOUND) == set(_FOUND)
+    assert with_both_drags(["viscous_drag", "lumped_mass"]) == {"viscous_drag", "quadratic_drag", "lumped_mass"}
+    assert with_both_drags(_FOUND) == set(_FOUND)
 
 
 def test_of_the_drags_their_sum_is_told_by_the_name_of_the_larger_one(found, everything):

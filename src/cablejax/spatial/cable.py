@@ -97,7 +97,7 @@ class SpatialCable(Simulator):
         return dataclasses.replace(self, rod=finer)
 
     def with_more_edges(self) -> SpatialCable:
-        """With as many edges as what values are estimated for, without correction."""
+        """With the number of edges that estimates are corrected for, without correction."""
         # the longest local error stays the same length
         rod = dataclasses.replace(
             self.rod, n_edges=round(_MORE_EDGES * self.rod.n_edges), local_error=_MORE_EDGES * self.rod.local_error

@@ -23,7 +23,7 @@ from cablejax.spatial.effects import GRIP
 from cablejax.spatial.gap import RESOLVABLE, constant_offset, gap_of, noise_of
 from cablejax.spatial.geometry import LocalChange, local_changes
 from cablejax.spatial.identify import Identified, identify
-from cablejax.spatial.named import named_effects, quantities_of, told_by
+from cablejax.spatial.named import named_effects, quantities_of, with_both_drags
 from cablejax.spatial.where import in_log, where_of
 from cablejax.spatial.windows import WINDOW, windows_of
 from cablejax.types import GapLog
@@ -83,7 +83,7 @@ def diagnose_space(
     density, guessed = cable["linear_density_kg_per_m"], "linear_density_kg_per_m" in log.meta.get("guessed", ())
     effects = named_effects(found, density)
     named, edges = [effect.name for effect in effects], found.cable.rod.n_edges
-    before, (after, results) = found.cable.motion(explanation()), found.unseen(told_by(named))
+    before, (after, results) = found.cable.motion(explanation()), found.unseen(with_both_drags(named))
     noise = noise_of(windows)
     lost = ~np.array([np.isfinite(part[valid]).all() for part, valid in zip(after, windows.valid, strict=True)])
     error = errors(after, windows)

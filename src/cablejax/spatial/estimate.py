@@ -195,9 +195,9 @@ def estimate(
 
 
 def restarts(one: Explanation) -> list[Explanation]:
-    """A fit, and the same from 0 in what is a recording's own.
+    """Where a fit to half of the recordings may begin: an explanation, and the same with recordings' own values at 0.
 
-    The search may have left that in a bad minimum, which a fit from 0 need not end in.
+    The search may have left those values in a bad minimum, in which a fit from 0 need not end.
     """
     return [one, one.moved(one.z, np.zeros_like(one.own))] if one.own.any() else [one]
 

@@ -1,9 +1,9 @@
 """Identifies a cable in space from windows of recordings: effects, values, and held-out predictions.
 
-A search adds effects one by one, which leads fits to the right minimum and shows what each is worth (`search`). From
-where it ends, everything that was tried is fitted together (`estimate`): what the cable is, and what it is simulated
-with. The search's choice alone would not do for either: what it leaves out near its threshold depends on accidents, and
-pulls the values of what it keeps.
+A search adds effects one by one, which brings fits close to the right minimum and shows how much each effect
+contributes (`search`). From where it ends, all effects that were tried are fitted together (`estimate`). Reported
+values and predictions both come from that fit. The search's own selection would serve neither: whether an effect near
+the threshold stays depends on chance, and leaving an effect out biases the others.
 """
 
 from __future__ import annotations

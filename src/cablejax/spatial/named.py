@@ -59,8 +59,8 @@ def named_effects(found: Identified, density: float) -> tuple[NamedEffect, ...]:
     return tuple(named)
 
 
-def told_by(named: Sequence[str]) -> set[str]:
-    """Effects whose values named ones tell: of a drag, that by either law, since motion shows their sum."""
+def with_both_drags(named: Sequence[str]) -> set[str]:
+    """Named effects, and with either drag the other one: only the sum of the two is identifiable."""
     return {*named, *(_DRAGS if set(_DRAGS) & set(named) else ())}
 
 

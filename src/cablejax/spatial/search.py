@@ -4,9 +4,9 @@ Recordings are split into two halves. Both halves are fitted separately all alon
 fit of the other half. At each step the effect is tried with which unseen windows are simulated best
 from the start; it stays if the error on unseen recordings falls by more than a fiftieth, and in more than 84 % of
 resamples of the recordings, one standard error. After four effects in a row that did not, the search ends. Windows that
-are lost or far off in every way are left out of that, and effects that lose many are no failures (`accidents`). So fits
-come near the right minimum one effect at a time, and a reader sees what each is worth; from there all are fitted
-together (`estimate`).
+are lost or far off in every way are left out of that, and effects that lose many are no failures (`accidents`). The
+search brings fits close to the right minimum and shows how much each effect contributes; from there all effects are
+fitted together (`estimate`).
 
 Fits, priors, losses and what is a recording's own are those of every diagnosis. This search is not: that of
 `cablejax.diagnose.search` fits all candidates of a step and believes the likelihood of whole episodes with a

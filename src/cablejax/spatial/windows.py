@@ -68,7 +68,10 @@ class Windows:
         return len(self.keypoints)
 
     def whole(self, count: int) -> Int[np.ndarray, "S"]:
-        """So many whole windows that can be simulated, spread evenly over the recordings; any, where there are none."""
+        """Indices of at most `count` windows that are recorded in full and not torn, spread evenly.
+
+        Of any windows, where there are none of these.
+        """
         whole = np.flatnonzero((self.valid.mean(axis=1) >= _WHOLE) & ~self.torn)
         if not len(whole):
             whole = np.arange(len(self))
