@@ -227,6 +227,22 @@ def test_a_simulation_that_breaks_down_beyond_a_value_is_survived():
     assert effect.name == "slope" and effect.parameters["ratio"].value == pytest.approx(1.3, abs=0.01)
 
 
+def test_an_effect_that_fits_only_beside_another_is_named_without_it():
+    class Snapping(Line):
+        # without an offset, most slopes take another way than the observed one, and fits end there
+        def predict(self, explanations, episodes):
+            predicted, x = super().predict(explanations, episodes), self.x[episodes][..., None]
+            slope, offset = np.array([one.vector(self.effects) for one in explanations]).T
+            other = (np.abs(slope - 1.3) > 0.02) & (np.abs(offset) < 1e-3)
+            predicted[other] += 0.2 * x + 0.1 * np.abs(x)
+            return predicted
+
+    result = diagnose_line(line(("slope", 0, 1.3)), Snapping(X))
+    (effect,) = result.effects
+    assert result.verdict == "named" and effect.name == "slope"
+    assert effect.parameters["ratio"].value == pytest.approx(1.3, abs=0.005)
+
+
 def test_one_motion_leaves_nothing_to_check_on():
     result = diagnose_line(line(("slope", 0, 1.3)), motion=np.zeros(6, int))
     assert result.gap.shrinkage is result.gap.shrinkage_ci90 is None and result.gap.held_out_episodes == ()

@@ -78,14 +78,14 @@ def search(
         progress(f"fitting sets of {size} effects")
         grown = [fit for base in bases for fit in _grown(evidence, base.explanation)]
         best_before = log_scores(fits[:1], evidence, calibration)[0]
-        fits = _best([*fits, *grown], evidence, calibration)
+        fits = _shrunk(_best([*fits, *grown], evidence, calibration), evidence, calibration)
         if log_scores(fits[:1], evidence, calibration)[0] < best_before + 1.0:
             break
         bases = fits[:1]
     if len(effect_names(fits[0].explanation)) > 1:
         progress("exchanging the effects of the best set one by one")
         exchanged = [fit for rest in without_one(fits[0].explanation) for fit in _grown(evidence, rest)]
-        fits = _best([*fits, *exchanged], evidence, calibration)
+        fits = _shrunk(_best([*fits, *exchanged], evidence, calibration), evidence, calibration)
     return Search(tuple(fits), log_scores(fits, evidence, calibration), screened)
 
 
@@ -100,6 +100,14 @@ def _promising(starts: Sequence[Explanation], screened: dict[str, float]) -> lis
 def without_one(whole: Explanation) -> list[Explanation]:
     """The explanation without each of its effects."""
     return [whole.without(name) for name in effect_names(whole)]
+
+
+def _shrunk(fits: list[Fit], evidence: Evidence, calibration: Calibration) -> list[Fit]:
+    """Adds the best fit without each of its effects: from its values an effect alone may reach what it missed before."""
+    if len(effect_names(fits[0].explanation)) < 2:
+        return fits
+    rest = evaluate(evidence, without_one(fits[0].explanation))
+    return _best([*fits, *improved(evidence, rest, evidence.simulator.plan.last_steps)], evidence, calibration)
 
 
 def _grown(evidence: Evidence, base: Explanation) -> list[Fit]:
