@@ -17,6 +17,7 @@ import pytest
 from nbclient import NotebookClient
 
 from cablejax.diagnose import (
+    Calibration,
     Effect,
     Parameter,
     Simulator,
@@ -241,6 +242,17 @@ def test_an_effect_that_fits_only_beside_another_is_named_without_it():
     (effect,) = result.effects
     assert result.verdict == "named" and effect.name == "slope"
     assert effect.parameters["ratio"].value == pytest.approx(1.3, abs=0.005)
+
+
+def test_calm_motions_do_not_take_a_gap_away():
+    # 2.5 mm, more than 1.6 errors of the simulator; 1.4 mm over all motions once eight calm ones are recorded besides
+    moved = (0.02 + 0.001 * np.arange(4)[:, None]) * np.linspace(-1.0, 1.0, 200)
+    x = np.append(moved, np.zeros((8, 200)), axis=0)
+    seen = 1.2 * x[..., None].repeat(2, axis=-1) + np.random.default_rng(1).normal(0.0, 1e-3, (12, 200, 2))
+    for n in (4, 12):
+        result = diagnose_line(seen[:n], Line(x[:n]), calibration=Calibration(baseline=1e-3))
+        assert result.verdict == "named" and [effect.name for effect in result.effects] == ["slope"]
+    assert diagnose_line(seen[4:], Line(x[4:]), calibration=Calibration(baseline=1e-3)).verdict == "none"
 
 
 def test_one_motion_leaves_nothing_to_check_on():

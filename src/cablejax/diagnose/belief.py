@@ -65,7 +65,7 @@ class Calibration:
         term_cost: nats that each effect must pay for itself.
         prior_cost: share of the nats that its parameters' prior takes away which it must pay too. The constants for
             logs on a table were set without.
-        resolvable: a gap up to this many baseline errors is none.
+        resolvable: a gap up to this many baseline errors is none, see `has_gap`.
         noise_share: so much of the noise is added to the baseline error in that comparison, for the noise floor itself
             is an estimate.
         adequate: an explanation that leaves less than this share of the gap, root mean square, is complete.
@@ -143,6 +143,14 @@ def left_by_motion(fit: Fit, evidence: Evidence) -> Float[np.ndarray, "M"]:
         for own in episodes_by_motion(evidence.motion)
     ]
     return level(evidence) * np.sqrt(squares)
+
+
+def has_gap(null: Fit, evidence: Evidence, calibration: Calibration) -> bool:
+    """Whether the nominal simulator is off by more than its own error, in the fourth-power mean over motions.
+
+    By a root mean square, calm motions that are recorded besides would make a gap disappear that some motions show.
+    """
+    return float(np.mean(left_by_motion(null, evidence) ** 4) ** 0.25) > calibration.smallest_gap(level(evidence))
 
 
 def excess(sse: float, evidence: Evidence) -> float:

@@ -16,6 +16,7 @@ from cablejax.diagnose.belief import (
     effect_names,
     excess,
     explains_most_motions,
+    has_gap,
     leftover_p,
     leftover_score,
     level,
@@ -102,8 +103,7 @@ def _concluded(
     left = excess(float(best.sse.sum()), evidence)
     explained = 1.0 - (left / gap) ** 2 if gap > 0 else 0.0
     ranking = _ranking(found, evidence, calibration)
-    smallest = calibration.smallest_gap(level(evidence))
-    if gap <= smallest:
+    if not has_gap(null, evidence, calibration):
         return Conclusion("none", null, (), (), ranking, 0.0), nothing
     as_much = leftover_p(leftover_score(left, gap, level(evidence), calibration), evidence.simulator.right_scores)
     shared = [drawn_by(law, best, calibration) for law in laws]

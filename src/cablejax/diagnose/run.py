@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import ArrayLike, Float, Int
 
-from cablejax.diagnose.belief import Calibration, excess, level
+from cablejax.diagnose.belief import Calibration, has_gap, level
 from cablejax.diagnose.conclude import Conclusion, baselines, conclude, sentence
 from cablejax.diagnose.diagnosis import Diagnosis, Gap
 from cablejax.diagnose.evidence import Evidence
@@ -199,7 +199,7 @@ def explain(
         progress: called with a line of text before each stage.
     """
     (null,) = refitted(evidence, [_null(evidence)])
-    if excess(float(null.sse.sum()), evidence) > calibration.smallest_gap(level(evidence)):
+    if has_gap(null, evidence, calibration):
         found = search(evidence, null, calibration, progress=progress)
         progress("fitting by other laws")
         laws = by_other_laws(found, evidence, calibration)

@@ -103,7 +103,7 @@ def without_one(whole: Explanation) -> list[Explanation]:
 
 
 def _shrunk(fits: list[Fit], evidence: Evidence, calibration: Calibration) -> list[Fit]:
-    """Adds the best fit without each of its effects: from its values an effect alone may reach what it missed before."""
+    """Adds the best fit without each of its effects: from here an effect may reach alone what it missed before."""
     if len(effect_names(fits[0].explanation)) < 2:
         return fits
     rest = evaluate(evidence, without_one(fits[0].explanation))
