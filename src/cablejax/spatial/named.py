@@ -16,7 +16,7 @@ from cablejax.spatial.identify import Identified
 
 # A marker that is this near to its nominal place is not reported as displaced [m].
 _PLACED = 1e-3
-# A damping time shorter than this part of a time step is not told from the integrator: BDF2 damps a vibration as one of
+# A damping time shorter than this part of a time step cannot be distinguished from the integrator: BDF2 damps a vibration as one of
 # up to 0.15 time steps would, most at five steps in a period.
 _HIDDEN = 0.25
 SURE = 0.95
@@ -77,9 +77,9 @@ def quantities_of(found: Identified, density: float | None) -> dict[str, Paramet
     known, estimate = {}, found.everything
     if _WHOLE in found.tried:
         stiffness = estimate.stiffness.wider_by_factor(UNMODELLED[_WHOLE])
-        known[_STIFFNESS] = _told(stiffness, "m^4/s^2")
+        known[_STIFFNESS] = _reported(stiffness, "m^4/s^2")
         if density is not None:
-            known["bending_stiffness_n_m2"] = _told(stiffness, "N m^2", times=density)
+            known["bending_stiffness_n_m2"] = _reported(stiffness, "N m^2", times=density)
     if set(_DRAGS) & set(found.tried):
         known |= parameters_of(_DRAGS[0], estimate, 1.0)[0]
     return known
@@ -144,41 +144,41 @@ def parameters_of(
     match effect:
         case "bending_stiffness":
             parameters = {
-                "ratio": _told(estimate.ratio(estimate.layout.log_stiffness).wider_by_factor(besides), ""),
-                "stiffness_over_density_m4_per_s2": _told(estimate.stiffness.wider_by_factor(besides), "m^4/s^2"),
+                "ratio": _reported(estimate.ratio(estimate.layout.log_stiffness).wider_by_factor(besides), ""),
+                "stiffness_over_density_m4_per_s2": _reported(estimate.stiffness.wider_by_factor(besides), "m^4/s^2"),
             }
         case "stiffness_profile":
             knot, ratio = _section(estimate)
             parameters, along = place(knot, PROFILE_KNOTS)
-            parameters["ratio"] = _told(ratio.wider_by_factor(besides), "")
+            parameters["ratio"] = _reported(ratio.wider_by_factor(besides), "")
         case "bending_damping":
-            parameters = {"time_s": _told(estimate.positive("damping_time").wider_by_factor(besides), "s")}
+            parameters = {"time_s": _reported(estimate.positive("damping_time").wider_by_factor(besides), "s")}
         case "viscous_drag" | "quadratic_drag":
             parameters = {
-                _DRAG: _told(from_zero(estimate.drag), "1/s"),
+                _DRAG: _reported(from_zero(estimate.drag), "1/s"),
                 "speed_m_per_s": _choice(estimate.speed, "m/s"),
             }
         case "lumped_mass":
             parameters = {
                 "centre_m": _choice([float(s) for s in estimate.layout.arclength[:-1]], "m"),
-                "mass_kg": _told(from_zero(estimate.marker_mass), "kg", times=density),
+                "mass_kg": _reported(from_zero(estimate.marker_mass), "kg", times=density),
             }
         case "gripper_rotation_offset":
             angles = [from_zero(size("clamp_rotation", 2 * gripper)) for gripper in range(2)]
-            parameters = {"gripper": _choice([0, 1], ""), "angle_rad": _all_told(angles, "rad")}
+            parameters = {"gripper": _choice([0, 1], ""), "angle_rad": _reported_all(angles, "rad")}
         case "keypoint_bias":
             slots = range(where["along"].start, where["along"].stop)
             each = [estimate.of(lambda values, i=i: values[i]).among(len(slots)) for i in slots]
             off = [i for i, e in enumerate(each) if abs(e.value) > _PLACED and not e.low <= 0 <= e.high]
             parameters = {
                 "index": _choice([i + first_marker for i in off], ""),
-                "offset_m": _all_told([each[i] for i in off], "m"),
+                "offset_m": _reported_all([each[i] for i in off], "m"),
             }
         case "intrinsic_curvature":
             curvature = estimate.shared[where["rest_curvature"]].reshape(-1, 2)
             knot = int(np.linalg.norm(curvature, axis=1).argmax())
             parameters, along = place(knot, CURVATURE_KNOTS)
-            parameters["curvature_per_m"] = _told(from_zero(size("rest_curvature", 2 * knot)), "1/m")
+            parameters["curvature_per_m"] = _reported(from_zero(size("rest_curvature", 2 * knot)), "1/m")
         case _:
             raise ValueError(f"The effect is {effect!r}, expected one of {estimate.layout.effects}.")
     return parameters, along
@@ -193,11 +193,11 @@ def _section(estimate: Estimate) -> tuple[int, Interval]:
     return knot, estimate.ratio(lambda values: values[where][knot] - values[where][rest].mean())
 
 
-def _told(interval: Interval, unit: str, *, times: float = 1.0) -> ParameterEstimate:
+def _reported(interval: Interval, unit: str, *, times: float = 1.0) -> ParameterEstimate:
     return ParameterEstimate(times * interval.value, (times * interval.low, times * interval.high), unit)
 
 
-def _all_told(intervals: Sequence[Interval], unit: str) -> ParameterEstimate:
+def _reported_all(intervals: Sequence[Interval], unit: str) -> ParameterEstimate:
     return ParameterEstimate([i.value for i in intervals], [(i.low, i.high) for i in intervals], unit)
 
 
