@@ -16,8 +16,8 @@ from cablejax.spatial.identify import Identified
 
 # A marker that is this near to its nominal place is not reported as displaced [m].
 _PLACED = 1e-3
-# A damping time shorter than this part of a time step cannot be distinguished from the integrator: BDF2 damps a vibration as one of
-# up to 0.15 time steps would, most at five steps in a period.
+# A damping time shorter than this part of a time step cannot be distinguished from the integrator: BDF2 damps a
+# vibration as one of up to 0.15 time steps would, most at five steps in a period.
 _HIDDEN = 0.25
 SURE = 0.95
 """An effect is named where an interval that holds its value in this share of cases leaves its absence out. By the 90 %
