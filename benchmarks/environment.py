@@ -10,6 +10,7 @@ import functools
 import json
 import os
 import time
+from typing import get_args
 
 import gymnasium
 import jax
@@ -17,10 +18,11 @@ import numpy as np
 
 from cablejax.compiled_programs import keep_compiled_programs
 from cablejax.control.shaping import load_model, make_controller
-from cablejax.control.targets import make_target
+from cablejax.control.targets import Shape, make_target
 from cablejax.dataset.schema import Randomisation
 from cablejax.environment import ENVIRONMENT, LinkPolicy, MjxShapeCable, ShapeCableConfig
 from cablejax.simulate.compile import compiler_options
+from cablejax.solver_names import SolverName
 
 VARIED = Randomisation(stiffness=(0.3, 3.0), damping=(0.3, 3.0), friction=(0.5, 2.0))
 
@@ -31,7 +33,8 @@ def steps_per_second(size: int, steps: int) -> dict[str, float]:
         ENVIRONMENT, size, vectorization_mode="vector_entry_point", config=ShapeCableConfig(randomisation=VARIED)
     )
     env.reset(seed=0)
-    actions = np.random.default_rng(0).uniform(-1, 1, (steps, *env.action_space.shape)).astype(np.float32)
+    shape = (steps, *(env.action_space.shape or ()))
+    actions = np.random.default_rng(0).uniform(-1, 1, shape).astype(np.float32)
     env.step(actions[0])
     wall, cpu = time.perf_counter(), time.process_time()
     for action in actions:
@@ -57,13 +60,13 @@ def pure_steps_per_second(size: int, steps: int) -> dict[str, float]:
     return {"per_second": size * steps / wall, "per_processor_second": size * steps / cpu}
 
 
-def baseline(weights: str, solver: str) -> dict[str, dict[str, float]]:
+def baseline(weights: str, solver: SolverName) -> dict[str, dict[str, float]]:
     """Errors of one episode for each letter on varied cables [cm]."""
     model = load_model(weights)
     config = ShapeCableConfig(randomisation=VARIED, tolerance=1e-6)
     policy = LinkPolicy(config, lambda target: make_controller(model, target, method="residual", solver=solver))
     env, errors = gymnasium.make(ENVIRONMENT, config=config), {}
-    for seed, letter in enumerate("USZ"):
+    for seed, letter in enumerate(get_args(Shape)):
         observation, info = env.reset(seed=seed, options={"target": letter})
         policy.begin(make_target(letter, config.cable))
         course, ended = [info["error"]], False

@@ -239,8 +239,9 @@ def lost(record: dict[str, Any], log_path: pathlib.Path) -> tuple[int, int]:
             continue
         seen = logged.get(round(stamp / PERIOD))
         intact = seen is not None and np.array_equal(seen[0], keypoints.astype(np.float32), equal_nan=True)
-        known = np.isfinite(pose).all()
-        missing += not (intact and (not known or np.allclose(seen[1], pose, atol=1e-5)))
+        if seen is not None and np.isfinite(pose).all():
+            intact = intact and np.allclose(seen[1], pose, atol=1e-5)
+        missing += not intact
     return missing, len(logged)
 
 

@@ -17,16 +17,17 @@ from pathlib import Path
 
 os.environ.setdefault("NPROC", "4")
 
+import jax.numpy as jnp
 import numpy as np
 
 from cablejax.dataset.generate import make_engine, simulate
 from cablejax.dataset.opening import open_store
+from cablejax.dataset.parallel import DeviceParallel
 from cablejax.dataset.schema import DatasetConfig, config_from_json
 from cablejax.dataset.windows import concatenate, read_trajectories
 from cablejax.dynamics.error_report import MODEL, error_report
 from cablejax.dynamics.evaluate import SNAP_FACTOR, SNAP_MARGIN
 from cablejax.dynamics.weights import load_info, load_weights
-from cablejax.simulate import ThreadedEngine
 from cablejax.types import Trajectory
 from pages import page_of_results, publish
 
@@ -38,10 +39,13 @@ def simulated(config: DatasetConfig, rows: range) -> Trajectory:
     # The shard size does not change a trajectory: one each, so that any row can be made alone.
     config = dataclasses.replace(config, shard_size=1)
     engine, parts = make_engine(config), []
-    together = TOGETHER if isinstance(engine, ThreadedEngine) else engine.shards_at_once
+    together = engine.shards_at_once if isinstance(engine, DeviceParallel) else TOGETHER
     for first in range(rows.start, rows.stop, together):
         blocks = simulate(config, engine, range(first, min(first + together, rows.stop)))
-        parts += [Trajectory(block.keypoints, block.gripper_pose, block.gripper_twist) for block in blocks]
+        parts += [
+            Trajectory(*(jnp.asarray(each) for each in (block.keypoints, block.gripper_pose, block.gripper_twist)))
+            for block in blocks
+        ]
         print(f"{len(parts)} of {len(rows)} simulated", file=sys.stderr, flush=True)
     return concatenate(parts)
 

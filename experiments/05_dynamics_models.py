@@ -169,7 +169,7 @@ def draw(errors: dict[str, np.ndarray], bare: dict[str, np.ndarray], calm: np.nd
         ("networks correct the grippers' interpolated motion", [*(f"{n}, no statics" for n in NETWORKS), "no motion"]),
         ("networks are given nothing, in the world's axes", [*(f"{n}, nothing given" for n in bare), "no motion"]),
     )
-    colours = dict(zip((*NETWORKS, SIMULATOR, *FLOORS), COLOURS, strict=True))
+    colours: dict[str, str] = dict(zip((*NETWORKS, SIMULATOR, *FLOORS), COLOURS, strict=True))
     for axis, (title, names) in zip(axes, groups, strict=True):
         for name in names:
             kind = name.split(",")[0]

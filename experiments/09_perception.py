@@ -39,8 +39,8 @@ from cablejax.report.style import LIGHT
 from cablejax.simulate import ThreadedEngine
 from cablejax.simulate.motions import random_motion
 from closed_loop.cases import mujoco_plant, stiffness_cases
-from closed_loop.methods import METHODS, NO_PRIOR_LEARNER
-from closed_loop.suite import released, run_case
+from closed_loop.methods import METHODS, NO_PRIOR_LEARNER, model_named
+from closed_loop.suite import run_case
 from pages import markdown_table, page_of_results, publish
 from rows import Rows
 
@@ -167,7 +167,7 @@ def loop(target_name: Shape, perception: str, seed: int) -> dict[str, Any]:
     spec, plant = METHODS[NO_PRIOR_LEARNER], mujoco_plant(LOOP_STIFFNESS)
     if perception == "cloud":
         plant = CloudPlant(plant.config, camera=CameraConfig(seed=seed))
-    run = run_case(dataclasses.replace(case, plant=lambda: plant), spec, released(str(spec.weights)))
+    run = run_case(dataclasses.replace(case, plant=lambda: plant), spec, model_named(str(spec.weights)))
     return {"terminal_cm": run.terminal_error_cm, "held": getattr(plant, "lost", 0)}
 
 

@@ -82,6 +82,7 @@ def compiled(solver: str, residuals: Callable | None, function: Callable | None)
         steps = GRADIENT_STEPS if solver in BY_GRADIENTS else LEAST_SQUARES_STEPS
         solve = functools.partial(least_squares, lambda y, _: residuals(y).ravel(), OURS[solver], max_steps=steps)
     else:
+        assert function is not None
         solve = functools.partial(minimise, lambda y, _: function(y), OURS[solver], max_steps=GRADIENT_STEPS)
     return jax.jit(functools.partial(solve, throw=False))
 
@@ -90,6 +91,7 @@ def compiled(solver: str, residuals: Callable | None, function: Callable | None)
 def derivatives(residuals: Callable | None, function: Callable | None, shape: tuple[int, ...]) -> tuple:
     """Objective with gradient, residuals, Jacobian; all of a flat point."""
     if residuals is None:
+        assert function is not None
         return jax.jit(jax.value_and_grad(lambda y: function(y.reshape(shape)))), None, None
 
     def flat(y):
@@ -121,9 +123,9 @@ def scipys(problem: BoundedProblem, solver: str) -> Run:
     method = solver.split()[1]
     shape = problem.start.shape
     both, residuals, jacobian = derivatives(problem.residuals, problem.function, shape)
-    lower, upper = -np.inf, np.inf
     start = problem.start.ravel().astype(float)
-    if problem.is_box:
+    lower, upper = np.full(start.shape, -np.inf), np.full(start.shape, np.inf)
+    if problem.lower is not None and problem.upper is not None:
         lower, upper = np.ravel(problem.lower), np.ravel(problem.upper)
         start = np.clip(start, lower, upper)
 
@@ -136,7 +138,7 @@ def scipys(problem: BoundedProblem, solver: str) -> Run:
             out = scipy.optimize.least_squares(
                 lambda y: np.asarray(residuals(y)),
                 start,
-                lambda y: np.asarray(jacobian(y)),
+                lambda y: np.asarray(jacobian(y)),  # pyright: ignore[reportArgumentType]
                 bounds=(lower, upper),
                 method=method,
                 x_scale="jac",
@@ -148,11 +150,11 @@ def scipys(problem: BoundedProblem, solver: str) -> Run:
             iterations = int(out.njev)
         elif method == "L-BFGS-B":
             limits = {"maxiter": GRADIENT_STEPS, "maxfun": GRADIENT_STEPS, "ftol": TIGHT, "gtol": TOLERANCE}
-            bounds = scipy.optimize.Bounds(lower, upper)
+            bounds = scipy.optimize.Bounds(lower, upper)  # pyright: ignore[reportArgumentType]
             out = scipy.optimize.minimize(value, start, jac=True, method=method, bounds=bounds, options=limits)
             iterations = int(out.nit)
         else:
-            bounds = scipy.optimize.Bounds(lower, upper) if problem.is_box else None
+            bounds = scipy.optimize.Bounds(lower, upper) if problem.is_box else None  # pyright: ignore[reportArgumentType]
             balls = () if problem.is_box else (slack_of(problem),)
             limits = {"maxiter": LEAST_SQUARES_STEPS, "ftol": TIGHT}
             out = scipy.optimize.minimize(

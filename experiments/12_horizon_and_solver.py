@@ -14,6 +14,7 @@ import argparse
 import dataclasses
 import os
 from pathlib import Path
+from typing import get_args
 
 os.environ.setdefault("NPROC", "4")
 
@@ -24,6 +25,7 @@ from matplotlib.ticker import FixedLocator, NullFormatter
 
 from cablejax.control.loop import run_closed_loop
 from cablejax.control.shaping import load_model
+from cablejax.control.targets import Shape
 from cablejax.mpc import MPC, SOLVERS, LevenbergMarquardt, MPCConfig
 from closed_loop.cases import PLANT_CHAIN, mujoco_plant
 from closed_loop.protocols import LaidOut, letter_task
@@ -33,7 +35,7 @@ from rows import Rows
 CONVERGED = "levenberg-marquardt, converged"
 PLANNERS = {**SOLVERS, CONVERGED: LevenbergMarquardt(max_iterations=12, trials_per_linearisation=1)}
 HORIZONS = (1, 2, 5, 10)
-SHAPES = ("U", "S", "Z")
+SHAPES = get_args(Shape)
 STIFFNESS = 2.0
 STEPS = 35
 SEEDS = (0,)
@@ -64,7 +66,7 @@ class Trial:
 KEY = ("solver", "horizon", "shape", "seed")
 
 
-def run(model, solver: str, horizon: int, shape: str, seed: int) -> Trial:
+def run(model, solver: str, horizon: int, shape: Shape, seed: int) -> Trial:
     """One of them; what is compiled is kept for the next target."""
     task = letter_task(shape, seed, PLANT_CHAIN)
     config = dataclasses.replace(MPCConfig(), horizon=horizon, solver=PLANNERS[solver])

@@ -157,7 +157,8 @@ def examine(seed: int, arm: str) -> dict[str, Any]:
         found = case.diagnosed(ARMS[arm])
         named = [effect.name for effect in found.effects]
         following = found.next_motion
-        separates = following is not None and ARMS[arm] == "explanations"
+        # only the motion that the package recommends is judged for what it separates
+        inseparable = ARMS[arm] == "explanations" and following is not None and following.inseparable
         logs.append(
             {
                 "verdict": found.verdict,
@@ -169,8 +170,7 @@ def examine(seed: int, arm: str) -> dict[str, Any]:
                 "information": None if following is None else following.information,
                 "doubt": None if following is None else following.doubt,
                 "seconds": time.perf_counter() - begin,
-                # only the motion that the package recommends is judged for what it separates
-                "ended": ended(found, {"inseparable": separates and following.inseparable}, rounds_left=ADDED - added),
+                "ended": ended(found, {"inseparable": inseparable}, rounds_left=ADDED - added),
             }
         )
         if logs[-1]["ended"]:

@@ -222,6 +222,6 @@ def leftovers(cases: list[Scored]) -> list[float]:
             continue
         left = {ranked["name"]: ranked["leftover_mm"] for ranked in case.verdict["ranking"]}
         # what the nominal cable leaves stands beside every effect that was not fitted
-        lengths = [1e-3 * x for x in (left[case.truth[0]], max(left.values()), case.verdict["gap"]["noise_floor_mm"])]
-        scores.append(leftover_score(*lengths, calibration))
+        rest, gap, noise = left[case.truth[0]], max(left.values()), case.verdict["gap"]["noise_floor_mm"]
+        scores.append(leftover_score(1e-3 * rest, 1e-3 * gap, 1e-3 * noise, calibration))
     return sorted(scores)
