@@ -17,10 +17,10 @@ from cablejax.diagnose.safe_motions import INTERVAL, there_and_back
 from cablejax.types import GapLog
 
 Ended = Literal["clear", "unknown", "inseparable", "rounds"]
-"""One answer is left; the cause is not in the library; no motion separates what is left; no rounds are left."""
+"""There is a clear answer; the cause is not in the library; no motion separates what is left; no rounds are left."""
 
 ENDED: dict[Ended, str] = {
-    "clear": "One answer is left.",
+    "clear": "The answer is clear.",
     "unknown": "The library has no cause that explains all of the gap, which more of the same does not change.",
     "inseparable": "No motion that was tried separates what is left: measure one of these causes by other means.",
     "rounds": "No rounds are left: give more with --rounds.",
