@@ -13,8 +13,7 @@ would go on. The arms differ by that motion only:
 - `random`: one of the safe motions that keep the bounds, drawn at random: nothing clever.
 
 Constants of the search were chosen on seed 0; the table has the seeds from 1 on. Densities and drags were made larger
-after those of seeds 2, 3 and 8 had made no gap, or hardly one. The rows of seeds 1 to 9 let the grippers be 0.995
-lengths apart, where the rod refuses more than 0.994.
+after those of seeds 2, 3 and 8 had made no gap, or hardly one.
 """
 
 from __future__ import annotations
@@ -195,8 +194,8 @@ def after(row: dict[str, Any], added: int) -> dict[str, Any]:
 
 
 def made_in(row: dict[str, Any]) -> int:
-    """Number of motions that are added until the study ends. Older rows continue after that."""
-    return next(k for k, log in enumerate(row["logs"]) if log["ended"])
+    """Number of motions that are added until the study ends."""
+    return len(row["logs"]) - 1
 
 
 def page(rows: Sequence[dict[str, Any]]) -> str:
@@ -230,13 +229,11 @@ def page(rows: Sequence[dict[str, Any]]) -> str:
                 several = [log for log in (after(row, added) for row in own) if len(log["open"]) > 1]
                 called = f"{sum(bool(log['inseparable']) for log in several)} of {len(several)}"
             table.append([*cells, f"{sum(alone)} of {len(alone)}", called])
+    gapless = sorted({row["seed"] for row in rows if row["seed"] in common and row["logs"][0]["verdict"] == "none"})
     families = Counter(family(seed) for seed in common)
     moved = [(row["arm"], broken) for row in rows if row["seed"] in common for broken in row["broken"]]
     kept = {arm: [not broken for name, broken in moved if name == arm] for arm in arms}
     bounds = ", ".join(f"{arm} {sum(k)} of {len(k)}" for arm, k in kept.items())
-    beyond = [row["logs"][made_in(row) :] for row in rows if row["seed"] in common]
-    beyond = [(first["open"], more) for first, *more in beyond if more and first["ended"] == "clear"]
-    undone = sum(any(log["open"] != answer for log in more) for answer, more in beyond)
     lines = [
         f"{len(common)} seeds, {len(RANGES)} effects in turn, by "
         + " and ".join(f"{count} of the {name}" for name, count in sorted(families.items()))
@@ -250,8 +247,8 @@ def page(rows: Sequence[dict[str, Any]]) -> str:
         "",
         *markdown_table(table),
         "",
-        f"In {len(beyond)} older rows one or two more motions followed a clear answer: {undone} of these answers "
-        "did not last.",
+        f"{len(gapless)} seeds ({', '.join(map(str, gapless)) or 'none'}) show less of a gap on the first log than the "
+        'simulator itself may be off by: the verdict is "none", and the truth counts as not found.',
         "",
         "Staged: "
         + ", ".join(f"`{row['effect']}`" for row in rows if row["arm"] == arms[0] and row["seed"] in common)
