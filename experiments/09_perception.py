@@ -359,7 +359,8 @@ def main() -> None:
             "## In the loop",
             "",
             f"Terminal error of the true keypoints after at most {LOOP_STEPS} commands, the network "
-            f"without statics, its estimate and the learner, the tables' plant with {LOOP_STIFFNESS:g} times the stiffness; mean over the "
+            f"without statics, its estimate and the learner, the tables' plant with {LOOP_STIFFNESS:g} times the "
+            "stiffness; mean over the "
             f"tables' starts of seeds {LOOP_SEEDS[0]} to {LOOP_SEEDS[-1]}, and the least and greatest difference. "
             "Clouds come from the depth camera with its default settings: 20 degrees of tilt, 2 mm of noise, 5 % "
             "dropout, 0.1 % random ranges, both grippers in view.",
