@@ -205,6 +205,13 @@ def test_missing_observations_and_short_episodes_do_not_matter():
     assert result.gap.horizon_s == pytest.approx(19.9)
 
 
+def test_an_episode_of_which_nothing_was_seen_says_nothing():
+    missing = np.zeros((6, 200, 2), bool)
+    missing[2] = True
+    assert diagnose_line(line(("slope", 0, 1.3), missing=missing)).verdict == "named"
+    assert diagnose_line(line(missing=missing)).verdict == "none"
+
+
 def test_derivatives_of_the_simulators_own_are_used():
     class Exact(Line):
         asked = 0

@@ -136,21 +136,28 @@ def as_good(fit: Fit, best: Fit, evidence: Evidence, calibration: Calibration) -
 
 
 def left_by_motion(fit: Fit, evidence: Evidence) -> Float[np.ndarray, "M"]:
-    """Remaining error of each motion, root mean square per coordinate above the noise."""
-    counts = evidence.count
-    squares = [
-        max(float((fit.sse - counts)[own].sum()), 0.0) / float(counts[own].sum())
-        for own in episodes_by_motion(evidence.motion)
-    ]
-    return level(evidence) * np.sqrt(squares)
+    """Remaining error of each motion that was seen, root mean square per coordinate above the noise."""
+    squares, count = _squares_by_motion(fit, evidence)
+    return level(evidence) * np.sqrt(np.maximum(squares, 0.0) / count)
 
 
 def has_gap(null: Fit, evidence: Evidence, calibration: Calibration) -> bool:
     """Whether the nominal simulator is off by more than its own error, in the fourth-power mean over motions.
 
     By a root mean square, calm motions that are recorded besides would make a gap disappear that some motions show.
+    What chance alone adds to the fourth power, by the noise of so few samples, is taken off.
     """
-    return float(np.mean(left_by_motion(null, evidence) ** 4) ** 0.25) > calibration.smallest_gap(level(evidence))
+    squares, count = _squares_by_motion(null, evidence)
+    fourth = float(np.mean((np.maximum(squares, 0.0) / count) ** 2 - 2.0 / count))
+    return level(evidence) * max(fourth, 0.0) ** 0.25 > calibration.smallest_gap(level(evidence))
+
+
+def _squares_by_motion(fit: Fit, evidence: Evidence) -> tuple[Float[np.ndarray, "M"], Float[np.ndarray, "M"]]:
+    """Sum of squares above the noise, in its units, and number of coordinates, of each motion that was seen."""
+    motions = episodes_by_motion(evidence.motion)
+    squares = np.array([(fit.sse - evidence.count)[own].sum() for own in motions])
+    count = np.array([evidence.count[own].sum() for own in motions])
+    return squares[count > 0], count[count > 0]
 
 
 def excess(sse: float, evidence: Evidence) -> float:
