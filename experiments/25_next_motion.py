@@ -1,6 +1,6 @@
 """The next motion designed, against Fisher-optimal and random safe ones, on effects that look alike.
 
-    python experiments/25_next_motion.py --seeds 20 --executor 2    # seven minutes a seed; resumable
+    python experiments/25_next_motion.py --seeds 20 --executor 2    # three to seven minutes a seed; resumable
     python experiments/25_next_motion.py --report docs/results/next_motion.md
 
 For every seed an effect is drawn from those that one log hardly separates, and staged in the contact plant (MuJoCo in
@@ -247,8 +247,8 @@ def page(rows: Sequence[dict[str, Any]]) -> str:
         "",
         *markdown_table(table),
         "",
-        f"{len(gapless)} seeds ({', '.join(map(str, gapless)) or 'none'}) show less of a gap on the first log than the "
-        'simulator itself may be off by: the verdict is "none", and the truth counts as not found.',
+        f"Seeds whose first log shows no gap above the simulator's own error: {len(gapless)} "
+        f'({", ".join(map(str, gapless)) or "none"}). The verdict on them is "none", and the truth counts as missed.',
         "",
         "Staged: "
         + ", ".join(f"`{row['effect']}`" for row in rows if row["arm"] == arms[0] and row["seed"] in common)
