@@ -165,9 +165,9 @@ def effect_place(effect: NamedEffect) -> str:
 def share(value: float) -> str:
     """A share in per cent; never 0 or 100 where it is only close."""
     percent = 100 * value
-    if percent >= 99.5:
+    if percent > 99:
         return "> 99 %"
-    if 0 < percent < 0.5:
+    if 0 < percent < 1:
         return "< 1 %"
     return "0 %" if -0.5 <= percent <= 0 else f"{percent:.0f} %"
 

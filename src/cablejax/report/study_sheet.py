@@ -53,9 +53,7 @@ def study_sheet(
             (
                 "Staged in the plant",
                 listed([effect_title(effect.name) for effect in staged]) or "nothing",
-                f"{', '.join(map(str, staged))}. The diagnosis did not know them."
-                if staged
-                else "The diagnosis did not know them.",
+                f"{', '.join(map(str, staged))}. The diagnosis was not given this." if staged else "",
             ),
         ],
         figures=pictures if ranked else [],
