@@ -5,7 +5,8 @@
 
 Every log is dealt out to two recordings, its odd and its even episodes. Two of one log agree, and a contradiction is a
 false alarm. The first of one log with the second of the next one, in the order of their names, are recordings of two
-set-ups that differ by their effects; where both have none, or the same one, there is nothing to find.
+set-ups that differ by their effects; where both have none, or the same one, there is nothing to find. Logs that state
+different cables are left out, since such recordings are refused.
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ import numpy as np
 from cablejax.diagnose import diagnose
 from cablejax.diagnose.rounds import UNLIKELY
 from cablejax.gaplog import read_gap_log
+from cablejax.gaplog_check import GapLogError
 from cablejax.gaplog_join import chosen, joined
 from cablejax.types import GapLog
 from executors import add_option, executor_of
@@ -48,6 +50,15 @@ def examine(folder: pathlib.Path, first: str, second: str) -> dict[str, Any]:
         "chance": None if rounds is None else rounds.contradiction,
         "seconds": found.seconds,
     }
+
+
+def may_be_joined(folder: pathlib.Path, one: str, other: str) -> bool:
+    """Whether two logs state one set-up."""
+    try:
+        joined([read_gap_log(folder / f"{name}.npz") for name in (one, other)], names=(one, other))
+    except GapLogError:
+        return False
+    return True
 
 
 def truth_of(folder: pathlib.Path) -> dict[str, str]:
@@ -76,7 +87,9 @@ def main() -> None:
     names = sorted(name for name in truth if (options.logs / f"{name}.npz").exists())
     pairs = [(name, name) for name in names]
     pairs += [
-        (one, other) for one, other in zip(names, names[1:] + names[:1], strict=True) if truth[one] != truth[other]
+        (one, other)
+        for one, other in zip(names, names[1:] + names[:1], strict=True)
+        if truth[one] != truth[other] and may_be_joined(options.logs, one, other)
     ]
     make = functools.partial(examine, options.logs.absolute())
     with executor_of(options.executor) as executor:

@@ -173,7 +173,7 @@ Made by `python experiments/31_wires.py {" ".join(arguments)}` in {seconds / 60:
 Three wires, each hung five times and traced in photographs (qj25/adapteddlo_muj, arXiv 2310.00911; 51 points, 1.5 m).
 The model is a planar elastica with weight; believed true is a straight wire of the published EI, in clamps that are
 level within 10 degrees. Effects are named by the rule of every diagnosis: the most probable explanation, if the gap in
-held-out photographs shrinks by it with an interval that excludes zero. All gaps are of held-out photographs, root
+the held-out photographs shrinks by it with an interval that excludes zero. All gaps are of held-out photographs, root
 mean square per coordinate; only the angles of the clamps are fitted to them. An effect's probability is that among all
 explanations with it or with another effect in its place; the interval of a shrinkage is by resampling photographs.
 
