@@ -415,11 +415,8 @@ def test_quantities_have_the_digits_that_their_intervals_support(arguments, word
 
 
 def test_shares_are_never_rounded_to_certainty():
-    assert (
-        share(0.9999) == share(1.0) == "> 99 %"
-        and share(0.001) == share(0.009) == "< 1 %"
-        and share(0.0) == share(-1e-4) == "0 %"
-    )
+    assert share(0.994) == share(0.9999) == share(1.0) == "> 99 %" and share(0.99) == "99 %"
+    assert share(0.001) == share(0.009) == "< 1 %" and share(0.01) == "1 %" and share(0.0) == share(-1e-4) == "0 %"
 
 
 def test_places_in_words():

@@ -78,14 +78,14 @@ def search(
         progress(f"fitting sets of {size} effects")
         grown = [fit for base in bases for fit in _grown(evidence, base.explanation)]
         best_before = log_scores(fits[:1], evidence, calibration)[0]
-        fits = _shrunk(_best([*fits, *grown], evidence, calibration), evidence, calibration)
+        fits = _joined(fits, grown, evidence, calibration)
         if log_scores(fits[:1], evidence, calibration)[0] < best_before + 1.0:
             break
         bases = fits[:1]
     if len(effect_names(fits[0].explanation)) > 1:
         progress("exchanging the effects of the best set one by one")
         exchanged = [fit for rest in without_one(fits[0].explanation) for fit in _grown(evidence, rest)]
-        fits = _shrunk(_best([*fits, *exchanged], evidence, calibration), evidence, calibration)
+        fits = _joined(fits, exchanged, evidence, calibration)
     return Search(tuple(fits), log_scores(fits, evidence, calibration), screened)
 
 
@@ -102,12 +102,17 @@ def without_one(whole: Explanation) -> list[Explanation]:
     return [whole.without(name) for name in effect_names(whole)]
 
 
-def _shrunk(fits: list[Fit], evidence: Evidence, calibration: Calibration) -> list[Fit]:
-    """Adds the best fit without each of its effects: from here an effect may reach alone what it missed before."""
-    if len(effect_names(fits[0].explanation)) < 2:
-        return fits
-    rest = evaluate(evidence, without_one(fits[0].explanation))
-    return _best([*fits, *improved(evidence, rest, evidence.simulator.plan.last_steps)], evidence, calibration)
+def _joined(fits: list[Fit], more: list[Fit], evidence: Evidence, calibration: Calibration) -> list[Fit]:
+    """The best of all, best first; a new best set also without each of its effects, from the values it has.
+
+    From there an effect may reach alone what it missed before.
+    """
+    best = _best([*fits, *more], evidence, calibration)
+    whole = best[0].explanation
+    if whole is fits[0].explanation or len(effect_names(whole)) < 2:
+        return best
+    rest = improved(evidence, evaluate(evidence, without_one(whole)), evidence.simulator.plan.last_steps)
+    return _best([*best, *rest], evidence, calibration)
 
 
 def _grown(evidence: Evidence, base: Explanation) -> list[Fit]:
