@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
@@ -86,10 +85,8 @@ def plan_or_recover(
         [start.straightening.motion, start.back.motion, start.still],
         plan.motion,
     )
-    # a rollout that is needed in few calls
-    value = jax.lax.cond(mode == Action.FOLLOW, lambda motion: plan.value, problem.value, motion)
     action = jnp.where(mode == Action.FOLLOW, decision.action, mode).astype(jnp.int32)
-    return Decision(dataclasses.replace(plan, motion=motion, value=value), action), progress
+    return Decision(dataclasses.replace(plan, motion=motion), action), progress
 
 
 def _followed(

@@ -29,13 +29,19 @@ def bounded_plan(
     max_steps: int,
 ) -> Plan:
     """The plan that a bounded solver finds from a guess; differentiable in the problem where it has converged."""
+
+    def linearise(motion, given):
+        problem, guess = given
+        # the first linearisation is at the guess; where there are more, a rollout is little beside each
+        return problem.linearise(motion, known=guess if max_steps == 1 else None)
+
     solution = least_squares(
         lambda motion, given: given[0].residuals(motion),
         solver,
         guess.motion,
         problem.feasible,
         (problem, guess),
-        linearise=lambda motion, given: given[0].linearise(motion, known=given[1]),
+        linearise=linearise,
         max_steps=max_steps,
         throw=False,
     )

@@ -153,13 +153,9 @@ class ShapingProblem:
 
         Args:
             motion: the plan.
-            known: a rollout of this problem; if it is of the same plan, it is not made again.
+            known: the plan's rollout, where it has been made already.
         """
-        if known is None:
-            here = self.rollout(motion)
-        else:
-            same = jnp.all(motion == known.motion)
-            here = jax.lax.cond(same, lambda motion: known, self.rollout, motion)
+        here = self.rollout(motion) if known is None else known
         twist = self.objective.to_twist(motion)
         of_steps = jax.vmap(functools.partial(step_jacobian, self.dynamics, self.weights))(here.met, twist)
 

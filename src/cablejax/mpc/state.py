@@ -123,7 +123,8 @@ class MPCInfo:
         shape_error: root mean square distance to the target now [m].
         rho: actual over predicted reduction of the error by the last command; 1 where it is not known.
         radius: bound on one step's motion that the command was planned with [m].
-        objective: value of the plan that the command belongs to [m^2].
+        objective: value of the plan, or of rest where the plan promised no more, also where the command goes back or
+            straightens the cable instead [m^2].
         evaluations: rollouts that the solver spent on trial plans.
         result: a `bounded.Result`: how the solve ended; `NONFINITE` also where its plan is not finite.
         action: an `Action`.
