@@ -53,8 +53,8 @@ def api_pages(package: Path) -> dict[str, str]:
 
 _INDEX = """# API reference
 
-Every public name of the package, from its docstring. Each room of the code has a page; at the top of a page are the
-names that its room exports. Shapes are written as `[E, T, N, D]`:
+Every public name of the package, from its docstring. Each subpackage has a page; at the top of a page are the names
+that it exports. Shapes are written as `[E, T, N, D]`:
 
 | letter | size | letter | size |
 | --- | --- | --- | --- |
@@ -65,7 +65,7 @@ names that its room exports. Shapes are written as `[E, T, N, D]`:
 
 SI units and radians everywhere. A field of a class is described in the class's list of attributes.
 
-| room | what it does |
+| subpackage | what it does |
 | --- | --- |"""
 
 

@@ -47,8 +47,8 @@ def open_store(path: str | os.PathLike[str]) -> Store:
     for name in _arrays(store.config):
         if fault := _fault(store, name):
             raise ValueError(
-                f"The data set {path} is damaged: {name} {fault}. Run the generation that began it again, which mends "
-                "it, or generate it elsewhere."
+                f"The data set {path} is damaged: {name} {fault}. Run the generation that began it again, which "
+                "repairs it, or generate it elsewhere."
             )
     return store
 

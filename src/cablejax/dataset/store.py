@@ -137,7 +137,7 @@ class Store:
         rows = np.arange(self.config.n_trajectories) if rows is None else np.asarray(rows, dtype=int)
         if len(rows) == 0 or rows.min() < 0 or rows.max() >= self.config.n_trajectories:
             raise ValueError(
-                f"Rows {rows[:5]}... asked of {self.path}, expected some of 0..{self.config.n_trajectories - 1}."
+                f"Rows {rows[:5]}... requested of {self.path}, expected some of 0..{self.config.n_trajectories - 1}."
             )
         out = {
             name: np.empty((len(rows), *shape), dtype) for name, (shape, dtype) in self.config.array_shapes().items()
@@ -183,7 +183,7 @@ class Store:
 
     def _slice(self, shard: int) -> slice:
         if not 0 <= shard < self.config.n_shards:
-            raise ValueError(f"Shard {shard} asked of {self.path}, which has shards 0..{self.config.n_shards - 1}.")
+            raise ValueError(f"Shard {shard} requested of {self.path}, which has shards 0..{self.config.n_shards - 1}.")
         rows = self.config.shard_rows(shard)
         return slice(rows.start, rows.stop)
 

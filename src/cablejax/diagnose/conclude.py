@@ -52,7 +52,7 @@ class Conclusion:
         equivalent: sets of effects that are indistinguishable on this log.
         ranking: of single effects.
         explained: share of the squared gap that the best explanation takes away, on the episodes of the fit.
-        leftover_p: of the test whether it leaves more than a right one does, see `conformal`; None without a gap.
+        leftover_p: of the test whether it leaves more than a right one does, by `belief.leftover_p`; None: no gap.
         posterior: see `Diagnosis`.
         under_laws: see `Diagnosis`.
     """

@@ -215,8 +215,8 @@ class Diagnosis:
         effects: what is named as the cause; empty for "none" and "unknown".
         equivalent: sets of effects that are indistinguishable on this log.
         ranking: every effect tried, most probable first; of a forward search, every trial in order.
-        leftover_p: chance that a right explanation leaves as much as the best one does, see `conformal`; None without a
-            gap, and where no labelled logs are like this one.
+        leftover_p: chance that a right explanation leaves as much as the best one does, see `belief.leftover_p`; None
+            without a gap, and where no labelled logs are like this one.
         gap: before and after.
         where: along the cable, in time, by regime, by frame; None where no adapter localises.
         next_motion: None if nothing would be gained, or no motion was evaluated.

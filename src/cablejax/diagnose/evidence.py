@@ -50,7 +50,7 @@ class Evidence:
         noise: standard deviation of each observed coordinate, of a shape that broadcasts against `observed[e, t]`.
         temper: how many correlated samples of each episode count as one independent, see `belief`, shape [E].
         freedom: of Student's distribution over episodes, see `belief`.
-        motion: episodes with the same number repeat one another, see `repeats`, shape [E].
+        motion: episodes with the same number repeat one another, see `repeated_motions`, shape [E].
         fit_freedom: of the distribution that fits maximise; None = `freedom`.
         robust: loss of the distances between points, over the last axis; None = squares.
     """

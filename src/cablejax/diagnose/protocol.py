@@ -166,8 +166,8 @@ class Simulator(abc.ABC):
     Attributes:
         effects: that may be at work, each with a name of its own.
         unit: of the observations; all have the same.
-        right_scores: scores of right explanations on labelled recordings like this one, see `conformal`; empty where
-            nobody has made any, and then no p-value is computed.
+        right_scores: scores of right explanations on labelled recordings like this one, see `belief.leftover_p`; empty
+            where nobody has made any, and then no p-value is computed.
         plan: of the search and of the fits.
         recording: of every episode, counted from 0; only needed where a recording has numbers of its own.
         fits_unseen: whether what a recording has for its own is fitted even to one that is held out: a nuisance that

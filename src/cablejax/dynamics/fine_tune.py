@@ -35,7 +35,7 @@ def starting_from(source: str | os.PathLike[str], config: ModelConfig) -> tuple[
     if dataclasses.replace(config, conditioned=False) != trained or config.network != "gns":
         raise ValueError(
             f"The model to start from is {trained}, but {config} is to be trained: they may differ in `conditioned` "
-            "only, and only the graph network can be made to listen."
+            "only, and only the graph network can be made conditioned."
         )
     encoder = ("node_encoder", "first", 0, "kernel")
     flat = dict(nnx.to_flat_state(weights))

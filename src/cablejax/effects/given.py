@@ -180,7 +180,7 @@ def read_verdict_json(path: str | os.PathLike[str]) -> dict[str, Any]:
     try:
         verdict = read_json(path)
     except (OSError, ValueError) as error:
-        raise ValueError(f"This is no verdict: {error} Expected a verdict.json of `diagnose`.") from error
+        raise ValueError(f"This is not a verdict: {error} Expected a verdict.json of `diagnose`.") from error
     if not isinstance(verdict, dict):
         raise ValueError(f"{path} is {shown(verdict)}, expected {VERDICT_SCHEMA!r}: a verdict.json of `diagnose`.")
     version_of(verdict.get("schema"), VERDICT_SCHEMA, path)

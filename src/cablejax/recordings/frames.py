@@ -98,7 +98,7 @@ def require_hanging(takes: tuple[Take, ...], frame: Frame) -> None:
     axis = int(np.argmax(abs(up)))
     found = ("" if up[axis] > 0 else "-") + "xyz"[axis]
     raise ValueError(
-        f"The frame was said to have {frame.up} up, but the cable hangs from its ends along the other way of {found}: "
+        f"The frame is stated to have {frame.up} up, but the cable hangs from its ends opposite to {found}: "
         f"say that {found} is up, or check the order of the coordinates."
     )
 

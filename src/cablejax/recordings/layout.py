@@ -107,7 +107,7 @@ def read_layout(path: str | os.PathLike[str], place: str) -> Layout:
     try:
         values = read_toml(path)
     except (ValueError, OSError) as error:
-        raise ValueError(f"This is no layout: {error} docs/how_to/own_recording.md has one.") from None
+        raise ValueError(f"This is not a layout: {error} docs/how_to/own_recording.md has one.") from None
     if unknown := set(values) - {"cable", "table", "frame", "source", place}:
         raise ValueError(
             f"{path} has the unknown tables {shown(sorted(unknown))}, expected [cable], [table], [frame], [source] "

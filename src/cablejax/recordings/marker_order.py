@@ -53,7 +53,7 @@ def restore_order(takes: tuple[Take, ...]) -> tuple[tuple[Take, ...], list[str]]
         parent = branches[0][0]
         where = "; ".join(f"keypoints {first} to {last} leave it at keypoint {at}" for first, last, at in branches)
         raise ValueError(
-            f"This is a branched cable: after keypoint {parent - 1} the chain goes on beside one of its own ({where}). "
+            f"This is a branched cable: after keypoint {parent - 1} the chain goes on near one of its own ({where}). "
             "Only a cable without branches is simulated. To diagnose the parent alone, give keypoints 0 to "
             f"{parent - 1} and leave out {parent} to {branches[-1][1]}; its mass then lacks that of the branches."
         )

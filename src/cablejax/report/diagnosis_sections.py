@@ -67,8 +67,8 @@ def alike(diagnosis: CableDiagnosis) -> list[tuple[list[str], list[str]]]:
 def under_other_laws(diagnosis: Diagnosis) -> list[str]:
     """What the verdict would be by each other law of the simulator, in words."""
     return [
-        f"If {law.assumes}, {_verdict_under(law)}. Beside the simulator as believed, that law has a probability of "
-        f"{share(law.probability)} on this log; the intervals are over both."
+        f"If {law.assumes}, {_verdict_under(law)}. Compared with the simulator as believed, that law has a probability "
+        f"of {share(law.probability)} on this log; the intervals cover both."
         for law in diagnosis.under_laws
     ]
 
@@ -127,7 +127,7 @@ def how_far(diagnosis: CableDiagnosis) -> str:
     if diagnosis.verdict == "none":
         text = "There is no gap above the noise that could shrink."
     elif diagnosis.explained is None:
-        text = "Nothing was put into the simulator, so nothing shrinks."
+        text = "No effect was added to the simulator, so nothing shrinks."
     elif gap.shrinkage is None:
         text = (
             "The log holds one motion, and all of it was fitted: there is nothing to check on, so how far the gap "

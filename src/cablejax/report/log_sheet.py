@@ -88,7 +88,7 @@ def _noise(log: GapLog) -> tuple[str, str]:
     try:
         floor = noise_floor(points, log.hold, order=3) if planar else noise_floor(points, None, order=4)
     except ValueError:
-        return "not known", "the log is too short to tell it from motion"
+        return "not known", "the log is too short to separate it from motion"
     source = "scatter while the grippers rest" if floor.from_holds else "scatter between neighbouring samples"
     return millimetres(1e3 * float(np.sqrt(np.mean(floor.std**2)))), source
 

@@ -58,12 +58,12 @@ def store_sheet(store: Store, name: str) -> Sheet:
         following=(
             f"Train a model on it: cablejax train --data {name}"
             if info.complete
-            else "Run the command again that began it: it goes on where it stopped.",
+            else "Run the command that began it again: it goes on where it stopped.",
             f"Write its cable to a file: cablejax cable --from {name} --out cable.toml",
         ),
         facts={
             **cable_facts(config.cable),
-            "motions drawn in vain": f"{info.attempts}",
+            "motions drawn and rejected": f"{info.attempts}",
             "digest": info.digest or "none until all trajectories are there",
             "versions": ", ".join(f"{package} {version}" for package, version in info.versions.items()),
         },

@@ -50,7 +50,7 @@ class RobotRun:
             try:
                 self.log.gap_log(self.link.target, self.cable, self.source)
             except GapLogError as error:
-                return self.stop(now, f"What was observed so far is no cable between these grippers: {error}")
+                return self.stop(now, f"What was observed so far is not a cable between these grippers: {error}")
         return reply
 
     def stop(self, now: float, reason: str) -> Reply:

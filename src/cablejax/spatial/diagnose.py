@@ -164,9 +164,9 @@ def _caveats(log, windows, left_out, found) -> tuple[str, ...]:
     result = [
         "The motion of a hanging cable does not depend on its weight: stiffness, drag and added masses are known "
         "relative to the linear density only, that of the cable with its markers, and a wrong density "
-        "(linear_density) cannot be seen.",
-        "A camera that lags would shift keypoints and grippers alike, for both come from the same marks: camera_lag "
-        "cannot be seen.",
+        "(linear_density) is not identifiable.",
+        "A camera that lags would shift keypoints and grippers alike, for both come from the same markers: camera_lag "
+        "is not identifiable.",
         "The noise is what markers scatter by from one sample to the next. A marker that sits off the cable's "
         "centreline, or off its stated place along the cable, is off all the time; that error is not part of the "
         "noise, but of the constant offsets, as is what the simulator has wrong at rest.",
@@ -186,7 +186,7 @@ def _caveats(log, windows, left_out, found) -> tuple[str, ...]:
         result.append(f"{left_out} windows are labelled eval; nothing was fitted to or scored on them.")
     if not found.time_steps.fine_enough:
         result.append(
-            f"The grippers move too fast for the finest time steps of the simulation: half of them would change it by "
+            f"The grippers move too fast for the finest time steps of the simulation: halving them would change it by "
             f"{1e3 * found.time_steps.error:.1f} mm. Gaps of that size may be its own."
         )
     parts = ("one half of the recordings", "the other half", "all recordings")
