@@ -58,7 +58,7 @@ def store_sheet(store: Store, name: str) -> Sheet:
         following=(
             f"Train a model on it: cablejax train --data {name}"
             if info.complete
-            else "Run the command that began it again: it goes on where it stopped.",
+            else "Run the same command again: it goes on where it stopped.",
             f"Write its cable to a file: cablejax cable --from {name} --out cable.toml",
         ),
         facts={
