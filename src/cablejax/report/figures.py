@@ -173,12 +173,10 @@ def _draw_cable(ax: Axes, run: ClosedLoopRun, index: int, method: Method) -> Non
     ax.plot(*run.keypoints[index].T, "o", color=colour, ms=3.0)
 
 
-def _scale_bar(ax: Axes, view: tuple[float, float, float, float], length: float = 0.2) -> None:
+def _scale_bar(ax: Axes, view: tuple[float, float, float, float]) -> None:
     x, y = view[1] - 0.02, view[2] + 0.02
-    ax.plot([x - length, x], [y, y], color=LIGHT.muted, lw=1.5, solid_capstyle="butt")
-    ax.text(
-        x - length / 2, y + 0.012, f"{100 * length:.0f} cm", ha="center", va="bottom", color=LIGHT.muted, fontsize=9
-    )
+    ax.plot([x - 0.2, x], [y, y], color=LIGHT.muted, lw=1.5, solid_capstyle="butt")
+    ax.text(x - 0.1, y + 0.012, "20 cm", ha="center", va="bottom", color=LIGHT.muted, fontsize=9)
 
 
 def _panel_width(n_panels: int) -> float:

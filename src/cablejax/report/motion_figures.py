@@ -89,16 +89,16 @@ def _film(figure: Any, following: NextMotion) -> None:
         figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside upper left", ncols=5, fontsize=10)
 
 
-def telling_moments(following: NextMotion, count: int = _MOMENTS) -> list[int]:
+def telling_moments(following: NextMotion) -> list[int]:
     """Samples at which the explanations differ most, an eighth of the motion apart; evenly spread without rivals."""
     points = np.stack(list(following.shapes.values()))
     samples = points.shape[1]
     if len(points) < 2:
-        return np.linspace(0, samples - 1, count).round().astype(int).tolist()
+        return np.linspace(0, samples - 1, _MOMENTS).round().astype(int).tolist()
     differences = np.linalg.norm(points[:, None] - points[None], axis=-1).max(axis=(0, 1, 3))
     chosen: list[int] = []
     for sample in np.argsort(-differences, kind="stable"):
-        if len(chosen) < count and all(abs(sample - other) >= samples // 8 for other in chosen):
+        if len(chosen) < _MOMENTS and all(abs(sample - other) >= samples // 8 for other in chosen):
             chosen.append(int(sample))
     return sorted(chosen)
 

@@ -73,18 +73,7 @@ LIGHT = Colours(
     residual="#0072b2",
     direct="#d55e00",
 )
-"""On white."""
-DARK = Colours(
-    background="#14181c",
-    ink="#e8ecef",
-    muted="#9aa5af",
-    faint="#343c44",
-    gripper="#b9c3cc",
-    target="#7f8a94",
-    residual="#56b4e9",
-    direct="#ff9d4d",
-)
-"""On black."""
+"""On white; the pages have their own for dark screens."""
 
 FIGURE_STYLE: dict[Any, Any] = {
     "font.family": "sans-serif",
@@ -158,13 +147,12 @@ def common_window(
     return views
 
 
-def gripper_outline(pose: Float[np.ndarray, "3"], end: int, scale: float = 1.0) -> list[Float[np.ndarray, "K 2"]]:
+def gripper_outline(pose: Float[np.ndarray, "3"], end: int) -> list[Float[np.ndarray, "K 2"]]:
     """Polygons [m] of a parallel-jaw gripper seen from above: two jaws along the cable, a palm and a wrist behind them.
 
     Args:
         pose: (x, y, theta), theta the direction of the cable's tangent.
         end: 0 where the cable leaves the gripper along theta, 1 where it comes in along theta.
-        scale: factor on the drawn size, 1 for jaws 5 cm long.
     """
     x, y, theta = np.asarray(pose, dtype=float)
     back = -1.0 if end == 0 else 1.0
@@ -172,7 +160,7 @@ def gripper_outline(pose: Float[np.ndarray, "3"], end: int, scale: float = 1.0) 
 
     def box(along: tuple[float, float], across: tuple[float, float]) -> np.ndarray:
         corners = [(along[0], across[0]), (along[1], across[0]), (along[1], across[1]), (along[0], across[1])]
-        local = scale * np.array([(back * a, c) for a, c in corners])
+        local = np.array([(back * a, c) for a, c in corners])
         return local @ rotation.T + [x, y]
 
     return [
