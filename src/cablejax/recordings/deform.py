@@ -203,11 +203,7 @@ def takes_of(recordings: DeformRecordings) -> tuple[Take, ...]:
 
 
 def import_deform(
-    path: str | os.PathLike[str],
-    *,
-    unit: str | None = None,
-    frame: Frame = Frame(),
-    nominal: Nominal = NOMINAL,
+    path: str | os.PathLike[str], *, unit: str | None = None, frame: Frame = Frame()
 ) -> tuple[GapLog, list[str]]:
     """Reads, checks and repairs the recordings of one cable.
 
@@ -215,7 +211,6 @@ def import_deform(
         path: as for `read_deform`.
         unit: of length; None = metres, or millimetres where the length of the cable leaves no doubt.
         frame: the frame of the positions; upstream's has z up.
-        nominal: what is believed of the cable.
 
     Returns:
         A gap log in space, and a sentence on each repair. Its `meta` has, per episode, the `take`, upstream's `split`,
@@ -232,4 +227,4 @@ def import_deform(
         "only bending stiffness per linear density shows. Gripper poses are from two markers each, their roll is not "
         "observed; commands are differences of these poses."
     )
-    return gap_log_from_takes(takes, nominal, source=source, repairs=repairs), repairs
+    return gap_log_from_takes(takes, NOMINAL, source=source, repairs=repairs), repairs

@@ -16,6 +16,8 @@ from cablejax.recordings.poses import poses_from_markers
 from cablejax.recordings.take import Take, spacing, typical_spacing
 from cablejax.recordings.units import METRES, metres_per, recognised_unit, require_metres
 
+_USUAL_LENGTH = 0.3, 3.0
+"""Lengths of a cable [m] by which an unstated unit is recognised."""
 _OUTLIER = 1.5
 """Distance of a keypoint from the median of its sample, in lengths of the cable, from which on it cannot be on it."""
 
@@ -47,14 +49,12 @@ class Setup:
         on_grippers: "pairs" if the first two and the last two keypoints are on the grippers; "ends" if only the first
             and the last are.
         hangs: the cable hangs free and is not on a table.
-        plausible_length: plausible lengths of the cable [m], to recognise an unstated unit.
     """
 
     unit: str | None = "m"
     frame: Frame = Frame()
     on_grippers: Literal["pairs", "ends"] = "pairs"
     hangs: bool = True
-    plausible_length: tuple[float, float] = (0.3, 3.0)
 
     def __post_init__(self):
         if self.unit is not None:
@@ -241,8 +241,8 @@ def _in_metres(takes: tuple[Take, ...], setup: Setup) -> tuple[tuple[Take, ...],
     repairs: list[str] = []
     unit = setup.unit
     if unit is None:
-        low, high = setup.plausible_length
-        candidates = recognised_unit(length, setup.plausible_length)
+        low, high = _USUAL_LENGTH
+        candidates = recognised_unit(length, _USUAL_LENGTH)
         if "m" in candidates:
             unit = "m"
         elif len(candidates) == 1:
