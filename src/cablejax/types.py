@@ -6,7 +6,8 @@ package:
 
     B batch   E episodes   T time samples   H history length   N keypoints   Q grippers   J bending joints   D 2 or 3
 
-SI units, radians, right-handed frames. Arrays may carry leading batch axes wherever a function is vmapped.
+SI units, radians, right-handed frames. A gripper's pose in the plane is (x, y, theta), its twist (vx, vy, omega), both
+in the world's frame. Arrays may carry leading batch axes wherever a function is vmapped.
 """
 
 from __future__ import annotations
@@ -18,9 +19,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
-
-PLANAR_DOF = 3
-"""A gripper's pose in the plane is (x, y, theta), its twist (vx, vy, omega), both in the world's frame."""
 
 
 @jax.tree_util.register_dataclass
