@@ -19,6 +19,7 @@ from cablejax.cable import Discretisation
 from cablejax.effects.base import Hook
 from cablejax.effects.physics import Physics, may_touch, without_obstacle
 from cablejax.simulate.compile import compiler_options
+from cablejax.simulate.equilibrium import equilibrium_state
 from cablejax.types import CableState, Trajectory
 
 _FINE_SAMPLE = 0.1
@@ -44,7 +45,6 @@ class Engine(abc.ABC):
     hooks: ClassVar[frozenset[Hook]]
     data_timestep: ClassVar[float] = 0.02
 
-    @abc.abstractmethod
     def initial_state(
         self, gripper_pose: Float[ArrayLike, "*B Q P"], *, guess: Float[ArrayLike, "*B N D"] | None = None
     ) -> CableState:
@@ -54,6 +54,7 @@ class Engine(abc.ABC):
             gripper_pose: (x, y, theta) in the plane, shape [Q, 3]; (x, y, z, qw, qx, qy, qz) in space, shape [Q, 7].
             guess: keypoints near the wanted equilibrium, for poses with several.
         """
+        return equilibrium_state(self.config, gripper_pose, guess=guess)
 
     @abc.abstractmethod
     def rollout(

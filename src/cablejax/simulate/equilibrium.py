@@ -13,6 +13,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
+from scipy.spatial.transform import Rotation
 
 from cablejax.arrays import wrapped
 from cablejax.cable import Discretisation
@@ -190,7 +191,7 @@ def _planar_qpos(config, pose, guess):
 
 def _spatial_qpos(config, pose, guess):
     """Spatial poses in one plane, the grippers not twisted against each other: a planar problem, tilted."""
-    frames = [_rotation_matrix(q) for q in pose[:, 3:]]
+    frames = Rotation.from_quat(pose[:, 3:], scalar_first=True).as_matrix()
     chord = pose[1, :3] - pose[0, :3]
     tangents = [frame[:, 0] for frame in frames]
     vectors = np.stack([chord / max(np.linalg.norm(chord), 1e-12), *tangents])
@@ -206,8 +207,8 @@ def _spatial_qpos(config, pose, guess):
     axis = frames[0].T @ normal
     in_plane = np.cross(normal, tangents[0])
     angle = np.arctan2(tangents[1] @ in_plane, tangents[1] @ tangents[0])
-    turned = _quaternion(normal * angle)
-    if np.abs(_rotation_matrix(turned) @ frames[0] - frames[1]).max() > 1e-6:
+    turned = Rotation.from_rotvec(normal * angle).as_matrix()
+    if np.abs(turned @ frames[0] - frames[1]).max() > 1e-6:
         raise ValueError(
             "The grippers are twisted against each other about the cable's axis. Start untwisted and turn one by a "
             "rollout."
@@ -218,22 +219,5 @@ def _spatial_qpos(config, pose, guess):
         relative = guess - pose[0, :3]
         flat_guess = np.stack([relative @ tangents[0], relative @ in_plane], axis=1)
     angles = _planar_qpos(config, planar, flat_guess)[3:]
-    joints = np.concatenate([_quaternion(axis * phi) for phi in angles])
-    return np.concatenate([pose[0], joints])
-
-
-def _quaternion(rotation):
-    angle = np.linalg.norm(rotation)
-    axis = rotation / angle if angle > 0 else rotation
-    return np.concatenate([[np.cos(angle / 2)], np.sin(angle / 2) * axis])
-
-
-def _rotation_matrix(quaternion):
-    w, x, y, z = quaternion / np.linalg.norm(quaternion)
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+    joints = Rotation.from_rotvec(axis * angles[:, None]).as_quat(scalar_first=True)
+    return np.concatenate([pose[0], joints.ravel()])

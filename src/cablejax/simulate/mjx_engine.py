@@ -21,7 +21,6 @@ from cablejax.simulate.compile import full_precision
 from cablejax.simulate.composite import build_chain, stable_damping_time
 from cablejax.simulate.contact import obstacle_contact
 from cablejax.simulate.engine import Engine, compiled_rollout, finely_sampled
-from cablejax.simulate.equilibrium import equilibrium_state
 from cablejax.simulate.friction import drag_coefficient, implicit_drag, on_table
 from cablejax.simulate.grasp import constrained_acceleration
 from cablejax.simulate.keypoints import hermite_weights, marked_keypoints
@@ -54,10 +53,6 @@ class MjxEngine(Engine):
     def mj_model(self) -> mujoco.MjModel:
         """The MuJoCo model of the bare chain."""
         return build_chain(self.config)
-
-    def initial_state(self, gripper_pose, *, guess=None) -> CableState:
-        """See `Engine`."""
-        return equilibrium_state(self.config, gripper_pose, guess=guess)
 
     @full_precision
     def keypoints(self, state: CableState) -> Float[Array, "N D"]:

@@ -22,7 +22,6 @@ from cablejax.effects.physics import Physics
 from cablejax.simulate.compiled_steps import advance
 from cablejax.simulate.composite import build_grasped_chain, stable_damping_time
 from cablejax.simulate.engine import Engine, finely_sampled
-from cablejax.simulate.equilibrium import equilibrium_state
 from cablejax.simulate.friction import PATCH_EDGE, STRIBECK_SPEED, on_table
 from cablejax.simulate.keypoints import hermite_weights, marked_keypoints
 from cablejax.types import CableState, Trajectory
@@ -52,10 +51,6 @@ class ThreadedEngine(Engine):
     def mj_model(self) -> mujoco.MjModel:
         """The MuJoCo model: the chain welded to two mocap bodies."""
         return build_grasped_chain(self.config)
-
-    def initial_state(self, gripper_pose, *, guess=None) -> CableState:
-        """See `Engine`."""
-        return equilibrium_state(self.config, gripper_pose, guess=guess)
 
     def rollout(self, physics, state, twist, interval=1.0):
         """See `Engine`. Runs one cable per thread; not differentiable."""

@@ -18,7 +18,6 @@ from cablejax.simulate.chain.replay import centreline_keypoints, follow
 from cablejax.simulate.chain.state import ChainState, expecting_no_change
 from cablejax.simulate.compile import full_precision
 from cablejax.simulate.engine import Engine, compiled_rollout, finely_sampled
-from cablejax.simulate.equilibrium import equilibrium_state
 from cablejax.simulate.pose import integrate_pose
 from cablejax.types import CableMemory, CableState, Trajectory
 
@@ -52,7 +51,7 @@ class ChainEngine(Engine):
 
     def initial_state(self, gripper_pose, *, guess=None) -> CableState:
         """See `Engine`; the cable remembers nothing yet."""
-        return self._remembering(equilibrium_state(self.config, gripper_pose, guess=guess))
+        return self._remembering(super().initial_state(gripper_pose, guess=guess))
 
     def rollout(self, physics, state, twist, interval=1.0):
         """See `Engine`. Compiles on the first call for a shape and interval."""
