@@ -114,15 +114,20 @@ def lagged(poses: Any, interval: Any, delay: Any, slow: Any) -> Any:
 
     Exact for piecewise linear input, see `lag_weights`.
     """
-    xp, n = poses.__array_namespace__(), len(poses)
-    back = xp.clip(np.arange(n) - delay / interval, 0.0, n - 1.0)
-    before = xp.clip(xp.floor(back).astype(int), 0, n - 2)
-    t = (back - before).reshape(-1, *(1,) * (poses.ndim - 1)).astype(poses.dtype)
-    late = (1 - t) * poses[before] + t * poses[before + 1]
+    xp, late = poses.__array_namespace__(), delayed(poses, delay / interval)
     ratio = xp.asarray(slow, dtype=poses.dtype) / interval
     decay, before_weight, after_weight = lag_weights(ratio)
     driven = before_weight * late[:-1] + after_weight * late[1:]
     return xp.concatenate([late[:1], _recursion(xp, decay, late[0], driven)])
+
+
+def delayed(values: Any, samples: Any) -> Any:
+    """Values [T, ...] so many samples late, linear between two samples; the first holds before. NumPy or JAX arrays."""
+    xp, n = values.__array_namespace__(), len(values)
+    back = xp.clip(np.arange(n) - samples, 0.0, n - 1.0)
+    before = xp.clip(xp.floor(back).astype(int), 0, n - 2)
+    t = (back - before).reshape(-1, *(1,) * (values.ndim - 1)).astype(values.dtype)
+    return (1 - t) * values[before] + t * values[before + 1]
 
 
 def _recursion(xp: Any, decay: Any, first: Any, driven: Any) -> Any:

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from cablejax.effects.arms import delayed
 from cablejax.effects.base import CableEffect
 from cablejax.effects.effect import Parameter
 from cablejax.effects.physics import Physics
@@ -124,11 +125,7 @@ def seen_by_camera(physics: Physics, keypoints: Any, interval: Any) -> Any:
         keypoints: where they are, at even times [m], shape [T, N, 2]. NumPy in, NumPy out; JAX in, JAX out.
         interval: between two samples [s].
     """
-    xp, n = keypoints.__array_namespace__(), len(keypoints)
-    back = xp.clip(np.arange(n) - physics.camera_lag / interval, 0.0, n - 1.0)
-    before = xp.clip(xp.floor(back).astype(int), 0, n - 2)
-    t = (back - before)[:, None, None].astype(keypoints.dtype)
-    return in_camera_frame(physics, (1 - t) * keypoints[before] + t * keypoints[before + 1])
+    return in_camera_frame(physics, delayed(keypoints, physics.camera_lag / interval))
 
 
 def in_camera_frame(physics: Physics, keypoints: Any) -> Any:
