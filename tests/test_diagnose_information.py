@@ -1,4 +1,4 @@
-"""Expected information: its bounds hold against a Monte Carlo estimate, and it behaves as information does."""
+"""Expected information: its bound holds against a Monte Carlo estimate, and it behaves as information does."""
 
 from __future__ import annotations
 
@@ -39,23 +39,22 @@ def by_sampling(means, spreads, chances, count=40_000) -> tuple[float, float]:
 
 @pytest.mark.parametrize("scale", [0.0, 0.3, 1.0, 3.0])
 @pytest.mark.parametrize("seed", [0, 1])
-def test_bounds_hold_against_sampling(scale, seed):
+def test_bound_holds_against_sampling(scale, seed):
     means, spreads = gaussians(scale, seed)
-    lower, upper = mutual_information(means, spreads, CHANCES)
+    lower = mutual_information(means, spreads, CHANCES)
     sampled, error = by_sampling(means, spreads, CHANCES)
-    assert lower <= sampled + 4 * error and upper >= sampled - 4 * error
-    assert 0 <= lower <= upper <= entropy(CHANCES)
+    assert 0 <= lower <= min(sampled + 4 * error, entropy(CHANCES))
 
 
 def test_explanations_that_predict_the_same_are_not_told_apart():
     means, spreads = gaussians(1.0)
     same = np.repeat(means[:1], 3, axis=0)
-    assert mutual_information(same, [spreads[0]] * 3, CHANCES) == pytest.approx((0.0, 0.0), abs=1e-12)
+    assert mutual_information(same, [spreads[0]] * 3, CHANCES) == pytest.approx(0.0, abs=1e-12)
 
 
 def test_information_grows_with_the_separation_up_to_the_doubt():
     means, spreads = gaussians(1.0)
-    lowers = [mutual_information(k * means, spreads, CHANCES)[0] for k in (0.1, 0.5, 1.0, 2.0, 5.0, 50.0)]
+    lowers = [mutual_information(k * means, spreads, CHANCES) for k in (0.1, 0.5, 1.0, 2.0, 5.0, 50.0)]
     assert (np.diff(lowers) > 0).all()
     assert lowers[-1] == pytest.approx(entropy(CHANCES), rel=1e-6)
 
@@ -63,9 +62,9 @@ def test_information_grows_with_the_separation_up_to_the_doubt():
 def test_difference_that_own_parameters_can_make_up_for_does_not_count():
     direction, chances = np.eye(1, 5), np.array([0.5, 0.5])
     means = np.concatenate([0 * direction, 3 * direction])
-    certain = mutual_information(means, [np.zeros((0, 5))] * 2, chances)[0]
-    open_ = mutual_information(means, [30 * direction] * 2, chances)[0]
-    elsewhere = mutual_information(means, [30 * np.eye(5)[1:2]] * 2, chances)[0]
+    certain = mutual_information(means, [np.zeros((0, 5))] * 2, chances)
+    open_ = mutual_information(means, [30 * direction] * 2, chances)
+    elsewhere = mutual_information(means, [30 * np.eye(5)[1:2]] * 2, chances)
     assert certain > 0.4 and open_ < 0.01
     assert elsewhere == pytest.approx(certain, rel=1e-9)
 

@@ -197,7 +197,7 @@ class Judge:
         else:
             whitened = ((seen - seen[:1]) * scale).reshape(len(seen), -1)
             every = [np.concatenate([spread, clamps]) for spread in spreads]
-            information = mutual_information(whitened, every, self.chances)[0]
+            information = mutual_information(whitened, every, self.chances)
         return Judged(poses, information, {}, seen)
 
 
