@@ -19,8 +19,8 @@ from cablejax.diagnose.planar import physics_of
 from cablejax.diagnose.playback import Playback
 from cablejax.diagnose.protocol import Term
 from cablejax.diagnose.search import search
-from cablejax.diagnose.significance import NOISE_TOLERANCE, contrast_p, exceedance_p, variance_inflation
-from cablejax.diagnose.where import LEVEL, localise
+from cablejax.diagnose.significance import LEVEL, NOISE_TOLERANCE, contrast_p, exceedance_p, variance_inflation
+from cablejax.diagnose.where import localise
 from cablejax.effects import CableEffect
 from cablejax.types import GapLog
 from diagnose_cases import BY_NAME, clean, evidence, evidence_of, log_of, noise, parts, playback, record, simulator

@@ -10,6 +10,8 @@ from cablejax.arrays import stretches
 from cablejax.diagnose.evidence import episodes_by_motion
 from cablejax.types import GapLog
 
+LEVEL = 0.05
+"""Family-wise level of every statement."""
 NOISE_TOLERANCE = 1.15
 """The noise floor is itself an estimate: a variance this much larger than stated is still held to be noise."""
 # Correlation time that is assumed where there is no hold to measure it in [s].

@@ -21,6 +21,7 @@ from jaxtyping import Bool, Float
 from cablejax.diagnose.evidence import repeated_motions
 from cablejax.diagnose.regimes import Regimes, regimes_of
 from cablejax.diagnose.significance import (
+    LEVEL,
     NOISE_TOLERANCE,
     contrast_p,
     exceedance_p,
@@ -30,8 +31,6 @@ from cablejax.diagnose.significance import (
 from cablejax.diagnose.where_words import describe
 from cablejax.types import GapLog
 
-LEVEL = 0.05
-"""Family-wise level of every statement."""
 HORIZONS = (1.0, 2.0, 5.0, 10.0, 20.0, 30.0)
 """Seconds since an episode's start; the value at one is taken from the one before on."""
 
@@ -80,20 +79,6 @@ class Where:
     regime_masks: dict[str, Bool[np.ndarray, "E T"]]
     sentences: tuple[str, ...]
 
-    @property
-    def episodes(self) -> tuple[int, ...]:
-        """Those whose gap stands out from the noise."""
-        return _below(self.episode_p)
-
-    @property
-    def keypoints(self) -> tuple[int, ...]:
-        """Those whose gap stands out from the noise."""
-        return _below(self.keypoint_p)
-
-
-def _below(p: Float[np.ndarray, "K"] | None) -> tuple[int, ...]:
-    return () if p is None else tuple(int(i) for i in np.flatnonzero(p < LEVEL))
-
 
 def localise(log: GapLog, nominal: Float[np.ndarray, "E T N 2"], noise: Float[np.ndarray, "N"]) -> Where:
     """Localises the gap between a log and its nominal simulation.
@@ -140,7 +125,7 @@ def localise(log: GapLog, nominal: Float[np.ndarray, "E T N 2"], noise: Float[np
         regime_masks=regimes.masks,
         sentences=(),
     )
-    sentences = describe(where, np.asarray(log.meta["keypoint_arclength_m"]), noise, LEVEL)
+    sentences = describe(where, np.asarray(log.meta["keypoint_arclength_m"]), noise)
     return dataclasses.replace(where, sentences=sentences)
 
 

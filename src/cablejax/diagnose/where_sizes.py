@@ -9,7 +9,7 @@ from types import MappingProxyType
 import numpy as np
 from jaxtyping import Float
 
-from cablejax.diagnose.where import LEVEL, Where
+from cablejax.diagnose.where import Where
 from cablejax.diagnose.where_words import describe
 
 
@@ -66,5 +66,5 @@ def sizes_of(
         regime_masks={},
         sentences=(),
     )
-    found = describe(where, np.asarray(arclength), np.array([noise]), LEVEL, names)
+    found = describe(where, np.asarray(arclength), np.array([noise]), names)
     return dataclasses.replace(where, sentences=(*first, *found))

@@ -7,6 +7,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from cablejax.diagnose.judgement import listed
+from cablejax.diagnose.significance import LEVEL
+
 if TYPE_CHECKING:
     from cablejax.diagnose.where import Where
 
@@ -17,7 +20,7 @@ _FRAME_SHARE = 0.7
 
 
 def describe(
-    where: Where, arclength: np.ndarray, noise: np.ndarray, level: float, names: Sequence[str] | None = None
+    where: Where, arclength: np.ndarray, noise: np.ndarray, names: Sequence[str] | None = None
 ) -> tuple[str, ...]:
     """Two to five sentences for a lab engineer.
 
@@ -25,21 +28,20 @@ def describe(
         where: the numbers; its own sentences are not read. Where nothing was tested, the sentences give sizes only.
         arclength: of the keypoints [m].
         noise: standard deviation of each keypoint's coordinates [m].
-        level: below which a p-value counts.
         names: what to call each episode; by default "episode 1" and so on.
     """
     floor = 1e3 * float(np.sqrt((noise**2).mean()))
     total = len(where.per_episode_mm)
     names = names or [f"episode {e + 1}" for e in range(total)]
     if where.episode_p is None or where.keypoint_p is None:
-        return (_size(where, None, floor, names), *_along(where, arclength), *_when(where, level), *_frame(where))[:5]
-    shown = [e for e in range(total) if where.episode_p[e] < level]
-    if not shown and not (where.keypoint_p < level).any():
+        return (_size(where, None, floor, names), *_along(where, arclength), *_when(where), *_frame(where))[:5]
+    shown = [e for e in range(total) if where.episode_p[e] < LEVEL]
+    if not shown and not (where.keypoint_p < LEVEL).any():
         return (
             f"No episode deviates from the simulator by more than its noise of {_mm(floor)}.",
             f"A gap of {_mm(max(where.smallest_mm, 0.01))} or more over the whole log would have shown.",
         )
-    sentences = [_size(where, shown, floor, names), *_along(where, arclength), *_when(where, level), *_frame(where)]
+    sentences = [_size(where, shown, floor, names), *_along(where, arclength), *_when(where), *_frame(where)]
     if total >= 6:
         return tuple(sentences[:5])
     few = (
@@ -55,7 +57,7 @@ def _size(where: Where, shown: list[int] | None, floor: float, names: Sequence[s
     if shown is not None and not shown:
         return f"{size}, too small to show in any single episode."
     if shown is not None and len(shown) < total:
-        numbers = _listed([str(e + 1) for e in shown])
+        numbers = listed([str(e + 1) for e in shown])
         return f"{size}; it shows in {'episode' if len(shown) == 1 else 'episodes'} {numbers} of {total} only."
     if total == 1:
         return f"{size}, in the one episode."
@@ -98,9 +100,9 @@ def _along(where: Where, arclength: np.ndarray) -> list[str]:
     return [sentence]
 
 
-def _when(where: Where, level: float) -> list[str]:
+def _when(where: Where) -> list[str]:
     sentences = []
-    known = {name: (ratio, p) for name, (ratio, p) in where.contrasts.items() if p < level}
+    known = {name: (ratio, p) for name, (ratio, p) in where.contrasts.items() if p < LEVEL}
     hold, moving = where.regimes.get("speed: hold"), _moving(where)
     if hold is not None and moving is not None:
         if "speed: hold" in known and known["speed: hold"][0] < 1 / _CLEAR_RATIO:
@@ -156,10 +158,6 @@ def _moving(where: Where) -> float | None:
 
 def _mm(value: float) -> str:
     return f"{value:.2f} mm" if 0.0 < value < 0.095 else f"{value:.1f} mm"
-
-
-def _listed(words: Sequence[str]) -> str:
-    return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} and {words[-1]}"
 
 
 def _count(number: int, word: str) -> str:
