@@ -136,7 +136,7 @@ def diagnose_and_report(
     Returns:
         The diagnosis and its page.
     """
-    from cablejax.diagnose import LIBRARY, diagnose, write_verdict
+    from cablejax.diagnose import LIBRARY, diagnose
     from cablejax.diagnose.motion_file import write_motion
     from cablejax.report.diagnosis_page import write_diagnosis_page
 
@@ -152,7 +152,6 @@ def diagnose_and_report(
         bounds=bounds,
         progress=lambda text: say(f"{text} ..."),
     )
-    write_verdict(folder / "verdict.json", result)
     write_motion(folder, result.next_motion, result.log)
     return result, write_diagnosis_page(result, folder)
 

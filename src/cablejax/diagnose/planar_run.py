@@ -30,10 +30,6 @@ from cablejax.effects import LIBRARY, CableEffect
 from cablejax.types import GapLog
 
 
-def _silent(text: str) -> None:
-    del text
-
-
 def diagnose(
     log: GapLog,
     *,
@@ -42,7 +38,7 @@ def diagnose(
     calibration: Calibration = Calibration(),
     bounds: Bounds | None = None,
     objective: Objective = "explanations",
-    progress: Callable[[str], None] = _silent,
+    progress: Callable[[str], None] = lambda text: None,
 ) -> CableDiagnosis:
     """Says where the nominal simulator is wrong on this log, which effect causes it, how far the gap shrinks with it.
 

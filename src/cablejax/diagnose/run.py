@@ -27,10 +27,6 @@ from cablejax.diagnose.search import Search, search
 _BASELINE = 0.1
 
 
-def _silent(text: str) -> None:
-    del text
-
-
 def diagnose_simulator(
     simulator: Simulator,
     observed: Float[ArrayLike, "E T *O"],
@@ -39,7 +35,7 @@ def diagnose_simulator(
     noise: Float[ArrayLike, "*O"] | None = None,
     motion: Int[ArrayLike, "E"] | None = None,
     calibration: Calibration | None = None,
-    progress: Callable[[str], None] = _silent,
+    progress: Callable[[str], None] = lambda text: None,
 ) -> Diagnosis:
     """Says which effect makes a simulator of your own wrong on a recording, and how far the gap shrinks with it.
 

@@ -19,6 +19,7 @@ from cablejax.simulate.motions import MotionConfig, admissible
 
 INTERVAL = 0.1
 """Between two samples of a motion [s]."""
+_SAMPLES = 300
 _SLOW = 0.3
 _HOLD = 3.0
 _FAR, _NEAR, _OVERLOAD = 0.93, 0.6, 0.3
@@ -98,23 +99,22 @@ def starting_pose(gripper_pose: Float[np.ndarray, "E T 2 3"]) -> Float[np.ndarra
 
 
 def there_and_back(
-    first: Float[np.ndarray, "2 3"], goal: Float[np.ndarray, "2 3"], n_samples: int = 300, bounds: Bounds = Bounds()
+    first: Float[np.ndarray, "2 3"], goal: Float[np.ndarray, "2 3"], bounds: Bounds
 ) -> Float[np.ndarray, "T 2 3"]:
-    """Gripper poses every 0.1 s from one pose to another, with a rest there, and back.
+    """Gripper poses every 0.1 s, 300 of them: from one pose to another, with a rest there, and back.
 
     Args:
         first: (x, y, theta) of both grippers [m, rad].
         goal: likewise.
-        n_samples: of the motion, which is cut off there.
         bounds: on the grippers' speed; the others are not looked at.
     """
     start, there = _Pair.of(first).vector, _Pair.of(goal).vector
     way = Way(np.stack([start, there, start]), np.ones(2), np.array([1.0, _HOLD, 2 * _HOLD]))
-    return way.played(n_samples, bounds)
+    return way.played(_SAMPLES, bounds)
 
 
 def safe_motions(
-    config: Discretisation, first: Float[np.ndarray, "2 3"], n_samples: int = 300, bounds: Bounds = Bounds()
+    config: Discretisation, first: Float[np.ndarray, "2 3"], n_samples: int = _SAMPLES, bounds: Bounds = Bounds()
 ) -> dict[str, Float[np.ndarray, "T 2 3"]]:
     """Motions by name, as gripper poses (x, y, theta) every 0.1 s; the last pose is held to the end.
 

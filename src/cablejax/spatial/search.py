@@ -35,6 +35,7 @@ from cablejax.spatial.effects import SpatialEffect
 _FAILURES = 4
 _LEAST = 0.02
 _CHANCE = 0.84
+_DRAWS = 2000
 _DAMPING, _LARGEST_STEP = 1e-3, 1.0
 # Windows of either half that effects are ordered by: what is tried next shows in a few.
 _PROMISED = 6
@@ -223,12 +224,10 @@ def with_effect(cable: Simulator, base: Explanation, effect: SpatialEffect, valu
     return cable.with_own(both)
 
 
-def _resampled(
-    change: Float[np.ndarray, "W"], group: Int[np.ndarray, "W"], *, draws: int = 2000
-) -> Float[np.ndarray, "D"]:
+def _resampled(change: Float[np.ndarray, "W"], group: Int[np.ndarray, "W"]) -> Float[np.ndarray, "D"]:
     """Means over windows of recordings that are drawn with replacement, with a fixed seed."""
     names = np.unique(group)
     total = np.array([change[group == g].sum() for g in names])
     count = np.array([(group == g).sum() for g in names])
-    pick = np.random.default_rng(0).integers(len(names), size=(draws, len(names)))
+    pick = np.random.default_rng(0).integers(len(names), size=(_DRAWS, len(names)))
     return total[pick].sum(axis=1) / count[pick].sum(axis=1)

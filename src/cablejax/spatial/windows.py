@@ -113,15 +113,15 @@ class Windows:
         )
 
 
-def windows_of(log: GapLog, *, length: float = WINDOW) -> Windows:
-    """Cuts every episode into windows.
+def windows_of(log: GapLog) -> Windows:
+    """Cuts every episode into windows of `WINDOW`.
 
     Raises:
         ValueError: a log in the plane, of unequal sample intervals, of a cable shorter than its keypoints are apart, or
             one that has no window of a second.
     """
     interval = _sample_interval(log)
-    samples = min(round(length / interval), int(log.episode_length.max()))
+    samples = min(round(WINDOW / interval), int(log.episode_length.max()))
     points = np.asarray(log.keypoints, float)
     pose = np.asarray(log.gripper_pose, float)
     valid = np.arange(points.shape[1]) < log.episode_length[:, None]
