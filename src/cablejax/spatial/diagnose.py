@@ -21,7 +21,7 @@ from cablejax.spatial.cable import errors
 from cablejax.spatial.clock import on_one_clock
 from cablejax.spatial.effects import GRIP
 from cablejax.spatial.gap import RESOLVABLE, constant_offset, gap_of, noise_of
-from cablejax.spatial.geometry import LocalChange, local_changes
+from cablejax.spatial.geometry import local_changes
 from cablejax.spatial.identify import Identified, identify
 from cablejax.spatial.named import named_effects, quantities_of, with_both_drags
 from cablejax.spatial.where import in_log, where_of
@@ -36,11 +36,9 @@ class SpatialDiagnosis(CableDiagnosis):
     """A diagnosis in space. Arrays of keypoints have three coordinates; held keypoints are as observed.
 
     Attributes:
-        changes: places and files where the set-up differs from the rest.
         identified: the simulator with the effects that were found.
     """
 
-    changes: tuple[LocalChange, ...]
     identified: Identified
 
 
@@ -121,7 +119,6 @@ def diagnose_space(
         noise_correlation=np.zeros(0),
         seconds=time.perf_counter() - begun,
         settings={"edges": edges, "window_s": WINDOW, "jax": jax.__version__, "devices": jax.default_backend()},
-        changes=changes,
         identified=found,
     )
 
