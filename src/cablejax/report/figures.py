@@ -68,13 +68,7 @@ def final_shapes(runs: Runs) -> Figure:
                     textcoords="offset points", color=LIGHT.method(method), va="top", fontsize=10.5,
                 )  # fmt: skip
         _scale_bar(axes[-1], views[next(reversed(views))])
-        handles = [Line2D([], [], color=LIGHT.target, lw=7, alpha=0.45, label="target")]
-        handles += [
-            Line2D([], [], color=LIGHT.method(m), lw=2.2, label=METHOD_LABEL[m])
-            for m in reversed(METHOD_ORDER)
-            if any(m in pair for pair in pairs.values())
-        ]
-        figure.legend(handles=handles, loc="outside upper left", ncols=3, handlelength=1.6)
+        _method_legend(figure, runs, Line2D([], [], color=LIGHT.target, lw=7, alpha=0.45, label="target"))
     return figure
 
 
@@ -85,7 +79,7 @@ def error_over_time(runs: Runs) -> Figure:
         figure, axes = _row_of_panels(list(pairs), "shape error [cm]")
         low = min(_GOAL_CM, *(float(np.nanmin(r.error_cm)) for r in runs.values()))
         high = max(_GOAL_CM, *(float(np.nanmax(r.error_cm)) for r in runs.values()))
-        for ax, (shape, pair) in zip(axes, pairs.items(), strict=True):
+        for ax, pair in zip(axes, pairs.values(), strict=True):
             for method in _present(pair):
                 run = pair[method]
                 ax.plot(run.times, run.error_cm, color=LIGHT.method(method), lw=2.2, label=METHOD_LABEL[method])
@@ -96,7 +90,6 @@ def error_over_time(runs: Runs) -> Figure:
             ax.minorticks_off()
             ax.set_yticks([t for t in (0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50) if low / 1.4 <= t <= high * 1.3])
             ax.axhline(_GOAL_CM, color=LIGHT.target, lw=1.2, ls=(0, (5, 3)))
-            ax.set_title(shape, fontsize=13)
         axes[0].text(0.0, _GOAL_CM / 1.08, f"{_GOAL_CM:g} cm", ha="left", va="top", color=LIGHT.muted, fontsize=9)
         _method_legend(figure, runs)
     return figure
@@ -106,13 +99,27 @@ def residual_share(runs: Runs) -> Figure:
     """Share of the online residual in the predicted motion [%], one panel per shape.
 
     Blank where the grippers rested: a share of no motion means nothing.
+
+    Raises:
+        ValueError: there is no run with the residual.
     """
+    pairs = {shape: pair["residual"] for shape, pair in by_shape(runs).items() if "residual" in pair}
+    if not pairs:
+        raise ValueError("This figure needs runs with method 'residual', got none.")
 
     def share(run: ClosedLoopRun) -> np.ndarray:
         moved = np.abs(np.diff(run.gripper_pose, axis=0, append=np.nan)).max(axis=(1, 2))
         return np.where(moved > _REST, 100.0 * run.residual_share, np.nan)
 
-    return _one_method_panels(runs, share, "residual's share of\nthe predicted motion [%]", "residual")
+    top, colour = max(float(np.nanmax(share(run), initial=0.0)) for run in pairs.values()), LIGHT.residual
+    with matplotlib.rc_context(_STYLE):
+        figure, axes = _row_of_panels(list(pairs), "residual's share of\nthe predicted motion [%]")
+        for ax, run in zip(axes, pairs.values(), strict=True):
+            ax.set_xlim(run.times[0], run.times[-1])
+            ax.fill_between(run.times, 0.0, share(run), color=colour, alpha=0.18, lw=0)
+            ax.plot(run.times, share(run), color=colour, lw=2.2)
+            ax.set_ylim(0.0, 1.08 * top or 1.0)
+    return figure
 
 
 def motion_bound(runs: Runs) -> Figure:
@@ -125,8 +132,6 @@ def motion_bound(runs: Runs) -> Figure:
                 run = pair[method]
                 ax.step(run.times, 100.0 * run.radius, where="post", color=LIGHT.method(method), lw=2.0)
             ax.set_ylim(bottom=0.0)
-        for ax, shape in zip(axes, pairs, strict=True):
-            ax.set_title(shape, fontsize=13)
         _method_legend(figure, runs)
     return figure
 
@@ -187,33 +192,18 @@ def _panel_width(n_panels: int) -> float:
 def _row_of_panels(shapes: list[str], label: str) -> tuple[Figure, np.ndarray]:
     figure = Figure(figsize=(_panel_width(len(shapes)) * len(shapes), 2.75), layout="constrained")
     axes = figure.subplots(1, len(shapes), squeeze=False, sharey=True)[0]
-    for ax in axes:
+    for ax, shape in zip(axes, shapes, strict=True):
         ax.grid(axis="y")
         ax.set_xlabel("time [s]")
+        ax.set_title(shape, fontsize=13)
     axes[0].set_ylabel(label)
     return figure, axes
 
 
-def _one_method_panels(runs: Runs, quantity, label: str, method: Method) -> Figure:
-    pairs = {s: pair[method] for s, pair in by_shape(runs).items() if method in pair}
-    if not pairs:
-        raise ValueError(f"This figure needs runs with method {method!r}, got none.")
-    top = max(float(np.nanmax(quantity(run), initial=0.0)) for run in pairs.values())
-    with matplotlib.rc_context(_STYLE):
-        figure, axes = _row_of_panels(list(pairs), label)
-        for ax, (shape, run) in zip(axes, pairs.items(), strict=True):
-            values = quantity(run)
-            ax.set_xlim(run.times[0], run.times[-1])
-            ax.fill_between(run.times, 0.0, values, color=LIGHT.method(method), alpha=0.18, lw=0)
-            ax.plot(run.times, values, color=LIGHT.method(method), lw=2.2)
-            ax.set_title(shape, fontsize=13)
-            ax.set_ylim(0.0, 1.08 * top or 1.0)
-    return figure
-
-
-def _method_legend(figure: Figure, runs: Runs) -> None:
+def _method_legend(figure: Figure, runs: Runs, *others: Line2D) -> None:
     present = {method for _, method in runs}
     handles = [
         Line2D([], [], color=LIGHT.method(m), lw=2.2, label=METHOD_LABEL[m]) for m in METHOD_ORDER[::-1] if m in present
     ]
-    figure.legend(handles=handles, loc="outside upper left", ncols=2, handlelength=1.6)
+    handles = [*others, *handles]
+    figure.legend(handles=handles, loc="outside upper left", ncols=len(handles), handlelength=1.6)
