@@ -14,12 +14,19 @@ def _at(gripper: int, value):
     return xp.stack([value, value * 0.0] if gripper == 0 else [value * 0.0, value])
 
 
-def _end(gripper: int, config):
-    s = 0.0 if gripper == 0 else config.cable.length
-    return {"along_cable_m": [s, s]}
+class _AtGripper(CableEffect):
+    """An effect at one gripper, whose number is the variant."""
+
+    variants = (0, 1)
+    variant_name = "gripper"
+
+    def location(self, values, variant, config):
+        """The gripper's end of the cable [m]."""
+        s = 0.0 if variant == 0 else config.cable.length
+        return {"along_cable_m": [s, s]}
 
 
-class GripperSlip(CableEffect):
+class GripperSlip(_AtGripper):
     """The cable slides through a gripper, once in every episode."""
 
     name = "gripper_slip"
@@ -30,8 +37,6 @@ class GripperSlip(CableEffect):
     )
     null = (10.0, 0.0)
     amplitude, reversible = 1, True
-    variants = (0, 1)
-    variant_name = "gripper"
 
     def apply(self, physics, values, variant, config):
         """Adds to the length that slips through one gripper [m], and sets the time at which it does [s]."""
@@ -46,10 +51,10 @@ class GripperSlip(CableEffect):
 
     def location(self, values, variant, config):
         """The gripper's end of the cable [m] and the time [s]."""
-        return {**_end(variant, config), "time_s": float(values[0])}
+        return {**super().location(values, variant, config), "time_s": float(values[0])}
 
 
-class GripperRotationOffset(CableEffect):
+class GripperRotationOffset(_AtGripper):
     """The grasp angle is off."""
 
     name = "gripper_rotation_offset"
@@ -57,8 +62,6 @@ class GripperRotationOffset(CableEffect):
     parameters = (Parameter("angle_rad", "rad", -1.0, 1.0, 0.0, 0.15),)
     null = (0.0,)
     amplitude, reversible = 0, True
-    variants = (0, 1)
-    variant_name = "gripper"
 
     def apply(self, physics, values, variant, config):
         """Adds to one gripper's angle between its pose and the cable's tangent [rad]."""
@@ -68,12 +71,8 @@ class GripperRotationOffset(CableEffect):
         """An offset of 0.05 rad at either gripper."""
         return [(g, (0.05,)) for g in (0, 1)]
 
-    def location(self, values, variant, config):
-        """The gripper's end of the cable [m]."""
-        return _end(variant, config)
 
-
-class GripperCompliance(CableEffect):
+class GripperCompliance(_AtGripper):
     """The grasp yields in rotation."""
 
     name = "gripper_compliance"
@@ -81,8 +80,6 @@ class GripperCompliance(CableEffect):
     parameters = (Parameter("stiffness_n_m_per_rad", "N m/rad", 1e-3, 1e4, 0.3, 1.2, log=True),)
     null = (float("inf"),)
     amplitude = 0
-    variants = (0, 1)
-    variant_name = "gripper"
 
     def apply(self, physics, values, variant, config):
         """Adds to one grasp's compliance in rotation [rad/(N m)]."""
@@ -91,7 +88,3 @@ class GripperCompliance(CableEffect):
     def starts(self, context):
         """A soft and a stiff grasp, 0.08 and 0.4 N m/rad, at either gripper."""
         return [(g, (k,)) for g in (0, 1) for k in (0.08, 0.4)]
-
-    def location(self, values, variant, config):
-        """The gripper's end of the cable [m]."""
-        return _end(variant, config)

@@ -11,10 +11,14 @@ from cablejax.effects.effect import Parameter
 
 # Where along the cable fits of local effects begin; a section of another sign is reached from the same place.
 _CENTRES = (0.08, 0.2, 0.32, 0.44, 0.56, 0.68, 0.8, 0.92)
+_CENTRE = Parameter("centre", "", 0.0, 1.0, 0.5, 0.3)
+_WIDTH = Parameter("width", "", 0.03, 1.0, 0.25, 0.7, log=True)
 
 
 class _Section(CableEffect):
     """An effect on a section of the cable; its first two parameters are centre and width over the cable's length."""
+
+    amplitude, reversible = 2, True
 
     def reported(self, values, variant, config):
         """Centre and width of the section in metres, then the last parameter in its own unit."""
@@ -59,13 +63,8 @@ class StiffnessProfile(_Section):
 
     name = "stiffness_profile"
     hook = "bending"
-    parameters = (
-        Parameter("centre", "", 0.0, 1.0, 0.5, 0.3),
-        Parameter("width", "", 0.03, 1.0, 0.25, 0.7, log=True),
-        Parameter("ratio", "", 0.05, 30.0, 1.0, 1.0, log=True),
-    )
+    parameters = (_CENTRE, _WIDTH, Parameter("ratio", "", 0.05, 30.0, 1.0, 1.0, log=True))
     null = (0.5, 0.25, 1.0)
-    amplitude, reversible = 2, True
 
     def apply(self, physics, values, variant, config):
         """Multiplies EI of the joints in the section by the ratio."""
@@ -82,13 +81,8 @@ class IntrinsicCurvature(_Section):
 
     name = "intrinsic_curvature"
     hook = "bending"
-    parameters = (
-        Parameter("centre", "", 0.0, 1.0, 0.5, 0.3),
-        Parameter("width", "", 0.03, 1.0, 0.25, 0.7, log=True),
-        Parameter("curvature_per_m", "1/m", -30.0, 30.0, 0.0, 3.0),
-    )
+    parameters = (_CENTRE, _WIDTH, Parameter("curvature_per_m", "1/m", -30.0, 30.0, 0.0, 3.0))
     null = (0.5, 0.25, 0.0)
-    amplitude, reversible = 2, True
 
     def apply(self, physics, values, variant, config):
         """Adds to the rest curvature of the joints in the section [1/m]."""
@@ -214,10 +208,7 @@ class LumpedMass(CableEffect):
 
     name = "lumped_mass"
     hook = "mass"
-    parameters = (
-        Parameter("centre", "", 0.0, 1.0, 0.5, 0.3),
-        Parameter("mass_kg", "kg", 1e-4, 1.0, 0.03, 1.0, log=True),
-    )
+    parameters = (_CENTRE, Parameter("mass_kg", "kg", 1e-4, 1.0, 0.03, 1.0, log=True))
     null = (0.5, 0.0)
     amplitude = 1
 
