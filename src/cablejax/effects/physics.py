@@ -157,9 +157,11 @@ def nominal_physics(
     return Physics(**arrays)
 
 
-def normal_gravity(physics: Physics) -> Float[Array, ""]:
-    """Gravity across the table [m/s^2]; the part in its plane is `tilt`."""
-    return jnp.sqrt(jnp.maximum(physics.gravity**2 - jnp.sum(physics.tilt**2), 0.0))
+def normal_gravity(physics: Physics) -> Any:
+    """Gravity across the table [m/s^2]; the part in its plane is `tilt`. NumPy in, NumPy out; JAX in, JAX out."""
+    square = physics.gravity**2 - (physics.tilt**2).sum()
+    xp = square.__array_namespace__()
+    return xp.sqrt(xp.maximum(square, 0.0))
 
 
 def may_touch(physics: Physics) -> bool:

@@ -79,7 +79,7 @@ def _hanging(physics: Physics, stiffness, nodes, link_length: float):
     """Mass that one gripper carries at each node, counted from it [kg]; negative where the cable comes down."""
     xp = nodes.__array_namespace__()
     held = physics.grip_height > 0
-    weight = physics.density * xp.sqrt(xp.maximum(physics.gravity**2 - xp.sum(physics.tilt**2), 0.0))
+    weight = physics.density * normal_gravity(physics)
     span = xp.where(held, (72.0 * stiffness * xp.where(held, physics.grip_height, 1.0) / weight) ** 0.25, 0.0)
     reach = span / link_length
     lifted = xp.clip(reach - nodes + 0.5, 0.0, xp.minimum(reach, 1.0))

@@ -18,7 +18,7 @@ from cablejax.cable import Discretisation
 from cablejax.effects.arms import executed_twist, follows_exactly
 from cablejax.effects.base import Hook
 from cablejax.effects.camera import seen_by_camera
-from cablejax.effects.physics import Physics
+from cablejax.effects.physics import Physics, normal_gravity
 from cablejax.simulate.compiled_steps import advance
 from cablejax.simulate.composite import build_grasped_chain, stable_damping_time
 from cablejax.simulate.engine import Engine, finely_sampled
@@ -159,12 +159,11 @@ class _Simulation:
         h = self.config.link_length
         if self.config.dimension == 3:
             return np.zeros(10)
-        normal = np.sqrt(max(float(physics.gravity) ** 2 - float(np.sum(physics.tilt**2)), 0.0))
-        weight = on_table(physics, float(physics.density) * h + np.asarray(physics.extra_mass), h)[1:-1] * normal
+        mass = on_table(physics, float(physics.density) * h + np.asarray(physics.extra_mass), h)[1:-1]
         friction = (physics.friction, physics.static_excess, *physics.patch_centre, physics.patch_radius)
         widths = (self.config.friction_speed, PATCH_EDGE, STRIBECK_SPEED)
         whole = [*map(float, friction), float(physics.patch_friction), float(physics.drag) * h, *widths]
-        return np.array([*whole, *weight])
+        return np.array([*whole, *(mass * normal_gravity(physics))])
 
     def _write(self, physics: Physics) -> None:
         """Puts the parameters into the model."""
@@ -189,8 +188,7 @@ class _Simulation:
         model.body_inertia[free] = self.nominal_inertia[free] * ratio
         if self.config.dimension == 2:
             model.body_mass[free] += physics.extra_mass[1:-1]
-            normal = np.sqrt(max(float(physics.gravity) ** 2 - float(np.sum(physics.tilt**2)), 0.0))
-            model.opt.gravity[:] = [*physics.tilt, -normal]
+            model.opt.gravity[:] = [*physics.tilt, -normal_gravity(physics)]
 
 
 @functools.lru_cache(maxsize=64)

@@ -14,9 +14,8 @@ from __future__ import annotations
 
 import mujoco
 import numpy as np
-from jaxtyping import Float
 
-from cablejax.effects.physics import Physics
+from cablejax.effects.physics import Physics, normal_gravity
 from cablejax.simulate.composite import add_links, link_lengths
 from cablejax.simulate.plant.config import PlantConfig
 
@@ -45,7 +44,7 @@ def plant_model(config: PlantConfig) -> mujoco.MjModel:
     h, dt = config.discretisation.link_length, config.discretisation.timestep
     lengths = link_lengths(config.discretisation)
     spec = mujoco.MjSpec()
-    spec.option.timestep, spec.option.gravity = dt, gravity_of(physics)
+    spec.option.timestep, spec.option.gravity = dt, [*physics.tilt, -normal_gravity(physics)]
     spec.option.integrator, spec.option.cone = mujoco.mjtIntegrator.mjINT_DISCRETE, mujoco.mjtCone.mjCONE_ELLIPTIC
     spec.option.impratio, spec.option.tolerance = config.cone_ratio, 1e-8
     spec.worldbody.add_geom(
@@ -145,12 +144,6 @@ def _set_drag(model: mujoco.MjModel, link: int, coefficient: float) -> None:
     inertia = model.body_inertia[link]
     sides = np.sqrt(6.0 * (inertia.sum() - 2.0 * inertia) / model.body_mass[link])
     model.opt.viscosity = coefficient / (3.0 * np.pi * sides.mean())
-
-
-def gravity_of(physics: Physics) -> Float[np.ndarray, "3"]:
-    """Gravity in the table's frame [m/s^2]: its magnitude stays where the table is tilted."""
-    normal = np.sqrt(max(float(physics.gravity) ** 2 - float(np.sum(np.square(physics.tilt))), 0.0))
-    return np.array([*np.asarray(physics.tilt), -normal])
 
 
 def quaternions(angles: np.ndarray) -> np.ndarray:
