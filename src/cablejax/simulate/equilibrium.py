@@ -43,20 +43,6 @@ def beyond_joints(links: Any) -> Any:
     return links[::-1].cumsum(axis=0)[::-1][1:]
 
 
-def with_tension(hessian: Any, tension: Any, beyond: Any, later: Any) -> Any:
-    """Second derivative of the energy in the joint angles, with the force that holds the far end.
-
-    The second derivative of the far end with respect to angles i and j is minus what lies beyond the later one.
-
-    Args:
-        hessian: of the bending energy, shape [J, J].
-        tension: force on the far end, x and y first.
-        beyond: from `beyond_joints`.
-        later: index of the later one of two joints, shape [J, J].
-    """
-    return hessian + tension[0] * beyond[later, 0] + tension[1] * beyond[later, 1]
-
-
 @dataclasses.dataclass(frozen=True)
 class Equilibrium:
     """A shape in which the frictionless cable rests.

@@ -25,7 +25,7 @@ from cablejax.cable import Cable, Discretisation
 from cablejax.effects.given import GivenEffect, with_effects
 from cablejax.effects.physics import nominal_physics
 from cablejax.simulate.composite import link_lengths, node_offsets
-from cablejax.simulate.equilibrium import beyond_joints, links_of, with_tension
+from cablejax.simulate.equilibrium import beyond_joints, links_of
 from cablejax.simulate.keypoints import hermite_weights
 
 LINKS = 25
@@ -252,7 +252,8 @@ def _newton_step(
     tension = jnp.linalg.solve(normal, jacobian @ moments)
     pulled = beyond @ tension[:2]
     hessian = jnp.diag(bending.stiffness / h + DAMPING / length)
-    hessian = with_tension(hessian, tension, beyond, matrices.later)
+    # the far end's second derivative in two angles is minus what lies beyond the later one
+    hessian = hessian + tension[0] * beyond[matrices.later, 0] + tension[1] * beyond[matrices.later, 1]
     hessian = hessian - (pulled[:, None] + pulled) / 2 + chord @ tension[:2] / 4
     system = jnp.block([[hessian, -jacobian.T], [-jacobian, -_SMALL * jnp.eye(3, dtype=angles.dtype)]])
     step = jnp.linalg.solve(system, jnp.concatenate([jacobian.T @ tension - moments, -error]))[:joints]
