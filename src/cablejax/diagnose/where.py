@@ -35,7 +35,7 @@ HORIZONS = (1.0, 2.0, 5.0, 10.0, 20.0, 30.0)
 """Seconds since an episode's start; the value at one is taken from the one before on."""
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, kw_only=True)
 class Where:
     """Sizes and places of the gap. All `_mm` are root mean squares per coordinate above the noise [mm].
 
@@ -67,17 +67,17 @@ class Where:
     gap_mm: float
     smallest_mm: float
     along_cable_mm: Float[np.ndarray, "N"]
-    bend_per_m: Float[np.ndarray, "N2"] | None
+    bend_per_m: Float[np.ndarray, "N2"] | None = None
     per_episode_mm: Float[np.ndarray, "E"]
-    episode_p: Float[np.ndarray, "E"] | None
-    keypoint_p: Float[np.ndarray, "N"] | None
+    episode_p: Float[np.ndarray, "E"] | None = None
+    keypoint_p: Float[np.ndarray, "N"] | None = None
     heat: Float[np.ndarray, "E T N"]
     horizons_mm: dict[float, float]
     regimes: dict[str, float]
-    frames: dict[str, float]
-    contrasts: dict[str, tuple[float, float]]
-    regime_masks: dict[str, Bool[np.ndarray, "E T"]]
-    sentences: tuple[str, ...]
+    frames: dict[str, float] = dataclasses.field(default_factory=dict)
+    contrasts: dict[str, tuple[float, float]] = dataclasses.field(default_factory=dict)
+    regime_masks: dict[str, Bool[np.ndarray, "E T"]] = dataclasses.field(default_factory=dict)
+    sentences: tuple[str, ...] = ()
 
 
 def localise(log: GapLog, nominal: Float[np.ndarray, "E T N 2"], noise: Float[np.ndarray, "N"]) -> Where:
@@ -123,7 +123,6 @@ def localise(log: GapLog, nominal: Float[np.ndarray, "E T N 2"], noise: Float[np
         frames=_frames(residual, noise, nominal, log),
         contrasts=_contrasts(residual, noise, squared, regimes, motion),
         regime_masks=regimes.masks,
-        sentences=(),
     )
     sentences = describe(where, np.asarray(log.meta["keypoint_arclength_m"]), noise)
     return dataclasses.replace(where, sentences=sentences)

@@ -54,17 +54,10 @@ def sizes_of(
         gap_mm=float(above(squares, noise)) if gap_mm is None else gap_mm,
         smallest_mm=smallest_mm,
         along_cable_mm=np.nan_to_num(above(squares, noise, (0, 1, 3))),
-        bend_per_m=None,
         per_episode_mm=above(squares, noise, (1, 2, 3)),
-        episode_p=None,
-        keypoint_p=None,
         heat=np.sqrt(mean_of_finite(squares, -1)) / max(noise, 1e-6),
         horizons_mm=dict(horizons_mm),
         regimes=dict(regimes),
-        frames={},
-        contrasts={},
-        regime_masks={},
-        sentences=(),
     )
     found = describe(where, np.asarray(arclength), np.array([noise]), names)
     return dataclasses.replace(where, sentences=(*first, *found))
