@@ -19,7 +19,7 @@ network change by 4 to 54 micrometres; its own median error is 0.26 mm."""
 
 
 def smoothed(graphdef: nnx.GraphDef, weights: nnx.State, corner: float = CORNER) -> nnx.GraphDef:
-    """The structure with which the same weights are a smooth network, see `cablejax.dynamics.layers.rectified`.
+    """The structure with which the same weights are a smooth network, see `cablejax.dynamics.networks.rectified`.
 
     Args:
         graphdef: of a network of perceptrons, as `load_weights` gives it.

@@ -85,9 +85,7 @@ def expectation(
         area: over which outliers are spread [m^2].
     """
     lengths = jnp.asarray(lengths, points.dtype)
-    normal = perpendicular(shape.tangent)
-    along = points @ shape.tangent.T - jnp.sum(shape.centre * shape.tangent, axis=-1)
-    across = points @ normal.T - jnp.sum(shape.centre * normal, axis=-1) - 0.5 * shape.curvature * along**2
+    along, across = _along_across(points, shape)
     spread = (ELONGATION * lengths) ** 2 + sigma**2
     scale = jnp.log((1.0 - outlier_weight) * lengths / jnp.sum(lengths)) - jnp.log(
         2.0 * jnp.pi * sigma * jnp.sqrt(spread)
@@ -109,11 +107,17 @@ def expectation(
 def distance_to(points: Float[Array, "S 2"], shape: Curve, lengths: Any) -> Float[Array, " S"]:
     """Distance [m] of every point to the curve, shape [S]."""
     half = 0.5 * jnp.asarray(lengths, points.dtype)
+    along, across = _along_across(points, shape)
+    excess = jax.nn.relu(jnp.abs(along) - half)
+    return jnp.sqrt(jnp.min(across**2 + excess**2, axis=-1))
+
+
+def _along_across(points: Float[Array, "S 2"], shape: Curve) -> tuple[Float[Array, "S n"], Float[Array, "S n"]]:
+    """Position of each point along each link, from its middle, and distance across it [m]."""
     normal = perpendicular(shape.tangent)
     along = points @ shape.tangent.T - jnp.sum(shape.centre * shape.tangent, axis=-1)
     across = points @ normal.T - jnp.sum(shape.centre * normal, axis=-1) - 0.5 * shape.curvature * along**2
-    excess = jax.nn.relu(jnp.abs(along) - half)
-    return jnp.sqrt(jnp.min(across**2 + excess**2, axis=-1))
+    return along, across
 
 
 def embedding_stiffness(centre: Float[Array, "n 2"]) -> Float[Array, "n n"]:

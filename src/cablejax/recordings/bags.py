@@ -14,6 +14,7 @@ import numpy as np
 from cablejax.limits import require
 from cablejax.recordings.assemble import gap_log_from_takes
 from cablejax.recordings.layout import Fields, Layout, read_layout
+from cablejax.recordings.poses import poses_at
 from cablejax.recordings.prepare import prepare
 from cablejax.recordings.table import unit_quaternions
 from cablejax.recordings.take import Take
@@ -133,13 +134,10 @@ def _sorted(messages: list[tuple[float, np.ndarray]]) -> tuple[np.ndarray, list[
 
 
 def _at(time: np.ndarray, stamps: np.ndarray, rows: list[np.ndarray]) -> np.ndarray:
-    """Poses at other times, shape [T, 7]: a straight line, and the shorter way between quaternions; NaN in gaps."""
-    poses = np.array(rows)[:, 0]
-    flips = np.cumprod(np.sign((poses[1:, 3:] * poses[:-1, 3:]).sum(axis=1) + 1e-300))
-    poses[1:, 3:] *= flips[:, None]
-    track = np.stack([np.interp(time, stamps, column, np.nan, np.nan) for column in poses.T], axis=1)
-    track[:, 3:] /= np.linalg.norm(track[:, 3:], axis=1, keepdims=True)
+    """Poses at other times, shape [T, 7], see `poses_at`; NaN in gaps, before the first and after the last."""
+    track = poses_at(time, stamps, np.array(rows)[:, 0])
     after = np.clip(np.searchsorted(stamps, time), 1, len(stamps) - 1)
     far = (stamps[after] - time > LARGEST_LAG) | (time - stamps[after - 1] > LARGEST_LAG)
-    track[far & (stamps[after] != time)] = np.nan
+    outside = (time < stamps[0]) | (time > stamps[-1])
+    track[outside | (far & (stamps[after] != time))] = np.nan
     return track

@@ -81,6 +81,27 @@ def rotated(quaternion: Float[np.ndarray, "*B 4"], vector: Float[np.ndarray, "*B
     return vector + quaternion[..., :1] * twice + np.cross(axis, twice)
 
 
+def poses_at(
+    at: Float[np.ndarray, " G"], time: Float[np.ndarray, " T"], pose: Float[np.ndarray, "T *Q 7"]
+) -> Float[np.ndarray, "G *Q 7"]:
+    """Poses at other times, shape [G, *Q, 7]: a straight line, and the shorter way between quaternions.
+
+    The first and the last pose are held.
+
+    Args:
+        at: those times [s].
+        time: when the poses were, ascending [s].
+        pose: (x, y, z, qw, qx, qy, qz) [m, 1].
+    """
+    pose = pose.astype(float)
+    same = np.sign((pose[1:, ..., 3:] * pose[:-1, ..., 3:]).sum(axis=-1, keepdims=True))
+    pose[1:, ..., 3:] *= np.cumprod(np.where(same == 0, 1.0, same), axis=0)
+    columns = [np.interp(at, time, column) for column in pose.reshape(len(pose), -1).T]
+    found = np.stack(columns, axis=1).reshape(len(at), *pose.shape[1:])
+    found[..., 3:] /= np.linalg.norm(found[..., 3:], axis=-1, keepdims=True)
+    return found
+
+
 def twists(time: Float[np.ndarray, " T"], pose: Float[np.ndarray, "T Q P"]) -> Float[np.ndarray, "T Q V"]:
     """The twist that carries each pose to the next one, by finite differences; zero after the last sample.
 

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from cablejax.diagnose.clock import keypoints_at
+from cablejax.recordings.poses import poses_at
 from cablejax.types import GapLog
 
 # Clocks whose intervals are all within this share of the usual one are taken as they are.
@@ -40,7 +41,7 @@ def on_one_clock(log: GapLog) -> tuple[GapLog, tuple[str, ...]]:
         before = np.clip(np.searchsorted(time, grid + 1e-9, side="right") - 1, 0, n - 1)
         whole["time"][e] = interval * np.arange(max(length))
         whole["keypoints"][e, :samples] = _points(grid, time, log.keypoints[e, :n].astype(float), interval)
-        whole["gripper_pose"][e] = _poses(interval * np.arange(max(length)), time, log.gripper_pose[e, :n])
+        whole["gripper_pose"][e] = poses_at(interval * np.arange(max(length)), time, log.gripper_pose[e, :n])
         whole["gripper_command"][e, :samples] = log.gripper_command[e, before]
         if log.hold is not None:
             whole["hold"][e, :samples] = log.hold[e, before] & log.hold[e, np.minimum(before + 1, n - 1)]
@@ -55,14 +56,3 @@ def _points(grid, time, points: Float[np.ndarray, "T N 3"], interval: float) -> 
     # an episode may be slower than the clock: a gap is one in its own clock
     own = max(interval, float(np.median(np.diff(time)))) if len(time) > 1 else interval
     return keypoints_at(grid, time, points, own) if len(time) > 1 else points
-
-
-def _poses(grid, time, pose: Float[np.ndarray, "T Q 7"]) -> Float[np.ndarray, "G Q 7"]:
-    """Linear, quaternions made continuous before and of unit length after; the last one is held."""
-    pose = pose.astype(float)
-    same = np.sign((pose[1:, :, 3:] * pose[:-1, :, 3:]).sum(axis=-1, keepdims=True))
-    pose[1:, :, 3:] *= np.cumprod(np.where(same == 0, 1.0, same), axis=0)
-    columns = [np.interp(grid, time, column) for column in pose.reshape(len(pose), -1).T]
-    pose = np.stack(columns, axis=1).reshape(len(grid), *pose.shape[1:])
-    pose[..., 3:] /= np.linalg.norm(pose[..., 3:], axis=-1, keepdims=True)
-    return pose
