@@ -154,12 +154,12 @@ class Discretisation:
         return self.n_links - 1
 
 
-def differing(one: Cable, other: Cable, tolerance: float = 1e-9) -> dict[str, tuple[Any, Any]]:
-    """The fields in which two cables differ by more than a relative tolerance, with both values."""
+def differing(one: Cable, other: Cable) -> dict[str, tuple[Any, Any]]:
+    """The fields in which two cables differ by more than rounding, with both values."""
     found = {}
     for field in dataclasses.fields(Cable):
         a, b = getattr(one, field.name), getattr(other, field.name)
-        same = abs(a - b) <= tolerance * max(abs(a), abs(b)) if isinstance(a, (int, float)) else a == b
+        same = abs(a - b) <= 1e-9 * max(abs(a), abs(b)) if isinstance(a, (int, float)) else a == b
         if not same:
             found[field.name] = (a, b)
     return found

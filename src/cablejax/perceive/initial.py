@@ -98,7 +98,7 @@ def first_fit(
     mask: Bool[np.ndarray, " S"],
     gripper_pose: Float[np.ndarray, "Q 3"],
     *,
-    reach: float = 0.015,
+    reach: float,
 ) -> CurveFit:
     """The most likely cable in a cloud, without any prior.
 
@@ -144,7 +144,7 @@ def guessed_fits(
     mask: Bool[np.ndarray, " S"],
     gripper_pose: Float[np.ndarray, "Q 3"],
     *,
-    reach: float = 0.015,
+    reach: float,
 ) -> CurveFit:
     """The fits of all guesses to a sample of the cloud, batched, best first; arguments as of `first_fit`."""
     present = np.asarray(points, float)[np.asarray(mask)]
