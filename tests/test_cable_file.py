@@ -79,7 +79,7 @@ def test_what_is_no_cable_is_refused_by_the_name_of_its_key(changes, message):
 )
 def test_a_file_that_is_no_toml_is_refused(content, tmp_path):
     (tmp_path / "cable.toml").write_bytes(content)
-    with pytest.raises(ValueError, match=r"cable could not be read.*(no TOML|no text).*cablejax cable --out"):
+    with pytest.raises(ValueError, match=r"cable could not be read.*(no TOML|not text).*cablejax cable --out"):
         read_cable(tmp_path / "cable.toml")
     for missing in (tmp_path, tmp_path / "none.toml"):
         with pytest.raises(ValueError, match="The cable could not be read"):

@@ -70,6 +70,16 @@ def test_motions_keep_to_their_limits(first, length):
         assert np.abs(np.diff(poses[-10:], axis=0)).max() == 0.0
 
 
+@pytest.mark.parametrize("first", [[[0, 0, 1.29], [0.63, 0, 2.15]], [[0, 0, 1.9], [0.83, 0, 0.84]]])
+def test_cables_of_any_length_bear_the_same_motions(first):
+    """Relative to their length: a short cable may be bent more sharply."""
+    borne = []
+    for length in (0.4, 1.0, 2.5):
+        config = Discretisation(Cable(length=length), n_links=9)
+        borne.append(set(safe_motions(config, np.array(first) * [length, length, 1.0])))
+    assert borne[0] == borne[1] == borne[2]
+
+
 def test_motions_start_where_the_log_did():
     motions = safe_motions(CONFIG, ARCH)
     assert set(motions) == NAMES

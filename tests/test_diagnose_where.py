@@ -8,6 +8,7 @@ import time
 import numpy as np
 import pytest
 
+from cablejax.diagnose.regimes import largest_curvature
 from cablejax.diagnose.significance import LEVEL, contrast_p, variance_inflation
 from cablejax.diagnose.where import localise
 from diagnose_cases import MOTIONS, SAMPLES, log_of, poses
@@ -189,3 +190,9 @@ def test_correlated_noise_widens_its_sum_of_squares():
 def test_what_cannot_be_compared_is_refused(change, words):
     with pytest.raises(ValueError, match=words):
         localise(*change(*case(), np.full(POINTS, NOISE)))
+
+
+def test_largest_curvature_of_keypoints_that_are_not_evenly_spaced():
+    arclength = np.array([0.0, 0.05, 0.1, 0.3, 0.5, 0.8, 0.85, 1.0])
+    circle = 0.5 * np.stack([np.cos(arclength / 0.5), np.sin(arclength / 0.5)], axis=-1)
+    np.testing.assert_allclose(largest_curvature(circle[None, None], arclength), 2.0, rtol=1e-12)

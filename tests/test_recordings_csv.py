@@ -187,7 +187,7 @@ def test_missing_files_are_reported(tmp_path):
     path, layout = written(tmp_path, in_space(), PAIRS)
     with pytest.raises(ValueError, match=r"absent\.csv could not be read"):
         import_csv(tmp_path / "absent.csv", layout)
-    with pytest.raises(ValueError, match=r"no layout: There is no file"):
+    with pytest.raises(ValueError, match=r"not a layout: There is no file"):
         import_csv(path, tmp_path / "absent.toml")
 
 

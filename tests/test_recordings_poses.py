@@ -6,6 +6,7 @@ import pytest
 
 from cablejax.recordings.frames import AXES, Frame, into_frame, require_hanging, require_rigid
 from cablejax.recordings.poses import (
+    poses_at,
     poses_from_markers,
     product,
     rotated,
@@ -171,3 +172,16 @@ def test_twists_of_angles_that_are_wrapped():
     twist = twists(time, pose)
     np.testing.assert_allclose(twist[:-1, 1, 2], 0.2, atol=1e-9)
     np.testing.assert_array_equal(twist[-1], 0.0)
+
+
+def test_a_pose_that_is_not_known_spoils_its_neighbourhood_alone():
+    """Quaternions of either sign are one rotation, before and after the gap."""
+    time = np.arange(6.0)
+    pose = np.tile(np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0]), (6, 1))
+    pose[4:] *= -1.0
+    pose[:, 0] = time
+    pose[1] = np.nan
+    found = poses_at(np.array([0.5, 2.5, 3.5, 4.5]), time, pose)
+    assert np.isnan(found[0]).all()
+    np.testing.assert_allclose(found[1:, 0], [2.5, 3.5, 4.5])
+    np.testing.assert_allclose(np.abs(found[1:, 3:]), np.tile([1.0, 0.0, 0.0, 0.0], (3, 1)), atol=1e-12)

@@ -8,7 +8,6 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float, Int
 
-from cablejax.arrays import wrapped
 from cablejax.cable import Discretisation
 from cablejax.cable_file import config_of_log
 from cablejax.diagnose.actuation import Actuation, actuation
@@ -18,6 +17,7 @@ from cablejax.diagnose.noise import NoiseFloor, noise_floor
 from cablejax.diagnose.planar import PlanarCable
 from cablejax.diagnose.playback import Playback
 from cablejax.diagnose.recording import DiagnosisError, Recording, prepare
+from cablejax.diagnose.regimes import largest_curvature
 from cablejax.diagnose.run import weighed
 from cablejax.effects import LIBRARY, CableEffect
 from cablejax.effects.physics import nominal_physics
@@ -101,7 +101,7 @@ class Case:
             playback=playback,
             correction=nominal - run(playback),
             duration=float((recording.interval * recording.length).min()),
-            max_curvature=_max_curvature(nominal, config),
+            max_curvature=largest_curvature(nominal, marks).max(axis=1),
         )
         moved = arms.deviates
         predicted = replay(FIT_LINKS, LARGEST_STEP, arms.predicted) if moved else playback
@@ -136,13 +136,6 @@ class Case:
         """NaN beyond an episode's end, and as long as the log."""
         valid = np.arange(keypoints.shape[1])[None] < self.recording.length[:, None]
         return np.where(valid[..., None, None], keypoints, np.nan)[:, : self.recording.length.max()]
-
-
-def _max_curvature(nominal: Float[np.ndarray, "E T N 2"], config: Discretisation) -> Float[np.ndarray, "E"]:
-    """Largest curvature of each episode [1/m], from the turns between neighbouring chords."""
-    chord = np.diff(nominal, axis=2)
-    turn = np.abs(wrapped(np.diff(np.arctan2(chord[..., 1], chord[..., 0]), axis=-1)))
-    return turn.max(axis=(1, 2)) / (config.cable.length / (config.cable.n_keypoints - 1))
 
 
 def _first_shapes(recording: Recording) -> list[np.ndarray | None]:

@@ -52,7 +52,7 @@ def regimes_of(log: GapLog, nominal: Float[np.ndarray, "E T N 2"], valid: Bool[n
     hold = rest if log.hold is None else valid & log.hold
     fast = valid & (speed >= _FAST_SPEED)
     distance = np.linalg.norm(log.gripper_pose[:, :, 1, :2] - log.gripper_pose[:, :, 0, :2], axis=-1)
-    curvature = _largest_curvature(nominal, np.asarray(log.meta["keypoint_arclength_m"]))
+    curvature = largest_curvature(nominal, np.asarray(log.meta["keypoint_arclength_m"], float))
     length = float(log.meta["cable"]["length_m"])
     rate = np.zeros(valid.shape)
     if valid.shape[1] > 1:
@@ -123,9 +123,12 @@ def _halves(name: str, values, valid, classes: tuple[str, str]) -> dict[str, np.
     return {f"{name}: {c}": mask for c, mask in zip(classes, (low, high), strict=True)}
 
 
-def _largest_curvature(points: Float[np.ndarray, "E T N 2"], arclength) -> Float[np.ndarray, "E T"]:
+def largest_curvature(
+    points: Float[np.ndarray, "E T N 2"], arclength: Float[np.ndarray, "N"]
+) -> Float[np.ndarray, "E T"]:
+    """Largest curvature of each shape [1/m], from the turns between chords of keypoints at these arc lengths [m]."""
     edges = np.diff(points, axis=2)
     heading = np.arctan2(edges[..., 1], edges[..., 0])
     turn = wrapped(np.diff(heading, axis=-1))
-    curvature = np.abs(turn) / np.gradient(np.asarray(arclength, np.float64))[1:-1]
+    curvature = np.abs(turn) / (0.5 * (arclength[2:] - arclength[:-2]))
     return np.max(curvature, axis=-1, initial=0.0)

@@ -139,7 +139,7 @@ def safe_motions(
         ValueError: `first` is not two planar poses.
     """
     motions = {name: way.played(n_samples, bounds) for name, way in safe_ways(config, first, bounds).items()}
-    limits = MotionConfig(straight_slack=1 - FARTHEST, min_distance=NEAREST)
+    limits = MotionConfig.for_length(config.cable.length, straight_slack=1 - FARTHEST, min_distance=NEAREST)
     return {name: poses for name, poses in motions.items() if all(admissible(config, limits, p) for p in poses[::5])}
 
 

@@ -86,7 +86,7 @@ def poses_at(
 ) -> Float[np.ndarray, "G *Q 7"]:
     """Poses at other times, shape [G, *Q, 7]: a straight line, and the shorter way between quaternions.
 
-    The first and the last pose are held.
+    The first and the last pose are held; next to a pose that is NaN the result is NaN.
 
     Args:
         at: those times [s].
@@ -94,8 +94,8 @@ def poses_at(
         pose: (x, y, z, qw, qx, qy, qz) [m, 1].
     """
     pose = pose.astype(float)
-    same = np.sign((pose[1:, ..., 3:] * pose[:-1, ..., 3:]).sum(axis=-1, keepdims=True))
-    pose[1:, ..., 3:] *= np.cumprod(np.where(same == 0, 1.0, same), axis=0)
+    opposite = (pose[1:, ..., 3:] * pose[:-1, ..., 3:]).sum(axis=-1, keepdims=True) < 0
+    pose[1:, ..., 3:] *= np.cumprod(np.where(opposite, -1.0, 1.0), axis=0)
     columns = [np.interp(at, time, column) for column in pose.reshape(len(pose), -1).T]
     found = np.stack(columns, axis=1).reshape(len(at), *pose.shape[1:])
     found[..., 3:] /= np.linalg.norm(found[..., 3:], axis=-1, keepdims=True)

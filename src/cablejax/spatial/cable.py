@@ -142,13 +142,26 @@ class SpatialCable(Simulator):
         result = []
         for one in explanations:
             directions, own = self.directions(one)
-            parts = self._in_parallel(1, one, episodes, (directions,))
-            predicted = np.concatenate([part[0] for part in parts])[:, self.samples]
+            predicted, slopes = self.along(one, directions, episodes)
             if self.correction is not None:
                 predicted = predicted + self.correction[episodes]
-            slopes = np.concatenate([part[1][:, :, self.samples] for part in parts])
-            result.append((predicted, np.moveaxis(slopes, 1, 0)[own]))
+            result.append((predicted, slopes[own]))
         return result
+
+    def along(
+        self, one: Explanation, directions: Float[np.ndarray, "K P"], episodes: Int[np.ndarray, "E"]
+    ) -> tuple[Float[np.ndarray, "E T F 3"], Float[np.ndarray, "K E T F 3"]]:
+        """Free markers [m] without correction at the samples that are compared, and their derivatives.
+
+        Args:
+            one: where.
+            directions: in the vector of physical values, along which derivatives are taken: forward, exact.
+            episodes: windows to simulate.
+        """
+        parts = self._in_parallel(1, one, episodes, (directions,))
+        predicted = np.concatenate([part[0] for part in parts])[:, self.samples]
+        slopes = np.concatenate([part[1][:, :, self.samples] for part in parts])
+        return predicted, np.moveaxis(slopes, 1, 0)
 
     def evidence(self) -> Evidence:
         """The windows, weighed for fits."""
