@@ -1,11 +1,17 @@
 """The noise floor: what is put into a recording comes out again."""
 
+import dataclasses
+import re
+
 import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from cablejax.diagnose.noise import SMALLEST, noise_floor
-from diagnose_cases import holds, log_of, poses
+from cablejax.diagnose.belief import Calibration
+from cablejax.diagnose.case import Case
+from cablejax.diagnose.noise import SMALLEST, noise_floor, still
+from cablejax.diagnose.planar_run import _caveats, calibrated
+from diagnose_cases import holds, log_of, poses, record
 
 EPISODES, SAMPLES, POINTS = 4, 300, 13
 
@@ -144,3 +150,46 @@ def test_too_few_observations_are_refused():
     points[:, :10] = white(1e-3)[:1, :10]
     with pytest.raises(ValueError, match="expected at least 20"):
         noise_floor(points, None)
+
+
+def test_holds_in_which_the_grippers_move_are_none():
+    """Wrong flags would take the motion for noise, and hide any gap."""
+    pose = np.stack([poses(motion, SAMPLES) for motion in ("approach", "mirror", "translation", "ramp_hold")])
+    everywhere = np.ones((EPISODES, SAMPLES), bool)
+    kept = still(everywhere, pose)
+    keypoints = moving() + white(1e-3)
+    assert kept.mean() < 0.5 and noise_floor(keypoints, everywhere).std.max() > 0.01
+    np.testing.assert_allclose(noise_floor(keypoints, still(everywhere, pose)).rapid, 1e-3, rtol=0.05)
+    rest, flags = held()
+    np.testing.assert_array_equal(still(flags, np.repeat(rest[:, :, :2, :1], 3, axis=-1)), flags)
+    # a gripper that lags arrives within a hold
+    late = np.zeros((1, 60, 2, 3))
+    late[0, :3, 0, 0] = [0.015, 0.01, 0.005]
+    assert still(np.ones((1, 60), bool), late).all()
+
+
+def test_keypoints_that_are_seen_in_every_third_sample_only():
+    keypoints = moving() + white(1e-3)
+    keypoints[:, np.arange(SAMPLES) % 3 != 0] = np.nan
+    np.testing.assert_allclose(noise_floor(keypoints, None).std, 1e-3, rtol=0.1)
+
+
+def test_caveats_on_a_length_that_is_wrong_and_on_holds_that_are_none():
+    log = record()
+    assert not [text for text in _caveats(Case.of(log), Calibration(), commissioned=True)]
+    cable = {**log.meta["cable"], "length_m": 1.01 * log.meta["cable"]["length_m"]}
+    marks = [1.01 * s for s in log.meta["keypoint_arclength_m"]]
+    longer = dataclasses.replace(log, meta={**log.meta, "cable": cable, "keypoint_arclength_m": marks})
+    (text,) = _caveats(Case.of(longer), Calibration(), commissioned=True)
+    assert re.match(r"Keypoints are 1\.0 % closer together than the stated arc lengths, in every episode", text)
+    (text, *_) = Case.of(dataclasses.replace(log, hold=np.ones_like(log.hold))).recording.caveats
+    assert re.match(r"\d+ of 400 samples are marked as holds while the grippers move", text)
+    creeping = np.array(log.keypoints)
+    creeping[:, :, 3:10, 1] += 0.004 * np.sin(0.9 * np.arange(creeping.shape[1]))[None, :, None]
+    texts = _caveats(Case.of(dataclasses.replace(log, keypoints=creeping)), Calibration(), commissioned=True)
+    assert any("while the grippers rest, and by" in text for text in texts)
+
+
+def test_simulator_is_taken_to_be_further_off_on_a_long_cable():
+    assert calibrated(3.0).baseline == pytest.approx(3 * Calibration.baseline)
+    assert calibrated(0.4) == Calibration()

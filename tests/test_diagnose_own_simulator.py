@@ -350,3 +350,24 @@ def test_what_is_generic_imports_no_cable(name):
     imported = {node.module for node in tree.body if isinstance(node, ast.ImportFrom) and node.module}
     own = {module for module in imported if module.startswith("cablejax")}
     assert own <= ALLOWED
+
+
+class Swing(Simulator):
+    """A damped oscillation, started from other amplitudes."""
+
+    unit = "m"
+    effects = (Effect(name="stiffer", parameters=(Parameter("ratio", "", 0.1, 10, 1.5, 0.5, log=True),), null=(1.0,)),)
+
+    def predict(self, explanations, episodes):
+        time, amplitude = 0.05 * np.arange(200), np.linspace(0.5, 1.5, 3)[episodes]
+        rates = [2 * np.sqrt(one.vector(self.effects)[0]) for one in explanations]
+        return np.stack([np.outer(amplitude, np.cos(rate * time))[..., None] for rate in rates])
+
+
+def test_one_episode_shows_a_gap_and_too_little_of_it_to_name_its_cause():
+    """No effect pays for itself in it; that does not mean that the library lacks the cause."""
+    swing, noise = Swing(), 1e-3 * np.random.default_rng(0).normal(size=(2, 200, 1))
+    true = swing.predict([explanation((Swing.effects[0], 0, [1.3]))], np.arange(2))[0] + noise
+    found = [diagnose_simulator(swing, true[:count], interval=0.05, noise=1e-3) for count in (1, 2)]
+    assert [one.verdict for one in found] == ["unknown", "named"]
+    assert found[0].sentence.startswith("There is a gap, but too little of it") and "library" not in found[0].sentence

@@ -183,7 +183,7 @@ CASES = {
     ),
     "unknown": (
         lambda: diagnosis("unknown", effects=(), next_motion=following("designed", (), 2.0, "settled")),
-        "Cause not in the library",
+        "Cause unknown",
         [
             "not in the library",
             "has no cause in the library",

@@ -165,3 +165,13 @@ def test_wrong_targets_are_refused():
         ShapeCableEnv(dataclasses.replace(CONFIG, targets=(make_target("U"),)))
     with pytest.raises(ValueError, match="no shape 'X'"):
         ShapeCableEnv(CONFIG).reset(options={"target": "X"})
+
+
+def test_wrong_options_and_actions_are_refused():
+    env = ShapeCableEnv(ShapeCableConfig())
+    with pytest.raises(ValueError, match="no option 'targte' of `reset`, expected target or effects"):
+        env.reset(options={"targte": "S"})
+    with pytest.raises(ValueError, match=r"'bending_stiffness:ratio=2', expected a list"):
+        env.reset(options={"effects": "bending_stiffness:ratio=2"})
+    with pytest.raises(ValueError, match=r"action has shape \(1, 6\), expected \(2, 3\)"):
+        env.step(np.zeros(6))

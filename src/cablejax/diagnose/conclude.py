@@ -66,6 +66,7 @@ class Conclusion:
     leftover_p: float | None = None
     posterior: tuple[tuple[EffectValues, ...], ...] = ()
     under_laws: tuple[UnderLaw, ...] = ()
+    undecided: bool = False
 
 
 def conclude(found: Search, evidence: Evidence, calibration: Calibration, laws: Sequence[Law] = ()) -> Conclusion:
@@ -111,7 +112,13 @@ def _concluded(
     if _excused(under):
         return Conclusion("none", null, (), (), ranking, 0.0, None, (), under), nothing
     if not best.explanation.terms:
-        return Conclusion("unknown", best, (), (), ranking, explained, as_much, (), under), nothing
+        # an effect would do, and yet the gap is too small or in too few motions to pay for it
+        undecided = any(
+            calibration.complete(excess(float(fit.sse.sum()), evidence), gap, level(evidence))
+            for fit in found.fits
+            if fit.explanation.terms
+        )
+        return Conclusion("unknown", best, (), (), ranking, explained, as_much, (), under, undecided), nothing
 
     own = draws(evidence, best, calibration) if drawn is None else drawn
     drawn = over_laws(own, [(law.probability, each[1]) for law, each in zip(laws, shared, strict=True) if each])
@@ -278,6 +285,8 @@ def sentence(conclusion: Conclusion, shrinkage: float | None) -> str:
         return (
             f"There is no gap that needs an effect if {law.assumes}, which fits this log better than the nominal law."
         )
+    if conclusion.undecided:
+        return "There is a gap, but too little of it in this log to name its cause: record more motions."
     explained = conclusion.explained if shrinkage is None else shrinkage
     return verdict_sentence(
         conclusion.verdict, conclusion.effects, conclusion.equivalent, conclusion.ranking, explained

@@ -6,13 +6,15 @@ import dataclasses
 import math
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from cablejax.arrays import stretches
 
 # Shortest hold that is used, in samples.
 _SHORTEST_HOLD = 10
 _LAGS = 5
+# A gripper that is so far from where it is for most of a hold moves the cable [m]: further than one goes that lags.
+_MOVED = 0.02
 # A keypoint counts as noisier than the others beyond this many standard errors.
 _DISTINCT = 4.0
 
@@ -28,11 +30,13 @@ class NoiseFloor:
         std: standard deviation of each keypoint's coordinates [m], shape [N].
         correlation: autocorrelation at lags 1, 2, ... samples, shape [K].
         from_holds: whether the recording had holds to learn it from; otherwise the noise is taken to be white.
+        rapid: standard deviation by third differences alone [m]; 0 where too few were observed.
     """
 
     std: Float[np.ndarray, "N"]
     correlation: Float[np.ndarray, "K"]
     from_holds: bool
+    rapid: float = 0.0
 
 
 def noise_floor(
@@ -53,6 +57,7 @@ def noise_floor(
         ValueError: fewer than 20 observed samples of every keypoint, or no noise at all.
     """
     rapid, n_rapid = _differences(keypoints, order)
+    level = float(np.average(rapid, weights=np.maximum(n_rapid, 1e-9)))
     held = _held(keypoints, hold) if hold is not None else None
     if held is None:
         variance, count, correlation, from_holds = rapid, n_rapid, np.zeros(_LAGS), False
@@ -60,28 +65,45 @@ def noise_floor(
         variance, count, correlation = held
         from_holds = True
         if abs(correlation[0]) < 4.0 / np.sqrt(max(count.sum(), 1)) + 0.02:
-            level = float(np.average(rapid, weights=np.maximum(n_rapid, 1e-9)))
             slow = float(np.average(variance, weights=np.maximum(count, 1e-9)))
             # white noise has one level at all frequencies; a jerky recording does not
             if abs(level / slow - 1) < 0.1:
                 variance, count = rapid, n_rapid
     if count.max() < 20:
-        raise ValueError(f"The log shows a keypoint at most {int(count.max())} times, expected at least 20 samples.")
+        raise ValueError(
+            "The noise cannot be estimated: no keypoint is observed often enough, expected at least 20 times in holds, "
+            f"or 20 times more than {order} in an episode."
+        )
     common = float(np.average(variance, weights=np.maximum(count, 1e-9)))
     common, variance = max(common, smallest**2), np.maximum(variance, smallest**2)
     if not common > 0:
         raise ValueError("The observations have no noise that could be estimated: say how large it is.")
     error = common * np.sqrt(2.0 / np.maximum(count, 1.0))
     distinct = (np.abs(variance - common) > _DISTINCT * error) & (count >= 20)
-    return NoiseFloor(std=np.sqrt(np.where(distinct, variance, common)), correlation=correlation, from_holds=from_holds)
+    std = np.sqrt(np.where(distinct, variance, common))
+    return NoiseFloor(std=std, correlation=correlation, from_holds=from_holds, rapid=math.sqrt(level))
+
+
+def still(hold: Bool[np.ndarray, "E T"], gripper_pose: Float[np.ndarray, "E T 2 3"]) -> Bool[np.ndarray, "E T"]:
+    """The samples of holds in which the measured grippers stay where they are: a moving cable is no noise."""
+    kept = np.zeros_like(hold)
+    for row, flags, poses in zip(kept, hold, gripper_pose[..., :2], strict=True):
+        for begin, end in stretches(flags):
+            there = poses[begin:end]
+            row[begin:end] = np.abs(there - np.median(there, axis=0)).max(axis=(1, 2)) < _MOVED
+    return kept
 
 
 def _differences(keypoints, order: int):
-    difference, power = np.diff(keypoints, n=order, axis=1), math.comb(2 * order, order)
-    difference = difference.transpose(2, 0, 1, 3).reshape(keypoints.shape[2], -1)
-    variance, count = np.zeros(len(difference)), np.zeros(len(difference))
-    for n, row in enumerate(difference):
+    """Of neighbouring samples; of neighbouring observed ones, where a keypoint is seen in every other sample only."""
+    power, n_points = math.comb(2 * order, order), keypoints.shape[2]
+    variance, count = np.zeros(n_points), np.zeros(n_points)
+    for n in range(n_points):
+        row = np.diff(keypoints[:, :, n], n=order, axis=1)
         row = row[np.isfinite(row)]
+        if len(row) < 20:
+            seen = [points[np.isfinite(points).all(axis=-1)] for points in keypoints[:, :, n]]
+            row = np.concatenate([np.diff(points, n=order, axis=0).ravel() for points in seen])
         if len(row) >= 20:
             # without the few where something snapped
             inner = row[np.abs(row) <= 4.0 * 1.4826 * np.median(np.abs(row))]

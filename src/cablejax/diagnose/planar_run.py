@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable, Sequence
 
 import numpy as np
+from jaxtyping import Float
 
 from cablejax.diagnose.actuation import with_arms
 from cablejax.diagnose.belief import Calibration, excess
@@ -29,13 +30,18 @@ from cablejax.diagnose.where import localise
 from cablejax.effects import LIBRARY, CableEffect
 from cablejax.types import GapLog
 
+# Holds in which keypoints scatter by so many times what they do between samples are worth a word.
+_SCATTERED = 1.5
+# Likewise keypoints that are so much closer or further apart than stated.
+_LENGTH_OFF = 0.004
+
 
 def diagnose(
     log: GapLog,
     *,
     effects: Sequence[CableEffect] = LIBRARY,
     commissioning: Sequence[GapLog] = (),
-    calibration: Calibration = Calibration(),
+    calibration: Calibration | None = None,
     bounds: Bounds | None = None,
     objective: Objective = "explanations",
     progress: Callable[[str], None] = lambda text: None,
@@ -46,7 +52,7 @@ def diagnose(
         log: of a cable on a table between two grippers; its `meta` states the cable and table believed in.
         effects: what to look for; `LIBRARY` and effects of your own.
         commissioning: logs known to have no effect: how far the simulator is off without any.
-        calibration: constants of the judgement.
+        calibration: constants of the judgement; by default those for a cable of this length, see `calibrated`.
         bounds: for a next motion that is designed; None = the best of the safe motions within the default bounds.
         objective: what the next motion is to give information about.
         progress: called with a line of text now and then.
@@ -56,6 +62,8 @@ def diagnose(
         BoundsError: no motion of the cable keeps all bounds; says how many each bound excludes.
     """
     begin = time.perf_counter()
+    if calibration is None:
+        calibration = calibrated(log.meta["cable"]["length_m"])
     if commissioning:
         calibration = dataclasses.replace(calibration, baseline=baseline_error(commissioning))
     case = Case.of(log, effects)
@@ -93,6 +101,11 @@ def diagnose(
         seconds=time.perf_counter() - begin,
         settings={**settings_of(case.simulator, calibration), "links": {"fit": FIT_LINKS, "nominal": FINE_LINKS}},
     )
+
+
+def calibrated(length: float) -> Calibration:
+    """The constants for a cable of this length [m]. They were set on cables of about 1 m; longer ones err by more."""
+    return Calibration(baseline=Calibration.baseline * max(1.0, length))
 
 
 def baseline_error(logs: Sequence[GapLog]) -> float:
@@ -138,6 +151,15 @@ def _contradictions(rounds: Rounds | None) -> tuple[str, ...]:
     )
 
 
+def _closeness(case: Case) -> Float[np.ndarray, "E"]:
+    """Distance of neighbouring keypoints over that of the nominal cable's, median of each episode; 1 if not seen."""
+    seen, nominal = (
+        np.linalg.norm(np.diff(points, axis=2), axis=-1) for points in (case.recording.keypoints, case.nominal)
+    )
+    ratio = seen / nominal
+    return np.array([np.median(one[np.isfinite(one)]) if np.isfinite(one).any() else 1.0 for one in ratio])
+
+
 def _caveats(case: Case, calibration: Calibration, *, commissioned: bool) -> tuple[str, ...]:
     caveats = list(case.recording.caveats)
     if not commissioned:
@@ -153,6 +175,21 @@ def _caveats(case: Case, calibration: Calibration, *, commissioned: bool) -> tup
                 f"{1e3 * off.max():.0f} mm from their commands, more than the {1e3 * MARGIN:g} mm by which a designed "
                 "motion keeps its bounds. The diagnosis uses the measured poses."
             )
+    scatter, rapid = float(np.median(case.noise.std)), case.noise.rapid
+    if case.noise.from_holds and rapid > 0 and scatter > _SCATTERED * rapid:
+        caveats.append(
+            f"Keypoints scatter by {1e3 * scatter:.2g} mm while the grippers rest, and by {1e3 * rapid:.2g} mm from "
+            "one sample to the next: their noise is correlated, or the cable still moves in what is marked as holds. "
+            "The larger number is taken for the noise, and gaps below it are not seen."
+        )
+    ratio = _closeness(case)
+    if np.abs(ratio - 1).min() > _LENGTH_OFF and np.ptp(np.sign(ratio - 1)) == 0:
+        closer = "closer together" if ratio[0] < 1 else "further apart"
+        caveats.append(
+            f"Keypoints are {100 * abs(float(np.median(ratio)) - 1):.1f} % {closer} than the stated arc lengths, in "
+            "every episode. A wrong length_m or keypoint_arclength_m does that, as do a camera's scale and a cable "
+            "that stretches: check the length before you believe either of these."
+        )
     if case.noise.std.max() <= SMALLEST:
         caveats.append(f"The keypoints carry no noise to speak of; {1e3 * SMALLEST:g} mm is assumed.")
     return tuple(caveats)

@@ -93,6 +93,8 @@ class ShapeCableConfig:
         Raises:
             ValueError: an effect is unknown, out of bounds, or a lag.
         """
+        if isinstance(effects, str):
+            raise ValueError(f"Effects are {effects!r}, expected a list of them: [{effects!r}].")
         given = tuple(parse_effect(effect) if isinstance(effect, str) else effect for effect in effects)
         recipe = DatasetConfig(
             interval=self.interval,
@@ -209,7 +211,13 @@ class Cables:
             The rewards, minus the error; whether the target is reached or the simulation has diverged; and whether the
             time is up.
         """
-        config = self.config
+        config, shape = self.config, (len(self.taken), 2, 3)
+        if np.shape(actions) != shape:
+            raise ValueError(
+                f"The action has shape {np.shape(actions)[-2:]}, expected (2, 3): (vx, vy, omega) of both grippers."
+                if len(self.taken) == 1
+                else f"The actions have shape {np.shape(actions)}, expected {shape}."
+            )
         twists = config.scale * np.clip(np.nan_to_num(np.asarray(actions, float), posinf=0.0, neginf=0.0), -1.0, 1.0)
         twists = config.limits.shortened(twists, self.gripper_pose, config.interval) * active[:, None, None]
         self._state, shown = self._engine.rollout(self._physics, self._state, twists[:, None], config.interval)

@@ -32,6 +32,14 @@ def _spaces(config: ShapeCableConfig) -> tuple[gymnasium.spaces.Dict, gymnasium.
     return gymnasium.spaces.Dict(observed), gymnasium.spaces.Box(-1.0, 1.0, (2, 3), np.float32)
 
 
+def _known(options: dict[str, Any] | None) -> dict[str, Any]:
+    """The options of a reset; raises ValueError if there is another one than `Cables.reset` takes."""
+    options = options or {}
+    if unknown := set(options) - {"target", "effects"}:
+        raise ValueError(f"There is no option {sorted(unknown)[0]!r} of `reset`, expected target or effects.")
+    return options
+
+
 class ShapeCableEnv(gymnasium.Env):
     """`cablejax/ShapeCable-v0`: bring a cable on a table to a shape by moving both of its ends.
 
@@ -53,7 +61,7 @@ class ShapeCableEnv(gymnasium.Env):
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None):
         """A new cable; see `Cables.reset` for the options."""
         super().reset(seed=seed)
-        self.cables.reset(0, self.np_random, **(options or {}))
+        self.cables.reset(0, self.np_random, **_known(options))
         return self._observation(), self._info()
 
     def step(self, action):
@@ -96,7 +104,7 @@ class ShapeCableVectorEnv(gymnasium.vector.VectorEnv):
             if own is not None:
                 self._randoms[row] = np_random(own)[0]
         for row, random in enumerate(self._randoms):
-            self.cables.reset(row, random, **(options or {}))
+            self.cables.reset(row, random, **_known(options))
         self._ended[:] = False
         return self._observation(), self._info()
 

@@ -42,7 +42,7 @@ _BADGES: dict[Verdict, tuple[str, str]] = {
     "named": ("named", "Cause named"),
     "ambiguous": ("ambiguous", "Cause narrowed down, not settled"),
     "named+unknown": ("partly", "Part of the cause named"),
-    "unknown": ("unknown", "Cause not in the library"),
+    "unknown": ("unknown", "Cause unknown"),
 }
 _DPI = 150
 _SPACE_CAPTION = (

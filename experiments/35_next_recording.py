@@ -1,0 +1,200 @@
+"""The next recording of a real cable in space, chosen by its expected information: is it better than one at random?
+
+    python experiments/35_next_recording.py --data $CABLEJAX_DATA/deform --executor 2     # resumable
+    python experiments/35_next_recording.py --report docs/results/next_recording.md
+
+Replayed on recorded motion. A cable is known from three windows of 5 s, drawn from the train split, and everything is
+fitted to them. Twelve other windows of that split are candidates for the next recording. Before it is looked at, each
+has an expected information about the parameters, from the motion of its clamps alone: what the fit leaves open, sent
+through the simulator's derivatives, over the error of a good fit; the recording's own grip is not asked for. Then the
+cable is fitted with each candidate in turn, and scored on upstream's eval split.
+
+One candidate is chosen by the information, and one by a simple rule: the motion whose clamps move fastest. Random
+choice scores what the candidates do on average, and the best that a choice could do is the best of them.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import functools
+import os
+import pathlib
+from collections.abc import Sequence
+from typing import Any
+
+os.environ.setdefault("NPROC", "4")
+
+import numpy as np
+from jaxtyping import Float
+from scipy.stats import spearmanr
+
+from cablejax.diagnose.information import parameter_information
+from cablejax.diagnose.protocol import Explanation
+from cablejax.recordings.deform import NOMINAL, read_deform
+from cablejax.simulate.rod import Rod
+from cablejax.spatial.accidents import moderated
+from cablejax.spatial.cable import SpatialCable, errors
+from cablejax.spatial.effects import GRIP
+from cablejax.spatial.estimate import Estimate, estimate
+from cablejax.spatial.identify import EDGES, identify
+from cablejax.spatial.windows import Windows
+from executors import add_option, executor_of
+from pages import markdown_table, page_of_results, publish, share
+from real_cables.protocol import cables_in, protocol_windows
+from real_cables.synthetic import synthetic_recordings
+from rows import Rows
+
+FIRST, CANDIDATES = 3, 12
+"""Windows that are known at first, and windows that the next one is chosen from."""
+SEED = 35
+# Rows of derivatives are taken in multiples of this, so that few numbers of them are compiled for.
+_COLUMNS = 8
+SYNTHETIC, FIRST_CABLE = "synthetic", 2000
+"""Cables of known stiffness, by both simulators of `34_fresh_cables.py` in turn, and the seed of the first."""
+ROWS = pathlib.Path("docs") / "results" / "trials" / "next_recording.jsonl"
+
+
+def information(cable: SpatialCable, found: Estimate) -> Float[np.ndarray, "W"]:
+    """Expected information of recording each of the cable's windows about the parameters of an estimate [nats].
+
+    What jackknife and priors leave open of the values is sent through the simulator's derivatives, and compared with
+    the error of a good fit. The recording's own grip is not asked for. Only the motion of the clamps and the first two
+    samples enter, not what the markers do then.
+
+    Args:
+        cable: in the windows that may be recorded.
+        found: what is known.
+    """
+    left_open, grip = np.concatenate([found.moves, found.shifts]), cable.layout.slots("gripper_rotation_offset")
+    count, own = len(left_open), np.arange(grip.start, grip.stop)
+    rows = np.zeros((-(-(count + len(own)) // _COLUMNS) * _COLUMNS, cable.layout.size))
+    rows[:count] = left_open
+    rows[count + np.arange(len(own)), own] = GRIP
+    evidence = cable.evidence()
+    slopes = cable.along(shared(found), rows, evidence.episodes)[1] / evidence.noise
+    seen = np.isfinite(evidence.observed) & np.isfinite(slopes).all(axis=0)
+    flat = np.where(seen, slopes, 0.0).swapaxes(0, 1).reshape(len(seen), len(rows), -1)
+    return np.array([parameter_information(each[:count], each[count : count + len(own)]) for each in flat])
+
+
+def shared(found: Estimate) -> Explanation:
+    """The estimate's explanation with what all recordings share, for a recording that was not fitted."""
+    one = found.explanation
+    return dataclasses.replace(one, own=np.zeros((0, one.own.shape[1])))
+
+
+def trial(data: str | None, name: str, seed: int) -> dict[str, Any]:
+    """One cable from three windows, and with each candidate as the fourth."""
+    rng, truth = np.random.default_rng([SEED, seed]), None
+    if name == SYNTHETIC:
+        made, recordings = synthetic_recordings(FIRST_CABLE + seed, "richer" if seed % 2 else "composite", 24)
+        truth, windows = float(np.log(made.stiffness / made.laden)), protocol_windows(recordings)
+        windows = dataclasses.replace(windows, split=("train",) * 16 + ("eval",) * (len(windows) - 16))
+    else:
+        assert data is not None
+        windows = protocol_windows(read_deform(cables_in(pathlib.Path(data))[name]))
+    is_eval, whole = np.array(windows.split) == "eval", windows.whole(len(windows))
+    drawn = rng.permutation(whole[~is_eval[whole]])[: FIRST + CANDIDATES]
+    first, candidates = drawn[:FIRST], drawn[FIRST:]
+    found = identify(windows.chosen(first), NOMINAL.stiffness_over_density)
+    known, checked = found.everything, found.cable.on(windows.chosen(np.flatnonzero(is_eval)))
+    fitted = dataclasses.replace(found.cable, rod=Rod(EDGES, 1, twisting=False)).finer(found.time_steps.substeps)
+    gain = information(fitted.on(windows.chosen(candidates)), known)
+    scored = [_score(checked, known)]
+    for candidate in candidates:
+        both = fitted.on(windows.chosen(np.append(first, candidate)))
+        scored.append(_score(checked, estimate(both, [known.explanation], found.tried)))
+    return {
+        "windows": drawn.tolist(),
+        "information_nats": gain.tolist(),
+        "clamp_speed_m_per_s": [clamp_speed(windows.chosen([c])) for c in candidates],
+        "true_log_stiffness": truth,
+        **{f"before_{name}": value for name, value in scored[0].items()},
+        **{f"after_{name}": [one[name] for one in scored[1:]] for name in scored[0]},
+    }
+
+
+def clamp_speed(windows: Windows) -> float:
+    """Root mean square speed of the clamps [m/s]."""
+    step = np.diff(np.where(windows.valid[:, :, None, None], windows.position, np.nan), axis=1) / windows.interval
+    return float(np.sqrt(np.nanmean((step**2).sum(axis=-1))))
+
+
+def _score(checked: SpatialCable, known: Estimate) -> dict[str, float]:
+    """Mean error on unseen windows [mm], none counted beyond ten times the median; the logarithms of EI / rho and of the
+    ratio of its interval's ends."""
+    share = checked.windows.keypoints.shape[2] / checked.windows.n_keypoints
+    error, stiffness = moderated(errors(checked.motion(shared(known)), checked.windows)), known.stiffness
+    return {
+        "mm": 1e3 * share * float(error.mean()),
+        "log_stiffness": float(np.log(stiffness.value)),
+        "log_interval": float(np.log(stiffness.high / stiffness.low)),
+    }
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--data", help="folder of recorded cables, .npz; without it, synthetic cables")
+    parser.add_argument("--seeds", type=int, default=6, help="draws of windows for each cable, or synthetic cables")
+    parser.add_argument("--rows", type=pathlib.Path, default=ROWS, help="file of the finished rows")
+    parser.add_argument("--report", type=pathlib.Path, help="write the page of the finished rows, and run nothing")
+    add_option(parser)
+    options = parser.parse_args()
+    rows = Rows(options.rows, ("cable", "seed"))
+    if options.report is not None:
+        publish(page(rows.read()), options.report)
+        return
+    names = [SYNTHETIC] if options.data is None else cables_in(pathlib.Path(options.data))
+    wanted = [(name, seed) for seed in range(options.seeds) for name in names]
+    with executor_of(options.executor) as executor:
+        rows.run(rows.missing(wanted), functools.partial(trial, options.data), executor=executor)
+
+
+def page(rows: Sequence[dict[str, Any]]) -> str:
+    """The tables, and what they are of."""
+    lines = [
+        f"{len(rows)} draws. Each cable is known from {FIRST} windows of 5 s; the next is one of {CANDIDATES} others. "
+        "`by information` is the one whose motion is expected to tell most about the parameters, before its markers "
+        "are seen; `fastest` the one whose clamps move fastest; `at random` the mean over all of them; `best` what "
+        "nobody can choose beforehand. Means over draws, of intervals geometric ones.",
+        "",
+    ]
+    for title, before, after, mean in (
+        ("90 % interval of EI/rho: upper end over lower end", "before_log_stiffness", "after_log_stiffness", np.exp),
+        ("Error on the eval split, recordings' own grips unknown [mm]", "before_mm", "after_mm", float),
+    ):
+        table = [["cable", "before", "at random", "fastest", "by information", "best"]]
+        cables = sorted({row["cable"] for row in rows})
+        for name in [*cables, "all"]:
+            of = [row for row in rows if name in (row["cable"], "all")]
+            cells = [[row[before], *_choices(row, after).values()] for row in of]
+            table.append([name, *(f"{mean(value):.2f}" for value in np.mean(cells, axis=0))])
+        nearer = [(lambda c: c["by information"] < c["at random"])(_choices(row, after)) for row in rows]
+        faster = [(lambda c: c["fastest"] < c["at random"])(_choices(row, after)) for row in rows]
+        ranks = np.array([spearmanr(row["information_nats"], row[after])[0] for row in rows])
+        error = ranks.std(ddof=1) / np.sqrt(len(ranks))
+        lines += [f"## {title}", "", *markdown_table(table), ""]
+        lines += [
+            f"Less than at random: by information in {' draws, '.join(share(nearer))}; fastest in "
+            f"{' draws, '.join(share(faster))}. Rank correlation of the information with this over the candidates: "
+            f"{ranks.mean():.2f} ± {error:.2f} (mean and its standard error; -1 would be perfect).",
+            "",
+        ]
+    made_by = "`python experiments/35_next_recording.py --data $CABLEJAX_DATA/deform` and `--report`"
+    return page_of_results("The next recording of a real cable", made_by, lines)
+
+
+def _choices(row: dict[str, Any], after: str) -> dict[str, float]:
+    """What each way of choosing among the candidates leads to."""
+    values = np.array(row[after])
+    return {
+        "at random": float(values.mean()),
+        "fastest": float(values[np.argmax(row["clamp_speed_m_per_s"])]),
+        "by information": float(values[np.argmax(row["information_nats"])]),
+        "best": float(values.min()),
+    }
+
+
+if __name__ == "__main__":
+    main()
