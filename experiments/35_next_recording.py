@@ -122,7 +122,7 @@ def clamp_speed(windows: Windows) -> float:
 
 
 def _score(checked: SpatialCable, known: Estimate) -> dict[str, float]:
-    """Mean error on unseen windows [mm], none counted beyond ten times the median; the logarithms of EI / rho and of the
+    """Mean error on unseen windows [mm], none counted beyond ten times the median; logarithms of EI / rho and of the
     ratio of its interval's ends."""
     share = checked.windows.keypoints.shape[2] / checked.windows.n_keypoints
     error, stiffness = moderated(errors(checked.motion(shared(known)), checked.windows)), known.stiffness
