@@ -1,13 +1,15 @@
 """The next recording of a real cable in space, chosen by its expected information: is it better than one at random?
 
     python experiments/35_next_recording.py --data $CABLEJAX_DATA/deform --executor 2     # resumable
+    python experiments/35_next_recording.py --seeds 12 --executor 2                       # synthetic cables
     python experiments/35_next_recording.py --report docs/results/next_recording.md
 
 Replayed on recorded motion. A cable is known from three windows of 5 s, drawn from the train split, and everything is
 fitted to them. Twelve other windows of that split are candidates for the next recording. Before it is looked at, each
 has an expected information about the parameters, from the motion of its clamps alone: what the fit leaves open, sent
 through the simulator's derivatives, over the error of a good fit; the recording's own grip is not asked for. Then the
-cable is fitted with each candidate in turn, and scored on upstream's eval split.
+cable is fitted with each candidate in turn, and scored on upstream's eval split. Synthetic cables, whose stiffness is
+known, go the same way.
 
 One candidate is chosen by the information, and one by a simple rule: the motion whose clamps move fastest. Random
 choice scores what the candidates do on average, and the best that a choice could do is the best of them.
@@ -40,7 +42,7 @@ from cablejax.spatial.estimate import Estimate, estimate
 from cablejax.spatial.identify import EDGES, identify
 from cablejax.spatial.windows import Windows
 from executors import add_option, executor_of
-from pages import markdown_table, page_of_results, publish, share
+from pages import markdown_table, page_of_results, publish
 from real_cables.protocol import cables_in, protocol_windows
 from real_cables.synthetic import synthetic_recordings
 from rows import Rows
@@ -153,41 +155,72 @@ def main() -> None:
 
 def page(rows: Sequence[dict[str, Any]]) -> str:
     """The tables, and what they are of."""
+    real = [row for row in rows if row["cable"] != SYNTHETIC]
+    known = [row | _off(row) for row in rows if row["cable"] == SYNTHETIC]
     lines = [
-        f"{len(rows)} draws. Each cable is known from {FIRST} windows of 5 s; the next is one of {CANDIDATES} others. "
-        "`by information` is the one whose motion is expected to tell most about the parameters, before its markers "
-        "are seen; `fastest` the one whose clamps move fastest; `at random` the mean over all of them; `best` what "
-        "nobody can choose beforehand. Means over draws, of intervals geometric ones.",
+        f"{len(real)} draws of {FIRST} windows of 5 s from real cables, and {len(known)} synthetic cables known from "
+        f"{FIRST} recordings of 1 s; the next is one of {CANDIDATES} others. `by information` is the one whose motion "
+        "is expected to tell most about the parameters, before its markers are seen; `fastest` the one whose clamps "
+        "move fastest; `at random` the mean over all of them; `best` what nobody can choose beforehand. Means over "
+        "draws; of intervals, geometric ones.",
+        "",
+        "A next motion will be recommended for a cable in space once its information ranks candidates better than "
+        "chance.",
         "",
     ]
-    for title, before, after, mean in (
-        ("90 % interval of EI/rho: upper end over lower end", "before_log_stiffness", "after_log_stiffness", np.exp),
-        ("Error on the eval split, recordings' own grips unknown [mm]", "before_mm", "after_mm", float),
+    for title, of, field, mean in (
+        ("Real cables: 90 % interval of EI/rho, upper end over lower end", real, "log_interval", np.exp),
+        ("Real cables: error on upstream's eval split, grips unknown [mm]", real, "mm", float),
+        ("Synthetic cables: EI/rho off the true value [%]", known, "off", float),
+        ("Synthetic cables: error on unseen recordings, grips unknown [mm]", known, "mm", float),
     ):
-        table = [["cable", "before", "at random", "fastest", "by information", "best"]]
-        cables = sorted({row["cable"] for row in rows})
-        for name in [*cables, "all"]:
-            of = [row for row in rows if name in (row["cable"], "all")]
-            cells = [[row[before], *_choices(row, after).values()] for row in of]
-            table.append([name, *(f"{mean(value):.2f}" for value in np.mean(cells, axis=0))])
-        nearer = [(lambda c: c["by information"] < c["at random"])(_choices(row, after)) for row in rows]
-        faster = [(lambda c: c["fastest"] < c["at random"])(_choices(row, after)) for row in rows]
-        ranks = np.array([spearmanr(row["information_nats"], row[after])[0] for row in rows])
-        error = ranks.std(ddof=1) / np.sqrt(len(ranks))
-        lines += [f"## {title}", "", *markdown_table(table), ""]
-        lines += [
-            f"Less than at random: by information in {' draws, '.join(share(nearer))}; fastest in "
-            f"{' draws, '.join(share(faster))}. Rank correlation of the information with this over the candidates: "
-            f"{ranks.mean():.2f} ± {error:.2f} (mean and its standard error; -1 would be perfect).",
-            "",
+        lines += [f"## {title}", "", *_table(of, field, mean), ""]
+    made_by = (
+        "`python experiments/35_next_recording.py --data $CABLEJAX_DATA/deform`, the same with `--seeds 12` and no "
+        "`--data`, and `--report docs/results/next_recording.md`"
+    )
+    return page_of_results("The next recording of a cable in space", made_by, lines)
+
+
+def _off(row: dict[str, Any]) -> dict[str, Any]:
+    """By how much EI / rho is off the true value before and after [%]."""
+    true = row["true_log_stiffness"]
+    return {
+        "before_off": 100 * abs(float(np.expm1(row["before_log_stiffness"] - true))),
+        "after_off": (100 * np.abs(np.expm1(np.array(row["after_log_stiffness"]) - true))).tolist(),
+    }
+
+
+def _table(rows: Sequence[dict[str, Any]], field: str, mean) -> list[str]:
+    """By cable, and what either rule gains."""
+    table = [["cable", "before", "at random", "fastest", "by information", "best"]]
+    cables = sorted({row["cable"] for row in rows})
+    for name in [*cables, *(["all"] if len(cables) > 1 else [])]:
+        cells = [
+            [row[f"before_{field}"], *_choices(row, field).values()] for row in rows if name in (row["cable"], "all")
         ]
-    made_by = "`python experiments/35_next_recording.py --data $CABLEJAX_DATA/deform` and `--report`"
-    return page_of_results("The next recording of a real cable", made_by, lines)
+        table.append([name, *(f"{mean(value):.2f}" for value in np.mean(cells, axis=0))])
+    words = []
+    for rule in ("by information", "fastest"):
+        gain = np.array([_choices(row, field)[rule] - _choices(row, field)["at random"] for row in rows])
+        number, unit = f"{gain.mean():+.2f} ± {_error(gain):.2f}", " in the logarithm" if mean is np.exp else ""
+        words.append(f"{rule} {number}{unit}, less in {int((gain < 0).sum())} of {len(gain)} draws")
+    ranks = np.array([spearmanr(row["information_nats"], row[f"after_{field}"])[0] for row in rows])
+    return [
+        *markdown_table(table),
+        "",
+        f"Compared with random choice (mean ± standard error): {'; '.join(words)}. Rank correlation of the information "
+        f"with this over the candidates: {ranks.mean():+.2f} ± {_error(ranks):.2f} (-1 would be perfect).",
+    ]
 
 
-def _choices(row: dict[str, Any], after: str) -> dict[str, float]:
+def _error(values: Float[np.ndarray, "K"]) -> float:
+    return float(values.std(ddof=1) / np.sqrt(len(values)))
+
+
+def _choices(row: dict[str, Any], field: str) -> dict[str, float]:
     """What each way of choosing among the candidates leads to."""
-    values = np.array(row[after])
+    values = np.array(row[f"after_{field}"])
     return {
         "at random": float(values.mean()),
         "fastest": float(values[np.argmax(row["clamp_speed_m_per_s"])]),
