@@ -55,6 +55,7 @@ class Conclusion:
         leftover_p: of the test whether it leaves more than a right one does, by `belief.leftover_p`; None: no gap.
         posterior: see `Diagnosis`.
         under_laws: see `Diagnosis`.
+        undecided: whether an effect that pays too little for itself would leave nothing, where none is named.
     """
 
     verdict: Verdict
