@@ -185,8 +185,7 @@ CASES = {
         lambda: diagnosis("unknown", effects=(), next_motion=following("designed", (), 2.0, "settled")),
         "Cause unknown",
         [
-            "not in the library",
-            "has no cause in the library",
+            "is explained by none of the effects that were tried",
             "closest: intrinsic curvature",
             "Record the <b>designed motion",
         ],

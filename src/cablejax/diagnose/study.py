@@ -21,7 +21,7 @@ Ended = Literal["clear", "unknown", "inseparable", "rounds"]
 
 ENDED: dict[Ended, str] = {
     "clear": "The answer is clear.",
-    "unknown": "The library has no cause that explains all of the gap, which more of the same does not change.",
+    "unknown": "No effect of the library explains all of the gap.",
     "inseparable": "No motion that was tried separates what is left: measure one of these causes by other means.",
     "rounds": "No rounds are left: give more with --rounds.",
 }

@@ -182,7 +182,7 @@ def _cards(diagnosis: CableDiagnosis) -> Iterator[tuple[str, str, str]]:
     else:
         best = max(diagnosis.ranking, key=lambda r: (r.probability or 0.0, r.held_out_shrinkage), default=None)
         note = "" if best is None else f"closest: {effect_title(best.name)}, which is not enough"
-        yield ("Cause", "not in the library", note)
+        yield ("Cause", "unknown", note)
         yield ("Place of the cause", "unknown", _peak(diagnosis))
     if gap.shrinkage is not None and diagnosis.explained is not None:
         interval = "" if gap.shrinkage_ci90 is None else f"90 % interval {between(*gap.shrinkage_ci90)}, "

@@ -94,12 +94,15 @@ def _verdict_under(law: UnderLaw) -> str:
 
 
 def what_is_left(diagnosis: CableDiagnosis) -> str:
-    """What has no cause in the library; "" where everything has one."""
+    """What no effect explains; "" where everything is explained."""
     if diagnosis.verdict not in ("unknown", "named+unknown"):
         return ""
     gap = diagnosis.gap
     left = millimetres(max(gap.after_rmse_mm**2 - gap.noise_floor_mm**2, 0.0) ** 0.5)
-    text = f"What is left after the best explanation, {left} above the noise, has no cause in the library."
+    text = (
+        f"What is left after the best explanation, {left} above the noise, is explained by none of the effects that "
+        "were tried."
+    )
     if diagnosis.leftover_p is None:
         return text
     share_of = f"{100 * diagnosis.leftover_p:.0f} %"
