@@ -32,17 +32,16 @@ from jaxtyping import Float
 from scipy.stats import spearmanr
 
 from cablejax.diagnose.information import parameter_information
-from cablejax.diagnose.protocol import Explanation
 from cablejax.recordings.deform import NOMINAL, read_deform
 from cablejax.simulate.rod import Rod
-from cablejax.spatial.accidents import moderated
-from cablejax.spatial.cable import SpatialCable, errors
+from cablejax.spatial.cable import SpatialCable
 from cablejax.spatial.effects import GRIP
 from cablejax.spatial.estimate import Estimate, estimate
 from cablejax.spatial.identify import EDGES, identify
 from cablejax.spatial.windows import Windows
 from executors import add_option, executor_of
 from pages import markdown_table, page_of_results, publish
+from real_cables.benchmark import errors_of, shared_only
 from real_cables.protocol import cables_in, protocol_windows
 from real_cables.synthetic import synthetic_recordings
 from rows import Rows
@@ -50,8 +49,6 @@ from rows import Rows
 FIRST, CANDIDATES = 3, 12
 """Windows that are known at first, and windows that the next one is chosen from."""
 SEED = 35
-# Rows of derivatives are taken in multiples of this, so that few numbers of them are compiled for.
-_COLUMNS = 8
 SYNTHETIC, FIRST_CABLE = "synthetic", 2000
 """Cables of known stiffness, by both simulators of `34_fresh_cables.py` in turn, and the seed of the first."""
 ROWS = pathlib.Path("docs") / "results" / "trials" / "next_recording.jsonl"
@@ -69,21 +66,12 @@ def information(cable: SpatialCable, found: Estimate) -> Float[np.ndarray, "W"]:
         found: what is known.
     """
     left_open, grip = np.concatenate([found.moves, found.shifts]), cable.layout.slots("gripper_rotation_offset")
-    count, own = len(left_open), np.arange(grip.start, grip.stop)
-    rows = np.zeros((-(-(count + len(own)) // _COLUMNS) * _COLUMNS, cable.layout.size))
-    rows[:count] = left_open
-    rows[count + np.arange(len(own)), own] = GRIP
-    evidence = cable.evidence()
-    slopes = cable.along(shared(found), rows, evidence.episodes)[1] / evidence.noise
+    rows, evidence = np.concatenate([left_open, GRIP * np.eye(cable.layout.size)[grip]]), cable.evidence()
+    slopes = cable.along(shared_only(found.explanation), rows, evidence.episodes)[1] / evidence.noise
     seen = np.isfinite(evidence.observed) & np.isfinite(slopes).all(axis=0)
     flat = np.where(seen, slopes, 0.0).swapaxes(0, 1).reshape(len(seen), len(rows), -1)
-    return np.array([parameter_information(each[:count], each[count : count + len(own)]) for each in flat])
-
-
-def shared(found: Estimate) -> Explanation:
-    """The estimate's explanation with what all recordings share, for a recording that was not fitted."""
-    one = found.explanation
-    return dataclasses.replace(one, own=np.zeros((0, one.own.shape[1])))
+    count = len(left_open)
+    return np.array([parameter_information(each[:count], each[count:]) for each in flat])
 
 
 def trial(data: str | None, name: str, seed: int) -> dict[str, Any]:
@@ -126,10 +114,9 @@ def clamp_speed(windows: Windows) -> float:
 def _score(checked: SpatialCable, known: Estimate) -> dict[str, float]:
     """Mean error on unseen windows [mm], none counted beyond ten times the median; logarithms of EI / rho and of the
     ratio of its interval's ends."""
-    share = checked.windows.keypoints.shape[2] / checked.windows.n_keypoints
-    error, stiffness = moderated(errors(checked.motion(shared(known)), checked.windows)), known.stiffness
+    predicted, stiffness = checked.motion(shared_only(known.explanation)), known.stiffness
     return {
-        "mm": 1e3 * share * float(error.mean()),
+        "mm": errors_of(predicted, checked.windows).mean,
         "log_stiffness": float(np.log(stiffness.value)),
         "log_interval": float(np.log(stiffness.high / stiffness.low)),
     }

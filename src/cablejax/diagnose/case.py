@@ -6,14 +6,14 @@ import dataclasses
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
 from cablejax.cable import Discretisation
 from cablejax.cable_file import config_of_log
 from cablejax.diagnose.actuation import Actuation, actuation
 from cablejax.diagnose.belief import Calibration
 from cablejax.diagnose.evidence import Evidence, repeated_motions
-from cablejax.diagnose.noise import NoiseFloor, noise_floor, still
+from cablejax.diagnose.noise import NoiseFloor, noise_floor
 from cablejax.diagnose.planar import PlanarCable
 from cablejax.diagnose.playback import Playback
 from cablejax.diagnose.recording import DiagnosisError, Recording, prepare
@@ -66,11 +66,7 @@ class Case:
             DiagnosisError: the log cannot be diagnosed; the message says why and what to do.
         """
         recording = prepare(log)
-        hold = recording.hold
-        if hold is not None:
-            hold = still(hold, recording.gripper_pose)
-            recording = dataclasses.replace(recording, hold=hold, caveats=_of_holds(recording, hold))
-        noise = noise_floor(recording.keypoints, hold)
+        noise = noise_floor(recording.keypoints, recording.hold)
         arms = actuation(
             recording.gripper_pose,
             recording.gripper_command if recording.has_commands else None,
@@ -140,19 +136,6 @@ class Case:
         """NaN beyond an episode's end, and as long as the log."""
         valid = np.arange(keypoints.shape[1])[None] < self.recording.length[:, None]
         return np.where(valid[..., None, None], keypoints, np.nan)[:, : self.recording.length.max()]
-
-
-def _of_holds(recording: Recording, kept: Bool[np.ndarray, "E T"]) -> tuple[str, ...]:
-    """The recording's caveats, and one on holds that are none."""
-    assert recording.hold is not None
-    wrong = int((recording.hold & ~kept).sum())
-    if not wrong:
-        return recording.caveats
-    return (
-        *recording.caveats,
-        f"{wrong} of {int(recording.hold.sum())} samples are marked as holds while the grippers move. They are not "
-        "taken for holds.",
-    )
 
 
 def _first_shapes(recording: Recording) -> list[np.ndarray | None]:

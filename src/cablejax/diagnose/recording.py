@@ -10,6 +10,7 @@ from jaxtyping import Float
 
 from cablejax.cable_length import BENT, bent_chord
 from cablejax.diagnose.clock import Samples, furthest_off, is_even, on_even_clock, usual_interval
+from cablejax.diagnose.noise import still
 from cablejax.gaplog import validate
 from cablejax.types import GapLog
 
@@ -35,7 +36,7 @@ class Recording:
         keypoints: [m], NaN = not observed or padding, shape [E, T, N, 2].
         gripper_pose: theta continuous, the last one held over the padding, shape [E, T, 2, 3].
         gripper_command: zero over the padding, shape [E, T, 2, 3].
-        hold: shape [E, T], or None.
+        hold: where the grippers rest too, shape [E, T], or None.
         interval: between samples [s], shape [E].
         length: valid samples, shape [E].
         caveats: what had to be repaired or is missing, in words.
@@ -119,6 +120,12 @@ def prepare(log: GapLog) -> Recording:
         pose[e, n:], command[e, : n - 1] = samples.gripper_pose[-1], samples.gripper_command[: n - 1]
         # both grippers by the same whole turns, so that an episode which repeats another one is known by its angles
         pose[e, ..., 2] += 2 * np.pi * np.round((pose[0, 0, 0, 2] - pose[e, 0, 0, 2]) / (2 * np.pi))
+    marked, hold = hold, still(hold, pose)
+    if wrong := int((marked & ~hold).sum()):
+        caveats.append(
+            f"{wrong} of {int(marked.sum())} samples are marked as holds while the grippers move. They are not taken "
+            "for holds."
+        )
     recording = Recording(
         keypoints=points,
         gripper_pose=pose,

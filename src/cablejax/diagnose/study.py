@@ -17,7 +17,7 @@ from cablejax.diagnose.safe_motions import INTERVAL, there_and_back
 from cablejax.types import GapLog
 
 Ended = Literal["clear", "unknown", "inseparable", "rounds"]
-"""There is a clear answer; the cause is not in the library; no motion separates what is left; no rounds are left."""
+"""There is a clear answer; no effect explains all of the gap; no motion separates what is left; no rounds are left."""
 
 ENDED: dict[Ended, str] = {
     "clear": "The answer is clear.",

@@ -103,8 +103,9 @@ class ShapeCableVectorEnv(gymnasium.vector.VectorEnv):
         for row, own in enumerate(seeds or []):
             if own is not None:
                 self._randoms[row] = np_random(own)[0]
+        options = _known(options)
         for row, random in enumerate(self._randoms):
-            self.cables.reset(row, random, **_known(options))
+            self.cables.reset(row, random, **options)
         self._ended[:] = False
         return self._observation(), self._info()
 

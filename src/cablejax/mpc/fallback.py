@@ -31,7 +31,8 @@ class Decision(NamedTuple):
     """The decision on a command.
 
     Attributes:
-        plan: to carry out the first command of; its `result` is the solver's.
+        plan: to carry out the first command of; its `result` is the solver's, and its `value` that of the solver's plan
+            or of rest, also where the motion is another.
         action: an `Action`, shape [].
     """
 

@@ -31,6 +31,7 @@ GOOD_FIT = 0.01
 TWISTED = "intrinsic_curvature"
 """The effect that needs the material frame, whose derivatives take four times as long as all others together."""
 _CHUNK = 4
+# Derivatives are taken along multiples of so many directions, so that few numbers of them are compiled for.
 _COLUMNS = 8
 # What a simulation has lost is off by this [m].
 _LOST = 1.0
@@ -158,10 +159,13 @@ class SpatialCable(Simulator):
             directions: in the vector of physical values, along which derivatives are taken: forward, exact.
             episodes: windows to simulate.
         """
-        parts = self._in_parallel(1, one, episodes, (directions,))
+        count = len(directions)
+        rows = np.zeros((max(_COLUMNS * -(-count // _COLUMNS), _COLUMNS), self.layout.size))
+        rows[:count] = directions
+        parts = self._in_parallel(1, one, episodes, (rows,))
         predicted = np.concatenate([part[0] for part in parts])[:, self.samples]
         slopes = np.concatenate([part[1][:, :, self.samples] for part in parts])
-        return predicted, np.moveaxis(slopes, 1, 0)
+        return predicted, np.moveaxis(slopes, 1, 0)[:count]
 
     def evidence(self) -> Evidence:
         """The windows, weighed for fits."""
@@ -206,13 +210,13 @@ class SpatialCable(Simulator):
         return values
 
     def directions(self, one: Explanation) -> tuple[Float[np.ndarray, "K P"], Int[np.ndarray, "C"]]:
-        """Rows of derivatives of the vector by the coordinates, padded, and which of them each column of a fit is."""
+        """Rows of derivatives of the vector by the coordinates, and which of them each column of a fit is."""
         slots = {e.name: np.arange(self.layout.size)[self.layout.slots(e.name)] for e in self.effects}
         columns = np.concatenate([np.zeros(0, int), *(slots[name] for name in one.names)])
         parameters = [p for term in one.terms for p in term.effect.parameters]
         values = np.concatenate([np.zeros(0), *one.values()])
         count = len(columns)
-        rows = np.zeros((max(_COLUMNS * -(-count // _COLUMNS), _COLUMNS), self.layout.size))
+        rows = np.zeros((count, self.layout.size))
         rows[np.arange(count), columns] = [
             p.scale * (v if p.log else 1.0) for p, v in zip(parameters, values, strict=True)
         ]

@@ -233,7 +233,7 @@ def estimate_at(evidence: Evidence, fit: Fit) -> Estimate:
     cable, one = evidence.simulator, fit.explanation
     assert isinstance(cable, SpatialCable)
     # of the vector by the coordinates
-    slopes = cable.directions(one)[0][: len(one.z)]
+    slopes = cable.directions(one)[0]
     moves, shifts = _rows(evidence, fit)
     return Estimate(cable.layout, one, moves @ slopes, shifts @ slopes, cable.windows.speed)
 
