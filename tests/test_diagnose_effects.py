@@ -11,10 +11,12 @@ import pytest
 
 from cablejax.cable import Discretisation
 from cablejax.diagnose import LIBRARY, CableEffect, Parameter
+from cablejax.diagnose.case import FINE_LINKS
 from cablejax.diagnose.check import check_effect
 from cablejax.effects.physics import nominal_physics
 from cablejax.simulate import MjxEngine, compiler_options
 from cablejax.simulate.chain.replay import Chain
+from diagnose_cases import evidence
 
 NAMES = {
     "bending_stiffness", "stiffness_profile", "intrinsic_curvature", "plasticity", "bending_hysteresis",
@@ -96,3 +98,21 @@ def test_chain_moves_like_the_mjx_engine():
     moved = np.abs(np.asarray(points[-1] - points[0])).max()
     assert moved > 0.01
     assert difference < 2e-5
+
+
+@pytest.mark.parametrize("other", [(), (("bending_stiffness", (0.6,)),)], ids=["alone", "and a softer cable"])
+def test_obstacle_is_sought_where_the_observed_cable_is_stopped(other):
+    disc = np.array([0.42, 0.25, 0.03])
+    facts = evidence(("obstacle", tuple(disc)), *other, n_links=FINE_LINKS)
+    effect = {one.name: one for one in LIBRARY}["obstacle"]
+    starts = [values for _, values in facts.simulator.starts(effect, facts.nominal, facts.observed - facts.nominal)]
+    assert 1 <= len(starts) <= 3
+    for x, y, radius in starts:
+        assert np.linalg.norm(facts.observed - [x, y], axis=-1).min() > radius - 1e-6
+    assert np.hypot(*(np.array(starts[0][:2]) - disc[:2])) < disc[2]
+
+
+def test_no_obstacle_is_sought_where_nothing_was_seen():
+    facts = evidence()
+    effect = {one.name: one for one in LIBRARY}["obstacle"]
+    assert not facts.simulator.starts(effect, facts.nominal, np.full_like(facts.nominal, np.nan))

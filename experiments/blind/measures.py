@@ -125,6 +125,8 @@ def table(cases: list[Scored]) -> list[Row]:
         )
     )
     add("unknown recall, no name beside it", [c.said == "unknown" for c in unknowns], "", "")
+    partly = [c.is_cause(name) for c in cases if c.said == "named+unknown" for name in c.named]
+    add("effects named beside an unknown cause that are there, or a look-alike", partly, "", "")
     add("both of a pair", [set(c.truth) <= set(c.named) for c in pairs], ">= 50 %", "75 %", 0.5)
     add("both of a pair, equivalents counted", [set(c.truth) <= c.reported for c in pairs], "", "")
     add("at least one of a pair", [bool(set(c.truth) & set(c.named)) for c in pairs], ">= 90 %", "97 %", 0.9)

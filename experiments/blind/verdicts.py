@@ -86,6 +86,11 @@ class Scored:
             return set().union(*sets)
         return found.union(*(group for group in sets if group & found))
 
+    def is_cause(self, name: str) -> bool:
+        """Whether a named effect is there, or one that is said to be equivalent to it."""
+        groups = [set(group) for group in (self.verdict or {}).get("equivalent") or []]
+        return bool(set(self.truth) & {name}.union(*(group for group in groups if name in group)))
+
     def ranked(self, count: int) -> list[str]:
         """The most probable names of the ranking."""
         ranking = (self.verdict or {}).get("ranking") or []

@@ -50,6 +50,10 @@ SCORES = (
 """Of 80 logs of the blind check of seed 20270404, printed by `python experiments/22_blind_score.py
 docs/results/blind/20270404/cases.jsonl --leftovers`."""
 
+BESIDE_UNKNOWN = 0.27
+"""Share of the effects named beside an unknown cause that are causes, or have a cause among their look-alikes: 14 of 51
+in the blind checks from seed 20270404 on, as `experiments/22_blind_score.py` prints for each."""
+
 
 @dataclasses.dataclass(frozen=True)
 class Calibration:
@@ -74,7 +78,7 @@ class Calibration:
         set_odds: an effect belongs to the reported set if its odds against the best are at least these,
         as_good: or if it leaves at most this many times what the best leaves, see the function `as_good`.
         widening: of the intervals of parameters, for a law that is not quite the real one shifts them too.
-        max_terms: effects in one explanation at most.
+        max_effects: in one explanation at most, one that repeats counted once.
     """
 
     baseline: float = 3.5e-4
@@ -91,7 +95,7 @@ class Calibration:
     set_odds: float = 0.08
     as_good: float = 1.25
     widening: float = 1.5
-    max_terms: int = 3
+    max_effects: int = 3
 
     def temper(self, gap: Float[np.ndarray, "E"], noise: float) -> Float[np.ndarray, "E"]:
         """See the module's docstring; `gap` of each episode and `noise` in metres per coordinate."""

@@ -152,7 +152,18 @@ def _concluded(
         return Conclusion("unknown", best, (), (), ranking, explained, as_much, (), under), nothing
     order = np.argsort([-e.probability for e in effects])
     named = tuple(effects[i] for i in order)
+    if verdict == "named+unknown":
+        named = tuple(_beside_unknown(effect, evidence.simulator.beside_unknown) for effect in named)
     return Conclusion(verdict, best, named, tuple(equivalent), ranking, explained, as_much, (), under), drawn
+
+
+def _beside_unknown(effect: NamedEffect, causes: float | None) -> NamedEffect:
+    """The effect as a part of an explanation that is not complete: what is missing may be what it stands for.
+
+    Among the effects of the library it is as probable as before; that share of such names are causes.
+    """
+    assert effect.probability is not None
+    return dataclasses.replace(effect, probability=None if causes is None else causes * effect.probability)
 
 
 def _excused(under: Sequence[UnderLaw]) -> bool:

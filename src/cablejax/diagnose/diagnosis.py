@@ -46,7 +46,8 @@ class NamedEffect:
     Attributes:
         name: from the gap log's list of names.
         probability: posterior that this effect is a cause, among all explanations with it or with another effect in its
-            place, were the cause one of those that were tried; None where nothing of the kind was computed.
+            place, were the cause one of those that were tried; beside an unknown cause, times the share of such names
+            that are causes (`Simulator.beside_unknown`). None where nothing of the kind was computed.
         parameters: by the names of the format.
         location: keys `PLACES`; None where an effect has no such place.
     """

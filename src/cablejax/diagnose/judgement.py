@@ -75,7 +75,7 @@ def verdict_sentence(
         "named": f"The gap comes from {names}, {explains} {share} of it.",
         "ambiguous": f"The gap comes from {names}{either}.{too}",
         "named+unknown": (
-            f"Part of the gap, {share}, is explained by {names}{rivals}; the rest by no effect of the library.{too}"
+            f"Part of the gap, {share}, looks like {names}{rivals}; the rest like no effect of the library.{too}"
         ),
         "unknown": f"The gap has a cause that is not in the library: the best explanation takes away {share} of it.",
     }[verdict]

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, cast
 
 import numpy as np
 from jaxtyping import Float
 
 from cablejax.cable import Discretisation
-from cablejax.diagnose.belief import SCORES
+from cablejax.diagnose.belief import BESIDE_UNKNOWN, SCORES
 from cablejax.diagnose.playback import Playback
 from cablejax.diagnose.protocol import Explanation, Report, Simulator
 from cablejax.effects.base import CableEffect, Context
@@ -50,6 +50,7 @@ class PlanarCable(Simulator):
             broadcasts against [E, T, N, 2].
         duration: of the shortest episode [s].
         max_curvature: largest curvature of the nominal cable in each episode [1/m], shape [E].
+        resized: the cable with another length than stated, where keypoints suggest one, by what that assumes in words.
     """
 
     effects: Sequence[CableEffect]
@@ -57,12 +58,14 @@ class PlanarCable(Simulator):
     correction: Float[np.ndarray, "E T N 2"]
     duration: float
     max_curvature: Float[np.ndarray, "E"]
+    resized: Mapping[str, PlanarCable] = dataclasses.field(default_factory=dict)
     right_scores = SCORES
+    beside_unknown = BESIDE_UNKNOWN
 
     @property
     def other_laws(self) -> dict[str, Simulator]:
-        """The same cable by each of `OTHER_LAWS`."""
-        believed, laws = self.playback.believed, {}
+        """The same cable by each of `OTHER_LAWS`, and with another length."""
+        believed, laws = self.playback.believed, dict[str, Simulator](self.resized)
         for assumes, changed in OTHER_LAWS.items():
             values = {name: np.asarray(value, believed.friction.dtype) for name, value in changed.items()}
             playback = dataclasses.replace(self.playback, believed=dataclasses.replace(believed, **values))

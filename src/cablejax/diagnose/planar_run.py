@@ -7,7 +7,6 @@ import time
 from collections.abc import Callable, Sequence
 
 import numpy as np
-from jaxtyping import Float
 
 from cablejax.diagnose.actuation import with_arms
 from cablejax.diagnose.belief import Calibration, excess
@@ -17,6 +16,7 @@ from cablejax.diagnose.diagnosis import CableDiagnosis, Gap
 from cablejax.diagnose.evidence import Evidence
 from cablejax.diagnose.fit import evaluate
 from cablejax.diagnose.gap import held_out_predictions, measure_gap
+from cablejax.diagnose.length import Length, other_length, with_other_length
 from cablejax.diagnose.motion_bounds import Bounds, BoundsError
 from cablejax.diagnose.motion_design import DesignConfig
 from cablejax.diagnose.motion_judge import MARGIN, Judge, Objective
@@ -32,8 +32,6 @@ from cablejax.types import GapLog
 
 # Holds in which keypoints scatter by so many times what they do between samples are worth a word.
 _SCATTERED = 1.5
-# Likewise keypoints that are so much closer or further apart than stated.
-_LENGTH_OFF = 0.004
 
 
 def diagnose(
@@ -69,8 +67,23 @@ def diagnose(
     case = Case.of(log, effects)
     if bounds is not None:
         require_some_motion(case.simulator.playback, case.noise.std, bounds)
+    length = other_length(case, log)
+    if length is not None:
+        case = with_other_length(case, length, log)
     evidence = case.evidence(calibration)
     found, conclusion = explain(evidence, calibration, progress=progress)
+    if length is not None and (probability := length.probability(conclusion.under_laws)) > 0.5:
+        progress(f"again, as {length.assumes}")
+        again = diagnose(
+            length.applied(log),
+            effects=effects,
+            commissioning=commissioning,
+            calibration=calibration,
+            bounds=bounds,
+            objective=objective,
+            progress=progress,
+        )
+        return length.taken(again, probability)
     conclusion = with_arms(conclusion, case.arms, calibration)
 
     progress("fitting without each episode in turn")
@@ -87,11 +100,12 @@ def diagnose(
             none_kept = (f"There is no motion to record next under the explanations found. {error}",)
     repaired = case.recording.as_log(log.meta)
     rounds = rounds_of(log, found.fits, found.scores, evidence, calibration)
+    caveats = _caveats(case, calibration, length, commissioned=bool(commissioning))
     return CableDiagnosis(
         **Examined(evidence, found, conclusion, reference, after, gap).fields(),
         where=localise(repaired, case.to_log(reference), case.noise.std),
         next_motion=following,
-        caveats=(*_contradictions(rounds), *_caveats(case, calibration, commissioned=bool(commissioning)), *none_kept),
+        caveats=(*_contradictions(rounds), *caveats, *none_kept),
         log=repaired,
         nominal=case.to_log(reference),
         explained=None if conclusion.verdict == "none" else case.to_log(after),
@@ -151,16 +165,7 @@ def _contradictions(rounds: Rounds | None) -> tuple[str, ...]:
     )
 
 
-def _closeness(case: Case) -> Float[np.ndarray, "E"]:
-    """Distance of neighbouring keypoints over that of the nominal cable's, median of each episode; 1 if not seen."""
-    seen, nominal = (
-        np.linalg.norm(np.diff(points, axis=2), axis=-1) for points in (case.recording.keypoints, case.nominal)
-    )
-    ratio = seen / nominal
-    return np.array([np.median(one[np.isfinite(one)]) if np.isfinite(one).any() else 1.0 for one in ratio])
-
-
-def _caveats(case: Case, calibration: Calibration, *, commissioned: bool) -> tuple[str, ...]:
+def _caveats(case: Case, calibration: Calibration, length: Length | None, *, commissioned: bool) -> tuple[str, ...]:
     caveats = list(case.recording.caveats)
     if not commissioned:
         caveats.append(
@@ -182,13 +187,10 @@ def _caveats(case: Case, calibration: Calibration, *, commissioned: bool) -> tup
             "one sample to the next: their noise is correlated, or the cable still moves in what is marked as holds. "
             "The larger number is taken for the noise, and gaps below it are not seen."
         )
-    ratio = _closeness(case)
-    if np.abs(ratio - 1).min() > _LENGTH_OFF and np.ptp(np.sign(ratio - 1)) == 0:
-        closer = "closer together" if ratio[0] < 1 else "further apart"
+    if length is not None:
         caveats.append(
-            f"Keypoints are {100 * abs(float(np.median(ratio)) - 1):.1f} % {closer} than the stated arc lengths, in "
-            "every episode. A wrong length_m or keypoint_arclength_m does that, as do a camera's scale and a cable "
-            "that stretches: check the length before you believe either of these."
+            f"Keypoints are {length.apart}. A wrong length_m or keypoint_arclength_m does that, as do a camera's scale "
+            "and a cable that stretches: check the length before you believe either of these."
         )
     if case.noise.std.max() <= SMALLEST:
         caveats.append(f"The keypoints carry no noise to speak of; {1e3 * SMALLEST:g} mm is assumed.")

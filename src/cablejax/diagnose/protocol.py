@@ -168,6 +168,8 @@ class Simulator(abc.ABC):
         unit: of the observations; all have the same.
         right_scores: scores of right explanations on labelled recordings like this one, see `belief.leftover_p`; empty
             where nobody has made any, and then no p-value is computed.
+        beside_unknown: share of the effects named beside an unknown cause that are causes, on labelled recordings;
+            None where nobody has made any, and then such names have no probability.
         plan: of the search and of the fits.
         recording: of every episode, counted from 0; only needed where a recording has numbers of its own.
         fits_unseen: whether what a recording has for its own is fitted even to one that is held out: a nuisance that
@@ -177,6 +179,7 @@ class Simulator(abc.ABC):
     effects: Sequence[Effect]
     unit: str = "m"
     right_scores: Sequence[float] = ()
+    beside_unknown: float | None = None
     plan: Plan = Plan()
     recording: Sequence[int] | Int[np.ndarray, "E"] = ()
     fits_unseen: bool = False

@@ -19,6 +19,8 @@ _FINALISTS = 9
 _BASES = 3
 _PARTNERS = 6
 _NEGLIGIBLE = 0.1
+# Of a set, an effect that repeats counted as often as it does: three keypoints off their places and another cause.
+_MOST_TERMS = 6
 
 
 @dataclasses.dataclass(frozen=True)
@@ -68,24 +70,29 @@ def search(
     # the leaders until they rest: what is taken for a missing second effect may be a valley not walked to its end
     fits = _best([*improved(evidence, fits[:_BASES], plan.last_steps), *fits[_BASES:]], evidence, calibration)
 
-    def adequate(fit: Fit) -> bool:
-        return calibration.complete(excess(float(fit.sse.sum()), evidence), gap, level(evidence))
+    def grow(fits: list[Fit], bases: Sequence[Fit]) -> list[Fit]:
+        """Sets of one more effect each, until the best is adequate or the next one no better."""
+        for size in range(1 + max(len(base.explanation.terms) for base in bases), _MOST_TERMS + 1):
+            if calibration.complete(excess(float(fits[0].sse.sum()), evidence), gap, level(evidence)):
+                break
+            progress(f"fitting sets of {size} effects")
+            grown = [fit for base in bases for fit in _grown(evidence, base.explanation, calibration)]
+            best_before = log_scores(fits[:1], evidence, calibration)[0]
+            fits = _joined(fits, grown, evidence, calibration)
+            if log_scores(fits[:1], evidence, calibration)[0] < best_before + 1.0:
+                break
+            bases = fits[:1]
+        return fits
 
-    bases = [fit for fit in fits if fit.explanation.terms][:_BASES]
-    for size in range(2, calibration.max_terms + 1):
-        if adequate(fits[0]):
-            break
-        progress(f"fitting sets of {size} effects")
-        grown = [fit for base in bases for fit in _grown(evidence, base.explanation)]
-        best_before = log_scores(fits[:1], evidence, calibration)[0]
-        fits = _joined(fits, grown, evidence, calibration)
-        if log_scores(fits[:1], evidence, calibration)[0] < best_before + 1.0:
-            break
-        bases = fits[:1]
+    if singles:
+        fits = grow(fits, [fit for fit in fits if fit.explanation.terms][:_BASES])
     if len(effect_names(fits[0].explanation)) > 1:
         progress("exchanging the effects of the best set one by one")
-        exchanged = [fit for rest in without_one(fits[0].explanation) for fit in _grown(evidence, rest)]
+        before = fits[0].explanation
+        exchanged = [fit for rest in without_one(before) for fit in _grown(evidence, rest, calibration)]
         fits = _joined(fits, exchanged, evidence, calibration)
+        if fits[0].explanation is not before:
+            fits = grow(fits, fits[:1])
     return Search(tuple(fits), log_scores(fits, evidence, calibration), screened)
 
 
@@ -115,9 +122,12 @@ def _joined(fits: list[Fit], more: list[Fit], evidence: Evidence, calibration: C
     return _best([*best, *rest], evidence, calibration)
 
 
-def _grown(evidence: Evidence, base: Explanation) -> list[Fit]:
+def _grown(evidence: Evidence, base: Explanation, calibration: Calibration) -> list[Fit]:
     """The base with one more effect each, the most promising ones fitted together with it."""
-    partners = [e for e in evidence.simulator.effects if e.name not in base.names or e.repeatable]
+    full = len(effect_names(base)) >= calibration.max_effects
+    partners = [e for e in evidence.simulator.effects if (e.repeatable if e.name in base.names else not full)]
+    if not partners:
+        return []
     templates = screen(evidence, base, partners, evidence.predict([base])[0])
     # An obstacle that is not quite in its place touches in other episodes: what its template takes away says little.
     fixed = [template for template in templates if template.start.terms[-1].effect.amplitude is None]

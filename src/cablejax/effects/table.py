@@ -5,12 +5,16 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from jaxtyping import Float
 
 from cablejax.cable import Discretisation
 from cablejax.effects.base import CableEffect, Context
 from cablejax.effects.effect import Parameter
 
-_DISC, _MOST_PLACES = 0.03, 10
+# Discs tried as obstacles: of which size at most, how many, and how far apart [m].
+_LARGEST, _MOST_DISCS, _APART = 0.06, 3, 0.05
+# Of the search for them: the grid's step over the cable's length, every which sample, and how near touches [m].
+_GRID, _EVERY, _CONTACT = 0.015, 4, 6e-3
 
 
 def _believed(config: Discretisation) -> float:
@@ -178,44 +182,58 @@ class Obstacle(CableEffect):
         )
 
     def starts(self, context):
-        """A disc of 3 cm at the places from which the cable seems to be pushed."""
-        return [(0, (x, y, _DISC)) for x, y in _pushed(context)]
+        """Discs that the simulated cable passes through and the observed one lies against."""
+        return [(0, disc) for disc in _in_the_way(context)]
 
     def location(self, values, variant, config):
         """The disc's centre on the table [m]."""
         return {"table_m": [float(values[0]), float(values[1])]}
 
 
-def _pushed(context: Context) -> list[tuple[float, float]]:
-    """Candidate places of a disc: next to the observed cable, on the side from which it is pushed, never inside it.
+def _in_the_way(context: Context) -> list[tuple[float, float, float]]:
+    """Candidate discs (x, y, radius) [m], best first: none overlaps the observed cable at any time.
 
-    The candidates are points a radius away from observed keypoints that deviate, against the deviation. An observed
-    cable never passes through the obstacle, so candidates that it comes closer to than half a radius are dropped.
+    Every point of a grid gets the largest such disc. It is as good as the simulated cable is deep in it, summed over
+    the times at which the observed cable lies against it: a cable that is stopped stays there, one that merely moves
+    otherwise does not. The prior of the radius decides between a disc and a larger one behind it.
     """
-    deviation = np.linalg.norm(context.residual, axis=-1)
-    observed = context.keypoints + context.residual
-    usable = np.isfinite(deviation)
-    usable[:, :, [0, -1]] = False
-    if not usable.any():
-        return []
-    limit = np.nanquantile(deviation[usable], 0.95)
-    chosen = usable & (deviation >= limit)
-    at = observed[chosen]
-    against = -context.residual[chosen] / deviation[chosen][:, None]
-    centres = at + _DISC * against
-    squares, first, visits = np.unique(
-        np.round(centres / 0.03).astype(int), axis=0, return_index=True, return_counts=True
+    observed, simulated = (
+        points[:, ::_EVERY].reshape(-1, *points.shape[2:])
+        for points in (context.keypoints + context.residual, context.keypoints)
     )
-    del squares
-    every = observed[:, ::3].reshape(-1, 2)
-    every = every[np.isfinite(every).all(axis=1)]
-    result = []
-    for index in first[np.argsort(-visits)]:
-        centre = centres[index]
-        clear = np.sqrt(((every - centre) ** 2).sum(axis=1).min()) > 0.5 * _DISC
-        apart = all(np.hypot(*(centre - other)) > 0.05 for other in result)
-        if clear and apart:
-            result.append((float(centre[0]), float(centre[1])))
-        if len(result) == _MOST_PLACES:
+    seen = np.isfinite(observed).all(axis=(1, 2)) & np.isfinite(simulated).all(axis=(1, 2))
+    if not seen.any():
+        return []
+    observed, simulated = observed[seen], simulated[seen]
+    low, high = simulated.min(axis=(0, 1)), simulated.max(axis=(0, 1))
+    step = _GRID * context.config.cable.length
+    axes = [np.arange(begin, end + step, step) for begin, end in zip(low, high, strict=True)]
+    grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
+    away = _distances(grid, observed)
+    radius = away.min(axis=1)
+    fits = (radius > Obstacle.parameters[2].low) & (radius < _LARGEST)
+    grid, away, radius = grid[fits], away[fits], radius[fits]
+    depth = np.maximum(radius[:, None] - _distances(grid, simulated), 0.0)
+    against = np.exp(-(((away - radius[:, None]) / _CONTACT) ** 2))
+    size = Obstacle.parameters[2]
+    prior = np.exp(-0.5 * (np.log(radius / size.centre) / size.scale) ** 2)
+    score = (np.sqrt(depth) * against).sum(axis=1) * prior
+    result: list[tuple[float, float, float]] = []
+    for i in np.argsort(-score, kind="stable"):
+        if score[i] <= 0 or len(result) == _MOST_DISCS:
             break
+        if all(np.hypot(*(grid[i] - disc[:2])) > _APART for disc in result):
+            result.append((float(grid[i, 0]), float(grid[i, 1]), float(radius[i])))
+    return result
+
+
+def _distances(points: Float[np.ndarray, "P 2"], cables: Float[np.ndarray, "M N 2"]) -> Float[np.ndarray, "P M"]:
+    """Distance of every point from every cable, straight between keypoints [m]."""
+    begin, along = cables[:, :-1].astype(np.float32), np.diff(cables, axis=1).astype(np.float32)
+    square = np.maximum((along**2).sum(axis=-1), 1e-12)
+    result = np.empty((len(points), len(cables)), np.float32)
+    for i, point in enumerate(points.astype(np.float32)):
+        there = point - begin
+        share = np.clip((there * along).sum(axis=-1) / square, 0.0, 1.0)
+        result[i] = np.sqrt(((there - share[..., None] * along) ** 2).sum(axis=-1).min(axis=-1))
     return result

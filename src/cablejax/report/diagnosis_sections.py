@@ -6,6 +6,7 @@ import itertools
 import json
 from collections.abc import Sequence
 
+from cablejax.diagnose.belief import BESIDE_UNKNOWN
 from cablejax.diagnose.diagnosis import CableDiagnosis, Diagnosis, NamedEffect, UnderLaw
 from cablejax.diagnose.judgement import listed, look_alikes
 from cablejax.report.effect_words import (
@@ -106,7 +107,13 @@ def what_is_left(diagnosis: CableDiagnosis) -> str:
     if diagnosis.leftover_p is None:
         return text
     share_of = f"{100 * diagnosis.leftover_p:.0f} %"
-    return f"{text} On labelled logs of simulated cables, right explanations leave as much in {share_of} of the cases."
+    text += f" On labelled logs of simulated cables, right explanations leave as much in {share_of} of the cases."
+    if diagnosis.effects:
+        text += (
+            f" Of the effects named there beside an unknown cause, {share(BESIDE_UNKNOWN)} are causes; the others only "
+            "resemble what is not in the library."
+        )
+    return text
 
 
 def ranking_note(diagnosis: CableDiagnosis) -> str:

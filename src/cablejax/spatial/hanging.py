@@ -186,7 +186,7 @@ def diagnose_wire(photographs: Photographs, progress: Callable[[str], None] = la
         fit_freedom=LEAST_SQUARES,
         prior_cost=1.0,
         as_good=1.0,
-        max_terms=2,
+        max_effects=2,
     )
     spread = np.full((observed.shape[2], 1), noise)
     nominal = checked_nominal(wire, observed, spread)

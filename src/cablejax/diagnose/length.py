@@ -1,0 +1,110 @@
+"""The cable's length, as its keypoints show it.
+
+A stated length that is 1 % wrong looks like a cable that stretches. Where keypoints are closer together or further
+apart than stated in every episode, a cable of the length that they suggest is one more law of the simulator, see
+`laws`: it is as likely beforehand as any other, and where the log makes it the most probable one, it is taken.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.stats import t as student
+
+from cablejax.diagnose.case import Case
+from cablejax.diagnose.diagnosis import CableDiagnosis, ParameterEstimate, UnderLaw
+from cablejax.diagnose.recording import DiagnosisError
+from cablejax.types import GapLog
+
+# Keypoints that are so much closer together or further apart than stated are worth a word.
+_OFF = 0.004
+
+
+@dataclasses.dataclass(frozen=True)
+class Length:
+    """A length that differs from the stated one.
+
+    Attributes:
+        stated: in the log [m].
+        measured: with its 90 % interval over episodes, None where there is one only.
+    """
+
+    stated: float
+    measured: ParameterEstimate
+
+    @property
+    def ratio(self) -> float:
+        """Measured over stated."""
+        return self.measured.value / self.stated
+
+    @property
+    def apart(self) -> str:
+        """In words: how far apart keypoints are."""
+        word = "closer together" if self.ratio < 1 else "further apart"
+        return f"{100 * abs(self.ratio - 1):.1f} % {word} than the stated arc lengths, in every episode"
+
+    @property
+    def assumes(self) -> str:
+        """In words, for a law of the simulator."""
+        return f"the cable is {self.measured.value:.4g} m long, not {self.stated:.4g} m as stated"
+
+    def probability(self, laws: Sequence[UnderLaw]) -> float:
+        """Of this length, among all laws that were tried; 0 where it was not tried."""
+        return sum(law.probability for law in laws if law.assumes == self.assumes)
+
+    def taken(self, diagnosis: CableDiagnosis, probability: float) -> CableDiagnosis:
+        """A diagnosis with this length, which says so."""
+        caveat = (
+            f"Keypoints are {self.apart}. A cable of {self.measured.value:.4g} m explains this log better than any "
+            f"effect of one of the stated {self.stated:.4g} m (probability {probability:.2f}), and that length is "
+            "taken. Measure the cable between the grippers, and correct length_m and keypoint_arclength_m."
+        )
+        return dataclasses.replace(
+            diagnosis,
+            sentence=f"{diagnosis.sentence} That is so if {self.assumes}.",
+            caveats=(caveat, *diagnosis.caveats),
+            quantities={**diagnosis.quantities, "length_m": self.measured},
+        )
+
+    def applied(self, log: GapLog) -> GapLog:
+        """The log of a cable of the measured length, its keypoints at the same shares of it."""
+        cable = log.meta["cable"] | {"length_m": self.measured.value}
+        marks = [float(s * self.ratio) for s in log.meta["keypoint_arclength_m"]]
+        return dataclasses.replace(log, meta=log.meta | {"cable": cable, "keypoint_arclength_m": marks})
+
+
+def other_length(case: Case, log: GapLog) -> Length | None:
+    """The length that the keypoints suggest, if it differs from the stated one in every episode in the same direction.
+
+    Args:
+        case: of the log.
+        log: with the stated length.
+    """
+    ratio = _closeness(case)
+    if np.abs(ratio - 1).min() <= _OFF or np.ptp(np.sign(ratio - 1)) > 0:
+        return None
+    stated = float(log.meta["cable"]["length_m"])
+    mean, count = float(ratio.mean()), len(ratio)
+    half = float(student.ppf(0.95, count - 1) * ratio.std(ddof=1) / np.sqrt(count)) if count > 1 else None
+    interval = None if half is None else (stated * (mean - half), stated * (mean + half))
+    return Length(stated, ParameterEstimate(stated * mean, interval, "m"))
+
+
+def with_other_length(case: Case, length: Length, log: GapLog) -> Case:
+    """The case, its simulator with the other length as one more law; as it is where such a cable would be torn."""
+    try:
+        other = Case.of(length.applied(log), case.simulator.effects).simulator
+    except DiagnosisError:
+        return case
+    return dataclasses.replace(case, simulator=dataclasses.replace(case.simulator, resized={length.assumes: other}))
+
+
+def _closeness(case: Case) -> np.ndarray:
+    """Distance of neighbouring keypoints over that of the nominal cable's, median of each episode; 1 if not seen."""
+    seen, nominal = (
+        np.linalg.norm(np.diff(points, axis=2), axis=-1) for points in (case.recording.keypoints, case.nominal)
+    )
+    ratio = seen / nominal
+    return np.array([np.median(one[np.isfinite(one)]) if np.isfinite(one).any() else 1.0 for one in ratio])
