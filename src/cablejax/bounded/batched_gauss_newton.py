@@ -23,6 +23,11 @@ Kept = TypeVar("Kept")
 # A coordinate this close to its bound is at it.
 _AT_BOUND = 1e-9
 
+# Damping begins at the first; an accepted step multiplies it by `_EASED`, a rejected one by `_RAISED`.
+_DAMPING, _EASED, _RAISED = 1e-2, 0.2, 8.0
+# It is never below the first, after a rejected step never below the second; at the third a problem has stalled.
+_LEAST_DAMPING, _LEAST_RAISED, _MOST_DAMPING = 1e-4, 0.1, 1e3
+
 
 @dataclasses.dataclass(frozen=True)
 class Linearised(Generic[Kept]):
@@ -83,22 +88,11 @@ class BatchedGaussNewton:
         tolerance: a problem has converged once a step promises to lower its value by less than this.
         max_steps: trial points of each problem, accepted or not.
         largest_step: longest change of one coordinate in one step; points are best given in units in which 1 is much.
-        damping: at the start.
-        eased: damping is multiplied by this after an accepted step, down to `least_damping`.
-        raised: damping is multiplied by this after a rejected step, to `least_raised` at least.
-        least_damping, least_raised: see there.
-        most_damping: a problem has stalled where damping has come to this.
     """
 
     tolerance: float
     max_steps: int
     largest_step: float = np.inf
-    damping: float = 1e-2
-    eased: float = 0.2
-    raised: float = 8.0
-    least_damping: float = 1e-4
-    least_raised: float = 0.1
-    most_damping: float = 1e3
 
     def minimise(
         self,
@@ -112,7 +106,7 @@ class BatchedGaussNewton:
             linearise: problems by their index in `starts` at trial points, all of one step in one call; the results
                 in the mapping's order.
         """
-        now, damping, trials_made = list(starts), np.full(len(starts), self.damping), np.zeros(len(starts), int)
+        now, damping, trials_made = list(starts), np.full(len(starts), _DAMPING), np.zeros(len(starts), int)
         results = [self._at_start(start) for start in starts]
         for _ in range(self.max_steps):
             trials = {}
@@ -129,10 +123,10 @@ class BatchedGaussNewton:
             for i, there in zip(trials, linearise(trials), strict=True):
                 trials_made[i] += 1
                 if there.value < now[i].value:
-                    now[i], damping[i] = there, max(damping[i] * self.eased, self.least_damping)
+                    now[i], damping[i] = there, max(damping[i] * _EASED, _LEAST_DAMPING)
                 else:
-                    damping[i] = max(damping[i] * self.raised, self.least_raised)
-                    results[i] = Result.STALLED if damping[i] >= self.most_damping else Result.STEP_LIMIT
+                    damping[i] = max(damping[i] * _RAISED, _LEAST_RAISED)
+                    results[i] = Result.STALLED if damping[i] >= _MOST_DAMPING else Result.STEP_LIMIT
         return [Minimised(*ended) for ended in zip(now, results, trials_made.tolist(), strict=True)]
 
     def _at_start(self, start: Linearised[Kept]) -> Result:

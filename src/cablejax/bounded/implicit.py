@@ -7,7 +7,6 @@ from typing import Any
 
 import equinox as eqx
 import jax
-import lineax as lx
 import optimistix as optx
 from jaxtyping import Array
 
@@ -24,18 +23,13 @@ class FixedPointAdjoint(optx.AbstractAdjoint):
     Hessian-vector product for every element of y. Where a bound is touched without holding (its multiplier is 0) the
     solution has a kink, and no derivative. Where the minimum is not isolated, or the function there is not a number,
     lineax raises as the derivative is taken, under `vmap` for the whole batch.
-
-    Attributes:
-        linear_solver: of the system `d(P(y - grad f) - y) / dy`.
     """
-
-    linear_solver: lx.AbstractLinearSolver = lx.AutoLinearSolver(well_posed=None)
 
     def apply(self, primal_fn, rewrite_fn, inputs, tags):
         """Solves, then differentiates the solver's fixed point by the implicit function theorem."""
         # The tags describe the Hessian, not this system.
         del rewrite_fn, tags
-        return optx.ImplicitAdjoint(self.linear_solver).apply(primal_fn, _fixed_point, inputs, frozenset())
+        return optx.ImplicitAdjoint().apply(primal_fn, _fixed_point, inputs, frozenset())
 
 
 def _fixed_point(y, residual, inputs):

@@ -14,6 +14,11 @@ from cablejax.bounded.certificate import projected_gradient_size
 from cablejax.bounded.objective import chosen, nothing_yet
 from cablejax.bounded.sets import ConvexSet
 
+_SLOPE = 1e-4
+"""Share of the linear decrease that a trial point has to reach."""
+_SHRINK = 0.3
+"""Ratio of a step size and the one tried before."""
+
 
 class _ArcState(eqx.Module):
     feasible: Any
@@ -85,13 +90,9 @@ class NonmonotoneArmijo(optx.AbstractSearch):
 
     Attributes:
         memory: M; 1 makes every accepted step a descent.
-        slope: share of the linear decrease that is asked for.
-        shrink: ratio of a step size and the one tried before.
     """
 
     memory: int = eqx.field(static=True)
-    slope: float = 1e-4
-    shrink: float = 0.3
 
     def init(self, y, f_info_struct):
         """A step size of one, and no values in memory."""
@@ -99,15 +100,15 @@ class NonmonotoneArmijo(optx.AbstractSearch):
         return _MemoryState(jnp.ones((), y.dtype), values, jnp.zeros((), jnp.int32), jnp.array(True))
 
     def step(self, first_step, y, y_eval, f_info, f_eval_info, state):
-        """Accepts a trial point that is lower than the worst value in memory, else halves the step."""
+        """Accepts a trial point that is lower than the worst value in memory, else shortens the step."""
         predicted = f_info.compute_grad_dot(y_eval - y)
         value = f_eval_info.as_min()
         reference = state.values.max()
         rounding = 4 * jnp.finfo(value.dtype).eps * jnp.abs(reference)
-        sufficient = value <= reference + self.slope * predicted + rounding
+        sufficient = value <= reference + _SLOPE * predicted + rounding
         accept = first_step | (sufficient & (predicted <= rounding))
         values = jnp.where(accept, jnp.roll(state.values, 1).at[0].set(value), state.values)
-        step_size = jnp.where(accept, 1.0, self.shrink * state.step_size).astype(state.step_size.dtype)
+        step_size = jnp.where(accept, 1.0, _SHRINK * state.step_size).astype(state.step_size.dtype)
         shrunk = jnp.where(accept, 0, state.shrunk + 1)
         finite = jnp.isfinite(value) & (accept | state.finite)
         state = _MemoryState(step_size, values, shrunk, finite)
