@@ -17,7 +17,6 @@ from cablejax.bounded.sets import (
     AbstractSet,
     AffineBalls,
     Balls,
-    Box,
     ConvexSet,
     Halfspaces,
     Intersection,
@@ -49,7 +48,6 @@ class FeasibleSet(AbstractSet):
         radius: bound epsilon on the norm of each gripper's motion in each step [m], shape [].
         min_distance: least distance between the grippers after every step [m], shape [].
         max_distance: greatest distance between the grippers after every step [m]: a cable does not stretch, shape [].
-        box: least and greatest motion of each gripper in each step [m], shape [2, Q, 3]; must include rest.
         position: of both grippers at the plan's start [m], shape [Q, 2]; goes with `workspace`.
         workspace: lowest and highest corner of where the grippers may be [m], shape [2, 2].
         change: bound on the norm of the change of each gripper's motion from step to step [m], shape [].
@@ -60,7 +58,6 @@ class FeasibleSet(AbstractSet):
     radius: Float[Array, "*batch"]
     min_distance: Float[Array, "*batch"]
     max_distance: Float[Array, "*batch"]
-    box: Float[Array, "*batch 2 Q 3"] | None = None
     position: Float[Array, "*batch Q 2"] | None = None
     workspace: Float[Array, "*batch 2 2"] | None = None
     change: Float[Array, "*batch"] | None = None
@@ -85,8 +82,6 @@ class FeasibleSet(AbstractSet):
                 jnp.sum(outward * start, axis=-1) - lower * (2.0 - tight),
             ),
         ]
-        if self.box is not None:
-            members.append(Box(self.box[0], self.box[1]))
         if self.workspace is not None and self.position is not None:
             members.append(self._workspace_planes(n_steps, dtype))
         if self.change is not None and self.previous is not None:
@@ -118,13 +113,12 @@ class FeasibleSet(AbstractSet):
             radius=self.radius * tight,
             lower=lower * (2.0 - tight),
             upper=upper * tight,
-            box=self.box,
             position=self.position,
             corners=corners,
         )
 
     def constraints(self, y: Float[Array, "T 2 3"]) -> Float[Array, " K"]:
-        """By how much each bound is broken [m], smooth: norms, greatest and least distance, box, workspace, changes."""
+        """By how much each bound is broken [m], smooth: norms, greatest and least distance, workspace, changes."""
         lower, upper = self._distance_bounds(len(y))
         relative = self._separations(y)
         parts = [
@@ -132,8 +126,6 @@ class FeasibleSet(AbstractSet):
             _ball_excess(relative, upper),
             -_ball_excess(relative, jnp.maximum(lower, 0.1 * upper), lower),
         ]
-        if self.box is not None:
-            parts += [(self.box[0] - y).ravel(), (y - self.box[1]).ravel()]
         if self.workspace is not None:
             low, high = self._workspace_bounds(len(y))
             parts += [(low - self._positions(y)).ravel(), (self._positions(y) - high).ravel()]
@@ -154,8 +146,6 @@ class FeasibleSet(AbstractSet):
             (distance - upper * tight).max(),
             (lower * (2.0 - tight) - distance).max(),
         ]
-        if self.box is not None:
-            excess += [(self.box[0] - y).max(), (y - self.box[1]).max()]
         if self.workspace is not None:
             low, high = self._workspace_bounds(len(y))
             excess += [(low - self._positions(y)).max(), (self._positions(y) - high).max()]
@@ -166,8 +156,6 @@ class FeasibleSet(AbstractSet):
     def empty(self) -> Bool[Array, ""]:
         """Whether bounds contradict themselves or are not numbers; a zero radius leaves rest, which is something."""
         pairs = [(self.min_distance, self.max_distance), (0.0, self.radius)]
-        if self.box is not None:
-            pairs += [(self.box[0], 0.0), (0.0, self.box[1])]
         if self.workspace is not None:
             pairs.append((self.workspace[0], self.workspace[1]))
         if self.change is not None:

@@ -20,14 +20,13 @@ def project_sequentially(
     radius: Float[Array, ""],
     lower: Float[Array, " T"],
     upper: Float[Array, " T"],
-    box: Float[Array, "2 Q 3"] | None,
     position: Float[Array, "Q 2"] | None,
     corners: Float[Array, "T 2 Q 2"] | None,
 ) -> Float[Array, "T 2 3"]:
     """A plan close to `motion` that keeps all these bounds; feasible plans stay as they are but for rounding.
 
     Steps are treated in the order in which they will be executed, each from where the previous ones have taken the
-    grippers: alternating projections onto the balls and the distance bounds, clipping to box and workspace, and scaling
+    grippers: alternating projections onto the balls and the distance bounds, clipping to the workspace, and scaling
     towards rest until the distance is within its bounds.
 
     Args:
@@ -36,7 +35,6 @@ def project_sequentially(
         radius: of the ball of one gripper's motion in one step [m].
         lower: least distance of the grippers after each step [m].
         upper: greatest distance [m].
-        box: least and greatest motion of each gripper in each step [m].
         position: of the grippers at the start [m]; goes with `corners`.
         corners: lowest and highest positions after each step [m].
     """
@@ -50,8 +48,6 @@ def project_sequentially(
         step = project_ball(step, radius)
         for _ in range(_ROUNDS):
             step = project_ball(_into_annulus(separation, step, low, high), radius)
-        if box is not None:
-            step = jnp.clip(step, box[0], box[1])
         if corner.size:
             step = step.at[:, :2].set(jnp.clip(place + step[:, :2], *corner) - place)
         step = step * _largest_scale(separation, step[1, :2] - step[0, :2], low, high)
