@@ -4,11 +4,11 @@ import jax
 import numpy as np
 import pytest
 
+from cablejax.arrays import quaternion_product
 from cablejax.recordings.frames import AXES, Frame, into_frame, require_hanging, require_rigid
 from cablejax.recordings.poses import (
     poses_at,
     poses_from_markers,
-    product,
     rotated,
     smallest_rotation,
     transported_frames,
@@ -48,7 +48,7 @@ def test_frames_are_transported_without_turning_about_the_tangent():
     quaternion = transported_frames(tangent)
     np.testing.assert_allclose(rotated(quaternion, np.tile([1.0, 0, 0], (400, 1))), tangent, atol=1e-12)
     np.testing.assert_allclose(quaternion[0], smallest_rotation(np.array([1.0, 0, 0]), tangent[0]), atol=1e-15)
-    spin = product(quaternion[1:], quaternion[:-1] * [1.0, -1, -1, -1])[:, 1:]
+    spin = quaternion_product(quaternion[1:], quaternion[:-1] * [1.0, -1, -1, -1])[:, 1:]
     middle = unit(tangent[1:] + tangent[:-1])
     assert abs((spin * middle).sum(axis=1)).max() < 1e-12
     assert abs(np.diff(quaternion, axis=0)).max() < 0.02

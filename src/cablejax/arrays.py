@@ -1,11 +1,12 @@
-"""Arrays that mean no particular thing: runs of flags, and angles within a turn."""
+"""Operations that belong to no stage: runs of flags, angles within a turn, and products of quaternions."""
 
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Int
+from jaxtyping import Bool, Float, Int
 
 
 def stretches(flags: Bool[np.ndarray, " T"]) -> Int[np.ndarray, "S 2"]:
@@ -16,3 +17,11 @@ def stretches(flags: Bool[np.ndarray, " T"]) -> Int[np.ndarray, "S 2"]:
 def wrapped(angle):
     """The same angle within [-pi, pi) [rad]. NumPy in, NumPy out; JAX in, JAX out."""
     return (angle + math.pi) % (2 * math.pi) - math.pi
+
+
+def quaternion_product(a: Float[Any, "*B 4"], b: Float[Any, "*B 4"]) -> Float[Any, "*B 4"]:
+    """Hamilton product, scalar first. NumPy in, NumPy out; JAX in, JAX out."""
+    xp = a.__array_namespace__()
+    scalar = a[..., :1] * b[..., :1] - xp.sum(a[..., 1:] * b[..., 1:], axis=-1, keepdims=True)
+    vector = a[..., :1] * b[..., 1:] + b[..., :1] * a[..., 1:] + xp.cross(a[..., 1:], b[..., 1:])
+    return xp.concatenate([scalar, vector], axis=-1)

@@ -12,7 +12,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float
 
-from cablejax.arrays import wrapped
+from cablejax.arrays import quaternion_product, wrapped
 
 _X = np.array([1.0, 0.0, 0.0])
 
@@ -51,7 +51,7 @@ def transported_frames(tangent: Float[np.ndarray, "T 3"]) -> Float[np.ndarray, "
     quaternion[0] = smallest_rotation(_X, tangent[0])
     turns = smallest_rotation(tangent[:-1], tangent[1:])
     for t, turn in enumerate(turns):
-        quaternion[t + 1] = product(turn, quaternion[t])
+        quaternion[t + 1] = quaternion_product(turn, quaternion[t])
     return quaternion / np.linalg.norm(quaternion, axis=-1, keepdims=True)
 
 
@@ -65,13 +65,6 @@ def smallest_rotation(start: Float[np.ndarray, "*B 3"], end: Float[np.ndarray, "
     sideways = sideways / np.linalg.norm(sideways, axis=-1, keepdims=True)
     half_turn = np.concatenate([np.zeros_like(cosine), sideways], axis=-1)
     return np.where(opposite, half_turn, quaternion / np.where(opposite, 1.0, norm))
-
-
-def product(a: Float[np.ndarray, "*B 4"], b: Float[np.ndarray, "*B 4"]) -> Float[np.ndarray, "*B 4"]:
-    """Hamilton product, scalar first."""
-    scalar = a[..., :1] * b[..., :1] - (a[..., 1:] * b[..., 1:]).sum(axis=-1, keepdims=True)
-    vector = a[..., :1] * b[..., 1:] + b[..., :1] * a[..., 1:] + np.cross(a[..., 1:], b[..., 1:])
-    return np.concatenate([scalar, vector], axis=-1)
 
 
 def rotated(quaternion: Float[np.ndarray, "*B 4"], vector: Float[np.ndarray, "*B 3"]) -> Float[np.ndarray, "*B 3"]:
@@ -113,7 +106,7 @@ def twists(time: Float[np.ndarray, " T"], pose: Float[np.ndarray, "T Q P"]) -> F
         change[..., 2] = wrapped(change[..., 2])
     else:
         start = pose[:-1, :, 3:] * np.array([1.0, -1.0, -1.0, -1.0])
-        turn = product(pose[1:, :, 3:], start)
+        turn = quaternion_product(pose[1:, :, 3:], start)
         turn = turn * np.where(turn[..., :1] < 0, -1.0, 1.0)
         sine = np.linalg.norm(turn[..., 1:], axis=-1, keepdims=True)
         angle = 2 * np.arctan2(sine, turn[..., :1])

@@ -11,10 +11,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from cablejax.arrays import quaternion_product
 from cablejax.cable import Discretisation
 from cablejax.simulate.composite import link_lengths, node_offsets
 from cablejax.simulate.mjx import mjx
-from cablejax.simulate.pose import quaternion_product
 
 
 def chain_kinematics(config: Discretisation, data: mjx.Data) -> mjx.Data:

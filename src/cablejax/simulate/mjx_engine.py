@@ -12,6 +12,7 @@ import mujoco
 import numpy as np
 from jaxtyping import Array, Float
 
+from cablejax.arrays import quaternion_product
 from cablejax.cable import Discretisation
 from cablejax.effects.arms import executed_twist
 from cablejax.effects.base import Hook
@@ -26,7 +27,7 @@ from cablejax.simulate.grasp import constrained_acceleration
 from cablejax.simulate.keypoints import hermite_weights, marked_keypoints
 from cablejax.simulate.kinematics import chain_kinematics
 from cablejax.simulate.mjx import mjx
-from cablejax.simulate.pose import integrate_pose, pose_velocity, quaternion_of, quaternion_product
+from cablejax.simulate.pose import integrate_pose, pose_velocity, quaternion_of
 from cablejax.types import CableState, Trajectory
 
 

@@ -7,6 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from cablejax.arrays import quaternion_product
+
 
 def integrate_pose(pose: Float[Array, "Q P"], twist: Float[Array, "Q V"], duration: float) -> Float[Array, "Q P"]:
     """The pose after a constant twist, in the world's frame, of given duration [s]. Differentiable throughout."""
@@ -28,13 +30,6 @@ def pose_velocity(pose: Float[Array, "Q P"], target: Float[Array, "Q P"], durati
     difference = quaternion_product(target[..., 3:], conjugate)
     rotation = 2.0 * difference[..., 1:] * jnp.sign(difference[..., :1])
     return jnp.concatenate([target[..., :3] - pose[..., :3], rotation], axis=-1) / duration
-
-
-def quaternion_product(a: Float[Array, "*B 4"], b: Float[Array, "*B 4"]) -> Float[Array, "*B 4"]:
-    """Hamilton product, scalar first."""
-    scalar = a[..., :1] * b[..., :1] - jnp.sum(a[..., 1:] * b[..., 1:], axis=-1, keepdims=True)
-    vector = a[..., :1] * b[..., 1:] + b[..., :1] * a[..., 1:] + jnp.cross(a[..., 1:], b[..., 1:])
-    return jnp.concatenate([scalar, vector], axis=-1)
 
 
 def quaternion_of(rotation: Float[Array, "*B 3"]) -> Float[Array, "*B 4"]:
