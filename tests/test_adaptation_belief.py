@@ -80,7 +80,7 @@ def test_it_never_leaves_its_limits_and_follows_a_change():
         error = jnp.asarray(h @ (np.array([-0.4, 0.2]) - np.asarray(belief.mean)))
         belief = update(config, belief, jnp.asarray(h), error, SEEN)
     np.testing.assert_allclose(belief.mean, [-0.4, 0.2], atol=0.02)
-    assert (np.asarray(belief.std) < 0.2).all()
+    assert (np.sqrt(np.diag(np.linalg.inv(belief.information))) < 0.2).all()
 
 
 def test_derivatives_match_finite_differences():

@@ -71,11 +71,6 @@ class CableBelief:
     mean: Float[Array, "*batch 2"]
     information: Float[Array, "*batch 2 2"]
 
-    @property
-    def std(self) -> Float[Array, "*batch 2"]:
-        """Standard deviations of the log ratios."""
-        return jnp.sqrt(jnp.diagonal(jnp.linalg.inv(self.information), axis1=-2, axis2=-1))
-
 
 def prior_belief(config: AdaptationConfig) -> CableBelief:
     """What is believed before anything was seen."""

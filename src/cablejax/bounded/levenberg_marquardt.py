@@ -10,6 +10,9 @@ from jaxtyping import Array, Float
 from cablejax.bounded.gain_ratio import GainRatio
 from cablejax.bounded.least_squares import AbstractBoundedLeastSquares, ModelDescent
 
+_DAMPING = 1e-3
+"""At a step size of 1, relative to the diagonal of the model's Hessian."""
+
 
 class ModelState(eqx.Module):
     """The model at a point, as a descent keeps it.
@@ -24,13 +27,7 @@ class ModelState(eqx.Module):
 
 
 class DampedQuadratic(ModelDescent):
-    """`step(s)` minimises `g'd + d'(H + damping / s diag H) d / 2` over the d with y + d feasible.
-
-    Attributes:
-        damping: at s = 1, relative to the diagonal of H.
-    """
-
-    damping: float = 1e-3
+    """`step(s)` minimises `g'd + d'(H + diag H / 1000 s) d / 2` over the d with y + d feasible."""
 
     def init(self, y, f_info_struct):
         """A model with the identity as its Hessian."""
@@ -43,11 +40,11 @@ class DampedQuadratic(ModelDescent):
         return ModelState(f_info.grad, self.convex(f_info))
 
     def step(self, step_size, state):
-        """The minimum over the set of the model with damping `damping / step_size` on its diagonal."""
+        """The minimum over the set of the model, damped less the larger the step size."""
         diagonal = jnp.diag(state.hessian)
         # no more than keeps what the model does not see at all from being singular: scales differ by as much as 1e10
         floor = jnp.finfo(diagonal.dtype).eps * diagonal.max() + jnp.finfo(diagonal.dtype).tiny
-        damped = state.hessian + jnp.diag(self.damping / step_size * jnp.maximum(diagonal, floor))
+        damped = state.hessian + jnp.diag(_DAMPING / step_size * jnp.maximum(diagonal, floor))
         return self.minimum(damped, state.gradient), optx.RESULTS.successful
 
 
@@ -56,17 +53,12 @@ class BoundedLevenbergMarquardt(AbstractBoundedLeastSquares):
 
     A plain Levenberg-Marquardt step projected back onto the set need not be a descent (Bertsekas, SIAM J. Control
     Optim. 20, 1982). Singular Jacobians do no harm.
-
-    Attributes:
-        damping: at the start, relative to the diagonal of the model's Hessian.
     """
-
-    damping: float = 1e-3
 
     @property
     def descent(self) -> DampedQuadratic:
         """The minimum of the damped model over the set."""
-        return DampedQuadratic(self.secant, damping=self.damping)
+        return DampedQuadratic(self.secant)
 
     @property
     def search(self) -> GainRatio:

@@ -52,19 +52,17 @@ class BoundedQuasiNewton(optx.AbstractMinimiser):
 
     Attributes:
         rtol, atol: relative and absolute tolerance on the projected gradient.
-        damping: at the start, relative to the diagonal of the model's Hessian.
         norm: `optimistix.max_norm`.
     """
 
     rtol: float = 0.0
     atol: float = 1e-8
-    damping: float = 1e-3
     norm: Callable[[PyTree], Scalar] = eqx.field(default=optx.max_norm)
 
     @property
     def descent(self) -> DampedQuadratic:
         """The minimum of the damped model over the set."""
-        return DampedQuadratic(secant=False, damping=self.damping)
+        return DampedQuadratic(secant=False)
 
     @property
     def search(self) -> GainRatio:

@@ -21,6 +21,12 @@ from cablejax.mpc.plan import Plan, Solver, plan_from
 from cablejax.mpc.problem import Rollout, ShapingProblem
 from cablejax.mpc.sampling import CrossEntropy, PathIntegral
 
+# Trial plans after each linearisation of the first part of `Accurate`.
+_FIRST_TRIALS = 3
+# Step of `ProjectedGradient` before the first curvature is known. The objective's Hessian is near 1 per step of the
+# horizon that a motion is felt in, and up to about 17 for the six-step sum, hence 0.1.
+_INITIAL_STEP = 0.1
+
 
 def bounded_plan(
     problem: ShapingProblem,
@@ -74,28 +80,13 @@ class _LeastSquaresPlanner(abc.ABC):
         return bounded_plan(problem, guess, self.bounded(), self.max_iterations)
 
 
-@dataclasses.dataclass(frozen=True)
 class LevenbergMarquardt(_LeastSquaresPlanner):
-    """Solver: damped Gauss-Newton models of the objective, minimised over the feasible set.
-
-    Attributes:
-        max_iterations, trials_per_linearisation, tolerance: see `_LeastSquaresPlanner`.
-        damping: at the start, relative to the diagonal of J'J.
-    """
-
-    damping: float = dataclasses.field(default=1e-3, kw_only=True)
-
-    def __post_init__(self):
-        super().__post_init__()
-        check(self, damping="positive")
+    """Solver: damped Gauss-Newton models of the objective, minimised over the feasible set."""
 
     def bounded(self) -> AbstractBoundedLeastSquares:
         """The solver without a secant model: planning uses few steps."""
         return BoundedLevenbergMarquardt(
-            atol=self.tolerance,
-            damping=self.damping,
-            secant=False,
-            trials_per_linearisation=self.trials_per_linearisation,
+            atol=self.tolerance, secant=False, trials_per_linearisation=self.trials_per_linearisation
         )
 
 
@@ -107,7 +98,6 @@ class Dogleg(_LeastSquaresPlanner):
         return BoundedDogleg(atol=self.tolerance, secant=False, trials_per_linearisation=self.trials_per_linearisation)
 
 
-@dataclasses.dataclass(frozen=True)
 class GaussNewton(_LeastSquaresPlanner):
     """Solver: Gauss-Newton models without damping, minimised over the feasible set, and a line search towards that."""
 
@@ -124,23 +114,21 @@ class Accurate:
 
     Attributes:
         linearisations: of the first part, at most.
-        trials_per_linearisation: trial plans after each.
         gradients: of the second part, at most.
         tolerance: stop once a unit projected gradient step moves no coordinate by more than this [m]. Where bounds
             press, the KKT residual is greater by the ratio of gradient and step bound, some 100 times.
     """
 
     linearisations: int = 2
-    trials_per_linearisation: int = 3
     gradients: int = 200
     tolerance: float = 1e-10
 
     def __post_init__(self):
-        check(self, linearisations="count", trials_per_linearisation="count", gradients="count", tolerance="positive")
+        check(self, linearisations="count", gradients="count", tolerance="positive")
 
     def parts(self) -> tuple[BoundedLevenbergMarquardt, BoundedQuasiNewton]:
         """The solver that begins, and the one that goes on from there."""
-        first = BoundedLevenbergMarquardt(atol=self.tolerance, trials_per_linearisation=self.trials_per_linearisation)
+        first = BoundedLevenbergMarquardt(atol=self.tolerance, trials_per_linearisation=_FIRST_TRIALS)
         return first, BoundedQuasiNewton(atol=self.tolerance)
 
     def __call__(self, problem: ShapingProblem, guess: Rollout) -> Plan:
@@ -164,19 +152,16 @@ class ProjectedGradient:
     Attributes:
         max_evaluations: trial plans, the guess included.
         tolerance: stop once a unit gradient step, projected, would move no coordinate by more than this [m].
-        initial_step: a before the first curvature is known. The objective's Hessian is near 1 per step of the horizon
-            that a motion is felt in, and up to about 17 for the six-step sum, hence 0.1.
         memory: a trial is compared with the worst of this many last accepted values (Grippo, Lampariello, Lucidi
             1986); 1 makes every accepted step a descent.
     """
 
     max_evaluations: int = 12
     tolerance: float = 2e-5
-    initial_step: float = 0.1
     memory: int = 1
 
     def __post_init__(self):
-        check(self, max_evaluations="count", tolerance="positive", initial_step="positive", memory="count")
+        check(self, max_evaluations="count", tolerance="positive", memory="count")
         if self.max_evaluations < 2:
             raise ValueError(
                 f"ProjectedGradient.max_evaluations is {self.max_evaluations}, expected at least 2 evaluations: of the "
@@ -186,7 +171,7 @@ class ProjectedGradient:
     def __call__(self, problem: ShapingProblem, guess: Rollout) -> Plan:
         """Minimises the objective from `guess` and returns the plan."""
         solver = SpectralProjectedGradient(
-            atol=self.tolerance, memory=self.memory, initial_length=self.initial_step, lengths=(1e-3, 1e2)
+            atol=self.tolerance, memory=self.memory, initial_length=_INITIAL_STEP, lengths=(1e-3, 1e2)
         )
         solution = minimise(
             lambda motion, problem: problem.value(motion),

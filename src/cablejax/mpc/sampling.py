@@ -14,6 +14,15 @@ from cablejax.limits import check
 from cablejax.mpc.plan import Plan
 from cablejax.mpc.problem import Rollout, ShapingProblem
 
+# Of the samples; the same in every call.
+_SEED = 0
+# Best samples of an iteration, and the share of the old mean and spread that stays.
+_ELITES, _SMOOTHING = 8, 0.1
+# Standard deviation of the samples, relative to the bound on one step's motion: at first, and in all iterations.
+_ELITE_SPREAD, _WEIGHED_SPREAD = 0.5, 0.3
+# Relative to the spread of the samples' values.
+_TEMPERATURE = 0.1
+
 
 @dataclasses.dataclass(frozen=True)
 class CrossEntropy:
@@ -23,27 +32,14 @@ class CrossEntropy:
 
     Attributes:
         samples: plans per iteration.
-        elites: best of them.
         iterations: how often.
-        spread: initial standard deviation, relative to the bound on one step's motion.
-        smoothing: share of the old mean and spread that stays.
-        seed: of the samples; the same in every call.
     """
 
     samples: int = 64
-    elites: int = 8
     iterations: int = 5
-    spread: float = 0.5
-    smoothing: float = 0.1
-    seed: int = 0
 
     def __post_init__(self):
-        check(self, samples="count", elites="count", iterations="count", spread="positive")
-        if self.elites > self.samples or not 0 <= self.smoothing < 1:
-            raise ValueError(
-                f"CrossEntropy(elites={self.elites}, smoothing={self.smoothing}): expected no more elites than samples "
-                "and a smoothing in [0, 1)."
-            )
+        check(self, samples="count", iterations="count")
 
     def __call__(self, problem: ShapingProblem, guess: Rollout) -> Plan:
         """Draws plans around a mean, moves the mean to the best of them, and returns the best plan drawn."""
@@ -51,15 +47,15 @@ class CrossEntropy:
         def iterate(carry, key):
             best, mean, deviation = carry
             drawn = drawn_plans(problem, key, mean, deviation, self.samples)
-            order = jnp.argsort(drawn.value)[: self.elites]
+            order = jnp.argsort(drawn.value)[:_ELITES]
             elite = drawn.motion[order]
-            mean = self.smoothing * mean + (1 - self.smoothing) * elite.mean(axis=0)
-            deviation = self.smoothing * deviation + (1 - self.smoothing) * elite.std(axis=0)
+            mean = _SMOOTHING * mean + (1 - _SMOOTHING) * elite.mean(axis=0)
+            deviation = _SMOOTHING * deviation + (1 - _SMOOTHING) * elite.std(axis=0)
             return (better_plan(best, drawn, order[0]), mean, deviation), None
 
         first = first_plan(problem, guess)
-        deviation = self.spread * problem.feasible.radius * jnp.ones_like(guess.motion)
-        keys = jax.random.split(jax.random.key(self.seed), self.iterations)
+        deviation = _ELITE_SPREAD * problem.feasible.radius * jnp.ones_like(guess.motion)
+        keys = jax.random.split(jax.random.key(_SEED), self.iterations)
         (best, _, _), _ = jax.lax.scan(iterate, (first, first.motion, deviation), keys)
         return sampled_plan(problem, best, 1 + self.samples * self.iterations)
 
@@ -73,23 +69,17 @@ class PathIntegral:
     Attributes:
         samples: plans per iteration.
         iterations: how often.
-        spread: standard deviation of the samples, relative to the bound on one step's motion.
-        temperature: relative to the spread of the samples' values.
-        seed: of the samples; the same in every call.
     """
 
     samples: int = 64
     iterations: int = 5
-    spread: float = 0.3
-    temperature: float = 0.1
-    seed: int = 0
 
     def __post_init__(self):
-        check(self, samples="count", iterations="count", spread="positive", temperature="positive")
+        check(self, samples="count", iterations="count")
 
     def __call__(self, problem: ShapingProblem, guess: Rollout) -> Plan:
         """Draws plans around a mean, moves the mean to their weighted average, and returns the best plan."""
-        deviation = self.spread * problem.feasible.radius * jnp.ones_like(guess.motion)
+        deviation = _WEIGHED_SPREAD * problem.feasible.radius * jnp.ones_like(guess.motion)
 
         def iterate(carry, key):
             best, mean = carry
@@ -97,13 +87,13 @@ class PathIntegral:
             known = jnp.isfinite(drawn.value)
             lowest = drawn.value.min()
             span = jnp.where(known, drawn.value - lowest, 0.0).max() + jnp.finfo(guess.motion.dtype).tiny
-            weight = jnp.where(known, jnp.exp(-(drawn.value - lowest) / (self.temperature * span)), 0.0)
+            weight = jnp.where(known, jnp.exp(-(drawn.value - lowest) / (_TEMPERATURE * span)), 0.0)
             weight = weight / jnp.maximum(weight.sum(), 1e-12)
             mean = jnp.where(known.any(), jnp.tensordot(weight, drawn.motion, axes=1), mean)
             return (better_plan(best, drawn, jnp.argmin(drawn.value)), mean), None
 
         first = first_plan(problem, guess)
-        keys = jax.random.split(jax.random.key(self.seed), self.iterations)
+        keys = jax.random.split(jax.random.key(_SEED), self.iterations)
         (best, mean), _ = jax.lax.scan(iterate, (first, first.motion), keys)
         last = first_plan(problem, problem.start(mean))
         best = jax.tree.map(lambda a, b: jnp.where(last.value < best.value, a, b), last, best)
