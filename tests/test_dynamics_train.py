@@ -28,7 +28,6 @@ from cablejax.dynamics.evaluate import open_loop_error
 from cablejax.dynamics.fingerprint import fingerprint
 from cablejax.dynamics.loss import random_walk_noise, rollout_loss
 from cablejax.dynamics.metrics import MetricsLog
-from cablejax.dynamics.model import bind
 from cablejax.dynamics.networks import GNS
 from cablejax.dynamics.normalisation import fit_normalisation
 from cablejax.dynamics.run_folder import claim_folder
@@ -297,36 +296,11 @@ def test_loss_is_quadratic_near_zero_and_linear_far_away():
             truth = jnp.where(known, window.future[0], window.future[jnp.minimum(step + 1, 1)])
             return truth + jnp.where(known, 0.0, error) - history.keypoints[-1]
 
-        return float(rollout_loss(dynamics, window, scale=1e-2, robust=1.0, interval=1.0, pushforward=False))
+        return float(rollout_loss(dynamics, window, scale=1e-2, robust=1.0, interval=1.0))
 
     assert loss(0.0) == pytest.approx(0.0, abs=1e-6)
     assert loss(1e-3) == pytest.approx(0.5 * 0.01, rel=1e-2)
     assert loss(1.0) == pytest.approx(0.5 * 2 * (np.sqrt(1 + 100**2) - 1), rel=1e-4)
-
-
-def test_pushforward_stops_gradients_between_steps():
-    graphdef, weights = network(SMALL)
-    window = jax.tree.map(lambda x: x[0], draw_windows(jax.random.key(1), DATA, batch=1, history=3, steps=3))
-
-    def slope(pushforward, keypoint):
-        def loss(shift):
-            moved = window.history.keypoints.at[:, 2].add(shift)
-            history = dataclasses.replace(window.history, keypoints=moved)
-            return rollout_loss(
-                bind(graphdef, weights),
-                dataclasses.replace(window, history=history),
-                scale=1e-2,
-                robust=1.0,
-                interval=1.0,
-                pushforward=pushforward,
-            )
-
-        return np.asarray(jax.grad(loss)(jnp.zeros(2)))[keypoint]
-
-    one = dataclasses.replace(window, twist=window.twist[:1], future=window.future[:1])
-    assert slope(True, 0) != pytest.approx(slope(False, 0), rel=1e-3)
-    window = one
-    assert slope(True, 0) == pytest.approx(slope(False, 0), rel=1e-5)
 
 
 def test_noise_walks_to_its_size_and_spares_the_held_ends():

@@ -25,7 +25,7 @@ def random_walk_noise(key: PRNGKeyArray, history: History, final_std: float) -> 
 
 
 def rollout_loss(
-    dynamics: OneStepModel, window: Window, *, scale: float, robust: float, interval: float, pushforward: bool
+    dynamics: OneStepModel, window: Window, *, scale: float, robust: float, interval: float
 ) -> Float[Array, ""]:
     """Robust position error of a rollout, averaged over the K steps of a window.
 
@@ -42,7 +42,6 @@ def rollout_loss(
         scale: unit of the error [m].
         robust: error, in units of `scale`, from which on it counts linearly.
         interval: duration of one step [s].
-        pushforward: no gradient from a step's input back into the steps before (Brandstetter et al. 2022).
     """
 
     def step(history: History, now):
@@ -50,7 +49,7 @@ def rollout_loss(
         history = advance(history, dynamics(history, twist), twist, interval)
         error = (history.keypoints[-1] - truth)[1:-1] / scale
         loss = 2 * robust**2 * (jnp.sqrt(1 + jnp.mean(error**2) / robust**2) - 1)
-        return jax.lax.stop_gradient(history) if pushforward else history, loss
+        return history, loss
 
     _, errors = jax.lax.scan(step, window.history, (window.twist, window.future))
     return jnp.mean(errors)

@@ -266,9 +266,7 @@ def batch_loss(weights: nnx.State, graphdef: nnx.GraphDef, windows: Window, phas
     scale, interval = model.normalisation.residual, model.interval
 
     def one(window: Window):
-        return rollout_loss(
-            dynamics, window, scale=scale, robust=phase.robust, interval=interval, pushforward=phase.pushforward
-        )
+        return rollout_loss(dynamics, window, scale=scale, robust=phase.robust, interval=interval)
 
     return jnp.mean(jax.vmap(one)(windows))
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Literal
 
 import optax
 
@@ -20,11 +19,9 @@ class Phase:
         batch: windows per step.
         rollout: steps K that the model is rolled out and compared with the truth.
         noise: final standard deviation of the random walk added to the history [m]; 0 = none.
-        lr_start: learning rate at the phase's beginning.
+        lr_start: learning rate at the phase's beginning; it falls like half a cosine.
         lr_end: at its end.
-        decay: exponential from start to end, or half a cosine.
         robust: error, in units of the residual's scale, from which on it counts linearly.
-        pushforward: stop gradients between the steps of the rollout.
     """
 
     steps: int
@@ -33,9 +30,7 @@ class Phase:
     noise: float = 3e-4
     lr_start: float = 1e-3
     lr_end: float = 1e-4
-    decay: Literal["exponential", "cosine"] = "cosine"
     robust: float = 1.0
-    pushforward: bool = False
 
     def __post_init__(self):
         check(
@@ -122,12 +117,7 @@ class TrainConfig:
         """Learning rate as a function of the optimiser step."""
         parts, ends, end = [], [], 0
         for phase in self.phases:
-            ratio = phase.lr_end / phase.lr_start
-            parts.append(
-                optax.cosine_decay_schedule(phase.lr_start, phase.steps, alpha=ratio)
-                if phase.decay == "cosine"
-                else optax.exponential_decay(phase.lr_start, phase.steps, ratio)
-            )
+            parts.append(optax.cosine_decay_schedule(phase.lr_start, phase.steps, phase.lr_end / phase.lr_start))
             end += phase.steps
             ends.append(end)
         schedule = optax.join_schedules(parts, ends[:-1])
