@@ -7,6 +7,7 @@ import pytest
 
 import cablejax.residual
 from cablejax.residual import Corrected, RidgeConfig, apply, zero_residual
+from cablejax.residual.ridge import BIAS_SCALE
 
 W, N, Q = 5, 4, 2
 # one program for each shape of a window: op by op, every line would be compiled by itself
@@ -24,7 +25,7 @@ def scaled_regressors(twist, config):
     units = np.array([config.motion_scale] * 2 + [config.motion_scale / config.rotation_weight])
     rows = np.asarray(twist).reshape(len(twist), -1) / np.tile(units, Q)
     if config.bias:
-        rows = np.concatenate([rows, np.full((len(rows), 1), config.bias_scale)], axis=1)
+        rows = np.concatenate([rows, np.full((len(rows), 1), BIAS_SCALE)], axis=1)
     return rows
 
 

@@ -21,6 +21,10 @@ from jaxtyping import Array, Bool, Float
 
 from cablejax.limits import check
 
+BIAS_SCALE = 5.0
+"""Value of the constant regressor; larger is a weaker penalty on the bias. At 5, five samples have `W * 5**2 = 125`, so
+that lambda = 10 shrinks the bias by 7 %."""
+
 
 @dataclasses.dataclass(frozen=True)
 class RidgeConfig:
@@ -32,8 +36,6 @@ class RidgeConfig:
         rotation_weight: w [m/rad], turns a rotation into a length before scaling.
         bias: whether the error at rest is fitted too. Without it an error that does not vanish with the motion (a wrong
             steady state, friction) ends up in the gain, or nowhere once the grippers are still.
-        bias_scale: value of the constant regressor; larger is a weaker penalty on the bias. At 5, five samples have
-            `W * 5**2 = 125`, so that lambda = 10 shrinks the bias by 7 %.
         forgetting: weight ratio of a sample and the next newer one, in (0, 1]; 1 weighs all alike. On the way to a
             shape the error changes from step to step, so the newest sample says most about the next.
         outlier: root mean square error of a sample [m] beyond which it counts less and less. Where the model follows
@@ -46,7 +48,6 @@ class RidgeConfig:
     motion_scale: float = 0.01
     rotation_weight: float = 0.15
     bias: bool = True
-    bias_scale: float = 5.0
     forgetting: float = 1.0
     outlier: float = math.inf
 
@@ -56,7 +57,6 @@ class RidgeConfig:
             regularisation="positive",
             motion_scale="positive",
             rotation_weight="positive",
-            bias_scale="positive",
             forgetting="share",
         )
         if not self.outlier > 0:
@@ -99,7 +99,7 @@ def fit(
 ) -> ResidualModel:
     """Ridge regression in closed form: the minimiser of `||S (dX - A C)||_F^2 + lambda ||C||_F^2` over C.
 
-    `A = [R / scale, bias_scale]` are the W scaled regressors and S holds the square roots of the samples' weights
+    `A = [R / scale, BIAS_SCALE]` are the W scaled regressors and S holds the square roots of the samples' weights
     (by age and by size, 0 where a sample is not valid). The minimiser is `C = (A' S^2 A + lambda I)^-1 A' S^2 dX`. (The
     paper prints it with regressors and targets swapped.) It is computed in its dual form,
     `C = (S A)' (S A A' S + lambda I)^-1 S dX`: the same C, from a W x W system (5 x 5) instead of one of 7 x 7, whose
@@ -131,7 +131,7 @@ def fit(
     units = _units(twist.shape[1], config).astype(twist.dtype)
     regressors = twist.reshape(window, -1) / units
     if config.bias:
-        regressors = jnp.concatenate([regressors, jnp.full((window, 1), config.bias_scale, regressors.dtype)], axis=1)
+        regressors = jnp.concatenate([regressors, jnp.full((window, 1), BIAS_SCALE, regressors.dtype)], axis=1)
     age = jnp.arange(window - 1, -1, -1)
     size = jnp.sum(delta**2, axis=(1, 2)) / jnp.maximum(jnp.sum(valid, axis=1), 1)
     # the root of Geman and McClure's weight
@@ -143,7 +143,7 @@ def fit(
     )
     n_inputs = units.shape[0]
     gain = coefficients[:n_inputs].reshape(n_inputs, -1) / units[:, None]
-    bias = coefficients[n_inputs] * config.bias_scale if config.bias else jnp.zeros_like(delta[0])
+    bias = coefficients[n_inputs] * BIAS_SCALE if config.bias else jnp.zeros_like(delta[0])
     seen = root_weight.max(axis=1)
     return ResidualModel(
         gain=gain,

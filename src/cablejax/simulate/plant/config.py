@@ -27,9 +27,6 @@ class PlantConfig:
         discretisation: the cable as it is believed to be, its links and time step. `friction_speed` has no meaning
             here and `dimension` must be 3.
         effects: what the plant does beyond that cable, in this order.
-        cone_ratio: MuJoCo's `impratio`: how much harder the friction cone's tangent is than its normal direction; it
-            sets how slowly a cable at rest creeps.
-        contact_time: time constant of the table's contacts [s].
         keypoint_noise: standard deviation of the observed keypoints [m] per coordinate, the held ends included.
         keypoint_dropout: probability with which a keypoint is not observed (NaN), except the first and last, which the
             grippers hold.
@@ -43,8 +40,6 @@ class PlantConfig:
 
     discretisation: Discretisation = Discretisation(n_links=40, dimension=3, timestep=0.005)
     effects: tuple[GivenEffect, ...] = ()
-    cone_ratio: float = 100.0
-    contact_time: float = 0.01
     keypoint_noise: float = 0.0
     keypoint_dropout: float = 0.0
     settle_time: float = 0.5
@@ -73,7 +68,7 @@ class PlantConfig:
             raise ValueError(
                 f"PlantConfig.discretisation.dimension is {self.discretisation.dimension}, expected 3, the plant's."
             )
-        check(self, "seed", cone_ratio="positive", contact_time="positive", settle_time="positive")
+        check(self, "seed", settle_time="positive")
         check_camera(self)
         object.__setattr__(self, "effects", tuple(self.effects))
         check_effects(self, HOOKS, {}, CHANGING)

@@ -34,6 +34,11 @@ AXIAL_DAMPING = 0.01
 """Time constant of the damping along the cable [s]; no measured one is known, and only slow stretch is of interest."""
 GRASP_DAMPING = 0.01
 """Time constant of the damping of a compliant grasp [s]."""
+CONE_RATIO = 100.0
+"""MuJoCo's `impratio`: how much harder the friction cone's tangent is than its normal direction; it sets how slowly a
+cable at rest creeps."""
+CONTACT_TIME = 0.01
+"""Time constant of the table's contacts [s]."""
 FRICTIONLESS = 1e-5
 """MuJoCo's smallest friction coefficient."""
 
@@ -46,13 +51,13 @@ def plant_model(config: PlantConfig) -> mujoco.MjModel:
     spec = mujoco.MjSpec()
     spec.option.timestep, spec.option.gravity = dt, [*physics.tilt, -normal_gravity(physics)]
     spec.option.integrator, spec.option.cone = mujoco.mjtIntegrator.mjINT_DISCRETE, mujoco.mjtCone.mjCONE_ELLIPTIC
-    spec.option.impratio, spec.option.tolerance = config.cone_ratio, 1e-8
+    spec.option.impratio, spec.option.tolerance = CONE_RATIO, 1e-8
     spec.worldbody.add_geom(
         name="table", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[5, 5, 0.1], contype=1, conaffinity=0, condim=3
     )
     links = add_links(
         spec, lengths, cable.diameter / 2, dimension=3, contype=0, conaffinity=1, condim=3, priority=1,
-        solref=[config.contact_time, 1.0], solimp=[*CONTACT_IMPEDANCE, 0.5, 2.0],
+        solref=[CONTACT_TIME, 1.0], solimp=[*CONTACT_IMPEDANCE, 0.5, 2.0],
     )  # fmt: skip
     for link, mass in zip(links, np.asarray(physics.density) * lengths + physics.extra_mass, strict=True):
         link.geoms[0].mass = mass
@@ -114,7 +119,7 @@ def _add_obstacle(spec: mujoco.MjSpec, config: PlantConfig) -> None:
     spec.worldbody.add_geom(
         name="obstacle", type=mujoco.mjtGeom.mjGEOM_CAPSULE, size=[radius, OBSTACLE_HEIGHT, 0],
         pos=[*physics.obstacle_centre, 0.0], contype=1, conaffinity=0, condim=1, priority=2,
-        solref=[config.contact_time, 1.0],
+        solref=[CONTACT_TIME, 1.0],
     )  # fmt: skip
 
 
