@@ -32,12 +32,10 @@ from jaxtyping import Float
 
 from cablejax.cable import GRAVITY, Cable, Discretisation
 from cablejax.effects import Hook
-from cablejax.effects.given import GivenEffect
-from cablejax.effects.physics import Physics
 from cablejax.simulate.composite import link_lengths
 from cablejax.simulate.elastica import solve_elastica
 from cablejax.simulate.plant.config import HOOKS as CONTACT_PLANT_HOOKS
-from cablejax.simulate.plant_config import check_camera, check_effects, plant_physics
+from cablejax.simulate.plant_config import ObservedConfig, check_camera, check_effects
 from cablejax.simulate.table_plant import Observation, TablePlant
 
 HOOKS: frozenset[Hook] = frozenset({"bending", "mass", "input", "observation"})
@@ -49,42 +47,25 @@ LARGEST_STRETCH = 0.1
 
 
 @dataclasses.dataclass(frozen=True)
-class RodPlantConfig:
+class RodPlantConfig(ObservedConfig):
     """What the rod is made of; the defaults are the reference cable.
 
     Attributes:
         discretisation: the cable, its elements (`n_links`) and time step. The cable's `friction_coefficient` is the
             kinetic one, mu_k; `friction_speed` has no meaning here, and `dimension` must be 2.
-        effects: what the rod does beyond that cable, in this order; see `HOOKS` for those it knows.
+        effects: see `HOOKS` for those that the rod knows.
         static_ratio: mu_s / mu_k >= 1.
         stribeck_speed: v_s [m/s], the speed at which sliding has taken away most of the difference.
         axial_ratio: EA / EI [1/m^2], EI that of the stiffest joint; `4 / r^2` for a solid rod of radius r. The stretch
             is the internal force over EI, at most about 100 / m^2 in the shapes of interest, over this.
-        keypoint_noise: standard deviation of the observed keypoints [m] per coordinate, the held ends included.
-        keypoint_dropout: probability with which a keypoint is not observed (NaN), except the first and last.
         settle_time: simulated time [s] given to a new cable to settle without friction.
-        seed: of noise and gaps.
     """
 
     discretisation: Discretisation = Discretisation(n_links=27, timestep=2e-4)
-    effects: tuple[GivenEffect, ...] = ()
     static_ratio: float = 1.3
     stribeck_speed: float = 0.005
     axial_ratio: float = 1e5
-    keypoint_noise: float = 0.0
-    keypoint_dropout: float = 0.0
     settle_time: float = 1.0
-    seed: int = 0
-
-    @property
-    def cable(self) -> Cable:
-        """The cable without the effects."""
-        return self.discretisation.cable
-
-    @property
-    def physics(self) -> Physics:
-        """The cable with the effects, float64."""
-        return plant_physics(self.discretisation, self.effects)
 
     @property
     def axial_stiffness(self) -> float:

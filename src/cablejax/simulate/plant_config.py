@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import functools
 from collections.abc import Mapping
-from typing import Protocol
 
 import numpy as np
 
@@ -16,38 +15,34 @@ from cablejax.effects.physics import Physics, nominal_physics
 from cablejax.limits import check
 
 
-class ObservedConfig(Protocol):
-    """Fields of a plant's configuration for its cable and the observation of it; see `PlantConfig`."""
+@dataclasses.dataclass(frozen=True)
+class ObservedConfig:
+    """Base of the plants' configurations: the cable, its effects, and how it is observed.
+
+    Attributes:
+        discretisation: the cable as it is believed to be, its links and time step.
+        effects: what the plant does beyond that cable, in this order.
+        keypoint_noise: standard deviation of the observed keypoints [m] per coordinate, the held ends included.
+        keypoint_dropout: probability with which a keypoint is not observed (NaN), except the first and last, which the
+            grippers hold.
+        seed: of noise and gaps.
+    """
+
+    discretisation: Discretisation
+    effects: tuple[GivenEffect, ...] = ()
+    keypoint_noise: float = 0.0
+    keypoint_dropout: float = 0.0
+    seed: int = 0
 
     @property
     def cable(self) -> Cable:
-        """The plant's cable."""
-        ...
-
-    @property
-    def discretisation(self) -> Discretisation:
-        """Its links and time step."""
-        ...
+        """The cable without the effects."""
+        return self.discretisation.cable
 
     @property
     def physics(self) -> Physics:
-        """Its physics with all effects."""
-        ...
-
-    @property
-    def keypoint_noise(self) -> float:
-        """Standard deviation of the observed keypoints [m]."""
-        ...
-
-    @property
-    def keypoint_dropout(self) -> float:
-        """Probability that a keypoint is not observed in a sample."""
-        ...
-
-    @property
-    def seed(self) -> int:
-        """Seed of noise and dropout."""
-        ...
+        """The cable with the effects, float64, each joint bending in the plane."""
+        return plant_physics(self.discretisation, self.effects)
 
 
 @functools.lru_cache(maxsize=64)

@@ -5,12 +5,12 @@ from __future__ import annotations
 import dataclasses
 from typing import get_args
 
-from cablejax.cable import Cable, Discretisation
+from cablejax.cable import Discretisation
 from cablejax.effects import Hook
 from cablejax.effects.given import GivenEffect
 from cablejax.effects.physics import Physics
 from cablejax.limits import check
-from cablejax.simulate.plant_config import check_camera, check_effects, plant_physics
+from cablejax.simulate.plant_config import ObservedConfig, check_camera, check_effects, plant_physics
 
 HOOKS: frozenset[Hook] = frozenset(get_args(Hook))
 """Hooks of the effects that the contact plant can stage."""
@@ -20,35 +20,21 @@ CHANGING: frozenset[Hook] = frozenset({"bending", "table", "mass"})
 
 
 @dataclasses.dataclass(frozen=True)
-class PlantConfig:
+class PlantConfig(ObservedConfig):
     """Configuration of the plant; the defaults are the reference cable, finer than the trained one.
 
     Attributes:
         discretisation: the cable as it is believed to be, its links and time step. `friction_speed` has no meaning
             here and `dimension` must be 3.
-        effects: what the plant does beyond that cable, in this order.
-        keypoint_noise: standard deviation of the observed keypoints [m] per coordinate, the held ends included.
-        keypoint_dropout: probability with which a keypoint is not observed (NaN), except the first and last, which the
-            grippers hold.
         settle_time: simulated time [s] given to a new cable to settle: without friction, with it, and once more after
             the grippers have come down to the height at which it lies.
-        seed: of noise and gaps.
 
     Raises:
         ValueError: a number or a parameter of an effect is out of range; the message names it.
     """
 
     discretisation: Discretisation = Discretisation(n_links=40, dimension=3, timestep=0.005)
-    effects: tuple[GivenEffect, ...] = ()
-    keypoint_noise: float = 0.0
-    keypoint_dropout: float = 0.0
     settle_time: float = 0.5
-    seed: int = 0
-
-    @property
-    def cable(self) -> Cable:
-        """The cable without the effects."""
-        return self.discretisation.cable
 
     @property
     def physics(self) -> Physics:
