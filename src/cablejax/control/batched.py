@@ -21,7 +21,6 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Float, Int
 
 from cablejax.control.link import Controller
-from cablejax.control.run import settling_time
 from cablejax.effects.physics import Physics, may_touch, without_obstacle
 from cablejax.limits import check
 from cablejax.simulate.chain.engine import ChainEngine
@@ -89,12 +88,6 @@ class BatchRun:
         """Errors at the end [cm]."""
         return np.asarray(self.error_cm[:, -1])
 
-    def settling_time_s(self, interval: float = 1.0) -> Float[np.ndarray, " B"]:
-        """See `control.run.settling_time` [s]; infinite for a trial that never settled."""
-        errors = np.asarray(self.error_cm, float)
-        times = interval * np.arange(errors.shape[1])
-        return np.array([settling_time(times, error) for error in errors])
-
 
 def for_each_cable(
     step: Callable[..., Any],
@@ -143,7 +136,6 @@ def shape_batch(
     config: LoopConfig,
     *,
     seeds: Int[np.ndarray, " B"] | None = None,
-    stacked: bool = False,
     devices: Sequence[jax.Device] | None = None,  # pyright: ignore[reportInvalidTypeForm]
 ) -> BatchRun:
     """Shapes B cables side by side, in one compiled call; another batch size or configuration compiles again.
@@ -156,7 +148,6 @@ def shape_batch(
         targets: desired keypoints [m], shape [B, N, 2].
         config: length, timing and camera of the trials.
         seeds: of each trial's noise and gaps; by default 0, 1, ...
-        stacked: the controller's other leaves have a leading axis B too: every trial has weights of its own.
         devices: to spread the batch over; by default the one on which the arguments are.
 
     Raises:
@@ -173,7 +164,7 @@ def shape_batch(
     refuse_lags(params)
     seeds = np.arange(size) if seeds is None else np.asarray(seeds)
     controllers = _with_target(controller, jnp.asarray(targets, float))
-    batched = _with_target(jax.tree.map(lambda _: stacked, controller), True)
+    batched = _with_target(jax.tree.map(lambda _: False, controller), True)
     own, shared = eqx.partition(controllers, batched)
     batch = (params, state, own, seeds)
     lengths = {np.shape(leaf)[:1] for leaf in jax.tree.leaves(batch)}
