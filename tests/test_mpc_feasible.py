@@ -6,7 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from cablejax.mpc import feasible_from, project_ball
+from cablejax.bounded import project_ball
+from cablejax.mpc import feasible_from
 from mpc_cases import feasible_set
 
 T = 4

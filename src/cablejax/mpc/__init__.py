@@ -2,7 +2,7 @@
 
 from cablejax.mpc.config import MPCConfig
 from cablejax.mpc.controller import MPC
-from cablejax.mpc.feasible import FeasibleSet, feasible_from, project_ball
+from cablejax.mpc.feasible import FeasibleSet, feasible_from
 from cablejax.mpc.plan import Plan, Solver, differentiable_plan, multi_start
 from cablejax.mpc.planners import (
     SOLVERS,
@@ -41,6 +41,5 @@ __all__ = [
     "differentiable_plan",
     "feasible_from",
     "multi_start",
-    "project_ball",
     "time_control",
 ]

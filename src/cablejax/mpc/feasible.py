@@ -13,18 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from cablejax.bounded.sets import (
-    AbstractSet,
-    AffineBalls,
-    Balls,
-    ConvexSet,
-    Halfspaces,
-    Intersection,
-    project_ball,
-)
+from cablejax.bounded.sets import AbstractSet, AffineBalls, Balls, ConvexSet, Halfspaces, Intersection
 from cablejax.mpc.sequential_projection import project_sequentially
-
-__all__ = ["FeasibleSet", "feasible_from", "project_ball"]
 
 # Relative distance kept from every bound, in units of rounding, so that a projected plan satisfies it strictly.
 _MARGIN_ULP = 16
