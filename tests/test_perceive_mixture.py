@@ -5,7 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from cablejax.perceive.curve import carried, curve, keypoints_of, perpendicular
+from cablejax.arrays import quarter_turn
+from cablejax.perceive.curve import carried, curve, keypoints_of
 from cablejax.perceive.mixture import ELONGATION, distance_to, embedding_stiffness, expectation
 from perceive_cases import ARCH, REGISTRATION, shape, start_angles
 
@@ -81,7 +82,7 @@ def test_the_curve_ends_where_its_angles_lead():
     assert np.linalg.norm(keypoints - before.keypoints, axis=1).max() < 5e-3
     chords = np.linalg.norm(np.diff(keypoints, axis=0), axis=1)
     assert (chords < 1 / 12 + 1e-6).all() and (chords > 0.95 / 12).all()
-    np.testing.assert_allclose(np.sum(perpendicular(chain.tangent) * chain.tangent, axis=1), 0.0, atol=1e-6)
+    np.testing.assert_allclose(np.sum(quarter_turn(chain.tangent) * chain.tangent, axis=1), 0.0, atol=1e-6)
 
 
 def test_a_rigid_shift_is_carried_exactly():

@@ -1,4 +1,4 @@
-"""Operations that belong to no stage: runs of flags, angles within a turn, and products of quaternions."""
+"""Operations that belong to no stage: runs of flags, angles within a turn, quarter turns, quaternions."""
 
 from __future__ import annotations
 
@@ -17,6 +17,11 @@ def stretches(flags: Bool[np.ndarray, " T"]) -> Int[np.ndarray, "S 2"]:
 def wrapped(angle):
     """The same angle within [-pi, pi) [rad]. NumPy in, NumPy out; JAX in, JAX out."""
     return (angle + math.pi) % (2 * math.pi) - math.pi
+
+
+def quarter_turn(vectors: Float[Any, "*B 2"]) -> Float[Any, "*B 2"]:
+    """Vectors of the plane, turned by a quarter to the left. NumPy in, NumPy out; JAX in, JAX out."""
+    return vectors.__array_namespace__().stack([-vectors[..., 1], vectors[..., 0]], axis=-1)
 
 
 def quaternion_product(a: Float[Any, "*B 4"], b: Float[Any, "*B 4"]) -> Float[Any, "*B 4"]:

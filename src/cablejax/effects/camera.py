@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from cablejax.arrays import quarter_turn
 from cablejax.effects.arms import delayed
 from cablejax.effects.base import CableEffect
 from cablejax.effects.effect import Parameter
@@ -93,7 +94,7 @@ class KeypointBias(CableEffect):
         """The three offsets that take away most of the residual, by least squares against tangent and normal."""
         tangent = np.gradient(context.keypoints, axis=2)
         tangent = tangent / np.linalg.norm(tangent, axis=-1, keepdims=True)
-        normal = np.stack([-tangent[..., 1], tangent[..., 0]], axis=-1)
+        normal = quarter_turn(tangent)
         gains = []
         for index in range(1, context.config.cable.n_keypoints - 1):
             for across, direction in ((0, tangent), (1, normal)):

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from cablejax.arrays import quarter_turn
 from cablejax.cable import Cable, Discretisation
 from cablejax.simulate.composite import link_lengths, node_offsets
 from cablejax.simulate.keypoints import hermite, hermite_weights
@@ -107,12 +108,7 @@ def keypoints_of(matrices: CurveMatrices, shape: Curve) -> Float[Array, "N 2"]:
 def centre_jacobian(matrices: CurveMatrices, shape: Curve) -> Float[Array, "n J 2"]:
     """Derivative of every link's middle by every joint angle [m/rad]: what lies beyond a joint turns about it."""
     arm = shape.centre[:, None] - shape.joint
-    return jnp.asarray(matrices.beyond, arm.dtype)[..., None] * perpendicular(arm)
-
-
-def perpendicular(vector: Float[Array, "*b 2"]) -> Float[Array, "*b 2"]:
-    """The vector turned by +90 degrees."""
-    return jnp.stack([-vector[..., 1], vector[..., 0]], axis=-1)
+    return jnp.asarray(matrices.beyond, arm.dtype)[..., None] * quarter_turn(arm)
 
 
 def carried(

@@ -22,7 +22,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from cablejax.perceive.curve import Curve, perpendicular
+from cablejax.arrays import quarter_turn
+from cablejax.perceive.curve import Curve
 
 ELONGATION = 0.4
 """Standard deviation of a Gaussian along its link, in lengths of the link."""
@@ -114,7 +115,7 @@ def distance_to(points: Float[Array, "S 2"], shape: Curve, lengths: Any) -> Floa
 
 def _along_across(points: Float[Array, "S 2"], shape: Curve) -> tuple[Float[Array, "S n"], Float[Array, "S n"]]:
     """Position of each point along each link, from its middle, and distance across it [m]."""
-    normal = perpendicular(shape.tangent)
+    normal = quarter_turn(shape.tangent)
     along = points @ shape.tangent.T - jnp.sum(shape.centre * shape.tangent, axis=-1)
     across = points @ normal.T - jnp.sum(shape.centre * normal, axis=-1) - 0.5 * shape.curvature * along**2
     return along, across

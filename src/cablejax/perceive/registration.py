@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from cablejax.arrays import quarter_turn
 from cablejax.limits import check
 from cablejax.perceive.curve import (
     Curve,
@@ -19,7 +20,6 @@ from cablejax.perceive.curve import (
     curve,
     curve_matrices,
     keypoints_of,
-    perpendicular,
 )
 from cablejax.perceive.mixture import NEIGHBOURS, STRIDE, Moments, distance_to, embedding_stiffness, expectation
 from cablejax.simulate.grasp import constrained_acceleration
@@ -205,7 +205,7 @@ def _maximisation(
     dtype = angles.dtype
     spacing = config.length / (config.n_links - 1)
     of_centre = centre_jacobian(matrices, shape)
-    across = jnp.einsum("kjd,kd->kj", of_centre, perpendicular(shape.tangent))
+    across = jnp.einsum("kjd,kd->kj", of_centre, quarter_turn(shape.tangent))
     turn = jnp.asarray(matrices.beyond, dtype)
     # A link that shifts by u across and turns by v changes the residual of a point at `a` to r - u - a v.
     precision = 1.0 / sigma**2
@@ -220,7 +220,7 @@ def _maximisation(
     hessian = hessian + (config.bending / spacing) * jnp.eye(len(angles), dtype=dtype)
     force = force - config.bending / spacing * angles
     arm = shape.end - shape.joint
-    constraint = jnp.concatenate([perpendicular(arm).T, jnp.full((1, len(angles)), config.length, dtype)])
+    constraint = jnp.concatenate([quarter_turn(arm).T, jnp.full((1, len(angles)), config.length, dtype)])
     error = _closure(config, shape, angles, pose)
     step = constrained_acceleration(hessian, force, constraint, error)
     return step * jnp.minimum(1.0, MAX_TURN / jnp.sqrt(jnp.max(step**2) + 1e-20))

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from cablejax.arrays import quarter_turn
 from cablejax.cable import Discretisation
 from cablejax.effects.physics import Physics
 
@@ -50,7 +51,7 @@ def marked_keypoints(
     points = (1 - 3 * t**2 + 2 * t**3) * a + (3 * t**2 - 2 * t**3) * b
     points = points + scale * h * ((t - 2 * t**2 + t**3) * da + (t**3 - t**2) * db)
     tangent = (1 - t) * da + t * db
-    normal = xp.stack([-tangent[..., 1], tangent[..., 0]], axis=-1)
+    normal = quarter_turn(tangent)
     return points + physics.bias_across[:, None] * normal
 
 

@@ -25,11 +25,6 @@ def beyond(x: Float[Array, "n k"]) -> Float[Array, "n k"]:
     return jnp.asarray(np.tri(len(x)).T, x.dtype) @ x
 
 
-def turned(x: Float[Array, "*n 2"]) -> Float[Array, "*n 2"]:
-    """A quarter turn to the left."""
-    return jnp.stack([-x[..., 1], x[..., 0]], axis=-1)
-
-
 def cross(a: Float[Array, "n 2"], b: Float[Array, "n 2"]) -> Float[Array, "n"]:
     """Component across the plane of the cross product."""
     return a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]

@@ -9,8 +9,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from cablejax.arrays import quarter_turn
 from cablejax.cable import Discretisation
-from cablejax.simulate.chain.geometry import chained, summed, turned
+from cablejax.simulate.chain.geometry import chained, summed
 from cablejax.simulate.composite import link_lengths, node_offsets
 
 
@@ -103,7 +104,7 @@ def frame_of(config: Discretisation, state: ChainState) -> Frame:
     along = scale * jnp.stack([jnp.cos(theta), jnp.sin(theta)], axis=1)
     joints = chained(lengths[:, None] * along)
     nodes = joints + offsets[:, None] * along
-    turning, pulling = rate[:, None] * turned(along), -(rate**2)[:, None] * along
+    turning, pulling = rate[:, None] * quarter_turn(along), -(rate**2)[:, None] * along
     velocity = chained(lengths[:, None] * turning) + offsets[:, None] * turning
     velocity = state.root_velocity + velocity + nodes * (state.velocity[-1] / scale)
     bias = chained(lengths[:, None] * pulling) + offsets[:, None] * pulling

@@ -28,9 +28,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from cablejax.arrays import quarter_turn
 from cablejax.cable import Discretisation
 from cablejax.effects.physics import Physics
-from cablejax.simulate.chain.geometry import beyond, cross, solve_lower, turned
+from cablejax.simulate.chain.geometry import beyond, cross, solve_lower
 from cablejax.simulate.chain.state import ChainState, Frame, frame_of, halfway_state
 from cablejax.simulate.composite import link_lengths
 from cablejax.simulate.contact import obstacle_contact
@@ -191,7 +192,7 @@ def _inertia(config: Discretisation, mass: Float[Array, "n"]) -> Float[Array, "n
 def _grasps(config: Discretisation, physics: Physics, frame: Frame) -> tuple[Float[Array, "5 n1"], Float[Array, "5"]]:
     """Rows G of the grasps and of the stretch, and their compliances."""
     nodes, n, dtype = frame.nodes, config.n_links, frame.theta.dtype
-    tip = turned(nodes[-1] - frame.joints)
+    tip = quarter_turn(nodes[-1] - frame.joints)
     tip_stretch = nodes[-1] / frame.scale
     ones, none, zero = jnp.ones(n, dtype), jnp.zeros(n, dtype), jnp.zeros((), dtype)
     rows = jnp.stack(
