@@ -42,7 +42,8 @@ def joined(logs: Sequence[GapLog], names: Sequence[str]) -> GapLog:
                     "Diagnose them apart, or correct the one that states it wrongly."
                 )
     extra = set.intersection(*(set(log.meta) for log in logs)) - {*META_FIELDS, "recordings"}
-    shared = [*META_FIELDS, *(name for name in sorted(extra) if all(_same(name, log, logs[0]) for log in logs))]
+    alike = (name for name in sorted(extra) if all(log.meta[name] == logs[0].meta[name] for log in logs))
+    shared = [*META_FIELDS, *alike]
     meta = {
         **{name: logs[0].meta[name] for name in shared},
         "motion": [motion for log in logs for motion in log.meta["motion"]],
@@ -115,10 +116,6 @@ def _set_up(log: GapLog) -> dict[str, Any]:
         **{f"meta.cable.{name}": value for name, value in meta["cable"].items()},
         **{f"meta.{name}": meta[name] for name in ("table", "gravity_m_per_s2", "keypoint_arclength_m", "grasp")},
     }
-
-
-def _same(name: str, log: GapLog, other: GapLog) -> bool:
-    return log.meta[name] == other.meta[name]
 
 
 def _same_recording(log: GapLog, other: GapLog) -> bool:

@@ -125,12 +125,8 @@ _COLUMNS = ["steps", "windows", "RMSE [cm]", "mean [cm]", "median [cm]", "90 %",
 
 def _row(error: OpenLoopError, k: int) -> list[str]:
     numbers = [getattr(error, f"{name}_cm")[k] for name in ("rmse", "mean", "median", "p90", "p95", "p99")]
-    shown = [_number(value) for value in (*numbers, error.relative[k])]
+    shown = [f"{value:.4f}" if math.isfinite(value) else "" for value in (*numbers, error.relative[k])]
     return [str(error.horizons[k]), str(error.starts[k]), *shown]
-
-
-def _number(value: float) -> str:
-    return f"{value:.4f}" if math.isfinite(value) else ""
 
 
 def _fields(error: OpenLoopError) -> dict[str, Any]:

@@ -116,7 +116,8 @@ class ShapingProblem:
         """Rolls a plan out with the model."""
 
         def one_step(history, twist):
-            after = self._advance(history, twist)
+            moved = self.dynamics(self.weights, history, twist)
+            after = advance(history, moved, twist, self.objective.interval)
             return after, (history, after.keypoints[-1])
 
         met, shapes = jax.lax.scan(one_step, self.history, self.objective.to_twist(motion))[1]
@@ -183,9 +184,6 @@ class ShapingProblem:
     def shape_error(self, keypoints: Float[Array, "*batch N 2"]) -> Float[Array, "*batch"]:
         """Root mean square distance of keypoints to the target [m]."""
         return jnp.sqrt(jnp.mean(jnp.sum((keypoints - self.target) ** 2, axis=-1), axis=-1))
-
-    def _advance(self, history: History, twist: Float[Array, "Q 3"]) -> History:
-        return advance(history, self.dynamics(self.weights, history, twist), twist, self.objective.interval)
 
     def _weigh(self, shape_error: Float[Array, "T N 2"], motion: Float[Array, "T Q 3"]) -> Float[Array, " M"]:
         n_steps, n_keypoints = shape_error.shape[:2]

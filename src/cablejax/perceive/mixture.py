@@ -134,15 +134,10 @@ def embedding_stiffness(centre: Float[Array, "n 2"]) -> Float[Array, "n n"]:
     gram = arms @ jnp.swapaxes(arms, -1, -2)
     trace = jnp.trace(gram, axis1=-2, axis2=-1)[:, None, None]
     gram = gram + RIDGE * trace * jnp.eye(NEIGHBOURS, dtype=centre.dtype)
-    weight = _solve(gram / trace)
+    weight = jnp.linalg.solve(gram / trace, jnp.ones((n, NEIGHBOURS, 1), gram.dtype))[..., 0]
     weight = weight / jnp.sum(weight, axis=-1, keepdims=True)
     difference = jnp.eye(n, dtype=centre.dtype).at[np.arange(n, dtype=np.int32)[:, None], index].add(-weight)
     return difference.T @ difference
-
-
-def _solve(gram: Float[Array, "n K K"]) -> Float[Array, "n K"]:
-    """Solves `gram w = 1` for all points at once."""
-    return jnp.linalg.solve(gram, jnp.ones((*gram.shape[:-1], 1), gram.dtype))[..., 0]
 
 
 def _neighbours(k: int, n: int) -> list[int]:
