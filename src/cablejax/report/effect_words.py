@@ -38,6 +38,7 @@ EFFECTS: dict[str, str] = {
 
 _PARAMETERS: dict[str, str] = {
     "centre_m": "centre, from gripper 0",
+    "length_m": "length between the grippers",
     "width_m": "length of the section",
     "ratio": "ratio to the believed value",
     "stiffness_over_density_m4_per_s2": "EI over the mass per length",
