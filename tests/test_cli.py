@@ -34,6 +34,12 @@ def test_version_is_that_of_the_package(capsys):
     assert capsys.readouterr().out == f"cablejax {importlib.metadata.version('cablejax')}\n"
 
 
+def test_two_threads_are_refused(monkeypatch, capsys):
+    monkeypatch.setenv("NPROC", "2")
+    assert main(["cable", "--out", "never.toml"]) == 2
+    assert "NPROC is 2" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("command", [c for c in SUBCOMMANDS if c != ["bench"]], ids=" ".join)
 def test_help_explains_every_option(command, capsys):
     text = help_of(command, capsys)

@@ -103,6 +103,11 @@ def _run(given: list[str]) -> int:
     command = command.what if isinstance(command, (Bench, Import)) else command
     hint = f"Interrupted. {command.resume_hint}"
     try:
+        if os.environ.get("NPROC") == "2":
+            raise ValueError(
+                "NPROC is 2, and XLA's pool of two threads can deadlock in batched steps. Set it to 1, or to 4 or "
+                "more, or leave it out."
+            )
         with answered(hint):
             command.run()
     except BrokenPipeError:
