@@ -52,7 +52,7 @@ class Study(Command):
     """Noise: standard deviation of the recorded keypoints, per coordinate [mm]."""
 
     links: int = 40
-    """Links of the plant's cable. Fewer are faster; the error of the plant itself grows with the square of their length."""
+    """Links of the plant's cable. Fewer are faster; the plant's own error grows with the square of their length."""
 
     def execute(self):
         """Records and diagnoses round by round, keeps each as it ends, and reports."""
