@@ -34,7 +34,7 @@ from cablejax.diagnose.diagnosis import (
 from cablejax.diagnose.evidence import Evidence
 from cablejax.diagnose.fit import Fit
 from cablejax.diagnose.gap import shrinkage
-from cablejax.diagnose.judgement import judged, verdict_sentence
+from cablejax.diagnose.judgement import beside_unknown, judged, verdict_sentence
 from cablejax.diagnose.laws import Law
 from cablejax.diagnose.posterior import drawn_by, draws, over_laws, posterior
 from cablejax.diagnose.protocol import Simulator
@@ -153,17 +153,8 @@ def _concluded(
     order = np.argsort([-e.probability for e in effects])
     named = tuple(effects[i] for i in order)
     if verdict == "named+unknown":
-        named = tuple(_beside_unknown(effect, evidence.simulator.beside_unknown) for effect in named)
+        named = tuple(beside_unknown(effect, evidence.simulator.beside_unknown) for effect in named)
     return Conclusion(verdict, best, named, tuple(equivalent), ranking, explained, as_much, (), under), drawn
-
-
-def _beside_unknown(effect: NamedEffect, causes: float | None) -> NamedEffect:
-    """The effect as a part of an explanation that is not complete: what is missing may be what it stands for.
-
-    Among the effects of the library it is as probable as before; that share of such names are causes.
-    """
-    assert effect.probability is not None
-    return dataclasses.replace(effect, probability=None if causes is None else causes * effect.probability)
 
 
 def _excused(under: Sequence[UnderLaw]) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 
 from cablejax.diagnose.diagnosis import NamedEffect, Ranked, Verdict
@@ -25,6 +26,18 @@ def judged(*, resolvable: bool, telling: bool, complete: bool, alike: bool) -> V
     if not complete:
         return "named+unknown"
     return "ambiguous" if alike else "named"
+
+
+def beside_unknown(effect: NamedEffect, causes: float | None) -> NamedEffect:
+    """The effect as a part of an explanation that is not complete: what is missing may be what it stands for.
+
+    Args:
+        effect: with its probability among those of the library.
+        causes: see `Simulator.beside_unknown`.
+    """
+    if causes is None or effect.probability is None:
+        return dataclasses.replace(effect, probability=None)
+    return dataclasses.replace(effect, probability=causes * effect.probability)
 
 
 FAINT = 0.01
