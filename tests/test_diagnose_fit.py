@@ -11,6 +11,7 @@ import pytest
 from cablejax.cable import Cable, Discretisation
 from cablejax.diagnose import LIBRARY, CableEffect, Calibration, Explanation, Parameter, explanation
 from cablejax.diagnose.belief import (
+    BESIDE_UNKNOWN,
     as_good,
     excess,
     explains_most_motions,
@@ -23,6 +24,7 @@ from cablejax.diagnose.conclude import conclude, sentence
 from cablejax.diagnose.evidence import Evidence
 from cablejax.diagnose.fit import Fit, evaluate, improve
 from cablejax.diagnose.gap import held_out_predictions
+from cablejax.diagnose.judgement import beside_unknown
 from cablejax.diagnose.planar import physics_of
 from cablejax.diagnose.playback import Playback
 from cablejax.diagnose.protocol import Term
@@ -125,6 +127,10 @@ def test_a_motion_that_nothing_explains_does_not_hide_the_cause_of_the_others():
     found = Search(tuple([right, wrong, null][i] for i in order), scores[order], {})
     conclusion = conclude(found, facts, calibration)
     assert conclusion.verdict == "named+unknown" and conclusion.explained < calibration.telling
+    # beside an unknown cause a name may only resemble it; where nobody has counted how often, it has no probability
+    (effect,) = conclusion.effects
+    assert effect.probability == pytest.approx(BESIDE_UNKNOWN, rel=1e-3)
+    assert beside_unknown(effect, None).probability is None
     assert [effect.name for effect in conclusion.effects] == ["gripper_rotation_offset"]
     assert conclusion.equivalent == ()
     left, gap = (excess(float(fit.sse.sum()), facts) for fit in (right, null))
