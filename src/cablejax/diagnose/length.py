@@ -92,8 +92,10 @@ def other_length(case: Case, log: GapLog) -> Length | None:
     return Length(stated, ParameterEstimate(stated * mean, interval, "m"))
 
 
-def with_other_length(case: Case, length: Length, log: GapLog) -> Case:
-    """The case, its simulator with the other length as one more law; as it is where such a cable would be torn."""
+def with_other_length(case: Case, length: Length | None, log: GapLog) -> Case:
+    """The case, its simulator with the other length as one more law; unchanged without one, or if it would be torn."""
+    if length is None:
+        return case
     try:
         other = Case.of(length.applied(log), case.simulator.effects).simulator
     except DiagnosisError:

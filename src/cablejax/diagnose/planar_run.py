@@ -68,8 +68,7 @@ def diagnose(
     if bounds is not None:
         require_some_motion(case.simulator.playback, case.noise.std, bounds)
     length = other_length(case, log)
-    if length is not None:
-        case = with_other_length(case, length, log)
+    case = with_other_length(case, length, log)
     evidence = case.evidence(calibration)
     found, conclusion = explain(evidence, calibration, progress=progress)
     if length is not None and (probability := length.probability(conclusion.under_laws)) > 0.5:
