@@ -136,7 +136,7 @@ def test_a_motion_that_nothing_explains_does_not_hide_the_cause_of_the_others():
     left, gap = (excess(float(fit.sse.sum()), facts) for fit in (right, null))
     assert conclusion.leftover_p == leftover_p(leftover_score(left, gap, level(facts), calibration)) < 0.05
     assert ", 70 %, looks" in sentence(conclusion, 0.7) and ", 0 %, looks" in sentence(conclusion, -0.2)
-    assert f", {100 * conclusion.explained:.0f} %, is" in sentence(conclusion, None)
+    assert f", {100 * conclusion.explained:.0f} %, looks" in sentence(conclusion, None)
 
 
 def test_two_effects_come_back_together():
