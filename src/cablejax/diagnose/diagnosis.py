@@ -30,7 +30,7 @@ class ParameterEstimate:
 
     Attributes:
         value: in `unit`; an integer or a list of integers for a choice such as the gripper.
-        ci90: 90 % interval, None for a choice.
+        ci90: 90 % interval; None for a choice, and where none was computed.
         unit: "" for a pure number.
     """
 

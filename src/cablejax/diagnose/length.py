@@ -11,7 +11,6 @@ import dataclasses
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.stats import t as student
 
 from cablejax.diagnose.case import Case
 from cablejax.diagnose.diagnosis import CableDiagnosis, ParameterEstimate, UnderLaw
@@ -28,16 +27,16 @@ class Length:
 
     Attributes:
         stated: in the log [m].
-        measured: with its 90 % interval over episodes, None where there is one only.
+        measured: from the keypoints [m].
     """
 
     stated: float
-    measured: ParameterEstimate
+    measured: float
 
     @property
     def ratio(self) -> float:
         """Measured over stated."""
-        return self.measured.value / self.stated
+        return self.measured / self.stated
 
     @property
     def apart(self) -> str:
@@ -48,7 +47,7 @@ class Length:
     @property
     def assumes(self) -> str:
         """In words, for a law of the simulator."""
-        return f"the cable is {self.measured.value:.4g} m long, not {self.stated:.4g} m as stated"
+        return f"the cable is {self.measured:.4g} m long, not {self.stated:.4g} m as stated"
 
     def probability(self, laws: Sequence[UnderLaw]) -> float:
         """Of this length, among all laws that were tried; 0 where it was not tried."""
@@ -57,7 +56,7 @@ class Length:
     def taken(self, diagnosis: CableDiagnosis, probability: float) -> CableDiagnosis:
         """A diagnosis with this length, which says so."""
         caveat = (
-            f"Keypoints are {self.apart}. A cable of {self.measured.value:.4g} m explains this log better than any "
+            f"Keypoints are {self.apart}. A cable of {self.measured:.4g} m explains this log better than any "
             f"effect of one of the stated {self.stated:.4g} m (probability {probability:.2f}), and that length is "
             "taken. Measure the cable between the grippers, and correct length_m and keypoint_arclength_m."
         )
@@ -65,12 +64,12 @@ class Length:
             diagnosis,
             sentence=f"{diagnosis.sentence} That is so if {self.assumes}.",
             caveats=(caveat, *diagnosis.caveats),
-            quantities={**diagnosis.quantities, "length_m": self.measured},
+            quantities={**diagnosis.quantities, "length_m": ParameterEstimate(self.measured, None, "m")},
         )
 
     def applied(self, log: GapLog) -> GapLog:
         """The log of a cable of the measured length, its keypoints at the same shares of it."""
-        cable = log.meta["cable"] | {"length_m": self.measured.value}
+        cable = log.meta["cable"] | {"length_m": self.measured}
         marks = [float(s * self.ratio) for s in log.meta["keypoint_arclength_m"]]
         return dataclasses.replace(log, meta=log.meta | {"cable": cable, "keypoint_arclength_m": marks})
 
@@ -86,10 +85,7 @@ def other_length(case: Case, log: GapLog) -> Length | None:
     if np.abs(ratio - 1).min() <= _OFF or np.ptp(np.sign(ratio - 1)) > 0:
         return None
     stated = float(log.meta["cable"]["length_m"])
-    mean, count = float(ratio.mean()), len(ratio)
-    half = float(student.ppf(0.95, count - 1) * ratio.std(ddof=1) / np.sqrt(count)) if count > 1 else None
-    interval = None if half is None else (stated * (mean - half), stated * (mean + half))
-    return Length(stated, ParameterEstimate(stated * mean, interval, "m"))
+    return Length(stated, stated * float(ratio.mean()))
 
 
 def with_other_length(case: Case, length: Length | None, log: GapLog) -> Case:
