@@ -112,6 +112,18 @@ def test_obstacle_is_sought_where_the_observed_cable_is_stopped(other):
     assert np.hypot(*(np.array(starts[0][:2]) - disc[:2])) < disc[2]
 
 
+def test_obstacle_is_sought_with_keypoints_that_were_not_seen():
+    disc = np.array([0.42, 0.25, 0.03])
+    facts = evidence(("obstacle", tuple(disc)), n_links=FINE_LINKS)
+    effect = {one.name: one for one in LIBRARY}["obstacle"]
+    residual = facts.observed - facts.nominal
+    # one never, and every fifth of the others
+    residual[:, :, 4] = np.nan
+    residual[np.random.default_rng(0).random(residual.shape[:3]) < 0.2] = np.nan
+    (_, (x, y, _)), *_ = facts.simulator.starts(effect, facts.nominal, residual)
+    assert np.hypot(x - disc[0], y - disc[1]) < disc[2]
+
+
 def test_no_obstacle_is_sought_where_nothing_was_seen():
     facts = evidence()
     effect = {one.name: one for one in LIBRARY}["obstacle"]

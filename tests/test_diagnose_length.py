@@ -9,7 +9,7 @@ import pytest
 from cablejax.diagnose import diagnose, verdict_json
 from cablejax.diagnose.belief import Calibration
 from cablejax.diagnose.case import Case
-from cablejax.diagnose.length import other_length, with_other_length
+from cablejax.diagnose.length import other_length
 from cablejax.diagnose.planar_run import _caveats
 from cablejax.types import GapLog
 from diagnose_cases import record
@@ -47,7 +47,7 @@ def test_caveat_on_keypoints_that_do_not_fit_the_length():
     length = other_length(case, log)
     (text,) = _caveats(case, Calibration(), length, commissioned=True)
     assert re.match(r"Keypoints are 1\.0 % closer together than the stated arc lengths, in every episode", text)
-    assert length.assumes in with_other_length(case, length, log).simulator.other_laws
+    assert length.assumes in length.as_law_of(case).simulator.other_laws
 
 
 @pytest.mark.slow

@@ -81,15 +81,21 @@ class Scored:
         """The named effects and everything said to be equivalent to one of them."""
         if self.verdict is None:
             return set()
-        found, sets = set(self.named), [set(group) for group in self.verdict.get("equivalent") or []]
-        if not found and self.said == "ambiguous":
-            return set().union(*sets)
-        return found.union(*(group for group in sets if group & found))
+        if not self.named and self.said == "ambiguous":
+            return set().union(*self._groups)
+        return set().union(*(self.alike(name) for name in self.named))
+
+    @property
+    def _groups(self) -> list[set[str]]:
+        return [set(group) for group in (self.verdict or {}).get("equivalent") or []]
+
+    def alike(self, name: str) -> set[str]:
+        """A named effect and everything said to be equivalent to it."""
+        return {name}.union(*(group for group in self._groups if name in group))
 
     def is_cause(self, name: str) -> bool:
         """Whether a named effect is there, or one that is said to be equivalent to it."""
-        groups = [set(group) for group in (self.verdict or {}).get("equivalent") or []]
-        return bool(set(self.truth) & {name}.union(*(group for group in groups if name in group)))
+        return bool(set(self.truth) & self.alike(name))
 
     def ranked(self, count: int) -> list[str]:
         """The most probable names of the ranking."""

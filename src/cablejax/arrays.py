@@ -1,4 +1,4 @@
-"""Operations that belong to no stage: runs of flags, angles within a turn, quarter turns, quaternions."""
+"""Operations that belong to no stage: flags, points not seen, angles within a turn, quarter turns, quaternions."""
 
 from __future__ import annotations
 
@@ -12,6 +12,12 @@ from jaxtyping import Bool, Float, Int
 def stretches(flags: Bool[np.ndarray, " T"]) -> Int[np.ndarray, "S 2"]:
     """First sample of each stretch in which a flag is set, and the first after it."""
     return np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(int))).reshape(-1, 2)
+
+
+def filled(points: Float[np.ndarray, "N D"]) -> Float[np.ndarray, "N D"]:
+    """Points of which some are NaN, these between their neighbours in the order of the points; at least one is not."""
+    seen, index = np.isfinite(points).all(axis=1), np.arange(len(points))
+    return np.stack([np.interp(index, index[seen], column[seen]) for column in points.T], axis=1)
 
 
 def wrapped(angle):

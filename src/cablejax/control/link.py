@@ -15,6 +15,7 @@ from typing import Any, Protocol
 import numpy as np
 from jaxtyping import Array, Float
 
+from cablejax.arrays import filled
 from cablejax.control.link_state import Instant, LinkConfig, LinkState, Reply, Status
 from cablejax.control.run import shape_error_cm
 from cablejax.control.targets import Target
@@ -239,16 +240,14 @@ class RobotLink:
     def _initial(self, seen: Observation) -> Any:
         """The controller's state for a cable at rest, as it is seen now."""
         history = History(
-            keypoints=np.repeat(_filled(seen.keypoints)[None], self.config.history_length, axis=0),  # pyright: ignore[reportArgumentType]
+            keypoints=np.repeat(_complete(seen.keypoints)[None], self.config.history_length, axis=0),  # pyright: ignore[reportArgumentType]
             gripper_pose=seen.gripper_pose,  # pyright: ignore[reportArgumentType]
         )
         return self.controller.init(history)
 
 
-def _filled(keypoints: np.ndarray) -> np.ndarray:
+def _complete(keypoints: np.ndarray) -> np.ndarray:
     """Keypoints with the ones not observed interpolated along the cable: a history has to start complete."""
-    seen = np.isfinite(keypoints).all(axis=1)
-    if not seen.any():
+    if not np.isfinite(keypoints).all(axis=1).any():
         raise ValueError("No keypoint of the cable was observed at the start: check the camera.")
-    index = np.arange(len(keypoints))
-    return np.stack([np.interp(index, index[seen], keypoints[seen, axis]) for axis in range(2)], axis=1)
+    return filled(keypoints)

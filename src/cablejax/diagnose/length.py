@@ -28,10 +28,12 @@ class Length:
     Attributes:
         stated: in the log [m].
         measured: from the keypoints [m].
+        case: the log of a cable of the measured length; None where it would be torn.
     """
 
     stated: float
     measured: float
+    case: Case | None
 
     @property
     def ratio(self) -> float:
@@ -53,8 +55,8 @@ class Length:
         """Of this length, among all laws that were tried; 0 where it was not tried."""
         return sum(law.probability for law in laws if law.assumes == self.assumes)
 
-    def taken(self, diagnosis: CableDiagnosis, probability: float) -> CableDiagnosis:
-        """A diagnosis with this length, which says so."""
+    def told(self, diagnosis: CableDiagnosis, probability: float) -> CableDiagnosis:
+        """A diagnosis that was made with this length, which says so."""
         caveat = (
             f"Keypoints are {self.apart}. A cable of {self.measured:.4g} m explains this log better than any "
             f"effect of one of the stated {self.stated:.4g} m (probability {probability:.2f}), and that length is "
@@ -73,6 +75,11 @@ class Length:
         marks = [float(s * self.ratio) for s in log.meta["keypoint_arclength_m"]]
         return dataclasses.replace(log, meta=log.meta | {"cable": cable, "keypoint_arclength_m": marks})
 
+    def as_law_of(self, case: Case) -> Case:
+        """The case of the stated length, its simulator with this length as one more law where that is possible."""
+        laws = {} if self.case is None else {self.assumes: self.case.simulator}
+        return dataclasses.replace(case, simulator=dataclasses.replace(case.simulator, resized=laws))
+
 
 def other_length(case: Case, log: GapLog) -> Length | None:
     """The length that the keypoints suggest, if it differs from the stated one in every episode in the same direction.
@@ -85,18 +92,11 @@ def other_length(case: Case, log: GapLog) -> Length | None:
     if np.abs(ratio - 1).min() <= _OFF or np.ptp(np.sign(ratio - 1)) > 0:
         return None
     stated = float(log.meta["cable"]["length_m"])
-    return Length(stated, stated * float(ratio.mean()))
-
-
-def with_other_length(case: Case, length: Length | None, log: GapLog) -> Case:
-    """The case, its simulator with the other length as one more law; unchanged without one, or if it would be torn."""
-    if length is None:
-        return case
+    length = Length(stated, stated * float(ratio.mean()), None)
     try:
-        other = Case.of(length.applied(log), case.simulator.effects).simulator
+        return dataclasses.replace(length, case=Case.of(length.applied(log), case.simulator.effects))
     except DiagnosisError:
-        return case
-    return dataclasses.replace(case, simulator=dataclasses.replace(case.simulator, resized={length.assumes: other}))
+        return length
 
 
 def _closeness(case: Case) -> np.ndarray:

@@ -12,11 +12,11 @@ from cablejax.diagnose.actuation import with_arms
 from cablejax.diagnose.belief import Calibration, excess
 from cablejax.diagnose.case import FINE_LINKS, FIT_LINKS, Case
 from cablejax.diagnose.conclude import Conclusion
-from cablejax.diagnose.diagnosis import CableDiagnosis, Gap
+from cablejax.diagnose.diagnosis import CableDiagnosis, Gap, NextMotion
 from cablejax.diagnose.evidence import Evidence
 from cablejax.diagnose.fit import evaluate
 from cablejax.diagnose.gap import held_out_predictions, measure_gap
-from cablejax.diagnose.length import Length, other_length, with_other_length
+from cablejax.diagnose.length import Length, other_length
 from cablejax.diagnose.motion_bounds import Bounds, BoundsError
 from cablejax.diagnose.motion_design import DesignConfig
 from cablejax.diagnose.motion_judge import MARGIN, Judge, Objective
@@ -67,22 +67,17 @@ def diagnose(
     case = Case.of(log, effects)
     if bounds is not None:
         require_some_motion(case.simulator.playback, case.noise.std, bounds)
-    length = other_length(case, log)
-    case = with_other_length(case, length, log)
+    length, taken = other_length(case, log), None
+    if length is not None:
+        case = length.as_law_of(case)
     evidence = case.evidence(calibration)
     found, conclusion = explain(evidence, calibration, progress=progress)
-    if length is not None and (probability := length.probability(conclusion.under_laws)) > 0.5:
+    if length is not None and length.case is not None and length.probability(conclusion.under_laws) > 0.5:
         progress(f"again, as {length.assumes}")
-        again = diagnose(
-            length.applied(log),
-            effects=effects,
-            commissioning=commissioning,
-            calibration=calibration,
-            bounds=bounds,
-            objective=objective,
-            progress=progress,
-        )
-        return length.taken(again, probability)
+        taken = length, length.probability(conclusion.under_laws)
+        log, case, length = length.applied(log), length.case, None
+        evidence = case.evidence(calibration)
+        found, conclusion = explain(evidence, calibration, progress=progress)
     conclusion = with_arms(conclusion, case.arms, calibration)
 
     progress("fitting without each episode in turn")
@@ -93,14 +88,11 @@ def diagnose(
         judge = Judge.of(
             case.simulator.playback, found.fits, found.scores, evidence, calibration, bounds or Bounds(), objective
         )
-        try:
-            following = next_motion(judge, None if bounds is None else DesignConfig())
-        except BoundsError as error:
-            none_kept = (f"There is no motion to record next under the explanations found. {error}",)
+        following, none_kept = _following(judge, None if bounds is None else DesignConfig())
     repaired = case.recording.as_log(log.meta)
     rounds = rounds_of(log, found.fits, found.scores, evidence, calibration)
     caveats = _caveats(case, calibration, length, commissioned=bool(commissioning))
-    return CableDiagnosis(
+    diagnosis = CableDiagnosis(
         **Examined(evidence, found, conclusion, reference, after, gap).fields(),
         where=localise(repaired, case.to_log(reference), case.noise.std),
         next_motion=following,
@@ -114,6 +106,15 @@ def diagnose(
         seconds=time.perf_counter() - begin,
         settings={**settings_of(case.simulator, calibration), "links": {"fit": FIT_LINKS, "nominal": FINE_LINKS}},
     )
+    return diagnosis if taken is None else taken[0].told(diagnosis, taken[1])
+
+
+def _following(judge: Judge, design: DesignConfig | None) -> tuple[NextMotion | None, tuple[str, ...]]:
+    """The next motion, or None and why there is none."""
+    try:
+        return next_motion(judge, design), ()
+    except BoundsError as error:
+        return None, (f"There is no motion to record next under the explanations found. {error}",)
 
 
 def calibrated(length: float) -> Calibration:

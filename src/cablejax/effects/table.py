@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float
 
+from cablejax.arrays import filled
 from cablejax.cable import Discretisation
 from cablejax.effects.base import CableEffect, Context
 from cablejax.effects.effect import Parameter
@@ -197,14 +198,14 @@ def _in_the_way(context: Context) -> list[tuple[float, float, float]]:
     the times at which the observed cable lies against it: a cable that is stopped stays there, one that merely moves
     otherwise does not. The prior of the radius decides between a disc and a larger one behind it.
     """
-    observed, simulated = (
+    residual, simulated, known = (
         points[:, ::_EVERY].reshape(-1, *points.shape[2:])
-        for points in (context.keypoints + context.residual, context.keypoints)
+        for points in (_completed(context.residual), context.keypoints, context.residual)
     )
-    seen = np.isfinite(observed).all(axis=(1, 2)) & np.isfinite(simulated).all(axis=(1, 2))
+    seen = np.isfinite(known).any(axis=(1, 2)) & np.isfinite(simulated + residual).all(axis=(1, 2))
     if not seen.any():
         return []
-    observed, simulated = observed[seen], simulated[seen]
+    simulated, observed = simulated[seen], (simulated + residual)[seen]
     low, high = simulated.min(axis=(0, 1)), simulated.max(axis=(0, 1))
     step = _GRID * context.config.cable.length
     axes = [np.arange(begin, end + step, step) for begin, end in zip(low, high, strict=True)]
@@ -225,6 +226,22 @@ def _in_the_way(context: Context) -> list[tuple[float, float, float]]:
         if all(np.hypot(*(grid[i] - disc[:2])) > _APART for disc in result):
             result.append((float(grid[i, 0]), float(grid[i, 1]), float(radius[i])))
     return result
+
+
+def _completed(residual: Float[np.ndarray, "E T N 2"]) -> Float[np.ndarray, "E T N 2"]:
+    """Keypoints that were not seen are off as they were before and after; those never seen, as their neighbours are.
+
+    NaN in an episode of which nothing was seen.
+    """
+    residual = np.array(residual)
+    for episode in residual:
+        seen = np.isfinite(episode).all(axis=2)
+        ever = seen.any(axis=0)
+        for n in np.flatnonzero(ever & ~seen.all(axis=0)):
+            episode[:, n] = filled(episode[:, n])
+        if ever.any() and not ever.all():
+            episode[:] = [filled(points) for points in episode]
+    return residual
 
 
 def _distances(points: Float[np.ndarray, "P 2"], cables: Float[np.ndarray, "M N 2"]) -> Float[np.ndarray, "P M"]:
