@@ -23,7 +23,6 @@ import json
 import pathlib
 import sys
 import time
-from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -32,7 +31,7 @@ import jax
 sys.path.append(str(pathlib.Path(__file__).resolve().parents[1] / "experiments"))
 
 from accelerator_page import page
-from accelerator_sections import SECTIONS, WAVES, Case, Prepared, Sizes
+from accelerator_sections import SECTIONS, WAVES, Case, Prepared, Sizes, timed
 from energy import EnergyMeter
 
 from cablejax.commands.options import say
@@ -113,12 +112,6 @@ def measured(prepared: Prepared, prepare_s: float, meter: EnergyMeter, sizes: Si
         "bytes": prepared.bytes,
         **prepared.details(),
     }
-
-
-def timed(function: Callable[[], Any]) -> tuple[Any, float]:
-    """What a function returns, and how long it took [s]."""
-    begin = time.perf_counter()
-    return function(), time.perf_counter() - begin
 
 
 def main(arguments: list[str] | None = None) -> None:

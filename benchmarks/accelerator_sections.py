@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import pathlib
-import tempfile
+import time
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -19,14 +18,14 @@ from cablejax.commands.workloads import (
     batched_control,
     closed_loop,
     controller_to_s,
+    data_stages,
     moving_arches,
     program_bytes,
     repeated,
 )
 from cablejax.control.shaping import initial_history, load_model
-from cablejax.dataset.generate import cable_params, draw
-from cablejax.dataset.opening import open_or_create
-from cablejax.dataset.schema import Block, DatasetConfig
+from cablejax.dataset.generate import make_engine, shards_at_once, simulate
+from cablejax.dataset.schema import DatasetConfig
 from cablejax.dynamics.config import ModelConfig
 from cablejax.dynamics.model import make_network
 from cablejax.dynamics.normalisation import fit_normalisation
@@ -52,8 +51,7 @@ class Sizes:
         gradient_batches: likewise with gradients, which compile for minutes.
         gradient_links: likewise.
         reference_batch: cables on which the engines are compared, and which one core simulates.
-        shard: trajectories simulated and written at once.
-        drawn: trajectories drawn and settled by the processor.
+        trajectories: of a data set.
         commands: of each trajectory.
         windows: batch and rollout of a training step.
         model: the network that is trained.
@@ -67,19 +65,18 @@ class Sizes:
     rounds: int = 5
     least_seconds: float = 1.0
     most_seconds: float = 10.0
-    batches: tuple[int, ...] = (64, 512, 4096, 32768)
-    links: tuple[int, ...] = (12, 24, 48, 96)
+    batches: tuple[int, ...] = (64, 4096, 32768)
+    links: tuple[int, ...] = (12, 48, 96)
     batch: int = 4096
-    gradient_batches: tuple[int, ...] = (64, 4096, 32768)
-    gradient_links: tuple[int, ...] = (12,)
+    gradient_batches: tuple[int, ...] = (64, 4096)
+    gradient_links: tuple[int, ...] = ()
     reference_batch: int = 64
-    shard: int = 2048
-    drawn: int = 8
+    trajectories: int = 10_000
     commands: int = 200
     windows: tuple[tuple[int, int], ...] = ((32, 1), (16, 4), (512, 1), (4096, 1))
     model: ModelConfig = ModelConfig()
     training_steps: int = 20
-    controlled: tuple[int, ...] = (64, 1024)
+    controlled: tuple[int, ...] = (1, 64, 1024)
     shaped: int = 1024
     loop_steps: int = 10
     horizon: int = 5
@@ -96,8 +93,7 @@ class Sizes:
             gradient_batches=(4,),
             gradient_links=(),
             reference_batch=2,
-            shard=4,
-            drawn=1,
+            trajectories=4,
             commands=5,
             windows=((4, 1),),
             model=ModelConfig(latent=16, hidden=16, message_passing=1),
@@ -107,6 +103,12 @@ class Sizes:
             loop_steps=2,
             horizon=1,
         )
+
+
+def timed(function: Callable[[], Any]) -> tuple[Any, float]:
+    """What a function returns, and how long it took [s]."""
+    begin = time.perf_counter()
+    return function(), time.perf_counter() - begin
 
 
 class Prepared(NamedTuple):
@@ -272,57 +274,19 @@ def precision_cases(sizes: Sizes) -> list[Case]:
 
 
 def data_cases(sizes: Sizes) -> list[Case]:
-    """Transitions into the store: each stage of `generate`, which runs them one after the other."""
-    config = DatasetConfig(
-        n_trajectories=sizes.drawn,
-        n_steps=sizes.commands,
-        discretisation=Discretisation(),
-        shard_size=sizes.drawn,
-        engine="mjx",
-    )
-    shard = dataclasses.replace(config, n_trajectories=sizes.shard, shard_size=sizes.shard)
-    engine = MjxEngine(config.discretisation)
+    """Transitions into a store by `generate`, once compiled, and how long drawing and simulating take alone."""
+    config = DatasetConfig(n_trajectories=sizes.trajectories, n_steps=sizes.commands)
 
-    def draws() -> Prepared:
-        return Prepared(lambda: [draw(config, i) for i in range(sizes.drawn)], sizes.drawn * sizes.commands)
+    def prepare() -> Prepared:
+        stages, engine = data_stages(config), make_engine(config)
+        simulate(config, engine, range(min(shards_at_once(config, engine), config.n_shards)))
 
-    def starts() -> Prepared:
-        poses = np.stack([draw(config, i).gripper_pose for i in range(sizes.drawn)])
-        return Prepared(lambda: engine.initial_state(poses), sizes.drawn * sizes.commands)
+        def details() -> dict[str, Any]:
+            return {f"{stage}_s": timed(stages[stage])[1] for stage in ("draw", "both")}
 
-    @functools.cache
-    def simulated():
-        drawn = [draw(config, i) for i in range(sizes.drawn)]
-        state = engine.initial_state(np.stack([one.gripper_pose for one in drawn]))
-        params = jax.tree.map(
-            lambda *leaves: np.stack(leaves), *[cable_params(config, one.parameters) for one in drawn]
-        )
-        inputs = (params, state, np.stack([one.gripper_twist for one in drawn]))
-        rows = np.arange(sizes.shard) % sizes.drawn
-        physics, start, twist = jax.tree.map(lambda leaf: np.asarray(leaf)[rows], inputs)
-        return lambda: jax.tree.map(np.asarray, engine.rollout(physics, start, twist, config.interval)[1])
+        return Prepared(stages["whole"], sizes.trajectories * sizes.commands, None, details)
 
-    def rollouts() -> Prepared:
-        return Prepared(simulated(), sizes.shard * sizes.commands)
-
-    def writing() -> Prepared:
-        trajectory, none = simulated()(), np.zeros(sizes.shard, np.int32)
-        arrays = {name: getattr(trajectory, name) for name in ("keypoints", "gripper_pose", "gripper_twist")}
-        block = Block(**arrays, parameters=np.ones((sizes.shard, 3)), attempts=none)
-
-        def run() -> None:
-            with tempfile.TemporaryDirectory() as folder:
-                open_or_create(pathlib.Path(folder) / "store", shard).write_shard(0, block)
-
-        return Prepared(run, sizes.shard * sizes.commands)
-
-    stages = {
-        "draw motions without snap-through": draws,
-        "settle the starts": starts,
-        f"simulate with MJX, batch {sizes.shard}": rollouts,
-        "write": writing,
-    }
-    return [Case("data", {"stage": name}, prepare) for name, prepare in stages.items()]
+    return [Case("data", {"engine": config.engine, "trajectories": sizes.trajectories}, prepare)]
 
 
 def training_cases(sizes: Sizes) -> list[Case]:
@@ -398,5 +362,5 @@ SECTIONS: dict[str, Callable[[Sizes], list[Case]]] = {
 }
 """The measurements of each section of the page."""
 
-WAVES = (("rollout",), ("precision", "data"), ("loop", "control"), ("training",), ("gradient",))
+WAVES = (("data", "loop", "control"), ("rollout",), ("training", "precision"), ("gradient",))
 """Sections that are compiled together, those that the goals need first."""

@@ -39,7 +39,7 @@ def simulated(config: DatasetConfig, rows: range) -> Trajectory:
     # The shard size does not change a trajectory: one each, so that any row can be made alone.
     config = dataclasses.replace(config, shard_size=1)
     engine, parts = make_engine(config), []
-    together = engine.shards_at_once if isinstance(engine, DeviceParallel) else TOGETHER
+    together = engine.width if isinstance(engine, DeviceParallel) else TOGETHER
     for first in range(rows.start, rows.stop, together):
         blocks = simulate(config, engine, range(first, min(first + together, rows.stop)))
         parts += [

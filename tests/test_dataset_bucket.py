@@ -15,12 +15,12 @@ import pytest
 
 from cablejax.cable import Cable, Discretisation
 from cablejax.cli import main
-from cablejax.dataset import generate as generation
 from cablejax.dataset.bucket import Bucket, UnreachableError, place_of
 from cablejax.dataset.generate import generate
 from cablejax.dataset.opening import open_or_create, open_store
 from cablejax.dataset.schema import DatasetConfig
 from cablejax.dataset.split import read_split
+from cablejax.dataset.store import Store
 from cablejax.simulate.motions import MotionConfig
 
 TINY = DatasetConfig(
@@ -149,23 +149,23 @@ def test_what_is_damaged_in_a_bucket_is_made_again(wire):
 
 def test_a_cut_connection_is_a_message_and_what_was_done_is_kept(wire, tmp_path, monkeypatch):
     store = open_or_create("s3://cables/cut", TINY)
-    original, simulated = generation.simulate, []
+    write, written = Store.write_shard, []
 
-    def cut_after_two(config, engine, shards, progress):
-        if len(simulated) == 2:
-            wire.cut_after = 2000  # in the middle of the next shard
-        simulated.extend(shards)
-        return original(config, engine, shards, progress)
+    def cut_at_the_third(self, shard, block):
+        if len(written) == 2:
+            wire.cut_after = 2000  # in the middle of this shard
+        written.append(shard)
+        write(self, shard, block)
 
-    monkeypatch.setattr(generation, "simulate", cut_after_two)
+    monkeypatch.setattr(Store, "write_shard", cut_at_the_third)
     with pytest.raises(UnreachableError, match=r"s3://cables/cut cannot be reached: .*run the same command again"):
         generate(TINY, "s3://cables/cut", progress=False)
-    assert simulated == [0, 1, 2]
+    assert written == [0, 1, 2]
     wire.cut_after = None
     assert [store.status(k) for k in (0, 1, 3)] == ["complete", "complete", "missing"]
     assert store.status(2) != "complete"
     info = generate(TINY, "s3://cables/cut", progress=False)
-    assert simulated == [0, 1, 2, 2, 3]
+    assert written == [0, 1, 2, 2, 3]
     assert info.digest == generate(TINY, tmp_path / "whole", progress=False).digest
 
 

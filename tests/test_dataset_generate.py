@@ -9,19 +9,22 @@ import socket
 import subprocess
 import sys
 import time
+import types
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from cablejax.cable import Cable, Discretisation
+from cablejax.dataset import generate as generation
+from cablejax.dataset.drawing import draw
 from cablejax.dataset.generate import (
     MAX_ATTEMPTS,
     GenerationInterrupted,
-    draw,
     find_fault,
     generate,
     make_engine,
+    shards_at_once,
     simulate,
 )
 from cablejax.dataset.opening import open_store
@@ -400,6 +403,16 @@ def test_two_and_eight_devices_make_the_bytes_of_one(tmp_path):
     block = simulate(config, ThreadedEngine(config.discretisation), range(config.n_shards))
     other = np.concatenate([part.keypoints for part in block])
     np.testing.assert_allclose(here.keypoints, other, atol=1e-3)
+
+
+@pytest.mark.parametrize("shard_size, devices, at_once", [(2, 1, 4), (3, 2, 4), (8, 1, 1), (64, 1, 1)])
+def test_an_accelerator_is_given_whole_shards(monkeypatch, shard_size, devices, at_once):
+    config = dataclasses.replace(TINY, engine="chain", shard_size=shard_size)
+    card = types.SimpleNamespace(platform="gpu")
+    monkeypatch.setattr(generation.jax, "local_devices", lambda: [card] * devices)
+    monkeypatch.setattr(generation, "CABLES_ON_ACCELERATOR", 8)
+    engine = make_engine(config)
+    assert shards_at_once(config, engine) == at_once and engine.width == at_once * shard_size
 
 
 def test_motions_of_a_longer_cable_are_in_proportion():

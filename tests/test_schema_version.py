@@ -11,7 +11,7 @@ import pytest
 from cablejax.cable import Cable
 from cablejax.cable_file import cable_text, read_cable
 from cablejax.commands.resuming import unfinished
-from cablejax.dataset.generate import draw
+from cablejax.dataset.drawing import draw
 from cablejax.dataset.opening import open_or_create, open_store
 from cablejax.dynamics.run_folder import claim_folder
 from cablejax.dynamics.weights import cable_of_weights, load_weights

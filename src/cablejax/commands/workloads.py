@@ -23,7 +23,8 @@ from cablejax.commands.options import say
 from cablejax.control.batched import AXIS, BatchRun, LoopConfig, for_each_cable, shape_batch
 from cablejax.control.shaping import Model, make_controller
 from cablejax.control.targets import make_target, straight_start
-from cablejax.dataset.generate import draw, generate, make_engine, simulate
+from cablejax.dataset.drawing import draw_all
+from cablejax.dataset.generate import generate, make_engine, shards_at_once, simulate
 from cablejax.dataset.schema import DatasetConfig
 from cablejax.dynamics.evaluate import snapping
 from cablejax.effects.physics import Physics, nominal_physics
@@ -127,23 +128,31 @@ def distance_from_fine(config: DatasetConfig, timestep: float = 0.002) -> Float[
     return away[~snapped & (one.attempts == truth.attempts)[:, None]]
 
 
-def data_seconds(config: DatasetConfig, rounds: int) -> dict[str, float]:
-    """Seconds that a data set takes, once compiled: drawing its motions, simulating them, and the checks and the store.
-
-    The last is what the whole takes beyond the others. Medians of the rounds.
-    """
-    engine, shards = make_engine(config), range(config.n_shards)
+def data_stages(config: DatasetConfig) -> dict[str, Callable[[], Any]]:
+    """What a data set takes: drawing its motions, drawing and simulating them, and all of it, into a store."""
+    engine = make_engine(config)
+    at_once, shards = shards_at_once(config, engine), range(config.n_shards)
+    groups = [shards[first : first + at_once] for first in shards[::at_once]]
+    rows = [[row for shard in group for row in config.shard_rows(shard)] for group in groups]
 
     def store() -> None:
         with tempfile.TemporaryDirectory() as folder:
             generate(config, pathlib.Path(folder) / "data.zarr", progress=False, engine=engine)
 
-    contestants = {
-        "draw": lambda: [draw(config, i) for i in range(config.n_trajectories)],
-        "both": lambda: [simulate(config, engine, [shard]) for shard in shards],
+    return {
+        "draw": lambda: [draw_all(config, indices) for indices in rows],
+        "both": lambda: [simulate(config, engine, group) for group in groups],
         "whole": store,
     }
-    drawn, both, whole = (float(np.median(s)) for s in seconds_in_turns(contestants, rounds).values())
+
+
+def data_seconds(config: DatasetConfig, rounds: int) -> dict[str, float]:
+    """Seconds that a data set takes, once compiled: drawing its motions, simulating them, and the checks and the store.
+
+    The last is what the whole takes beyond the others. Medians of the rounds.
+    """
+    turns = seconds_in_turns(data_stages(config), rounds)
+    drawn, both, whole = (float(np.median(seconds)) for seconds in turns.values())
     return {"drawing": drawn, "simulation": both - drawn, "store": max(whole - both, 0.0)}
 
 

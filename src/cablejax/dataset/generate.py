@@ -6,35 +6,34 @@ devices or processes, writes the same bytes (with the same engine on the same ki
 
 from __future__ import annotations
 
+import concurrent.futures
 import contextlib
-import dataclasses
 import itertools
 import math
 import os
 import shutil
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
 from tqdm import tqdm
 
 from cablejax.dataset.bucket import Bucket
+from cablejax.dataset.drawing import Draw, cable_params, draw_all
 from cablejax.dataset.opening import open_or_create
 from cablejax.dataset.parallel import DeviceParallel
 from cablejax.dataset.schema import Block, DatasetConfig
 from cablejax.dataset.store import DatasetInfo, Store
-from cablejax.effects.given import with_effects
-from cablejax.effects.physics import Physics, nominal_physics
 from cablejax.simulate import ENGINES, Engine, ThreadedEngine
-from cablejax.simulate.motions import random_motion
 from cablejax.types import Trajectory
 from cablejax.whole_file import sole_writer
 
 MAX_ATTEMPTS = 10
 """Motions drawn for one trajectory before generation gives up."""
+
+CABLES_ON_ACCELERATOR = 2048
+"""Cables in a batch on each accelerator: beyond, its steps take longer as their number grows."""
 
 GRASP_TOLERANCE = 1e-2
 """Largest distance of an end keypoint from its gripper [m]: a cable that snaps through pulls its ends off a bit."""
@@ -51,59 +50,6 @@ STRETCH_TOLERANCE = 0.01
 
 class GenerationInterrupted(KeyboardInterrupt):
     """Ctrl-C during generation: every shard written so far is kept. The message says how to go on."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Draw:
-    """The random part of one trajectory.
-
-    Attributes:
-        gripper_pose: where the grippers start, float32, shape [Q, 3].
-        gripper_twist: what they do, float32, shape [T, Q, 3].
-        parameters: the columns of `cablejax.dataset.schema.PARAMETERS`, float64, shape [3].
-        index: of the trajectory, for `DatasetConfig.effects_of`.
-    """
-
-    gripper_pose: np.ndarray
-    gripper_twist: np.ndarray
-    parameters: np.ndarray
-    index: int
-
-
-def draw(config: DatasetConfig, index: int, attempt: int = 0) -> Draw:
-    """Everything random about trajectory `index`, from (seed, index, attempt) alone."""
-    rng = np.random.default_rng(np.random.SeedSequence(config.seed, spawn_key=(index, attempt)))
-    parameters = draw_parameters(config, rng)
-    pose, twist = random_motion(rng, config.discretisation, config.n_steps, config.motion, config.interval)
-    return Draw(
-        gripper_pose=np.asarray(pose, np.float32),
-        gripper_twist=np.asarray(twist, np.float32),
-        parameters=parameters,
-        index=index,
-    )
-
-
-def draw_parameters(config: DatasetConfig, rng: np.random.Generator) -> Float[np.ndarray, "3"]:
-    """The random parameters of one cable, the columns of `cablejax.dataset.schema.PARAMETERS`."""
-    ranges, cable = config.randomisation, config.cable
-    stiffness, friction, damping = (
-        1.0 if limits is None else float(np.exp(rng.uniform(*np.log(limits))))
-        for limits in (ranges.stiffness, ranges.friction, ranges.damping)
-    )
-    return np.array([stiffness, friction * cable.friction_coefficient, damping * cable.damping_time])
-
-
-def cable_params(config: DatasetConfig, parameters: Float[Any, "3"], index: int = 0) -> Physics:
-    """The simulator's parameters of trajectory `index`: its row of the store's `parameters`, and its effects.
-
-    NumPy in, NumPy out; JAX in, JAX out.
-    """
-    stiffness, friction, damping = parameters.astype(np.float32)
-    nominal = nominal_physics(config.discretisation)
-    drawn = dataclasses.replace(
-        nominal, stiffness=nominal.stiffness * stiffness, friction=friction, damping_time=damping
-    )
-    return with_effects(drawn, config.effects_of(index), config.discretisation)
 
 
 def generate(
@@ -149,7 +95,7 @@ def generate(
     if not resume and any(store.status(shard) != "missing" for shard in mine):
         raise ValueError(f"{path} exists and holds trajectories. Allow resuming, or give a new folder.")
     simulator = engine or make_engine(config)
-    at_once = simulator.shards_at_once if isinstance(simulator, DeviceParallel) else 1
+    at_once = shards_at_once(config, simulator)
 
     done: list[int] = []
     total = sum(len(config.shard_rows(shard)) for shard in mine)
@@ -168,12 +114,10 @@ def generate(
             bar.update(len(config.shard_rows(shard)))
             return False
 
+        todo = filter(lacking, mine)
+        groups = iter(lambda: list(itertools.islice(todo, at_once)), [])
         try:
-            todo = filter(lacking, mine)
-            while shards := list(itertools.islice(todo, at_once)):
-                for shard, block in zip(shards, simulate(config, simulator, shards, bar.update), strict=True):
-                    store.write_shard(shard, block)
-                    done.append(shard)
+            _make(config, simulator, store, groups, done, bar)
         except KeyboardInterrupt:
             raise GenerationInterrupted(
                 f"Stopped at {sum(len(config.shard_rows(shard)) for shard in done)} of {total} trajectories; they are "
@@ -185,6 +129,27 @@ def generate(
 
         multihost_utils.sync_global_devices("cablejax.dataset.generate")
     return store.info()
+
+
+def _make(
+    config: DatasetConfig, engine: Engine, store: Store, groups: Iterator[list[int]], done: list[int], bar: tqdm
+) -> None:
+    """Simulates groups of shards; what has been simulated is written while the next group is. Adds to `done`."""
+
+    def write(shards: list[int], blocks: list[Block]) -> None:
+        for shard, block in zip(shards, blocks, strict=True):
+            store.write_shard(shard, block)
+            done.append(shard)
+
+    writing = None
+    with concurrent.futures.ThreadPoolExecutor(1) as writer:
+        for shards in groups:
+            blocks = simulate(config, engine, shards, bar.update)
+            if writing:
+                writing.result()
+            writing = writer.submit(write, shards, blocks)
+        if writing:
+            writing.result()
 
 
 def _check_room(store: Store) -> None:
@@ -238,7 +203,7 @@ def simulate(
     for attempt in range(MAX_ATTEMPTS):
         problems = {}
         for part in np.split(pending, range(at_once, len(pending), at_once)):
-            draws = [draw(config, int(index), attempt) for index in rows[part]]
+            draws = draw_all(config, rows[part].tolist(), attempt)
             trajectory = _rollout(config, engine, draws)
             out["keypoints"][part] = trajectory.keypoints
             out["gripper_pose"][part] = trajectory.gripper_pose
@@ -285,11 +250,22 @@ def find_fault(config: DatasetConfig, one: Block) -> str | None:
 
 
 def make_engine(config: DatasetConfig) -> Engine:
-    """The simulator that the configuration names, spread over this process' devices."""
+    """The simulator that the configuration names, spread over this process' devices.
+
+    A device's batch is one shard on a processor; on an accelerator, which a few cables leave idle, as many whole shards
+    as make `CABLES_ON_ACCELERATOR` cables.
+    """
     engine = ENGINES[config.engine](config.discretisation)  # pyright: ignore[reportCallIssue]
     if isinstance(engine, ThreadedEngine):
         return engine
-    return DeviceParallel(engine, config.shard_size, tuple(jax.local_devices()))
+    devices = tuple(jax.local_devices())
+    shards = 1 if devices[0].platform == "cpu" else max(CABLES_ON_ACCELERATOR // config.shard_size, 1)
+    return DeviceParallel(engine, min(shards, config.n_shards) * config.shard_size, devices)
+
+
+def shards_at_once(config: DatasetConfig, engine: Engine) -> int:
+    """Shards that `simulate` is best given together."""
+    return engine.width // config.shard_size if isinstance(engine, DeviceParallel) else 1
 
 
 def _rollout(config: DatasetConfig, engine: Engine, draws: Sequence[Draw]) -> Trajectory:

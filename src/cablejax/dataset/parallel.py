@@ -36,9 +36,9 @@ class DeviceParallel(Engine):
         return self.engine.config
 
     @property
-    def shards_at_once(self) -> int:
-        """Shards of `per_device` trajectories to be simulated together."""
-        return len(self.devices)
+    def width(self) -> int:
+        """Cables on all devices together."""
+        return self.per_device * len(self.devices)
 
     def initial_state(self, gripper_pose, *, guess=None) -> CableState:
         """The engine's initial state."""
@@ -50,7 +50,7 @@ class DeviceParallel(Engine):
         Raises:
             ValueError: the batch is larger than that.
         """
-        size, width = np.shape(twist)[0], self.per_device * len(self.devices)
+        size, width = np.shape(twist)[0], self.width
         if not 0 < size <= width:
             raise ValueError(f"The batch has {size} cables, expected 1 to {width}: {self.per_device} on each device.")
         rows = np.minimum(np.arange(width), size - 1)

@@ -14,7 +14,7 @@ from cablejax.cable import Cable, Discretisation
 from cablejax.control.command_limits import CommandLimits
 from cablejax.control.run import shape_error_cm
 from cablejax.control.targets import Shape, Target, make_target, straight_start
-from cablejax.dataset.generate import cable_params, draw_parameters
+from cablejax.dataset.drawing import cable_params, draw_parameters
 from cablejax.dataset.schema import DatasetConfig, Randomisation
 from cablejax.effects.given import GivenEffect, parse_effect
 from cablejax.limits import check

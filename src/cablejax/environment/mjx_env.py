@@ -17,7 +17,7 @@ from flax import struct
 from jaxtyping import Array, Float
 
 from cablejax.control.targets import straight_start
-from cablejax.dataset.generate import cable_params, draw_parameters
+from cablejax.dataset.drawing import cable_params, draw_parameters
 from cablejax.dataset.schema import Randomisation
 from cablejax.effects.physics import Physics, may_touch, without_obstacle
 from cablejax.environment.cables import ShapeCableConfig

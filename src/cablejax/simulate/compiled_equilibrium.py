@@ -1,4 +1,7 @@
-"""Newton's method for the resting chain, compiled by numba: drawing a trajectory takes hundreds of its solutions."""
+"""Newton's method for the resting chain, and the random motions that take hundreds of its solutions, by numba.
+
+Both are in one file: numba keeps compiled code on disk until the file itself changes, whatever that code calls.
+"""
 
 from __future__ import annotations
 
@@ -11,6 +14,7 @@ _MAX_STRETCH = 0.2  # largest correction of the far end in one iteration, relati
 _TOLERANCE = 1e-10
 _SAFE_CURVATURE = 1e-3  # smallest pivot [1 / h] from which on the reduced Hessian counts as positive
 _LEAST_CURVATURE = 1e-6  # smaller eigenvalues count as this [1 / h]
+_MAX_REDRAWS = 50
 
 
 @numba.njit(cache=True, nogil=True)
@@ -26,8 +30,15 @@ def settle(lengths, pose, guess):
         Joint angles [rad], shape [n - 1]; smallest eigenvalue of the energy's second derivative along the constraints
         [1 / m], for EI = 1, NaN = not settled; remaining error of the far end.
     """
+    angles, settled, free, off = _newton(lengths, pose, guess)
+    return angles, np.linalg.eigh(free)[0][0] if settled else np.nan, off
+
+
+@numba.njit(cache=True, nogil=True)
+def _newton(lengths, pose, guess):
+    """Joint angles, whether they have settled, the second derivative along the constraints, error of the far end."""
     h, length, n = lengths[1], lengths.sum(), len(guess)
-    angles, off = guess.copy(), np.inf
+    angles, off, free = guess.copy(), np.inf, np.empty((n - 3, n - 3))
     beyond, error = np.empty((n, 2)), np.empty(3)
     for _ in range(_MAX_ITERATIONS):
         _far_end(lengths, pose, angles, beyond, error)
@@ -65,8 +76,91 @@ def settle(lengths, pose, guess):
         largest = np.abs(step).max()
         angles += min(1.0, _MAX_TURN / max(largest, 1e-300)) * step
         if largest < _TOLERANCE and off < 1e-8:
-            return angles, np.linalg.eigh(free)[0][0], off
-    return angles, np.nan, off
+            return angles, True, free, off
+    return angles, False, free, off
+
+
+@numba.njit(cache=True, nogil=True)
+def walk(rng, lengths, pose, angles, count, interval, unit, persistence, rest_probability, bound, reach, limits):
+    """Twists of a random motion that keeps to its limits [m/s, rad/s], shape [count, 2, 3].
+
+    Args:
+        rng: source of all randomness.
+        lengths: of the links of a coarse chain [m], shape [n]; half-length links at the ends.
+        pose: of the two grippers at the start (x, y, theta), float64, shape [2, 3].
+        angles: joint angles at which that chain rests there [rad], shape [n - 1].
+        count: number of twists.
+        interval: for which each is held [s].
+        unit: the twist that a proposal of one stands for [m/s, rad/s], shape [3].
+        persistence: correlation of a proposal with the one before.
+        rest_probability: chance that the grippers stand still during an interval.
+        bound: of one gripper's `sqrt(vx^2 + vy^2 + (weight omega)^2)` [m/s], and the weight [m/rad].
+        reach: largest movement of any point of the resting chain, relative to the sum of what the grippers move.
+        limits: see `admissible`.
+    """
+    fastest, weight = bound
+    nodes, twists = _nodes(lengths, pose, angles), np.zeros((count, 2, 3))
+    innovation, velocity = np.sqrt(1.0 - persistence**2), rng.standard_normal((2, 3))
+    for t in range(count):
+        if rng.random() < rest_probability:
+            continue
+        proposal = persistence * velocity + innovation * rng.standard_normal((2, 3))
+        velocity = np.zeros((2, 3))
+        for _ in range(_MAX_REDRAWS):
+            twist, moved = proposal * unit, 0.0
+            for q in range(2):
+                speed = np.sqrt(twist[q, 0] ** 2 + twist[q, 1] ** 2 + (weight * twist[q, 2]) ** 2)
+                twist[q] *= min(1.0, fastest / max(speed, 1e-12))
+                moved += interval * min(speed, fastest)
+            following = pose + interval * twist
+            if admissible(following, limits):
+                rest, settled, _, _ = _newton(lengths, following, angles)
+                there = _nodes(lengths, following, rest)
+                if settled and _furthest(there, nodes) <= reach * moved:
+                    velocity, twists[t], pose, angles, nodes = proposal, twist, following, rest, there
+                    break
+            proposal = rng.standard_normal((2, 3))
+    return twists
+
+
+@numba.njit(cache=True, nogil=True)
+def admissible(pose, limits):
+    """See `cablejax.simulate.motions.admissible`.
+
+    Args:
+        pose: of the two grippers (x, y, theta), float64, shape [2, 3].
+        limits: least distance of the grippers [m], the largest of straight ones [m], largest curvature [1/m] and
+            largest angle between a gripper and the line through both [rad].
+    """
+    x, y = pose[1, 0] - pose[0, 0], pose[1, 1] - pose[0, 1]
+    heading, distance, detour = np.arctan2(y, x), np.sqrt(x * x + y * y), 0.0
+    for q in range(2):
+        angle = np.abs((pose[q, 2] - heading + np.pi) % (2 * np.pi) - np.pi)
+        if angle > limits[3]:
+            return False
+        detour += 2.0 / limits[2] * (angle - np.sin(angle))
+    return distance >= limits[0] and distance <= limits[1] - detour
+
+
+@numba.njit(cache=True, nogil=True)
+def _nodes(lengths, pose, angles):
+    """Positions of the joints [m], shape [n - 1, 2]."""
+    theta, (x, y) = pose[0, 2], pose[0, :2]
+    nodes = np.empty((len(angles), 2))
+    for i in range(len(angles)):
+        x, y = x + lengths[i] * np.cos(theta), y + lengths[i] * np.sin(theta)
+        nodes[i, 0], nodes[i, 1] = x, y
+        theta += angles[i]
+    return nodes
+
+
+@numba.njit(cache=True, nogil=True)
+def _furthest(one, other):
+    """Largest distance of two points of the same number [m]."""
+    largest = 0.0
+    for i in range(len(one)):
+        largest = max(largest, (one[i, 0] - other[i, 0]) ** 2 + (one[i, 1] - other[i, 1]) ** 2)
+    return np.sqrt(largest)
 
 
 @numba.njit(cache=True, nogil=True)

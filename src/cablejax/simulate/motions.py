@@ -8,12 +8,13 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float
 
-from cablejax.arrays import wrapped
 from cablejax.cable import Cable, Discretisation
 from cablejax.limits import check
-from cablejax.simulate.equilibrium import arch_angles, chain_nodes, find_equilibrium
+from cablejax.simulate import compiled_equilibrium
+from cablejax.simulate.compiled_equilibrium import walk
+from cablejax.simulate.composite import link_lengths
+from cablejax.simulate.equilibrium import arch_angles, find_equilibrium
 
-_MAX_REDRAWS = 50
 _COARSE_LINKS = 13
 
 
@@ -106,68 +107,31 @@ def random_motion(
         Gripper poses (x, y, theta) at the start [Q, 3] and twists [T, Q, 3] in m/s and rad/s.
     """
     start = _straight_start if motion.start == "straight" else _random_start
-    first = pose = start(rng, config, motion)
-    shape = _Shape.settled(config, pose) if np.isfinite(motion.max_amplification) else None
+    pose = start(rng, config, motion)
+    coarse = dataclasses.replace(config, n_links=min(config.n_links, _COARSE_LINKS))
     scale = np.exp(rng.uniform(np.log(motion.min_scale), 0.0))
     persistence = rng.uniform(0.0, motion.max_persistence)
-    innovation = np.sqrt(1.0 - persistence**2)
     unit = np.array([1.0, 1.0, 1.0 / motion.rotation_weight]) * scale * motion.max_step / interval / np.sqrt(2.0)
-    velocity = rng.standard_normal((2, 3))
-    twists = np.zeros((n_steps, 2, 3))
-    for t in range(n_steps):
-        if rng.random() < motion.rest_probability:
-            continue
-        proposal = persistence * velocity + innovation * rng.standard_normal((2, 3))
-        for _ in range(_MAX_REDRAWS):
-            twist = bound_twist(proposal * unit, motion.max_step / interval, motion.rotation_weight)
-            following = pose + interval * twist
-            reach = motion.max_amplification * interval * twist_size(twist, motion.rotation_weight).sum()
-            if admissible(config, motion, following) and (
-                shape is None or (moved := shape.moved(following, reach)) is not None
-            ):
-                velocity, twists[t], pose = proposal, twist, following
-                shape = None if shape is None else moved
-                break
-            proposal = rng.standard_normal((2, 3))
-        else:
-            velocity = np.zeros((2, 3))
-    return first, twists
-
-
-@dataclasses.dataclass(frozen=True)
-class _Shape:
-    """The frictionless equilibrium, on a coarse chain, that a motion carries along."""
-
-    config: Discretisation
-    angles: np.ndarray
-    nodes: np.ndarray
-
-    @classmethod
-    def settled(cls, config: Discretisation, pose: np.ndarray) -> _Shape:
-        coarse = dataclasses.replace(config, n_links=min(config.n_links, _COARSE_LINKS))
-        angles = find_equilibrium(coarse, pose, arch_angles(coarse, pose)).angles
-        return cls(coarse, angles, chain_nodes(coarse, pose, angles))
-
-    def moved(self, pose: np.ndarray, reach: float) -> _Shape | None:
-        """The equilibrium at the next pose, or None if a point of it is further than `reach` [m] from here."""
-        try:
-            angles = find_equilibrium(self.config, pose, self.angles).angles
-        except ValueError:
-            return None
-        nodes = chain_nodes(self.config, pose, angles)
-        if np.linalg.norm(nodes - self.nodes, axis=1).max() > reach:
-            return None
-        return _Shape(self.config, angles, nodes)
+    twists = walk(
+        rng,
+        link_lengths(coarse),
+        pose,
+        find_equilibrium(coarse, pose, arch_angles(coarse, pose)).angles,
+        n_steps,
+        float(interval),
+        unit,
+        persistence,
+        motion.rest_probability,
+        (motion.max_step / interval, motion.rotation_weight),
+        motion.max_amplification,
+        _limits(config, motion),
+    )
+    return pose, twists
 
 
 def twist_size(twist: Float[np.ndarray, "Q 3"], rotation_weight: float) -> Float[np.ndarray, "Q"]:
     """`sqrt(vx^2 + vy^2 + (rotation_weight omega)^2)` of each gripper [m/s]."""
     return np.linalg.norm(twist * np.array([1.0, 1.0, rotation_weight]), axis=-1)
-
-
-def bound_twist(twist: Float[np.ndarray, "Q 3"], bound: float, rotation_weight: float) -> Float[np.ndarray, "Q 3"]:
-    """Scales each gripper's twist down to `twist_size <= bound`."""
-    return twist * np.minimum(1.0, bound / np.maximum(twist_size(twist, rotation_weight), 1e-12))[..., None]
 
 
 def admissible(config: Discretisation, motion: MotionConfig, pose: Float[np.ndarray, "Q 3"]) -> bool:
@@ -176,15 +140,14 @@ def admissible(config: Discretisation, motion: MotionConfig, pose: Float[np.ndar
     An end that leaves the line through both grippers at angle a must bend there and back. On arcs of radius
     R = 1 / max_curvature this takes 2 R (|a| - sin |a|) of the length.
     """
-    chord = pose[1, :2] - pose[0, :2]
-    distance = np.linalg.norm(chord)
-    angles = np.abs(wrapped(pose[:, 2] - np.arctan2(chord[1], chord[0])))
-    detour = 2.0 / motion.max_curvature * np.sum(angles - np.sin(angles))
-    return bool(
-        distance >= motion.min_distance * config.cable.length
-        and distance <= config.cable.length * (1.0 - motion.straight_slack) - detour
-        and angles.max() <= motion.max_angle
-    )
+    return bool(compiled_equilibrium.admissible(np.asarray(pose, np.float64), _limits(config, motion)))
+
+
+def _limits(config: Discretisation, motion: MotionConfig) -> tuple[float, float, float, float]:
+    """The arguments `limits` of the compiled functions."""
+    length = config.cable.length
+    shortest, longest = motion.min_distance * length, (1.0 - motion.straight_slack) * length
+    return shortest, longest, float(motion.max_curvature), float(motion.max_angle)
 
 
 def _straight_start(rng, config, motion):
