@@ -7,10 +7,14 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
+from cablejax.diagnose import explanation
 from cablejax.diagnose.belief import Calibration
 from cablejax.diagnose.case import Case
+from cablejax.diagnose.conclude import Conclusion
+from cablejax.diagnose.diagnosis import NamedEffect
+from cablejax.diagnose.fit import Fit
 from cablejax.diagnose.noise import SMALLEST, noise_floor, still
-from cablejax.diagnose.planar_run import _caveats, calibrated
+from cablejax.diagnose.planar_run import _caveats, _worth_naming, calibrated
 from diagnose_cases import holds, log_of, poses, record
 
 EPISODES, SAMPLES, POINTS = 4, 300, 13
@@ -176,15 +180,50 @@ def test_keypoints_that_are_seen_in_every_third_sample_only():
 
 def test_caveats_on_holds_that_are_none():
     log = record()
-    assert not _caveats(Case.of(log), Calibration(), None, commissioned=True)
+    assert not _caveats(Case.of(log), Calibration(), None, 0.0, commissioned=True)
     (text, *_) = Case.of(dataclasses.replace(log, hold=np.ones_like(log.hold))).recording.caveats
     assert re.match(r"\d+ of 400 samples are marked as holds while the grippers move", text)
     creeping = np.array(log.keypoints)
     creeping[:, :, 3:10, 1] += 0.004 * np.sin(0.9 * np.arange(creeping.shape[1]))[None, :, None]
-    texts = _caveats(Case.of(dataclasses.replace(log, keypoints=creeping)), Calibration(), None, commissioned=True)
+    texts = _caveats(Case.of(dataclasses.replace(log, keypoints=creeping)), Calibration(), None, 0.0, commissioned=True)
     assert any("while the grippers rest, and by" in text for text in texts)
 
 
 def test_simulator_is_taken_to_be_further_off_on_a_long_cable():
     assert calibrated(3.0).baseline == pytest.approx(3 * Calibration.baseline)
     assert calibrated(0.4) == Calibration()
+
+
+def test_what_stated_numbers_may_be_off_by_is_small_unless_the_cable_is_soft():
+    log = record()
+    case = Case.of(log)
+    assert 0 < case.stated_error() < 0.1 * Calibration.baseline
+    cable = {**log.meta["cable"], "bending_stiffness_n_m2": 4e-4, "linear_density_kg_per_m": 0.1}
+    rope = Case.of(dataclasses.replace(log, meta={**log.meta, "cable": cable}))
+    stated = rope.stated_error()
+    # the same from predictions under each change alone
+    playback, off = rope.simulator.playback, []
+    for name in ("stiffness", "friction"):
+        high, low = (
+            playback.keypoints(
+                [dataclasses.replace(playback.believed, **{name: factor * getattr(playback.believed, name)})]
+            )
+            for factor in (1.01, 0.99)
+        )
+        off.append(np.mean((high - low)[0] ** 2, axis=(1, 2, 3)) / 4)
+    assert stated == pytest.approx(np.sqrt(np.median(sum(off))), rel=1e-3) and stated > 10 * case.stated_error()
+    texts = _caveats(rope, Calibration(), None, 1e-3, commissioned=True)
+    assert any("1 % more or less stiffness or friction" in text and "1 mm per coordinate" in text for text in texts)
+
+
+def test_what_stands_beside_an_unknown_cause_makes_the_gap_smaller():
+    effect = NamedEffect("obstacle", 0.2, {}, {})
+    fit = Fit(explanation(), np.zeros(4), np.zeros((4, 0)), np.zeros((4, 0, 0)))
+    found = Conclusion("named+unknown", fit, (effect,), (("obstacle", "friction_patch"),), (), 0.3)
+    for shrinkage in (None, 0.05):
+        assert _worth_naming(found, shrinkage) is found
+    for shrinkage in (0.0, -0.5):
+        left = _worth_naming(found, shrinkage)
+        assert left.verdict == "unknown" and not left.effects and not left.equivalent
+    named = dataclasses.replace(found, verdict="named")
+    assert _worth_naming(named, -0.5) is named

@@ -10,7 +10,7 @@ import numpy as np
 
 from cablejax.diagnose.actuation import with_arms
 from cablejax.diagnose.belief import Calibration, excess
-from cablejax.diagnose.case import FINE_LINKS, FIT_LINKS, Case
+from cablejax.diagnose.case import FINE_LINKS, FIT_LINKS, STATED, Case
 from cablejax.diagnose.conclude import Conclusion
 from cablejax.diagnose.diagnosis import CableDiagnosis, Gap, NextMotion
 from cablejax.diagnose.evidence import Evidence
@@ -65,6 +65,8 @@ def diagnose(
     if commissioning:
         calibration = dataclasses.replace(calibration, baseline=baseline_error(commissioning))
     case = Case.of(log, effects)
+    stated = case.stated_error()
+    calibration = dataclasses.replace(calibration, baseline=float(np.hypot(calibration.baseline, stated)))
     if bounds is not None:
         require_some_motion(case.simulator.playback, case.noise.std, bounds)
     length, taken = other_length(case, log), None
@@ -82,6 +84,8 @@ def diagnose(
 
     progress("fitting without each episode in turn")
     gap, reference, after = _measured(case, evidence, conclusion)
+    if not case.arms.deviates:
+        conclusion = _worth_naming(conclusion, gap.shrinkage)
     following, none_kept = None, ()
     if conclusion.verdict != "none":
         progress("looking for the next motion" if bounds is None else "designing the next motion")
@@ -91,7 +95,7 @@ def diagnose(
         following, none_kept = _following(judge, None if bounds is None else DesignConfig())
     repaired = case.recording.as_log(log.meta)
     rounds = rounds_of(log, found.fits, found.scores, evidence, calibration)
-    caveats = _caveats(case, calibration, length, commissioned=bool(commissioning))
+    caveats = _caveats(case, calibration, length, stated, commissioned=bool(commissioning))
     diagnosis = CableDiagnosis(
         **Examined(evidence, found, conclusion, reference, after, gap).fields(),
         where=localise(repaired, case.to_log(reference), case.noise.std),
@@ -155,6 +159,20 @@ def _measured(case: Case, evidence: Evidence, conclusion: Conclusion) -> tuple[G
     return gap, reference, after
 
 
+def _worth_naming(conclusion: Conclusion, shrinkage: float | None) -> Conclusion:
+    """The conclusion, once its effects were tried on episodes left out of the fit.
+
+    What stands beside an unknown cause and makes the gap there no smaller is no part of it: nothing is named then.
+
+    Args:
+        conclusion: from the fit.
+        shrinkage: of the gap on episodes left out; None where nothing could be.
+    """
+    if conclusion.verdict != "named+unknown" or shrinkage is None or shrinkage > 0:
+        return conclusion
+    return dataclasses.replace(conclusion, verdict="unknown", effects=(), equivalent=(), posterior=())
+
+
 def _contradictions(rounds: Rounds | None) -> tuple[str, ...]:
     if rounds is None or not rounds.contradictory:
         return ()
@@ -165,12 +183,19 @@ def _contradictions(rounds: Rounds | None) -> tuple[str, ...]:
     )
 
 
-def _caveats(case: Case, calibration: Calibration, length: Length | None, *, commissioned: bool) -> tuple[str, ...]:
+def _caveats(
+    case: Case, calibration: Calibration, length: Length | None, stated: float, *, commissioned: bool
+) -> tuple[str, ...]:
     caveats = list(case.recording.caveats)
     if not commissioned:
         caveats.append(
             "No commissioning logs were given: the simulator's own error is not separated from the cable's gap; "
             f"{1e3 * calibration.baseline:.2g} mm of it is assumed."
+        )
+    if stated > Calibration.baseline:
+        caveats.append(
+            f"This cable's shape hangs on its numbers: {100 * STATED:g} % more or less stiffness or friction than "
+            f"stated moves keypoints by {1e3 * stated:.2g} mm per coordinate. A gap of that size is not told from it."
         )
     if case.recording.has_commands:
         off = np.linalg.norm((case.recording.gripper_pose - case.arms.commanded)[..., :2], axis=-1).max(axis=(1, 2))
