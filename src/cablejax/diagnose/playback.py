@@ -17,8 +17,10 @@ from cablejax.cable import Cable, Discretisation
 from cablejax.effects.camera import seen_by_camera
 from cablejax.effects.physics import Physics, nominal_physics
 from cablejax.simulate.chain.replay import LARGEST_STEP, Chain
+from cablejax.simulate.chain.state import chain_nodes
 from cablejax.simulate.compile import compiler_options
-from cablejax.simulate.equilibrium import equilibrium_state
+from cablejax.simulate.equilibrium import angles_of_keypoints, equilibrium_state
+from cablejax.simulate.keypoints import marked_keypoints
 
 # Cables that one compiled call replays at once, at most.
 _ROWS = 24
@@ -31,7 +33,7 @@ class Playback:
     Attributes:
         config: nominal cable and resolution.
         gripper_pose: measured, theta continuous, the last one held over the padding, shape [E, T, 2, 3].
-        angles: of the settled nominal cable at the first pose [rad], shape [E, n].
+        angles: of the cable at the first pose, from which a replay lets it settle [rad], shape [E, n].
         interval: between samples [s], shape [E].
         believed: physics of the cable without any effect.
         largest_step: longest time step [s].
@@ -60,16 +62,16 @@ class Playback:
         *,
         believed: Physics | None = None,
     ) -> Playback:
-        """Finds the settled start of every episode near its first keypoints, or a gentle arch where there are none.
+        """Begins every episode as its first keypoints were seen, or with a gentle arch where there are none.
+
+        A cable whose damping is as usual has settled before the replay begins; one that takes long to settle, as by the
+        effect `bending_damping`, may not have done so before it was first seen.
 
         Without `believed` the cable is that of `config` on a level table, keypoints uniform along it.
         """
-        angles = [
-            np.asarray(
-                equilibrium_state(config, pose[0], guess=None if first_keypoints is None else first_keypoints[e]).qpos
-            )[2:]
-            for e, pose in enumerate(np.asarray(gripper_pose, np.float64))
-        ]
+        shapes = [None] * len(gripper_pose) if first_keypoints is None else first_keypoints
+        poses = np.asarray(gripper_pose, np.float64)[:, 0]
+        angles = [_first_angles(config, pose, shape) for pose, shape in zip(poses, shapes, strict=True)]
         return cls(
             config=config,
             gripper_pose=np.asarray(gripper_pose, np.float32),
@@ -126,6 +128,24 @@ class Playback:
             for task in tasks:
                 task.result()
         return points
+
+
+def _first_angles(
+    config: Discretisation, pose: Float[np.ndarray, "2 3"], keypoints: Float[np.ndarray, "N 2"] | None
+) -> Float[np.ndarray, "n"]:
+    """Theta of the first link and joint angles [rad] of the cable through keypoints at uniform marks.
+
+    They are those of the resting cable, and what its keypoints are turned by: what keypoints do not tell of a bend
+    between them stays as it is at rest.
+    """
+    rest = np.array(equilibrium_state(config, pose, guess=keypoints).qpos[2:], np.float64)
+    if keypoints is None:
+        return rest
+    config = dataclasses.replace(config, cable=dataclasses.replace(config.cable, marks=None))
+    nodes, unit = (np.asarray(x, np.float64) for x in chain_nodes(config, rest, np.zeros(())))
+    resting = marked_keypoints(config, nominal_physics(config), pose[0, :2] + nodes, unit)
+    turned = angles_of_keypoints(config, pose, keypoints) - angles_of_keypoints(config, pose, resting)
+    return rest + np.append(0.0, turned)
 
 
 def _workers() -> int:

@@ -21,6 +21,9 @@ FINE_STEP = 0.01
 """Longest time step of the nominal cable that a log is compared with [s]."""
 _SETTLE_STEPS = 20
 _SETTLE_STEP = 0.2
+"""Of a cable that settles soon [s]."""
+_SLOW = 1.0
+"""Damping time beyond which a cable has hardly settled when it is first seen [s]."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -48,12 +51,12 @@ class Chain:
     ) -> Float[Array, "T N 2"]:
         """Keypoints on the centreline, as the physics has them: before any camera.
 
-        The cable first settles, without friction, from `angles` at the first pose. Differentiable in everything but
-        `n_substeps` and `n_samples`.
+        The cable first settles, without friction, from `angles` at the first pose; one that takes long to settle, by its
+        `damping_time`, begins as `angles` are. Differentiable in everything but `n_substeps` and `n_samples`.
 
         Args:
             physics: of this cable.
-            angles: theta of the first link and joint angles near the settled start [rad].
+            angles: theta of the first link and joint angles as first seen, or near the settled start [rad].
             gripper_pose: (x, y, theta) at every sample, theta continuous.
             interval: between two samples [s].
             n_substeps: time steps between two samples.
@@ -93,7 +96,7 @@ class Chain:
         return jnp.concatenate([points[None], moved])
 
     def _settled(self, physics: Physics, angles: Float[Array, "n"], pose: Float[Array, "Q 3"]) -> ChainState:
-        """The cable at rest at the first pose, with nothing locked in."""
+        """The cable at rest at the first pose, as far as its damping lets it come to rest, with nothing locked in."""
         zeros, still = jnp.zeros(self.config.n_joints, angles.dtype), jnp.zeros(self.config.n_links + 1, angles.dtype)
         start = ChainState(
             angles=angles,
@@ -114,8 +117,10 @@ class Chain:
             drag=jnp.zeros_like(physics.drag),
         )
 
+        dt = _SETTLE_STEP / (1.0 + (physics.damping_time / _SLOW) ** 2)
+
         def settle(state, _):
-            state = advance(self.config, calm, state, pose, pose, _SETTLE_STEP, -1e3, with_contact=self.with_contact)
+            state = advance(self.config, calm, state, pose, pose, dt, -1e3, with_contact=self.with_contact)
             return dataclasses.replace(state, expected=still), None
 
         start, _ = jax.lax.scan(settle, start, None, length=_SETTLE_STEPS)
