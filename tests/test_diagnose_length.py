@@ -45,7 +45,7 @@ def test_caveat_on_keypoints_that_do_not_fit_the_length():
     log = stated(record(), 1.01)
     case = Case.of(log)
     length = other_length(case, log)
-    (text,) = _caveats(case, Calibration(), length, commissioned=True)
+    (text,) = _caveats(case, Calibration(), length, 0.0, commissioned=True)
     assert re.match(r"Keypoints are 1\.0 % closer together than the stated arc lengths, in every episode", text)
     assert length.assumes in length.as_law_of(case).simulator.other_laws
 

@@ -10,6 +10,7 @@ import os
 from collections.abc import Sequence
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
@@ -24,6 +25,8 @@ from cablejax.simulate.keypoints import marked_keypoints
 
 # Cables that one compiled call replays at once, at most.
 _ROWS = 24
+# Each time a chain is turned towards keypoints it leaves at most half of what is between them.
+_TURNS = 4
 
 
 @dataclasses.dataclass(frozen=True)
@@ -135,17 +138,19 @@ def _first_angles(
 ) -> Float[np.ndarray, "n"]:
     """Theta of the first link and joint angles [rad] of the cable through keypoints at uniform marks.
 
-    They are those of the resting cable, and what its keypoints are turned by: what keypoints do not tell of a bend
-    between them stays as it is at rest.
+    They are those of the resting cable, turned until its keypoints lie as these do: what keypoints do not tell of a
+    bend between them stays as it is at rest.
     """
-    rest = np.array(equilibrium_state(config, pose, guess=keypoints).qpos[2:], np.float64)
+    angles = np.array(equilibrium_state(config, pose, guess=keypoints).qpos[2:], np.float64)
     if keypoints is None:
-        return rest
+        return angles
     config = dataclasses.replace(config, cable=dataclasses.replace(config.cable, marks=None))
-    nodes, unit = (np.asarray(x, np.float64) for x in chain_nodes(config, rest, np.zeros(())))
-    resting = marked_keypoints(config, nominal_physics(config), pose[0, :2] + nodes, unit)
-    turned = angles_of_keypoints(config, pose, keypoints) - angles_of_keypoints(config, pose, resting)
-    return rest + np.append(0.0, turned)
+    seen, physics = angles_of_keypoints(config, pose, keypoints), nominal_physics(config)
+    for _ in range(_TURNS):
+        nodes, unit = map(np.asarray, chain_nodes(config, jnp.asarray(angles, jnp.float32), jnp.zeros(())))
+        points = marked_keypoints(config, physics, pose[0, :2] + nodes, unit)
+        angles[1:] += seen - angles_of_keypoints(config, pose, points)
+    return angles
 
 
 def _workers() -> int:

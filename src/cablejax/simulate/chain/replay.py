@@ -51,8 +51,8 @@ class Chain:
     ) -> Float[Array, "T N 2"]:
         """Keypoints on the centreline, as the physics has them: before any camera.
 
-        The cable first settles, without friction, from `angles` at the first pose; one that takes long to settle, by its
-        `damping_time`, begins as `angles` are. Differentiable in everything but `n_substeps` and `n_samples`.
+        The cable first settles, without friction, from `angles` at the first pose; one that takes long to do so, by
+        its `damping_time`, begins as `angles` are. Differentiable in everything but `n_substeps` and `n_samples`.
 
         Args:
             physics: of this cable.
