@@ -121,9 +121,9 @@ def random_motion(
         float(interval),
         unit,
         persistence,
-        motion.rest_probability,
-        (motion.max_step / interval, motion.rotation_weight),
-        motion.max_amplification,
+        float(motion.rest_probability),
+        (motion.max_step / interval, float(motion.rotation_weight)),
+        float(motion.max_amplification),
         _limits(config, motion),
     )
     return pose, twists
