@@ -136,7 +136,7 @@ class Case:
         Both errors add up as squares; the median over episodes. Hardly anything for a cable of the usual stiffness, and
         millimetres for a soft rope, which buckles and is held by friction as it lies.
         """
-        playback, seen = self.simulator.playback, np.isfinite(self.recording.keypoints)
+        playback = self.simulator.playback
         changed = [
             dataclasses.replace(playback.believed, **{name: getattr(playback.believed, name) * (1 + sign * STATED)})
             for name in ("stiffness", "friction")
@@ -144,8 +144,9 @@ class Case:
         ]
         stiffer, softer, rougher, smoother = playback.keypoints(changed).astype(np.float64)
         squares = ((stiffer - softer) ** 2 + (rougher - smoother) ** 2) / 4
-        axes = tuple(range(1, seen.ndim))
-        mean = np.where(seen, squares, 0.0).sum(axis=axes) / np.maximum(seen.sum(axis=axes), 1)
+        # where something was seen, and no simulation broke down
+        known, axes = np.isfinite(self.recording.keypoints) & np.isfinite(squares), (1, 2, 3)
+        mean = np.where(known, squares, 0.0).sum(axis=axes) / np.maximum(known.sum(axis=axes), 1)
         return float(np.sqrt(np.median(mean)))
 
     @property
