@@ -11,7 +11,6 @@ with the message and no verdict. The labels' hashes are published before this ru
 from __future__ import annotations
 
 import argparse
-import dataclasses
 import functools
 import os
 import pathlib
@@ -35,11 +34,11 @@ def main() -> None:
     parser.add_argument("--commissioning", type=pathlib.Path, help="folder of logs without effect, of the same set-up")
     add_option(parser)
     options = parser.parse_args()
-    compiled, calibration, field = options.out.with_suffix(".compiled").absolute(), Calibration(), "verdict"
+    compiled, calibration, field = options.out.with_suffix(".compiled").absolute(), None, "verdict"
     keep_programs(compiled)
     if options.commissioning:
         logs = [read_gap_log(path) for path in sorted(options.commissioning.glob("*.npz"))]
-        calibration = dataclasses.replace(calibration, baseline=baseline_error(logs))
+        calibration = Calibration(baseline=baseline_error(logs))
         field = "verdict_commissioned"
         print(f"baseline error of {len(logs)} commissioning logs: {1e3 * calibration.baseline:.3f} mm", flush=True)
 
@@ -56,7 +55,7 @@ def keep_programs(folder: pathlib.Path) -> None:
 
 
 def diagnosed(
-    logs: pathlib.Path, compiled: pathlib.Path, calibration: Calibration, field: str, name: str
+    logs: pathlib.Path, compiled: pathlib.Path, calibration: Calibration | None, field: str, name: str
 ) -> dict[str, Any]:
     """The row of one log."""
     keep_programs(compiled)

@@ -50,7 +50,8 @@ def diagnose(
         log: of a cable on a table between two grippers; its `meta` states the cable and table believed in.
         effects: what to look for; `LIBRARY` and effects of your own.
         commissioning: logs known to have no effect: how far the simulator is off without any.
-        calibration: constants of the judgement; by default those for a cable of this length, see `calibrated`.
+        calibration: constants of the judgement; by default those for a cable of this length, see `calibrated`, with
+            what an error of its stated stiffness and friction makes, see `Case.stated_error`.
         bounds: for a next motion that is designed; None = the best of the safe motions within the default bounds.
         objective: what the next motion is to give information about.
         progress: called with a line of text now and then.
@@ -60,13 +61,13 @@ def diagnose(
         BoundsError: no motion of the cable keeps all bounds; says how many each bound excludes.
     """
     begin = time.perf_counter()
-    if calibration is None:
-        calibration = calibrated(log.meta["cable"]["length_m"])
+    given, stated, case = calibration, 0.0, Case.of(log, effects)
+    calibration = given or calibrated(log.meta["cable"]["length_m"])
     if commissioning:
         calibration = dataclasses.replace(calibration, baseline=baseline_error(commissioning))
-    case = Case.of(log, effects)
-    stated = case.stated_error()
-    calibration = dataclasses.replace(calibration, baseline=float(np.hypot(calibration.baseline, stated)))
+    if given is None:
+        stated = case.stated_error()
+        calibration = dataclasses.replace(calibration, baseline=float(np.hypot(calibration.baseline, stated)))
     if bounds is not None:
         require_some_motion(case.simulator.playback, case.noise.std, bounds)
     length, taken = other_length(case, log), None
