@@ -37,7 +37,7 @@ def page(records: Sequence[Record], setting: dict[str, str]) -> str:
         "",
         *markdown_table([["what", "asked", "goal", "measured", "asked is reached"], *_goals(records)]),
         "",
-        "A transition is one command of 1 s, for the chain 20 time steps of 50 ms at 33 links. An episode has 60 commands.",
+        "A transition is one command of 1 s: for the chain, 20 steps of 50 ms at 33 links. An episode has 60 commands.",
     ]
     for section, (title, about, titles, row) in _TABLES.items():
         found = [record for record in records if record["section"] == section]
