@@ -15,6 +15,7 @@ from cablejax.diagnose.diagnosis import NamedEffect
 from cablejax.diagnose.fit import Fit
 from cablejax.diagnose.noise import SMALLEST, noise_floor, still
 from cablejax.diagnose.planar_run import _caveats, _worth_naming, calibrated
+from cablejax.diagnose.playback import Playback
 from diagnose_cases import holds, log_of, poses, record
 
 EPISODES, SAMPLES, POINTS = 4, 300, 13
@@ -214,6 +215,19 @@ def test_what_stated_numbers_may_be_off_by_is_small_unless_the_cable_is_soft():
     assert stated == pytest.approx(np.sqrt(np.median(sum(off))), rel=1e-3) and stated > 10 * case.stated_error()
     texts = _caveats(rope, Calibration(), None, 1e-3, commissioned=True)
     assert any("1 % more or less stiffness or friction" in text and "1 mm per coordinate" in text for text in texts)
+
+
+def test_simulations_that_break_down_do_not_count_in_what_stated_numbers_may_be_off_by(monkeypatch):
+    case = Case.of(record())
+    whole, keypoints = case.stated_error(), Playback.keypoints
+
+    def broken(self, physics):
+        points = keypoints(self, physics)
+        points[1, 2, 50:] = np.nan
+        return points
+
+    monkeypatch.setattr(Playback, "keypoints", broken)
+    assert case.stated_error() == pytest.approx(whole, rel=0.5)
 
 
 def test_what_stands_beside_an_unknown_cause_makes_the_gap_smaller():

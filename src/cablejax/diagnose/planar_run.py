@@ -195,8 +195,8 @@ def _caveats(
         )
     if stated > Calibration.baseline:
         caveats.append(
-            f"This cable's shape hangs on its numbers: {100 * STATED:g} % more or less stiffness or friction than "
-            f"stated moves keypoints by {1e3 * stated:.2g} mm per coordinate. A gap of that size is not told from it."
+            f"This cable is sensitive to its stated numbers: {100 * STATED:g} % more or less stiffness or friction "
+            f"moves keypoints by {1e3 * stated:.2g} mm per coordinate, and a gap must be larger to count."
         )
     if case.recording.has_commands:
         off = np.linalg.norm((case.recording.gripper_pose - case.arms.commanded)[..., :2], axis=-1).max(axis=(1, 2))

@@ -99,7 +99,7 @@ def walk(rng, lengths, pose, angles, count, interval, unit, persistence, rest_pr
         limits: see `admissible`.
     """
     fastest, weight = bound
-    nodes, twists = _nodes(lengths, pose, angles), np.zeros((count, 2, 3))
+    nodes, twists = joints(lengths, pose, angles), np.zeros((count, 2, 3))
     innovation, velocity = np.sqrt(1.0 - persistence**2), rng.standard_normal((2, 3))
     for t in range(count):
         if rng.random() < rest_probability:
@@ -115,7 +115,7 @@ def walk(rng, lengths, pose, angles, count, interval, unit, persistence, rest_pr
             following = pose + interval * twist
             if admissible(following, limits):
                 rest, settled, _, _ = _newton(lengths, following, angles)
-                there = _nodes(lengths, following, rest)
+                there = joints(lengths, following, rest)
                 if settled and _furthest(there, nodes) <= reach * moved:
                     velocity, twists[t], pose, angles, nodes = proposal, twist, following, rest, there
                     break
@@ -143,8 +143,8 @@ def admissible(pose, limits):
 
 
 @numba.njit(cache=True, nogil=True)
-def _nodes(lengths, pose, angles):
-    """Positions of the joints [m], shape [n - 1, 2]."""
+def joints(lengths, pose, angles):
+    """Positions of the joints of the chain that leaves gripper 0 [m], shape [n - 1, 2]."""
     theta, (x, y) = pose[0, 2], pose[0, :2]
     nodes = np.empty((len(angles), 2))
     for i in range(len(angles)):

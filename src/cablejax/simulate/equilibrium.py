@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from cablejax.arrays import wrapped
 from cablejax.cable import Discretisation
-from cablejax.simulate.compiled_equilibrium import settle
+from cablejax.simulate.compiled_equilibrium import joints, settle
 from cablejax.simulate.composite import link_lengths
 from cablejax.types import CableState
 
@@ -106,8 +106,7 @@ def chain_nodes(
     config: Discretisation, gripper_pose: Float[np.ndarray, "2 3"], angles: Float[np.ndarray, "J"]
 ) -> Float[np.ndarray, "J 2"]:
     """Positions of the bending joints [m] of the chain that leaves gripper 0."""
-    _, steps = links_of(link_lengths(config), angles, gripper_pose[0, 2])
-    return gripper_pose[0, :2] + np.cumsum(steps, axis=0)[:-1]
+    return joints(link_lengths(config), np.asarray(gripper_pose, np.float64), np.asarray(angles, np.float64))
 
 
 def arch_angles(config: Discretisation, gripper_pose: Float[np.ndarray, "2 3"]) -> Float[np.ndarray, "J"]:
