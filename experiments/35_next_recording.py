@@ -147,9 +147,9 @@ def page(rows: Sequence[dict[str, Any]]) -> str:
     lines = [
         f"{len(real)} draws of {FIRST} windows of 5 s from real cables, and {len(known)} synthetic cables known from "
         f"{FIRST} recordings of 1 s; the next is one of {CANDIDATES} others. `by information` is the one whose motion "
-        "is expected to tell most about the parameters, before its markers are seen; `fastest` the one whose clamps "
-        "move fastest; `at random` the mean over all of them; `best` what nobody can choose beforehand. Means over "
-        "draws; of intervals, geometric ones.",
+        "is expected to be most informative about the parameters, before its markers are seen; `fastest` the one whose "
+        "clamps move fastest; `at random` the mean over all of them; `best` what nobody can choose beforehand. Means "
+        "over draws; of intervals, geometric ones.",
         "",
         "A next motion will be recommended for a cable in space once its information ranks candidates better than "
         "chance.",

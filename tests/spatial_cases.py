@@ -50,7 +50,7 @@ def physics(ratio=TRUE_RATIO, damping=TRUE_DAMPING, curvature=0.0) -> RodPhysics
         length=np.asarray(LENGTH), stiffness=np.full(1, NOMINAL * ratio), rest_curvature=rest,
         damping_time=np.asarray(damping), drag=np.zeros(()), quadratic_drag=np.zeros(()),
         twist_stiffness=np.asarray(0.7 * NOMINAL), stretch=np.asarray(5e4), marker_mass=np.zeros(()),
-        clamp_rotation=np.zeros((2, 2)), clamp_offset=np.zeros((2, 3)), roll=np.zeros(()), arclength=MARKS,
+        clamp_rotation=np.zeros((2, 2)), arclength=MARKS,
         offset=np.zeros((len(MARKS), 2)), gravity=np.array([0.0, 0.0, -9.81]),
     )  # fmt: skip
 

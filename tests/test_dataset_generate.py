@@ -433,3 +433,9 @@ def test_unevenly_spaced_keypoints_are_no_fault(tmp_path):
     chords = np.linalg.norm(np.diff(points, axis=2), axis=-1)
     assert (chords <= 1.02 * np.diff(marks)).all() and chords[..., 0].max() < 0.06 < chords[..., 1].min()
     assert open_store(tmp_path / "data").config.cable.marks == marks
+
+
+def test_bounds_that_no_random_start_keeps_are_an_error_not_a_hang():
+    motion = MotionConfig(start="random", min_distance=0.9995)
+    with pytest.raises(ValueError, match="None of 10000 random starts keeps the bounds .* Widen them"):
+        random_motion(np.random.default_rng(0), TINY.discretisation, 1, motion)

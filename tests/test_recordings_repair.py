@@ -248,7 +248,7 @@ def test_a_jerk_of_a_gripper_is_told_and_kept():
     (one, *_), repairs = prepare((take(points), *others()), PAIRS)
     assert len(one.time) == 200
     (sentence,) = repairs
-    assert sentence.startswith("Jerked were gripper 0 of take a by ") and " at 1 s. " in sentence
+    assert sentence.startswith("Sudden accelerations: gripper 0 of take a by ") and " at 1 s. " in sentence
 
 
 def test_a_gripper_never_seen_is_refused():

@@ -69,7 +69,7 @@ def _physics(arclength, **changes):
     values = {
         "length": 1.0, "stiffness": np.full(1, 0.05), "rest_curvature": np.zeros((1, 2)), "damping_time": 0.05,
         "drag": 0.0, "quadratic_drag": 0.0, "twist_stiffness": 0.05, "stretch": 1e6, "marker_mass": 0.0,
-        "clamp_rotation": np.zeros((2, 2)), "clamp_offset": np.zeros((2, 3)), "roll": 0.0, "arclength": arclength,
+        "clamp_rotation": np.zeros((2, 2)), "arclength": arclength,
         "offset": np.zeros((n, 2)), "gravity": np.array([0.0, 0.0, -9.81]),
     }  # fmt: skip
     return RodPhysics(**{name: jnp.asarray(v, float) for name, v in {**values, **changes}.items()})

@@ -57,8 +57,8 @@ def physics_of(case: Case) -> RodPhysics:
     values: dict[str, Any] = {
         "length": case.length, "stiffness": np.full(1, case.stiffness), "rest_curvature": np.zeros((1, 2)),
         "damping_time": case.damping_time, "drag": 0.1, "quadratic_drag": 0.0, "twist_stiffness": 0.7 * case.stiffness,
-        "stretch": 5e4, "marker_mass": 0.0, "clamp_rotation": np.zeros((2, 2)), "clamp_offset": np.zeros((2, 3)),
-        "roll": 0.0, "arclength": arclength, "offset": np.zeros((MARKERS, 2)), "gravity": np.array([0.0, 0.0, -9.81]),
+        "stretch": 5e4, "marker_mass": 0.0, "clamp_rotation": np.zeros((2, 2)), "arclength": arclength,
+        "offset": np.zeros((MARKERS, 2)), "gravity": np.array([0.0, 0.0, -9.81]),
     }  # fmt: skip
     # arrays of numpy keep double precision until they are simulated
     fields: dict[str, Any] = {name: np.asarray(value, float) for name, value in values.items()}

@@ -212,8 +212,7 @@ def _simulated(cable: SyntheticCable, s, position, frames) -> Float[np.ndarray, 
         "length": cable.length, "stiffness": cable.stiffness * np.exp(cable.profile),
         "rest_curvature": cable.rest_curvature, "damping_time": cable.damping_time, "drag": cable.drag,
         "quadratic_drag": cable.quadratic_drag, "twist_stiffness": TWIST_RATIO * cable.stiffness, "stretch": 5e4,
-        "marker_mass": cable.marker_mass, "clamp_offset": np.zeros((2, 3)), "roll": 0.0, "arclength": s,
-        "offset": cable.offset, "gravity": [0.0, 0.0, -9.81],
+        "marker_mass": cable.marker_mass, "arclength": s, "offset": cable.offset, "gravity": [0.0, 0.0, -9.81],
     }  # fmt: skip
     arrays: dict[str, Any] = {n: np.repeat(np.asarray(v, float)[None], len(position), 0) for n, v in values.items()}
     physics = RodPhysics(**arrays, clamp_rotation=cable.grips)  # pyright: ignore[reportArgumentType]

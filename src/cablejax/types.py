@@ -105,6 +105,8 @@ class Measurement(NamedTuple):
     gripper_pose: Float[Array | np.ndarray, "*batch Q 3"]
 
 
+ROTATION_WEIGHT = 0.15
+"""Metres that one radian of a gripper counts for where its motions are compared or added up [m/rad]."""
 REFERENCE_STIFFNESS = 0.02
 """EI of the reference cable [N m^2]."""
 REFERENCE_FRICTION = 0.1 * 0.08 * 9.81

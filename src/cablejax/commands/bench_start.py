@@ -181,7 +181,7 @@ def first_call(weights: str, horizon: int) -> None:
 
 
 def staged_log(path: pathlib.Path, seed: int) -> pathlib.Path:
-    """Writes a gap log of a cable that is too soft, as `cablejax study` records it first.
+    """Writes a gap log of a cable that is too soft, as `cablejax study` records it first, with fewer links.
 
     Args:
         path: of the file.

@@ -18,10 +18,10 @@ from cablejax.diagnose.conclude import Conclusion
 from cablejax.diagnose.diagnosis import PLACES, NamedEffect, ParameterEstimate, Ranked, Verdict
 from cablejax.diagnose.evidence import episodes_by_motion, student_log_likelihoods
 from cablejax.effects.arms import lagged
+from cablejax.types import ROTATION_WEIGHT
 
-# Poses are believed to this [m]; radians count for 0.15 m.
+# Poses are believed to this [m].
 _ENCODER_NOISE = 5e-5
-_ROTATION_WEIGHT = 0.15
 # A deviation of less than this is none [m].
 _NEGLIGIBLE = 2e-4
 # An effect explains the arms' deviation if it leaves no more than this share of it, root mean square.
@@ -100,7 +100,7 @@ class _Arms:
 
     def off(self, poses: Float[np.ndarray, "E T 2 3"]) -> Float[np.ndarray, "E T 2 3"]:
         """Errors of the measured poses [m]; 0 in the padding."""
-        return np.array([1.0, 1.0, _ROTATION_WEIGHT]) * self.valid[:, :, None, None] * (self.pose - poses)
+        return np.array([1.0, 1.0, ROTATION_WEIGHT]) * self.valid[:, :, None, None] * (self.pose - poses)
 
     def each(self, poses: Float[np.ndarray, "E T 2 3"]) -> Float[np.ndarray, "E"]:
         """Root mean square of that in each episode [m]."""

@@ -18,7 +18,7 @@ def checked_nominal(
     """Predictions without any effect, from a simulator that does what the protocol asks for.
 
     Raises:
-        ValueError: it does not; the message says what came and what was expected.
+        ValueError: it does not; the message says what was found and what was expected.
     """
     effects = list(simulator.effects)
     names = [effect.name for effect in effects]

@@ -17,7 +17,7 @@ from cablejax.diagnose.diagnosis import CableDiagnosis, ParameterEstimate, Under
 from cablejax.diagnose.recording import DiagnosisError
 from cablejax.types import GapLog
 
-# Keypoints that are so much closer together or further apart than stated are worth a word.
+# Keypoints that are closer together or further apart than stated by more than this share are reported.
 _OFF = 0.004
 
 

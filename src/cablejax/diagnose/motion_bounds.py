@@ -16,11 +16,10 @@ from cablejax.limits import LIMITS, check, check_workspace, require, shown
 from cablejax.simulate.equilibrium import arch_angles, chain_nodes, find_equilibrium
 from cablejax.simulate.motions import MotionConfig, admissible
 from cablejax.text_file import read_toml, unknown_key
+from cablejax.types import ROTATION_WEIGHT
 
 SNAP_THROUGH = "snap_through"
 """Name of the bound that a motion breaks on which the cable jumps to another shape, or is close to that."""
-TURN_LENGTH = 0.15
-"""Length that one radian counts for where motions of the grippers are added up [m/rad]."""
 NEAREST, FARTHEST, TIGHTEST = 0.15, 0.995, 0.03
 """Distances of the grippers and bend radius where none are given, in lengths of the cable."""
 AMPLIFICATION = 5.0
@@ -64,7 +63,7 @@ class Bounds:
     workspace: tuple[tuple[float, float], tuple[float, float]] | None = None
     keep_out: tuple[tuple[float, float, float], ...] = ()
     speed: float = 0.05
-    turn_rate: float = 0.05 / TURN_LENGTH
+    turn_rate: float = 0.05 / ROTATION_WEIGHT
     min_distance: float | None = None
     max_distance: float | None = None
     bend_radius: float | None = None
@@ -142,7 +141,7 @@ def read_bounds(path: str | os.PathLike[str]) -> Bounds:
 
 
 def _rows(value: Any, width: int, where: str) -> tuple[tuple[float, ...], ...]:
-    """A list of rows of so many numbers."""
+    """A list of rows of `width` numbers."""
     rows: list[Any] = value if isinstance(value, list) else [None]
     if not all(isinstance(r, list) and len(r) == width and all(v in LIMITS["place"] for v in r) for r in rows):
         example = "[[x, y], [x, y]], the lowest and the highest corner" if width == 2 else "[[x, y, radius], ...]"
@@ -213,7 +212,7 @@ def cable_beyond(
     if margin > 0:
         least, most = least * 1.1, most * _PLANNED
     step = np.linalg.norm(np.diff(keypoints, axis=1), axis=-1).max(axis=-1)
-    sizes = np.linalg.norm(np.diff(poses, axis=0) * [1.0, 1.0, TURN_LENGTH], axis=-1).sum(axis=-1)
+    sizes = np.linalg.norm(np.diff(poses, axis=0) * [1.0, 1.0, ROTATION_WEIGHT], axis=-1).sum(axis=-1)
     recent = np.lib.stride_tricks.sliding_window_view(np.pad(sizes, (_RECENT, 0)), _RECENT + 1).max(axis=-1)
     jump = float((step / np.maximum(recent, _REST)).max(initial=0.0))
     return _those_broken(
@@ -289,7 +288,7 @@ def _near_snapping(config: Discretisation, poses: Float[np.ndarray, "T 2 3"]) ->
         angles, least = rest.angles, min(least, rest.stability / config.n_links)
         nodes = chain_nodes(config, pose, angles)
         if before is not None:
-            size = np.linalg.norm((pose - before[1]) * [1.0, 1.0, TURN_LENGTH], axis=-1).sum()
+            size = np.linalg.norm((pose - before[1]) * [1.0, 1.0, ROTATION_WEIGHT], axis=-1).sum()
             moved = np.linalg.norm(nodes - before[0], axis=-1).max()
             most = max(most, float(moved / max(size, 2 * _REST)))
         before = nodes, pose

@@ -30,7 +30,7 @@ from cablejax.diagnose.where import localise
 from cablejax.effects import LIBRARY, CableEffect
 from cablejax.types import GapLog
 
-# Holds in which keypoints scatter by so many times what they do between samples are worth a word.
+# Reported: holds in which keypoints scatter by this many times what they do between samples.
 _SCATTERED = 1.5
 
 

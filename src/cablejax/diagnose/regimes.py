@@ -9,9 +9,8 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from cablejax.arrays import wrapped
-from cablejax.types import GapLog
+from cablejax.types import ROTATION_WEIGHT, GapLog
 
-_METRES_PER_RADIAN = 0.15
 # Grippers slower than this rest [m/s].
 _REST_SPEED = 1e-3
 _FAST_SPEED = 0.02
@@ -93,9 +92,9 @@ def regimes_of(log: GapLog, nominal: Float[np.ndarray, "E T N 2"], valid: Bool[n
 
 
 def _velocity(pose: Float[np.ndarray, "T Q 3"], time: Float[np.ndarray, "T"]) -> Float[np.ndarray, "T Q 3"]:
-    """Twists [m/s], rotation times 0.15 m/rad."""
+    """Twists [m/s], rotation times `ROTATION_WEIGHT`."""
     pose = pose.astype(np.float64)
-    pose[..., 2] = _METRES_PER_RADIAN * np.unwrap(pose[..., 2], axis=0)
+    pose[..., 2] = ROTATION_WEIGHT * np.unwrap(pose[..., 2], axis=0)
     return np.gradient(pose, time, axis=0)
 
 

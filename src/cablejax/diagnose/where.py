@@ -18,6 +18,7 @@ import functools
 import numpy as np
 from jaxtyping import Bool, Float
 
+from cablejax.arrays import quarter_turn
 from cablejax.diagnose.evidence import repeated_motions
 from cablejax.diagnose.regimes import Regimes, regimes_of
 from cablejax.diagnose.significance import (
@@ -178,7 +179,7 @@ def _frames(residual, noise, nominal, log: GapLog) -> dict[str, float]:
         return {}
     tangent = np.gradient(nominal, axis=2)
     tangent = tangent / np.maximum(np.linalg.norm(tangent, axis=-1, keepdims=True), 1e-12)
-    normal = np.stack([-tangent[..., 1], tangent[..., 0]], axis=-1)
+    normal = quarter_turn(tangent)
     count = np.maximum(seen.sum(axis=(0, 1)), 1)
 
     def of_means(parts) -> float:

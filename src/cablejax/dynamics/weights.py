@@ -48,7 +48,7 @@ _KEY = "cablejax"
 
 
 class WeightsError(ValueError):
-    """A weights file that cannot be used: says what came, what was expected and what to do."""
+    """A weights file that cannot be used: says what was found, what was expected and what to do."""
 
 
 def save_weights(

@@ -14,7 +14,7 @@ from cablejax.limits import check
 from cablejax.mpc.feasible import FeasibleSet
 from cablejax.mpc.target_pose import continued, target_pose, total_turn, way_to
 from cablejax.residual.jacobian import Dynamics, step_jacobian
-from cablejax.types import History, advance
+from cablejax.types import ROTATION_WEIGHT, History, advance
 
 
 @dataclasses.dataclass(frozen=True)
@@ -36,7 +36,7 @@ class ObjectiveConfig:
 
     terminal_weight: float = 1.0
     motion_weight: float = 1e-3
-    rotation_weight: float = 0.15
+    rotation_weight: float = ROTATION_WEIGHT
     interval: float = 1.0
     arrival_weight: float = 1.0
     arrival_margin: float = 0.05

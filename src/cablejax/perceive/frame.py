@@ -14,9 +14,8 @@ from jaxtyping import Array, Bool, Float, Int
 from cablejax.arrays import wrapped
 from cablejax.limits import check
 from cablejax.perceive.registration import CurveFit, RegistrationConfig, register
+from cablejax.types import ROTATION_WEIGHT
 
-ROTATION_WEIGHT = 0.15
-"""Metres that one radian of a gripper's motion counts for."""
 WIDENING = 1.5
 """Factor on the last standard deviation from which the next frame starts."""
 

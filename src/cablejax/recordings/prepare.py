@@ -29,7 +29,7 @@ _FEW_STRETCHED = 0.2
 """Up to this part of the takes is left out where the cable stretches; more have a cause that needs another mend."""
 
 _JERK = 50.0, 10.0
-"""Acceleration of a gripper [m/s^2] that is worth a word, and how many times its median in the take: noise has some."""
+"""Acceleration of a gripper [m/s^2] that is reported, and how many times its median in the take: noise has some."""
 _TOLD = 5
 _NAMED = 20
 
@@ -74,8 +74,8 @@ def prepare(takes: tuple[Take, ...], setup: Setup) -> tuple[tuple[Take, ...], li
         The takes in metres, z up, right-handed, without gaps, each with gripper poses; and a sentence on each repair.
 
     Raises:
-        ValueError: something is wrong that cannot be repaired without guessing; says what came, what was expected and
-            what to do.
+        ValueError: something is wrong that cannot be repaired without guessing; says what was found, what was
+            expected and what to do.
     """
     if not takes:
         raise ValueError("The recording has no take, expected at least one.")
@@ -231,8 +231,8 @@ def _jerks(takes: tuple[Take, ...]) -> list[str]:
     strongest = [text for _, text in sorted(found, reverse=True)]
     more = f", and {len(found) - _TOLD} more" if len(found) > _TOLD else ""
     return [
-        f"Jerked were {', '.join(strongest[:_TOLD])}{more}. This was kept; if it was no motion of the arm, leave that "
-        "part out."
+        f"Sudden accelerations: {', '.join(strongest[:_TOLD])}{more}. They were kept; if the arm did not "
+        "move like that, leave that part out."
     ]
 
 

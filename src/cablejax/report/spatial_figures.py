@@ -98,7 +98,8 @@ def orbit_data(diagnosis: CableDiagnosis) -> dict[str, Any]:
     used = np.flatnonzero(np.isfinite(size))
     order = used[np.argsort(-size[used])]
     chosen = list(dict.fromkeys(order[np.linspace(0, len(order) - 1, _SHOWN).round().astype(int)].tolist()))
-    interval = float(np.median(np.diff(log.time[0, : log.episode_length[0]])))
+    between = [np.diff(time[:count]) for time, count in zip(log.time, log.episode_length, strict=True)]
+    interval = float(np.median(np.concatenate(between)))
     every = max(1, round(_FRAME / interval))
 
     def whole(points):

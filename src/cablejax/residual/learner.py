@@ -38,6 +38,7 @@ from jaxtyping import Array, Bool, Float
 from cablejax.limits import check
 from cablejax.residual.jacobian import Linearised
 from cablejax.residual.ridge import ResidualModel, RidgeConfig, apply, fit, zero_residual
+from cablejax.types import ROTATION_WEIGHT
 
 
 @dataclasses.dataclass(frozen=True)
@@ -94,7 +95,7 @@ class LearnerConfig:
     memory: float = 0.8
     error_std: float = 2e-4
     error_ratio: float = 0.1
-    rotation_weight: float = 0.15
+    rotation_weight: float = ROTATION_WEIGHT
     outlier: float = 0.02
     dimensions: float = 4.0
 

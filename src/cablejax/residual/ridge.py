@@ -20,6 +20,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from cablejax.limits import check
+from cablejax.types import ROTATION_WEIGHT
 
 BIAS_SCALE = 5.0
 """Value of the constant regressor; larger is a weaker penalty on the bias. At 5, five samples have `W * 5**2 = 125`, so
@@ -46,7 +47,7 @@ class RidgeConfig:
 
     regularisation: float = 10.0
     motion_scale: float = 0.01
-    rotation_weight: float = 0.15
+    rotation_weight: float = ROTATION_WEIGHT
     bias: bool = True
     forgetting: float = 1.0
     outlier: float = math.inf

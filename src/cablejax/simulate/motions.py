@@ -14,8 +14,11 @@ from cablejax.simulate import compiled_equilibrium
 from cablejax.simulate.compiled_equilibrium import walk
 from cablejax.simulate.composite import link_lengths
 from cablejax.simulate.equilibrium import arch_angles, find_equilibrium
+from cablejax.types import ROTATION_WEIGHT
 
 _COARSE_LINKS = 13
+# Poses that are drawn before the bounds are said to exclude all of them.
+_DRAWS = 10_000
 
 
 @dataclasses.dataclass(frozen=True)
@@ -43,7 +46,7 @@ class MotionConfig:
 
     start: Literal["straight", "random"] = "straight"
     max_step: float = 0.05
-    rotation_weight: float = 0.15
+    rotation_weight: float = ROTATION_WEIGHT
     min_scale: float = 0.1
     max_persistence: float = 0.95
     rest_probability: float = 0.05
@@ -160,7 +163,7 @@ def _straight_start(rng, config, motion):
 
 
 def _random_start(rng, config, motion):
-    while True:
+    for _ in range(_DRAWS):
         half = 0.5 * config.cable.length * rng.uniform(motion.min_distance, 1.0)
         heading = rng.uniform(-np.pi, np.pi)
         offset = half * np.array([np.cos(heading), np.sin(heading)])
@@ -168,3 +171,8 @@ def _random_start(rng, config, motion):
         pose = np.array([[*-offset, angles[0]], [*offset, angles[1]]])
         if admissible(config, motion, pose):
             return pose
+    raise ValueError(
+        f"None of {_DRAWS} random starts keeps the bounds of MotionConfig: grippers {motion.min_distance:g} to "
+        f"{1 - motion.straight_slack:g} lengths apart, at most {motion.max_angle:g} rad from their line and "
+        f"{motion.max_curvature:g} /m. Widen them: min_distance, straight_slack, max_angle or max_curvature."
+    )

@@ -31,7 +31,7 @@ GOOD_FIT = 0.01
 TWISTED = "intrinsic_curvature"
 """The effect that needs the material frame, whose derivatives take four times as long as all others together."""
 _CHUNK = 4
-# Derivatives are taken along multiples of so many directions, so that few numbers of them are compiled for.
+# The number of directions of a derivative is rounded up to a multiple of this, so that few programs are compiled.
 _COLUMNS = 8
 # What a simulation has lost is off by this [m].
 _LOST = 1.0

@@ -2,8 +2,8 @@
 
 All effects sit side by side in one vector of physical values that the simulator is compiled for once
 (`Explanation.vector`); an effect that takes no part is at its null value there. Names are those of the gap log where
-one fits. Two are not among them: `quadratic_drag`, air drag with the square of the speed, and `twist_stiffness` does
-not appear at all: it is a nuisance of `intrinsic_curvature`, without which it is hardly seen.
+one fits; `quadratic_drag`, air drag with the square of the speed, is not in it. The stiffness against twist is no
+effect of its own: it is fitted along with `intrinsic_curvature`, without which it is hardly seen.
 
 Weight is no effect here: a cable that hangs free moves the same whatever its density. Only ratios to it are found. They
 are per mass of the cable as it was recorded, markers included (`Layout.laden`): markers all along a cable slow it down
@@ -177,8 +177,6 @@ class Layout:
             stretch=jnp.asarray(_STRETCH),
             marker_mass=part["marker_mass"][0],
             clamp_rotation=part["clamp_rotation"].reshape(2, 2),
-            clamp_offset=jnp.zeros((2, 3)),
-            roll=jnp.zeros(()),
             arclength=arclength[:-1],
             offset=jnp.zeros((points, 2)),
             gravity=jnp.array(self.gravity),

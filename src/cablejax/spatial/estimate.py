@@ -29,7 +29,7 @@ from cablejax.spatial.cable import TWISTED, SpatialCable, typical_error
 from cablejax.spatial.effects import Layout
 
 # Predictions may be off by what edges and time steps of finite length do; values are not to make up for it. Fits are
-# made in rounds of so many steps at most, predictions corrected before each, until no value moves by this share of its
+# made in rounds of at most `_STEPS` steps, predictions corrected before each, until no value moves by this share of its
 # standard error, but not more often than this. A cable that snaps over in one of the windows keeps them moving closer
 # than that: the last round is one after which they move by more than this share of what the one before moved them by.
 _SETTLED, _ROUNDS, _STEPS, _STALLED = 0.3, 5, 4, 0.9
@@ -79,7 +79,7 @@ class Interval:
         )
 
     def among(self, count: int) -> Interval:
-        """One of so many intervals that hold their true values together in nine of ten cases (Bonferroni)."""
+        """One of `count` intervals that hold all their true values in nine of ten cases (Bonferroni)."""
         times = float(norm.ppf(1 - (1 - _TAIL) / count) / norm.ppf(_TAIL))
         low, high = self.value - times * (self.value - self.low), self.value + times * (self.high - self.value)
         return Interval(self.value, low, high)

@@ -85,7 +85,7 @@ class Memory:
             Estimate(
                 self._layout,
                 self._read(e["explanation"]),
-                # of so many columns, also where there are no rows
+                # the number of columns holds also where there are no rows
                 moves=np.array(e["moves"]).reshape(-1, self._layout.size),
                 shifts=np.array(e["shifts"]).reshape(-1, self._layout.size),
                 speed=e["speed"],

@@ -43,20 +43,17 @@ def held_nodes(
         frames: of the grippers, rows are axes in the world.
         h: length of an edge [m].
     """
-    origin = position + jnp.einsum("qk,tqkc->tqc", physics.clamp_offset, frames)
     angle = physics.clamp_rotation
     along = unit(frames[:, :, 0] + angle[:, 1:] * frames[:, :, 1] - angle[:, :1] * frames[:, :, 2])
     half = 0.5 * h * along
     held = jnp.stack(
         [
-            origin[:, 0] - half[:, 0],
-            origin[:, 0] + half[:, 0],
-            origin[:, 1] - half[:, 1],
-            origin[:, 1] + half[:, 1],
+            position[:, 0] - half[:, 0],
+            position[:, 0] + half[:, 0],
+            position[:, 1] - half[:, 1],
+            position[:, 1] + half[:, 1],
         ],
         axis=1,
     )
-    side = jnp.stack(
-        [frames[:, 0, 1], jnp.cos(physics.roll) * frames[:, 1, 1] + jnp.sin(physics.roll) * frames[:, 1, 2]], axis=1
-    )
+    side = frames[:, :, 1]
     return held, unit(side - along * jnp.sum(side * along, axis=2, keepdims=True))

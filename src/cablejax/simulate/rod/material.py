@@ -40,7 +40,7 @@ def spin_of_joints(
     """Angular velocity of the material at every joint, the mean of both edges' [rad/s].
 
     An edge's motion shows how it turns, except about itself. There it turns as its neighbours do, for twist spreads at
-    once: by so much that the twist grows alike at all joints.
+    once: just enough for the twist to grow equally at all joints.
 
     Args:
         edges: between neighbouring nodes [m].

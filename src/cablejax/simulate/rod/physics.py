@@ -24,8 +24,6 @@ class RodPhysics:
         stretch: EA / rho [m^2/s^2].
         marker_mass: of each marker, as length of cable of the same mass [m].
         clamp_rotation: of the cable against either gripper, about its second and third axis [rad], shape [2, 2].
-        clamp_offset: of the cable from either gripper's position, along all three axes [m], shape [2, 3].
-        roll: turn of the second gripper's frame that leaves the cable without twist [rad].
         arclength: of every free marker from the first clamp [m], shape [N].
         offset: of every free marker from the centreline along the second and third axis [m], shape [N, 2].
         gravity: [m/s^2], shape [3].
@@ -41,8 +39,6 @@ class RodPhysics:
     stretch: Float[Array, ""]
     marker_mass: Float[Array, ""]
     clamp_rotation: Float[Array, "2 2"]
-    clamp_offset: Float[Array, "2 3"]
-    roll: Float[Array, ""]
     arclength: Float[Array, "N"]
     offset: Float[Array, "N 2"]
     gravity: Float[Array, "3"]
