@@ -215,8 +215,8 @@ def test_derivatives_are_those_of_finite_differences():
         marker_mass=0.01,
         twist_stiffness=0.03,
     )
-    keys = jax.random.split(jax.random.key(0), 15)
     leaves, tree = jax.tree.flatten(physics)
+    keys = jax.random.split(jax.random.key(0), len(leaves))
     sizes = [1e-2 * jnp.maximum(jnp.abs(leaf).max(), 0.05) for leaf in leaves]
     moved = [size * jax.random.normal(k, leaf.shape) for size, k, leaf in zip(sizes, keys, leaves, strict=True)]
     direction = jax.tree.unflatten(tree, moved)
