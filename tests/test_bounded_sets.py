@@ -195,6 +195,29 @@ def test_from_far_away_the_nearest_point_is_still_found(size):
         assert float(between.max()) <= 1e-9 * max(size, 1.0)
 
 
+@pytest.mark.parametrize("size", [1e2, 1e4, 1e8])
+@pytest.mark.parametrize("x64", [False, True])
+def test_nearest_point_of_a_box_given_as_half_spaces(x64, size):
+    """The unit box has its projection in closed form; in float32 the sum of a far point and a step would be a guess."""
+    with jax.enable_x64(x64):
+        eye, y = jnp.eye(3), jnp.asarray([size, 0.01 * size, 0.002 * size])
+        feasible = Halfspaces(jnp.concatenate([eye, -eye]), jnp.ones(6))
+        np.testing.assert_allclose(feasible.project(y), jnp.clip(y, -1, 1), atol=1e-12 if x64 else 0.05)
+        assert float(feasible.violation(feasible.project(y))) <= 1e-6
+
+
+@pytest.mark.parametrize("curvature", [1e-4, 1e-6, 1e-10, 0.0])
+@pytest.mark.parametrize("x64", [False, True])
+def test_unknowns_of_little_curvature_are_at_their_bounds_or_not_converged(x64, curvature):
+    with jax.enable_x64(x64):
+        box = Box(-jnp.ones(3), jnp.ones(3))
+        hessian, linear = jnp.diag(jnp.asarray([1.0, curvature, curvature])), jnp.asarray([1.0, -1.0, 0.3])
+        found = minimise_quadratic(hessian, linear, box, jnp.zeros(3))
+        right = np.abs(np.asarray(found.point) - [-1.0, 1.0, -1.0]).max() < (1e-8 if x64 else 1e-3)
+        assert right == bool(found.converged)
+        assert right or curvature == 1e-10
+
+
 @pytest.mark.slow
 def test_derivatives_of_the_projection_from_far_away():
     """A thousand times as far as the balls are wide: forward mode against central differences."""

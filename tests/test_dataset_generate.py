@@ -437,5 +437,5 @@ def test_unevenly_spaced_keypoints_are_no_fault(tmp_path):
 
 def test_bounds_that_no_random_start_keeps_are_an_error_not_a_hang():
     motion = MotionConfig(start="random", min_distance=0.9995)
-    with pytest.raises(ValueError, match="None of 10000 random starts keeps the bounds .* Widen them"):
+    with pytest.raises(ValueError, match=r"None of 10000 random starts keeps the bounds .* Widen them"):
         random_motion(np.random.default_rng(0), TINY.discretisation, 1, motion)

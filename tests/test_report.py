@@ -204,7 +204,7 @@ def test_missing_keypoints_reach_the_player_as_null():
 def test_headline_does_not_claim_what_the_residual_did_not_do():
     worse = {"residual": run("U", "residual", short=0.2), "direct": run("U", "direct", short=0.05)}
     title, _, ends = headline({"U": worse})
-    assert title == f"The cable stays {worse['residual'].terminal_error_cm:.2f} cm away from U"
+    assert title == f"The cable ends {worse['residual'].terminal_error_cm:.2f} cm away from U"
     assert f"{worse['direct'].terminal_error_cm:.2f}" in ends["direct"]
 
 

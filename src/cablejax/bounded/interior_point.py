@@ -2,7 +2,8 @@
 
 One dense Cholesky factor per iteration; Newton's matrix holds the curvature of the bounds. From far away its terms
 differ by more than rounding, and forces cease to balance. Where that happens, the bounds that hold are known, and
-Newton's method on them as equations, by the larger system that the factor avoids, finds the minimum.
+Newton's method on them as equations, by the larger system that the factor avoids, finds the minimum. The same step
+finishes what converges relative to the largest of all forces, and not yet in each unknown.
 """
 
 from __future__ import annotations
@@ -21,6 +22,8 @@ _ITERATIONS = 100
 _POLISHING = 8
 # Share of the way to the nearest bound that a step may take.
 _TO_BOUND = 0.995
+# The first slack of a straight bound, relative to the size of the bounds, at most ten times less than this.
+_ROOM = 1e3
 
 
 class _Scaled(NamedTuple):
@@ -117,20 +120,20 @@ def interior_point(
     zero = jnp.zeros((), jnp.int32)
     error = jnp.asarray(jnp.inf, dtype)
     last = jax.lax.while_loop(unfinished, one, _Progress(first, jnp.ones((), dtype), first, error, zero, zero))
-    best, error, more = _polished(problem, sizes, last)
+    best, error, more = _polished(problem, last)
     forces = jnp.where(problem.present, best.multipliers / problem.row_scale, 0.0)
     # where nothing pulls and no bound is broken, the first iterate is the minimum
     at_rest = sizes.force <= jnp.finfo(dtype).tiny
     return best.x / problem.unit, forces, (error <= eps**0.6) | at_rest, last.count + more
 
 
-def _polished(problem: _Scaled, sizes: _Sizes, last: _Progress) -> tuple[_Iterate, Float[Array, ""], Int[Array, ""]]:
-    """The best iterate, its error and how many steps were taken; none where the method has converged."""
+def _polished(problem: _Scaled, last: _Progress) -> tuple[_Iterate, Float[Array, ""], Int[Array, ""]]:
+    """The best iterate, its `_worst` residual and how many steps were taken; none where the method has converged."""
     eps = jnp.finfo(problem.linear.dtype).eps
 
     def one(progress: _Progress) -> _Progress:
-        new = _step_on_bounds(problem, sizes, progress.now)
-        error = _residuals(problem, sizes, new).error
+        new = _step_on_bounds(problem, progress.now)
+        error = _worst(problem, new)
         better = error < progress.error
         best = jax.tree.map(lambda a, b: jnp.where(better, a, b), new, progress.best)
         return progress._replace(
@@ -138,21 +141,56 @@ def _polished(problem: _Scaled, sizes: _Sizes, last: _Progress) -> tuple[_Iterat
         )
 
     def unfinished(progress: _Progress):
-        return (progress.error > eps**0.6) & jnp.isfinite(progress.error) & (progress.count < _POLISHING)
+        return (progress.error > eps**0.7) & jnp.isfinite(progress.error) & (progress.count < _POLISHING)
 
-    done = jax.lax.while_loop(unfinished, one, last._replace(now=last.best, count=jnp.zeros_like(last.count)))
+    begin = last._replace(now=last.best, error=_worst(problem, last.best), count=jnp.zeros_like(last.count))
+    done = jax.lax.while_loop(unfinished, one, begin)
     return done.best, done.error, done.count
 
 
-def _step_on_bounds(problem: _Scaled, sizes: _Sizes, now: _Iterate) -> _Iterate:
+def _worst(problem: _Scaled, at: _Iterate) -> Float[Array, ""]:
+    """The largest residual of the conditions of a minimum, each relative to what it is the difference of.
+
+    Relative to the largest force or length of the whole problem, an unknown of little curvature could be anywhere, and
+    so could one whose bound is near while the minimum without bounds is far.
+    """
+    one = jnp.ones((), at.x.dtype)
+    found = _residuals(problem, _Sizes(one, one), at)
+    forces, lengths, pulls = _terms(problem, at, found.jacobian)
+    either = jnp.minimum(jnp.abs(at.slack) / lengths, jnp.abs(at.multipliers) / pulls)
+    broken = jnp.where(problem.present, jnp.maximum(either, jnp.abs(found.primal) / lengths), 0.0)
+    return jnp.maximum((jnp.abs(found.dual) / forces).max(), broken.max(initial=0.0))
+
+
+def _terms(
+    problem: _Scaled, at: _Iterate, jacobian: Float[Array, "K P"]
+) -> tuple[Float[Array, " P"], Float[Array, " K"], Float[Array, " K"]]:
+    """Sizes of the forces that add up at each unknown, of the terms of each bound, and of the forces that it meets."""
+    quadrics, tiny = problem.quadrics, jnp.finfo(at.x.dtype).tiny
+    steep = jnp.abs(jacobian)
+    forces = jnp.abs(problem.hessian) @ jnp.abs(at.x) + jnp.abs(problem.linear) + at.multipliers @ steep + tiny
+    lengths = _lengths(quadrics, jnp.abs(quadrics.matrix) @ jnp.abs(at.x) + jnp.abs(quadrics.offset))
+    return forces, lengths + tiny, steep @ forces / (steep.sum(axis=1) ** 2 + tiny) + tiny
+
+
+def _lengths(quadrics: Quadrics, far: Float[Array, " M"]) -> Float[Array, " K"]:
+    """Sizes of the terms of each bound where the lifted point is about as large as `far`."""
+    return quadrics.groups @ (0.5 * quadrics.curvature * far**2 + jnp.abs(quadrics.slope) * far) + jnp.abs(
+        quadrics.level
+    )
+
+
+def _step_on_bounds(problem: _Scaled, now: _Iterate) -> _Iterate:
     """Newton's step on the conditions of a minimum, with the bounds that seem to hold as equations."""
     quadrics, (x, slack, multipliers), eps = problem.quadrics, now, jnp.finfo(now.x.dtype).eps
-    active = problem.present & (multipliers * sizes.length >= slack * sizes.force)
+    _, lengths, pulls = _terms(problem, now, quadrics.jacobian(quadrics.lift(x)))
+    active = problem.present & (multipliers / pulls >= slack / lengths)
     z = quadrics.lift(x)
     normals, forces = jnp.where(active[:, None], quadrics.jacobian(z), 0.0), jnp.where(active, multipliers, 0.0)
     # a little below zero where active, so that normals which depend on each other do no harm
     corner = jnp.diag(jnp.where(active, -8 * eps, 1.0))
-    matrix = jnp.block([[problem.hessian + quadrics.bend(forces), normals.T], [normals, corner]])
+    curvature = problem.hessian + quadrics.bend(forces) + 4 * eps * jnp.eye(x.size, dtype=x.dtype)
+    matrix = jnp.block([[curvature, normals.T], [normals, corner]])
     unbalanced = problem.hessian @ x + problem.linear + forces @ normals
     broken = jnp.where(active, quadrics.of_lift(z), 0.0)
     step = jnp.linalg.solve(matrix, -jnp.concatenate([unbalanced, broken]))
@@ -189,7 +227,9 @@ def _start(problem: _Scaled) -> tuple[_Iterate, _Sizes]:
     force = jnp.linalg.norm(problem.linear) + outside + jnp.finfo(dtype).tiny
     # The step is about as long as the force, as far as there is room; a curved bound leaves its radius.
     curved = quadrics.groups @ quadrics.curvature > 0
-    room = jnp.where(curved, jnp.minimum(-2.0 * quadrics.level, force), force)
+    size = jnp.where(present, _lengths(quadrics, jnp.abs(quadrics.offset)), 0.0).max(initial=0.0)
+    most = jnp.minimum(force, _ROOM * size)
+    room = jnp.where(curved, jnp.minimum(-2.0 * quadrics.level, force), most)
     slack = jnp.where(present, jnp.maximum(-start, 0.1 * room), 1.0)
     length = jnp.sum(jnp.where(present, jnp.minimum(slack, room), 0.0)) / _count(present, dtype)
     length = jnp.where(present.any(), length, force) + jnp.finfo(dtype).tiny

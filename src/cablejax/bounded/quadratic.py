@@ -17,6 +17,10 @@ if TYPE_CHECKING:
     from cablejax.bounded.sets import ConvexSet
 
 
+# A point further from the set than this many times the set's own size is moved near it first, so often at most.
+_FAR, _CENTRES = 64.0, 3
+
+
 class QuadraticMinimum(NamedTuple):
     """The minimum of a quadratic over a set.
 
@@ -61,8 +65,34 @@ def _minimum(quadrics: Quadrics, hessian, linear, start) -> QuadraticMinimum:
 @jax.jit
 def nearest_point(quadrics: Quadrics, y: Float[Array, " P"]) -> Float[Array, " P"]:
     """The point nearest to `y` with all `quadrics` <= 0; differentiable in both."""
-    step = _solve(quadrics, jnp.eye(y.size, dtype=y.dtype), jnp.zeros_like(y), y)[0]
-    return y + step
+    centre = _near_the_set(*jax.lax.stop_gradient((quadrics, y)))
+    return centre + _step_to_nearest(quadrics, y, centre)
+
+
+def _near_the_set(quadrics: Quadrics, y):
+    """A `y` far away, moved near the set: its nearest point is a difference of large numbers from where it was."""
+    present, eps = jnp.isfinite(quadrics.level), jnp.finfo(y.dtype).eps
+    size = jnp.where(present, jnp.abs(quadrics.level), 0.0).max(initial=0.0)
+
+    def far(carry):
+        z = quadrics.lift(carry[0])
+        steepness = jnp.linalg.norm(quadrics.jacobian(z), axis=1) + jnp.finfo(y.dtype).tiny
+        beyond = jnp.where(present, quadrics.of_lift(z) / steepness, 0.0).max(initial=0.0)
+        return (beyond > _FAR * size + 64 * eps * jnp.abs(z).max()) & (carry[1] < _CENTRES)
+
+    def nearer(carry):
+        return carry[0] + _step_to_nearest(quadrics, y, carry[0]), carry[1] + 1
+
+    reach = (
+        1e3 * (size + jnp.abs(quadrics.offset).max()) / (jnp.abs(quadrics.matrix @ y).max() + jnp.finfo(y.dtype).tiny)
+    )
+    shorter = jnp.where(far((y, 0)) & (reach > 0), jnp.minimum(reach, 1.0), 1.0) * y
+    return jax.lax.while_loop(far, nearer, (shorter, jnp.zeros((), jnp.int32)))[0]
+
+
+def _step_to_nearest(quadrics: Quadrics, y, centre):
+    """From any centre to the point nearest to `y`."""
+    return _solve(quadrics, jnp.eye(y.size, dtype=y.dtype), centre - y, centre)[0]
 
 
 def _inside(quadrics: Quadrics, start, step):

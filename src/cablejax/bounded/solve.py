@@ -101,7 +101,8 @@ def _solve(entry, fn, solver, y0, feasible: AbstractSet, args, option: str, give
     given = None if given is None else eqx.filter_closure_convert(given, start, args)
     options = {"feasible": feasible, option: given}
     out = entry(fn, solver, start, args, options, max_steps=max_steps, adjoint=FixedPointAdjoint(), throw=False)
-    return _finish(out, fn, args, feasible, start, jnp.isnan(y0).any(), throw)
+    unknown = jnp.isnan(y0).any() | ~jnp.isfinite(start).all()
+    return _finish(out, fn, args, feasible, start, unknown, throw)
 
 
 @eqx.filter_custom_jvp
@@ -120,11 +121,11 @@ def _value_at_jvp(primals, tangents):
 def _finish(
     out: optx.Solution, fn, args, feasible: AbstractSet, start: Array, unknown: Bool[Array, ""], throw: bool
 ) -> Solution:
-    """The solution as ours; `unknown` = the start was not a number."""
+    """The solution as ours; `unknown` = the start was not finite."""
     rounding = jnp.finfo(start.dtype).eps ** 0.5 * (1.0 + jnp.abs(start).max())
-    empty = feasible.empty() | ~(feasible.violation(start) <= rounding)
-    code = jnp.where(empty, Result.EMPTY_SET, result_of(out.result))
-    code = jnp.where(unknown, Result.NONFINITE, code).astype(jnp.int32)
+    apart = ~unknown & ~(feasible.violation(start) <= rounding)
+    code = jnp.where(unknown, Result.NONFINITE, result_of(out.result))
+    code = jnp.where(feasible.empty() | apart, Result.EMPTY_SET, code).astype(jnp.int32)
     solution = Solution(
         value=out.value,
         objective=_value_at(fn, out.value, args, out.stats["objective"]),

@@ -117,8 +117,8 @@ class Parts:
 def unfinished(out: pathlib.Path, settings: Mapping[str, Any], *, overwrite: bool) -> Iterator[Parts]:
     """A folder for results that is marked as unfinished until the block has ended.
 
-    However the block was left, the same command goes on in the folder; another one is refused as it would be by any
-    folder that is not empty.
+    However the block was left, the same command goes on in the folder; another one is refused, as it is by any folder
+    that is not empty.
 
     Args:
         out: the folder.
@@ -132,6 +132,11 @@ def unfinished(out: pathlib.Path, settings: Mapping[str, Any], *, overwrite: boo
     parts = Parts(out / "parts", settings)
     begun = parts.match()
     if not begun:
+        if parts.folder.exists() and not overwrite:
+            raise UsageError(
+                f"{out} holds an unfinished run with other options: run it with these to finish it, give "
+                "another folder with --out, or add --overwrite."
+            )
         output_folder(out, overwrite=overwrite)
         parts.folder.mkdir(exist_ok=True)
     with sole_writer(parts.folder):

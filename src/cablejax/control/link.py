@@ -173,7 +173,23 @@ class RobotLink:
         newer = last is None or stamp > last.time
         if newer and share >= self.config.min_seen and np.isfinite(pose).all():
             state = dataclasses.replace(state, newest=cleaned)
+        elif state.newest is None:
+            state = dataclasses.replace(state, reason=self._unusable(pose, share))
         return state, cleaned
+
+    def _unusable(self, pose: np.ndarray, share: float) -> str:
+        """Why there is nothing to begin with in an observation."""
+        apart = float(np.linalg.norm(pose[1, :2] - pose[0, :2]))
+        if not np.isfinite(pose).all():
+            return "The grippers' poses are not known yet."
+        if apart > 2 * self._length:
+            return (
+                f"The grippers are {apart:.3g} m apart, and the cable is {self._length:g} m long: are poses in metres?"
+            )
+        return (
+            f"{100 * share:.0f} % of the keypoints are known and within reach of the grippers, expected "
+            f"{100 * self.config.min_seen:.0f} %: are they in metres, in the grippers' frame?"
+        )
 
     def _decide(self, state: LinkState) -> tuple[LinkState, Instant | None]:
         config, newest = self.config, state.newest

@@ -171,6 +171,11 @@ def make_controller(model: Model, target: Target, *, method: Method, solver: Sol
 
     Bounds on motions scale with the cable's length, see `MPCConfig.for_length`.
     """
+    if len(target.keypoints) != model.config.n_keypoints:
+        raise ValueError(
+            f"Target {target.name!r} has {len(target.keypoints)} keypoints, expected {model.config.n_keypoints} as "
+            f"the model {model.name}: use a model that was trained on this cable."
+        )
     learner = STATIC if model.config.prior == "static" else LearnerConfig()
     config = MPCConfig.for_length(
         model.config.length,

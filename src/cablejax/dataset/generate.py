@@ -221,7 +221,8 @@ def simulate(
             return [Block(**{name: part[i] for name, part in parts.items()}) for i in range(len(shards))]
     raise ValueError(
         f"{len(problems)} trajectories failed {MAX_ATTEMPTS} times in a row; number {rows[pending[0]]}: "
-        f"{problems[pending[0]]}. Check the cable's resolution (n_links, timestep) and the bounds of the motion."
+        f"{problems[pending[0]]}. Another engine, time step or number of links may do: --engine threaded, "
+        "--timestep, --links. A soft cable on a rough table needs the first, or fewer links."
     )
 
 

@@ -33,9 +33,14 @@ def starting_from(source: str | os.PathLike[str], config: ModelConfig) -> tuple[
     if config == trained:
         return config, weights
     if dataclasses.replace(config, conditioned=False) != trained or config.network != "gns":
+        other = [
+            f"{field.name} is {getattr(trained, field.name)!r} there and {getattr(config, field.name)!r} here"
+            for field in dataclasses.fields(config)
+            if getattr(trained, field.name) != getattr(config, field.name)
+        ]
         raise ValueError(
-            f"The model to start from is {trained}, but {config} is to be trained: they may differ in `conditioned` "
-            "only, and only the graph network can be made conditioned."
+            f"The model to start from differs: {'; '.join(other)}. Only `conditioned` may differ, and only a graph "
+            "network can be made conditioned."
         )
     encoder = ("node_encoder", "first", 0, "kernel")
     flat = dict(nnx.to_flat_state(weights))

@@ -198,8 +198,7 @@ def _with_scales(
     model = dataclasses.replace(model, normalisation=scales)
     if initial is not None and initial[0] != model:
         raise ValueError(
-            f"The model to start from is {initial[0]}, but {model} is to be trained: "
-            "use `cablejax.dynamics.fine_tune.starting_from`."
+            "The model to start from is not the one to be trained: use `cablejax.dynamics.fine_tune.starting_from`."
         )
     return model
 

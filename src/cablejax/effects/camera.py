@@ -110,6 +110,11 @@ class KeypointBias(CableEffect):
         return {"index": (variant // 2, ""), "across": (variant % 2, ""), "offset_m": (float(values[0]), "m")}
 
     def _from_reported(self, parameters, config):
+        count = config.cable.n_keypoints
+        if not 0 <= parameters["index"] < count:
+            raise ValueError(f"{self.name}: index is {parameters['index']:g}, expected 0 to {count - 1}.")
+        if parameters.get("across", 0) not in (0, 1):
+            raise ValueError(f"{self.name}: across is {parameters['across']:g}, expected 0 or 1.")
         return parameters | {"variant": 2 * parameters["index"] + parameters.get("across", 0)}
 
     def location(self, values, variant, config):

@@ -13,6 +13,7 @@ import numpy as np
 from cablejax.cable import Discretisation
 from cablejax.effects import ARMS, LIBRARY
 from cablejax.effects.base import CableEffect, Hook
+from cablejax.effects.effect import Parameter
 from cablejax.effects.physics import Physics
 from cablejax.limits import require, shown
 from cablejax.text_file import read_json, version_of
@@ -22,6 +23,9 @@ EFFECTS: Mapping[str, CableEffect] = {effect.name: effect for effect in (*LIBRAR
 
 VERDICT_SCHEMA = "cablejax-verdict/1"
 """Format and version of `verdict.json`."""
+
+
+_CHOICES = frozenset({"index", "across", *(effect.variant_name for effect in EFFECTS.values())})
 
 
 @dataclasses.dataclass(frozen=True)
@@ -53,11 +57,15 @@ class GivenEffect:
         object.__setattr__(self, "parameters", tuple((str(n), v) for n, v in self.parameters))
         known, required = _parameter_names(self.effect)
         named = dict(self.parameters)
+        if len(named) < len(self.parameters):
+            raise ValueError(f"{self.name} has a parameter twice: {', '.join(name for name, _ in self.parameters)}.")
         example = f"{self.name}:{','.join(f'{name}=...' for name in required)}"
         for name, value in named.items():
             if name not in known:
                 raise ValueError(f"{self.name} has no parameter {shown(name)}, expected {', '.join(known)}: {example}.")
             require(value, "finite", f"{self.name}: {name}")
+            if name in _CHOICES and value != int(value):
+                raise ValueError(f"{self.name}: {name} is {value:g}, expected a whole number.")
         missing = [name for name in required if name not in named]
         if missing:
             raise ValueError(f"{self.name} lacks {', '.join(missing)}. Expected {example}.")
@@ -87,12 +95,20 @@ class GivenEffect:
             raise ValueError(f"{self.name}: {self.effect.variant_name} {variant} does not exist.")
         for parameter, value in zip(self.effect.parameters, values, strict=True):
             if not parameter.low * (1 - 1e-9) <= value <= parameter.high:
-                raise ValueError(
-                    f"{self.name}: {parameter.name} is {value:g}, expected {parameter.low:g} to {parameter.high:g} "
-                    f"{parameter.unit}".rstrip()
-                    + "."
-                )
+                raise ValueError(f"{self.name}: {self._out_of_bounds(parameter, value, variant, chain)}")
         return self.effect.apply(physics, [np.float32(v) for v in values], variant, chain)
+
+    def _out_of_bounds(self, parameter: Parameter, value: float, variant: int, chain: Discretisation) -> str:
+        """What a parameter is and may be, by the name and in the unit in which it was given."""
+        given = {name: v for name, v in self.parameters if name.startswith(parameter.name)}
+        name, number = next(iter(given.items()), (parameter.name, value))
+        unit, scale = parameter.unit, number / value if value else 1.0
+        if name != parameter.name:
+            unit = self.effect.reported([p.centre for p in self.effect.parameters], variant, chain)[name][1]
+        return (
+            f"{name} is {number:g}, expected {scale * parameter.low:g} to {scale * parameter.high:g} {unit}".rstrip()
+            + "."
+        )
 
     def __str__(self) -> str:
         """The effect as `parse_effect` reads it back, without loss."""

@@ -158,10 +158,15 @@ def nominal_physics(
 
 
 def normal_gravity(physics: Physics) -> Any:
-    """Gravity across the table [m/s^2]; the part in its plane is `tilt`. NumPy in, NumPy out; JAX in, JAX out."""
-    square = physics.gravity**2 - (physics.tilt**2).sum()
+    """Gravity across the table [m/s^2]; the part in its plane is `tilt`. NumPy in, NumPy out; JAX in, JAX out.
+
+    Differentiable; where gravity lies in the table's plane as far as rounding goes, it is 0, and so is its derivative.
+    """
+    whole = physics.gravity**2
+    square = whole - (physics.tilt**2).sum()
     xp = square.__array_namespace__()
-    return xp.sqrt(xp.maximum(square, 0.0))
+    across = square > 16 * np.finfo(square.dtype).eps * whole
+    return xp.where(across, xp.sqrt(xp.where(across, square, 1.0)), 0.0)
 
 
 def may_touch(physics: Physics) -> bool:

@@ -138,6 +138,11 @@ class Cables:
         pose = straight_start(config.cable)
         self._start = self._engine.initial_state(pose[None])
         self._shown = np.asarray(self._engine.rollout(*self._resting(), np.zeros((1, 1, 2, 3)))[1].keypoints[0, 0])
+        if not np.isfinite(self._shown).all():
+            raise ValueError(
+                f"The simulation of this cable by {config.discretisation.n_links} links diverges at rest. It is soft "
+                "for its length and friction: take a discretisation with fewer links (n_links)."
+            )
 
         def rows(leaf):
             return np.repeat(np.asarray(leaf), size, axis=0)

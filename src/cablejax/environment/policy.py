@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from cablejax.control.link import Controller, RobotLink
-from cablejax.control.link_state import LinkConfig
+from cablejax.control.link_state import LinkConfig, Status
 from cablejax.control.targets import Target
 from cablejax.environment.cables import ShapeCableConfig
 from cablejax.simulate.table_plant import Observation
@@ -48,6 +48,6 @@ class LinkPolicy:
         seen = Observation(observation["keypoints"], observation["gripper_pose"], now)
         self._state, reply = self._link.step(self._state, now, [seen])
         self._steps += 1
-        if reply.reason:
+        if reply.reason and reply.status != Status.WAITING:
             raise ValueError(reply.reason)
         return np.clip(reply.twist / self._config.scale, -1.0, 1.0).astype(np.float32)

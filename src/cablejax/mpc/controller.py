@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from cablejax.adaptation.belief import update
+from cablejax.limits import LIMITS
 from cablejax.mpc.config import MPCConfig
 from cablejax.mpc.fallback import plan_or_hold, plan_or_recover, radius_after
 from cablejax.mpc.feasible import FeasibleSet, feasible_from
@@ -168,10 +169,11 @@ def _observe(config: MPCConfig, state: MPCState, measurement: Measurement) -> tu
     """
     keypoints, gripper_pose = map(jnp.asarray, measurement)
     last, dtype = state.last, state.last.predicted.dtype
-    observed = jnp.isfinite(keypoints).all(axis=-1)
+    largest = LIMITS["coordinate"].high
+    observed = (jnp.abs(keypoints) <= largest).all(axis=-1)
     keypoints = jnp.where(observed[:, None], keypoints, last.predicted).astype(dtype)
     expected_pose = state.history.gripper_pose + config.objective.interval * last.twist
-    gripper_pose = jnp.where(jnp.isfinite(gripper_pose), gripper_pose, expected_pose).astype(dtype)
+    gripper_pose = jnp.where(jnp.abs(gripper_pose) <= largest, gripper_pose, expected_pose).astype(dtype)
 
     first = state.steps == 0
     past = state.history.keypoints

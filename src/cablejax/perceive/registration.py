@@ -154,6 +154,8 @@ def register(
     """
     matrices = config.matrices
     dtype = points.dtype
+    # what is padding may be anything, NaN included
+    points = jnp.where(mask[:, None], points, 0.0)
     start = curve(matrices, angles, angles_pose)
     reference = carried(matrices, start.centre, angles_pose, gripper_pose)
     if coherent:

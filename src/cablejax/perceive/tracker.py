@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
+from cablejax.limits import LIMITS
 from cablejax.perceive.frame import Status, Track, TrackerConfig, TrackState, judge, track
 from cablejax.perceive.initial import cloud_path, first_fit, path_length
 
@@ -45,7 +46,8 @@ def padded(points: Float[np.ndarray, "n D"], capacity: int) -> PaddedCloud:
             f"A cloud has shape {array.shape} and type {array.dtype}, expected numbers of shape [n, 2] or [n, 3]: one "
             "row per point, in metres, in the frame of the grippers."
         )
-    finite = np.isfinite(array).all(axis=1)
+    # cameras report what they do not see as not finite, or as a number without meaning
+    finite = (np.abs(array) <= LIMITS["coordinate"].high).all(axis=1)
     kept = array[finite, :2].astype(np.float32)
     if len(kept) > capacity:
         kept = kept[np.random.default_rng(0).choice(len(kept), capacity, replace=False)]

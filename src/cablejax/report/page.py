@@ -115,7 +115,7 @@ def headline(pairs: Mapping[str, Mapping[Method, ClosedLoopRun]]) -> tuple[str, 
         parts.append(f"The cable reaches {listed(list(reached))} to within {max(reached.values()):.2f} cm")
     if missed:
         far = listed([f"{end:.2f}" for end in missed.values()])
-        parts.append(f"{'it' if reached else 'The cable'} stays {far} cm away from {listed(list(missed))}")
+        parts.append(f"{'it' if reached else 'The cable'} ends {far} cm away from {listed(list(missed))}")
     start = listed([f"{run.error_cm[0]:.1f}" for run in main.values()])
     errors: dict[Method, list[str]] = {
         method: [f"{runs[method].terminal_error_cm:.2f}" for runs in pairs.values() if method in runs]

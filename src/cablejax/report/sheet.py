@@ -66,7 +66,8 @@ def cable_sheet(cable: Cable, name: str) -> Sheet:
         figures=[(letters_figure(cable), LETTERS_CAPTION)],
         following=(
             f"Simulate motions of it: cablejax simulate --cable {name}",
-            f"Stage it as the plant of a controller: cablejax shape --cable {name}",
+            "Train a model on them: cablejax train --data runs/data.zarr --out runs/train",
+            "Shape it with that model: cablejax shape --target Z --weights runs/train",
         ),
         facts=cable_facts(cable),
     )

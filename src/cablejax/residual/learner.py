@@ -193,9 +193,11 @@ def initial_learner(config: LearnerConfig, n_keypoints: int, n_grippers: int, dt
 def observe(config: LearnerConfig, state: LearnerState, sample: Sample) -> LearnerState:
     """The state with one more sample: the candidates are judged by it first, and fitted to it then.
 
-    Values of `sample.error` where it is not valid are ignored, NaN included, as is what is not finite of the model.
+    Values of `sample.error` where it is not valid are ignored, NaN included, as is what is not finite of the model and
+    of the command.
     """
-    sample = sample._replace(model=jax.tree.map(lambda x: jnp.nan_to_num(x, posinf=0.0, neginf=0.0), sample.model))
+    model, twist = jax.tree.map(lambda x: jnp.nan_to_num(x, posinf=0.0, neginf=0.0), (sample.model, sample.twist))
+    sample = sample._replace(model=model, twist=twist)
     window = jax.tree.map(lambda old, new: jnp.concatenate([old, new[None]])[1:], state.window, sample)
     models = _candidates(config, state.window, sample.model)
     mixture = _mixed(models, weights(config, state))
@@ -211,7 +213,8 @@ def observe(config: LearnerConfig, state: LearnerState, sample: Sample) -> Learn
     fade = jnp.where(seen > 0, config.memory, 1.0).astype(loss.dtype)
     return LearnerState(
         window=window,
-        evidence=fade * state.evidence + telling * loss[:-1],
+        # an error too large to be squared tells nothing either
+        evidence=fade * state.evidence + jnp.where(telling > 0, telling * loss[:-1], 0.0),
         count=fade * state.count + telling * (seen > 0),
         loss=state.loss + loss,
     )

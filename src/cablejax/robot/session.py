@@ -64,6 +64,8 @@ class RobotRun:
         Raises:
             GapLogError: nothing usable was observed, or the recording violates the format.
         """
+        if self._state.status == Status.WAITING:
+            raise GapLogError(f"There is no log: nothing usable was observed. {self._state.reason}".strip())
         return write_gap_log(self.path, self.log.gap_log(self.link.target, self.cable, self.source))
 
     def result(self) -> ClosedLoopRun:

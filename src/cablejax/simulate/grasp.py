@@ -58,7 +58,9 @@ def solve_held(
     """
     free, response = solved[:, 0], solved[:, 1:]
     dual = rows @ response + jnp.diag(jnp.broadcast_to(yielding, wanted.shape))
-    size = jnp.sqrt(jnp.diagonal(dual))
+    # a row of zeros, or of rounding, asks for nothing
+    square = jnp.diagonal(dual)
+    size = jnp.sqrt(jnp.where(square > jnp.finfo(dual.dtype).eps ** 1.5 * square.max(), square, 1.0))
     scaled = dual / (size[:, None] * size) + _REGULARISATION * jnp.eye(dual.shape[0], dtype=dual.dtype)
     multiplier = solve_positive(scaled, ((wanted - rows @ free) / size)[:, None])[:, 0] / size
     return free + response @ multiplier

@@ -203,8 +203,8 @@ class TablePlant(abc.ABC):
         if not stable:
             time, self._steps_done = self.time, None  # nothing but a reset makes sense now
             raise PlantError(
-                f"The plant's simulation became unstable at {time:.3f} s: use a shorter timestep than {dt} s or "
-                "gentler commands."
+                f"The plant's simulation became unstable at {time:.3f} s: with fewer links, a shorter "
+                f"timestep than {dt} s, or gentler commands it may stay stable."
             )
 
     def _steps(self, interval: float) -> int:

@@ -90,7 +90,8 @@ def statics_with(effects: Iterable[GivenEffect], cable: Cable) -> Statics:
     of_clamps = np.asarray(physics.rotation_compliance, float) * (LINKS - 1) / cable.length
     softness[[0, -1]] += of_clamps
     stiffness = 1 / (softness * np.asarray(nominal.stiffness, float))
-    curvature = np.asarray(physics.rest_curvature, float)
+    # a model has learned the rest curvature of its own cable
+    curvature = np.asarray(physics.rest_curvature, float) - np.asarray(nominal.rest_curvature, float)
     return Statics(
         () if np.ptp(stiffness) == 0 else tuple((stiffness / stiffness.mean()).tolist()),
         () if not curvature.any() else tuple(curvature.tolist()),
