@@ -92,7 +92,10 @@ def test_parts_of_other_settings_are_refused_or_replaced(tmp_path):
     with pytest.raises(KeyboardInterrupt), unfinished(tmp_path, SETTINGS, overwrite=False) as parts:
         parts.save("U", made_up_run(TARGET))
         raise KeyboardInterrupt
-    with pytest.raises(UsageError, match="not empty"), unfinished(tmp_path, {"steps": 3}, overwrite=False):
+    with (
+        pytest.raises(UsageError, match="unfinished run with other options"),
+        unfinished(tmp_path, {"steps": 3}, overwrite=False),
+    ):
         pass
     with unfinished(tmp_path, {"steps": 3}, overwrite=True) as parts:
         assert parts.load("U") is None

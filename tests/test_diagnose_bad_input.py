@@ -102,6 +102,67 @@ def test_nothing_seen_is_refused():
         told(holed(record(), 0.95))
 
 
+def test_only_the_ends_seen_is_refused():
+    log = record()
+    keypoints = log.keypoints.copy()
+    keypoints[:, :, 1:-1] = np.nan
+    with pytest.raises(DiagnosisError, match=r"missing|No keypoint between the grippers"):
+        told(dataclasses.replace(log, keypoints=keypoints))
+
+
+def test_a_tracker_that_repeats_its_last_value_is_not_believed():
+    log = record()
+    keypoints = log.keypoints.copy()
+    keypoints[:, 40:, 4] = keypoints[:, 39:40, 4]
+    result = told(dataclasses.replace(log, keypoints=keypoints))
+    assert result.verdict == "none" and caveat(result, "Keypoint 4 repeats its last value")
+
+
+def test_an_offset_of_the_tool_is_told():
+    log = record()
+    angle = log.gripper_pose[:, :, 0, 2]
+    pose = log.gripper_pose.copy()
+    pose[:, :, 0, 0] -= 0.008 * np.cos(angle)
+    pose[:, :, 0, 1] -= 0.008 * np.sin(angle)
+    caveats = prepare(dataclasses.replace(log, gripper_pose=pose)).caveats
+    assert any("at gripper 0 is 8.0 mm ahead of its pose and 0.0 mm beside it" in text for text in caveats)
+    assert not any("ahead of" in text or "behind" in text for text in prepare(log).caveats)
+
+
+def _in_frame_of_gripper(command, log):
+    cosine, sine = np.cos(log.gripper_pose[..., 2]), np.sin(log.gripper_pose[..., 2])
+    x, y = command[..., 0], command[..., 1]
+    return np.stack([cosine * x + sine * y, cosine * y - sine * x, command[..., 2]], axis=-1)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda command, log: command * np.array([1, 1, 180 / np.pi]), "degrees per second"),
+        (lambda command, log: command * np.array([1e3, 1e3, 1]), "vx and vy in mm/s: divide"),
+        (lambda command, log: command * np.diff(log.time[:, :2], axis=1)[:, :, None, None], "motion of a sample"),
+        (lambda command, log: log.gripper_pose, "poses, not velocities"),
+        (_in_frame_of_gripper, "gripper's frame"),
+        (lambda command, log: command[:, :, ::-1], "other gripper"),
+    ],
+    ids=["degrees", "millimetres", "per sample", "poses", "frame", "exchanged"],
+)
+def test_commands_of_another_meaning_are_refused(change, message):
+    log = record()
+    command = np.asarray(change(log.gripper_command, log), np.float32)
+    with pytest.raises(DiagnosisError, match=message):
+        prepare(dataclasses.replace(log, gripper_command=command))
+
+
+def test_commands_that_arms_do_not_follow_leave_the_cable_its_verdict():
+    log = record()
+    command = log.gripper_command.copy()
+    command[:, :, 0] = 0
+    result = told(dataclasses.replace(log, gripper_command=command))
+    assert result.verdict == "unknown" and result.sentence.startswith("With the measured poses the simulator explains")
+    assert caveat(result, "neither a gain nor a lag explains that")
+
+
 def test_a_moment_is_refused():
     with pytest.raises(DiagnosisError, match="longest episode has 15 samples"):
         told(samples(record(), np.arange(15)))

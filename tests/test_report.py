@@ -213,7 +213,7 @@ def test_headline_tells_reached_from_missed():
     ends = [one.terminal_error_cm for one in runs.values()]
     title, *_ = headline({shape: {"residual": one} for shape, one in runs.items()})
     assert title == (
-        f"The cable reaches U and Z to within {max(ends[0], ends[2]):.2f} cm, but it stays {ends[1]:.2f} cm away from S"
+        f"The cable reaches U and Z to within {max(ends[0], ends[2]):.2f} cm, but it ends {ends[1]:.2f} cm away from S"
     )
 
 

@@ -105,6 +105,12 @@ def _angle_fault(angle: Float[np.ndarray, " S"], direction: Float[np.ndarray, " 
             f"up to {np.abs(angle).max():.3g}, which fits the cable next to it in degrees (median difference "
             f"{in_degrees:.2g} rad) and not in radians ({off:.2g} rad): expected radians. Multiply it by pi / 180."
         )
+    mirrored = float(np.median(np.arccos(np.cos(angle + direction))))
+    if off > INWARDS and mirrored < _DEGREES_OFF:
+        return (
+            f"{np.degrees(off):.0f} degrees off the cable next to it (median), and {np.degrees(mirrored):.0f} with the "
+            "other sign: either y or the angle is mirrored. Negate the angle if it counts clockwise."
+        )
     if off > INWARDS:
         return (
             f"{np.degrees(off):.0f} degrees off the cable next to it (median): expected the cable's tangent, from "

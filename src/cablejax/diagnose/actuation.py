@@ -7,6 +7,7 @@ arms are estimated from commands and poses alone. They neither hide an effect of
 from __future__ import annotations
 
 import dataclasses
+import functools
 from typing import Any, get_args
 
 import numpy as np
@@ -17,6 +18,7 @@ from cablejax.diagnose.belief import Calibration, probabilities
 from cablejax.diagnose.conclude import Conclusion
 from cablejax.diagnose.diagnosis import PLACES, NamedEffect, ParameterEstimate, Ranked, Verdict
 from cablejax.diagnose.evidence import episodes_by_motion, student_log_likelihoods
+from cablejax.diagnose.log_faults import integrated
 from cablejax.effects.arms import lagged
 from cablejax.types import ROTATION_WEIGHT
 
@@ -44,8 +46,9 @@ class Actuation:
             from fits to the other motions, shape [E] each.
         count: coordinates of each episode, shape [E].
         motion: episodes with the same number repeat one another, shape [E].
-        deviation: root mean square of measured less commanded poses [m].
+        deviation: root mean square of measured less commanded poses [m], above their noise.
         leftover: the same after the effects.
+        noise: of the measured poses [m].
         commanded: poses that exact arms would have had, shape [E, T, 2, 3].
         predicted: poses with the effects, each motion from a fit without it where there are several, shape
             [E, T, 2, 3].
@@ -59,14 +62,18 @@ class Actuation:
     motion: Int[np.ndarray, "E"]
     deviation: float
     leftover: float
+    noise: float
     commanded: Float[np.ndarray, "E T 2 3"]
     predicted: Float[np.ndarray, "E T 2 3"]
     deviates: bool
 
-    @property
-    def explained(self) -> bool:
-        """Whether the effects leave nothing of note."""
-        return not self.deviates or self.leftover <= max(_EXPLAINED * self.deviation, _NEGLIGIBLE)
+    def strays(self, negligible: float) -> bool:
+        """Whether the arms are off their commands by more than is `negligible` [m], and no effect explains a part."""
+        return self.deviates and not self.effects and self.deviation > negligible
+
+    def explained(self, negligible: float) -> bool:
+        """Whether the effects leave no more than is `negligible` [m]: grippers move the cable as far as themselves."""
+        return not self.deviates or self.leftover <= max(_EXPLAINED * self.deviation, negligible)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -107,12 +114,19 @@ class _Arms:
         return np.sqrt(np.sum(self.off(poses) ** 2, axis=(1, 2, 3)) / (6 * np.maximum(self.valid.sum(axis=1), 1)))
 
     def rms(self, poses: Float[np.ndarray, "E T 2 3"]) -> float:
-        """Root mean square of that over coordinates [m]."""
-        return float(np.sqrt(np.sum(self.off(poses) ** 2) / (self.valid.sum() * 6)))
+        """Root mean square of that over coordinates [m], above the noise."""
+        return float(np.sqrt(max(np.sum(self.off(poses) ** 2) / (self.valid.sum() * 6) - self.noise**2, 0.0)))
+
+    @functools.cached_property
+    def noise(self) -> float:
+        """Of the measured poses [m], from third differences of their errors: these are smooth but for jumps."""
+        third = np.diff(self.off(self.commanded), 3, axis=1)[self.valid[:, 3:]]
+        each = np.median(np.abs(third), axis=0) / (0.6745 * np.sqrt(20.0)) if third.size else np.zeros(1)
+        return float(np.sqrt(np.mean(each**2)))
 
     def fit(self, effects: tuple[str, ...], starts) -> Any:
         """The best of scipy's least squares results."""
-        bounds = [(0.1, 3.0)] * ("actuation_gain" in effects) + [(0.0, 5.0)] * (2 * ("actuation_lag" in effects))
+        bounds = _bounds(effects)
         results = [
             scipy.optimize.least_squares(
                 lambda theta: self.off(self.predicted(effects, theta)).ravel() / _ENCODER_NOISE,
@@ -124,6 +138,13 @@ class _Arms:
         ]
         return min(results, key=lambda result: result.cost)
 
+    def extreme(self, effects: tuple[str, ...], theta) -> bool:
+        """Whether a value is at a bound of the fit other than 0, as no arm has it: something else is the cause."""
+        return any(
+            value > 0.98 * high or value < 1.02 * low
+            for value, (low, high) in zip(theta, _bounds(effects), strict=True)
+        )
+
     def unseen(self, effects: tuple[str, ...], theta, motion: Int[np.ndarray, "E"]) -> Float[np.ndarray, "E T 2 3"]:
         """Poses of each motion from a fit without it, begun at the fit of all; from that where there is one motion."""
         result, groups = self.predicted(effects, theta), episodes_by_motion(motion)
@@ -132,6 +153,10 @@ class _Arms:
             inside = np.clip(theta, [1e-3] * len(theta), [2.9] * len(theta))
             result[group] = self.chosen(group).predicted(effects, rest.fit(effects, [inside]).x)
         return result
+
+
+def _bounds(effects: tuple[str, ...]) -> list[tuple[float, float]]:
+    return [(0.1, 3.0)] * (_GAIN in effects) + [(0.0, 5.0)] * (2 * (_LAG in effects))
 
 
 def actuation(
@@ -153,9 +178,9 @@ def actuation(
         motion: episodes with the same number repeat one another.
     """
     if command is None:
-        return Actuation({}, {}, {}, np.zeros(len(pose), int), motion, 0.0, 0.0, pose, pose, deviates=False)
+        return Actuation({}, {}, {}, np.zeros(len(pose), int), motion, 0.0, 0.0, 0.0, pose, pose, deviates=False)
     valid = np.arange(pose.shape[1])[None] < np.asarray(length)[:, None]
-    arms = _Arms(pose, _integrated(pose[:, 0], command, interval), np.asarray(interval), valid)
+    arms = _Arms(pose, integrated(pose[:, 0], command, interval), np.asarray(interval), valid)
     deviation = arms.rms(arms.commanded)
     nothing = Actuation(
         effects={},
@@ -165,6 +190,7 @@ def actuation(
         motion=motion,
         deviation=deviation,
         leftover=deviation,
+        noise=max(arms.noise, _ENCODER_NOISE),
         commanded=arms.commanded,
         predicted=arms.commanded,
         deviates=False,
@@ -189,9 +215,9 @@ def actuation(
         unseen={(): arms.each(arms.commanded)} | {effects: arms.each(poses) for effects, poses in unseen.items()},
         deviates=True,
     )
-    if left[best] >= _TELLING * deviation:
+    if max(left[best], arms.rms(unseen[best])) >= _TELLING * deviation or arms.extreme(best, found[best].x):
         return tried
-    named = _named(best, found[best], max(left[best] / _ENCODER_NOISE, 1.0))
+    named = _named(best, found[best], max(float(np.hypot(left[best], arms.noise)) / _ENCODER_NOISE, 1.0))
     return dataclasses.replace(tried, effects=named, leftover=left[best], predicted=unseen[best])
 
 
@@ -221,11 +247,11 @@ def with_arms(conclusion: Conclusion, arms: Actuation, calibration: Calibration)
         for name, (left, unseen) in arms.alone.items()
     ]
     changed: dict[Verdict, Verdict] = {}
-    if named and arms.explained:
+    if named and arms.explained(calibration.smallest_gap(0.0)):
         changed = {"none": "named", "unknown": "named+unknown"}
     elif named:
         changed = dict.fromkeys(get_args(Verdict), "named+unknown")
-    else:
+    elif arms.strays(calibration.smallest_gap(0.0)):
         changed = {"none": "unknown", "named": "named+unknown", "ambiguous": "named+unknown"}
     share = 1 - (arms.leftover / arms.deviation) ** 2
     return dataclasses.replace(
@@ -244,10 +270,10 @@ def _chances(arms: Actuation, calibration: Calibration) -> dict[tuple[str, ...],
     every effect.
     """
     calibration = dataclasses.replace(calibration, baseline=_NEGLIGIBLE)
-    temper = calibration.temper(arms.unseen[()], _ENCODER_NOISE)
+    temper = calibration.temper(arms.unseen[()], arms.noise)
     scores = [
         student_log_likelihoods(
-            arms.count * ((error / _ENCODER_NOISE) ** 2 - 1.0) / temper, calibration.freedom, arms.motion
+            arms.count * ((error / arms.noise) ** 2 - 1.0) / temper, calibration.freedom, arms.motion
         ).sum()
         - calibration.term_cost * len(effects)
         for effects, error in arms.unseen.items()
@@ -268,8 +294,3 @@ def _named(effects: tuple[str, ...], result: Any, scale: float) -> dict[str, tup
         half = 1.645 * float(np.sqrt(covariance[-2:, -2:].sum())) + 0.01 * total
         named[_LAG] = (total, (max(total - half, 0.0), total + half), "s")
     return named
-
-
-def _integrated(first, command, interval):
-    steps = command * np.asarray(interval)[:, None, None, None]
-    return first[:, None] + np.concatenate([np.zeros_like(steps[:, :1]), np.cumsum(steps, axis=1)[:, :-1]], axis=1)

@@ -109,6 +109,13 @@ class Calibration:
         """Whether an explanation that leaves so much of the gap, all in metres per coordinate, needs no other."""
         return left <= self.may_leave(gap, noise)
 
+    def needs_no_other(self, gap: float, noise: float) -> float:
+        """An explanation that leaves no more than this is not tried with another effect: its law may be off by that.
+
+        A complete one that leaves more is: an effect that takes most of the gap may bear values that are another's.
+        """
+        return max(self.law_error * gap, self.smallest_gap(noise))
+
     def may_leave(self, gap: float, noise: float) -> float:
         """So much of the gap a complete explanation may leave."""
         return max(self.adequate * gap, self.smallest_gap(noise))

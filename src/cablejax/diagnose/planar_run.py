@@ -30,6 +30,10 @@ from cablejax.diagnose.where import localise
 from cablejax.effects import LIBRARY, CableEffect
 from cablejax.types import GapLog
 
+_ONLY_ARMS = (
+    "With the measured poses the simulator explains this log. The arms do not follow their commands, for a reason "
+    "that is not in the library."
+)
 # Reported: holds in which keypoints scatter by this many times what they do between samples.
 _SCATTERED = 1.5
 
@@ -81,7 +85,7 @@ def diagnose(
         log, case, length = length.applied(log), length.case, None
         evidence = case.evidence(calibration)
         found, conclusion = explain(evidence, calibration, progress=progress)
-    conclusion = with_arms(conclusion, case.arms, calibration)
+    alone, conclusion = conclusion, with_arms(conclusion, case.arms, calibration)
 
     progress("fitting without each episode in turn")
     gap, reference, after = _measured(case, evidence, conclusion)
@@ -97,8 +101,11 @@ def diagnose(
     repaired = case.recording.as_log(log.meta)
     rounds = rounds_of(log, found.fits, found.scores, evidence, calibration)
     caveats = _caveats(case, calibration, length, stated, commissioned=bool(commissioning))
+    fields = Examined(evidence, found, conclusion, reference, after, gap).fields()
+    if alone.verdict == "none" and case.arms.strays(calibration.smallest_gap(0.0)):
+        fields["sentence"] = _ONLY_ARMS
     diagnosis = CableDiagnosis(
-        **Examined(evidence, found, conclusion, reference, after, gap).fields(),
+        **fields,
         where=localise(repaired, case.to_log(reference), case.noise.std),
         next_motion=following,
         caveats=(*_contradictions(rounds), *caveats, *none_kept),
@@ -119,7 +126,10 @@ def _following(judge: Judge, design: DesignConfig | None) -> tuple[NextMotion | 
     try:
         return next_motion(judge, design), ()
     except BoundsError as error:
-        return None, (f"There is no motion to record next under the explanations found. {error}",)
+        why = (
+            str(error) if design is not None else "Under one of them the cable would snap over in all that were tried."
+        )
+        return None, (f"There is no motion to record next under the explanations found. {why}",)
 
 
 def calibrated(length: float) -> Calibration:
@@ -198,7 +208,13 @@ def _caveats(
             f"This cable is sensitive to its stated numbers: {100 * STATED:g} % more or less stiffness or friction "
             f"moves keypoints by {1e3 * stated:.2g} mm per coordinate, and a gap must be larger to count."
         )
-    if case.recording.has_commands:
+    if case.arms.strays(calibration.smallest_gap(0.0)):
+        caveats.append(
+            f"The measured poses are {1e3 * case.arms.deviation:.3g} mm (root mean square) from where the commands "
+            "lead, and neither a gain nor a lag explains that. Check the frame and the units of gripper_command, and "
+            "whether the commands of both arms were logged."
+        )
+    elif case.recording.has_commands:
         off = np.linalg.norm((case.recording.gripper_pose - case.arms.commanded)[..., :2], axis=-1).max(axis=(1, 2))
         if off.max() > MARGIN:
             caveats.append(

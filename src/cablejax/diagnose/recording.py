@@ -10,6 +10,7 @@ from jaxtyping import Float
 
 from cablejax.cable_length import BENT, bent_chord
 from cablejax.diagnose.clock import Samples, furthest_off, is_even, on_even_clock, usual_interval
+from cablejax.diagnose.log_faults import command_fault, tool_offset, without_frozen
 from cablejax.diagnose.noise import still
 from cablejax.gaplog import validate
 from cablejax.types import GapLog
@@ -126,6 +127,7 @@ def prepare(log: GapLog) -> Recording:
             f"{wrong} of {int(marked.sum())} samples are marked as holds while the grippers move. They are not taken "
             "for holds."
         )
+    caveats += without_frozen(points)
     recording = Recording(
         keypoints=points,
         gripper_pose=pose,
@@ -136,6 +138,9 @@ def prepare(log: GapLog) -> Recording:
         caveats=(),
     )
     caveats += _plausible(log, recording)
+    valid = np.arange(total)[None] < recording.length[:, None]
+    if recording.has_commands and (fault := command_fault(pose, command, recording.interval, valid)):
+        raise DiagnosisError(fault)
     if log.hold is None or not hold.any():
         caveats.append("No holds are marked: the noise is taken to be white, and a slow drift would count as a gap.")
     if not recording.has_commands:
@@ -183,16 +188,26 @@ def _plausible(log: GapLog, recording: Recording) -> list[str]:
     missing = 1 - seen[valid].mean()
     if missing > 0.9:
         raise DiagnosisError(f"{missing:.0%} of the keypoints are missing: nothing to diagnose.")
+    if not seen[:, :, 1:-1].any():
+        raise DiagnosisError("No keypoint between the grippers was observed: nothing to diagnose.")
     if missing > 0.1:
         caveats.append(f"{missing:.0%} of the keypoints are missing: small or local effects may go unseen.")
     for gripper, end in ((0, 0), (1, -1)):
         distance = np.linalg.norm(points[:, :, end] - recording.gripper_pose[:, :, gripper, :2], axis=-1)
         away = np.nanmedian(np.where(valid, distance, np.nan)) if seen[:, :, end].any() else 0.0
         if away > _FAR:
+            other = recording.gripper_pose[:, :, 1 - gripper, :2]
+            crossed = np.nanmedian(np.where(valid, np.linalg.norm(points[:, :, end] - other, axis=-1), np.nan))
             raise DiagnosisError(
                 f"Keypoint {'0' if end == 0 else 'N - 1'} is {away:.2f} m from gripper {gripper}, expected it at the "
-                "gripper: are the keypoints and the poses in one frame, in metres, and of one cable?"
+                "gripper: "
+                + (
+                    f"it is at gripper {1 - gripper}. Exchange the grippers, or reverse the order of the keypoints."
+                    if crossed < _FAR
+                    else "are the keypoints and the poses in one frame, in metres, and of one cable?"
+                )
             )
+        caveats += tool_offset(points[:, :, end], recording.gripper_pose[:, :, gripper], gripper)
     length = log.meta["cable"]["length_m"]
     span = np.linalg.norm(recording.gripper_pose[:, :, 1, :2] - recording.gripper_pose[:, :, 0, :2], axis=-1)
     if span[valid].max() > 1.001 * length:
@@ -200,8 +215,6 @@ def _plausible(log: GapLog, recording: Recording) -> list[str]:
             f"The grippers are up to {span[valid].max():.3f} m apart, more than the cable's length of {length} m: "
             "correct meta.cable.length_m."
         )
-    if points.shape[2] < 3:
-        raise DiagnosisError("The log has no keypoint between the grippers: nothing to diagnose.")
     # chords are shorter than the cable between them, the more so the fewer there are
     nominal = np.diff(log.meta["keypoint_arclength_m"])
     chord = np.linalg.norm(np.diff(points, axis=2), axis=-1)

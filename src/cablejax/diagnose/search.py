@@ -73,7 +73,7 @@ def search(
     def grow(fits: list[Fit], bases: Sequence[Fit]) -> list[Fit]:
         """Sets of one more effect each, until the best is adequate or the next one no better."""
         for size in range(1 + max(len(base.explanation.terms) for base in bases), _MOST_TERMS + 1):
-            if calibration.complete(excess(float(fits[0].sse.sum()), evidence), gap, level(evidence)):
+            if excess(float(fits[0].sse.sum()), evidence) <= calibration.needs_no_other(gap, level(evidence)):
                 break
             progress(f"fitting sets of {size} effects")
             grown = [fit for base in bases for fit in _grown(evidence, base.explanation, calibration)]

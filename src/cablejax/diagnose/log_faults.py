@@ -1,0 +1,114 @@
+"""Faults of a recording that look like effects: frozen keypoints, offsets of a tool, commands of another meaning."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from cablejax.arrays import quarter_turn, stretches
+from cablejax.types import ROTATION_WEIGHT
+
+# So many samples without any change, while both neighbours move in most of them, are a tracker's last value.
+_FROZEN, _MOVING = 10, 0.8
+# An end keypoint that is off its gripper by this [m], at the same place of the gripper's frame, is reported.
+_TOOL, _FIXED = 2e-3, 0.5
+# Commands that leave the poses by this [m], and by this part of it in another meaning, have that one.
+_UNFIT, _FITS = 0.02, 0.2
+
+
+def without_frozen(points: Float[np.ndarray, "E T N 2"]) -> list[str]:
+    """Takes out, in place, what a tracker repeats to the last digit while both neighbours of a keypoint move on.
+
+    Args:
+        points: keypoints [m], NaN = not observed.
+
+    Returns:
+        A sentence on it, or nothing.
+    """
+    same = (points[:, 1:] == points[:, :-1]).all(axis=-1)
+    found = set()
+    for episode, keypoint in zip(*np.nonzero(same[..., 1:-1].sum(axis=1) >= _FROZEN), strict=True):
+        index = keypoint + 1
+        for first, after in stretches(same[episode, :, index]):
+            beside = points[episode, first : after + 1][:, [index - 1, index + 1]]
+            moving = (np.abs(np.diff(beside, axis=0)) > 0).any(axis=-1)
+            if after - first >= _FROZEN and moving.mean(axis=0).min() > _MOVING:
+                points[episode, first + 1 : after + 1, index] = np.nan
+                found.add(int(index))
+    if not found:
+        return []
+    return [
+        f"Keypoint {', '.join(map(str, sorted(found)))} repeats its last value to the digit while its neighbours move: "
+        "taken as not observed there."
+    ]
+
+
+def tool_offset(end: Float[np.ndarray, "E T 2"], pose: Float[np.ndarray, "E T 3"], gripper: int) -> list[str]:
+    """A sentence where an end of the cable is off its gripper, always by the same vector of the gripper's frame.
+
+    Args:
+        end: keypoint at the gripper [m], NaN = not observed.
+        pose: of the gripper [m, rad].
+        gripper: its number, for the sentence.
+    """
+    own = _turned(end - pose[..., :2], -pose[..., 2])
+    own = own[np.isfinite(own).all(axis=-1)]
+    if not len(own):
+        return []
+    along, across = np.median(own, axis=0)
+    size = float(np.hypot(along, across))
+    if size < _TOOL or np.median(np.linalg.norm(own - [along, across], axis=-1)) > _FIXED * size:
+        return []
+    return [
+        f"The keypoint at gripper {gripper} is {1e3 * abs(along):.1f} mm {'ahead of' if along > 0 else 'behind'} its "
+        f"pose and {1e3 * abs(across):.1f} mm beside it in the gripper's frame, in all samples: an offset of the "
+        "tool or of the marker is no effect of the library and can look like one. Correct the pose if it is wrong."
+    ]
+
+
+def integrated(
+    first: Float[np.ndarray, "E 2 3"], command: Float[np.ndarray, "E T 2 3"], interval: Float[np.ndarray, "E"]
+) -> Float[np.ndarray, "E T 2 3"]:
+    """Poses of arms that follow their commands exactly, from the first ones on."""
+    steps = command * np.asarray(interval)[:, None, None, None]
+    return first[:, None] + np.concatenate([np.zeros_like(steps[:, :1]), np.cumsum(steps, axis=1)[:, :-1]], axis=1)
+
+
+def command_fault(
+    pose: Float[np.ndarray, "E T 2 3"],
+    command: Float[np.ndarray, "E T 2 3"],
+    interval: Float[np.ndarray, "E"],
+    valid: Bool[np.ndarray, "E T"],
+) -> str | None:
+    """Says which unit or meaning commands have that fit the poses only so; None for twists in the world's frame."""
+    degrees, millimetres = np.array([1, 1, np.pi / 180]), np.array([1e-3, 1e-3, 1])
+    weight = np.array([1.0, 1.0, ROTATION_WEIGHT])
+
+    def off(twist: np.ndarray) -> float:
+        return float(np.sqrt(np.mean((weight * (pose - integrated(pose[:, 0], twist, interval)))[valid] ** 2)))
+
+    differences = np.diff(command, axis=1, append=command[:, -1:])
+    others = {
+        "poses, not velocities: divide their differences by the time between samples": differences
+        / interval[:, None, None, None],
+        "omega in degrees per second: multiply it by pi / 180": command * degrees,
+        "vx and vy in mm/s: divide them by 1000": command * millimetres,
+        "vx and vy in mm/s and omega in degrees per second: convert them": command * millimetres * degrees,
+        "the motion of a sample: divide it by the time between samples": command / interval[:, None, None, None],
+        "velocities in the gripper's frame: turn them by its angle": np.concatenate(
+            [_turned(command[..., :2], pose[..., 2]), command[..., 2:]], axis=-1
+        ),
+        "those of the other gripper: exchange them": command[:, :, ::-1],
+    }
+    as_is = off(command)
+    best = min(others, key=lambda name: off(others[name]))
+    if as_is < _UNFIT or off(others[best]) > _FITS * as_is:
+        return None
+    return (
+        f"Field 'gripper_command' leads {as_is:.2g} m away from 'gripper_pose' (root mean square), expected twists "
+        f"(vx, vy, omega) in the world's frame, in m/s and rad/s. What fits the poses is {best}."
+    )
+
+
+def _turned(vectors: Float[np.ndarray, "*B 2"], angle: Float[np.ndarray, "*B"]) -> Float[np.ndarray, "*B 2"]:
+    return np.cos(angle)[..., None] * vectors + np.sin(angle)[..., None] * quarter_turn(vectors)
