@@ -1,5 +1,6 @@
 """A model that is informed of effects: its cable rests as one with them does, and it begins with their belief."""
 
+import dataclasses
 import json
 
 import jax.numpy as jnp
@@ -53,6 +54,18 @@ def test_a_conditioned_model_begins_with_what_it_is_informed_of():
     np.testing.assert_allclose(far.believed[1] - far.believed[0], np.log(8.0), rtol=1e-5)
     assert far.believed[1] == mpc.config.adaptation.limits[1]
     make_controller(far, make_target("U", far.cable), method="direct", solver="levenberg-marquardt")
+
+
+def test_a_cables_own_rest_curvature_is_no_effect(model):
+    """A model has learned it; effects that act otherwise than on the rest do not enter because of it."""
+    curved = dataclasses.replace(model, cable=dataclasses.replace(model.cable, rest_curvature=1.5))
+    friction, profile = map(parse_effect, ("viscous_drag:coefficient_n_s_per_m2=5", CURVED))
+    assert not enters(curved, (friction,)) and enters(curved, (profile,))
+    np.testing.assert_allclose(
+        knowing(curved, (profile,)).config.statics.rest_curvature,
+        knowing(model, (profile,)).config.statics.rest_curvature,
+        atol=1e-6,
+    )
 
 
 def test_a_model_without_prior_can_be_informed_of_stiffness_alone():

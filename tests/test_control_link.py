@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+import re
 
 import numpy as np
 import pytest
@@ -275,6 +276,26 @@ def test_limits_are_checked():
         CommandLimits(min_distance=1.0, max_distance=0.5)
     with pytest.raises(ValueError, match="workspace"):
         CommandLimits(workspace=((1.0, 1.0), (0.0, 0.0)))
+
+
+@pytest.mark.parametrize(
+    ("changes", "reason"),
+    [
+        (
+            {"keypoints": 1e3 * KEYPOINTS, "gripper_pose": START * [1e3, 1e3, 1]},
+            "990 m apart, and the cable is 0.996 m long",
+        ),
+        ({"keypoints": 1e3 * KEYPOINTS}, "of the keypoints are known and within reach"),
+        ({"gripper_pose": np.full((2, 3), np.nan)}, "poses are not known"),
+    ],
+    ids=["millimetres", "keypoints in millimetres", "no poses"],
+)
+def test_the_link_says_why_it_waits(changes, reason):
+    harness = Harness()
+    reply = harness.step(0.0, harness.seen(0.0, **changes))
+    assert reply.status == Status.WAITING and re.search(reason, reply.reason)
+    reply = harness.run(1.5, begin=0.1)
+    assert reply.status == Status.SHAPING and reply.reason == ""
 
 
 def test_nothing_recorded_is_no_log():

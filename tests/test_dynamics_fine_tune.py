@@ -53,7 +53,7 @@ def test_a_conditioned_model_starts_as_the_model_it_came_from_and_learns_to_list
 
 def test_what_does_not_fit_is_refused(trained, tmp_path):
     path, _ = trained
-    with pytest.raises(ValueError, match="latent is 8 there and 16 here. Only `conditioned` may differ"):
+    with pytest.raises(ValueError, match=r"latent is 8 there and 16 here. Only `conditioned` may differ"):
         starting_from(path, dataclasses.replace(SMALL, latent=16))
     with pytest.raises(ValueError, match="conditioned model is trained on what is known"):
         train(resized(TINY_TRAINING, conditioned=True), trajectories(), tmp_path / "run", progress=False)

@@ -205,6 +205,20 @@ def test_nothing_observed_at_all_keeps_going_on_predictions():
     assert not state.learner.window.valid.any()
 
 
+@pytest.mark.parametrize("far", [1e20, 3.4e38])
+def test_a_keypoint_without_meaning_counts_as_not_observed(far):
+    control, cable = controller(), Cable(rate=0.8, sag=0.0)
+    state = control.init(at_rest(START))
+    for step in range(6):
+        keypoints = cable.keypoints.copy()
+        if step == 3:
+            keypoints[2] = far
+        state, twist, info = control.step(state, Measurement(keypoints, cable.pose))
+        assert int(info.unobserved) == (step == 3) and int(info.result) != Result.NONFINITE
+        assert np.isfinite(info.weights).all() and np.linalg.norm(twist) > 0.01
+        cable.step(twist)
+
+
 def test_a_model_that_yields_nan_makes_the_grippers_hold_still_and_says_so():
     control, cable = controller(rate=float("nan")), Cable()
     state, twists, info = run(control, cable, 4)

@@ -23,7 +23,10 @@ def case(request):
 
 
 def fitted(points, before, after, *, iterations=8):
-    rows = padded(points, CAPACITY)
+    return register_rows(padded(points, CAPACITY), before, after, iterations=iterations)
+
+
+def register_rows(rows, before, after, *, iterations=8):
     return register(
         REGISTRATION,
         jnp.asarray(rows.points),
@@ -89,6 +92,45 @@ def test_padding_and_the_order_of_points_do_not_matter(case):
     shuffled = np.full((CAPACITY, 2), np.nan)
     shuffled[1::2] = points[::-1]
     np.testing.assert_allclose(fitted(shuffled, before, after).keypoints, fit.keypoints, atol=2e-5)
+
+
+@pytest.mark.parametrize("padding", [np.nan, np.inf, 1e10])
+def test_padding_may_be_anything(case, padding):
+    before, after = case
+    points = cloud(after, 6, n=CAPACITY // 2)
+    rows = padded(points, CAPACITY)
+    rows = rows._replace(points=np.where(rows.mask[:, None], rows.points, np.float32(padding)))
+    np.testing.assert_array_equal(register_rows(rows, before, after).keypoints, fitted(points, before, after).keypoints)
+
+
+@pytest.mark.parametrize("far", [1e6, 3.4e38, 1e300])
+def test_a_point_that_no_camera_sees_is_no_point(case, far):
+    points = cloud(case[1], 6, n=CAPACITY // 2)
+    rows = padded(np.concatenate([points, [[far, 0.0]]]), CAPACITY)
+    assert rows.mask.sum() == len(points) and rows.dropped == 1
+
+
+@pytest.mark.parametrize("heading", [0.0, 0.3, np.pi / 2])
+@pytest.mark.parametrize("span", [1.0, 0.9])
+def test_a_straight_start_is_a_start(heading, span):
+    direction = np.array([np.cos(heading), np.sin(heading)])
+    pose = jnp.asarray(
+        np.array([[*(-0.5 * span * direction), heading], [*(0.5 * span * direction), heading]]), jnp.float32
+    )
+    points = np.linspace(-0.5 * span, 0.5 * span, 200)[:, None] * direction
+    rows = padded(points + 1e-3 * np.random.default_rng(0).normal(size=points.shape), CAPACITY)
+    start = jnp.zeros(REGISTRATION.n_links - 1)
+    fit = register(
+        REGISTRATION,
+        jnp.asarray(rows.points),
+        jnp.asarray(rows.mask),
+        pose,
+        start,
+        pose,
+        jnp.asarray(SIGMA),
+        iterations=8,
+    )
+    assert np.isfinite(fit.keypoints).all() and float(fit.gap) < 1e-3
 
 
 @pytest.mark.slow

@@ -121,6 +121,15 @@ def test_one_snap_through_does_not_stay_in_the_evidence_and_what_was_not_seen_is
     assert np.isfinite(again.loss).all()
 
 
+def test_what_is_not_finite_and_not_seen_leaves_no_trace():
+    calm = list(steps("drift"))
+    blind = calm[31]._replace(error=calm[31].error * jnp.nan, twist=calm[31].twist * jnp.nan, valid=jnp.zeros(N, bool))
+    wild = calm[31]._replace(error=jnp.full_like(calm[31].error, 1e30))
+    for one in (blind, wild):
+        state = after([*calm[:30], one, *calm[32:]])
+        assert np.isfinite(state.evidence).all() and np.isfinite(weights(CONFIG, state)).all()
+
+
 def test_gradients_match_finite_differences():
     with jax.enable_x64(True):
         samples = jax.tree.map(lambda *leaves: jnp.stack(leaves), *steps("gain", 6))

@@ -13,7 +13,7 @@ import scipy.optimize
 
 from cablejax.cable import Cable, Discretisation
 from cablejax.effects.given import EFFECTS, GivenEffect, parse_effect, with_effects
-from cablejax.effects.physics import Physics, nominal_physics
+from cablejax.effects.physics import Physics, nominal_physics, normal_gravity
 from cablejax.simulate import ENGINES, ChainEngine, MjxEngine, check_effects
 from cablejax.simulate.friction import on_table
 
@@ -368,3 +368,20 @@ def test_derivatives_in_every_hook(programs, start):
         if start == "moving":
             silent = [name for name, value in found.items() if value[1] < 1e-7]
             assert not silent, silent
+
+
+@pytest.mark.parametrize("gravity", [(0.0, 0.0, 0.0), (0.0, -9.81, 0.0), (0.0, 0.0, -9.81)])
+def test_weight_has_a_derivative_without_weight_too(gravity):
+    """The mass that the grippers carry, and gravity across a table in whose plane all of it lies."""
+    config = Discretisation(Cable(), n_links=9)
+    with jax.enable_x64(True):
+        nominal = jax.tree.map(jnp.asarray, nominal_physics(config, np.float64, gravity=gravity))
+        mass = jnp.full(config.n_links, 0.01)
+
+        def carried(change):
+            stiffness, tilt = nominal.stiffness * (1 + change[0]), nominal.tilt + change[1]
+            physics = dataclasses.replace(nominal, stiffness=stiffness, tilt=tilt)
+            return jnp.append(on_table(physics, mass, config.link_length), normal_gravity(physics))
+
+        derivative = jax.jit(jax.jacfwd(carried))(jnp.zeros(2))
+        assert np.isfinite(derivative).all() and np.abs(derivative).max() < 1.0

@@ -10,7 +10,8 @@ import pytest
 
 from cablejax.cable import Cable, Discretisation
 from cablejax.effects.arms import executed
-from cablejax.effects.given import EFFECTS, parse_effect
+from cablejax.effects.given import EFFECTS, parse_effect, with_effects
+from cablejax.effects.physics import nominal_physics
 from cablejax.perceive.plant import CloudPlant
 from cablejax.simulate.arms import Arms
 from cablejax.simulate.plant import Plant, PlantConfig
@@ -160,3 +161,30 @@ def test_the_rest_curvature_of_a_cable_shows_at_a_soft_section():
         soft = parse_effect("stiffness_profile:centre_m=0.25,width_m=0.3,ratio=0.2")
         shapes.append(Plant(PlantConfig(discretisation=cable, effects=(soft,), settle_time=0.3)).reset(ARCH).keypoints)
     assert np.abs(shapes[1] - shapes[0]).max() > 5e-3
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("bending_stiffness:ratio=0.2,ratio=3", "has a parameter twice: ratio, ratio"),
+        ("gripper_rotation_offset:gripper=0.5,angle_rad=0.1", "gripper is 0.5, expected a whole number"),
+        ("keypoint_bias:index=1.5,offset_m=0.01", "index is 1.5, expected a whole number"),
+    ],
+)
+def test_an_effect_that_is_misspelt_is_not_another_one(text, message):
+    with pytest.raises(ValueError, match=message):
+        parse_effect(text)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("keypoint_bias:index=99,offset_m=0.01", "index is 99, expected 0 to 12"),
+        ("keypoint_bias:index=3,across=2,offset_m=0.01", "across is 2, expected 0 or 1"),
+        ("intrinsic_curvature:centre_m=2.5,width_m=0.1,curvature_per_m=3", "centre_m is 2.5, expected 0 to 0.6 m"),
+    ],
+)
+def test_a_place_out_of_bounds_is_told_as_it_was_given(text, message):
+    config = Discretisation(Cable(length=0.6))
+    with pytest.raises(ValueError, match=message):
+        with_effects(nominal_physics(config), [parse_effect(text)], config)

@@ -222,8 +222,13 @@ def _maximisation(
     hessian = hessian + (config.bending / spacing) * jnp.eye(len(angles), dtype=dtype)
     force = force - config.bending / spacing * angles
     arm = shape.end - shape.joint
-    constraint = jnp.concatenate([quarter_turn(arm).T, jnp.full((1, len(angles)), config.length, dtype)])
-    error = _closure(config, shape, angles, pose)
+    # along and across the chord: a taut cable cannot move along it, whatever its heading
+    chord = pose[1, :2] - pose[0, :2]
+    chord = chord / jnp.sqrt(jnp.sum(chord**2) + jnp.finfo(dtype).tiny)
+    frame = jnp.stack([chord, quarter_turn(chord)])
+    constraint = jnp.concatenate([frame @ quarter_turn(arm).T, jnp.full((1, len(angles)), config.length, dtype)])
+    gap = _closure(config, shape, angles, pose)
+    error = jnp.concatenate([frame @ gap[:2], gap[2:]])
     step = constrained_acceleration(hessian, force, constraint, error)
     return step * jnp.minimum(1.0, MAX_TURN / jnp.sqrt(jnp.max(step**2) + 1e-20))
 

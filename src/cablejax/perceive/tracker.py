@@ -20,7 +20,7 @@ class PaddedCloud(NamedTuple):
     Attributes:
         points: [m], zeros where `mask` is false, float32, shape [S, 2].
         mask: which rows are points, shape [S].
-        dropped: points that were not finite.
+        dropped: points that were not finite, or farther away than any camera sees.
     """
 
     points: Float[np.ndarray, "S 2"]
