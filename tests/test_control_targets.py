@@ -102,7 +102,7 @@ def test_unreadable_files_are_refused(tmp_path):
         load_target(tmp_path / "none.npz", CABLE)
     path = tmp_path / "wrong.txt"
     path.write_text("")
-    with pytest.raises(ValueError, match="none of"):
+    with pytest.raises(ValueError, match="neither U, S or Z nor a file"):
         load_target(path, CABLE)
     path = tmp_path / "wrong.csv"
     path.write_text("x,y\n1.0,apple\n")

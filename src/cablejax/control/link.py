@@ -183,7 +183,7 @@ class RobotLink:
         if not np.isfinite(pose).all():
             return "The grippers' poses are not known yet."
         if apart > 2 * self._length:
-            return f"The grippers are {apart:.3g} m apart, and the cable is {self._length:.3g} m long: are poses in metres?"
+            return f"The grippers are {apart:.3g} m apart, and the cable is {self._length:.3g} m long: metres?"
         return (
             f"{100 * share:.0f} % of the keypoints are known and within reach of the grippers, expected "
             f"{100 * self.config.min_seen:.0f} %: are they in metres, in the grippers' frame?"

@@ -174,7 +174,10 @@ def load_target(path: str | pathlib.Path, config: Cable = Cable()) -> Target:
     path = pathlib.Path(path)
     read = _READERS.get(path.suffix.lower())
     if read is None:
-        raise ValueError(f"{path} is none of {', '.join(_READERS)}: save the target's keypoints in one of these.")
+        raise ValueError(
+            f"{path} is neither U, S or Z nor a file of {', '.join(_READERS)}: save the target's "
+            "keypoints in one of these."
+        )
     try:
         fields = read(path)
     except (ValueError, TypeError) as error:
@@ -209,7 +212,11 @@ def _read_csv(path: pathlib.Path) -> dict[str, np.ndarray]:
     lines = [line for line in read_text(path).splitlines() if line.strip()]
     if lines and lines[0].lstrip()[0] not in "+-.0123456789" and not lines[0].strip().lower().startswith("nan"):
         lines = lines[1:]  # a heading
-    return {"keypoints": np.array([[float(cell) for cell in line.split(",")] for line in lines])}
+    try:
+        rows = [[float(cell) for cell in line.split(",")] for line in lines]
+    except ValueError as error:
+        raise ValueError(f"expected rows x,y in metres ({error})") from error
+    return {"keypoints": np.array(rows)}
 
 
 _READERS = {".npz": _read_npz, ".json": _read_json, ".csv": _read_csv}

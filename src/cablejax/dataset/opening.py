@@ -129,7 +129,9 @@ def open_or_create(path: str | os.PathLike[str] | Bucket, config: DatasetConfig)
     elif place.exists() and not place.is_dir():
         raise ValueError(f"{place} is a file, expected a folder to write a data set to. Give another place.")
     elif place.is_dir() and any(place.iterdir()) and not (place / "zarr.json").is_file():
-        raise ValueError(f"{place} exists and holds no data set. Give an empty or new folder; nothing was changed.")
+        raise ValueError(
+            f"{place} exists and holds no data set but other files. Give an empty or new folder; nothing was changed."
+        )
     elif not place.is_dir() or not any(place.iterdir()):
         _create(place, config, versions)
     store = _recorded(place, "r+")

@@ -58,7 +58,13 @@ def check_effect(effect: CableEffect) -> None:
             )
         best = trials[int(np.argmax(moved))]
         for i, parameter in enumerate(effect.parameters):
-            exact, difference = _derivatives(best, i, nominal, motion, angles)
+            try:
+                exact, difference = _derivatives(best, i, nominal, motion, angles)
+            except jax.errors.JAXTypeError as error:
+                raise ValueError(
+                    f"Effect {effect.name!r}: `apply` cannot be traced by JAX ({str(error).splitlines()[0]}) Write it "
+                    "with the array namespace of its values, without `float`, rounding or branches on them."
+                ) from error
             error = np.abs(exact - difference).max()
             if not error <= _TOLERANCE * np.abs(difference).max() + 1e-7:
                 raise ValueError(

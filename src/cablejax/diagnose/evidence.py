@@ -13,10 +13,11 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from cablejax.diagnose.protocol import Explanation, Simulator
-from cablejax.types import ROTATION_WEIGHT
 
 _ALIKE = 0.05
 """Motions whose gripper poses differ by less than this share of the cable's length, root mean square, are one."""
+_ARM = 0.15
+"""Share of the cable's length that a radian of a gripper counts for there."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -140,7 +141,7 @@ def repeated_motions(gripper_pose: Float[np.ndarray, "E T 2 3"], length: float) 
         gripper_pose: of the grippers, theta continuous, NaN beyond an episode's end [m, m, rad].
         length: of the cable [m].
     """
-    place = gripper_pose * np.array([1.0, 1.0, ROTATION_WEIGHT * length])
+    place = gripper_pose * np.array([1.0, 1.0, _ARM * length])
     first = np.arange(len(place))
     for e in range(1, len(place)):
         square = ((place[:e] - place[e]) ** 2).sum(axis=(2, 3))

@@ -197,13 +197,17 @@ def _store_figure(block: Block) -> Figure:
     return figure
 
 
+def _titled(column: str) -> str:
+    return f"{parameter_title(column)} [s]" if column == "damping_time" else parameter_title(column)
+
+
 def _store_ranges(block: Block):
     quantities = {
         "x of the keypoints [m]": block.keypoints[..., 0],
         "y of the keypoints [m]": block.keypoints[..., 1],
         "speed of a gripper [cm/s]": 100 * np.linalg.norm(block.gripper_twist[..., :2], axis=-1),
         "turning speed of a gripper [deg/s]": np.degrees(np.abs(block.gripper_twist[..., 2])),
-        **{parameter_title(column): block.parameters[:, k] for k, column in enumerate(PARAMETERS)},
+        **{_titled(column): block.parameters[:, k] for k, column in enumerate(PARAMETERS)},
     }
     rows = [(name, span(values)) for name, values in quantities.items()]
     return f"Ranges in the first shard, {len(block)} trajectories", ("quantity", "least to largest"), rows

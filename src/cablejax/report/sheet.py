@@ -78,8 +78,9 @@ def cable_cards(cable: Cable, *, on_table: bool = True) -> list[tuple[str, str, 
     weight = cable.linear_density * GRAVITY
     droop = (cable.bending_stiffness / weight) ** (1 / 3)
     friction = cable.friction_coefficient * weight * cable.length**3 / cable.bending_stiffness
+    curved = f", curved by {cable.rest_curvature:g} /m at rest" if cable.rest_curvature else ""
     cards = [
-        ("Length", f"{cable.length:g} m", f"{cable.n_keypoints} keypoints, {1e3 * cable.diameter:g} mm thick"),
+        ("Length", f"{cable.length:g} m", f"{cable.n_keypoints} keypoints, {1e3 * cable.diameter:g} mm thick{curved}"),
         ("Mass", f"{1e3 * cable.linear_density * cable.length:.3g} g", f"{cable.linear_density:g} kg/m"),
         ("Bending stiffness", f"{cable.bending_stiffness:g} N m²", f"(EI / weight)^(1/3) is {100 * droop:.3g} cm"),
         ("Friction", f"{cable.friction_coefficient:g}", f"friction over stiffness, mu w L^3 / EI, is {friction:.3g}"),
