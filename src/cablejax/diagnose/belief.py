@@ -110,9 +110,9 @@ class Calibration:
         return left <= self.may_leave(gap, noise)
 
     def needs_no_other(self, gap: float, noise: float) -> float:
-        """An explanation that leaves no more than this is not tried with another effect: its law may be off by that.
+        """A single effect that leaves no more than this is not tried with another one: its law may be off by that.
 
-        A complete one that leaves more is: an effect that takes most of the gap may bear values that are another's.
+        A complete one that leaves more is: it may take most of the gap by values that are in part another's.
         """
         return max(self.law_error * gap, self.smallest_gap(noise))
 

@@ -73,7 +73,9 @@ def search(
     def grow(fits: list[Fit], bases: Sequence[Fit]) -> list[Fit]:
         """Sets of one more effect each, until the best is adequate or the next one no better."""
         for size in range(1 + max(len(base.explanation.terms) for base in bases), _MOST_TERMS + 1):
-            if excess(float(fits[0].sse.sum()), evidence) <= calibration.needs_no_other(gap, level(evidence)):
+            left, noise = excess(float(fits[0].sse.sum()), evidence), level(evidence)
+            alone = len(effect_names(fits[0].explanation)) == 1
+            if left <= (calibration.needs_no_other if alone else calibration.may_leave)(gap, noise):
                 break
             progress(f"fitting sets of {size} effects")
             grown = [fit for base in bases for fit in _grown(evidence, base.explanation, calibration)]
