@@ -145,9 +145,7 @@ def _concluded(
         if len(alike) > 1:
             equivalent.append(tuple(alike))
         effects.append(_named(name, best, odds[name] / total, drawn, evidence.simulator))
-    # what an effect that is not the cause explains of the motions it was fitted to, it explains of others less
-    unseen = excess(float(best.held_out_sse(evidence).sum()), evidence) if best.refits is None else left
-    complete = calibration.complete(max(left, unseen / calibration.as_good), gap, level(evidence))
+    complete = calibration.complete(left, gap, level(evidence))
     telling = _telling(best, null, explained, complete, evidence, calibration)
     verdict = judged(resolvable=True, telling=telling, complete=complete, alike=bool(equivalent))
     if verdict == "unknown":
