@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import time
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -101,11 +102,8 @@ def diagnose(
     repaired = case.recording.as_log(log.meta)
     rounds = rounds_of(log, found.fits, found.scores, evidence, calibration)
     caveats = _caveats(case, calibration, length, stated, commissioned=bool(commissioning))
-    fields = Examined(evidence, found, conclusion, reference, after, gap).fields()
-    if alone.verdict == "none" and case.arms.strays(calibration.smallest_gap(0.0)):
-        fields["sentence"] = _ONLY_ARMS
     diagnosis = CableDiagnosis(
-        **fields,
+        **Examined(evidence, found, conclusion, reference, after, gap).fields() | _of_arms(alone, case, calibration),
         where=localise(repaired, case.to_log(reference), case.noise.std),
         next_motion=following,
         caveats=(*_contradictions(rounds), *caveats, *none_kept),
@@ -194,6 +192,12 @@ def _contradictions(rounds: Rounds | None) -> tuple[str, ...]:
     )
 
 
+def _of_arms(alone: Conclusion, case: Case, calibration: Calibration) -> dict[str, Any]:
+    """The sentence of a verdict that is about the arms only; `alone` is what the cable showed."""
+    only = alone.verdict == "none" and case.arms.strays(calibration.smallest_gap(0.0))
+    return {"sentence": _ONLY_ARMS} if only else {}
+
+
 def _caveats(
     case: Case, calibration: Calibration, length: Length | None, stated: float, *, commissioned: bool
 ) -> tuple[str, ...]:
@@ -214,7 +218,7 @@ def _caveats(
             "lead, and neither a gain nor a lag explains that. Check the frame and the units of gripper_command, and "
             "whether the commands of both arms were logged."
         )
-    elif case.recording.has_commands:
+    if case.recording.has_commands:
         off = np.linalg.norm((case.recording.gripper_pose - case.arms.commanded)[..., :2], axis=-1).max(axis=(1, 2))
         if off.max() > MARGIN:
             caveats.append(
