@@ -251,7 +251,10 @@ def differences(before: dict[str, Any], after: dict[str, Any]) -> list[str]:
     if groups != groups_now:
         found.append(f"equivalent {sorted(groups - groups_now)} -> {sorted(groups_now - groups)}")
     for name in causes.keys() & now.keys():
-        for key, parameter in causes[name].items():
+        for key in sorted(causes[name].keys() ^ now[name].keys()):
+            found.append(f"{name}.{key} {'is not given any more' if key in causes[name] else 'is new'}")
+        for key in causes[name].keys() & now[name].keys():
+            parameter = causes[name][key]
             value, interval = now[name][key]["value"], parameter["ci90"]
             if interval is None:
                 same = value == parameter["value"]

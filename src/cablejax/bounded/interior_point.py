@@ -137,13 +137,19 @@ def _polished(problem: _Scaled, last: _Progress) -> tuple[_Iterate, Float[Array,
         better = error < progress.error
         best = jax.tree.map(lambda a, b: jnp.where(better, a, b), new, progress.best)
         return progress._replace(
-            now=new, best=best, error=jnp.where(better, error, progress.error), count=progress.count + 1
+            now=new,
+            best=best,
+            error=jnp.where(better, error, progress.error),
+            stale=jnp.where(error < 0.5 * progress.error, 0, progress.stale + 1),
+            count=progress.count + 1,
         )
 
     def unfinished(progress: _Progress):
-        return (progress.error > eps**0.7) & jnp.isfinite(progress.error) & (progress.count < _POLISHING)
+        going = jnp.isfinite(progress.error) & (progress.count < _POLISHING) & (progress.stale < 2)
+        return (progress.error > eps**0.7) & going
 
-    begin = last._replace(now=last.best, error=_worst(problem, last.best), count=jnp.zeros_like(last.count))
+    zero = jnp.zeros_like(last.count)
+    begin = last._replace(now=last.best, error=_worst(problem, last.best), stale=zero, count=zero)
     done = jax.lax.while_loop(unfinished, one, begin)
     return done.best, done.error, done.count
 
