@@ -175,15 +175,8 @@ def _terms(
     quadrics, tiny = problem.quadrics, jnp.finfo(at.x.dtype).tiny
     steep = jnp.abs(jacobian)
     forces = jnp.abs(problem.hessian) @ jnp.abs(at.x) + jnp.abs(problem.linear) + at.multipliers @ steep + tiny
-    lengths = _lengths(quadrics, jnp.abs(quadrics.matrix) @ jnp.abs(at.x) + jnp.abs(quadrics.offset))
+    lengths = quadrics.sizes(jnp.abs(quadrics.matrix) @ jnp.abs(at.x) + jnp.abs(quadrics.offset))
     return forces, lengths + tiny, steep @ forces / (steep.sum(axis=1) ** 2 + tiny) + tiny
-
-
-def _lengths(quadrics: Quadrics, far: Float[Array, " M"]) -> Float[Array, " K"]:
-    """Sizes of the terms of each bound where the lifted point is about as large as `far`."""
-    return quadrics.groups @ (0.5 * quadrics.curvature * far**2 + jnp.abs(quadrics.slope) * far) + jnp.abs(
-        quadrics.level
-    )
 
 
 def _step_on_bounds(problem: _Scaled, now: _Iterate) -> _Iterate:
@@ -233,7 +226,7 @@ def _start(problem: _Scaled) -> tuple[_Iterate, _Sizes]:
     force = jnp.linalg.norm(problem.linear) + outside + jnp.finfo(dtype).tiny
     # The step is about as long as the force, as far as there is room; a curved bound leaves its radius.
     curved = quadrics.groups @ quadrics.curvature > 0
-    size = jnp.where(present, _lengths(quadrics, jnp.abs(quadrics.offset)), 0.0).max(initial=0.0)
+    size = jnp.where(present, quadrics.sizes(quadrics.offset), 0.0).max(initial=0.0)
     most = jnp.minimum(force, _ROOM * size)
     room = jnp.where(curved, jnp.minimum(-2.0 * quadrics.level, force), most)
     slack = jnp.where(present, jnp.maximum(-start, 0.1 * room), 1.0)

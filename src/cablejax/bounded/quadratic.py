@@ -16,9 +16,9 @@ from cablejax.bounded.quadrics import Quadrics
 if TYPE_CHECKING:
     from cablejax.bounded.sets import ConvexSet
 
-
-# A point further from the set than this many times the set's own size is moved near it first, so often at most.
-_FAR, _CENTRES = 64.0, 3
+# A point further from the set than this many times the set's own size is moved near it first: along its own direction
+# to this many sizes, then to the nearest point found, so often at most.
+_FAR, _NEAR, _CENTRES = 64.0, 1e3, 3
 
 
 class QuadraticMinimum(NamedTuple):
@@ -71,21 +71,19 @@ def nearest_point(quadrics: Quadrics, y: Float[Array, " P"]) -> Float[Array, " P
 
 def _near_the_set(quadrics: Quadrics, y):
     """A `y` far away, moved near the set: its nearest point is a difference of large numbers from where it was."""
-    present, eps = jnp.isfinite(quadrics.level), jnp.finfo(y.dtype).eps
+    present, eps, tiny = jnp.isfinite(quadrics.level), jnp.finfo(y.dtype).eps, jnp.finfo(y.dtype).tiny
     size = jnp.where(present, jnp.abs(quadrics.level), 0.0).max(initial=0.0)
 
     def far(carry):
         z = quadrics.lift(carry[0])
-        steepness = jnp.linalg.norm(quadrics.jacobian(z), axis=1) + jnp.finfo(y.dtype).tiny
+        steepness = jnp.linalg.norm(quadrics.jacobian(z), axis=1) + tiny
         beyond = jnp.where(present, quadrics.of_lift(z) / steepness, 0.0).max(initial=0.0)
         return (beyond > _FAR * size + 64 * eps * jnp.abs(z).max()) & (carry[1] < _CENTRES)
 
     def nearer(carry):
         return carry[0] + _step_to_nearest(quadrics, y, carry[0]), carry[1] + 1
 
-    reach = (
-        1e3 * (size + jnp.abs(quadrics.offset).max()) / (jnp.abs(quadrics.matrix @ y).max() + jnp.finfo(y.dtype).tiny)
-    )
+    reach = _NEAR * (size + jnp.abs(quadrics.offset).max()) / (jnp.abs(quadrics.matrix @ y).max() + tiny)
     shorter = jnp.where(far((y, 0)) & (reach > 0), jnp.minimum(reach, 1.0), 1.0) * y
     return jax.lax.while_loop(far, nearer, (shorter, jnp.zeros((), jnp.int32)))[0]
 
@@ -98,7 +96,7 @@ def _step_to_nearest(quadrics: Quadrics, y, centre):
 def _inside(quadrics: Quadrics, start, step):
     """The end of a step; of one that leaves the set by more than rounding, the last point inside."""
     z, along = quadrics.lift(start), quadrics.matrix @ step
-    scale = _rounding_scale(quadrics, z) + _rounding_scale(quadrics, z + along)
+    scale = quadrics.sizes(z) + quadrics.sizes(z + along)
     # What is beyond a bound by rounding stays: at a bound, a step along it would otherwise not get anywhere.
     tolerance = 16 * jnp.finfo(step.dtype).eps * (scale + jnp.abs(along).max())
     now = jnp.minimum(quadrics.of_lift(z) - tolerance, 0.0)
@@ -110,11 +108,6 @@ def _inside(quadrics: Quadrics, start, step):
     denominator = jnp.where(leaves, slope + root, 1.0)
     reach = jnp.where(leaves, -2.0 * jnp.where(leaves, now, 0.0) / jnp.where(denominator > 0, denominator, 1.0), 1.0)
     return start + jnp.clip(reach.min(), 0.0, 1.0) * step
-
-
-def _rounding_scale(quadrics: Quadrics, z):
-    level = jnp.where(jnp.isfinite(quadrics.level), jnp.abs(quadrics.level), 0.0)
-    return level + quadrics.groups @ (0.5 * quadrics.curvature * z**2 + jnp.abs(quadrics.slope * z))
 
 
 @eqx.filter_custom_jvp

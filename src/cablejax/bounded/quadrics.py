@@ -41,6 +41,11 @@ class Quadrics(eqx.Module):
         """C where the lifted point is z."""
         return self.groups @ (0.5 * self.curvature * z**2 + self.slope * z) + self.level
 
+    def sizes(self, z: Float[Array, " M"]) -> Float[Array, " K"]:
+        """Sizes of the terms of which c is the sum where the lifted point is z; 0 for the level of an absent bound."""
+        terms = self.groups @ (0.5 * self.curvature * z**2 + jnp.abs(self.slope * z))
+        return jnp.where(jnp.isfinite(self.level), jnp.abs(self.level), 0.0) + terms
+
     def values(self, x: Float[Array, " P"]) -> Float[Array, " K"]:
         """C at a point."""
         return self.of_lift(self.lift(x))

@@ -72,7 +72,7 @@ class ConvexSet(AbstractSet):
     def project(self, y: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
         """The nearest point of the set, to rounding of the set's size; differentiable in `y` and in the set's arrays.
 
-        In float32 a `y` further away than a million times that size leaves an error of a hundredth.
+        In float32 it is a rough one for a `y` more than a million times that size away.
         """
         return nearest_point(self.quadrics(y), y.ravel()).reshape(y.shape)
 

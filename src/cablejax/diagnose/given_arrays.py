@@ -24,8 +24,8 @@ def checked_nominal(
     names = [effect.name for effect in effects]
     if not effects or len(set(names)) < len(names):
         raise ValueError(f"The simulator has the effects {names}, expected at least one, and every name once.")
-    alone = any(simulator.own(explanation((e, e.variants[0], e.null))) for e in effects)
-    if alone and (len(simulator.recording) != len(observed) or simulator.plan.parts is None):
+    own = any(simulator.own(explanation((e, e.variants[0], e.null))) for e in effects)
+    if own and (len(simulator.recording) != len(observed) or simulator.plan.parts is None):
         raise ValueError(
             f"Recordings have numbers of their own (`own`), which needs `recording`, one number for each of "
             f"{len(observed)} episodes (it has {len(simulator.recording)}), and a plan that leaves out parts of them: "

@@ -75,7 +75,8 @@ def search(
         for size in range(1 + max(len(base.explanation.terms) for base in bases), _MOST_TERMS + 1):
             left, noise = excess(float(fits[0].sse.sum()), evidence), level(evidence)
             alone = len(effect_names(fits[0].explanation)) == 1
-            if left <= (calibration.needs_no_other if alone else calibration.may_leave)(gap, noise):
+            enough = calibration.needs_no_other(gap, noise) if alone else calibration.may_leave(gap, noise)
+            if left <= enough:
                 break
             progress(f"fitting sets of {size} effects")
             grown = [fit for base in bases for fit in _grown(evidence, base.explanation, calibration)]

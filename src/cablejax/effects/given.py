@@ -25,6 +25,7 @@ VERDICT_SCHEMA = "cablejax-verdict/1"
 """Format and version of `verdict.json`."""
 
 
+# Parameters that say which: a gripper, a keypoint, a direction.
 _CHOICES = frozenset({"index", "across", *(effect.variant_name for effect in EFFECTS.values())})
 
 

@@ -15,7 +15,7 @@ import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
 
-from cablejax.dataset.schema import PARAMETERS, Block
+from cablejax.dataset.schema import Block
 from cablejax.dataset.store import MissingShardError, Store
 from cablejax.diagnose.diagnosis import Diagnosis
 from cablejax.diagnose.judgement import listed
@@ -23,7 +23,7 @@ from cablejax.dynamics.card import network_words
 from cablejax.dynamics.weights import cable_of_weights, load_info, load_weights, weights_path
 from cablejax.report.diagnosis_charts import ranking_figure
 from cablejax.report.diagnosis_sections import named_effects
-from cablejax.report.effect_words import between, effect_title, parameter_title, share
+from cablejax.report.effect_words import between, effect_title, share
 from cablejax.report.sheet import LETTERS_CAPTION, Sheet, cable_cards, cable_facts, letters_figure, span
 from cablejax.report.style import DIAGNOSIS_STYLE, LIGHT, cable_curve
 from cablejax.text_file import read_text
@@ -197,17 +197,13 @@ def _store_figure(block: Block) -> Figure:
     return figure
 
 
-def _titled(column: str) -> str:
-    return f"{parameter_title(column)} [s]" if column == "damping_time" else parameter_title(column)
-
-
 def _store_ranges(block: Block):
     quantities = {
         "x of the keypoints [m]": block.keypoints[..., 0],
         "y of the keypoints [m]": block.keypoints[..., 1],
         "speed of a gripper [cm/s]": 100 * np.linalg.norm(block.gripper_twist[..., :2], axis=-1),
         "turning speed of a gripper [deg/s]": np.degrees(np.abs(block.gripper_twist[..., 2])),
-        **{_titled(column): block.parameters[:, k] for k, column in enumerate(PARAMETERS)},
+        **dict(zip(("stiffness ratio", "friction coefficient", "damping time [s]"), block.parameters.T, strict=True)),
     }
     rows = [(name, span(values)) for name, values in quantities.items()]
     return f"Ranges in the first shard, {len(block)} trajectories", ("quantity", "least to largest"), rows
