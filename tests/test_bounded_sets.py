@@ -206,6 +206,22 @@ def test_nearest_point_of_a_box_given_as_half_spaces(x64, size):
         assert float(feasible.violation(feasible.project(y))) <= 1e-6
 
 
+@pytest.mark.parametrize("x64", [False, True])
+@pytest.mark.parametrize("size", [1e-3, 1.0, 1e3])
+def test_the_tip_of_a_cone_and_a_bound_of_zero_are_minima_too(x64, size):
+    """There all terms of a bound vanish, and nothing is large or small beside them."""
+    with jax.enable_x64(x64):
+        cone = Halfspaces(jnp.asarray([[1.0, 1.0, 0.0], [0.0, 1.0, -1.0], [-1.0, 0.0, 0.0]]), jnp.zeros(3))
+        linear = size * jnp.asarray([1.0, -2.0, 0.5])
+        found = minimise_quadratic(jnp.eye(3), linear, cone, jnp.zeros(3))
+        assert bool(found.converged) and np.abs(found.point).max() <= 1e-6 * size
+        np.testing.assert_allclose(cone.project(-linear), 0.0, atol=1e-6 * size)
+        positive = Box(jnp.zeros(3), jnp.full(3, jnp.inf))
+        found = minimise_quadratic(jnp.diag(jnp.asarray([1.0, 0.1, 2.0])), linear, positive, jnp.zeros(3))
+        assert bool(found.converged)
+        np.testing.assert_allclose(found.point, [0.0, 20 * size, 0.0], atol=1e-5 * size)
+
+
 @pytest.mark.parametrize("curvature", [1e-4, 1e-6, 1e-10, 0.0])
 @pytest.mark.parametrize("x64", [False, True])
 def test_unknowns_of_little_curvature_are_at_their_bounds_or_not_converged(x64, curvature):
