@@ -48,6 +48,17 @@ def test_help_explains_every_option(command, capsys):
     assert "(required)" not in options_box, "every command runs without options"
 
 
+@pytest.mark.parametrize("command", [c for c in SUBCOMMANDS if c != ["bench"]], ids=" ".join)
+def test_help_of_an_option_is_wrapped_by_the_terminal_alone(command, capsys, monkeypatch):
+    # the line breaks of a docstring once stayed in the middle of a sentence
+    monkeypatch.setenv("COLUMNS", "2000")
+    text = help_of(command, capsys)
+    lines = [line.strip("│| ") for line in text[text.index("--seed") :].splitlines()]
+    lines = [line for line in lines if any(letter.isalpha() for letter in line)]
+    assert len(lines) > 3
+    assert all(line.startswith("-") or before.startswith("-") for before, line in zip(lines, lines[1:], strict=False))
+
+
 def test_help_is_fast_because_it_loads_neither_jax_nor_mujoco():
     check = (
         "import sys, cablejax.cli\n"

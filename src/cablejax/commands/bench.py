@@ -17,22 +17,21 @@ from cablejax.solver_names import SolverName
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class BenchMpc(Command):
-    """Time the controller's call (observe, fit the residual, plan, command) with every solver, and in batches."""
+    """Time the controller's call (observe, fit the residual, plan, command) with every solver, and in batches.
+
+    Attributes:
+        weights: Released model by name, or the folder of a training by `cablejax train`.
+        solvers: How plans are found; the first one is also timed in batches.
+        horizon: Steps that a plan looks ahead, beyond the next one.
+        repeats: Calls to time, after the first one, which compiles.
+        batches: Cables to control at once; by default 1 and 16 on a processor, and 1, 64 and 1024 on an accelerator.
+    """
 
     weights: str = "gns-reference"
-    """Released model by name, or the folder of a training by `cablejax train`."""
-
     solvers: tuple[SolverName, ...] = get_args(SolverName)
-    """How plans are found; the first one is also timed in batches."""
-
     horizon: int = 5
-    """Steps that a plan looks ahead, beyond the next one."""
-
     repeats: int = 60
-    """Calls to time, after the first one, which compiles."""
-
     batches: tuple[int, ...] = ()
-    """Cables to control at once; by default 1 and 16 on a processor, and 1, 64 and 1024 on an accelerator."""
 
     def execute(self):
         """Times single and batched control calls and returns milliseconds."""
@@ -96,13 +95,15 @@ class BenchMpc(Command):
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class BenchPerception(Command):
-    """Time the tracker: one frame of a moving cable, and a first frame without a prior."""
+    """Time the tracker: one frame of a moving cable, and a first frame without a prior.
+
+    Attributes:
+        points: Points in the cloud.
+        repeats: Frames to time, after the first ones, which compile.
+    """
 
     points: int = 2000
-    """Points in the cloud."""
-
     repeats: int = 200
-    """Frames to time, after the first ones, which compile."""
 
     def execute(self):
         """Times frames of the tracker and returns frames per second."""
@@ -150,22 +151,21 @@ class BenchPerception(Command):
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class BenchLoop(Command):
-    """Time the closed loop in batches: simulated plant, residual, plan and command of many cables in one call."""
+    """Time the closed loop in batches: simulated plant, residual, plan and command of many cables in one call.
+
+    Attributes:
+        weights: Released model by name, or the folder of a training by `cablejax train`.
+        solver: How the plan is found.
+        batches: Numbers of cables to shape at once.
+        steps: Control steps per round.
+        rounds: How often each batch takes its turn.
+    """
 
     weights: str = "gns-reference"
-    """Released model by name, or the folder of a training by `cablejax train`."""
-
     solver: SolverName = "levenberg-marquardt"
-    """How the plan is found."""
-
     batches: tuple[int, ...] = (1, 8)
-    """Numbers of cables to shape at once."""
-
     steps: int = 5
-    """Control steps per round."""
-
     rounds: int = 3
-    """How often each batch takes its turn."""
 
     def execute(self):
         """Times the batched closed loop and returns steps per second."""
@@ -208,7 +208,11 @@ class BenchLoop(Command):
 
 @dataclasses.dataclass(frozen=True)
 class Bench:
-    """Measure speed on this machine."""
+    """Measure speed on this machine.
+
+    Attributes:
+        what: What is measured.
+    """
 
     what: (
         Annotated[BenchSimulate, subcommand("simulate")]
@@ -217,4 +221,3 @@ class Bench:
         | Annotated[BenchPerception, subcommand("perception")]
         | Annotated[BenchStart, subcommand("start")]
     )
-    """What is measured."""

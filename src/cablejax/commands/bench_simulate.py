@@ -24,31 +24,27 @@ class BenchSimulate(Command):
 
     The engines take turns, and the median of the rounds counts. Accuracy is the distance of the keypoints from a
     simulation at 2 ms, over random motions as data sets have them.
+
+    Attributes:
+        batch: Cables that chain and MJX simulate at once; C simulates as many, one after the other.
+        seconds: Simulated seconds per round.
+        rounds: How often each engine takes its turn.
+        threads: Threads of C MuJoCo to compare with one.
+        trajectories: Motions to compare with finer ones, and to draw, simulate and store with each engine; 0 leaves
+            this out.
+        steps: Commands of such a motion, one second each.
+        links: Links of the cable; by default the package's.
+        cable: A cable file, or a data set, weights or a log that holds a cable. By default the reference cable.
     """
 
     batch: int = 256
-    """Cables that chain and MJX simulate at once; C simulates as many, one after the other."""
-
     seconds: int = 1
-    """Simulated seconds per round."""
-
     rounds: int = 5
-    """How often each engine takes its turn."""
-
     threads: int = 2
-    """Threads of C MuJoCo to compare with one."""
-
     trajectories: int = 64
-    """Motions to compare with finer ones, and to draw, simulate and store with each engine; 0 leaves this out."""
-
     steps: int = 200
-    """Commands of such a motion, one second each."""
-
     links: int | None = None
-    """Links of the cable; by default the package's."""
-
     cable: pathlib.Path | None = None
-    """A cable file, or a data set, weights or a log that holds a cable. By default the reference cable."""
 
     def execute(self):
         """Times the engines in turns and returns microseconds, distances and transitions per second."""

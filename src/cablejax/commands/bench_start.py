@@ -36,22 +36,20 @@ class BenchStart(Command):
 
     Each runs with an empty folder for compiled programs, then with the folder as the first run has left it. Processor
     time, of all cores together, is stated beside wall time: on a busy machine only that can be compared.
+
+    Attributes:
+        logs: Gap logs to diagnose; by default one of a cable that is too soft, staged with the contact plant.
+        parts: What to time: `import cablejax`, `cablejax --help`, a first control call, `cablejax diagnose LOG`.
+        weights: Released model by name, or the folder of a training by `cablejax train`, of the control call.
+        horizon: Steps that the control call's plan looks ahead, beyond the next one.
+        repeats: How often `import` and `--help` are run; the median counts.
     """
 
     logs: Annotated[tuple[pathlib.Path, ...], tyro.conf.Positional] = ()
-    """Gap logs to diagnose; by default one of a cable that is too soft, staged with the contact plant."""
-
     parts: tuple[Part, ...] = get_args(Part)
-    """What to time: `import cablejax`, `cablejax --help`, a first control call, `cablejax diagnose LOG`."""
-
     weights: str = "gns-reference"
-    """Released model by name, or the folder of a training by `cablejax train`, of the control call."""
-
     horizon: int = 5
-    """Steps that the control call's plan looks ahead, beyond the next one."""
-
     repeats: int = 5
-    """How often `import` and `--help` are run; the median counts."""
 
     def execute(self):
         """Runs every part with an empty and a filled folder and returns seconds of both kinds."""

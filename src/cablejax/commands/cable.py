@@ -22,17 +22,17 @@ class CableFile(Command):
 
     `simulate` and `shape` take the file as `--cable`. Data sets, weights and logs keep the cable that they were made
     with.
+
+    Attributes:
+        out: The file to write, by custom cable.toml; by default the text is only printed.
+        from_: A data set, trained weights (a file, a folder, or a released model by name), a log, or another cable
+            file. By default the reference cable.
+        overwrite: Replace a file that is there.
     """
 
     out: pathlib.Path | None = None
-    """The file to write, by custom cable.toml; by default the text is only printed."""
-
     from_: Annotated[str | None, tyro.conf.arg(name="from")] = None
-    """A data set, trained weights (a file, a folder, or a released model by name), a log, or another cable file. By
-    default the reference cable."""
-
     overwrite: bool = False
-    """Replace a file that is there."""
 
     def execute(self):
         """Writes a cable file, or prints it where no --out is given."""

@@ -22,30 +22,26 @@ class Demo(Command):
     is made with and without the online residual, and after 25 s the cable is pushed aside. Writes summary.json,
     log.npz, report.html and demo.gif, and ends by diagnosing its own run until the push: diagnosis/report.html names
     what the simulator lacks.
+
+    Attributes:
+        out: Folder for the results.
+        overwrite: Replace the results that are in the folder.
+        weights: Released model by name, or the folder of a training by `cablejax train`.
+        shapes: Which shapes to make.
+        steps: Commands per run, one second each.
+        links: Links of the plant's cable.
+        solver: How the controller finds its plan.
     """
 
     resume_hint: ClassVar[str] = "Run the same command again: finished runs are kept and not repeated."
 
     out: pathlib.Path = pathlib.Path("runs/demo")
-    """Folder for the results."""
-
     overwrite: bool = False
-    """Replace the results that are in the folder."""
-
     weights: str = "gns-reference"
-    """Released model by name, or the folder of a training by `cablejax train`."""
-
     shapes: tuple[Literal["U", "S", "Z"], ...] = ("U", "S", "Z")
-    """Which shapes to make."""
-
     steps: int = 45
-    """Commands per run, one second each."""
-
     links: int = 24
-    """Links of the plant's cable."""
-
     solver: Literal["levenberg-marquardt", "projected-gradient"] = "levenberg-marquardt"
-    """How the controller finds its plan."""
 
     def execute(self):
         """Shapes U, S and Z with and without the residual, reports, and diagnoses the run."""

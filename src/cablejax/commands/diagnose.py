@@ -25,29 +25,26 @@ class Diagnose(Command):
     Reads a gap log (`cablejax-gap-log/1`, as `cablejax shape` writes it) and writes report.html, verdict.json and the
     figures. A log of six episodes on a table takes about half a minute; a log in space takes some minutes and
     goes on where it was if interrupted.
+
+    Attributes:
+        logs: The recorded run, an .npz file. Several of one set-up are diagnosed together, in the order in which they
+            were recorded, and the verdict says what each one added.
+        out: Folder of the report.
+        commissioning: Logs of the same set-up known to have no effect: they separate the simulator's own error from the
+            gap. For planar logs only.
+        only: Names of the effects to look for; by default all; in space all but intrinsic_curvature, which takes four
+            times as long as the others together.
+        bounds: Bounds of a motion, a TOML file: the motion to record next is designed within them, instead of taken
+            from a few safe ones. For planar logs only.
+        overwrite: Replace a report that is there.
     """
 
     logs: Annotated[tuple[pathlib.Path, ...], tyro.conf.Positional]
-    """The recorded run, an .npz file. Several of one set-up are diagnosed together, in the order in which they were
-    recorded, and the verdict says what each one added."""
-
     out: pathlib.Path = pathlib.Path("runs/diagnosis")
-    """Folder of the report."""
-
     commissioning: tuple[pathlib.Path, ...] = ()
-    """Logs of the same set-up known to have no effect: they separate the simulator's own error from the gap. For planar
-    logs only."""
-
     only: tuple[str, ...] = ()
-    """Names of the effects to look for; by default all; in space all but intrinsic_curvature, which takes four times as
-    long as the others together."""
-
     bounds: pathlib.Path | None = None
-    """Bounds of a motion, a TOML file: the motion to record next is designed within them, instead of taken from a few
-    safe ones. For planar logs only."""
-
     overwrite: bool = False
-    """Replace a report that is there."""
 
     def execute(self):
         """Diagnoses a log, on a table or in space, and writes its verdict and page."""

@@ -25,19 +25,18 @@ class Export(Command):
 
     mcap: an MCAP file with JSON messages, which Foxglove shows. lerobot: a LeRobot data set, version 3.0. rerun: a
     Rerun recording with grippers, keypoints, target and errors; of a diagnosis also with the simulated cables.
+
+    Attributes:
+        format: What to write.
+        source: A gap log, the folder of a run or of a diagnosis, or an exported log.
+        out: The file, or the data set's folder, to write. By default log.mcap, log-lerobot or run.rrd.
+        overwrite: Replace a file that is there; a folder is never replaced.
     """
 
     format: Annotated[Literal["mcap", "lerobot", "rerun"], tyro.conf.Positional]
-    """What to write."""
-
     source: Annotated[pathlib.Path, tyro.conf.Positional]
-    """A gap log, the folder of a run or of a diagnosis, or an exported log."""
-
     out: pathlib.Path | None = None
-    """The file, or the data set's folder, to write. By default log.mcap, log-lerobot or run.rrd."""
-
     overwrite: bool = False
-    """Replace a file that is there; a folder is never replaced."""
 
     def execute(self):
         """Reads the log, and writes it in the other format."""

@@ -19,16 +19,17 @@ if TYPE_CHECKING:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class _Import(Command, abc.ABC):
-    """Common options of all kinds of recordings."""
+    """Common options of all kinds of recordings.
+
+    Attributes:
+        source: The recording.
+        out: The gap log to write.
+        overwrite: Replace a log that is there.
+    """
 
     source: Annotated[pathlib.Path, tyro.conf.Positional]
-    """The recording."""
-
     out: pathlib.Path = pathlib.Path("log.npz")
-    """The gap log to write."""
-
     overwrite: bool = False
-    """Replace a log that is there."""
 
     @abc.abstractmethod
     def logs(self) -> list[tuple[pathlib.Path, GapLog, Sequence[str]]]:
@@ -54,16 +55,16 @@ class Deform(_Import):
 
     SOURCE is upstream's folder of one cable, with pickles in train/ and eval/, one such pickle, or an .npz. Pickles are
     read without running anything that they say.
+
+    Attributes:
+        unit: Unit of length. By default metres, or another one where the length of the cable leaves no doubt.
+        up: The axis that points up.
+        handedness: left: the coordinates are of a left-handed frame.
     """
 
     unit: Literal["m", "cm", "mm", "in"] | None = None
-    """Unit of length. By default metres, or another one where the length of the cable leaves no doubt."""
-
     up: Literal["x", "y", "z", "-x", "-y", "-z"] = "z"
-    """The axis that points up."""
-
     handedness: Literal["right", "left"] = "right"
-    """left: the coordinates are of a left-handed frame."""
 
     def logs(self):
         """One log of one cable of the data set, and its repairs."""
@@ -90,10 +91,13 @@ class Wires(_Import):
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Csv(_Import):
-    """Import a csv file of your own, one row per sample; a small TOML file names its columns and units."""
+    """Import a csv file of your own, one row per sample; a small TOML file names its columns and units.
+
+    Attributes:
+        layout: The TOML file; docs/how_to/own_recording.md has an example.
+    """
 
     layout: pathlib.Path = pathlib.Path("layout.toml")
-    """The TOML file; docs/how_to/own_recording.md has an example."""
 
     def logs(self):
         """One log of the table, and its repairs."""
@@ -107,10 +111,12 @@ class Mcap(_Import):
     """Import a ROS 2 bag or MCAP file with pose arrays; a small TOML file names its topics and units.
 
     A log that `cablejax export mcap` wrote needs no such file.
+
+    Attributes:
+        layout: The TOML file; docs/how_to/own_recording.md has an example.
     """
 
     layout: pathlib.Path = pathlib.Path("layout.toml")
-    """The TOML file; docs/how_to/own_recording.md has an example."""
 
     def logs(self):
         """One log of the bag, and its repairs; an exported log as it was."""
@@ -135,7 +141,11 @@ class LeRobot(_Import):
 
 @dataclasses.dataclass(frozen=True)
 class Import:
-    """Import a real recording as a gap log, which `cablejax diagnose` reads."""
+    """Import a real recording as a gap log, which `cablejax diagnose` reads.
+
+    Attributes:
+        what: Format of the recording.
+    """
 
     what: (
         Annotated[Deform, subcommand("deform")]
@@ -144,7 +154,6 @@ class Import:
         | Annotated[Mcap, subcommand("mcap")]
         | Annotated[LeRobot, subcommand("lerobot")]
     )
-    """Format of the recording."""
 
 
 def _summary(path: pathlib.Path, log: GapLog, repairs: Sequence[str]) -> dict[str, Any]:

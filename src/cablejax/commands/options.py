@@ -19,19 +19,19 @@ class UsageError(ValueError):
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Command(abc.ABC):
-    """Options of every subcommand."""
+    """Options of every subcommand.
+
+    Attributes:
+        resume_hint: Advice that Ctrl-C prints: how to resume.
+        seed: Seed of everything random; the same seed gives the same result.
+        device: Where JAX computes. auto: an accelerator if there is one.
+        json: Print the result as one JSON object on stdout, and nothing else there; progress goes to stderr.
+    """
 
     resume_hint: ClassVar[str] = "Run the same command again."
-    """Advice that Ctrl-C prints: how to resume."""
-
     seed: int = 0
-    """Seed of everything random; the same seed gives the same result."""
-
     device: Literal["auto", "cpu", "gpu"] = "auto"
-    """Where JAX computes. auto: an accelerator if there is one."""
-
     json: bool = False
-    """Print the result as one JSON object on stdout, and nothing else there; progress goes to stderr."""
 
     @abc.abstractmethod
     def execute(self) -> tuple[Mapping[str, Any], str]:

@@ -21,64 +21,53 @@ class Shape(Command):
 
     The target is a letter or a file: .npz or .json with "keypoints" [N, 2] in metres, or .csv with rows x,y. Writes
     summary.json, log.npz, report.html and demo.gif.
+
+    Attributes:
+        target: U, S, Z, or a file with the keypoints to reach.
+        out: Folder for the results.
+        overwrite: Replace the results that are in the folder.
+        method: residual: correct the model online. direct: trust it as it was trained. both: one run of each.
+        weights: Released model by name, or the folder of a training by `cablejax train`.
+        solver: How the controller finds its plan.
+        steps: Commands, one second each.
+        cable: The plant's cable: a cable file, or a data set, weights or a log that holds one. By default the cable
+            that the model was trained on.
+        plant_effect: An effect of the plant that the model may not know, as NAME:PARAMETER=VALUE,... in SI units; may
+            be given several times. By default bending_stiffness:ratio=0.2; `none` for no effect. With from_s=... and
+            until_s=... it begins and ends in the middle of the run.
+        effect: An effect that the model is informed of, as for --plant-effect; may be given several times. What of it
+            enters the model: stiffness_profile, intrinsic_curvature, gripper_rotation_offset and gripper_compliance the
+            rest of its cable; bending_stiffness, table_friction and linear_density the first belief of a conditioned
+            model.
+        with_: A verdict.json of `cablejax diagnose`: the model is informed, as by --effect, of the effects that it
+            names; where nothing of them enters it, of the first of their look-alikes that does.
+        perception: true: the controller observes the simulated keypoints. cloud: it observes keypoints estimated from
+            clouds of a depth camera; the printed errors are still those of the true keypoints.
+        motion: Play this motion on the plant instead of shaping: a gap log with commands, such as the next_motion.npz
+            of `cablejax diagnose`. Writes log.npz only, of the cable in that log unless --cable is given; model, target
+            and method are not used.
+        noise_mm: Noise: standard deviation of the observed keypoints, per coordinate, or of the camera's range [mm]. By
+            default 0 for the first and 2 for the second.
+        links: Links of the plant's cable.
     """
 
     resume_hint: ClassVar[str] = "Run the same command again: finished runs are kept and not repeated."
 
     target: str = "U"
-    """U, S, Z, or a file with the keypoints to reach."""
-
     out: pathlib.Path = pathlib.Path("runs/shape")
-    """Folder for the results."""
-
     overwrite: bool = False
-    """Replace the results that are in the folder."""
-
     method: Literal["residual", "direct", "both"] = "both"
-    """residual: correct the model online. direct: trust it as it was trained. both: one run of each."""
-
     weights: str = "gns-reference"
-    """Released model by name, or the folder of a training by `cablejax train`."""
-
     solver: SolverName = "levenberg-marquardt"
-    """How the controller finds its plan."""
-
     steps: int = 40
-    """Commands, one second each."""
-
     cable: pathlib.Path | None = None
-    """The plant's cable: a cable file, or a data set, weights or a log that holds one. By default the cable that the
-    model was trained on."""
-
     plant_effect: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
-    """An effect of the plant that the model may not know, as NAME:PARAMETER=VALUE,... in SI units; may be given several
-    times. By default bending_stiffness:ratio=0.2; `none` for no effect. With from_s=... and until_s=... it begins and
-    ends in the middle of the run."""
-
     effect: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
-    """An effect that the model is informed of, as for --plant-effect; may be given several times. What of it enters the
-    model: stiffness_profile, intrinsic_curvature, gripper_rotation_offset and gripper_compliance the rest of its cable;
-    bending_stiffness, table_friction and linear_density the first belief of a conditioned model."""
-
     with_: Annotated[tuple[pathlib.Path, ...], tyro.conf.arg(name="with"), tyro.conf.UseAppendAction] = ()
-    """A verdict.json of `cablejax diagnose`: the model is informed of the effects that it names, as by --effect; where
-    nothing of them enters it, of the first of their look-alikes that does."""
-
     perception: Literal["true", "cloud"] = "true"
-    """true: the controller observes the simulated keypoints. cloud: it observes keypoints estimated from clouds of a
-    depth camera; the printed errors are still those of the true keypoints."""
-
     motion: pathlib.Path | None = None
-    """Play this motion on the plant instead of shaping: a gap log with commands, such as the next_motion.npz of
-    `cablejax diagnose`. Writes log.npz only, of the cable in that log unless --cable is given; model, target and method
-    are not used."""
-
     noise_mm: float | None = None
-    """Noise: standard deviation of the observed keypoints, per coordinate, or of the camera's range [mm]. By default 0
-    for the first and 2 for the second."""
-
     links: int = 24
-    """Links of the plant's cable."""
 
     def execute(self):
         """Brings the cable to the targets, keeps each run as it ends, and reports."""

@@ -24,65 +24,52 @@ class Simulate(Command):
 
     The store can be interrupted at any time: the same command goes on where it stopped. Several processes may share
     the work, each with its own --process-index; the result does not depend on how many there are.
+
+    Attributes:
+        out: Folder of the data set (a Zarr v3 store), or its place in object storage, s3://BUCKET/PREFIX.
+        trajectories: How many trajectories to simulate.
+        steps: Commands per trajectory, one second each.
+        start: How each cable lies at first.
+        max_amplification: Largest movement of any point of the frictionless cable, relative to what the grippers move
+            together. It keeps the cable from snapping through; 1000 lets it snap.
+        engine: chain: batched in JAX, with its time step written out; the fastest, and it can simulate every effect.
+            mjx: the same cable by MJX. threaded: C MuJoCo on all CPU cores.
+        timestep: Time step of the simulation [s]; by default 0.05 for the chain and 0.02 for the others, which is about
+            as accurate.
+        cable: The cable to simulate: a cable file (see `cablejax cable`), or a data set, trained weights or a log that
+            holds a cable. By default the reference cable.
+        effect: An effect to add to every cable, as NAME:PARAMETER=VALUE,... in SI units; may be given several times.
+        with_: A verdict.json of `cablejax diagnose`: the effects that it names are added, each trajectory with another
+            draw of what the verdict leaves open; may be given several times.
+        links: Links of the simulated cable; by default the resolution that the released model was trained on.
+        stiffness_range: Draw each cable's stiffness between these two factors of the nominal one; by default all are
+            alike.
+        damping_range: Draw each cable's damping time between these two factors of the nominal one.
+        friction_range: Draw each cable's friction coefficient between these two factors of the nominal one.
+        process_index: Number of this process, from 0.
+        process_count: How many processes share the work.
+        overwrite: Delete a data set that is there and was made by other options. Nothing else is ever deleted.
     """
 
     resume_hint: ClassVar[str] = "What was complete is kept; run the same command again to go on."
 
     out: pathlib.Path = pathlib.Path("runs/data.zarr")
-    """Folder of the data set (a Zarr v3 store), or its place in object storage, s3://BUCKET/PREFIX."""
-
     trajectories: int = 2000
-    """How many trajectories to simulate."""
-
     steps: int = 200
-    """Commands per trajectory, one second each."""
-
     start: Literal["straight", "random"] = "straight"
-    """How each cable lies at first."""
-
     max_amplification: float = 1.5
-    """Largest movement of any point of the frictionless cable, relative to what the grippers move together. It keeps
-    the cable from snapping through; 1000 lets it snap."""
-
     engine: Literal["chain", "mjx", "threaded"] = "chain"
-    """chain: batched in JAX, with its time step written out; the fastest, and it can simulate every effect. mjx: the
-    same cable by MJX. threaded: C MuJoCo on all CPU cores."""
-
     timestep: float | None = None
-    """Time step of the simulation [s]; by default 0.05 for the chain and 0.02 for the others, which is about as
-    accurate."""
-
     cable: pathlib.Path | None = None
-    """The cable to simulate: a cable file (see `cablejax cable`), or a data set, trained weights or a log that holds a
-    cable. By default the reference cable."""
-
     effect: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
-    """An effect to add to every cable, as NAME:PARAMETER=VALUE,... in SI units; may be given several times."""
-
     with_: Annotated[tuple[pathlib.Path, ...], tyro.conf.arg(name="with"), tyro.conf.UseAppendAction] = ()
-    """A verdict.json of `cablejax diagnose`: the effects that it names are added, each trajectory with another draw of
-    what the verdict leaves open; may be given several times."""
-
     links: int | None = None
-    """Links of the simulated cable; by default the resolution that the released model was trained on."""
-
     stiffness_range: tuple[float, float] | None = None
-    """Draw each cable's stiffness between these two factors of the nominal one; by default all are alike."""
-
     damping_range: tuple[float, float] | None = None
-    """Draw each cable's damping time between these two factors of the nominal one."""
-
     friction_range: tuple[float, float] | None = None
-    """Draw each cable's friction coefficient between these two factors of the nominal one."""
-
     process_index: int = 0
-    """Number of this process, from 0."""
-
     process_count: int = 1
-    """How many processes share the work."""
-
     overwrite: bool = False
-    """Delete a data set that is there and was made by other options. Nothing else is ever deleted."""
 
     def execute(self):
         """Generates what the store lacks and returns its size and digest."""

@@ -24,35 +24,31 @@ class Study(Command):
     the motion that is most informative about which of them holds, records it, and diagnoses all recordings together.
     Ends when one answer is left, when no motion separates what is left, or after --rounds. Writes report.html,
     recording_1.npz, ... and the diagnosis of each round in round_1, ... A round takes two minutes.
+
+    Attributes:
+        out: Folder for the results.
+        overwrite: Replace the results that are in the folder.
+        cable: The cable that the plant is believed to have: a cable file, or a data set, weights or a log that holds
+            one. By default the reference cable.
+        plant_effect: An effect of the plant that the diagnosis does not know, as NAME:PARAMETER=VALUE,... in SI units;
+            may be given several times. By default bending_stiffness:ratio=0.2; `none` for no effect.
+        rounds: Recordings to make at most.
+        bounds: Bounds of the motions, a TOML file; by default those of the cable and a usual arm's speed.
+        noise_mm: Noise: standard deviation of the recorded keypoints, per coordinate [mm].
+        links: Links of the plant's cable. Fewer are faster; the plant's own error grows with the square of their
+            length.
     """
 
     resume_hint: ClassVar[str] = "Run the same command again: finished rounds are kept and not repeated."
 
     out: pathlib.Path = pathlib.Path("runs/study")
-    """Folder for the results."""
-
     overwrite: bool = False
-    """Replace the results that are in the folder."""
-
     cable: pathlib.Path | None = None
-    """The cable that the plant is believed to have: a cable file, or a data set, weights or a log that holds one. By
-    default the reference cable."""
-
     plant_effect: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
-    """An effect of the plant that the diagnosis does not know, as NAME:PARAMETER=VALUE,... in SI units; may be given
-    several times. By default bending_stiffness:ratio=0.2; `none` for no effect."""
-
     rounds: int = 3
-    """Recordings to make at most."""
-
     bounds: pathlib.Path | None = None
-    """Bounds of the motions, a TOML file; by default those of the cable and a usual arm's speed."""
-
     noise_mm: float = 1.0
-    """Noise: standard deviation of the recorded keypoints, per coordinate [mm]."""
-
     links: int = 40
-    """Links of the plant's cable. Fewer are faster; the plant's own error grows with the square of their length."""
 
     def execute(self):
         """Records and diagnoses round by round, keeps each as it ends, and reports."""

@@ -24,65 +24,52 @@ class Train(Command):
     Writes checkpoints, metrics (CSV and TensorBoard), weights.safetensors, a model card, and the error on held-out
     trajectories. A training that was interrupted goes on with the same command and ends in the very same weights. All
     devices that JAX sees share each batch; a training may go on with another number of them.
+
+    Attributes:
+        data: Folders of the data sets, or their places in object storage (s3://BUCKET/PREFIX), in this order.
+        out: Folder for what the training writes; one that holds the same training is resumed.
+        overwrite: Delete another training that is in the folder, or write among what else is there.
+        preset: released: as the released model was trained. small: to compare variants, some minutes. smoke: a few
+            steps.
+        network: gns: the graph network. mlp, lstm: the networks that it is compared with.
+        prior: The prior that the network corrects. static: the frictionless resting shape. rigid: the grippers' motion,
+            interpolated. none: nothing.
+        frame: Axes that the network sees the cable in: the grippers' own, which turn with it, or the world's.
+        symmetric: Tie the weights so that a mirrored cable, and one whose keypoints are counted from the other end,
+            move alike.
+        conditioned: Give the network each cable's stiffness and friction as inputs; the data should vary in them.
+        start_from: Weights to start from instead of random ones: a released model by name, or a training's folder.
+        lr: Learning rate at the beginning; the whole schedule is scaled with it. By default that of the preset.
+        pretrain: Steps for which the encoders are first trained as auto-encoders; 0 for none.
+        held_out: Fraction of each data set kept away from training to measure the error on.
+        buffer: Trajectories to train on that are in memory at a time, for data sets larger than that; by default all.
+            One shard gives way to another every 50 steps.
+        steps: Optimiser steps in all; by default those of the preset. Its phases keep their proportions.
+        batch: Windows per optimiser step, in every phase; by default those of the preset.
+        latent: Width of every hidden layer and latent vector; by default that of the preset.
+        message_passing: Message-passing steps; by default those of the preset.
     """
 
     resume_hint: ClassVar[str] = "The last checkpoint is kept; run the same command again to go on."
 
     data: tuple[pathlib.Path, ...] = (pathlib.Path("runs/data.zarr"),)
-    """Folders of the data sets, or their places in object storage (s3://BUCKET/PREFIX), in this order."""
-
     out: pathlib.Path = pathlib.Path("runs/train")
-    """Folder for what the training writes; one that holds the same training is resumed."""
-
     overwrite: bool = False
-    """Delete another training that is in the folder, or write among what else is there."""
-
     preset: Literal["released", "small", "smoke"] = "released"
-    """released: as the released model was trained. small: to compare variants, some minutes. smoke: a few steps."""
-
     network: Literal["gns", "mlp", "lstm"] = "gns"
-    """gns: the graph network. mlp, lstm: the networks that it is compared with."""
-
     prior: Literal["static", "rigid", "none"] = "static"
-    """The prior that the network corrects. static: the frictionless resting shape. rigid: the grippers' motion,
-    interpolated. none: nothing."""
-
     frame: Literal["grippers", "world"] = "grippers"
-    """Axes that the network sees the cable in: the grippers' own, which turn with it, or the world's."""
-
     symmetric: bool = False
-    """Tie the weights so that a mirrored cable, and one whose keypoints are counted from the other end, move alike."""
-
     conditioned: bool = False
-    """Give the network each cable's stiffness and friction as inputs; the data should vary in them."""
-
     start_from: str | None = None
-    """Weights to start from instead of random ones: a released model by name, or a training's folder."""
-
     lr: float | None = None
-    """Learning rate at the beginning; the whole schedule is scaled with it. By default that of the preset."""
-
     pretrain: int = 0
-    """Steps for which the encoders are first trained as auto-encoders; 0 for none."""
-
     held_out: float = 0.05
-    """Fraction of each data set kept away from training to measure the error on."""
-
     buffer: int | None = None
-    """Trajectories to train on that are in memory at a time, for data sets larger than that; by default all. One shard
-    gives way to another every 50 steps."""
-
     steps: int | None = None
-    """Optimiser steps in all; by default those of the preset. Its phases keep their proportions."""
-
     batch: int | None = None
-    """Windows per optimiser step, in every phase; by default those of the preset."""
-
     latent: int | None = None
-    """Width of every hidden layer and latent vector; by default that of the preset."""
-
     message_passing: int | None = None
-    """Message-passing steps; by default those of the preset."""
 
     def execute(self):
         """Trains, from a checkpoint where there is one, and reports the open-loop error."""

@@ -22,19 +22,19 @@ class View(Command):
 
     Takes a gap log, a data set, weights, a verdict, the folder of a run, or a cable file, and finds out by its content
     which it is. Runs and diagnoses have their page already; for the others a page is written.
+
+    Attributes:
+        artefact: The file or folder, or a released model by name.
+        out: The page to write, an .html file. By default next to the file, with its name; a run's page stays where it
+            is.
+        overwrite: Replace a page that is there.
+        browser: Also open the page in this machine's web browser.
     """
 
     artefact: Annotated[pathlib.Path, tyro.conf.Positional]
-    """The file or folder, or a released model by name."""
-
     out: pathlib.Path | None = None
-    """The page to write, an .html file. By default next to the file, with its name; a run's page stays where it is."""
-
     overwrite: bool = False
-    """Replace a page that is there."""
-
     browser: bool = False
-    """Also open the page in this machine's web browser."""
 
     def execute(self):
         """Finds out what it is, writes its page and prints the path."""
