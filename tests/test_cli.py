@@ -1,6 +1,7 @@
 """The command line as a person or a script meets it."""
 
 import importlib.metadata
+import itertools
 import json
 import os
 import signal
@@ -56,7 +57,7 @@ def test_help_of_an_option_is_wrapped_by_the_terminal_alone(command, capsys, mon
     lines = [line.strip("│| ") for line in text[text.index("--seed") :].splitlines()]
     lines = [line for line in lines if any(letter.isalpha() for letter in line)]
     assert len(lines) > 3
-    assert all(line.startswith("-") or before.startswith("-") for before, line in zip(lines, lines[1:], strict=False))
+    assert all(line.startswith("-") or before.startswith("-") for before, line in itertools.pairwise(lines))
 
 
 def test_help_is_fast_because_it_loads_neither_jax_nor_mujoco():

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from cablejax.diagnose import CableDiagnosis, DiagnosisError, diagnose
+from cablejax.diagnose.log_faults import steadied
 from cablejax.diagnose.recording import prepare
 from cablejax.gaplog import GapLogError
 from cablejax.types import GapLog
@@ -127,6 +128,55 @@ def test_an_offset_of_the_tool_is_told():
     caveats = prepare(dataclasses.replace(log, gripper_pose=pose)).caveats
     assert any("at gripper 0 is 8.0 mm ahead of its pose and 0.0 mm beside it" in text for text in caveats)
     assert not any("ahead of" in text or "behind" in text for text in prepare(log).caveats)
+
+
+SCATTER = np.array([3e-4, 3e-4, 4e-3])
+
+
+def scattered(pose: np.ndarray) -> np.ndarray:
+    return pose + SCATTER * np.random.default_rng(1).standard_normal(pose.shape)
+
+
+@pytest.mark.parametrize("commanded", [True, False])
+def test_poses_that_scatter_are_smoothed(commanded):
+    recording = prepare(record())
+    true = recording.gripper_pose
+    expected = true if commanded else np.zeros_like(true)
+    smooth, taken = steadied(scattered(true), expected, recording.length)
+    error = np.sqrt(np.mean((smooth - true)[:, : recording.length.min()] ** 2, axis=(0, 1, 2)))
+    assert (error < (0.3 if commanded else 0.7) * SCATTER).all()
+    assert taken == pytest.approx(np.tile(SCATTER, (2, 1)), rel=0.25)
+
+
+@pytest.mark.parametrize("commanded", [True, False])
+def test_poses_of_encoders_stay_as_they_are(commanded):
+    recording = prepare(record())
+    exact = recording.gripper_pose + 0.1 * SCATTER * np.random.default_rng(1).standard_normal((2, 3))
+    expected = exact if commanded else np.zeros_like(exact)
+    smooth, taken = steadied(exact, expected, recording.length)
+    assert smooth is exact and not taken.any()
+
+
+def test_a_lag_of_the_arms_is_not_smoothed_away():
+    # what the arms are off their commands by is itself no scatter
+    recording = prepare(record())
+    late = np.roll(recording.gripper_pose, 3, axis=1)
+    late[:, :3] = late[:, 3:4]
+    smooth, _ = steadied(scattered(late), recording.gripper_pose, recording.length)
+    error = np.sqrt(np.mean((smooth - late)[:, : recording.length.min()] ** 2, axis=(0, 1, 2)))
+    assert (error < 0.8 * SCATTER).all()
+
+
+def test_measured_poses_that_scatter_are_no_gap():
+    log = record()
+    result = told(dataclasses.replace(log, gripper_pose=scattered(log.gripper_pose).astype(np.float32)))
+    assert result.verdict == "none" and caveat(result, "gripper poses scatter")
+
+
+def test_commands_made_of_poses_are_none():
+    log = record()
+    caveats = prepare(dataclasses.replace(log, meta={**log.meta, "commands_from_poses": True})).caveats
+    assert any("No commands were logged" in text for text in caveats)
 
 
 def _in_frame_of_gripper(command, log):

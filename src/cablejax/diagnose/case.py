@@ -13,6 +13,7 @@ from cablejax.cable_file import config_of_log
 from cablejax.diagnose.actuation import Actuation, actuation
 from cablejax.diagnose.belief import Calibration
 from cablejax.diagnose.evidence import Evidence, repeated_motions
+from cablejax.diagnose.log_faults import steadied
 from cablejax.diagnose.noise import NoiseFloor, noise_floor
 from cablejax.diagnose.planar import PlanarCable
 from cablejax.diagnose.playback import Playback
@@ -42,6 +43,7 @@ class Case:
         config: the nominal cable at the resolution of the fits.
         arms: how the grippers followed their commands.
         noise: floor of the recording.
+        scatter: what was taken from the gripper poses so that they are smooth [m, m, rad], shape [2, 3].
         nominal: keypoints of a fine nominal cable under the measured poses [m], shape [E, T, N, 2].
         simulator: the cable under the measured poses, corrected for the error of discretisation.
         commanded_nominal: as `nominal`, under the poses that exact arms would have had.
@@ -52,6 +54,7 @@ class Case:
     config: Discretisation
     arms: Actuation
     noise: NoiseFloor
+    scatter: Float[np.ndarray, "2 3"]
     nominal: Float[np.ndarray, "E T N 2"]
     simulator: PlanarCable
     commanded_nominal: Float[np.ndarray, "E T N 2"]
@@ -77,6 +80,9 @@ class Case:
             recording.length,
             repeated_motions(recording.gripper_pose, log.meta["cable"]["length_m"]),
         )
+        expected = arms.predicted if recording.has_commands else np.zeros_like(recording.gripper_pose)
+        pose, scatter = steadied(recording.gripper_pose, expected, recording.length)
+        recording = dataclasses.replace(recording, gripper_pose=pose)
         config = config_of_log(log, n_links=FIT_LINKS)
         marks = np.asarray(log.meta["keypoint_arclength_m"], float)
         first = [_at_uniform_marks(shape, marks) for shape in _first_shapes(recording)]
@@ -113,6 +119,7 @@ class Case:
             config=config,
             arms=arms,
             noise=noise,
+            scatter=scatter,
             nominal=nominal,
             simulator=simulator,
             commanded_nominal=run(replay(FINE_LINKS, FINE_STEP, arms.commanded)) if moved else nominal,
@@ -143,8 +150,25 @@ class Case:
             for sign in (-1, 1)
         ]
         stiffer, softer, rougher, smoother = playback.keypoints(changed).astype(np.float64)
-        squares = ((stiffer - softer) ** 2 + (rougher - smoother) ** 2) / 4
-        # where something was seen, and no simulation broke down
+        return self._usual_size(((stiffer - softer) ** 2 + (rougher - smoother) ** 2) / 4)
+
+    def pose_error(self) -> float:
+        """Error of the nominal simulator, per coordinate [m], by what is left of the scatter of the gripper poses.
+
+        Of a replay under the smooth poses with the same scatter added and smoothed again; the median over episodes.
+        """
+        if not self.scatter.any():
+            return 0.0
+        playback, recording = self.simulator.playback, self.recording
+        expected = self.arms.predicted if recording.has_commands else np.zeros_like(recording.gripper_pose)
+        drawn = np.random.default_rng(0).standard_normal(recording.gripper_pose.shape)
+        again, _ = steadied(recording.gripper_pose + self.scatter * drawn, expected, recording.length)
+        shaken = dataclasses.replace(playback, gripper_pose=again.astype(np.float32))
+        (before,), (after,) = (one.keypoints([one.believed]).astype(np.float64) for one in (playback, shaken))
+        return self._usual_size((after - before) ** 2)
+
+    def _usual_size(self, squares: Float[np.ndarray, "E T N 2"]) -> float:
+        """Root mean square of an episode, the median over episodes; where something was seen and nothing broke down."""
         known, axes = np.isfinite(self.recording.keypoints) & np.isfinite(squares), (1, 2, 3)
         mean = np.where(known, squares, 0.0).sum(axis=axes) / np.maximum(known.sum(axis=axes), 1)
         return float(np.sqrt(np.median(mean)))

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
+from scipy.signal import savgol_coeffs, savgol_filter
 
 from cablejax.arrays import quarter_turn, stretches
 from cablejax.types import ROTATION_WEIGHT
@@ -12,6 +13,11 @@ from cablejax.types import ROTATION_WEIGHT
 _FROZEN, _MOVING = 10, 0.8
 # An end keypoint that is off its gripper by this [m], at the same place of the gripper's frame, is reported.
 _TOOL, _FIXED = 2e-3, 0.5
+# Poses that scatter by less than this from one sample to the next [m, rad] are replayed as they were measured.
+_STEADY = np.array([1e-4, 1e-4, 1e-3])
+# Samples over which they may be smoothed by a parabola.
+_WINDOWS = (5, 7, 11, 15, 21, 31, 45, 65, 91)
+_PARABOLA = 2
 # Commands that leave the poses by this [m], and by this part of it in another meaning, have that one.
 _UNFIT, _FITS = 0.02, 0.2
 
@@ -72,6 +78,61 @@ def integrated(
     """Poses of arms that follow their commands exactly, from the first ones on."""
     steps = command * np.asarray(interval)[:, None, None, None]
     return first[:, None] + np.concatenate([np.zeros_like(steps[:, :1]), np.cumsum(steps, axis=1)[:, :-1]], axis=1)
+
+
+def steadied(
+    pose: Float[np.ndarray, "E T 2 3"], expected: Float[np.ndarray, "E T 2 3"], length: Int[np.ndarray, "E"]
+) -> tuple[Float[np.ndarray, "E T 2 3"], Float[np.ndarray, "2 3"]]:
+    """Measured poses without what scatters from one sample to the next, which would shake the simulated cable.
+
+    What they are off the expected ones by is smoothed by local parabolas (Savitzky and Golay), over so many samples as
+    generalised cross-validation chooses for each coordinate. Poses of encoders stay as they are.
+
+    Args:
+        pose: theta continuous, the last one held over the padding [m, m, rad].
+        expected: motion without scatter that they follow more or less, zero where there is none.
+        length: valid samples of each episode.
+
+    Returns:
+        The poses, and the root mean square of what was taken from each coordinate [m, m, rad]; zero for encoders.
+    """
+    off, steady = pose - expected, np.zeros((2, 3))
+    valid = np.arange(pose.shape[1])[None] < np.asarray(length)[:, None]
+    third = np.abs(np.diff(off, 3, axis=1)[valid[:, 3:]])
+    if not len(third):
+        return pose, steady
+    # the median, since they are smooth but for jumps; a third difference of white noise is sqrt(20) times as large
+    scatter = np.median(third, axis=0) / (0.6745 * np.sqrt(20.0))
+    noisy = scatter > _STEADY
+    if not noisy.any():
+        return pose, steady
+    smooth = pose.copy()
+    for gripper, axis in np.argwhere(noisy):
+        paths = _least_unseen_error([row[:n] for row, n in zip(off[..., gripper, axis], length, strict=True)])
+        for episode, path in enumerate(paths):
+            n = len(path)
+            smooth[episode, :n, gripper, axis] = expected[episode, :n, gripper, axis] + path
+            smooth[episode, n:, gripper, axis] = smooth[episode, n - 1, gripper, axis]
+    taken = np.sqrt(np.mean((pose - smooth)[valid] ** 2, axis=0))
+    return (smooth, taken) if (taken > _STEADY).any() else (pose, steady)
+
+
+def _least_unseen_error(series: list[Float[np.ndarray, "T"]]) -> list[Float[np.ndarray, "T"]]:
+    """Local parabolas through each of the series, over the number of samples that predicts left-out ones best."""
+    best, least = series, np.inf
+    for window in _WINDOWS:
+        paths = [_parabolas(values, min(window, (len(values) - 1) | 1)) for values in series]
+        # a left-out sample is missed by so many times what it is missed by itself
+        factor = 1.0 / (1.0 - savgol_coeffs(window, _PARABOLA)[window // 2])
+        off = np.concatenate([values - path for values, path in zip(series, paths, strict=True)])
+        error = factor * float(np.sqrt(np.mean(off**2)))
+        if error < least:
+            best, least = paths, error
+    return best
+
+
+def _parabolas(values: Float[np.ndarray, "T"], window: int) -> Float[np.ndarray, "T"]:
+    return np.asarray(savgol_filter(values, window, _PARABOLA)) if window > _PARABOLA + 1 else values
 
 
 def command_fault(

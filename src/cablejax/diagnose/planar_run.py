@@ -56,7 +56,8 @@ def diagnose(
         effects: what to look for; `LIBRARY` and effects of your own.
         commissioning: logs known to have no effect: how far the simulator is off without any.
         calibration: constants of the judgement; by default those for a cable of this length, see `calibrated`, with
-            what an error of its stated stiffness and friction makes, see `Case.stated_error`.
+            what errors of its stated stiffness and friction make, and noise of the gripper poses; see
+            `Case.stated_error` and `Case.pose_error`.
         bounds: for a next motion that is designed; None = the best of the safe motions within the default bounds.
         objective: what the next motion is to give information about.
         progress: called with a line of text now and then.
@@ -72,7 +73,8 @@ def diagnose(
         calibration = dataclasses.replace(calibration, baseline=baseline_error(commissioning))
     if given is None:
         stated = case.stated_error()
-        calibration = dataclasses.replace(calibration, baseline=float(np.hypot(calibration.baseline, stated)))
+        assumed = float(np.linalg.norm([calibration.baseline, stated, case.pose_error()]))
+        calibration = dataclasses.replace(calibration, baseline=assumed)
     if bounds is not None:
         require_some_motion(case.simulator.playback, case.noise.std, bounds)
     length, taken = other_length(case, log), None
@@ -211,6 +213,12 @@ def _caveats(
         caveats.append(
             f"This cable is sensitive to its stated numbers: {100 * STATED:g} % more or less stiffness or friction "
             f"moves keypoints by {1e3 * stated:.2g} mm per coordinate, and a gap must be larger to count."
+        )
+    if case.scatter.any():
+        caveats.append(
+            f"The measured gripper poses scatter by up to {1e3 * case.scatter[:, :2].max():.2g} mm and "
+            f"{1e3 * case.scatter[:, 2].max():.2g} mrad from one sample to the next. They are smoothed, or they would "
+            "shake the simulated cable."
         )
     if case.arms.strays(calibration.smallest_gap(0.0)):
         caveats.append(

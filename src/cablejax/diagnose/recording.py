@@ -154,10 +154,11 @@ def _samples(log: GapLog, e: int, *, observed: bool) -> tuple[Float[np.ndarray, 
     points, pose = log.keypoints[e, :n].astype(float), log.gripper_pose[e, :n].astype(float)
     pose[..., 2] = np.unwrap(pose[..., 2], axis=0)
     pose[:, 1, 2] += _whole_turns(points, pose)
+    derived = log.meta.get("commands_from_poses", False)  # an importer made them of the poses: no commands are known
     return log.time[e, :n], Samples(
         keypoints=points if observed else np.full_like(points, np.nan),
         gripper_pose=pose,
-        gripper_command=np.nan_to_num(log.gripper_command[e, :n].astype(float)),
+        gripper_command=np.zeros_like(pose) if derived else np.nan_to_num(log.gripper_command[e, :n].astype(float)),
         hold=np.zeros(n, bool) if log.hold is None else log.hold[e, :n],
     )
 

@@ -52,7 +52,8 @@ class Nominal:
 def gap_log_from_takes(takes: Sequence[Take], nominal: Nominal, *, source: str, repairs: Sequence[str] = ()) -> GapLog:
     """One gap log with an episode per take, with the labels of the takes as further fields of `meta`.
 
-    `gripper_command` is the twist that carries each measured pose to the next, since the recording holds no commands.
+    `gripper_command` is the twist that carries each measured pose to the next, since the recording holds no commands;
+    `meta` says so by `commands_from_poses`.
     `hold` is left out: nobody said when the grippers rested.
 
     Args:
@@ -102,6 +103,7 @@ def gap_log_from_takes(takes: Sequence[Take], nominal: Nominal, *, source: str, 
         keypoint_arclength=arclength.tolist(),
         extra={
             "take": [take.name for take in takes],
+            "commands_from_poses": True,
             **({"guessed": list(nominal.guessed)} if nominal.guessed else {}),
             **{name: [take.labels[name] for take in takes] for name in names},
         },
