@@ -33,19 +33,30 @@ def test_a_cable_that_settles_slowly_begins_as_it_was_seen():
     rest = first(CABLE.damping_time, None)
     # at rest it stays, however slow it is
     np.testing.assert_allclose(first(SLOW_S, list(rest)), rest, atol=1e-5)
-    bent = clean(CURVED, n_links=LINKS)[:, 0]
-    assert np.abs(bent - rest).max() > 0.01
-    np.testing.assert_allclose(first(SLOW_S, list(bent)), bent, atol=6e-4)
+    bent = unsettled()[:, 0]
+    assert np.abs(bent - rest).max() > 0.004
+    np.testing.assert_allclose(first(SLOW_S, list(bent)), bent, atol=1e-3)
 
 
-def unsettled_log(seed: int = 0):
-    """A log that begins right after the grippers arrived at its first pose, by the motion backwards."""
+def test_a_keypoint_off_its_place_is_not_how_a_slow_cable_lies():
+    # a cable that hardly settles would keep the error, and explain it in all later samples
+    rest = first(CABLE.damping_time, None)
+    wrong = rest.copy()
+    wrong[:, [3, 9], 1] += 0.006
+    assert np.abs(first(SLOW_S, list(wrong)) - rest).max() < 0.5 * 0.006
+
+
+def unsettled() -> np.ndarray:
+    """Keypoints [m] of a slow cable from when the grippers arrived at its first pose, by the motion backwards."""
     there = [np.concatenate([poses(f"back_{motion}")[:-1], poses(motion)]) for motion in MOTIONS]
     config = playback(LINKS).config
     player = Playback.of_motion(config, np.stack(there), None, np.full(len(MOTIONS), INTERVAL))
-    points = player.keypoints([physics_of(explanation(*parts(SLOW)), player.believed, config)])[
-        0, :, len(holds()) - 1 :
-    ]
+    points = player.keypoints([physics_of(explanation(*parts(SLOW)), player.believed, config)])[0]
+    return points[:, len(holds()) - 1 :]
+
+
+def unsettled_log(seed: int = 0):
+    points = unsettled()
     return log_of(points + noise(points.shape, 0.5, seed))
 
 

@@ -27,6 +27,8 @@ from cablejax.simulate.keypoints import marked_keypoints
 _ROWS = 24
 # Each time a chain is turned towards keypoints it leaves at most half of what is between them.
 _TURNS = 4
+# Half waves along the cable of which its first shape may differ from that at rest.
+_WAVES = 5
 
 
 @dataclasses.dataclass(frozen=True)
@@ -139,17 +141,25 @@ def _first_angles(
     """Theta of the first link and joint angles [rad] of the cable through keypoints at uniform marks.
 
     They are those of the resting cable, turned until its keypoints lie as these do: what keypoints do not tell of a
-    bend between them stays as it is at rest.
+    bend between them stays as it is at rest. What is left of an earlier motion is smooth along the cable: only that of
+    the difference to rest is believed, for a cable that hardly settles would keep every error of the first keypoints.
     """
     angles = np.array(equilibrium_state(config, pose, guess=keypoints).qpos[2:], np.float64)
     if keypoints is None:
         return angles
     config = dataclasses.replace(config, cable=dataclasses.replace(config.cable, marks=None))
-    seen, physics = angles_of_keypoints(config, pose, keypoints), nominal_physics(config)
-    for _ in range(_TURNS):
+    physics = nominal_physics(config)
+
+    def points() -> Float[np.ndarray, "N 2"]:
         nodes, unit = map(np.asarray, chain_nodes(config, jnp.asarray(angles, jnp.float32), jnp.zeros(())))
-        points = marked_keypoints(config, physics, pose[0, :2] + nodes, unit)
-        angles[1:] += seen - angles_of_keypoints(config, pose, points)
+        return np.asarray(marked_keypoints(config, physics, pose[0, :2] + nodes, unit))
+
+    rest = points()
+    waves = np.sin(np.pi * np.outer(np.linspace(0.0, 1.0, len(rest)), np.arange(1, _WAVES + 1)))
+    smooth = rest + waves @ np.linalg.lstsq(waves, keypoints - rest)[0]
+    seen = angles_of_keypoints(config, pose, smooth)
+    for _ in range(_TURNS):
+        angles[1:] += seen - angles_of_keypoints(config, pose, points())
     return angles
 
 
