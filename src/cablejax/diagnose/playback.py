@@ -67,7 +67,7 @@ class Playback:
         *,
         believed: Physics | None = None,
     ) -> Playback:
-        """Begins every episode as its first keypoints were seen, or with a gentle arch where there are none.
+        """Begins every episode near how its first keypoints were seen, or with a gentle arch where there are none.
 
         A cable whose damping is as usual has settled before the replay begins; one that takes long to settle, as by the
         effect `bending_damping`, may not have done so before it was first seen.
