@@ -18,7 +18,7 @@ from cablejax.diagnose.belief import Calibration, probabilities
 from cablejax.diagnose.conclude import Conclusion
 from cablejax.diagnose.diagnosis import PLACES, NamedEffect, ParameterEstimate, Ranked, Verdict
 from cablejax.diagnose.evidence import episodes_by_motion, student_log_likelihoods
-from cablejax.diagnose.log_faults import integrated
+from cablejax.diagnose.log_faults import integrated, scatter_of
 from cablejax.effects.arms import lagged
 from cablejax.types import ROTATION_WEIGHT
 
@@ -119,10 +119,8 @@ class _Arms:
 
     @functools.cached_property
     def noise(self) -> float:
-        """Of the measured poses [m], from third differences of their errors: these are smooth but for jumps."""
-        third = np.diff(self.off(self.commanded), 3, axis=1)[self.valid[:, 3:]]
-        each = np.median(np.abs(third), axis=0) / (0.6745 * np.sqrt(20.0)) if third.size else np.zeros(1)
-        return float(np.sqrt(np.mean(each**2)))
+        """Of the measured poses [m], root mean square over coordinates."""
+        return float(np.sqrt(np.mean(scatter_of(self.off(self.commanded), self.valid) ** 2)))
 
     def fit(self, effects: tuple[str, ...], starts) -> Any:
         """The best of scipy's least squares results."""

@@ -80,8 +80,7 @@ class Case:
             recording.length,
             repeated_motions(recording.gripper_pose, log.meta["cable"]["length_m"]),
         )
-        expected = arms.predicted if recording.has_commands else np.zeros_like(recording.gripper_pose)
-        pose, scatter = steadied(recording.gripper_pose, expected, recording.length)
+        pose, scatter = _steadied(recording.gripper_pose, recording, arms)
         recording = dataclasses.replace(recording, gripper_pose=pose)
         config = config_of_log(log, n_links=FIT_LINKS)
         marks = np.asarray(log.meta["keypoint_arclength_m"], float)
@@ -159,13 +158,11 @@ class Case:
         """
         if not self.scatter.any():
             return 0.0
-        playback, recording = self.simulator.playback, self.recording
-        expected = self.arms.predicted if recording.has_commands else np.zeros_like(recording.gripper_pose)
-        drawn = np.random.default_rng(0).standard_normal(recording.gripper_pose.shape)
-        again, _ = steadied(recording.gripper_pose + self.scatter * drawn, expected, recording.length)
-        shaken = dataclasses.replace(playback, gripper_pose=again.astype(np.float32))
-        (before,), (after,) = (one.keypoints([one.believed]).astype(np.float64) for one in (playback, shaken))
-        return self._usual_size((after - before) ** 2)
+        playback, pose = self.simulator.playback, self.recording.gripper_pose
+        drawn = np.random.default_rng(0).standard_normal(pose.shape)
+        again, _ = _steadied(pose + self.scatter * drawn, self.recording, self.arms)
+        (after,) = dataclasses.replace(playback, gripper_pose=again.astype(np.float32)).keypoints([playback.believed])
+        return self._usual_size((after - (self.nominal - self.simulator.correction)) ** 2)
 
     def _usual_size(self, squares: Float[np.ndarray, "E T N 2"]) -> float:
         """Root mean square of an episode, the median over episodes; where something was seen and nothing broke down."""
@@ -182,6 +179,11 @@ class Case:
         """NaN beyond an episode's end, and as long as the log."""
         valid = np.arange(keypoints.shape[1])[None] < self.recording.length[:, None]
         return np.where(valid[..., None, None], keypoints, np.nan)[:, : self.recording.length.max()]
+
+
+def _steadied(pose: Float[np.ndarray, "E T 2 3"], recording: Recording, arms: Actuation):
+    """As `steadied`, about what the arms make of their commands, where there are any."""
+    return steadied(pose, arms.predicted if recording.has_commands else np.zeros_like(pose), recording.length)
 
 
 def _first_shapes(recording: Recording) -> list[np.ndarray | None]:

@@ -80,6 +80,18 @@ def integrated(
     return first[:, None] + np.concatenate([np.zeros_like(steps[:, :1]), np.cumsum(steps, axis=1)[:, :-1]], axis=1)
 
 
+def scatter_of(off: Float[np.ndarray, "E T 2 3"], valid: Bool[np.ndarray, "E T"]) -> Float[np.ndarray, "2 3"]:
+    """Noise of poses, from third differences of what they are off: that is smooth but for jumps.
+
+    Args:
+        off: in any unit of each coordinate.
+        valid: samples that are no padding.
+    """
+    third = np.diff(off, 3, axis=1)[valid[:, 3:]]
+    # of white noise a third difference is sqrt(20) times as large
+    return np.median(np.abs(third), axis=0) / (0.6745 * np.sqrt(20.0)) if third.size else np.zeros(off.shape[2:])
+
+
 def steadied(
     pose: Float[np.ndarray, "E T 2 3"], expected: Float[np.ndarray, "E T 2 3"], length: Int[np.ndarray, "E"]
 ) -> tuple[Float[np.ndarray, "E T 2 3"], Float[np.ndarray, "2 3"]]:
@@ -98,12 +110,7 @@ def steadied(
     """
     off, steady = pose - expected, np.zeros((2, 3))
     valid = np.arange(pose.shape[1])[None] < np.asarray(length)[:, None]
-    third = np.abs(np.diff(off, 3, axis=1)[valid[:, 3:]])
-    if not len(third):
-        return pose, steady
-    # the median, since they are smooth but for jumps; a third difference of white noise is sqrt(20) times as large
-    scatter = np.median(third, axis=0) / (0.6745 * np.sqrt(20.0))
-    noisy = scatter > _STEADY
+    noisy = scatter_of(off, valid) > _STEADY
     if not noisy.any():
         return pose, steady
     smooth = pose.copy()

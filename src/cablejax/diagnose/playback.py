@@ -28,7 +28,7 @@ _ROWS = 24
 # Each time a chain is turned towards keypoints it leaves at most half of what is between them.
 _TURNS = 4
 # Half waves along the cable of which its first shape may differ from that at rest.
-_WAVES = 5
+_WAVES = 7
 
 
 @dataclasses.dataclass(frozen=True)

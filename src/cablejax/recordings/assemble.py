@@ -53,8 +53,7 @@ def gap_log_from_takes(takes: Sequence[Take], nominal: Nominal, *, source: str, 
     """One gap log with an episode per take, with the labels of the takes as further fields of `meta`.
 
     `gripper_command` is the twist that carries each measured pose to the next, since the recording holds no commands;
-    `meta` says so by `commands_from_poses`.
-    `hold` is left out: nobody said when the grippers rested.
+    `meta` says so by `commands_from_poses`. `hold` is left out: nobody said when the grippers rested.
 
     Args:
         takes: as `prepare` yields them.
