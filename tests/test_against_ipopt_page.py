@@ -84,6 +84,7 @@ def test_every_exception_is_explained(of_row, said, words):
     assert "None." in ipopt_sections([row()], {}, [], [], ())
 
 
+@pytest.mark.slow
 def test_other_starts_are_tried_until_one_has_all_that_is_asked():
     with jax.enable_x64(True):
         case = planning_case()

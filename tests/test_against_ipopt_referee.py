@@ -172,6 +172,7 @@ def test_other_radii_are_the_controllers():
     assert cases[0].limits().max_distance == pytest.approx(0.99)
 
 
+@pytest.mark.slow
 def test_the_recorder_takes_down_what_the_controller_asks():
     case = planning_case()
     log = RecordingSolver(CONFIG.solver)

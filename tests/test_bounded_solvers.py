@@ -121,6 +121,11 @@ def test_certificate_tells_a_minimum_from_other_points():
 UNIT = np.array([-1.0, -1.0]), np.array([1.0, 1.0])
 
 
+def itself(y, _):
+    """Its minimum is 0. One function for all, so that what it needs is compiled once."""
+    return y
+
+
 def ended(fn, solver, start=(0.5, 0.5), bounds=UNIT):
     feasible = Box(jnp.asarray(bounds[0]), jnp.asarray(bounds[1]))
     solution = least_squares(fn, SOLVERS[solver], jnp.asarray(start), feasible, max_steps=100, throw=False)
@@ -137,7 +142,7 @@ def test_a_function_that_is_not_a_number_ends_the_solve_with_a_feasible_point(so
         result, value = ended(lambda y, _: jnp.where(y < 0.2, jnp.nan, y), solver)
         assert result in (Result.NONFINITE, Result.STEP_LIMIT)
         assert np.isfinite(value).all() and (value >= 0.2).all() and (value < 0.5).all()
-        assert ended(lambda y, _: y, solver, start=(np.nan, 0.5))[0] is Result.NONFINITE
+        assert ended(itself, solver, start=(np.nan, 0.5))[0] is Result.NONFINITE
 
 
 def test_where_there_is_a_value_but_no_gradient_is_no_place_to_go_on_from():
@@ -198,12 +203,12 @@ def test_a_singular_jacobian_does_no_harm(solver):
 def test_an_empty_set_is_distinguished_from_a_point_set():
     with jax.enable_x64(True):
         for bounds in ((UNIT[1], UNIT[0]), (UNIT[0], UNIT[1] * np.nan)):
-            assert ended(lambda y, _: y, "Levenberg-Marquardt", bounds=bounds)[0] is Result.EMPTY_SET
-        result, value = ended(lambda y, _: y, "Levenberg-Marquardt", bounds=(UNIT[1], UNIT[1]))
+            assert ended(itself, "Levenberg-Marquardt", bounds=bounds)[0] is Result.EMPTY_SET
+        result, value = ended(itself, "Levenberg-Marquardt", bounds=(UNIT[1], UNIT[1]))
         assert result is Result.CONVERGED
         np.testing.assert_array_equal(value, UNIT[1])
         apart = Intersection((Box(*map(jnp.asarray, UNIT)), Halfspaces(jnp.ones((1, 2)), jnp.asarray([-3.0]))))
-        out = least_squares(lambda y, _: y, SOLVERS["dogleg"], jnp.zeros(2), apart, max_steps=5, throw=False)
+        out = least_squares(itself, SOLVERS["dogleg"], jnp.zeros(2), apart, max_steps=5, throw=False)
         assert Result(int(out.result)) is Result.EMPTY_SET
 
 
@@ -252,6 +257,14 @@ def minimum_of(name, x):
     return jnp.append(found.value, found.objective)
 
 
+@functools.partial(jax.jit, static_argnums=0)
+def both_jacobians(name, x):
+    """By forward and by reverse mode, about one solve, which is most of what has to be compiled."""
+    _, forward = jax.linearize(functools.partial(minimum_of, name), x)
+    backward = jax.vmap(jax.linear_transpose(forward, x))(jnp.eye(4))[0]
+    return jax.vmap(forward, out_axes=1)(jnp.eye(5)), backward
+
+
 X0 = np.array([0.5, 0.3, 0.6, 0.9, 0.0])
 
 
@@ -265,12 +278,11 @@ def test_derivatives_of_the_solution_are_those_of_solving_again(name):
         minimum = minimum_of(name, x)[:3]
         active = int((regime(name, x).constraints(minimum) > -1e-9).sum())
         assert active == {"inactive": 0, "ball": 1, "ball and plane": 2}[name]
-        forward = jax.jit(jax.jacfwd(functools.partial(minimum_of, name)))(x)
+        forward, backward = both_jacobians(name, x)
         for k in range(5):
             move = x.at[k].set(step)
             expected = (minimum_of(name, move) - minimum_of(name, -move)) / (2 * step)
             np.testing.assert_allclose(forward[:, k], expected, atol=2e-6)
-        backward = jax.jit(jax.jacrev(functools.partial(minimum_of, name)))(x)
         np.testing.assert_allclose(backward, forward, atol=1e-9)
         known = jax.jit(jax.jacfwd(lambda x: with_derivatives(minimum, curved, regime(name, x), X0[:4] + x[:4])))(x)
         np.testing.assert_allclose(known, forward[:3], atol=1e-7)

@@ -54,6 +54,7 @@ def no_model(case):
     raise AssertionError("a method without a model asks for none")
 
 
+@pytest.mark.slow
 def test_a_suite_is_shared_resumed_and_read_whole(tmp_path):
     cases = [case(1), case(0)]
     with executor_of("2") as executor:

@@ -180,18 +180,23 @@ def test_reading_over_a_cut_connection_says_so_and_damages_nothing(wire):
     assert open_store("s3://cables/read").info() == info
 
 
-def test_commands_take_buckets(wire, tmp_path, capsys):
-    small = ["--trajectories", "4", "--steps", "24", "--links", "5"]
-    assert main(["simulate", "--json", "--out", "s3://cables/cli.zarr", *small]) == 0
+def test_commands_take_buckets(wire, capsys):
+    small = ["simulate", "--out", "s3://cables/cli.zarr", "--trajectories", "4", "--steps", "24", "--links", "5"]
+    assert main([*small, "--json"]) == 0
     result = json.loads(capsys.readouterr().out)
     assert result["path"] == "s3://cables/cli.zarr" and result["complete"] == 4
-    train = ["train", "--data", "s3://cables/cli.zarr", "--out", str(tmp_path / "train"), "--preset", "smoke"]
-    assert main([*train, "--steps", "2", "--latent", "8", "--message-passing", "1"]) == 0
-    assert "cablejax train --data cli.zarr" in (tmp_path / "train" / "card.md").read_text()
     wire.cut()
-    capsys.readouterr()
-    assert main(["simulate", "--out", "s3://cables/cli.zarr", *small]) == 2
+    assert main(small) == 2
     assert "s3://cables/cli.zarr cannot be reached" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_a_training_reads_a_bucket(wire, tmp_path):
+    bucket = "s3://cables/trained.zarr"
+    assert main(["simulate", "--out", bucket, "--trajectories", "4", "--steps", "24", "--links", "5"]) == 0
+    train = ["train", "--data", bucket, "--out", str(tmp_path / "train"), "--preset", "smoke"]
+    assert main([*train, "--steps", "2", "--latent", "8", "--message-passing", "1"]) == 0
+    assert "cablejax train --data trained.zarr" in (tmp_path / "train" / "card.md").read_text()
 
 
 def test_places():

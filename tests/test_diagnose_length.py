@@ -25,7 +25,7 @@ def stated(log: GapLog, ratio: float) -> GapLog:
     return dataclasses.replace(log, meta={**log.meta, "cable": cable, "keypoint_arclength_m": marks})
 
 
-@pytest.mark.parametrize("ratio", [0.99, 1.01])
+@pytest.mark.parametrize("ratio", [0.99, pytest.param(1.01, marks=pytest.mark.slow)])
 def test_keypoints_show_the_length(ratio):
     log = stated(record(), ratio)
     length = other_length(Case.of(log), log)

@@ -112,6 +112,7 @@ def test_two_and_eight_devices_have_the_gradient_of_one():
     on_eight_devices("compare_gradients()")
 
 
+@pytest.mark.slow
 def test_a_training_goes_on_with_another_number_of_devices(tmp_path):
     on_eight_devices(f"go_on_with_other_devices({os.fspath(tmp_path)!r})")
 

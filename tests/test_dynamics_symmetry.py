@@ -104,6 +104,7 @@ def test_tied_weights_begin_as_large_as_others():
     assert after == pytest.approx(before, rel=0.1)
 
 
+@pytest.mark.slow
 def test_training_and_pretraining_keep_them_tied(tmp_path):
     training = dataclasses.replace(TINY_TRAINING, model=dataclasses.replace(SMALL, symmetric=True))
     data = trajectories()

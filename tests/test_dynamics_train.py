@@ -112,6 +112,7 @@ def stored(folder: pathlib.Path) -> Store:
     return store
 
 
+@pytest.mark.slow
 def test_a_streamed_training_goes_on_where_it_was_and_another_buffer_is_another_training(tmp_path):
     store = stored(tmp_path / "data.zarr")
     streamed, _ = read_split([store], 0.2, buffer=4)

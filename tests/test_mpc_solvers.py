@@ -20,6 +20,10 @@ SOLVERS = {
     "dogleg": Dogleg(max_iterations=12, trials_per_linearisation=1, tolerance=1e-5),
     "Gauss-Newton": GaussNewton(max_iterations=12, trials_per_linearisation=1, tolerance=1e-5),
 }
+EACH = [
+    name if name in ("projected gradient", "Levenberg-Marquardt") else pytest.param(name, marks=pytest.mark.slow)
+    for name in SOLVERS
+]
 CASES = {
     "unbounded": {"target": "near", "radius": 1.0},
     "bounds active": {"target": "U", "radius": 0.05},
@@ -78,7 +82,7 @@ def solve(solver_name, case, guess):
     return plan, float(value), float(start)
 
 
-@pytest.mark.parametrize("solver", SOLVERS)
+@pytest.mark.parametrize("solver", EACH)
 @pytest.mark.parametrize("name", CASES)
 def test_reaches_the_objective_that_scipy_reaches(solver, name):
     case = problem(**CASES[name])
@@ -86,7 +90,7 @@ def test_reaches_the_objective_that_scipy_reaches(solver, name):
     assert value - reference(name) <= 2e-3 * (start - reference(name))
 
 
-@pytest.mark.parametrize("solver", SOLVERS)
+@pytest.mark.parametrize("solver", EACH)
 @pytest.mark.parametrize("target", TARGETS)
 def test_plan_is_feasible_and_no_worse_than_the_guess_whatever_the_guess(solver, target):
     for seed in range(3):
@@ -95,7 +99,7 @@ def test_plan_is_feasible_and_no_worse_than_the_guess_whatever_the_guess(solver,
         assert value <= start * (1 + 1e-6)
 
 
-@pytest.mark.parametrize("solver", SOLVERS)
+@pytest.mark.parametrize("solver", EACH)
 def test_says_when_it_has_converged(solver):
     case = problem("U")
     plan, value, _ = solve(solver, case, jnp.zeros((STEPS, 2, 3)))
@@ -120,7 +124,7 @@ def test_stops_at_its_budget_with_an_improvement(solver):
     assert float(value) < 0.8 * float(before)
 
 
-@pytest.mark.parametrize("solver", SOLVERS)
+@pytest.mark.parametrize("solver", EACH)
 def test_stays_finite_where_the_model_is_not(solver):
     """NaN for every motion: the guess comes back."""
     case = problem("U", rate=float("nan"))

@@ -40,6 +40,7 @@ def test_experiment_shapes_a_cable(weights, tmp_path, capsys):
     ]
 
 
+@pytest.mark.slow
 def test_notebook_shapes_a_cable(weights, monkeypatch):
     monkeypatch.setenv("CABLEJAX_NOTEBOOK_STEPS", "1")
     monkeypatch.setenv("CABLEJAX_NOTEBOOK_LINKS", "12")

@@ -48,7 +48,7 @@ class Study(Command):
     rounds: int = 3
     bounds: pathlib.Path | None = None
     noise_mm: float = 1.0
-    links: int = 40
+    links: int = 48
 
     def execute(self):
         """Records and diagnoses round by round, keeps each as it ends, and reports."""
