@@ -44,14 +44,13 @@ def gradient(count: int, double: bool):
         return [np.asarray(leaf) for leaf in jax.tree.leaves(made)]
 
 
-def compare_gradients():
-    for double, tolerance in ((False, 1e-6), (True, 1e-14)):
-        one = gradient(1, double)
-        size = max(np.abs(leaf).max() for leaf in one[1:])
-        assert size > 1e-3 and one[0].dtype == (np.float64 if double else np.float32)
-        for count in (2, 8):
-            for a, b in zip(one, gradient(count, double), strict=True):
-                np.testing.assert_allclose(b, a, rtol=0, atol=10 * tolerance * size)
+def compare_gradients(double: bool, tolerance: float):
+    one = gradient(1, double)
+    size = max(np.abs(leaf).max() for leaf in one[1:])
+    assert size > 1e-3 and one[0].dtype == (np.float64 if double else np.float32)
+    for count in (2, 8):
+        for a, b in zip(one, gradient(count, double), strict=True):
+            np.testing.assert_allclose(b, a, rtol=0, atol=10 * tolerance * size)
 
 
 def train_on(count: int, folder: pathlib.Path) -> np.ndarray:
@@ -108,8 +107,12 @@ def run_on_devices(count: int, command: list[str]) -> subprocess.CompletedProces
     return subprocess.run(command, env=environment, capture_output=True, text=True, timeout=900)
 
 
-def test_two_and_eight_devices_have_the_gradient_of_one():
-    on_eight_devices("compare_gradients()")
+@pytest.mark.parametrize(
+    "precision",
+    [pytest.param("False, 1e-6", marks=pytest.mark.slow, id="single"), pytest.param("True, 1e-14", id="double")],
+)
+def test_two_and_eight_devices_have_the_gradient_of_one(precision):
+    on_eight_devices(f"compare_gradients({precision})")
 
 
 @pytest.mark.slow

@@ -28,6 +28,7 @@ def learned():
         yield windows, simulated, network.fit_network(simulated, windows)
 
 
+@pytest.mark.slow
 def test_corrects_recordings_that_were_left_out(learned):
     windows, simulated, fitted = learned
     before = errors(simulated, windows).mean()
@@ -38,6 +39,7 @@ def test_corrects_recordings_that_were_left_out(learned):
     assert fitted.rounds > 0 and fitted.unseen[1] < fitted.unseen[0]
 
 
+@pytest.mark.slow
 def test_turns_and_moves_with_the_room(learned):
     windows, simulated, fitted = learned
     turn = np.array([[0.6, -0.8, 0.0], [0.8, 0.6, 0.0], [0.0, 0.0, 1.0]])
@@ -52,6 +54,7 @@ def test_turns_and_moves_with_the_room(learned):
     np.testing.assert_allclose(corrected, fitted.correct(simulated, windows) @ turn.T + shift, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_no_rounds_correct_nothing(learned):
     windows, simulated, fitted = learned
     untrained = dataclasses.replace(fitted, rounds=0, weights=None)
