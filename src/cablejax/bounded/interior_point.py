@@ -8,6 +8,7 @@ finishes what converges relative to the largest of all forces, and not yet in ea
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -99,17 +100,9 @@ def interior_point(
     first, sizes = _start(problem)
 
     def one(progress: _Progress) -> _Progress:
-        new = _newton_step(problem, sizes, progress.now)
-        found = _residuals(problem, sizes, new)
-        better = found.error < progress.error
-        return _Progress(
-            now=new,
-            gap=found.gap / (sizes.length * sizes.force),
-            best=jax.tree.map(lambda a, b: jnp.where(better, a, b), new, progress.best),
-            error=jnp.where(better, found.error, progress.error),
-            stale=jnp.where(found.error < 0.5 * progress.error, 0, progress.stale + 1),
-            count=progress.count + 1,
-        )
+        found = _residuals(problem, sizes, progress.now)
+        progress = _judged(progress, found.error)._replace(gap=found.gap / (sizes.length * sizes.force))
+        return _after(progress, unfinished(progress), lambda: _newton_step(problem, progress.now, found))
 
     def unfinished(progress: _Progress):
         # Once the gap is below rounding, further steps only press the slacks to nothing.
@@ -129,29 +122,39 @@ def interior_point(
 
 def _polished(problem: _Scaled, last: _Progress) -> tuple[_Iterate, Float[Array, ""], Int[Array, ""]]:
     """The best iterate, its `_worst` residual and how many steps were taken; none where the method has converged."""
-    eps = jnp.finfo(problem.linear.dtype).eps
+    limits = jnp.finfo(problem.linear.dtype)
 
     def one(progress: _Progress) -> _Progress:
-        new = _step_on_bounds(problem, progress.now)
-        error = _worst(problem, new)
-        better = error < progress.error
-        best = jax.tree.map(lambda a, b: jnp.where(better, a, b), new, progress.best)
-        return progress._replace(
-            now=new,
-            best=best,
-            error=jnp.where(better, error, progress.error),
-            stale=jnp.where(error < 0.5 * progress.error, 0, progress.stale + 1),
-            count=progress.count + 1,
-        )
+        progress = _judged(progress, _worst(problem, progress.now))
+        return _after(progress, unfinished(progress), lambda: _step_on_bounds(problem, progress.now))
 
     def unfinished(progress: _Progress):
-        going = jnp.isfinite(progress.error) & (progress.count < _POLISHING) & (progress.stale < 2)
-        return (progress.error > eps**0.7) & going
+        return (progress.error > limits.eps**0.7) & (progress.count < _POLISHING) & (progress.stale < 2)
 
     zero = jnp.zeros_like(last.count)
-    begin = last._replace(now=last.best, error=_worst(problem, last.best), stale=zero, count=zero)
+    begin = last._replace(now=last.best, error=jnp.full_like(last.error, limits.max), stale=zero, count=zero)
     done = jax.lax.while_loop(unfinished, one, begin)
     return done.best, done.error, done.count
+
+
+def _judged(progress: _Progress, error: Float[Array, ""]) -> _Progress:
+    """What the error of the newest iterate says."""
+    better = error < progress.error
+    return progress._replace(
+        best=jax.tree.map(lambda a, b: jnp.where(better, a, b), progress.now, progress.best),
+        error=jnp.where(better, error, progress.error),
+        stale=jnp.where(error < 0.5 * progress.error, 0, progress.stale + 1),
+    )
+
+
+def _after(progress: _Progress, going: Bool[Array, ""], step: Callable[[], _Iterate]) -> _Progress:
+    """One more step, where the loop goes on.
+
+    A loop judges first and steps then, so that both are compiled once: a control call holds several of these loops, and
+    compiling them was half of its start.
+    """
+    now = jax.lax.cond(going, step, lambda: progress.now)
+    return progress._replace(now=now, count=progress.count + going)
 
 
 def _worst(problem: _Scaled, at: _Iterate) -> Float[Array, ""]:
@@ -262,12 +265,12 @@ def _residuals(problem: _Scaled, sizes: _Sizes, at: _Iterate) -> _Residuals:
     return _Residuals(jacobian, dual, primal, gap, error)
 
 
-def _newton_step(problem: _Scaled, sizes: _Sizes, now: _Iterate) -> _Iterate:
+def _newton_step(problem: _Scaled, now: _Iterate, at: _Residuals) -> _Iterate:
     """Mehrotra's predictor and corrector, as far as the bounds let them."""
     x, slack, multipliers = now
     scaled, present, dtype = problem.quadrics, problem.present, now.x.dtype
     eps = jnp.finfo(dtype).eps
-    jacobian, dual, primal, gap, _ = _residuals(problem, sizes, now)
+    jacobian, dual, primal, gap, _ = at
     weight = multipliers / slack
     matrix = problem.hessian + scaled.bend(multipliers) + (jacobian.T * weight) @ jacobian
     factor = jax.scipy.linalg.cho_factor(matrix + jnp.diag(4 * eps * (1.0 + jnp.diag(matrix))))

@@ -65,32 +65,40 @@ def _minimum(quadrics: Quadrics, hessian, linear, start) -> QuadraticMinimum:
 @jax.jit
 def nearest_point(quadrics: Quadrics, y: Float[Array, " P"]) -> Float[Array, " P"]:
     """The point nearest to `y` with all `quadrics` <= 0; differentiable in both."""
-    centre = _near_the_set(*jax.lax.stop_gradient((quadrics, y)))
-    return centre + _step_to_nearest(quadrics, y, centre)
+    centre, solution = _nearest(*jax.lax.stop_gradient((quadrics, y)))
+    return centre + _solved(solution, quadrics, *_distance(y, centre), centre)[0]
 
 
-def _near_the_set(quadrics: Quadrics, y):
-    """A `y` far away, moved near the set: its nearest point is a difference of large numbers from where it was."""
+def _nearest(quadrics: Quadrics, y):
+    """The centre of the last quadratic that was minimised, and the `interior_point` of that.
+
+    A `y` far away is moved near the set first: its nearest point is a difference of large numbers from where it was.
+    """
     present, eps, tiny = jnp.isfinite(quadrics.level), jnp.finfo(y.dtype).eps, jnp.finfo(y.dtype).tiny
     size = jnp.where(present, jnp.abs(quadrics.level), 0.0).max(initial=0.0)
 
-    def far(carry):
-        z = quadrics.lift(carry[0])
+    def far(centre):
+        z = quadrics.lift(centre)
         steepness = jnp.linalg.norm(quadrics.jacobian(z), axis=1) + tiny
         beyond = jnp.where(present, quadrics.of_lift(z) / steepness, 0.0).max(initial=0.0)
-        return (beyond > _FAR * size + 64 * eps * jnp.abs(z).max()) & (carry[1] < _CENTRES)
+        return beyond > _FAR * size + 64 * eps * jnp.abs(z).max()
 
     def nearer(carry):
-        return carry[0] + _step_to_nearest(quadrics, y, carry[0]), carry[1] + 1
+        centre, solution, count, _ = carry
+        centre = centre + solution[0]
+        return centre, interior_point(quadrics, *_distance(y, centre), centre), count + 1, far(centre)
 
     reach = _NEAR * (size + jnp.abs(quadrics.offset).max()) / (jnp.abs(quadrics.matrix @ y).max() + tiny)
-    shorter = jnp.where(far((y, 0)) & (reach > 0), jnp.minimum(reach, 1.0), 1.0) * y
-    return jax.lax.while_loop(far, nearer, (shorter, jnp.zeros((), jnp.int32)))[0]
+    shorter = jnp.where(far(y) & (reach > 0), jnp.minimum(reach, 1.0), 1.0) * y
+    none, unsolved = jnp.zeros((), jnp.int32), jnp.zeros((), bool)
+    begin = shorter, (jnp.zeros_like(y), jnp.zeros_like(quadrics.level), unsolved, none), none, ~unsolved
+    last = jax.lax.while_loop(lambda carry: carry[3] & (carry[2] <= _CENTRES), nearer, begin)
+    return last[:2]
 
 
-def _step_to_nearest(quadrics: Quadrics, y, centre):
-    """From any centre to the point nearest to `y`."""
-    return _solve(quadrics, jnp.eye(y.size, dtype=y.dtype), centre - y, centre)[0]
+def _distance(y, centre):
+    """Hessian and gradient, at a centre, of half the squared distance to `y`."""
+    return jnp.eye(y.size, dtype=y.dtype), centre - y
 
 
 def _inside(quadrics: Quadrics, start, step):
@@ -110,15 +118,24 @@ def _inside(quadrics: Quadrics, start, step):
     return start + jnp.clip(reach.min(), 0.0, 1.0) * step
 
 
-@eqx.filter_custom_jvp
 def _solve(quadrics: Quadrics, hessian, linear, centre):
-    return interior_point(quadrics, hessian, linear, centre)
+    """`interior_point`, with derivatives."""
+    problem = quadrics, hessian, linear, centre
+    return _solved(interior_point(*jax.lax.stop_gradient(problem)), *problem)
 
 
-@_solve.def_jvp
-def _solve_jvp(primals, tangents):
+@eqx.filter_custom_jvp
+def _solved(solution, quadrics: Quadrics, hessian, linear, centre):
+    """The known solution of a problem, with its derivatives by the problem."""
+    del quadrics, hessian, linear, centre
+    return solution
+
+
+@_solved.def_jvp
+def _solved_jvp(primals, tangents):
     """By the implicit function theorem, on the bounds that hold the minimiser."""
-    step, multipliers, converged, iterations = _solve(*primals)
+    step, multipliers, converged, iterations = _solved(*primals)
+    primals, tangents = primals[1:], tangents[1:]
     quadrics, hessian, _, centre = primals
     size = step.size
     z = quadrics.lift(centre + step)
