@@ -268,9 +268,8 @@ def both_jacobians(name, x):
 X0 = np.array([0.5, 0.3, 0.6, 0.9, 0.0])
 
 
-@pytest.mark.parametrize(
-    "name", ["ball and plane", *[pytest.param(n, marks=pytest.mark.slow) for n in ("inactive", "ball")]]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("name", REGIMES)
 def test_derivatives_of_the_solution_are_those_of_solving_again(name):
     """Central differences of re-solves in float64; reverse against forward mode."""
     with jax.enable_x64(True):

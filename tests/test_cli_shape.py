@@ -30,6 +30,7 @@ def shape_arguments(weights, out) -> list[str]:
     return ["shape", "--weights", str(weights), "--out", str(out), *small]
 
 
+@pytest.mark.slow
 def test_shape_is_resumed_where_it_was_interrupted_and_writes_everything(weights, tmp_path, capsys, monkeypatch):
     out = tmp_path / "run"
     done = []

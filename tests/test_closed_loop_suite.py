@@ -148,6 +148,7 @@ def test_every_method_has_its_controller(tmp_path):
             assert (controller.config.residual is not None) == (spec.learner is not None)
 
 
+@pytest.mark.slow
 def test_fine_tuning_records_the_cable_at_hand_and_changes_the_weights(tmp_path):
     small_model(tmp_path / "source")
     phase = Phase(steps=2, batch=2, rollout=1)

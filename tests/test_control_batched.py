@@ -108,6 +108,7 @@ def test_a_batch_of_loops_equals_each_loop_alone():
     assert np.abs(run.keypoints[0] - run.keypoints[2]).max() > 1e-4
 
 
+@pytest.mark.slow
 def test_trials_have_their_own_noise_and_gaps():
     letters = "UUU"
     config = LoopConfig(steps=4, keypoint_noise=0.002, keypoint_dropout=0.4)

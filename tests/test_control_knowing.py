@@ -26,6 +26,7 @@ def model():
     return load_model("gns-reference")
 
 
+@pytest.mark.slow
 def test_a_model_that_knows_the_cause_is_right_without_another_training(model):
     effects = (parse_effect(CURVED),)
     config = DatasetConfig(n_trajectories=2, n_steps=25, seed=5, effects=effects)

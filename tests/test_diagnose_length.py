@@ -25,7 +25,8 @@ def stated(log: GapLog, ratio: float) -> GapLog:
     return dataclasses.replace(log, meta={**log.meta, "cable": cable, "keypoint_arclength_m": marks})
 
 
-@pytest.mark.parametrize("ratio", [0.99, pytest.param(1.01, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("ratio", [0.99, 1.01])
 def test_keypoints_show_the_length(ratio):
     log = stated(record(), ratio)
     length = other_length(Case.of(log), log)
@@ -41,6 +42,7 @@ def test_a_right_length_is_not_doubted():
     assert other_length(Case.of(log), log) is None
 
 
+@pytest.mark.slow
 def test_caveat_on_keypoints_that_do_not_fit_the_length():
     log = stated(record(), 1.01)
     case = Case.of(log)

@@ -200,6 +200,7 @@ def test_hangs_as_a_catenary_when_it_hardly_resists_bending():
     assert np.abs(found[-1] - catenary).max() < 2e-3
 
 
+@pytest.mark.slow
 def test_derivatives_are_those_of_finite_differences():
     arclength = np.linspace(0.1, 0.9, 9)
     position, frames = _inputs(25, 0.1)

@@ -50,6 +50,7 @@ def test_fast_grippers_need_more():
     assert np.abs(chosen - exact)[:, :25].mean() < 0.5 * np.abs(once - exact)[:, :25].mean()
 
 
+@pytest.mark.slow
 def test_says_when_the_finest_are_too_coarse():
     windows = _swung(1.0)
     time = windows.interval * np.arange(windows.position.shape[1])

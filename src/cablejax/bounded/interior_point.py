@@ -148,11 +148,7 @@ def _judged(progress: _Progress, error: Float[Array, ""]) -> _Progress:
 
 
 def _after(progress: _Progress, going: Bool[Array, ""], step: Callable[[], _Iterate]) -> _Progress:
-    """One more step, where the loop goes on.
-
-    A loop judges first and steps then, so that both are compiled once: a control call holds several of these loops, and
-    compiling them was half of its start.
-    """
+    """One more step, where the loop goes on. A loop judges first and steps then: so both are compiled once."""
     now = jax.lax.cond(going, step, lambda: progress.now)
     return progress._replace(now=now, count=progress.count + going)
 
