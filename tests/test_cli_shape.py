@@ -26,7 +26,7 @@ def weights(tmp_path_factory):
 
 
 def shape_arguments(weights, out) -> list[str]:
-    small = ["--steps", "2", "--links", "12", "--target", "U", "--solver", "projected-gradient"]
+    small = ["--steps", "2", "--links", "12", "--target", "U"]
     return ["shape", "--weights", str(weights), "--out", str(out), *small]
 
 
