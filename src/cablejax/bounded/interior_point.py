@@ -85,6 +85,7 @@ class _Progress(NamedTuple):
     error: Float[Array, ""]
     stale: Int[Array, ""]
     count: Int[Array, ""]
+    going: Bool[Array, ""]
 
 
 def interior_point(
@@ -110,9 +111,9 @@ def interior_point(
         going = jnp.isfinite(progress.gap) & (progress.count < _ITERATIONS)
         return (progress.error > 8 * eps) & ~at_rounding & going
 
-    zero = jnp.zeros((), jnp.int32)
-    error = jnp.asarray(jnp.inf, dtype)
-    last = jax.lax.while_loop(unfinished, one, _Progress(first, jnp.ones((), dtype), first, error, zero, zero))
+    zero, error = jnp.zeros((), jnp.int32), jnp.asarray(jnp.inf, dtype)
+    begin = _Progress(first, jnp.ones((), dtype), first, error, zero, zero, jnp.array(True))
+    last = jax.lax.while_loop(lambda progress: progress.going, one, begin)
     best, error, more = _polished(problem, last)
     forces = jnp.where(problem.present, best.multipliers / problem.row_scale, 0.0)
     # where nothing pulls and no bound is broken, the first iterate is the minimum
@@ -122,18 +123,19 @@ def interior_point(
 
 def _polished(problem: _Scaled, last: _Progress) -> tuple[_Iterate, Float[Array, ""], Int[Array, ""]]:
     """The best iterate, its `_worst` residual and how many steps were taken; none where the method has converged."""
-    limits = jnp.finfo(problem.linear.dtype)
+    eps = jnp.finfo(problem.linear.dtype).eps
 
     def one(progress: _Progress) -> _Progress:
         progress = _judged(progress, _worst(problem, progress.now))
         return _after(progress, unfinished(progress), lambda: _step_on_bounds(problem, progress.now))
 
     def unfinished(progress: _Progress):
-        return (progress.error > limits.eps**0.7) & (progress.count < _POLISHING) & (progress.stale < 2)
+        going = jnp.isfinite(progress.error) & (progress.count < _POLISHING) & (progress.stale < 2)
+        return (progress.error > eps**0.7) & going
 
     zero = jnp.zeros_like(last.count)
-    begin = last._replace(now=last.best, error=jnp.full_like(last.error, limits.max), stale=zero, count=zero)
-    done = jax.lax.while_loop(unfinished, one, begin)
+    begin = _Progress(last.best, last.gap, last.best, jnp.full_like(last.error, jnp.inf), zero, zero, jnp.array(True))
+    done = jax.lax.while_loop(lambda progress: progress.going, one, begin)
     return done.best, done.error, done.count
 
 
@@ -150,7 +152,7 @@ def _judged(progress: _Progress, error: Float[Array, ""]) -> _Progress:
 def _after(progress: _Progress, going: Bool[Array, ""], step: Callable[[], _Iterate]) -> _Progress:
     """One more step, where the loop goes on. A loop judges first and steps then: so both are compiled once."""
     now = jax.lax.cond(going, step, lambda: progress.now)
-    return progress._replace(now=now, count=progress.count + going)
+    return progress._replace(now=now, count=progress.count + going, going=going)
 
 
 def _worst(problem: _Scaled, at: _Iterate) -> Float[Array, ""]:
