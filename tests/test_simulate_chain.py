@@ -16,6 +16,7 @@ from cablejax.effects.given import EFFECTS, GivenEffect, parse_effect, with_effe
 from cablejax.effects.physics import Physics, nominal_physics, normal_gravity
 from cablejax.simulate import ENGINES, ChainEngine, MjxEngine, check_effects
 from cablejax.simulate.friction import on_table
+from cablejax.simulate.motions import MotionConfig, random_motion
 
 POSE = np.array([[-0.45, 0.0, 0.5], [0.45, 0.0, -0.5]])
 GIVEN = tuple(
@@ -385,3 +386,28 @@ def test_weight_has_a_derivative_without_weight_too(gravity):
 
         derivative = jax.jit(jax.jacfwd(carried))(jnp.zeros(2))
         assert np.isfinite(derivative).all() and np.abs(derivative).max() < 1.0
+
+
+ROPE = Cable(length=2.2, bending_stiffness=4e-4, linear_density=0.09, friction_coefficient=0.5)
+"""Friction bends it over a decimetre: its links are hardly shorter."""
+
+
+def test_a_soft_rope_rests_in_single_precision():
+    config = Discretisation(ROPE, timestep=0.05)
+    pose = jnp.array([[[0, 0, 0.3], [share * 2.2, 0.22, -0.2]] for share in (0.5, 0.7, 0.9)], jnp.float32)
+    engine = ChainEngine(config)
+    physics = jax.tree.map(lambda leaf: jnp.repeat(jnp.asarray(leaf)[None], 3, axis=0), nominal_physics(config))
+    points = engine.rollout(physics, engine.initial_state(pose), jnp.zeros((3, 20, 2, 3)))[1].keypoints
+    np.testing.assert_allclose(points, np.broadcast_to(points[:, :1], points.shape), atol=1e-4)
+
+
+def test_a_soft_rope_that_buckles_stays_finite():
+    config = Discretisation(ROPE, timestep=0.05)
+    motion = MotionConfig.for_length(ROPE.length)
+    poses, twists = zip(
+        *(random_motion(np.random.default_rng(seed), config, 20, motion) for seed in range(8)), strict=True
+    )
+    engine = ChainEngine(config)
+    physics = jax.tree.map(lambda leaf: jnp.repeat(jnp.asarray(leaf)[None], 8, axis=0), nominal_physics(config))
+    points = engine.rollout(physics, engine.initial_state(jnp.array(poses)), jnp.array(twists))[1].keypoints
+    assert np.isfinite(points).all() and np.abs(points).max() < 2 * ROPE.length

@@ -140,8 +140,8 @@ class Cables:
         self._shown = np.asarray(self._engine.rollout(*self._resting(), np.zeros((1, 1, 2, 3)))[1].keypoints[0, 0])
         if not np.isfinite(self._shown).all():
             raise ValueError(
-                f"The simulation of this cable by {config.discretisation.n_links} links diverges at rest. It is soft "
-                "for its length and friction: take a discretisation with fewer links (n_links)."
+                f"The simulation of this cable by {config.discretisation.n_links} links diverges at rest. Check "
+                "the cable's numbers and their units, or take a discretisation with fewer links (n_links)."
             )
 
         def rows(leaf):

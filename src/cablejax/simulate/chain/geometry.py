@@ -7,6 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from cablejax.cable import Discretisation
+from cablejax.simulate.composite import link_lengths, node_offsets
+
 # Sums are products with triangles of ones: on a processor, XLA's `cumsum` takes several times as long.
 
 
@@ -15,19 +18,9 @@ def summed(x: Float[Array, "n *k"]) -> Float[Array, "n *k"]:
     return jnp.asarray(np.tri(len(x)), x.dtype) @ x
 
 
-def chained(steps: Float[Array, "n 2"]) -> Float[Array, "n 2"]:
-    """Start of each link if link k leads on by `steps[k]`."""
-    return jnp.asarray(np.tri(len(steps), k=-1), steps.dtype) @ steps
-
-
-def beyond(x: Float[Array, "n k"]) -> Float[Array, "n k"]:
-    """Sums over this link and all that follow."""
-    return jnp.asarray(np.tri(len(x)).T, x.dtype) @ x
-
-
-def cross(a: Float[Array, "n 2"], b: Float[Array, "n 2"]) -> Float[Array, "n"]:
-    """Component across the plane of the cross product."""
-    return a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
+def levers(config: Discretisation) -> np.ndarray:
+    """How far each link carries each node along its own direction [m], shape [n nodes, n links]."""
+    return np.tri(config.n_links, k=-1) * link_lengths(config) + np.diag(node_offsets(config))
 
 
 def solve_lower(matrix: Float[Array, "n n"], rhs: Float[Array, "n k"]) -> Float[Array, "n k"]:

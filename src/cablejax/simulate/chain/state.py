@@ -11,8 +11,7 @@ from jaxtyping import Array, Float
 
 from cablejax.arrays import quarter_turn
 from cablejax.cable import Discretisation
-from cablejax.simulate.chain.geometry import chained, summed
-from cablejax.simulate.composite import link_lengths, node_offsets
+from cablejax.simulate.chain.geometry import levers, summed
 
 
 @jax.tree_util.register_dataclass
@@ -49,7 +48,7 @@ class Frame(NamedTuple):
         rate: its velocity [rad/s], shape [n].
         scale: 1 + stretch, shape [].
         along: direction of each link times the scale, shape [n, 2].
-        joints: where each link begins [m], shape [n, 2].
+        turning: how `along` turns with `theta`, shape [n, 2].
         nodes: [m], shape [n, 2].
         velocity: of the nodes in the world [m/s], shape [n, 2].
         bias: accelerations of the nodes at constant rates [m/s^2], shape [n, 2].
@@ -59,7 +58,7 @@ class Frame(NamedTuple):
     rate: Array
     scale: Array
     along: Array
-    joints: Array
+    turning: Array
     nodes: Array
     velocity: Array
     bias: Array
@@ -69,11 +68,9 @@ def chain_nodes(
     config: Discretisation, angles: Float[Array, "n"], stretch: Float[Array, ""]
 ) -> tuple[Float[Array, "n 2"], Float[Array, "n 2"]]:
     """Nodes relative to gripper 0 [m], and unit vectors along the links."""
-    lengths, offsets = (jnp.asarray(f(config), angles.dtype) for f in (link_lengths, node_offsets))
     theta = summed(angles)
     unit = jnp.stack([jnp.cos(theta), jnp.sin(theta)], axis=1)
-    along = (1.0 + stretch) * unit
-    return chained(lengths[:, None] * along) + offsets[:, None] * along, unit
+    return jnp.asarray(levers(config), angles.dtype) @ ((1.0 + stretch) * unit), unit
 
 
 def expecting_no_change(state: ChainState) -> ChainState:
@@ -98,14 +95,11 @@ def halfway_state(state: ChainState, dt) -> ChainState:
 
 def frame_of(config: Discretisation, state: ChainState) -> Frame:
     """Where the links of a state are."""
-    lengths, offsets = (jnp.asarray(f(config), state.angles.dtype) for f in (link_lengths, node_offsets))
+    arms = jnp.asarray(levers(config), state.angles.dtype)
     theta, rate = summed(state.angles), summed(state.velocity[:-1])
     scale = 1.0 + state.stretch
     along = scale * jnp.stack([jnp.cos(theta), jnp.sin(theta)], axis=1)
-    joints = chained(lengths[:, None] * along)
-    nodes = joints + offsets[:, None] * along
-    turning, pulling = rate[:, None] * quarter_turn(along), -(rate**2)[:, None] * along
-    velocity = chained(lengths[:, None] * turning) + offsets[:, None] * turning
-    velocity = state.root_velocity + velocity + nodes * (state.velocity[-1] / scale)
-    bias = chained(lengths[:, None] * pulling) + offsets[:, None] * pulling
-    return Frame(theta, rate, scale, along, joints, nodes, velocity, bias)
+    nodes, turning = arms @ along, quarter_turn(along)
+    velocity = state.root_velocity + arms @ (rate[:, None] * turning) + nodes * (state.velocity[-1] / scale)
+    bias = arms @ (-(rate**2)[:, None] * along)
+    return Frame(theta, rate, scale, along, turning, nodes, velocity, bias)

@@ -1,23 +1,26 @@
 """One time step of the planar chain with every effect built in, in closed form.
 
 The same cable as `MjxEngine`'s, rigid links and hinges between two held ends, by the same linearly implicit Euler step.
-The step is written out for a chain instead of a tree: inertia and drag of all links meet in sums over everything beyond
-a joint,
+The step is written out for a chain instead of a tree,
 
-    A_ij = sum_{k >= max(i, j)} (x_k - a_i)' R' W_k R (x_k - a_j),    W_k = m_k + dt c_k + dt^2 K_k,
+    A_ij = sum_k c_ki c_kj t_i' W_k t_j,    W_k = m_k + dt c_k + dt^2 K_k,
 
-with x_k the nodes, a_i the joints, R a quarter turn, m mass, c drag and K the stiffness of a contact. The unknowns are
-the velocities at the end of the step: of the first link's angle, of the joint angles, and of one uniform stretch of the
-whole cable, which carries both elasticity along the cable and a slip through a gripper. Gripper 0 carries the root. The
-grasps are five rows `G u = g` in the dual form of `cablejax.simulate.grasp`; a compliant grasp is a number on that
-matrix's diagonal, so that zero compliance is the rigid grasp itself.
+with c_ki how far link i carries node k, t_i the direction in which it turns, m mass, c drag and K the stiffness of a
+contact. The unknowns are the velocities at the end of the step: of the links' angles, and of one uniform stretch of the
+whole cable, which carries both elasticity along the cable and a slip through a gripper. In the joints' angles instead,
+the condition number would grow with the fourth power of the number of links instead of the second, and float32 would
+not do for soft cables. Gripper 0 carries the root. The grasps are five rows `G u = g` in the dual form of
+`cablejax.simulate.grasp`; a compliant grasp is a number on that matrix's diagonal, so that zero compliance is the rigid
+grasp itself.
 
 Stiffness is implicit too, by the trapezoidal rule: a cable that damps less than believed must not make the simulation
 unstable, and the step must not damp for it.
 
 Where the links are and how fast they rub on the table is taken halfway through the step, from the velocities that the
 last steps lead one to expect. Taken at its start, it made motions at 50 ms ten times less accurate. Only contacts,
-which are stiff, are taken at the start of the step and solved for its end.
+which are stiff, are taken at the start of the step and solved for its end. Centrifugal forces, quadratic in an expected
+velocity, fade where the links turn so fast that the expectation is worth little: of half of the motions drawn for a
+soft rope that buckles, they made links swing ever more from step to step.
 """
 
 from __future__ import annotations
@@ -28,10 +31,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from cablejax.arrays import quarter_turn
 from cablejax.cable import Discretisation
 from cablejax.effects.physics import Physics
-from cablejax.simulate.chain.geometry import beyond, cross, solve_lower
+from cablejax.simulate.chain.geometry import levers, solve_lower
 from cablejax.simulate.chain.state import ChainState, Frame, frame_of, halfway_state
 from cablejax.simulate.composite import link_lengths
 from cablejax.simulate.contact import obstacle_contact
@@ -40,6 +42,9 @@ from cablejax.simulate.grasp import solve_held
 
 SLIP_DURATION = 0.1
 """Time constant of a slip [s]."""
+
+_FAST_TURN = 0.2
+"""Root mean square turn of the links in half a step [rad] at which centrifugal forces count half."""
 
 
 class Load(NamedTuple):
@@ -90,7 +95,8 @@ def advance(
     rows, yielding = _grasps(config, physics, halfway)
     wanted = _wanted(config, physics, state, start, after, dt, time)
     solved = solve_lower(matrix, jnp.concatenate([rhs[:, None], rows.T], axis=1))
-    speeds = solve_held(solved, rows, wanted, yielding / dt**2)
+    rates = solve_held(solved, rows, wanted, yielding / dt**2)
+    speeds = jnp.concatenate([rates[:1], jnp.diff(rates[:-1]), rates[-1:]])
     return _remembered(config, physics, state, speeds, root_velocity, dt)
 
 
@@ -132,40 +138,44 @@ def _joints(config: Discretisation, physics: Physics, state: ChainState, dt) -> 
 
 
 def _matrix(frame: Frame, load: Load, config: Discretisation, joint_implicit, dt) -> Float[Array, "n1 n1"]:
-    """Lower triangle of A, in units of mass."""
-    nodes, joints, n, dtype = frame.nodes, frame.joints, config.n_links, frame.theta.dtype
+    """Lower triangle of A, in units of mass; the last row is the stretch's."""
+    n, arms, turning = config.n_links, levers(config), frame.turning
     weight, contact = load.mass + dt * load.drag, load.contact
-    # R' W R: a quarter turn swaps the axes of the contact's stiffness
-    xx = weight + dt**2 * contact[:, 2]
-    xy = -(dt**2) * contact[:, 1]
-    yy = weight + dt**2 * contact[:, 0]
-    first_moment = jnp.stack([xx * nodes[:, 0] + xy * nodes[:, 1], xy * nodes[:, 0] + yy * nodes[:, 1]], axis=1)
-    second_moment = jnp.sum(first_moment * nodes, axis=1)
-    sums = jnp.stack([xx, xy, yy, *first_moment.T, second_moment + _inertia(config, load.mass)], axis=1)
-    sxx, sxy, syy, sx, sy, s2 = beyond(sums).T
-    ax, ay = joints.T
-    weighted = beyond(weight[:, None] * nodes)
-    coupling = -cross(joints, weighted) / frame.scale
-    corner = jnp.sum(weight[:, None] * nodes**2) / frame.scale**2 + 1e-9
-    # entry by entry, in one loop; the last row is the stretch's
-    column, across_x, across_y, ax, ay = jnp.pad(
-        jnp.stack([s2 - ax * sx - ay * sy, sxx * ax + sxy * ay - sx, sxy * ax + syy * ay - sy, ax, ay]),
-        [(0, 0), (0, 1)],
+    resisting = jnp.stack(
+        [weight + dt**2 * contact[:, 0], dt**2 * contact[:, 1], weight + dt**2 * contact[:, 2]], axis=1
     )
-    row = jnp.arange(n + 1)[:, None]
-    matrix = column[:, None] + across_x[:, None] * ax + across_y[:, None] * ay
-    matrix = jnp.where(row == n, jnp.append(coupling, corner), matrix)
-    diagonal = jnp.concatenate([jnp.full(1, 1e-9, dtype), joint_implicit, jnp.zeros(1, dtype)])
-    return matrix + jnp.where(row == jnp.arange(n + 1), diagonal, 0.0)
+
+    def pressed(sums):
+        xx, xy, yy = sums.T
+        return jnp.stack([xx * turning[:, 0] + xy * turning[:, 1], xy * turning[:, 0] + yy * turning[:, 1]], axis=1)
+
+    # of the later of two links, all that it moves; of the earlier its whole length
+    later = pressed(jnp.asarray(arms.T, weight.dtype) @ resisting)
+    earlier = jnp.asarray(link_lengths(config), weight.dtype)[:, None] * turning
+    own = jnp.sum(pressed(jnp.asarray(arms.T**2, weight.dtype) @ resisting) * turning, axis=1)
+    coupling = _turned(config, frame, weight[:, None] * frame.nodes) / frame.scale
+    corner = jnp.sum(weight[:, None] * frame.nodes**2) / frame.scale**2 + 1e-9
+    # a joint resists the difference of two links' angles
+    between = jnp.pad(joint_implicit, 1)
+    diagonal = jnp.append(own + _inertia(config, load.mass) + between[1:] + between[:-1], corner)
+    neighbours = jnp.append(-joint_implicit, jnp.zeros(2, weight.dtype))
+    # entry by entry, in one loop
+    later_x, later_y, earlier_x, earlier_y = jnp.pad(jnp.concatenate([later, earlier], axis=1).T, [(0, 0), (0, 1)])
+    row, column = jnp.arange(n + 1)[:, None], jnp.arange(n + 1)
+    matrix = later_x[:, None] * earlier_x + later_y[:, None] * earlier_y
+    matrix = matrix + jnp.where(row == column + 1, neighbours, 0.0)
+    matrix = jnp.where(row == n, jnp.append(coupling, 0.0), matrix)
+    return jnp.where(row == column, diagonal, matrix)
 
 
 def _impulses(
     start: Frame, halfway: Frame, load: Load, config: Discretisation, moment, root_velocity, dt
 ) -> Float[Array, "n1"]:
     """Right-hand side: momentum at the start of the step and impulses during it."""
-    nodes, contact = halfway.nodes, load.contact
+    contact = load.contact
+    fading = 1.0 + jnp.mean((0.5 * dt * halfway.rate) ** 2) / _FAST_TURN**2
     impulse = (
-        load.mass[:, None] * (start.velocity - root_velocity - dt * halfway.bias)
+        load.mass[:, None] * (start.velocity - root_velocity - dt * halfway.bias / fading)
         + dt * load.force
         - dt * load.drag[:, None] * root_velocity
     )
@@ -177,11 +187,14 @@ def _impulses(
         axis=1,
     )
     impulse = impulse - dt**2 * contact_drag
-    spin = (_inertia(config, load.mass) * start.rate)[:, None]
-    total = beyond(jnp.concatenate([impulse, cross(nodes, impulse)[:, None] + spin], axis=1))
-    rhs = total[:, 2] - cross(halfway.joints, total[:, :2])
-    rhs = rhs.at[1:].add(-dt * moment)
-    return jnp.append(rhs, jnp.sum(nodes * impulse) / halfway.scale)
+    spin = _inertia(config, load.mass) * start.rate
+    rhs = _turned(config, halfway, impulse) + spin + dt * jnp.diff(jnp.pad(moment, 1))
+    return jnp.append(rhs, jnp.sum(halfway.nodes * impulse) / halfway.scale)
+
+
+def _turned(config: Discretisation, frame: Frame, along: Float[Array, "n 2"]) -> Float[Array, "n"]:
+    """Of vectors at the nodes: their components in what each link's angle moves, weighted with its lever."""
+    return jnp.sum(frame.turning * (jnp.asarray(levers(config).T, along.dtype) @ along), axis=1)
 
 
 def _inertia(config: Discretisation, mass: Float[Array, "n"]) -> Float[Array, "n"]:
@@ -191,19 +204,11 @@ def _inertia(config: Discretisation, mass: Float[Array, "n"]) -> Float[Array, "n
 
 def _grasps(config: Discretisation, physics: Physics, frame: Frame) -> tuple[Float[Array, "5 n1"], Float[Array, "5"]]:
     """Rows G of the grasps and of the stretch, and their compliances."""
-    nodes, n, dtype = frame.nodes, config.n_links, frame.theta.dtype
-    tip = quarter_turn(nodes[-1] - frame.joints)
-    tip_stretch = nodes[-1] / frame.scale
-    ones, none, zero = jnp.ones(n, dtype), jnp.zeros(n, dtype), jnp.zeros((), dtype)
-    rows = jnp.stack(
-        [
-            jnp.append(none.at[0].set(1.0), 0.0),
-            jnp.append(tip[:, 0], tip_stretch[0]),
-            jnp.append(tip[:, 1], tip_stretch[1]),
-            jnp.append(ones, 0.0),
-            jnp.append(none, 1.0),
-        ]
-    )
+    n, dtype = config.n_links, frame.theta.dtype
+    tip = jnp.asarray(levers(config)[-1], dtype)[:, None] * frame.turning
+    unit = jnp.eye(n + 1, dtype=dtype)
+    across, zero = jnp.append(tip, frame.nodes[-1:] / frame.scale, axis=0).T, jnp.zeros((), dtype)
+    rows = jnp.concatenate([unit[:1], across, unit[n - 1 :]])
     c = physics.rotation_compliance
     return rows, jnp.stack([c[0], zero, zero, c[1], physics.axial_compliance / config.cable.length])
 
