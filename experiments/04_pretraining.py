@@ -17,10 +17,10 @@ os.environ.setdefault("NPROC", "4")
 
 import numpy as np
 
+from autoencoder import PretrainConfig, pretrain
 from cablejax.dataset.generate import generate
 from cablejax.dataset.schema import DatasetConfig
 from cablejax.dataset.windows import read_trajectories
-from cablejax.dynamics.autoencoder import PretrainConfig, pretrain
 from cablejax.dynamics.evaluate import OpenLoopError, open_loop_error, prior_motion
 from cablejax.dynamics.train import train
 from cablejax.dynamics.train_config import PRESETS

@@ -99,4 +99,4 @@ def test_only_what_was_changed_is_said_and_no_local_folder():
     folders = tuple(pathlib.Path("/home/somebody") / name for name in ("a.zarr", "b.zarr"))
     train = Train(data=folders, out=pathlib.Path("/tmp/mine"), held_out=0.1, json=True, device="cpu")
     assert command_line(train, "train") == "cablejax train --data a.zarr b.zarr --out mine --held-out 0.1"
-    assert command_line(dataclasses.replace(Train(), pretrain=5), "train") == "cablejax train --pretrain 5"
+    assert command_line(dataclasses.replace(Train(), latent=5), "train") == "cablejax train --latent 5"

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from flax import nnx
 
-from cablejax.dynamics.autoencoder import PretrainConfig, pretrain
+from autoencoder import PretrainConfig, pretrain
 from cablejax.dynamics.config import ModelConfig
 from cablejax.dynamics.model import apply, make_network
 from cablejax.dynamics.symmetry import initially_symmetric, symmetrised

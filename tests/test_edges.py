@@ -417,7 +417,7 @@ def kept_files(folder, edit):
 OPTIONS = {
     "simulate": "--trajectories --steps --max-amplification --links --timestep --seed --stiffness-range --effect "
     "--cable --with --out --process-count --process-index --device",
-    "train": "--lr --held-out --steps --batch --latent --message-passing --pretrain --seed --start-from",
+    "train": "--lr --held-out --steps --batch --latent --message-passing --seed --start-from",
     "shape": "--steps --noise-mm --links --seed --target --weights --plant-effect --cable --solver",
     "cable": "--from --out --seed",
     "bench simulate": "--batch --seconds --rounds --threads --links",

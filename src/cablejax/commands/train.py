@@ -40,7 +40,6 @@ class Train(Command):
         conditioned: Give the network each cable's stiffness and friction as inputs; the data should vary in them.
         start_from: Weights to start from instead of random ones: a released model by name, or a training's folder.
         lr: Learning rate at the beginning; the whole schedule is scaled with it. By default that of the preset.
-        pretrain: Steps for which the encoders are first trained as auto-encoders; 0 for none.
         held_out: Fraction of each data set kept away from training to measure the error on.
         buffer: Trajectories to train on that are in memory at a time, for data sets larger than that; by default all.
             One shard gives way to another every 50 steps.
@@ -63,7 +62,6 @@ class Train(Command):
     conditioned: bool = False
     start_from: str | None = None
     lr: float | None = None
-    pretrain: int = 0
     held_out: float = 0.05
     buffer: int | None = None
     steps: int | None = None
@@ -75,18 +73,13 @@ class Train(Command):
         """Trains, from a checkpoint where there is one, and reports the open-loop error."""
         from cablejax.dataset.opening import open_store
         from cablejax.dataset.split import read_split
-        from cablejax.dataset.streaming import StreamedData
         from cablejax.dataset.windows import concatenate
-        from cablejax.dynamics.autoencoder import PretrainConfig, pretrain
         from cablejax.dynamics.error_report import error_report
         from cablejax.dynamics.fine_tune import starting_from
         from cablejax.dynamics.parallel import training_mesh
         from cablejax.dynamics.train import train
         from cablejax.dynamics.weights import FILE_NAME, save_weights
 
-        if self.start_from is not None and self.pretrain:
-            raise UsageError("--start-from and --pretrain both say where to start: give one of them.")
-        require(self.pretrain, "count_from_zero", "--pretrain")
         if self.steps is not None:
             require(self.steps, "optimiser_steps", "--steps", "Leave it out for those of the preset.")
         if self.lr is not None:
@@ -96,16 +89,10 @@ class Train(Command):
         config = self._config(stores[0])
         training_mesh(config)  # refuses a batch that the devices cannot share, before anything is read
         training, held_out = read_split(stores, self.held_out, buffer=self.buffer, seed=self.seed)
-        streamed = isinstance(training, StreamedData)
         count = sum(len(part.gripper_twist) for part in held_out)
         total = sum(store.config.n_trajectories for store in stores) - count
         say(f"{total} trajectories to train on, {count} held out; {config.total_steps} steps")
-        initial = None
-        if self.pretrain:
-            pretrained = pretrain(config, training.at(0) if streamed else training, PretrainConfig(steps=self.pretrain))
-            initial = pretrained.model, pretrained.weights
-        if self.start_from is not None:
-            initial = starting_from(self.start_from, config.model)
+        initial = None if self.start_from is None else starting_from(self.start_from, config.model)
         result = train(
             config, training, self.out, validation=concatenate(held_out), initial=initial, overwrite=self.overwrite
         )
@@ -215,7 +202,7 @@ class Train(Command):
                 }
                 for name, store, count in zip(names, stores, held_out, strict=True)
             ],
-            "training": training | {"pretrain": self.pretrain},
+            "training": training,
             "versions": versions(),
             "machine": machine(),
         }

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from flax import nnx
 
+from autoencoder import AutoEncoders, PretrainConfig, features, pretrain
 from cablejax.dataset.windows import draw_windows
-from cablejax.dynamics.autoencoder import AutoEncoders, PretrainConfig, features, pretrain
 from cablejax.dynamics.graph import build_graph, prior_of
 from cablejax.dynamics.model import apply
 from cablejax.dynamics.networks import GNS
