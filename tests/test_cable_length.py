@@ -8,7 +8,6 @@ import pytest
 from cablejax.cable_length import require_fitting_length
 from cablejax.recordings.assemble import Nominal, gap_log_from_takes
 from cablejax.recordings.take import Take
-from cablejax.recordings.wires import HangingWire, wire_log
 from cablejax.spatial.windows import windows_of
 
 MARKS = np.linspace(0.0, 1.0, 13)
@@ -68,10 +67,3 @@ def test_stated_arc_lengths_are_checked_at_the_import():
         gap_log_from_takes([take()], dataclasses.replace(NOMINAL, arclength=stated), source="test")
     with pytest.raises(ValueError, match="correct keypoint_arclength_m"):
         gap_log_from_takes([take()], dataclasses.replace(NOMINAL, arclength=tuple(0.9 * MARKS)), source="test")
-
-
-def test_wires_are_checked():
-    wire = HangingWire("red", taut()[:2], 1.0, 0.02, np.full(2, 1e-3))
-    wire_log(wire)
-    with pytest.raises(ValueError, match="correct length_m, for red"):
-        wire_log(dataclasses.replace(wire, length=0.9))

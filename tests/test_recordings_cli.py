@@ -7,7 +7,7 @@ import pytest
 
 from cablejax.cli import main
 from cablejax.gaplog import read_gap_log
-from recording_cases import DATA, needs_wires, swinging
+from recording_cases import swinging
 
 
 @pytest.fixture
@@ -19,7 +19,7 @@ def folder(tmp_path):
     return tmp_path / "DLO9"
 
 
-@pytest.mark.parametrize("kind", ["deform", "wires", "csv", "mcap"])
+@pytest.mark.parametrize("kind", ["deform", "csv", "mcap"])
 def test_help_explains_every_kind(kind, capsys):
     with pytest.raises(SystemExit) as stop:
         main(["import", kind, "--help"])
@@ -66,11 +66,3 @@ def test_a_wrong_frame_is_refused(folder, tmp_path, capsys):
 def test_a_wrong_name_for_the_log_is_refused(folder, capsys):
     assert main(["import", "deform", str(folder), "--out", "log.csv"]) == 2
     assert "ends in .npz" in capsys.readouterr().err
-
-
-@needs_wires
-def test_each_wire_becomes_a_log(tmp_path, capsys):
-    source = DATA / "hanging_wires" / "wires.npz"
-    assert main(["import", "wires", str(source), "--out", str(tmp_path / "wire.npz")]) == 0
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["wire-black.npz", "wire-red.npz", "wire-white.npz"]
-    assert read_gap_log(tmp_path / "wire-red.npz").keypoints.shape == (5, 1, 51, 3)

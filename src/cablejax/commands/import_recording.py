@@ -76,20 +76,6 @@ class Deform(_Import):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Wires(_Import):
-    """Import photographs of hanging wires: one log for each wire, --out with the wire's name before .npz."""
-
-    def logs(self):
-        """One log per wire; nothing is repaired."""
-        from cablejax.recordings.wires import read_wires, wire_log
-
-        return [
-            (self.out.with_name(f"{self.out.stem}-{wire.name}.npz"), wire_log(wire), ())
-            for wire in read_wires(self.source)
-        ]
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
 class Csv(_Import):
     """Import a csv file of your own, one row per sample; a small TOML file names its columns and units.
 
@@ -149,7 +135,6 @@ class Import:
 
     what: (
         Annotated[Deform, subcommand("deform")]
-        | Annotated[Wires, subcommand("wires")]
         | Annotated[Csv, subcommand("csv")]
         | Annotated[Mcap, subcommand("mcap")]
         | Annotated[LeRobot, subcommand("lerobot")]

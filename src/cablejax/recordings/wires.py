@@ -13,16 +13,10 @@ import pathlib
 import numpy as np
 from jaxtyping import Float
 
-from cablejax.cable import Cable
-from cablejax.cable_length import require_fitting_length
-from cablejax.gaplog import Episode, gap_log_from_episodes
 from cablejax.npz import read_npz
-from cablejax.recordings.poses import poses_from_markers
 from cablejax.recordings.units import require_metres
-from cablejax.types import GapLog
 
 _FIELDS = ("wire", "keypoints", "length_m", "mass_per_length_kg_m", "EI_published_Nm2")
-_DIAMETER = 0.003
 
 
 @dataclasses.dataclass(frozen=True)
@@ -78,57 +72,4 @@ def read_wires(path: str | os.PathLike[str]) -> tuple[HangingWire, ...]:
             arrays["EI_published_Nm2"].astype(float),
             strict=True,
         )
-    )
-
-
-def wire_log(wire: HangingWire) -> GapLog:
-    """A gap log in space with an episode of one sample for each time that the wire was hung.
-
-    The mean of the published stiffnesses is what is believed true; the diameter is a guess. Gripper poses are the first
-    and last point with the direction to the point next to it, since the photographs do not show the clamps.
-
-    Raises:
-        ValueError: the wire is shorter than its points are apart.
-    """
-    repeats, count, _ = wire.keypoints.shape
-    require_fitting_length(
-        [points[None] for points in wire.keypoints], np.linspace(0.0, wire.length, count), f"length_m, for {wire.name},"
-    )
-    cable = Cable(
-        length=wire.length,
-        diameter=_DIAMETER,
-        n_keypoints=count,
-        bending_stiffness=float(wire.published_stiffness.mean()),
-        damping_time=0.0,
-        linear_density=wire.linear_density,
-        friction_coefficient=0.0,
-    )
-    episodes = []
-    for points in wire.keypoints:
-        ends = [
-            poses_from_markers(points[None, 0], points[None, 1], points[None, 0]),
-            poses_from_markers(points[None, -2], points[None, -1], points[None, -1]),
-        ]
-        episodes.append(
-            Episode(
-                motion="hang",
-                time=np.zeros(1),
-                keypoints=points[None],
-                gripper_pose=np.stack(ends, axis=1),
-                gripper_command=np.zeros((1, 2, 6)),
-                hold=np.ones(1, bool),
-            )
-        )
-    return gap_log_from_episodes(
-        episodes,
-        cable,
-        source=(
-            f"{wire.name} wire of qj25/adapteddlo_muj (arXiv 2310.00911), traced in photographs while it hung between "
-            "two clamps. Bending stiffness: mean of the published values; the diameter is a guess. Gripper poses are "
-            "from the first and last two points."
-        ),
-        extra={
-            "take": [f"{wire.name} {index}" for index in range(repeats)],
-            "published_stiffness_n_m2": wire.published_stiffness.tolist(),
-        },
     )
