@@ -40,10 +40,6 @@ def simulate_command(config: DatasetConfig, out: str) -> str:
     """The `cablejax simulate` that makes a data set, or a comment that its options cannot.
 
     A cable other than the reference is expected in `cable.toml`.
-
-    Args:
-        config: of the data set.
-        out: its folder.
     """
     command = Simulate(
         out=pathlib.Path(out),

@@ -25,10 +25,6 @@ def profile_widths(evidence: Evidence, fit: Fit) -> Float[np.ndarray, "P 2"]:
 
     They start from Laplace's approximation and are corrected by the cost that is found there, the other coordinates
     moved to where one Gauss-Newton step has them best; all ends of one round are replayed together.
-
-    Args:
-        evidence: that was fitted.
-        fit: at its optimum.
     """
     z, bounds = fit.explanation.z, fit.explanation.bounds
     covariance = np.linalg.inv(fit.precision(evidence))

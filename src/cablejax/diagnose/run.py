@@ -126,7 +126,7 @@ def examine(
     *,
     progress: Callable[[str], None],
 ) -> Examined:
-    """Searches, judges, and measures the gap on what no fit has seen; see `explain` for the arguments.
+    """Searches, judges, and measures the gap on what no fit has seen.
 
     Args:
         evidence: to explain.
@@ -187,13 +187,7 @@ def weighed(
 def explain(
     evidence: Evidence, calibration: Calibration, *, progress: Callable[[str], None]
 ) -> tuple[Search, Conclusion]:
-    """Searches for explanations where there is a gap, and judges them.
-
-    Args:
-        evidence: to explain.
-        calibration: of the judgement.
-        progress: called with a line of text before each stage.
-    """
+    """Searches for explanations where there is a gap, and judges them."""
     (null,) = refitted(evidence, [_null(evidence)])
     if has_gap(null, evidence, calibration):
         found = search(evidence, null, calibration, progress=progress)

@@ -38,9 +38,6 @@ _OTHER, _SAME = np.log(1.25), np.log(1.1)
 def restore_order(takes: tuple[Take, ...]) -> tuple[tuple[Take, ...], list[str]]:
     """Puts exchanged markers back in their places.
 
-    Args:
-        takes: of one cable.
-
     Returns:
         The takes, and one sentence for each that was changed.
 

@@ -26,12 +26,7 @@ _MOMENTS = 5
 
 
 def log_sheet(log: GapLog, name: str) -> Sheet:
-    """What a gap log holds.
-
-    Args:
-        log: in the plane or in space.
-        name: of its file.
-    """
+    """What a gap log holds."""
     episodes, targets, planar = episodes_of(log), targets_of(log), log.keypoints.shape[-1] == 2
     cable = dataclasses.replace(config_of_log(log).cable, diameter=log.meta["cable"]["diameter_m"])
     seconds = sum(float(episode.time[-1] - episode.time[0]) for episode in episodes)

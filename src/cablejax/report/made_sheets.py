@@ -121,12 +121,7 @@ _TRAINING_CAPTION = "Loss over the training, and the open-loop error on held-out
 
 
 def verdict_sheet(diagnosis: Diagnosis, name: str) -> Sheet:
-    """What a verdict says; the diagnosis' own page, next to it, says more.
-
-    Args:
-        diagnosis: as `cablejax.diagnose.verdict_json.read_verdict` reads it.
-        name: of its file.
-    """
+    """What a verdict says; the diagnosis' own page, next to it, says more."""
     gap = diagnosis.gap
     unit = "mm" if gap.unit == "m" else f"thousandths of {gap.unit}"
     shrinks = "not known" if gap.shrinkage is None else share(gap.shrinkage)

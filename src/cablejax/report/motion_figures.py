@@ -39,12 +39,7 @@ def motion_figure(following: NextMotion | None) -> Figure | None:
 
 
 def write_motion_gif(path: str | os.PathLike[str], following: NextMotion) -> int:
-    """Writes a preview of the motion, five times as fast, and returns its size in bytes.
-
-    Args:
-        path: the file to write.
-        following: the motion.
-    """
+    """Writes a preview of the motion, five times as fast, and returns its size in bytes."""
     low, high = _window(following)
     scale = _WIDTH / (high[0] - low[0])
     names = list(following.shapes)
