@@ -32,8 +32,7 @@ if __name__ == "__main__":
                 "slack depend on the seed; a cell is the mean over stiffnesses and seeds. A run ends after 60 "
                 f"commands, or after {PATIENCE} in which the error does not change. The settling time is the first "
                 "from which on the error stays within a tenth, or 1 mm, of its last value; Wang et al. do not define "
-                "theirs. The row of domain randomisation was run with the controller before, which took back what "
-                "makes the shape worse after eight commands instead of two."
+                "theirs."
             ),
             small=Extent(
                 functools.partial(stiffness_cases, ("U", "S", "Z"), (2.0,)),
