@@ -4,6 +4,7 @@ import dataclasses
 import math
 import re
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -234,6 +235,12 @@ def test_a_command_is_shortened_to_its_limits(twist, share):
     np.testing.assert_allclose(shortened, share * np.array(twist), atol=1e-12)
 
 
+def test_grippers_do_not_pass_through_each_other():
+    pose, twist = np.array([[0, 0, 0], [0.11, 0, 0.0]]), np.array([[0.1, 0, 0], [-0.1, 0, 0.0]])
+    for of in (np.array, jnp.float32):
+        np.testing.assert_allclose(LIMITS.shortened(of(twist), of(pose), 1.2), 0.04 * twist, atol=1e-7)
+
+
 def test_from_outside_only_the_way_back_is_open():
     pose = np.array([[-0.7, 0.0, 0.0], [0.1, 0.0, 0.0]])
     back, out = np.array([[0.05, 0, 0], [0, 0, 0]]), np.array([[-0.05, 0, 0], [0, 0, 0]])
@@ -296,6 +303,30 @@ def test_the_link_says_why_it_waits(changes, reason):
     assert reply.status == Status.WAITING and re.search(reason, reply.reason)
     reply = harness.run(1.5, begin=0.1)
     assert reply.status == Status.SHAPING and reply.reason == ""
+
+
+def test_seldom_observations_and_other_shapes_are_why_it_waits():
+    harness = Harness()
+    harness.step(0.0, harness.seen(0.0))
+    reply = harness.step(0.8)
+    assert reply.status == Status.WAITING and "0.80 s, expected one every 0.5 s" in reply.reason
+    reply = harness.step(0.9, harness.seen(0.9, keypoints=KEYPOINTS[:5]))
+    assert reply.status == Status.WAITING and "(5, 2)" in reply.reason
+
+
+def test_a_clock_that_was_set_back_is_reported():
+    harness = Harness()
+    harness.run(503.0, begin=500.0)
+    reply = harness.step(504.0)
+    assert reply.status == Status.PAUSED
+    reply = harness.step(504.1, harness.seen(4.1))
+    assert reply.status == Status.PAUSED and "was the clock set back?" in reply.reason
+
+
+def test_limits_that_leave_no_motion_are_reported():
+    harness = Harness(limits=CommandLimits(workspace=((0.6, 0.6), (0.9, 0.9))))
+    reply = harness.run(3.0)
+    assert reply.status == Status.SHAPING and not reply.twist.any() and "leave nothing" in reply.reason
 
 
 def test_nothing_recorded_is_no_log():

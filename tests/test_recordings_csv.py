@@ -146,9 +146,13 @@ def test_a_wrong_layout_is_reported(tmp_path, old, new, message):
         (lambda text: "\n".join(text.split("\n")[:2]), "has 2 rows"),
         (lambda text: re.sub(r"\n500010.0,[^,]*,", "\n500010.0,oops,", text), "line 3: column 'm1x' is 'oops'"),
         (lambda text: text.replace("\n500020.0,", "\n500020.0,7,"), "line 4: 29 cells, expected 28"),
-        (lambda text: text.replace("\n500020.0,", "\n500000.0,"), r"times do not increase \(sample 2"),
+        (lambda text: text.replace("\n500020.0,", "\n500000.0,"), r"times do not increase \(sample 2: 500 after 500"),
+        (lambda text: text.replace("\n500020.0,", "\n,"), "line 4: the time is empty"),
+        (lambda text: text.replace("\n500010.0,", "\n\n\n5_00010.0,"), "line 5: column 't' is '5_00010.0'"),
+        (lambda text: text.replace(",", ";"), "cells between semicolons, expected commas"),
+        (lambda text: "# made in the lab\n" + text, "begins with a comment"),
     ],
-    ids=["twice", "empty", "text", "cells", "time"],
+    ids=["twice", "empty", "text", "cells", "time", "no time", "blank lines", "semicolons", "comment"],
 )
 def test_a_wrong_table_is_reported(tmp_path, change, message):
     path, layout = written(tmp_path, in_space(), PAIRS)
@@ -181,6 +185,28 @@ def test_a_quaternion_in_the_wrong_columns_is_reported(tmp_path):
     path, layout = written(tmp_path, table | pose, PAIRS + grippers)
     with pytest.raises(ValueError, match="quaternion of length 0, expected 1"):
         import_csv(path, layout)
+
+
+def test_the_quaternion_that_is_none_is_reported(tmp_path):
+    table, names = in_space(), ("x", "y", "z", "qw", "qx", "qy", "qz")
+    pose = {f"g{q}{name}": np.full(200, float(name == "qw")) for q in (0, 1) for name in names}
+    pose["g1qw"][100] = 0.0
+    grippers = "".join(f"gripper_{q} = {[f'g{q}{name}' for name in names]}\n" for q in (0, 1))
+    with pytest.raises(ValueError, match="sample 100 has a gripper quaternion of length 0, expected 1"):
+        import_csv(*written(tmp_path, table | pose, PAIRS + grippers))
+
+
+def test_keypoints_in_the_plane_lie_on_a_table(tmp_path):
+    with pytest.raises(ValueError, match="friction coefficient is not given"):
+        import_csv(*written(tmp_path, in_the_plane(), PLANAR.replace("[table]\nfriction_coefficient = 0.1\n", "")))
+
+
+def test_grippers_that_do_not_hold_the_cable_are_refused(tmp_path):
+    table = in_the_plane()
+    for column in ("gx0", "gx1"):
+        table[column] = table[column] + 0.3
+    with pytest.raises(ValueError, match=r"Keypoint 0 is 0.30 m from gripper 0.*in one frame"):
+        import_csv(*written(tmp_path, table, PLANAR))
 
 
 def test_missing_files_are_reported(tmp_path):

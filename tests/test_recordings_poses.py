@@ -1,5 +1,7 @@
 """Poses from marker pairs, frames and units."""
 
+import dataclasses
+
 import jax
 import numpy as np
 import pytest
@@ -101,9 +103,13 @@ def test_every_frame_becomes_right_handed_with_z_up(up, handedness):
     np.testing.assert_allclose(turned.keypoints @ frame.matrix, points, atol=1e-12)
 
 
-def test_a_planar_take_has_no_frame():
-    flat = take(swinging()[..., :2])
-    assert into_frame(flat, Frame("y", "left")) is flat
+def test_a_planar_take_is_mirrored_and_has_no_up():
+    flat = dataclasses.replace(take(swinging()[..., :2]), gripper_pose=np.full((len(swinging()), 2, 3), 0.5))
+    mirrored = into_frame(flat, Frame("z", "left"))
+    np.testing.assert_array_equal(mirrored.keypoints, flat.keypoints * [1, -1])
+    np.testing.assert_array_equal(mirrored.gripper_pose, flat.gripper_pose * [1, -1, -1])
+    with pytest.raises(ValueError, match="y up, but the keypoints have x and y only"):
+        into_frame(flat, Frame("y"))
 
 
 @pytest.mark.parametrize("up", AXES)

@@ -23,10 +23,12 @@ import robot_soak
 from cablejax.control.link import RobotLink
 from cablejax.control.link_state import LinkConfig
 from cablejax.control.targets import straight_start
-from cablejax.gaplog import read_gap_log
+from cablejax.gaplog import GapLogError, read_gap_log
 from cablejax.robot import server
 from cablejax.robot.ros_node import make_node
 from cablejax.robot.session import RobotRun
+from cablejax.simulate.elastica import elastica
+from cablejax.simulate.table_plant import Observation
 from test_control_link import CABLE, START, TARGET, Harness, Inwards
 
 
@@ -218,6 +220,64 @@ def test_grippers_that_point_backwards_are_found_before_anything_moves(tmp_path)
         assert not reply.twist.any()
     assert reply.status == "stopped" and "tangent" in reply.reason
     assert run.result().stopped == reply.reason
+
+
+ARCH = np.array([[-0.4, 0.0, 0.7], [0.4, 0.0, -0.7]])
+BENT = elastica(ARCH, CABLE.length, CABLE.keypoint_arclength)
+
+
+@pytest.mark.parametrize(
+    ("points", "pose", "reason"),
+    [
+        (BENT, ARCH * [1, 1, 180 / np.pi], "in degrees: expected radians"),
+        (BENT, ARCH * [1, 1, np.pi / 180], "it was converted from degrees"),
+        (BENT, ARCH * [1, 1, -1], "mirrored. Negate the angle"),
+        (BENT, ARCH + np.array([0, 0, np.pi / 2]), "quarter turn"),
+        (BENT, ARCH[::-1], "Exchange the grippers"),
+        (BENT + np.array([0.0, 0.45]), ARCH, "in one frame"),
+        (np.random.default_rng(0).permutation(BENT[1:-1]), ARCH, "times as far apart"),
+        (0.7 * BENT, ARCH * [0.7, 0.7, 1], "times as far apart"),
+    ],
+    ids=["degrees", "not degrees", "mirrored", "quarter", "exchanged", "elsewhere", "shuffled", "shrunk"],
+)
+def test_a_cable_that_the_grippers_do_not_hold_is_not_moved(tmp_path, points, pose, reason):
+    run, rng = run_to(tmp_path / "log.npz"), np.random.default_rng(1)
+    if len(points) < len(BENT):
+        points = np.concatenate([BENT[:1], points, BENT[-1:]])
+    for k in range(15):
+        seen = Observation(points + 1e-4 * rng.normal(size=points.shape), pose, 0.1 * k)
+        reply = run.exchange(0.1 * k, [seen])
+        assert not reply.twist.any()
+    assert reply.status == "stopped" and reason in reply.reason
+
+
+def test_a_cable_that_they_hold_is_moved(tmp_path):
+    run, rng = run_to(tmp_path / "log.npz"), np.random.default_rng(1)
+    for k in range(15):
+        reply = run.exchange(0.1 * k, [Observation(BENT + 1e-4 * rng.normal(size=BENT.shape), ARCH, 0.1 * k)])
+    assert reply.status == "shaping" and reply.twist.any()
+
+
+def test_the_path_of_a_log_is_checked_before_the_run(tmp_path):
+    with pytest.raises(ValueError, match=r"ends in \.npz"):
+        run_to(tmp_path / "log")
+    (tmp_path / "file").write_bytes(b"")
+    with pytest.raises(OSError, match="file"):
+        run_to(tmp_path / "file" / "log.npz")
+
+
+def test_a_recording_is_kept_where_its_name_was_taken_or_it_is_no_log(tmp_path):
+    run, harness = run_to(tmp_path / "log.npz"), Harness()
+    run.exchange(0.0, [harness.seen(0.0)])
+    (tmp_path / "log.npz").write_bytes(b"taken")
+    assert run.finish() == tmp_path / "log_2.npz"
+    run = run_to(tmp_path / "burst.npz")
+    for stamp in [*np.arange(0.0, 0.02, 0.001), 0.95]:  # a pause that is unusual for such a rate
+        run.exchange(stamp, [harness.seen(stamp)])
+    with pytest.raises(GapLogError, match=r"samples are kept in .*burst.raw.npz: .*pause"):
+        run.finish()
+    with np.load(tmp_path / "burst.raw.npz") as kept:
+        assert kept["keypoints_0"].shape == (21, CABLE.n_keypoints, 2)
 
 
 def test_a_log_is_not_overwritten(tmp_path):

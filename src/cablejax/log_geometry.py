@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float
 
+from cablejax.cable_length import BENT, bent_chord
 from cablejax.types import GapLog
 
 REACH = 5.0
@@ -14,7 +15,13 @@ INWARDS = np.radians(120.0)
 """Median angle between a gripper's tangent and the cable next to it, at which the tangent points the wrong way."""
 MOVED = 0.02
 """Motion of a gripper, in lengths of the cable, in which keypoints that are held by it move too."""
+AT_GRIPPER = 0.1
+"""Largest median distance of an end's keypoint from its gripper [m]."""
+ASKEW = np.radians(60.0)
+"""Median angle between a gripper's tangent and the cable next to it that no clamp has."""
 _FEWEST = 5
+_FEWEST_NEAR = 9
+"""Keypoints from which on the first two show the cable's direction at a gripper."""
 _DEGREES_OFF = 0.5
 _DEGREES_BETTER = 3.0
 _DEGREES_TURN = 10.0
@@ -81,6 +88,75 @@ def geometry_fault(log: GapLog) -> str | None:
     return None
 
 
+def cable_fault(log: GapLog) -> str | None:
+    """Finds keypoints that are not of a cable of the stated length between these grippers; a message, or None.
+
+    Args:
+        log: valid; in the plane, between two grippers, else nothing is checked.
+    """
+    if log.keypoints.shape[-1] != 2 or log.gripper_pose.shape[2] != 2:
+        return None
+    valid = np.arange(log.keypoints.shape[1])[None] < log.episode_length[:, None]
+    points, grippers = log.keypoints[valid].astype(float), log.gripper_pose[valid][..., :2].astype(float)
+    for gripper, (end, name) in enumerate(((0, "0"), (-1, "N - 1"))):
+        ends = points[np.isfinite(points[:, end]).all(axis=-1)][:, end], grippers[np.isfinite(points[:, end]).all(-1)]
+        away, crossed = (
+            float(np.median(np.linalg.norm(ends[0] - ends[1][:, q], axis=-1))) if len(ends[0]) else 0.0
+            for q in (gripper, 1 - gripper)
+        )
+        if away > AT_GRIPPER:
+            advice = (
+                f"it is at gripper {1 - gripper}. Exchange the grippers, or reverse the order of the keypoints."
+                if crossed < AT_GRIPPER
+                else "are the keypoints and the poses in one frame, in metres, and of one cable?"
+            )
+            return f"Keypoint {name} is {away:.2f} m from gripper {gripper}, expected it at the gripper: {advice}"
+    # chords are shorter than the cable between them, the more so the fewer there are
+    chord = np.linalg.norm(np.diff(points, axis=1), axis=-1) / np.diff(log.meta["keypoint_arclength_m"])
+    ratio = float(np.nanmedian(chord)) if np.isfinite(chord).any() else 1.0
+    if not bent_chord(points.shape[1]) - BENT <= ratio <= 1 + BENT:
+        return (
+            f"The keypoints lie {ratio:.2f} times as far apart as meta.keypoint_arclength_m says: correct the length, "
+            "the unit, or the marks."
+        )
+    return None
+
+
+def setup_fault(log: GapLog) -> str | None:
+    """As `cable_fault`, and finds angles of grippers that fit the cable far better in another unit or direction.
+
+    For measured poses: a simulated clamp may hold the cable as askew as its effect says.
+    """
+    if fault := cable_fault(log):
+        return fault
+    if log.keypoints.shape[-1] != 2 or log.gripper_pose.shape[2] != 2 or log.keypoints.shape[2] < _FEWEST_NEAR:
+        return None
+    for gripper in (0, 1):
+        angle, direction = _tangents(log, gripper)
+        if not len(angle):
+            continue
+        off = _median_angle(angle - direction)
+        others = {
+            "in degrees: expected radians. Multiply it by pi / 180.": np.radians(angle) - direction,
+            "in units of 180 / pi rad: it was converted from degrees, and was none.": np.degrees(angle) - direction,
+            "with the other sign: either y or the angle is mirrored. Negate the angle.": -angle - direction,
+            "a quarter turn further: expected the cable's tangent.": angle + np.pi / 2 - direction,
+            "a quarter turn back: expected the cable's tangent.": angle - np.pi / 2 - direction,
+        }
+        best, better = min((_median_angle(change), advice) for advice, change in others.items())
+        begin = f"The angle of gripper {gripper} is {np.degrees(off):.0f} degrees off the cable next"
+        if off > _DEGREES_OFF and best < off / _DEGREES_BETTER:
+            return f"{begin} to it (median), and {np.degrees(best):.0f} {better}"
+        if off > ASKEW:
+            return f"{begin} to it (median): expected the cable's tangent, from gripper 0 towards gripper 1, at both."
+    return None
+
+
+def _median_angle(difference: Float[np.ndarray, " S"]) -> float:
+    """Median magnitude of angles that are known up to whole turns [rad]."""
+    return float(np.median(np.arccos(np.cos(difference))))
+
+
 def _tangents(log: GapLog, gripper: int) -> tuple[Float[np.ndarray, " S"], Float[np.ndarray, " S"]]:
     """A gripper's angle, and the direction of the cable next to it [rad], in all samples that show it."""
     angles, directions = [], []
@@ -97,15 +173,14 @@ def _tangents(log: GapLog, gripper: int) -> tuple[Float[np.ndarray, " S"], Float
 def _angle_fault(angle: Float[np.ndarray, " S"], direction: Float[np.ndarray, " S"]) -> str | None:
     if not len(angle):
         return None
-    off = float(np.median(np.arccos(np.cos(angle - direction))))
-    in_degrees = float(np.median(np.arccos(np.cos(np.radians(angle) - direction))))
+    off, in_degrees = _median_angle(angle - direction), _median_angle(np.radians(angle) - direction)
     turns_too_far = np.ptp(angle) > max(np.pi, _DEGREES_TURN * np.ptp(np.unwrap(direction)))
     if turns_too_far and off > max(_DEGREES_OFF, _DEGREES_BETTER * in_degrees):
         return (
             f"up to {np.abs(angle).max():.3g}, which fits the cable next to it in degrees (median difference "
             f"{in_degrees:.2g} rad) and not in radians ({off:.2g} rad): expected radians. Multiply it by pi / 180."
         )
-    mirrored = float(np.median(np.arccos(np.cos(angle + direction))))
+    mirrored = _median_angle(angle + direction)
     if off > INWARDS and mirrored < _DEGREES_OFF:
         return (
             f"{np.degrees(off):.0f} degrees off the cable next to it (median), and {np.degrees(mirrored):.0f} with the "

@@ -56,12 +56,12 @@ class CommandLimits:
         """
         if isinstance(twist, np.ndarray):
             twist, pose = np.asarray(twist, float), np.asarray(pose, float)
-            if not self._broken(twist, pose, duration).any():
-                return twist
         xp = twist.__array_namespace__()
         shares = xp.asarray(_SHARES, dtype=twist.dtype)
         # the grippers pass through the end points of all smaller shares
         broken = self._broken(shares.reshape(-1, *[1] * twist.ndim) * twist, pose, duration)
+        if isinstance(twist, np.ndarray) and not broken.any():
+            return twist
         last = xp.where(broken.any(axis=0), broken.argmax(axis=0), len(_SHARES)) - 1
         return shares[xp.maximum(last, 0)][..., None, None] * twist
 

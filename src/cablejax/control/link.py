@@ -110,6 +110,8 @@ class RobotLink:
                 accepted.append(cleaned)
             except (ValueError, TypeError, OverflowError) as error:
                 refused.append(str(error))
+                if state.newest is None:
+                    state = dataclasses.replace(state, reason=refused[-1])
         state, instant = self._decide(state)
         twist, since, until = state.command
         if now - state.offset >= until:
@@ -171,6 +173,11 @@ class RobotLink:
         state = dataclasses.replace(state, offset=min(state.offset, offset), unchanged=unchanged)
         share = np.isfinite(cleaned.keypoints).all(axis=1).mean()
         newer = last is None or stamp > last.time
+        if last is not None and state.status == Status.PAUSED and last.time - stamp > self.config.watchdog:
+            behind = (
+                f"The newest time stamp is {last.time - stamp:.3g} s before an earlier one: was the clock set back?"
+            )
+            state = dataclasses.replace(state, reason=behind)
         if newer and share >= self.config.min_seen and np.isfinite(pose).all():
             state = dataclasses.replace(state, newest=cleaned)
         elif state.newest is None:
@@ -196,7 +203,8 @@ class RobotLink:
         age = state.now - state.offset - newest.time
         if age > config.watchdog:
             if state.commands == 0:  # the first time stamps may have been wrong
-                return dataclasses.replace(self.init(), now=state.now), None
+                reason = f"No usable observation for {age:.2f} s, expected one every {config.watchdog:g} s or sooner."
+                return dataclasses.replace(self.init(), now=state.now, reason=reason), None
             if state.status == Status.PAUSED:
                 return state, None
             return self._held(state, Status.PAUSED, f"No usable observation for {age:.2f} s."), None
@@ -244,6 +252,7 @@ class RobotLink:
         )
         state = dataclasses.replace(
             state,
+            reason="" if allowed.any() or not twist.any() else "The limits leave nothing of the controller's command.",
             controller=controller,
             due=seen.time + config.interval,
             command=(allowed, seen.time, seen.time + config.interval + config.grace),

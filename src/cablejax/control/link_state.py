@@ -103,7 +103,7 @@ class Reply:
         since: time stamp from which it holds [s].
         until: time stamp at which the robot stops by itself unless another command has come [s].
         status: what the link does.
-        reason: of a pause or an end, or why the link still waits; else empty.
+        reason: of a pause or an end, why the link still waits, or that the limits leave no motion; else empty.
         accepted: observations of this step for the log, cleaned; none before the first usable one.
         refused: why the others were refused.
         settled: the cable has not been moved yet.
@@ -127,7 +127,7 @@ class LinkState:
 
     Attributes:
         status: see `Status`.
-        reason: of a pause or an end, or why the link still waits.
+        reason: see `Reply`.
         controller: the controller's state; None before its first command.
         newest: the newest usable observation.
         unchanged: keypoints as last seen to change, and the poses at that time.

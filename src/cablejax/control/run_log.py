@@ -58,6 +58,11 @@ class RunLog:
         if not self.events or self.events[-1][1:] != (reply.status, reply.reason):
             self.events.append((reply.since, str(reply.status), reply.reason))
 
+    @property
+    def recorded(self) -> bool:
+        """Whether there is any observation."""
+        return bool(self._samples)
+
     def refuse(self, reasons: Sequence[str]) -> None:
         """Takes note of messages that are no observations."""
         self.counts["received"] += len(reasons)

@@ -170,7 +170,13 @@ def make_controller(model: Model, target: Target, *, method: Method, solver: Sol
     """The controller for one target, with or without the online residual; a conditioned model adapts in any case.
 
     Bounds on motions scale with the cable's length, see `MPCConfig.for_length`.
+
+    Raises:
+        ValueError: the target is not of the model's cable, or there is no such method or solver.
     """
+    for name, value, known in (("method", method, get_args(Method)), ("solver", solver, tuple(SOLVERS))):
+        if value not in known:
+            raise ValueError(f"The {name} is {value!r}, expected one of {', '.join(known)}.")
     if len(target.keypoints) != model.config.n_keypoints:
         raise ValueError(
             f"Target {target.name!r} has {len(target.keypoints)} keypoints, expected {model.config.n_keypoints} as "

@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from cablejax.cable_length import BENT, bent_chord
 from cablejax.diagnose.clock import Samples, furthest_off, is_even, on_even_clock, usual_interval
 from cablejax.diagnose.log_faults import command_fault, tool_offset, without_frozen
 from cablejax.diagnose.noise import still
 from cablejax.gaplog import validate
+from cablejax.log_geometry import cable_fault
 from cablejax.types import GapLog
 
 # Samples are padded to a multiple of this, so that logs of nearly equal length share one compiled program.
@@ -20,7 +20,6 @@ _PADDING = 50
 _SHORTEST = 20
 # Of an episode of one sample.
 _ANY_INTERVAL = 0.1
-_FAR = 0.1
 # Share of gravity in the plane of the table beyond which it is none.
 _STEEP = 0.9
 
@@ -194,20 +193,6 @@ def _plausible(log: GapLog, recording: Recording) -> list[str]:
     if missing > 0.1:
         caveats.append(f"{missing:.0%} of the keypoints are missing: small or local effects may go unseen.")
     for gripper, end in ((0, 0), (1, -1)):
-        distance = np.linalg.norm(points[:, :, end] - recording.gripper_pose[:, :, gripper, :2], axis=-1)
-        away = np.nanmedian(np.where(valid, distance, np.nan)) if seen[:, :, end].any() else 0.0
-        if away > _FAR:
-            other = recording.gripper_pose[:, :, 1 - gripper, :2]
-            crossed = np.nanmedian(np.where(valid, np.linalg.norm(points[:, :, end] - other, axis=-1), np.nan))
-            raise DiagnosisError(
-                f"Keypoint {'0' if end == 0 else 'N - 1'} is {away:.2f} m from gripper {gripper}, expected it at the "
-                "gripper: "
-                + (
-                    f"it is at gripper {1 - gripper}. Exchange the grippers, or reverse the order of the keypoints."
-                    if crossed < _FAR
-                    else "are the keypoints and the poses in one frame, in metres, and of one cable?"
-                )
-            )
         caveats += tool_offset(points[:, :, end], recording.gripper_pose[:, :, gripper], gripper)
     length = log.meta["cable"]["length_m"]
     span = np.linalg.norm(recording.gripper_pose[:, :, 1, :2] - recording.gripper_pose[:, :, 0, :2], axis=-1)
@@ -216,15 +201,8 @@ def _plausible(log: GapLog, recording: Recording) -> list[str]:
             f"The grippers are up to {span[valid].max():.3f} m apart, more than the cable's length of {length} m: "
             "correct meta.cable.length_m."
         )
-    # chords are shorter than the cable between them, the more so the fewer there are
-    nominal = np.diff(log.meta["keypoint_arclength_m"])
-    chord = np.linalg.norm(np.diff(points, axis=2), axis=-1)
-    ratio = float(np.nanmedian(chord / nominal)) if np.isfinite(chord).any() else 1.0
-    if not bent_chord(points.shape[2]) - BENT <= ratio <= 1 + BENT:
-        raise DiagnosisError(
-            f"The keypoints lie {ratio:.2f} times as far apart as meta.keypoint_arclength_m says: correct the length, "
-            "the unit, or the marks."
-        )
+    if fault := cable_fault(log):
+        raise DiagnosisError(fault)
     gravity = np.asarray(log.meta["gravity_m_per_s2"], float)
     if np.linalg.norm(gravity[:2]) > _STEEP * np.linalg.norm(gravity):
         raise DiagnosisError(

@@ -13,6 +13,7 @@ from scipy.interpolate import CubicSpline
 from cablejax.cable import Cable
 from cablejax.cable_length import require_fitting_length
 from cablejax.gaplog import Episode, gap_log_from_episodes
+from cablejax.log_geometry import setup_fault
 from cablejax.recordings.poses import twists
 from cablejax.recordings.take import Take, typical_spacing
 from cablejax.types import GapLog
@@ -62,9 +63,15 @@ def gap_log_from_takes(takes: Sequence[Take], nominal: Nominal, *, source: str, 
         repairs: sentences on the changes, for the log's source.
 
     Raises:
-        ValueError: takes or values that make no gap log, or a cable shorter than its keypoints are apart.
+        ValueError: takes or values that make no gap log, a cable shorter than its keypoints are apart, or grippers that
+            do not hold it.
     """
     points = takes[0].keypoints.shape[1]
+    if takes[0].keypoints.shape[2] == 2 and nominal.friction_coefficient is None:
+        raise ValueError(
+            "The keypoints are in the plane, of a cable that lies on a table, and the table's friction coefficient is "
+            "not given: add it ([table] friction_coefficient), or give the third coordinate of a cable that hangs."
+        )
     arclength = measured_arclength(takes) if nominal.arclength is None else np.asarray(nominal.arclength, float)
     if arclength.shape != (points,) or arclength[0] != 0 or (np.diff(arclength) <= 0).any():
         raise ValueError(
@@ -107,6 +114,8 @@ def gap_log_from_takes(takes: Sequence[Take], nominal: Nominal, *, source: str, 
             **{name: [take.labels[name] for take in takes] for name in names},
         },
     )
+    if fault := setup_fault(log):
+        raise ValueError(fault)
     return dataclasses.replace(log, hold=None)
 
 

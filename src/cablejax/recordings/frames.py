@@ -63,11 +63,19 @@ class Frame:
 
 
 def into_frame(take: Take, frame: Frame) -> Take:
-    """The take in a right-handed frame with z up; planar takes stay as they are."""
-    if take.keypoints.shape[2] == 2:
-        return take
-    matrix = frame.matrix
+    """The take in a right-handed frame with z up; of a planar take, a left-handed one is mirrored.
+
+    Raises:
+        ValueError: an axis other than z is said to be up in the plane of a table.
+    """
     pose = take.gripper_pose
+    if take.keypoints.shape[2] == 2:
+        if frame.up != "z":
+            raise ValueError(f"The frame has {frame.up} up, but the keypoints have x and y only: leave `up` out.")
+        mirror = np.array([1.0, -1.0, -1.0]) if frame.handedness == "left" else np.ones(3)
+        pose = None if pose is None else pose * mirror
+        return dataclasses.replace(take, keypoints=take.keypoints * mirror[:2], gripper_pose=pose)
+    matrix = frame.matrix
     if pose is not None:
         # A reflection M turns a rotation about the axis a by an angle into that about -M a by the same angle.
         sign = np.linalg.det(matrix)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import dataclasses
 import io
 import itertools
 import math
@@ -23,7 +24,23 @@ SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 """Seconds in one of each unit of time."""
 
 _ANGLES = {"rad": 1.0, "deg": math.pi / 180}
-_EMPTY = ("", "nan", "NaN", "NAN", "null", "NA")
+_EMPTY = ("", "nan", "null", "none", "na", "n/a")
+_OTHER_DELIMITERS = {";": "semicolons", "\t": "tabs", "|": "bars"}
+
+
+@dataclasses.dataclass(frozen=True)
+class _Table:
+    """A csv file.
+
+    Attributes:
+        path: of the file.
+        columns: cells of each column, by its name in the header.
+        lines: at which each row is in the file.
+    """
+
+    path: pathlib.Path
+    columns: dict[str, list[str]]
+    lines: list[int]
 
 
 def import_csv(path: str | os.PathLike[str], layout: str | os.PathLike[str]) -> tuple[GapLog, list[str]]:
@@ -46,24 +63,29 @@ def import_csv(path: str | os.PathLike[str], layout: str | os.PathLike[str]) -> 
 
 
 def _takes(path: pathlib.Path, how: Layout) -> tuple[Take, ...]:
-    columns = _read(path)
+    table = _read(path)
     fields = how.place
     time_unit = fields.take("time_unit", str, "s, ms, us or ns", "s")
     if time_unit not in SECONDS:
         raise ValueError(f"{how.path}: [columns] time_unit is {time_unit!r}, expected one of {', '.join(SECONDS)}.")
-    time = _numbers(path, columns, [fields.take("time", str, "the name of a column")])[:, 0] * SECONDS[time_unit]
-    keypoints = _keypoints(path, columns, fields)
-    pose = _poses(path, columns, fields, keypoints.shape[2])
+    time = _numbers(table, [fields.take("time", str, "the name of a column")])[:, 0] * SECONDS[time_unit]
+    if np.isnan(time).any():
+        line = table.lines[int(np.isnan(time).argmax())]
+        raise ValueError(f"{path}, line {line}: the time is empty, expected one for each row.")
+    keypoints = _keypoints(table, fields)
+    pose = _poses(table, fields, keypoints.shape[2])
     episode = fields.take("episode", str, "the name of a column", None)
     motion = fields.take("motion", str, "the name of a column", None)
     fields.nothing_left()
-    episodes = ["1"] * len(time) if episode is None else _column(path, columns, episode)
-    motions = ["recorded"] * len(time) if motion is None else _column(path, columns, motion)
+    episodes = ["1"] * len(time) if episode is None else _column(table, episode)
+    motions = ["recorded"] * len(time) if motion is None else _column(table, motion)
     edges = [0, *(t for t in range(1, len(time)) if episodes[t] != episodes[t - 1]), len(time)]
     takes = []
     for a, b in itertools.pairwise(edges):
         if b - a < 2:
-            raise ValueError(f"{path}: episode {episodes[a]!r} has one row only (line {a + 2}), expected at least two.")
+            raise ValueError(
+                f"{path}: episode {episodes[a]!r} has one row only (line {table.lines[a]}), expected at least two."
+            )
         takes.append(
             Take(
                 name=episodes[a],
@@ -76,43 +98,53 @@ def _takes(path: pathlib.Path, how: Layout) -> tuple[Take, ...]:
     return tuple(takes)
 
 
-def _read(path: pathlib.Path) -> dict[str, list[str]]:
+def _read(path: pathlib.Path) -> _Table:
     try:
-        rows = [row for row in csv.reader(io.StringIO(read_text(path), newline="")) if row]
+        text = read_text(path)
+        reader = csv.reader(io.StringIO(text, newline=""))
+        rows = [(reader.line_num, row) for row in reader if row]
     except (csv.Error, FileNotFoundError) as error:
         raise ValueError(f"{path} could not be read as csv: {error}") from None
     if len(rows) < 3:
         raise ValueError(f"{path} has {len(rows)} rows, expected a header and at least two samples.")
-    header = [name.strip() for name in rows[0]]
+    header = [name.strip() for name in rows[0][1]]
+    for delimiter, name in _OTHER_DELIMITERS.items():
+        if len(header) == 1 and delimiter in header[0]:
+            raise ValueError(f"{path} has cells between {name}, expected commas, and points in numbers: write it so.")
+    if header[0].startswith("#"):
+        raise ValueError(f"{path} begins with a comment, expected the names of the columns in its first line.")
     if len(set(header)) < len(header):
         twice = next(name for name in header if header.count(name) > 1)
         raise ValueError(f"{path} has the column {twice!r} twice: give each column a name of its own.")
-    for line, row in enumerate(rows[1:], 2):
+    for line, row in rows[1:]:
         if len(row) != len(header):
             raise ValueError(f"{path}, line {line}: {len(row)} cells, expected {len(header)} as in the header.")
-    return {name: [row[index].strip() for row in rows[1:]] for index, name in enumerate(header)}
+    columns = {name: [row[index].strip() for _, row in rows[1:]] for index, name in enumerate(header)}
+    return _Table(path, columns, [line for line, _ in rows[1:]])
 
 
-def _column(path: pathlib.Path, columns: dict[str, list[str]], name: str) -> list[str]:
-    if name not in columns:
-        known = shown(", ".join(columns))
-        raise ValueError(f"{path} has no column {shown(name)}; it has {known}. Correct the name in the layout.")
-    return columns[name]
+def _column(table: _Table, name: str) -> list[str]:
+    if name not in table.columns:
+        known = shown(", ".join(table.columns))
+        raise ValueError(f"{table.path} has no column {shown(name)}; it has {known}. Correct the name in the layout.")
+    return table.columns[name]
 
 
-def _numbers(path: pathlib.Path, columns: dict[str, list[str]], names: list[str]) -> np.ndarray:
+def _numbers(table: _Table, names: list[str]) -> np.ndarray:
     """The named columns, shape [T, number of names]."""
-    values = np.empty((len(next(iter(columns.values()))), len(names)))
+    values = np.empty((len(table.lines), len(names)))
     for place, name in enumerate(names):
-        for row, cell in enumerate(_column(path, columns, name)):
+        for row, cell in enumerate(_column(table, name)):
             try:
-                values[row, place] = np.nan if cell in _EMPTY else float(cell)
+                # Python reads 1_0 as ten
+                values[row, place] = np.nan if cell.lower() in _EMPTY else float(cell.replace("_", "?"))
             except ValueError:
-                raise ValueError(f"{path}, line {row + 2}: column {shown(name)} is {shown(cell)}, no number.") from None
+                where = f"{table.path}, line {table.lines[row]}"
+                raise ValueError(f"{where}: column {shown(name)} is {shown(cell)}, no number.") from None
     return values
 
 
-def _keypoints(path: pathlib.Path, columns: dict[str, list[str]], fields: Fields) -> np.ndarray:
+def _keypoints(table: _Table, fields: Fields) -> np.ndarray:
     templates = fields.names("keypoint", (2, 3), "two or three names such as 'm{i}_x', where {i} counts the keypoints")
     first = fields.take("first", int, "the number of the first keypoint", 0)
     count = fields.take("count", int, "how many keypoints there are")
@@ -121,10 +153,10 @@ def _keypoints(path: pathlib.Path, columns: dict[str, list[str]], fields: Fields
     require(count, "keypoints", f"{fields.path}: [columns] count")
     require(abs(first), "count_from_zero", f"{fields.path}: [columns] first")
     names = [name.replace("{i}", str(i)) for i in range(first, first + count) for name in templates]
-    return _numbers(path, columns, names).reshape(-1, count, len(templates))
+    return _numbers(table, names).reshape(-1, count, len(templates))
 
 
-def _poses(path: pathlib.Path, columns: dict[str, list[str]], fields: Fields, dimension: int) -> np.ndarray | None:
+def _poses(table: _Table, fields: Fields, dimension: int) -> np.ndarray | None:
     width = 3 if dimension == 2 else 7
     what = "x, y and the angle" if dimension == 2 else "x, y, z, qw, qx, qy and qz"
     names = [fields.names(f"gripper_{q}", (width,), f"the {width} columns of {what}", None) for q in (0, 1)]
@@ -139,11 +171,11 @@ def _poses(path: pathlib.Path, columns: dict[str, list[str]], fields: Fields, di
             f"{fields.path}: [columns] names gripper_{1 - missing} but not gripper_{missing}: both grippers must be "
             "known. Leave both out to find them from two markers on each."
         )
-    pose = np.stack([_numbers(path, columns, row) for row in names], axis=1)
+    pose = np.stack([_numbers(table, row) for row in names], axis=1)
     if dimension == 2:
         pose[..., 2] *= _ANGLES[unit]
         return pose
-    return unit_quaternions(pose, str(path))
+    return unit_quaternions(pose, str(table.path))
 
 
 def unit_quaternions(pose: np.ndarray, where: str) -> np.ndarray:
@@ -155,8 +187,9 @@ def unit_quaternions(pose: np.ndarray, where: str) -> np.ndarray:
     norm = np.linalg.norm(pose[..., 3:], axis=-1, keepdims=True)
     if (np.abs(norm[np.isfinite(norm)] - 1) > 0.02).any():
         sample = int(np.argmax(np.nan_to_num(np.abs(norm - 1)).max(axis=(1, 2))))
+        length = float(norm[sample].ravel()[np.nan_to_num(np.abs(norm[sample] - 1)).argmax()])
         raise ValueError(
-            f"{where}: sample {sample} has a gripper quaternion of length {float(np.nanmax(norm[sample])):.3g}, "
+            f"{where}: sample {sample} has a gripper quaternion of length {length:.3g}, "
             "expected 1: check the columns of qw, qx, qy and qz."
         )
     return np.concatenate([pose[..., :3], pose[..., 3:] / norm], axis=-1)

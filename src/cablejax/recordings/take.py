@@ -40,8 +40,8 @@ class Take:
         if not np.isfinite(self.time).all() or (np.diff(self.time) <= 0).any():
             row = int(np.argmax(~(np.diff(self.time) > 0))) + 1
             raise ValueError(
-                f"Take {self.name}: its times do not increase (sample {row}: {self.time[row]!r} after "
-                f"{self.time[row - 1]!r}): sort the samples and leave out what is there twice."
+                f"Take {self.name}: its times do not increase (sample {row}: {self.time[row]:.17g} after "
+                f"{self.time[row - 1]:.17g}): sort the samples and leave out what is there twice."
             )
         for name, values in (("keypoints", self.keypoints), ("gripper_pose", self.gripper_pose)):
             largest = 0.0 if values is None else float(np.nanmax(np.abs(values), initial=0.0))

@@ -56,7 +56,8 @@ def serve(
         with socket.create_server((host, port)) as listening:
             ready(listening.getsockname()[1])
             connection, _ = listening.accept()
-        with connection, contextlib.suppress(ConnectionError):  # a robot that has gone stops by itself
+        # a robot that has gone, or does not read what is sent, stops by itself
+        with connection, contextlib.suppress(ConnectionError, TimeoutError):
             connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             connection.settimeout(None if simulated_clock else TICK)
             _converse(run, connection, simulated_clock)
@@ -124,7 +125,7 @@ def _message(line: bytes, simulated_clock: bool) -> Observation | float:
     require(content["time"], "stamp", '"time"', "Is it in seconds?")
     try:
         keypoints, pose = (
-            np.array([[np.nan] * width if row is None else row for row in content[name]], float)
+            np.array([[np.nan] * width if row is None else [_number(v) for v in row] for row in content[name]], float)
             for name, width in (("keypoints", 2), ("gripper_pose", 3))
         )
     except (TypeError, ValueError, OverflowError):
@@ -132,6 +133,12 @@ def _message(line: bytes, simulated_clock: bool) -> Observation | float:
             'Expected "keypoints" as rows [x, y] and "gripper_pose" as rows [x, y, theta], null where unknown.'
         ) from None
     return Observation(keypoints, pose, float(content["time"]))
+
+
+def _number(value: object) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise TypeError("no number")
+    return float(value)
 
 
 def reply_line(reply: Reply, refused: Sequence[str] = ()) -> bytes:

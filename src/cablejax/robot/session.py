@@ -2,16 +2,23 @@
 
 from __future__ import annotations
 
+import itertools
+import os
 import pathlib
 from collections.abc import Sequence
+
+import numpy as np
 
 from cablejax.cable import Cable
 from cablejax.control.link import RobotLink
 from cablejax.control.link_state import Reply, Status
 from cablejax.control.run import ClosedLoopRun
-from cablejax.control.run_log import RunLog
+from cablejax.control.run_log import RunLog, motion
 from cablejax.gaplog import GapLogError, write_gap_log
+from cablejax.log_geometry import setup_fault
 from cablejax.simulate.table_plant import Observation
+from cablejax.types import GapLog
+from cablejax.whole_file import whole_file
 
 
 class RobotRun:
@@ -24,11 +31,17 @@ class RobotRun:
         source: of the log, free text.
 
     Raises:
-        ValueError: the controller does not fit its target.
+        ValueError: the controller does not fit its target, or the path does not end in `.npz`.
         FileExistsError: there is such a file.
+        OSError: its folder cannot be written to.
     """
 
     def __init__(self, link: RobotLink, cable: Cable, path: pathlib.Path, source: str = "robot"):
+        if path.suffix != ".npz":
+            raise ValueError(f"The log's path is {path}, expected one that ends in .npz.")
+        path.parent.mkdir(parents=True, exist_ok=True)
+        if not os.access(path.parent, os.W_OK):
+            raise PermissionError(f"{path.parent} cannot be written to: choose another folder for the run's log.")
         if path.exists():
             raise FileExistsError(f"{path} exists: give the log of this run another name.")
         self.link, self.cable, self.path, self.source = link, cable, path, source
@@ -48,9 +61,11 @@ class RobotRun:
         self.log.add(reply)
         if first and reply.status == Status.SHAPING:
             try:
-                self.log.gap_log(self.link.target, self.cable, self.source)
+                fault = setup_fault(self._recorded())
             except GapLogError as error:
-                return self.stop(now, f"What was observed so far is not a cable between these grippers: {error}")
+                fault = str(error)
+            if fault:
+                return self.stop(now, f"What was observed so far is not a cable between these grippers: {fault}")
         return reply
 
     def stop(self, now: float, reason: str) -> Reply:
@@ -59,14 +74,28 @@ class RobotRun:
         return self.exchange(now)
 
     def finish(self) -> pathlib.Path:
-        """Writes the gap log and returns its path.
+        """Writes the gap log and returns its path: a free one next to it if that of this run has been taken meanwhile.
 
         Raises:
-            GapLogError: nothing usable was observed, or the recording violates the format.
+            GapLogError: nothing usable was observed; or the recording violates the format, and its samples are written.
         """
-        if self._state.status == Status.WAITING:
+        if not self.log.recorded:
             raise GapLogError(f"There is no log: nothing usable was observed. {self._state.reason}".strip())
-        return write_gap_log(self.path, self.log.gap_log(self.link.target, self.cable, self.source))
+        path, count = self.path, itertools.count(2)
+        while path.exists():
+            path = self.path.with_stem(f"{self.path.stem}_{next(count)}")
+        try:
+            return write_gap_log(path, self._recorded())
+        except GapLogError as error:
+            kept = path.with_suffix(".raw.npz")
+            pieces = enumerate(self.log.episodes(motion(self.link.target)))
+            arrays = {f"{name}_{k}": array for k, (_, episode) in pieces for name, array in vars(episode).items()}
+            with whole_file(kept) as stream:
+                np.savez_compressed(stream, allow_pickle=False, **arrays)
+            raise GapLogError(f"The recording is no gap log, and its samples are kept in {kept}: {error}") from None
+
+    def _recorded(self) -> GapLog:
+        return self.log.gap_log(self.link.target, self.cable, self.source)
 
     def result(self) -> ClosedLoopRun:
         """The run for reports: its error and commands at the control instants. Raises ValueError without any."""
