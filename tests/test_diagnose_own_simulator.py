@@ -280,6 +280,14 @@ BAD = {
     "no episodes": (lambda: Line(X), {}, np.zeros((3, 4)), r"\[E, T, \.\.\.\]"),
     "nothing seen": (lambda: Line(X), {}, np.full((6, 200, 2), np.nan), "at least one observed"),
     "interval": (lambda: Line(X), {"interval": 0.0}, None, "interval is 0.0 s"),
+    "an interval too many": (lambda: Line(X), {"interval": np.full(7, 0.1)}, None, "one for each of 6"),
+    "infinite": (lambda: Line(X), {}, np.full((6, 200, 2), np.inf), "observed has infinite values"),
+    "a list": (
+        lambda: broken(predict=lambda self, ones, episodes: Line.predict(self, ones, episodes).tolist()),
+        {},
+        None,
+        "predict gave a list, expected a NumPy array",
+    ),
     "noise of another shape": (lambda: Line(X), {"noise": np.ones(3)}, None, "does not broadcast"),
     "no noise": (lambda: Line(X), {"noise": 0.0}, None, "no measurement is exact"),
     "motion": (lambda: Line(X), {"motion": np.zeros(5, int)}, None, "one number for each of 6 episodes"),
@@ -313,6 +321,18 @@ def test_what_does_not_keep_to_the_protocol_is_refused(case):
     options = {"noise": 1e-3, "interval": 0.1, **options}
     with pytest.raises(ValueError, match=message):
         diagnose_simulator(build(), line() if seen is None else seen, **options)
+
+
+@pytest.mark.parametrize("baseline", [np.nan, -1.0])
+def test_a_calibration_of_nonsense_is_refused(baseline):
+    with pytest.raises(ValueError, match=r"Calibration.baseline is .*, expected a finite number"):
+        Calibration(baseline=baseline)
+
+
+def test_names_of_parameters_are_there_once():
+    twice = Line.effects[0].parameters[:1] * 2
+    with pytest.raises(ValueError, match="every one once"):
+        Effect(name="odd", parameters=twice, null=(0.0, 0.0))
 
 
 def test_an_effect_has_a_null_for_each_parameter():

@@ -67,6 +67,15 @@ def test_the_same_seed_is_the_same_episode_and_another_is_not():
     assert names == {"U", "S", "Z"}
 
 
+def test_cables_side_by_side_differ_from_run_to_run_unless_they_are_seeded():
+    runs = [ShapeCableVectorEnv(3, CONFIG) for _ in range(2)]
+    first = [env.reset()[0]["keypoints"] for env in runs]
+    assert np.abs(first[0] - first[1]).min(axis=(1, 2)).max() > 0
+    np.testing.assert_array_equal(*(env.reset(seed=np.int64(4))[0]["keypoints"] for env in runs))
+    with pytest.raises(ValueError, match="2 seeds, expected one number, or one for each of 3"):
+        runs[0].reset(seed=[1, 2])
+
+
 def test_effects_targets_and_random_parameters_change_the_episode():
     actions, env = np.full((4, 2, 3), [[1.0, 0.3, -1.0], [-1.0, 0.3, 1.0]]), ShapeCableEnv(clean())
     plain = rollout(env, actions, target="S")

@@ -12,6 +12,7 @@ import pytest
 import scipy.optimize
 
 from cablejax.cable import Cable, Discretisation
+from cablejax.effects.arms import delayed
 from cablejax.effects.given import EFFECTS, GivenEffect, parse_effect, with_effects
 from cablejax.effects.physics import Physics, nominal_physics, normal_gravity
 from cablejax.simulate import ENGINES, ChainEngine, MjxEngine, check_effects
@@ -321,6 +322,30 @@ def programs(request):
         return jax.vjp(lambda physics, twist: final(physics, state, twist), physics, twist)[1](cotangent)
 
     return engine, jax.jit(final), push, pull
+
+
+def test_a_rollout_is_differentiable_within_programs_of_the_callers():
+    engine = ChainEngine(Discretisation(n_links=5, timestep=0.05))
+    physics, state = nominal_physics(engine.config), engine.initial_state(np.array([[-0.35, 0, 1], [0.35, 0, -1]]))
+
+    def moved(twist):
+        return jnp.sum(engine.rollout(physics, state, twist, 0.1)[1].keypoints ** 2)
+
+    twist = jnp.full((2, 2, 3), 0.01)
+    slopes = [jax.grad(moved)(twist), jax.jit(jax.grad(moved))(twist), jax.jacfwd(moved)(twist)]
+    for slope in slopes[1:]:
+        np.testing.assert_allclose(slope, slopes[0], rtol=1e-3, atol=1e-5)
+    assert np.abs(slopes[0]).max() > 0.01
+
+
+@pytest.mark.parametrize("lag", [0.0, 0.1, 0.13])
+def test_the_derivative_by_a_lag_is_that_of_becoming_later(lag):
+    values = jnp.array(np.random.default_rng(0).normal(size=(6, 2)))
+    slope = jax.jacfwd(lambda time: delayed(values, time / 0.1))(lag)
+    step = 1e-3
+    np.testing.assert_allclose(
+        slope, (delayed(values, (lag + step) / 0.1) - delayed(values, lag / 0.1)) / step, rtol=1e-2, atol=2e-2
+    )
 
 
 @pytest.mark.slow

@@ -191,10 +191,10 @@ def about(job: Job) -> str:
     changes = _changes(believed, plant)
     if changes:
         sentences.append(f"The plant has {listed(changes)}.")
-    always = [f"{EFFECTS[e.name]} ({e})" for e in plant.effects if e.lasting]
+    always = [f"{EFFECTS.get(e.name, e.name)} ({e})" for e in plant.effects if e.lasting]
     if always:
         sentences.append(f"Staged in the plant: {listed(always)}.")
-    sentences += [f"{_when(e)}: {EFFECTS[e.name]} ({e})." for e in plant.effects if not e.lasting]
+    sentences += [f"{_when(e)}: {EFFECTS.get(e.name, e.name)} ({e})." for e in plant.effects if not e.lasting]
     if not changes and not plant.effects:
         sentences.append("The plant has the same cable.")
     sentences.append(

@@ -97,6 +97,11 @@ class Calibration:
     widening: float = 1.5
     max_effects: int = 3
 
+    def __post_init__(self):
+        for name, value in vars(self).items():
+            if not (np.isfinite(value) and value >= 0):
+                raise ValueError(f"Calibration.{name} is {value}, expected a finite number that is not negative.")
+
     def temper(self, gap: Float[np.ndarray, "E"], noise: float) -> Float[np.ndarray, "E"]:
         """See the module's docstring; `gap` of each episode and `noise` in metres per coordinate."""
         return 1.0 + self.correlated_samples * (self.baseline**2 + (self.law_error * gap) ** 2) / noise**2

@@ -39,7 +39,9 @@ def checked_nominal(
         if np.allclose(null.values()[0], effect.null):
             nulls.append(null)
     everything = np.arange(len(observed))
-    predicted = np.asarray(simulator.predict([explanation(), *nulls], everything), float)
+    predicted = simulator.predict([explanation(), *nulls], everything)
+    if not isinstance(predicted, np.ndarray):
+        raise ValueError(f"predict gave a {type(predicted).__name__}, expected a NumPy array: np.asarray(...).")
     expected = (1 + len(nulls), *observed.shape)
     if predicted.shape != expected:
         raise ValueError(f"predict gave an array of shape {predicted.shape}, expected {expected}: [X, E, T, ...].")
@@ -73,12 +75,17 @@ def recorded_arrays(observed: ArrayLike, interval: ArrayLike) -> tuple[np.ndarra
         ValueError: arrays that are no recording.
     """
     observed = np.asarray(observed, float)
+    if np.isinf(observed).any():
+        raise ValueError("observed has infinite values, expected numbers, and NaN where nothing was observed.")
     if observed.ndim < 3 or not np.isfinite(observed).any():
         raise ValueError(
             f"observed has shape {observed.shape} and {np.isfinite(observed).sum()} finite values, expected episodes, "
             "samples and at least one observed coordinate: [E, T, ...]."
         )
-    every = np.broadcast_to(np.asarray(interval, float), len(observed))
+    every = np.asarray(interval, float)
+    if every.shape not in ((), (len(observed),)):
+        raise ValueError(f"interval has shape {every.shape}, expected one number, or one for each of {len(observed)}.")
+    every = np.broadcast_to(every, len(observed))
     if not (np.isfinite(every) & (every > 0)).all():
         raise ValueError(f"interval is {interval} s, expected positive numbers.")
     return observed, every

@@ -43,6 +43,17 @@ class ActuationLag(CableEffect):
     null = (0.0, 0.0)
     amplitude = 0
 
+    def given(self, parameters, config):
+        """See `CableEffect`; the delay is a part of the time, and an estimate may exceed it a little.
+
+        Raises:
+            ValueError: it is longer by more than a tenth.
+        """
+        (total, delay), variant = super().given(parameters, config)
+        if delay > 1.1 * total:
+            raise ValueError(f"{self.name}: delay_s is {delay:g}, expected at most time_s, {total:g} s in all.")
+        return (max(total, delay), delay), variant
+
     def apply(self, physics, values, variant, config):
         """Adds the pure delay [s], and the rest of the time as the first-order lag's time constant [s]."""
         total, delay = values
@@ -122,10 +133,14 @@ def lagged(poses: Any, interval: Any, delay: Any, slow: Any) -> Any:
 
 
 def delayed(values: Any, samples: Any) -> Any:
-    """Values [T, ...] so many samples late, linear between two samples; the first holds before. NumPy or JAX arrays."""
+    """Values [T, ...] so many samples late, linear between two samples; the first holds before. NumPy or JAX arrays.
+
+    At whole samples its derivative is that of becoming later, the only one that there is for values without delay.
+    """
     xp, n = values.__array_namespace__(), len(values)
-    back = xp.clip(np.arange(n) - samples, 0.0, n - 1.0)
-    before = xp.clip(xp.floor(back).astype(int), 0, n - 2)
+    index = np.arange(n)
+    back = xp.where(index > samples, index - samples, 0.0)
+    before = xp.clip(xp.ceil(back).astype(int) - 1, 0, n - 2)
     t = (back - before).reshape(-1, *(1,) * (values.ndim - 1)).astype(values.dtype)
     return (1 - t) * values[before] + t * values[before + 1]
 

@@ -36,10 +36,12 @@ class Parameter:
     difference: float = 0.03
 
     def __post_init__(self):
-        if not (self.low <= self.centre <= self.high and self.scale > 0 and (not self.log or self.low > 0)):
+        ordered = self.low <= self.centre <= self.high and (not self.log or self.low > 0)
+        if not (ordered and self.scale > 0 and self.difference > 0):
             raise ValueError(
-                f"Parameter {self.name!r}: expected low <= centre <= high and scale > 0, and low > 0 if log; got low "
-                f"{self.low}, centre {self.centre}, high {self.high}, scale {self.scale}, log {self.log}."
+                f"Parameter {self.name!r}: expected low <= centre <= high, scale and difference > 0, and low > 0 if "
+                f"log; got low {self.low}, centre {self.centre}, high {self.high}, scale {self.scale}, difference "
+                f"{self.difference}, log {self.log}."
             )
 
     def value(self, z: Any) -> Any:
@@ -89,6 +91,9 @@ class Effect:
     repeatable: bool = False
 
     def __post_init__(self):
+        names = [parameter.name for parameter in self.parameters]
+        if not self.name or len(set(names)) < len(names):
+            raise ValueError(f"Effect {self.name!r} has the parameters {names}, expected a name, and every one once.")
         if len(self.parameters) != len(self.null) or not self.parameters:
             raise ValueError(
                 f"Effect {self.name!r} has {len(self.parameters)} parameters and {len(self.null)} null values, "

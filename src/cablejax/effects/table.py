@@ -139,6 +139,8 @@ class GravityTilt(CableEffect):
         Parameter("sine_y", "", -0.9, 0.9, 0.0, 0.15),
     )
     null = (0.0, 0.0)
+    steepest = 1.1
+    """Slope of which gravity's part in either direction is within the bounds [rad]."""
 
     def apply(self, physics, values, variant, config):
         """Adds gravity's component in the plane of the table [m/s^2]."""
@@ -157,7 +159,10 @@ class GravityTilt(CableEffect):
         return {"angle_rad": (float(np.arcsin(sine)), "rad"), "direction_rad": (float(np.arctan2(y, x)), "rad")}
 
     def _from_reported(self, parameters, config):
-        sine, direction = np.sin(parameters["angle_rad"]), parameters["direction_rad"]
+        angle, direction = parameters["angle_rad"], parameters["direction_rad"]
+        if not 0 <= angle <= self.steepest:
+            raise ValueError(f"{self.name}: angle_rad is {angle:g}, expected 0 to {self.steepest:g} rad.")
+        sine = np.sin(angle)
         return {"sine_x": sine * np.cos(direction), "sine_y": sine * np.sin(direction)}
 
 

@@ -94,12 +94,18 @@ class ShapeCableVectorEnv(gymnasium.vector.VectorEnv):
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self.cables = Cables(config, num_envs)
-        self._randoms = [np.random.default_rng(row) for row in range(num_envs)]
+        self._randoms = [np_random()[0] for _ in range(num_envs)]
         self._ended = np.zeros(num_envs, bool)
 
     def reset(self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None):
-        """New cables everywhere; environment i has the seed `seed + i`. The options are those of `Cables.reset`."""
-        seeds = [seed + row for row in range(self.num_envs)] if isinstance(seed, int) else seed
+        """New cables everywhere; environment i has the seed `seed + i`. The options are those of `Cables.reset`.
+
+        Raises:
+            ValueError: another number of seeds than of environments, or see `Cables.reset`.
+        """
+        seeds = seed if seed is None or np.ndim(seed) else [int(seed) + row for row in range(self.num_envs)]  # pyright: ignore[reportArgumentType]
+        if seeds is not None and len(seeds) != self.num_envs:
+            raise ValueError(f"There are {len(seeds)} seeds, expected one number, or one for each of {self.num_envs}.")
         for row, own in enumerate(seeds or []):
             if own is not None:
                 self._randoms[row] = np_random(own)[0]

@@ -129,6 +129,8 @@ def _warn_if_taut(engine: Engine, physics: Physics, state: CableState, twist: An
     if any(isinstance(x, jax.core.Tracer) for x in inputs) or any(np.any(np.asarray(x) != 0) for x in inputs[2:]):
         return
     pose, moved = (np.asarray(x)[..., :3] for x in inputs[:2])
+    if not moved.size:
+        return
     chord = (pose[..., 1, :] - pose[..., 0, :])[..., None, :] + interval * np.cumsum(
         moved[..., 1, :] - moved[..., 0, :], axis=-2
     )
@@ -163,8 +165,21 @@ def _parts(engine: Engine, physics: Physics, interval: float) -> int:
 
 
 def compiled_rollout(engine: Any, physics: Physics, batch_axes: int, interval: float) -> Callable[..., Any]:
-    """`engine.unroll` vmapped and jitted, for physics like this one: contacts cost nothing where no obstacle is."""
-    return _compiled(engine, batch_axes, interval, may_touch(physics))
+    """`engine.unroll` vmapped and jitted, for physics like this one: contacts cost nothing where no obstacle is.
+
+    Within a caller's `jax.jit` or `jax.grad` it is part of that program, whose compiler options then hold.
+    """
+    function, compiled = _compiled(engine, batch_axes, interval, may_touch(physics))
+
+    def run(physics, state, twist):
+        try:
+            return compiled(physics, state, twist)
+        except ValueError as error:
+            if "can only be passed to top-level" not in str(error):
+                raise
+            return function(physics, state, twist)
+
+    return run
 
 
 @functools.lru_cache(maxsize=32)
@@ -174,4 +189,4 @@ def _compiled(engine: Any, batch_axes: int, interval: float, touching: bool):
 
     for _ in range(batch_axes):
         function = jax.vmap(function)
-    return jax.jit(function, compiler_options=compiler_options())
+    return function, jax.jit(function, compiler_options=compiler_options())
