@@ -280,7 +280,7 @@ def acting(dtype) -> Physics:
         "hardening": 0.4,
         "hysteresis_moment": 0.004,
         "hysteresis_curvature": 0.7,
-        "static_excess": 0.5,
+        "static_excess": 0.3,
         "patch_centre": np.array([0.05, 0.1]),
         "patch_radius": 0.1,
         "patch_friction": 0.1,
@@ -395,7 +395,8 @@ def test_derivatives_in_every_hook(programs, start):
         wrong = {n: v for n, v in found.items() if v[0] > 1e-5 * v[1] + 1e-10 or v[2] > 1e-7 * (v[1] + 1e-3)}
         assert not wrong, wrong
         if start == "moving":
-            silent = [name for name, value in found.items() if value[1] < 1e-7]
+            # ten times what the comparison resolves
+            silent = [name for name, value in found.items() if value[1] < 1e-9]
             assert not silent, silent
 
 
