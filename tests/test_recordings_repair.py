@@ -208,6 +208,21 @@ def test_a_gripper_not_seen_for_a_moment_is_filled_in():
     assert np.linalg.norm(parts[0].keypoints - right, axis=-1).max() < 2e-3
 
 
+@pytest.mark.parametrize(("interval", "missing", "parts"), [(0.05, 1, 1), (0.05, 2, 2), (0.1, 1, 1), (0.2, 1, 2)])
+def test_on_a_table_one_lost_frame_is_filled_in(interval, missing, parts):
+    samples = 60
+    points = np.stack([np.linspace(0, 1, 5), np.zeros(5)], axis=1) + 0.001 * np.arange(samples)[:, None, None]
+    pose = np.stack([np.append(points[:, end], np.zeros((samples, 1)), axis=1) for end in (0, -1)], axis=1)
+    kept = np.delete(np.arange(samples), np.arange(30, 30 + missing))
+    takes, _ = cut_at_gaps((Take("1", interval * kept, points[kept], pose[kept]),), None)
+    assert len(takes) == parts
+    pose[30 : 30 + missing] = np.nan
+    takes, _ = cut_at_gaps((Take("1", interval * np.arange(samples), points, pose),), None)
+    assert len(takes) == parts
+    if parts == 1:
+        np.testing.assert_allclose(takes[0].gripper_pose[30, :, :2], points[30, [0, -1]], atol=1e-12)
+
+
 def test_keypoints_between_the_grippers_may_be_missing():
     points = swinging()
     points[20:180, 3:5] = np.nan

@@ -19,6 +19,9 @@ from cablejax.recordings.take import Take, median_step
 FILLED = 0.05
 """Longest gap [s] in the grippers' poses that is interpolated linearly."""
 
+FILLED_ON_TABLE = 0.21
+"""The same where a single sample is missing of a cable on a table, whose grippers move slowly [s]."""
+
 SHORTEST_SAMPLES, SHORTEST = 10, 0.5
 """A take of fewer samples, or shorter [s], is left out after cutting."""
 
@@ -53,7 +56,7 @@ def cut_at_gaps(takes: tuple[Take, ...], on_grippers: tuple[int, ...] | None) ->
         if filled:
             reports.append(
                 f"Take {take.name}: {filled} samples without one of the grippers were filled in by straight lines: "
-                f"none of these gaps is longer than {FILLED:g} s."
+                f"none of these gaps is longer than {_fillable(take):.2g} s."
             )
         known = _known(take, on_grippers)
         breaks, reasons = _breaks(take)
@@ -68,7 +71,7 @@ def cut_at_gaps(takes: tuple[Take, ...], on_grippers: tuple[int, ...] | None) ->
         if not known.all():
             reports.append(
                 f"Take {take.name}: in {int((~known).sum())} samples one of the grippers is not seen, for more than "
-                f"{FILLED:g} s; they were left out."
+                f"{_fillable(take):.2g} s; they were left out."
             )
         if lost := sum(b - a for a, b in spans) - sum(b - a for a, b in kept):
             reports.append(
@@ -105,6 +108,13 @@ def _require_grippers(takes: tuple[Take, ...], on_grippers: tuple[int, ...] | No
                 f"Gripper {gripper} {what}. Both ends must be known: name the columns or topic of its pose, or two "
                 "markers that are on it."
             )
+
+
+def _fillable(take: Take) -> float:
+    """Longest gap that is filled [s]."""
+    usual = float(np.median(np.diff(take.time)))
+    one_missing = min(2.1 * usual, FILLED_ON_TABLE) if take.keypoints.shape[2] == 2 else 0.0
+    return max(FILLED + 1e-9, one_missing)
 
 
 def _long_enough(time: np.ndarray) -> bool:
@@ -145,9 +155,9 @@ def _without_repeats(take: Take, reports: list[str]) -> Take:
 def _filled(take: Take, on_grippers: tuple[int, ...] | None) -> tuple[Take, int]:
     """Short gaps in what is known of the grippers, filled in; and how many samples that were."""
     known = _known(take, on_grippers)
-    few = np.zeros(len(known), bool)
+    few, longest = np.zeros(len(known), bool), _fillable(take)
     for a, b in stretches(~known):
-        if a > 0 and b < len(known) and take.time[b] - take.time[a - 1] <= FILLED + 1e-9:
+        if a > 0 and b < len(known) and take.time[b] - take.time[a - 1] <= longest:
             few[a:b] = True
     if not few.any():
         return take, 0
@@ -174,7 +184,7 @@ def _breaks(take: Take) -> tuple[list[int], list[str]]:
     usual = float(np.median(interval))
     late = interval > 1.5 * usual
     breaks, reports = [], []
-    for t in np.flatnonzero(late & (interval > FILLED)):
+    for t in np.flatnonzero(late & (interval > _fillable(take))):
         breaks.append(int(t) + 1)
         reports.append(
             f"Take {take.name}: no samples for {interval[t]:.3g} s after sample {t}, where {usual:.3g} s is usual; the "
