@@ -92,10 +92,11 @@ def test_gain_and_lag_are_told_together():
     assert result.effects["actuation_lag"][0] == pytest.approx(0.25, abs=0.02)
 
 
-def test_backlash_is_seen_but_has_no_name():
-    result = told(backlash=0.012)
-    assert result.deviates and not result.explained(2e-4)
-    assert with_arms(NOTHING, result, Calibration()).verdict == "unknown"
+@pytest.mark.parametrize(("backlash", "verdict"), [(0.012, "unknown"), (0.001, "none")])
+def test_backlash_is_seen_but_has_no_name(backlash, verdict):
+    result = told(backlash=backlash)
+    assert result.deviates and not result.effects
+    assert with_arms(NOTHING, result, Calibration()).verdict == verdict
 
 
 @pytest.mark.parametrize("faults", [{}, {"gain": 1.08}], ids=["none", "gain"])

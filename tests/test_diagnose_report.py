@@ -14,6 +14,7 @@ from PIL import Image
 import spatial_cases
 from cablejax.commands.cable import find_cable
 from cablejax.diagnose.diagnosis import CableDiagnosis, Gap, NamedEffect, NextMotion, ParameterEstimate, Ranked
+from cablejax.diagnose.judgement import verdict_sentence
 from cablejax.diagnose.verdict_json import verdict_json, write_verdict
 from cablejax.diagnose.where import localise
 from cablejax.gaplog import write_gap_log
@@ -422,3 +423,12 @@ def test_places_in_words():
     assert effect_place(CURVED) == "0.20 to 0.42 m from gripper 0"
     held = dataclasses.replace(CURVED, parameters={"gripper": ParameterEstimate(1, None, "")})
     assert effect_place(held) == "at gripper 1"
+
+
+@pytest.mark.parametrize(("shrinkage", "confirmed"), [(None, True), (0.9, True), (0.01, False), (-0.3, False)])
+def test_a_name_that_unseen_motions_do_not_confirm_is_said_to_be_fitted(shrinkage, confirmed):
+    effect = NamedEffect("friction_patch", 0.99, {}, {})
+    said = verdict_sentence("named", [effect], (), (), 0.93, shrinkage)
+    share = 93 if shrinkage is None or not confirmed else 90
+    assert said.startswith(f"The gap comes from friction patch, which explains {share} % of it.")
+    assert ("On motions left out of the fit" in said) == (not confirmed)

@@ -28,8 +28,9 @@ _ENCODER_NOISE = 5e-5
 _NEGLIGIBLE = 2e-4
 # An effect explains the arms' deviation if it leaves no more than this share of it, root mean square.
 _EXPLAINED = 0.25
-# An effect that leaves more of it than this is not named.
-_TELLING = 0.7
+# An effect that leaves more of it than this is not named: gains and lags leave a hundredth, a backlash that looks like
+# a lag two thirds.
+_TELLING = 0.5
 ARMS = ("actuation_gain", "actuation_lag")
 """Names of the effects of the arms."""
 _GAIN, _LAG = ARMS

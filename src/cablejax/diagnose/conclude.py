@@ -290,7 +290,11 @@ def sentence(conclusion: Conclusion, shrinkage: float | None) -> str:
         )
     if conclusion.undecided:
         return "There is a gap, but too little of it in this log to name its cause: record more motions."
-    explained = conclusion.explained if shrinkage is None else shrinkage
     return verdict_sentence(
-        conclusion.verdict, conclusion.effects, conclusion.equivalent, conclusion.ranking, explained
+        conclusion.verdict,
+        conclusion.effects,
+        conclusion.equivalent,
+        conclusion.ranking,
+        conclusion.explained,
+        shrinkage,
     )

@@ -7,6 +7,9 @@ from collections.abc import Sequence
 
 from cablejax.diagnose.diagnosis import NamedEffect, Ranked, Verdict
 
+_CONFIRMED = 0.5
+"""Share of the squared gap that has to go away on motions left out of the fit."""
+
 
 def judged(*, resolvable: bool, telling: bool, complete: bool, alike: bool) -> Verdict:
     """The verdict on an explanation of a gap.
@@ -64,6 +67,7 @@ def verdict_sentence(
     equivalent: Sequence[Sequence[str]],
     ranking: Sequence[Ranked],
     explained: float,
+    shrinkage: float | None = None,
 ) -> str:
     """The verdict in words.
 
@@ -73,8 +77,11 @@ def verdict_sentence(
         equivalent: sets of effects that are indistinguishable on the log.
         ranking: every effect tried.
         explained: share of the squared gap that the best explanation takes away; a negative one reads as none.
+        shrinkage: the same on motions left out of the fit; None where none could be.
     """
-    share = f"{100 * max(explained, 0.0):.0f} %"
+    # what acts in one motion alone cannot be found from the others
+    fitted_only = verdict in ("named", "ambiguous") and shrinkage is not None and shrinkage < _CONFIRMED
+    share = f"{100 * max(explained if shrinkage is None or fitted_only else shrinkage, 0.0):.0f} %"
     names = listed([_words(e.name) for e in effects])
     split = [look_alikes(group, effects, ranking) for group in equivalent]
     alike = "; ".join(listed([*map(_words, likely)], "or") for likely, _ in split if len(likely) > 1)
@@ -83,15 +90,22 @@ def verdict_sentence(
     rivals = f" (this log cannot tell apart: {alike})" if alike else ""
     too = f" {faint[:1].upper()}{faint[1:]} would leave as little, at a probability below 1 %." if faint else ""
     either = f" or a look-alike, which this log cannot tell apart: {alike}" if alike else ""
-    return {
+    said = {
         "none": "The simulator explains this log within what the noise and its own resolution allow.",
         "named": f"The gap comes from {names}, {explains} {share} of it.",
         "ambiguous": f"The gap comes from {names}{either}.{too}",
         "named+unknown": (
             f"Part of the gap, {share}, looks like {names}{rivals}; the rest like no effect of the library.{too}"
         ),
-        "unknown": f"The gap has a cause that is not in the library: the best explanation takes away {share} of it.",
+        "unknown": f"No effect of the library explains the gap: the best explanation takes away {share} of it.",
     }[verdict]
+    if not fitted_only:
+        return said
+    return (
+        f"{said} That is how it was fitted. On motions left out of the fit {100 * max(shrinkage or 0.0, 0.0):.0f} % of "
+        "the gap goes away: it shows in too few motions to be found from the others. Repeat the motions in which it "
+        "shows."
+    )
 
 
 def listed(words: Sequence[str], last: str = "and") -> str:

@@ -97,13 +97,14 @@ class ShapeCableVectorEnv(gymnasium.vector.VectorEnv):
         self._randoms = [np_random()[0] for _ in range(num_envs)]
         self._ended = np.zeros(num_envs, bool)
 
-    def reset(self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None):
+    def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None):
         """New cables everywhere; environment i has the seed `seed + i`. The options are those of `Cables.reset`.
 
         Raises:
             ValueError: another number of seeds than of environments, or see `Cables.reset`.
         """
-        seeds = seed if seed is None or np.ndim(seed) else [int(seed) + row for row in range(self.num_envs)]  # pyright: ignore[reportArgumentType]
+        one = isinstance(seed, int | np.integer)
+        seeds = [int(seed) + row for row in range(self.num_envs)] if one else seed
         if seeds is not None and len(seeds) != self.num_envs:
             raise ValueError(f"There are {len(seeds)} seeds, expected one number, or one for each of {self.num_envs}.")
         for row, own in enumerate(seeds or []):
