@@ -431,4 +431,4 @@ def test_a_name_that_unseen_motions_do_not_confirm_is_said_to_be_fitted(shrinkag
     said = verdict_sentence("named", [effect], (), (), 0.93, shrinkage)
     share = 93 if shrinkage is None or not confirmed else 90
     assert said.startswith(f"The gap comes from friction patch, which explains {share} % of it.")
-    assert ("On motions left out of the fit" in said) == (not confirmed)
+    assert ("unconfirmed: on motions left out of the fit" in said) == (not confirmed)

@@ -101,9 +101,9 @@ def verdict_sentence(
     }[verdict]
     if not fitted_only:
         return said
+    confirmed = f"{100 * max(shrinkage or 0.0, 0.0):.0f} %"
     return (
-        f"{said} That is how it was fitted. On motions left out of the fit {100 * max(shrinkage or 0.0, 0.0):.0f} % of "
-        "the gap goes away: it shows in too few motions to be found from the others. Repeat the motions in which it "
+        f"{said} That is unconfirmed: on motions left out of the fit {confirmed} goes away. Repeat the motions in which it "
         "shows."
     )
 
