@@ -102,10 +102,8 @@ def verdict_sentence(
     if not fitted_only:
         return said
     confirmed = f"{100 * max(shrinkage or 0.0, 0.0):.0f} %"
-    return (
-        f"{said} That is unconfirmed: on motions left out of the fit {confirmed} goes away. Repeat the motions in which it "
-        "shows."
-    )
+    again = "Repeat the motions in which it shows."
+    return f"{said} That is unconfirmed: on motions left out of the fit {confirmed} goes away. {again}"
 
 
 def listed(words: Sequence[str], last: str = "and") -> str:
