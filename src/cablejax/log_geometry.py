@@ -99,11 +99,11 @@ def cable_fault(log: GapLog) -> str | None:
     valid = np.arange(log.keypoints.shape[1])[None] < log.episode_length[:, None]
     points, grippers = log.keypoints[valid].astype(float), log.gripper_pose[valid][..., :2].astype(float)
     for gripper, (end, name) in enumerate(((0, "0"), (-1, "N - 1"))):
-        ends = points[np.isfinite(points[:, end]).all(axis=-1)][:, end], grippers[np.isfinite(points[:, end]).all(-1)]
-        away, crossed = (
-            float(np.median(np.linalg.norm(ends[0] - ends[1][:, q], axis=-1))) if len(ends[0]) else 0.0
-            for q in (gripper, 1 - gripper)
-        )
+        seen = np.isfinite(points[:, end]).all(axis=-1)
+        if not seen.any():
+            continue
+        distances = np.median(np.linalg.norm(points[seen, None, end] - grippers[seen], axis=-1), axis=0)
+        away, crossed = float(distances[gripper]), float(distances[1 - gripper])
         if away > AT_GRIPPER:
             advice = (
                 f"it is at gripper {1 - gripper}. Exchange the grippers, or reverse the order of the keypoints."
