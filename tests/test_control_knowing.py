@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from cablejax.cable import Cable
 from cablejax.cli import main
 from cablejax.commands.runs import known_from
 from cablejax.control.shaping import enters, knowing, load_model, make_controller
@@ -136,3 +137,13 @@ def test_shape_with_a_verdict_tells_the_model(tmp_path, capsys):
     assert errors[1] < errors[0]
     page = (tmp_path / "informed" / "report.html").read_text()
     assert "It was informed of intrinsic_curvature" in page
+
+
+def test_what_a_controller_cannot_be_made_of_is_refused():
+    model = load_model("gns-reference")
+    target, options = make_target("U", model.cable), {"method": "direct", "solver": "levenberg-marquardt"}
+    with pytest.raises(ValueError, match=r"0\.4\d+ m along its keypoints.*of a cable of 1 m"):
+        make_controller(model, make_target("U", Cable(length=0.5)), **options)
+    for wrong in ({"method": "residuals"}, {"solver": "two-trial"}):
+        with pytest.raises(ValueError, match="expected one of"):
+            make_controller(model, target, **{**options, **wrong})
