@@ -6,7 +6,6 @@ Simulated plants (`control.loop`), a socket (`robot.server`) and ROS (`robot.ros
 from __future__ import annotations
 
 import dataclasses
-import functools
 import math
 import time
 from collections.abc import Sequence
@@ -70,11 +69,6 @@ class RobotLink:
     controller: Controller
     target: Target
     config: LinkConfig = LinkConfig()
-
-    @functools.cached_property
-    def _length(self) -> float:
-        """Of the polyline through the target's keypoints, for that of the cable [m]."""
-        return float(np.linalg.norm(np.diff(self.target.keypoints, axis=0), axis=1).sum())
 
     def warm_up(self, observation: Observation | None = None) -> None:
         """Compiles the controller, half a minute or more, before anything moves.
@@ -162,12 +156,12 @@ class RobotLink:
         # an absent pose can only be judged by the last one
         near = pose if np.isfinite(pose).all() or last is None else last.gripper_pose
         keypoints[~(np.abs(keypoints) <= largest)] = np.nan
-        keypoints[out_of_reach(keypoints, near[:, :2], self._length)] = np.nan
+        keypoints[out_of_reach(keypoints, near[:, :2], self.target.length)] = np.nan
         cleaned = dataclasses.replace(observation, keypoints=keypoints, gripper_pose=pose, time=stamp)
         unchanged = state.unchanged
         if unchanged is None or not np.array_equal(keypoints, unchanged.keypoints, equal_nan=True):
             unchanged = cleaned
-        elif np.linalg.norm((pose - unchanged.gripper_pose)[:, :2], axis=1).max() > MOVED * self._length:
+        elif np.linalg.norm((pose - unchanged.gripper_pose)[:, :2], axis=1).max() > MOVED * self.target.length:
             # a tracker that has stopped repeats its last frame
             cleaned = dataclasses.replace(cleaned, keypoints=np.full_like(keypoints, np.nan))
         state = dataclasses.replace(state, offset=min(state.offset, offset), unchanged=unchanged)
@@ -189,8 +183,8 @@ class RobotLink:
         apart = float(np.linalg.norm(pose[1, :2] - pose[0, :2]))
         if not np.isfinite(pose).all():
             return "The grippers' poses are not known yet."
-        if apart > 2 * self._length:
-            return f"The grippers are {apart:.3g} m apart, and the cable is {self._length:.3g} m long: metres?"
+        if apart > 2 * self.target.length:
+            return f"The grippers are {apart:.3g} m apart, and the cable is {self.target.length:.3g} m long: metres?"
         return (
             f"{100 * share:.0f} % of the keypoints are known and within reach of the grippers, expected "
             f"{100 * self.config.min_seen:.0f} %: are they in metres, in the grippers' frame?"

@@ -182,11 +182,10 @@ def make_controller(model: Model, target: Target, *, method: Method, solver: Sol
             f"Target {target.name!r} has {len(target.keypoints)} keypoints, expected {model.config.n_keypoints} as "
             f"the model {model.name}: use a model that was trained on this cable."
         )
-    along = float(np.linalg.norm(np.diff(target.keypoints, axis=0), axis=1).sum())
-    if not 0.8 <= along / model.config.length <= 1.1:  # of bent cables a polyline is shorter
+    if not 0.8 <= target.length / model.config.length <= 1.1:  # of bent cables a polyline is shorter
         raise ValueError(
-            f"Target {target.name!r} is {along:.3g} m along its keypoints, and the model {model.name} is of a cable of "
-            f"{model.config.length:.3g} m: take a target, or a model, of the other's length."
+            f"Target {target.name!r} is {target.length:.3g} m along its keypoints, and the model {model.name} is "
+            f"of a cable of {model.config.length:.3g} m: take a target, or a model, of the other's length."
         )
     learner = STATIC if model.config.prior == "static" else LearnerConfig()
     config = MPCConfig.for_length(

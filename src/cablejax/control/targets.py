@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import pathlib
 from typing import Literal
 
@@ -42,6 +43,11 @@ class Target:
     name: str
     keypoints: Float[np.ndarray, "N 2"]
     gripper_pose: Float[np.ndarray, "Q 3"]
+
+    @functools.cached_property
+    def length(self) -> float:
+        """Of the polyline through the keypoints [m]; a bent cable is a little longer."""
+        return float(np.linalg.norm(np.diff(self.keypoints, axis=0), axis=1).sum())
 
 
 @dataclasses.dataclass(frozen=True)

@@ -28,8 +28,7 @@ _ENCODER_NOISE = 5e-5
 _NEGLIGIBLE = 2e-4
 # An effect explains the arms' deviation if it leaves no more than this share of it, root mean square.
 _EXPLAINED = 0.25
-# An effect that leaves more of it than this is not named: gains and lags leave a hundredth, a backlash that looks like
-# a lag two thirds.
+# An effect that leaves more of it than this is not named: a backlash looks like a lag, and leaves more.
 _TELLING = 0.5
 ARMS = ("actuation_gain", "actuation_lag")
 """Names of the effects of the arms."""

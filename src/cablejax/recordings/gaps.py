@@ -112,7 +112,8 @@ def _require_grippers(takes: tuple[Take, ...], on_grippers: tuple[int, ...] | No
 
 def _fillable(take: Take) -> float:
     """Longest gap that is filled [s]."""
-    usual = float(np.median(np.diff(take.time)))
+    steps = np.diff(take.time)
+    usual = float(np.median(steps)) if len(steps) else 0.0
     one_missing = min(2.1 * usual, FILLED_ON_TABLE) if take.keypoints.shape[2] == 2 else 0.0
     return max(FILLED + 1e-9, one_missing)
 

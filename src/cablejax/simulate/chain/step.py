@@ -19,8 +19,8 @@ unstable, and the step must not damp for it.
 Where the links are and how fast they rub on the table is taken halfway through the step, from the velocities that the
 last steps lead one to expect. Taken at its start, it made motions at 50 ms ten times less accurate. Only contacts,
 which are stiff, are taken at the start of the step and solved for its end. Centrifugal forces, quadratic in an expected
-velocity, fade where the links turn so fast that the expectation is worth little: of half of the motions drawn for a
-soft rope that buckles, they made links swing ever more from step to step.
+velocity, fade where the links turn so fast that the expectation is worth little: they made the links of a soft rope
+that buckles swing ever more from step to step.
 """
 
 from __future__ import annotations
