@@ -67,6 +67,35 @@ def test_correlation_in_time_is_found_in_holds():
     np.testing.assert_allclose(floor.correlation[:3], [0.6, 0.36, 0.216], atol=0.08)
 
 
+def short_holds() -> tuple[np.ndarray, np.ndarray]:
+    """The same with holds of 16 samples, and the flags."""
+    flags = np.zeros((EPISODES, SAMPLES), bool)
+    for begin in range(0, SAMPLES - 16, 32):
+        flags[:, begin : begin + 16] = True
+    index = np.arange(SAMPLES)
+    return moving()[:, np.where(index % 32 < 16, index - index % 32, index)], flags
+
+
+@pytest.mark.parametrize("rho", [0.5, 0.7, 0.85])
+def test_what_a_line_takes_from_slow_noise_in_short_holds_is_given_back(rho):
+    points, flags = short_holds()
+    floor = noise_floor(points + coloured(7e-4, rho), flags)
+    np.testing.assert_allclose(floor.std, 7e-4, rtol=0.12)
+    np.testing.assert_allclose(floor.correlation[0], rho, atol=0.06)
+
+
+def test_a_cable_that_comes_to_rest_in_short_holds_is_no_slow_noise():
+    points, flags = short_holds()
+    settling = 5e-3 * np.exp(-(np.arange(SAMPLES) % 32) / 4.0)
+    with_creep = noise_floor(points + settling[:, None, None] + white(7e-4), flags)
+    about_lines = [
+        settling[b : b + 16] - np.polyval(np.polyfit(range(16), settling[b : b + 16], 1), range(16))
+        for b in range(0, SAMPLES - 16, 32)
+    ]
+    added = np.sum(np.square(about_lines)) / (len(about_lines) * 14)
+    np.testing.assert_allclose(with_creep.std, np.sqrt(7e-4**2 + added), rtol=0.06)
+
+
 def test_correlated_noise_is_not_sharpened_by_differences():
     """Third differences see only the fast part of slow noise: half of it here."""
     points, flags = held()

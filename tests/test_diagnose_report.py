@@ -20,6 +20,7 @@ from cablejax.diagnose.where import localise
 from cablejax.gaplog import write_gap_log
 from cablejax.report.diagnosis_charts import ranking_figure
 from cablejax.report.diagnosis_page import write_diagnosis_page
+from cablejax.report.diagnosis_sections import ranking_note
 from cablejax.report.effect_words import effect_place, quantity, share
 from cablejax.report.spatial_figures import recording_ends
 from cablejax.simulate.rod import Rod
@@ -353,6 +354,13 @@ def space(tmp_path_factory):
     )
     folder = tmp_path_factory.mktemp("space")
     return result, write_diagnosis_page(result, folder).read_text(encoding="utf-8"), verdict_json(result)
+
+
+def test_a_ranking_whose_first_takes_away_less_than_the_next_says_why():
+    first, second = Ranked("stiffness_profile", 0.99, -0.4, 19.0), Ranked("intrinsic_curvature", 0.01, 0.6, 10.0)
+    unknown = diagnosis("unknown", effects=(), ranking=(first, second))
+    assert "every motion counts alike" in ranking_note(unknown)
+    assert "counts alike" not in ranking_note(dataclasses.replace(unknown, ranking=(second, first)))
 
 
 def test_in_space_what_was_not_computed_is_null_and_not_on_the_page(space):

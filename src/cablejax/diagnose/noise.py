@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import collections
 import dataclasses
 import math
 
@@ -15,6 +16,8 @@ _SHORTEST_HOLD = 10
 _LAGS = 5
 # A gripper that is so far from where it is for most of a hold moves the cable [m]: further than one goes that lags.
 _MOVED = 0.02
+# First-order noise has the measured correlations to this; a cable that creeps in its holds does not.
+_LIKE_FIRST_ORDER = 0.05
 # A keypoint counts as noisier than the others beyond this many standard errors.
 _DISTINCT = 4.0
 
@@ -44,6 +47,9 @@ def noise_floor(
 ) -> NoiseFloor:
     """Noise from holds, each detrended by a line since a cable may creep; without holds, from third differences.
 
+    The line takes slow noise with it. Where the correlations are those of a first-order process, like a tracker's that
+    smooths, its level is what that process needs to leave such scatter about a line (`_first_order`).
+
     If the noise in the holds is white, third differences of the whole recording sharpen its level: there are many more
     of them, and no cable moves by jerks that fast. Keypoints share one level unless one is clearly noisier.
 
@@ -64,7 +70,7 @@ def noise_floor(
     else:
         variance, count, correlation = held
         from_holds = True
-        if abs(correlation[0]) < 4.0 / np.sqrt(max(count.sum(), 1)) + 0.02:
+        if abs(correlation[0]) < _scattered(count):
             slow = float(np.average(variance, weights=np.maximum(count, 1e-9)))
             # white noise has one level at all frequencies; a jerky recording does not
             if abs(level / slow - 1) < 0.1:
@@ -117,6 +123,7 @@ def _held(keypoints, hold):
     """Variance and count per keypoint, pooled autocorrelation; None without a hold."""
     n_points = keypoints.shape[2]
     squares, count, products = np.zeros(n_points), np.zeros(n_points), np.zeros((_LAGS, 2))
+    lengths: collections.Counter[int] = collections.Counter()
     for episode, flags in zip(keypoints, hold, strict=True):
         for begin, end in stretches(flags):
             if end - begin < _SHORTEST_HOLD:
@@ -131,6 +138,7 @@ def _held(keypoints, hold):
                     rest = values - np.polyval(np.polyfit(t[seen], values[seen], 1), t)
                     squares[n] += np.nansum(rest**2)
                     count[n] += seen.sum() - 2
+                    lengths[end - begin] += 1
                     for lag in range(1, _LAGS + 1):
                         pair = rest[lag:] * rest[:-lag]
                         products[lag - 1] += np.nansum(pair), np.isfinite(pair).sum()
@@ -138,4 +146,43 @@ def _held(keypoints, hold):
         return None
     variance = squares / np.maximum(count, 1)
     level = squares.sum() / count.sum()
-    return variance, count, products[:, 0] / np.maximum(products[:, 1], 1) / level
+    correlation = products[:, 0] / np.maximum(products[:, 1], 1) / level
+    slow = _first_order(correlation, lengths, _scattered(count))
+    return (variance, count, correlation) if slow is None else (variance * slow[0], count, slow[1])
+
+
+def _scattered(count: Float[np.ndarray, "N"]) -> float:
+    """A correlation up to this may be chance."""
+    return 4.0 / np.sqrt(max(count.sum(), 1)) + 0.02
+
+
+def _first_order(correlation: Float[np.ndarray, "K"], lengths: collections.Counter[int], smallest: float):
+    """What a first-order process with these correlations about a line has before the line is taken out.
+
+    Its correlation time is at most half of a hold: a longer one cannot be told from a trend.
+
+    Args:
+        correlation: of what is left of holds without their lines, at lags 1, 2, ...
+        lengths: how often a hold of each length was used [samples].
+        smallest: correlation that is one.
+
+    Returns:
+        By how much its variance is larger, and its correlations; None where no such process has the measured ones.
+    """
+    coefficients = np.linspace(0.0, np.exp(-2.0 / np.mean(list(lengths.elements()))), 50)
+    lags = np.arange(1 + _LAGS)
+    variance, products = np.zeros(50), np.zeros((50, _LAGS))
+    for length, times in lengths.items():
+        t = np.arange(length)
+        line = np.linalg.qr(np.stack([np.ones(length), t], axis=1))[0]
+        rest = np.eye(length) - line @ line.T
+        apart = np.abs(t[:, None] - t)
+        for i, coefficient in enumerate(coefficients):
+            left = rest @ coefficient**apart @ rest
+            variance[i] += times * np.trace(left) / (length - 2)
+            products[i] += [times * np.trace(left, lag) / (length - lag) for lag in lags[1:]]
+    expected = products / variance[:, None]
+    best = int(np.abs(expected - correlation).max(axis=1).argmin())
+    if coefficients[best] < smallest or np.abs(expected[best] - correlation).max() > _LIKE_FIRST_ORDER:
+        return None
+    return sum(lengths.values()) / variance[best], coefficients[best] ** lags[1:]

@@ -22,8 +22,9 @@ class Template:
 
     Attributes:
         start: the explanation, moved along its amplitude to meet the gap where that is possible.
-        explained: share of the squared gap that it takes away, the noise taken out of the gap: of the template at its
-            best length where a parameter decides on that, else of the template as it is. At most about 1.
+        explained: share of the squared gap that it takes away, episodes weighed as in a fit from the base and the noise
+            taken out of the gap: of the template at its best length where a parameter decides on that, else of the
+            template as it is. At most about 1.
     """
 
     start: Explanation
@@ -36,7 +37,8 @@ def screen(
     """Templates of every start of every effect on top of a base explanation.
 
     An effect of finite size, not a derivative, is held against the gap: a cable that does not yield, slip or touch at
-    the null value has no derivative there.
+    the null value has no derivative there. One episode in which the cable snaps must not choose alone: its gap is most
+    of the squares, and no template meets it.
 
     Args:
         evidence: to explain.
@@ -50,14 +52,18 @@ def screen(
         for effect in effects
         for variant, values in evidence.simulator.starts(effect, predicted, residual)
     ]
-    residuals = evidence.whitened(evidence.predict([base, *starts])).reshape(1 + len(starts), -1)
+    residuals = evidence.whitened(evidence.predict([base, *starts]))
+    whole = np.isfinite(residuals[0]).all(axis=-1)
+    weight = np.where(whole, evidence.weight((residuals[0] ** 2).sum(axis=-1)), 0.0)
+    noise = float(weight @ evidence.count)
+    residuals = np.where(whole[:, None], np.sqrt(weight)[:, None] * residuals, 0.0).reshape(len(residuals), -1)
     gap = -residuals[0]
-    power = max(float(gap @ gap) - float(evidence.count.sum()), 1e-6)
+    power = max(float(gap @ gap) - noise, 1e-6 * noise)
     result = []
     for start, moved in zip(starts, residuals[1:], strict=True):
         template = moved - residuals[0]
         size = float(template @ template)
-        if not np.isfinite(size) or size < 1e-6:
+        if not np.isfinite(size) or size < 1e-6 * noise:
             continue
         product = float(template @ gap)
         stretched = _stretch(start, len(base.z), product / size)

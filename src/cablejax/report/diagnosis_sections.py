@@ -23,6 +23,8 @@ from cablejax.report.effect_words import (
 
 # More episodes than this are counted, not listed.
 _LISTED = 8
+# An effect with less chance whose share is larger by this seems to contradict the first.
+_CONTRADICTS = 0.1
 
 _RULES = {
     "lowest_cost": "best fit to the log itself",
@@ -125,6 +127,12 @@ def ranking_note(diagnosis: CableDiagnosis) -> str:
             "worse. Not judged: its simulations were lost in many windows."
         )
     note = "Every effect alone, the most probable first."
+    shares = [ranked.held_out_shrinkage for ranked in diagnosis.ranking]
+    if shares and max(shares) > shares[0] + _CONTRADICTS:
+        note += (
+            " For the probability every motion counts alike; the share is of all squares, in which one motion where "
+            "the cable swings over can outweigh the others."
+        )
     if len(diagnosis.effects) > 1:
         note += " The cause named above is a set; alone, none of its members is enough."
     return note
