@@ -231,6 +231,24 @@ def test_outside_compiled_code_failures_are_raised_with_what_to_do():
         assert all(result.message for result in Result)
 
 
+@pytest.mark.parametrize(
+    ("start", "options", "message"),
+    [
+        (jnp.ones(2), {"feasible": None}, "feasible is None, expected a set"),
+        ({"a": 1.0}, {}, "expected an array of one number or more"),
+        (jnp.zeros(0), {}, "expected an array of one number or more"),
+        (jnp.zeros(3), {}, r"y0 of shape \(3,\) does not fit the set Box"),
+        (jnp.ones(2), {"max_steps": 0}, "max_steps is 0"),
+        (jnp.ones(2), {"solver": BoundedQuasiNewton(atol=-1.0)}, "BoundedQuasiNewton: atol is -1.0"),
+        (jnp.ones(2), {"solver": BoundedLevenbergMarquardt(rtol=float("nan"))}, "rtol is nan"),
+    ],
+)
+def test_what_no_solver_can_work_with_is_refused(start, options, message):
+    options = {"solver": SOLVERS["quasi-Newton"], "feasible": Box(*map(jnp.asarray, UNIT)), **options}
+    with pytest.raises(ValueError, match=message):
+        minimise(lambda y, _: jnp.sum(y**2), y0=start, **options)
+
+
 # --- derivatives of the solution --------------------------------------------------------------------------------------
 
 # None active; a ball; a ball and a plane. Where a bound is touched with a zero multiplier there is no derivative.

@@ -290,7 +290,20 @@ BAD = {
     ),
     "noise of another shape": (lambda: Line(X), {"noise": np.ones(3)}, None, "does not broadcast"),
     "no noise": (lambda: Line(X), {"noise": 0.0}, None, "no measurement is exact"),
-    "motion": (lambda: Line(X), {"motion": np.zeros(5, int)}, None, "one number for each of 6 episodes"),
+    "motion": (lambda: Line(X), {"motion": np.zeros(5, int)}, None, "one whole number for each of 6 episodes"),
+    "motion is no number": (lambda: Line(X), {"motion": [np.nan] * 6}, None, "motion is float64 of shape"),
+    "starts of another effect": (
+        lambda: broken(starts=lambda self, effect, *_: [(0, (1.0, 2.0))]),
+        {},
+        line(("slope", 0, 2.0)),
+        r"has the values \[1.0, 2.0\], expected one number each",
+    ),
+    "starts of no variant": (
+        lambda: broken(starts=lambda self, effect, *_: [(7, (1.0,))]),
+        {},
+        line(("slope", 0, 2.0)),
+        "has the variant 7, expected one of",
+    ),
     "one name twice": (lambda: broken(effects=Line.effects[:1] * 2), {}, None, "every name once"),
     "no effects": (lambda: broken(effects=()), {}, None, "at least one"),
     "null that acts": (moved_null, {}, None, "at its null value .* changes the prediction"),
@@ -338,6 +351,24 @@ def test_names_of_parameters_are_there_once():
 def test_an_effect_has_a_null_for_each_parameter():
     with pytest.raises(ValueError, match="1 parameters and 2 null values"):
         Effect(name="odd", parameters=Line.effects[0].parameters, null=(0.0, 1.0))
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"amplitude": 1}, "amplitude is 1, expected the index of one of its 1 parameters"),
+        ({"variants": ()}, "no variant"),
+        ({"null": (np.nan,)}, "null values .nan,., expected numbers"),
+    ],
+)
+def test_an_effect_that_contradicts_itself_is_refused(wrong, message):
+    with pytest.raises(ValueError, match=message):
+        Effect(**{"name": "odd", "parameters": Line.effects[0].parameters[:1], "null": (0.0,), **wrong})
+
+
+def test_a_simulator_without_any_start_explains_nothing():
+    result = diagnose_line(line(("slope", 0, 2.0)), broken(starts=lambda self, effect, *_: []))
+    assert result.verdict == "unknown" and not result.effects
 
 
 def test_batches_are_of_one_size_and_pairs_in_place():

@@ -57,6 +57,13 @@ def test_prediction_turns_and_shifts_with_the_cable(config):
         np.testing.assert_allclose(here @ rotation(angle).T, there, atol=1e-9)
 
 
+def test_a_history_of_another_length_is_refused():
+    history = arched_history(SMALL)
+    longer = dataclasses.replace(history, keypoints=jnp.concatenate([history.keypoints[:1], history.keypoints]))
+    with pytest.raises(ValueError, match=r"expected .*: this model looks back on"):
+        bind(*network(SMALL))(longer, TWIST)
+
+
 def test_batches_by_vmap_give_what_single_cables_give():
     model = jax.jit(bind(*network(SMALL)))
     histories = [arched_history(SMALL, seed) for seed in range(3)]

@@ -1,6 +1,7 @@
 """Gymnasium's environment: its rules, its randomisation, its vector form and a controller as its policy."""
 
 import dataclasses
+import functools
 import warnings
 
 import numpy as np
@@ -174,6 +175,12 @@ def test_wrong_targets_are_refused():
         ShapeCableEnv(dataclasses.replace(CONFIG, targets=(make_target("U"),)))
     with pytest.raises(ValueError, match="no shape 'X'"):
         ShapeCableEnv(CONFIG).reset(options={"target": "X"})
+
+
+@pytest.mark.parametrize("make", [ShapeCableEnv, functools.partial(ShapeCableVectorEnv, 2)])
+def test_what_cannot_be_rendered_is_refused(make):
+    with pytest.raises(ValueError, match="render_mode is 'human', expected None"):
+        make(config=CONFIG, render_mode="human")
 
 
 def test_wrong_options_and_actions_are_refused():

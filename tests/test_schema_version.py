@@ -124,3 +124,15 @@ def test_what_is_no_version_is_another_kind_of_file(schema):
 
 def test_versions_up_to_the_known_one_are_returned():
     assert [version_of(f"toy/{number}", "toy/3", "x") for number in (1, 2, 3)] == [1, 2, 3]
+
+
+def test_a_verdict_in_other_units_is_refused(tmp_path):
+    def read(unit):
+        parameters = {"mass_kg": {"value": 20.0, "unit": unit}, "centre_m": {"value": 0.3, "unit": "m"}}
+        verdict = {"schema": "cablejax-verdict/1", "effects": [{"name": "lumped_mass", "parameters": parameters}]}
+        (tmp_path / "verdict.json").write_text(json.dumps(verdict))
+        return effects_of_verdict(tmp_path / "verdict.json")
+
+    with pytest.raises(ValueError, match="lumped_mass has mass_kg in 'g', expected 'kg'"):
+        read("g")
+    assert read("kg") == read(None)

@@ -45,7 +45,7 @@ def minimise(
         The solution, differentiable in `args` and the set where it has converged, see `FixedPointAdjoint`.
 
     Raises:
-        ValueError: the set is empty.
+        ValueError: the set is empty, or start, set or tolerances are none.
         RuntimeError: the solve ended in another way than convergence.
     """
     return _solve(optx.minimise, fn, solver, y0, feasible, args, "hessian", hessian, max_steps, throw)
@@ -79,7 +79,7 @@ def least_squares(
         The solution, differentiable in `args` and the set where it has converged, see `FixedPointAdjoint`.
 
     Raises:
-        ValueError: the set is empty.
+        ValueError: the set is empty, or start, set or tolerances are none.
         RuntimeError: the solve ended in another way than convergence.
     """
     if isinstance(solver, optx.AbstractMinimiser):
@@ -94,8 +94,7 @@ def least_squares(
 
 def _solve(entry, fn, solver, y0, feasible: AbstractSet, args, option: str, given, max_steps: int, throw: bool):
     """By one of optimistix's entry points; `given` is the function that the solver takes as an option, or None."""
-    y0 = jnp.asarray(y0)
-    start = feasible.project(y0)
+    y0, start = _checked(solver, y0, feasible, max_steps)
     # with what they close over as arguments, so that it may be traced
     fn = eqx.filter_closure_convert(fn, start, args)
     given = None if given is None else eqx.filter_closure_convert(given, start, args)
@@ -103,6 +102,27 @@ def _solve(entry, fn, solver, y0, feasible: AbstractSet, args, option: str, give
     out = entry(fn, solver, start, args, options, max_steps=max_steps, adjoint=FixedPointAdjoint(), throw=False)
     unknown = jnp.isnan(y0).any() | ~jnp.isfinite(start).all()
     return _finish(out, fn, args, feasible, start, unknown, throw)
+
+
+def _checked(solver, y0, feasible, max_steps: int) -> tuple[Array, Array]:
+    """The start as an array, and its projection; raises ValueError for what no solver can work with."""
+    if not isinstance(feasible, AbstractSet):
+        raise ValueError(f"feasible is {feasible!r}, expected a set: Box, Balls, Halfspaces, Intersection or your own.")
+    if not eqx.is_array_like(y0) or jnp.size(y0) == 0:
+        raise ValueError(
+            f"y0 is {y0!r}, expected an array of one number or more (of a pytree: jax.flatten_util.ravel_pytree)."
+        )
+    for name in ("rtol", "atol"):
+        tolerance = getattr(solver, name)
+        if isinstance(tolerance, float | int) and not tolerance >= 0:
+            raise ValueError(f"{type(solver).__name__}: {name} is {tolerance}, expected a number of at least 0.")
+    if max_steps < 1:
+        raise ValueError(f"max_steps is {max_steps}, expected at least 1.")
+    y0 = jnp.asarray(y0)
+    try:
+        return y0, feasible.project(y0)
+    except TypeError as error:
+        raise ValueError(f"y0 of shape {y0.shape} does not fit the set {type(feasible).__name__}: {error}") from error
 
 
 @eqx.filter_custom_jvp

@@ -116,7 +116,16 @@ class Explanation:
 
 
 def explanation(*parts: tuple[Effect, int, Sequence[float]]) -> Explanation:
-    """An explanation from (effect, variant, parameter values), each value brought within its bounds."""
+    """An explanation from (effect, variant, parameter values), each value brought within its bounds.
+
+    Raises:
+        ValueError: the effect has no such variant, or another number of parameters; a value is NaN.
+    """
+    for effect, variant, values in parts:
+        if len(values) != len(effect.parameters) or np.isnan(np.asarray(values, float)).any():
+            raise ValueError(f"Effect {effect.name!r} has the values {list(values)}, expected one number each.")
+        if variant not in effect.variants:
+            raise ValueError(f"Effect {effect.name!r} has the variant {variant}, expected one of {effect.variants}.")
     z = [
         np.clip(p.coordinate(float(value)), *p.z_bounds)
         for effect, _, values in parts
@@ -201,11 +210,9 @@ class Simulator(abc.ABC):
             return one if not one.own.size else dataclasses.replace(one, own=np.zeros((0, 0)))
         kept = one.own if one.own.shape[1] == count else np.zeros((0, count))
         more = 1 + max(self.recording) - len(kept)
-        return (
-            one
-            if more <= 0 and kept is one.own
-            else dataclasses.replace(one, own=np.pad(kept, ((0, max(more, 0)), (0, 0))))
-        )
+        if more <= 0 and kept is one.own:
+            return one
+        return dataclasses.replace(one, own=np.pad(kept, ((0, max(more, 0)), (0, 0))))
 
     @abc.abstractmethod
     def predict(self, explanations: Sequence[Explanation], episodes: Int[np.ndarray, "e"]) -> np.ndarray:

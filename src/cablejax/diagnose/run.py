@@ -60,9 +60,12 @@ def diagnose_simulator(
     begin = time.perf_counter()
     observed, interval = recorded_arrays(observed, interval)
     spread = spread_of(observed, noise)
-    motion = np.arange(len(observed)) if motion is None else np.asarray(motion, int)
-    if motion.shape != (len(observed),):
-        raise ValueError(f"motion has shape {motion.shape}, expected one number for each of {len(observed)} episodes.")
+    motion = np.arange(len(observed)) if motion is None else np.asarray(motion)
+    if motion.shape != (len(observed),) or motion.dtype.kind not in "iu":
+        raise ValueError(
+            f"motion is {motion.dtype} of shape {motion.shape}, expected one whole number for each of {len(observed)} "
+            "episodes."
+        )
     nominal = checked_nominal(simulator, observed, spread)
     caveats = []
     if calibration is None:

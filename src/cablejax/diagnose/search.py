@@ -102,7 +102,7 @@ def search(
 def _promising(starts: Sequence[Explanation], screened: dict[str, float]) -> list[Explanation]:
     """Starts of effects whose best template explains a part of the gap worth a fit, and of the next best ones."""
     ordered = sorted(screened, key=lambda name: -screened[name])
-    threshold = _NEGLIGIBLE * max(screened[ordered[0]], 0.0)
+    threshold = _NEGLIGIBLE * max([0.0, *screened.values()])
     kept = {name for rank, name in enumerate(ordered) if rank < _FINALISTS or screened[name] > threshold}
     return [start for start in starts if start.names[-1] in kept]
 

@@ -38,9 +38,17 @@ def apply(
         model: the network, or its split form `(graphdef, weights)`.
         history: the last H samples; vmap for batches.
         twist: control input of both grippers [m/s, rad/s], shape [2, 3].
+
+    Raises:
+        ValueError: a history of another number of samples or keypoints than the model was trained with.
     """
     network: Network = nnx.merge(*model) if isinstance(model, tuple) else model
     config = network.config
+    if history.keypoints.shape != (expected := (config.history, config.n_keypoints, 2)):
+        raise ValueError(
+            f"The history has keypoints of shape {history.keypoints.shape}, expected {expected}: this model looks back "
+            f"on {config.history} samples of {config.n_keypoints} keypoints (`history_length` of a link or a loop)."
+        )
     prior = prior_of(history, twist, config)
     graph = build_graph(history, twist, prior, config)
     axes = frame_of(history.gripper_pose, config).axes

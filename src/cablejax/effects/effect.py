@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -99,6 +100,15 @@ class Effect:
                 f"Effect {self.name!r} has {len(self.parameters)} parameters and {len(self.null)} null values, "
                 "expected as many of one as of the other, and at least one."
             )
+        if any(math.isnan(value) for value in self.null):
+            raise ValueError(f"Effect {self.name!r} has the null values {self.null}, expected numbers.")
+        if self.amplitude is not None and not 0 <= self.amplitude < len(self.parameters):
+            raise ValueError(
+                f"Effect {self.name!r}: amplitude is {self.amplitude}, expected the index of one of its "
+                f"{len(self.parameters)} parameters, or None."
+            )
+        if not self.variants:
+            raise ValueError(f"Effect {self.name!r} has no variant, expected one at least: variants=(0,).")
 
     def starts(self, context: Any) -> Sequence[tuple[int, Sequence[float]]]:
         """Pairs (variant, values) from which fits begin; enough of them that one is within reach of the truth.

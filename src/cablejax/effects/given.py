@@ -237,6 +237,7 @@ def check_hooks(
 def _pieces(effect: Any, path: Any) -> list[GivenEffect]:
     try:
         values = {name: entry["value"] for name, entry in effect["parameters"].items()}
+        _check_units(effect["name"], {name: entry.get("unit") for name, entry in effect["parameters"].items()}, path)
         count = max((len(value) for value in values.values() if isinstance(value, list)), default=1)
         rows = [
             tuple((name, value[i] if isinstance(value, list) else value) for name, value in values.items())
@@ -247,20 +248,35 @@ def _pieces(effect: Any, path: Any) -> list[GivenEffect]:
         raise ValueError(f"{path}: an effect is not of the verdict's format ({error}).") from error
 
 
+def _check_units(name: str, units: Mapping[str, str | None], path: Any) -> None:
+    """Raises ValueError if a parameter is stated in another unit than its effect has; a unit may be left out."""
+    expected = _parameter_units(EFFECTS[name]) if name in EFFECTS else {}
+    for parameter, unit in units.items():
+        if unit is not None and unit != expected.get(parameter, unit):
+            raise ValueError(
+                f"{path}: {name} has {parameter} in {shown(unit)}, expected {shown(expected[parameter])}. Convert the "
+                "values and their intervals."
+            )
+
+
 def number_text(value: float) -> str:
     """A number as short as it can be without loss."""
     short = f"{value:g}"
     return short if float(short) == value else repr(float(value))
 
 
+def _parameter_units(effect: CableEffect) -> dict[str, str]:
+    """Names of the verdict that an effect takes, and their units."""
+    chain, units = Discretisation(), {}
+    values = [p.centre for p in effect.parameters]
+    for variant in effect.variants[:2]:
+        units |= {name: unit for name, (_, unit) in effect.reported(values, variant, chain).items()}
+    return units
+
+
 def _parameter_names(effect: CableEffect) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Names of the verdict that an effect takes, and those of them that it needs."""
-    chain = Discretisation()
-    values = [p.centre for p in effect.parameters]
-    every: dict[str, None] = {}
-    for variant in effect.variants[:2]:
-        every |= dict.fromkeys(effect.reported(values, variant, chain))
-    known = tuple(every)
+    known = tuple(_parameter_units(effect))
     return known, tuple(name for name in known if name not in OPTIONAL)
 
 

@@ -20,8 +20,10 @@ OBSERVED = ("keypoints", "gripper_pose", "target")
 """Parts of an observation."""
 
 
-def _spaces(config: ShapeCableConfig) -> tuple[gymnasium.spaces.Dict, gymnasium.spaces.Box]:
-    """What is observed, and the actions."""
+def _spaces(config: ShapeCableConfig, render_mode: str | None) -> tuple[gymnasium.spaces.Dict, gymnasium.spaces.Box]:
+    """What is observed, and the actions; raises ValueError for a render mode."""
+    if render_mode is not None:
+        raise ValueError(f"render_mode is {render_mode!r}, expected None: look at runs with `cablejax.report`.")
     points, length = config.cable.n_keypoints, config.cable.length
     turns = 2 * np.pi + config.steps * config.turn_rate * config.interval
     pose = np.repeat(np.array([[3 * length, 3 * length, turns]], np.float32), 2, axis=0)
@@ -55,7 +57,7 @@ class ShapeCableEnv(gymnasium.Env):
 
     def __init__(self, config: ShapeCableConfig = ShapeCableConfig(), render_mode: str | None = None):
         self.config, self.render_mode = config, render_mode
-        self.observation_space, self.action_space = _spaces(config)
+        self.observation_space, self.action_space = _spaces(config, render_mode)
         self.cables = Cables(config, 1)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None):
@@ -90,7 +92,7 @@ class ShapeCableVectorEnv(gymnasium.vector.VectorEnv):
 
     def __init__(self, num_envs: int, config: ShapeCableConfig = ShapeCableConfig(), render_mode: str | None = None):
         self.num_envs, self.config, self.render_mode = num_envs, config, render_mode
-        self.single_observation_space, self.single_action_space = _spaces(config)
+        self.single_observation_space, self.single_action_space = _spaces(config, render_mode)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self.cables = Cables(config, num_envs)
