@@ -291,6 +291,14 @@ class TestJoined:
         again = joined([joined(*self._halves()), third], ["ab.npz", "c.npz"])
         assert [part["name"] for part in recordings(again)] == ["a.npz", "b.npz", "c.npz"]
 
+    def test_labels_of_episodes_stay_with_them_and_recordings_apart(self):
+        logs, names = self._halves()
+        logs[0].meta.update(recording=["1"], take=["1/1"])
+        logs[1].meta.update(recording=["1"], split=["eval"])
+        meta = joined(logs, names).meta
+        assert meta["recording"] == ["a.npz: 1", "b.npz: 1"] and meta["take"] == ["a.npz: 1/1", "b.npz: 0"]
+        assert meta["split"] == ["", "eval"] and "file" not in meta
+
     def test_a_recording_without_holds(self):
         logs, names = self._halves()
         logs[1] = dataclasses.replace(logs[1], hold=None)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from cablejax.arrays import quaternion_product
-from cablejax.recordings.frames import AXES, Frame, into_frame, require_hanging, require_rigid
+from cablejax.recordings.frames import AXES, Frame, into_frame, require_along_x, require_hanging, require_rigid
 from cablejax.recordings.poses import (
     poses_at,
     poses_from_markers,
@@ -148,6 +148,19 @@ def test_orientations_of_another_frame_are_refused_and_the_frame_named(change, m
     with pytest.raises(ValueError, match=message) as raised:
         require_rigid((take(wrong, pose=other),), ((0, 1),))
     assert "turn against its orientation" in str(raised.value)
+
+
+@pytest.mark.parametrize(("axis", "name"), [((0.1, 0.99, 0.0), "y"), ((0.2, 0.1, -0.97), "-z"), ((-1.0, 0.1, 0), "-x")])
+def test_a_gripper_whose_x_axis_is_not_along_its_markers_is_refused(axis, name):
+    quaternion = wandering()
+    points = swinging()
+    points[:, 1] = points[:, 0] + 0.03 * rotated(quaternion, np.tile(axis, (200, 1)))
+    pose = np.concatenate([points[:, [0, -1]], np.stack([quaternion, wandering()], axis=1)], axis=-1)
+    require_rigid((take(points, pose=pose),), ((0, 1),))
+    with pytest.raises(ValueError, match=f"nearest to its {name} axis; expected x"):
+        require_along_x((take(points, pose=pose),), ((0, 1),))
+    points[:, 1] = points[:, 0] + 0.03 * rotated(quaternion, np.tile([0.9, 0.3, 0.3], (200, 1)))
+    require_along_x((take(points, pose=pose),), ((0, 1),))
 
 
 def test_units_are_recognised_by_the_length_of_the_cable():

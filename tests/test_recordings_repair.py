@@ -190,6 +190,25 @@ def test_a_gap_that_the_times_do_not_tell_cuts_a_take():
     assert "the whole cable jumps between samples 79 and 80" in repairs[0]
 
 
+def test_time_stamps_that_jitter_are_no_gap_and_do_not_hide_one():
+    jitter = 0.002 * np.random.default_rng(3).normal(size=200)
+    time = np.sort(DT * np.arange(200) + jitter)
+    whole = dataclasses.replace(take(swinging()), time=time)
+    assert samples_of(cut_at_gaps((whole,), HELD)[0]) == [("a", 200)]
+    keep = np.r_[0:80, 110:200]
+    lost = dataclasses.replace(take(swinging()[keep]), time=time[:170])
+    assert samples_of(cut_at_gaps((lost,), HELD)[0]) == [("a/1", 80), ("a/2", 90)]
+
+
+def test_what_was_cut_is_still_one_recording():
+    points = swinging()
+    points[80:110, 0] = np.nan
+    parts, _ = cut_at_gaps((take(points), take(swinging(), "b")), HELD)
+    assert [(part.name, part.labels["recording"]) for part in parts] == [("a/1", "a"), ("a/2", "a"), ("b", "b")]
+    labelled = dataclasses.replace(take(points), labels={"recording": 7})
+    assert [part.labels["recording"] for part in cut_at_gaps((labelled,), HELD)[0]] == [7, 7]
+
+
 @pytest.mark.parametrize("column", [0, 7])
 def test_a_gripper_not_seen_for_long_cuts_a_take(column):
     points = swinging()
@@ -255,6 +274,17 @@ def test_a_marker_that_jumps_is_not_observed_there():
     np.testing.assert_array_equal(np.delete(one.keypoints, 4, axis=1), np.delete(right, 4, axis=1))
     (sentence,) = repairs
     assert sentence.startswith("Take a: keypoint 4 is farther") and "20 of 200 samples, from sample 70" in sentence
+
+
+@pytest.mark.parametrize("end", [0, 8])
+def test_an_end_that_jumps_does_not_move_its_gripper(end):
+    right = swinging()
+    points = right.copy()
+    points[70:72, end] = 0.0
+    (one, *_), repairs = prepare((take(points), *others()), PAIRS)
+    assert np.linalg.norm(one.keypoints - right, axis=-1).max() < 2e-3, "filled in"
+    assert any(text.startswith(f"Take a: keypoint {end} is farther") for text in repairs)
+    assert not any("accelerations" in text for text in repairs)
 
 
 def test_a_jerk_of_a_gripper_is_told_and_kept():

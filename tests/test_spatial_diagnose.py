@@ -12,15 +12,18 @@ import pytest
 import spatial_cases as cases
 from cablejax.bounded import Result
 from cablejax.diagnose import explanation, verdict_json
+from cablejax.diagnose.diagnosis import ParameterEstimate
 from cablejax.diagnose.fit import evaluate, improved
+from cablejax.log_geometry import setup_fault
 from cablejax.report.diagnosis_page import write_diagnosis_page
 from cablejax.simulate.rod import Rod
 from cablejax.spatial.cable import SpatialCable, errors
 from cablejax.spatial.clock import on_one_clock
 from cablejax.spatial.diagnose import diagnose_space
-from cablejax.spatial.gap import noise_of
+from cablejax.spatial.gap import OWN, noise_of, smallest_gap
 from cablejax.spatial.geometry import local_changes
 from cablejax.spatial.identify import layout_of
+from cablejax.spatial.named import _shown
 from cablejax.spatial.search import falls, halves
 from cablejax.spatial.windows import windows_of
 
@@ -34,6 +37,81 @@ def test_windows_know_what_the_grippers_hold():
     np.testing.assert_allclose(
         windows.frames @ np.swapaxes(windows.frames, -1, -2), np.eye(3) * np.ones((4, 100, 2, 1, 1)), atol=1e-6
     )
+
+
+def test_clamps_that_scatter_are_smoothed_and_others_are_not():
+    clean = cases.recording()
+    quiet = windows_of(clean)
+    assert quiet.smoothed == 0 and quiet.first_clamp == pytest.approx(cases.REACH)
+    noisy = copy.deepcopy(clean)
+    scatter = 5e-4 * np.random.default_rng(5).normal(size=noisy.keypoints.shape)
+    noisy.keypoints[:] += scatter
+    tangent = 1e-2 * np.random.default_rng(6).normal(size=noisy.gripper_pose[..., 4:].shape)
+    noisy.gripper_pose[..., 4:] += tangent
+    noisy.gripper_pose[..., 3:] /= np.linalg.norm(noisy.gripper_pose[..., 3:], axis=-1, keepdims=True)
+    shaken = windows_of(noisy)
+    assert shaken.held == quiet.held and 3e-4 < shaken.smoothed < 8e-4
+    raw = noisy.keypoints[:, :100, [1, -2]].astype(float)
+
+    def jerk(paths):
+        return np.abs(np.diff(paths, 3, axis=1)).mean()
+
+    assert jerk(shaken.position) < 0.2 * jerk(raw)
+    off = np.linalg.norm(shaken.position - quiet.position, axis=-1)
+    assert off.mean() < 0.7 * np.linalg.norm(raw - quiet.position, axis=-1).mean()
+    turned = np.linalg.norm(shaken.frames[..., 0, :] - quiet.frames[..., 0, :], axis=-1)
+    assert turned.mean() < 0.012
+    np.testing.assert_allclose(np.linalg.norm(shaken.frames, axis=-1), 1.0, atol=1e-6)
+    # the noise of markers is no speed
+    assert shaken.speed == pytest.approx(quiet.speed, rel=0.05)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda log: log.gripper_pose[..., :3].__iadd__(0.3), "Keypoint 0 is 0.52 m from gripper 0"),
+        (
+            lambda log: log.gripper_pose.__setitem__(slice(None), log.gripper_pose[:, :, ::-1].copy()),
+            "Exchange the",
+        ),
+    ],
+)
+def test_grippers_elsewhere_are_refused(change, message):
+    log = copy.deepcopy(cases.recording())
+    change(log)
+    with pytest.raises(ValueError, match=message):
+        windows_of(log)
+
+
+def test_an_axis_that_points_away_from_the_cable_or_passes_it_is_a_fault():
+    log = cases.recording()
+    assert setup_fault(log) is None
+    turned = copy.deepcopy(log)
+    # half a turn about the gripper's own z axis
+    w, x, y, z = np.moveaxis(log.gripper_pose[..., 3:], -1, 0)
+    turned.gripper_pose[..., 3:] = np.stack([-z, y, -x, w], axis=-1)
+    assert "The x axis of gripper 0 is 1" in (setup_fault(turned) or "")
+    beside = copy.deepcopy(log)
+    beside.gripper_pose[..., 0] += 0.03
+    beside.gripper_pose[..., 2] += 0.04
+    assert "beside the x axis of gripper" in (setup_fault(beside) or "")
+
+
+def test_a_stated_damping_is_believed():
+    windows = windows_of(cases.recording())
+    layout = layout_of(windows, cases.NOMINAL, 0.04)
+    assert float(layout.physics(layout.null).damping_time) == pytest.approx(0.04)
+    interval = ParameterEstimate(0.041, (0.037, 0.046), "s")
+    assert _shown("bending_damping", interval, 0.001, longer_only=True)
+    assert not _shown("bending_damping", interval, 0.04, longer_only=False)
+    assert _shown("bending_damping", interval, 0.1, longer_only=False), "less than stated"
+    assert not _shown("bending_damping", interval, 0.1, longer_only=True)
+
+
+def test_a_gap_is_more_than_the_simulator_may_err_by():
+    windows = windows_of(cases.recording())
+    assert smallest_gap(1e-5, windows) == pytest.approx(OWN, rel=0.01)
+    assert smallest_gap(1e-3, windows) == pytest.approx(3e-3, rel=0.03)
 
 
 def test_a_fit_finds_stiffness_and_damping():

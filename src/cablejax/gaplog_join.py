@@ -12,12 +12,16 @@ from cablejax.gaplog_check import META_FIELDS, GapLogError
 from cablejax.limits import shown
 from cablejax.types import GapLog
 
+EPISODE_LABELS = ("file", "recording", "split", "take")
+"""Extra fields of `meta` with one entry per episode that importers write; what a diagnosis keeps apart by them."""
+
 
 def joined(logs: Sequence[GapLog], names: Sequence[str]) -> GapLog:
     """One log of several recordings of one set-up, episodes in the order given.
 
     Its `meta` has the field `recordings`: the name of each and how many episodes it has, by which a diagnosis says what
-    each one added. Extra fields of `meta` stay where all recordings have the same.
+    each one added. Of the extra fields of `meta`, `EPISODE_LABELS` are joined too (equal names of different logs stay
+    apart), and others stay where all recordings have the same.
 
     Args:
         logs: at least one.
@@ -41,17 +45,32 @@ def joined(logs: Sequence[GapLog], names: Sequence[str]) -> GapLog:
                     f"{name} is not of the set-up of {names[0]}: '{field}' is {shown(here)}, and there {shown(there)}. "
                     "Diagnose them apart, or correct the one that states it wrongly."
                 )
-    extra = set.intersection(*(set(log.meta) for log in logs)) - {*META_FIELDS, "recordings"}
+    extra = set.intersection(*(set(log.meta) for log in logs)) - {*META_FIELDS, *EPISODE_LABELS, "recordings"}
     alike = (name for name in sorted(extra) if all(log.meta[name] == logs[0].meta[name] for log in logs))
     shared = [*META_FIELDS, *alike]
     meta = {
         **{name: logs[0].meta[name] for name in shared},
+        **{name: values for name in EPISODE_LABELS if (values := _labels(logs, names, name)) is not None},
         "motion": [motion for log in logs for motion in log.meta["motion"]],
         "source": "; ".join(dict.fromkeys(log.meta["source"] for log in logs)),
         "recordings": [part for log, name in zip(logs, names, strict=True) for part in recordings(log, name)],
     }
     episodes = [episode for log in logs for episode in episodes_of(log)]
     return stack_episodes(episodes, meta, holds=any(log.hold is not None for log in logs))
+
+
+def _labels(logs: Sequence[GapLog], names: Sequence[str], field: str) -> list[Any] | None:
+    """A label of all episodes, by its log; its number where it has none (no split: ""). None where no log has any."""
+    every: list[Any] = []
+    found = False
+    for log, name in zip(logs, names, strict=True):
+        own, episodes = log.meta.get(field), len(log.episode_length)
+        if isinstance(own, list) and len(own) == episodes:
+            found = True
+        else:
+            own = [""] * episodes if field == "split" else list(range(episodes))
+        every += own if field == "split" else [f"{name}: {value}" for value in own]
+    return every if found else None
 
 
 def chosen(log: GapLog, episodes: Sequence[int]) -> GapLog:

@@ -17,6 +17,8 @@ MOVED = 0.02
 """Motion of a gripper, in lengths of the cable, in which keypoints that are held by it move too."""
 AT_GRIPPER = 0.1
 """Largest median distance of an end's keypoint from its gripper [m]."""
+BESIDE = 0.02
+"""Largest median distance of an end's keypoint from the x axis of its gripper in space [m]."""
 ASKEW = np.radians(60.0)
 """Median angle between a gripper's tangent and the cable next to it that no clamp has."""
 _FEWEST = 5
@@ -92,12 +94,13 @@ def cable_fault(log: GapLog) -> str | None:
     """Finds keypoints that are not of a cable of the stated length between these grippers; a message, or None.
 
     Args:
-        log: valid; in the plane, between two grippers, else nothing is checked.
+        log: valid; between two grippers, else nothing is checked.
     """
-    if log.keypoints.shape[-1] != 2 or log.gripper_pose.shape[2] != 2:
+    dimension = log.keypoints.shape[-1]
+    if log.gripper_pose.shape[2] != 2:
         return None
     valid = np.arange(log.keypoints.shape[1])[None] < log.episode_length[:, None]
-    points, grippers = log.keypoints[valid].astype(float), log.gripper_pose[valid][..., :2].astype(float)
+    points, grippers = log.keypoints[valid].astype(float), log.gripper_pose[valid][..., :dimension].astype(float)
     for gripper, (end, name) in enumerate(((0, "0"), (-1, "N - 1"))):
         seen = np.isfinite(points[:, end]).all(axis=-1)
         if not seen.any():
@@ -129,7 +132,11 @@ def setup_fault(log: GapLog) -> str | None:
     """
     if fault := cable_fault(log):
         return fault
-    if log.keypoints.shape[-1] != 2 or log.gripper_pose.shape[2] != 2 or log.keypoints.shape[2] < _FEWEST_NEAR:
+    if log.gripper_pose.shape[2] != 2:
+        return None
+    if log.keypoints.shape[-1] == 3:
+        return _axis_fault(log)
+    if log.keypoints.shape[2] < _FEWEST_NEAR:
         return None
     for gripper in (0, 1):
         angle, direction = _tangents(log, gripper)
@@ -149,6 +156,32 @@ def setup_fault(log: GapLog) -> str | None:
             return f"{begin} to it (median), and {np.degrees(best):.0f} {better}"
         if off > ASKEW:
             return f"{begin} to it (median): expected the cable's tangent, from gripper 0 towards gripper 1, at both."
+    return None
+
+
+def _axis_fault(log: GapLog) -> str | None:
+    """Finds grippers in space whose x axis does not leave along the cable."""
+    valid = np.arange(log.keypoints.shape[1])[None] < log.episode_length[:, None]
+    points, pose = log.keypoints[valid].astype(float), log.gripper_pose[valid].astype(float)
+    for gripper, (end, inner, name) in enumerate(((0, 1, "0"), (-1, -2, "N - 1"))):
+        w, x, y, z = pose[:, gripper, 3:].T
+        axis = np.stack([1 - 2 * (y**2 + z**2), 2 * (x * y + w * z), 2 * (x * z - w * y)], axis=-1)
+        along = (1, -1)[gripper] * (points[:, inner] - points[:, end])
+        cosine = (along * axis).sum(axis=-1) / np.linalg.norm(along, axis=-1)
+        off = float(np.nanmedian(np.arccos(np.clip(cosine, -1, 1)))) if np.isfinite(cosine).any() else 0.0
+        if off > INWARDS:
+            return (
+                f"The x axis of gripper {gripper} is {np.degrees(off):.0f} degrees off the cable next to it (median): "
+                "expected it along the cable, from gripper 0 towards gripper 1, at both."
+            )
+        offset = points[:, end] - pose[:, gripper, :3]
+        beside = np.linalg.norm(offset - (offset * axis).sum(axis=-1, keepdims=True) * axis, axis=-1)
+        if np.isfinite(beside).any() and (away := float(np.nanmedian(beside))) > BESIDE:
+            return (
+                f"Keypoint {name} is {1e3 * away:.0f} mm beside the x axis of gripper {gripper} (median): expected the "
+                "pose's origin at that keypoint and its x axis along the cable. Shift the pose to where the cable is "
+                "held."
+            )
     return None
 
 

@@ -93,7 +93,11 @@ def scatter_of(off: Float[np.ndarray, "E T 2 3"], valid: Bool[np.ndarray, "E T"]
 
 
 def steadied(
-    pose: Float[np.ndarray, "E T 2 3"], expected: Float[np.ndarray, "E T 2 3"], length: Int[np.ndarray, "E"]
+    pose: Float[np.ndarray, "E T 2 3"],
+    expected: Float[np.ndarray, "E T 2 3"],
+    length: Int[np.ndarray, "E"],
+    *,
+    least: Float[np.ndarray, "3"] = _STEADY,
 ) -> tuple[Float[np.ndarray, "E T 2 3"], Float[np.ndarray, "2 3"]]:
     """Measured poses without what scatters from one sample to the next, which would shake the simulated cable.
 
@@ -104,13 +108,14 @@ def steadied(
         pose: theta continuous, the last one held over the padding [m, m, rad].
         expected: motion without scatter that they follow more or less, zero where there is none.
         length: valid samples of each episode.
+        least: scatter from which on a coordinate is smoothed; [m, m, rad] by default.
 
     Returns:
         The poses, and the root mean square of what was taken from each coordinate [m, m, rad]; zero for encoders.
     """
     off, steady = pose - expected, np.zeros((2, 3))
     valid = np.arange(pose.shape[1])[None] < np.asarray(length)[:, None]
-    noisy = scatter_of(off, valid) > _STEADY
+    noisy = scatter_of(off, valid) > least
     if not noisy.any():
         return pose, steady
     smooth = pose.copy()
@@ -121,7 +126,7 @@ def steadied(
             smooth[episode, :n, gripper, axis] = expected[episode, :n, gripper, axis] + path
             smooth[episode, n:, gripper, axis] = smooth[episode, n - 1, gripper, axis]
     taken = np.sqrt(np.mean((pose - smooth)[valid] ** 2, axis=0))
-    return (smooth, taken) if (taken > _STEADY).any() else (pose, steady)
+    return (smooth, taken) if (taken > least).any() else (pose, steady)
 
 
 def _least_unseen_error(series: list[Float[np.ndarray, "T"]]) -> list[Float[np.ndarray, "T"]]:

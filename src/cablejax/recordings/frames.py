@@ -26,6 +26,9 @@ AXES: tuple[Axis, ...] = ("x", "y", "z", "-x", "-y", "-z")
 LARGEST_TILT = np.radians(50)
 """Largest angle between the stated vertical and the direction in which the cable hangs."""
 
+ALONG = np.radians(45)
+"""Largest angle between a gripper's x axis and the markers on it."""
+
 RIGID = np.radians(8)
 """Largest root-mean-square angle by which a pair of markers may turn against the gripper that it is on."""
 
@@ -127,22 +130,16 @@ def require_rigid(takes: tuple[Take, ...], pairs: tuple[tuple[int, int], ...]) -
         ValueError: says by how much they differ, and which convention would fit.
     """
     for gripper, (first, second) in enumerate(pairs):
-        along, turn = [], []
-        for take in takes:
-            if take.gripper_pose is None:
-                continue
-            along.append(take.keypoints[:, second] - take.keypoints[:, first])
-            turn.append(take.gripper_pose[:, gripper, 3:])
-        if not along:
+        seen = _seen(takes, gripper, first, second)
+        if seen is None:
             continue
-        direction, quaternion = np.concatenate(along), np.concatenate(turn)
-        seen = np.isfinite(direction).all(axis=1) & np.isfinite(quaternion).all(axis=1)
-        direction, quaternion = direction[seen], quaternion[seen]
-        direction = direction / np.linalg.norm(direction, axis=-1, keepdims=True)
-        spread = _spread(quaternion, direction)
+        quaternion, direction = seen
+        spread = _in_gripper(quaternion, direction)[1]
         if spread <= RIGID:
             continue
-        fitting = [name for name, change in _CONVENTIONS.items() if _spread(*change(quaternion, direction)) <= RIGID]
+        fitting = [
+            name for name, change in _CONVENTIONS.items() if _in_gripper(*change(quaternion, direction))[1] <= RIGID
+        ]
         raise ValueError(
             f"The markers {first} and {second} on gripper {gripper} turn against its orientation by "
             f"{np.degrees(spread):.0f} degrees (root mean square), expected at most {np.degrees(RIGID):.0f}: positions "
@@ -151,12 +148,50 @@ def require_rigid(takes: tuple[Take, ...], pairs: tuple[tuple[int, int], ...]) -
         )
 
 
-def _spread(quaternion: Float[np.ndarray, "S 4"], direction: Float[np.ndarray, "S 3"]) -> float:
-    """Root-mean-square angle of a direction, in the gripper's own frame, about its mean [rad]."""
+def require_along_x(takes: tuple[Take, ...], pairs: tuple[tuple[int, int], ...]) -> None:
+    """Refuses grippers whose x axis is not along the two markers on them: the cable's tangent is taken from it.
+
+    Args:
+        takes: with measured poses in space that fit the markers, see `require_rigid`.
+        pairs: the two keypoints on each gripper.
+
+    Raises:
+        ValueError: names the axis of the gripper that is nearest to the markers.
+    """
+    for gripper, (first, second) in enumerate(pairs):
+        seen = _seen(takes, gripper, first, second)
+        mean = np.array([1.0, 0.0, 0.0]) if seen is None else _in_gripper(*seen)[0]
+        if np.arccos(np.clip(mean[0], -1, 1)) <= ALONG:
+            continue
+        axis = int(np.argmax(np.abs(mean)))
+        raise ValueError(
+            f"The markers {first} and {second} on gripper {gripper} lie along ({mean[0]:.2f}, {mean[1]:.2f}, "
+            f"{mean[2]:.2f}) in its frame, nearest to its {'-' if mean[axis] < 0 else ''}{'xyz'[axis]} axis; expected "
+            "x, along the cable from gripper 0 towards gripper 1. Turn the gripper's frame, or give both "
+            "in one frame."
+        )
+
+
+def _seen(takes: tuple[Take, ...], gripper: int, first: int, second: int) -> tuple[np.ndarray, np.ndarray] | None:
+    """Orientations of a gripper, and the directions of its markers, where both were observed; None without poses."""
+    posed = [take for take in takes if take.gripper_pose is not None]
+    if not posed:
+        return None
+    direction = np.concatenate([take.keypoints[:, second] - take.keypoints[:, first] for take in posed])
+    quaternion = np.concatenate([pose[:, gripper, 3:] for take in posed if (pose := take.gripper_pose) is not None])
+    seen = np.isfinite(direction).all(axis=1) & np.isfinite(quaternion).all(axis=1)
+    direction = direction[seen]
+    return quaternion[seen], direction / np.linalg.norm(direction, axis=-1, keepdims=True)
+
+
+def _in_gripper(
+    quaternion: Float[np.ndarray, "S 4"], direction: Float[np.ndarray, "S 3"]
+) -> tuple[Float[np.ndarray, "3"], float]:
+    """Mean of a direction in the gripper's own frame, and the root-mean-square angle about it [rad]."""
     own = rotated(quaternion * np.array([1.0, -1.0, -1.0, -1.0]), direction)
     mean = own.mean(axis=0)
     mean = mean / max(float(np.linalg.norm(mean)), 1e-12)
-    return float(np.sqrt((np.arccos(np.clip(own @ mean, -1, 1)) ** 2).mean()))
+    return mean, float(np.sqrt((np.arccos(np.clip(own @ mean, -1, 1)) ** 2).mean()))
 
 
 def _mirrored(axis: int):

@@ -43,7 +43,8 @@ def cut_at_gaps(takes: tuple[Take, ...], on_grippers: tuple[int, ...] | None) ->
         on_grippers: keypoints on the grippers, which locate them; None where the poses were measured separately.
 
     Returns:
-        The takes, and one sentence for each that was changed.
+        The takes, each with the name of its recording as a label where it has none, and one sentence for each that was
+        changed.
 
     Raises:
         ValueError: nothing long enough is left, or one gripper is never seen; says why.
@@ -78,6 +79,8 @@ def cut_at_gaps(takes: tuple[Take, ...], on_grippers: tuple[int, ...] | None) ->
                 f"Take {take.name}: {lost} samples in stretches shorter than {SHORTEST:g} s or {SHORTEST_SAMPLES} "
                 "samples were left out."
             )
+        # what was cut is still one recording
+        take = dataclasses.replace(take, labels={"recording": take.name, **take.labels})
         if len(kept) == 1:
             parts.append(take.part(*kept[0], take.name))
         else:
@@ -191,7 +194,8 @@ def _breaks(take: Take) -> tuple[list[int], list[str]]:
             f"Take {take.name}: no samples for {interval[t]:.3g} s after sample {t}, where {usual:.3g} s is usual; the "
             "take was cut there."
         )
-    for t in _jumps(median_step(take.keypoints), interval):
+    # a stamp that is late makes the next interval short, and no jump
+    for t in _jumps(median_step(take.keypoints), np.maximum(interval, usual)):
         breaks.append(t + 1)
         reports.append(
             f"Take {take.name}: the whole cable jumps between samples {t} and {t + 1}, so samples are missing that the "

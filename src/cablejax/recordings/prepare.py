@@ -9,7 +9,7 @@ import numpy as np
 from scipy.cluster.hierarchy import fcluster, linkage
 
 from cablejax.cable_length import STRETCH
-from cablejax.recordings.frames import Frame, into_frame, require_hanging, require_rigid
+from cablejax.recordings.frames import Frame, into_frame, require_along_x, require_hanging, require_rigid
 from cablejax.recordings.gaps import cut_at_gaps
 from cablejax.recordings.marker_order import restore_order
 from cablejax.recordings.poses import poses_from_markers
@@ -110,6 +110,7 @@ def prepare(takes: tuple[Take, ...], setup: Setup) -> tuple[tuple[Take, ...], li
     takes, cut = cut_at_gaps(takes, None if measured else (*pairs[0], *pairs[1]))
     if measured and setup.on_grippers == "pairs" and takes[0].keypoints.shape[2] == 3:
         require_rigid(takes, pairs)
+        require_along_x(takes, pairs)
     if not measured:
         takes = tuple(_with_poses(take, pairs) for take in takes)
     return takes, [*repairs, *outliers, *exchanged, *jumps, *stretched, *cut, *_jerks(takes)]
@@ -186,11 +187,15 @@ def _without_jumps(takes: tuple[Take, ...]) -> tuple[tuple[Take, ...], list[str]
         across = np.linalg.norm(take.keypoints[:, 2:] - take.keypoints[:, :-2], axis=-1)
         off = np.zeros(take.keypoints.shape[:2], bool)
         off[:, 1:-1] = far[:, :-1] & far[:, 1:] & ~apart(across, usual[:-1] + usual[1:], usual.sum())
+        # an end has one neighbour, which is where it should be by its other one
+        near = np.nan_to_num(spacing(take.keypoints), nan=np.inf) <= usual + part * usual.sum()
+        off[:, 0] = far[:, 0] & near[:, 1]
+        off[:, -1] = far[:, -1] & near[:, -2]
         kept.append(dataclasses.replace(take, keypoints=np.where(off[..., None], np.nan, take.keypoints)))
         for index in np.flatnonzero(off.any(axis=0)):
             samples = np.flatnonzero(off[:, index])
             reports.append(
-                f"Take {take.name}: keypoint {index} is farther from both neighbours than the cable reaches in "
+                f"Take {take.name}: keypoint {index} is farther from its neighbours than the cable reaches in "
                 f"{len(samples)} of {len(off)} samples, from sample {samples[0]}: taken as not observed."
             )
     return tuple(kept), reports

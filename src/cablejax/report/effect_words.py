@@ -23,7 +23,7 @@ EFFECTS: dict[str, str] = {
     "quadratic_drag": "a drag that grows with the square of the speed",
     "gravity_tilt": "the table is tilted",
     "linear_density": "the mass per length differs",
-    "lumped_mass": "a connector or clip on the cable",
+    "lumped_mass": "mass sits on the cable, as of a connector or of markers",
     "gripper_slip": "the cable slides through a gripper",
     "gripper_rotation_offset": "the cable is gripped at another angle than measured",
     "gripper_compliance": "the grasp yields in rotation",

@@ -20,7 +20,7 @@ from cablejax.spatial.accidents import accident_sentences, kept, moderated, off
 from cablejax.spatial.cable import errors
 from cablejax.spatial.clock import on_one_clock
 from cablejax.spatial.effects import GRIP
-from cablejax.spatial.gap import RESOLVABLE, constant_offset, gap_of, noise_of
+from cablejax.spatial.gap import constant_offset, gap_of, noise_of, smallest_gap
 from cablejax.spatial.geometry import local_changes
 from cablejax.spatial.identify import Identified, identify
 from cablejax.spatial.named import named_effects, quantities_of, with_both_drags
@@ -76,7 +76,7 @@ def diagnose_space(
     changes = local_changes(log, windows.held)
     for change in changes:
         progress(change.sentence)
-    found = identify(windows, stiffness, only=only, state=state, progress=progress)
+    found = identify(windows, stiffness, cable["bending_damping_s"], only=only, state=state, progress=progress)
 
     density, guessed = cable["linear_density_kg_per_m"], "linear_density_kg_per_m" in log.meta.get("guessed", ())
     effects = named_effects(found, density)
@@ -88,7 +88,7 @@ def diagnose_space(
     use = np.flatnonzero(kept(lost | off(error) | windows.torn))
     gap = gap_of(before[use], after[use], found.cable.on(windows.chosen(use)), noise)
     equivalent = _equivalent(found, named)
-    verdict = _verdict(gap, named, equivalent)
+    verdict = _verdict(gap, 1e3 * smallest_gap(noise, windows), named, equivalent)
     if verdict in ("none", "unknown"):
         effects = ()
     offset = ParameterEstimate(constant_offset(after[use], windows.chosen(use)), None, "m")
@@ -123,8 +123,8 @@ def diagnose_space(
     )
 
 
-def _verdict(gap: Gap, named: Sequence[str], equivalent: tuple[tuple[str, ...], ...]) -> Verdict:
-    allowed = max(_CALIBRATION.adequate * gap.before_rmse_mm, RESOLVABLE * gap.noise_floor_mm)
+def _verdict(gap: Gap, smallest_mm: float, named: Sequence[str], equivalent: tuple[tuple[str, ...], ...]) -> Verdict:
+    allowed = max(_CALIBRATION.adequate * gap.before_rmse_mm, smallest_mm)
     return judged(
         resolvable=gap.shrinkage is not None,
         telling=bool(named) and gap.shrinkage_ci90 is not None and gap.shrinkage_ci90[0] > 0,
@@ -178,6 +178,12 @@ def _caveats(log, windows, left_out, found) -> tuple[str, ...]:
             "How the cable sits in the grippers is fitted for each recording: it differs by "
             f"{np.sqrt((own**2).mean()):.2f} rad (root mean square) from the mean. Recordings that no fit has seen are "
             "predicted with the mean."
+        )
+    if windows.smoothed:
+        result.append(
+            f"The grippers' measured paths scatter by {1e3 * windows.smoothed:.2g} mm from one sample to the next. "
+            "They are smoothed; what is left of the scatter shakes the simulated cable, and a bending damping may come "
+            "out too large by it."
         )
     if left_out:
         result.append(f"{left_out} windows are labelled eval; nothing was fitted to or scored on them.")

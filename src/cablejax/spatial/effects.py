@@ -83,11 +83,11 @@ def _from_zero(name: str, field: str, scale: float, templates: tuple[float, ...]
     return SpatialEffect(name=name, parameters=(parameter,), null=(0.0,), fields=((field, 1),), templates=templates)
 
 
-def effects_of(n_markers: int) -> tuple[SpatialEffect, ...]:
-    """All effects of a cable with so many free markers."""
+def effects_of(n_markers: int, damping: float = 0.0) -> tuple[SpatialEffect, ...]:
+    """All effects of a cable with so many free markers, of which this damping time is believed true [s]."""
     return (
         _positive("bending_stiffness", "ratio", 1.0, (math.exp(-1), 1.0, math.exp(1), math.exp(2)), null=1.0),
-        _positive("bending_damping", "damping_time", 0.03, (0.01, 0.03, 0.1)),
+        _positive("bending_damping", "damping_time", 0.03, (0.01, 0.03, 0.1), null=damping),
         _from_zero("viscous_drag", "drag", 0.5, (0.2, 0.8)),
         _from_zero("quadratic_drag", "quadratic_drag", 0.2, (0.05, 0.3)),
         _linear("stiffness_profile", ("log_profile", PROFILE_KNOTS, 0.5)),

@@ -7,6 +7,7 @@ import dataclasses
 import numpy as np
 from jaxtyping import Float
 
+from cablejax.diagnose.belief import Calibration
 from cablejax.diagnose.diagnosis import Gap
 from cablejax.diagnose.evidence import Evidence
 from cablejax.diagnose.gap import measure_gap
@@ -15,12 +16,20 @@ from cablejax.spatial.cable import SpatialCable, bounded
 from cablejax.spatial.windows import Windows
 
 RESOLVABLE = 3.0
-"""A gap up to so many times the noise is none."""
+"""An error up to so many times the noise is none."""
+
+OWN = Calibration().smallest_gap(0.0)
+"""Nor is one that the simulator may have by itself [m], of a cable of up to a metre: as on a table."""
 
 
 def noise_of(windows: Windows) -> float:
     """Standard deviation of a coordinate [m], from fourth differences in time, which no motion of a cable has."""
     return float(np.sqrt((noise_floor(windows.observed, None, order=4).std ** 2).mean()))
+
+
+def smallest_gap(noise: float, windows: Windows) -> float:
+    """The error of a coordinate [m], root mean square, from which on there is a gap; longer cables err by more."""
+    return float(np.hypot(RESOLVABLE * noise, OWN * max(1.0, windows.arclength[-1])))
 
 
 def constant_offset(predicted: Float[np.ndarray, "W T F 3"], windows: Windows) -> float:
@@ -75,6 +84,6 @@ def gap_of(
         interval=np.full(len(windows), windows.interval),
         length=windows.valid.sum(axis=1),
         held_out=tuple(range(len(windows))),
-        resolvable=bool(np.nanmean(squares(before, windows)) > (RESOLVABLE * noise) ** 2),
+        resolvable=bool(np.nanmean(squares(before, windows)) > smallest_gap(noise, windows) ** 2),
     )
     return dataclasses.replace(gap, held_out_episodes=tuple(sorted({int(e) for e in windows.episode})))

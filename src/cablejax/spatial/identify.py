@@ -77,10 +77,10 @@ class Identified:
         return np.where(self.first[:, None, None, None], other, one), np.where(self.first, other_ended, ended)
 
 
-def layout_of(windows: Windows, nominal_stiffness: float) -> Layout:
-    """The parameters of a cable with these windows' markers; `nominal_stiffness` is EI / rho [m^4/s^2]."""
+def layout_of(windows: Windows, nominal_stiffness: float, nominal_damping: float = 0.0) -> Layout:
+    """The parameters of a cable with these windows' markers; believed are EI / rho [m^4/s^2] and a damping time [s]."""
     return Layout(
-        effects_of(windows.keypoints.shape[2]),
+        effects_of(windows.keypoints.shape[2], nominal_damping),
         float(nominal_stiffness),
         tuple(float(s) for s in windows.arclength),
         tuple(float(g) for g in windows.gravity),
@@ -90,6 +90,7 @@ def layout_of(windows: Windows, nominal_stiffness: float) -> Layout:
 def identify(
     windows: Windows,
     nominal_stiffness: float,
+    nominal_damping: float = 0.0,
     *,
     only: Sequence[str] | None = None,
     state: pathlib.Path | None = None,
@@ -100,6 +101,7 @@ def identify(
     Args:
         windows: to explain; all of them may be fitted.
         nominal_stiffness: EI / rho believed true [m^4/s^2].
+        nominal_damping: time of Kelvin-Voigt damping in bending believed true [s].
         only: names of the effects to try; by default all but `intrinsic_curvature`, whose derivatives follow the
             material frame and take four times as long as all others together.
         state: file that keeps what is done, so that an interrupted call goes on where it was.
@@ -111,7 +113,7 @@ def identify(
     if unknown := [name for name in only or () if name not in effect_names()]:
         raise ValueError(f"There is no effect {unknown[0]!r} in space, expected some of {', '.join(effect_names())}.")
     names = [name for name in effect_names() if (name != TWISTED if only is None else name in only)]
-    layout = layout_of(windows, nominal_stiffness)
+    layout = layout_of(windows, nominal_stiffness, nominal_damping)
     cable = SpatialCable(Rod(EDGES, 1, twisting=False), layout, windows)
     time_steps = time_steps_for(cable.on(windows.chosen(windows.whole(_TIMED))))
     progress(

@@ -29,7 +29,8 @@ def fingerprint(cable: SpatialCable, names: Sequence[str]) -> str:
     )
     # what coordinates and values mean is among the inputs: those of another version may mean something else
     meaning = [np.asarray(part, np.float32) for part in jax.tree.leaves(layout.physics(layout.null + 0.5))]
-    for array in (windows.keypoints, windows.position, windows.valid, windows.group, *meaning):
+    arrays = (windows.keypoints, windows.position, windows.frames, windows.valid, windows.group)
+    for array in (*arrays, np.float64(windows.interval), *meaning):
         digest.update(np.ascontiguousarray(array).tobytes())
     return digest.hexdigest()
 

@@ -48,13 +48,18 @@ def named_effects(found: Identified, density: float) -> tuple[NamedEffect, ...]:
         density: mass per length, with the markers, that is believed true [kg/m], for what is known per mass only.
     """
     named, windows, estimate = [], found.cable.windows, found.everything
+    layout = estimate.layout
+    hidden = _HIDDEN * windows.interval / found.cable.rod.substeps
+    damping = max(float(layout.null[layout.slices["damping_time"]].item()), hidden)
     # motion shows the drags' sum: it goes by the names that stayed in the search, or by that of the larger one
     drags = [name for name in found.effects if name in _DRAGS] or [_main_drag(estimate)]
     for name in dict.fromkeys((*found.effects, *found.tried)):
         if name in _DRAGS and name not in drags:
             continue
-        parameters, along = parameters_of(name, estimate, density, first_marker=windows.held[0])
-        if _shown(name, parameters[_TELLING[name]], windows.interval / found.cable.rod.substeps):
+        parameters, along = parameters_of(
+            name, estimate, density, first_marker=windows.held[0], first_clamp=windows.first_clamp
+        )
+        if _shown(name, parameters[_TELLING[name]], damping, longer_only=damping == hidden):
             named.append(NamedEffect(name, None, parameters, {"along_cable_m": along, "time_s": None, "table_m": None}))
     return tuple(named)
 
@@ -90,17 +95,24 @@ def _main_drag(estimate: Estimate) -> str:
     return _DRAGS[int(estimate.speed * quadratic > linear)]
 
 
-def _shown(effect: str, parameter: ParameterEstimate, time_step: float) -> bool:
-    """Whether it is as good as excluded that the effect is absent, or shorter than time steps [s] show."""
+def _shown(effect: str, parameter: ParameterEstimate, damping: float, *, longer_only: bool) -> bool:
+    """Whether it is as good as excluded that the effect is absent.
+
+    Args:
+        effect: name.
+        parameter: that says how far it is from its absence.
+        damping: time that a damping is compared with [s]: the one believed, or the shortest that time steps show.
+        longer_only: whether a shorter one cannot be told from it.
+    """
     ends = np.reshape(np.array(parameter.ci90, float), (-1, 2)).T
-    ends, damping = np.stack([np.ravel(parameter.value), *ends]), effect == "bending_damping"
-    if damping:
-        ends = np.log(ends / (_HIDDEN * time_step))
+    ends, damped = np.stack([np.ravel(parameter.value), *ends]), effect == "bending_damping"
+    if damped:
+        ends = np.log(ends / damping)
     elif _TELLING[effect] == "ratio":
         ends = np.log(ends)
     value, low, high = ends
     above, below = value - _WIDER * (value - low) > 0, value + _WIDER * (high - value) < 0
-    return bool(above.any() or (below.any() and not damping))
+    return bool(above.any() or (below.any() and not (damped and longer_only)))
 
 
 def parameters_of(
@@ -109,6 +121,7 @@ def parameters_of(
     density: float,
     *,
     first_marker: int = 0,
+    first_clamp: float = 0.0,
     unmodelled: Mapping[str, float] = UNMODELLED,
 ) -> tuple[dict[str, ParameterEstimate], list[float] | None]:
     """Parameters of an effect by the names of the gap log, and the stretch of cable that they belong to [m].
@@ -118,10 +131,10 @@ def parameters_of(
         estimate: in which it is free.
         density: see `named_effects`.
         first_marker: index of the first free marker among all keypoints.
+        first_clamp: arc length of the first clamp, from the first keypoint [m].
         unmodelled: error of an effect's parameter besides, see `UNMODELLED`.
     """
-    besides = unmodelled.get(effect, 0.0)
-    where, length = estimate.layout.slices, estimate.layout.arclength[-1]
+    besides, where, length = unmodelled.get(effect, 0.0), estimate.layout.slices, estimate.layout.arclength[-1]
 
     def size(field, first):
         """Of two values as a vector; its interval is as wide as that of the less certain one."""
@@ -137,8 +150,8 @@ def parameters_of(
 
     def place(knot, knots):
         centre, half = knot * length / (knots - 1), 0.5 * length / (knots - 1)
-        along = [max(centre - half, 0.0), min(centre + half, length)]
-        return {"centre_m": _choice(centre, "m"), "width_m": _choice(along[1] - along[0], "m")}, along
+        along = [first_clamp + max(centre - half, 0.0), first_clamp + min(centre + half, length)]
+        return {"centre_m": _choice(first_clamp + centre, "m"), "width_m": _choice(along[1] - along[0], "m")}, along
 
     along = None
     match effect:
@@ -160,7 +173,7 @@ def parameters_of(
             }
         case "lumped_mass":
             parameters = {
-                "centre_m": _choice([float(s) for s in estimate.layout.arclength[:-1]], "m"),
+                "centre_m": _choice([first_clamp + float(s) for s in estimate.layout.arclength[:-1]], "m"),
                 "mass_kg": _reported(from_zero(estimate.marker_mass), "kg", times=density),
             }
         case "gripper_rotation_offset":

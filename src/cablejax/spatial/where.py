@@ -10,7 +10,7 @@ from jaxtyping import Float
 from cablejax.diagnose.where import HORIZONS, Where
 from cablejax.diagnose.where_sizes import above, sizes_of
 from cablejax.spatial.cable import bounded
-from cablejax.spatial.gap import RESOLVABLE, squares
+from cablejax.spatial.gap import smallest_gap, squares
 from cablejax.spatial.geometry import LocalChange
 from cablejax.spatial.windows import Windows, labels
 from cablejax.types import GapLog
@@ -54,7 +54,7 @@ def where_of(
         off,
         noise,
         np.asarray(log.meta["keypoint_arclength_m"]),
-        smallest_mm=1e3 * RESOLVABLE * noise,
+        smallest_mm=1e3 * smallest_gap(noise, windows),
         names=[f"file {name}" for name in labels(log, "file", "take")],
         gap_mm=float(above(squared, noise)),
         horizons_mm=_by_time(squared, windows.interval, noise),

@@ -9,6 +9,9 @@ from jaxtyping import Bool, Float, Int
 
 from cablejax.cable import GRAVITY
 from cablejax.cable_length import TOLERANCE, require_fitting_length
+from cablejax.diagnose.log_faults import steadied
+from cablejax.diagnose.noise import noise_floor
+from cablejax.log_geometry import cable_fault
 from cablejax.recordings.poses import rotated
 from cablejax.simulate.rod.clamps import frames_along
 from cablejax.types import GapLog
@@ -20,6 +23,8 @@ _SHORTEST = 1.0
 _HELD = 0.003
 # Part of a window that must be recorded for it to be a whole one.
 _WHOLE = 0.8
+# Clamps that scatter by less than this from one sample to the next [m], and their tangents, stay as they were measured.
+_STEADY, _STEADY_TANGENT = np.full(3, 1e-4), np.full(3, 5e-3)
 # Weight in fits of a window in which the grippers are further apart than the cable is long.
 _TORN = 0.01
 
@@ -42,8 +47,11 @@ class Windows:
         held: number of keypoints held at either end.
         arclength: of the free markers and the second clamp, from the first clamp [m], shape [F + 1].
         n_keypoints: N.
+        first_clamp: arc length of the first clamp, from the first keypoint [m].
         gravity: as the log states it [m/s^2].
         trust: weight of each window in fits, shape [W]; None = 1.
+        smoothed: what was taken from the measured paths of the clamps so that they are smooth, root mean square of a
+            coordinate [m].
         left_out: where the log has windows that do not begin with two samples of all keypoints, in words.
     """
 
@@ -60,8 +68,10 @@ class Windows:
     held: tuple[int, int]
     arclength: Float[np.ndarray, "F1"]
     n_keypoints: int
+    first_clamp: float = 0.0
     gravity: tuple[float, ...] = (0.0, 0.0, -GRAVITY)
     trust: Float[np.ndarray, "W"] | None = None
+    smoothed: float = 0.0
     left_out: tuple[str, ...] = ()
 
     def __len__(self) -> int:
@@ -95,9 +105,10 @@ class Windows:
 
     @property
     def speed(self) -> float:
-        """Root mean square speed of the free markers [m/s]."""
+        """Root mean square speed of the free markers [m/s], without what the noise adds to differences."""
         step = np.diff(self.observed, axis=1) / self.interval
-        return float(np.sqrt(np.nanmean((step**2).sum(axis=-1))))
+        noise = 6.0 * (noise_floor(self.observed, None, order=4).std ** 2).mean() / self.interval**2
+        return float(np.sqrt(max(np.nanmean((step**2).sum(axis=-1)) - noise, 0.0)))
 
     def chosen(self, index) -> Windows:
         """Some of the windows."""
@@ -116,9 +127,11 @@ class Windows:
 def windows_of(log: GapLog) -> Windows:
     """Cuts every episode into windows of `WINDOW`.
 
+    Clamps whose paths scatter from one sample to the next would shake the simulated cable, and are smoothed.
+
     Raises:
-        ValueError: a log in the plane, of unequal sample intervals, of a cable shorter than its keypoints are apart, or
-            one that has no window of a second.
+        ValueError: a log in the plane, of unequal sample intervals, of a cable shorter than its keypoints are apart or
+            that is not between its grippers, or one that has no window of a second.
     """
     interval = _sample_interval(log)
     samples = min(round(WINDOW / interval), int(log.episode_length.max()))
@@ -129,6 +142,10 @@ def windows_of(log: GapLog) -> Windows:
     held = _held(points, pose[..., :3], tangent, valid)
     s = np.asarray(log.meta["keypoint_arclength_m"], float)
     clamp = _clamps(points, pose[..., :3], tangent, s, held)
+    clamp, taken = steadied(clamp, np.zeros_like(clamp), log.episode_length, least=_STEADY)
+    tangent, turned = steadied(tangent, np.zeros_like(tangent), log.episode_length, least=_STEADY_TANGENT)
+    if turned.any():
+        tangent = tangent / np.linalg.norm(tangent, axis=-1, keepdims=True)
     first = s[held[0] - 1] if held[0] else s[0]
     last = s[len(s) - held[1]] if held[1] else s[-1]
     free = slice(held[0], len(s) - held[1])
@@ -178,7 +195,9 @@ def windows_of(log: GapLog) -> Windows:
         held=held,
         arclength=np.append(s[free], last) - first,
         n_keypoints=len(s),
+        first_clamp=float(first - s[0]),
         gravity=tuple(log.meta["gravity_m_per_s2"]),
+        smoothed=float(np.sqrt((taken**2).mean(axis=-1)).max()),
         left_out=tuple(f"file {files[e]} from {begin * interval:.3g} s" for e, begin, _ in left_out),
     )
     return dataclasses.replace(windows, trust=np.where(windows.torn, _TORN, 1.0)) if windows.torn.any() else windows
@@ -235,6 +254,8 @@ def _sample_interval(log: GapLog) -> float:
         np.asarray(log.meta["keypoint_arclength_m"], float),
         "meta.keypoint_arclength_m",
     )
+    if fault := cable_fault(log):
+        raise ValueError(fault)
     return interval
 
 
