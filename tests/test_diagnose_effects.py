@@ -69,6 +69,34 @@ def test_check_refuses_an_effect_that_does_nothing():
         check_effect(effect)
 
 
+def test_check_refuses_a_parameter_that_is_rounded_away():
+    class Rounded(_Shift):
+        def apply(self, physics, values, variant, config):
+            angle = physics.camera_angle + 0.001 * jnp.round(1e3 * values[0])
+            return dataclasses.replace(physics, camera_angle=angle)
+
+    with pytest.raises(ValueError, match="'offset_m' changes nothing from one of its values to the next"):
+        check_effect(Rounded())
+
+
+def test_check_refuses_what_is_no_effect():
+    class Elsewhere(_Shift):
+        hook = "tabel"  # pyright: ignore[reportAssignmentType]
+
+    class Forgets(_Shift):
+        def apply(self, physics, values, variant, config):
+            dataclasses.replace(physics, camera_angle=values[0])
+
+    for wrong, message in (
+        (_Shift, "expected a `CableEffect`: add brackets"),
+        ("shift", "expected a `CableEffect`"),
+        (Elsewhere(), "has the hook 'tabel', expected one of"),
+        (Forgets(), "`apply` gave a NoneType, expected the changed Physics"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            check_effect(wrong)  # pyright: ignore[reportArgumentType]
+
+
 def test_check_refuses_a_hidden_derivative():
     class Hidden(_Shift):
         def apply(self, physics, values, variant, config):

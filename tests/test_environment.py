@@ -10,6 +10,7 @@ import pytest
 # ruff: noqa: E402
 gymnasium = pytest.importorskip("gymnasium", reason="needs Gymnasium: pip install 'cablejax[rl]'")
 
+from gymnasium.error import ResetNeeded
 from gymnasium.utils.env_checker import check_env
 
 from cablejax.cable import Cable, Discretisation
@@ -183,11 +184,37 @@ def test_what_cannot_be_rendered_is_refused(make):
         make(config=CONFIG, render_mode="human")
 
 
+def test_seeds_may_be_an_array():
+    one, other = (ShapeCableVectorEnv(2, CONFIG).reset(seed=seeds)[0] for seeds in ([1, 2], np.array([1, 2])))
+    for name, values in one.items():
+        np.testing.assert_array_equal(values, other[name])
+
+
+@pytest.mark.parametrize("make", [ShapeCableEnv, functools.partial(ShapeCableVectorEnv, 1)])
+def test_there_is_no_step_before_a_reset(make):
+    env = make(config=CONFIG)
+    with pytest.raises(ResetNeeded, match="call `reset` before `step`"):
+        env.step(np.zeros(env.action_space.shape))
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"discretisation": Cable()}, r"discretisation is a Cable, expected a Discretisation: Discretisation\(cable\)"),
+        ({"randomisation": {"friction": 0.1}}, "randomisation is a dict"),
+        ({"targets": "USZ"}, "targets is 'USZ', expected a tuple"),
+    ],
+)
+def test_settings_of_another_type_are_refused(settings, message):
+    with pytest.raises(ValueError, match=message):
+        ShapeCableConfig(**settings)
+
+
 def test_wrong_options_and_actions_are_refused():
     env = ShapeCableEnv(ShapeCableConfig())
     with pytest.raises(ValueError, match="no option 'targte' of `reset`, expected target or effects"):
         env.reset(options={"targte": "S"})
     with pytest.raises(ValueError, match=r"'bending_stiffness:ratio=2', expected a list"):
         env.reset(options={"effects": "bending_stiffness:ratio=2"})
-    with pytest.raises(ValueError, match=r"action has shape \(1, 6\), expected \(2, 3\)"):
+    with pytest.raises(ValueError, match=r"action has shape \(6,\), expected \(2, 3\)"):
         env.step(np.zeros(6))

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from cablejax.bounded import Result
+from cablejax.control.targets import Target
 from cablejax.mpc import MPC, Action, LevenbergMarquardt, MPCConfig, ProjectedGradient, time_control
 from cablejax.mpc.fallback import ABOUT, RETURNS, _followed, radius_after
 from cablejax.mpc.state import initial_state
@@ -473,3 +474,26 @@ def test_impossible_inputs_are_refused():
         control.step(state, Measurement([[0.0, 0.0]] * N, np.zeros((2, 3))))
     with pytest.raises(ValueError, match="gripper poses"):
         control.step(state, Measurement(np.zeros((N, 2)), np.zeros((3, 3))))
+
+
+@pytest.mark.parametrize(
+    ("dynamics", "message"),
+    [
+        (lambda weights, history, twist: history.keypoints[-1, 1:], rf"an array of shape \({N - 1}, 2\), expected"),
+        (lambda weights, history, twist: jnp.zeros(2), r"an array of shape \(2,\), expected displacements"),
+        (lambda weights, history, twist: None, "The model gave NoneType, expected"),
+        (lambda history, twist: history.keypoints[-1], r"could not be called: .* Expected `dynamics\(weights"),
+    ],
+)
+def test_a_model_that_gives_no_displacements_is_refused_at_the_start(dynamics, message):
+    with pytest.raises(ValueError, match=message):
+        MPC(CONFIG, dynamics, jnp.ones(()), hermite_shape(START, N)).init(at_rest(START))
+
+
+def test_millimetres_and_whole_targets_are_refused():
+    millimetres = jax.tree.map(lambda x: 1000.0 * x, at_rest(START))
+    with pytest.raises(ValueError, match=r"m apart, and the cable is .* expected poses and keypoints in metres"):
+        controller().init(millimetres)
+    whole = Target("own", np.asarray(hermite_shape(START, N)), np.asarray(START))
+    with pytest.raises(ValueError, match=r"The target is a Target, expected an array of keypoints .*: its `keypoints`"):
+        MPC(CONFIG, relaxing_cable, jnp.ones(()), whole)  # pyright: ignore[reportArgumentType]

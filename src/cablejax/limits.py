@@ -33,7 +33,9 @@ class Limit:
 
     def __str__(self) -> str:
         unit = f" {self.unit}" if self.unit else ""
-        return f"a {'whole number' if self.whole else 'number'} from {self.low:.9g} to {self.high:.9g}{unit}"
+        if self.whole:
+            return f"a whole number from {self.low} to {self.high}{unit}"
+        return f"a number from {self.low:.9g} to {self.high:.9g}{unit}"
 
 
 LIMITS: Mapping[str, Limit] = MappingProxyType(

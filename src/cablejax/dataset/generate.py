@@ -260,6 +260,12 @@ def make_engine(config: DatasetConfig) -> Engine:
     if isinstance(engine, ThreadedEngine):
         return engine
     devices = tuple(jax.local_devices())
+    threads = os.environ.get("NPROC", "")
+    if devices[0].platform == "cpu" and threads.isdecimal() and int(threads) < len(devices):
+        raise ValueError(
+            f"NPROC={threads} gives XLA fewer threads than there are devices ({len(devices)}), which would wait for "
+            "each other for ever: raise NPROC, or use fewer devices."
+        )
     shards = 1 if devices[0].platform == "cpu" else max(CABLES_ON_ACCELERATOR // config.shard_size, 1)
     return DeviceParallel(engine, min(shards, config.n_shards) * config.shard_size, devices)
 

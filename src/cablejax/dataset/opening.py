@@ -57,7 +57,9 @@ def _recorded(path: Path | Bucket, mode: Literal["r", "r+"]) -> Store:
     """The data set that a folder says it holds, without a look at its arrays."""
     there = path.read("zarr.json") if isinstance(path, Bucket) else (path / "zarr.json").is_file() or None
     if there is None:
-        raise ValueError(f"{path} holds no data set (no zarr.json). Generate one there, or give another folder.")
+        raise ValueError(
+            f"{path} holds no data set (no zarr.json): give the folder of one, or generate one in a new folder."
+        )
     try:
         group = zarr.open_group(path.zarr(read_only=mode == "r") if isinstance(path, Bucket) else path, mode=mode)
         described = json.loads(there) if isinstance(there, bytes) else read_json(path / "zarr.json")  # pyright: ignore[reportOperatorIssue]

@@ -1,4 +1,4 @@
-"""Spreads one batched engine over several devices, without a trace in the result."""
+"""Spreads one batched engine over several devices, with the same result up to rounding."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class DeviceParallel(Engine):
     """Runs an engine with its batch sharded over devices, always the same number of cables on each.
 
     The last bits of a compiled batch may depend on its size. So every device gets `per_device` cables, padded by copies
-    where the batch is smaller: what one device computes is the same program whatever the number of devices.
+    where the batch is smaller. XLA may still compile another program for another number of devices.
 
     Attributes:
         engine: compiles itself and follows the sharding of its arguments.

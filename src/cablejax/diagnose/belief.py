@@ -106,9 +106,9 @@ class Calibration:
         """See the module's docstring; `gap` of each episode and `noise` in metres per coordinate."""
         return 1.0 + self.correlated_samples * (self.baseline**2 + (self.law_error * gap) ** 2) / noise**2
 
-    def smallest_gap(self, noise: float) -> float:
-        """The gap from which on there is one."""
-        return self.resolvable * float(np.hypot(self.baseline, self.noise_share * noise))
+    def smallest_gap(self, noise: float, own: float | None = None) -> float:
+        """The gap from which on there is one; `own` is the simulator's error if it is not `baseline`."""
+        return self.resolvable * float(np.hypot(self.baseline if own is None else own, self.noise_share * noise))
 
     def complete(self, left: float, gap: float, noise: float) -> bool:
         """Whether an explanation that leaves so much of the gap, all in metres per coordinate, needs no other."""
@@ -161,11 +161,16 @@ def has_gap(null: Fit, evidence: Evidence, calibration: Calibration) -> bool:
     """Whether the nominal simulator is off by more than its own error, in the fourth-power mean over motions.
 
     By a root mean square, calm motions that are recorded besides would make a gap disappear that some motions show.
-    What chance alone adds to the fourth power, by the noise of so few samples, is taken off.
+    What chance alone adds to the fourth power, by the noise of so few samples, is taken off. Each motion counts in
+    units of what the simulator may be off by in it: where the cable snaps over, that is more.
     """
     squares, count = _squares_by_motion(null, evidence)
-    fourth = float(np.mean((np.maximum(squares, 0.0) / count) ** 2 - 2.0 / count))
-    return level(evidence) * max(fourth, 0.0) ** 0.25 > calibration.smallest_gap(level(evidence))
+    noise = level(evidence)
+    own = np.full(len(evidence.count), calibration.baseline) if evidence.own_error is None else evidence.own_error
+    motions = [rows for rows in episodes_by_motion(evidence.motion) if evidence.count[rows].sum() > 0]
+    smallest = np.array([calibration.smallest_gap(noise, float(own[rows].max())) for rows in motions])
+    fourth = (np.maximum(squares, 0.0) / count) ** 2 - 2.0 / count
+    return float(np.mean(fourth * (noise / smallest) ** 4)) > 1.0
 
 
 def _squares_by_motion(fit: Fit, evidence: Evidence) -> tuple[Float[np.ndarray, "M"], Float[np.ndarray, "M"]]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from typing import get_args
 
 import jax
 import jax.numpy as jnp
@@ -11,9 +12,9 @@ import numpy as np
 from cablejax.cable import Discretisation
 from cablejax.diagnose.planar import physics_of
 from cablejax.diagnose.protocol import Explanation, explanation
-from cablejax.effects.base import CableEffect, Context
+from cablejax.effects.base import CableEffect, Context, Hook
 from cablejax.effects.camera import seen_by_camera
-from cablejax.effects.physics import nominal_physics
+from cablejax.effects.physics import Physics, nominal_physics
 from cablejax.simulate.chain.replay import Chain
 from cablejax.simulate.compile import compiler_options
 from cablejax.simulate.equilibrium import equilibrium_state
@@ -23,6 +24,8 @@ _SAMPLES, _INTERVAL = 60, 0.1
 # Of central differences, in prior standard deviations: so small that no contact, yield or slip begins within it.
 _STEP = 1e-6
 _TOLERANCE = 1e-4
+# A derivative below this [m per prior standard deviation] is of a parameter that does nothing.
+_NOTHING = 1e-9
 
 
 def check_effect(effect: CableEffect) -> None:
@@ -32,12 +35,25 @@ def check_effect(effect: CableEffect) -> None:
         ValueError: the null value changes the rollout, no start changes it at all, or the forward derivative of the
             rollout in some parameter is not what central differences give.
     """
+    if not isinstance(effect, CableEffect):
+        raise ValueError(
+            f"The effect is {effect!r}, expected a `CableEffect`{': add brackets' if isinstance(effect, type) else ''}."
+        )
+    # only data generation asks for one
+    hook = getattr(effect, "hook", None)
+    if hook is not None and hook not in get_args(Hook):
+        raise ValueError(f"Effect {effect.name!r} has the hook {hook!r}, expected one of {', '.join(get_args(Hook))}.")
     with jax.enable_x64(True):
         motion, angles = _motion()
         nominal = nominal_physics(_CONFIG, dtype=jnp.float64)
         still = np.asarray(_replay(nominal, motion, angles))
         for variant in effect.variants[:2]:
             null = effect.apply(nominal, [np.float64(v) for v in effect.null], variant, _CONFIG)
+            if not isinstance(null, Physics):
+                raise ValueError(
+                    f"Effect {effect.name!r}: `apply` gave a {type(null).__name__}, expected the changed Physics: "
+                    "dataclasses.replace(physics, ...)."
+                )
             if not np.array_equal(np.asarray(_replay(null, motion, angles)), still):
                 raise ValueError(
                     f"Effect {effect.name!r}: its null value {effect.null} (variant {variant}) changes the nominal "
@@ -65,6 +81,11 @@ def check_effect(effect: CableEffect) -> None:
                     f"Effect {effect.name!r}: `apply` cannot be traced by JAX ({str(error).splitlines()[0]}) Write it "
                     "with the array namespace of its values, without `float`, rounding or branches on them."
                 ) from error
+            if not np.abs(difference).max() > _NOTHING:
+                raise ValueError(
+                    f"Effect {effect.name!r}: {parameter.name!r} changes nothing from one of its values to the next; "
+                    "expected an `apply` that uses it, without rounding."
+                )
             error = np.abs(exact - difference).max()
             if not error <= _TOLERANCE * np.abs(difference).max() + 1e-7:
                 raise ValueError(

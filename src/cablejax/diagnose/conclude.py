@@ -290,11 +290,9 @@ def sentence(conclusion: Conclusion, shrinkage: float | None) -> str:
         )
     if conclusion.undecided:
         return "There is a gap, but too little of it in this log to name its cause: record more motions."
-    return verdict_sentence(
-        conclusion.verdict,
-        conclusion.effects,
-        conclusion.equivalent,
-        conclusion.ranking,
-        conclusion.explained,
-        shrinkage,
-    )
+    parts = (conclusion.effects, conclusion.equivalent, conclusion.ranking, conclusion.explained)
+    said, nothing = verdict_sentence(conclusion.verdict, *parts, shrinkage), conclusion.posterior.count(())
+    if not nothing:
+        return said
+    chance = f"{100 * nothing / len(conclusion.posterior):.0f} %"
+    return f"{said} With a probability of {chance} it is no effect, but what the simulator itself is off by."

@@ -52,6 +52,7 @@ class Evidence:
         freedom: of Student's distribution over episodes, see `belief`.
         motion: episodes with the same number repeat one another, see `repeated_motions`, shape [E].
         fit_freedom: of the distribution that fits maximise; None = `freedom`.
+        own_error: of the simulator in each episode, shape [E]; None = `Calibration.baseline` in all.
         robust: loss of the distances between points, over the last axis; None = squares.
     """
 
@@ -64,6 +65,7 @@ class Evidence:
     freedom: float
     motion: Int[np.ndarray, "E"]
     fit_freedom: float | None = None
+    own_error: Float[np.ndarray, "E"] | None = None
     robust: Robust | None = None
 
     def restricted(self, rows: Sequence[int] | Int[np.ndarray, "_"]) -> Evidence:
@@ -76,6 +78,7 @@ class Evidence:
             nominal=self.nominal[chosen],
             temper=self.temper[chosen],
             motion=self.motion[chosen],
+            own_error=None if self.own_error is None else self.own_error[chosen],
         )
 
     def predict(self, explanations: Sequence[Explanation]) -> Float[np.ndarray, "X E T *O"]:

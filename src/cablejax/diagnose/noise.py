@@ -16,6 +16,8 @@ _SHORTEST_HOLD = 10
 _LAGS = 5
 # A gripper that is so far from where it is for most of a hold moves the cable [m]: further than one goes that lags.
 _MOVED = 0.02
+# A hold of so many times the usual variance is none.
+_RESTLESS = 4.0
 # First-order noise has the measured correlations to this; a cable that creeps in its holds does not.
 _LIKE_FIRST_ORDER = 0.05
 # A keypoint counts as noisier than the others beyond this many standard errors.
@@ -34,12 +36,14 @@ class NoiseFloor:
         correlation: autocorrelation at lags 1, 2, ... samples, shape [K].
         from_holds: whether the recording had holds to learn it from; otherwise the noise is taken to be white.
         rapid: standard deviation by third differences alone [m]; 0 where too few were observed.
+        restless: holds that were left out, since the cable moves in them.
     """
 
     std: Float[np.ndarray, "N"]
     correlation: Float[np.ndarray, "K"]
     from_holds: bool
     rapid: float = 0.0
+    restless: int = 0
 
 
 def noise_floor(
@@ -66,9 +70,9 @@ def noise_floor(
     level = float(np.average(rapid, weights=np.maximum(n_rapid, 1e-9)))
     held = _held(keypoints, hold) if hold is not None else None
     if held is None:
-        variance, count, correlation, from_holds = rapid, n_rapid, np.zeros(_LAGS), False
+        variance, count, correlation, from_holds, restless = rapid, n_rapid, np.zeros(_LAGS), False, 0
     else:
-        variance, count, correlation = held
+        variance, count, correlation, restless = held
         from_holds = True
         if abs(correlation[0]) < _scattered(count):
             slow = float(np.average(variance, weights=np.maximum(count, 1e-9)))
@@ -87,7 +91,9 @@ def noise_floor(
     error = common * np.sqrt(2.0 / np.maximum(count, 1.0))
     distinct = (np.abs(variance - common) > _DISTINCT * error) & (count >= 20)
     std = np.sqrt(np.where(distinct, variance, common))
-    return NoiseFloor(std=std, correlation=correlation, from_holds=from_holds, rapid=math.sqrt(level))
+    return NoiseFloor(
+        std=std, correlation=correlation, from_holds=from_holds, rapid=math.sqrt(level), restless=restless
+    )
 
 
 def still(hold: Bool[np.ndarray, "E T"], gripper_pose: Float[np.ndarray, "E T 2 3"]) -> Bool[np.ndarray, "E T"]:
@@ -120,35 +126,47 @@ def _differences(keypoints, order: int):
 
 
 def _held(keypoints, hold):
-    """Variance and count per keypoint, pooled autocorrelation; None without a hold."""
-    n_points = keypoints.shape[2]
-    squares, count, products = np.zeros(n_points), np.zeros(n_points), np.zeros((_LAGS, 2))
-    lengths: collections.Counter[int] = collections.Counter()
+    """Variance and count per keypoint, pooled autocorrelation, and holds left out; None without a hold.
+
+    A hold that scatters far more than the others is one in which the cable moves.
+    """
+    holds = []
     for episode, flags in zip(keypoints, hold, strict=True):
         for begin, end in stretches(flags):
-            if end - begin < _SHORTEST_HOLD:
-                continue
-            for n in range(n_points):
-                for axis in range(keypoints.shape[3]):
-                    values = episode[begin:end, n, axis]
-                    seen = np.isfinite(values)
-                    if seen.sum() < _SHORTEST_HOLD:
-                        continue
-                    t = np.arange(end - begin, dtype=float)
-                    rest = values - np.polyval(np.polyfit(t[seen], values[seen], 1), t)
-                    squares[n] += np.nansum(rest**2)
-                    count[n] += seen.sum() - 2
-                    lengths[end - begin] += 1
-                    for lag in range(1, _LAGS + 1):
-                        pair = rest[lag:] * rest[:-lag]
-                        products[lag - 1] += np.nansum(pair), np.isfinite(pair).sum()
-    if count.max(initial=0) < 20:
+            if end - begin >= _SHORTEST_HOLD:
+                holds.append((end - begin, *_about_lines(episode[begin:end])))
+    usual = [float(squares.sum() / count.sum()) for _, squares, count, _ in holds if count.sum() > 0]
+    largest = _RESTLESS * float(np.median(usual)) if usual else 0.0
+    kept = [one for one in holds if 0 < one[1].sum() <= largest * one[2].sum()]
+    if not kept:
+        return None
+    squares, count, products = (np.sum([one[k] for one in kept], axis=0) for k in (1, 2, 3))
+    if count.max() < 20:
         return None
     variance = squares / np.maximum(count, 1)
     level = squares.sum() / count.sum()
     correlation = products[:, 0] / np.maximum(products[:, 1], 1) / level
-    slow = _first_order(correlation, lengths, _scattered(count))
-    return (variance, count, correlation) if slow is None else (variance * slow[0], count, slow[1])
+    slow = _first_order(correlation, collections.Counter(one[0] for one in kept), _scattered(count))
+    factor, correlation = (1.0, correlation) if slow is None else slow
+    return variance * factor, count, correlation, len(usual) - len(kept)
+
+
+def _about_lines(keypoints: Float[np.ndarray, "T N D"]):
+    """Squares about a line and their number, per keypoint, and products at lags 1, 2, ... with theirs, of one hold."""
+    t, (_, n_points, axes) = np.arange(len(keypoints), dtype=float), keypoints.shape
+    squares, count, products = np.zeros(n_points), np.zeros(n_points), np.zeros((_LAGS, 2))
+    for n, axis in np.ndindex(n_points, axes):
+        values = keypoints[:, n, axis]
+        seen = np.isfinite(values)
+        if seen.sum() < _SHORTEST_HOLD:
+            continue
+        rest = values - np.polyval(np.polyfit(t[seen], values[seen], 1), t)
+        squares[n] += np.nansum(rest**2)
+        count[n] += seen.sum() - 2
+        for lag in range(1, _LAGS + 1):
+            pair = rest[lag:] * rest[:-lag]
+            products[lag - 1] += np.nansum(pair), np.isfinite(pair).sum()
+    return squares, count, products
 
 
 def _scattered(count: Float[np.ndarray, "N"]) -> float:

@@ -241,6 +241,11 @@ def _caveats(
             "one sample to the next: their noise is correlated, or the cable still moves in what is marked as holds. "
             "The larger number is taken for the noise, and gaps below it are not seen."
         )
+    if case.noise.restless:
+        caveats.append(
+            f"In {case.noise.restless} of the holds the keypoints scatter far more than in the others: the cable moves "
+            "there, and they say nothing of the noise. Mark as holds what is at rest, the cable included."
+        )
     if length is not None:
         caveats.append(
             f"Keypoints are {length.apart}. A wrong length_m or keypoint_arclength_m does that, as do a camera's scale "

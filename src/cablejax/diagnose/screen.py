@@ -22,23 +22,24 @@ class Template:
 
     Attributes:
         start: the explanation, moved along its amplitude to meet the gap where that is possible.
-        explained: share of the squared gap that it takes away, episodes weighed as in a fit from the base and the noise
-            taken out of the gap: of the template at its best length where a parameter decides on that, else of the
-            template as it is. At most about 1.
+        explained: share of the squared gap that it takes away, the noise taken out of the gap: of the template at its
+            best length where a parameter decides on that, else of the template as it is. At most about 1.
+        weighed: whether episodes count in both as in a fit from the base, and not by their squares alone: where the
+            cable snaps over, the gap of one episode is most of the squares, and no template meets it.
     """
 
     start: Explanation
     explained: float
+    weighed: bool = False
 
 
 def screen(
     evidence: Evidence, base: Explanation, effects: Sequence[Effect], predicted: Float[np.ndarray, "E T *O"]
 ) -> list[Template]:
-    """Templates of every start of every effect on top of a base explanation.
+    """Templates of every start of every effect on top of a base explanation, by all squares and weighed.
 
     An effect of finite size, not a derivative, is held against the gap: a cable that does not yield, slip or touch at
-    the null value has no derivative there. One episode in which the cable snaps must not choose alone: its gap is most
-    of the squares, and no template meets it.
+    the null value has no derivative there.
 
     Args:
         evidence: to explain.
@@ -53,25 +54,21 @@ def screen(
         for variant, values in evidence.simulator.starts(effect, predicted, residual)
     ]
     residuals = evidence.whitened(evidence.predict([base, *starts]))
-    whole = np.isfinite(residuals[0]).all(axis=-1)
-    weight = np.where(whole, evidence.weight((residuals[0] ** 2).sum(axis=-1)), 0.0)
-    noise = float(weight @ evidence.count)
-    residuals = np.where(whole[:, None], np.sqrt(weight)[:, None] * residuals, 0.0).reshape(len(residuals), -1)
     gap = -residuals[0]
-    power = max(float(gap @ gap) - noise, 1e-6 * noise)
+    squares, ones = (gap**2).sum(axis=-1), np.ones(len(gap))
     result = []
-    for start, moved in zip(starts, residuals[1:], strict=True):
-        template = moved - residuals[0]
-        size = float(template @ template)
-        if not np.isfinite(size) or size < 1e-6 * noise:
-            continue
-        product = float(template @ gap)
-        stretched = _stretch(start, len(base.z), product / size)
-        if stretched is None:
-            explained = (2 * product - size) / power
-        else:
-            start, explained = stretched, product**2 / size / power
-        result.append(Template(start=start, explained=explained))
+    for weighed, weight in ((False, ones), (True, evidence.weight(squares))):
+        power = max(float(weight @ (squares - evidence.count)), 1e-6)
+        for start, moved in zip(starts, residuals[1:], strict=True):
+            template = moved - residuals[0]
+            size, product = (float(weight @ (template * by).sum(axis=-1)) for by in (template, gap))
+            if not np.isfinite(size) or size < 1e-6:
+                continue
+            stretched = _stretch(start, len(base.z), product / size)
+            if stretched is None:
+                result.append(Template(start, (2 * product - size) / power, weighed))
+            else:
+                result.append(Template(stretched, product**2 / size / power, weighed))
     return result
 
 
@@ -99,12 +96,14 @@ def _stretch(start: Explanation, n_base: int, amplitude: float) -> Explanation |
     return start.moved(z)
 
 
-def shortlist(templates: Sequence[Template], per_variant: int = 3, per_effect: int = 3) -> list[Explanation]:
-    """The best starts: so many of each effect, of these so many of each variant."""
+def shortlist(
+    templates: Sequence[Template], per_variant: int = 3, per_effect: int = 3, *, weighed: bool = False
+) -> list[Explanation]:
+    """The best starts of the one kind of template: so many of each effect, of these so many of each variant."""
     chosen: list[Explanation] = []
     taken: dict[str, int] = {}
     variants: dict[tuple[str, int], int] = {}
-    for template in sorted(templates, key=lambda t: -t.explained):
+    for template in sorted((t for t in templates if t.weighed is weighed), key=lambda t: -t.explained):
         term = template.start.terms[-1]
         name, key = term.effect.name, (term.effect.name, term.variant)
         if taken.get(name, 0) < per_effect and variants.get(key, 0) < per_variant:

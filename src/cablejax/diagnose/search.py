@@ -18,6 +18,8 @@ from cablejax.diagnose.screen import screen, shortlist
 _FINALISTS = 9
 _BASES = 3
 _PARTNERS = 6
+# The best of them by weighed templates are tried too.
+_WEIGHED_PARTNERS = 3
 _NEGLIGIBLE = 0.1
 # Of a set, an effect that repeats counted as often as it does: three keypoints off their places and another cause.
 _MOST_TERMS = 6
@@ -60,7 +62,8 @@ def search(
     screened: dict[str, float] = {}
     for template in templates:
         name = template.start.names[-1]
-        screened[name] = max(screened.get(name, 0.0), template.explained)
+        if not template.weighed:
+            screened[name] = max(screened.get(name, 0.0), template.explained)
     progress("fitting every effect")
     plan = evidence.simulator.plan
     starts = _promising(shortlist(templates), screened)
@@ -136,6 +139,9 @@ def _grown(evidence: Evidence, base: Explanation, calibration: Calibration) -> l
     fixed = [template for template in templates if template.start.terms[-1].effect.amplitude is None]
     starts = [start for start in shortlist(templates, per_variant=1, per_effect=2) if not _repeats(start)][:_PARTNERS]
     tried = {start.names[-1] for start in starts}
+    weighed = [start for start in shortlist(templates, 1, 1, weighed=True) if start.names[-1] not in base.names]
+    starts += [start for start in weighed[:_WEIGHED_PARTNERS] if start.names[-1] not in tried]
+    tried |= {start.names[-1] for start in starts}
     starts += [start for start in shortlist(fixed, per_variant=1, per_effect=1) if start.names[-1] not in tried]
     return improved(evidence, evaluate(evidence, starts), evidence.simulator.plan.grown_steps)
 

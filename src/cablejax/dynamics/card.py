@@ -83,7 +83,7 @@ def write_card(
         "",
         *(f"- {', '.join(f'{key} {value}' for key, value in phase.items())}" for phase in info["training"]["phases"]),
         "",
-        "The loss is a mean over the 50 steps or so of one compiled call; open-loop errors are medians on held-out "
+        "The loss is a mean over the steps of one compiled call; open-loop errors are medians on held-out "
         "trajectories [cm] of the averaged weights, after the steps named.",
         "",
         *_curve(metrics),

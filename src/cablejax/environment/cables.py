@@ -55,6 +55,14 @@ class ShapeCableConfig:
 
     def __post_init__(self):
         check(self, "speed", "interval", steps="commands", turn_rate="speed", tolerance="share", keypoint_noise="noise")
+        for name, kind in (("discretisation", Discretisation), ("randomisation", Randomisation)):
+            if not isinstance(getattr(self, name), kind):
+                raise ValueError(
+                    f"ShapeCableConfig.{name} is a {type(getattr(self, name)).__name__}, expected a {kind.__name__}"
+                    f"{': Discretisation(cable)' if kind is Discretisation else ''}."
+                )
+        if isinstance(self.targets, str):
+            raise ValueError(f"ShapeCableConfig.targets is {self.targets!r}, expected a tuple: ({self.targets!r},).")
         if not self.targets:
             raise ValueError("ShapeCableConfig.targets is empty, expected one target or more.")
         self.recipe(self.effects)
@@ -109,6 +117,8 @@ class ShapeCableConfig:
     def target(self, target: Shape | Target) -> Target:
         """A target of this cable; raises ValueError for another letter or number of keypoints."""
         made = make_target(target, self.cable) if isinstance(target, str) else target
+        if not isinstance(made, Target):
+            raise ValueError(f"The target is a {type(made).__name__}, expected a letter or a `Target`.")
         if made.keypoints.shape != (self.cable.n_keypoints, 2):
             raise ValueError(
                 f"Target {made.name!r} has keypoints of shape {made.keypoints.shape}, expected "
@@ -218,11 +228,7 @@ class Cables:
         """
         config, shape = self.config, (len(self.taken), 2, 3)
         if np.shape(actions) != shape:
-            raise ValueError(
-                f"The action has shape {np.shape(actions)[-2:]}, expected (2, 3): (vx, vy, omega) of both grippers."
-                if len(self.taken) == 1
-                else f"The actions have shape {np.shape(actions)}, expected {shape}."
-            )
+            raise ValueError(f"The actions have shape {np.shape(actions)}, expected {shape}: (vx, vy, omega) of each.")
         twists = config.scale * np.clip(np.nan_to_num(np.asarray(actions, float), posinf=0.0, neginf=0.0), -1.0, 1.0)
         twists = config.limits.shortened(twists, self.gripper_pose, config.interval) * active[:, None, None]
         self._state, shown = self._engine.rollout(self._physics, self._state, twists[:, None], config.interval)

@@ -88,7 +88,8 @@ class MjxShapeCable:
         See `Cables.step`. A cable that diverges stays where it was, and its episode is done.
         """
         config, info, before = self.config, state.info, state.data
-        share = jnp.clip(jnp.nan_to_num(action.reshape(2, 3), posinf=0.0, neginf=0.0), -1.0, 1.0)
+        action = jnp.asarray(action, jnp.float32).reshape(2, 3)
+        share = jnp.clip(jnp.nan_to_num(action, posinf=0.0, neginf=0.0), -1.0, 1.0)
         twist = jnp.asarray(config.scale, share.dtype) * share
         twist = config.limits.shortened(twist, before.gripper_pose, config.interval)
         after, (_, seen) = self._moved(info["physics"], before, twist)

@@ -42,6 +42,11 @@ def _known(options: dict[str, Any] | None) -> dict[str, Any]:
     return options
 
 
+def _require_reset(cables: Cables) -> None:
+    if not all(cables.names):
+        raise gymnasium.error.ResetNeeded("There is no cable yet: call `reset` before `step`.")
+
+
 class ShapeCableEnv(gymnasium.Env):
     """`cablejax/ShapeCable-v0`: bring a cable on a table to a shape by moving both of its ends.
 
@@ -68,6 +73,11 @@ class ShapeCableEnv(gymnasium.Env):
 
     def step(self, action):
         """One action; see `Cables.step`."""
+        if np.shape(action) != (2, 3):
+            raise ValueError(
+                f"The action has shape {np.shape(action)}, expected (2, 3): (vx, vy, omega) of both grippers."
+            )
+        _require_reset(self.cables)
         rewards, terminated, truncated = self.cables.step(np.asarray(action)[None], [self.np_random], np.array([True]))
         return self._observation(), float(rewards[0]), bool(terminated[0]), bool(truncated[0]), self._info()
 
@@ -107,11 +117,12 @@ class ShapeCableVectorEnv(gymnasium.vector.VectorEnv):
         """
         one = isinstance(seed, int | np.integer)
         seeds = [int(seed) + row for row in range(self.num_envs)] if one else seed
-        if seeds is not None and len(seeds) != self.num_envs:
-            raise ValueError(f"There are {len(seeds)} seeds, expected one number, or one for each of {self.num_envs}.")
-        for row, own in enumerate(seeds or []):
+        if seeds is not None and np.shape(seeds) != (self.num_envs,):
+            count = len(seeds) if np.ndim(seeds) else "no whole"
+            raise ValueError(f"There are {count} seeds, expected one number, or one for each of {self.num_envs}.")
+        for row, own in enumerate([] if seeds is None else seeds):
             if own is not None:
-                self._randoms[row] = np_random(own)[0]
+                self._randoms[row] = np_random(int(own))[0]
         options = _known(options)
         for row, random in enumerate(self._randoms):
             self.cables.reset(row, random, **options)
@@ -120,6 +131,7 @@ class ShapeCableVectorEnv(gymnasium.vector.VectorEnv):
 
     def step(self, actions):
         """One action of each; those that ended before are reset instead, with a reward of 0."""
+        _require_reset(self.cables)
         ended = self._ended
         rewards, terminated, truncated = self.cables.step(actions, self._randoms, ~ended)
         for row in np.flatnonzero(ended).tolist():

@@ -18,7 +18,13 @@ from cablejax.mpc.fallback import plan_or_hold, plan_or_recover, radius_after
 from cablejax.mpc.feasible import FeasibleSet, feasible_from
 from cablejax.mpc.problem import ShapingProblem
 from cablejax.mpc.state import CableEstimate, LastCommand, MPCInfo, MPCState, initial_state
-from cablejax.mpc.validation import check_history, check_measurement, check_target
+from cablejax.mpc.validation import (
+    check_dynamics,
+    check_history,
+    check_measurement,
+    check_reach,
+    check_target,
+)
 from cablejax.mpc.warm_start import find_starts
 from cablejax.residual.jacobian import Corrected, Dynamics, linearised
 from cablejax.residual.learner import Sample, learned, observe
@@ -55,11 +61,14 @@ class MPC(eqx.Module):
         """State for a cable seen at rest or in motion.
 
         Raises:
-            ValueError: if the history is empty, not finite or not of floating-point numbers, or has another number of
-                keypoints than the target.
+            ValueError: if the history is empty, not finite or not of floating-point numbers, has another number of
+                keypoints than the target, or grippers out of the cable's reach; or if the model does not take it.
         """
         check_history(self.target, history)
-        return initial_state(self.config, jax.tree.map(jnp.asarray, history))
+        check_reach(self.config.cable_length, history)
+        history = jax.tree.map(jnp.asarray, history)
+        check_dynamics(self.dynamics, self.weights, history)
+        return initial_state(self.config, history)
 
     def step(self, state: MPCState, measurement: Measurement) -> tuple[MPCState, Float[Array, "Q 3"], MPCInfo]:
         """One control step, compiled at its first call.

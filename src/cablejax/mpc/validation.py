@@ -2,16 +2,28 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any
+
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from cablejax.types import History, Measurement
 
+# Grippers may be farther apart than the cable is long by noise and by the offset of a tool, not by this factor.
+_FAR = 2.0
+
 
 def check_target(target: Float[Array | np.ndarray, "*batch N 2"]) -> None:
     """Raises ValueError unless the target is an array of finite keypoints [N, 2], N at least 3: fewer have no shape."""
+    if not isinstance(target, (np.ndarray, jax.Array)):
+        raise ValueError(
+            f"The target is a {type(target).__name__}, expected an array of keypoints [N, 2]"
+            f"{': its `keypoints`' if hasattr(target, 'keypoints') else ''}."
+        )
     shape = np.shape(target)
     finite = isinstance(target, Tracer) or bool(np.isfinite(target).all())
     if len(shape) < 2 or shape[-2] < 3 or shape[-1] != 2 or not finite:
@@ -34,6 +46,34 @@ def check_history(target: Float[Array | np.ndarray, "N 2"], history: History) ->
     given = [leaf for leaf in (history.keypoints, history.gripper_pose) if not isinstance(leaf, Tracer)]
     if not all(np.isfinite(leaf).all() for leaf in given):
         raise ValueError("The initial history has non-finite values: start from a complete observation.")
+
+
+def check_reach(length: float, history: History) -> None:
+    """Raises ValueError if the grippers are much farther apart than a cable of this length [m] reaches."""
+    pose = history.gripper_pose
+    if isinstance(pose, Tracer):
+        return
+    apart = float(np.linalg.norm(np.asarray(pose[0, :2] - pose[1, :2])))
+    if apart > _FAR * length:
+        raise ValueError(
+            f"The grippers are {apart:.3g} m apart, and the cable is {length:g} m long (`MPCConfig.for_length`): "
+            "expected poses and keypoints in metres."
+        )
+
+
+def check_dynamics(dynamics: Callable[..., Any], weights: Any, history: History) -> None:
+    """Raises ValueError unless a model can be called, and gives a displacement [N, 2] for every keypoint."""
+    twist = jnp.zeros((2, 3), history.keypoints.dtype)
+    try:
+        given = jax.eval_shape(dynamics, weights, history, twist)
+    except (TypeError, AttributeError) as error:
+        raise ValueError(
+            f"The model could not be called: {error} Expected `dynamics(weights, history, twist)` for one cable."
+        ) from error
+    shape, expected = getattr(given, "shape", None), history.keypoints.shape[1:]
+    if shape != expected:
+        what = f"an array of shape {shape}" if shape is not None else type(given).__name__
+        raise ValueError(f"The model gave {what}, expected displacements [m] of shape {expected}.")
 
 
 def check_measurement(target: Float[Array | np.ndarray, "N 2"], measurement: Measurement) -> None:
