@@ -16,6 +16,7 @@ from cablejax.effects.arms import delayed
 from cablejax.effects.given import EFFECTS, GivenEffect, parse_effect, with_effects
 from cablejax.effects.physics import Physics, nominal_physics, normal_gravity
 from cablejax.simulate import ENGINES, ChainEngine, MjxEngine, check_effects
+from cablejax.simulate.engine import compiled_rollout
 from cablejax.simulate.friction import on_table
 from cablejax.simulate.motions import MotionConfig, random_motion
 
@@ -336,6 +337,9 @@ def test_a_rollout_is_differentiable_within_programs_of_the_callers():
     for slope in slopes[1:]:
         np.testing.assert_allclose(slope, slopes[0], rtol=1e-3, atol=1e-5)
     assert np.abs(slopes[0]).max() > 0.01
+    # `bench simulate` asks the compiled program for its memory
+    program = compiled_rollout(engine, physics, 0, 0.1).lower(physics, state, twist)
+    assert program.compile().memory_analysis().temp_size_in_bytes > 0
 
 
 @pytest.mark.parametrize("lag", [0.0, 0.1, 0.13])

@@ -164,22 +164,23 @@ def _parts(engine: Engine, physics: Physics, interval: float) -> int:
     return next(parts for parts in range(wanted, count + 1) if count % parts == 0)
 
 
-def compiled_rollout(engine: Any, physics: Physics, batch_axes: int, interval: float) -> Callable[..., Any]:
-    """`engine.unroll` vmapped and jitted, for physics like this one: contacts cost nothing where no obstacle is.
+def compiled_rollout(engine: Any, physics: Physics, batch_axes: int, interval: float) -> Any:
+    """`engine.unroll` vmapped and jitted, for physics like this one: contacts cost nothing where no obstacle is."""
+    return _compiled(engine, batch_axes, interval, may_touch(physics))[1]
+
+
+def rolled_out(engine: Any, physics: Physics, state: Any, twist: Any, interval: float) -> Any:
+    """A rollout by `compiled_rollout`.
 
     Within a caller's `jax.jit` or `jax.grad` it is part of that program, whose compiler options then hold.
     """
-    function, compiled = _compiled(engine, batch_axes, interval, may_touch(physics))
-
-    def run(physics, state, twist):
-        try:
-            return compiled(physics, state, twist)
-        except ValueError as error:
-            if "can only be passed to top-level" not in str(error):
-                raise
-            return function(physics, state, twist)
-
-    return run
+    function, compiled = _compiled(engine, twist.ndim - 3, interval, may_touch(physics))
+    try:
+        return compiled(physics, state, twist)
+    except ValueError as error:
+        if "can only be passed to top-level" not in str(error):
+            raise
+        return function(physics, state, twist)
 
 
 @functools.lru_cache(maxsize=32)

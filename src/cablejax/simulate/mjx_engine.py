@@ -21,7 +21,7 @@ from cablejax.effects.physics import Physics, may_touch, nominal_physics, normal
 from cablejax.simulate.compile import full_precision
 from cablejax.simulate.composite import build_chain, stable_damping_time
 from cablejax.simulate.contact import obstacle_contact
-from cablejax.simulate.engine import Engine, compiled_rollout, finely_sampled
+from cablejax.simulate.engine import Engine, finely_sampled, rolled_out
 from cablejax.simulate.friction import drag_coefficient, implicit_drag, on_table
 from cablejax.simulate.grasp import constrained_acceleration
 from cablejax.simulate.keypoints import hermite_weights, marked_keypoints
@@ -68,7 +68,7 @@ class MjxEngine(Engine):
         self.check_twist(twist)
 
         def run(physics, state, twist, interval):
-            return compiled_rollout(self, physics, twist.ndim - 3, interval)(physics, state, twist)
+            return rolled_out(self, physics, state, twist, interval)
 
         return finely_sampled(run, self, physics, state, twist, interval)
 

@@ -17,7 +17,7 @@ from cablejax.effects.physics import Physics, may_touch
 from cablejax.simulate.chain.replay import centreline_keypoints, follow
 from cablejax.simulate.chain.state import ChainState, expecting_no_change
 from cablejax.simulate.compile import full_precision
-from cablejax.simulate.engine import Engine, compiled_rollout, finely_sampled
+from cablejax.simulate.engine import Engine, finely_sampled, rolled_out
 from cablejax.simulate.pose import integrate_pose
 from cablejax.types import CableMemory, CableState, Trajectory
 
@@ -59,7 +59,7 @@ class ChainEngine(Engine):
         self.check_twist(twist)
 
         def run(physics, state, twist, interval):
-            return compiled_rollout(self, physics, twist.ndim - 3, interval)(physics, state, twist)
+            return rolled_out(self, physics, state, twist, interval)
 
         return finely_sampled(run, self, physics, self._remembering(state), twist, interval)
 
