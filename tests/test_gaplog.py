@@ -21,6 +21,7 @@ from cablejax.gaplog import (
     write_gap_log,
 )
 from cablejax.gaplog_join import chosen, joined, recordings
+from cablejax.text_file import parse_json
 from cablejax.types import GapLog
 from file_cases import with_other_bytes
 
@@ -268,6 +269,12 @@ def test_keypoints_may_be_anywhere_and_further_fields_travel(tmp_path):
         gap_log_from_episodes([episode(4)], CABLE, source="test", keypoint_arclength=[0.0, 1.0])
     with pytest.raises(GapLogError, match="extra fields source are fields of the format"):
         gap_log_from_episodes([episode(4)], CABLE, source="test", extra={"source": "other"})
+
+
+def test_half_a_character_is_no_text():
+    with pytest.raises(ValueError, match=r"holds half of a character \('\\udc80'\)"):
+        parse_json('{"source": "run \\udc80"}')
+    assert parse_json('"\\ud83d\\ude00"') == "\U0001f600"
 
 
 class TestJoined:

@@ -75,10 +75,16 @@ def parse_json(text: str | bytes) -> Any:
     """Parses a JSON text.
 
     Raises:
-        ValueError: "is no JSON" or "is nested too deep", to be put after what it is.
+        ValueError: "is no JSON", "is nested too deep" or "holds half of a character", to be put after what it is.
     """
     try:
-        return json.loads(text)
+        value = json.loads(text)
+        # a surrogate without its other half can be written nowhere
+        json.dumps(value, ensure_ascii=False).encode()
+        return value
+    except UnicodeEncodeError as error:
+        half = ascii(error.object[error.start])
+        raise ValueError(f"holds half of a character ({half}), which is no text: leave it out.") from error
     except RecursionError as error:
         raise ValueError("is nested too deep for a JSON file.") from error
     except ValueError as error:
