@@ -135,7 +135,7 @@ def test_processes_of_jax_distributed_are_refused(monkeypatch):
 @pytest.mark.slow
 def test_the_command_says_so_before_it_reads(tmp_path):
     command = [sys.executable, "-m", "cablejax"]
-    data = [*command, "simulate", "--trajectories", "4", "--steps", "24", "--links", "5", "--process-count", "4"]
+    data = [*command, "simulate", "--trajectories", "40", "--steps", "24", "--links", "5", "--process-count", "4"]
     assert run_on_devices(1, [*data, "--process-index", "0", "--out", str(tmp_path / "data")]).returncode == 0
     begun = [*command, "train", "--preset", "smoke", "--data", str(tmp_path / "data"), "--out", str(tmp_path / "run")]
     assert "which 3 devices cannot share equally" in run_on_devices(3, begun).stderr
