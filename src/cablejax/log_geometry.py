@@ -167,7 +167,8 @@ def _axis_fault(log: GapLog) -> str | None:
         w, x, y, z = pose[:, gripper, 3:].T
         axis = np.stack([1 - 2 * (y**2 + z**2), 2 * (x * y + w * z), 2 * (x * z - w * y)], axis=-1)
         along = (1, -1)[gripper] * (points[:, inner] - points[:, end])
-        cosine = (along * axis).sum(axis=-1) / np.linalg.norm(along, axis=-1)
+        with np.errstate(invalid="ignore"):
+            cosine = (along * axis).sum(axis=-1) / np.linalg.norm(along, axis=-1)
         off = float(np.nanmedian(np.arccos(np.clip(cosine, -1, 1)))) if np.isfinite(cosine).any() else 0.0
         if off > INWARDS:
             return (
