@@ -16,6 +16,8 @@ _SHORTEST_HOLD = 10
 _LAGS = 5
 # A gripper that is so far from where it is for most of a hold moves the cable [m]: further than one goes that lags.
 _MOVED = 0.02
+# Of longer holds [samples] a line takes next to nothing.
+_LONG = 300
 # A hold of so many times the usual variance is none.
 _RESTLESS = 4.0
 # First-order noise has the measured correlations to this; a cable that creeps in its holds does not.
@@ -146,7 +148,7 @@ def _held(keypoints, hold):
     variance = squares / np.maximum(count, 1)
     level = squares.sum() / count.sum()
     correlation = products[:, 0] / np.maximum(products[:, 1], 1) / level
-    slow = _first_order(correlation, collections.Counter(one[0] for one in kept), _scattered(count))
+    slow = _first_order(correlation, collections.Counter(min(one[0], _LONG) for one in kept), _scattered(count))
     factor, correlation = (1.0, correlation) if slow is None else slow
     return variance * factor, count, correlation, len(usual) - len(kept)
 
@@ -193,10 +195,12 @@ def _first_order(correlation: Float[np.ndarray, "K"], lengths: collections.Count
     for length, times in lengths.items():
         t = np.arange(length)
         line = np.linalg.qr(np.stack([np.ones(length), t], axis=1))[0]
-        rest = np.eye(length) - line @ line.T
         apart = np.abs(t[:, None] - t)
         for i, coefficient in enumerate(coefficients):
-            left = rest @ coefficient**apart @ rest
+            whole = coefficient**apart
+            # the line taken out of both sides, without products of whole matrices
+            along = whole @ line - 0.5 * line @ (line.T @ whole @ line)
+            left = whole - along @ line.T - line @ along.T
             variance[i] += times * np.trace(left) / (length - 2)
             products[i] += [times * np.trace(left, lag) / (length - lag) for lag in lags[1:]]
     expected = products / variance[:, None]
