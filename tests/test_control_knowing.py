@@ -10,11 +10,12 @@ import pytest
 from cablejax.cable import Cable
 from cablejax.cli import main
 from cablejax.commands.runs import known_from
-from cablejax.control.shaping import enters, knowing, load_model, make_controller
+from cablejax.control.shaping import enters, initial_history, knowing, load_model, make_controller
 from cablejax.control.targets import make_target
 from cablejax.dataset.generate import make_engine, simulate
 from cablejax.dataset.schema import DatasetConfig
 from cablejax.dynamics.evaluate import open_loop_error
+from cablejax.dynamics.weights import released_names
 from cablejax.effects.given import parse_effect
 from cablejax.residual import STATIC, LearnerConfig
 from cablejax.types import Trajectory
@@ -38,6 +39,16 @@ def test_a_model_that_knows_the_cause_is_right_without_another_training(model):
         for one in (model, knowing(model, effects))
     )
     assert informed < 0.1 < 0.5 < plain
+
+
+@pytest.mark.parametrize("name", released_names())
+def test_the_controller_of_every_released_model_takes_a_history(name):
+    released = load_model(name)
+    controller = make_controller(
+        released, make_target("U", released.cable), method="residual", solver="levenberg-marquardt"
+    )
+    state = controller.init(initial_history(released.cable, released.config))
+    assert (state.history.cable is not None) == released.config.conditioned
 
 
 def test_informed_of_nothing_a_model_is_as_it_was(model):

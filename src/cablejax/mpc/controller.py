@@ -66,9 +66,10 @@ class MPC(eqx.Module):
         """
         check_history(self.target, history)
         check_reach(self.config.cable_length, history)
-        history = jax.tree.map(jnp.asarray, history)
-        check_dynamics(self.dynamics, self.weights, history)
-        return initial_state(self.config, history)
+        state = initial_state(self.config, jax.tree.map(jnp.asarray, history))
+        # with what the controller adds to the history for a conditioned model
+        check_dynamics(self.dynamics, self.weights, state.history)
+        return state
 
     def step(self, state: MPCState, measurement: Measurement) -> tuple[MPCState, Float[Array, "Q 3"], MPCInfo]:
         """One control step, compiled at its first call.
