@@ -51,11 +51,11 @@ def made_up_run(target: Target, commands: int = 2) -> ClosedLoopRun:
         twist=np.where(last[:, None, None], np.nan, 0.0) * pose,
         error_cm=error,
         residual_share=np.where(last, np.nan, 0.5),
+        action=np.full_like(error, np.nan),
         radius=np.where(last, np.nan, 0.05),
         mpc_ms=np.where(last, np.nan, 100.0),
         unobserved=0,
         stopped=None,
-        observed_error_cm=error,
         episode=Episode(
             motion=f"approach_{target.name.lower()}",
             time=np.arange(samples, dtype=float),

@@ -35,11 +35,11 @@ def run(
         twist=twist,
         error_cm=error,
         residual_share=np.where(last, np.nan, 0.3 if method == "residual" else 0.0),
+        action=np.full_like(error, np.nan),
         radius=np.full(n, 0.05),
         mpc_ms=np.where(last, np.nan, 100.0),
         unobserved=0,
         stopped=None,
-        observed_error_cm=error,
         episode=Episode("approach", times, keypoints, pose, np.nan_to_num(twist), hold=times < 1),
     )
 

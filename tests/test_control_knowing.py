@@ -9,7 +9,9 @@ import pytest
 
 from cablejax.cable import Cable
 from cablejax.cli import main
-from cablejax.commands.runs import known_from
+from cablejax.commands.runs import Job, about, known_from
+from cablejax.control.link import RobotLink
+from cablejax.control.link_state import LinkConfig
 from cablejax.control.shaping import enters, initial_history, knowing, load_model, make_controller
 from cablejax.control.targets import make_target
 from cablejax.dataset.generate import make_engine, simulate
@@ -18,6 +20,7 @@ from cablejax.dynamics.evaluate import open_loop_error
 from cablejax.dynamics.weights import released_names
 from cablejax.effects.given import parse_effect
 from cablejax.residual import STATIC, LearnerConfig
+from cablejax.simulate.plant.config import PlantConfig
 from cablejax.types import Trajectory
 
 CURVED = "intrinsic_curvature:centre_m=0.6,width_m=0.3,curvature_per_m=2"
@@ -153,8 +156,37 @@ def test_shape_with_a_verdict_tells_the_model(tmp_path, capsys):
 def test_what_a_controller_cannot_be_made_of_is_refused():
     model = load_model("gns-reference")
     target, options = make_target("U", model.cable), {"method": "direct", "solver": "levenberg-marquardt"}
-    with pytest.raises(ValueError, match=r"0\.4\d+ m along its keypoints.*of a cable of 1 m"):
+    with pytest.raises(ValueError, match=r"0\.5 m along its keypoints.*of a cable of 1 m"):
         make_controller(model, make_target("U", Cable(length=0.5)), **options)
     for wrong in ({"method": "residuals"}, {"solver": "two-trial"}):
         with pytest.raises(ValueError, match="expected one of"):
             make_controller(model, target, **{**options, **wrong})
+
+
+def test_a_controller_plans_for_the_models_interval(model):
+    config = dataclasses.replace(model.config, interval=0.5)
+    target = make_target("S", model.cable)
+    fast = dataclasses.replace(model, config=config)
+    controller = make_controller(fast, target, method="direct", solver="levenberg-marquardt")
+    assert controller.interval == 0.5
+    with pytest.raises(ValueError, match=r"plans for 0\.5 s between commands, and the interval of this run is 1 s"):
+        RobotLink(controller, target)
+    RobotLink(controller, target, LinkConfig(interval=0.5))
+
+
+def test_a_plant_whose_cable_is_curved_at_rest_is_not_the_same(model):
+    def said(cable):
+        chain = dataclasses.replace(PlantConfig().discretisation, cable=cable)
+        job = Job(
+            plant=PlantConfig(discretisation=chain),
+            model=model,
+            targets=(make_target("S", model.cable),),
+            methods=("direct",),
+            solver="levenberg-marquardt",
+            steps=1,
+        )
+        return about(job)
+
+    assert "The plant has the same cable." in said(model.cable)
+    curved = said(dataclasses.replace(model.cable, rest_curvature=3.0))
+    assert "The plant has curvature at rest 3 1/m (the model's is 0)." in curved and "same cable" not in curved

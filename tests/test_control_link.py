@@ -231,21 +231,31 @@ LIMITS = CommandLimits(speed=0.1, turn_rate=0.5, max_distance=1.0, workspace=((-
 )
 def test_a_command_is_shortened_to_its_limits(twist, share):
     pose = np.array([[-0.498, 0.05, 0.0], [0.498, 0.05, 0.0]])
-    shortened = LIMITS.shortened(np.array(twist, float), pose, 1.0)
+    shortened = LIMITS.shortened(np.array(twist, float), pose, 1.0, 1.0)
     np.testing.assert_allclose(shortened, share * np.array(twist), atol=1e-12)
+
+
+@pytest.mark.parametrize("length", [0.4, 2.0])
+def test_distances_are_in_lengths_of_the_cable(length):
+    limits = CommandLimits()
+    pose = np.array([[0.0, 0.0, 0.0], [0.9 * length, 0.0, 0.0]])
+    apart = np.array([[0.0, 0.0, 0.0], [0.05 * length, 0.0, 0.0]])
+    assert limits.shortened(apart, pose, 1.0, length) is apart
+    ended = pose + 4.0 * limits.shortened(apart, pose, 4.0, length)
+    assert 0.985 * length < ended[1, 0] <= 0.995 * length + 1e-9
 
 
 def test_grippers_do_not_pass_through_each_other():
     pose, twist = np.array([[0, 0, 0], [0.11, 0, 0.0]]), np.array([[0.1, 0, 0], [-0.1, 0, 0.0]])
     for of in (np.array, jnp.float32):
-        np.testing.assert_allclose(LIMITS.shortened(of(twist), of(pose), 1.2), 0.04 * twist, atol=1e-7)
+        np.testing.assert_allclose(LIMITS.shortened(of(twist), of(pose), 1.2, 1.0), 0.04 * twist, atol=1e-7)
 
 
 def test_from_outside_only_the_way_back_is_open():
     pose = np.array([[-0.7, 0.0, 0.0], [0.1, 0.0, 0.0]])
     back, out = np.array([[0.05, 0, 0], [0, 0, 0]]), np.array([[-0.05, 0, 0], [0, 0, 0]])
-    assert LIMITS.shortened(back, pose, 1.0) is back
-    assert not LIMITS.shortened(out, pose, 1.0).any()
+    assert LIMITS.shortened(back, pose, 1.0, 1.0) is back
+    assert not LIMITS.shortened(out, pose, 1.0, 1.0).any()
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -255,7 +265,7 @@ def test_commands_stay_within_all_limits(seed):
         pose = np.concatenate([rng.uniform(-0.2, 0.2, (2, 2)), rng.uniform(-3, 3, (2, 1))], axis=1)
         pose[0, 0] -= 0.3
         pose[1, 0] += 0.3
-        ended = pose + 1.2 * LIMITS.shortened(rng.normal(size=(2, 3)), pose, 1.2)
+        ended = pose + 1.2 * LIMITS.shortened(rng.normal(size=(2, 3)), pose, 1.2, 1.0)
         middle = (pose + ended) / 2
         for at in (middle, ended):
             assert 0.1 <= np.linalg.norm(at[1, :2] - at[0, :2]) <= 1.0
@@ -290,7 +300,7 @@ def test_limits_are_checked():
     [
         (
             {"keypoints": 1e3 * KEYPOINTS, "gripper_pose": START * [1e3, 1e3, 1]},
-            "990 m apart, and the cable is 0.996 m long",
+            "990 m apart, and the cable is 1 m long",
         ),
         ({"keypoints": 1e3 * KEYPOINTS}, "of the keypoints are known and within reach"),
         ({"gripper_pose": np.full((2, 3), np.nan)}, "poses are not known"),

@@ -104,6 +104,19 @@ def test_a_rival_that_leaves_as_little_is_a_look_alike():
     assert len({draw[0].parameters["ratio"] for draw in posterior[:8]}) == 8
 
 
+def test_of_few_motions_an_explanation_that_leaves_a_little_more_is_as_good():
+    facts = evidence(noise_mm=0.5)
+    (fit,) = evaluate(facts, [explanation()])
+
+    def leaving(ratio):
+        return dataclasses.replace(fit, sse=facts.count * (1 + (10 * ratio) ** 2))
+
+    one = dataclasses.replace(facts, motion=np.zeros(len(facts.count), int))
+    for ratio, among_four, alone in ((1.2, True, True), (1.4, False, True), (1.7, False, False)):
+        assert as_good(leaving(ratio), leaving(1.0), facts, Calibration()) == among_four
+        assert as_good(leaving(ratio), leaving(1.0), one, Calibration()) == alone
+
+
 def test_a_motion_that_nothing_explains_does_not_hide_the_cause_of_the_others():
     """Three motions with a turned gripper, one with an error that no effect makes: named beside unknown, not a
     look-alike of everything."""

@@ -11,6 +11,7 @@ from cablejax.diagnose.belief import Calibration
 from cablejax.diagnose.case import Case
 from cablejax.diagnose.length import other_length
 from cablejax.diagnose.planar_run import _caveats
+from cablejax.diagnose.reading import with_readings
 from cablejax.types import GapLog
 from diagnose_cases import record
 
@@ -32,7 +33,7 @@ def test_keypoints_show_the_length(ratio):
     length = other_length(Case.of(log), log)
     assert length.stated == ratio
     assert length.measured == pytest.approx(1.0, abs=1e-3)
-    back = length.applied(log)
+    back = length.log
     assert back.meta["cable"]["length_m"] == length.measured
     np.testing.assert_allclose(back.meta["keypoint_arclength_m"], np.linspace(0, length.measured, 13))
 
@@ -42,6 +43,12 @@ def test_a_right_length_is_not_doubted():
     assert other_length(Case.of(log), log) is None
 
 
+def test_a_crumpled_nominal_cable_says_nothing_of_the_length():
+    log = record()
+    case = Case.of(log)
+    assert other_length(dataclasses.replace(case, nominal=0.4 * case.nominal), log) is None
+
+
 @pytest.mark.slow
 def test_caveat_on_keypoints_that_do_not_fit_the_length():
     log = stated(record(), 1.01)
@@ -49,7 +56,7 @@ def test_caveat_on_keypoints_that_do_not_fit_the_length():
     length = other_length(case, log)
     (text,) = _caveats(case, Calibration(), length, 0.0, commissioned=True)
     assert re.match(r"Keypoints are 1\.0 % closer together than the stated arc lengths, in every episode", text)
-    assert length.assumes in length.as_law_of(case).simulator.other_laws
+    assert length.assumes in with_readings(case, [length]).simulator.other_laws
 
 
 @pytest.mark.slow

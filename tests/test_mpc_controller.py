@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.optimize
 
 from cablejax.bounded import Result
 from cablejax.control.targets import Target
@@ -277,9 +278,37 @@ def test_where_no_plan_helps_the_cable_is_straightened():
     assert count > 2 and (info.action[:count] == Action.STRAIGHTEN).all(), "at once, and in one go"
     assert (info.action[count:] == Action.HOLD).all() and int(state.progress.restarts) == 1
     assert (np.linalg.norm(twists * [1, 1, 0.15], axis=-1) <= 0.05 * (1 + 1e-5)).all()
-    way = (np.asarray(straightened(control.target, 0.99)) - cable.pose) * [1, 1, 0.15]
+    # a cable that seems to be shorter than believed is not straightened to the full
+    way = (np.asarray(straightened(control.target, 0.99 * 0.95)) - cable.pose) * [1, 1, 0.15]
     assert np.linalg.norm(way, axis=1).max() < 0.05, "it ends a step before that, where planning takes over"
     assert (run(control, cable, 3, restarts=WITHOUT.max_restarts)[2].action == Action.HOLD).all()
+
+
+def test_a_cable_that_is_shorter_than_believed_is_not_pulled_taut():
+    class Slipped(Cable):
+        """Of 0.97 m: no farther apart than that are its grippers."""
+
+        farthest = 0.0
+
+        def step(self, twist):
+            super().step(twist)
+            apart = self.pose[1, :2] - self.pose[0, :2]
+            self.farthest = max(self.farthest, np.linalg.norm(apart))
+            offset = np.zeros((N, 2))
+            offset[:, 1] = np.sin(np.pi * np.linspace(0.0, 1.0, N))
+            flat = self.pose[0, :2] + np.linspace(0.0, 1.0, N)[:, None] * apart
+
+            def length(height):
+                return np.linalg.norm(np.diff(flat + height * offset, axis=0), axis=1).sum()
+
+            high = scipy.optimize.brentq(lambda height: length(height) - 0.97, 0.0, 1.0) if length(0.0) < 0.97 else 0.0
+            self.keypoints = flat + high * offset
+
+    cable = Slipped(sag=0.0, pose=[[0.0, 0.0, 0.6], [0.7, 0.1, -0.6]])
+    cable.step(np.zeros((2, 3)))
+    _, _, info = run(controller("S", WITHOUT, rate=5.0, dynamics=stubborn_cable), cable, 20)
+    assert (info.action == Action.STRAIGHTEN).sum() > 2
+    assert 0.9 < cable.farthest < 0.97
 
 
 def test_a_cable_that_comes_no_nearer_is_straightened_as_often_as_allowed():
@@ -333,6 +362,8 @@ def test_the_grippers_rest_at_a_good_moment():
     assert list(modes([*tired, 0.005, 0.0055, 0.0058]))[-3:] == [rest, rest, rest], "the cable relaxes by itself"
     assert list(modes([*tired, 0.005, 0.005, 0.0065]))[-1] == follow, "and is disturbed"
     assert list(modes([*tired, 0.1, 0.03, 0.03]))[-1] == follow, "as it may be while it relaxes"
+    far = [0.03, 0.02, 0.02, 0.02, 0.039, 0.077, 0.077]
+    assert list(modes(far))[3:] == [rest, rest, rest, follow], "nor far away"
 
 
 def test_what_makes_the_error_worse_is_taken_back_and_tried_again_with_smaller_motions():

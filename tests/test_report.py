@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from cablejax.mpc import Action
 from cablejax.report import figures
 from cablejax.report.animation import write_gif
 from cablejax.report.page import animation_data, headline, write_page
@@ -86,6 +87,18 @@ def test_error_figure_shows_the_errors():
     panel = figures.error_over_time(runs).axes[0]
     drawn = {tuple(np.round(line.get_ydata(), 9)) for line in panel.lines if len(line.get_ydata()) > 2}
     assert drawn == {tuple(np.round(r.error_cm, 9)) for (shape, _), r in runs.items() if shape == "U"}
+
+
+def test_where_the_cable_was_straightened_the_error_is_dotted_and_the_verdict_says_so():
+    one = run(short=0.5)
+    assert "straightened" not in one.verdict()
+    action = np.append(np.repeat([Action.FOLLOW, Action.STRAIGHTEN], 4), np.nan)
+    one = dataclasses.replace(one, action=action)
+    panel = figures.error_over_time({("U", "residual"): one}).axes[0]
+    (dotted,) = (line for line in panel.lines if line.get_color() == "white")
+    np.testing.assert_array_equal(np.isfinite(dotted.get_ydata()), action == Action.STRAIGHTEN)
+    assert any("to begin again" in text.get_text() for text in panel.texts)
+    assert one.verdict().endswith("It was being straightened for another try: more commands may reach the target.")
 
 
 def test_share_is_blank_where_the_grippers_rested():

@@ -217,11 +217,12 @@ def _when(effect: GivenEffect) -> str:
 
 _QUANTITIES = {
     "stiffness": ("bending stiffness", " N m^2"),
+    "rest_curvature": ("curvature at rest", " 1/m"),
     "friction": ("friction coefficient", ""),
     "density": ("mass per length", " kg/m"),
     "damping_time": ("damping time", " s"),
 }
-"""Fields of `Physics` that are compared as a ratio where they are uniform along the cable: name and unit."""
+"""Fields of `Physics` that are compared where they are uniform along the cable: name and unit."""
 
 
 def _changes(believed: Cable, plant: PlantConfig) -> list[str]:

@@ -20,7 +20,7 @@ import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Float, Int
 
-from cablejax.control.link import Controller
+from cablejax.control.link import Controller, check_interval
 from cablejax.effects.physics import Physics, may_touch, without_obstacle
 from cablejax.limits import check
 from cablejax.simulate.chain.engine import ChainEngine
@@ -151,8 +151,8 @@ def shape_batch(
         devices: to spread the batch over; by default the one on which the arguments are.
 
     Raises:
-        ValueError: the batch axes differ, the cable is not planar, arms or camera lag, or a target has another number
-            of keypoints.
+        ValueError: the batch axes differ, the cable is not planar, arms or camera lag, a target has another number of
+            keypoints, or the controller was made for another interval.
     """
     size, chain = len(targets), engine.config
     if chain.dimension != 2 or np.shape(targets) != (size, chain.cable.n_keypoints, 2):
@@ -161,6 +161,7 @@ def shape_batch(
             f"{chain.dimension} dimensions, expected (B, {chain.cable.n_keypoints}, 2) on a planar cable."
         )
     engine.substeps(config.interval)
+    check_interval(controller, config.interval)
     refuse_lags(params)
     seeds = np.arange(size) if seeds is None else np.asarray(seeds)
     controllers = _with_target(controller, jnp.asarray(targets, float))

@@ -21,8 +21,8 @@ class CommandLimits:
     Attributes:
         speed: of each gripper at most [m/s].
         turn_rate: of each gripper at most [rad/s].
-        min_distance: of the grippers from each other at least [m].
-        max_distance: of the grippers from each other at most [m]: below the cable's length, or it is pulled taut.
+        min_distance: of the grippers from each other at least, in lengths of the cable.
+        max_distance: of the grippers from each other at most, in lengths of the cable: below 1, or it is pulled taut.
         workspace: lowest and highest corner (x, y) of where the grippers may be [m]; None = anywhere.
     """
 
@@ -33,16 +33,16 @@ class CommandLimits:
     workspace: tuple[tuple[float, float], tuple[float, float]] | None = None
 
     def __post_init__(self):
-        check(self, "speed", turn_rate="speed", min_distance="not_negative", max_distance="length")
-        if self.min_distance >= self.max_distance:
+        check(self, "speed", turn_rate="speed")
+        if not 0 <= self.min_distance < self.max_distance <= 1:
             raise ValueError(
-                f"CommandLimits distances {self.min_distance} to {self.max_distance}: expected the first below the "
-                "second [m]."
+                f"CommandLimits distances {self.min_distance} to {self.max_distance}: expected 0 <= min_distance < "
+                "max_distance <= 1, in lengths of the cable."
             )
         check_workspace(self)
 
     def shortened(
-        self, twist: Float[Any, "*B Q 3"], pose: Float[Any, "*B Q 3"], duration: float
+        self, twist: Float[Any, "*B Q 3"], pose: Float[Any, "*B Q 3"], duration: float, length: float
     ) -> Float[Any, "*B Q 3"]:
         """The twist, or the largest share of it (in steps of 0.5 %) that stays within all limits while it is held.
 
@@ -53,27 +53,28 @@ class CommandLimits:
             twist: [m/s, rad/s], finite.
             pose: of both grippers when it begins [m, rad].
             duration: for which it is held at most [s].
+            length: of the cable [m].
         """
         if isinstance(twist, np.ndarray):
             twist, pose = np.asarray(twist, float), np.asarray(pose, float)
         xp = twist.__array_namespace__()
         shares = xp.asarray(_SHARES, dtype=twist.dtype)
         # the grippers pass through the end points of all smaller shares
-        broken = self._broken(shares.reshape(-1, *[1] * twist.ndim) * twist, pose, duration)
+        broken = self._broken(shares.reshape(-1, *[1] * twist.ndim) * twist, pose, duration, length)
         if isinstance(twist, np.ndarray) and not broken.any():
             return twist
         last = xp.where(broken.any(axis=0), broken.argmax(axis=0), len(_SHARES)) - 1
         return shares[xp.maximum(last, 0)][..., None, None] * twist
 
-    def _broken(self, twist: Any, pose: Any, duration: float) -> Bool[Any, "*B"]:
+    def _broken(self, twist: Any, pose: Any, duration: float, length: float) -> Bool[Any, "*B"]:
         """Which twists end outside of a limit, and farther out than they begin."""
         xp, start = twist.__array_namespace__(), pose[..., :2]
         ends = start + duration * twist[..., :2]
         apart, before = (xp.linalg.norm(places[..., 1, :] - places[..., 0, :], axis=-1) for places in (ends, start))
         broken = (xp.linalg.norm(twist[..., :2], axis=-1) > self.speed + _ROUNDING).any(axis=-1)
         broken |= (xp.abs(twist[..., 2]) > self.turn_rate + _ROUNDING).any(axis=-1)
-        broken |= apart > xp.maximum(self.max_distance, before) + _ROUNDING
-        broken |= apart < xp.minimum(self.min_distance, before) - _ROUNDING
+        broken |= apart > xp.maximum(self.max_distance * length, before) + _ROUNDING
+        broken |= apart < xp.minimum(self.min_distance * length, before) - _ROUNDING
         if self.workspace is not None:
             low, high = (xp.asarray(corner, dtype=start.dtype) for corner in self.workspace)
             outside = (ends < xp.minimum(low, start) - _ROUNDING) | (ends > xp.maximum(high, start) + _ROUNDING)

@@ -34,7 +34,8 @@ DRIFT = 1e-3
 class Controller(Protocol):
     """A controller: an object with two pure functions. `mpc.MPC` is one.
 
-    For `control.batched` it is a pytree with a leaf `target` as well, the keypoints [N, 2] that it steers towards.
+    For `control.batched` it is a pytree with a leaf `target` as well, the keypoints [N, 2] that it steers towards. One
+    that was made for a certain time between commands has it as `interval` [s].
     """
 
     def init(self, history: History) -> Any:
@@ -44,12 +45,22 @@ class Controller(Protocol):
     def step(self, state: Any, measurement: Measurement) -> tuple[Any, Float[Array | np.ndarray, "Q 3"], Any]:
         """The next state, the twist to hold until then [m/s, rad/s], and a report.
 
-        Of the report the fields `residual_share` and `radius` are recorded, where it has them.
+        Of the report the fields `residual_share`, `radius` and `action` are recorded, where it has them.
         """
         ...
 
 
 _STILL = np.zeros((2, 3))
+
+
+def check_interval(controller: Controller, interval: float) -> None:
+    """Raises ValueError if a controller was made for another time between commands [s]."""
+    own = getattr(controller, "interval", interval)
+    if not math.isclose(own, interval):
+        raise ValueError(
+            f"The controller plans for {own:g} s between commands, and the interval of this run is {interval:g} s. "
+            "Give both the same: `interval` of the run, and of `MPCConfig.objective`."
+        )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -64,11 +75,17 @@ class RobotLink:
         controller: what shapes the cable.
         target: the wanted shape.
         config: see `LinkConfig`.
+
+    Raises:
+        ValueError: the controller was made for another interval.
     """
 
     controller: Controller
     target: Target
     config: LinkConfig = LinkConfig()
+
+    def __post_init__(self):
+        check_interval(self.controller, self.config.interval)
 
     def warm_up(self, observation: Observation | None = None) -> None:
         """Compiles the controller, half a minute or more, before anything moves.
@@ -235,12 +252,14 @@ class RobotLink:
         spent = 1e3 * (time.perf_counter() - began)
         allowed = twist
         if config.limits is not None:
-            allowed = config.limits.shortened(twist, seen.gripper_pose, config.interval + config.grace)
+            held = config.interval + config.grace
+            allowed = config.limits.shortened(twist, seen.gripper_pose, held, self.target.length)
         instant = Instant(
             seen,
             allowed,
             float(getattr(info, "residual_share", math.nan)),
             float(getattr(info, "radius", math.nan)),
+            float(getattr(info, "action", math.nan)),
             spent,
             limited=allowed is not twist,
         )

@@ -78,6 +78,7 @@ class Instant:
         twist: the command [m/s, rad/s], shape [Q, 3].
         residual_share: the controller's report, NaN where it makes none.
         radius: likewise, its bound on one step's motion [m].
+        action: likewise, the `mpc.Action` of the command.
         mpc_ms: wall time of the controller's call [ms].
         limited: the command was shortened to stay within its limits.
     """
@@ -86,6 +87,7 @@ class Instant:
     twist: np.ndarray | None = None
     residual_share: float = math.nan
     radius: float = math.nan
+    action: float = math.nan
     mpc_ms: float = math.nan
     limited: bool = False
 

@@ -5,10 +5,11 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from cablejax.control.targets import Target
 from cablejax.gaplog import Episode
+from cablejax.mpc.state import Action
 
 SETTLING_FRACTION = 0.1
 """Half-width of the band around the terminal error in which a run counts as settled, relative to that error or, where
@@ -23,7 +24,7 @@ SETTLING_DWELL = 3
 class ClosedLoopRun:
     """One cable brought towards one target, at the control instants; `episode` has it at the camera's rate.
 
-    At the last sample no command was computed: `twist`, `residual_share`, `radius` and `mpc_ms` are NaN there.
+    At the last sample no command was computed: `twist` and the fields from `residual_share` to `mpc_ms` are NaN there.
 
     Attributes:
         target: what was asked for.
@@ -35,10 +36,10 @@ class ClosedLoopRun:
             simulated one, which knows them, otherwise of the observed ones.
         residual_share: the controller's report, NaN where it makes none, shape [T].
         radius: the controller's bound on one step's motion [m], NaN where it reports none, shape [T].
+        action: the `mpc.Action` of each command, NaN where the controller reports none, shape [T].
         mpc_ms: wall time of each control call [ms], compilation excluded, shape [T].
         unobserved: keypoint observations that are missing, over the whole run.
         stopped: why the run ended early, or None.
-        observed_error_cm: the same error of the observed keypoints, which is all that the controller knows, shape [T].
         episode: the run for the gap log, resting time before the first command included.
     """
 
@@ -50,10 +51,10 @@ class ClosedLoopRun:
     error_cm: Float[np.ndarray, " T"]
     residual_share: Float[np.ndarray, " T"]
     radius: Float[np.ndarray, " T"]
+    action: Float[np.ndarray, " T"]
     mpc_ms: Float[np.ndarray, " T"]
     unobserved: int
     stopped: str | None
-    observed_error_cm: Float[np.ndarray, " T"]
     episode: Episode
 
     @property
@@ -71,16 +72,28 @@ class ClosedLoopRun:
         """See `settling_time`."""
         return settling_time(self.times, self.error_cm)
 
-    def verdict(self, tolerance_cm: float = 1.0) -> str:
+    @property
+    def straightened(self) -> Bool[np.ndarray, " T"]:
+        """Where the cable was being straightened, to be shaped once more."""
+        return self.action == Action.STRAIGHTEN
+
+    @property
+    def goal_cm(self) -> float:
+        """Error up to which a target counts as reached [cm]: a hundredth of its length."""
+        return self.target.length
+
+    def verdict(self) -> str:
         """One sentence: whether the target was reached, and if not, how far the cable got and where it is off."""
         start, end = self.initial_error_cm, self.terminal_error_cm
         early = f" It stopped after {self.times[-1]:.0f} s: {self.stopped}" if self.stopped else ""
-        if end <= tolerance_cm:
+        if end <= self.goal_cm:
             return f"{self.target.name}: reached, from {start:.2f} to {end:.2f} cm.{early}"
         distance = 100 * np.linalg.norm(self.keypoints[-1] - self.target.keypoints, axis=-1)
         best = int(np.nanargmin(self.error_cm))
+        if self.straightened[-2:].any():
+            early += " It was being straightened for another try: more commands may reach the target."
         return (
-            f"{self.target.name}: not reached within {tolerance_cm:.2f} cm. The error went from {start:.2f} to "
+            f"{self.target.name}: not reached within {self.goal_cm:.2f} cm. The error went from {start:.2f} to "
             f"{end:.2f} cm (lowest {self.error_cm[best]:.2f} cm after {self.times[best]:.0f} s); keypoint "
             f"{int(np.nanargmax(distance))} is farthest off, by {np.nanmax(distance):.2f} cm.{early}"
         )

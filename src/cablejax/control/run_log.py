@@ -138,10 +138,10 @@ class RunLog:
             error_cm=shape_error_cm(truth, target.keypoints),
             residual_share=np.array([row.residual_share for row in rows]),
             radius=np.array([row.radius for row in rows]),
+            action=np.array([row.action for row in rows]),
             mpc_ms=np.array([row.mpc_ms for row in rows]),
             unobserved=int(np.isnan(keypoints).any(axis=-1).sum()),
             stopped=stopped,
-            observed_error_cm=shape_error_cm(keypoints, target.keypoints),
             episode=self.episodes(motion(target))[0][1],
         )
 

@@ -30,6 +30,13 @@ STRETCH = 0.2
 """How much farther neighbouring keypoints may be apart than the cable between them is long, relative to it."""
 
 
+def length_through(points: Float[np.ndarray, "N 2"]) -> float:
+    """Length [m] of a cable through three or more points, from arcs: an edge that turns by a is the chord of one."""
+    edges = np.diff(points, axis=0)
+    turn = np.abs(np.gradient(np.unwrap(np.arctan2(edges[:, 1], edges[:, 0]))))
+    return float((np.hypot(*edges.T) / np.sinc(turn / 2 / np.pi)).sum())
+
+
 @dataclasses.dataclass(frozen=True)
 class Target:
     """A shape to bring a cable to.
@@ -46,8 +53,8 @@ class Target:
 
     @functools.cached_property
     def length(self) -> float:
-        """Of the polyline through the keypoints [m]; a bent cable is a little longer."""
-        return float(np.linalg.norm(np.diff(self.keypoints, axis=0), axis=1).sum())
+        """Of the cable through the keypoints [m]."""
+        return length_through(self.keypoints)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -132,9 +139,7 @@ def target_from_keypoints(
         )
     edges = np.diff(points, axis=0)
     angle = np.unwrap(np.arctan2(edges[:, 1], edges[:, 0]))
-    # An edge is the chord of an arc: turned by a it is shorter than the arc by sin(a / 2) / (a / 2).
-    turn = np.abs(np.gradient(angle))
-    length = float((np.hypot(*edges.T) / np.sinc(turn / 2 / np.pi)).sum())
+    length = length_through(points)
     if abs(length - config.length) > LENGTH_TOLERANCE * config.length:
         raise ValueError(
             f"Target {name!r} is {length:.4g} m long, but the cable is {config.length:.4g} m long and does not "

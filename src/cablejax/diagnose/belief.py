@@ -38,6 +38,8 @@ LEAST_SQUARES = 1e12
 """Degrees of freedom with which Student's distribution is a normal one."""
 # Each costs simulations of every motion that is considered.
 _MOST_IN_DOUBT = 5
+# In the logs on which `Calibration.as_good` was set.
+_MOTIONS = 6
 # fmt: off
 SCORES = (
     0.00, 0.00, 0.00, 0.03, 0.06, 0.08, 0.08, 0.09, 0.10, 0.10, 0.11, 0.12, 0.13, 0.13, 0.14, 0.16,
@@ -76,7 +78,8 @@ class Calibration:
         telling: below this share of explained squared gap nothing is named, unless most motions are explained
             completely.
         set_odds: an effect belongs to the reported set if its odds against the best are at least these,
-        as_good: or if it leaves at most this many times what the best leaves, see the function `as_good`.
+        as_good: or if it leaves at most this many times what the best leaves, in six motions or more, see the function
+            `as_good`.
         widening: of the intervals of parameters, for a law that is not quite the real one shifts them too.
         max_effects: in one explanation at most, one that repeats counted once.
     """
@@ -144,11 +147,13 @@ def explains_most_motions(fit: Fit, null: Fit, evidence: Evidence, calibration: 
 def as_good(fit: Fit, best: Fit, evidence: Evidence, calibration: Calibration) -> bool:
     """Whether a fit leaves little more than the best, over the whole log and in at least half of its motions.
 
-    One motion that no effect explains would make all explanations look alike.
+    One motion that no effect explains would make all explanations look alike. What a law leaves differs from motion to
+    motion, and of few it is known less well: by the root of their number.
     """
-    whole = excess(float(fit.sse.sum()), evidence) <= calibration.as_good * excess(float(best.sse.sum()), evidence)
     least = np.maximum(left_by_motion(best, evidence), calibration.smallest_gap(level(evidence)))
-    return whole and float(np.mean(left_by_motion(fit, evidence) <= calibration.as_good * least)) >= 0.5
+    little = 1.0 + (calibration.as_good - 1.0) * max(1.0, np.sqrt(_MOTIONS / len(least)))
+    whole = excess(float(fit.sse.sum()), evidence) <= little * excess(float(best.sse.sum()), evidence)
+    return whole and float(np.mean(left_by_motion(fit, evidence) <= little * least)) >= 0.5
 
 
 def left_by_motion(fit: Fit, evidence: Evidence) -> Float[np.ndarray, "M"]:

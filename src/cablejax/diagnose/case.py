@@ -23,7 +23,7 @@ from cablejax.diagnose.regimes import largest_curvature
 from cablejax.diagnose.run import weighed
 from cablejax.effects import LIBRARY, CableEffect
 from cablejax.effects.physics import nominal_physics
-from cablejax.simulate.chain.replay import FINE_STEP, LARGEST_STEP
+from cablejax.simulate.chain.replay import FINE_STEP, LARGEST_STEP, SETTLING
 from cablejax.types import GapLog
 
 FIT_LINKS = 33
@@ -62,12 +62,13 @@ class Case:
     predicted: PlanarCable
 
     @classmethod
-    def of(cls, log: GapLog, effects: Sequence[CableEffect] = LIBRARY) -> Case:
+    def of(cls, log: GapLog, effects: Sequence[CableEffect] = LIBRARY, *, settling: float = SETTLING) -> Case:
         """Checks a log and replays it.
 
         Args:
             log: of a cable on a table between two grippers.
             effects: that may be at work.
+            settling: see `Playback`.
 
         Raises:
             DiagnosisError: the log cannot be diagnosed; the message says why and what to do.
@@ -85,7 +86,7 @@ class Case:
         recording = dataclasses.replace(recording, gripper_pose=pose)
         config = config_of_log(log, n_links=FIT_LINKS)
         marks = np.asarray(log.meta["keypoint_arclength_m"], float)
-        first = [_at_uniform_marks(shape, marks) for shape in _first_shapes(recording)]
+        first = [_at_uniform_marks(shape, marks) for shape in first_shapes(recording)]
 
         def replay(n_links, step, pose):
             of_links = dataclasses.replace(config, n_links=n_links)
@@ -96,7 +97,7 @@ class Case:
                 raise DiagnosisError(f"The nominal cable has no settled shape at a first pose: {error}") from error
             # the fine cable is replayed once or twice, by a program of its own
             rows = made.rows if n_links == FIT_LINKS else min(made.rows, len(pose))
-            return dataclasses.replace(made, length=recording.length, rows=rows)
+            return dataclasses.replace(made, length=recording.length, rows=rows, settling=settling)
 
         def run(playback):
             return playback.keypoints([playback.believed])[0].astype(np.float64)
@@ -198,7 +199,7 @@ def _steadied(pose: Float[np.ndarray, "E T 2 3"], recording: Recording, arms: Ac
     return steadied(pose, arms.predicted if recording.has_commands else np.zeros_like(pose), recording.length)
 
 
-def _first_shapes(recording: Recording) -> list[np.ndarray | None]:
+def first_shapes(recording: Recording) -> list[np.ndarray | None]:
     """Keypoints at the start of every episode, averaged over its first samples at rest; None where too few are seen."""
     shapes: list[np.ndarray | None] = []
     for points, pose in zip(recording.keypoints, recording.gripper_pose, strict=True):

@@ -76,7 +76,7 @@ def verdict_sentence(
         effects: named.
         equivalent: sets of effects that are indistinguishable on the log.
         ranking: every effect tried.
-        explained: share of the squared gap that the best explanation takes away; a negative one reads as none.
+        explained: share of the squared gap that the best explanation takes away.
         shrinkage: the same on motions left out of the fit; None where none could be.
     """
     # what acts in one motion alone cannot be found from the others
@@ -90,6 +90,12 @@ def verdict_sentence(
     rivals = f" (this log cannot tell apart: {alike})" if alike else ""
     too = f" {faint[:1].upper()}{faint[1:]} would leave as little, at a probability below 1 %." if faint else ""
     either = f" or a look-alike, which this log cannot tell apart: {alike}" if alike else ""
+    better = shrinkage is None or shrinkage > 0
+    best = (
+        f"the best explanation takes away {share} of it"
+        if better
+        else "on motions left out of the fit, the best explanation does no better than none"
+    )
     said = {
         "none": "The simulator explains this log within what the noise and its own resolution allow.",
         "named": f"The gap comes from {names}, {explains} {share} of it.",
@@ -97,7 +103,7 @@ def verdict_sentence(
         "named+unknown": (
             f"Part of the gap, {share}, looks like {names}{rivals}; the rest like no effect of the library.{too}"
         ),
-        "unknown": f"No effect of the library explains the gap: the best explanation takes away {share} of it.",
+        "unknown": f"No effect of the library explains the gap: {best}.",
     }[verdict]
     if not fitted_only:
         return said

@@ -1,39 +1,42 @@
 """The cable's length, as its keypoints show it.
 
 A stated length that is 1 % wrong looks like a cable that stretches. Where keypoints are closer together or further
-apart than stated in every episode, a cable of the length that they suggest is one more law of the simulator, see
-`laws`: it is as likely beforehand as any other, and where the log makes it the most probable one, it is taken.
+apart than stated in every episode, a cable of the length that they suggest is one more reading of the log.
 """
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
 
 import numpy as np
 
 from cablejax.diagnose.case import Case
-from cablejax.diagnose.diagnosis import CableDiagnosis, ParameterEstimate, UnderLaw
+from cablejax.diagnose.diagnosis import ParameterEstimate
+from cablejax.diagnose.reading import Reading
 from cablejax.diagnose.recording import DiagnosisError
 from cablejax.types import GapLog
 
 # Keypoints that are closer together or further apart than stated by more than this share are reported.
 _OFF = 0.004
+# Of the arc between two keypoints: their distance where the cable is hardly bent.
+_STRETCHED = 0.9
 
 
 @dataclasses.dataclass(frozen=True)
-class Length:
+class Length(Reading):
     """A length that differs from the stated one.
 
     Attributes:
-        stated: in the log [m].
+        log: of a cable of the measured length, its keypoints at the same shares of it.
+        case: of that log; None where the cable would be torn.
+        stated: in the given log [m].
         measured: from the keypoints [m].
-        case: the log of a cable of the measured length; None where it would be torn.
     """
 
+    log: GapLog
+    case: Case | None
     stated: float
     measured: float
-    case: Case | None
 
     @property
     def ratio(self) -> float:
@@ -48,15 +51,11 @@ class Length:
 
     @property
     def assumes(self) -> str:
-        """In words, for a law of the simulator."""
+        """See `Reading`."""
         return f"the cable is {self.measured:.4g} m long, not {self.stated:.4g} m as stated"
 
-    def probability(self, laws: Sequence[UnderLaw]) -> float:
-        """Of this length, among all laws that were tried; 0 where it was not tried."""
-        return sum(law.probability for law in laws if law.assumes == self.assumes)
-
-    def told(self, diagnosis: CableDiagnosis, probability: float) -> CableDiagnosis:
-        """A diagnosis that was made with this length, which says so."""
+    def told(self, diagnosis, probability):
+        """See `Reading`."""
         caveat = (
             f"Keypoints are {self.apart}. A cable of {self.measured:.4g} m explains this log better than any "
             f"effect of one of the stated {self.stated:.4g} m (probability {probability:.2f}), and that length is "
@@ -68,17 +67,6 @@ class Length:
             caveats=(caveat, *diagnosis.caveats),
             quantities={**diagnosis.quantities, "length_m": ParameterEstimate(self.measured, None, "m")},
         )
-
-    def applied(self, log: GapLog) -> GapLog:
-        """The log of a cable of the measured length, its keypoints at the same shares of it."""
-        cable = log.meta["cable"] | {"length_m": self.measured}
-        marks = [float(s * self.ratio) for s in log.meta["keypoint_arclength_m"]]
-        return dataclasses.replace(log, meta=log.meta | {"cable": cable, "keypoint_arclength_m": marks})
-
-    def as_law_of(self, case: Case) -> Case:
-        """The case of the stated length, its simulator with this length as one more law where that is possible."""
-        laws = {} if self.case is None else {self.assumes: self.case.simulator}
-        return dataclasses.replace(case, simulator=dataclasses.replace(case.simulator, resized=laws))
 
 
 def other_length(case: Case, log: GapLog) -> Length | None:
@@ -92,17 +80,27 @@ def other_length(case: Case, log: GapLog) -> Length | None:
     if np.abs(ratio - 1).min() <= _OFF or np.ptp(np.sign(ratio - 1)) > 0:
         return None
     stated = float(log.meta["cable"]["length_m"])
-    length = Length(stated, stated * float(ratio.mean()), None)
+    measured = stated * float(ratio.mean())
+    cable = log.meta["cable"] | {"length_m": measured}
+    marks = [float(s * measured / stated) for s in log.meta["keypoint_arclength_m"]]
+    other = dataclasses.replace(log, meta=log.meta | {"cable": cable, "keypoint_arclength_m": marks})
     try:
-        return dataclasses.replace(length, case=Case.of(length.applied(log), case.simulator.effects))
+        settling = case.simulator.playback.settling
+        return Length(other, Case.of(other, case.simulator.effects, settling=settling), stated, measured)
     except DiagnosisError:
-        return length
+        return Length(other, None, stated, measured)
 
 
 def _closeness(case: Case) -> np.ndarray:
-    """Distance of neighbouring keypoints over that of the nominal cable's, median of each episode; 1 if not seen."""
+    """Distance of neighbouring keypoints over that of the nominal cable's, median of each episode; 1 if not seen.
+
+    Where the nominal cable is bent so much between two keypoints that these are far closer than along it, they say
+    nothing of the length.
+    """
     seen, nominal = (
         np.linalg.norm(np.diff(points, axis=2), axis=-1) for points in (case.recording.keypoints, case.nominal)
     )
-    ratio = seen / nominal
+    marks = case.config.cable.keypoint_arclength + case.simulator.playback.believed.bias_along
+    stretched = nominal > _STRETCHED * np.diff(marks)
+    ratio = np.where(stretched, seen / np.where(stretched, nominal, 1.0), np.nan)
     return np.array([np.median(one[np.isfinite(one)]) if np.isfinite(one).any() else 1.0 for one in ratio])

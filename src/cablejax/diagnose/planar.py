@@ -50,7 +50,7 @@ class PlanarCable(Simulator):
             broadcasts against [E, T, N, 2].
         duration: of the shortest episode [s].
         max_curvature: largest curvature of the nominal cable in each episode [1/m], shape [E].
-        resized: the cable with another length than stated, where keypoints suggest one, by what that assumes in words.
+        readings: the same by what else the log may mean, by what that assumes in words; see `reading`.
     """
 
     effects: Sequence[CableEffect]
@@ -58,14 +58,14 @@ class PlanarCable(Simulator):
     correction: Float[np.ndarray, "E T N 2"]
     duration: float
     max_curvature: Float[np.ndarray, "E"]
-    resized: Mapping[str, PlanarCable] = dataclasses.field(default_factory=dict)
+    readings: Mapping[str, PlanarCable] = dataclasses.field(default_factory=dict)
     right_scores = SCORES
     beside_unknown = BESIDE_UNKNOWN
 
     @property
     def other_laws(self) -> dict[str, Simulator]:
-        """The same cable by each of `OTHER_LAWS`, and with another length."""
-        believed, laws = self.playback.believed, dict[str, Simulator](self.resized)
+        """The same cable by each of `OTHER_LAWS`, and as the log may be read otherwise."""
+        believed, laws = self.playback.believed, dict[str, Simulator](self.readings)
         for assumes, changed in OTHER_LAWS.items():
             values = {name: np.asarray(value, believed.friction.dtype) for name, value in changed.items()}
             playback = dataclasses.replace(self.playback, believed=dataclasses.replace(believed, **values))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import time
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -24,9 +24,11 @@ from cablejax.diagnose.motion_judge import MARGIN, Judge, Objective
 from cablejax.diagnose.next_motion import next_motion, require_some_motion
 from cablejax.diagnose.noise import SMALLEST
 from cablejax.diagnose.protocol import explanation
+from cablejax.diagnose.reading import Reading, held, with_readings
 from cablejax.diagnose.reference import ahead_of_observations
 from cablejax.diagnose.rounds import UNLIKELY, Rounds, rounds_of
 from cablejax.diagnose.run import Examined, explain, settings_of
+from cablejax.diagnose.search import Search
 from cablejax.diagnose.where import localise
 from cablejax.effects import LIBRARY, CableEffect
 from cablejax.types import GapLog
@@ -77,17 +79,7 @@ def diagnose(
         calibration = dataclasses.replace(calibration, baseline=assumed)
     if bounds is not None:
         require_some_motion(case.simulator.playback, case.noise.std, bounds)
-    length, taken = other_length(case, log), None
-    if length is not None:
-        case = length.as_law_of(case)
-    evidence = case.evidence(calibration)
-    found, conclusion = explain(evidence, calibration, progress=progress)
-    if length is not None and length.case is not None and length.probability(conclusion.under_laws) > 0.5:
-        progress(f"again, as {length.assumes}")
-        taken = length, length.probability(conclusion.under_laws)
-        log, case, length = length.applied(log), length.case, None
-        evidence = case.evidence(calibration)
-        found, conclusion = explain(evidence, calibration, progress=progress)
+    log, case, evidence, found, conclusion, length, taken = _read(log, case, calibration, progress)
     alone, conclusion = conclusion, with_arms(conclusion, case.arms, calibration)
 
     progress("fitting without each episode in turn")
@@ -118,7 +110,41 @@ def diagnose(
         seconds=time.perf_counter() - begin,
         settings={**settings_of(case.simulator, calibration), "links": {"fit": FIT_LINKS, "nominal": FINE_LINKS}},
     )
-    return diagnosis if taken is None else taken[0].told(diagnosis, taken[1])
+    for reading, probability in taken:
+        diagnosis = reading.told(diagnosis, probability)
+    return diagnosis
+
+
+class _Read(NamedTuple):
+    """A log as it is most probably to be read, with what explains it."""
+
+    log: GapLog
+    case: Case
+    evidence: Evidence
+    found: Search
+    conclusion: Conclusion
+    length: Length | None
+    """That the keypoints suggest beside the one of the log."""
+    taken: Sequence[tuple[Reading, float]]
+    """Readings other than the literal one, with their probabilities."""
+
+
+def _read(log: GapLog, case: Case, calibration: Calibration, progress: Callable[[str], None]) -> _Read:
+    """Explains a log, and again by another reading as long as one is more probable than all else together."""
+    taken: list[tuple[Reading, float]] = []
+    while True:
+        length = None if any(isinstance(one, Length) for one, _ in taken) else other_length(case, log)
+        readings = [one for one in (length, held(case, log, calibration)) if one is not None]
+        case = with_readings(case, readings)
+        evidence = case.evidence(calibration)
+        found, conclusion = explain(evidence, calibration, progress=progress)
+        likely = [(one, one.probability(conclusion.under_laws)) for one in readings]
+        reading, probability = max(likely, key=lambda one: one[1], default=(None, 0.0))
+        if reading is None or reading.case is None or probability <= 0.5:
+            return _Read(log, case, evidence, found, conclusion, length, taken)
+        progress(f"again, as {reading.assumes}")
+        taken.append((reading, probability))
+        log, case = reading.log, reading.case
 
 
 def _following(judge: Judge, design: DesignConfig | None) -> tuple[NextMotion | None, tuple[str, ...]]:
@@ -173,7 +199,8 @@ def _measured(case: Case, evidence: Evidence, conclusion: Conclusion) -> tuple[G
 def _worth_naming(conclusion: Conclusion, shrinkage: float | None) -> Conclusion:
     """The conclusion, once its effects were tried on episodes left out of the fit.
 
-    What stands beside an unknown cause and makes the gap there no smaller is no part of it: nothing is named then.
+    What stands beside an unknown cause and makes the gap there no smaller is no part of it: nothing is named then, nor
+    by the other laws.
 
     Args:
         conclusion: from the fit.
@@ -181,7 +208,11 @@ def _worth_naming(conclusion: Conclusion, shrinkage: float | None) -> Conclusion
     """
     if conclusion.verdict != "named+unknown" or shrinkage is None or shrinkage > 0:
         return conclusion
-    return dataclasses.replace(conclusion, verdict="unknown", effects=(), equivalent=(), posterior=())
+    nothing: dict[str, Any] = {"verdict": "unknown", "effects": (), "equivalent": ()}
+    under = tuple(
+        dataclasses.replace(law, **nothing) if law.verdict == "named+unknown" else law for law in conclusion.under_laws
+    )
+    return dataclasses.replace(conclusion, **nothing, posterior=(), under_laws=under)
 
 
 def _contradictions(rounds: Rounds | None) -> tuple[str, ...]:

@@ -17,7 +17,7 @@ from jaxtyping import Float, Int
 from cablejax.cable import Cable, Discretisation
 from cablejax.effects.camera import seen_by_camera
 from cablejax.effects.physics import Physics, nominal_physics
-from cablejax.simulate.chain.replay import LARGEST_STEP, Chain
+from cablejax.simulate.chain.replay import LARGEST_STEP, SETTLING, Chain
 from cablejax.simulate.chain.state import chain_nodes
 from cablejax.simulate.compile import compiler_options
 from cablejax.simulate.equilibrium import angles_of_keypoints, equilibrium_state
@@ -45,6 +45,7 @@ class Playback:
         length: samples of each episode without the padding, over which the last keypoints are repeated, shape [E];
             None = there is no padding.
         rows: cables that one compiled call replays at once; fewer for few replays by a program of their own.
+        settling: for how long the cable settles before the first pose [s]; 0 = it begins as it was first seen.
     """
 
     config: Discretisation
@@ -55,6 +56,7 @@ class Playback:
     largest_step: float = LARGEST_STEP
     length: Int[np.ndarray, "E"] | None = None
     rows: int = _ROWS
+    settling: float = SETTLING
 
     @classmethod
     def of_motion(
@@ -116,7 +118,8 @@ class Playback:
             p, e = full[:, 0], chosen[full[:, 1]]
             batch = jax.tree.map(lambda leaf: leaf[p], stacked)
             replay = _compiled(Chain(geometry, with_contact), substeps)
-            result = replay(batch, self.angles[e], self.gripper_pose[e], self.interval[e], length[e].max())
+            settling = np.float32(self.settling)
+            result = replay(batch, self.angles[e], self.gripper_pose[e], self.interval[e], length[e].max(), settling)
             points[rows[:, 0], rows[:, 1]] = np.asarray(result)[: len(rows)]
 
         touching, longest_first = stacked.obstacle_radius > 0, np.argsort(-length[chosen], kind="stable")
@@ -169,10 +172,12 @@ def _workers() -> int:
 
 @functools.lru_cache(maxsize=16)
 def _compiled(chain: Chain, n_substeps: int):
-    def one(physics, angles, pose, interval, n_samples):
-        points = chain.rollout(physics, angles, pose, interval, n_substeps=n_substeps, n_samples=n_samples)
+    def one(physics, angles, pose, interval, n_samples, settling):
+        points = chain.rollout(
+            physics, angles, pose, interval, n_substeps=n_substeps, n_samples=n_samples, settling=settling
+        )
         return seen_by_camera(physics, points, interval)
 
     # runs far longer than it compiles: worth LLVM's optimisations where XLA_FLAGS go without them
     optimised = {"xla_backend_optimization_level": 3}
-    return jax.jit(jax.vmap(one, in_axes=(0, 0, 0, 0, None)), compiler_options=compiler_options() | optimised)
+    return jax.jit(jax.vmap(one, in_axes=(0, 0, 0, 0, None, None)), compiler_options=compiler_options() | optimised)

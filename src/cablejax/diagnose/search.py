@@ -13,7 +13,7 @@ from cablejax.diagnose.evidence import Evidence
 from cablejax.diagnose.fit import Fit, evaluate, improved
 from cablejax.diagnose.protocol import Explanation
 from cablejax.diagnose.refits import refitted
-from cablejax.diagnose.screen import screen, shortlist
+from cablejax.diagnose.screen import Template, screen, shortlist
 
 _FINALISTS = 9
 _BASES = 3
@@ -67,6 +67,7 @@ def search(
     progress("fitting every effect")
     plan = evidence.simulator.plan
     starts = _promising(shortlist(templates), screened)
+    starts += _of_fixed_size(templates, {start.names[-1] for start in starts})
     singles = _best(improved(evidence, evaluate(evidence, starts), plan.first_steps), evidence, calibration)
     fits = improved(evidence, singles[:_FINALISTS], plan.last_steps) + singles[_FINALISTS:]
     fits = _best([null, *fits], evidence, calibration)
@@ -135,15 +136,22 @@ def _grown(evidence: Evidence, base: Explanation, calibration: Calibration) -> l
     if not partners:
         return []
     templates = screen(evidence, base, partners, evidence.predict([base])[0])
-    # An obstacle that is not quite in its place touches in other episodes: what its template takes away says little.
-    fixed = [template for template in templates if template.start.terms[-1].effect.amplitude is None]
     starts = [start for start in shortlist(templates, per_variant=1, per_effect=2) if not _repeats(start)][:_PARTNERS]
     tried = {start.names[-1] for start in starts}
     weighed = [start for start in shortlist(templates, 1, 1, weighed=True) if start.names[-1] not in base.names]
     starts += [start for start in weighed[:_WEIGHED_PARTNERS] if start.names[-1] not in tried]
-    tried |= {start.names[-1] for start in starts}
-    starts += [start for start in shortlist(fixed, per_variant=1, per_effect=1) if start.names[-1] not in tried]
+    starts += _of_fixed_size(templates, tried | {start.names[-1] for start in starts})
     return improved(evidence, evaluate(evidence, starts), evidence.simulator.plan.grown_steps)
+
+
+def _of_fixed_size(templates: Sequence[Template], tried: set[str]) -> list[Explanation]:
+    """The best start of each effect that was not tried and that no parameter stretches to meet the gap.
+
+    What its template takes away says little: an obstacle that is not quite in its place touches in other episodes, and
+    a lag that starts three times too long looks worse than none.
+    """
+    fixed = [template for template in templates if template.start.terms[-1].effect.amplitude is None]
+    return [start for start in shortlist(fixed, per_variant=1, per_effect=1) if start.names[-1] not in tried]
 
 
 def _repeats(start: Explanation) -> bool:

@@ -90,8 +90,6 @@ class ShapeCableConfig:
         return CommandLimits(
             speed=2.0 * self.speed * length,
             turn_rate=self.turn_rate + 1e-6,
-            min_distance=0.1 * length,
-            max_distance=0.995 * length,
             workspace=((-1.5 * length, -1.5 * length), (1.5 * length, 1.5 * length)),
         )
 
@@ -230,7 +228,8 @@ class Cables:
         if np.shape(actions) != shape:
             raise ValueError(f"The actions have shape {np.shape(actions)}, expected {shape}: (vx, vy, omega) of each.")
         twists = config.scale * np.clip(np.nan_to_num(np.asarray(actions, float), posinf=0.0, neginf=0.0), -1.0, 1.0)
-        twists = config.limits.shortened(twists, self.gripper_pose, config.interval) * active[:, None, None]
+        length = config.cable.length
+        twists = config.limits.shortened(twists, self.gripper_pose, config.interval, length) * active[:, None, None]
         self._state, shown = self._engine.rollout(self._physics, self._state, twists[:, None], config.interval)
         keypoints, poses = np.asarray(shown.keypoints[:, -1]), np.asarray(shown.gripper_pose[:, -1])
         diverged = ~(np.abs(keypoints) < config.room).all(axis=(1, 2))

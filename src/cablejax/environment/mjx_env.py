@@ -91,7 +91,7 @@ class MjxShapeCable:
         action = jnp.asarray(action, jnp.float32).reshape(2, 3)
         share = jnp.clip(jnp.nan_to_num(action, posinf=0.0, neginf=0.0), -1.0, 1.0)
         twist = jnp.asarray(config.scale, share.dtype) * share
-        twist = config.limits.shortened(twist, before.gripper_pose, config.interval)
+        twist = config.limits.shortened(twist, before.gripper_pose, config.interval, config.cable.length)
         after, (_, seen) = self._moved(info["physics"], before, twist)
         sound = (jnp.abs(seen) < config.room).all()
         data = jax.tree.map(lambda new, old: jnp.where(sound, new, old), after, before)

@@ -57,6 +57,11 @@ class MPC(eqx.Module):
     def __check_init__(self):
         check_target(self.target)
 
+    @property
+    def interval(self) -> float:
+        """Time between two steps [s]."""
+        return self.config.objective.interval
+
     def init(self, history: History) -> MPCState:
         """State for a cable seen at rest or in motion.
 

@@ -72,9 +72,10 @@ def plan_or_recover(
       every plan of a few steps makes the error worse before it makes it better. From the straight cable the target can
       be reached, so it is straightened.
     - Near it. Stick and slip are of the size of what the model promises. The grippers rest as soon as the error is
-      about as low as it has been, until it rises, as after a disturbance. Where the cable gets worse instead, they go
-      back to where it was best before friction holds it in another shape, and plan again with half the bound on their
-      motion (`radius_after`): a trust region's rejected step. They rest there after `RETURNS` ways back.
+      about as low as it has been, until it rises, as after a disturbance, or turns out to be far. Where the cable gets
+      worse instead, they go back to where it was best before friction holds it in another shape, and plan again with
+      half the bound on their motion (`radius_after`): a trust region's rejected step. They rest there after `RETURNS`
+      ways back.
     """
     plan, sound = decision.plan, _sound(decision.plan.result)
     held = decision.action == Action.HOLD
@@ -115,7 +116,9 @@ def _followed(
     # what moved fast comes to rest a while after its grippers
     relaxed = (before.since < RELAXES) & (error <= RELAXED * before.rest_error + config.wake)
     calming = resting & (before.since < RELAXES)
-    woken = resting & ~calming & (error > before.rest_error + config.wake)
+    # of a camera that lags, the cable is seen to relax far away only once its grippers rest
+    risen = (error > before.rest_error + config.wake) | (error > config.restart_above)
+    woken = resting & ~calming & risen
     planning = (before.mode == Action.FOLLOW) | woken
     best = jnp.where(woken, jnp.inf, before.best_error)
     better = planning & (error < 0.99 * best)

@@ -32,7 +32,7 @@ def target_pose(target: Float[Array, "N 2"]) -> Float[Array, "2 3"]:
     return jnp.concatenate([target[jnp.array([0, -1])], heading[:, None]], axis=1)
 
 
-def straightened(target: Float[Array, "N 2"], distance: float) -> Float[Array, "2 3"]:
+def straightened(target: Float[Array, "N 2"], distance: float | Float[Array, ""]) -> Float[Array, "2 3"]:
     """(x, y, theta) of the two grippers holding a straight cable along the target's chord, around its middle.
 
     From there stable shapes lead to every target (Borum and Bretl, ICRA 2015), whatever shape the cable had before.

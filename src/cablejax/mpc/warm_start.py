@@ -13,6 +13,11 @@ from cablejax.mpc.config import MPCConfig
 from cablejax.mpc.problem import Rollout, ShapingProblem
 from cablejax.mpc.target_pose import straight_plan, straightened, target_pose, way_to
 
+# Of the polyline through the keypoints of a cable that is hardly bent: no cable of their arc length is longer.
+_ARCS = 1.005
+# Of a cable, relative to its length: what polylines fall short of it by more is their bends.
+_SHORTEST = 0.95
+
 
 class StraightWay(NamedTuple):
     """The straight way to a pair of gripper poses.
@@ -57,7 +62,10 @@ def find_starts(
     """
     radius, radius_max = problem.feasible.radius, jnp.asarray(config.radius_max, last.dtype)
     to_target = _straight_way(config, problem, target_pose(problem.target), radius)
-    apart = straightened(problem.target, config.max_distance * config.cable_length)
+    # a cable that is shorter than believed, as after a slip, is not to be pulled taut
+    seen = jnp.linalg.norm(jnp.diff(problem.history.keypoints[-1], axis=0), axis=1).sum()
+    length = config.cable_length * jnp.clip(_ARCS * seen / config.cable_length, _SHORTEST, 1.0)
+    apart = straightened(problem.target, config.max_distance * length)
     # what leads away from here does not rest on the model
     to_straight = _straight_way(config, problem, apart, radius_max)
     to_best = _straight_way(config, problem, best_pose, radius_max)

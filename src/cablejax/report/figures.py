@@ -32,7 +32,8 @@ if TYPE_CHECKING:
 
 _REST = 5e-4
 """Grippers that move by less than this in a step [m, rad] rest."""
-_GOAL_CM = 1.0
+_DOTTED: dict[str, Any] = {"color": "white", "lw": 2.6, "ls": (0, (1, 1.2))}
+_NOTE: dict[str, Any] = {"ha": "right", "va": "top", "color": LIGHT.muted, "fontsize": 9}
 
 _STYLE: dict[Any, Any] = FIGURE_STYLE | {
     "font.size": 10.0,
@@ -73,24 +74,29 @@ def final_shapes(runs: Runs) -> Figure:
 
 
 def error_over_time(runs: Runs) -> Figure:
-    """Shape error against time on a logarithmic axis, one panel per shape; a line marks the goal of 1 cm."""
+    """Shape error against time on a logarithmic axis, one panel per shape; a line marks the goal, 1 % of the length."""
     pairs = by_shape(runs)
     with matplotlib.rc_context(_STYLE):
         figure, axes = _row_of_panels(list(pairs), "shape error [cm]")
-        low = min(_GOAL_CM, *(float(np.nanmin(r.error_cm)) for r in runs.values()))
-        high = max(_GOAL_CM, *(float(np.nanmax(r.error_cm)) for r in runs.values()))
+        goal = float(np.mean([r.goal_cm for r in runs.values()]))
+        low = min(goal, *(float(np.nanmin(r.error_cm)) for r in runs.values()))
+        high = max(goal, *(float(np.nanmax(r.error_cm)) for r in runs.values()))
         for ax, pair in zip(axes, pairs.values(), strict=True):
             for method in _present(pair):
                 run = pair[method]
                 ax.plot(run.times, run.error_cm, color=LIGHT.method(method), lw=2.2, label=METHOD_LABEL[method])
+                if run.straightened.any():
+                    ax.plot(run.times, np.where(run.straightened, run.error_cm, np.nan), **_DOTTED)
                 ax.plot(run.times[-1], run.terminal_error_cm, "o", ms=5, color=LIGHT.method(method))
             ax.set_yscale("log")
             ax.set_ylim(low / 1.4, high * 1.3)
             ax.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
             ax.minorticks_off()
             ax.set_yticks([t for t in (0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50) if low / 1.4 <= t <= high * 1.3])
-            ax.axhline(_GOAL_CM, color=LIGHT.target, lw=1.2, ls=(0, (5, 3)))
-        axes[0].text(0.0, _GOAL_CM / 1.08, f"{_GOAL_CM:g} cm", ha="left", va="top", color=LIGHT.muted, fontsize=9)
+            ax.axhline(goal, color=LIGHT.target, lw=1.2, ls=(0, (5, 3)))
+            if any(run.straightened.any() for run in pair.values()):
+                ax.text(0.98, 0.98, "dotted: straightened,\nto begin again", transform=ax.transAxes, **_NOTE)
+        axes[0].text(0.0, goal / 1.08, f"{goal:.2g} cm", ha="left", va="top", color=LIGHT.muted, fontsize=9)
         _method_legend(figure, runs)
     return figure
 

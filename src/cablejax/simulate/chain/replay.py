@@ -1,4 +1,4 @@
-"""Replays of measured gripper poses by the planar chain, from a settled start."""
+"""Replays of measured gripper poses by the planar chain."""
 
 from __future__ import annotations
 
@@ -19,9 +19,11 @@ LARGEST_STEP = 0.05
 """Longest time step of a fit [s]. What it is off for the nominal cable is known from one replay with `FINE_STEP`."""
 FINE_STEP = 0.01
 """Longest time step of the nominal cable that a log is compared with [s]."""
+SETTLING = 4.0
+"""For how long a cable that settles soon does so before a replay [s]."""
 _SETTLE_STEPS = 20
-_SETTLE_STEP = 0.2
-"""Of a cable that settles soon [s]."""
+_SHORTEST_STEP = 1e-4
+"""With it a cable stays where it is [s]."""
 _SLOW = 1.0
 """Damping time beyond which a cable has hardly settled when it is first seen [s]."""
 
@@ -48,6 +50,7 @@ class Chain:
         *,
         n_substeps: int,
         n_samples: Int[Array, ""] | int | None = None,
+        settling: Float[Array, ""] | float = SETTLING,
     ) -> Float[Array, "T N 2"]:
         """Keypoints on the centreline, as the physics has them: before any camera.
 
@@ -62,9 +65,11 @@ class Chain:
             n_substeps: time steps between two samples.
             n_samples: of the poses; the keypoints of the last one are repeated over the others, which takes no time as
                 long as all cables of a batch share this number. None = all.
+            settling: for how long the cable settles [s]; 0 = it begins as `angles` are, and the table holds it there as
+                far as its friction goes.
         """
         config, first, zero = self.config, gripper_pose[0], jnp.zeros((), angles.dtype)
-        start = self._settled(physics, angles, first)
+        start = self._settled(physics, angles, first, settling)
 
         def move(carry, target):
             state, pose, time, _ = carry
@@ -95,7 +100,13 @@ class Chain:
         _, moved = jax.lax.scan(sample, (start, first, zero, points), items)
         return jnp.concatenate([points[None], moved])
 
-    def _settled(self, physics: Physics, angles: Float[Array, "n"], pose: Float[Array, "Q 3"]) -> ChainState:
+    def _settled(
+        self,
+        physics: Physics,
+        angles: Float[Array, "n"],
+        pose: Float[Array, "Q 3"],
+        settling: Float[Array, ""] | float,
+    ) -> ChainState:
         """The cable at rest at the first pose, as far as its damping lets it come to rest, with nothing locked in."""
         zeros, still = jnp.zeros(self.config.n_joints, angles.dtype), jnp.zeros(self.config.n_links + 1, angles.dtype)
         start = ChainState(
@@ -117,7 +128,8 @@ class Chain:
             drag=jnp.zeros_like(physics.drag),
         )
 
-        dt = _SETTLE_STEP / (1.0 + (physics.damping_time / _SLOW) ** 2)
+        step = settling / _SETTLE_STEPS / (1.0 + (physics.damping_time / _SLOW) ** 2)
+        dt = jnp.maximum(step, _SHORTEST_STEP)
 
         def settle(state, _):
             state = advance(self.config, calm, state, pose, pose, dt, -1e3, with_contact=self.with_contact)

@@ -1,0 +1,102 @@
+"""What a log may mean instead of what it states: another length, or cables that begin where the table holds them.
+
+Each such reading is one more law of the simulator, see `laws`: it is as likely beforehand as any other, and where the
+log makes it the most probable one, the log is diagnosed again as it has it.
+"""
+
+from __future__ import annotations
+
+import abc
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+
+from cablejax.diagnose.belief import Calibration
+from cablejax.diagnose.case import Case, first_shapes
+from cablejax.diagnose.diagnosis import CableDiagnosis, UnderLaw
+from cablejax.diagnose.recording import DiagnosisError
+from cablejax.types import GapLog
+
+
+class Reading(abc.ABC):
+    """A reading of a log.
+
+    Attributes:
+        assumes: in words, for a law of the simulator.
+        log: as this reading has it.
+        case: of that log; None where the simulator cannot follow it.
+    """
+
+    assumes: str
+    log: GapLog
+    case: Case | None
+
+    @abc.abstractmethod
+    def told(self, diagnosis: CableDiagnosis, probability: float) -> CableDiagnosis:
+        """A diagnosis that was made with this reading, which says so."""
+
+    def probability(self, laws: Sequence[UnderLaw]) -> float:
+        """Of this reading, among all laws that were tried; 0 where it was not tried."""
+        return sum(law.probability for law in laws if law.assumes == self.assumes)
+
+
+def with_readings(case: Case, readings: Sequence[Reading]) -> Case:
+    """The case, its simulator with these readings as further laws where that is possible."""
+    laws = {one.assumes: one.case.simulator for one in readings if one.case is not None}
+    return dataclasses.replace(case, simulator=dataclasses.replace(case.simulator, readings=laws))
+
+
+@dataclasses.dataclass(frozen=True)
+class Held(Reading):
+    """Cables that begin as they were first seen: the table holds them there, away from where they would settle.
+
+    Attributes:
+        log: the same.
+        case: its cables not settled.
+        off: largest distance of a keypoint's first place from that of the settled nominal cable [m].
+    """
+
+    log: GapLog
+    case: Case
+    off: float
+
+    assumes = "the cable begins as it was first seen, held there by the table"
+
+    def told(self, diagnosis, probability):
+        """See `Reading`."""
+        caveat = (
+            f"At the start, keypoints are up to {1e3 * self.off:.2g} mm from where the simulated cable would settle. "
+            f"A cable that begins as it was first seen, held there by the table's friction, explains this log best "
+            f"(probability {probability:.2f}), and that is how it is simulated here."
+        )
+        return dataclasses.replace(
+            diagnosis,
+            sentence=f"{diagnosis.sentence} That is so if {self.assumes}.",
+            caveats=(caveat, *diagnosis.caveats),
+        )
+
+
+def held(case: Case, log: GapLog, calibration: Calibration) -> Held | None:
+    """The reading that the table holds the cable at the start, if it lies elsewhere than settled by more than counts.
+
+    Args:
+        case: of the log, its cables settled.
+        log: that was read.
+        calibration: of the judgement.
+    """
+    if case.simulator.playback.settling == 0:
+        return None
+    noise, off = float(np.sqrt(np.mean(case.noise.std**2))), []
+    for shape, settled in zip(first_shapes(case.recording), case.nominal[:, 0], strict=True):
+        apart = np.zeros(1) if shape is None else np.linalg.norm(shape - settled, axis=1)
+        off.append(apart[np.isfinite(apart)])
+    # per coordinate, as the smallest gap is; a first shape may be of one sample
+    smallest = np.hypot(calibration.smallest_gap(noise), noise)
+    if max(float(np.sqrt(np.mean(one**2) / 2)) for one in off) <= smallest:
+        return None
+    try:
+        unsettled = Case.of(log, case.simulator.effects, settling=0.0)
+    except DiagnosisError:
+        return None
+    return Held(log, unsettled, max(float(one.max()) for one in off))

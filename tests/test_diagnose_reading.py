@@ -1,0 +1,70 @@
+"""Cables that begin where the table holds them, and not where they would settle."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from cablejax.cable import Discretisation
+from cablejax.diagnose import diagnose, explanation
+from cablejax.diagnose.belief import Calibration
+from cablejax.diagnose.case import FINE_LINKS, Case
+from cablejax.diagnose.planar import physics_of
+from cablejax.diagnose.playback import Playback
+from cablejax.diagnose.reading import Held, held, with_readings
+from cablejax.gaplog import Episode, gap_log_from_episodes
+from cablejax.simulate.chain.replay import FINE_STEP
+from cablejax.types import GapLog
+from diagnose_cases import CABLE, INTERVAL, MOTIONS, holds, noise, parts, poses, record
+
+ROUGH = dataclasses.replace(CABLE, friction_coefficient=0.6)
+
+
+def held_log(*effects) -> GapLog:
+    """Of a cable on a rough table, led to its first pose by the motion backwards, that stayed as this left it."""
+    there = [np.concatenate([poses(f"back_{motion}")[:-1], poses(motion)]) for motion in MOTIONS]
+    config = Discretisation(ROUGH, n_links=FINE_LINKS)
+    player = Playback.of_motion(config, np.stack(there), None, np.full(len(MOTIONS), INTERVAL), FINE_STEP)
+    points = player.keypoints([physics_of(explanation(*parts(*effects)), player.believed, config)])[0]
+    points = points[:, len(holds()) - 1 :] + noise(points[:, len(holds()) - 1 :].shape, 0.5, 0)
+    episodes = []
+    for motion, seen in zip(MOTIONS, points, strict=True):
+        pose = poses(motion)
+        command = np.concatenate([np.diff(pose, axis=0) / INTERVAL, np.zeros((1, 2, 3))])
+        episodes.append(Episode(motion, INTERVAL * np.arange(len(pose)), seen, pose, command, holds()))
+    return gap_log_from_episodes(episodes, ROUGH, source="the diagnosing simulator itself")
+
+
+def test_a_log_whose_cable_begins_elsewhere_is_read_as_held_by_the_table():
+    log = held_log()
+    case = Case.of(log)
+    reading = held(case, log, Calibration())
+    assert isinstance(reading, Held) and reading.case is not None
+    assert 0.003 < reading.off < 0.1
+    # it begins where it was seen and stays there: the grippers rest in the first 17 samples
+    seen, settled, start = (x[:, :16] for x in (case.recording.keypoints, case.nominal, reading.case.nominal))
+    assert np.abs(start - seen.mean(axis=1, keepdims=True)).max() < 0.0012
+    assert np.abs(settled - seen.mean(axis=1, keepdims=True)).max() > 0.002
+    assert reading.assumes in with_readings(case, [reading]).simulator.other_laws
+    assert held(reading.case, log, Calibration()) is None
+
+
+def test_a_cable_that_has_settled_is_read_in_one_way():
+    log = record()
+    assert held(Case.of(log), log, Calibration()) is None
+
+
+@pytest.mark.slow
+def test_a_start_held_by_the_table_is_no_gap():
+    found = diagnose(held_log())
+    assert found.verdict == "none" and not found.effects
+    assert "if the cable begins as it was first seen, held there by the table" in found.sentence
+    assert found.caveats[0].startswith("At the start, keypoints are up to")
+
+
+@pytest.mark.slow
+def test_an_effect_is_named_beside_a_start_held_by_the_table():
+    found = diagnose(held_log(("gripper_rotation_offset", (0.15,))))
+    assert found.verdict == "named" and [effect.name for effect in found.effects] == ["gripper_rotation_offset"]
+    low, high = found.effects[0].parameters["angle_rad"].ci90
+    assert low <= 0.15 <= high
