@@ -72,8 +72,12 @@ def test_first_recording_goes_to_the_goals_and_back_in_the_middle_of_the_workspa
 
 
 def test_bounds_without_room_are_refused():
-    with pytest.raises(ValueError, match=r"No way to U, S, Z.*Make a first recording of your own"):
+    with pytest.raises(ValueError, match=r"\(U, S, Z\): workspace excludes 3.*Make a first recording of your own"):
         first_recording(LONG, straight_start(LONG), GOALS, Bounds(workspace=((0.0, 0.0), (0.5, 0.5))))
+    narrow = Bounds(max_distance=0.9 * LONG.length)
+    log = first_recording(LONG, straight_start(LONG), GOALS, narrow)
+    apart = np.linalg.norm(log.gripper_pose[:, :, 1, :2] - log.gripper_pose[:, :, 0, :2], axis=-1)
+    assert apart[:, 0].max() <= 0.9 * LONG.length + 1e-9 and len(log.episode_length) == len(GOALS)
 
 
 @pytest.mark.parametrize(

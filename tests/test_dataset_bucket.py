@@ -15,6 +15,7 @@ import pytest
 
 from cablejax.cable import Cable, Discretisation
 from cablejax.cli import main
+from cablejax.commands.simulate import _clear
 from cablejax.dataset.bucket import Bucket, UnreachableError, place_of
 from cablejax.dataset.generate import generate
 from cablejax.dataset.opening import open_or_create, open_store
@@ -133,6 +134,13 @@ def test_a_bucket_holds_what_a_folder_holds(wire, tmp_path):
     Bucket("s3://cables/other").write("letter.txt", b"hello")
     with pytest.raises(ValueError, match="holds something, but no data set"):
         open_or_create("s3://cables/other", TINY)
+    _clear(Bucket("s3://cables/data.zarr"), TINY)
+    assert open_store("s3://cables/data.zarr").config == TINY
+    _clear(Bucket("s3://cables/data.zarr"), dataclasses.replace(TINY, seed=6))
+    with pytest.raises(ValueError, match=r"s3://cables/data.zarr holds no data set"):
+        open_store("s3://cables/data.zarr")
+    with pytest.raises(ValueError, match=r"s3://cables/other holds no data set"):
+        _clear(Bucket("s3://cables/other"), TINY)
 
 
 def test_what_is_damaged_in_a_bucket_is_made_again(wire):

@@ -55,7 +55,7 @@ Start with `cablejax demo`: it needs nothing else and writes a page to look at. 
 `cable` in a file, `simulate` a data set, `train` on it, `shape` a cable with the result, and `diagnose` what the
 simulator lacks; `study` does that in rounds on a simulated plant. A recording of a real cable is `import`ed first;
 `view` shows what any of them has written, `export` takes it to other programs. `cablejax COMMAND --help` explains each
-one, `cablejax --version` says which this is."""
+one, `cablejax --version` prints the version."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -24,7 +24,7 @@ class CableFile(Command):
     with.
 
     Attributes:
-        out: The file to write, by custom cable.toml; by default the text is only printed.
+        out: The file to write, for example cable.toml; by default the text is only printed.
         from_: A data set, trained weights (a file, a folder, or a released model by name), a log, or another cable
             file. By default the reference cable.
         overwrite: Replace a file that is there.

@@ -37,8 +37,8 @@ class Shape(Command):
             until_s=... it begins and ends in the middle of the run.
         effect: An effect that the model is informed of, as for --plant-effect; may be given several times. What of it
             enters the model: stiffness_profile, intrinsic_curvature, gripper_rotation_offset and gripper_compliance the
-            rest of its cable; bending_stiffness, table_friction and linear_density the first belief of a conditioned
-            model.
+            shape in which its cable rests; bending_stiffness, table_friction and linear_density the first belief of a
+            conditioned model.
         with_: A verdict.json of `cablejax diagnose`: the model is informed, as by --effect, of the effects that it
             names; where nothing of them enters it, of the first of their look-alikes that does.
         perception: true: the controller observes the simulated keypoints. cloud: it observes keypoints estimated from

@@ -14,6 +14,7 @@ from cablejax.whole_file import sole_writer
 
 if TYPE_CHECKING:
     from cablejax.cable import Cable
+    from cablejax.dataset.bucket import Bucket
     from cablejax.dataset.schema import DatasetConfig
     from cablejax.effects.given import GivenEffect
 
@@ -73,19 +74,12 @@ class Simulate(Command):
 
     def execute(self):
         """Generates what the store lacks and returns its size and digest."""
-        import shutil
-
         from cablejax.dataset.bucket import place_of
-        from cablejax.dataset.generate import WRITER, generate
-        from cablejax.dataset.opening import open_store
+        from cablejax.dataset.generate import generate
 
-        config = self.dataset_config()
-        if self.overwrite and self.out.is_dir() and any(self.out.iterdir()) and open_store(self.out).config != config:
-            for writer in self.out.glob(f"{WRITER}*"):
-                with sole_writer(writer):
-                    pass
-            shutil.rmtree(self.out)
-        place = place_of(self.out)
+        config, place = self.dataset_config(), place_of(self.out)
+        if self.overwrite:
+            _clear(place, config)
         say(f"{config.n_trajectories} trajectories of {config.n_steps} steps into {place}")
         begin = time.perf_counter()
         info = generate(config, place, process_index=self.process_index, process_count=self.process_count)
@@ -149,3 +143,21 @@ class Simulate(Command):
             engine=self.engine,
             effects=effects,
         )
+
+
+def _clear(place: pathlib.Path | Bucket, config: DatasetConfig) -> None:
+    """Deletes a data set of another configuration; refuses whatever is no data set, or is being written."""
+    import shutil
+
+    from cablejax.dataset.bucket import Bucket
+    from cablejax.dataset.generate import WRITER
+    from cablejax.dataset.opening import open_store
+
+    if isinstance(place, Bucket):
+        if (names := place.names()) and open_store(str(place)).config != config:
+            place.remove(names)
+    elif place.is_dir() and any(place.iterdir()) and open_store(place).config != config:
+        for writer in place.glob(f"{WRITER}*"):
+            with sole_writer(writer):
+                pass
+        shutil.rmtree(place)

@@ -34,8 +34,8 @@ from cablejax.effects import LIBRARY, CableEffect
 from cablejax.types import GapLog
 
 _ONLY_ARMS = (
-    "With the measured poses the simulator explains this log. The arms do not follow their commands, for a reason "
-    "that is not in the library."
+    "With the measured poses the simulator explains this log. The arms do not follow their commands, and no effect of "
+    "the library explains why."
 )
 # Reported: holds in which keypoints scatter by this many times what they do between samples.
 _SCATTERED = 1.5

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping
 from typing import Any, Literal
 
@@ -39,23 +40,28 @@ def first_recording(
     Args:
         cable: that is believed to be moved.
         start: gripper poses (x, y, theta) of every motion [m, rad]; in a workspace start and goals are moved to the
-            middle of it.
+            middle of it. A start farther apart than the bounds allow is brought together.
         goals: gripper poses by name. A motion that breaks the bounds on the grippers is left out; one that comes close
             to a snap-through is not, since a robot that shapes a cable does that too.
         bounds: to keep.
 
     Raises:
-        ValueError: none keeps the bounds.
+        ValueError: none keeps the bounds; says how many each bound excludes.
     """
-    config = Discretisation(cable)
+    config, (_, farthest) = Discretisation(cable), bounds.distances(cable.length)
+    centre, apart = start[:, :2].mean(axis=0), float(np.linalg.norm(start[1, :2] - start[0, :2]))
+    start = start.copy()
+    start[:, :2] = centre + min(1.0, farthest / max(apart, 1e-9)) * (start[:, :2] - centre)
     middle = np.zeros(3) if bounds.workspace is None else np.append(np.mean(bounds.workspace, axis=0), 0.0)
     motions = {name: there_and_back(start + middle, goal + middle, bounds=bounds) for name, goal in goals.items()}
     broken = {name: grippers_beyond(bounds, config, poses, INTERVAL).keys() for name, poses in motions.items()}
     kept = {name: poses for name, poses in motions.items() if broken[name] <= {SNAP_THROUGH}}
     if not kept:
+        counts = Counter(name.replace("_", " ") for names in broken.values() for name in names - {SNAP_THROUGH})
+        words = ", ".join(f"{name} excludes {count}" for name, count in counts.most_common())
         raise ValueError(
-            f"No way to {', '.join(goals)}, by which a study begins, keeps the bounds. Make a first recording of your "
-            "own, and give it to `cablejax diagnose` with these bounds."
+            f"No way keeps the bounds, of those by which a study begins ({', '.join(goals)}): {words}. Make a first "
+            "recording of your own, and give it to `cablejax diagnose` with these bounds."
         )
     return commands_log(kept, INTERVAL, cable)
 

@@ -40,7 +40,7 @@ def starting_from(source: str | os.PathLike[str], config: ModelConfig) -> tuple[
         ]
         raise ValueError(
             f"The model to start from differs: {'; '.join(other)}. Only `conditioned` may differ, and only a graph "
-            "network can be made conditioned."
+            "network can be made conditioned. Train with the settings of that model."
         )
     encoder = ("node_encoder", "first", 0, "kernel")
     flat = dict(nnx.to_flat_state(weights))

@@ -145,8 +145,7 @@ def _released(name: str) -> Path:
     if name not in released_names():
         known = ", ".join(released_names()) or "none in this installation"
         raise WeightsError(
-            f"No model is released under the name {name!r} (released: {known}). "
-            "Give one of these, or the folder or file of a training of your own."
+            f"There is no file or folder {name!r} here, and no model is released under that name (released: {known})."
         )
     return Path(str(_folder() / f"{name}{SUFFIX}"))
 

@@ -196,6 +196,8 @@ def read_verdict_json(path: str | os.PathLike[str]) -> dict[str, Any]:
     """
     try:
         verdict = read_json(path)
+    except FileNotFoundError as error:
+        raise ValueError(f"{error} Expected a verdict.json of `diagnose`.") from error
     except (OSError, ValueError) as error:
         raise ValueError(f"This is not a verdict: {error} Expected a verdict.json of `diagnose`.") from error
     if not isinstance(verdict, dict):

@@ -22,7 +22,7 @@ from cablejax.whole_file import whole_file
 
 
 class RobotRun:
-    """Drives a link and records it; `finish` writes the gap log. The first step waits for the controller to compile.
+    """Drives a link and records it; `finish` writes the gap log. The controller is compiled when it is made.
 
     Args:
         link: the controller, its target and settings.
