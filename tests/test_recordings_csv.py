@@ -229,3 +229,11 @@ def test_the_example_in_the_documentation_works(tmp_path):
             table[f"m{i}_{name}"] = 1000 * points[:, i, k]
     log, _ = import_csv(*written(tmp_path, table, layout))
     assert log.meta["motion"] == ["swing", "swing"] and log.keypoints.shape == (2, 200, 9, 3)
+
+
+def test_keypoints_that_the_layout_leaves_out_are_reported(tmp_path):
+    table = in_space()
+    _, repairs = import_csv(*written(tmp_path, table, PAIRS))
+    assert not any("not read" in one for one in repairs)
+    _, repairs = import_csv(*written(tmp_path, table, PAIRS.replace("count = 9", "count = 8")))
+    assert repairs[0] == "Keypoint 9 has columns that were not read: the layout has first = 1, count = 8."

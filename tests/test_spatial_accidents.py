@@ -130,15 +130,26 @@ def test_how_each_simulation_ended_is_known(with_a_lost_window):
     assert np.isfinite(np.delete(found, 1, 0)).all() and not np.array_equal(found[0], points[0])
 
 
-def test_windows_that_do_not_begin_with_all_keypoints_are_counted():
+def test_a_window_begins_where_all_keypoints_are_observed():
     log = cases.recording()
     points = log.keypoints.copy()
     points[2, 1, 4] = np.nan
+    whole, later = windows_of(log), windows_of(dataclasses.replace(log, keypoints=points))
+    assert later.left_out == () and later.begin.tolist() == [0, 0, 2, 0]
+    np.testing.assert_array_equal(later.valid.sum(axis=1), whole.valid.sum(axis=1) - [0, 0, 2, 0])
+    kept = int(later.valid[2].sum())
+    np.testing.assert_array_equal(later.keypoints[2, :kept], whole.keypoints[2, 2 : kept + 2])
+
+
+def test_windows_that_never_show_all_keypoints_are_counted():
+    log = cases.recording()
+    points = log.keypoints.copy()
+    points[2, 1:-1:2, 4] = np.nan
     windows = windows_of(dataclasses.replace(log, keypoints=points))
     assert windows.name == ("0", "1", "3") and windows.left_out == ("file 2 from 0 s",)
     error, none = np.full(3, 0.004), np.zeros(3, bool)
     (sentence,) = accident_sentences(none, error, windows, none)
-    assert sentence.startswith("1 more windows do not begin") and "file 2 from 0 s." in sentence
+    assert sentence.startswith("1 more windows have no second that begins") and "file 2 from 0 s." in sentence
     assert windows_of(log).left_out == ()
 
 

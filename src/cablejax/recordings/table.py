@@ -58,11 +58,14 @@ def import_csv(path: str | os.PathLike[str], layout: str | os.PathLike[str]) -> 
             guessing; names it.
     """
     how = read_layout(layout, "columns")
-    takes, repairs = prepare(_takes(pathlib.Path(path), how), how.setup)
+    takes, unread = _takes(pathlib.Path(path), how)
+    takes, repairs = prepare(takes, how.setup)
+    repairs = [*unread, *repairs]
     return gap_log_from_takes(takes, how.nominal, source=how.source, repairs=repairs), repairs
 
 
-def _takes(path: pathlib.Path, how: Layout) -> tuple[Take, ...]:
+def _takes(path: pathlib.Path, how: Layout) -> tuple[tuple[Take, ...], list[str]]:
+    """The recorded takes, and which keypoints were not read, in words."""
     table = _read(path)
     fields = how.place
     time_unit = fields.take("time_unit", str, "s, ms, us or ns", "s")
@@ -72,7 +75,7 @@ def _takes(path: pathlib.Path, how: Layout) -> tuple[Take, ...]:
     if np.isnan(time).any():
         line = table.lines[int(np.isnan(time).argmax())]
         raise ValueError(f"{path}, line {line}: the time is empty, expected one for each row.")
-    keypoints = _keypoints(table, fields)
+    keypoints, unread = _keypoints(table, fields)
     pose = _poses(table, fields, keypoints.shape[2])
     episode = fields.take("episode", str, "the name of a column", None)
     motion = fields.take("motion", str, "the name of a column", None)
@@ -95,7 +98,7 @@ def _takes(path: pathlib.Path, how: Layout) -> tuple[Take, ...]:
                 labels={"motion": motions[a]},
             )
         )
-    return tuple(takes)
+    return tuple(takes), unread
 
 
 def _read(path: pathlib.Path) -> _Table:
@@ -144,7 +147,7 @@ def _numbers(table: _Table, names: list[str]) -> np.ndarray:
     return values
 
 
-def _keypoints(table: _Table, fields: Fields) -> np.ndarray:
+def _keypoints(table: _Table, fields: Fields) -> tuple[np.ndarray, list[str]]:
     templates = fields.names("keypoint", (2, 3), "two or three names such as 'm{i}_x', where {i} counts the keypoints")
     first = fields.take("first", int, "the number of the first keypoint", 0)
     count = fields.take("count", int, "how many keypoints there are")
@@ -153,7 +156,11 @@ def _keypoints(table: _Table, fields: Fields) -> np.ndarray:
     require(count, "keypoints", f"{fields.path}: [columns] count")
     require(abs(first), "count_from_zero", f"{fields.path}: [columns] first")
     names = [name.replace("{i}", str(i)) for i in range(first, first + count) for name in templates]
-    return _numbers(table, names).reshape(-1, count, len(templates))
+    around = [i for i in (first - 1, first + count) if templates[0].replace("{i}", str(i)) in table.columns]
+    unread = [
+        f"Keypoint {i} has columns that were not read: the layout has first = {first}, count = {count}." for i in around
+    ]
+    return _numbers(table, names).reshape(-1, count, len(templates)), unread
 
 
 def _poses(table: _Table, fields: Fields, dimension: int) -> np.ndarray | None:

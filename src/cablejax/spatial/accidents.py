@@ -102,7 +102,7 @@ def accident_sentences(
         count = len(windows.left_out)
         more = f" and {count - _SHOWN} more" if count > _SHOWN else ""
         result.append(
-            f"{count} more windows do not begin with two samples of all keypoints, and were left out of everything: "
+            f"{count} more windows have no second that begins with two samples of all keypoints, and were left out: "
             f"{', '.join(windows.left_out[:_SHOWN])}{more}."
         )
     return result

@@ -52,7 +52,7 @@ class Windows:
         trust: weight of each window in fits, shape [W]; None = 1.
         smoothed: what was taken from the measured paths of the clamps so that they are smooth, root mean square of a
             coordinate [m].
-        left_out: where the log has windows that do not begin with two samples of all keypoints, in words.
+        left_out: where the log has windows without a second that begins with two samples of all keypoints, in words.
     """
 
     keypoints: Float[np.ndarray, "W T F 3"]
@@ -125,7 +125,7 @@ class Windows:
 
 
 def windows_of(log: GapLog) -> Windows:
-    """Cuts every episode into windows of `WINDOW`.
+    """Cuts every episode into windows of `WINDOW`, or shorter where keypoints are not observed in the beginning of one.
 
     Clamps whose paths scatter from one sample to the next would shake the simulated cable, and are smoothed.
 
@@ -166,10 +166,17 @@ def windows_of(log: GapLog) -> Windows:
     pieces, left_out = [], []
     for e, count in enumerate(log.episode_length):
         for begin in range(0, int(count), samples):
-            size = min(samples, int(count) - begin)
-            if size * interval >= _SHORTEST:
-                whole = np.isfinite(points[e, begin : begin + 2, free]).all()
-                (pieces if whole else left_out).append((e, begin, size))
+            end = min(begin + samples, int(count))
+            if (end - begin) * interval < _SHORTEST:
+                continue
+            # a window begins where its initial shape and velocity are known
+            seen = np.asarray(np.isfinite(points[e, begin:end, free]).all(axis=(1, 2)))
+            whole = np.flatnonzero(seen[:-1] & seen[1:])
+            start = begin + int(whole[0]) if len(whole) else end
+            if (end - start) * interval >= _SHORTEST:
+                pieces.append((e, start, end - start))
+            else:
+                left_out.append((e, begin))
     if not pieces:
         raise ValueError(f"No episode has {_SHORTEST:g} s that begin with two samples of all keypoints.")
 
@@ -198,7 +205,7 @@ def windows_of(log: GapLog) -> Windows:
         first_clamp=float(first - s[0]),
         gravity=tuple(log.meta["gravity_m_per_s2"]),
         smoothed=float(np.sqrt((taken**2).mean(axis=-1)).max()),
-        left_out=tuple(f"file {files[e]} from {begin * interval:.3g} s" for e, begin, _ in left_out),
+        left_out=tuple(f"file {files[e]} from {begin * interval:.3g} s" for e, begin in left_out),
     )
     return dataclasses.replace(windows, trust=np.where(windows.torn, _TORN, 1.0)) if windows.torn.any() else windows
 
