@@ -237,3 +237,42 @@ def test_keypoints_that_the_layout_leaves_out_are_reported(tmp_path):
     assert not any("not read" in one for one in repairs)
     _, repairs = import_csv(*written(tmp_path, table, PAIRS.replace("count = 9", "count = 8")))
     assert repairs[0] == "Keypoint 9 has columns that were not read: the layout has first = 1, count = 8."
+
+
+def above_the_table(height: float = 0.005) -> tuple[dict[str, list | np.ndarray], str]:
+    """The table's csv as motion capture records it, with y up, and its layout."""
+    table = in_the_plane()
+    rng = np.random.default_rng(0)
+    for i in range(4):
+        # a right-handed frame with y up: its z is the table's x, its x the table's y
+        table |= {f"z{i}": table.pop(f"x{i}"), f"x{i}": table.pop(f"y{i}"), f"y{i}": height * rng.uniform(-1, 1, 40)}
+    for q in (0, 1):
+        half = np.radians(table.pop(f"a{q}")) / 2
+        table |= {f"gz{q}": table.pop(f"gx{q}"), f"gx{q}": table.pop(f"gy{q}"), f"gy{q}": np.full(40, 0.01)}
+        # gripper's x axis along the cable: turned from z of that frame by the angle about its y
+        turned = half - np.pi / 4
+        table |= {f"qw{q}": np.cos(turned), f"qx{q}": 0 * half, f"qy{q}": np.sin(turned), f"qz{q}": 0 * half}
+    layout = PLANAR.replace('["x{i}", "y{i}"]', '["x{i}", "y{i}", "z{i}"]').replace('angle_unit = "deg"\n', "")
+    layout = layout.replace('unit = "m"', 'unit = "m"\nup = "y"')
+    for q in (0, 1):
+        names = ", ".join(f'"{name}{q}"' for name in ("gx", "gy", "gz", "qw", "qx", "qy", "qz"))
+        layout = layout.replace(f'["gx{q}", "gy{q}", "a{q}"]', f"[{names}]")
+    return table, layout
+
+
+def test_heights_above_a_table_are_left_out(tmp_path):
+    expected, _ = import_csv(*written(tmp_path, in_the_plane(), PLANAR))
+    log, repairs = import_csv(*written(tmp_path, *above_the_table()))
+    validate(log)
+    assert repairs == ["The cable lies on a table: heights (99 % of them within 5.4 mm) were left out."]
+    np.testing.assert_allclose(log.keypoints, expected.keypoints, atol=1e-6)
+    np.testing.assert_allclose(log.gripper_pose, expected.gripper_pose, atol=1e-6)
+    assert log.meta["table"] == {"friction_coefficient": 0.1}
+
+
+def test_a_cable_that_does_not_lie_flat_is_not_on_a_table(tmp_path):
+    with pytest.raises(ValueError, match=r"keypoints lie 54.* mm above or below the others, expected at most 20 mm"):
+        import_csv(*written(tmp_path, *above_the_table(height=0.05)))
+    table, layout = above_the_table()
+    with pytest.raises(ValueError, match="Check which axis points up"):
+        import_csv(*written(tmp_path, table, layout.replace('up = "y"', 'up = "z"')))

@@ -101,6 +101,10 @@ def test_every_frame_becomes_right_handed_with_z_up(up, handedness):
     turned = into_frame(take(points, pose=pose), frame)
     require_rigid((turned,), ((0, 1),))
     np.testing.assert_allclose(turned.keypoints @ frame.matrix, points, atol=1e-12)
+    # the axis along the cable is a gripper's own x axis, whatever axis points up in the world
+    before, after = (rotated(p[..., 3:], np.array([1.0, 0.0, 0.0])) for p in (pose, turned.gripper_pose))
+    np.testing.assert_allclose(after, before @ frame.matrix.T, atol=1e-12)
+    np.testing.assert_allclose(np.linalg.norm(turned.gripper_pose[..., 3:], axis=-1), 1.0, atol=1e-12)
 
 
 def test_a_planar_take_is_mirrored_and_has_no_up():

@@ -14,6 +14,7 @@ from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
+from scipy.spatial.transform import Rotation
 
 from cablejax.recordings.poses import rotated
 from cablejax.recordings.take import Take
@@ -28,6 +29,9 @@ LARGEST_TILT = np.radians(50)
 
 ALONG = np.radians(45)
 """Largest angle between a gripper's x axis and the markers on it."""
+
+FLAT = 0.02
+"""Height above or below the others that 99 % of the keypoints of a cable on a table keep within [m]."""
 
 RIGID = np.radians(8)
 """Largest root-mean-square angle by which a pair of markers may turn against the gripper that it is on."""
@@ -80,10 +84,55 @@ def into_frame(take: Take, frame: Frame) -> Take:
         return dataclasses.replace(take, keypoints=take.keypoints * mirror[:2], gripper_pose=pose)
     matrix = frame.matrix
     if pose is not None:
-        # A reflection M turns a rotation about the axis a by an angle into that about -M a by the same angle.
-        sign = np.linalg.det(matrix)
-        pose = np.concatenate([pose[..., :3] @ matrix.T, pose[..., 3:4], sign * pose[..., 4:] @ matrix.T], axis=-1)
+        mirror = np.diag([1.0, np.linalg.det(matrix), 1.0])
+        turn = Rotation.from_matrix(mirror @ matrix).as_quat(scalar_first=True)
+        w, v = pose[..., 3:4], pose[..., 4:]
+        # the frame is turned, and the gripper with it: its x axis stays the one along the cable
+        vector = turn[0] * v + w * turn[1:] + np.cross(turn[1:], v)
+        # a reflection M turns a rotation about the axis a by an angle into that about -M a by the same angle
+        vector = np.linalg.det(mirror) * vector @ mirror
+        pose = np.concatenate([pose[..., :3] @ matrix.T, turn[0] * w - v @ turn[1:, None], vector], axis=-1)
     return dataclasses.replace(take, keypoints=take.keypoints @ matrix.T, gripper_pose=pose)
+
+
+def onto_table(takes: tuple[Take, ...]) -> tuple[tuple[Take, ...], list[str]]:
+    """Takes in space of a cable that lies on a table, in its plane: without heights, grippers by their angle about z.
+
+    Args:
+        takes: in a right-handed frame with z up.
+
+    Returns:
+        The takes in the plane, and a sentence on what was left out.
+
+    Raises:
+        ValueError: the cable does not lie in a horizontal plane.
+    """
+    points = np.concatenate([take.keypoints.reshape(-1, 3) for take in takes])
+    off = np.abs(points - np.nanmedian(points, axis=0))
+    extent = np.nanquantile(off, 0.99, axis=0)
+    if not extent[2] <= FLAT:
+        raise ValueError(
+            f"The layout has a [table], and keypoints lie {1e3 * extent[2]:.3g} mm above or below the others, expected "
+            f"at most {1e3 * FLAT:g} mm (99 % of them; along the two horizontal axes they extend {1e3 * extent[0]:.3g} "
+            f"and {1e3 * extent[1]:.3g} mm). Check which axis points up, and that it is the table's normal; leave "
+            "[table] out of the layout of a cable that hangs."
+        )
+
+    def flat(take: Take) -> Take:
+        pose = take.gripper_pose
+        if pose is not None:
+            along = rotated(pose[..., 3:], np.array([1.0, 0.0, 0.0]))
+            angle = np.arctan2(along[..., 1], along[..., 0])
+            known = np.isfinite(angle)
+            for q in range(angle.shape[1]):
+                angle[known[:, q], q] = np.unwrap(angle[known[:, q], q])
+            pose = np.concatenate([pose[..., :2], angle[..., None]], axis=-1)
+        return dataclasses.replace(take, keypoints=take.keypoints[..., :2], gripper_pose=pose)
+
+    height = f"{1e3 * extent[2]:.2g} mm"
+    return tuple(map(flat, takes)), [
+        f"The cable lies on a table: heights (99 % of them within {height}) were left out."
+    ]
 
 
 def require_hanging(takes: tuple[Take, ...], frame: Frame) -> None:

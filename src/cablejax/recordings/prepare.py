@@ -9,7 +9,7 @@ import numpy as np
 from scipy.cluster.hierarchy import fcluster, linkage
 
 from cablejax.cable_length import STRETCH
-from cablejax.recordings.frames import Frame, into_frame, require_along_x, require_hanging, require_rigid
+from cablejax.recordings.frames import Frame, into_frame, onto_table, require_along_x, require_hanging, require_rigid
 from cablejax.recordings.gaps import cut_at_gaps
 from cablejax.recordings.marker_order import restore_order
 from cablejax.recordings.poses import poses_from_markers
@@ -48,7 +48,7 @@ class Setup:
         frame: the coordinate frame; planar recordings have none.
         on_grippers: "pairs" if the first two and the last two keypoints are on the grippers; "ends" if only the first
             and the last are.
-        hangs: the cable hangs free and is not on a table.
+        hangs: the cable hangs free; otherwise it lies on a table.
     """
 
     unit: str | None = "m"
@@ -66,9 +66,9 @@ class Setup:
 def prepare(takes: tuple[Take, ...], setup: Setup) -> tuple[tuple[Take, ...], list[str]]:
     """Checks and repairs takes of one cable, and gives each the poses of both grippers.
 
-    In this order: the unit of length; the frame; branches and the order of the markers; whether it is one cable; jumps
-    of single markers; takes in which the cable stretches, which are left out; gaps in time; orientations against
-    markers; jerks of the grippers, which are kept.
+    In this order: the unit of length; the frame; heights above a table, which are left out; branches and the order of
+    the markers; whether it is one cable; jumps of single markers; takes in which the cable stretches, which are left
+    out; gaps in time; orientations against markers; jerks of the grippers, which are kept.
 
     Returns:
         The takes in metres, z up, right-handed, without gaps, each with gripper poses; and a sentence on each repair.
@@ -98,12 +98,14 @@ def prepare(takes: tuple[Take, ...], setup: Setup) -> tuple[tuple[Take, ...], li
             "a cable that moves. Check the columns, and that the tracker ran."
         )
     takes, outliers = _without_outliers(takes)
-    takes = tuple(into_frame(take, setup.frame) for take in takes)
+    takes, flattened = tuple(into_frame(take, setup.frame) for take in takes), []
+    if not setup.hangs and takes[0].keypoints.shape[2] == 3:
+        takes, flattened = onto_table(takes)
     takes, exchanged = restore_order(takes)
     _require_one_cable(takes, setup)
     takes, jumps = _without_jumps(takes)
     takes, stretched = _without_stretched(takes)
-    if setup.hangs and takes[0].keypoints.shape[2] == 3:
+    if takes[0].keypoints.shape[2] == 3:
         require_hanging(takes, setup.frame)
     last = takes[0].keypoints.shape[1] - 1
     pairs = ((0, 1), (last - 1, last))
@@ -113,7 +115,7 @@ def prepare(takes: tuple[Take, ...], setup: Setup) -> tuple[tuple[Take, ...], li
         require_along_x(takes, pairs)
     if not measured:
         takes = tuple(_with_poses(take, pairs) for take in takes)
-    return takes, [*repairs, *outliers, *exchanged, *jumps, *stretched, *cut, *_jerks(takes)]
+    return takes, [*repairs, *outliers, *flattened, *exchanged, *jumps, *stretched, *cut, *_jerks(takes)]
 
 
 def _frozen(keypoints: np.ndarray) -> bool:
