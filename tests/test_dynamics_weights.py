@@ -131,7 +131,9 @@ def test_released_models_are_found_by_name(saved, monkeypatch):
     (folder / saved.name).rename(folder / "mine.safetensors")
     assert released_names() == ("mine",)
     assert load_weights("mine")[0] == CONFIG
-    with pytest.raises(WeightsError, match=r"'other' here, and no model is released under that name \(released: mine\)"):
+    with pytest.raises(
+        WeightsError, match=r"'other' here, and no model is released under that name \(released: mine\)"
+    ):
         load_weights("other")
 
 
