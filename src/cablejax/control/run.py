@@ -82,11 +82,16 @@ class ClosedLoopRun:
         """Error up to which a target counts as reached [cm]: a hundredth of its length."""
         return self.target.length
 
+    @property
+    def reached(self) -> bool:
+        """Whether the target was."""
+        return self.terminal_error_cm <= self.goal_cm
+
     def verdict(self) -> str:
         """One sentence: whether the target was reached, and if not, how far the cable got and where it is off."""
         start, end = self.initial_error_cm, self.terminal_error_cm
         early = f" It stopped after {self.times[-1]:.0f} s: {self.stopped}" if self.stopped else ""
-        if end <= self.goal_cm:
+        if self.reached:
             return f"{self.target.name}: reached, from {start:.2f} to {end:.2f} cm.{early}"
         distance = 100 * np.linalg.norm(self.keypoints[-1] - self.target.keypoints, axis=-1)
         best = int(np.nanargmin(self.error_cm))

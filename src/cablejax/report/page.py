@@ -31,9 +31,6 @@ if TYPE_CHECKING:
     from cablejax.control.run import ClosedLoopRun
     from cablejax.control.shaping import Method, Runs
 
-REACHED_CM = 1.0
-"""Largest final error with which a target counts as reached [cm]."""
-
 _UNITS_PER_METRE = 10_000
 _CSS_CLASS: dict[Method, str] = {"residual": "with", "direct": "without"}
 
@@ -108,7 +105,7 @@ def headline(pairs: Mapping[str, Mapping[Method, ClosedLoopRun]]) -> tuple[str, 
     """The result as a title, a sentence on the errors at the start, and the errors at the end by method [cm]."""
     main = {shape: runs.get("residual") or runs["direct"] for shape, runs in pairs.items()}
     ends = {shape: run.terminal_error_cm for shape, run in main.items()}
-    reached = {shape: end for shape, end in ends.items() if end <= REACHED_CM}
+    reached = {shape: ends[shape] for shape, run in main.items() if run.reached}
     missed = {shape: end for shape, end in ends.items() if shape not in reached}
     parts = []
     if reached:
@@ -128,10 +125,11 @@ def _reached(pairs: Mapping[str, Mapping[Method, ClosedLoopRun]]) -> str:
     """How many targets were reached by each method, in a sentence."""
     counts = []
     for method in METHOD_ORDER[::-1]:
-        ends = [runs[method].terminal_error_cm for runs in pairs.values() if method in runs]
-        if ends:
-            counts.append(f"{sum(end <= REACHED_CM for end in ends)} of {len(ends)} {METHOD_LABEL[method]}")
-    return f"Targets reached to within {REACHED_CM:g} cm: {listed(counts)}. Every figure is below."
+        own = [runs[method] for runs in pairs.values() if method in runs]
+        if own:
+            counts.append(f"{sum(run.reached for run in own)} of {len(own)} {METHOD_LABEL[method]}")
+    goal = max(run.goal_cm for runs in pairs.values() for run in runs.values())
+    return f"Targets reached to within {goal:.2g} cm: {listed(counts)}. Every figure is below."
 
 
 def animation_data(runs: Runs) -> dict[str, Any]:
