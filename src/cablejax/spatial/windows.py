@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -163,20 +164,7 @@ def windows_of(log: GapLog) -> Windows:
             f"Keypoint {', '.join(map(str, unseen))} is never observed: leave it out of keypoints and of "
             "meta.keypoint_arclength_m."
         )
-    pieces, left_out = [], []
-    for e, count in enumerate(log.episode_length):
-        for begin in range(0, int(count), samples):
-            end = min(begin + samples, int(count))
-            if (end - begin) * interval < _SHORTEST:
-                continue
-            # a window begins where its initial shape and velocity are known
-            seen = np.asarray(np.isfinite(points[e, begin:end, free]).all(axis=(1, 2)))
-            whole = np.flatnonzero(seen[:-1] & seen[1:])
-            start = begin + int(whole[0]) if len(whole) else end
-            if (end - start) * interval >= _SHORTEST:
-                pieces.append((e, start, end - start))
-            else:
-                left_out.append((e, begin))
+    pieces, left_out = _pieces(points[:, :, free], log.episode_length, samples, math.ceil(_SHORTEST / interval - 1e-9))
     if not pieces:
         raise ValueError(f"No episode has {_SHORTEST:g} s that begin with two samples of all keypoints.")
 
@@ -208,6 +196,27 @@ def windows_of(log: GapLog) -> Windows:
         left_out=tuple(f"file {files[e]} from {begin * interval:.3g} s" for e, begin in left_out),
     )
     return dataclasses.replace(windows, trust=np.where(windows.torn, _TORN, 1.0)) if windows.torn.any() else windows
+
+
+def _pieces(
+    points: Float[np.ndarray, "E T F 3"], length: Int[np.ndarray, "E"], samples: int, least: int
+) -> tuple[list[tuple[int, int, int]], list[tuple[int, int]]]:
+    """Windows (episode, first sample, samples), and those left out, which nowhere begin with two whole samples."""
+    pieces, left_out = [], []
+    for e, count in enumerate(length):
+        for begin in range(0, int(count), samples):
+            end = min(begin + samples, int(count))
+            if end - begin < least:
+                continue
+            # a window begins where its initial shape and velocity are known
+            seen = np.asarray(np.isfinite(points[e, begin:end]).all(axis=(1, 2)))
+            whole = np.flatnonzero(seen[:-1] & seen[1:])
+            start = begin + int(whole[0]) if len(whole) else end
+            if end - start >= least:
+                pieces.append((e, start, end - start))
+            else:
+                left_out.append((e, begin))
+    return pieces, left_out
 
 
 def labels(log: GapLog, *names: str, default: str | None = None) -> list[str]:
