@@ -118,14 +118,26 @@ def evidence_of(
     )
 
 
-def log_of(keypoints: Float[np.ndarray, "E T N 2"], motions: Sequence[str] = MOTIONS) -> GapLog:
+def arrived(*effects: tuple[Any, ...], cable: Cable = CABLE, n_links: int = FINE_LINKS) -> Float[np.ndarray, "E T N 2"]:
+    """Keypoints [m] of the motions from when the grippers arrived at their first poses, by the motions backwards."""
+    there = [np.concatenate([poses(f"back_{motion}")[:-1], poses(motion)]) for motion in MOTIONS]
+    config = Discretisation(cable, n_links=n_links)
+    step = FINE_STEP if n_links == FINE_LINKS else LARGEST_STEP
+    player = Playback.of_motion(config, np.stack(there), None, np.full(len(MOTIONS), INTERVAL), step)
+    points = player.keypoints([physics_of(explanation(*parts(*effects)), player.believed, config)])[0]
+    return points[:, SAMPLES - 1 :]
+
+
+def log_of(
+    keypoints: Float[np.ndarray, "E T N 2"], motions: Sequence[str] = MOTIONS, *, cable: Cable = CABLE
+) -> GapLog:
     """A gap log of these keypoints under the motions, with exact arms."""
     episodes = []
     for motion, points in zip(motions, keypoints, strict=True):
         pose = poses(motion)
         command = np.concatenate([np.diff(pose, axis=0) / INTERVAL, np.zeros((1, 2, 3))])
         episodes.append(Episode(motion, INTERVAL * np.arange(len(pose)), points, pose, command, holds()))
-    return gap_log_from_episodes(episodes, CABLE, source="the diagnosing simulator itself")
+    return gap_log_from_episodes(episodes, cable, source="the diagnosing simulator itself")
 
 
 def record(*effects: tuple[Any, ...], noise_mm: float = 0.5, seed: int = 0) -> GapLog:

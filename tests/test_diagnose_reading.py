@@ -5,34 +5,20 @@ import dataclasses
 import numpy as np
 import pytest
 
-from cablejax.cable import Discretisation
-from cablejax.diagnose import diagnose, explanation
+from cablejax.diagnose import diagnose
 from cablejax.diagnose.belief import Calibration
-from cablejax.diagnose.case import FINE_LINKS, Case
-from cablejax.diagnose.planar import physics_of
-from cablejax.diagnose.playback import Playback
+from cablejax.diagnose.case import Case
 from cablejax.diagnose.reading import Held, held, with_readings
-from cablejax.gaplog import Episode, gap_log_from_episodes
-from cablejax.simulate.chain.replay import FINE_STEP
 from cablejax.types import GapLog
-from diagnose_cases import CABLE, INTERVAL, MOTIONS, holds, noise, parts, poses, record
+from diagnose_cases import CABLE, arrived, log_of, noise, record
 
 ROUGH = dataclasses.replace(CABLE, friction_coefficient=0.6)
 
 
 def held_log(*effects) -> GapLog:
     """Of a cable on a rough table, led to its first pose by the motion backwards, that stayed as this left it."""
-    there = [np.concatenate([poses(f"back_{motion}")[:-1], poses(motion)]) for motion in MOTIONS]
-    config = Discretisation(ROUGH, n_links=FINE_LINKS)
-    player = Playback.of_motion(config, np.stack(there), None, np.full(len(MOTIONS), INTERVAL), FINE_STEP)
-    points = player.keypoints([physics_of(explanation(*parts(*effects)), player.believed, config)])[0]
-    points = points[:, len(holds()) - 1 :] + noise(points[:, len(holds()) - 1 :].shape, 0.5, 0)
-    episodes = []
-    for motion, seen in zip(MOTIONS, points, strict=True):
-        pose = poses(motion)
-        command = np.concatenate([np.diff(pose, axis=0) / INTERVAL, np.zeros((1, 2, 3))])
-        episodes.append(Episode(motion, INTERVAL * np.arange(len(pose)), seen, pose, command, holds()))
-    return gap_log_from_episodes(episodes, ROUGH, source="the diagnosing simulator itself")
+    points = arrived(*effects, cable=ROUGH)
+    return log_of(points + noise(points.shape, 0.5, 0), cable=ROUGH)
 
 
 def test_a_log_whose_cable_begins_elsewhere_is_read_as_held_by_the_table():

@@ -5,10 +5,9 @@ import dataclasses
 import numpy as np
 import pytest
 
-from cablejax.diagnose import diagnose, explanation
-from cablejax.diagnose.planar import physics_of
+from cablejax.diagnose import diagnose
 from cablejax.diagnose.playback import Playback
-from diagnose_cases import CABLE, INTERVAL, MOTIONS, clean, holds, log_of, noise, parts, playback, poses
+from diagnose_cases import CABLE, arrived, clean, log_of, noise, playback
 
 SLOW_S = 10.0
 SLOW = ("bending_damping", (SLOW_S / CABLE.damping_time,))
@@ -46,17 +45,8 @@ def test_a_keypoint_off_its_place_is_not_how_a_slow_cable_lies():
     assert np.abs(first(SLOW_S, list(wrong)) - rest).max() < 0.5 * 0.006
 
 
-def unsettled() -> np.ndarray:
-    """Keypoints [m] of a slow cable from when the grippers arrived at its first pose, by the motion backwards."""
-    there = [np.concatenate([poses(f"back_{motion}")[:-1], poses(motion)]) for motion in MOTIONS]
-    config = playback(LINKS).config
-    player = Playback.of_motion(config, np.stack(there), None, np.full(len(MOTIONS), INTERVAL))
-    points = player.keypoints([physics_of(explanation(*parts(SLOW)), player.believed, config)])[0]
-    return points[:, len(holds()) - 1 :]
-
-
 def unsettled_log(seed: int = 0):
-    points = unsettled()
+    points = arrived(SLOW, n_links=LINKS)
     return log_of(points + noise(points.shape, 0.5, seed))
 
 

@@ -188,15 +188,14 @@ def make_controller(model: Model, target: Target, *, method: Method, solver: Sol
             f"of a cable of {model.config.length:.3g} m: take a target, or a model, of the other's length."
         )
     learner = STATIC if model.config.prior == "static" else LearnerConfig()
-    objective = MPCConfig.for_length(model.config.length).objective
     config = MPCConfig.for_length(
         model.config.length,
-        objective=dataclasses.replace(objective, interval=model.config.interval),
         residual=learner.scaled(model.config.length) if method == "residual" else None,
         adaptation=AdaptationConfig(prior_mean=model.believed) if model.config.conditioned else None,
         solver=SOLVERS[solver],
     )
-    return MPC(config, model.dynamics, model.weights, target.keypoints)
+    objective = dataclasses.replace(config.objective, interval=model.config.interval)
+    return MPC(dataclasses.replace(config, objective=objective), model.dynamics, model.weights, target.keypoints)
 
 
 def initial_history(cable: Cable, config: ModelConfig) -> History:

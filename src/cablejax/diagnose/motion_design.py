@@ -10,7 +10,7 @@ from __future__ import annotations
 import collections
 import dataclasses
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Literal
 
 import numpy as np
@@ -116,12 +116,17 @@ def design_motion(
 
 def excluded(tried: list[Judged]) -> str:
     """Says how many motions each bound excludes."""
-    counts = collections.Counter(name for one in tried for name in one.beyond)
-    words = ", ".join(f"{name} excludes {count}" for name, count in counts.most_common())
+    words = excluded_by(one.beyond for one in tried)
     return (
         f"No motion keeps all bounds: of {len(tried)} that were tried, {words}. Relax the first of these, or record a "
         "log that starts further inside the bounds."
     )
+
+
+def excluded_by(broken: Iterable[Iterable[str]]) -> str:
+    """In words, how many motions each bound excludes; `broken` has the names of the bounds that each motion breaks."""
+    counts = collections.Counter(name for names in broken for name in names)
+    return ", ".join(f"{name} excludes {count}" for name, count in counts.most_common())
 
 
 class _Genome:

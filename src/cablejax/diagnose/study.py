@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Mapping
 from typing import Any, Literal
 
@@ -13,6 +12,7 @@ from cablejax.cable import Cable, Discretisation
 from cablejax.diagnose.diagnosis import Diagnosis
 from cablejax.diagnose.judgement import look_alikes
 from cablejax.diagnose.motion_bounds import SNAP_THROUGH, Bounds, grippers_beyond
+from cablejax.diagnose.motion_design import excluded_by
 from cablejax.diagnose.motion_file import commands_log
 from cablejax.diagnose.safe_motions import INTERVAL, there_and_back
 from cablejax.types import GapLog
@@ -57,8 +57,7 @@ def first_recording(
     broken = {name: grippers_beyond(bounds, config, poses, INTERVAL).keys() for name, poses in motions.items()}
     kept = {name: poses for name, poses in motions.items() if broken[name] <= {SNAP_THROUGH}}
     if not kept:
-        counts = Counter(name.replace("_", " ") for names in broken.values() for name in names - {SNAP_THROUGH})
-        words = ", ".join(f"{name} excludes {count}" for name, count in counts.most_common())
+        words = excluded_by(names - {SNAP_THROUGH} for names in broken.values())
         raise ValueError(
             f"No way keeps the bounds, of those by which a study begins ({', '.join(goals)}): {words}. Make a first "
             "recording of your own, and give it to `cablejax diagnose` with these bounds."
