@@ -335,7 +335,7 @@ def loop_cases(sizes: Sizes) -> list[Case]:
     def prepare(products: str) -> Prepared:
         model = load_model("gns-reference")
         controller = controller_to_s(model, "levenberg-marquardt", sizes.horizon)
-        loop = closed_loop(controller, model.config.history, sizes.loop_steps, Discretisation())
+        loop = closed_loop(controller, sizes.loop_steps, Discretisation())
 
         def run():
             with jax.default_matmul_precision(products):

@@ -107,7 +107,7 @@ def evaluation(share: int, shares: int, small: bool, weights: str) -> Callable[[
 
     model = load_model(weights)
     controller = controller_to_s(model, "levenberg-marquardt", 1 if small else 5)
-    run = closed_loop(controller, model.config.history, 1 if small else 10, Discretisation(n_links=12))
+    run = closed_loop(controller, 1 if small else 10, Discretisation(n_links=12))
     size = (4 if small else 16) // shares
     assert size % len(jax.devices()) == 0
     return lambda: run(size)

@@ -84,7 +84,7 @@ def test_bounds_without_room_are_refused():
     ("options", "message"),
     [
         (["--rounds", "0"], "--rounds is 0"),
-        (["--noise-mm", "1e6"], "--noise-mm in metres"),
+        (["--noise-mm", "1e6"], "--noise-mm is 1000000.0"),
         (["--plant-effect", "magic:x=1"], "no effect 'magic'"),
         (["--plant-effect", "none", "--plant-effect", "linear_density:ratio=2"], "give either"),
         (["--bounds", "none.toml"], "none.toml"),

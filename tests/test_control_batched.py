@@ -82,10 +82,10 @@ def shapes(letters: str) -> np.ndarray:
     return np.stack([target.keypoints for target in targets(letters)])
 
 
-def alone(controller, params: Physics, target: Target, steps: int, history_length: int = 6):
+def alone(controller, params: Physics, target: Target, steps: int):
     return run_closed_loop(
         EnginePlant(ENGINE, params), controller, target, steps,
-        start=straight_start(CABLE.cable), record_hz=1.0, history_length=history_length,
+        start=straight_start(CABLE.cable), record_hz=1.0,
     )  # fmt: skip
 
 
@@ -133,13 +133,13 @@ def test_trials_have_their_own_noise_and_gaps():
 def test_the_controller_in_a_batch_equals_the_controller_alone():
     """With a graph network, the online residual and a plan of two steps."""
     graphdef, weights = network(SMALL)
-    config, dynamics = MPCConfig(horizon=1, solver=OneGradientStep()), NetworkDynamics(graphdef)
+    config = MPCConfig(horizon=1, history_length=SMALL.history, solver=OneGradientStep())
     engine, params, state = arguments("SU", np.array([2.0, 0.5]))
-    loop = LoopConfig(steps=5, history_length=SMALL.history)
+    loop = LoopConfig(steps=5)
     target = targets("SU")[1]
-    controller = MPC(config, dynamics, weights, target.keypoints)
+    controller = MPC(config, NetworkDynamics(graphdef), weights, target.keypoints)
     run = shape_batch(engine, params, state, controller, shapes("SU"), loop)
-    one = alone(controller, member(params, 1), target, 5, SMALL.history)
+    one = alone(controller, member(params, 1), target, 5)
     np.testing.assert_allclose(run.keypoints[1], one.keypoints, atol=3e-6)
     np.testing.assert_allclose(run.twist[1], one.twist[:-1], atol=3e-6)
     np.testing.assert_allclose(run.radius[1], one.radius[:-1], atol=1e-6)

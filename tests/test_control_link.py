@@ -279,7 +279,6 @@ def test_commands_stay_within_all_limits(seed):
         {"watchdog": math.nan},
         {"min_seen": 2.0},
         {"steps": 0},
-        {"history_length": 0},
         {"grace": -1.0},
     ],
 )

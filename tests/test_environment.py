@@ -143,8 +143,8 @@ def test_the_controller_is_a_policy():
     length = config.cable.length
     env, target = ShapeCableEnv(config), make_target("U", config.cable)
     solver = LevenbergMarquardt(max_iterations=1, trials_per_linearisation=1)
-    settings = MPCConfig.for_length(length, horizon=1, solver=solver)
-    policy = LinkPolicy(config, lambda goal: MPC(settings, relaxing_cable, 0.8, goal.keypoints), history_length=3)
+    settings = MPCConfig.for_length(length, horizon=1, history_length=3, solver=solver)
+    policy = LinkPolicy(config, lambda goal: MPC(settings, relaxing_cable, 0.8, goal.keypoints))
     observation, first = env.reset(seed=0)
     policy.begin(target)
     errors = [first["error"]]

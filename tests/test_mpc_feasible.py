@@ -116,6 +116,29 @@ def test_a_start_outside_is_led_back_inside(distance, sign):
     assert LOWER <= float(jnp.linalg.norm(relative)) <= UPPER
 
 
+@pytest.mark.parametrize("start", ["at rest", "moving outwards"])
+def test_a_start_outside_is_led_back_within_the_bound_on_the_change(start):
+    """From both outside, command by command: every bound that closes in is kept, and the grippers come inside."""
+    with jax.enable_x64(True):
+        change, radius, inside = 0.004, 0.02, jnp.asarray([[-0.16, -0.12], [0.16, 0.12]])
+        pose = jnp.asarray([[-0.198, 0.15, 0.0], [0.198, 0.0, 0.0]])
+        last = jnp.zeros((2, 3)) if start == "at rest" else jnp.asarray([[-0.015, 0.0, 0.0], [0.0, 0.0, 0.015]])
+
+        def next_command(carry, _):
+            pose, last = carry
+            feasible = feasible_from(
+                pose, radius, (0.06, 0.4), workspace=tuple(map(tuple, inside)), change=change, previous=last
+            )
+            plan = feasible.project(jnp.zeros((T, 2, 3)))
+            return (pose + plan[0], plan[0]), (feasible.violation(plan), plan[0], pose[:, :2])
+
+        _, (broken, motion, places) = jax.jit(lambda: jax.lax.scan(next_command, (pose, last), length=14))()
+        assert float(broken.max()) <= 1e-11
+        changes = jnp.linalg.norm(jnp.diff(motion, axis=0, prepend=last[None]), axis=-1)
+        assert float(changes.max()) <= change + 1e-11
+        assert float(jnp.maximum(inside[0] - places[-1], places[-1] - inside[1]).max()) <= 1e-11
+
+
 def test_after_a_motion_faster_than_is_allowed_now_there_is_room():
     """The bound on a step has shrunk since the last one, and a bound on the change is kept from there."""
     with jax.enable_x64(True):

@@ -190,7 +190,7 @@ class BenchLoop(Command):
             require(value, "count", f"--{name}")
         model = load_model(self.weights)
         controller = controller_to_s(model, self.solver)
-        run = closed_loop(controller, model.config.history, self.steps, Discretisation(model.cable))
+        run = closed_loop(controller, self.steps, Discretisation(model.cable))
         say(f"compiling the closed loop for batches of {', '.join(map(str, self.batches))} ...")
         contestants = {str(size): functools.partial(run, size) for size in self.batches}
         seconds = seconds_in_turns(contestants, self.rounds)

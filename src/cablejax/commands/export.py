@@ -74,7 +74,7 @@ def recorded(source: pathlib.Path) -> tuple[GapLog, dict[str, np.ndarray], str]:
     if source.is_dir() and kind in ("run", "verdict", "log"):
         kind, path = "log", _log_of_run(source)
     if kind not in ("log", "mcap", "lerobot"):
-        raise UsageError(f"{source} holds no recorded run, but a {kind}. Give a gap log, or the folder of a run.")
+        raise UsageError(f"{source} is a {kind}, not a recorded run. Give a gap log, or the folder of a run.")
     log = read_log(kind, path)
     simulated = read_simulated(path, log) if kind == "log" else {}
     verdict = path.with_name("verdict.json")

@@ -36,16 +36,16 @@ class Shape(Command):
             be given several times. By default bending_stiffness:ratio=0.2; `none` for no effect. With from_s=... and
             until_s=... it begins and ends in the middle of the run.
         effect: An effect that the model is informed of, as for --plant-effect; may be given several times. What of it
-            enters the model: stiffness_profile, intrinsic_curvature, gripper_rotation_offset and gripper_compliance the
-            shape in which its cable rests; bending_stiffness, table_friction and linear_density the first belief of a
-            conditioned model.
+            enters the model: stiffness_profile, intrinsic_curvature, gripper_rotation_offset and gripper_compliance
+            change the shape in which its cable rests; bending_stiffness, table_friction and linear_density change the
+            first estimate of the cable, for a conditioned model.
         with_: A verdict.json of `cablejax diagnose`: the model is informed, as by --effect, of the effects that it
             names; where nothing of them enters it, of the first of their look-alikes that does.
         perception: true: the controller observes the simulated keypoints. cloud: it observes keypoints estimated from
             clouds of a depth camera; the printed errors are still those of the true keypoints.
         motion: Play this motion on the plant instead of shaping: a gap log with commands, such as the next_motion.npz
-            of `cablejax diagnose`. Writes log.npz only, of the cable in that log unless --cable is given; model, target
-            and method are not used.
+            of `cablejax diagnose`. Writes log.npz only, of the cable in that log unless --cable is given; of the other
+            options only --plant-effect, --noise-mm, --links and --seed are used.
         noise_mm: Noise: standard deviation of the observed keypoints, per coordinate, or of the camera's range [mm]. By
             default 0 for the first and 2 for the second.
         links: Links of the plant's cable.
@@ -77,12 +77,15 @@ class Shape(Command):
         from cablejax.commands.runs import Job, known_from, plant_of, shape_and_report, staged_effects
         from cablejax.control.shaping import METHODS, knowing, load_model
         from cablejax.control.targets import load_target, make_target
+        from cablejax.limits import require
         from cablejax.perceive.camera import CameraConfig
 
         if self.motion is not None and self.perception == "cloud":
             raise UsageError("--motion records the keypoints of the plant: leave --perception out.")
         if self.motion is not None and (self.effect or self.with_):
             raise UsageError("--motion uses no model that could be informed by --effect or --with: leave them out.")
+        if self.noise_mm is not None:
+            require(self.noise_mm, "noise_mm", "--noise-mm")
         effects = staged_effects(self.plant_effect)
         cloud = self.perception == "cloud"
         noise_mm = (2.0 if cloud else 0.0) if self.noise_mm is None else self.noise_mm
@@ -130,12 +133,9 @@ class Shape(Command):
         from cablejax.commands.cable import find_cable
         from cablejax.commands.runs import plant_of
         from cablejax.gaplog import read_gap_log, write_gap_log
-        from cablejax.limits import require
         from cablejax.simulate.plant import Plant
         from cablejax.simulate.play import play
 
-        noise = 1e-3 * (self.noise_mm or 0.0)
-        require(noise, "noise", "--noise-mm in metres")
         commands, out = read_gap_log(path), output_folder(self.out, overwrite=self.overwrite)
         plant = plant_of(
             find_cable(path if self.cable is None else self.cable), effects, links=self.links, seed=self.seed
@@ -144,7 +144,7 @@ class Shape(Command):
             Plant(plant),
             commands,
             source=f"contact plant, {', '.join(map(str, effects)) or 'no effect'}",
-            noise=noise,
+            noise=1e-3 * (self.noise_mm or 0.0),
             seed=self.seed,
         )
         written = write_gap_log(out / "log.npz", log, overwrite=True)

@@ -30,7 +30,7 @@ class Simulate(Command):
         out: Folder of the data set (a Zarr v3 store), or its place in object storage, s3://BUCKET/PREFIX.
         trajectories: How many trajectories to simulate.
         steps: Commands per trajectory, one second each.
-        start: How each cable lies at first.
+        start: How each cable lies at first: straight, or at rest between gripper poses drawn at random.
         max_amplification: Largest movement of any point of the frictionless cable, relative to what the grippers move
             together. It keeps the cable from snapping through; 1000 lets it snap.
         engine: chain: batched in JAX, with its time step written out; the fastest, and it can simulate every effect.
@@ -43,10 +43,10 @@ class Simulate(Command):
         with_: A verdict.json of `cablejax diagnose`: the effects that it names are added, each trajectory with another
             draw of what the verdict leaves open; may be given several times.
         links: Links of the simulated cable; by default the resolution that the released model was trained on.
-        stiffness_range: Draw each cable's stiffness between these two factors of the nominal one; by default all are
-            alike.
-        damping_range: Draw each cable's damping time between these two factors of the nominal one.
-        friction_range: Draw each cable's friction coefficient between these two factors of the nominal one.
+        stiffness_range: Draw each cable's stiffness between these two factors of the nominal one, log-uniformly; by
+            default all are alike.
+        damping_range: Draw each cable's damping time likewise.
+        friction_range: Draw each cable's friction coefficient likewise.
         process_index: Number of this process, from 0.
         process_count: How many processes share the work.
         overwrite: Delete a data set that is there and was made by other options. Nothing else is ever deleted.

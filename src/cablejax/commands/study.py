@@ -71,7 +71,7 @@ class Study(Command):
         from cablejax.text_file import read_json, write_json
 
         require(self.rounds, "count", "--rounds")
-        require(1e-3 * self.noise_mm, "noise", "--noise-mm in metres")
+        require(self.noise_mm, "noise_mm", "--noise-mm")
         cable = Cable() if self.cable is None else find_cable(self.cable)
         bounds = Bounds() if self.bounds is None else read_bounds(self.bounds)
         config = plant_of(cable, staged_effects(self.plant_effect), links=self.links, seed=self.seed)

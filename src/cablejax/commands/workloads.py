@@ -201,9 +201,9 @@ def varied_params(config: Discretisation, stiffness_ratio: Float[np.ndarray, " B
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *one)
 
 
-def closed_loop(controller: MPC, history_length: int, steps: int, chain: Discretisation) -> Callable[[int], BatchRun]:
+def closed_loop(controller: MPC, steps: int, chain: Discretisation) -> Callable[[int], BatchRun]:
     """A function that shapes a number of straight cables, half to twice as stiff as nominal, for `steps` commands."""
-    config = LoopConfig(steps, interval=controller.config.objective.interval, history_length=history_length)
+    config = LoopConfig(steps, interval=controller.interval)
     engine = MjxEngine(chain)
 
     @functools.lru_cache

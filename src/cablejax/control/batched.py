@@ -20,7 +20,7 @@ import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Float, Int
 
-from cablejax.control.link import Controller, check_interval
+from cablejax.control.link import Controller, check_interval, resting
 from cablejax.effects.physics import Physics, may_touch, without_obstacle
 from cablejax.limits import check
 from cablejax.simulate.chain.engine import ChainEngine
@@ -28,7 +28,7 @@ from cablejax.simulate.compile import compiler_options
 from cablejax.simulate.engine import refuse_lags
 from cablejax.simulate.mjx_engine import MjxEngine
 from cablejax.simulate.plant_config import check_camera
-from cablejax.types import CableState, History, Measurement
+from cablejax.types import CableState, Measurement
 
 AXIS = "cable"
 """Of devices, by which a batch is spread."""
@@ -43,7 +43,6 @@ class LoopConfig:
     Attributes:
         steps: commands of each trial, T.
         interval: time that each command is held [s].
-        history_length: samples H of the history that a controller starts from, all of them the cable at rest.
         rest: intervals without motion before the first command.
         keypoint_noise: standard deviation of the observed keypoints [m] per coordinate.
         keypoint_dropout: probability with which a keypoint is not observed (NaN), except the first and last, which the
@@ -52,13 +51,12 @@ class LoopConfig:
 
     steps: int
     interval: float = 1.0
-    history_length: int = 6
     rest: int = 1
     keypoint_noise: float = 0.0
     keypoint_dropout: float = 0.0
 
     def __post_init__(self):
-        check(self, "interval", steps="commands", history_length="history", rest="count_from_zero")
+        check(self, "interval", steps="commands", rest="count_from_zero")
         check_camera(self)
 
 
@@ -222,16 +220,13 @@ def _trials(
     def seen(key, index, keypoints):
         return _observed(config, jax.random.fold_in(key, index), keypoints)
 
-    def start(key, cable, keypoints):
-        first = _noisy(config, jax.random.fold_in(key, config.steps), keypoints)
-        repeated = jnp.repeat(first[None], config.history_length, axis=0)
-        return History(keypoints=repeated, gripper_pose=cable.gripper_pose)
+    def start(own, key, cable, keypoints):
+        first, controller = _noisy(config, jax.random.fold_in(key, config.steps), keypoints), eqx.combine(own, shared)
+        return first, controller.init(resting(controller, first, cable.gripper_pose))
 
     still = jnp.zeros((len(seeds), config.rest, *cables.gripper_pose.shape[1:]), cables.qpos.dtype)
     cables, keypoints = jax.vmap(moved)(params, cables, still)
-    histories = jax.vmap(start)(keys, cables, keypoints)
-    first = histories.keypoints[:, -1]
-    states = jax.vmap(lambda own, history: eqx.combine(own, shared).init(history))(own, histories)
+    first, states = jax.vmap(start)(own, keys, cables, keypoints)
 
     def commanded(own, state, measurement):
         state, twist, info = eqx.combine(own, shared).step(state, measurement)

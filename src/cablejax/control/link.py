@@ -29,13 +29,16 @@ EARLY = 0.02
 """By how much an observation may come before a control instant and count as its own, in intervals."""
 DRIFT = 1e-3
 """Rate at which the two clocks may drift apart; a delay that grows more slowly is not noticed."""
+_HISTORY = 6
+"""Samples of a first history where the controller does not say."""
 
 
 class Controller(Protocol):
     """A controller: an object with two pure functions. `mpc.MPC` is one.
 
     For `control.batched` it is a pytree with a leaf `target` as well, the keypoints [N, 2] that it steers towards. One
-    that was made for a certain time between commands has it as `interval` [s].
+    that was made for a certain time between commands has it as `interval` [s], and one that wants another number of
+    samples in its first history than 6 has that as `history_length`.
     """
 
     def init(self, history: History) -> Any:
@@ -61,6 +64,13 @@ def check_interval(controller: Controller, interval: float) -> None:
             f"The controller plans for {own:g} s between commands, and the interval of this run is {interval:g} s. "
             "Give both the same: `interval` of the run, and of `MPCConfig.objective`."
         )
+
+
+def resting(controller: Controller, keypoints: Array | np.ndarray, gripper_pose: Array | np.ndarray) -> History:
+    """The history with which a controller begins, of a cable that rests at these keypoints [N, 2]."""
+    samples = getattr(controller, "history_length", _HISTORY)
+    repeated = keypoints.__array_namespace__().repeat(keypoints[None], samples, axis=0)
+    return History(keypoints=repeated, gripper_pose=gripper_pose)  # pyright: ignore[reportArgumentType]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -275,11 +285,7 @@ class RobotLink:
 
     def _initial(self, seen: Observation) -> Any:
         """The controller's state for a cable at rest, as it is seen now."""
-        history = History(
-            keypoints=np.repeat(_complete(seen.keypoints)[None], self.config.history_length, axis=0),  # pyright: ignore[reportArgumentType]
-            gripper_pose=seen.gripper_pose,  # pyright: ignore[reportArgumentType]
-        )
-        return self.controller.init(history)
+        return self.controller.init(resting(self.controller, _complete(seen.keypoints), seen.gripper_pose))
 
 
 def _complete(keypoints: np.ndarray) -> np.ndarray:

@@ -44,7 +44,6 @@ class LinkConfig:
     Attributes:
         interval: time between two commands [s].
         rest: time without motion before the first command and after a pause [s].
-        history_length: samples H of the history that the controller starts from, all of them the cable at rest.
         steps: commands after which the run is done; None = goes on.
         patience: the run is done once the error has stayed within `RESTING_CM` for so many commands; None = never.
         watchdog: age of the newest usable observation at which the grippers are held [s].
@@ -55,7 +54,6 @@ class LinkConfig:
 
     interval: float = 1.0
     rest: float = 1.0
-    history_length: int = 6
     steps: int | None = None
     patience: int | None = None
     watchdog: float = 0.5
@@ -64,7 +62,7 @@ class LinkConfig:
     limits: CommandLimits | None = CommandLimits()
 
     def __post_init__(self):
-        check(self, "interval", rest="duration", history_length="history", watchdog="interval", grace="duration")
+        check(self, "interval", rest="duration", watchdog="interval", grace="duration")
         check(self, min_seen="probability")
         check(self, **{name: "count" for name in ("steps", "patience") if getattr(self, name) is not None})
 

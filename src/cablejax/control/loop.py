@@ -36,7 +36,6 @@ def run_closed_loop(
     start: Float[np.ndarray, "Q 3"],
     interval: float = 1.0,
     record_hz: float = 10.0,
-    history_length: int = 6,
     patience: int | None = None,
 ) -> ClosedLoopRun:
     """Lays a new cable between the grippers and lets a controller shape it.
@@ -53,7 +52,6 @@ def run_closed_loop(
         start: gripper poses (x, y, theta) [m, rad] of the cable at the beginning, shape [Q, 3].
         interval: time that each command is held [s].
         record_hz: samples per second of the recorded episode.
-        history_length: samples H of the history that the controller starts from, all of them the cable at rest.
         patience: end the run once the error has stayed within `RESTING_CM` for so many commands; None = never.
 
     Raises:
@@ -75,7 +73,6 @@ def run_closed_loop(
     config = LinkConfig(
         interval=interval,
         rest=interval,
-        history_length=history_length,
         steps=steps,
         patience=patience,
         # a plant never keeps its controller waiting, and sets its own bounds

@@ -193,6 +193,7 @@ def make_controller(model: Model, target: Target, *, method: Method, solver: Sol
         residual=learner.scaled(model.config.length) if method == "residual" else None,
         adaptation=AdaptationConfig(prior_mean=model.believed) if model.config.conditioned else None,
         solver=SOLVERS[solver],
+        history_length=model.config.history,
     )
     objective = dataclasses.replace(config.objective, interval=model.config.interval)
     return MPC(dataclasses.replace(config, objective=objective), model.dynamics, model.weights, target.keypoints)
@@ -260,5 +261,4 @@ def shape_once(
         steps,
         start=straight_start(cable),
         interval=config.interval,
-        history_length=config.history,
     )

@@ -123,7 +123,7 @@ def read_bounds(path: str | os.PathLike[str]) -> Bounds:
     try:
         fields = read_toml(path)
     except (ValueError, OSError) as error:
-        raise ValueError(f"The bounds could not be read. {error}") from None
+        raise ValueError(f"{error} Expected a TOML file of bounds.") from None
     values: dict[str, Any] = {}
     for key, value in fields.items():
         if key not in KEYS:

@@ -47,7 +47,7 @@ def apply(
     if history.keypoints.shape != (expected := (config.history, config.n_keypoints, 2)):
         raise ValueError(
             f"The history has keypoints of shape {history.keypoints.shape}, expected {expected}: this model looks back "
-            f"on {config.history} samples of {config.n_keypoints} keypoints (`history_length` of a link or a loop)."
+            f"on {config.history} samples of {config.n_keypoints} keypoints (`MPCConfig.history_length`)."
         )
     prior = prior_of(history, twist, config)
     graph = build_graph(history, twist, prior, config)

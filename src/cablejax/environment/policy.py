@@ -21,17 +21,12 @@ class LinkPolicy:
         config: of the environment.
         controller: makes the controller for a target, for example `lambda target: make_controller(model, target,
             method="residual", solver="two-trials")`.
-        history_length: samples of the history that it starts from.
     """
 
-    def __init__(
-        self, config: ShapeCableConfig, controller: Callable[[Target], Controller], *, history_length: int = 6
-    ):
+    def __init__(self, config: ShapeCableConfig, controller: Callable[[Target], Controller]):
         self._config, self._controller = config, controller
         interval = config.interval
-        self._settings = LinkConfig(
-            interval=interval, rest=0.0, history_length=history_length, watchdog=interval, limits=None
-        )
+        self._settings = LinkConfig(interval=interval, rest=0.0, watchdog=interval, limits=None)
 
     def begin(self, target: Target) -> None:
         """Begins an episode with this target, the one whose keypoints the environment shows."""

@@ -20,6 +20,7 @@ class MPCConfig:
 
     Attributes:
         horizon: h; a plan has h + 1 commands.
+        history_length: samples H of the cable that the model looks back on.
         cable_length: free length of the cable L [m].
         min_distance: least distance of the grippers, relative to L.
         max_distance: greatest distance of the grippers, relative to L: a taut cable cannot be shaped.
@@ -51,6 +52,7 @@ class MPCConfig:
     """
 
     horizon: int = 5
+    history_length: int = 6
     cable_length: float = 1.0
     min_distance: float = 0.15
     max_distance: float = 0.99
@@ -105,6 +107,7 @@ class MPCConfig:
         check(
             self,
             "horizon",
+            history_length="history",
             cable_length="positive",
             radius_max="positive",
             grow="positive",

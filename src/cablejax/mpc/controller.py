@@ -62,6 +62,11 @@ class MPC(eqx.Module):
         """Time between two steps [s]."""
         return self.config.objective.interval
 
+    @property
+    def history_length(self) -> int:
+        """Samples of a history."""
+        return self.config.history_length
+
     def init(self, history: History) -> MPCState:
         """State for a cable seen at rest or in motion.
 

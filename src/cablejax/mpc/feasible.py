@@ -29,9 +29,9 @@ class FeasibleSet(AbstractSet):
 
     The set is convex but for the least distance, whose bound leaves out a disc: `at` has a half-plane of relative
     positions instead, which touches the disc on the side where the grippers are. Grippers that start outside have a
-    bound that closes in on them as they can follow, so that distances or a workspace alone never leave the set empty.
-    Together, outside both, they may contradict each other, and so may a bound on the change (it takes a way to stop):
-    `violation` of a projected plan is then positive.
+    bound that closes in on them as they can follow, within the bound on the change, so that distances or a workspace
+    alone never leave the set empty. Together, outside both, they may contradict each other, and so may a bound on the
+    change (it takes a way to stop): `violation` of a projected plan is then positive.
 
     Attributes:
         separation: position of gripper 1 relative to gripper 0 at the plan's start [m], shape [2].
@@ -166,15 +166,37 @@ class FeasibleSet(AbstractSet):
     def _distance_bounds(self, n_steps: int) -> tuple[Float[Array, " T"], Float[Array, " T"]]:
         """Least and greatest distance after each step, wider while the grippers come back from outside."""
         distance = jnp.linalg.norm(self.separation)
-        reach = 2.0 * _RETURN_SPEED * self.radius * jnp.arange(1, n_steps + 1)
-        return jnp.minimum(self.min_distance, distance + reach), jnp.maximum(self.max_distance, distance - reach)
+        apart = jnp.zeros_like(distance)
+        if self.previous is not None:
+            outward = self.separation / jnp.maximum(distance, 1e-9)
+            apart = jnp.sum(outward * (self.previous[1, :2] - self.previous[0, :2]))
+        out, back = (self._way_back(n_steps, speed, 2.0 * _RETURN_SPEED) for speed in (apart, -apart))
+        return (
+            jnp.where(distance < self.min_distance, jnp.minimum(self.min_distance, distance + out), self.min_distance),
+            jnp.where(distance > self.max_distance, jnp.maximum(self.max_distance, distance - back), self.max_distance),
+        )
 
     def _workspace_bounds(self, n_steps: int) -> tuple[Float[Array, "T 2 2"], Float[Array, "T 2 2"]]:
         """Lowest and highest positions after each step, wider while the grippers come back from outside."""
-        reach = _RETURN_SPEED / math.sqrt(2.0) * self.radius * jnp.arange(1, n_steps + 1)[:, None, None]
         lower, upper = self.workspace  # pyright: ignore[reportGeneralTypeIssues]
         position: Array = self.position  # pyright: ignore[reportAssignmentType]
-        return jnp.minimum(lower, position + reach), jnp.maximum(upper, position - reach)
+        speed = jnp.zeros_like(position) if self.previous is None else self.previous[:, :2]
+        up, down = (self._way_back(n_steps, towards, _RETURN_SPEED / math.sqrt(2.0)) for towards in (speed, -speed))
+        return (
+            jnp.where(position < lower, jnp.minimum(lower, position + up), lower),
+            jnp.where(position > upper, jnp.maximum(upper, position - down), upper),
+        )
+
+    def _way_back(self, n_steps: int, towards: Float[Array, "..."], share: float) -> Float[Array, "T ..."]:
+        """How far the grippers come after each step [m], at a share of the radius and of the bound on the change.
+
+        `towards` is their motion in that direction in the step before [m].
+        """
+        steps = jnp.arange(1, n_steps + 1).reshape(-1, *[1] * towards.ndim)
+        fastest = jnp.broadcast_to(share * self.radius, (n_steps, *towards.shape))
+        if self.change is not None:
+            fastest = jnp.minimum(fastest, towards + share * self.change * steps)
+        return jnp.cumsum(fastest, axis=0)
 
     def _workspace_planes(self, n_steps: int, dtype) -> Halfspaces:
         low, high = self._workspace_bounds(n_steps)

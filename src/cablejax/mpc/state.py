@@ -23,7 +23,8 @@ class Action(enum.IntEnum):
     FOLLOW = 0
     """It is the first one of the solver's plan."""
     HOLD = 1
-    """The grippers hold, or brake as fast as they may: no plan is better, or none can be trusted (see the result)."""
+    """No plan is better, or none can be trusted (see the result): the grippers hold, brake as fast as they may, or come
+    back from outside of their bounds."""
     STRAIGHTEN = 2
     """The error stayed where it is, as in another shape between the same grippers: the cable is straightened first."""
     RETURN = 3

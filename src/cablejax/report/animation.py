@@ -1,21 +1,20 @@
-"""The animation as a GIF: every shape side by side, with and without the residual overlaid, drawn with Pillow.
-
-Frames are drawn at several times their size and scaled down, which gives smooth lines without a plotting library, and
-share one palette, which keeps the file small.
-"""
+"""Animations as GIFs: the runs of every shape, with and without the residual overlaid, and what else moves."""
 
 from __future__ import annotations
 
 import os
 import pathlib
-from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Iterable
+from typing import TYPE_CHECKING, Any
 
 import matplotlib
 import numpy as np
-from PIL import Image, ImageColor, ImageDraw, ImageFont
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from PIL import Image
 
 from cablejax.report.style import (
+    FIGURE_STYLE,
     LIGHT,
     METHOD_LABEL,
     METHOD_ORDER,
@@ -24,22 +23,21 @@ from cablejax.report.style import (
     common_window,
     gripper_outline,
 )
+from cablejax.whole_file import whole_file
 
 if TYPE_CHECKING:
     from cablejax.control.run import ClosedLoopRun
     from cablejax.control.shaping import Method, Runs
 
-OVERSAMPLING = 3
-"""Pixels drawn for each one of the picture."""
+DPI = 100
+"""Pixels per inch of a figure that is animated."""
 _SPEED = 5.0
 """Seconds of the run per second of the animation."""
 _HOLD_S = 2.5
 """How long the last frame stands [s]."""
-_SHADES = 7
-_DASH, _GAP = 7.0, 5.0
-_HEADER = 44
-_TITLE = 34
-_FOOTER = 48
+_GHOST = "#c3c9cf"
+_HEADER, _FOOTER = 78, 48
+_COLOURS = 64
 
 
 def write_gif(path: str | os.PathLike[str], runs: Runs, *, width: int = 960, frames_per_second: float = 12.0) -> int:
@@ -54,158 +52,114 @@ def write_gif(path: str | os.PathLike[str], runs: Runs, *, width: int = 960, fra
     Raises:
         ValueError: if there is no run.
     """
-    pairs = by_shape(runs)
+    pairs, views = by_shape(runs), common_window(runs, margin=0.1)
     end = max(float(r.times[-1]) for r in runs.values())
     # The cable moves most at the start, so time runs slower there: frame times grow with the square.
-    n_frames = max(2, round(end / _SPEED * frames_per_second))
-    instants = end * np.linspace(0.0, 1.0, n_frames) ** 2
-    scene = _Scene(pairs, common_window(runs, margin=0.1), width)
-    frames = [scene.draw(t) for t in instants]
-    drawn = (LIGHT.ink, LIGHT.muted, LIGHT.gripper, LIGHT.target, LIGHT.residual, LIGHT.direct)
-    return save_frames(path, frames, drawn, frames_per_second=frames_per_second, hold_s=_HOLD_S)
+    instants = end * np.linspace(0.0, 1.0, max(2, round(end / _SPEED * frames_per_second))) ** 2
+    x0, x1, y0, y1 = next(iter(views.values()))
+    height = round((y1 - y0) / (x1 - x0) * width / len(pairs)) + _HEADER + _FOOTER
+    with matplotlib.rc_context(FIGURE_STYLE):
+        figure = Figure(figsize=(width / DPI, height / DPI), dpi=DPI)
+        axes = figure.subplots(1, len(pairs), squeeze=False)[0]
+        figure.subplots_adjust(0, _FOOTER / height, 1, 1 - _HEADER / height, wspace=0)
+        top = 1 - 24 / height
+        figure.text(16 / width, top, "Two grippers shape a cable", size=13, weight="bold", va="center")
+        clock = figure.text(1 - 16 / width, top, "", size=13, weight="bold", ha="right", va="center")
+        for ax, (shape, panel) in zip(axes, pairs.items(), strict=True):
+            _still(ax, shape, panel, views[shape])
+        drawn = axes[-1].lines[:1]
+        figure.legend(drawn, ["target"], loc="center left", bbox_to_anchor=(300 / width, top), labelcolor=LIGHT.muted)
+        _scale_bar(axes[-1], views[list(pairs)[-1]])
+
+        def draw(time: float) -> list[Any]:
+            clock.set_text(f"{time:.0f} s")
+            panels = zip(axes, pairs.values(), strict=True)
+            return [artist for ax, panel in panels for artist in _moving(ax, panel, time)]
+
+        return animate(path, figure, draw, instants, frames_per_second=frames_per_second, hold_s=_HOLD_S)
 
 
-def save_frames(
+def animate(
     path: str | os.PathLike[str],
-    frames: list[Image.Image],
-    drawn: Sequence[str],
+    figure: Figure,
+    draw: Callable[[Any], list[Any]],
+    moments: Iterable[Any],
     *,
     frames_per_second: float,
     hold_s: float,
 ) -> int:
-    """Writes pictures as a GIF and returns its size in bytes.
+    """Writes a GIF of a figure and returns its size in bytes. All frames share one palette, which keeps it small.
 
     Args:
         path: the file to write.
-        frames: in order.
-        drawn: their colours.
+        figure: with what stands still.
+        draw: adds what moves at a moment, and returns those artists; they are removed after the frame.
+        moments: what `draw` is called with, in order.
         frames_per_second: of the file.
         hold_s: how long the last frame stands [s].
     """
-    palette = _palette(drawn)
+    canvas, frames = FigureCanvasAgg(figure), []
+    for moment in moments:
+        artists = draw(moment)
+        canvas.draw()
+        frames.append(Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB"))
+        for artist in artists:
+            artist.remove()
+    # the other methods move the background away from white
+    palette = frames[len(frames) // 2].quantize(_COLOURS, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
     indexed = [frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]
     durations = [round(1000.0 / frames_per_second)] * (len(frames) - 1) + [round(1000.0 * hold_s)]
     path = pathlib.Path(path)
-    indexed[0].save(
-        path, format="GIF", save_all=True, append_images=indexed[1:], duration=durations, loop=0, optimize=False
-    )
+    with whole_file(path) as stream:
+        indexed[0].save(
+            stream, format="GIF", save_all=True, append_images=indexed[1:], duration=durations, loop=0, optimize=False
+        )
     return path.stat().st_size
 
 
-def _palette(drawn: Sequence[str]) -> Image.Image:
-    """Every colour drawn, in steps towards the background as its smoothed edges have them."""
-    background = np.array(ImageColor.getrgb(LIGHT.background))
-    colours = [background]
-    for colour in drawn:
-        for share in np.linspace(1.0 / _SHADES, 1.0, _SHADES):
-            colours.append((1.0 - share) * background + share * np.array(ImageColor.getrgb(colour)))
-    palette = Image.new("P", (1, 1))
-    palette.putpalette(np.round(np.array(colours)).astype(np.uint8).ravel().tolist())
-    return palette
+def gripper_patches(ax: Any, pose: np.ndarray, colour: str) -> list[Any]:
+    """Draws both grippers at their poses [m, rad], shape [2, 3]."""
+    outlines = [polygon for end in range(2) for polygon in gripper_outline(pose[end], end)]
+    return [patch for polygon in outlines for patch in ax.fill(*polygon.T, color=colour, lw=0)]
 
 
-class _Scene:
-    """The constant part of all frames: the layout, the targets, the words."""
-
-    def __init__(self, pairs: dict[str, dict[Method, ClosedLoopRun]], views: dict, width: int):
-        self.pairs = pairs
-        self.views = views
-        x0, x1, y0, y1 = next(iter(views.values()))
-        self.panel_width = width // len(pairs)
-        self.pixels_per_metre = self.panel_width / (x1 - x0)
-        self.panel_height = round((y1 - y0) * self.pixels_per_metre)
-        self.size = (self.panel_width * len(pairs), _HEADER + _TITLE + self.panel_height + _FOOTER)
-        self.background = self._static()
-
-    def draw(self, time: float) -> Image.Image:
-        """The frame at one instant [s]; between samples the cable is interpolated."""
-        image = self.background.copy()
-        canvas = Canvas(image)
-        canvas.text((self.size[0] - 16, 12), f"{time:.0f} s", LIGHT.ink, 18, anchor="ra", bold=True)
-        for index, (shape, runs) in enumerate(self.pairs.items()):
-            row = 0
-            for method in METHOD_ORDER:
-                if method not in runs:
-                    continue
-                run = runs[method]
-                strong = method == "residual" or len(runs) == 1
-                pose = _at(run.times, run.gripper_pose, time)
-                keypoints = _at(run.times, run.keypoints, time)
-                for end in range(2):
-                    for polygon in gripper_outline(pose[end], end):
-                        canvas.polygon(self._pixels(index, shape, polygon), LIGHT.gripper if strong else "#c3c9cf")
-                canvas.line(self._pixels(index, shape, cable_curve(keypoints, pose)), LIGHT.method(method), 3.0)
-                canvas.dots(self._pixels(index, shape, keypoints), LIGHT.method(method), 2.4)
-            for method in METHOD_ORDER[::-1]:
-                if method in runs:
-                    error = float(_at(runs[method].times, runs[method].error_cm, time))
-                    x, y = index * self.panel_width + 62, _HEADER + _TITLE + self.panel_height + 20 * row
-                    canvas.text((x, y), f"{error:.2f}", LIGHT.method(method), 14, anchor="ra", bold=True)
-                    canvas.text((x + 6, y), f"cm {METHOD_LABEL[method]}", LIGHT.method(method), 14)
-                    row += 1
-        return image.resize(self.size, Image.Resampling.BOX)
-
-    def _static(self) -> Image.Image:
-        image = Image.new("RGB", (OVERSAMPLING * self.size[0], OVERSAMPLING * self.size[1]), LIGHT.background)
-        canvas = Canvas(image)
-        canvas.text((16, 12), "Two grippers shape a cable", LIGHT.ink, 18, bold=True)
-        canvas.dashes(np.array([(318.0, 24.0), (352.0, 24.0)]), LIGHT.target, 3.0)
-        canvas.text((360, 15), "target", LIGHT.muted, 14)
-        for index, (shape, runs) in enumerate(self.pairs.items()):
-            canvas.text((index * self.panel_width + 16, _HEADER), shape, LIGHT.ink, 20, bold=True)
-            target = next(iter(runs.values())).target.keypoints
-            canvas.dashes(self._pixels(index, shape, cable_curve(target, n_points=400)), LIGHT.target, 3.0)
-        right, bottom = self.size[0] - 16, _HEADER + _TITLE + self.panel_height - 6
-        bar = 0.2 * self.pixels_per_metre
-        canvas.line(np.array([(right - bar, bottom), (right, bottom)]), LIGHT.muted, 2.0)
-        canvas.text((right - bar / 2, bottom - 4), "20 cm", LIGHT.muted, 12, anchor="ms")
-        return image
-
-    def _pixels(self, index: int, shape: str, points: np.ndarray) -> np.ndarray:
-        x0, _, _, y1 = self.views[shape]
-        x = index * self.panel_width + (points[:, 0] - x0) * self.pixels_per_metre
-        y = _HEADER + _TITLE + (y1 - points[:, 1]) * self.pixels_per_metre
-        return np.stack([x, y], axis=1)
+def _still(ax: Any, shape: str, runs: dict[Method, ClosedLoopRun], view: tuple[float, float, float, float]) -> None:
+    """A panel without its cables."""
+    ax.set(xlim=view[:2], ylim=view[2:], aspect="equal")
+    ax.set_axis_off()
+    ax.text(0.05, 1.0, shape, size=15, weight="bold", transform=ax.transAxes, parse_math=False)
+    target = cable_curve(next(iter(runs.values())).target.keypoints, n_points=400)
+    ax.plot(*target.T, color=LIGHT.target, lw=2.2, ls=(0, (2.4, 1.7)))
 
 
-class Canvas:
-    """Drawing in final pixels on an oversampled image."""
+def _scale_bar(ax: Any, view: tuple[float, float, float, float]) -> None:
+    right, low, room = view[1], view[2], 0.02 * (view[1] - view[0])
+    ax.plot([right - room - 0.2, right - room], [low + room] * 2, color=LIGHT.muted, lw=1.5)
+    ax.text(right - room - 0.1, low + 1.5 * room, "20 cm", color=LIGHT.muted, size=9, ha="center")
 
-    def __init__(self, image: Image.Image):
-        self.pen = ImageDraw.Draw(image)
 
-    def line(self, points: np.ndarray, colour: str, width: float) -> None:
-        """A line [pixels]."""
-        scaled = [tuple(p) for p in points * OVERSAMPLING]
-        self.pen.line(scaled, fill=colour, width=round(width * OVERSAMPLING), joint="curve")
-        self.dots(points[[0, -1]], colour, width / 2)
-
-    def dots(self, points: np.ndarray, colour: str, radius: float) -> None:
-        """Dots of a radius [pixels], where points are finite."""
-        for x, y in points[np.isfinite(points).all(axis=1)] * OVERSAMPLING:
-            r = radius * OVERSAMPLING
-            self.pen.ellipse((x - r, y - r, x + r, y + r), fill=colour)
-
-    def polygon(self, points: np.ndarray, colour: str) -> None:
-        """A filled polygon [pixels]."""
-        self.pen.polygon([tuple(p) for p in points * OVERSAMPLING], fill=colour)
-
-    def dashes(self, points: np.ndarray, colour: str, width: float) -> None:
-        """A dashed line [pixels]."""
-        distance = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(points, axis=0).T))])
-        for start in np.arange(0.0, distance[-1], _DASH + _GAP):
-            along = np.linspace(start, min(start + _DASH, distance[-1]), 6)
-            piece = np.stack([np.interp(along, distance, points[:, k]) for k in range(2)], axis=1)
-            scaled = [tuple(p) for p in piece * OVERSAMPLING]
-            self.pen.line(scaled, fill=colour, width=round(width * OVERSAMPLING), joint="curve")
-
-    def text(self, place, words: str, colour: str, size: float, *, anchor: str = "la", bold: bool = False) -> None:
-        """Words at a place [pixels]."""
-        name = "DejaVuSans-Bold.ttf" if bold else "DejaVuSans.ttf"
-        file = pathlib.Path(matplotlib.get_data_path()) / "fonts" / "ttf" / name
-        font = ImageFont.truetype(str(file), round(size * OVERSAMPLING))
-        x, y = place
-        self.pen.text((x * OVERSAMPLING, y * OVERSAMPLING), words, fill=colour, font=font, anchor=anchor)
+def _moving(ax: Any, runs: dict[Method, ClosedLoopRun], time: float) -> list[Any]:
+    """Draws the runs of a panel at one instant [s]; between samples the cable is interpolated."""
+    artists, methods = [], [method for method in METHOD_ORDER if method in runs]
+    for method in methods:
+        run, colour = runs[method], LIGHT.method(method)
+        strong = method == "residual" or len(runs) == 1
+        pose, keypoints = _at(run.times, run.gripper_pose, time), _at(run.times, run.keypoints, time)
+        artists += gripper_patches(ax, pose, LIGHT.gripper if strong else _GHOST)
+        artists += ax.plot(*cable_curve(keypoints, pose).T, color=colour, lw=2.2, solid_capstyle="round")
+        artists += ax.plot(*keypoints.T, color=colour, ls="", marker="o", ms=3.4)
+    for row, method in enumerate(methods[::-1]):
+        error = float(_at(runs[method].times, runs[method].error_cm, time))
+        place = {
+            "xy": (0.2, 0.0),
+            "xycoords": "axes fraction",
+            "textcoords": "offset points",
+            "color": LIGHT.method(method),
+        }
+        below = (0, -14 - 14 * row)
+        artists.append(ax.annotate(f"{error:.2f}", xytext=below, ha="right", weight="bold", **place))
+        artists.append(ax.annotate(f"  cm {METHOD_LABEL[method]}", xytext=below, ha="left", **place))
+    return artists
 
 
 def _at(times: np.ndarray, values: np.ndarray, time: float) -> np.ndarray:

@@ -32,6 +32,7 @@ from cablejax.report.effect_words import (
 from cablejax.report.html import json_script, svg, write_html
 from cablejax.report.motion_figures import motion_figure, write_motion_gif
 from cablejax.report.spatial_figures import cable_still, files_figure, orbit_data
+from cablejax.whole_file import whole_file
 
 PAGE = "report.html"
 """Name of the page in a diagnosis' folder."""
@@ -90,7 +91,8 @@ def write_diagnosis_page(diagnosis: CableDiagnosis, out: str | os.PathLike[str])
         if figure is not None and name != "motion":
             # laid out already: to find room for all words takes longer than to draw them
             figure.set_layout_engine("none")
-            figure.savefig(picture, dpi=_DPI)
+            with whole_file(picture) as stream:
+                figure.savefig(stream, format="png", dpi=_DPI)
         else:
             # none of an earlier diagnosis next to this page
             picture.unlink(missing_ok=True)

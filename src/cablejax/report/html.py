@@ -16,11 +16,14 @@ from matplotlib.figure import Figure
 
 from cablejax.report.effect_words import explanation_title, share
 from cablejax.report.style import LIGHT
+from cablejax.whole_file import whole_file
 
 
 def write_html(path: str | os.PathLike[str], template: str, **values: Any) -> None:
     """Writes a template filled in; strings are escaped unless they are `Markup`."""
-    pathlib.Path(path).write_text(_environment().get_template(template).render(**values), encoding="utf-8")
+    page = _environment().get_template(template).render(**values)
+    with whole_file(pathlib.Path(path)) as stream:
+        stream.write(page.encode())
 
 
 @functools.cache

@@ -9,10 +9,9 @@ import matplotlib
 import numpy as np
 from jaxtyping import Float
 from matplotlib.figure import Figure
-from PIL import Image
 
 from cablejax.diagnose.diagnosis import NextMotion
-from cablejax.report.animation import OVERSAMPLING, Canvas, save_frames
+from cablejax.report.animation import DPI, animate, gripper_patches
 from cablejax.report.effect_words import effect_title, explanation_title
 from cablejax.report.style import DIAGNOSIS_STYLE, LIGHT, cable_curve, gripper_outline
 
@@ -41,31 +40,29 @@ def motion_figure(following: NextMotion | None) -> Figure | None:
 def write_motion_gif(path: str | os.PathLike[str], following: NextMotion) -> int:
     """Writes a preview of the motion, five times as fast, and returns its size in bytes."""
     low, high = _window(following)
-    scale = _WIDTH / (high[0] - low[0])
-    names = list(following.shapes)
-    top = _HEADER + _LINE * len(names)
-    size = (_WIDTH, top + max(round((high[1] - low[1]) * scale), 1))
+    names, width = list(following.shapes), _WIDTH / DPI
+    header = (_HEADER + _LINE * len(names)) / DPI
+    height = header + max(width * (high[1] - low[1]) / (high[0] - low[0]), 0.01)
     last, step = len(following.poses) - 1, _SPEED / _FRAMES_PER_SECOND / following.interval
-    frames = []
-    for sample in [*np.arange(0.0, last, step).round().astype(int), last]:
-        image = Image.new("RGB", (OVERSAMPLING * size[0], OVERSAMPLING * size[1]), LIGHT.background)
-        canvas = Canvas(image)
-        canvas.text((14, 10), "Record next", LIGHT.ink, 16, bold=True)
-        canvas.text((_WIDTH - 14, 10), f"{following.interval * sample:.0f} s", LIGHT.ink, 16, anchor="ra", bold=True)
-        pose = following.poses[sample]
-
-        def pixels(points: Float[np.ndarray, "P 2"]) -> Float[np.ndarray, "P 2"]:
-            return np.stack([(points[:, 0] - low[0]) * scale, top + (high[1] - points[:, 1]) * scale], axis=1)
-
-        for end in range(2):
-            for polygon in gripper_outline(pose[end], end):
-                canvas.polygon(pixels(polygon), LIGHT.gripper)
+    with matplotlib.rc_context(DIAGNOSIS_STYLE):
+        figure = Figure(figsize=(width, height), dpi=DPI)
+        ax = figure.add_axes((0.0, 0.0, 1.0, 1.0 - header / height), xlim=(low[0], high[0]), ylim=(low[1], high[1]))
+        ax.set_axis_off()
+        figure.text(0.02, 1.0 - 0.1 / height, "Record next", size=12, weight="bold", va="top")
+        clock = figure.text(0.98, 1.0 - 0.1 / height, "", size=12, weight="bold", ha="right", va="top")
         for row, (name, colour) in enumerate(zip(names, _COLOURS, strict=False)):
-            canvas.line(pixels(cable_curve(following.shapes[name][sample])), colour, 2.5)
-            canvas.text((14, _HEADER + _LINE * row), explanation_title(name), colour, 13)
-        frames.append(image.resize(size, Image.Resampling.BOX))
-    drawn = (LIGHT.ink, LIGHT.gripper, *_COLOURS)
-    return save_frames(path, frames, drawn, frames_per_second=_FRAMES_PER_SECOND, hold_s=_HOLD_S)
+            top = 1.0 - (_HEADER + _LINE * row) / DPI / height
+            figure.text(0.02, top, explanation_title(name), size=10, color=colour, va="top")
+
+        def draw(sample: int) -> list[Any]:
+            clock.set_text(f"{following.interval * sample:.0f} s")
+            artists = gripper_patches(ax, following.poses[sample], LIGHT.gripper)
+            for name, colour in zip(names, _COLOURS, strict=False):
+                artists += ax.plot(*cable_curve(following.shapes[name][sample]).T, color=colour, lw=1.8)
+            return artists
+
+        samples = [*np.arange(0.0, last, step).round().astype(int), last]
+        return animate(path, figure, draw, samples, frames_per_second=_FRAMES_PER_SECOND, hold_s=_HOLD_S)
 
 
 def _film(figure: Any, following: NextMotion) -> None:
