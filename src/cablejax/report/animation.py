@@ -140,7 +140,8 @@ def _scale_bar(ax: Any, view: tuple[float, float, float, float]) -> None:
 
 def _moving(ax: Any, runs: dict[Method, ClosedLoopRun], time: float) -> list[Any]:
     """Draws the runs of a panel at one instant [s]; between samples the cable is interpolated."""
-    artists, methods = [], [method for method in METHOD_ORDER if method in runs]
+    artists: list[Any] = []
+    methods: list[Method] = [method for method in METHOD_ORDER if method in runs]
     for method in methods:
         run, colour = runs[method], LIGHT.method(method)
         strong = method == "residual" or len(runs) == 1
