@@ -13,6 +13,7 @@ from cablejax.cable import Discretisation
 from cablejax.diagnose import LIBRARY, CableEffect, Parameter
 from cablejax.diagnose.case import FINE_LINKS
 from cablejax.diagnose.check import check_effect
+from cablejax.effects.camera import in_camera_frame
 from cablejax.effects.physics import nominal_physics
 from cablejax.simulate import MjxEngine, compiler_options
 from cablejax.simulate.chain.replay import Chain
@@ -33,6 +34,28 @@ def test_library_has_every_effect_of_cable_and_camera():
 @pytest.mark.parametrize("effect", LIBRARY, ids=lambda e: e.name)
 def test_effect_passes_its_check(effect):
     check_effect(effect)
+
+
+PLACE = np.array([4.0, -6.0])
+
+
+@pytest.mark.parametrize("effect", LIBRARY, ids=lambda e: e.name)
+def test_an_effect_about_another_place_is_reported_in_the_worlds_frame(effect):
+    """What is reported is what the effect of the library does."""
+    config, moved = Discretisation(n_links=12), effect.around(PLACE)
+    nominal, variant = nominal_physics(config), effect.variants[-1]
+    values = [np.float32(p.value(np.float64(0.7))) for p in moved.parameters]
+    physics = moved.apply(nominal, values, variant, config)
+    reported = {name: value for name, (value, _) in moved.reported(values, variant, config).items()}
+    own, own_variant = effect.given(reported, config)
+    same = effect.apply(nominal, [np.float32(value) for value in own], own_variant, config)
+    for one, other in zip(jax.tree.leaves(physics), jax.tree.leaves(same), strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-5, atol=2e-6)
+    assert moved.given(reported, config)[0] == pytest.approx(values, rel=1e-5, abs=1e-6)
+    if effect.name == "camera_similarity":  # a small rotation about the cable is no large offset
+        turned = moved.apply(nominal, [np.float32(v) for v in (1.0, 0.02, 0.0, 0.0)], 0, config)
+        there = in_camera_frame(turned, PLACE.astype(np.float32)[None])[0]
+        np.testing.assert_allclose(there, PLACE, atol=1e-6)
 
 
 class _Shift(CableEffect):

@@ -98,3 +98,63 @@ def test_derivatives_and_precision_hold_the_own_numbers():
     cross, alone = share * _TIME.sum(), share * _SAMPLES + 1.0
     exact = 1.0 + 4 * (share * (_TIME**2).sum() - cross**2 / alone)
     np.testing.assert_allclose(fit.precision(evidence), [[exact]], rtol=1e-6)
+
+
+class Swings(Simulator):
+    """Springs that swing, 150 samples each."""
+
+    unit = "m"
+    effects = (
+        Effect(name="stiffness", parameters=(Parameter("ratio", "", 0.2, 5.0, 1.0, 0.2, log=True),), null=(1.0,)),
+        Effect(name="damping", parameters=(Parameter("per_s", "1/s", 0.0, 5.0, 0.2, 0.2),), null=(0.0,)),
+    )
+    time = np.linspace(0.0, 3.0, 150)
+    size = np.array([0.05, 0.08])[:, None]
+    rate = np.array([1.0, 1.5])[:, None]
+
+    def predict(self, explanations, episodes):
+        result = []
+        for one in explanations:
+            ratio, damping = one.vector(self.effects)
+            swing = np.cos(self.rate * np.sqrt(ratio) * self.time) * np.exp(-damping * self.time)
+            result.append((self.size * swing)[np.asarray(episodes)])
+        return np.stack(result)[..., None]
+
+
+class Deaf(Swings):
+    """Of which one effect changes nothing, or breaks the simulation."""
+
+    def __init__(self, factor: float):
+        self.factor = factor
+
+    def predict(self, explanations, episodes):
+        still = [one if "damping" not in one.names else explanation() for one in explanations]
+        factor = [1.0 if one.vector(self.effects)[1] == 0 else self.factor for one in explanations]
+        return super().predict(still, episodes) * np.array(factor)[:, None, None, None]
+
+
+def observed_swings(ratio: float) -> np.ndarray:
+    spring = Swings.effects[0]
+    exact = Swings().predict([explanation((spring, 0, (ratio,)))], np.arange(2))[0]
+    return exact + np.random.default_rng(0).normal(scale=1e-4, size=exact.shape)
+
+
+def test_a_few_samples_weigh_more_than_a_prior_that_is_far_off():
+    """No more samples can be correlated than an episode has."""
+    found = diagnose_simulator(Swings(), observed_swings(2.2), interval=0.02, noise=1e-4)
+    assert found.verdict == "named" and [effect.name for effect in found.effects] == ["stiffness"]
+    estimate = found.effects[0].parameters["ratio"]
+    assert estimate.ci90[0] < 2.2 < estimate.ci90[1] and estimate.value == pytest.approx(2.2, rel=0.05)
+    assert any("3.8 prior standard deviations" in caveat for caveat in found.caveats)
+
+
+@pytest.mark.parametrize(
+    ("factor", "message"),
+    [
+        (1.0, r"effect 'damping' \(per_s = 0.4\) predict gives exactly what it gives without"),
+        (np.nan, "are not finite"),
+    ],
+)
+def test_an_effect_that_does_nothing_is_refused(factor, message):
+    with pytest.raises(ValueError, match=message):
+        diagnose_simulator(Deaf(factor), observed_swings(1.3), interval=0.02, noise=1e-4)

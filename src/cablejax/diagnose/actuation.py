@@ -268,7 +268,7 @@ def _chances(arms: Actuation, calibration: Calibration) -> dict[tuple[str, ...],
     every effect.
     """
     calibration = dataclasses.replace(calibration, baseline=_NEGLIGIBLE)
-    temper = calibration.temper(arms.unseen[()], arms.noise)
+    temper = calibration.temper(arms.unseen[()], arms.noise, arms.count)
     scores = [
         student_log_likelihoods(
             arms.count * ((error / arms.noise) ** 2 - 1.0) / temper, calibration.freedom, arms.motion

@@ -8,7 +8,7 @@ measured against
 
 with b the error of the baseline simulator, rho the relative error of an effect's law (real friction is not quite
 Coulomb's), g_e the gap of that episode, sigma the noise, and n the number of samples over which these errors stay the
-same. An explanation's log likelihood is that of Student's distribution over episodes,
+same, at most all of the episode. An explanation's log likelihood is that of Student's distribution over episodes,
 
     log p(log | c) = -(nu + 1) / 2 sum_e log(1 + Q_e / nu),
 
@@ -65,7 +65,7 @@ class Calibration:
         baseline: root mean square error per coordinate of the simulator without any effect, in the unit of the
             observations; commissioning logs replace it.
         law_error: rho, of an effect's law relative to the gap it makes.
-        correlated_samples: n, over which errors of simulators stay the same.
+        correlated_samples: n, over which errors of simulators stay the same; in a shorter episode all its samples.
         freedom: nu of Student's distribution.
         fit_freedom: the same in fits; `LEAST_SQUARES` where episodes are so few that a fit may set none aside.
         term_cost: nats that each effect must pay for itself.
@@ -105,9 +105,12 @@ class Calibration:
             if not (np.isfinite(value) and value >= 0):
                 raise ValueError(f"Calibration.{name} is {value}, expected a finite number that is not negative.")
 
-    def temper(self, gap: Float[np.ndarray, "E"], noise: float) -> Float[np.ndarray, "E"]:
-        """See the module's docstring; `gap` of each episode and `noise` in metres per coordinate."""
-        return 1.0 + self.correlated_samples * (self.baseline**2 + (self.law_error * gap) ** 2) / noise**2
+    def temper(
+        self, gap: Float[np.ndarray, "E"], noise: float, count: Float[np.ndarray, "E"] | int
+    ) -> Float[np.ndarray, "E"]:
+        """See the module's docstring; `gap` and samples of each episode, and `noise`, in metres per coordinate."""
+        together = np.minimum(self.correlated_samples, np.maximum(count, 1))
+        return 1.0 + together * (self.baseline**2 + (self.law_error * gap) ** 2) / noise**2
 
     def smallest_gap(self, noise: float, own: float | None = None) -> float:
         """The gap from which on there is one; `own` is the simulator's error if it is not `baseline`."""

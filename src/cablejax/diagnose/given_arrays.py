@@ -68,6 +68,25 @@ def checked_nominal(
     return nominal
 
 
+def check_effects_act(simulator: Simulator, observed: Float[np.ndarray, "E T *O"], nominal: np.ndarray) -> None:
+    """Raises ValueError for an effect with which `predict` gives no numbers, or the same as without it."""
+    for effect in simulator.effects:
+        begun = [explanation((effect, *start)) for start in simulator.starts(effect, nominal, observed - nominal)]
+        if not begun:
+            continue
+        predicted = np.asarray(simulator.predict(begun, np.arange(len(observed))), float)
+        finite = np.isfinite(predicted).reshape(len(begun), -1).all(axis=1)
+        values = ", ".join(f"{p.name} = {v:g}" for p, v in zip(effect.parameters, begun[-1].values()[0], strict=True))
+        if (predicted[finite] != nominal).any():
+            continue
+        if not finite.all():
+            raise ValueError(f"With effect {effect.name!r} ({values}) predict gives values that are not finite.")
+        raise ValueError(
+            f"With effect {effect.name!r} ({values}) predict gives exactly what it gives without: does it use the "
+            "explanations that it is given?"
+        )
+
+
 def recorded_arrays(observed: ArrayLike, interval: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
     """The observations, shape [E, T, ...], and the sample interval of each episode [s].
 

@@ -185,7 +185,7 @@ class Judge:
             return Judged(poses, np.nan, beyond or {SNAP_THROUGH: 10.0}, seen)
         gaps = ((seen - points[0]) ** 2).mean(axis=(1, 2, 3))
         noise = float(np.sqrt(np.mean(self.noise**2)))
-        temper = float(self.calibration.temper(np.sqrt(self.chances @ gaps)[None], noise)[0])
+        temper = float(self.calibration.temper(np.sqrt(self.chances @ gaps)[None], noise, seen[0].size)[0])
         scale = 1.0 / (self.noise[:, None] * np.sqrt(temper))
         clamps = ((points[-2:] - points[1]) * scale).reshape(2, -1).astype(float)
         spreads = []

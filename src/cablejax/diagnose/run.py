@@ -17,7 +17,7 @@ from cablejax.diagnose.diagnosis import Diagnosis, Gap
 from cablejax.diagnose.evidence import Evidence
 from cablejax.diagnose.fit import Fit, evaluate, improved
 from cablejax.diagnose.gap import held_out_predictions, measure_gap
-from cablejax.diagnose.given_arrays import checked_nominal, recorded_arrays, spread_of
+from cablejax.diagnose.given_arrays import check_effects_act, checked_nominal, recorded_arrays, spread_of
 from cablejax.diagnose.laws import by_other_laws
 from cablejax.diagnose.protocol import Simulator, explanation
 from cablejax.diagnose.refits import refitted
@@ -25,6 +25,8 @@ from cablejax.diagnose.search import Search, search
 
 # Of the noise: the error of its own that a simulator is taken to have if nobody says more.
 _BASELINE = 0.1
+# Prior standard deviations at which a fitted value is worth a word.
+_FAR = 3.0
 
 
 def diagnose_simulator(
@@ -67,6 +69,7 @@ def diagnose_simulator(
             "episodes."
         )
     nominal = checked_nominal(simulator, observed, spread)
+    check_effects_act(simulator, observed, nominal)
     caveats = []
     if calibration is None:
         calibration = Calibration(baseline=_BASELINE * float(np.sqrt(np.mean(spread**2))))
@@ -75,6 +78,7 @@ def diagnose_simulator(
         )
     evidence = weighed(simulator, observed, nominal, spread, motion, calibration)
     examined = examine(evidence, interval, calibration, progress=progress)
+    caveats += _far_out(examined.conclusion)
     return Diagnosis(
         **examined.fields(),
         where=None,
@@ -83,6 +87,18 @@ def diagnose_simulator(
         seconds=time.perf_counter() - begin,
         settings=settings_of(simulator, calibration),
     )
+
+
+def _far_out(conclusion: Conclusion) -> list[str]:
+    """Caveats of fitted values that their prior did not expect."""
+    best = conclusion.best.explanation
+    return [
+        f"{term.effect.name}: {parameter.name} lies {abs(z):.1f} prior standard deviations from its median. If that is "
+        "possible, widen its prior."
+        for term, part in best.by_term()
+        for parameter, z in zip(term.effect.parameters, part, strict=True)
+        if abs(z) > _FAR
+    ]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -179,12 +195,13 @@ def weighed(
         fit_freedom=calibration.fit_freedom,
     )
     if simulator.own(explanation()):
-        bare = dataclasses.replace(bare, temper=calibration.temper(np.zeros(len(observed)), level(bare)))
+        temper = calibration.temper(np.zeros(len(observed)), level(bare), bare.count)
+        bare = dataclasses.replace(bare, temper=temper)
         nominal = bare.predict([_null(bare).explanation])[0]
         bare = dataclasses.replace(bare, nominal=nominal)
     squares = (bare.whitened(nominal) ** 2).sum(axis=1)
     gap = level(bare) * np.sqrt(np.maximum(squares / np.maximum(bare.count, 1) - 1, 0.0))
-    return dataclasses.replace(bare, temper=calibration.temper(gap, level(bare)))
+    return dataclasses.replace(bare, temper=calibration.temper(gap, level(bare), bare.count))
 
 
 def explain(

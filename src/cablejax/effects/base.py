@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import abc
+import copy
 import dataclasses
 from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar, Literal
@@ -57,6 +58,11 @@ class CableEffect(Effect, abc.ABC):
     def __init__(self):
         self.__post_init__()
 
+    def around(self, place: Float[np.ndarray, "2"]) -> CableEffect:
+        """The effect where the cable is about this place [m]: priors of places on the table move with it."""
+        del place
+        return self
+
     @abc.abstractmethod
     def apply(self, physics: Physics, values: Sequence[Any], variant: int, config: Discretisation) -> Physics:
         """The physics with this effect. NumPy in, NumPy out; JAX in, JAX out, differentiable in `values`.
@@ -96,6 +102,20 @@ class CableEffect(Effect, abc.ABC):
         """The effect's place: keys "along_cable_m", "time_s", "table_m" of the verdict, where they apply."""
         del values, variant, config
         return {}
+
+
+def moved(effect: CableEffect, place: Float[np.ndarray, "2"]) -> CableEffect:
+    """An effect whose parameters x_m and y_m [m] have their bounds, prior medians and null values about a place."""
+    by = {"x_m": float(place[0]), "y_m": float(place[1])}
+    shifts = [by.get(p.name, 0.0) for p in effect.parameters]
+    parameters = tuple(
+        dataclasses.replace(p, low=p.low + shift, high=p.high + shift, centre=p.centre + shift) if shift else p
+        for p, shift in zip(effect.parameters, shifts, strict=True)
+    )
+    null = tuple(value + shift for value, shift in zip(effect.null, shifts, strict=True))
+    other = copy.copy(effect)
+    vars(other).update(parameters=parameters, null=null)
+    return other
 
 
 def section(centre: Any, width: Any, config: Discretisation) -> Any:

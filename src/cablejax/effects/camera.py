@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from dataclasses import replace
 from typing import Any
 
@@ -15,7 +16,11 @@ from cablejax.effects.physics import Physics
 
 
 class CameraSimilarity(CableEffect):
-    """Scale, rotation and offset of the keypoints' frame."""
+    """Scale, rotation and offset of the keypoints' frame.
+
+    The verdict's offset is that of scale and rotation about the world's origin; `x_m` and `y_m` of the parameters are
+    for those about `origin`, a place near the cable.
+    """
 
     name = "camera_similarity"
     hook = "observation"
@@ -27,22 +32,50 @@ class CameraSimilarity(CableEffect):
     )
     null = (1.0, 0.0, 0.0, 0.0)
     side = "observation"
+    origin = (0.0, 0.0)
+
+    def around(self, place):
+        """Scale and rotation are about the place: elsewhere a small rotation comes with a large offset."""
+        other = copy.copy(self)
+        vars(other).update(origin=(float(place[0]), float(place[1])))
+        return other
 
     def apply(self, physics, values, variant, config):
         """Scales, turns [rad] and shifts [m] the keypoints' frame."""
         xp = values[0].__array_namespace__()
+        x, y = self._shifted(values, 1.0)
         return replace(
             physics,
             camera_scale=physics.camera_scale * values[0],
             camera_angle=physics.camera_angle + values[1],
-            camera_offset=physics.camera_offset + xp.stack([values[2], values[3]]),
+            camera_offset=physics.camera_offset + xp.stack([x, y]),
         )
+
+    def reported(self, values, variant, config):
+        """The offset [m] is that about the world's origin."""
+        x, y = self._shifted([np.float64(value) for value in values], 1.0)
+        return super().reported((values[0], values[1], x, y), variant, config)
+
+    def _from_reported(self, parameters, config):
+        named = {p.name: p.centre for p in self.parameters} | parameters
+        x, y = self._shifted([np.float64(named[p.name]) for p in self.parameters], -1.0)
+        return {**named, "x_m": x, "y_m": y}
+
+    def _shifted(self, values: Any, sign: float) -> tuple[Any, Any]:
+        """The offset about the world's origin from that about `origin`, or with the other sign the reverse."""
+        scale, angle, x, y = values
+        if not any(self.origin):
+            return x, y
+        xp, (ox, oy) = scale.__array_namespace__(), self.origin
+        cosine, sine = scale * xp.cos(angle), scale * xp.sin(angle)
+        return x + sign * (ox - cosine * ox + sine * oy), y + sign * (oy - sine * ox - cosine * oy)
 
     def starts(self, context):
         """The similarity nearest to the observed keypoints, by linear least squares."""
         seen = np.isfinite(context.residual).all(axis=-1)
         x, y = context.keypoints[seen].T
         zero, one = np.zeros_like(x), np.ones_like(x)
+        x, y = x - self.origin[0], y - self.origin[1]
         columns = np.concatenate([np.stack([x, -y, one, zero], axis=1), np.stack([y, x, zero, one], axis=1)])
         a, b, dx, dy = np.linalg.lstsq(columns, context.residual[seen].T.ravel(), rcond=None)[0]
         return [(0, (np.hypot(1 + a, b), np.arctan2(b, 1 + a), dx, dy))]

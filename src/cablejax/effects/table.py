@@ -9,7 +9,7 @@ from jaxtyping import Float
 
 from cablejax.arrays import filled
 from cablejax.cable import Discretisation
-from cablejax.effects.base import CableEffect, Context
+from cablejax.effects.base import CableEffect, Context, moved
 from cablejax.effects.effect import Parameter
 
 # Discs tried as obstacles: of which size at most, how many, and how far apart [m].
@@ -77,6 +77,10 @@ class FrictionPatch(CableEffect):
     )
     null = (0.4, 0.1, 0.12, 1.0)
     amplitude, reversible = 3, True
+
+    def around(self, place):
+        """Its centre is sought about the place."""
+        return moved(self, place)
 
     def apply(self, physics, values, variant, config):
         """Sets the patch's centre and radius [m] and what it adds to the coefficient inside."""
@@ -177,6 +181,10 @@ class Obstacle(CableEffect):
         Parameter("radius_m", "m", 0.005, 0.2, 0.03, 0.5, log=True),
     )
     null = (3.0, 3.0, 0.005)
+
+    def around(self, place):
+        """Its centre is sought about the place."""
+        return moved(self, place)
 
     def apply(self, physics, values, variant, config):
         """Sets the disc's centre and radius [m]."""
