@@ -43,7 +43,7 @@ PLACE = np.array([4.0, -6.0])
 def test_an_effect_about_another_place_is_reported_in_the_worlds_frame(effect):
     """What is reported is what the effect of the library does."""
     config, moved = Discretisation(n_links=12), effect.around(PLACE)
-    nominal, variant = nominal_physics(config), effect.variants[-1]
+    nominal, variant = nominal_physics(config), effect.variants[:2][-1]
     values = [np.float32(p.value(np.float64(0.7))) for p in moved.parameters]
     physics = moved.apply(nominal, values, variant, config)
     reported = {name: value for name, (value, _) in moved.reported(values, variant, config).items()}
