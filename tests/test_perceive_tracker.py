@@ -101,6 +101,22 @@ def test_another_cable_is_not_taken_for_this_one(tracker, motion, started, lengt
     assert seen.status == Status.TRACKED and mean_error(seen.keypoints, motion[0]) < 1e-3
 
 
+@pytest.mark.parametrize(
+    ("turn", "scale", "shift", "words"),
+    [
+        (np.pi, 1.0, 0.0, "Check theta"),
+        (0.0, 1e3, 0.0, "Are both in metres"),
+        (0.0, 1.0, 0.3, "another frame than the grippers"),
+    ],
+)
+def test_a_lost_frame_is_explained_by_what_is_wrong(tracker, motion, turn, scale, shift, words):
+    points = scale * cloud(motion[0], 9) + shift
+    pose = np.asarray(ARCH, float) + np.array([0.0, 0.0, turn])
+    _, seen = tracker.init(points, pose)
+    assert seen.status == Status.NO_FIT
+    assert words in tracker.explain(seen, points, pose)
+
+
 def test_a_cable_that_was_not_there_at_first_is_found_when_it_comes(tracker, motion):
     state, seen = tracker.init(NOTHING, ARCH)
     assert seen.status == Status.FEW_POINTS and np.isnan(seen.keypoints).all()

@@ -101,6 +101,8 @@ class Track(NamedTuple):
         sigma: standard deviation of the points across the cable [m], shape [].
         support: part of this cloud within reach of the fit, shape [].
         seen: part of the cable that has points, shape [].
+        curvature: largest of the fit [1/m], shape [].
+        gap: by which the fit misses gripper 1 [m], see `CurveFit`, shape [].
     """
 
     keypoints: Float[Array, "*b N 2"]
@@ -109,6 +111,8 @@ class Track(NamedTuple):
     sigma: Float[Array, "*b"]
     support: Float[Array, "*b"]
     seen: Float[Array, "*b"]
+    curvature: Float[Array, "*b"]
+    gap: Float[Array, "*b"]
 
 
 @functools.partial(jax.jit, static_argnames="config")
@@ -169,7 +173,7 @@ def track(
         found=state.found,
     )
     keypoints = jnp.where(state.found, best.keypoints, jnp.nan)
-    return after, Track(keypoints, status, lost, seen.sigma, seen.support, seen.seen)
+    return after, Track(keypoints, status, lost, seen.sigma, seen.support, seen.seen, seen.curvature, seen.gap)
 
 
 @functools.partial(jax.jit, static_argnames="config")

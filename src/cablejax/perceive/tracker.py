@@ -7,11 +7,15 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Array, Bool, Float
 
 from cablejax.limits import LIMITS
 from cablejax.perceive.frame import Status, Track, TrackerConfig, TrackState, judge, track
 from cablejax.perceive.initial import cloud_path, first_fit, path_length
+from cablejax.perceive.registration import CurveFit
+
+# Lengths of the cable over which a cloud and the grippers can hardly extend.
+_FARTHEST = 4.0
 
 
 class PaddedCloud(NamedTuple):
@@ -123,12 +127,33 @@ class Tracker:
                 f"The cloud has {count} usable points{dropped}, expected at least {config.min_points}: the cable is "
                 "occluded, or the camera does not look at it."
             )
-        found = path_length(cloud_path(cloud.points[cloud.mask], gripper_pose, config.registration.length))
+        length, used = config.registration.length, cloud.points[cloud.mask]
+        places = np.concatenate([used, np.asarray(gripper_pose, np.float32)[:, :2]])
+        across = float(np.ptp(places, axis=0).max())
+        begin = f"The cloud does not fit a cable of {length:.3g} m between these grippers: "
+        if across > _FARTHEST * length:
+            return f"{begin}together they extend over {across:.3g} m. Are both in metres, and in one frame?"
+        way = path_length(cloud_path(used, gripper_pose, length))
+        return f"{begin}{self._misfit(track)}. The shortest way along its points is {way:.3g} m."
+
+    def _misfit(self, track: Track) -> str:
+        """Which of the thresholds that `judge` looks at a fit does not keep, and what may be the reason."""
+        config, reach = self.config, f"{1e3 * self.config.reach:.0f} mm"
+        support, seen, sigma = float(track.support), float(track.seen), float(track.sigma)
+        if not support >= config.min_support:
+            return (
+                f"{support:.0%} of its points lie within {reach} of the best fit, expected {config.min_support:.0%}. "
+                "Is something else in the cloud, or is it in another frame than the grippers"
+            )
+        if not seen >= config.min_seen:
+            return f"{seen:.0%} of the cable have points, expected {config.min_seen:.0%}: is it hidden"
+        if not sigma <= config.max_sigma:
+            return f"its points scatter by {1e3 * sigma:.1f} mm, expected {1e3 * config.max_sigma:.0f} mm at most"
         return (
-            f"The cloud does not fit a cable of {config.registration.length:.3g} m between these grippers: "
-            f"{float(track.support):.0%} of its points lie within {1e3 * config.reach:.0f} mm of the best fit, "
-            f"expected {config.min_support:.0%} and no fold; the shortest way along its points is {found:.3g} m. "
-            "Check the cable, its length, and the frame of the cloud."
+            f"its points are near the best fit, which is bent to {float(track.curvature):.0f} 1/m (at most "
+            f"{config.max_curvature:.0f}) and misses the second gripper by {1e3 * float(track.gap):.0f} mm (at most "
+            f"{reach}). Check theta, the direction of the cable from gripper 0 to gripper 1 in rad, the order of the "
+            "grippers, and the length"
         )
 
     def _search(
@@ -151,15 +176,20 @@ class Tracker:
                     misfits=zero,
                     found=jnp.asarray(True),
                 )
-                return found, Track(fit.keypoints, status, zero, fit.sigma, fit.support, fit.seen)
-            support, seen, sigma = fit.support, fit.seen, fit.sigma
+                return found, Track(fit.keypoints, status, zero, *_quality(fit))
+            quality = _quality(fit)
         else:
-            status = jnp.asarray(Status.FEW_POINTS)
-            support, seen, sigma = jnp.asarray(0.0), jnp.asarray(0.0), state.sigma
+            status, zero = jnp.asarray(Status.FEW_POINTS), jnp.asarray(0.0)
+            quality = (state.sigma, zero, zero, zero, zero)
         if otherwise is not None:
             return state, otherwise
         nowhere = jnp.full((config.registration.n_keypoints, 2), jnp.nan)
-        return state, Track(nowhere, status, state.lost, sigma, support, seen)
+        return state, Track(nowhere, status, state.lost, *quality)
+
+
+def _quality(fit: CurveFit) -> tuple[Array, ...]:
+    """The last fields of a `Track`."""
+    return fit.sigma, fit.support, fit.seen, fit.curvature, fit.gap
 
 
 def _checked_pose(value: Float[np.ndarray, "Q 3"]) -> np.ndarray:
