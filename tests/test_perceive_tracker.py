@@ -104,7 +104,7 @@ def test_another_cable_is_not_taken_for_this_one(tracker, motion, started, lengt
 @pytest.mark.parametrize(
     ("turn", "scale", "shift", "words"),
     [
-        (np.pi, 1.0, 0.0, "Check theta"),
+        (np.pi, 1.0, 0.0, "is theta not the direction"),
         (0.0, 1e3, 0.0, "Are both in metres"),
         (0.0, 1.0, 0.3, "another frame than the grippers"),
     ],

@@ -143,7 +143,8 @@ class Tracker:
         if not support >= config.min_support:
             return (
                 f"{support:.0%} of its points lie within {reach} of the best fit, expected {config.min_support:.0%}. "
-                "Is something else in the cloud, or is it in another frame than the grippers"
+                "Is something else in the cloud, is it in another frame than the grippers, or is theta not the direction "
+                "of the cable from gripper 0 to gripper 1, in rad"
             )
         if not seen >= config.min_seen:
             return f"{seen:.0%} of the cable have points, expected {config.min_seen:.0%}: is it hidden"
