@@ -134,7 +134,7 @@ class Tracker:
         if across > _FARTHEST * length:
             return f"{begin}together they extend over {across:.3g} m. Are both in metres, and in one frame?"
         way = path_length(cloud_path(used, gripper_pose, length))
-        return f"{begin}{self._misfit(track)}. The shortest way along its points is {way:.3g} m."
+        return f"{begin}{self._misfit(track)} The shortest way along its points is {way:.3g} m."
 
     def _misfit(self, track: Track) -> str:
         """Which of the thresholds that `judge` looks at a fit does not keep, and what may be the reason."""
@@ -143,18 +143,18 @@ class Tracker:
         if not support >= config.min_support:
             return (
                 f"{support:.0%} of its points lie within {reach} of the best fit, expected {config.min_support:.0%}. "
-                "Is something else in the cloud, is it in another frame than the grippers, or is theta not the direction "
-                "of the cable from gripper 0 to gripper 1, in rad"
+                "Is something else in the cloud, is it in another frame than the grippers, or is theta not the "
+                "direction of the cable from gripper 0 to gripper 1, in rad?"
             )
         if not seen >= config.min_seen:
-            return f"{seen:.0%} of the cable have points, expected {config.min_seen:.0%}: is it hidden"
+            return f"{seen:.0%} of the cable have points, expected {config.min_seen:.0%}: is it hidden?"
         if not sigma <= config.max_sigma:
-            return f"its points scatter by {1e3 * sigma:.1f} mm, expected {1e3 * config.max_sigma:.0f} mm at most"
+            return f"its points scatter by {1e3 * sigma:.1f} mm, expected {1e3 * config.max_sigma:.0f} mm at most."
         return (
             f"its points are near the best fit, which is bent to {float(track.curvature):.0f} 1/m (at most "
             f"{config.max_curvature:.0f}) and misses the second gripper by {1e3 * float(track.gap):.0f} mm (at most "
             f"{reach}). Check theta, the direction of the cable from gripper 0 to gripper 1 in rad, the order of the "
-            "grippers, and the length"
+            "grippers, and the length."
         )
 
     def _search(
