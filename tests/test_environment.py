@@ -4,6 +4,8 @@ import dataclasses
 import functools
 import warnings
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -16,7 +18,14 @@ from gymnasium.utils.env_checker import check_env
 from cablejax.cable import Cable, Discretisation
 from cablejax.control.targets import make_target
 from cablejax.dataset.schema import Randomisation
-from cablejax.environment import ENVIRONMENT, LinkPolicy, ShapeCableConfig, ShapeCableEnv, ShapeCableVectorEnv
+from cablejax.environment import (
+    ENVIRONMENT,
+    LinkPolicy,
+    MjxShapeCable,
+    ShapeCableConfig,
+    ShapeCableEnv,
+    ShapeCableVectorEnv,
+)
 from cablejax.mpc import MPC, LevenbergMarquardt, MPCConfig
 from mpc_cases import relaxing_cable
 
@@ -136,6 +145,30 @@ def test_a_cable_that_diverges_ends_its_episode_alone(value):
     assert not terminated.any() and rewards[1] == 0.0
     seen, rewards, terminated, _, _ = many.step(np.zeros((3, 2, 3)))
     assert not terminated.any() and rewards[1] < 0.0
+
+
+@pytest.mark.parametrize("form", ["gymnasium", "jax"])
+def test_reward_is_of_the_true_keypoints_where_the_camera_is_off(form):
+    """From the first observation on; without noise the error is not that of what is observed."""
+    config = clean(targets=("U",), effects=("camera_similarity:scale=1.05,angle_rad=0.05,x_m=0.05,y_m=0.05",))
+    plain, target = dataclasses.replace(config, effects=()), make_target("U", config.cable).keypoints
+    seen, errors = [], []
+    for one in (config, plain):
+        if form == "gymnasium":
+            env = ShapeCableEnv(one)
+            first, info = env.reset(seed=0)
+            second, _, _, _, after = env.step(np.zeros((2, 3), np.float32))
+            seen.append([first["keypoints"], second["keypoints"]])
+            errors.append([info["error"], after["error"]])
+        else:
+            env = MjxShapeCable(one)
+            states = [state := env.reset(jax.random.key(0)), env.step(state, jnp.zeros(6))]
+            seen.append([np.asarray(state.obs)[: target.size].reshape(target.shape) for state in states])
+            errors.append([float(state.metrics["error"]) for state in states])
+    np.testing.assert_allclose(errors[0], errors[1], rtol=1e-5)
+    for off, true in zip(*seen, strict=True):
+        turned = true @ np.array([[np.cos(0.05), np.sin(0.05)], [-np.sin(0.05), np.cos(0.05)]])
+        np.testing.assert_allclose(off, 1.05 * turned + 0.05, atol=1e-5)
 
 
 def test_the_controller_is_a_policy():

@@ -167,6 +167,16 @@ def seen_by_camera(physics: Physics, keypoints: Any, interval: Any) -> Any:
     return in_camera_frame(physics, delayed(keypoints, physics.camera_lag / interval))
 
 
+def without_camera(physics: Physics) -> Physics:
+    """The physics seen in the world's frame: keypoints neither scaled, turned nor moved."""
+    return replace(
+        physics,
+        camera_scale=physics.camera_scale * 0.0 + 1.0,
+        camera_angle=physics.camera_angle * 0.0,
+        camera_offset=physics.camera_offset * 0.0,
+    )
+
+
 def in_camera_frame(physics: Physics, keypoints: Any) -> Any:
     """Keypoints [..., 2] scaled and turned about the world's origin, then moved [m]; see `seen_by_camera`."""
     xp, x, y = keypoints.__array_namespace__(), keypoints[..., 0], keypoints[..., 1]

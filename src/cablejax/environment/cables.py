@@ -16,6 +16,7 @@ from cablejax.control.run import shape_error_cm
 from cablejax.control.targets import Shape, Target, make_target, straight_start
 from cablejax.dataset.drawing import cable_params, draw_parameters
 from cablejax.dataset.schema import DatasetConfig, Randomisation
+from cablejax.effects.camera import in_camera_frame, without_camera
 from cablejax.effects.given import GivenEffect, parse_effect
 from cablejax.limits import check
 from cablejax.simulate.chain.engine import ChainEngine
@@ -145,7 +146,9 @@ class Cables:
         self._targets = [config.target(target) for target in config.targets]
         pose = straight_start(config.cable)
         self._start = self._engine.initial_state(pose[None])
-        self._shown = np.asarray(self._engine.rollout(*self._resting(), np.zeros((1, 1, 2, 3)))[1].keypoints[0, 0])
+        physics, start = self._resting()
+        rest = self._engine.rollout(without_camera(physics), start, np.zeros((1, 1, 2, 3)))[1]
+        self._shown = np.asarray(rest.keypoints[0, 0])
         if not np.isfinite(self._shown).all():
             raise ValueError(
                 f"The simulation of this cable by {config.discretisation.n_links} links diverges at rest. Check "
@@ -230,7 +233,8 @@ class Cables:
         twists = config.scale * np.clip(np.nan_to_num(np.asarray(actions, float), posinf=0.0, neginf=0.0), -1.0, 1.0)
         length = config.cable.length
         twists = config.limits.shortened(twists, self.gripper_pose, config.interval, length) * active[:, None, None]
-        self._state, shown = self._engine.rollout(self._physics, self._state, twists[:, None], config.interval)
+        truly = without_camera(self._physics)
+        self._state, shown = self._engine.rollout(truly, self._state, twists[:, None], config.interval)
         keypoints, poses = np.asarray(shown.keypoints[:, -1]), np.asarray(shown.gripper_pose[:, -1])
         diverged = ~(np.abs(keypoints) < config.room).all(axis=(1, 2))
         self.taken += active
@@ -244,7 +248,14 @@ class Cables:
         """Takes in the true keypoints [B, N, 2] of some rows."""
         config = self.config
         self.error[rows] = shape_error_cm(keypoints[rows], self.target[rows]) / (100.0 * config.cable.length)
-        self.keypoints[rows] = keypoints[rows]
+        physics = self._physics
+        camera = dataclasses.replace(
+            physics,
+            camera_scale=physics.camera_scale[:, None, None],
+            camera_angle=physics.camera_angle[:, None],
+            camera_offset=physics.camera_offset[:, None],
+        )
+        self.keypoints[rows] = in_camera_frame(camera, keypoints)[rows]
         if config.keypoint_noise:
             for row in np.flatnonzero(rows).tolist():
                 self.keypoints[row] += config.keypoint_noise * randoms[row].standard_normal(keypoints.shape[1:])

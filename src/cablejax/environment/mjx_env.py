@@ -19,6 +19,7 @@ from jaxtyping import Array, Float
 from cablejax.control.targets import straight_start
 from cablejax.dataset.drawing import cable_params, draw_parameters
 from cablejax.dataset.schema import Randomisation
+from cablejax.effects.camera import in_camera_frame, without_camera
 from cablejax.effects.physics import Physics, may_touch, without_obstacle
 from cablejax.environment.cables import ShapeCableConfig
 from cablejax.simulate.chain.engine import ChainEngine
@@ -79,7 +80,7 @@ class MjxShapeCable:
         target = jnp.asarray(self._targets)[jax.random.randint(choice, (), 0, len(self._targets))]
         start, zero = self._start, jnp.zeros(())
         seen = self._moved(physics, start, jnp.zeros((2, 3)))[1][0]
-        rng, obs, error = self._observed(rng, seen, start, target)
+        rng, obs, error = self._observed(rng, physics, seen, start, target)
         return State(start, obs, zero, zero, {"error": error}, {"rng": rng, "physics": physics, "target": target})
 
     def step(self, state: State, action: Float[Array, " 6"]) -> State:
@@ -95,7 +96,7 @@ class MjxShapeCable:
         after, (_, seen) = self._moved(info["physics"], before, twist)
         sound = (jnp.abs(seen) < config.room).all()
         data = jax.tree.map(lambda new, old: jnp.where(sound, new, old), after, before)
-        rng, obs, error = self._observed(info["rng"], seen, data, info["target"])
+        rng, obs, error = self._observed(info["rng"], info["physics"], seen, data, info["target"])
         obs, error = jnp.where(sound, obs, state.obs), jnp.where(sound, error, state.metrics["error"])
         done = ((error <= config.tolerance) | ~sound).astype(jnp.float32)
         return dataclasses.replace(
@@ -156,12 +157,13 @@ class MjxShapeCable:
     def _moved(self, physics: Physics, data: CableState, twist: Float[Array, "2 3"]):
         """The cable after a twist, and its true keypoints before and after, shape [2, N, 2]."""
         known = physics if self._obstacle else without_obstacle(physics)
-        data, shown = self._engine.unroll(known, data, twist[None], self.config.interval)
+        data, shown = self._engine.unroll(without_camera(known), data, twist[None], self.config.interval)
         return data, shown.keypoints
 
-    def _observed(self, rng: Array, keypoints: Float[Array, "N 2"], data: CableState, target: Float[Array, "N 2"]):
-        """The next key, an observation and the error."""
+    def _observed(self, rng: Array, physics: Physics, keypoints: Array, data: CableState, target: Array):
+        """The next key, an observation of the true keypoints [N, 2], and their error to the target [N, 2]."""
         error = jnp.sqrt(jnp.mean(jnp.sum((keypoints - target) ** 2, axis=-1))) / self.config.cable.length
+        keypoints = in_camera_frame(physics, keypoints)
         if noise := self.config.keypoint_noise:
             rng, own = jax.random.split(rng)
             keypoints = keypoints + noise * jax.random.normal(own, keypoints.shape)
