@@ -107,16 +107,9 @@ class Examined:
 
     def fields(self) -> dict[str, Any]:
         """The fields of `Diagnosis` that follow from these."""
-        conclusion = self.conclusion
-        return {
-            "verdict": conclusion.verdict,
-            "sentence": sentence(conclusion, self.gap.shrinkage),
-            "effects": conclusion.effects,
-            "equivalent": conclusion.equivalent,
-            "ranking": conclusion.ranking,
-            "leftover_p": conclusion.leftover_p,
-            "posterior": conclusion.posterior,
-            "under_laws": conclusion.under_laws,
+        shared = {f.name for f in dataclasses.fields(Conclusion)} & {f.name for f in dataclasses.fields(Diagnosis)}
+        return {name: getattr(self.conclusion, name) for name in shared} | {
+            "sentence": sentence(self.conclusion, self.gap.shrinkage),
             "gap": self.gap,
             "baselines": baselines(self.found, self.evidence),
         }
