@@ -10,7 +10,7 @@ import pytest
 from cablejax.diagnose import explanation
 from cablejax.diagnose.evidence import repeated_motions, share_of_motion
 from cablejax.diagnose.fit import evaluate, improve
-from cablejax.diagnose.profile import QUANTILE, profile_widths
+from cablejax.diagnose.posterior import QUANTILE, profile_widths
 from diagnose_cases import evidence, parts
 
 

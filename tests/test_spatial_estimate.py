@@ -16,10 +16,9 @@ from cablejax.diagnose.protocol import explanation
 from cablejax.simulate.rod import Rod
 from cablejax.spatial.cable import TWISTED, SpatialCable
 from cablejax.spatial.estimate import UNMODELLED, Interval, estimate, restarts
-from cablejax.spatial.identify import Identified, layout_of
+from cablejax.spatial.identify import Identified, TimeSteps, layout_of
 from cablejax.spatial.named import named_effects, parameters_of, quantities_of, with_both_drags
 from cablejax.spatial.search import with_effect
-from cablejax.spatial.time_steps import TimeSteps
 from cablejax.spatial.windows import windows_of
 
 _FOUND = ("bending_stiffness", "bending_damping")
