@@ -157,12 +157,12 @@ def identify(
     steps = search(
         picked,
         [name for name in names if name != TWISTED],
-        begun=memory.steps("search"),
+        begun=memory.done("search"),
         save=lambda found: memory.keep("search", found),
         progress=progress,
     )
     if TWISTED in names:
-        found = memory.steps("twisted")
+        found = memory.done("twisted")
         if not found:
             progress("rest curvature, which needs the material frame: slower")
             found = _twisted(picked, steps, progress)
@@ -186,7 +186,7 @@ def identify(
 
 def _estimates(cable: SpatialCable, first, begun, tried, memory: Memory, progress) -> list[Estimate]:
     """Of either half of the recordings, from the fits of the search, and of all."""
-    windows, done = cable.windows, memory.estimates()
+    windows, done = cable.windows, memory.done("estimates")
     parts = ((first, "one half"), (~first, "the other half"), (np.ones(len(windows), bool), "all recordings"))
     for part, word in parts[len(done) :]:
         progress(f"fitting {word}")
@@ -196,7 +196,7 @@ def _estimates(cable: SpatialCable, first, begun, tried, memory: Memory, progres
         else:
             starts = [best_start(own, done[0].explanation, done[1].explanation)]
         done.append(estimate(own, starts, tried, progress=progress))
-        memory.keep_estimates(done)
+        memory.keep("estimates", done)
     return done
 
 
