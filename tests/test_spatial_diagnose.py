@@ -131,8 +131,8 @@ def test_a_fit_finds_stiffness_and_damping():
 
 def test_finds_the_file_that_was_gripped_anew():
     (change,) = local_changes(cases.recording(regripped=2), (2, 2))
-    assert change.pair == (0, 1) and change.gripper == 0 and change.episodes == (2,)
-    assert "gripper 0" in change.sentence and "22.0 mm apart instead of 30.0 mm" in change.sentence
+    assert "file 2, keypoints 0 and 1 at gripper 0 " in change
+    assert "22.0 mm apart instead of 30.0 mm: it was gripped again." in change
     assert local_changes(cases.recording(), (2, 2)) == ()
 
 

@@ -75,7 +75,7 @@ def diagnose_space(
     progress(f"{len(windows)} windows of {WINDOW:g} s, {len(np.unique(windows.group))} recordings")
     changes = local_changes(log, windows.held)
     for change in changes:
-        progress(change.sentence)
+        progress(change)
     found = identify(windows, stiffness, cable["bending_damping_s"], only=only, state=state, progress=progress)
 
     density, guessed = cable["linear_density_kg_per_m"], "linear_density_kg_per_m" in log.meta.get("guessed", ())
@@ -92,12 +92,11 @@ def diagnose_space(
     if verdict in ("none", "unknown"):
         effects = ()
     offset = ParameterEstimate(constant_offset(after[use], windows.chosen(use)), None, "m")
-    first = [change.sentence for change in changes[:1]]
     nominal, explained = (in_log(log, windows, part) for part in (before, after))
     where = where_of(log, windows.chosen(use), nominal, before[use], noise, changes)
     return SpatialDiagnosis(
         verdict=verdict,
-        sentence=" ".join([verdict_sentence(verdict, effects, equivalent, (), gap.shrinkage or 0.0), *first]),
+        sentence=" ".join([verdict_sentence(verdict, effects, equivalent, (), gap.shrinkage or 0.0), *changes[:1]]),
         effects=effects,
         equivalent=equivalent,
         quantities=quantities_of(found, None if guessed else density) | {"constant_offset_m": offset},

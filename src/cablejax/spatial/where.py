@@ -11,7 +11,6 @@ from cablejax.diagnose.where import HORIZONS, Where
 from cablejax.diagnose.where_sizes import above, sizes_of
 from cablejax.spatial.cable import bounded
 from cablejax.spatial.gap import smallest_gap, squares
-from cablejax.spatial.geometry import LocalChange
 from cablejax.spatial.windows import Windows, labels
 from cablejax.types import GapLog
 
@@ -33,7 +32,7 @@ def where_of(
     nominal: Float[np.ndarray, "E T N 3"],
     before: Float[np.ndarray, "W T F 3"],
     noise: float,
-    changes: Sequence[LocalChange],
+    changes: Sequence[str],
 ) -> Where:
     """Keypoints, episodes and speeds at which the nominal simulator is off.
 
@@ -43,7 +42,7 @@ def where_of(
         nominal: predictions of the nominal simulator at the log's samples [m].
         before: the same of the windows [m].
         noise: standard deviation of a coordinate [m].
-        changes: of the set-up between recordings.
+        changes: of the set-up between recordings, in words.
     """
     off = bounded(np.asarray(log.keypoints, float) - nominal) ** 2
     off = np.where(np.isfinite(log.keypoints) & np.isfinite(nominal), off, np.nan)
@@ -62,7 +61,7 @@ def where_of(
             "speed: fast": float(above(np.where(fast, squared, np.nan), noise)),
             "speed: slow": float(above(np.where(fast, np.nan, squared), noise)),
         },
-        first=[change.sentence for change in changes],
+        first=changes,
     )
 
 
