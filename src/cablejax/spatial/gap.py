@@ -12,6 +12,7 @@ from cablejax.diagnose.diagnosis import Gap
 from cablejax.diagnose.evidence import Evidence
 from cablejax.diagnose.gap import measure_gap
 from cablejax.diagnose.noise import noise_floor
+from cablejax.diagnose.where_sizes import mean_of_finite
 from cablejax.spatial.cable import SpatialCable, bounded
 from cablejax.spatial.windows import Windows
 
@@ -41,9 +42,8 @@ def constant_offset(predicted: Float[np.ndarray, "W T F 3"], windows: Windows) -
     off = np.where(np.isfinite(windows.observed), windows.observed - predicted, np.nan)
     means = []
     for group in np.unique(windows.group):
-        part = off[windows.group == group].reshape(-1, *off.shape[2:])
-        seen = np.isfinite(part)
-        means.append((np.where(seen, part, 0.0).sum(axis=0) / np.maximum(seen.sum(axis=0), 1))[seen.any(axis=0)])
+        mean = mean_of_finite(off[windows.group == group].reshape(-1, *off.shape[2:]), 0)
+        means.append(mean[np.isfinite(mean)])
     return float(np.sqrt((np.concatenate(means) ** 2).mean()))
 
 
