@@ -159,7 +159,7 @@ def test_grips_of_every_recording_are_found_and_leave_the_stiffness_alone(cable)
     evidence, fits = seen.evidence(), {}
     for grips in (False, True):
         start = at(cable, _EFFECTS[: 2 + grips])
-        (fits[grips],) = improved(evidence, evaluate(evidence, [start]), 40)
+        (fits[grips],) = improve(evidence, evaluate(evidence, [start]), 40)
         assert fits[grips].result is Result.CONVERGED
     found = fits[True].explanation
     assert abs(found.z[0] - 0.7) < 0.05

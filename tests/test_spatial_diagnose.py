@@ -13,7 +13,7 @@ import spatial_cases as cases
 from cablejax.bounded import Result
 from cablejax.diagnose import explanation, verdict_json
 from cablejax.diagnose.diagnosis import ParameterEstimate
-from cablejax.diagnose.fit import evaluate, improved
+from cablejax.diagnose.fit import evaluate, improve
 from cablejax.log_geometry import setup_fault
 from cablejax.report.diagnosis_page import write_diagnosis_page
 from cablejax.simulate.rod import Rod
@@ -121,7 +121,7 @@ def test_a_fit_finds_stiffness_and_damping():
     effects = [cable.layout.named(name) for name in ("bending_stiffness", "bending_damping")]
     start = explanation(*((effect, 0, (value,)) for effect, value in zip(effects, (1.0, 0.05), strict=True)))
     evidence = cable.evidence()
-    (fit,) = improved(evidence, evaluate(evidence, [start]), cable.plan.last_steps)
+    (fit,) = improve(evidence, evaluate(evidence, [start]), cable.plan.last_steps)
     assert fit.result is Result.CONVERGED
     assert errors(cable.motion(fit.explanation), windows).mean() < 0.1 * before
     (ratio,), (damping,) = fit.explanation.values()

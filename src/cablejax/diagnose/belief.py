@@ -206,12 +206,6 @@ def log_scores(fits: Sequence[Fit], evidence: Evidence, calibration: Calibration
     return np.array([evidence.log_likelihood(fit.held_out_sse(evidence)) - cost(fit.explanation) for fit in fits])
 
 
-def probabilities(scores: Float[np.ndarray, "F"]) -> Float[np.ndarray, "F"]:
-    """Normalised exponentials."""
-    weights = np.exp(scores - scores.max())
-    return weights / weights.sum()
-
-
 def in_doubt(
     fits: Sequence[Fit], scores: Float[np.ndarray, "F"], evidence: Evidence, calibration: Calibration
 ) -> tuple[list[Fit], Float[np.ndarray, "K"]]:

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float
+from scipy.special import softmax
 
 from cablejax.arrays import wrapped
 from cablejax.diagnose.belief import (
@@ -20,7 +21,6 @@ from cablejax.diagnose.belief import (
     leftover_p,
     leftover_score,
     level,
-    probabilities,
 )
 from cablejax.diagnose.diagnosis import (
     PLACES,
@@ -98,7 +98,7 @@ def _concluded(
     `drawn` are draws by the simulator's own law, where there are some.
     """
     nothing = np.zeros((0, 0))
-    chances = probabilities(found.scores)
+    chances = softmax(found.scores)
     best = found.fits[0]
     null = next(fit for fit in found.fits if not fit.explanation.terms)
     gap = excess(float(null.sse.sum()), evidence)
@@ -201,7 +201,7 @@ def _ranking(found: Search, evidence: Evidence, calibration: Calibration) -> tup
     singles = [(f, s) for f, s in zip(found.fits, found.scores, strict=True) if len(effect_names(f.explanation)) == 1]
     if not singles:
         return ()
-    chances = probabilities(np.array([s for _, s in singles]))
+    chances = softmax(np.array([s for _, s in singles]))
     null = next(fit for fit in found.fits if not fit.explanation.terms)
     before = max(float(null.held_out_sse(evidence).sum()) - evidence.count.sum(), 1e-9)
     result = []

@@ -96,8 +96,11 @@ def diagnose(
     repaired = case.recording.as_log(log.meta)
     rounds = rounds_of(log, found.fits, found.scores, evidence, calibration)
     caveats = _caveats(case, calibration, length, stated, commissioned=bool(commissioning))
+    fields = Examined(evidence, found, conclusion, reference, after, gap).fields()
+    if alone.verdict == "none" and case.arms.strays(calibration.smallest_gap(0.0)):
+        fields["sentence"] = _ONLY_ARMS
     diagnosis = CableDiagnosis(
-        **Examined(evidence, found, conclusion, reference, after, gap).fields() | _of_arms(alone, case, calibration),
+        **fields,
         where=localise(repaired, case.to_log(reference), case.noise.std),
         next_motion=following,
         caveats=(*_contradictions(rounds), *caveats, *none_kept),
@@ -223,12 +226,6 @@ def _contradictions(rounds: Rounds | None) -> tuple[str, ...]:
         f"the rest, as recordings of one set-up would be in fewer than {UNLIKELY:g} of all cases. Check what was "
         "changed between them, and diagnose each one alone.",
     )
-
-
-def _of_arms(alone: Conclusion, case: Case, calibration: Calibration) -> dict[str, Any]:
-    """The sentence of a verdict that is about the arms only; `alone` is what the cable showed."""
-    only = alone.verdict == "none" and case.arms.strays(calibration.smallest_gap(0.0))
-    return {"sentence": _ONLY_ARMS} if only else {}
 
 
 def _caveats(

@@ -15,7 +15,7 @@ from cablejax.diagnose.belief import Calibration, has_gap, level
 from cablejax.diagnose.conclude import Conclusion, baselines, conclude, sentence
 from cablejax.diagnose.diagnosis import Diagnosis, Gap
 from cablejax.diagnose.evidence import Evidence
-from cablejax.diagnose.fit import Fit, evaluate, improved
+from cablejax.diagnose.fit import Fit, evaluate, improve
 from cablejax.diagnose.gap import held_out_predictions, measure_gap
 from cablejax.diagnose.given_arrays import checked_nominal, recorded_arrays, spread_of
 from cablejax.diagnose.laws import by_other_laws
@@ -196,7 +196,7 @@ def explain(
 
 def _null(evidence: Evidence) -> Fit:
     """The nominal simulator, with what each recording has for its own."""
-    return improved(evidence, evaluate(evidence, [explanation()]), evidence.simulator.plan.last_steps)[0]
+    return improve(evidence, evaluate(evidence, [explanation()]), evidence.simulator.plan.last_steps)[0]
 
 
 def settings_of(simulator: Simulator, calibration: Calibration) -> dict:

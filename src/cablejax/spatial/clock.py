@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
-from jaxtyping import Float
 
 from cablejax.diagnose.clock import keypoints_at
 from cablejax.recordings.poses import poses_at
@@ -40,7 +39,11 @@ def on_one_clock(log: GapLog) -> tuple[GapLog, tuple[str, ...]]:
         grid = interval * np.arange(samples)
         before = np.clip(np.searchsorted(time, grid + 1e-9, side="right") - 1, 0, n - 1)
         whole["time"][e] = interval * np.arange(max(length))
-        whole["keypoints"][e, :samples] = _points(grid, time, log.keypoints[e, :n].astype(float), interval)
+        points = log.keypoints[e, :n].astype(float)
+        if n > 1:
+            # an episode may be slower than the clock: a gap is one in its own clock
+            points = keypoints_at(grid, time, points, max(interval, float(np.median(np.diff(time)))))
+        whole["keypoints"][e, :samples] = points
         whole["gripper_pose"][e] = poses_at(interval * np.arange(max(length)), time, log.gripper_pose[e, :n])
         whole["gripper_command"][e, :samples] = log.gripper_command[e, before]
         if log.hold is not None:
@@ -50,9 +53,3 @@ def on_one_clock(log: GapLog) -> tuple[GapLog, tuple[str, ...]]:
         f"{1e3 * interval:.3g} ms."
     )
     return dataclasses.replace(log, episode_length=np.array(length, np.int32), **whole), (report,)
-
-
-def _points(grid, time, points: Float[np.ndarray, "T N 3"], interval: float) -> Float[np.ndarray, "G N 3"]:
-    # an episode may be slower than the clock: a gap is one in its own clock
-    own = max(interval, float(np.median(np.diff(time)))) if len(time) > 1 else interval
-    return keypoints_at(grid, time, points, own) if len(time) > 1 else points
