@@ -78,7 +78,6 @@ def diagnose_simulator(
     return Diagnosis(
         **examined.fields(),
         where=None,
-        next_motion=None,
         caveats=tuple(caveats),
         seconds=time.perf_counter() - begin,
         settings=settings_of(simulator, calibration),

@@ -130,11 +130,9 @@ def read_verdict(path: str | os.PathLike[str]) -> Diagnosis:
                 unit=str(gap["unit"]),
             ),
             where=None,
-            next_motion=None,
             baselines=dict(verdict["baselines"]),
             caveats=tuple(map(str, verdict["caveats"])),
             seconds=float(verdict["seconds"]),
-            settings={},
             posterior=tuple(
                 tuple(EffectValues(str(one["name"]), dict(one["parameters"])) for one in draw)
                 for draw in verdict.get("posterior", ())

@@ -20,11 +20,10 @@ from cablejax.spatial.accidents import accident_sentences, kept, moderated, off
 from cablejax.spatial.cable import errors
 from cablejax.spatial.clock import on_one_clock
 from cablejax.spatial.effects import GRIP
-from cablejax.spatial.gap import constant_offset, gap_of, noise_of, smallest_gap
+from cablejax.spatial.gap import constant_offset, gap_of, in_log, noise_of, smallest_gap, where_of
 from cablejax.spatial.geometry import local_changes
 from cablejax.spatial.identify import Identified, identify
 from cablejax.spatial.named import named_effects, quantities_of, with_both_drags
-from cablejax.spatial.where import in_log, where_of
 from cablejax.spatial.windows import WINDOW, windows_of
 from cablejax.types import GapLog
 
@@ -101,15 +100,12 @@ def diagnose_space(
         equivalent=equivalent,
         quantities=quantities_of(found, None if guessed else density) | {"constant_offset_m": offset},
         ranking=_ranking(found),
-        leftover_p=None,
         gap=gap,
         where=where,
-        next_motion=None,
-        baselines={},
         caveats=(
             *repairs,
             *accident_sentences(lost, error, windows, results == RodResult.COARSE),
-            *_caveats(log, windows, left_out, found),
+            *_caveats(windows, left_out, found),
         ),
         log=log,
         nominal=nominal,
@@ -156,7 +152,7 @@ def _ranking(found: Identified) -> tuple[Ranked, ...]:
     return tuple(ranked)
 
 
-def _caveats(log, windows, left_out, found) -> tuple[str, ...]:
+def _caveats(windows, left_out, found) -> tuple[str, ...]:
     result = [
         "The motion of a hanging cable does not depend on its weight: stiffness, drag and added masses are known "
         "relative to the linear density only, that of the cable with its markers, and a wrong density "

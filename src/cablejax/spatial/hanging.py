@@ -204,8 +204,6 @@ def diagnose_wire(photographs: Photographs, progress: Callable[[str], None] = la
     return WireDiagnosis(
         **examined.fields(),
         where=where,
-        next_motion=None,
-        caveats=(),
         seconds=time.perf_counter() - begun,
         settings=settings_of(wire, calibration),
         stiffness=_stiffness(examined, calibration),
