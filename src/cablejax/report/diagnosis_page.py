@@ -10,7 +10,7 @@ import numpy as np
 
 from cablejax.diagnose.belief import Calibration
 from cablejax.diagnose.diagnosis import CableDiagnosis, NamedEffect, Verdict
-from cablejax.diagnose.judgement import FAINT, listed, look_alikes
+from cablejax.diagnose.judgement import FAINT, effect_title, listed, look_alikes
 from cablejax.diagnose.verdict_json import write_verdict
 from cablejax.gaplog import SIMULATED, write_gap_log
 from cablejax.report import diagnosis_sections as sections
@@ -21,7 +21,6 @@ from cablejax.report.effect_words import (
     MOTIONS,
     between,
     effect_place,
-    effect_title,
     error_falls,
     explained_label,
     millimetres,

@@ -12,8 +12,9 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from cablejax.diagnose.diagnosis import NextMotion
+from cablejax.diagnose.judgement import effect_title
 from cablejax.report.animation import OVERSAMPLING, Canvas, save_frames
-from cablejax.report.effect_words import effect_title, explanation_title
+from cablejax.report.effect_words import explanation_title
 from cablejax.report.style import DIAGNOSIS_STYLE, LIGHT, cable_curve, gripper_outline
 
 _COLOURS = (LIGHT.residual, LIGHT.direct, "#009e73", "#cc79a7", "#e69f00")
