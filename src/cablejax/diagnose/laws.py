@@ -15,8 +15,8 @@ import numpy as np
 
 from cablejax.diagnose.belief import Calibration, in_doubt, log_scores
 from cablejax.diagnose.evidence import Evidence
-from cablejax.diagnose.fit import Fit, evaluate, improve
-from cablejax.diagnose.protocol import Explanation, explanation
+from cablejax.diagnose.fit import evaluate, improve
+from cablejax.diagnose.protocol import explanation
 from cablejax.diagnose.refits import refitted
 from cablejax.diagnose.search import Search
 
@@ -36,10 +36,6 @@ class Law:
     evidence: Evidence
     found: Search
     probability: float
-
-    def fit_of(self, one: Explanation) -> Fit | None:
-        """The fit of the same terms by this law."""
-        return next((fit for fit in self.found.fits if fit.explanation.terms == one.terms), None)
 
 
 def by_other_laws(found: Search, evidence: Evidence, calibration: Calibration) -> tuple[Law, ...]:

@@ -53,7 +53,7 @@ def draws(evidence: Evidence, fit: Fit, calibration: Calibration) -> Float[np.nd
 
 def drawn_by(law: Law, best: Fit, calibration: Calibration) -> tuple[Fit, Float[np.ndarray, "D P"]] | None:
     """The fit of the same terms by another law, and draws of its coordinates; None where the law counts for nothing."""
-    same = law.fit_of(best.explanation)
+    same = next((fit for fit in law.found.fits if fit.explanation.terms == best.explanation.terms), None)
     if same is None or not same.explanation.terms or law.probability < 1.0 / _DRAWS:
         return None
     return same, draws(law.evidence, same, calibration)

@@ -55,7 +55,7 @@ def search(
         calibration: of the judgement.
         progress: called with a line of text before each stage.
     """
-    gap = excess(float(null.sse.sum()), evidence)
+    gap = excess(null, evidence)
     effects = evidence.simulator.effects
     progress(f"screening {len(effects)} effects")
     templates = screen(evidence, null.explanation, effects, evidence.nominal)
@@ -77,7 +77,7 @@ def search(
     def grow(fits: list[Fit], bases: Sequence[Fit]) -> list[Fit]:
         """Sets of one more effect each, until the best is adequate or the next one no better."""
         for size in range(1 + max(len(base.explanation.terms) for base in bases), _MOST_TERMS + 1):
-            left, noise = excess(float(fits[0].sse.sum()), evidence), level(evidence)
+            left, noise = excess(fits[0], evidence), level(evidence)
             alone = len(effect_names(fits[0].explanation)) == 1
             enough = calibration.needs_no_other(gap, noise) if alone else calibration.may_leave(gap, noise)
             if left <= enough:
