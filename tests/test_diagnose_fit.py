@@ -132,7 +132,7 @@ def test_a_motion_that_nothing_explains_does_not_hide_the_cause_of_the_others():
     assert explains_most_motions(right, null, facts, calibration)
     assert not explains_most_motions(wrong, null, facts, calibration)
     # over the whole log all leave about the same
-    assert excess(float(wrong.sse.sum()), facts) < calibration.as_good * excess(float(right.sse.sum()), facts)
+    assert excess(wrong, facts) < calibration.as_good * excess(right, facts)
     assert not as_good(wrong, right, facts, calibration)
     assert as_good(right, right, facts, calibration)
     scores = log_scores([right, wrong, null], facts, calibration)
@@ -146,7 +146,7 @@ def test_a_motion_that_nothing_explains_does_not_hide_the_cause_of_the_others():
     assert beside_unknown(effect, None).probability is None
     assert [effect.name for effect in conclusion.effects] == ["gripper_rotation_offset"]
     assert conclusion.equivalent == ()
-    left, gap = (excess(float(fit.sse.sum()), facts) for fit in (right, null))
+    left, gap = (excess(fit, facts) for fit in (right, null))
     assert conclusion.leftover_p == leftover_p(leftover_score(left, gap, level(facts), calibration)) < 0.05
     assert ", 70 %, looks" in sentence(conclusion, 0.7) and ", 0 %, looks" in sentence(conclusion, -0.2)
     assert f", {100 * conclusion.explained:.0f} %, looks" in sentence(conclusion, None)

@@ -9,7 +9,7 @@ import pytest
 
 from cablejax.diagnose import Calibration, Effect, Parameter, Simulator, diagnose_simulator, explanation
 from cablejax.diagnose.belief import LEAST_SQUARES
-from cablejax.diagnose.fit import evaluate, improved
+from cablejax.diagnose.fit import evaluate, improve
 from cablejax.diagnose.protocol import Plan
 from cablejax.diagnose.refits import refitted
 from cablejax.diagnose.run import weighed
@@ -74,7 +74,7 @@ def test_unseen_recordings_have_none_unless_they_are_fitted_too():
         evidence = weighed(
             simulator, observed, np.zeros_like(observed), np.array([_NOISE]), Ramps.recording, _CALIBRATION
         )
-        (fit,) = refitted(evidence, improved(evidence, evaluate(evidence, [start]), 20))
+        (fit,) = refitted(evidence, improve(evidence, evaluate(evidence, [start]), 20))
         assert fit.refits is not None and len(fit.refits.left_out) == 4
         np.testing.assert_allclose([one.z[0] for one in fit.refits.explanations], 0.7, atol=0.05)
         assert sorted(np.concatenate(fit.refits.left_out)) == list(range(_EPISODES))

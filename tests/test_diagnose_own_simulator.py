@@ -386,7 +386,7 @@ def test_batches_are_of_one_size_and_pairs_in_place():
 
 GENERIC = (
     "belief", "conclude", "diagnosis", "evidence", "fit", "gap", "given_arrays", "judgement", "laws",
-    "noise", "posterior", "profile", "protocol", "refits", "run", "screen", "search",
+    "noise", "posterior", "protocol", "refits", "run", "screen", "search",
 )  # fmt: skip
 ALLOWED = {f"cablejax.diagnose.{name}" for name in GENERIC} | {
     "cablejax.arrays",

@@ -25,9 +25,8 @@ from cablejax.report.effect_words import effect_place, quantity, share
 from cablejax.report.spatial_figures import recording_ends
 from cablejax.simulate.rod import Rod
 from cablejax.spatial.cable import SpatialCable
-from cablejax.spatial.gap import constant_offset, gap_of, noise_of
+from cablejax.spatial.gap import constant_offset, gap_of, in_log, noise_of, where_of
 from cablejax.spatial.identify import layout_of
-from cablejax.spatial.where import in_log, where_of
 from cablejax.spatial.windows import windows_of
 from diagnose_cases import log_of, poses
 

@@ -9,7 +9,7 @@ import pytest
 from cablejax.diagnose import Calibration
 from cablejax.diagnose.belief import log_scores
 from cablejax.diagnose.evidence import Evidence
-from cablejax.diagnose.fit import evaluate, improved
+from cablejax.diagnose.fit import evaluate, improve
 from cablejax.diagnose.protocol import explanation
 from cablejax.diagnose.rounds import Rounds, rounds_of
 from diagnose_cases import clean, evidence_of, log_of, parts
@@ -30,7 +30,7 @@ def _mixed(*effects) -> Evidence:
 def _rounds(evidence: Evidence) -> tuple[Rounds, np.ndarray]:
     """The rounds of two recordings, and the scores of the explanations, best first."""
     starts = [explanation(*parts(one)) for one in (SOFT, RUBBED)]
-    fits = improved(evidence, evaluate(evidence, [explanation(), *starts]), 12)
+    fits = improve(evidence, evaluate(evidence, [explanation(), *starts]), 12)
     scores = log_scores(fits, evidence, CALIBRATION)
     order = np.argsort(-scores)
     log = log_of(np.nan_to_num(evidence.observed))

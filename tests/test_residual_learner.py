@@ -67,7 +67,6 @@ def test_what_has_predicted_well_is_believed_and_the_mixture_is_never_much_worse
     *candidates, mixture = np.asarray(state.loss)
     # it starts undecided, and loses what no correction loses in a step
     assert mixture <= 1.1 * min(candidates) + candidates[NONE] / 40
-    assert float(state.regret) == pytest.approx(mixture - min(candidates), abs=1e-9)
     if kind != "nothing":
         assert mixture < 0.5 * candidates[NONE]
 

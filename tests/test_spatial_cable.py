@@ -10,7 +10,7 @@ import pytest
 import spatial_cases as cases
 from cablejax.bounded import Result
 from cablejax.diagnose.evidence import Robust
-from cablejax.diagnose.fit import Fit, evaluate, improved
+from cablejax.diagnose.fit import Fit, evaluate, improve
 from cablejax.diagnose.protocol import Explanation, explanation
 from cablejax.simulate.rod import Rod
 from cablejax.spatial.cable import SpatialCable
@@ -159,7 +159,7 @@ def test_grips_of_every_recording_are_found_and_leave_the_stiffness_alone(cable)
     evidence, fits = seen.evidence(), {}
     for grips in (False, True):
         start = at(cable, _EFFECTS[: 2 + grips])
-        (fits[grips],) = improved(evidence, evaluate(evidence, [start]), 40)
+        (fits[grips],) = improve(evidence, evaluate(evidence, [start]), 40)
         assert fits[grips].result is Result.CONVERGED
     found = fits[True].explanation
     assert abs(found.z[0] - 0.7) < 0.05
@@ -179,9 +179,9 @@ def test_what_was_done_is_read_back(cable, tmp_path):
     memory.keep("search", [step])
     size = cable.layout.size
     told = Estimate(cable.layout, one, np.ones((3, size)), np.zeros((0, size)), 0.7, settled=False)
-    memory.keep_estimates([told])
+    memory.keep("estimates", [told])
     again = Memory(path, "mark", cable.layout)
-    (read,), (estimated,) = again.steps("search"), again.estimates()
+    (read,), (estimated,) = again.done("search"), again.done("estimates")
     assert (read.effect, read.accepted, read.chance) == ("bending_damping", True, 0.9)
     assert (estimated.speed, estimated.settled) == (0.7, False)
     for name in ("shared", "moves", "shifts"):
@@ -190,4 +190,4 @@ def test_what_was_done_is_read_back(cable, tmp_path):
         assert kept.terms == one.terms
         np.testing.assert_array_equal(kept.z, one.z)
         np.testing.assert_array_equal(kept.own, one.own)
-    assert read.halves[1].terms == () and Memory(path, "other", cable.layout).steps("search") == []
+    assert read.halves[1].terms == () and Memory(path, "other", cable.layout).done("search") == []

@@ -11,15 +11,14 @@ import numpy as np
 import pytest
 
 import spatial_cases as cases
-from cablejax.diagnose.fit import evaluate, improve, improved
+from cablejax.diagnose.fit import evaluate, improve
 from cablejax.diagnose.protocol import explanation
 from cablejax.simulate.rod import Rod
 from cablejax.spatial.cable import TWISTED, SpatialCable
 from cablejax.spatial.estimate import UNMODELLED, Interval, estimate, restarts
-from cablejax.spatial.identify import Identified, layout_of
+from cablejax.spatial.identify import Identified, TimeSteps, layout_of
 from cablejax.spatial.named import named_effects, parameters_of, quantities_of, with_both_drags
 from cablejax.spatial.search import with_effect
-from cablejax.spatial.time_steps import TimeSteps
 from cablejax.spatial.windows import windows_of
 
 _FOUND = ("bending_stiffness", "bending_damping")
@@ -33,7 +32,7 @@ def fitted():
     cable = SpatialCable(Rod(16, twisting=False), layout_of(windows, cases.NOMINAL), windows)
     start = explanation(*((cable.layout.named(n), 0, (v,)) for n, v in zip(_FOUND, (1.0, 0.05), strict=True)))
     evidence = cable.evidence()
-    (fit,) = improved(evidence, evaluate(evidence, [start]), 40)
+    (fit,) = improve(evidence, evaluate(evidence, [start]), 40)
     return cable, fit.explanation
 
 

@@ -11,8 +11,7 @@ import spatial_cases as cases
 from cablejax.diagnose.protocol import explanation
 from cablejax.simulate.rod import Rod
 from cablejax.spatial.cable import SpatialCable
-from cablejax.spatial.identify import layout_of
-from cablejax.spatial.time_steps import time_steps_for
+from cablejax.spatial.identify import layout_of, time_steps_for
 from cablejax.spatial.windows import Windows, windows_of
 
 _EDGES = 16

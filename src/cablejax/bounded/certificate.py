@@ -23,18 +23,14 @@ class Certificate:
         stationarity: largest element of `g + N' lambda`, N the constraints' derivatives, shape [].
         feasibility: by how much the worst bound is broken, shape [].
         complementarity: largest product of a multiplier and its constraint's slack, shape [].
-        smallest_multiplier: of the nearly active bounds; not negative by construction, and near zero where a bound is
-            touched without holding anything back, shape [].
-        multipliers: lambda, shape [K].
-        projected_gradient: largest element of `P(y - g) - y`, shape [].
+        multipliers: lambda, not negative by construction; that of a nearly active bound is near zero where the bound is
+            touched without holding anything back, shape [K].
     """
 
     stationarity: Float[Array, "*batch"]
     feasibility: Float[Array, "*batch"]
     complementarity: Float[Array, "*batch"]
-    smallest_multiplier: Float[Array, "*batch"]
     multipliers: Float[Array, "*batch K"]
-    projected_gradient: Float[Array, "*batch"]
 
     @property
     def residual(self) -> Float[Array, "*batch"]:
@@ -72,9 +68,7 @@ def certify(
         stationarity=jnp.abs(slope + multipliers @ normals).max(),
         feasibility=feasible.violation(y),
         complementarity=jnp.abs(multipliers * slack).max(),
-        smallest_multiplier=jnp.min(jnp.where(active, multipliers, jnp.inf)),
         multipliers=multipliers,
-        projected_gradient=projected_gradient_size(feasible.at(y), y, gradient),
     )
 
 

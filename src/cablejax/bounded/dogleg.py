@@ -2,39 +2,26 @@
 
 from __future__ import annotations
 
-import equinox as eqx
 import jax.numpy as jnp
 import optimistix as optx
-from jaxtyping import Array, Float
 
 from cablejax.bounded.gain_ratio import GainRatio
 from cablejax.bounded.gauss_newton import regularised
 from cablejax.bounded.least_squares import AbstractBoundedLeastSquares, ModelDescent
 
 
-class LegsState(eqx.Module):
-    """The corners of the dogleg, as steps from y.
-
-    Attributes:
-        cauchy: to the model's minimum along the projected gradient, shape [P].
-        newton: to its minimum over the set, shape [P].
-    """
-
-    cauchy: Float[Array, " P"]
-    newton: Float[Array, " P"]
-
-
 class BoundedDoglegDescent(ModelDescent):
     """`step(s)` goes along two legs, to the projected Cauchy point and on to the model's minimum over the set.
 
     It stops at the length `s |newton|`, the trust region; s = 1 is the whole way (as in `optimistix.DoglegDescent`).
-    The corners are feasible, so on a convex set the legs are.
+    The corners are feasible, so on a convex set the legs are. They are the state, as steps [P] from y: to the model's
+    minimum along the projected gradient, and to its minimum over the set.
     """
 
     def init(self, y, f_info_struct):
         """Two legs of length zero."""
         del f_info_struct
-        return LegsState(jnp.zeros_like(y), jnp.zeros_like(y))
+        return jnp.zeros_like(y), jnp.zeros_like(y)
 
     def query(self, y, f_info, state):
         """Computes both legs at a new point: to the Cauchy point, and to the minimum of the model in the set."""
@@ -49,13 +36,13 @@ class BoundedDoglegDescent(ModelDescent):
         # the projection bends the ray: along the chord the model may have its minimum before the end
         slope, curvature = jnp.sum(gradient * cauchy), cauchy @ model @ cauchy
         cauchy = cauchy * jnp.clip(-slope / (curvature + tiny), 0.0, 1.0)
-        return LegsState(cauchy, self.minimum(model, gradient))
+        return cauchy, self.minimum(model, gradient)
 
     def step(self, step_size, state):
         """The point on the two legs whose distance along them is `step_size * |newton|`."""
-        tiny = jnp.finfo(step_size.dtype).tiny
-        cauchy, leg = state.cauchy, state.newton - state.cauchy
-        reach = step_size * jnp.linalg.norm(state.newton)
+        tiny, (cauchy, newton) = jnp.finfo(step_size.dtype).tiny, state
+        leg = newton - cauchy
+        reach = step_size * jnp.linalg.norm(newton)
         near = jnp.linalg.norm(cauchy)
         first = cauchy * jnp.minimum(reach / (near + tiny), 1.0)
         # |cauchy + t leg| = reach, by the greater root, written without cancellation

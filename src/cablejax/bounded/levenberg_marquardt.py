@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import equinox as eqx
 import jax.numpy as jnp
 import optimistix as optx
-from jaxtyping import Array, Float
 
 from cablejax.bounded.gain_ratio import GainRatio
 from cablejax.bounded.least_squares import AbstractBoundedLeastSquares, ModelDescent
@@ -14,38 +12,30 @@ _DAMPING = 1e-3
 """At a step size of 1, relative to the diagonal of the model's Hessian."""
 
 
-class ModelState(eqx.Module):
-    """The model at a point, as a descent keeps it.
-
-    Attributes:
-        gradient: shape [P].
-        hessian: positive semi-definite, shape [P, P].
-    """
-
-    gradient: Float[Array, " P"]
-    hessian: Float[Array, "P P"]
-
-
 class DampedQuadratic(ModelDescent):
-    """`step(s)` minimises `g'd + d'(H + diag H / 1000 s) d / 2` over the d with y + d feasible."""
+    """`step(s)` minimises `g'd + d'(H + diag H / 1000 s) d / 2` over the d with y + d feasible.
+
+    Its state is the gradient [P] and the positive semi-definite Hessian [P, P] of the model.
+    """
 
     def init(self, y, f_info_struct):
         """A model with the identity as its Hessian."""
         del f_info_struct
-        return ModelState(jnp.zeros_like(y), jnp.eye(y.size, dtype=y.dtype))
+        return jnp.zeros_like(y), jnp.eye(y.size, dtype=y.dtype)
 
     def query(self, y, f_info, state):
         """Keeps gradient and Hessian of the model at a new point."""
         del y, state
-        return ModelState(f_info.grad, self.convex(f_info))
+        return f_info.grad, self.convex(f_info)
 
     def step(self, step_size, state):
         """The minimum over the set of the model, damped less the larger the step size."""
-        diagonal = jnp.diag(state.hessian)
+        gradient, hessian = state
+        diagonal = jnp.diag(hessian)
         # no more than keeps what the model does not see at all from being singular: scales differ by as much as 1e10
         floor = jnp.finfo(diagonal.dtype).eps * diagonal.max() + jnp.finfo(diagonal.dtype).tiny
-        damped = state.hessian + jnp.diag(_DAMPING / step_size * jnp.maximum(diagonal, floor))
-        return self.minimum(damped, state.gradient), optx.RESULTS.successful
+        damped = hessian + jnp.diag(_DAMPING / step_size * jnp.maximum(diagonal, floor))
+        return self.minimum(damped, gradient), optx.RESULTS.successful
 
 
 class BoundedLevenbergMarquardt(AbstractBoundedLeastSquares):

@@ -58,7 +58,9 @@ def minimise_quadratic(
 
 @jax.jit
 def _minimum(quadrics: Quadrics, hessian, linear, start) -> QuadraticMinimum:
-    step, multipliers, converged, iterations = _solve(quadrics, hessian, linear, start)
+    problem = quadrics, hessian, linear, start
+    solution = interior_point(*jax.lax.stop_gradient(problem))
+    step, multipliers, converged, iterations = _solved(solution, *problem)
     return QuadraticMinimum(_inside(quadrics, start, step), multipliers, converged, iterations)
 
 
@@ -118,12 +120,6 @@ def _inside(quadrics: Quadrics, start, step):
     return start + jnp.clip(reach.min(), 0.0, 1.0) * step
 
 
-def _solve(quadrics: Quadrics, hessian, linear, centre):
-    """`interior_point`, with derivatives."""
-    problem = quadrics, hessian, linear, centre
-    return _solved(interior_point(*jax.lax.stop_gradient(problem)), *problem)
-
-
 @eqx.filter_custom_jvp
 def _solved(solution, quadrics: Quadrics, hessian, linear, centre):
     """The known solution of a problem, with its derivatives by the problem."""
@@ -139,7 +135,8 @@ def _solved_jvp(primals, tangents):
     quadrics, hessian, _, centre = primals
     size = step.size
     z = quadrics.lift(centre + step)
-    active = multipliers > -quadrics.of_lift(z) * jnp.abs(multipliers).max() / _typical_length(quadrics, step)
+    length = jnp.abs(quadrics.matrix @ step).max() + jnp.finfo(step.dtype).tiny
+    active = multipliers > -quadrics.of_lift(z) * jnp.abs(multipliers).max() / length
     binding = jnp.where(active, multipliers, 0.0)
 
     def conditions(quadrics, hessian, linear, centre):
@@ -157,7 +154,3 @@ def _solved_jvp(primals, tangents):
     moved = jnp.linalg.solve(matrix, -change)
     tangent = moved[:size], jnp.where(active, moved[size:], 0.0)
     return (step, multipliers, converged, iterations), (*tangent, None, None)
-
-
-def _typical_length(quadrics: Quadrics, step):
-    return jnp.abs(quadrics.matrix @ step).max() + jnp.finfo(step.dtype).tiny

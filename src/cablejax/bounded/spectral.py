@@ -60,20 +60,15 @@ class ProjectionArc(optx.AbstractDescent):
         # Along a direction of no or negative curvature the model gives no length: try a longer one than before.
         length = jnp.clip(jnp.where(curved, spectral, 4.0 * state.length), self.shortest, self.longest)
         length = jnp.where(state.first, state.length, length)
-        feasible = _set(self.feasible)
-        optimality = projected_gradient_size(feasible, y, f_info.grad)
-        return _ArcState(feasible, y, f_info.grad, length, jnp.array(False), optimality)
+        if self.feasible is None:
+            raise ValueError('There is no feasible set: give one as options={"feasible": ...}.')
+        optimality = projected_gradient_size(self.feasible, y, f_info.grad)
+        return _ArcState(self.feasible, y, f_info.grad, length, jnp.array(False), optimality)
 
     def step(self, step_size, state):
         """The projection of a step against the gradient, `step_size` times the spectral length long."""
         target = state.y - step_size * state.length * state.grad
         return state.feasible.project(target) - state.y, optx.RESULTS.successful
-
-
-def _set(feasible: ConvexSet | None) -> ConvexSet:
-    if feasible is None:
-        raise ValueError('There is no feasible set: give one as options={"feasible": ...}.')
-    return feasible
 
 
 class _MemoryState(eqx.Module):

@@ -13,8 +13,9 @@ from typing import Any, get_args
 import numpy as np
 import scipy.optimize
 from jaxtyping import Bool, Float, Int
+from scipy.special import softmax
 
-from cablejax.diagnose.belief import Calibration, probabilities
+from cablejax.diagnose.belief import Calibration
 from cablejax.diagnose.conclude import Conclusion
 from cablejax.diagnose.diagnosis import PLACES, NamedEffect, ParameterEstimate, Ranked, Verdict
 from cablejax.diagnose.evidence import episodes_by_motion, student_log_likelihoods
@@ -40,32 +41,32 @@ class Actuation:
     """Fits of the arms to their commands.
 
     Attributes:
+        count: coordinates of each episode, shape [E].
+        motion: episodes with the same number repeat one another, shape [E].
+        commanded: poses that exact arms would have had, shape [E, T, 2, 3].
+        predicted: poses with the effects, each motion from a fit without it where there are several, shape
+            [E, T, 2, 3].
+        deviation: root mean square of measured less commanded poses [m], above their noise.
+        leftover: the same after the effects.
+        noise: of the measured poses [m].
+        deviates: whether measured and commanded poses differ at all.
         effects: names and parameters (value, 90 % interval, unit) of what explains the deviation, at most both.
         alone: what every effect that was tried leaves by itself, of poses that it was fitted to and of others [m].
         unseen: root mean square error of each episode [m] by set of effects: of poses as commanded for no effect, else
             from fits to the other motions, shape [E] each.
-        count: coordinates of each episode, shape [E].
-        motion: episodes with the same number repeat one another, shape [E].
-        deviation: root mean square of measured less commanded poses [m], above their noise.
-        leftover: the same after the effects.
-        noise: of the measured poses [m].
-        commanded: poses that exact arms would have had, shape [E, T, 2, 3].
-        predicted: poses with the effects, each motion from a fit without it where there are several, shape
-            [E, T, 2, 3].
-        deviates: whether measured and commanded poses differ at all.
     """
 
-    effects: dict[str, tuple[float, tuple[float, float], str]]
-    alone: dict[str, tuple[float, float]]
-    unseen: dict[tuple[str, ...], Float[np.ndarray, "E"]]
     count: Int[np.ndarray, "E"]
     motion: Int[np.ndarray, "E"]
-    deviation: float
-    leftover: float
-    noise: float
     commanded: Float[np.ndarray, "E T 2 3"]
     predicted: Float[np.ndarray, "E T 2 3"]
-    deviates: bool
+    deviation: float = 0.0
+    leftover: float = 0.0
+    noise: float = 0.0
+    deviates: bool = False
+    effects: dict[str, tuple[float, tuple[float, float], str]] = dataclasses.field(default_factory=dict)
+    alone: dict[str, tuple[float, float]] = dataclasses.field(default_factory=dict)
+    unseen: dict[tuple[str, ...], Float[np.ndarray, "E"]] = dataclasses.field(default_factory=dict)
 
     def strays(self, negligible: float) -> bool:
         """Whether the arms are off their commands by more than is `negligible` [m], and no effect explains a part."""
@@ -176,23 +177,12 @@ def actuation(
         motion: episodes with the same number repeat one another.
     """
     if command is None:
-        return Actuation({}, {}, {}, np.zeros(len(pose), int), motion, 0.0, 0.0, 0.0, pose, pose, deviates=False)
+        return Actuation(np.zeros(len(pose), int), motion, pose, pose)
     valid = np.arange(pose.shape[1])[None] < np.asarray(length)[:, None]
     arms = _Arms(pose, integrated(pose[:, 0], command, interval), np.asarray(interval), valid)
     deviation = arms.rms(arms.commanded)
-    nothing = Actuation(
-        effects={},
-        alone={},
-        unseen={},
-        count=6 * valid.sum(axis=1),
-        motion=motion,
-        deviation=deviation,
-        leftover=deviation,
-        noise=max(arms.noise, _ENCODER_NOISE),
-        commanded=arms.commanded,
-        predicted=arms.commanded,
-        deviates=False,
-    )
+    count, noise = 6 * valid.sum(axis=1), max(arms.noise, _ENCODER_NOISE)
+    nothing = Actuation(count, motion, arms.commanded, arms.commanded, deviation, deviation, noise)
     if deviation < _NEGLIGIBLE:
         return nothing
 
@@ -276,7 +266,7 @@ def _chances(arms: Actuation, calibration: Calibration) -> dict[tuple[str, ...],
         - calibration.term_cost * len(effects)
         for effects, error in arms.unseen.items()
     ]
-    return dict(zip(arms.unseen, probabilities(np.array(scores)).tolist(), strict=True))
+    return dict(zip(arms.unseen, softmax(scores).tolist(), strict=True))
 
 
 def _named(effects: tuple[str, ...], result: Any, scale: float) -> dict[str, tuple[float, tuple[float, float], str]]:

@@ -155,7 +155,7 @@ def as_good(fit: Fit, best: Fit, evidence: Evidence, calibration: Calibration) -
     """
     least = np.maximum(left_by_motion(best, evidence), calibration.smallest_gap(level(evidence)))
     little = 1.0 + (calibration.as_good - 1.0) * max(1.0, np.sqrt(_MOTIONS / len(least)))
-    whole = excess(float(fit.sse.sum()), evidence) <= little * excess(float(best.sse.sum()), evidence)
+    whole = excess(fit, evidence) <= little * excess(best, evidence)
     return whole and float(np.mean(left_by_motion(fit, evidence) <= little * least)) >= 0.5
 
 
@@ -189,10 +189,10 @@ def _squares_by_motion(fit: Fit, evidence: Evidence) -> tuple[Float[np.ndarray, 
     return squares[count > 0], count[count > 0]
 
 
-def excess(sse: float, evidence: Evidence) -> float:
-    """Root mean square per coordinate above the noise that whitened residuals of this sum mean."""
+def excess(fit: Fit, evidence: Evidence) -> float:
+    """Error that a fit leaves, root mean square per coordinate above the noise."""
     count = float(evidence.count.sum())
-    return float(np.sqrt(max(sse - count, 0.0) / count)) * level(evidence)
+    return float(np.sqrt(max(float(fit.sse.sum()) - count, 0.0) / count)) * level(evidence)
 
 
 def level(evidence: Evidence) -> float:
@@ -203,16 +203,12 @@ def level(evidence: Evidence) -> float:
 def log_scores(fits: Sequence[Fit], evidence: Evidence, calibration: Calibration) -> Float[np.ndarray, "F"]:
     """Log posterior of every explanation, all sets of effects with as many members being equally likely beforehand."""
 
-    def cost(one: Explanation) -> float:
-        return calibration.term_cost * len(set(one.terms)) + calibration.prior_cost * 0.5 * float(one.z @ one.z)
+    def score(fit: Fit) -> float:
+        one = fit.explanation
+        cost = calibration.term_cost * len(set(one.terms)) + calibration.prior_cost * 0.5 * float(one.z @ one.z)
+        return float(evidence.log_likelihoods(fit.held_out_sse(evidence)).sum()) - cost
 
-    return np.array([evidence.log_likelihood(fit.held_out_sse(evidence)) - cost(fit.explanation) for fit in fits])
-
-
-def probabilities(scores: Float[np.ndarray, "F"]) -> Float[np.ndarray, "F"]:
-    """Normalised exponentials."""
-    weights = np.exp(scores - scores.max())
-    return weights / weights.sum()
+    return np.array([score(fit) for fit in fits])
 
 
 def in_doubt(

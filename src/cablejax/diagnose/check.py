@@ -44,9 +44,9 @@ def check_effect(effect: CableEffect) -> None:
     if hook is not None and hook not in get_args(Hook):
         raise ValueError(f"Effect {effect.name!r} has the hook {hook!r}, expected one of {', '.join(get_args(Hook))}.")
     with jax.enable_x64(True):
-        motion, angles = _motion()
+        (replay, _), (motion, angles) = _compiled(), _motion()
         nominal = nominal_physics(_CONFIG, dtype=jnp.float64)
-        still = np.asarray(_replay(nominal, motion, angles))
+        still = np.asarray(replay(nominal, motion, angles))
         for variant in effect.variants[:2]:
             null = effect.apply(nominal, [np.float64(v) for v in effect.null], variant, _CONFIG)
             if not isinstance(null, Physics):
@@ -54,7 +54,7 @@ def check_effect(effect: CableEffect) -> None:
                     f"Effect {effect.name!r}: `apply` gave a {type(null).__name__}, expected the changed Physics: "
                     "dataclasses.replace(physics, ...)."
                 )
-            if not np.array_equal(np.asarray(_replay(null, motion, angles)), still):
+            if not np.array_equal(np.asarray(replay(null, motion, angles)), still):
                 raise ValueError(
                     f"Effect {effect.name!r}: its null value {effect.null} (variant {variant}) changes the nominal "
                     "rollout; expected no change at all."
@@ -64,7 +64,7 @@ def check_effect(effect: CableEffect) -> None:
             raise ValueError(f"Effect {effect.name!r}: `starts` gave none for an ordinary log; expected at least one.")
         trials = [explanation((effect, variant, values)) for variant, values in starts]
         moved = [
-            np.abs(np.asarray(_replay(physics_of(c, nominal, _CONFIG, c.z), motion, angles)) - still).max()
+            np.abs(np.asarray(replay(physics_of(c, nominal, _CONFIG, c.z), motion, angles)) - still).max()
             for c in trials
         ]
         if not max(moved) > 1e-6:
@@ -104,8 +104,9 @@ def _derivatives(best: Explanation, i: int, nominal, motion, angles):
         return jax.tree.map(jnp.asarray, physics_of(best, nominal, _CONFIG, z))
 
     value, change = jax.jvp(physics, (z,), (direction,))
-    exact = _replay_jvp(value, change, motion, angles)
-    ahead, behind = (_replay(physics(z + s * _STEP * direction), motion, angles) for s in (1, -1))
+    replay, tangent = _compiled()
+    exact = tangent(value, change, motion, angles)
+    ahead, behind = (replay(physics(z + s * _STEP * direction), motion, angles) for s in (1, -1))
     return np.asarray(exact), np.asarray(ahead - behind) / (2 * _STEP)
 
 
@@ -121,14 +122,6 @@ def _compiled():
         return jax.jvp(lambda p: replay(p, motion, angles), (physics,), (change,))[1]
 
     return tuple(jax.jit(f, compiler_options=compiler_options()) for f in (replay, tangent))
-
-
-def _replay(physics, motion, angles):
-    return _compiled()[0](physics, motion, angles)
-
-
-def _replay_jvp(physics, change, motion, angles):
-    return _compiled()[1](physics, change, motion, angles)
 
 
 def _motion():

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float
+from scipy.special import softmax
 
 from cablejax.arrays import wrapped
 from cablejax.diagnose.belief import (
@@ -20,7 +21,6 @@ from cablejax.diagnose.belief import (
     leftover_p,
     leftover_score,
     level,
-    probabilities,
 )
 from cablejax.diagnose.diagnosis import (
     PLACES,
@@ -98,13 +98,13 @@ def _concluded(
     `drawn` are draws by the simulator's own law, where there are some.
     """
     nothing = np.zeros((0, 0))
-    chances = probabilities(found.scores)
+    chances = softmax(found.scores)
     best = found.fits[0]
     null = next(fit for fit in found.fits if not fit.explanation.terms)
-    gap = excess(float(null.sse.sum()), evidence)
-    left = excess(float(best.sse.sum()), evidence)
+    gap = excess(null, evidence)
+    left = excess(best, evidence)
     explained = 1.0 - (left / gap) ** 2 if gap > 0 else 0.0
-    ranking = _ranking(found, evidence, calibration)
+    ranking = _ranking(found, evidence)
     if not has_gap(null, evidence, calibration):
         return Conclusion("none", null, (), (), ranking, 0.0), nothing
     as_much = leftover_p(leftover_score(left, gap, level(evidence), calibration), evidence.simulator.right_scores)
@@ -115,7 +115,7 @@ def _concluded(
     if not best.explanation.terms:
         # an effect would do, and yet the gap is too small or in too few motions to pay for it
         undecided = any(
-            calibration.complete(excess(float(fit.sse.sum()), evidence), gap, level(evidence))
+            calibration.complete(excess(fit, evidence), gap, level(evidence))
             for fit in found.fits
             if fit.explanation.terms
         )
@@ -197,11 +197,11 @@ def baselines(found: Search, evidence: Evidence) -> dict[str, str]:
     }
 
 
-def _ranking(found: Search, evidence: Evidence, calibration: Calibration) -> tuple[Ranked, ...]:
+def _ranking(found: Search, evidence: Evidence) -> tuple[Ranked, ...]:
     singles = [(f, s) for f, s in zip(found.fits, found.scores, strict=True) if len(effect_names(f.explanation)) == 1]
     if not singles:
         return ()
-    chances = probabilities(np.array([s for _, s in singles]))
+    chances = softmax(np.array([s for _, s in singles]))
     null = next(fit for fit in found.fits if not fit.explanation.terms)
     before = max(float(null.held_out_sse(evidence).sum()) - evidence.count.sum(), 1e-9)
     result = []
@@ -212,13 +212,13 @@ def _ranking(found: Search, evidence: Evidence, calibration: Calibration) -> tup
                 name=fit.explanation.names[0],
                 probability=float(chance),
                 held_out_shrinkage=float(np.clip(1 - held_out / before, -1.0, 1.0)),
-                leftover_mm=1e3 * excess(float(fit.sse.sum()), evidence),
+                leftover_mm=1e3 * excess(fit, evidence),
             )
         )
     tried = {r.name for r in result}
     # effects whose best template explained too little to be fitted
     result += [
-        Ranked(name, 0.0, float(np.clip(share, 0.0, 1.0)), 1e3 * excess(float(null.sse.sum()), evidence))
+        Ranked(name, 0.0, float(np.clip(share, 0.0, 1.0)), 1e3 * excess(null, evidence))
         for name, share in found.screened.items()
         if name not in tried
     ]

@@ -240,14 +240,14 @@ class Diagnosis:
     effects: tuple[NamedEffect, ...]
     equivalent: tuple[tuple[str, ...], ...]
     ranking: tuple[Ranked, ...]
-    leftover_p: float | None
+    leftover_p: float | None = None
     gap: Gap
     where: Where | None
-    next_motion: NextMotion | None
-    baselines: dict[str, str]
-    caveats: tuple[str, ...]
+    next_motion: NextMotion | None = None
+    baselines: dict[str, str] = dataclasses.field(default_factory=dict)
+    caveats: tuple[str, ...] = ()
     seconds: float
-    settings: dict[str, Any]
+    settings: dict[str, Any] = dataclasses.field(default_factory=dict)
     posterior: tuple[tuple[EffectValues, ...], ...] = ()
     under_laws: tuple[UnderLaw, ...] = ()
     quantities: dict[str, ParameterEstimate] = dataclasses.field(default_factory=dict)

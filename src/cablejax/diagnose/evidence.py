@@ -99,12 +99,8 @@ class Evidence:
         """Of each episode's squared residuals, see `student_log_likelihoods`."""
         return student_log_likelihoods(self.surprise(sse), self.freedom, self.motion)
 
-    def log_likelihood(self, sse: Float[np.ndarray, "E"]) -> float:
-        """Of all episodes' squared residuals."""
-        return float(self.log_likelihoods(sse).sum())
-
     def fit_log_likelihood(self, sse: Float[np.ndarray, "E"]) -> float:
-        """The same as fits have it."""
+        """Of all episodes' squared residuals, as fits have it."""
         each = student_log_likelihoods(self.surprise(sse), self.fit_freedom or self.freedom, self.motion)
         return float(each.sum())
 

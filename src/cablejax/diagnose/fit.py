@@ -212,7 +212,12 @@ def _robust(evidence: Evidence, predicted, slopes):
 
 
 def improve(
-    evidence: Evidence, fits: Sequence[Fit], *, max_iterations: int, tolerance: float = 0.02, own_only: bool = False
+    evidence: Evidence,
+    fits: Sequence[Fit],
+    max_iterations: int,
+    *,
+    tolerance: float | None = None,
+    own_only: bool = False,
 ) -> list[Fit]:
     """Damped Gauss-Newton from evaluated explanations, all in lockstep.
 
@@ -222,9 +227,11 @@ def improve(
         evidence: to fit.
         fits: from `evaluate`; each keeps its terms.
         max_iterations: steps, accepted or not.
-        tolerance: an explanation is done once a step promises to lower its cost by less than this, in nats.
+        tolerance: an explanation is done once a step promises to lower its cost by less than this, in nats; None = as
+            the simulator's plan has it.
         own_only: what all recordings share stays as it is.
     """
+    tolerance = evidence.simulator.plan.tolerance if tolerance is None else tolerance
     solver = BatchedGaussNewton(tolerance=tolerance, max_steps=max_iterations, largest_step=_LARGEST_STEP)
 
     def linearised(fit: Fit) -> Linearised[Fit]:
@@ -240,9 +247,3 @@ def improve(
 
     ended = solver.minimise([linearised(fit) for fit in fits], linearise)
     return [dataclasses.replace(one.best.kept, result=one.result) for one in ended]
-
-
-def improved(evidence: Evidence, fits: Sequence[Fit], steps: int, *, own_only: bool = False) -> list[Fit]:
-    """`improve` by so many steps, with the tolerance of the simulator's plan."""
-    tolerance = evidence.simulator.plan.tolerance
-    return improve(evidence, fits, max_iterations=steps, tolerance=tolerance, own_only=own_only)

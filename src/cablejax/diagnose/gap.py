@@ -9,6 +9,7 @@ from cablejax.diagnose.belief import level
 from cablejax.diagnose.diagnosis import Gap
 from cablejax.diagnose.evidence import Evidence, episodes_by_motion
 from cablejax.diagnose.fit import Fit, evaluate, improve
+from cablejax.diagnose.protocol import Plan
 from cablejax.diagnose.search import without_one
 
 _HORIZONS = (1.0, 2.0, 5.0, 10.0)
@@ -40,7 +41,7 @@ def held_out_predictions(evidence: Evidence, best: Fit) -> tuple[Float[np.ndarra
     for group in groups:
         rows = np.array([e for e in range(n_episodes) if e not in group])
         rest, whole = evidence.restricted(rows), best.restricted(rows)
-        (fit,) = improve(rest, [whole], max_iterations=_FOLD_STEPS)
+        (fit,) = improve(rest, [whole], _FOLD_STEPS, tolerance=Plan.tolerance)
         least = min((other.restricted(rows) for other in simpler), key=lambda other: other.cost(rest))
         chosen.append(least if least.cost(rest) < whole.cost(rest) + _WORTH else fit)
     every = evidence.predict([fit.explanation for fit in chosen])

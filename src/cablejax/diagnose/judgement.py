@@ -82,10 +82,10 @@ def verdict_sentence(
     # what acts in one motion alone cannot be found from the others
     fitted_only = verdict in ("named", "ambiguous") and shrinkage is not None and shrinkage < _CONFIRMED
     share = f"{100 * max(explained if shrinkage is None or fitted_only else shrinkage, 0.0):.0f} %"
-    names = listed([_words(e.name) for e in effects])
+    names = listed([effect_title(e.name) for e in effects])
     split = [look_alikes(group, effects, ranking) for group in equivalent]
-    alike = "; ".join(listed([*map(_words, likely)], "or") for likely, _ in split if len(likely) > 1)
-    faint = listed([_words(name) for _, members in split for name in members])
+    alike = "; ".join(listed([*map(effect_title, likely)], "or") for likely, _ in split if len(likely) > 1)
+    faint = listed([effect_title(name) for _, members in split for name in members])
     explains = "which explains" if len(effects) == 1 else "which together explain"
     rivals = f" (this log cannot tell apart: {alike})" if alike else ""
     too = f" {faint[:1].upper()}{faint[1:]} would leave as little, at a probability below 1 %." if faint else ""
@@ -117,5 +117,6 @@ def listed(words: Sequence[str], last: str = "and") -> str:
     return "" if not words else words[0] if len(words) == 1 else f"{', '.join(words[:-1])} {last} {words[-1]}"
 
 
-def _words(name: str) -> str:
+def effect_title(name: str) -> str:
+    """The name of an effect as words."""
     return name.replace("_", " ")

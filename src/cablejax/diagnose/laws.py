@@ -15,8 +15,8 @@ import numpy as np
 
 from cablejax.diagnose.belief import Calibration, in_doubt, log_scores
 from cablejax.diagnose.evidence import Evidence
-from cablejax.diagnose.fit import Fit, evaluate, improved
-from cablejax.diagnose.protocol import Explanation, explanation
+from cablejax.diagnose.fit import evaluate, improve
+from cablejax.diagnose.protocol import explanation
 from cablejax.diagnose.refits import refitted
 from cablejax.diagnose.search import Search
 
@@ -37,10 +37,6 @@ class Law:
     found: Search
     probability: float
 
-    def fit_of(self, one: Explanation) -> Fit | None:
-        """The fit of the same terms by this law."""
-        return next((fit for fit in self.found.fits if fit.explanation.terms == one.terms), None)
-
 
 def by_other_laws(found: Search, evidence: Evidence, calibration: Calibration) -> tuple[Law, ...]:
     """Fits what a search left open by each of the simulator's other laws.
@@ -60,8 +56,11 @@ def by_other_laws(found: Search, evidence: Evidence, calibration: Calibration) -
         bare = dataclasses.replace(evidence, simulator=simulator)
         other = dataclasses.replace(bare, nominal=bare.predict([explanation()])[0])
         *starts, null = evaluate(other, [*leading, explanation()])
-        fits = improved(other, starts, simulator.plan.last_steps)
-        searches.append(_ordered(refitted(other, [*fits, null]), other, calibration))
+        fits = improve(other, starts, simulator.plan.last_steps)
+        fits = refitted(other, [*fits, null])
+        scores = log_scores(fits, other, calibration)
+        best_first = np.argsort(-scores, kind="stable")
+        searches.append(Search(tuple(fits[i] for i in best_first), scores[best_first], {}))
         evidences.append(other)
     tried = [set(one.terms) for one in leading] + [set()]
     own = [score for fit, score in zip(found.fits, found.scores, strict=True) if set(fit.explanation.terms) in tried]
@@ -71,10 +70,3 @@ def by_other_laws(found: Search, evidence: Evidence, calibration: Calibration) -
         Law(assumes, other, search, float(chance))
         for assumes, other, search, chance in zip(others, evidences, searches, chances, strict=True)
     )
-
-
-def _ordered(fits: list[Fit], evidence: Evidence, calibration: Calibration) -> Search:
-    """Fits of one law, best first."""
-    scores = log_scores(fits, evidence, calibration)
-    order = np.argsort(-scores, kind="stable")
-    return Search(tuple(fits[i] for i in order), scores[order], {})

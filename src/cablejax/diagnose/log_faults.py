@@ -133,7 +133,11 @@ def _least_unseen_error(series: list[Float[np.ndarray, "T"]]) -> list[Float[np.n
     """Local parabolas through each of the series, over the number of samples that predicts left-out ones best."""
     best, least = series, np.inf
     for window in _WINDOWS:
-        paths = [_parabolas(values, min(window, (len(values) - 1) | 1)) for values in series]
+        widths = [min(window, (len(values) - 1) | 1) for values in series]
+        paths = [
+            np.asarray(savgol_filter(values, width, _PARABOLA)) if width > _PARABOLA + 1 else values
+            for values, width in zip(series, widths, strict=True)
+        ]
         # a left-out sample is missed by so many times what it is missed by itself
         factor = 1.0 / (1.0 - savgol_coeffs(window, _PARABOLA)[window // 2])
         off = np.concatenate([values - path for values, path in zip(series, paths, strict=True)])
@@ -141,10 +145,6 @@ def _least_unseen_error(series: list[Float[np.ndarray, "T"]]) -> list[Float[np.n
         if error < least:
             best, least = paths, error
     return best
-
-
-def _parabolas(values: Float[np.ndarray, "T"], window: int) -> Float[np.ndarray, "T"]:
-    return np.asarray(savgol_filter(values, window, _PARABOLA)) if window > _PARABOLA + 1 else values
 
 
 def command_fault(

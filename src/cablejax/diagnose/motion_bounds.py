@@ -164,7 +164,8 @@ def grippers_beyond(
         interval: between samples [s].
     """
     length, moved = config.cable.length, np.diff(poses, axis=0) / interval
-    apart = np.linalg.norm(poses[:, 1, :2] - poses[:, 0, :2], axis=-1)
+    line = poses[:, 1, :2] - poses[:, 0, :2]
+    apart = np.linalg.norm(line, axis=-1)
     low, high = bounds.distances(length)
     found = {
         "speed": np.linalg.norm(moved[..., :2], axis=-1).max(initial=0.0) / bounds.speed - 1,
@@ -175,7 +176,7 @@ def grippers_beyond(
     }
     broken = _those_broken(found)
     if not broken:
-        angles = np.abs(wrapped(poses[..., 2] - _heading(poses)[:, None]))
+        angles = np.abs(wrapped(poses[..., 2] - np.arctan2(*line.T[::-1])[:, None]))
         limits = MotionConfig.for_length(length, straight_slack=1 - FARTHEST, min_distance=1e-6)
         taken = [admissible(config, limits, pose) for pose in poses[::_SPACING]]
         if not all(taken):
@@ -249,10 +250,6 @@ def curvature(points: Float[np.ndarray, "*B N 2"]) -> Float[np.ndarray, "*B N"]:
     inner = 2 * (a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]) / np.maximum(sides, 1e-12)
     first, last = 2 * inner[..., :1] - inner[..., 1:2], 2 * inner[..., -1:] - inner[..., -2:-1]
     return np.abs(np.concatenate([first, inner, last], axis=-1))
-
-
-def _heading(poses: Float[np.ndarray, "T 2 3"]) -> Float[np.ndarray, "T"]:
-    return np.arctan2(*(poses[:, 1, :2] - poses[:, 0, :2]).T[::-1])
 
 
 def _beyond_places(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import time
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -96,8 +96,11 @@ def diagnose(
     repaired = case.recording.as_log(log.meta)
     rounds = rounds_of(log, found.fits, found.scores, evidence, calibration)
     caveats = _caveats(case, calibration, length, stated, commissioned=bool(commissioning))
+    fields = Examined(evidence, found, conclusion, reference, after, gap).fields()
+    if alone.verdict == "none" and case.arms.strays(calibration.smallest_gap(0.0)):
+        fields["sentence"] = _ONLY_ARMS
     diagnosis = CableDiagnosis(
-        **Examined(evidence, found, conclusion, reference, after, gap).fields() | _of_arms(alone, case, calibration),
+        **fields,
         where=localise(repaired, case.to_log(reference), case.noise.std),
         next_motion=following,
         caveats=(*_contradictions(rounds), *caveats, *none_kept),
@@ -115,22 +118,15 @@ def diagnose(
     return diagnosis
 
 
-class _Read(NamedTuple):
-    """A log as it is most probably to be read, with what explains it."""
+def _read(
+    log: GapLog, case: Case, calibration: Calibration, progress: Callable[[str], None]
+) -> tuple[GapLog, Case, Evidence, Search, Conclusion, Length | None, list[tuple[Reading, float]]]:
+    """Explains a log, and again by another reading as long as one is more probable than all else together.
 
-    log: GapLog
-    case: Case
-    evidence: Evidence
-    found: Search
-    conclusion: Conclusion
-    length: Length | None
-    """That the keypoints suggest beside the one of the log."""
-    taken: Sequence[tuple[Reading, float]]
-    """Readings other than the literal one, with their probabilities."""
-
-
-def _read(log: GapLog, case: Case, calibration: Calibration, progress: Callable[[str], None]) -> _Read:
-    """Explains a log, and again by another reading as long as one is more probable than all else together."""
+    Returns:
+        The log as it is most probably to be read, its case and what explains it, the length that the keypoints suggest
+        besides the stated one, and the readings that are not literal with their probabilities.
+    """
     taken: list[tuple[Reading, float]] = []
     while True:
         length = None if any(isinstance(one, Length) for one, _ in taken) else other_length(case, log)
@@ -141,7 +137,7 @@ def _read(log: GapLog, case: Case, calibration: Calibration, progress: Callable[
         likely = [(one, one.probability(conclusion.under_laws)) for one in readings]
         reading, probability = max(likely, key=lambda one: one[1], default=(None, 0.0))
         if reading is None or reading.case is None or probability <= 0.5:
-            return _Read(log, case, evidence, found, conclusion, length, taken)
+            return log, case, evidence, found, conclusion, length, taken
         progress(f"again, as {reading.assumes}")
         taken.append((reading, probability))
         log, case = reading.log, reading.case
@@ -168,7 +164,7 @@ def baseline_error(logs: Sequence[GapLog]) -> float:
     squares = []
     for log in logs:
         evidence = Case.of(log).evidence(Calibration())
-        squares.append(excess(float(evaluate(evidence, [explanation()])[0].sse.sum()), evidence) ** 2)
+        squares.append(excess(evaluate(evidence, [explanation()])[0], evidence) ** 2)
     return max(float(np.sqrt(np.mean(squares))), 5e-5)
 
 
@@ -200,11 +196,7 @@ def _worth_naming(conclusion: Conclusion, shrinkage: float | None) -> Conclusion
     """The conclusion, once its effects were tried on episodes left out of the fit.
 
     What stands beside an unknown cause and makes the gap there no smaller is no part of it: nothing is named then, nor
-    by the other laws.
-
-    Args:
-        conclusion: from the fit.
-        shrinkage: of the gap on episodes left out; None where nothing could be.
+    by the other laws. `shrinkage` is that of the gap on episodes left out; None where nothing could be.
     """
     if conclusion.verdict != "named+unknown" or shrinkage is None or shrinkage > 0:
         return conclusion
@@ -223,12 +215,6 @@ def _contradictions(rounds: Rounds | None) -> tuple[str, ...]:
         f"the rest, as recordings of one set-up would be in fewer than {UNLIKELY:g} of all cases. Check what was "
         "changed between them, and diagnose each one alone.",
     )
-
-
-def _of_arms(alone: Conclusion, case: Case, calibration: Calibration) -> dict[str, Any]:
-    """The sentence of a verdict that is about the arms only; `alone` is what the cable showed."""
-    only = alone.verdict == "none" and case.arms.strays(calibration.smallest_gap(0.0))
-    return {"sentence": _ONLY_ARMS} if only else {}
 
 
 def _caveats(

@@ -123,7 +123,7 @@ class Playback:
             points[rows[:, 0], rows[:, 1]] = np.asarray(result)[: len(rows)]
 
         touching, longest_first = stacked.obstacle_radius > 0, np.argsort(-length[chosen], kind="stable")
-        with concurrent.futures.ThreadPoolExecutor(max_workers=_workers()) as pool:
+        with concurrent.futures.ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
             tasks = []
             for with_contact in (False, True):
                 which = np.flatnonzero(touching == with_contact)
@@ -164,10 +164,6 @@ def _first_angles(
     for _ in range(_TURNS):
         angles[1:] += seen - angles_of_keypoints(config, pose, points())
     return angles
-
-
-def _workers() -> int:
-    return max(1, len(os.sched_getaffinity(0)))
 
 
 @functools.lru_cache(maxsize=16)

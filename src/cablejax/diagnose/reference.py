@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 
 import jax
@@ -20,33 +19,21 @@ _STEP = 1.0
 _RIDGE = RidgeConfig()
 
 
-@dataclasses.dataclass(frozen=True)
-class Ahead:
-    """Errors of predictions from the last observation, over `HORIZON` control steps of one second.
-
-    Attributes:
-        alone: root mean square per coordinate of the simulator's displacement [m].
-        corrected: with the residual of the last five steps added.
-    """
-
-    alone: float
-    corrected: float
-
-
 def predicted_ahead(
     observed: Float[np.ndarray, "E T N 2"],
     simulated: Float[np.ndarray, "E T N 2"],
     gripper_pose: Float[np.ndarray, "E T 2 3"],
     interval: Float[np.ndarray, "E"],
     length: np.ndarray,
-) -> Ahead | None:
+) -> tuple[float, float] | None:
     """Corrects a simulator's displacements as the controller does: `delta = R J + b` over the last five steps.
 
     The residual is fitted to what the last five steps of one second got wrong, and carried on for `HORIZON` steps with
     the grippers' true motion. Errors contain the noise of two observations.
 
     Returns:
-        None if no episode is long enough, or none was observed for so long.
+        Root mean square errors of a coordinate [m]: of the simulator's displacement, and with the residual added; None
+        if no episode is long enough, or none was observed for so long.
     """
     alone, corrected = [], []
     for e in range(len(observed)):
@@ -69,7 +56,8 @@ def predicted_ahead(
         corrected.append(wrong - guess)
     if not alone or not np.isfinite(np.concatenate(corrected)).any():
         return None
-    return Ahead(*(float(np.sqrt(np.nanmean(np.concatenate(x) ** 2))) for x in (alone, corrected)))
+    plain, better = (float(np.sqrt(np.nanmean(np.concatenate(x) ** 2))) for x in (alone, corrected))
+    return plain, better
 
 
 def ahead_of_observations(
@@ -96,9 +84,10 @@ def ahead_of_observations(
         return None, None
     # both ends of the prediction are observed with noise
     floor = 2 * float(np.mean(noise**2))
-    left = max(named.alone**2 - floor, 0.0)
-    learnable = (named.alone**2 - max(named.corrected**2, floor)) / left if left > 0.1 * floor else 0.0
-    errors = {"nominal": 1e3 * nominal.alone, "ridge": 1e3 * nominal.corrected, "named": 1e3 * named.alone}
+    alone, corrected = named
+    left = max(alone**2 - floor, 0.0)
+    learnable = (alone**2 - max(corrected**2, floor)) / left if left > 0.1 * floor else 0.0
+    errors = {"nominal": 1e3 * nominal[0], "ridge": 1e3 * nominal[1], "named": 1e3 * alone}
     return errors, float(np.clip(learnable, 0.0, 1.0))
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Int
 
 from cablejax.diagnose.evidence import Evidence
-from cablejax.diagnose.fit import Fit, Refits, evaluate, improved
+from cablejax.diagnose.fit import Fit, Refits, evaluate, improve
 from cablejax.diagnose.protocol import Explanation
 
 
@@ -41,10 +41,10 @@ def refitted(evidence: Evidence, fits: Sequence[Fit]) -> list[Fit]:
         out, rest = np.flatnonzero(part_of == part), np.flatnonzero(part_of != part)
         left_out.append(out)
         seen, unseen = evidence.restricted(rest), evidence.restricted(out)
-        there = improved(seen, [fits[i].restricted(rest) for i in todo], plan.last_steps)
+        there = improve(seen, [fits[i].restricted(rest) for i in todo], plan.last_steps)
         checks = evaluate(unseen, [_forgotten(unseen, fit.explanation) for fit in there])
         if evidence.simulator.fits_unseen:
-            checks = improved(unseen, checks, plan.last_steps, own_only=True)
+            checks = improve(unseen, checks, plan.last_steps, own_only=True)
         for k, check in enumerate(checks):
             sse[k][out] = check.sse
             ended[k].append(check.explanation)

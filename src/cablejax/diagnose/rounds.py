@@ -16,11 +16,12 @@ from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Float
+from scipy.special import softmax
 from scipy.stats import chi2
 
-from cablejax.diagnose.belief import Calibration, effect_names, in_doubt, probabilities
+from cablejax.diagnose.belief import Calibration, effect_names, in_doubt
 from cablejax.diagnose.evidence import Evidence
-from cablejax.diagnose.fit import Fit, evaluate, improved
+from cablejax.diagnose.fit import Fit, evaluate, improve
 from cablejax.gaplog_join import recordings
 from cablejax.types import GapLog
 
@@ -101,7 +102,7 @@ def rounds_of(
     rounds = []
     for part, own, end, gain in zip(parts, rows, ends, gains, strict=True):
         nats = each[:, own].sum(axis=1)
-        chances = probabilities(believed + each[:, :end].sum(axis=1))
+        chances = softmax(believed + each[:, :end].sum(axis=1))
         rounds.append(
             Round(
                 name=part["name"],
@@ -122,5 +123,5 @@ def _own_gain(fit: Fit, evidence: Evidence, rows: np.ndarray) -> float:
         return 0.0
     alone = evidence.restricted(rows)
     (start,) = evaluate(alone, [fit.explanation])
-    (own,) = improved(alone, [start], evidence.simulator.plan.last_steps)
+    (own,) = improve(alone, [start], evidence.simulator.plan.last_steps)
     return max(start.cost(alone) - own.cost(alone), 0.0)

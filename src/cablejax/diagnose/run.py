@@ -15,7 +15,7 @@ from cablejax.diagnose.belief import Calibration, has_gap, level
 from cablejax.diagnose.conclude import Conclusion, baselines, conclude, sentence
 from cablejax.diagnose.diagnosis import Diagnosis, Gap
 from cablejax.diagnose.evidence import Evidence
-from cablejax.diagnose.fit import Fit, evaluate, improved
+from cablejax.diagnose.fit import Fit, evaluate, improve
 from cablejax.diagnose.gap import held_out_predictions, measure_gap
 from cablejax.diagnose.given_arrays import check_effects_act, checked_nominal, recorded_arrays, spread_of
 from cablejax.diagnose.laws import by_other_laws
@@ -82,7 +82,6 @@ def diagnose_simulator(
     return Diagnosis(
         **examined.fields(),
         where=None,
-        next_motion=None,
         caveats=tuple(caveats),
         seconds=time.perf_counter() - begin,
         settings=settings_of(simulator, calibration),
@@ -123,16 +122,9 @@ class Examined:
 
     def fields(self) -> dict[str, Any]:
         """The fields of `Diagnosis` that follow from these."""
-        conclusion = self.conclusion
-        return {
-            "verdict": conclusion.verdict,
-            "sentence": sentence(conclusion, self.gap.shrinkage),
-            "effects": conclusion.effects,
-            "equivalent": conclusion.equivalent,
-            "ranking": conclusion.ranking,
-            "leftover_p": conclusion.leftover_p,
-            "posterior": conclusion.posterior,
-            "under_laws": conclusion.under_laws,
+        shared = {f.name for f in dataclasses.fields(Conclusion)} & {f.name for f in dataclasses.fields(Diagnosis)}
+        return {name: getattr(self.conclusion, name) for name in shared} | {
+            "sentence": sentence(self.conclusion, self.gap.shrinkage),
             "gap": self.gap,
             "baselines": baselines(self.found, self.evidence),
         }
@@ -220,7 +212,7 @@ def explain(
 
 def _null(evidence: Evidence) -> Fit:
     """The nominal simulator, with what each recording has for its own."""
-    return improved(evidence, evaluate(evidence, [explanation()]), evidence.simulator.plan.last_steps)[0]
+    return improve(evidence, evaluate(evidence, [explanation()]), evidence.simulator.plan.last_steps)[0]
 
 
 def settings_of(simulator: Simulator, calibration: Calibration) -> dict:

@@ -64,32 +64,11 @@ class Way:
         return _poses(np.stack([np.interp(grid, times, column) for column in np.array(vectors).T], axis=1))
 
 
-@dataclasses.dataclass(frozen=True)
-class _Pair:
-    """Both grippers by the line between them.
-
-    Attributes:
-        middle: of that line [m].
-        heading: its direction, from gripper 0 to gripper 1 [rad].
-        distance: its length [m].
-        angles: of either gripper to that line [rad].
-    """
-
-    middle: Float[np.ndarray, "2"]
-    heading: float
-    distance: float
-    angles: Float[np.ndarray, "2"]
-
-    @classmethod
-    def of(cls, pose: Float[np.ndarray, "2 3"]) -> _Pair:
-        chord = pose[1, :2] - pose[0, :2]
-        heading = float(np.arctan2(chord[1], chord[0]))
-        angles = wrapped(pose[:, 2] - heading)
-        return cls(pose[:, :2].mean(axis=0), heading, float(np.hypot(*chord)), angles)
-
-    @property
-    def vector(self) -> Float[np.ndarray, "6"]:
-        return np.array([*self.middle, self.heading, self.distance, *self.angles])
+def _vector(pose: Float[np.ndarray, "2 3"]) -> Float[np.ndarray, "6"]:
+    """Both grippers as a place of a `Way`."""
+    chord = pose[1, :2] - pose[0, :2]
+    heading = float(np.arctan2(chord[1], chord[0]))
+    return np.array([*pose[:, :2].mean(axis=0), heading, float(np.hypot(*chord)), *wrapped(pose[:, 2] - heading)])
 
 
 def starting_pose(gripper_pose: Float[np.ndarray, "E T 2 3"]) -> Float[np.ndarray, "2 3"]:
@@ -108,7 +87,7 @@ def there_and_back(
         goal: likewise.
         bounds: on the grippers' speed; the others are not looked at.
     """
-    start, there = _Pair.of(first).vector, _Pair.of(goal).vector
+    start, there = _vector(first), _vector(goal)
     way = Way(np.stack([start, there, start]), np.ones(2), np.array([1.0, _HOLD, 2 * _HOLD]))
     return way.played(_SAMPLES, bounds)
 
@@ -158,21 +137,20 @@ def safe_ways(config: Discretisation, first: Float[np.ndarray, "2 3"], bounds: B
     if first.shape != (2, 3) or not np.isfinite(first).all():
         raise ValueError(f"first has shape {first.shape}, expected two finite poses (x, y, theta).")
     length = config.cable.length
-    given = _Pair.of(first)
+    start = _vector(first)
     low, high = (distance / length for distance in bounds.distances(length))
-    start = dataclasses.replace(given, distance=float(np.clip(given.distance, low * length, high * length)))
-    side = -1.0 if given.angles[0] < given.angles[1] else 1.0
+    start[3] = np.clip(start[3], low * length, high * length)
+    side = -1.0 if start[4] < start[5] else 1.0
 
-    def at(ratio: float, mirrored: bool = False, shift: float = 0.0) -> _Pair:
+    def at(ratio: float, mirrored: bool = False, shift: float = 0.0) -> Float[np.ndarray, "6"]:
         """An arch on the side to which the cable leans, its grippers turned half as far as they would turn freely."""
         lean = 0.5 * _free_angle(ratio) * (-side if mirrored else side)
-        across = np.array([-np.sin(start.heading), np.cos(start.heading)])
-        return _Pair(start.middle + shift * length * across, start.heading, ratio * length, np.array([lean, -lean]))
+        across = np.array([-np.sin(start[2]), np.cos(start[2])])
+        return np.array([*(start[:2] + shift * length * across), start[2], ratio * length, lean, -lean])
 
-    moved = dataclasses.replace(start, middle=at(1.0, shift=_SHIFT).middle)
-    taut = dataclasses.replace(start, distance=(high - 1e-6) * length, angles=np.zeros(2))
-    mirrored = dataclasses.replace(start, angles=-start.angles)
-    plans: dict[str, list[tuple[_Pair, float, float]]] = {
+    moved, taut, mirrored = start.copy(), start.copy(), start.copy()
+    moved[:2], taut[3:], mirrored[4:] = at(1.0, shift=_SHIFT)[:2], [(high - 1e-6) * length, 0.0, 0.0], -start[4:]
+    plans: dict[str, list[tuple[np.ndarray, float, float]]] = {
         # (where to, share of the largest speed, hold there [s])
         "mirror": [
             (mirrored, 1.0, 1.0),
@@ -199,7 +177,7 @@ def safe_ways(config: Discretisation, first: Float[np.ndarray, "2 3"], bounds: B
     }
     return {
         name: Way(
-            places=np.stack([pair.vector for pair, _, _ in plan]),
+            places=np.stack([place for place, _, _ in plan]),
             shares=np.array([share for _, share, _ in plan[1:]]),
             holds=np.array([hold for _, _, hold in plan]),
         )

@@ -10,7 +10,7 @@ from jaxtyping import Float
 
 from cablejax.diagnose.belief import Calibration, best_by_effects, effect_names, excess, level, log_scores
 from cablejax.diagnose.evidence import Evidence
-from cablejax.diagnose.fit import Fit, evaluate, improved
+from cablejax.diagnose.fit import Fit, evaluate, improve
 from cablejax.diagnose.protocol import Explanation
 from cablejax.diagnose.refits import refitted
 from cablejax.diagnose.screen import Template, screen, shortlist
@@ -55,7 +55,7 @@ def search(
         calibration: of the judgement.
         progress: called with a line of text before each stage.
     """
-    gap = excess(float(null.sse.sum()), evidence)
+    gap = excess(null, evidence)
     effects = evidence.simulator.effects
     progress(f"screening {len(effects)} effects")
     templates = screen(evidence, null.explanation, effects, evidence.nominal)
@@ -68,16 +68,16 @@ def search(
     plan = evidence.simulator.plan
     starts = _promising(shortlist(templates), screened)
     starts += _of_fixed_size(templates, {start.names[-1] for start in starts})
-    singles = _best(improved(evidence, evaluate(evidence, starts), plan.first_steps), evidence, calibration)
-    fits = improved(evidence, singles[:_FINALISTS], plan.last_steps) + singles[_FINALISTS:]
+    singles = _best(improve(evidence, evaluate(evidence, starts), plan.first_steps), evidence, calibration)
+    fits = improve(evidence, singles[:_FINALISTS], plan.last_steps) + singles[_FINALISTS:]
     fits = _best([null, *fits], evidence, calibration)
     # the leaders until they rest: what is taken for a missing second effect may be a valley not walked to its end
-    fits = _best([*improved(evidence, fits[:_BASES], plan.last_steps), *fits[_BASES:]], evidence, calibration)
+    fits = _best([*improve(evidence, fits[:_BASES], plan.last_steps), *fits[_BASES:]], evidence, calibration)
 
     def grow(fits: list[Fit], bases: Sequence[Fit]) -> list[Fit]:
         """Sets of one more effect each, until the best is adequate or the next one no better."""
         for size in range(1 + max(len(base.explanation.terms) for base in bases), _MOST_TERMS + 1):
-            left, noise = excess(float(fits[0].sse.sum()), evidence), level(evidence)
+            left, noise = excess(fits[0], evidence), level(evidence)
             alone = len(effect_names(fits[0].explanation)) == 1
             enough = calibration.needs_no_other(gap, noise) if alone else calibration.may_leave(gap, noise)
             if left <= enough:
@@ -125,7 +125,7 @@ def _joined(fits: list[Fit], more: list[Fit], evidence: Evidence, calibration: C
     whole = best[0].explanation
     if whole is fits[0].explanation or len(effect_names(whole)) < 2:
         return best
-    rest = improved(evidence, evaluate(evidence, without_one(whole)), evidence.simulator.plan.last_steps)
+    rest = improve(evidence, evaluate(evidence, without_one(whole)), evidence.simulator.plan.last_steps)
     return _best([*best, *rest], evidence, calibration)
 
 
@@ -136,12 +136,13 @@ def _grown(evidence: Evidence, base: Explanation, calibration: Calibration) -> l
     if not partners:
         return []
     templates = screen(evidence, base, partners, evidence.predict([base])[0])
-    starts = [start for start in shortlist(templates, per_variant=1, per_effect=2) if not _repeats(start)][:_PARTNERS]
+    starts = shortlist(templates, per_variant=1, per_effect=2)
+    starts = [start for start in starts if start.terms[-1] not in start.terms[:-1]][:_PARTNERS]
     tried = {start.names[-1] for start in starts}
     weighed = [start for start in shortlist(templates, 1, 1, weighed=True) if start.names[-1] not in base.names]
     starts += [start for start in weighed[:_WEIGHED_PARTNERS] if start.names[-1] not in tried]
     starts += _of_fixed_size(templates, tried | {start.names[-1] for start in starts})
-    return improved(evidence, evaluate(evidence, starts), evidence.simulator.plan.grown_steps)
+    return improve(evidence, evaluate(evidence, starts), evidence.simulator.plan.grown_steps)
 
 
 def _of_fixed_size(templates: Sequence[Template], tried: set[str]) -> list[Explanation]:
@@ -152,10 +153,6 @@ def _of_fixed_size(templates: Sequence[Template], tried: set[str]) -> list[Expla
     """
     fixed = [template for template in templates if template.start.terms[-1].effect.amplitude is None]
     return [start for start in shortlist(fixed, per_variant=1, per_effect=1) if start.names[-1] not in tried]
-
-
-def _repeats(start: Explanation) -> bool:
-    return start.terms[-1] in start.terms[:-1]
 
 
 def _best(fits: Sequence[Fit], evidence: Evidence, calibration: Calibration) -> list[Fit]:

@@ -53,21 +53,18 @@ def verdict_json(diagnosis: Diagnosis) -> dict[str, Any]:
             "verdict": diagnosis.verdict,
             "sentence": diagnosis.sentence,
             "effects": [_effect(effect) for effect in diagnosis.effects],
-            "quantities": _estimates(diagnosis.quantities),
+            "quantities": {name: dataclasses.asdict(one) for name, one in diagnosis.quantities.items()},
             "equivalent": diagnosis.equivalent,
             "posterior": [[dataclasses.asdict(one) for one in draw] for draw in diagnosis.posterior],
             "under_laws": [
-                {
-                    "assumes": law.assumes,
-                    "probability": law.probability,
-                    "verdict": law.verdict,
-                    "effects": [_effect(effect) for effect in law.effects],
-                    "equivalent": law.equivalent,
-                }
+                dataclasses.asdict(law) | {"effects": [_effect(effect) for effect in law.effects]}
                 for law in diagnosis.under_laws
             ],
             "baselines": diagnosis.baselines,
-            "ranking": [_ranked(ranked, gap.unit) for ranked in diagnosis.ranking],
+            "ranking": [
+                dataclasses.asdict(one) | {"leftover_mm": one.leftover_mm if gap.unit == "m" else None}
+                for one in diagnosis.ranking
+            ],
             "leftover_p": diagnosis.leftover_p,
             # what no effect was named for has not shrunk, however much an explanation that was not believed takes away
             "gap": _gap(gap, blamed=diagnosis.verdict != "unknown"),
@@ -133,11 +130,9 @@ def read_verdict(path: str | os.PathLike[str]) -> Diagnosis:
                 unit=str(gap["unit"]),
             ),
             where=None,
-            next_motion=None,
             baselines=dict(verdict["baselines"]),
             caveats=tuple(map(str, verdict["caveats"])),
             seconds=float(verdict["seconds"]),
-            settings={},
             posterior=tuple(
                 tuple(EffectValues(str(one["name"]), dict(one["parameters"])) for one in draw)
                 for draw in verdict.get("posterior", ())
@@ -161,11 +156,7 @@ def read_verdict(path: str | os.PathLike[str]) -> Diagnosis:
 
 def _effect_of(effect: Mapping[str, Any]) -> NamedEffect:
     place = effect["location"]
-    location = {
-        "along_cable_m": _pair(place["along_cable_m"]),
-        "time_s": _number(place["time_s"]),
-        "table_m": _pair(place["table_m"]),
-    }
+    location = {name: (_number if name == "time_s" else _pair)(place[name]) for name in PLACES}
     estimates = {str(name): _estimate_of(estimate) for name, estimate in effect["parameters"].items()}
     return NamedEffect(str(effect["name"]), _number(effect["probability"]), estimates, location)
 
@@ -200,26 +191,7 @@ def _size(value: float | None, scale: float = 1.0) -> float:
 
 
 def _effect(effect: NamedEffect) -> dict[str, Any]:
-    return {
-        "name": effect.name,
-        "probability": effect.probability,
-        "parameters": _estimates(effect.parameters),
-        "location": {place: effect.location.get(place) for place in PLACES},
-    }
-
-
-def _estimates(estimates: Mapping[str, ParameterEstimate]) -> dict[str, Any]:
-    return {name: dataclasses.asdict(estimate) for name, estimate in estimates.items()}
-
-
-def _ranked(ranked: Ranked, unit: str) -> dict[str, Any]:
-    return {
-        "name": ranked.name,
-        "probability": ranked.probability,
-        "held_out_shrinkage": ranked.held_out_shrinkage,
-        "leftover_mm": ranked.leftover_mm if unit == "m" else None,
-        "outcome": ranked.outcome,
-    }
+    return dataclasses.asdict(effect) | {"location": {place: effect.location.get(place) for place in PLACES}}
 
 
 def _gap(gap: Gap, *, blamed: bool) -> dict[str, Any]:

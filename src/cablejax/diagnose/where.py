@@ -121,7 +121,7 @@ def localise(log: GapLog, nominal: Float[np.ndarray, "E T N 2"], noise: Float[np
         heat=np.sqrt(squared),
         horizons_mm=_horizons(log, valid, everywhere, above),
         regimes={name: above(mask[..., None] & everywhere) for name, mask in regimes.masks.items() if mask.any()},
-        frames=_frames(residual, noise, nominal, log),
+        frames=_frames(residual, noise, nominal),
         contrasts=_contrasts(residual, noise, squared, regimes, motion),
         regime_masks=regimes.masks,
     )
@@ -170,7 +170,7 @@ def _horizons(log: GapLog, valid, everywhere, above) -> dict[float, float]:
     return result
 
 
-def _frames(residual, noise, nominal, log: GapLog) -> dict[str, float]:
+def _frames(residual, noise, nominal) -> dict[str, float]:
     """Share of the squared gap that a constant error in each frame explains, noise taken out of both."""
     seen = np.isfinite(residual).all(axis=-1)
     floor = np.broadcast_to(noise**2, seen.shape)

@@ -44,9 +44,8 @@ def describe(
     sentences = [_size(where, shown, floor, names), *_along(where, arclength), *_when(where), *_frame(where)]
     if total >= 6:
         return tuple(sentences[:5])
-    few = (
-        f"With {_count(total, 'episode')} no comparison between regimes can be tested at the 5 % level: six are needed."
-    )
+    episodes = f"{total} episode{'' if total == 1 else 's'}"
+    few = f"With {episodes} no comparison between regimes can be tested at the 5 % level: six are needed."
     return (*sentences[:4], few)
 
 
@@ -158,7 +157,3 @@ def _moving(where: Where) -> float | None:
 
 def _mm(value: float) -> str:
     return f"{value:.2f} mm" if 0.0 < value < 0.095 else f"{value:.1f} mm"
-
-
-def _count(number: int, word: str) -> str:
-    return f"{number} {word}{'' if number == 1 else 's'}"

@@ -123,17 +123,8 @@ def first_fit(
             chosen.append(index)
     chosen = (chosen * FINALISTS)[:FINALISTS]
     best = jax.tree.map(lambda leaf: np.asarray(leaf)[chosen], guesses)
-    dtype = best.angles.dtype
-    refined = _register_all(
-        config,
-        jnp.asarray(points, dtype),
-        jnp.asarray(mask),
-        best.gripper_pose,
-        best.angles,
-        2.0 * best.sigma,
-        reach,
-        REFINEMENTS,
-    )
+    cloud = jnp.asarray(points, float)
+    refined = _register_all(config, cloud, mask, best.gripper_pose, best.angles, 2.0 * best.sigma, reach, REFINEMENTS)
     merit = _merit(config, refined)
     return jax.tree.map(lambda leaf: jnp.asarray(np.asarray(leaf)[int(np.argmax(merit))]), refined)
 
@@ -160,18 +151,8 @@ def guessed_fits(
     poses[:, 1, 2] = pose[1, 2] + 2 * np.pi * np.round((turn - between) / (2 * np.pi))
     sigma = config.length * np.where(np.arange(len(tangents)) < n_paths, PATH_SIGMA, GUESS_SIGMA)
 
-    sample = _sample(present)
-    dtype = jnp.asarray(0.0).dtype
-    fits = _register_all(
-        config,
-        jnp.asarray(sample, dtype),
-        jnp.asarray(np.arange(SAMPLE) < min(len(present), SAMPLE)),
-        jnp.asarray(poses, dtype),
-        jnp.asarray(np.diff(tangents, axis=1), dtype),
-        jnp.asarray(sigma, dtype),
-        reach,
-        ITERATIONS,
-    )
+    angles, mask = np.diff(tangents, axis=1), np.arange(SAMPLE) < len(present)
+    fits = _register_all(config, _sample(present), mask, poses, angles, sigma, reach, ITERATIONS)
     order = np.argsort(-_merit(config, fits), kind="stable")
     return jax.tree.map(lambda leaf: np.asarray(leaf)[order], fits)
 

@@ -14,7 +14,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from cablejax.diagnose.diagnosis import CableDiagnosis, Diagnosis
-from cablejax.report.effect_words import effect_title, explained_label
+from cablejax.diagnose.judgement import effect_title
+from cablejax.report.effect_words import explained_label
 from cablejax.report.style import DIAGNOSIS_STYLE, LIGHT
 
 _MAX_RANKED = 8

@@ -14,7 +14,8 @@ from matplotlib.patches import Circle, Rectangle
 
 from cablejax.arrays import stretches
 from cablejax.diagnose.diagnosis import CableDiagnosis, NamedEffect
-from cablejax.report.effect_words import effect_title, explained_label
+from cablejax.diagnose.judgement import effect_title
+from cablejax.report.effect_words import explained_label
 from cablejax.report.style import DIAGNOSIS_STYLE, LIGHT, cable_curve, gripper_outline
 
 # Transparent where there is no gap, so that it reads on a light and on a dark page.

@@ -10,7 +10,7 @@ import numpy as np
 
 from cablejax.diagnose.belief import Calibration
 from cablejax.diagnose.diagnosis import CableDiagnosis, NamedEffect, Verdict
-from cablejax.diagnose.judgement import FAINT, listed, look_alikes
+from cablejax.diagnose.judgement import FAINT, effect_title, listed, look_alikes
 from cablejax.diagnose.verdict_json import write_verdict
 from cablejax.gaplog import SIMULATED, write_gap_log
 from cablejax.report import diagnosis_sections as sections
@@ -21,7 +21,6 @@ from cablejax.report.effect_words import (
     MOTIONS,
     between,
     effect_place,
-    effect_title,
     error_falls,
     explained_label,
     millimetres,
@@ -102,7 +101,10 @@ def write_diagnosis_page(diagnosis: CableDiagnosis, out: str | os.PathLike[str])
     else:
         write_motion_gif(preview, diagnosis.next_motion)
     kind, badge = _BADGES[diagnosis.verdict]
-    following = diagnosis.next_motion
+    following, orbit = diagnosis.next_motion, None
+    if space:
+        label = explained_label(diagnosis) if diagnosis.explained is not None and diagnosis.effects else ""
+        orbit = {"data": json_script(orbit_data(diagnosis)), "explained": label}
     path = out / PAGE
     write_html(
         path,
@@ -115,7 +117,7 @@ def write_diagnosis_page(diagnosis: CableDiagnosis, out: str | os.PathLike[str])
         cards=_cards(diagnosis),
         works=_works(diagnosis),
         pictures=inline,
-        orbit=_orbit(diagnosis) if space else None,
+        orbit=orbit,
         cable_caption=_SPACE_CAPTION if space else _cable_caption(diagnosis),
         where_caption=_FILES_CAPTION if space else _WHERE_CAPTION,
         effects=sections.named_effects(diagnosis),
@@ -134,12 +136,6 @@ def write_diagnosis_page(diagnosis: CableDiagnosis, out: str | os.PathLike[str])
         record=sections.record(diagnosis),
     )
     return path
-
-
-def _orbit(diagnosis: CableDiagnosis) -> dict[str, str]:
-    """What the view in space needs: its data, and the name of the explained cable where there is one."""
-    explained = diagnosis.explained is not None and diagnosis.effects
-    return {"data": json_script(orbit_data(diagnosis)), "explained": explained_label(diagnosis) if explained else ""}
 
 
 def _lead(diagnosis: CableDiagnosis) -> str:

@@ -8,12 +8,11 @@ from collections.abc import Sequence
 
 from cablejax.diagnose.belief import BESIDE_UNKNOWN
 from cablejax.diagnose.diagnosis import CableDiagnosis, Diagnosis, NamedEffect, UnderLaw
-from cablejax.diagnose.judgement import listed, look_alikes
+from cablejax.diagnose.judgement import effect_title, listed, look_alikes
 from cablejax.report.effect_words import (
     EFFECTS,
     between,
     effect_place,
-    effect_title,
     explanation_title,
     millimetres,
     parameter_title,
@@ -63,8 +62,7 @@ def quantities(diagnosis: Diagnosis) -> list[tuple[str, str]]:
 
 def alike(diagnosis: CableDiagnosis) -> list[tuple[list[str], list[str]]]:
     """Names of the effects that are indistinguishable on the log: those with a chance, and those without."""
-    groups = (look_alikes(group, diagnosis.effects, diagnosis.ranking) for group in diagnosis.equivalent)
-    return [(list(likely), list(faint)) for likely, faint in groups]
+    return [look_alikes(group, diagnosis.effects, diagnosis.ranking) for group in diagnosis.equivalent]
 
 
 def under_other_laws(diagnosis: Diagnosis) -> list[str]:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from cablejax.diagnose.diagnosis import CableDiagnosis, Gap, NamedEffect
-from cablejax.diagnose.judgement import listed
+from cablejax.diagnose.judgement import effect_title, listed
 
 EFFECTS: dict[str, str] = {
     "bending_stiffness": "the bending stiffness differs everywhere by one factor",
@@ -80,11 +80,6 @@ MOTIONS: dict[str, str] = {
     "shifted_repeat": "Close in and go back; repeat it shifted across the table by 20 % of the cable's length.",
 }
 """Instruction for each motion of `cablejax.diagnose.safe_motions`, and for a designed one."""
-
-
-def effect_title(name: str) -> str:
-    """The name of an effect as words."""
-    return name.replace("_", " ")
 
 
 def explanation_title(names: str) -> str:

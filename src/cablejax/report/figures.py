@@ -142,16 +142,19 @@ def motion_bound(runs: Runs) -> Figure:
     return figure
 
 
-def snapshots(runs: Runs, shape: str | None = None, method: Method = "residual", count: int = 5) -> Figure:
-    """One run as a film strip: the cable and its grippers at `count` instants, dense at the start, over the target."""
-    pairs = by_shape(runs)
-    shape = next(iter(pairs)) if shape is None else shape
-    if shape not in pairs or method not in pairs[shape]:
-        raise ValueError(f"No run of shape {shape!r} with method {method!r}; shapes: {', '.join(pairs)}.")
-    run = pairs[shape][method]
+def snapshots(runs: Runs) -> Figure:
+    """The first shape with the residual as a film strip: cable and grippers at five instants, dense at the start.
+
+    Raises:
+        ValueError: there is no such run.
+    """
+    shape, pair = next(iter(by_shape(runs).items()))
+    if "residual" not in pair:
+        raise ValueError(f"This figure needs a run of shape {shape!r} with method 'residual', got none.")
+    run = pair["residual"]
     last = len(run.times) - 1
-    chosen = np.unique(np.round(last * np.linspace(0.0, 1.0, count) ** 1.6).astype(int))
-    view = common_window({(shape, method): run})[shape]
+    chosen = np.unique(np.round(last * np.linspace(0.0, 1.0, 5) ** 1.6).astype(int))
+    view = common_window({(shape, "residual"): run})[shape]
     width = 2.3
     with matplotlib.rc_context(_STYLE):
         height = width * (view[3] - view[2]) / (view[1] - view[0])
@@ -160,7 +163,7 @@ def snapshots(runs: Runs, shape: str | None = None, method: Method = "residual",
         for ax, index in zip(axes, chosen, strict=True):
             _table_axes(ax, view)
             ax.plot(*cable_curve(run.target.keypoints).T, color=LIGHT.target, lw=1.6, ls=(0, (4, 3)))
-            _draw_cable(ax, run, int(index), method)
+            _draw_cable(ax, run, int(index), "residual")
             ax.set_title(f"{run.times[index]:.0f} s   {run.error_cm[index]:.2f} cm", fontsize=10)
         _scale_bar(axes[-1], view)
     return figure

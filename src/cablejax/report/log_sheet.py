@@ -34,7 +34,8 @@ def log_sheet(log: GapLog, name: str) -> Sheet:
     steps = np.concatenate([np.diff(episode.time) for episode in episodes])
     points = np.concatenate([episode.keypoints for episode in episodes])
     noise, how = _noise(log)
-    chosen = _chosen(len(episodes))
+    # a few episodes, evenly over the log
+    chosen = np.unique(np.linspace(0, len(episodes) - 1, min(len(episodes), _SHOWN)).round().astype(int)).tolist()
     which = "" if len(chosen) == len(episodes) else f" {len(chosen)} of {len(episodes)} episodes."
     ranges = ", ".join(f"{axis} {span(points[..., k])}" for k, axis in enumerate("xyz"[: points.shape[-1]]))
     return Sheet(
@@ -114,11 +115,6 @@ def _speed(episode: Episode) -> np.ndarray:
     """Speed of the faster gripper after each sample but the last [cm/s]."""
     linear = episode.gripper_command[:-1, :, : episode.keypoints.shape[-1]]
     return 100 * np.linalg.norm(linear, axis=-1).max(axis=-1, initial=0.0)
-
-
-def _chosen(count: int) -> list[int]:
-    """A few episodes, evenly over the log."""
-    return np.unique(np.linspace(0, count - 1, min(count, _SHOWN)).round().astype(int)).tolist()
 
 
 def _shapes_figure(episodes: Sequence[tuple[Episode, np.ndarray | None]]) -> Figure:

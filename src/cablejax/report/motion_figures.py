@@ -11,8 +11,9 @@ from jaxtyping import Float
 from matplotlib.figure import Figure
 
 from cablejax.diagnose.diagnosis import NextMotion
+from cablejax.diagnose.judgement import effect_title
 from cablejax.report.animation import DPI, animate, gripper_patches
-from cablejax.report.effect_words import effect_title, explanation_title
+from cablejax.report.effect_words import explanation_title
 from cablejax.report.style import DIAGNOSIS_STYLE, LIGHT, cable_curve, gripper_outline
 
 _COLOURS = (LIGHT.residual, LIGHT.direct, "#009e73", "#cc79a7", "#e69f00")

@@ -111,10 +111,10 @@ def letters_figure(cable: Cable) -> Figure:
     return figure
 
 
-def span(values: np.ndarray, digits: str = ".3g") -> str:
+def span(values: np.ndarray) -> str:
     """Least and largest of the finite values: "0.1 to 3"; "n/a" where there is none."""
     known = np.asarray(values, float)[np.isfinite(values)]
     if not known.size:
         return "n/a"
-    low, high = format(known.min(), digits), format(known.max(), digits)
+    low, high = f"{known.min():.3g}", f"{known.max():.3g}"
     return low if low == high else f"{low} to {high}"

@@ -10,6 +10,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from cablejax.diagnose.diagnosis import CableDiagnosis
+from cablejax.diagnose.where_sizes import mean_of_finite
 from cablejax.report.effect_words import explained_label
 from cablejax.report.style import DIAGNOSIS_STYLE, LIGHT
 
@@ -21,8 +22,7 @@ _LOST = 0.5  # [m]
 def error_per_file(diagnosis: CableDiagnosis, predicted: np.ndarray) -> np.ndarray:
     """Root mean square error of each keypoint in each episode [mm], shape [E, N]; NaN where nothing was predicted."""
     squared = np.minimum(np.abs(np.asarray(diagnosis.log.keypoints, float) - predicted), 1.0) ** 2
-    count = np.isfinite(squared).sum(axis=(1, 3))
-    return 1e3 * np.sqrt(np.where(count > 0, np.nansum(squared, axis=(1, 3)) / np.maximum(count, 1), np.nan))
+    return 1e3 * np.sqrt(mean_of_finite(squared, (1, 3)))
 
 
 def _names(diagnosis: CableDiagnosis) -> list[str]:

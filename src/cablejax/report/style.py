@@ -42,38 +42,29 @@ def by_shape(runs: Runs) -> dict[str, dict[Method, ClosedLoopRun]]:
 
 @dataclasses.dataclass(frozen=True)
 class Colours:
-    """One colour scheme, as hexadecimal strings.
+    """The colours on white, as hexadecimal strings; the pages have their own for dark screens.
 
     Attributes:
         background, ink, muted, faint: of the page, its text, its captions and its lines.
         gripper, target, residual, direct: of the grippers, the target, and the cable by each method.
     """
 
-    background: str
-    ink: str
-    muted: str
-    faint: str
-    gripper: str
-    target: str
-    residual: str
-    direct: str
+    background: str = "#ffffff"
+    ink: str = "#1c2228"
+    muted: str = "#5c6670"
+    faint: str = "#d9dee3"
+    gripper: str = "#3c4650"
+    target: str = "#8b949d"
+    residual: str = "#0072b2"
+    direct: str = "#d55e00"
 
     def method(self, method: Method) -> str:
         """The colour of one method's lines."""
         return self.residual if method == "residual" else self.direct
 
 
-LIGHT = Colours(
-    background="#ffffff",
-    ink="#1c2228",
-    muted="#5c6670",
-    faint="#d9dee3",
-    gripper="#3c4650",
-    target="#8b949d",
-    residual="#0072b2",
-    direct="#d55e00",
-)
-"""On white; the pages have their own for dark screens."""
+LIGHT = Colours()
+"""The colours of every picture."""
 
 FIGURE_STYLE: dict[Any, Any] = {
     "font.family": "sans-serif",

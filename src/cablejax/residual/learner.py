@@ -172,11 +172,6 @@ class LearnerState(NamedTuple):
     count: Float[Array, "*batch"]
     loss: Float[Array, "*batch K1"]
 
-    @property
-    def regret(self) -> Float[Array, "*batch"]:
-        """By how much the mixture's summed squared error exceeds that of the candidate that was best in hindsight."""
-        return self.loss[..., -1] - self.loss[..., :-1].min(axis=-1)
-
 
 def initial_learner(config: LearnerConfig, n_keypoints: int, n_grippers: int, dtype) -> LearnerState:
     """The state before the first sample, for N keypoints and Q grippers."""

@@ -57,14 +57,12 @@ class SpatialCable(Simulator):
         rod: resolution; the material frame is followed where an explanation needs it.
         layout: of the effects.
         windows: to simulate.
-        samples: of the windows that are predicted.
         correction: added to what is predicted in the windows, see `corrected`, shape [W, T, F, 3]; None = nothing.
     """
 
     rod: Rod
     layout: Layout
     windows: Windows
-    samples: slice = dataclasses.field(default_factory=lambda: _FITTED)
     correction: Float[np.ndarray, "W T F 3"] | None = None
 
     @property
@@ -135,7 +133,7 @@ class SpatialCable(Simulator):
     def predict(self, explanations, episodes) -> Float[np.ndarray, "X E T F 3"]:
         """Free markers [m] at the samples that are compared; NaN from where on the simulation was not solved."""
         parts = ((self._in_parallel(0, one, episodes, ())) for one in explanations)
-        found = np.stack([np.concatenate([points for points, _ in part])[:, self.samples] for part in parts])
+        found = np.stack([np.concatenate([points for points, _ in part])[:, _FITTED] for part in parts])
         return found if self.correction is None else found + self.correction[episodes]
 
     def linearise(self, explanations, episodes):
@@ -163,19 +161,19 @@ class SpatialCable(Simulator):
         rows = np.zeros((max(_COLUMNS * -(-count // _COLUMNS), _COLUMNS), self.layout.size))
         rows[:count] = directions
         parts = self._in_parallel(1, one, episodes, (rows,))
-        predicted = np.concatenate([part[0] for part in parts])[:, self.samples]
-        slopes = np.concatenate([part[1][:, :, self.samples] for part in parts])
+        predicted = np.concatenate([part[0] for part in parts])[:, _FITTED]
+        slopes = np.concatenate([part[1][:, :, _FITTED] for part in parts])
         return predicted, np.moveaxis(slopes, 1, 0)[:count]
 
     def evidence(self) -> Evidence:
         """The windows, weighed for fits."""
-        windows, stride = self.windows, self.samples.step or 1
+        windows, stride = self.windows, _FITTED.step
         unit = GOOD_FIT * np.sqrt(3 * _CORRELATION / (stride * windows.interval))
         return Evidence(
             simulator=self,
             episodes=np.arange(len(windows)),
-            observed=windows.observed[:, self.samples],
-            nominal=np.zeros_like(windows.keypoints[:, self.samples]),
+            observed=windows.observed[:, _FITTED],
+            nominal=np.zeros_like(windows.keypoints[:, _FITTED]),
             noise=np.full((windows.keypoints.shape[2], 1), unit),
             temper=np.ones(len(windows)) if windows.trust is None else 1 / windows.trust,
             freedom=LEAST_SQUARES,

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
-from jaxtyping import Float
 
 from cablejax.diagnose.clock import keypoints_at
 from cablejax.recordings.poses import poses_at
@@ -29,19 +28,22 @@ def on_one_clock(log: GapLog) -> tuple[GapLog, tuple[str, ...]]:
         int(np.floor((time[n - 1] - time[0]) / interval + 1e-6)) + 1
         for time, n in zip(log.time, log.episode_length, strict=True)
     ]
-    whole: dict[str, np.ndarray] = {"time": np.zeros((len(length), max(length)))}
+    clock = interval * np.arange(max(length))
+    whole = {"time": np.tile(clock, (len(length), 1))}
     for name in ("keypoints", "gripper_pose", "gripper_command", "hold"):
         array = getattr(log, name)
         if array is not None:
             empty = np.nan if name == "keypoints" else 0
             whole[name] = np.full((len(length), max(length), *array.shape[2:]), empty, array.dtype)
     for e, (samples, n) in enumerate(zip(length, log.episode_length, strict=True)):
-        time = log.time[e, :n] - log.time[e, 0]
-        grid = interval * np.arange(samples)
+        time, grid = log.time[e, :n] - log.time[e, 0], clock[:samples]
         before = np.clip(np.searchsorted(time, grid + 1e-9, side="right") - 1, 0, n - 1)
-        whole["time"][e] = interval * np.arange(max(length))
-        whole["keypoints"][e, :samples] = _points(grid, time, log.keypoints[e, :n].astype(float), interval)
-        whole["gripper_pose"][e] = poses_at(interval * np.arange(max(length)), time, log.gripper_pose[e, :n])
+        points = log.keypoints[e, :n].astype(float)
+        if n > 1:
+            # an episode may be slower than the clock: a gap is one in its own clock
+            points = keypoints_at(grid, time, points, max(interval, float(np.median(np.diff(time)))))
+        whole["keypoints"][e, :samples] = points
+        whole["gripper_pose"][e] = poses_at(clock, time, log.gripper_pose[e, :n])
         whole["gripper_command"][e, :samples] = log.gripper_command[e, before]
         if log.hold is not None:
             whole["hold"][e, :samples] = log.hold[e, before] & log.hold[e, np.minimum(before + 1, n - 1)]
@@ -50,9 +52,3 @@ def on_one_clock(log: GapLog) -> tuple[GapLog, tuple[str, ...]]:
         f"{1e3 * interval:.3g} ms."
     )
     return dataclasses.replace(log, episode_length=np.array(length, np.int32), **whole), (report,)
-
-
-def _points(grid, time, points: Float[np.ndarray, "T N 3"], interval: float) -> Float[np.ndarray, "G N 3"]:
-    # an episode may be slower than the clock: a gap is one in its own clock
-    own = max(interval, float(np.median(np.diff(time)))) if len(time) > 1 else interval
-    return keypoints_at(grid, time, points, own) if len(time) > 1 else points

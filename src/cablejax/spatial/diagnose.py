@@ -20,11 +20,10 @@ from cablejax.spatial.accidents import accident_sentences, kept, moderated, off
 from cablejax.spatial.cable import errors
 from cablejax.spatial.clock import on_one_clock
 from cablejax.spatial.effects import GRIP
-from cablejax.spatial.gap import constant_offset, gap_of, noise_of, smallest_gap
+from cablejax.spatial.gap import constant_offset, gap_of, in_log, noise_of, smallest_gap, where_of
 from cablejax.spatial.geometry import local_changes
 from cablejax.spatial.identify import Identified, identify
 from cablejax.spatial.named import named_effects, quantities_of, with_both_drags
-from cablejax.spatial.where import in_log, where_of
 from cablejax.spatial.windows import WINDOW, windows_of
 from cablejax.types import GapLog
 
@@ -75,7 +74,7 @@ def diagnose_space(
     progress(f"{len(windows)} windows of {WINDOW:g} s, {len(np.unique(windows.group))} recordings")
     changes = local_changes(log, windows.held)
     for change in changes:
-        progress(change.sentence)
+        progress(change)
     found = identify(windows, stiffness, cable["bending_damping_s"], only=only, state=state, progress=progress)
 
     density, guessed = cable["linear_density_kg_per_m"], "linear_density_kg_per_m" in log.meta.get("guessed", ())
@@ -92,25 +91,21 @@ def diagnose_space(
     if verdict in ("none", "unknown"):
         effects = ()
     offset = ParameterEstimate(constant_offset(after[use], windows.chosen(use)), None, "m")
-    first = [change.sentence for change in changes[:1]]
     nominal, explained = (in_log(log, windows, part) for part in (before, after))
     where = where_of(log, windows.chosen(use), nominal, before[use], noise, changes)
     return SpatialDiagnosis(
         verdict=verdict,
-        sentence=" ".join([verdict_sentence(verdict, effects, equivalent, (), gap.shrinkage or 0.0), *first]),
+        sentence=" ".join([verdict_sentence(verdict, effects, equivalent, (), gap.shrinkage or 0.0), *changes[:1]]),
         effects=effects,
         equivalent=equivalent,
         quantities=quantities_of(found, None if guessed else density) | {"constant_offset_m": offset},
         ranking=_ranking(found),
-        leftover_p=None,
         gap=gap,
         where=where,
-        next_motion=None,
-        baselines={},
         caveats=(
             *repairs,
             *accident_sentences(lost, error, windows, results == RodResult.COARSE),
-            *_caveats(log, windows, left_out, found),
+            *_caveats(windows, left_out, found),
         ),
         log=log,
         nominal=nominal,
@@ -157,7 +152,7 @@ def _ranking(found: Identified) -> tuple[Ranked, ...]:
     return tuple(ranked)
 
 
-def _caveats(log, windows, left_out, found) -> tuple[str, ...]:
+def _caveats(windows, left_out, found) -> tuple[str, ...]:
     result = [
         "The motion of a hanging cable does not depend on its weight: stiffness, drag and added masses are known "
         "relative to the linear density only, that of the cable with its markers, and a wrong density "

@@ -1,8 +1,9 @@
-"""Error of a simulation on the recorded windows, and its shrinkage by an explanation."""
+"""Error of a simulation on the recorded windows: its size, its place, and its shrinkage by an explanation."""
 
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Float
@@ -12,8 +13,11 @@ from cablejax.diagnose.diagnosis import Gap
 from cablejax.diagnose.evidence import Evidence
 from cablejax.diagnose.gap import measure_gap
 from cablejax.diagnose.noise import noise_floor
+from cablejax.diagnose.where import HORIZONS, Where
+from cablejax.diagnose.where_sizes import above, mean_of_finite, sizes_of
 from cablejax.spatial.cable import SpatialCable, bounded
-from cablejax.spatial.windows import Windows
+from cablejax.spatial.windows import Windows, labels
+from cablejax.types import GapLog
 
 RESOLVABLE = 3.0
 """An error up to so many times the noise is none."""
@@ -41,9 +45,8 @@ def constant_offset(predicted: Float[np.ndarray, "W T F 3"], windows: Windows) -
     off = np.where(np.isfinite(windows.observed), windows.observed - predicted, np.nan)
     means = []
     for group in np.unique(windows.group):
-        part = off[windows.group == group].reshape(-1, *off.shape[2:])
-        seen = np.isfinite(part)
-        means.append((np.where(seen, part, 0.0).sum(axis=0) / np.maximum(seen.sum(axis=0), 1))[seen.any(axis=0)])
+        mean = mean_of_finite(off[windows.group == group].reshape(-1, *off.shape[2:]), 0)
+        means.append(mean[np.isfinite(mean)])
     return float(np.sqrt((np.concatenate(means) ** 2).mean()))
 
 
@@ -87,3 +90,64 @@ def gap_of(
         resolvable=bool(np.nanmean(squares(before, windows)) > smallest_gap(noise, windows) ** 2),
     )
     return dataclasses.replace(gap, held_out_episodes=tuple(sorted({int(e) for e in windows.episode})))
+
+
+def in_log(log: GapLog, windows: Windows, predicted: Float[np.ndarray, "W T F 3"]) -> Float[np.ndarray, "E T N 3"]:
+    """Predictions at the log's samples; held keypoints as observed, NaN where nothing was predicted."""
+    points = np.full(log.keypoints.shape, np.nan)
+    first, last = windows.held[0], windows.n_keypoints - windows.held[1]
+    for e, begin, valid, part in zip(windows.episode, windows.begin, windows.valid, predicted, strict=True):
+        count = int(valid.sum())
+        points[e, begin : begin + count] = log.keypoints[e, begin : begin + count]
+        points[e, begin : begin + count, first:last] = part[:count]
+    return points
+
+
+def where_of(
+    log: GapLog,
+    windows: Windows,
+    nominal: Float[np.ndarray, "E T N 3"],
+    before: Float[np.ndarray, "W T F 3"],
+    noise: float,
+    changes: Sequence[str],
+) -> Where:
+    """Keypoints, episodes and speeds at which the nominal simulator is off.
+
+    Args:
+        log: in space.
+        windows: of the log.
+        nominal: predictions of the nominal simulator at the log's samples [m].
+        before: the same of the windows [m].
+        noise: standard deviation of a coordinate [m].
+        changes: of the set-up between recordings, in words.
+    """
+    off = bounded(np.asarray(log.keypoints, float) - nominal) ** 2
+    off = np.where(np.isfinite(log.keypoints) & np.isfinite(nominal), off, np.nan)
+    squared = squares(before, windows)
+    speed = np.linalg.norm(np.diff(windows.position, axis=1, prepend=windows.position[:, :1]), axis=-1).max(axis=2)
+    fast = (speed > np.median(speed[windows.valid]))[..., None, None]
+    return sizes_of(
+        off,
+        noise,
+        np.asarray(log.meta["keypoint_arclength_m"]),
+        smallest_mm=1e3 * smallest_gap(noise, windows),
+        names=[f"file {name}" for name in labels(log, "file", "take")],
+        gap_mm=float(above(squared, noise)),
+        horizons_mm=_by_time(squared, windows.interval, noise),
+        regimes={
+            "speed: fast": float(above(np.where(fast, squared, np.nan), noise)),
+            "speed: slow": float(above(np.where(fast, np.nan, squared), noise)),
+        },
+        first=changes,
+    )
+
+
+def _by_time(squared, interval: float, noise: float) -> dict[float, float]:
+    """Gap [mm] by seconds since a window's beginning, each from the one before on."""
+    result, before = {}, 0
+    for horizon in HORIZONS:
+        end = round(horizon / interval)
+        if before < squared.shape[1]:
+            result[horizon] = float(above(squared[:, before:end], noise))
+        before = end
+    return {horizon: size for horizon, size in result.items() if np.isfinite(size)}

@@ -7,7 +7,6 @@ differs from the median over episodes by far more than episodes scatter.
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Sequence
 
 import numpy as np
@@ -23,69 +22,31 @@ _SMALLEST_FREE = 0.006  # [m]
 _QUANTILE = 0.9
 
 
-@dataclasses.dataclass(frozen=True)
-class LocalChange:
-    """One pair of neighbouring keypoints that is further apart or closer in some episodes than in the others.
-
-    Attributes:
-        pair: the two keypoints.
-        arclength: nominal places of the two [m].
-        episodes: in which.
-        files: names of those episodes.
-        usual, here: distance in the other episodes and in these [m].
-        gripper: that holds both, None = a free part of the cable.
-    """
-
-    pair: tuple[int, int]
-    arclength: tuple[float, float]
-    episodes: tuple[int, ...]
-    files: tuple[str, ...]
-    usual: float
-    here: float
-    gripper: int | None
-
-    @property
-    def sentence(self) -> str:
-        """The change in words."""
-        where = f"at gripper {self.gripper}" if self.gripper is not None else "on the free cable"
-        files = f"file{'' if len(self.files) == 1 else 's'} {_ranges(self.files)}"
-        return (
-            f"In {files}, keypoints {self.pair[0]} and {self.pair[1]} {where} ({self.arclength[0]:.2f} to "
-            f"{self.arclength[1]:.2f} m) are {1e3 * self.here:.1f} mm apart instead of {1e3 * self.usual:.1f} mm: "
-            f"{'it was gripped again' if self.gripper is not None else 'a marker or the cable between has moved'}."
-        )
-
-
-def local_changes(log: GapLog, held: tuple[int, int]) -> tuple[LocalChange, ...]:
-    """Finds where the geometry of some episodes differs, the largest change first."""
+def local_changes(log: GapLog, held: tuple[int, int]) -> tuple[str, ...]:
+    """Says where the geometry of some episodes differs from that of the others, the largest change first."""
     points = log.keypoints.shape[2]
     grippers = [0 if k + 1 < held[0] else 1 if k >= points - held[1] else None for k in range(points - 1)]
     spacing = pair_distances(log, [gripper is not None for gripper in grippers])
-    arclength = np.asarray(log.meta["keypoint_arclength_m"], float)
-    names = labels(log, "file", "take")
-    found = []
-    for k in range(points - 1):
-        gripper = grippers[k]
+    s, names, found = np.asarray(log.meta["keypoint_arclength_m"], float), labels(log, "file", "take"), []
+    for k, gripper in enumerate(grippers):
         column = spacing[:, k]
         usual = np.nanmedian(column)
         scatter = 1.4826 * np.nanmedian(np.abs(column - usual))
         least = _SMALLEST if gripper is not None else _SMALLEST_FREE
         odd = np.flatnonzero(np.abs(column - usual) > max(_SCATTERS * scatter, least))
+        where = f"at gripper {gripper}" if gripper is not None else "on the free cable"
+        why = "it was gripped again" if gripper is not None else "a marker or the cable between has moved"
         for sign in (-1, 1):
             part = odd[np.sign(column[odd] - usual) == sign]
             if len(part):
-                found.append(
-                    LocalChange(
-                        pair=(k, k + 1),
-                        arclength=(float(arclength[k]), float(arclength[k + 1])),
-                        episodes=tuple(int(e) for e in part),
-                        files=tuple(dict.fromkeys(str(names[e]) for e in part)),
-                        usual=float(usual),
-                        here=float(np.median(column[part])),
-                        gripper=gripper,
-                    )
+                here, files = np.median(column[part]), list(dict.fromkeys(names[e] for e in part))
+                sentence = (
+                    f"In file{'' if len(files) == 1 else 's'} {_ranges(files)}, keypoints {k} and {k + 1} {where} "
+                    f"({s[k]:.2f} to {s[k + 1]:.2f} m) are {1e3 * here:.1f} mm apart instead of {1e3 * usual:.1f} mm: "
+                    f"{why}."
                 )
-    return tuple(sorted(found, key=lambda change: -abs(change.here - change.usual)))
+                found.append((abs(here - usual), sentence))
+    return tuple(sentence for _, sentence in sorted(found, key=lambda one: -one[0]))
 
 
 def pair_distances(log: GapLog, rigid: Sequence[bool]) -> Float[np.ndarray, "E M"]:

@@ -18,11 +18,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 from scipy.optimize import brentq
+from scipy.special import softmax
 from scipy.stats import norm, t
 
-from cablejax.diagnose.belief import LEAST_SQUARES, Calibration, log_scores, probabilities
+from cablejax.diagnose.belief import LEAST_SQUARES, Calibration, log_scores
 from cablejax.diagnose.diagnosis import PLACES, Diagnosis
-from cablejax.diagnose.fit import Fit, evaluate, improved
+from cablejax.diagnose.fit import Fit, evaluate, improve
 from cablejax.diagnose.given_arrays import checked_nominal
 from cablejax.diagnose.noise import noise_floor
 from cablejax.diagnose.protocol import Explanation, Plan, Report, Simulator, Term, in_batches
@@ -203,8 +204,6 @@ def diagnose_wire(photographs: Photographs, progress: Callable[[str], None] = la
     return WireDiagnosis(
         **examined.fields(),
         where=where,
-        next_motion=None,
-        caveats=(),
         seconds=time.perf_counter() - begun,
         settings=settings_of(wire, calibration),
         stiffness=_stiffness(examined, calibration),
@@ -240,8 +239,8 @@ def _stiffness(examined: Examined, calibration: Calibration) -> tuple[float, flo
     if not any({*best.names, effect.name} == set(fit.explanation.names) for fit in fits):
         # a search ends where an explanation is adequate; EI is of interest all the same
         both = Explanation((*best.terms, Term(effect, 0)), np.append(best.z, 0.0), best.own)
-        fits += refitted(evidence, improved(evidence, evaluate(evidence, [both]), evidence.simulator.plan.last_steps))
-    parts = list(zip(fits, probabilities(log_scores(fits, evidence, calibration)), strict=True))
+        fits += refitted(evidence, improve(evidence, evaluate(evidence, [both]), evidence.simulator.plan.last_steps))
+    parts = list(zip(fits, softmax(log_scores(fits, evidence, calibration)), strict=True))
     weights = np.array([chance for _, chance in parts]) / sum(chance for _, chance in parts)
     centres, spreads = np.array([_centre_and_spread(fit, evidence) for fit, _ in parts]).T
 

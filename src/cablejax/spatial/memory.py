@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import dataclasses
+import contextlib
 import hashlib
 import json
 import pathlib
@@ -36,92 +36,56 @@ def fingerprint(cable: SpatialCable, names: Sequence[str]) -> str:
 
 
 class Memory:
-    """Progress in one JSON file that is written atomically."""
+    """Progress in one JSON file that is written atomically: steps of searches by their names, and "estimates"."""
 
     def __init__(self, path: pathlib.Path | None, fingerprint: str, layout: Layout):
-        self._path, self._layout = path, layout
-        self._held: dict[str, Any] = {"fingerprint": fingerprint}
+        self._path, self._layout, self._fingerprint = path, layout, fingerprint
+        self._done: dict[str, list[Any]] = {}
         if path is not None and path.exists():
             # what cannot be read is found again
-            before = self._held
-            try:
+            with contextlib.suppress(ValueError, TypeError, KeyError, IndexError, AttributeError):
                 found = read_json(path)
-                if isinstance(found, dict) and found.get("fingerprint") == fingerprint:
-                    self._held = found
-                    self.estimates()
-                    for name in found.keys() - {"fingerprint", "estimates"}:
-                        self.steps(name)
-            except (ValueError, TypeError, KeyError, IndexError, AttributeError):
-                self._held = before
+                if found.pop("fingerprint") == fingerprint:
+                    self._done = {
+                        name: [self._estimate(one) if name == "estimates" else self._step(one) for one in kept]
+                        for name, kept in found.items()
+                    }
 
-    def steps(self, name: str) -> list[Step]:
-        """Steps of a search that was begun."""
-        return [
-            Step(
-                s["effect"],
-                s["accepted"],
-                (self._read(s["halves"][0]), self._read(s["halves"][1])),
-                np.array(s["error"]),
-                s["chance"],
-                s["counts"],
-            )
-            for s in self._held.get(name, [])
-        ]
+    def done(self, name: str) -> list[Any]:
+        """The `Step`s of a search that was begun, or each `Estimate` that is done."""
+        return list(self._done.get(name, []))
 
-    def keep(self, name: str, steps: Sequence[Step]) -> None:
-        """Keeps the steps of a search."""
-        plain = [
-            {
-                **{f.name: getattr(s, f.name) for f in dataclasses.fields(s)},
-                "halves": [_plain(half) for half in s.halves],
-                "error": s.error.tolist(),
-            }
-            for s in steps
-        ]
-        self._write(name, plain)
-
-    def estimates(self) -> list[Estimate]:
-        """Estimates that are done."""
-        return [
-            Estimate(
-                self._layout,
-                self._read(e["explanation"]),
-                # the number of columns holds also where there are no rows
-                moves=np.array(e["moves"]).reshape(-1, self._layout.size),
-                shifts=np.array(e["shifts"]).reshape(-1, self._layout.size),
-                speed=e["speed"],
-                settled=e["settled"],
-            )
-            for e in self._held.get("estimates", [])
-        ]
-
-    def keep_estimates(self, estimates: Sequence[Estimate]) -> None:
-        """Keeps the estimates."""
-        plain = [
-            {
-                "explanation": _plain(e.explanation),
-                "moves": e.moves.tolist(),
-                "shifts": e.shifts.tolist(),
-                "speed": e.speed,
-                "settled": e.settled,
-            }
-            for e in estimates
-        ]
-        self._write("estimates", plain)
-
-    def _read(self, kept: dict[str, Any]) -> Explanation:
-        own = np.array(kept["own"], float)
-        terms = tuple(Term(self._layout.named(name), 0) for name in kept["effects"])
-        return Explanation(terms, np.array(kept["z"], float), own if own.size else np.zeros((0, 0)))
-
-    def _write(self, name, value):
-        self._held[name] = value
+    def keep(self, name: str, done: Sequence[Step] | Sequence[Estimate]) -> None:
+        """Keeps what is done of a search, or the estimates."""
+        self._done[name] = list(done)
         if self._path is None:
             return
         self._path.parent.mkdir(parents=True, exist_ok=True)
         with whole_file(self._path) as stream:
-            stream.write(json.dumps(self._held).encode())
+            stream.write(json.dumps({"fingerprint": self._fingerprint, **self._done}, default=_plain).encode())
+
+    def _step(self, kept: dict[str, Any]) -> Step:
+        one, other = map(self._explanation, kept["halves"])
+        kept["halves"], kept["error"] = (one, other), np.array(kept["error"])
+        return Step(**kept)
+
+    def _estimate(self, kept: dict[str, Any]) -> Estimate:
+        kept["explanation"] = self._explanation(kept["explanation"])
+        for name in ("moves", "shifts"):
+            # the number of columns holds also where there are no rows
+            kept[name] = np.array(kept[name]).reshape(-1, self._layout.size)
+        return Estimate(self._layout, **kept)
+
+    def _explanation(self, kept: dict[str, Any]) -> Explanation:
+        own = np.array(kept["own"], float)
+        terms = tuple(Term(self._layout.named(name), 0) for name in kept["effects"])
+        return Explanation(terms, np.array(kept["z"], float), own if own.size else np.zeros((0, 0)))
 
 
-def _plain(one: Explanation) -> dict[str, Any]:
-    return {"effects": list(one.names), "z": one.z.tolist(), "own": one.own.tolist()}
+def _plain(one: Any) -> Any:
+    """What JSON has in the place of an array, an explanation, a step or an estimate."""
+    if isinstance(one, np.ndarray):
+        return one.tolist()
+    if isinstance(one, Explanation):
+        return {"effects": one.names, "z": one.z, "own": one.own}
+    return {name: value for name, value in vars(one).items() if name != "layout"}

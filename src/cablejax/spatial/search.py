@@ -25,7 +25,7 @@ from jaxtyping import Bool, Float, Int
 
 from cablejax.bounded import solve_arrow
 from cablejax.diagnose.evidence import Evidence
-from cablejax.diagnose.fit import evaluate, improved
+from cablejax.diagnose.fit import evaluate, improve
 from cablejax.diagnose.protocol import Explanation, Simulator, Term, explanation
 from cablejax.diagnose.refits import dealt
 from cablejax.spatial.accidents import compared, moderated, off
@@ -147,7 +147,7 @@ def tried_with(
     """
     fits = []
     for start, (seen, _, _) in zip(starts, _parts(cable.trusting(before.error)), strict=True):
-        (fit,) = improved(seen, evaluate(seen, [start]), cable.plan.last_steps)
+        (fit,) = improve(seen, evaluate(seen, [start]), cable.plan.last_steps)
         fits.append(fit.explanation)
     halves = fits[0], fits[1]
     error = unseen_error(cable, halves)
