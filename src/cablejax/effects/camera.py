@@ -33,6 +33,7 @@ class CameraSimilarity(CableEffect):
     null = (1.0, 0.0, 0.0, 0.0)
     side = "observation"
     origin = (0.0, 0.0)
+    """Place that the keypoints are scaled and turned about in the fit [m]."""
 
     def around(self, place):
         """Scale and rotation are about the place: elsewhere a small rotation comes with a large offset."""
