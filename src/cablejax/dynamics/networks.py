@@ -15,6 +15,7 @@ are not for the other two: what they hold follows from the nodes' positions.
 from __future__ import annotations
 
 import itertools
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
@@ -32,10 +33,10 @@ class MLP(nnx.Module):
     be multiplied before it is copied to them.
 
     Attributes:
-        corner: half the width of the activations' rounded corners, see `rectified`.
+        activation: between the layers.
     """
 
-    corner: float = 0.0
+    activation: Callable[[Array], Array] = staticmethod(jax.nn.relu)
 
     def __init__(self, inputs: tuple[int, ...], output: int, config: ModelConfig, *, normalise: bool, rngs: nnx.Rngs):
         share = nnx.initializers.variance_scaling(1.0 / len(inputs), "fan_in", "truncated_normal")
@@ -52,24 +53,13 @@ class MLP(nnx.Module):
     def after_first(self, x: Float[Array, "rows hidden"]) -> Float[Array, "rows output"]:
         """The network from the first layer's sum on."""
         for layer in self.rest:
-            x = layer(rectified(x, self.corner))
+            x = layer(self.activation(x))
         return x if self.norm is None else self.norm(x)
 
     def __call__(self, *inputs: Float[Array, "rows _"]) -> Float[Array, "rows output"]:
         """Applies the layers to the concatenation of the inputs, without concatenating them."""
         first = sum(layer(x) for layer, x in zip(self.first[1:], inputs[1:], strict=True))
         return self.after_first(self.first[0](inputs[0]) + first)
-
-
-def rectified(x: Float[Array, "*shape"], corner: float) -> Float[Array, "*shape"]:
-    """`max(x, 0)`, its corner rounded between -c and c by `(x + c)^3 (3 c - x) / 16 c^3`: twice differentiable.
-
-    It is at most 3 c / 16 above `max(x, 0)`, at 0, and the same beyond the corner.
-    """
-    if corner == 0:
-        return jax.nn.relu(x)
-    inside = jnp.clip(x, -corner, corner)
-    return jnp.where(x > corner, x, (inside + corner) ** 3 * (3 * corner - inside) / (16 * corner**3))
 
 
 class MessagePassing(nnx.Module):
