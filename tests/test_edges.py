@@ -407,12 +407,12 @@ def kept_files(folder, edit):
     parts = Parts(folder / "parts", settings_)
     parts.begin()
     parts.save("U-direct", made_up_run(target()))
-    run_folder.claim_folder(folder / "train", {"config": {}, "data": "a"}, resume=True, overwrite=False)
+    run_folder.claim_folder(folder / "train", {"config": {}, "data": "a"}, overwrite=False)
     file = (parts.folder / "settings.json", parts.folder / "U-direct.run.npz", folder / "train" / "run.json")[which]
     file.write_bytes(edges.edited_bytes(file.read_bytes(), raw))
     answer(lambda: Parts(folder / "parts", settings_).match())
     answer(lambda: parts.load("U-direct") and None)
-    answer(lambda: run_folder.claim_folder(folder / "train", {"config": {}, "data": "a"}, resume=True, overwrite=False))
+    answer(lambda: run_folder.claim_folder(folder / "train", {"config": {}, "data": "a"}, overwrite=False))
 
 
 OPTIONS = {

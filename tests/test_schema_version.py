@@ -60,7 +60,7 @@ def test_a_cable_file_and_a_training_without_version_are_of_version_1(tmp_path):
     assert read_cable(tmp_path / "cable.toml") == Cable() and "cablejax-cable/1" in text
     run = {"config": {"seed": 0}, "data": "a"}
     (tmp_path / "run.json").write_text(json.dumps(run))
-    claim_folder(tmp_path, run, resume=True, overwrite=False)
+    claim_folder(tmp_path, run, overwrite=False)
 
 
 @pytest.mark.parametrize("file", ["data set", "weights", "log", "verdict", "cable", "training", "parts"])
@@ -93,7 +93,7 @@ def test_a_newer_version_is_refused(file, tmp_path, old_store):
     def training():
         run = {"config": {}, "data": "a"}
         (tmp_path / "run.json").write_text(json.dumps({"schema": "cablejax-training/2", **run}))
-        claim_folder(tmp_path, run, resume=True, overwrite=True)
+        claim_folder(tmp_path, run, overwrite=True)
 
     def parts():
         (tmp_path / "parts").mkdir()

@@ -86,7 +86,6 @@ class TrainResult:
         weights: averaged weights.
         steps: optimiser steps done.
         completed: false if Ctrl-C ended it early; calling `train` again goes on from there.
-        validation_cm: median open-loop error of the averaged weights by horizon [cm], empty without validation data.
     """
 
     model: ModelConfig
@@ -94,7 +93,6 @@ class TrainResult:
     weights: nnx.State
     steps: int
     completed: bool
-    validation_cm: dict[int, float]
 
 
 def train(
@@ -104,7 +102,6 @@ def train(
     *,
     validation: Trajectory | None = None,
     initial: tuple[ModelConfig, nnx.State] | None = None,
-    resume: bool = True,
     overwrite: bool = False,
     progress: bool = True,
     devices: Sequence[jax.Device] | None = None,  # pyright: ignore[reportInvalidTypeForm]
@@ -119,7 +116,6 @@ def train(
         validation: held-out trajectories, evaluated open loop every `config.evaluate_every` chunks.
         initial: a model to start from instead of random weights. Its scales stay, since its weights mean nothing
             without them.
-        resume: false refuses a folder that holds this run already.
         overwrite: another run in the folder is deleted, and other files there may be replaced.
         progress: show a progress bar with remaining time.
         devices: of this process, which share each batch; all that JAX sees by default.
@@ -134,7 +130,7 @@ def train(
     identity, out_dir = data.identity if isinstance(data, StreamedData) else data, Path(out_dir)
     run = {"config": dataclasses.asdict(config), "data": fingerprint((identity, initial and initial[1]))}
     report = functools.partial(tqdm.write, file=sys.stderr)
-    claim_folder(out_dir, run, resume=resume, overwrite=overwrite, report=report)
+    claim_folder(out_dir, run, overwrite=overwrite, report=report)
 
     graphdef, weights = nnx.split(make_network(config.model, nnx.Rngs(config.seed)))
     weights = initially_symmetric(weights, config.model) if initial is None else initial[1]
@@ -176,7 +172,7 @@ def train(
                 with saving():
                     checkpoints.save(step, on_one_device(state, mesh))
     average = symmetrised(on_one_device(state.average, mesh), config.model)
-    return TrainResult(config.model, graphdef, average, step, step == total, scores)
+    return TrainResult(config.model, graphdef, average, step, step == total)
 
 
 def _buffers(data: Trajectory | StreamedData, calls: int, mesh: Mesh | None) -> Iterator[Trajectory]:
@@ -212,7 +208,7 @@ def chunk_update(config: TrainConfig, phase_index: int, graphdef: nnx.GraphDef, 
     phase, model, optimiser = config.phases[phase_index], config.model, config.optimiser()
 
     def loss_of(weights: nnx.State, windows: Window):
-        return batch_loss(weights, graphdef, windows, phase, model)
+        return batch_loss(weights, graphdef, windows, model)
 
     def update(state: TrainState, data: Trajectory):
         def one(state: TrainState, _):
@@ -259,15 +255,11 @@ def noisy_windows(key: Array, data: Trajectory, phase: Phase, history: int) -> W
     return dataclasses.replace(windows, history=noisy(jax.random.split(key_noise, phase.batch), windows.history))
 
 
-def batch_loss(weights: nnx.State, graphdef: nnx.GraphDef, windows: Window, phase: Phase, model: ModelConfig) -> Array:
+def batch_loss(weights: nnx.State, graphdef: nnx.GraphDef, windows: Window, model: ModelConfig) -> Array:
     """Mean `rollout_loss` of a batch of windows."""
     dynamics = bind(graphdef, weights)
-    scale, interval = model.normalisation.residual, model.interval
-
-    def one(window: Window):
-        return rollout_loss(dynamics, window, scale=scale, robust=phase.robust, interval=interval)
-
-    return jnp.mean(jax.vmap(one)(windows))
+    loss = functools.partial(rollout_loss, dynamics, scale=model.normalisation.residual, interval=model.interval)
+    return jnp.mean(jax.vmap(loss)(windows))
 
 
 class Validation:
