@@ -28,12 +28,13 @@ from tqdm import tqdm
 from cablejax.dataset.streaming import StreamedData
 from cablejax.dataset.windows import Window, draw_windows
 from cablejax.dynamics.checkpoint import Checkpoints
-from cablejax.dynamics.config import ModelConfig
+from cablejax.dynamics.config import RECORDED, ModelConfig
 from cablejax.dynamics.evaluate import HORIZONS, evaluation_windows, make_errors
 from cablejax.dynamics.fingerprint import fingerprint
 from cablejax.dynamics.loss import random_walk_noise, rollout_loss
 from cablejax.dynamics.metrics import MetricsLog
-from cablejax.dynamics.model import bind, make_network
+from cablejax.dynamics.model import bind
+from cablejax.dynamics.networks import GNS
 from cablejax.dynamics.normalisation import check_trajectories, fit_normalisation
 from cablejax.dynamics.parallel import loss_and_gradient, on_all_devices, on_one_device, training_mesh
 from cablejax.dynamics.run_folder import CHECKPOINTS, claim_folder
@@ -102,6 +103,7 @@ def train(
     *,
     validation: Trajectory | None = None,
     initial: tuple[ModelConfig, nnx.State] | None = None,
+    network: type = GNS,
     overwrite: bool = False,
     progress: bool = True,
     devices: Sequence[jax.Device] | None = None,  # pyright: ignore[reportInvalidTypeForm]
@@ -114,8 +116,8 @@ def train(
             streamed, one turn of its buffer per compiled call. Scales are then measured on its first buffer.
         out_dir: receives `run.json`, `metrics.csv`, `tensorboard/`, `checkpoints/`.
         validation: held-out trajectories, evaluated open loop every `config.evaluate_every` chunks.
-        initial: a model to start from instead of random weights. Its scales stay, since its weights mean nothing
-            without them.
+        initial: a model to start from instead of random weights; its scales stay, without which they mean nothing.
+        network: class of the network, made of a `ModelConfig` and `nnx.Rngs`; see `cablejax.dynamics.model.apply`.
         overwrite: another run in the folder is deleted, and other files there may be replaced.
         progress: show a progress bar with remaining time.
         devices: of this process, which share each batch; all that JAX sees by default.
@@ -129,10 +131,11 @@ def train(
     config = dataclasses.replace(config, model=_with_scales(config, data, initial))
     identity, out_dir = data.identity if isinstance(data, StreamedData) else data, Path(out_dir)
     run = {"config": dataclasses.asdict(config), "data": fingerprint((identity, initial and initial[1]))}
+    run["config"]["model"] |= RECORDED | {"network": network.__name__.lower()}
     report = functools.partial(tqdm.write, file=sys.stderr)
     claim_folder(out_dir, run, overwrite=overwrite, report=report)
 
-    graphdef, weights = nnx.split(make_network(config.model, nnx.Rngs(config.seed)))
+    graphdef, weights = nnx.split(network(config.model, nnx.Rngs(config.seed)))
     weights = initially_symmetric(weights, config.model) if initial is None else initial[1]
     optimiser = config.optimiser()
     state = TrainState(weights, weights, optimiser.init(weights), jnp.zeros((), jnp.int32))
