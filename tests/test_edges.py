@@ -49,7 +49,6 @@ from cablejax.recordings.bags import import_mcap
 from cablejax.recordings.lerobot import write_lerobot
 from cablejax.recordings.mcap_log import write_mcap
 from cablejax.recordings.wires import read_wires
-from cablejax.robot.server import observation_line
 from cablejax.simulate import play
 from cablejax.spatial.windows import windows_of
 from cli_cases import made_up_run, small_model
@@ -341,7 +340,10 @@ def robot_lines(folder, edit):
     which, tree, raw = edit
     harness, lines = Harness(), []
     for k in range(20):
-        lines += [observation_line(harness.seen(0.1 * k)), json.dumps({"now": 0.1 * k}).encode() + b"\n"]
+        lines += [
+            robots.robot_soak.observation_line(harness.seen(0.1 * k)),
+            json.dumps({"now": 0.1 * k}).encode() + b"\n",
+        ]
     line = lines[which % len(lines)]
     damaged = json.dumps(edges.edited_tree(json.loads(line), tree)).encode() + b"\n"
     lines[which % len(lines)] = damaged if raw is None else edges.edited_bytes(line, raw)
