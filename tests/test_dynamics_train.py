@@ -24,7 +24,6 @@ from cablejax.dataset.store import Store
 from cablejax.dataset.streaming import StreamedData
 from cablejax.dataset.windows import draw_windows
 from cablejax.dynamics.checkpoint import Checkpoints
-from cablejax.dynamics.evaluate import open_loop_error
 from cablejax.dynamics.fingerprint import fingerprint
 from cablejax.dynamics.loss import random_walk_noise, rollout_loss
 from cablejax.dynamics.metrics import MetricsLog
@@ -34,6 +33,7 @@ from cablejax.dynamics.run_folder import claim_folder
 from cablejax.dynamics.train import DivergedError, train
 from cablejax.dynamics.train_config import PRESETS, Phase, TrainConfig
 from dynamics_cases import SMALL, TINY_TRAINING, network, resized, trajectories
+from open_loop import open_loop_error
 
 DATA = trajectories()
 LONG = dataclasses.replace(TINY_TRAINING, phases=(Phase(steps=60, batch=4), Phase(steps=4, batch=2, rollout=2)))
