@@ -27,7 +27,7 @@ from cablejax.control.shaping import initial_history, load_model
 from cablejax.dataset.generate import make_engine, shards_at_once, simulate
 from cablejax.dataset.schema import DatasetConfig
 from cablejax.dynamics.config import ModelConfig
-from cablejax.dynamics.model import make_network
+from cablejax.dynamics.networks import GNS
 from cablejax.dynamics.normalisation import fit_normalisation
 from cablejax.dynamics.train import TrainState, chunk_update
 from cablejax.dynamics.train_config import Phase, TrainConfig
@@ -301,7 +301,7 @@ def training_cases(sizes: Sizes) -> list[Case]:
         model = dataclasses.replace(sizes.model, normalisation=fit_normalisation(data(), sizes.model))
         phase = Phase(steps=1000, batch=batch, rollout=rollout)
         config = TrainConfig(model=model, phases=(phase,), chunk=sizes.training_steps)
-        graphdef, weights = nnx.split(make_network(model, nnx.Rngs(0)))
+        graphdef, weights = nnx.split(GNS(model, nnx.Rngs(0)))
         state = TrainState(weights, weights, config.optimiser().init(weights), jnp.zeros((), jnp.int32))
         arguments = (state, jax.tree.map(jnp.asarray, data()))
         program = chunk_update(config, 0, graphdef, sizes.training_steps).lower(*arguments).compile()

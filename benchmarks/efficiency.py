@@ -72,7 +72,7 @@ def training(share: int, shares: int, small: bool, weights: str) -> Callable[[],
     from cablejax.dataset.generate import make_engine, simulate
     from cablejax.dataset.schema import DatasetConfig
     from cablejax.dynamics.config import ModelConfig
-    from cablejax.dynamics.model import make_network
+    from cablejax.dynamics.networks import GNS
     from cablejax.dynamics.normalisation import fit_normalisation
     from cablejax.dynamics.parallel import on_all_devices, training_mesh
     from cablejax.dynamics.train import TrainState, chunk_update
@@ -90,7 +90,7 @@ def training(share: int, shares: int, small: bool, weights: str) -> Callable[[],
     steps = 2 if small else 10
     config = TrainConfig(model=model, phases=(Phase(steps=steps),))
     mesh = training_mesh(config)
-    graphdef, start = nnx.split(make_network(model, nnx.Rngs(0)))
+    graphdef, start = nnx.split(GNS(model, nnx.Rngs(0)))
     state = TrainState(start, start, config.optimiser().init(start), jnp.zeros((), jnp.int32))
     arguments = on_all_devices((state, trajectories), mesh)
     update = chunk_update(config, 0, graphdef, steps, mesh)

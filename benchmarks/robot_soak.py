@@ -30,7 +30,7 @@ from cablejax.control.link_state import LinkConfig
 from cablejax.control.targets import Shape, make_target, straight_start
 from cablejax.effects.given import parse_effect
 from cablejax.gaplog import read_gap_log
-from cablejax.robot.server import TICK, observation_line, serve
+from cablejax.robot.server import TICK, serve
 from cablejax.robot.session import RobotRun
 from cablejax.simulate.plant import Plant, PlantConfig
 from cablejax.simulate.table_plant import Observation
@@ -42,6 +42,15 @@ OUTAGE = (0.4, 3.0)
 """Shortest and longest time in which nothing comes at all [s]."""
 LIMITS = CommandLimits(workspace=((-1.5, -1.5), (1.5, 1.5)))
 LINK = LinkConfig(limits=LIMITS)
+
+
+def observation_line(observation: Observation) -> bytes:
+    """An observation as the server receives it: "time", "keypoints" and "gripper_pose", null where unknown."""
+    rows = {
+        name: [row if np.isfinite(row).all() else None for row in getattr(observation, name).tolist()]
+        for name in ("keypoints", "gripper_pose")
+    }
+    return json.dumps({"time": observation.time, **rows}, allow_nan=False).encode() + b"\n"
 
 
 @dataclasses.dataclass(frozen=True)

@@ -36,7 +36,7 @@ from cablejax.cable_file import config_of_log
 from cablejax.commands.workloads import distance_from_fine, moving_arches
 from cablejax.dataset.generate import make_engine, simulate
 from cablejax.dataset.schema import DatasetConfig
-from cablejax.dynamics.evaluate import open_loop_error, prior_motion
+from cablejax.dynamics.evaluate import prior_motion
 from cablejax.dynamics.train import train
 from cablejax.dynamics.train_config import PRESETS
 from cablejax.effects.physics import nominal_physics
@@ -46,6 +46,7 @@ from cablejax.simulate.elastica import elastica
 from cablejax.simulate.equilibrium import equilibrium_state
 from cablejax.simulate.motions import MotionConfig
 from cablejax.types import Trajectory
+from open_loop import open_loop_error
 from pages import page_of_results, publish
 from recorded_replay import replay_episode
 

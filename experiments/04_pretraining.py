@@ -21,10 +21,11 @@ from autoencoder import PretrainConfig, pretrain
 from cablejax.dataset.generate import generate
 from cablejax.dataset.schema import DatasetConfig
 from cablejax.dataset.windows import read_trajectories
-from cablejax.dynamics.evaluate import OpenLoopError, open_loop_error, prior_motion
+from cablejax.dynamics.evaluate import OpenLoopError, prior_motion
 from cablejax.dynamics.train import train
 from cablejax.dynamics.train_config import PRESETS
 from cablejax.simulate.motions import MotionConfig
+from open_loop import open_loop_error
 from pages import page_of_results, publish
 
 TRAIN, HELD_OUT = 100, 10

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import functools
 import os
 import sys
 from pathlib import Path
@@ -22,21 +23,21 @@ os.environ.setdefault("NPROC", "4")
 import jax
 import matplotlib.pyplot as plt
 import numpy as np
-from flax import nnx
 
 from cablejax.cable import Cable, Discretisation
+from cablejax.control.shaping import Model
 from cablejax.dataset.generate import make_engine, simulate
 from cablejax.dataset.schema import DatasetConfig, config_from_json
 from cablejax.dataset.windows import Window, concatenate
 from cablejax.dynamics.config import ModelConfig
 from cablejax.dynamics.evaluate import evaluation_windows, no_motion, prior_motion, snapping, window_errors
-from cablejax.dynamics.model import structure_of
-from cablejax.dynamics.weights import load_info, load_weights
+from cablejax.dynamics.weights import load_info
 from cablejax.effects.physics import nominal_physics
 from cablejax.simulate import ThreadedEngine
 from cablejax.simulate.equilibrium import angles_of_keypoints
 from cablejax.types import CableState, Trajectory
 from pages import markdown_table, page_of_results, publish
+from rivals import load_any, on_another_cable
 
 MODELS = {
     "GNS": "gns-reference",
@@ -68,12 +69,6 @@ CABLES = ((1.0, 13), (0.7, 13), (1.5, 13), (1.0, 9), (1.0, 17), (1.0, 25))
 COLOURS = ("#0072b2", "#009e73", "#d55e00", "#000000", "#cc79a7", "#999999")
 
 
-def source(name: str) -> str | Path:
-    """Where weights are."""
-    folder = Path(__file__).parent / "weights" / name
-    return folder if folder.is_dir() else name
-
-
 def simulated(config: DatasetConfig, count: int) -> Trajectory:
     """The last trajectories of a data set, generated again: those held out from training."""
     # the networks' data are by C MuJoCo, whose trajectories do not depend on how many are simulated together
@@ -97,11 +92,16 @@ def simulator_errors(windows: Window, cable: Discretisation) -> np.ndarray:
     return np.sqrt(np.mean(np.sum((np.asarray(seen) - windows.future) ** 2, axis=-1), axis=-1))
 
 
+def errors_in(windows: Window, model: Model) -> np.ndarray:
+    """Error [m] of a model in every window after every step."""
+    return window_errors(functools.partial(model.dynamics, model.weights), windows, model.config)
+
+
 def network_errors(name: str, data: Trajectory, steps: int, stride: int) -> np.ndarray:
     """Error [cm] of the network with these weights in every window after every step."""
-    config, graphdef, weights = load_weights(source(name))
-    windows = evaluation_windows(data, config, steps=steps, stride=stride)
-    errors = 100 * window_errors((graphdef, weights), windows, config)
+    model = load_any(name)
+    windows = evaluation_windows(data, model.config, steps=steps, stride=stride)
+    errors = 100 * errors_in(windows, model)
     print(f"{name}: {np.median(errors[:, -1]):.3f} cm after {steps} steps", file=sys.stderr, flush=True)
     return errors
 
@@ -149,7 +149,7 @@ def budgets() -> str:
     """How long each model was trained, in words."""
 
     def steps(weights: str) -> int:
-        return sum(phase["steps"] for phase in load_info(source(weights))["training"]["phases"])
+        return sum(phase["steps"] for phase in load_info(load_any(weights).name)["training"]["phases"])
 
     return "; ".join(f"{name} {steps(weights)}" for name, weights in MODELS.items())
 
@@ -187,25 +187,6 @@ def draw(errors: dict[str, np.ndarray], bare: dict[str, np.ndarray], calm: np.nd
     figure.savefig(path, dpi=140)
 
 
-def on_another_cable(config: ModelConfig, *, n_keypoints: int, length: float) -> tuple[ModelConfig, nnx.GraphDef]:
-    """Configuration and structure with which the same weights read another cable.
-
-    A graph network has the same weights at every node and edge, and so has a recurrence along the cable. The connective
-    radius stays what it was in metres, so that finer keypoints have more neighbours; nothing says that the network has
-    learned what those mean.
-
-    Raises:
-        ValueError: the network has weights of its own for every keypoint, or no two keypoints would be connected.
-    """
-    if config.network == "mlp" and n_keypoints != config.n_keypoints:
-        raise ValueError(
-            f"The network is a perceptron over {config.n_keypoints} keypoints: it cannot read {n_keypoints}. "
-            "Train another one."
-        )
-    other = dataclasses.replace(config, n_keypoints=n_keypoints, length=length)
-    return other, structure_of(other)[0]
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--full", action="store_true", help="all held-out trajectories")
@@ -241,14 +222,13 @@ def main() -> None:
         calm_moved = ~snapping(moved, steps=20, stride=10)[:, -1]
         row = [f"{length:g} m, {n} keypoints"]
         for name in MODELS.values():
-            config, _, weights = load_weights(source(name))
             try:
-                other, graphdef = on_another_cable(config, n_keypoints=n, length=length)
+                other = on_another_cable(load_any(name), n_keypoints=n, length=length)
             except ValueError:
                 row.append("cannot")
                 continue
-            windows = evaluation_windows(moved, other, steps=20, stride=10)
-            error = window_errors((graphdef, weights), windows, other)[calm_moved, -1]
+            windows = evaluation_windows(moved, other.config, steps=20, stride=10)
+            error = errors_in(windows, other)[calm_moved, -1]
             row.append(f"{100 * np.median(error) / length:.3f} / {100 * np.percentile(error, 90) / length:.3f}")
         config = ModelConfig(n_keypoints=n, length=length)
         windows = evaluation_windows(moved, config, steps=20, stride=10)

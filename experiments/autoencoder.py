@@ -104,10 +104,8 @@ def pretrain(
     """Initial weights of `train(config, data, ...)` whose encoders have learned to keep what the features say.
 
     Raises:
-        ValueError: bad data, or a network without encoders.
+        ValueError: bad data.
     """
-    if config.model.network != "gns":
-        raise ValueError(f"A {config.model.network} network has no encoders of nodes and edges: train it from scratch.")
     check_trajectories(data, config.model, steps=1, what="training data")
     model = dataclasses.replace(config.model, normalisation=fit_normalisation(data, config.model))
     rngs = nnx.Rngs(config.seed)

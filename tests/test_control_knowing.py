@@ -16,12 +16,12 @@ from cablejax.control.shaping import enters, initial_history, knowing, load_mode
 from cablejax.control.targets import make_target
 from cablejax.dataset.generate import make_engine, simulate
 from cablejax.dataset.schema import DatasetConfig
-from cablejax.dynamics.evaluate import open_loop_error
 from cablejax.dynamics.weights import released_names
 from cablejax.effects.given import parse_effect
 from cablejax.residual import STATIC, LearnerConfig
 from cablejax.simulate.plant.config import PlantConfig
 from cablejax.types import Trajectory
+from open_loop import open_loop_error
 
 CURVED = "intrinsic_curvature:centre_m=0.6,width_m=0.3,curvature_per_m=2"
 

@@ -292,8 +292,6 @@ def test_ctrl_c_keeps_what_is_done_and_says_how_to_go_on(reference, tmp_path):
     with pytest.raises(GenerationInterrupted, match=r"Stopped at 4 of 8 .* again to go on"):
         generate(TINY, path, progress=False, engine=Interrupted(TINY.discretisation))
     assert open_store(path).info().n_complete == 4
-    with pytest.raises(ValueError, match="exists and holds trajectories"):
-        generate(TINY, path, progress=False, resume=False)
     engine = Interrupted(TINY.discretisation)
     assert generate(TINY, path, progress=False, engine=engine).complete
     assert engine.calls == [2, 2]  # the two shards that were left, and nothing twice

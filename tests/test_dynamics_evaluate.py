@@ -11,7 +11,6 @@ from cablejax.dynamics.error_report import GROUPS, MODEL, error_report
 from cablejax.dynamics.evaluate import (
     evaluation_windows,
     no_motion,
-    open_loop_error,
     predict,
     prior_motion,
     snapping,
@@ -20,6 +19,7 @@ from cablejax.dynamics.evaluate import (
 from cablejax.dynamics.graph import rigid_interpolation
 from cablejax.types import Trajectory
 from dynamics_cases import SMALL, network, trajectories
+from open_loop import open_loop_error
 
 DATA = trajectories(m=3, t=8)
 SHORT = (1, 4)

@@ -37,7 +37,7 @@ def gradient(count: int, double: bool):
         weights, windows = on_all_devices((cast(weights), windows), mesh)
 
         def loss(weights, windows):
-            return batch_loss(weights, graphdef, windows, phase, SMALL)
+            return batch_loss(weights, graphdef, windows, SMALL)
 
         made = jax.jit(lambda weights, windows: loss_and_gradient(loss, weights, windows, mesh))(weights, windows)
         assert all(len(leaf.devices()) == count for leaf in jax.tree.leaves(made))

@@ -24,7 +24,6 @@ from cablejax.dataset.store import Store
 from cablejax.dataset.streaming import StreamedData
 from cablejax.dataset.windows import draw_windows
 from cablejax.dynamics.checkpoint import Checkpoints
-from cablejax.dynamics.evaluate import open_loop_error
 from cablejax.dynamics.fingerprint import fingerprint
 from cablejax.dynamics.loss import random_walk_noise, rollout_loss
 from cablejax.dynamics.metrics import MetricsLog
@@ -34,6 +33,7 @@ from cablejax.dynamics.run_folder import claim_folder
 from cablejax.dynamics.train import DivergedError, train
 from cablejax.dynamics.train_config import PRESETS, Phase, TrainConfig
 from dynamics_cases import SMALL, TINY_TRAINING, network, resized, trajectories
+from open_loop import open_loop_error
 
 DATA = trajectories()
 LONG = dataclasses.replace(TINY_TRAINING, phases=(Phase(steps=60, batch=4), Phase(steps=4, batch=2, rollout=2)))
@@ -91,7 +91,6 @@ def test_a_complete_training_is_not_repeated_and_learns(tmp_path):
         TINY_TRAINING, phases=(Phase(steps=160, batch=16, noise=0.0, lr_start=1e-2),), chunk=40
     )
     result = run(config, tmp_path / "run", validation=DATA)
-    assert set(result.validation_cm) == {1, 5}
     untrained = open_loop_error(network(result.model, last=0.0), DATA, result.model, horizons=(1,), stride=2)
     learned = open_loop_error((result.graphdef, result.weights), DATA, result.model, horizons=(1,), stride=2)
     assert learned.rmse_cm[0] < 0.9 * untrained.rmse_cm[0]
@@ -140,24 +139,22 @@ def test_a_folder_with_another_training_is_left_alone(tmp_path):
         run(dataclasses.replace(TINY_TRAINING, seed=1), tmp_path)
     with pytest.raises(ValueError, match=r"differs in .*data"):
         train(TINY_TRAINING, trajectories(seed=3), tmp_path, progress=False)
-    with pytest.raises(ValueError, match="holds a training already"):
-        run(TINY_TRAINING, tmp_path, resume=False)
 
 
 def test_a_training_is_overwritten_on_request_and_nothing_else(tmp_path):
     first = {"config": {"seed": 0}, "data": "a"}
-    claim_folder(tmp_path, first, resume=True, overwrite=False)
+    claim_folder(tmp_path, first, overwrite=False)
     kept = [tmp_path / "checkpoints" / "20" / "a", tmp_path / "weights.safetensors", tmp_path / "metrics.csv"]
     mine = [tmp_path / "notes.txt", tmp_path / "checkpoints" / "mine.txt"]
     for file in (*kept, *mine):
         file.parent.mkdir(parents=True, exist_ok=True)
         file.write_text("")
-    claim_folder(tmp_path, first, resume=True, overwrite=True)
+    claim_folder(tmp_path, first, overwrite=True)
     assert all(file.exists() for file in kept), "the same training is resumed"
     second = {"config": {"seed": 1}, "data": "a"}
     with pytest.raises(ValueError, match=r"differs in config.seed \(0, now 1\)"):
-        claim_folder(tmp_path, second, resume=True, overwrite=False)
-    claim_folder(tmp_path, second, resume=True, overwrite=True)
+        claim_folder(tmp_path, second, overwrite=False)
+    claim_folder(tmp_path, second, overwrite=True)
     assert not any(file.exists() for file in kept) and all(file.exists() for file in mine)
     stored = json.loads((tmp_path / "run.json").read_text())
     assert {name: stored[name] for name in second} == second
@@ -167,7 +164,7 @@ def test_a_training_that_goes_on_with_other_packages_says_so(tmp_path):
     run, lines = {"config": {"seed": 0}, "data": "a"}, []
 
     def claim():
-        claim_folder(tmp_path, run, resume=True, overwrite=False, report=lines.append)
+        claim_folder(tmp_path, run, overwrite=False, report=lines.append)
 
     claim(), claim()
     stored = json.loads((tmp_path / "run.json").read_text())
@@ -261,7 +258,6 @@ def test_a_rollout_longer_than_the_data_is_refused(tmp_path):
         (lambda: Phase(steps=0), "Phase.steps is 0"),
         (lambda: Phase(steps=1, noise=-1.0), "Phase.noise is -1.0"),
         (lambda: Phase(steps=1, lr_end=0.0), "Phase.lr_end is 0.0"),
-        (lambda: Phase(steps=1, robust=0.0), "Phase.robust is 0"),
         (lambda: TrainConfig(phases=()), "phases is empty"),
         (lambda: TrainConfig(ema=1.0), "ema is 1.0"),
         (lambda: TrainConfig(chunk=0), "chunk is 0"),
@@ -297,7 +293,7 @@ def test_loss_is_quadratic_near_zero_and_linear_far_away():
             truth = jnp.where(known, window.future[0], window.future[jnp.minimum(step + 1, 1)])
             return truth + jnp.where(known, 0.0, error) - history.keypoints[-1]
 
-        return float(rollout_loss(dynamics, window, scale=1e-2, robust=1.0, interval=1.0))
+        return float(rollout_loss(dynamics, window, scale=1e-2, interval=1.0))
 
     assert loss(0.0) == pytest.approx(0.0, abs=1e-6)
     assert loss(1e-3) == pytest.approx(0.5 * 0.01, rel=1e-2)

@@ -49,7 +49,6 @@ from cablejax.recordings.bags import import_mcap
 from cablejax.recordings.lerobot import write_lerobot
 from cablejax.recordings.mcap_log import write_mcap
 from cablejax.recordings.wires import read_wires
-from cablejax.robot.server import observation_line
 from cablejax.simulate import play
 from cablejax.spatial.windows import windows_of
 from cli_cases import made_up_run, small_model
@@ -268,7 +267,7 @@ def store_files(folder, edit):
         file.write_bytes(edges.edited_bytes(file.read_bytes(), raw))
     read = answer(lambda: open_store(path).read())
     again = answer(lambda: stores.complete(open_or_create(path, stores.SMALL)))
-    if again is not None:  # the same generation mends what it does not refuse
+    if again is not None:  # the same generation makes again what it does not refuse
         assert open_store(path).info().complete and len(open_store(path).read()) == 7
     return read
 
@@ -341,7 +340,10 @@ def robot_lines(folder, edit):
     which, tree, raw = edit
     harness, lines = Harness(), []
     for k in range(20):
-        lines += [observation_line(harness.seen(0.1 * k)), json.dumps({"now": 0.1 * k}).encode() + b"\n"]
+        lines += [
+            robots.robot_soak.observation_line(harness.seen(0.1 * k)),
+            json.dumps({"now": 0.1 * k}).encode() + b"\n",
+        ]
     line = lines[which % len(lines)]
     damaged = json.dumps(edges.edited_tree(json.loads(line), tree)).encode() + b"\n"
     lines[which % len(lines)] = damaged if raw is None else edges.edited_bytes(line, raw)
@@ -407,12 +409,12 @@ def kept_files(folder, edit):
     parts = Parts(folder / "parts", settings_)
     parts.begin()
     parts.save("U-direct", made_up_run(target()))
-    run_folder.claim_folder(folder / "train", {"config": {}, "data": "a"}, resume=True, overwrite=False)
+    run_folder.claim_folder(folder / "train", {"config": {}, "data": "a"}, overwrite=False)
     file = (parts.folder / "settings.json", parts.folder / "U-direct.run.npz", folder / "train" / "run.json")[which]
     file.write_bytes(edges.edited_bytes(file.read_bytes(), raw))
     answer(lambda: Parts(folder / "parts", settings_).match())
     answer(lambda: parts.load("U-direct") and None)
-    answer(lambda: run_folder.claim_folder(folder / "train", {"config": {}, "data": "a"}, resume=True, overwrite=False))
+    answer(lambda: run_folder.claim_folder(folder / "train", {"config": {}, "data": "a"}, overwrite=False))
 
 
 OPTIONS = {

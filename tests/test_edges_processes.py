@@ -192,9 +192,9 @@ def test_a_second_writer_is_refused_and_the_first_loses_nothing(tmp_path, store,
             with pytest.raises(ValueError, match="Another process"), other:
                 pass
         assert parts.state.read_text() == "kept" and parts.match()
-    claim_folder(tmp_path / "train", {"config": {}, "data": "a"}, resume=True, overwrite=False)
+    claim_folder(tmp_path / "train", {"config": {}, "data": "a"}, overwrite=False)
     with sole_writer(tmp_path / "train"), pytest.raises(ValueError, match="Another process"):
-        claim_folder(tmp_path / "train", {"config": {}, "data": "b"}, resume=True, overwrite=True)
+        claim_folder(tmp_path / "train", {"config": {}, "data": "b"}, overwrite=True)
     assert (tmp_path / "train" / "run.json").exists()
 
 

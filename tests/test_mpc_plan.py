@@ -8,10 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from against_ipopt.accurate import Accurate
 from cablejax.bounded import Result
 from cablejax.mpc import (
     SOLVERS,
-    Accurate,
     CrossEntropy,
     LevenbergMarquardt,
     PathIntegral,

@@ -114,7 +114,7 @@ def test_the_referee_of_the_soak_sees_what_goes_wrong(tmp_path, monkeypatch):
 def test_in_real_time_the_pause_comes_unasked(tmp_path):
     robot, harness = Client(run_to(tmp_path / "log.npz", rest=0.0)), Harness()
     for k in range(6):
-        robot.say(server.observation_line(harness.seen(5.0 + 0.05 * k)))
+        robot.say(robot_soak.observation_line(harness.seen(5.0 + 0.05 * k)))
         reply = robot.answer()
         time.sleep(0.05)
     assert reply["status"] == "shaping" and np.abs(reply["twist"]).max() == 0.01
@@ -142,7 +142,7 @@ NOISE = [
 @pytest.mark.parametrize("simulated", [True, False])
 def test_messages_that_are_none_are_answered_and_counted(tmp_path, simulated):
     robot, harness = Client(run_to(tmp_path / "log.npz"), simulated_clock=simulated), Harness()
-    robot.say(server.observation_line(harness.seen(0.0)), now(0.0) if simulated else b"")
+    robot.say(robot_soak.observation_line(harness.seen(0.0)), now(0.0) if simulated else b"")
     assert robot.answer()["status"] == "resting"
     refused = []
     for line in NOISE:
@@ -161,7 +161,7 @@ def test_messages_that_are_none_are_answered_and_counted(tmp_path, simulated):
 
 def test_half_lines_wait_for_their_end(tmp_path):
     robot, harness = Client(run_to(tmp_path / "log.npz"), simulated_clock=True), Harness()
-    line = server.observation_line(harness.seen(0.0)) + now(0.0)
+    line = robot_soak.observation_line(harness.seen(0.0)) + now(0.0)
     for byte in range(0, len(line), 100):
         robot.say(line[byte : byte + 100])
         time.sleep(0.001)
@@ -172,7 +172,7 @@ def test_half_lines_wait_for_their_end(tmp_path):
 def test_a_line_without_end_ends_the_run_and_keeps_the_log(tmp_path, monkeypatch):
     monkeypatch.setattr(server, "LONGEST_LINE", 10_000)
     robot, harness = Client(run_to(tmp_path / "log.npz"), simulated_clock=True), Harness()
-    robot.say(server.observation_line(harness.seen(0.0)), now(0.0))
+    robot.say(robot_soak.observation_line(harness.seen(0.0)), now(0.0))
     robot.answer()
     robot.say(b"x" * 50_000)
     assert "longer than 10000 bytes" in str(robot.leave())
@@ -200,7 +200,7 @@ def test_ctrl_c_ends_the_server_and_keeps_the_log(tmp_path):
         with socket.create_connection(("127.0.0.1", int(port)), timeout=60) as robot, robot.makefile("rb") as lines:
             harness = Harness()
             for k in range(3):
-                robot.sendall(server.observation_line(harness.seen(0.1 * k)))
+                robot.sendall(robot_soak.observation_line(harness.seen(0.1 * k)))
                 assert json.loads(lines.readline())["status"] == "resting"
             process.send_signal(signal.SIGINT)
             process.wait(timeout=60)

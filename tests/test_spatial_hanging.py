@@ -12,8 +12,9 @@ from scipy.integrate import solve_bvp
 from cablejax.cable import GRAVITY
 from cablejax.diagnose.protocol import explanation
 from cablejax.recordings.wires import read_wires
+from cablejax.simulate import hanging
 from cablejax.simulate.elastica import elastica
-from cablejax.simulate.hanging import Wire, hanging_angles, hanging_points, imbalance, joint_arclength
+from cablejax.simulate.hanging import Wire, hanging_angles, hanging_points, joint_arclength
 from cablejax.spatial.hanging import (
     HangingWire,
     Photographs,
@@ -34,6 +35,18 @@ STIFFNESS = 6e-3
 def double_precision():
     with jax.enable_x64(True):
         yield
+
+
+def imbalance(angles: jax.Array, wire: Wire, clamps: jax.Array) -> jax.Array:
+    """Largest moment out of balance, over EI / L of the wire's middle, and largest distance from the clamp over L."""
+    links = angles.shape[0]
+    zero = hanging._residual(jnp.append(angles, jnp.zeros(2, angles.dtype)), wire, clamps)
+    # The forces that balance the links best; the moments that they leave are those out of balance.
+    h = wire.length / links
+    lever = h * jnp.stack([-jnp.sin(angles), jnp.cos(angles)], axis=-1)
+    force = jnp.linalg.lstsq(lever, -zero[:-2])[0]
+    moment = (zero[:-2] + lever @ force) * wire.length / wire.stiffness[links // 2]
+    return jnp.maximum(jnp.abs(moment).max(), jnp.abs(zero[-2:]).max() / wire.length)
 
 
 solved, balance = jax.jit(hanging_angles), jax.jit(imbalance)

@@ -1,6 +1,6 @@
 """One planning problem by our solver and by IPOPT: objectives, feasibility, optimality, and the clock.
 
-The problems are those of the network with rounded corners (`cablejax.dynamics.smooth`): by the network as it was
+The problems are those of the network with rounded corners (`against_ipopt.rounded`): by the network as it was
 trained the gradient jumps, and there is no stationary point to be found. The values of the plans by that
 network are reported too.
 
@@ -21,12 +21,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from against_ipopt.accurate import Accurate
 from against_ipopt.planning_problems import PlanningCase, ProblemMaker, smooth_model
 from against_ipopt.referee import RefereeConfig, referee, slope_of, value_of
 from against_ipopt.solver_path import PathFinder, SolverPath
 from cablejax.bounded import certify
 from cablejax.control.shaping import Model
-from cablejax.mpc import Accurate, ShapingProblem
+from cablejax.mpc import ShapingProblem
 from rows import Rows
 
 EQUAL = 1e-6

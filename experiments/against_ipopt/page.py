@@ -24,7 +24,7 @@ from against_ipopt.judge import (
     meets_all,
 )
 from against_ipopt.referee import FOUND
-from cablejax.dynamics.smooth import CORNER
+from against_ipopt.rounded import CORNER
 from pages import markdown_table
 
 STEEP = 50.0
@@ -75,7 +75,7 @@ def _why_rounded(rows: list[dict], kinks: list[dict]) -> list[str]:
     lines = [
         "By the network as it was trained the objective has a kink wherever one of the million ReLUs of a rollout "
         "passes zero. Minima lie on kinks, where no gradient vanishes: a solver cannot end there with a small KKT "
-        f"residual. Rounded within {CORNER:g} of zero (`cablejax.dynamics.smooth`), the objective of the network is "
+        f"residual. Rounded within {CORNER:g} of zero (`against_ipopt.rounded`), the objective of the network is "
         "twice differentiable; at our plans its value differs from the trained network's by "
         f"{quantiles(changes)}, relative (median / 95 % / largest).",
     ]

@@ -18,10 +18,10 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from against_ipopt.referee import Limits
+from against_ipopt.rounded import CORNER, smoothed
 from cablejax.control.loop import run_closed_loop
 from cablejax.control.shaping import Model, NetworkDynamics
 from cablejax.control.targets import Shape
-from cablejax.dynamics.smooth import CORNER, smoothed
 from cablejax.mpc import MPC, MPCConfig, ObjectiveConfig, Plan, ShapingProblem, Solver
 from cablejax.mpc.feasible import feasible_from
 from cablejax.mpc.problem import Rollout

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from pathlib import Path
 
 from cablejax.control.link import Controller
-from cablejax.control.shaping import Model, load_model, make_controller
+from cablejax.control.shaping import Model, make_controller
 from cablejax.control.targets import Target
 from cablejax.residual import PAPER, STATIC, LearnerConfig
 from closed_loop.baselines import StraightDrive, statics_model
 from closed_loop.paper import DIRECT, FINE_TUNED, METHOD_LABEL, RANDOMISED, RESIDUAL, VISUAL_SERVO
 from closed_loop.visual_servo import ServoConfig, VisualServo
+from rivals import load_any
 
 LEARNER = "learner"
 NO_PRIOR = "no prior"
@@ -86,10 +86,7 @@ in any case."""
 @functools.lru_cache(maxsize=8)
 def model_named(name: str) -> Model:
     """A released model, one of `experiments/weights`, a training's folder, or the statics; loaded once."""
-    if name == STATICS:
-        return statics_model()
-    folder = Path(__file__).parents[1] / "weights" / name
-    return load_model(str(folder) if folder.is_dir() else name)
+    return statics_model() if name == STATICS else load_any(name)
 
 
 def controller_of(spec: MethodSpec, model: Model | None, target: Target) -> Controller:

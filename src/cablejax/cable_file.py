@@ -170,20 +170,15 @@ def config_of_log(log: GapLog, *, n_links: int | None = None, timestep: float | 
 
     In the plane the diameter hardly matters to the motion, and a cable thicker than a link is long gets a smaller one.
     """
-    cable, table = log.meta["cable"], log.meta["table"]
     dimension, chosen = log.keypoints.shape[-1], {"n_links": n_links, "timestep": timestep}
-    described = Cable(
-        length=cable["length_m"],
-        diameter=cable["diameter_m"] if dimension == 3 else min(cable["diameter_m"], _SLENDER * cable["length_m"]),
-        linear_density=cable["linear_density_kg_per_m"],
-        bending_stiffness=cable["bending_stiffness_n_m2"],
-        damping_time=cable["bending_damping_s"],
-        rest_curvature=cable.get("rest_curvature_per_m", 0.0),
-        friction_coefficient=0.0 if table is None else table["friction_coefficient"],
-        n_keypoints=log.keypoints.shape[-2],
-    )
+    stated = {**_OPTIONAL, **log.meta["cable"], "friction_coefficient": 0.0, **(log.meta["table"] or {})}
+    numbers = {name: stated[key] for key, (name, _) in NUMBERS.items()}
+    if dimension == 2:
+        numbers["diameter"] = min(numbers["diameter"], _SLENDER * numbers["length"])
     return Discretisation(
-        described, dimension=dimension, **{name: value for name, value in chosen.items() if value is not None}
+        Cable(**numbers, n_keypoints=log.keypoints.shape[-2]),
+        dimension=dimension,
+        **{name: value for name, value in chosen.items() if value is not None},
     )
 
 

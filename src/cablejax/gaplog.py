@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Float
 
 from cablejax.cable import GRAVITY, Cable
+from cablejax.cable_file import NUMBERS
 from cablejax.gaplog_check import DTYPES, META_FIELDS, SCHEMA, GapLogError, validate
 from cablejax.limits import LIMITS
 from cablejax.npz import NpzError, read_npz
@@ -77,22 +78,15 @@ def gap_log_from_episodes(
     if taken := set(extra or {}) & set(META_FIELDS):
         raise GapLogError(f"The extra fields {', '.join(sorted(taken))} are fields of the format: choose other names.")
     arclength = cable.keypoint_arclength if keypoint_arclength is None else np.asarray(keypoint_arclength, float)
+    numbers = {key: getattr(cable, name) for key, (name, _) in NUMBERS.items()}
+    table = {"friction_coefficient": numbers.pop("friction_coefficient")}
     return stack_episodes(
         episodes,
         {
             "schema": SCHEMA,
-            "cable": {
-                "length_m": cable.length,
-                "diameter_m": cable.diameter,
-                "linear_density_kg_per_m": cable.linear_density,
-                "bending_stiffness_n_m2": cable.bending_stiffness,
-                "bending_damping_s": cable.damping_time,
-                "rest_curvature_per_m": cable.rest_curvature,
-            },
+            "cable": numbers,
             # a cable in the plane lies on a table even where that is perfectly smooth
-            "table": {"friction_coefficient": cable.friction_coefficient}
-            if cable.friction_coefficient > 0 or episodes[0].keypoints.shape[-1] == 2
-            else None,
+            "table": table if cable.friction_coefficient > 0 or episodes[0].keypoints.shape[-1] == 2 else None,
             "gravity_m_per_s2": [0.0, 0.0, -GRAVITY],
             "keypoint_arclength_m": arclength.tolist(),
             "grasp": list(grasp),

@@ -20,6 +20,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from cablejax.cable import GRAVITY, Cable
+
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
@@ -107,9 +109,9 @@ class Measurement(NamedTuple):
 
 ROTATION_WEIGHT = 0.15
 """Metres that one radian of a gripper counts for where its motions are compared or added up [m/rad]."""
-REFERENCE_STIFFNESS = 0.02
+REFERENCE_STIFFNESS = Cable.bending_stiffness
 """EI of the reference cable [N m^2]."""
-REFERENCE_FRICTION = 0.1 * 0.08 * 9.81
+REFERENCE_FRICTION = Cable.friction_coefficient * Cable.linear_density * GRAVITY
 """Friction force per length of the reference cable on its table, `mu w` [N/m]."""
 
 

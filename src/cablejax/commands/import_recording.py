@@ -32,21 +32,19 @@ class _Import(Command, abc.ABC):
     overwrite: bool = False
 
     @abc.abstractmethod
-    def logs(self) -> list[tuple[pathlib.Path, GapLog, Sequence[str]]]:
-        """Path and content of each log, and its repairs."""
+    def imported(self) -> tuple[GapLog, Sequence[str]]:
+        """The log, and its repairs."""
 
     def execute(self):
         from cablejax.gaplog import write_gap_log
 
         if self.out.suffix.lower() != ".npz":
             raise UsageError(f"--out is {self.out}, expected a file name that ends in .npz.")
-        logs = self.logs()
-        for path, _, _ in logs:
-            if path.exists() and not self.overwrite:
-                raise UsageError(f"{path} exists. Give another file with --out, or add --overwrite.")
-        written = [(write_gap_log(path, log, overwrite=self.overwrite), log, repairs) for path, log, repairs in logs]
-        results = [_summary(path, log, repairs) for path, log, repairs in written]
-        return {"logs": results}, "\n\n".join(map(_as_text, results))
+        log, repairs = self.imported()
+        if self.out.exists() and not self.overwrite:
+            raise UsageError(f"{self.out} exists. Give another file with --out, or add --overwrite.")
+        result = _summary(write_gap_log(self.out, log, overwrite=self.overwrite), log, repairs)
+        return {"logs": [result]}, _as_text(result)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -66,13 +64,12 @@ class Deform(_Import):
     up: Literal["x", "y", "z", "-x", "-y", "-z"] = "z"
     handedness: Literal["right", "left"] = "right"
 
-    def logs(self):
-        """One log of one cable of the data set, and its repairs."""
+    def imported(self):
+        """The log of one cable of the data set, and its repairs."""
         from cablejax.recordings.deform import import_deform
         from cablejax.recordings.frames import Frame
 
-        log, repairs = import_deform(self.source, unit=self.unit, frame=Frame(self.up, self.handedness))
-        return [(self.out, log, repairs)]
+        return import_deform(self.source, unit=self.unit, frame=Frame(self.up, self.handedness))
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -85,11 +82,11 @@ class Csv(_Import):
 
     layout: pathlib.Path = pathlib.Path("layout.toml")
 
-    def logs(self):
-        """One log of the table, and its repairs."""
+    def imported(self):
+        """The log of the table, and its repairs."""
         from cablejax.recordings.table import import_csv
 
-        return [(self.out, *import_csv(self.source, self.layout))]
+        return import_csv(self.source, self.layout)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -104,25 +101,25 @@ class Mcap(_Import):
 
     layout: pathlib.Path = pathlib.Path("layout.toml")
 
-    def logs(self):
-        """One log of the bag, and its repairs; an exported log as it was."""
+    def imported(self):
+        """The log of the bag, and its repairs; an exported log as it was."""
         from cablejax.recordings.bags import import_mcap
         from cablejax.recordings.mcap_log import read_mcap, written_here
 
         if written_here(self.source):
-            return [(self.out, read_mcap(self.source), ())]
-        return [(self.out, *import_mcap(self.source, self.layout))]
+            return read_mcap(self.source), ()
+        return import_mcap(self.source, self.layout)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class LeRobot(_Import):
     """Import a LeRobot data set that `cablejax export lerobot` wrote."""
 
-    def logs(self):
+    def imported(self):
         """The log as it was exported; nothing is repaired."""
         from cablejax.recordings.lerobot import read_lerobot
 
-        return [(self.out, read_lerobot(self.source), ())]
+        return read_lerobot(self.source), ()
 
 
 @dataclasses.dataclass(frozen=True)

@@ -31,10 +31,8 @@ class Train(Command):
         overwrite: Delete another training that is in the folder, or write among what else is there.
         preset: released: as the released model was trained. small: to compare variants, some minutes. smoke: a few
             steps.
-        network: gns: the graph network. mlp, lstm: the networks that it is compared with.
         prior: The prior that the network corrects. static: the frictionless resting shape. rigid: the grippers' motion,
             interpolated. none: nothing.
-        frame: Axes that the network sees the cable in: the grippers' own, which turn with it, or the world's.
         symmetric: Tie the weights so that a mirrored cable, and one whose keypoints are counted from the other end,
             move alike.
         conditioned: Give the network each cable's stiffness and friction as inputs; the data should vary in them.
@@ -55,9 +53,7 @@ class Train(Command):
     out: pathlib.Path = pathlib.Path("runs/train")
     overwrite: bool = False
     preset: Literal["released", "small", "smoke"] = "released"
-    network: Literal["gns", "mlp", "lstm"] = "gns"
     prior: Literal["static", "rigid", "none"] = "static"
-    frame: Literal["grippers", "world"] = "grippers"
     symmetric: bool = False
     conditioned: bool = False
     start_from: str | None = None
@@ -154,9 +150,7 @@ class Train(Command):
         config, cable = PRESETS[self.preset], store.config.cable
         model = dataclasses.replace(
             config.model,
-            network=self.network,
             prior=self.prior,
-            frame=self.frame,
             symmetric=self.symmetric,
             conditioned=self.conditioned,
             n_keypoints=cable.n_keypoints,

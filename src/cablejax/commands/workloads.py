@@ -109,15 +109,15 @@ def moving_arches(
     return params, states, jnp.asarray(twist, float)
 
 
-def distance_from_fine(config: DatasetConfig, timestep: float = 0.002) -> Float[np.ndarray, "samples"]:
-    """Largest distance [m] of a keypoint from the chain at a fine time step, at every sample of a data set's motions.
+def distance_from_fine(config: DatasetConfig) -> Float[np.ndarray, "samples"]:
+    """Largest distance [m] of a keypoint from the chain with steps of 2 ms, at every sample of a data set's motions.
 
     Samples after a snap-through are left out: on which side of it a cable is says nothing of the time step.
     """
     fine = dataclasses.replace(
         config,
         engine="chain",
-        discretisation=dataclasses.replace(config.discretisation, timestep=timestep),
+        discretisation=dataclasses.replace(config.discretisation, timestep=0.002),
         shard_size=config.n_trajectories,
     )
     config = dataclasses.replace(config, shard_size=config.n_trajectories)

@@ -89,10 +89,6 @@ class Instant:
     mpc_ms: float = math.nan
     limited: bool = False
 
-    def without_command(self) -> Instant:
-        """The same instant, of a command that was not carried out."""
-        return Instant(self.observation)
-
 
 @dataclasses.dataclass(frozen=True)
 class Reply:

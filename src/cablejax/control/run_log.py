@@ -71,7 +71,7 @@ class RunLog:
 
     def forget_command(self) -> None:
         """Removes the last command, which was not carried out."""
-        self.instants[-1] = self.instants[-1].without_command()
+        self.instants[-1] = Instant(self.instants[-1].observation)
         since, _, twist = self._commands[-1]
         self._commands[-1] = (since, math.inf, np.zeros_like(twist))
 

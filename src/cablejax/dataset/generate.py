@@ -56,7 +56,6 @@ def generate(
     config: DatasetConfig,
     path: str | os.PathLike[str] | Bucket,
     *,
-    resume: bool = True,
     process_index: int | None = None,
     process_count: int | None = None,
     progress: bool = True,
@@ -70,7 +69,6 @@ def generate(
     Args:
         config: what to make.
         path: folder of the store, or `s3://BUCKET/PREFIX`: new, empty or begun earlier with the same configuration.
-        resume: if False, refuse a store in which this process has shards already.
         process_index: p; by default JAX's.
         process_count: P; by default JAX's.
         progress: show a bar with the time left, in trajectories.
@@ -92,8 +90,6 @@ def generate(
     store = open_or_create(path, config)
     _check_room(store)
     mine = range(index, config.n_shards, count)
-    if not resume and any(store.status(shard) != "missing" for shard in mine):
-        raise ValueError(f"{path} exists and holds trajectories. Allow resuming, or give a new folder.")
     simulator = engine or make_engine(config)
     at_once = shards_at_once(config, simulator)
 

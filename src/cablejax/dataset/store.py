@@ -35,7 +35,6 @@ class DatasetInfo:
     """Summary of a store.
 
     Attributes:
-        path: its folder, or where it is in object storage.
         config: what was asked for.
         versions: package versions that made it.
         n_complete: trajectories on disk in complete shards.
@@ -43,7 +42,6 @@ class DatasetInfo:
         digest: SHA-256 over all trajectories, or None until all are there. It does not depend on the shard size.
     """
 
-    path: Path | Bucket
     config: DatasetConfig
     versions: dict[str, str]
     n_complete: int
@@ -163,7 +161,6 @@ class Store:
                 continue
         done = digest.any(axis=1)
         return DatasetInfo(
-            path=self.path,
             config=self.config,
             versions=self.versions,
             n_complete=int(done.sum()),

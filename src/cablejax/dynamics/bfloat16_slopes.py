@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from flax import nnx
 from jaxtyping import Array, Float
 
-from cablejax.dynamics.model import Network
+from cablejax.dynamics.networks import GNS
 
 
 @jax.custom_vjp
@@ -47,7 +47,7 @@ def _of_linear_layer(x, kernel, dimension_numbers, **options):
     return product(x, kernel)
 
 
-def with_bfloat16_slopes(network: Network) -> Network:
+def with_bfloat16_slopes(network: GNS) -> GNS:
     """The network, changed in place so that all its linear layers have rough slopes by their input."""
     for _, module in nnx.iter_graph(network):
         if isinstance(module, nnx.Linear):

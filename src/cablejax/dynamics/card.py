@@ -19,11 +19,7 @@ _CURVE = ("step", "phase", "learning_rate", "loss")
 
 
 def network_words(config: ModelConfig) -> str:
-    """Kind and size of the network, to begin a sentence with."""
-    if config.network == "mlp":
-        return f"A perceptron of {config.hidden_layers} hidden layers of {config.hidden}"
-    if config.network == "lstm":
-        return f"A bidirectional recurrence along the cable, {config.hidden_layers} layers of {config.latent},"
+    """Size of the network, to begin a sentence with."""
     return f"A graph network of {config.message_passing} message-passing steps, latent size {config.latent},"
 
 
@@ -59,7 +55,6 @@ def write_card(
         f"{network_words(config)} of the dynamics of a cable of {config.length:g} m held at both ends: "
         f"{config.n_keypoints} keypoints, one step of {config.interval:g} s, {config.history} samples of history. It "
         f"corrects {'no' if config.prior == 'none' else f'the {config.prior}'} prior"
-        + (", sees the cable in the world's frame" if config.frame == "world" else "")
         + (", commutes with mirroring and with reversing the cable" if config.symmetric else "")
         + (" and has the cable's stiffness and friction as inputs." if config.conditioned else "."),
         "",

@@ -17,14 +17,14 @@ _OVERHEAD = 2**16
 
 
 class Checkpoints:
-    """The last few training states of one run, under `folder`.
+    """The last two training states of one run, under `folder`.
 
     Restored leaves are arrays of exactly the bits saved. Synchronous: when `save` returns, the state is on disk.
     """
 
-    def __init__(self, folder: Path, keep: int = 2):
+    def __init__(self, folder: Path):
         self._folder = folder
-        options = ocp.CheckpointManagerOptions(max_to_keep=keep, create=True, enable_async_checkpointing=False)
+        options = ocp.CheckpointManagerOptions(max_to_keep=2, create=True, enable_async_checkpointing=False)
         self._manager = ocp.CheckpointManager(folder.absolute(), options=options)
 
     def __enter__(self) -> Checkpoints:

@@ -8,6 +8,10 @@ from typing import Literal
 from cablejax.limits import check
 from cablejax.simulate.chain.statics import Statics
 
+RECORDED = {"network": "gns", "frame": "grippers"}
+"""What files record of a model beyond its `ModelConfig`: its kind, and the axes that it sees the cable in. Networks of
+other kinds and in the world's axes are in experiments/rivals.py."""
+
 
 @dataclasses.dataclass(frozen=True)
 class Normalisation:
@@ -40,29 +44,24 @@ class ModelConfig:
     """Static description of a learned model of one cable. The defaults are those of Wang et al., RA-L 2022.
 
     Attributes:
-        network: "gns", the graph network, or for comparison "mlp", one perceptron over all keypoints, or "lstm",
-            bidirectional recurrence along the cable.
         n_keypoints: observed keypoints N, uniform in arc length, both ends held by grippers.
         length: free length of the cable [m].
         radius: connective radius [m], measured along the cable at rest.
         history: samples seen H = m + 1.
         conditioned: whether the cable's descriptor, `History.cable`, is an input of the network.
         interval: duration of one step [s].
-        latent: size of latent node and edge vectors; of the recurrent state.
+        latent: size of latent node and edge vectors.
         hidden: width of the hidden layers of every network.
-        hidden_layers: hidden layers of every network; recurrent layers.
+        hidden_layers: hidden layers of every network.
         message_passing: message-passing steps, each with weights of its own.
         prior: movement that the network corrects: "static", towards the frictionless resting shape after the command,
             see `cablejax.simulate.chain.statics`; "rigid", the interpolation of the grippers' motion; or "none".
-        frame: axes that features and output are expressed in: "grippers", which turn and shift with the cable, or for
-            comparison "world".
         symmetric: whether the graph network's weights are tied so that mirrored or reversed cables move alike, see
             `cablejax.dynamics.symmetry`.
         normalisation: scales of features and output.
         statics: what the static prior knows of the cable beyond its length.
     """
 
-    network: Literal["gns", "mlp", "lstm"] = "gns"
     n_keypoints: int = 13
     length: float = 1.0
     radius: float = 0.2
@@ -74,7 +73,6 @@ class ModelConfig:
     hidden_layers: int = 2
     message_passing: int = 10
     prior: Literal["static", "rigid", "none"] = "static"
-    frame: Literal["grippers", "world"] = "grippers"
     symmetric: bool = False
     normalisation: Normalisation = Normalisation()
     statics: Statics = Statics()
@@ -92,18 +90,8 @@ class ModelConfig:
             hidden_layers="layers",
             message_passing="layers",
         )
-        for name, known in (
-            ("network", ("gns", "mlp", "lstm")),
-            ("prior", ("static", "rigid", "none")),
-            ("frame", ("grippers", "world")),
-        ):
-            if getattr(self, name) not in known:
-                raise ValueError(f"ModelConfig.{name} is {getattr(self, name)!r}, expected one of {known}.")
-        if self.symmetric and (self.network != "gns" or self.frame != "grippers"):
-            raise ValueError(
-                f"ModelConfig.symmetric is for the graph network in the grippers' frame, not for network "
-                f"{self.network!r} in frame {self.frame!r}: leave it False there."
-            )
+        if self.prior not in (known := ("static", "rigid", "none")):
+            raise ValueError(f"ModelConfig.prior is {self.prior!r}, expected one of {known}.")
         if self.symmetric and (self.latent % 4 or self.hidden % 4):
             raise ValueError(
                 f"ModelConfig.latent is {self.latent} and hidden {self.hidden}, expected multiples of 4: a symmetric "

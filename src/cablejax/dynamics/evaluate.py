@@ -112,32 +112,17 @@ def make_errors(rollout: Callable[..., OneStepModel], interval: float) -> Callab
     return errors
 
 
-def open_loop_error(
-    model: OneStepModel | tuple[nnx.GraphDef, nnx.State],
-    data: Trajectory,
-    config: ModelConfig,
-    *,
-    horizons: Sequence[int] = HORIZONS,
-    stride: int = 10,
-) -> OpenLoopError:
-    """Rolls `model` from every `stride`-th sample of every trajectory and summarises the errors.
-
-    Args:
-        model: one-step model, or a network as `(graphdef, weights)`.
-        data: held-out trajectories, arrays [M, T + 1, N, 2], [M, T + 1, 2, 3], [M, T, 2, 3].
-        config: of the graph: history, keypoints, interval.
-        horizons: steps after which errors are reported.
-        stride: samples between start points.
-    """
-    steps = max(horizons)
-    windows = evaluation_windows(data, config, steps=steps, stride=stride)
-    return summarise(window_errors(model, windows, config), windows, horizons=horizons)
-
-
 def window_errors(
     model: OneStepModel | tuple[nnx.GraphDef, nnx.State], windows: Window, config: ModelConfig, *, batch: int = 64
 ) -> Float[np.ndarray, "W K"]:
-    """Error [m] of every window after every step; `batch` windows are rolled out at once, see `open_loop_error`."""
+    """Error [m] of every window after every step.
+
+    Args:
+        model: one-step model, or a network as `(graphdef, weights)`.
+        windows: see `evaluation_windows`.
+        config: of the graph: history, keypoints, interval.
+        batch: windows that are rolled out at once.
+    """
     if isinstance(model, tuple):
         graphdef, weights = model
         errors, arguments = make_errors(lambda w: bind(graphdef, w), config.interval), (weights,)
@@ -154,7 +139,7 @@ def summarise(
     error: Float[np.ndarray, "W K"],
     windows: Window,
     *,
-    horizons: Sequence[int] = HORIZONS,
+    horizons: Sequence[int],
     count: Bool[np.ndarray, "W K"] | None = None,
 ) -> OpenLoopError:
     """Statistics of errors [m] over windows, those that `count` marks as true or all."""

@@ -32,15 +32,15 @@ def starting_from(source: str | os.PathLike[str], config: ModelConfig) -> tuple[
     config = dataclasses.replace(config, normalisation=trained.normalisation)
     if config == trained:
         return config, weights
-    if dataclasses.replace(config, conditioned=False) != trained or config.network != "gns":
+    if dataclasses.replace(config, conditioned=False) != trained:
         other = [
             f"{field.name} is {getattr(trained, field.name)!r} there and {getattr(config, field.name)!r} here"
             for field in dataclasses.fields(config)
             if getattr(trained, field.name) != getattr(config, field.name)
         ]
         raise ValueError(
-            f"The model to start from differs: {'; '.join(other)}. Only `conditioned` may differ, and only a graph "
-            "network can be made conditioned. Train with the settings of that model."
+            f"The model to start from differs: {'; '.join(other)}. Only `conditioned` may differ. Train with the "
+            "settings of that model."
         )
     encoder = ("node_encoder", "first", 0, "kernel")
     flat = dict(nnx.to_flat_state(weights))

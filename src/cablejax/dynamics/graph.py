@@ -23,6 +23,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -94,16 +95,20 @@ class Frame(NamedTuple):
     axes: Float[Array, "2 2"]
 
 
-def frame_of(gripper_pose: Float[Array, "2 3"], config: ModelConfig) -> Frame:
-    """The frame that a model works in. Differentiable as long as the grippers are apart."""
-    if config.frame == "world":
-        return Frame(jnp.zeros(2, gripper_pose.dtype), jnp.eye(2, dtype=gripper_pose.dtype))
+def frame_of(gripper_pose: Float[Array, "2 3"]) -> Frame:
+    """The grippers' frame, which turns and shifts with the cable. Differentiable as long as the grippers are apart."""
     along = gripper_pose[1, :2] - gripper_pose[0, :2]
     x = along / jnp.sqrt(jnp.sum(along**2))
     return Frame(gripper_pose[:, :2].mean(axis=0), jnp.stack([x, jnp.stack([-x[1], x[0]])]))
 
 
-def build_graph(history: History, twist: Float[Array, "2 3"], prior: Prior, config: ModelConfig) -> jraph.GraphsTuple:
+def build_graph(
+    history: History,
+    twist: Float[Array, "2 3"],
+    prior: Prior,
+    config: ModelConfig,
+    frame: Callable[[Float[Array, "2 3"]], Frame] = frame_of,
+) -> jraph.GraphsTuple:
     """The graph of one cable at one instant, see the top of this file. Differentiable in `history` and `twist`.
 
     Args:
@@ -111,10 +116,11 @@ def build_graph(history: History, twist: Float[Array, "2 3"], prior: Prior, conf
         twist: control input of both grippers in the world's frame [m/s, rad/s], shape [2, 3].
         prior: what `prior_of` gives for these.
         config: of the model that reads the graph.
+        frame: by the grippers' poses, the frame of positions and directions.
     """
     topology, scale = topology_of(config), config.normalisation
     pose = clamped(history.gripper_pose, config.statics)
-    origin, axes = frame_of(pose, config)
+    origin, axes = frame(pose)
     past = (history.keypoints - origin) @ axes.T
     now = past[-1]
 

@@ -24,15 +24,12 @@ def random_walk_noise(key: PRNGKeyArray, history: History, final_std: float) -> 
     return dataclasses.replace(history, keypoints=history.keypoints + jnp.pad(walk, ((0, 0), (1, 1), (0, 0))))
 
 
-def rollout_loss(
-    dynamics: OneStepModel, window: Window, *, scale: float, robust: float, interval: float
-) -> Float[Array, ""]:
+def rollout_loss(dynamics: OneStepModel, window: Window, *, scale: float, interval: float) -> Float[Array, ""]:
     """Robust position error of a rollout, averaged over the K steps of a window.
 
-    The mean of `2 d^2 (sqrt(1 + m / d^2) - 1)`, m being the mean square error over free keypoints and coordinates in
-    units of `scale`, and d = `robust`. Near zero this is m. Beyond d it grows like sqrt(m), so that steps in which the
-    cable snaps through, which no model predicts to the millimetre, do not dominate: on random motions 1 % of the steps
-    hold half of the sum of m.
+    The mean of `2 (sqrt(1 + m) - 1)`, m being the mean square error over free keypoints and coordinates in units of
+    `scale`. Near zero this is m. Beyond 1 it grows like sqrt(m), so that steps in which the cable snaps through, which
+    no model predicts to the millimetre, do not dominate: on random motions 1 % of the steps hold half of the sum of m.
     With K = 1 and a noisy history this is the one-step loss whose target is corrected for the noise: the displacement
     that leads from the noisy position to the true next one. Differentiable in the weights behind `dynamics`.
 
@@ -40,7 +37,6 @@ def rollout_loss(
         dynamics: one-step model.
         window: history, commands and true future, unbatched.
         scale: unit of the error [m].
-        robust: error, in units of `scale`, from which on it counts linearly.
         interval: duration of one step [s].
     """
 
@@ -48,8 +44,7 @@ def rollout_loss(
         twist, truth = now
         history = advance(history, dynamics(history, twist), twist, interval)
         error = (history.keypoints[-1] - truth)[1:-1] / scale
-        loss = 2 * robust**2 * (jnp.sqrt(1 + jnp.mean(error**2) / robust**2) - 1)
-        return history, loss
+        return history, 2 * (jnp.sqrt(1 + jnp.mean(error**2)) - 1)
 
     _, errors = jax.lax.scan(step, window.history, (window.twist, window.future))
     return jnp.mean(errors)

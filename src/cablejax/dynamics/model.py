@@ -9,40 +9,37 @@ from flax import nnx
 from jaxtyping import Array, Float
 
 from cablejax.dynamics.config import ModelConfig
-from cablejax.dynamics.graph import build_graph, frame_of, prior_of
-from cablejax.dynamics.networks import GNS, BiLSTM, FlatMLP
+from cablejax.dynamics.graph import Frame, build_graph, frame_of, prior_of
+from cablejax.dynamics.networks import GNS
 from cablejax.types import History
 
 OneStepModel = Callable[[History, Float[Array, "Q 3"]], Float[Array, "N 2"]]
 """A one-step model: the displacement X(t + 1) - X(t) [m] that a command causes after a history."""
 
-Network = GNS | FlatMLP | BiLSTM
-"""Node features [N, F] and edge features [E, G] to movement beyond the prior [N, 2], in units of its scale."""
-
-
-def make_network(config: ModelConfig, rngs: nnx.Rngs) -> Network:
-    """An untrained network of the kind that the configuration names."""
-    return {"gns": GNS, "mlp": FlatMLP, "lstm": BiLSTM}[config.network](config, rngs)
-
 
 def apply(
-    model: Network | tuple[nnx.GraphDef, nnx.State], history: History, twist: Float[Array, "2 3"]
+    model: GNS | tuple[nnx.GraphDef, nnx.State],
+    history: History,
+    twist: Float[Array, "2 3"],
+    frame: Callable[[Float[Array, "2 3"]], Frame] = frame_of,
 ) -> Float[Array, "N 2"]:
     """Displacement X(t + 1) - X(t) [m] of every keypoint; at the two grasped ones it is the grippers', exactly.
 
-    Rotating and shifting the input rotates the output, unless the model works in the world's frame. With tied weights
-    the same holds for mirroring the input and for counting its keypoints from the other end. Differentiable in weights,
-    history and twist (almost everywhere: the activation is ReLU).
+    Rotating and shifting the input rotates the output, in the grippers' frame. With tied weights the same holds for
+    mirroring the input and for counting its keypoints from the other end. Differentiable in weights, history and twist
+    (almost everywhere: the activation is ReLU).
 
     Args:
-        model: the network, or its split form `(graphdef, weights)`.
+        model: the network, or its split form `(graphdef, weights)`. Any module with a `config` will do that maps node
+            features [N, F] and edge features [E, G] to movement beyond the prior [N, 2], in units of its scale.
         history: the last H samples; vmap for batches.
         twist: control input of both grippers [m/s, rad/s], shape [2, 3].
+        frame: by the grippers' poses, the frame that the network sees the cable in.
 
     Raises:
         ValueError: a history of another number of samples or keypoints than the model was trained with.
     """
-    network: Network = nnx.merge(*model) if isinstance(model, tuple) else model
+    network: GNS = nnx.merge(*model) if isinstance(model, tuple) else model
     config = network.config
     if history.keypoints.shape != (expected := (config.history, config.n_keypoints, 2)):
         raise ValueError(
@@ -50,8 +47,8 @@ def apply(
             f"on {config.history} samples of {config.n_keypoints} keypoints (`MPCConfig.history_length`)."
         )
     prior = prior_of(history, twist, config)
-    graph = build_graph(history, twist, prior, config)
-    axes = frame_of(history.gripper_pose, config).axes
+    graph = build_graph(history, twist, prior, config, frame)
+    axes = frame(history.gripper_pose).axes
     output = network(graph.nodes, graph.edges)  # pyright: ignore[reportArgumentType]
     beyond = output[1:-1] * config.normalisation.residual
     return prior.displacement + jnp.pad(beyond @ axes, ((1, 1), (0, 0)))
@@ -63,5 +60,5 @@ def bind(graphdef: nnx.GraphDef, weights: nnx.State) -> OneStepModel:
 
 
 def structure_of(config: ModelConfig) -> tuple[nnx.GraphDef, nnx.State]:
-    """The structure of a network and the shapes and dtypes of its weights, without any memory."""
-    return nnx.split(nnx.eval_shape(lambda: make_network(config, nnx.Rngs(0))))
+    """The structure of a graph network and the shapes and dtypes of its weights, without any memory."""
+    return nnx.split(nnx.eval_shape(lambda: GNS(config, nnx.Rngs(0))))

@@ -1,20 +1,19 @@
-"""The networks: a graph network, and the perceptron and bidirectional LSTM that it is compared with.
+"""The graph network on the features of `cablejax.dynamics.graph`.
 
-All see the same node features (`cablejax.dynamics.graph`), correct the same prior, and are trained alike. The graph
-network encodes, processes by message passing, and decodes:
+It encodes, processes by message passing, and decodes:
 
     encode     v_i = f_V(node features),  e_ij = f_E(edge features)
     process    e_ij <- e_ij + f^k_e(e_ij, v_i, v_j),  v_j <- v_j + f^k_v(v_j, sum_i e'_ij)      k = 1, ..., K
     decode     output_j = f_D(v_j)
 
 after Sanchez-Gonzalez et al., "Learning to Simulate Complex Physics with Graph Networks", ICML 2020, with the sizes of
-Wang et al., RA-L 2022. Every f is a ReLU network, followed by layer normalisation except in the decoder. Edge features
-are not for the other two: what they hold follows from the nodes' positions.
+Wang et al., RA-L 2022. Every f is a ReLU network, followed by layer normalisation except in the decoder.
 """
 
 from __future__ import annotations
 
 import itertools
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
@@ -32,10 +31,10 @@ class MLP(nnx.Module):
     be multiplied before it is copied to them.
 
     Attributes:
-        corner: half the width of the activations' rounded corners, see `rectified`.
+        activation: between the layers.
     """
 
-    corner: float = 0.0
+    activation: Callable[[Array], Array] = staticmethod(jax.nn.relu)
 
     def __init__(self, inputs: tuple[int, ...], output: int, config: ModelConfig, *, normalise: bool, rngs: nnx.Rngs):
         share = nnx.initializers.variance_scaling(1.0 / len(inputs), "fan_in", "truncated_normal")
@@ -52,24 +51,13 @@ class MLP(nnx.Module):
     def after_first(self, x: Float[Array, "rows hidden"]) -> Float[Array, "rows output"]:
         """The network from the first layer's sum on."""
         for layer in self.rest:
-            x = layer(rectified(x, self.corner))
+            x = layer(self.activation(x))
         return x if self.norm is None else self.norm(x)
 
     def __call__(self, *inputs: Float[Array, "rows _"]) -> Float[Array, "rows output"]:
         """Applies the layers to the concatenation of the inputs, without concatenating them."""
         first = sum(layer(x) for layer, x in zip(self.first[1:], inputs[1:], strict=True))
         return self.after_first(self.first[0](inputs[0]) + first)
-
-
-def rectified(x: Float[Array, "*shape"], corner: float) -> Float[Array, "*shape"]:
-    """`max(x, 0)`, its corner rounded between -c and c by `(x + c)^3 (3 c - x) / 16 c^3`: twice differentiable.
-
-    It is at most 3 c / 16 above `max(x, 0)`, at 0, and the same beyond the corner.
-    """
-    if corner == 0:
-        return jax.nn.relu(x)
-    inside = jnp.clip(x, -corner, corner)
-    return jnp.where(x > corner, x, (inside + corner) ** 3 * (3 * corner - inside) / (16 * corner**3))
 
 
 class MessagePassing(nnx.Module):
@@ -150,71 +138,3 @@ class GNS(EncodeProcessDecode):
 
     def __init__(self, config: ModelConfig, rngs: nnx.Rngs):
         super().__init__((config.node_features, config.edge_features), 2, config, rngs)
-
-
-class FlatMLP(nnx.Module):
-    """All node features in one vector through `config.hidden_layers` layers of `config.hidden`.
-
-    With the defaults the two-layer perceptron of Wang et al., RA-L 2022, section V.C. It fits one number of keypoints.
-    """
-
-    def __init__(self, config: ModelConfig, rngs: nnx.Rngs):
-        self.config = config
-        n = config.n_keypoints
-        self.layers = MLP((n * config.node_features,), 2 * n, config, normalise=False, rngs=rngs)
-
-    def __call__(
-        self, node_features: Float[Array, "N node_features"], edge_features: Float[Array, "E edge_features"]
-    ) -> Float[Array, "N 2"]:
-        """Output of every keypoint from the node features of all; edge features are not used."""
-        return self.layers(node_features.reshape(1, -1)).reshape(-1, 2)
-
-
-class LSTM(nnx.Module):
-    """One long short-term memory along the cable, from keypoint 0 to N - 1 or back (Hochreiter, Schmidhuber 1997)."""
-
-    def __init__(self, inputs: int, size: int, *, backwards: bool, rngs: nnx.Rngs):
-        self.size, self.backwards = size, backwards
-        self.of_input = nnx.Linear(inputs, 4 * size, rngs=rngs)
-        self.of_state = nnx.Linear(size, 4 * size, use_bias=False, kernel_init=nnx.initializers.orthogonal(), rngs=rngs)
-
-    def __call__(self, along: Float[Array, "N inputs"]) -> Float[Array, "N size"]:
-        """Hidden state at every keypoint. `along` holds the inputs of the gates, before the recurrent part."""
-        kernel = self.of_state.kernel.get_value()
-
-        def cell(carry, given):
-            hidden, memory = carry
-            enter, forget, leave, new = jnp.split(given + hidden @ kernel, 4)
-            # a bias of 1: at first nothing is forgotten
-            memory = jax.nn.sigmoid(forget + 1.0) * memory + jax.nn.sigmoid(enter) * jnp.tanh(new)
-            hidden = jax.nn.sigmoid(leave) * jnp.tanh(memory)
-            return (hidden, memory), hidden
-
-        start = jnp.zeros(self.size, along.dtype)
-        return jax.lax.scan(cell, (start, start), self.of_input(along), reverse=self.backwards)[1]
-
-
-class BiLSTM(nnx.Module):
-    """Recurrent along the cable, in both directions: the same cell at every keypoint.
-
-    After Yan et al., "Self-Supervised Learning of State Estimation for Manipulating Deformable Linear Objects", RA-L
-    2020: an encoder at every node, `config.hidden_layers` bidirectional layers of `config.latent`, a decoder.
-    """
-
-    def __init__(self, config: ModelConfig, rngs: nnx.Rngs):
-        self.config = config
-        size = config.latent
-        self.encoder = MLP((config.node_features,), size, config, normalise=True, rngs=rngs)
-        inputs = [size] + [2 * size] * (config.hidden_layers - 1)
-        self.forwards = nnx.List([LSTM(n, size, backwards=False, rngs=rngs) for n in inputs])
-        self.backwards = nnx.List([LSTM(n, size, backwards=True, rngs=rngs) for n in inputs])
-        self.decoder = MLP((2 * size,), 2, config, normalise=False, rngs=rngs)
-
-    def __call__(
-        self, node_features: Float[Array, "N node_features"], edge_features: Float[Array, "E edge_features"]
-    ) -> Float[Array, "N 2"]:
-        """Output of every keypoint from both directions; edge features are not used."""
-        along = self.encoder(node_features)
-        for forwards, backwards in zip(self.forwards, self.backwards, strict=True):
-            along = jnp.concatenate([forwards(along), backwards(along)], axis=-1)
-        return self.decoder(along)

@@ -74,7 +74,7 @@ def fit_normalisation(data: Trajectory, config: ModelConfig) -> Normalisation:
     beyond = np.mean((moved - np.asarray(expected(*arrays), np.float64))[:, :, 1:-1] ** 2, axis=(2, 3))
     # The few steps in which a cable snaps through would set the scale alone.
     usual = np.sort(beyond.ravel())[: max(1, int(0.95 * beyond.size))]
-    origin = np.asarray(jax.vmap(jax.vmap(lambda p: frame_of(p, config).origin))(jnp.asarray(pose)), np.float64)
+    origin = np.asarray(jax.vmap(jax.vmap(lambda p: frame_of(p).origin))(jnp.asarray(pose)), np.float64)
     shorter = config.spacing - np.linalg.norm(np.diff(x, axis=2), axis=-1)
 
     def rms(values: np.ndarray, least: float) -> float:

@@ -29,7 +29,6 @@ def claim_folder(
     out_dir: Path,
     run: dict[str, Any],
     *,
-    resume: bool,
     overwrite: bool,
     report: Callable[[str], object] = lambda text: None,
 ) -> None:
@@ -38,13 +37,12 @@ def claim_folder(
     Args:
         out_dir: the folder.
         run: what decides the outcome of the training, as for JSON: "config" and "data".
-        resume: whether the folder may hold this very training.
         overwrite: whether another training, or files of something else, may be there. The training is deleted; of the
             other files those are replaced that have the names of its own.
         report: called with a line of text if other versions of the packages began this very training.
 
     Raises:
-        ValueError: the folder holds another run, any run without `resume`, or something else without `overwrite`.
+        ValueError: the folder holds another run, or something else without `overwrite`.
     """
     if out_dir.exists() and not out_dir.is_dir():
         raise ValueError(f"{out_dir} is a file, expected a folder for the training. Name another one.")
@@ -54,8 +52,6 @@ def claim_folder(
         found = _read(path)
         began = found.pop("versions", versions)  # earlier trainings recorded none
         if found == run:
-            if not resume:
-                raise ValueError(f"{out_dir} holds a training already. Choose another folder, or resume it.")
             if others := differences(began, versions):
                 changes = ", ".join(f"{name} ({old}, now {new})" for name, (old, new) in others.items())
                 report(

@@ -28,12 +28,13 @@ from tqdm import tqdm
 from cablejax.dataset.streaming import StreamedData
 from cablejax.dataset.windows import Window, draw_windows
 from cablejax.dynamics.checkpoint import Checkpoints
-from cablejax.dynamics.config import ModelConfig
+from cablejax.dynamics.config import RECORDED, ModelConfig
 from cablejax.dynamics.evaluate import HORIZONS, evaluation_windows, make_errors
 from cablejax.dynamics.fingerprint import fingerprint
 from cablejax.dynamics.loss import random_walk_noise, rollout_loss
 from cablejax.dynamics.metrics import MetricsLog
-from cablejax.dynamics.model import bind, make_network
+from cablejax.dynamics.model import bind
+from cablejax.dynamics.networks import GNS
 from cablejax.dynamics.normalisation import check_trajectories, fit_normalisation
 from cablejax.dynamics.parallel import loss_and_gradient, on_all_devices, on_one_device, training_mesh
 from cablejax.dynamics.run_folder import CHECKPOINTS, claim_folder
@@ -86,7 +87,6 @@ class TrainResult:
         weights: averaged weights.
         steps: optimiser steps done.
         completed: false if Ctrl-C ended it early; calling `train` again goes on from there.
-        validation_cm: median open-loop error of the averaged weights by horizon [cm], empty without validation data.
     """
 
     model: ModelConfig
@@ -94,7 +94,6 @@ class TrainResult:
     weights: nnx.State
     steps: int
     completed: bool
-    validation_cm: dict[int, float]
 
 
 def train(
@@ -104,7 +103,7 @@ def train(
     *,
     validation: Trajectory | None = None,
     initial: tuple[ModelConfig, nnx.State] | None = None,
-    resume: bool = True,
+    network: type = GNS,
     overwrite: bool = False,
     progress: bool = True,
     devices: Sequence[jax.Device] | None = None,  # pyright: ignore[reportInvalidTypeForm]
@@ -117,9 +116,8 @@ def train(
             streamed, one turn of its buffer per compiled call. Scales are then measured on its first buffer.
         out_dir: receives `run.json`, `metrics.csv`, `tensorboard/`, `checkpoints/`.
         validation: held-out trajectories, evaluated open loop every `config.evaluate_every` chunks.
-        initial: a model to start from instead of random weights. Its scales stay, since its weights mean nothing
-            without them.
-        resume: false refuses a folder that holds this run already.
+        initial: a model to start from instead of random weights; its scales stay, without which they mean nothing.
+        network: class of the network, made of a `ModelConfig` and `nnx.Rngs`; see `cablejax.dynamics.model.apply`.
         overwrite: another run in the folder is deleted, and other files there may be replaced.
         progress: show a progress bar with remaining time.
         devices: of this process, which share each batch; all that JAX sees by default.
@@ -133,10 +131,11 @@ def train(
     config = dataclasses.replace(config, model=_with_scales(config, data, initial))
     identity, out_dir = data.identity if isinstance(data, StreamedData) else data, Path(out_dir)
     run = {"config": dataclasses.asdict(config), "data": fingerprint((identity, initial and initial[1]))}
+    run["config"]["model"] |= RECORDED | {"network": network.__name__.lower()}
     report = functools.partial(tqdm.write, file=sys.stderr)
-    claim_folder(out_dir, run, resume=resume, overwrite=overwrite, report=report)
+    claim_folder(out_dir, run, overwrite=overwrite, report=report)
 
-    graphdef, weights = nnx.split(make_network(config.model, nnx.Rngs(config.seed)))
+    graphdef, weights = nnx.split(network(config.model, nnx.Rngs(config.seed)))
     weights = initially_symmetric(weights, config.model) if initial is None else initial[1]
     optimiser = config.optimiser()
     state = TrainState(weights, weights, optimiser.init(weights), jnp.zeros((), jnp.int32))
@@ -176,7 +175,7 @@ def train(
                 with saving():
                     checkpoints.save(step, on_one_device(state, mesh))
     average = symmetrised(on_one_device(state.average, mesh), config.model)
-    return TrainResult(config.model, graphdef, average, step, step == total, scores)
+    return TrainResult(config.model, graphdef, average, step, step == total)
 
 
 def _buffers(data: Trajectory | StreamedData, calls: int, mesh: Mesh | None) -> Iterator[Trajectory]:
@@ -212,7 +211,7 @@ def chunk_update(config: TrainConfig, phase_index: int, graphdef: nnx.GraphDef, 
     phase, model, optimiser = config.phases[phase_index], config.model, config.optimiser()
 
     def loss_of(weights: nnx.State, windows: Window):
-        return batch_loss(weights, graphdef, windows, phase, model)
+        return batch_loss(weights, graphdef, windows, model)
 
     def update(state: TrainState, data: Trajectory):
         def one(state: TrainState, _):
@@ -259,15 +258,11 @@ def noisy_windows(key: Array, data: Trajectory, phase: Phase, history: int) -> W
     return dataclasses.replace(windows, history=noisy(jax.random.split(key_noise, phase.batch), windows.history))
 
 
-def batch_loss(weights: nnx.State, graphdef: nnx.GraphDef, windows: Window, phase: Phase, model: ModelConfig) -> Array:
+def batch_loss(weights: nnx.State, graphdef: nnx.GraphDef, windows: Window, model: ModelConfig) -> Array:
     """Mean `rollout_loss` of a batch of windows."""
     dynamics = bind(graphdef, weights)
-    scale, interval = model.normalisation.residual, model.interval
-
-    def one(window: Window):
-        return rollout_loss(dynamics, window, scale=scale, robust=phase.robust, interval=interval)
-
-    return jnp.mean(jax.vmap(one)(windows))
+    loss = functools.partial(rollout_loss, dynamics, scale=model.normalisation.residual, interval=model.interval)
+    return jnp.mean(jax.vmap(loss)(windows))
 
 
 class Validation:

@@ -21,7 +21,6 @@ class Phase:
         noise: final standard deviation of the random walk added to the history [m]; 0 = none.
         lr_start: learning rate at the phase's beginning; it falls like half a cosine.
         lr_end: at its end.
-        robust: error, in units of the residual's scale, from which on it counts linearly.
     """
 
     steps: int
@@ -30,7 +29,6 @@ class Phase:
     noise: float = 3e-4
     lr_start: float = 1e-3
     lr_end: float = 1e-4
-    robust: float = 1.0
 
     def __post_init__(self):
         check(
@@ -39,7 +37,6 @@ class Phase:
             "noise",
             steps="optimiser_steps",
             rollout="commands",
-            robust="positive",
             lr_start="learning_rate",
             lr_end="learning_rate",
         )

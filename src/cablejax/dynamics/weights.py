@@ -28,7 +28,7 @@ from safetensors.numpy import save
 
 from cablejax.cable import Cable
 from cablejax.cable_file import cable_from_fields
-from cablejax.dynamics.config import ModelConfig, Normalisation
+from cablejax.dynamics.config import RECORDED, ModelConfig, Normalisation
 from cablejax.dynamics.model import structure_of
 from cablejax.limits import require
 from cablejax.simulate.chain.statics import Statics
@@ -68,7 +68,7 @@ def save_weights(
     path = Path(path)
     tensors = {name: np.asarray(leaf) for name, leaf in _named(weights).items()}
     _check_tensors(tensors, _named(structure_of(model_config)[1]), f"The weights to be saved in {path}")
-    content = {"schema": SCHEMA, "config": dataclasses.asdict(model_config), "info": dict(info)}
+    content = {"schema": SCHEMA, "config": RECORDED | dataclasses.asdict(model_config), "info": dict(info)}
     data = save(tensors, metadata={_KEY: json.dumps(content, allow_nan=False)})
     with whole_file(path) as stream:
         stream.write(data)
@@ -183,6 +183,8 @@ def _open(source: str | os.PathLike[str]) -> tuple[Path, dict[str, Any]]:
 def _config_of(content: dict[str, Any], path: Path) -> ModelConfig:
     try:
         recorded: dict[str, Any] = dict(content["config"])
+        if (kind := {name: recorded.pop(name, value) for name, value in RECORDED.items()}) != RECORDED:
+            raise ValueError(f"{kind}, expected {RECORDED}. Networks for comparison are read by experiments/rivals.py.")
         recorded["normalisation"] = Normalisation(**recorded["normalisation"])
         recorded["statics"] = Statics(**recorded.get("statics", {}))
         return ModelConfig(**recorded)

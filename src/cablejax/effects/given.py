@@ -56,7 +56,8 @@ class GivenEffect:
                 f"{self.name}: from_s is {self.from_s}, until_s {self.until_s}; expected 0 <= from_s < until_s [s]."
             )
         object.__setattr__(self, "parameters", tuple((str(n), v) for n, v in self.parameters))
-        known, required = _parameter_names(self.effect)
+        known = tuple(_parameter_units(self.effect))
+        required = [name for name in known if name not in OPTIONAL]
         named = dict(self.parameters)
         if len(named) < len(self.parameters):
             raise ValueError(f"{self.name} has a parameter twice: {', '.join(name for name, _ in self.parameters)}.")
@@ -274,12 +275,6 @@ def _parameter_units(effect: CableEffect) -> dict[str, str]:
     for variant in effect.variants[:2]:
         units |= {name: unit for name, (_, unit) in effect.reported(values, variant, chain).items()}
     return units
-
-
-def _parameter_names(effect: CableEffect) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Names of the verdict that an effect takes, and those of them that it needs."""
-    known = tuple(_parameter_units(effect))
-    return known, tuple(name for name in known if name not in OPTIONAL)
 
 
 OPTIONAL = frozenset({"hardening", "static_excess", "across", "delay_s"})

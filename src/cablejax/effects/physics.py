@@ -14,8 +14,8 @@ from jaxtyping import Array, Float
 
 from cablejax.cable import GRAVITY, Discretisation
 
-# Far enough to be out of the game, near enough for single precision.
-_NEVER = 1e3
+NEVER = 1e3
+"""A curvature [1/m] that no cable yields at, a place [m] that none reaches; near enough for single precision."""
 
 
 @jax.tree_util.register_dataclass
@@ -121,7 +121,7 @@ def nominal_physics(
         "stiffness": np.full(joints, config.cable.bending_stiffness),
         "rest_curvature": np.full(joints if config.dimension == 2 else (joints, 3), config.cable.rest_curvature),
         "damping_time": config.cable.damping_time,
-        "yield_curvature": _NEVER,
+        "yield_curvature": NEVER,
         "hardening": 0.0,
         "hysteresis_moment": 0.0,
         "hysteresis_curvature": 1.0,
@@ -141,7 +141,7 @@ def nominal_physics(
         "slip_time": 0.0,
         "rotation_offset": np.zeros(2),
         "rotation_compliance": np.zeros(2),
-        "obstacle_centre": np.full(2, _NEVER),
+        "obstacle_centre": np.full(2, NEVER),
         "obstacle_radius": 0.0,
         "bias_along": marks - config.cable.keypoint_arclength,
         "bias_across": np.zeros(config.cable.n_keypoints),

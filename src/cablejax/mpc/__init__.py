@@ -6,7 +6,6 @@ from cablejax.mpc.feasible import FeasibleSet, feasible_from
 from cablejax.mpc.plan import Plan, Solver, differentiable_plan, multi_start
 from cablejax.mpc.planners import (
     SOLVERS,
-    Accurate,
     Dogleg,
     GaussNewton,
     LevenbergMarquardt,
@@ -20,7 +19,6 @@ from cablejax.mpc.timing import ControlTiming, time_control
 __all__ = [
     "MPC",
     "SOLVERS",
-    "Accurate",
     "Action",
     "ControlTiming",
     "CrossEntropy",

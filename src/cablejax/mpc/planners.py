@@ -13,7 +13,6 @@ from cablejax.bounded.dogleg import BoundedDogleg
 from cablejax.bounded.gauss_newton import BoundedGaussNewton
 from cablejax.bounded.least_squares import AbstractBoundedLeastSquares
 from cablejax.bounded.levenberg_marquardt import BoundedLevenbergMarquardt
-from cablejax.bounded.quasi_newton import BoundedQuasiNewton
 from cablejax.bounded.solve import least_squares, minimise
 from cablejax.bounded.spectral import SpectralProjectedGradient
 from cablejax.limits import check
@@ -21,8 +20,6 @@ from cablejax.mpc.plan import Plan, Solver, plan_from
 from cablejax.mpc.problem import Rollout, ShapingProblem
 from cablejax.mpc.sampling import CrossEntropy, PathIntegral
 
-# Trial plans after each linearisation of the first part of `Accurate`.
-_FIRST_TRIALS = 3
 # Step of `ProjectedGradient` before the first curvature is known. The objective's Hessian is near 1 per step of the
 # horizon that a motion is felt in, and up to about 17 for the six-step sum, hence 0.1.
 _INITIAL_STEP = 0.1
@@ -104,43 +101,6 @@ class GaussNewton(_LeastSquaresPlanner):
     def bounded(self) -> AbstractBoundedLeastSquares:
         """The solver with these settings."""
         return BoundedGaussNewton(atol=self.tolerance, trials_per_linearisation=self.trials_per_linearisation)
-
-
-@dataclasses.dataclass(frozen=True)
-class Accurate:
-    """Solver: a few linearisations, which get near a good minimum, then quasi-Newton steps of one gradient each.
-
-    For float64 and a network with rounded corners (`dynamics.smooth`): another has no point to end at.
-
-    Attributes:
-        linearisations: of the first part, at most.
-        gradients: of the second part, at most.
-        tolerance: stop once a unit projected gradient step moves no coordinate by more than this [m]. Where bounds
-            press, the KKT residual is greater by the ratio of gradient and step bound, some 100 times.
-    """
-
-    linearisations: int = 2
-    gradients: int = 200
-    tolerance: float = 1e-10
-
-    def __post_init__(self):
-        check(self, linearisations="count", gradients="count", tolerance="positive")
-
-    def parts(self) -> tuple[BoundedLevenbergMarquardt, BoundedQuasiNewton]:
-        """The solver that begins, and the one that goes on from there."""
-        first = BoundedLevenbergMarquardt(atol=self.tolerance, trials_per_linearisation=_FIRST_TRIALS)
-        return first, BoundedQuasiNewton(atol=self.tolerance)
-
-    def __call__(self, problem: ShapingProblem, guess: Rollout) -> Plan:
-        """The plan from a guess; differentiable in the problem where it has converged."""
-        first, second = self.parts()
-        near = bounded_plan(problem, guess, first, self.linearisations)
-        plan = bounded_plan(problem, problem.rollout(near.motion), second, self.gradients)
-        return dataclasses.replace(
-            plan,
-            evaluations=near.evaluations + plan.evaluations,
-            linearisations=near.linearisations + plan.linearisations,  # pyright: ignore[reportOperatorIssue]
-        )
 
 
 @dataclasses.dataclass(frozen=True)

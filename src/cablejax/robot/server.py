@@ -146,30 +146,12 @@ def reply_line(reply: Reply, refused: Sequence[str] = ()) -> bytes:
 
     "since" and "until" are time stamps of the robot's clock, null for at once and for good.
     """
-    return _encoded(
-        {
-            "twist": reply.twist.tolist(),
-            "since": reply.since if math.isfinite(reply.since) else None,
-            "until": reply.until if math.isfinite(reply.until) else None,
-            "status": reply.status,
-            "reason": reply.reason,
-            "refused": [*refused, *reply.refused],
-        }
-    )
-
-
-def observation_line(observation: Observation) -> bytes:
-    """An observation as the server receives it: "time", "keypoints" and "gripper_pose", null where unknown."""
-    return _encoded(
-        {
-            "time": observation.time,
-            **{
-                name: [row if np.isfinite(row).all() else None for row in getattr(observation, name).tolist()]
-                for name in ("keypoints", "gripper_pose")
-            },
-        }
-    )
-
-
-def _encoded(message: dict[str, Any]) -> bytes:
+    message = {
+        "twist": reply.twist.tolist(),
+        "since": reply.since if math.isfinite(reply.since) else None,
+        "until": reply.until if math.isfinite(reply.until) else None,
+        "status": reply.status,
+        "reason": reply.reason,
+        "refused": [*refused, *reply.refused],
+    }
     return json.dumps(message, allow_nan=False).encode() + b"\n"

@@ -60,8 +60,8 @@ def hanging_angles(
 ) -> Float[Array, " M"]:
     """Angles of the links of a wire at rest [rad], counter-clockwise from the horizontal, shape [M].
 
-    Which of several equilibria is found depends on the guess. It is the caller's to check `imbalance`, which is small
-    if one was found. Differentiable in the wire and the clamps, in both modes.
+    Which of several equilibria is found, or whether one is, depends on the guess. Differentiable in the wire and the
+    clamps, in both modes.
 
     Args:
         wire: of M links.
@@ -98,18 +98,6 @@ def hanging_points(
     step = length / links * jnp.stack([jnp.cos(angles), jnp.sin(angles)], axis=-1)
     nodes = clamps[0, :2] + jnp.concatenate([jnp.zeros((1, 2), step.dtype), jnp.cumsum(step, axis=0)])
     return nodes[:: links // (count - 1)]
-
-
-def imbalance(angles: Float[Array, " M"], wire: Wire, clamps: Float[Array, "2 3"]) -> Float[Array, ""]:
-    """Largest moment out of balance, over EI / L of the wire's middle, and largest distance from the clamp over L."""
-    links = angles.shape[0]
-    zero = _residual(jnp.append(angles, jnp.zeros(2, angles.dtype)), wire, clamps)
-    # The forces that balance the links best; the moments that they leave are those out of balance.
-    h = wire.length / links
-    lever = h * jnp.stack([-jnp.sin(angles), jnp.cos(angles)], axis=-1)
-    force = jnp.linalg.lstsq(lever, -zero[:-2])[0]
-    moment = (zero[:-2] + lever @ force) * wire.length / wire.stiffness[links // 2]
-    return jnp.maximum(jnp.abs(moment).max(), jnp.abs(zero[-2:]).max() / wire.length)
 
 
 def _residual(unknowns: Float[Array, " U"], wire: Wire, clamps: Float[Array, "2 3"]) -> Float[Array, " U"]:

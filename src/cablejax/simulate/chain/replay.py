@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from cablejax.cable import Discretisation
-from cablejax.effects.physics import Physics
+from cablejax.effects.physics import NEVER, Physics
 from cablejax.simulate.chain.state import ChainState, chain_nodes
 from cablejax.simulate.chain.step import advance, slipped
 from cablejax.simulate.compile import full_precision
@@ -124,7 +124,7 @@ class Chain:
             friction=jnp.zeros_like(physics.friction),
             patch_friction=jnp.zeros_like(physics.patch_friction),
             hysteresis_moment=jnp.zeros_like(physics.hysteresis_moment),
-            yield_curvature=jnp.full_like(physics.yield_curvature, 1e3),
+            yield_curvature=jnp.full_like(physics.yield_curvature, NEVER),
             drag=jnp.zeros_like(physics.drag),
         )
 

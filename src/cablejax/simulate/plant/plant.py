@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from cablejax.effects.given import GivenEffect
+from cablejax.effects.physics import NEVER
 from cablejax.simulate.composite import node_offsets
 from cablejax.simulate.elastica import solve_elastica
 from cablejax.simulate.plant.between_steps import Extension, Memory, TableFriction
@@ -20,8 +21,6 @@ RESTING = 2e-4
 """Motion within `settle_time` below which a cable has settled [m]."""
 LONGEST_SETTLING = 20
 """How often `settle_time` passes before a cable that keeps moving counts as settled."""
-NO_YIELD = 1e3
-"""Curvature that no cable yields at [1/m]: the null value of `Physics.yield_curvature`."""
 
 
 class Plant(TablePlant):
@@ -48,7 +47,7 @@ class Plant(TablePlant):
         # The mocap bodies coincide with the frames of what they hold: the last link begins before the grasped end.
         physics, h = self._physics, config.discretisation.link_length
         self._inset = 0.0 if physics.rotation_compliance[1] > 0 else 0.5 * h
-        remembers = physics.hysteresis_moment > 0 or physics.yield_curvature < NO_YIELD
+        remembers = physics.hysteresis_moment > 0 or physics.yield_curvature < NEVER
         uneven = physics.patch_friction or physics.static_excess
         self._memory = Memory(self.model, self._data, config) if remembers else None
         self._friction = TableFriction(self.model, self._data, self._links, config) if uneven else None

