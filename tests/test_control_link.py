@@ -223,7 +223,6 @@ LIMITS = CommandLimits(speed=0.1, turn_rate=0.5, max_distance=1.0, workspace=((-
     [
         ([[0.03, 0, 0.1], [-0.03, 0, 0]], 1.0),
         ([[0.4, 0, 0], [0, 0, 0]], 0.25),
-        ([[0, 0, -2.0], [0, 0, 0]], 0.25),
         ([[-0.05, 0, 0], [0.05, 0, 0]], 0.04),  # apart: 0.1 m in 1 s, and 4 mm are left
         ([[0.0, 0.1, 0], [0.0, 0.1, 0]], 1.0),
         ([[0.1, 0, 0], [0.1, 0, 0]], 1.0),  # 0.595 m
@@ -243,6 +242,20 @@ def test_distances_are_in_lengths_of_the_cable(length):
     assert limits.shortened(apart, pose, 1.0, length) is apart
     ended = pose + 4.0 * limits.shortened(apart, pose, 4.0, length)
     assert 0.985 * length < ended[1, 0] <= 0.995 * length + 1e-9
+
+
+def test_a_turn_is_shortened_to_its_rate():
+    pose, twist = np.array([[-0.45, 0.05, 0.0], [0.45, 0.05, 0.0]]), np.array([[0, 0, -2.0], [0, 0, 0]])
+    np.testing.assert_allclose(LIMITS.shortened(twist, pose, 1.0, 1.0), 0.25 * twist, atol=1e-12)
+
+
+def test_turned_grippers_may_not_be_as_far_apart():
+    """A cable that leaves both at an angle does not reach as far as one that leaves them straight."""
+    limits, pose = CommandLimits(), np.array([[0.0, 0.0, 0.0], [0.97, 0.0, 0.0]])
+    turning = np.array([[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]])
+    turned = pose + limits.shortened(turning, pose, 1.0, 1.0)
+    assert 0.3 < turned[0, 2] < 0.9
+    assert limits.shortened(turning, pose + np.array([[0.0, 0.0, 0.0], [-0.2, 0.0, 0.0]]), 1.0, 1.0) is turning
 
 
 def test_grippers_do_not_pass_through_each_other():

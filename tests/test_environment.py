@@ -171,6 +171,26 @@ def test_reward_is_of_the_true_keypoints_where_the_camera_is_off(form):
         np.testing.assert_allclose(off, 1.05 * turned + 0.05, atol=1e-5)
 
 
+@pytest.mark.parametrize("turn", [(1.0, 1.0), (1.0, -1.0)], ids=["both left", "outwards"])
+def test_turning_grippers_do_not_tear_the_cable_out(turn):
+    """At almost the full length apart, for longer than a turn: in both forms the ends stay in their grippers."""
+    config = clean(steps=30)
+    action = np.zeros((2, 3), np.float32)
+    action[:, 2] = turn
+    env, pure = ShapeCableEnv(config), MjxShapeCable(config)
+    env.reset(seed=0)
+    state, step = pure.reset(jax.random.key(0)), jax.jit(pure.step)
+    for _ in range(25):
+        seen, _, terminated, _, _ = env.step(action)
+        state = step(state, jnp.asarray(action.ravel()))
+        observed = np.split(np.asarray(state.obs), [14, 20])
+        for keypoints, pose in ((seen["keypoints"], seen["gripper_pose"]), (observed[0], observed[1])):
+            ends = np.reshape(keypoints, (-1, 2))[[0, -1]] - np.reshape(pose, (2, 3))[:, :2]
+            assert np.abs(ends).max() < 0.01 * config.cable.length
+        assert not terminated and not state.done
+    assert np.abs(seen["gripper_pose"][:, 2]).min() > 0.25
+
+
 def test_the_controller_is_a_policy():
     config = clean(steps=30, targets=("U",))
     length = config.cable.length

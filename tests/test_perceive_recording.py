@@ -63,8 +63,15 @@ def test_a_folder_of_pcd_files_is_read(tmp_path, encoding):
     same(read_clouds(folder(tmp_path, encoding)), sequence().clouds)
 
 
+def test_files_are_ordered_by_their_numbers(tmp_path):
+    sequence_folder = folder(tmp_path)
+    for index, file in enumerate(sorted(tmp_path.glob("*.pcd"))):
+        file.rename(tmp_path / f"cloud_{9 + index}.pcd")
+    same(read_clouds(sequence_folder), sequence().clouds)
+
+
 def test_missing_measurements_stay_missing(tmp_path):
-    folder(tmp_path)
+    sequence_folder = folder(tmp_path)
     (tmp_path / "0000.pcd").write_bytes(pcd(np.full((2, 3), np.nan, np.float32), "ascii"))
     assert np.isnan(read_clouds(tmp_path).clouds[0]).all()
 

@@ -78,6 +78,14 @@ def test_a_second_without_a_cable_is_held_reported_and_recovered_from(tracker, m
     assert mean_error(seen.keypoints, motion[11]) < 1e-3
 
 
+def test_in_double_precision_too(tracker, motion):
+    with jax.enable_x64(True):
+        state, seen = tracker.init(cloud(motion[0], 1), motion[0].pose)
+        state, seen = tracker.step(state, cloud(motion[1], 2), motion[1].pose)
+        assert seen.status == Status.TRACKED and seen.keypoints.dtype == np.float64
+        assert mean_error(seen.keypoints, motion[1]) < 1e-3
+
+
 def test_some_points_that_are_not_finite_do_no_harm(tracker, motion, started):
     points = cloud(motion[1], 4)
     points[::5] = np.nan

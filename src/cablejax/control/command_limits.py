@@ -12,6 +12,8 @@ from cablejax.limits import check, check_workspace
 
 _SHARES = np.linspace(0.0, 1.0, 201)
 _ROUNDING = 1e-12
+_CLAMPED = 0.05
+"""Length of the cable, in lengths of it, along which it leaves a gripper in the gripper's direction."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -23,6 +25,7 @@ class CommandLimits:
         turn_rate: of each gripper at most [rad/s].
         min_distance: of the grippers from each other at least, in lengths of the cable.
         max_distance: of the grippers from each other at most, in lengths of the cable: below 1, or it is pulled taut.
+            Where the grippers are turned away from each other the cable reaches less far, and the limit is lower.
         workspace: lowest and highest corner (x, y) of where the grippers may be [m]; None = anywhere.
     """
 
@@ -71,9 +74,15 @@ class CommandLimits:
         xp, start = twist.__array_namespace__(), pose[..., :2]
         ends = start + duration * twist[..., :2]
         apart, before = (xp.linalg.norm(places[..., 1, :] - places[..., 0, :], axis=-1) for places in (ends, start))
+        clamped = _CLAMPED * length * xp.asarray([1.0, -1.0], dtype=start.dtype)[:, None]
+        free = []
+        for places, theta in ((ends, pose[..., 2] + duration * twist[..., 2]), (start, pose[..., 2])):
+            beyond = places + clamped * xp.stack([xp.cos(theta), xp.sin(theta)], axis=-1)
+            free.append(xp.linalg.norm(beyond[..., 1, :] - beyond[..., 0, :], axis=-1))
         broken = (xp.linalg.norm(twist[..., :2], axis=-1) > self.speed + _ROUNDING).any(axis=-1)
         broken |= (xp.abs(twist[..., 2]) > self.turn_rate + _ROUNDING).any(axis=-1)
         broken |= apart > xp.maximum(self.max_distance * length, before) + _ROUNDING
+        broken |= free[0] > xp.maximum(self.max_distance * (1 - 2 * _CLAMPED) * length, free[1]) + _ROUNDING
         broken |= apart < xp.minimum(self.min_distance * length, before) - _ROUNDING
         if self.workspace is not None:
             low, high = (xp.asarray(corner, dtype=start.dtype) for corner in self.workspace)

@@ -84,6 +84,11 @@ class ShapeCableConfig:
         # the grippers' square, a length of cable, and a metre for camera offsets and noise
         return 3 * self.cable.length + 1
 
+    @property
+    def widest(self) -> float:
+        """Distance of the cable's end from its gripper [m] beyond which it is torn out."""
+        return 0.01 * self.cable.length
+
     @functools.cached_property
     def limits(self) -> CommandLimits:
         """Of every action: the grippers stay within a square of three lengths, and never pull the cable taut."""
@@ -216,7 +221,8 @@ class Cables:
     ) -> tuple[Float[np.ndarray, " B"], Bool[np.ndarray, " B"], Bool[np.ndarray, " B"]]:
         """Executes actions: twists of both grippers in units of `speed` and `turn_rate`, cut off at 1.
 
-        A twist that would leave `limits` is shortened, and one that is not finite counts as zero.
+        A twist that would leave `limits` is shortened. One that is not finite counts as zero. One that would tear the
+        cable out of a gripper, as where it is wound up, is not executed.
 
         Args:
             actions: in the world's frame.
@@ -234,11 +240,15 @@ class Cables:
         length = config.cable.length
         twists = config.limits.shortened(twists, self.gripper_pose, config.interval, length) * active[:, None, None]
         truly = without_camera(self._physics)
-        self._state, shown = self._engine.rollout(truly, self._state, twists[:, None], config.interval)
+        after, shown = self._engine.rollout(truly, self._state, twists[:, None], config.interval)
+        torn = np.asarray(self._engine.opening(after)) > config.widest
+        self._state = jax.tree.map(
+            lambda new, old: np.where(torn.reshape(-1, *[1] * (new.ndim - 1)), old, new), after, self._state
+        )
         keypoints, poses = np.asarray(shown.keypoints[:, -1]), np.asarray(shown.gripper_pose[:, -1])
-        diverged = ~(np.abs(keypoints) < config.room).all(axis=(1, 2))
+        diverged = ~torn & ~(np.abs(keypoints) < config.room).all(axis=(1, 2))
         self.taken += active
-        seen = active & ~diverged
+        seen = active & ~diverged & ~torn
         self.gripper_pose[seen] = poses[seen]
         self._observe(seen, keypoints, randoms)
         done = (self.error <= config.tolerance) | diverged

@@ -94,11 +94,13 @@ class MjxShapeCable:
         twist = jnp.asarray(config.scale, share.dtype) * share
         twist = config.limits.shortened(twist, before.gripper_pose, config.interval, config.cable.length)
         after, (_, seen) = self._moved(info["physics"], before, twist)
-        sound = (jnp.abs(seen) < config.room).all()
+        torn = self._engine.opening(after) > config.widest
+        diverged = ~torn & ~(jnp.abs(seen) < config.room).all()
+        sound = ~torn & ~diverged
         data = jax.tree.map(lambda new, old: jnp.where(sound, new, old), after, before)
         rng, obs, error = self._observed(info["rng"], info["physics"], seen, data, info["target"])
         obs, error = jnp.where(sound, obs, state.obs), jnp.where(sound, error, state.metrics["error"])
-        done = ((error <= config.tolerance) | ~sound).astype(jnp.float32)
+        done = ((error <= config.tolerance) | diverged).astype(jnp.float32)
         return dataclasses.replace(
             state,
             data=data,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import os
 import pathlib
+import re
 
 import numpy as np
 from jaxtyping import Float
@@ -104,8 +105,13 @@ def read_clouds(path: str | os.PathLike[str]) -> CloudSequence:
     return CloudSequence(np.asarray(arrays["time"], float), clouds, np.asarray(arrays["gripper_pose"], float))
 
 
+def _by_number(path: pathlib.Path) -> list[tuple[str, int]]:
+    """Orders names by the numbers in them: 9.pcd before 10.pcd."""
+    return [(word, int(number or 0)) for word, number in re.findall(r"(\D*)(\d*)", path.name)]
+
+
 def _read_folder(folder: pathlib.Path) -> CloudSequence:
-    files = sorted(path for path in folder.iterdir() if path.suffix.lower() == ".pcd")
+    files = sorted((path for path in folder.iterdir() if path.suffix.lower() == ".pcd"), key=_by_number)
     poses = folder / POSES_FILE
     if not files or not poses.is_file():
         raise ValueError(

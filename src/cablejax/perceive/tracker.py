@@ -106,7 +106,7 @@ class Tracker:
         """Takes in the next cloud; arguments and errors as of `init`."""
         pose = _checked_pose(gripper_pose)
         cloud = padded(points, self.config.capacity)
-        after, seen = track(self.config, state, cloud.points, cloud.mask, jnp.asarray(pose, float))
+        after, seen = track(self.config, state, jnp.asarray(cloud.points, float), cloud.mask, jnp.asarray(pose, float))
         misfits = int(after.misfits)
         if misfits == 1 or (misfits > 0 and misfits % self.config.retry == 0):
             return self._search(after, cloud, pose, otherwise=seen)
@@ -164,7 +164,8 @@ class Tracker:
         config = self.config
         count = int(cloud.mask.sum())
         if count >= config.min_points:
-            fit = first_fit(config.registration, cloud.points, cloud.mask, pose, reach=config.reach)
+            points = jnp.asarray(cloud.points, float)
+            fit = first_fit(config.registration, points, cloud.mask, pose, reach=config.reach)
             status = judge(config, fit, jnp.asarray(count))
             if int(status) == Status.TRACKED:
                 zero = jnp.zeros_like(state.lost)

@@ -15,7 +15,7 @@ from cablejax.effects.base import Hook
 from cablejax.effects.camera import seen_by_camera
 from cablejax.effects.physics import Physics, may_touch
 from cablejax.simulate.chain.replay import centreline_keypoints, follow
-from cablejax.simulate.chain.state import ChainState, expecting_no_change
+from cablejax.simulate.chain.state import ChainState, chain_nodes, expecting_no_change
 from cablejax.simulate.compile import full_precision
 from cablejax.simulate.engine import Engine, finely_sampled, rolled_out
 from cablejax.simulate.pose import integrate_pose
@@ -95,6 +95,16 @@ class ChainEngine(Engine):
             gripper_twist=twist,
         )
         return _cable_state(*final), trajectory
+
+    def opening(self, state: CableState) -> Float[Array, "*B"]:
+        """Distance of the cable's end from gripper 1 [m]: more than rounding only where it does not reach that far."""
+        memory = self._remembering(state).memory
+        assert memory is not None
+
+        def one(qpos, pose, stretch):
+            return jnp.linalg.norm(qpos[:2] + chain_nodes(self.config, qpos[2:], stretch)[0][-1] - pose[1, :2])
+
+        return jnp.vectorize(one, signature="(q),(g,p),()->()")(state.qpos, state.gripper_pose, memory.stretch)
 
     def _remembering(self, state: CableState) -> CableState:
         """The state with a memory: a cable without one has never been bent beyond its limits."""
