@@ -164,8 +164,7 @@ class Tracker:
         config = self.config
         count = int(cloud.mask.sum())
         if count >= config.min_points:
-            points = jnp.asarray(cloud.points, float)
-            fit = first_fit(config.registration, points, cloud.mask, pose, reach=config.reach)
+            fit = first_fit(config.registration, cloud.points, cloud.mask, pose, reach=config.reach)
             status = judge(config, fit, jnp.asarray(count))
             if int(status) == Status.TRACKED:
                 zero = jnp.zeros_like(state.lost)
