@@ -87,7 +87,7 @@ def test_help_is_fast_because_it_loads_neither_jax_nor_mujoco():
         (["simulate", "--trajectories", "9" * 30], "n_trajectories is an integer of 100 bits, expected a whole number"),
         (["simulate", "--stiffness-range", "1e308", "1e308"], "each a number from 0.001 to 1000"),
         (["train", "--lr", "1e308"], "--lr is 1e+308, expected a number from 1e-12 to 1"),
-        (["shape", "--noise-mm", "1e30"], "expected a number from 0 to 0.1 m"),
+        (["shape", "--noise-mm", "1e30"], "expected a number from 0 to 100 mm"),
         (["simulate", "--with", "/dev/zero"], "no regular file"),
         (["train", "--steps", "0"], "--steps is 0"),
         (["train", "--steps", "-1"], "--steps is -1"),

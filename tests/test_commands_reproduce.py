@@ -9,10 +9,13 @@ import pytest
 import tyro
 
 from cablejax.cable import Cable, Discretisation
-from cablejax.cable_file import write_cable
+from cablejax.cable_file import cable_to_fields, write_cable
+from cablejax.commands.cable import find_cable
 from cablejax.commands.reproduce import command_line, simulate_command
+from cablejax.commands.runs import known_from
 from cablejax.commands.simulate import Simulate
 from cablejax.commands.train import Train
+from cablejax.control.shaping import load_model
 from cablejax.dataset.schema import DatasetConfig, Randomisation
 from cablejax.effects.given import parse_effect
 from cablejax.simulate.motions import MotionConfig
@@ -67,6 +70,22 @@ def test_the_effects_of_a_verdict_are_added_to_those_given(tmp_path):
     assert list(map(str, parsed.effects)) == ["bending_stiffness:ratio=2", "linear_density:ratio=1.5"]
     words = shlex.split(simulate_command(parsed, "name.zarr"))
     assert tyro.cli(Simulate, args=words[2:], config=(tyro.conf.FlagCreatePairsOff,)).dataset_config() == parsed
+
+
+def test_the_cable_of_a_verdict_is_simulated_and_another_one_refused(tmp_path):
+    """An effect is one of the cable to which it is added."""
+    theirs = Cable(length=2.0, bending_stiffness=0.08, n_keypoints=9)
+    named = {"name": "bending_stiffness", "parameters": {"ratio": {"value": 1.5, "ci90": None, "unit": ""}}}
+    verdict = {"schema": "cablejax-verdict/1", "verdict": "named", "cable": cable_to_fields(theirs), "effects": [named]}
+    path = tmp_path / "verdict.json"
+    path.write_text(json.dumps(verdict))
+    assert Simulate(with_=(path,)).dataset_config().cable == theirs
+    assert find_cable(path) == theirs
+    write_cable(tmp_path / "own.toml", dataclasses.replace(theirs, length=1.9))
+    with pytest.raises(ValueError, match=r"another cable than this one \(length_m = 2, not 1.9\).*Leave --cable out"):
+        Simulate(cable=tmp_path / "own.toml", with_=(path,)).dataset_config()
+    with pytest.raises(ValueError, match=r"bending_stiffness_n_m2 = 0\.08, not 0\.02"):
+        known_from(load_model("gns-reference"), (), (path,))
 
 
 def test_a_verdicts_draws_are_dealt_out_to_the_trajectories(tmp_path):

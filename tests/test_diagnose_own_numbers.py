@@ -148,6 +148,16 @@ def test_a_few_samples_weigh_more_than_a_prior_that_is_far_off():
     assert any("3.8 prior standard deviations" in caveat for caveat in found.caveats)
 
 
+def test_noise_alone_makes_no_gap():
+    """The mean square of a few hundred samples scatters by a tenth."""
+    exact = Swings().predict([explanation()], np.arange(2))[0]
+    verdicts = []
+    for seed in range(40):
+        observed = exact + np.random.default_rng(seed).normal(scale=1e-3, size=exact.shape)
+        verdicts.append(diagnose_simulator(Swings(), observed, interval=0.02, noise=1e-3).verdict)
+    assert verdicts.count("none") >= 38
+
+
 @pytest.mark.parametrize(
     ("factor", "message"),
     [

@@ -71,7 +71,7 @@ def test_files_are_ordered_by_their_numbers(tmp_path):
 
 
 def test_missing_measurements_stay_missing(tmp_path):
-    sequence_folder = folder(tmp_path)
+    folder(tmp_path)
     (tmp_path / "0000.pcd").write_bytes(pcd(np.full((2, 3), np.nan, np.float32), "ascii"))
     assert np.isnan(read_clouds(tmp_path).clouds[0]).all()
 

@@ -54,7 +54,7 @@ def kind_of(source: str | pathlib.Path) -> tuple[Kind, pathlib.Path]:
                 return kind, path / names[0] if kind in ("verdict", "log") else path
         if (path / "parts").is_dir():
             raise UsageError(f"{path} is an unfinished run without a page: run its command again, which resumes it.")
-        raise UsageError(_none_of_ours(path, "a folder without any of them"))
+        raise UsageError(_none_of_ours(path, "a folder, and holds nothing that this package has written"))
     if not path.exists():
         if path.suffix or len(path.parts) != 1:
             raise FileNotFoundError(f"There is no file or folder {path}.")

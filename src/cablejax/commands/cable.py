@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 import pathlib
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Annotated
 
 import tyro
@@ -63,6 +65,8 @@ def find_cable(source: str | pathlib.Path) -> Cable:
         from cablejax.cable_file import read_cable
 
         return read_cable(path)
+    if kind == "verdict" and (stated := cable_of_verdict(path)) is not None:
+        return stated
     if kind == "store":
         from cablejax.dataset.opening import open_store
 
@@ -74,3 +78,40 @@ def find_cable(source: str | pathlib.Path) -> Cable:
     from cablejax.cable_file import cable_of_log
 
     return cable_of_log(recorded(path)[0])
+
+
+def cable_of_verdict(path: pathlib.Path) -> Cable | None:
+    """The cable that a verdict's log stated; None where the verdict does not say.
+
+    Raises:
+        ValueError: it is no verdict, or its cable is none.
+    """
+    from cablejax.cable_file import cable_from_fields
+    from cablejax.effects.given import read_verdict_json
+
+    stated = read_verdict_json(path).get("cable")
+    return None if stated is None else cable_from_fields(stated, f"{path}: cable")
+
+
+def check_verdicts(paths: Sequence[pathlib.Path], cable: Cable, remedy: str) -> None:
+    """Checks that verdicts are of this cable: an effect is one of the cable to which it is added.
+
+    Raises:
+        ValueError: one is of another cable; says how the two differ, and `remedy`.
+    """
+    from cablejax.cable_file import NUMBERS
+
+    for path in paths:
+        theirs = cable_of_verdict(path)
+        numbers = (
+            {}
+            if theirs is None
+            else {key: (getattr(theirs, name), getattr(cable, name)) for key, (name, _) in NUMBERS.items()}
+        )
+        off = [
+            f"{key} = {one:g}, not {other:g}"
+            for key, (one, other) in numbers.items()
+            if not math.isclose(one, other, rel_tol=1e-4)
+        ]
+        if off:
+            raise ValueError(f"{path} is the verdict on another cable than this one ({', '.join(off)}). {remedy}")

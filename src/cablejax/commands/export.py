@@ -110,8 +110,8 @@ def _log_of_run(folder: pathlib.Path) -> pathlib.Path:
         if (folder / name).is_file():
             return folder / name
     raise UsageError(
-        f"{folder} has neither log.npz nor simulated.npz: a diagnosis by an earlier version kept no log. Give the gap "
-        "log itself, or diagnose it again."
+        f"{folder} has neither log.npz nor simulated.npz. Give a gap log: of a study that in one of its folders, "
+        "round_1 for instance."
     )
 
 

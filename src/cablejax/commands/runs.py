@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from cablejax.cable import Cable, Discretisation
+from cablejax.commands.cable import check_verdicts
 from cablejax.commands.options import UsageError, say
 from cablejax.commands.results import summarise, write_results
 from cablejax.commands.resuming import Parts
@@ -141,8 +142,9 @@ def known_from(model: Model, given: Sequence[str], verdicts: Sequence[pathlib.Pa
     draws of its posterior have them.
 
     Raises:
-        ValueError: a text is no effect, or a file is no verdict or names nothing.
+        ValueError: a text is no effect, or a file is no verdict, names nothing or is of another cable.
     """
+    check_verdicts(verdicts, model.cable, "Take a model that was trained on the verdict's cable.")
     known = list(map(parse_effect, given))
     for path in verdicts:
         named = effects_of_verdict(path)

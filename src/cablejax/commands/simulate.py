@@ -38,7 +38,7 @@ class Simulate(Command):
         timestep: Time step of the simulation [s]; by default 0.05 for the chain and 0.02 for the others, which is about
             as accurate.
         cable: The cable to simulate: a cable file (see `cablejax cable`), or a data set, trained weights or a log that
-            holds a cable. By default the reference cable.
+            holds a cable. By default that of the verdicts of --with, else the reference cable.
         effect: An effect to add to every cable, as NAME:PARAMETER=VALUE,... in SI units; may be given several times.
         with_: A verdict.json of `cablejax diagnose`: the effects that it names are added, each trajectory with another
             draw of what the verdict leaves open; may be given several times.
@@ -103,7 +103,7 @@ class Simulate(Command):
             ValueError: an option is out of its range, or a file that it names cannot be used.
         """
         from cablejax.cable import Cable
-        from cablejax.commands.cable import find_cable
+        from cablejax.commands.cable import cable_of_verdict, check_verdicts, find_cable
         from cablejax.effects.given import parse_effect, posterior_of_verdict
 
         effects = tuple(parse_effect(text) for text in self.effect)
@@ -114,7 +114,12 @@ class Simulate(Command):
         )
         if len(together) == 1:
             effects, together = effects + together[0], ()
-        config = self.config_of(Cable() if self.cable is None else find_cable(self.cable), effects)
+        if self.cable is not None:
+            cable = find_cable(self.cable)
+        else:
+            cable = next(filter(None, map(cable_of_verdict, self.with_)), Cable())
+        check_verdicts(self.with_, cable, "Leave --cable out to simulate the verdict's.")
+        config = self.config_of(cable, effects)
         return dataclasses.replace(config, posterior=together)
 
     def config_of(self, cable: Cable, effects: tuple[GivenEffect, ...]) -> DatasetConfig:

@@ -169,16 +169,20 @@ def has_gap(null: Fit, evidence: Evidence, calibration: Calibration) -> bool:
     """Whether the nominal simulator is off by more than its own error, in the fourth-power mean over motions.
 
     By a root mean square, calm motions that are recorded besides would make a gap disappear that some motions show.
-    What chance alone adds to the fourth power, by the noise of so few samples, is taken off. Each motion counts in
-    units of what the simulator may be off by in it: where the cable snaps over, that is more.
+    What chance alone adds to the fourth power, by the noise of so few samples, is taken off, and twice its standard
+    deviation. Each motion counts in units of what the simulator may be off by in it: where the cable snaps over, that
+    is more.
     """
     squares, count = _squares_by_motion(null, evidence)
     noise = level(evidence)
     own = np.full(len(evidence.count), calibration.baseline) if evidence.own_error is None else evidence.own_error
     motions = [rows for rows in episodes_by_motion(evidence.motion) if evidence.count[rows].sum() > 0]
     smallest = np.array([calibration.smallest_gap(noise, float(own[rows].max())) for rows in motions])
-    fourth = (np.maximum(squares, 0.0) / count) ** 2 - 2.0 / count
-    return float(np.mean(fourth * (noise / smallest) ** 4)) > 1.0
+    unit = (noise / smallest) ** 4
+    fourth = ((np.maximum(squares, 0.0) / count) ** 2 - 2.0 / count) * unit
+    # of the square of a normal variable, whose variance is 2 / count
+    chance = np.linalg.norm(2.0 * np.sqrt(2.0) / count * unit) / len(count)
+    return float(np.mean(fourth) - 2.0 * chance) > 1.0
 
 
 def _squares_by_motion(fit: Fit, evidence: Evidence) -> tuple[Float[np.ndarray, "M"], Float[np.ndarray, "M"]]:

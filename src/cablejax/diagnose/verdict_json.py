@@ -12,8 +12,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from cablejax.cable_file import cable_of_log, cable_to_fields
 from cablejax.diagnose.diagnosis import (
     PLACES,
+    CableDiagnosis,
     Diagnosis,
     EffectValues,
     Gap,
@@ -38,18 +40,20 @@ def verdict_json(diagnosis: Diagnosis) -> dict[str, Any]:
     explanation all the same. `ci90` is null for a choice, such as a gripper, and a list where the value is one. All
     `_mm` are null where observations are not in metres; `gap` has the sizes in their own unit too.
 
-    In addition to the fields of the format it has `sentence`, `baselines`, `leftover_p`, `caveats`, `seconds`,
-    `quantities` (by name, like an effect's parameters), `posterior` (fields of `EffectValues`), `under_laws` (fields of
-    `UnderLaw`) and `next_motion_worth`: fields of `NextMotion`, those in nats with `_nats`, and whether no motion that
-    was tried separates the explanations; of several recordings `rounds`, the fields of `Round`, and
-    `rounds_contradict`. `next_motion` is recommended only where that is false. `gap` has also `unit`, `before_rmse`,
-    `noise_floor`, `after_rmse`, `horizons`, `split`, `ahead_mm` and `best_shrinkage`, `ranking` also `leftover_mm` and
-    `outcome`, and `where` also `sentences`, `per_horizon_mm` and `frames`.
+    In addition to the fields of the format it has `cable` (the keys of a cable file: as the log states it), `sentence`,
+    `baselines`, `leftover_p`, `caveats`, `seconds`, `quantities` (by name, like an effect's parameters), `posterior`
+    (fields of `EffectValues`), `under_laws` (fields of `UnderLaw`) and `next_motion_worth`: fields of `NextMotion`,
+    those in nats with `_nats`, and whether no motion that was tried separates the explanations; of several recordings
+    `rounds`, the fields of `Round`, and `rounds_contradict`. `next_motion` is recommended only where that is false.
+    `gap` has also `unit`, `before_rmse`, `noise_floor`, `after_rmse`, `horizons`, `split`, `ahead_mm` and
+    `best_shrinkage`, `ranking` also `leftover_mm` and `outcome`, and `where` also `sentences`, `per_horizon_mm` and
+    `frames`.
     """
     gap, rounds = diagnosis.gap, getattr(diagnosis, "rounds", None)
     return _plain(
         {
             "schema": VERDICT_SCHEMA,
+            "cable": _cable(diagnosis),
             "verdict": diagnosis.verdict,
             "sentence": diagnosis.sentence,
             "effects": [_effect(effect) for effect in diagnosis.effects],
@@ -77,6 +81,16 @@ def verdict_json(diagnosis: Diagnosis) -> dict[str, Any]:
             "seconds": diagnosis.seconds,
         }
     )
+
+
+def _cable(diagnosis: Diagnosis) -> dict[str, Any] | None:
+    """The cable to which the effects would be added; None of a simulator of one's own."""
+    if not isinstance(diagnosis, CableDiagnosis):
+        return None
+    try:
+        return cable_to_fields(cable_of_log(diagnosis.log))
+    except ValueError:  # a rod that no planar simulator can take
+        return None
 
 
 def write_verdict(path: str | os.PathLike[str], diagnosis: Diagnosis) -> pathlib.Path:

@@ -102,15 +102,17 @@ class GivenEffect:
 
     def _out_of_bounds(self, parameter: Parameter, value: float, variant: int, chain: Discretisation) -> str:
         """What a parameter is and may be, by the name and in the unit in which it was given."""
-        given = {name: v for name, v in self.parameters if name.startswith(parameter.name)}
-        name, number = next(iter(given.items()), (parameter.name, value))
-        unit, scale = parameter.unit, number / value if value else 1.0
-        if name != parameter.name:
-            unit = self.effect.reported([p.centre for p in self.effect.parameters], variant, chain)[name][1]
-        return (
-            f"{name} is {number:g}, expected {scale * parameter.low:g} to {scale * parameter.high:g} {unit}".rstrip()
-            + "."
-        )
+        own = [p.name for p in self.effect.parameters]
+        # one that the fit knows by another name was given by the name of the verdict
+        given = [name for name, _ in self.parameters if name == parameter.name]
+        name, *_ = [*given, *(name for name, _ in self.parameters if name not in own), parameter.name]
+        limits = []
+        for limit in (parameter.low, parameter.high):
+            values = [limit if p is parameter else p.centre for p in self.effect.parameters]
+            shown, unit = self.effect.reported(values, variant, chain).get(name, (limit, parameter.unit))
+            limits.append(shown)
+        number = dict(self.parameters).get(name, value)
+        return f"{name} is {number:g}, expected {min(limits):g} to {max(limits):g} {unit}".rstrip() + "."
 
     def __str__(self) -> str:
         """The effect as `parse_effect` reads it back, without loss."""

@@ -119,7 +119,7 @@ class ShapeCableConfig:
         return recipe
 
     def target(self, target: Shape | Target) -> Target:
-        """A target of this cable; raises ValueError for another letter or number of keypoints."""
+        """A target of this cable; raises ValueError for another letter or number of keypoints, or one out of reach."""
         made = make_target(target, self.cable) if isinstance(target, str) else target
         if not isinstance(made, Target):
             raise ValueError(f"The target is a {type(made).__name__}, expected a letter or a `Target`.")
@@ -127,6 +127,11 @@ class ShapeCableConfig:
             raise ValueError(
                 f"Target {made.name!r} has keypoints of shape {made.keypoints.shape}, expected "
                 f"({self.cable.n_keypoints}, 2) as the cable."
+            )
+        if not (np.abs(made.keypoints) <= self.room).all():
+            raise ValueError(
+                f"Target {made.name!r} has a coordinate that is not finite or beyond {self.room:g} m, where no gripper "
+                "of this environment comes."
             )
         return made
 

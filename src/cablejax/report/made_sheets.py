@@ -21,6 +21,7 @@ from cablejax.diagnose.diagnosis import Diagnosis
 from cablejax.diagnose.judgement import effect_title, listed
 from cablejax.dynamics.card import network_words
 from cablejax.dynamics.weights import cable_of_weights, load_info, load_weights, weights_path
+from cablejax.effects.given import EFFECTS
 from cablejax.report.diagnosis_charts import ranking_figure
 from cablejax.report.diagnosis_sections import named_effects
 from cablejax.report.effect_words import between, share
@@ -127,6 +128,7 @@ def verdict_sheet(diagnosis: Diagnosis, name: str) -> Sheet:
     shrinks = "not known" if gap.shrinkage is None else share(gap.shrinkage)
     interval = "" if gap.shrinkage_ci90 is None else f"90 % interval {between(*gap.shrinkage_ci90)}"
     ranking = ranking_figure(diagnosis)
+    addable = diagnosis.effects and all(effect.name in EFFECTS for effect in diagnosis.effects)
     return Sheet(
         kind="verdict",
         title=diagnosis.sentence,
@@ -147,7 +149,7 @@ def verdict_sheet(diagnosis: Diagnosis, name: str) -> Sheet:
             for effect, meaning, estimates in named_effects(diagnosis)
         ],
         following=(
-            f"Add what is named to the simulator: cablejax simulate --cable LOG --with {name} --engine chain",
+            *([f"Add what is named to the simulator: cablejax simulate --with {name}"] if addable else []),
             *diagnosis.caveats,
         ),
         facts={

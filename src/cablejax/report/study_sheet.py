@@ -65,7 +65,11 @@ def study_sheet(
             )
         ],
         following=(
-            f"Simulate with what was named: cablejax simulate --with round_{rounds}/verdict.json",
+            *(
+                [f"Simulate with what was named, in this folder: cablejax simulate --with round_{rounds}/verdict.json"]
+                if last.effects
+                else []
+            ),
             f"What each recording added: round_{rounds}/report.html",
         ),
         facts={"time of the diagnoses": f"{sum(one.seconds for one in found):.0f} s"},
