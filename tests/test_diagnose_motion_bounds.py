@@ -68,7 +68,7 @@ def test_file_is_refused_with_what_is_wrong(tmp_path, line, words):
 
 
 def test_file_that_is_not_there(tmp_path):
-    with pytest.raises(ValueError, match="could not be read"):
+    with pytest.raises(ValueError, match="There is no file"):
         read_bounds(tmp_path / "none.toml")
 
 

@@ -128,7 +128,7 @@ def test_information_is_that_of_the_predictions():
     # without the clamps' error two explanations without parameters have a Bhattacharyya distance of d^2 / 8
     nominal = motion.keypoints([motion.believed])[0, 0].astype(float)
     gap = np.sqrt(0.5 * ((a - nominal) ** 2).mean() + 0.5 * ((b - nominal) ** 2).mean())
-    temper = Calibration().temper(np.array([gap]), 1e-3)[0]
+    temper = Calibration().temper(np.array([gap]), 1e-3, a.size)[0]
     distance = ((a - b) ** 2).sum() / 1e-6 / temper / 8
     assert 0 < judged.information < np.log(2) - np.log(1 + np.exp(-distance))
     assert judged.information == pytest.approx(np.log(2) - np.log(1 + np.exp(-distance)), rel=0.5)

@@ -159,12 +159,18 @@ def test_noise_alone_makes_no_gap():
 
 
 @pytest.mark.parametrize(
-    ("factor", "message"),
-    [
-        (1.0, r"effect 'damping' \(per_s = 0.4\) predict gives exactly what it gives without"),
-        (np.nan, "are not finite"),
-    ],
+    ("factor", "gives"), [(1.0, "exactly what it gives without"), (np.nan, "values that are not finite")]
 )
-def test_an_effect_that_does_nothing_is_refused(factor, message):
-    with pytest.raises(ValueError, match=message):
-        diagnose_simulator(Deaf(factor), observed_swings(1.3), interval=0.02, noise=1e-4)
+def test_an_effect_that_does_nothing_is_a_caveat(factor, gives):
+    found = diagnose_simulator(Deaf(factor), observed_swings(1.3), interval=0.02, noise=1e-4)
+    assert any(f"With damping (per_s = 0.4) predict gives {gives}" in caveat for caveat in found.caveats)
+    assert [effect.name for effect in found.effects] == ["stiffness"]
+
+
+def test_a_simulator_that_ignores_its_explanations_is_refused():
+    class Ignoring(Swings):
+        def predict(self, explanations, episodes):
+            return super().predict([explanation() for _ in explanations], episodes)
+
+    with pytest.raises(ValueError, match="Does predict use the explanations"):
+        diagnose_simulator(Ignoring(), observed_swings(1.3), interval=0.02, noise=1e-4)

@@ -419,6 +419,7 @@ def test_one_episode_shows_a_gap_and_too_little_of_it_to_name_its_cause():
     """No effect pays for itself in it; that does not mean that the library lacks the cause."""
     swing, noise = Swing(), 1e-3 * np.random.default_rng(0).normal(size=(2, 200, 1))
     true = swing.predict([explanation((Swing.effects[0], 0, [1.3]))], np.arange(2))[0] + noise
-    found = [diagnose_simulator(swing, true[:count], interval=0.05, noise=1e-3) for count in (1, 2)]
+    dear = Calibration(baseline=1e-4, term_cost=12.0)
+    found = [diagnose_simulator(swing, true[:n], interval=0.05, noise=1e-3, calibration=dear) for n in (1, 2)]
     assert [one.verdict for one in found] == ["unknown", "named"]
     assert found[0].sentence.startswith("There is a gap, but too little of it") and "library" not in found[0].sentence

@@ -24,7 +24,7 @@ def arguments(folder, *more):
 
 def test_impossible_noise_is_reported_before_anything_is_written(tmp_path, capsys):
     assert main(arguments(tmp_path, "--noise-mm", "-1")) == 2
-    assert "range_noise is -0.001" in capsys.readouterr().err
+    assert "--noise-mm is -1" in capsys.readouterr().err
     assert not (tmp_path / "run").exists()
 
 

@@ -168,7 +168,7 @@ def test_what_is_none_of_ours_is_refused(tmp_path, capsys):
         "d": "is an empty file",
         "e.conf": "is a TOML file with the keys ['colour']",
         "f.zip": "is an archive without the array 'meta'",
-        "folder": "is a folder without any of them",
+        "folder": "is a folder, and holds nothing",
     }.items():
         said = refused(capsys, tmp_path / name)
         assert words in said and "Expected a gap log" in said and "cablejax import" in said, name

@@ -68,23 +68,27 @@ def checked_nominal(
     return nominal
 
 
-def check_effects_act(simulator: Simulator, observed: Float[np.ndarray, "E T *O"], nominal: np.ndarray) -> None:
-    """Raises ValueError for an effect with which `predict` gives no numbers, or the same as without it."""
+def inert_effects(simulator: Simulator, observed: Float[np.ndarray, "E T *O"], nominal: np.ndarray) -> list[str]:
+    """Caveats of effects with which `predict` gives no numbers on this recording, or the same as without them.
+
+    Raises:
+        ValueError: that is so of every effect.
+    """
+    caveats = []
     for effect in simulator.effects:
         begun = [explanation((effect, *start)) for start in simulator.starts(effect, nominal, observed - nominal)]
         if not begun:
             continue
         predicted = np.asarray(simulator.predict(begun, np.arange(len(observed))), float)
         finite = np.isfinite(predicted).reshape(len(begun), -1).all(axis=1)
-        values = ", ".join(f"{p.name} = {v:g}" for p, v in zip(effect.parameters, begun[-1].values()[0], strict=True))
         if (predicted[finite] != nominal).any():
             continue
-        if not finite.all():
-            raise ValueError(f"With effect {effect.name!r} ({values}) predict gives values that are not finite.")
-        raise ValueError(
-            f"With effect {effect.name!r} ({values}) predict gives exactly what it gives without: does it use the "
-            "explanations that it is given?"
-        )
+        values = ", ".join(f"{p.name} = {v:g}" for p, v in zip(effect.parameters, begun[-1].values()[0], strict=True))
+        gives = "exactly what it gives without" if finite.all() else "values that are not finite"
+        caveats.append(f"With {effect.name} ({values}) predict gives {gives}: the effect was not tried.")
+    if simulator.effects and len(caveats) == len(simulator.effects):
+        raise ValueError(f"{' '.join(caveats)} Does predict use the explanations that it is given?")
+    return caveats
 
 
 def recorded_arrays(observed: ArrayLike, interval: ArrayLike) -> tuple[np.ndarray, np.ndarray]:

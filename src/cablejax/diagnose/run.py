@@ -17,7 +17,7 @@ from cablejax.diagnose.diagnosis import Diagnosis, Gap
 from cablejax.diagnose.evidence import Evidence
 from cablejax.diagnose.fit import Fit, evaluate, improve
 from cablejax.diagnose.gap import held_out_predictions, measure_gap
-from cablejax.diagnose.given_arrays import check_effects_act, checked_nominal, recorded_arrays, spread_of
+from cablejax.diagnose.given_arrays import checked_nominal, inert_effects, recorded_arrays, spread_of
 from cablejax.diagnose.laws import by_other_laws
 from cablejax.diagnose.protocol import Simulator, explanation
 from cablejax.diagnose.refits import refitted
@@ -69,8 +69,7 @@ def diagnose_simulator(
             "episodes."
         )
     nominal = checked_nominal(simulator, observed, spread)
-    check_effects_act(simulator, observed, nominal)
-    caveats = []
+    caveats = inert_effects(simulator, observed, nominal)
     if calibration is None:
         calibration = Calibration(baseline=_BASELINE * float(np.sqrt(np.mean(spread**2))))
         caveats.append(
