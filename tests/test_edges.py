@@ -267,7 +267,7 @@ def store_files(folder, edit):
         file.write_bytes(edges.edited_bytes(file.read_bytes(), raw))
     read = answer(lambda: open_store(path).read())
     again = answer(lambda: stores.complete(open_or_create(path, stores.SMALL)))
-    if again is not None:  # the same generation makes again what it does not refuse
+    if again is not None:  # the same generation mends what it does not refuse
         assert open_store(path).info().complete and len(open_store(path).read()) == 7
     return read
 

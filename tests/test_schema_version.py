@@ -3,22 +3,44 @@
 import dataclasses
 import json
 import pathlib
+import zipfile
 
+import numpy as np
 import pytest
 
 from cablejax.cable import Cable
 from cablejax.cable_file import cable_text, read_cable
 from cablejax.commands.resuming import unfinished
+from cablejax.dataset.drawing import draw
 from cablejax.dataset.opening import open_or_create, open_store
-from cablejax.dataset.schema import DatasetConfig
 from cablejax.dynamics.run_folder import claim_folder
 from cablejax.dynamics.weights import cable_of_weights, load_weights
 from cablejax.effects.given import effects_of_verdict
 from cablejax.gaplog import read_gap_log, write_gap_log
 from cablejax.text_file import version_of
 
-# What earlier versions wrote.
+# What was written by the last commit before schema 2 of the data sets.
 OLD = pathlib.Path(__file__).parent / "old_files"
+
+
+@pytest.fixture
+def old_store(tmp_path):
+    with zipfile.ZipFile(OLD / "dataset-1.zip") as archive:
+        archive.extractall(tmp_path / "data")
+    return tmp_path / "data"
+
+
+def test_a_data_set_of_version_1_is_read(old_store):
+    store = open_store(old_store)
+    config, rows = store.config, range(2)
+    assert (config.discretisation.n_links, config.cable, config.n_steps, config.seed) == (5, Cable(), 4, 3)
+    assert store.info().complete
+    block = store.read(rows)
+    assert block.keypoints.shape == (2, 5, 13, 2) and np.isfinite(block.keypoints).all()
+    for row in rows:  # the configuration means what it did
+        np.testing.assert_array_equal(draw(config, row).gripper_twist, block.gripper_twist[row])
+    with pytest.raises(ValueError, match="effects is 'absent' in the store"):
+        open_or_create(old_store, config)  # unfinished work is finished by the version that began it
 
 
 def test_weights_of_before_are_read():
@@ -42,13 +64,12 @@ def test_a_cable_file_and_a_training_without_version_are_of_version_1(tmp_path):
 
 
 @pytest.mark.parametrize("file", ["data set", "weights", "log", "verdict", "cable", "training", "parts"])
-def test_a_newer_version_is_refused(file, tmp_path):
+def test_a_newer_version_is_refused(file, tmp_path, old_store):
     def store():
-        open_or_create(tmp_path / "data", DatasetConfig(n_trajectories=1, n_steps=1))
-        meta = json.loads((tmp_path / "data" / "zarr.json").read_text())
+        meta = json.loads((old_store / "zarr.json").read_text())
         meta["attributes"]["schema"] = "cablejax-dataset/3"
-        (tmp_path / "data" / "zarr.json").write_text(json.dumps(meta))
-        open_store(tmp_path / "data")
+        (old_store / "zarr.json").write_text(json.dumps(meta))
+        open_store(old_store)
 
     def weights():
         content = (OLD / "weights-1.safetensors").read_bytes()

@@ -23,6 +23,7 @@ from cablejax.dataset.schema import (
     SCHEMA,
     DatasetConfig,
     config_from_json,
+    config_of_version_1,
     config_to_json,
     digest_of_config,
 )
@@ -40,16 +41,15 @@ def open_store(path: str | os.PathLike[str]) -> Store:
     """Opens a data set, complete or not, to read it.
 
     Raises:
-        ValueError: there is no data set, a damaged one, or one of another schema version.
+        ValueError: there is no data set, or one of a newer schema version; older ones are read.
     """
-    return _intact(_recorded(place_of(path), "r"))
-
-
-def _intact(store: Store) -> Store:
-    """The store, if every array is described as its configuration says."""
+    store = _recorded(place_of(path), "r")
     for name in _arrays(store.config):
         if fault := _fault(store, name):
-            raise ValueError(f"The data set {store.path} is damaged: {name} {fault}. Generate it again elsewhere.")
+            raise ValueError(
+                f"The data set {path} is damaged: {name} {fault}. Run the generation that began it again, which "
+                "repairs it, or generate it elsewhere."
+            )
     return store
 
 
@@ -66,14 +66,15 @@ def _recorded(path: Path | Bucket, mode: Literal["r", "r+"]) -> Store:
         attributes: dict[str, Any] = dict(described["attributes"])
     except Exception as error:  # zarr raises what its parts raise
         raise ValueError(f"The data set {path} is damaged: {_reason(error)}. Generate it again elsewhere.") from error
-    if version_of(attributes.get("schema"), SCHEMA, path) == 1:
-        raise ValueError(f"{path} is a data set of version 1, which no published version wrote: generate it again.")
+    version = version_of(attributes.get("schema"), SCHEMA, path)
     recorded = attributes.get("config", {})
     if attributes.get("config_digest") != digest_of_config(recorded):
         raise ValueError(
             f"The configuration recorded in {path} was altered: it no longer matches its digest. "
             "Restore its zarr.json, or generate the data set again elsewhere."
         )
+    if version == 1:
+        recorded = config_of_version_1(recorded)
     versions = attributes.get("versions")
     if not isinstance(versions, dict):
         raise ValueError(f"The data set {path} is damaged: its versions are {shown(versions)}. Generate it again.")
@@ -122,7 +123,7 @@ def open_or_create(path: str | os.PathLike[str] | Bucket, config: DatasetConfig)
 
     Raises:
         ValueError: the folder holds something else, a newer schema version, another configuration, or was begun by
-            other package versions, or is damaged.
+            other package versions. Damaged descriptions of arrays are mended.
     """
     place, versions = place_of(path), package_versions()
     if isinstance(place, Bucket):
@@ -148,7 +149,21 @@ def open_or_create(path: str | os.PathLike[str] | Bucket, config: DatasetConfig)
             f"{place} was begun with other packages: {changes}. Trajectories of two versions are not mixed: "
             "install those versions, or generate in another folder. Nothing was changed."
         )
-    return _intact(store)
+    faulty = [name for name in _arrays(config) if _fault(store, name)]
+    if isinstance(place, Bucket):
+        if faulty:
+            descriptions = _descriptions(config, versions)
+            for name in faulty:
+                place.write(f"{name}/zarr.json", descriptions[f"{name}/zarr.json"])
+            store = _recorded(place, "r+")
+    elif faulty:
+        draft = _draft(place, config, versions)
+        for name in faulty:  # the trajectories stay: each is checked against its digest
+            (place / name).mkdir(exist_ok=True)
+            os.replace(draft / name / "zarr.json", place / name / "zarr.json")
+        shutil.rmtree(draft)
+        store = _recorded(place, "r+")
+    return store
 
 
 def _changes(stored: Mapping[str, Any], asked: Mapping[str, Any]) -> str:
@@ -169,14 +184,7 @@ def package_versions(packages: Sequence[str] = PACKAGES) -> dict[str, str]:
 
 def _create(path: Path, config: DatasetConfig, versions: dict[str, str]) -> None:
     """Makes the empty store under a temporary name and renames it: it appears whole, and only once."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    draft = path.parent / f".{path.name}.{os.getpid()}.draft"
-    shutil.rmtree(draft, ignore_errors=True)
-    try:
-        _fill(draft, config, versions)
-    except BaseException:  # a full disk
-        shutil.rmtree(draft, ignore_errors=True)
-        raise
+    draft = _draft(path, config, versions)
     try:
         draft.rename(path)
     except OSError:  # another process was first
@@ -194,11 +202,30 @@ def _create_in_bucket(bucket: Bucket, config: DatasetConfig, versions: dict[str,
         return
     if any(not name.endswith("/zarr.json") for name in bucket.names()):
         raise ValueError(f"{bucket} holds something, but no data set. Give a new prefix; nothing was changed.")
+    descriptions = _descriptions(config, versions)
+    for name in sorted(descriptions, key=lambda name: name == "zarr.json"):
+        bucket.write(name, descriptions[name])
+
+
+def _descriptions(config: DatasetConfig, versions: dict[str, str]) -> dict[str, bytes]:
+    """The files of an empty store, by their names."""
     with tempfile.TemporaryDirectory() as folder:
         draft = Path(folder) / "draft"
         _fill(draft, config, versions)
-        for file in sorted(draft.rglob("zarr.json"), key=lambda file: file.parent == draft):
-            bucket.write(str(file.relative_to(draft)), file.read_bytes())
+        return {str(file.relative_to(draft)): file.read_bytes() for file in draft.rglob("zarr.json")}
+
+
+def _draft(path: Path, config: DatasetConfig, versions: dict[str, str]) -> Path:
+    """An empty store next to the place where one is wanted."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    draft = path.parent / f".{path.name}.{os.getpid()}.draft"
+    shutil.rmtree(draft, ignore_errors=True)
+    try:
+        _fill(draft, config, versions)
+    except BaseException:  # a full disk
+        shutil.rmtree(draft, ignore_errors=True)
+        raise
+    return draft
 
 
 def _fill(folder: Path, config: DatasetConfig, versions: dict[str, str]) -> None:

@@ -22,7 +22,7 @@ from cablejax.simulate.equilibrium import FEWEST_LINKS
 from cablejax.simulate.motions import MotionConfig
 
 SCHEMA = "cablejax-dataset/2"
-"""Name and version of the store's layout. No published version wrote version 1."""
+"""Name and version of the store's layout. Version 1 is read too, see `config_of_version_1`."""
 
 PARAMETERS = ("stiffness_ratio", "friction_coefficient", "damping_time")
 """Columns of the `parameters` array: EI over nominal EI [-], Coulomb coefficient [-], Kelvin-Voigt time [s]."""
@@ -197,6 +197,21 @@ def config_from_json(cls: type, value: Mapping[str, Any]) -> Any:
         return cls(**{name: _decode(hints[name], item) for name, item in value.items()})
     except (TypeError, AttributeError) as error:
         raise ValueError(f"The recorded {cls.__name__} has a value of another type: {error}.") from error
+
+
+def config_of_version_1(recorded: Mapping[str, Any]) -> dict[str, Any]:
+    """The configuration that a store of version 1 recorded, as version 2 records it: the cable apart from its links."""
+    cable = recorded.get("cable") if isinstance(recorded, Mapping) else None
+    if not isinstance(cable, Mapping):
+        raise ValueError(f"The configuration of version 1 has the cable {shown(cable)}, expected an object.")
+    links = {field.name for field in dataclasses.fields(Discretisation)}
+    return {
+        **{name: value for name, value in recorded.items() if name != "cable"},
+        "discretisation": {
+            **{name: value for name, value in cable.items() if name in links},
+            "cable": {name: value for name, value in cable.items() if name not in links},
+        },
+    }
 
 
 def _decode(hint: Any, value: Any) -> Any:
