@@ -2,14 +2,13 @@
 
 A perceptron over all keypoints and a bidirectional recurrence along the cable. Both see the same node features
 (`cablejax.dynamics.graph`), correct the same prior, and are trained alike, by `cablejax.dynamics.train.train` with
-`network=FlatMLP` or `network=BiLSTM`. Edge features are not for them: what those hold follows from the nodes'
-positions. Some of the weights, of any network, see the cable in the world's axes instead of the grippers'.
+`network=FlatMLP` or `BiLSTM`; `WorldMLP` and `WorldGNS` see the cable in the world's axes instead of the grippers'.
+Edge features are for the graph networks only: what those hold follows from the nodes' positions.
 """
 
 from __future__ import annotations
 
 import dataclasses
-import functools
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -24,7 +23,6 @@ from safetensors import safe_open
 from cablejax.control.shaping import Model, NetworkDynamics, load_model
 from cablejax.dynamics.config import RECORDED, ModelConfig, Normalisation
 from cablejax.dynamics.graph import Frame
-from cablejax.dynamics.model import apply
 from cablejax.dynamics.networks import GNS, MLP
 from cablejax.dynamics.weights import cable_of_weights, weights_path
 from cablejax.simulate.chain.statics import Statics
@@ -101,19 +99,31 @@ class BiLSTM(nnx.Module):
         return self.decoder(along)
 
 
-NETWORKS: dict[str, Callable[[ModelConfig, nnx.Rngs], nnx.Module]] = {"gns": GNS, "mlp": FlatMLP, "lstm": BiLSTM}
-"""The networks by the names that files of weights record."""
-
-
 def worlds_frame(gripper_pose: Float[Array, "2 3"]) -> Frame:
     """The world's own axes, wherever the grippers are."""
     return Frame(jnp.zeros(2, gripper_pose.dtype), jnp.eye(2, dtype=gripper_pose.dtype))
 
 
-class WorldDynamics(NetworkDynamics):
-    """A network that sees the cable in the world's axes, as a function of its weights."""
+class WorldGNS(GNS):
+    """The graph network in the world's axes, as in the paper."""
 
-    displacement = staticmethod(functools.partial(apply, frame=worlds_frame))
+    frame = staticmethod(worlds_frame)
+
+
+class WorldMLP(FlatMLP):
+    """The perceptron in the world's axes."""
+
+    frame = staticmethod(worlds_frame)
+
+
+NETWORKS: dict[tuple[str, str], Callable[[ModelConfig, nnx.Rngs], nnx.Module]] = {
+    ("gns", "grippers"): GNS,
+    ("mlp", "grippers"): FlatMLP,
+    ("lstm", "grippers"): BiLSTM,
+    ("gns", "world"): WorldGNS,
+    ("mlp", "world"): WorldMLP,
+}
+"""The networks by name and frame, as files of weights record them."""
 
 
 def load_rival(folder: Path) -> Model:
@@ -130,11 +140,10 @@ def load_rival(folder: Path) -> Model:
     recorded["normalisation"] = Normalisation(**recorded["normalisation"])
     recorded["statics"] = Statics(**recorded.get("statics", {}))
     config = ModelConfig(**recorded)
-    graphdef, expected = nnx.split(nnx.eval_shape(lambda: NETWORKS[kind](config, nnx.Rngs(0))))
+    graphdef, expected = nnx.split(nnx.eval_shape(lambda: NETWORKS[kind, frame](config, nnx.Rngs(0))))
     flat = nnx.to_flat_state(expected)
     weights = nnx.from_flat_state([(key, leaf.replace(tensors[".".join(map(str, key))])) for key, leaf in flat])
-    dynamics = {"grippers": NetworkDynamics, "world": WorldDynamics}[frame](graphdef)
-    return Model(str(folder), config, dynamics, weights, cable_of_weights(path))
+    return Model(str(folder), config, NetworkDynamics(graphdef), weights, cable_of_weights(path))
 
 
 def load_any(name: str) -> Model:

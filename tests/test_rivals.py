@@ -21,15 +21,15 @@ from dynamics_cases import (
     trajectories,
     turned_twist,
 )
-from rivals import LSTM, NETWORKS, WEIGHTS, BiLSTM, FlatMLP, load_any, on_another_cable
+from rivals import LSTM, WEIGHTS, BiLSTM, FlatMLP, WorldGNS, WorldMLP, load_any, on_another_cable
 
 TWIST = jnp.asarray([[0.01, -0.02, 0.1], [-0.01, 0.01, -0.05]])
-KINDS = ("mlp", "lstm")
+KINDS = (FlatMLP, BiLSTM)
 
 
 def stirred(kind, seed=0):
     """A network of this kind whose weights are all random."""
-    graphdef, weights = nnx.split(NETWORKS[kind](SMALL, nnx.Rngs(seed)))
+    graphdef, weights = nnx.split(kind(SMALL, nnx.Rngs(seed)))
     rng = np.random.default_rng(seed)
     return graphdef, jax.tree.map(lambda w: w + 0.1 * rng.standard_normal(w.shape).astype(w.dtype), weights)
 
@@ -38,7 +38,7 @@ def stirred(kind, seed=0):
 def test_untrained_it_is_its_prior_and_it_turns_with_the_cable(kind):
     history = arched_history(SMALL)
     model = stirred(kind)
-    fresh = nnx.split(NETWORKS[kind](SMALL, nnx.Rngs(0)))
+    fresh = nnx.split(kind(SMALL, nnx.Rngs(0)))
     np.testing.assert_array_equal(apply(fresh, history, TWIST), prior_of(history, TWIST, SMALL).displacement)
     moved = apply(model, history, TWIST)
     assert np.abs(moved - prior_of(history, TWIST, SMALL).displacement).max() > 1e-4
@@ -65,7 +65,7 @@ def test_the_recurrence_runs_both_ways_along_the_cable():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", [FlatMLP, BiLSTM])
+@pytest.mark.parametrize("kind", [FlatMLP, BiLSTM, WorldMLP, WorldGNS])
 def test_it_trains_like_the_graph_network(kind, tmp_path):
     result = train(TINY_TRAINING, trajectories(), tmp_path / "run", network=kind, progress=False)
     assert result.completed

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping, Sequence
-from typing import ClassVar, Literal, get_args
+from typing import Literal, get_args
 
 import jax.numpy as jnp
 import numpy as np
@@ -78,12 +78,10 @@ class NetworkDynamics:
     """
 
     graphdef: nnx.GraphDef
-    displacement: ClassVar = staticmethod(apply)
-    """How a network moves the cable, for a subclass to replace."""
 
     def __call__(self, weights: nnx.State, history: History, twist: Float[Array, "2 3"]) -> Float[Array, "N 2"]:
         """Displacement of every keypoint [m] under a twist held for one interval."""
-        return self.displacement((self.graphdef, weights), history, twist)
+        return apply((self.graphdef, weights), history, twist)
 
     def jacobian(self, weights: nnx.State, history: History, twist: Float[Array, "2 3"]) -> StepJacobian:
         """Derivatives of a step: exact in float64, good to about a thousandth in float32 (`dynamics.bfloat16_slopes`).
@@ -91,7 +89,7 @@ class NetworkDynamics:
         The grasped keypoints move as their grippers do, so that only the others' cotangents go through the network.
         """
         network = with_bfloat16_slopes(nnx.merge(self.graphdef, weights))
-        between = reverse(lambda history, twist: self.displacement(network, history, twist)[1:-1], history, twist)
+        between = reverse(lambda history, twist: apply(network, history, twist)[1:-1], history, twist)
         padded = StepJacobian(*(jnp.pad(part, [(1, 1)] + [(0, 0)] * (part.ndim - 1)) for part in between))
         grasped = network.config.interval * jnp.eye(2, 3, dtype=twist.dtype)
         return padded._replace(twist=padded.twist.at[0, :, 0].set(grasped).at[-1, :, 1].set(grasped))

@@ -9,7 +9,7 @@ from flax import nnx
 from jaxtyping import Array, Float
 
 from cablejax.dynamics.config import ModelConfig
-from cablejax.dynamics.graph import Frame, build_graph, frame_of, prior_of
+from cablejax.dynamics.graph import build_graph, frame_of, prior_of
 from cablejax.dynamics.networks import GNS
 from cablejax.types import History
 
@@ -18,10 +18,7 @@ OneStepModel = Callable[[History, Float[Array, "Q 3"]], Float[Array, "N 2"]]
 
 
 def apply(
-    model: GNS | tuple[nnx.GraphDef, nnx.State],
-    history: History,
-    twist: Float[Array, "2 3"],
-    frame: Callable[[Float[Array, "2 3"]], Frame] = frame_of,
+    model: GNS | tuple[nnx.GraphDef, nnx.State], history: History, twist: Float[Array, "2 3"]
 ) -> Float[Array, "N 2"]:
     """Displacement X(t + 1) - X(t) [m] of every keypoint; at the two grasped ones it is the grippers', exactly.
 
@@ -31,10 +28,10 @@ def apply(
 
     Args:
         model: the network, or its split form `(graphdef, weights)`. Any module with a `config` will do that maps node
-            features [N, F] and edge features [E, G] to movement beyond the prior [N, 2], in units of its scale.
+            features [N, F] and edge features [E, G] to movement beyond the prior [N, 2], in units of its scale. One
+            that sees the cable in another frame than the grippers' has that as `frame`, see `GNS`.
         history: the last H samples; vmap for batches.
         twist: control input of both grippers [m/s, rad/s], shape [2, 3].
-        frame: by the grippers' poses, the frame that the network sees the cable in.
 
     Raises:
         ValueError: a history of another number of samples or keypoints than the model was trained with.
@@ -46,7 +43,7 @@ def apply(
             f"The history has keypoints of shape {history.keypoints.shape}, expected {expected}: this model looks back "
             f"on {config.history} samples of {config.n_keypoints} keypoints (`MPCConfig.history_length`)."
         )
-    prior = prior_of(history, twist, config)
+    prior, frame = prior_of(history, twist, config), getattr(network, "frame", frame_of)
     graph = build_graph(history, twist, prior, config, frame)
     axes = frame(history.gripper_pose).axes
     output = network(graph.nodes, graph.edges)  # pyright: ignore[reportArgumentType]

@@ -21,7 +21,7 @@ from flax import nnx
 from jaxtyping import Array, Float
 
 from cablejax.dynamics.config import ModelConfig
-from cablejax.dynamics.graph import topology_of
+from cablejax.dynamics.graph import frame_of, topology_of
 
 
 class MLP(nnx.Module):
@@ -135,6 +135,9 @@ class GNS(EncodeProcessDecode):
 
     Reads the features of `cablejax.dynamics.graph`.
     """
+
+    frame = staticmethod(frame_of)
+    """By the grippers' poses, the frame that the network sees the cable in."""
 
     def __init__(self, config: ModelConfig, rngs: nnx.Rngs):
         super().__init__((config.node_features, config.edge_features), 2, config, rngs)

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 
 from cablejax.dynamics.config import ModelConfig, Normalisation
-from cablejax.dynamics.graph import frame_of, prior_of
+from cablejax.dynamics.graph import Frame, frame_of, prior_of
 from cablejax.types import History, Trajectory
 
 GRASP_TOLERANCE = 2e-2
@@ -55,7 +58,9 @@ def check_trajectories(data: Trajectory, config: ModelConfig, *, steps: int, wha
         )
 
 
-def fit_normalisation(data: Trajectory, config: ModelConfig) -> Normalisation:
+def fit_normalisation(
+    data: Trajectory, config: ModelConfig, frame: Callable[[Float[Array, "2 3"]], Frame] = frame_of
+) -> Normalisation:
     """Root mean squares of features and targets over trajectories [M, T, ...], see `Normalisation`.
 
     The residual's leaves out the 5 % of steps with the largest.
@@ -74,7 +79,7 @@ def fit_normalisation(data: Trajectory, config: ModelConfig) -> Normalisation:
     beyond = np.mean((moved - np.asarray(expected(*arrays), np.float64))[:, :, 1:-1] ** 2, axis=(2, 3))
     # The few steps in which a cable snaps through would set the scale alone.
     usual = np.sort(beyond.ravel())[: max(1, int(0.95 * beyond.size))]
-    origin = np.asarray(jax.vmap(jax.vmap(lambda p: frame_of(p).origin))(jnp.asarray(pose)), np.float64)
+    origin = np.asarray(jax.vmap(jax.vmap(lambda p: frame(p).origin))(jnp.asarray(pose)), np.float64)
     shorter = config.spacing - np.linalg.norm(np.diff(x, axis=2), axis=-1)
 
     def rms(values: np.ndarray, least: float) -> float:

@@ -31,6 +31,7 @@ from cablejax.dynamics.checkpoint import Checkpoints
 from cablejax.dynamics.config import RECORDED, ModelConfig
 from cablejax.dynamics.evaluate import HORIZONS, evaluation_windows, make_errors
 from cablejax.dynamics.fingerprint import fingerprint
+from cablejax.dynamics.graph import frame_of
 from cablejax.dynamics.loss import random_walk_noise, rollout_loss
 from cablejax.dynamics.metrics import MetricsLog
 from cablejax.dynamics.model import bind
@@ -128,7 +129,7 @@ def train(
         DivergedError: the loss is no longer finite.
     """
     mesh = training_mesh(config, devices)
-    config = dataclasses.replace(config, model=_with_scales(config, data, initial))
+    config = dataclasses.replace(config, model=_with_scales(config, data, initial, network))
     identity, out_dir = data.identity if isinstance(data, StreamedData) else data, Path(out_dir)
     run = {"config": dataclasses.asdict(config), "data": fingerprint((identity, initial and initial[1]))}
     run["config"]["model"] |= RECORDED | {"network": network.__name__.lower()}
@@ -188,12 +189,16 @@ def _buffers(data: Trajectory | StreamedData, calls: int, mesh: Mesh | None) -> 
 
 
 def _with_scales(
-    config: TrainConfig, data: Trajectory | StreamedData, initial: tuple[ModelConfig, nnx.State] | None
+    config: TrainConfig, data: Trajectory | StreamedData, initial: tuple[ModelConfig, nnx.State] | None, network: type
 ) -> ModelConfig:
     """The network's configuration with the scales of the data, which are checked, or of the model to start from."""
     model, first = config.model, data.at(0) if isinstance(data, StreamedData) else data
     check_trajectories(first, model, steps=config.longest_rollout, what="training data")
-    scales = fit_normalisation(first, model) if initial is None else initial[0].normalisation
+    scales = (
+        fit_normalisation(first, model, getattr(network, "frame", frame_of))
+        if initial is None
+        else initial[0].normalisation
+    )
     model = dataclasses.replace(model, normalisation=scales)
     if initial is not None and initial[0] != model:
         raise ValueError(
