@@ -246,12 +246,12 @@ class Cables:
         twists = config.limits.shortened(twists, self.gripper_pose, config.interval, length) * active[:, None, None]
         truly = without_camera(self._physics)
         after, shown = self._engine.rollout(truly, self._state, twists[:, None], config.interval)
-        torn = np.asarray(self._engine.opening(after)) > config.widest
+        keypoints, poses = np.asarray(shown.keypoints[:, -1]), np.asarray(shown.gripper_pose[:, -1])
+        diverged = ~(np.abs(keypoints) < config.room).all(axis=(1, 2))
+        torn = ~diverged & (np.asarray(self._engine.opening(after)) > config.widest)
         self._state = jax.tree.map(
             lambda new, old: np.where(torn.reshape(-1, *[1] * (new.ndim - 1)), old, new), after, self._state
         )
-        keypoints, poses = np.asarray(shown.keypoints[:, -1]), np.asarray(shown.gripper_pose[:, -1])
-        diverged = ~torn & ~(np.abs(keypoints) < config.room).all(axis=(1, 2))
         self.taken += active
         seen = active & ~diverged & ~torn
         self.gripper_pose[seen] = poses[seen]

@@ -94,9 +94,8 @@ class MjxShapeCable:
         twist = jnp.asarray(config.scale, share.dtype) * share
         twist = config.limits.shortened(twist, before.gripper_pose, config.interval, config.cable.length)
         after, (_, seen) = self._moved(info["physics"], before, twist)
-        torn = self._engine.opening(after) > config.widest
-        diverged = ~torn & ~(jnp.abs(seen) < config.room).all()
-        sound = ~torn & ~diverged
+        diverged = ~(jnp.abs(seen) < config.room).all()
+        sound = ~diverged & ~(self._engine.opening(after) > config.widest)
         data = jax.tree.map(lambda new, old: jnp.where(sound, new, old), after, before)
         rng, obs, error = self._observed(info["rng"], info["physics"], seen, data, info["target"])
         obs, error = jnp.where(sound, obs, state.obs), jnp.where(sound, error, state.metrics["error"])
