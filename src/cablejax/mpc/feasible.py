@@ -7,6 +7,7 @@ A plan is a motion `u` of shape [T, Q, 3]: what each gripper moves in each inter
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -171,10 +172,7 @@ class FeasibleSet(AbstractSet):
             outward = self.separation / jnp.maximum(distance, 1e-9)
             apart = jnp.sum(outward * (self.previous[1, :2] - self.previous[0, :2]))
         out, back = (self._way_back(n_steps, speed, 2.0 * _RETURN_SPEED) for speed in (apart, -apart))
-        return (
-            jnp.where(distance < self.min_distance, jnp.minimum(self.min_distance, distance + out), self.min_distance),
-            jnp.where(distance > self.max_distance, jnp.maximum(self.max_distance, distance - back), self.max_distance),
-        )
+        return self._outside_only(distance, (self.min_distance, self.max_distance), (distance + out, distance - back))
 
     def _workspace_bounds(self, n_steps: int) -> tuple[Float[Array, "T 2 2"], Float[Array, "T 2 2"]]:
         """Lowest and highest positions after each step, wider while the grippers come back from outside."""
@@ -182,10 +180,7 @@ class FeasibleSet(AbstractSet):
         position: Array = self.position  # pyright: ignore[reportAssignmentType]
         speed = jnp.zeros_like(position) if self.previous is None else self.previous[:, :2]
         up, down = (self._way_back(n_steps, towards, _RETURN_SPEED / math.sqrt(2.0)) for towards in (speed, -speed))
-        return (
-            jnp.where(position < lower, jnp.minimum(lower, position + up), lower),
-            jnp.where(position > upper, jnp.maximum(upper, position - down), upper),
-        )
+        return self._outside_only(position, (lower, upper), (position + up, position - down))
 
     def _way_back(self, n_steps: int, towards: Float[Array, "..."], share: float) -> Float[Array, "T ..."]:
         """How far the grippers come after each step [m], at a share of the radius and of the bound on the change.
@@ -193,10 +188,18 @@ class FeasibleSet(AbstractSet):
         `towards` is their motion in that direction in the step before [m].
         """
         steps = jnp.arange(1, n_steps + 1).reshape(-1, *[1] * towards.ndim)
-        fastest = jnp.broadcast_to(share * self.radius, (n_steps, *towards.shape))
-        if self.change is not None:
-            fastest = jnp.minimum(fastest, towards + share * self.change * steps)
-        return jnp.cumsum(fastest, axis=0)
+        if self.change is None:
+            return share * self.radius * steps
+        return jnp.cumsum(jnp.minimum(share * self.radius, towards + share * self.change * steps), axis=0)
+
+    def _outside_only(self, start: Array, bounds: tuple[Array, Array], closing: tuple[Array, Array]) -> Any:
+        """Bounds that are as far out as `closing` where the grippers start outside of them."""
+        (lower, upper), (low, high) = bounds, closing
+        wider = jnp.minimum(lower, low), jnp.maximum(upper, high)
+        if self.change is None:
+            return wider
+        # grippers that start inside and cannot brake in time get no wider bound
+        return jnp.where(start < lower, wider[0], lower), jnp.where(start > upper, wider[1], upper)
 
     def _workspace_planes(self, n_steps: int, dtype) -> Halfspaces:
         low, high = self._workspace_bounds(n_steps)
