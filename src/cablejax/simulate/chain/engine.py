@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from typing import ClassVar, get_args
 
 import jax
@@ -96,6 +97,7 @@ class ChainEngine(Engine):
         )
         return _cable_state(*final), trajectory
 
+    @functools.partial(jax.jit, static_argnames="self")
     def opening(self, state: CableState) -> Float[Array, "*B"]:
         """Distance of the cable's end from gripper 1 [m]: more than rounding only where it does not reach that far."""
         memory = self._remembering(state).memory
