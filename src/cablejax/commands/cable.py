@@ -102,16 +102,9 @@ def check_verdicts(paths: Sequence[pathlib.Path], cable: Cable, remedy: str) -> 
     from cablejax.cable_file import NUMBERS
 
     for path in paths:
-        theirs = cable_of_verdict(path)
-        numbers = (
-            {}
-            if theirs is None
-            else {key: (getattr(theirs, name), getattr(cable, name)) for key, (name, _) in NUMBERS.items()}
-        )
-        off = [
-            f"{key} = {one:g}, not {other:g}"
-            for key, (one, other) in numbers.items()
-            if not math.isclose(one, other, rel_tol=1e-4)
-        ]
+        if (theirs := cable_of_verdict(path)) is None:
+            continue
+        pairs = {key: (getattr(theirs, name), getattr(cable, name)) for key, (name, _) in NUMBERS.items()}
+        off = [f"{key} = {a:g}, not {b:g}" for key, (a, b) in pairs.items() if not math.isclose(a, b, rel_tol=1e-4)]
         if off:
             raise ValueError(f"{path} is the verdict on another cable than this one ({', '.join(off)}). {remedy}")

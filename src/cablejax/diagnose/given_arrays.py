@@ -74,17 +74,22 @@ def inert_effects(simulator: Simulator, observed: Float[np.ndarray, "E T *O"], n
     Raises:
         ValueError: that is so of every effect.
     """
+    begun = [
+        explanation((effect, *start))
+        for effect in simulator.effects
+        for start in simulator.starts(effect, nominal, observed - nominal)
+    ]
+    predicted = np.asarray(simulator.predict(begun, np.arange(len(observed))), float) if begun else np.zeros(0)
     caveats = []
     for effect in simulator.effects:
-        begun = [explanation((effect, *start)) for start in simulator.starts(effect, nominal, observed - nominal)]
-        if not begun:
+        own = [k for k, one in enumerate(begun) if one.names == (effect.name,)]
+        finite = [k for k in own if np.isfinite(predicted[k]).all()]
+        if not own or any((predicted[k] != nominal).any() for k in finite):
             continue
-        predicted = np.asarray(simulator.predict(begun, np.arange(len(observed))), float)
-        finite = np.isfinite(predicted).reshape(len(begun), -1).all(axis=1)
-        if (predicted[finite] != nominal).any():
-            continue
-        values = ", ".join(f"{p.name} = {v:g}" for p, v in zip(effect.parameters, begun[-1].values()[0], strict=True))
-        gives = "exactly what it gives without" if finite.all() else "values that are not finite"
+        values = ", ".join(
+            f"{p.name} = {v:g}" for p, v in zip(effect.parameters, begun[own[-1]].values()[0], strict=True)
+        )
+        gives = "exactly what it gives without" if finite == own else "values that are not finite"
         caveats.append(f"With {effect.name} ({values}) predict gives {gives}: the effect was not tried.")
     if simulator.effects and len(caveats) == len(simulator.effects):
         raise ValueError(f"{' '.join(caveats)} Does predict use the explanations that it is given?")

@@ -115,6 +115,11 @@ class Track(NamedTuple):
     gap: Float[Array, "*b"]
 
 
+def quality(fit: CurveFit) -> tuple[Array, ...]:
+    """The last fields of a `Track`, of a fit."""
+    return fit.sigma, fit.support, fit.seen, fit.curvature, fit.gap
+
+
 @functools.partial(jax.jit, static_argnames="config")
 def track(
     config: TrackerConfig,
@@ -173,7 +178,7 @@ def track(
         found=state.found,
     )
     keypoints = jnp.where(state.found, best.keypoints, jnp.nan)
-    return after, Track(keypoints, status, lost, seen.sigma, seen.support, seen.seen, seen.curvature, seen.gap)
+    return after, Track(keypoints, status, lost, *quality(seen))
 
 
 @functools.partial(jax.jit, static_argnames="config")

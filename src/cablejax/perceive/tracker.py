@@ -7,12 +7,11 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Bool, Float
 
 from cablejax.limits import LIMITS
-from cablejax.perceive.frame import Status, Track, TrackerConfig, TrackState, judge, track
+from cablejax.perceive.frame import Status, Track, TrackerConfig, TrackState, judge, quality, track
 from cablejax.perceive.initial import cloud_path, first_fit, path_length
-from cablejax.perceive.registration import CurveFit
 
 # Lengths of the cable over which a cloud and the grippers can hardly extend.
 _FARTHEST = 4.0
@@ -177,20 +176,15 @@ class Tracker:
                     misfits=zero,
                     found=jnp.asarray(True),
                 )
-                return found, Track(fit.keypoints, status, zero, *_quality(fit))
-            quality = _quality(fit)
+                return found, Track(fit.keypoints, status, zero, *quality(fit))
+            found_by = quality(fit)
         else:
             status, zero = jnp.asarray(Status.FEW_POINTS), jnp.asarray(0.0)
-            quality = (state.sigma, zero, zero, zero, zero)
+            found_by = (state.sigma, zero, zero, zero, zero)
         if otherwise is not None:
             return state, otherwise
         nowhere = jnp.full((config.registration.n_keypoints, 2), jnp.nan)
-        return state, Track(nowhere, status, state.lost, *quality)
-
-
-def _quality(fit: CurveFit) -> tuple[Array, ...]:
-    """The last fields of a `Track`."""
-    return fit.sigma, fit.support, fit.seen, fit.curvature, fit.gap
+        return state, Track(nowhere, status, state.lost, *found_by)
 
 
 def _checked_pose(value: Float[np.ndarray, "Q 3"]) -> np.ndarray:
