@@ -26,6 +26,10 @@ os.environ.setdefault(FOLDER, str(pathlib.Path(__file__).parents[1] / ".pytest_c
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.3")
 keep_compiled_programs()
 
+# Tracing makes many objects that live long, and looking through all of them at Python's usual rate takes a tenth of the
+# time of the tests.
+gc.set_threshold(200_000, 50, 100)
+
 _MAPS = pathlib.Path("/proc/self/maps")
 _MANY, _SOME = 40_000, 10
 """Linux gives a process 65,530 memory mappings, and aborts a compilation that wants more; so few tests make less than
