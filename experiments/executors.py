@@ -16,8 +16,8 @@ SECONDS = 20.0
 """How long a scheduler may take to answer."""
 
 
-class ExecutorError(ValueError):
-    """An executor cannot be used; the message says why and what to do."""
+class ExecutorError(SystemExit):
+    """An executor cannot be used; the message, with which the program ends, says why and what to do."""
 
 
 def add_option(parser: argparse.ArgumentParser) -> None:

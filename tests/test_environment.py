@@ -233,6 +233,8 @@ def test_wrong_targets_are_refused():
 
 @pytest.mark.parametrize("make", [ShapeCableEnv, functools.partial(ShapeCableVectorEnv, 2)])
 def test_what_cannot_be_rendered_is_refused(make):
+    with pytest.raises(ValueError, match="config is of type dict, expected a ShapeCableConfig"):
+        make(config={"length": 1.0})
     with pytest.raises(ValueError, match="render_mode is 'human', expected None"):
         make(config=CONFIG, render_mode="human")
 

@@ -76,6 +76,12 @@ def test_missing_measurements_stay_missing(tmp_path):
     assert np.isnan(read_clouds(tmp_path).clouds[0]).all()
 
 
+def short(poses):
+    """Replaces the second row by two numbers."""
+    lines = poses.read_text().splitlines()
+    poses.write_text("\n".join([*lines[:2], "0.5,1.0", *lines[3:]]))
+
+
 def edit(file, old, new):
     file.write_bytes(file.read_bytes().replace(old, new, 1))
 
@@ -87,7 +93,7 @@ def broken(path, what):
         return path
     if what == "pickle":
         np.save(path / "a.npy", np.array([{"a": 1}], dtype=object), allow_pickle=True)
-        return path / "a.npy"
+        return (path / "a.npy").rename(path / "a.npz")
     if what == "objects":
         np.savez(path / "a.npz", time=TIME, gripper_pose=POSES, points=np.array([[1], [1, 2]], dtype=object))
         return path / "a.npz"
@@ -116,6 +122,8 @@ def broken(path, what):
         return path / "a.npz"
     return {
         "few rows": lambda: folder(path, rows=2),
+        "another file": lambda: (folder(path), path / "poses.csv")[1],
+        "short row": lambda: (folder(path), short(path / "poses.csv"))[0],
         "compressed": lambda: folder(path, "binary_compressed"),
         "cut": lambda: folder(path, cut=3),
         "cut text": lambda: folder(path, "ascii", cut=40),
@@ -131,6 +139,8 @@ def broken(path, what):
     ("what", "message"),
     [
         ("no file", "does not exist"),
+        ("another file", "another kind of file, expected an .npz"),
+        ("short row", "a row '0.5,1.0', expected 7 numbers"),
         ("empty folder", "0 PCD files"),
         ("pickle", "no .npz archive"),
         ("objects", "holds Python objects"),

@@ -7,6 +7,7 @@ from jaxtyping import ArrayLike, Float
 
 from cablejax.diagnose.noise import noise_floor
 from cablejax.diagnose.protocol import Explanation, Simulator, explanation
+from cablejax.effects.effect import Effect
 
 # Of the noise: by so much predictions may differ that should be the same.
 _SAME = 0.01
@@ -20,7 +21,11 @@ def checked_nominal(
     Raises:
         ValueError: it does not; the message says what was found and what was expected.
     """
-    effects = list(simulator.effects)
+    if not isinstance(simulator, Simulator):
+        raise ValueError(f"The simulator is {_kind(simulator)}, expected an instance of a subclass of `Simulator`.")
+    effects = list(getattr(simulator, "effects", ()))
+    if strange := [effect for effect in effects if not isinstance(effect, Effect)]:
+        raise ValueError(f"The simulator's effects hold {_kind(strange[0])}, expected instances of `Effect`.")
     names = [effect.name for effect in effects]
     if not effects or len(set(names)) < len(names):
         raise ValueError(f"The simulator has the effects {names}, expected at least one, and every name once.")
@@ -40,8 +45,9 @@ def checked_nominal(
             nulls.append(null)
     everything = np.arange(len(observed))
     predicted = simulator.predict([explanation(), *nulls], everything)
-    if not isinstance(predicted, np.ndarray):
-        raise ValueError(f"predict gave a {type(predicted).__name__}, expected a NumPy array: np.asarray(...).")
+    if not isinstance(predicted, np.ndarray) or predicted.dtype.kind != "f":
+        kind = f"an array of {predicted.dtype}" if isinstance(predicted, np.ndarray) else _kind(predicted)
+        raise ValueError(f"predict gave {kind}, expected a NumPy array of floating point numbers.")
     expected = (1 + len(nulls), *observed.shape)
     if predicted.shape != expected:
         raise ValueError(f"predict gave an array of shape {predicted.shape}, expected {expected}: [X, E, T, ...].")
@@ -66,6 +72,11 @@ def checked_nominal(
             "part of what it gave for all episodes: it has to simulate the episodes that it is asked for."
         )
     return nominal
+
+
+def _kind(value: object) -> str:
+    """What was given, in words."""
+    return f"the class {value.__name__}" if isinstance(value, type) else f"a {type(value).__name__}"
 
 
 def inert_effects(simulator: Simulator, observed: Float[np.ndarray, "E T *O"], nominal: np.ndarray) -> list[str]:
@@ -102,7 +113,10 @@ def recorded_arrays(observed: ArrayLike, interval: ArrayLike) -> tuple[np.ndarra
     Raises:
         ValueError: arrays that are no recording.
     """
-    observed = np.asarray(observed, float)
+    given = np.asarray(observed)
+    if given.dtype.kind not in "fiu":
+        raise ValueError(f"observed is an array of {given.dtype}, expected real numbers.")
+    observed = given.astype(float)
     if np.isinf(observed).any():
         raise ValueError("observed has infinite values, expected numbers, and NaN where nothing was observed.")
     if observed.ndim < 3 or not np.isfinite(observed).any():

@@ -60,6 +60,8 @@ def diagnose_simulator(
         ValueError: arrays or a simulator that cannot be diagnosed; the message says what was expected.
     """
     begin = time.perf_counter()
+    if not isinstance(calibration, Calibration | None):
+        raise ValueError(f"calibration is {calibration!r}, expected a `Calibration` or None.")
     observed, interval = recorded_arrays(observed, interval)
     spread = spread_of(observed, noise)
     motion = np.arange(len(observed)) if motion is None else np.asarray(motion)

@@ -78,8 +78,9 @@ def read_clouds(path: str | os.PathLike[str]) -> CloudSequence:
     path = pathlib.Path(path)
     if path.is_dir():
         return _read_folder(path)
-    if not path.is_file():
-        raise ValueError(f"{path} does not exist, expected an .npz file or a folder of PCD files.")
+    if not path.is_file() or path.suffix.lower() != ".npz":
+        found = "is another kind of file" if path.is_file() else "does not exist"
+        raise ValueError(f"{path} {found}, expected an .npz file or a folder of PCD files.")
     arrays = read_npz(path, ["time", "gripper_pose", "points"], ["count"])
     for name in ("time", "gripper_pose", "points"):
         if not np.issubdtype(arrays[name].dtype, np.floating):
@@ -121,14 +122,16 @@ def _read_folder(folder: pathlib.Path) -> CloudSequence:
     first, *lines = [line for line in read_text(poses).splitlines() if line.strip()] or [""]
     if tuple(name.strip() for name in first.split(",")) != POSES_HEADER:
         raise ValueError(f"{poses} begins with {shown(first)}, expected {','.join(POSES_HEADER)!r}.")
-    try:
-        rows = np.array([[float(value) for value in line.split(",")] for line in lines])
-    except ValueError as error:
-        raise ValueError(f"{poses} has a row that is not seven numbers: {shown(str(error))}") from None
-    if rows.shape != (len(files), len(POSES_HEADER)):
-        raise ValueError(
-            f"{poses} has rows of shape {rows.shape}, expected {len(files)} rows of {len(POSES_HEADER)}: one per file."
-        )
+    if len(lines) != len(files):
+        raise ValueError(f"{poses} has {len(lines)} rows, expected {len(files)} rows: one for each file.")
+    rows = np.empty((len(files), len(POSES_HEADER)))
+    for row, line in zip(rows, lines, strict=True):
+        try:
+            row[:] = np.array(line.split(","), float).reshape(row.shape)
+        except ValueError:
+            raise ValueError(
+                f"{poses} has a row {shown(line)}, expected {len(POSES_HEADER)} numbers separated by commas."
+            ) from None
     return CloudSequence(rows[:, 0], [read_pcd(file) for file in files], rows[:, 1:].reshape(-1, 2, 3))
 
 

@@ -132,7 +132,9 @@ class Tracker:
         begin = f"The cloud does not fit a cable of {length:.3g} m between these grippers: "
         if across > _FARTHEST * length:
             return f"{begin}together they extend over {across:.3g} m. Are both in metres, and in one frame?"
-        way = path_length(cloud_path(used, gripper_pose, length))
+        # a path is smooth, which takes a little off its ends
+        ends = np.asarray(gripper_pose, float)[:, :2]
+        way = path_length(np.stack([ends[0], *cloud_path(used, gripper_pose, length), ends[1]]))
         return f"{begin}{self._misfit(track)} The shortest way along its points is {way:.3g} m."
 
     def _misfit(self, track: Track) -> str:
