@@ -9,11 +9,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from cablejax.cable import Discretisation
+from cablejax.cable import Cable, Discretisation
 from cablejax.diagnose import LIBRARY, CableEffect, Parameter
 from cablejax.diagnose.case import FINE_LINKS
 from cablejax.diagnose.check import check_effect
 from cablejax.effects.camera import in_camera_frame
+from cablejax.effects.given import parse_effect, with_effects
 from cablejax.effects.physics import nominal_physics
 from cablejax.simulate import MjxEngine, compiler_options
 from cablejax.simulate.chain.replay import Chain
@@ -56,6 +57,35 @@ def test_an_effect_about_another_place_is_reported_in_the_worlds_frame(effect):
         turned = moved.apply(nominal, [np.float32(v) for v in (1.0, 0.02, 0.0, 0.0)], 0, config)
         there = in_camera_frame(turned, PLACE.astype(np.float32)[None])[0]
         np.testing.assert_allclose(there, PLACE, atol=1e-6)
+
+
+@pytest.mark.parametrize("effect", LIBRARY, ids=lambda e: e.name)
+def test_an_effect_given_twice_acts_twice_or_is_refused(effect):
+    chain = Discretisation(Cable())
+    believed = nominal_physics(chain, np.float64)
+    once, other = ([np.float64(p.value(np.float64(z))) for p in effect.parameters] for z in (0.4, 0.9))
+    alone = effect.apply(believed, other, effect.variants[0], chain)
+    both = effect.apply(effect.apply(believed, once, effect.variants[0], chain), other, effect.variants[0], chain)
+    lost = all(np.array_equal(getattr(alone, f.name), getattr(both, f.name)) for f in dataclasses.fields(alone))
+    assert lost == effect.alone
+
+
+def test_two_patches_at_a_time_are_refused():
+    chain, text = Discretisation(Cable()), "friction_patch:x_m={},y_m=0,radius_m=0.1,coefficient=0.6,from_s={}"
+    one, other, later = (parse_effect(text.format(x, start)) for x, start in ((0.2, 0), (0.5, 10), (0.5, 20)))
+    with pytest.raises(ValueError, match=r"friction_patch is given twice .* one at a time"):
+        with_effects(nominal_physics(chain), [one, other], chain)
+    with_effects(nominal_physics(chain), [dataclasses.replace(one, until_s=20.0), later], chain)
+
+
+def test_a_patch_has_its_coefficient_whatever_the_table_around_has():
+    chain = Discretisation(Cable())
+    patch = parse_effect("friction_patch:x_m=0.2,y_m=0,radius_m=0.1,coefficient=0.1")
+    rough = parse_effect("table_friction:coefficient=0.6")
+    for effects in ([patch, rough], [rough, patch]):
+        physics = with_effects(nominal_physics(chain, np.float64), effects, chain)
+        assert physics.friction == pytest.approx(0.6, abs=1e-6)
+        assert physics.friction + physics.patch_friction == pytest.approx(0.1, abs=1e-6)
 
 
 class _Shift(CableEffect):

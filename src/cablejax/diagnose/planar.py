@@ -32,7 +32,8 @@ def physics_of(explanation: Explanation, nominal: Physics, config: Discretisatio
         config: the nominal cable.
         z: coordinates in place of the explanation's own; the result is differentiable in them if they are a JAX array.
     """
-    for term, part in explanation.by_term(np.asarray(explanation.z, np.float32) if z is None else z):
+    terms = explanation.by_term(np.asarray(explanation.z, np.float32) if z is None else z)
+    for term, part in sorted(terms, key=lambda one: cast(CableEffect, one[0].effect).stage):
         effect = cast(CableEffect, term.effect)
         values = [p.value(x) for p, x in zip(effect.parameters, part, strict=True)]
         nominal = effect.apply(nominal, values, term.variant, config)

@@ -54,6 +54,10 @@ class CableEffect(Effect, abc.ABC):
     """The hook through which the effect acts."""
     side: ClassVar[Literal["dynamics", "observation"]] = "dynamics"
     """Whether the cable moves differently, or is only seen differently."""
+    stage: ClassVar[int] = 0
+    """Effects of a later stage change what those of earlier ones have made, in whatever order they are given."""
+    alone: ClassVar[bool] = False
+    """Whether a simulation has one of them at a time: a second one would take the place of the first."""
 
     def __init__(self):
         self.__post_init__()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
 import os
 from collections.abc import Iterable, Mapping, Sequence
@@ -81,6 +82,11 @@ class GivenEffect:
         """Whether it acts at this time [s]."""
         return self.from_s <= time and (self.until_s is None or time < self.until_s)
 
+    def meets(self, other: GivenEffect) -> bool:
+        """Whether there is a time at which both act."""
+        first, second = sorted((self, other), key=lambda one: one.from_s)
+        return first.until_s is None or second.from_s < first.until_s
+
     @property
     def effect(self) -> CableEffect:
         """Its entry of the library."""
@@ -125,8 +131,19 @@ class GivenEffect:
 
 
 def with_effects(physics: Physics, effects: Iterable[GivenEffect], chain: Discretisation) -> Physics:
-    """The physics with every effect, applied in order. An effect may be given more than once, at several places."""
-    for effect in effects:
+    """The physics with every effect, applied in order of their stages.
+
+    Raises:
+        ValueError: an effect of which there can be one at a time is given twice, or see `GivenEffect.applied`.
+    """
+    ordered = sorted(effects, key=lambda one: one.effect.stage)
+    for one, other in itertools.combinations(ordered, 2):
+        if one.name == other.name and one.effect.alone and one.meets(other):
+            raise ValueError(
+                f"{one.name} is given twice ({one}; {other}), and a simulation has one at a time: leave one out, or "
+                "let them act one after the other (from_s, until_s)."
+            )
+    for effect in ordered:
         physics = effect.applied(physics, chain)
     return physics
 

@@ -104,6 +104,7 @@ class Plasticity(CableEffect):
         Parameter("hardening", "", 1e-3, 30.0, 0.3, 1.5, log=True),
     )
     null = (100.0, 0.3)
+    alone = True
 
     def apply(self, physics, values, variant, config):
         """Sets the yield curvature [1/m] and the hardening of every joint."""
@@ -128,7 +129,7 @@ class BendingHysteresis(CableEffect):
         Parameter("transition_curvature_per_m", "1/m", 0.02, 20.0, 0.5, 0.8, log=True),
     )
     null = (0.0, 0.5)
-    amplitude = 0
+    amplitude, alone = 0, True
 
     def apply(self, physics, values, variant, config):
         """Sets the friction moment [N m] and the transition curvature [1/m] of every joint."""

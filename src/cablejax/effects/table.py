@@ -76,21 +76,22 @@ class FrictionPatch(CableEffect):
         Parameter("ratio", "", 0.01, 50.0, 1.0, 1.2, log=True),
     )
     null = (0.4, 0.1, 0.12, 1.0)
-    amplitude, reversible = 3, True
+    amplitude, reversible, stage, alone = 3, True, 1, True
 
     def around(self, place):
         """Its centre is sought about the place."""
         return moved(self, place)
 
     def apply(self, physics, values, variant, config):
-        """Sets the patch's centre and radius [m] and what it adds to the coefficient inside."""
+        """Sets the patch's centre and radius [m] and the coefficient inside, whatever it is outside."""
         x, y, radius, ratio = values
         xp = ratio.__array_namespace__()
+        elsewhere = physics.friction - config.cable.friction_coefficient
         return replace(
             physics,
             patch_centre=xp.stack([x, y]),
             patch_radius=physics.patch_radius * 0.0 + radius,
-            patch_friction=(ratio - 1.0) * _believed(config),
+            patch_friction=(ratio - 1.0) * _believed(config) - elsewhere,
         )
 
     def starts(self, context):
@@ -181,6 +182,7 @@ class Obstacle(CableEffect):
         Parameter("radius_m", "m", 0.005, 0.2, 0.03, 0.5, log=True),
     )
     null = (3.0, 3.0, 0.005)
+    alone = True
 
     def around(self, place):
         """Its centre is sought about the place."""
