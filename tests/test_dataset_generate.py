@@ -29,6 +29,7 @@ from cablejax.dataset.generate import (
 )
 from cablejax.dataset.opening import open_store
 from cablejax.dataset.schema import DatasetConfig, Randomisation, config_from_json, config_to_json
+from cablejax.dataset.windows import read_trajectories
 from cablejax.effects.given import EFFECTS, GivenEffect
 from cablejax.simulate import ThreadedEngine
 from cablejax.simulate.motions import MotionConfig, random_motion
@@ -44,6 +45,22 @@ TINY = DatasetConfig(
     randomisation=Randomisation(stiffness=(0.1, 3.0), friction=(0.5, 2.0)),
     engine="threaded",
 )
+
+
+def test_what_is_known_of_a_cable_has_its_effects(tmp_path):
+    staged = (
+        GivenEffect("bending_stiffness", (("ratio", 2.0),)),
+        GivenEffect("table_friction", (("coefficient", 0.6),)),
+    )
+    posterior = (staged[:1], staged)
+    generate(dataclasses.replace(TINY, posterior=posterior, n_trajectories=4), tmp_path / "a.zarr", progress=False)
+    generate(dataclasses.replace(TINY, n_trajectories=4), tmp_path / "b.zarr", progress=False)
+    with_them, without = (read_trajectories(tmp_path / name).cable for name in ("a.zarr", "b.zarr"))
+    more = np.log(0.6 / TINY.cable.friction_coefficient)
+    expected = np.array([[np.log(2.0), 0.0], [np.log(2.0), more]] * 2)
+    np.testing.assert_allclose(with_them - without, expected, atol=1e-5)
+    np.testing.assert_array_equal(read_trajectories(tmp_path / "a.zarr", [3, 1]).cable, with_them[[3, 1]])
+
 
 STAGED = dataclasses.replace(
     TINY, n_trajectories=2, n_steps=4, shard_size=2, engine="chain", randomisation=Randomisation()

@@ -12,7 +12,7 @@ from flax import nnx
 from jaxtyping import Array, Float
 
 from cablejax.adaptation.belief import AdaptationConfig
-from cablejax.cable import GRAVITY, Cable, Discretisation
+from cablejax.cable import Cable, Discretisation
 from cablejax.control.loop import run_closed_loop
 from cablejax.control.run import ClosedLoopRun
 from cablejax.control.targets import Target, straight_start
@@ -21,7 +21,7 @@ from cablejax.dynamics.config import ModelConfig
 from cablejax.dynamics.model import apply, structure_of
 from cablejax.dynamics.weights import cable_of_weights, load_info, load_weights
 from cablejax.effects.given import GivenEffect, with_effects
-from cablejax.effects.physics import nominal_physics
+from cablejax.effects.physics import mean_resistance, nominal_physics
 from cablejax.limits import shown
 from cablejax.mpc import MPC, SOLVERS, MPCConfig
 from cablejax.perceive.camera import CameraConfig
@@ -157,8 +157,7 @@ def _believed(effects: Sequence[GivenEffect], cable: Cable) -> tuple[float, floa
     """
     config = Discretisation(cable)
     physics = with_effects(nominal_physics(config, np.float64), effects, config)
-    force = np.asarray(physics.friction * physics.density * GRAVITY)
-    descriptor = cable_descriptor(jnp.asarray(np.mean(physics.stiffness)), jnp.asarray(force))
+    descriptor = cable_descriptor(*map(jnp.asarray, mean_resistance(physics)))
     # before they are clipped: a bound in single precision may lie beyond itself
     stiffness, friction = np.asarray(descriptor, float)
     low, high = AdaptationConfig().limits

@@ -15,9 +15,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from cablejax.cable import GRAVITY
+from cablejax.dataset.drawing import cable_params
 from cablejax.dataset.opening import open_store
 from cablejax.dataset.store import Store
+from cablejax.effects.physics import mean_resistance
 from cablejax.types import History, Trajectory, cable_descriptor
 
 
@@ -30,10 +31,11 @@ def read_trajectories(
         ValueError: a shard is missing or damaged, or a row does not exist.
     """
     store = source if isinstance(source, Store) else open_store(source)
-    block, cable = store.read(rows), store.config.cable
-    stiffness_ratio, friction_coefficient, _ = block.parameters.T
-    weight = cable.linear_density * GRAVITY
-    known = cable_descriptor(stiffness_ratio * cable.bending_stiffness, friction_coefficient * weight)
+    block, indices = store.read(rows), range(store.config.n_trajectories) if rows is None else np.asarray(rows)
+    # with the effects that were simulated: a stiffer cable is known to be one
+    cables = [cable_params(store.config, row, int(i)) for i, row in zip(indices, block.parameters, strict=True)]
+    stiffness, friction = np.array([mean_resistance(cable) for cable in cables]).T
+    known = cable_descriptor(stiffness, friction)
     return Trajectory(
         keypoints=block.keypoints,  # pyright: ignore[reportArgumentType]
         gripper_pose=block.gripper_pose,  # pyright: ignore[reportArgumentType]

@@ -169,6 +169,11 @@ def normal_gravity(physics: Physics) -> Any:
     return xp.where(across, xp.sqrt(xp.where(across, square, 1.0)), 0.0)
 
 
+def mean_resistance(physics: Physics) -> tuple[float, float]:
+    """Mean bending stiffness [N m^2] and friction per length on the table [N/m], see `types.cable_descriptor`."""
+    return float(np.mean(physics.stiffness)), float(physics.friction * physics.density * GRAVITY)
+
+
 def may_touch(physics: Physics) -> bool:
     """Whether a cable of this physics can touch an obstacle: false only where the radius is known to be zero.
 
