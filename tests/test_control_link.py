@@ -327,6 +327,31 @@ def test_the_link_says_why_it_waits(changes, reason):
     assert reply.status == Status.SHAPING and reply.reason == ""
 
 
+class Particular(Inwards):
+    """Refuses grippers that are farther apart than its cable is long, as a model's statics do."""
+
+    def init(self, history):
+        apart = np.linalg.norm(np.diff(history.gripper_pose[:, :2], axis=0))
+        if apart > 1:
+            raise ValueError(f"The grippers are {apart:.2f} m apart.")
+        return super().init(history)
+
+
+def test_a_first_pose_that_the_controller_refuses_is_why_it_waits():
+    robot = Harness(Particular())
+    away = robot.pose.copy()
+    robot.pose = 1.5 * away
+    assert robot.run(1.0).reason == "The grippers are 1.48 m apart." and robot.state.status == Status.WAITING
+    robot.pose = away
+    assert robot.run(3.0, begin=1.1).status == Status.SHAPING
+    robot.step(3.6)
+    robot.pose = 1.5 * away
+    reply = robot.run(4.7, begin=3.7)
+    assert reply.status == Status.PAUSED and reply.reason == "The grippers are 1.48 m apart." and not reply.twist.any()
+    robot.pose = away
+    assert robot.run(6.5, begin=4.8).status == Status.SHAPING
+
+
 def test_seldom_observations_and_other_shapes_are_why_it_waits():
     harness = Harness()
     harness.step(0.0, harness.seen(0.0))

@@ -100,6 +100,28 @@ def test_a_failing_controller_loses_nothing():
     assert "It stopped after 2 s" in run.verdict()
 
 
+def test_a_run_whose_end_was_hardly_seen_is_not_a_success():
+    target = make_target("U", CABLE.cable)
+    run = run_closed_loop(
+        Plant(CONFIG), GoToPose(target.gripper_pose), target, 14, start=straight_start(CABLE.cable), record_hz=1.0
+    )
+
+    def observed(*seen: int):
+        keypoints = run.keypoints.copy()
+        keypoints[1:] = np.nan
+        keypoints[1:, list(seen)] = run.keypoints[1:, list(seen)]
+        error = shape_error_cm(keypoints, target.keypoints)
+        return dataclasses.replace(run, keypoints=keypoints, error_cm=error)
+
+    assert observed(*range(7)).reached and not observed(0, 12).reached
+    assert "at the end 2 of 13 keypoints were seen, of which keypoint" in observed(0, 12).verdict()
+    assert "at the end 0 of 13 keypoints were seen." in observed().verdict()
+    # the simulation knows better than its camera
+    assert dataclasses.replace(observed(0, 12), error_cm=run.error_cm).reached
+    nothing = dataclasses.replace(observed(), error_cm=np.full(15, np.nan))
+    assert nothing.verdict() == "U: no keypoint of the cable was ever seen."
+
+
 def test_a_taut_pull_stops_the_run():
     start = straight_start(CABLE.cable)
     apart = start + np.array([[-0.3, 0, 0], [0.3, 0, 0]])

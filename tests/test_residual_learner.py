@@ -174,6 +174,16 @@ def test_impossible_settings_are_refused(change, message):
         LearnerConfig(**change)
 
 
+@pytest.mark.parametrize("interval", [0.1, 5.0])
+def test_the_same_motions_teach_the_same_in_steps_of_any_duration(interval):
+    samples, config = list(steps("gain", 6)), LearnerConfig()
+    faster = [
+        s._replace(twist=s.twist / interval, model=s.model._replace(gain=s.model.gain * interval)) for s in samples
+    ]
+    one, other = after(samples, config), after(faster, config.scaled(1.0, interval))
+    np.testing.assert_allclose(other.loss, one.loss, rtol=1e-4)
+
+
 def test_a_longer_cable_is_learned_like_a_short_one():
     config = LearnerConfig((Candidate(), Candidate(response=True), Candidate(ridge=RidgeConfig(outlier=0.02)))).scaled(
         2.0

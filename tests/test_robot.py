@@ -220,6 +220,7 @@ def test_grippers_that_point_backwards_are_found_before_anything_moves(tmp_path)
         assert not reply.twist.any()
     assert reply.status == "stopped" and "tangent" in reply.reason
     assert run.result().stopped == reply.reason
+    assert not np.nan_to_num(run.result().twist).any(), "a command that was never sent"
 
 
 ARCH = np.array([[-0.4, 0.0, 0.7], [0.4, 0.0, -0.7]])

@@ -102,5 +102,5 @@ def controller_of(spec: MethodSpec, model: Model | None, target: Target) -> Cont
     if model is None:
         return VisualServo(ServoConfig(), target.keypoints)
     controller = make_controller(model, target, method="direct", solver="levenberg-marquardt")
-    learner = spec.learner and spec.learner.scaled(model.config.length)
+    learner = spec.learner and spec.learner.scaled(model.config.length, model.config.interval)
     return dataclasses.replace(controller, config=dataclasses.replace(controller.config, residual=learner))

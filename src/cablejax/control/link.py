@@ -154,6 +154,12 @@ class RobotLink:
         """The state in which the grippers hold for good; an end that has come before stays."""
         return state if state.status.ended else self._held(state, Status.STOPPED, reason)
 
+    def _waiting(self, state: LinkState, reason: str) -> LinkState:
+        """Holds until there are usable observations; before the first command as if there had been none."""
+        if state.commands == 0:  # the first time stamps may have been wrong
+            return dataclasses.replace(self.init(), now=state.now, reason=reason)
+        return self._held(state, Status.PAUSED, reason)
+
     def _held(self, state: LinkState, status: Status, reason: str) -> LinkState:
         command = (_STILL, state.now - state.offset, math.inf)
         return dataclasses.replace(state, status=status, reason=reason, command=command)
@@ -223,12 +229,10 @@ class RobotLink:
             return state, None
         age = state.now - state.offset - newest.time
         if age > config.watchdog:
-            if state.commands == 0:  # the first time stamps may have been wrong
-                reason = f"No usable observation for {age:.2f} s, expected one every {config.watchdog:g} s or sooner."
-                return dataclasses.replace(self.init(), now=state.now, reason=reason), None
             if state.status == Status.PAUSED:
                 return state, None
-            return self._held(state, Status.PAUSED, f"No usable observation for {age:.2f} s."), None
+            expected = f", expected one every {config.watchdog:g} s or sooner" if state.commands == 0 else ""
+            return self._waiting(state, f"No usable observation for {age:.2f} s{expected}."), None
         if state.status in (Status.WAITING, Status.PAUSED):
             state = dataclasses.replace(
                 self._held(state, Status.RESTING, ""), due=newest.time + config.rest, controller=None
@@ -236,7 +240,10 @@ class RobotLink:
         if newest.time < state.due - EARLY * config.interval:
             return state, None
         if state.controller is None:  # what happened in a pause is not the model's error
-            state = dataclasses.replace(state, controller=self._initial(newest))
+            try:
+                state = dataclasses.replace(state, controller=self._initial(newest))
+            except ValueError as error:
+                return self._waiting(state, str(error)), None
         return self._command(dataclasses.replace(state, status=Status.SHAPING), newest)
 
     def _command(self, state: LinkState, seen: Observation) -> tuple[LinkState, Instant]:

@@ -16,6 +16,8 @@ SETTLING_FRACTION = 0.1
 that is less, to the change of the error over the run."""
 SETTLING_FLOOR_CM = 0.1
 """Smallest half-width of that band [cm]."""
+_SEEN = 0.5
+"""Share of the keypoints below which a view says too little of where the cable is."""
 SETTLING_DWELL = 3
 """Samples at the end that must lie in the band, or the run has not settled."""
 
@@ -84,8 +86,10 @@ class ClosedLoopRun:
 
     @property
     def reached(self) -> bool:
-        """Whether the target was."""
-        return self.terminal_error_cm <= self.goal_cm
+        """Whether the target was: by the true keypoints, or by half or more of them as they were last observed."""
+        seen = np.isfinite(self.keypoints[-1]).all(axis=-1)
+        guessed = self.terminal_error_cm == shape_error_cm(self.keypoints[-1], self.target.keypoints)
+        return self.terminal_error_cm <= self.goal_cm and (seen.mean() >= _SEEN or not guessed)
 
     def verdict(self) -> str:
         """One sentence: whether the target was reached, and if not, how far the cable got and where it is off."""
@@ -94,13 +98,19 @@ class ClosedLoopRun:
         if self.reached:
             return f"{self.target.name}: reached, from {start:.2f} to {end:.2f} cm.{early}"
         distance = 100 * np.linalg.norm(self.keypoints[-1] - self.target.keypoints, axis=-1)
+        seen, known = np.isfinite(distance), np.isfinite(self.error_cm)
+        if not known.any():
+            return f"{self.target.name}: no keypoint of the cable was ever seen.{early}"
         best = int(np.nanargmin(self.error_cm))
+        last = f"at the end {seen.sum()} of {len(seen)} keypoints were seen"
+        if seen.any():
+            far = f"keypoint {int(np.nanargmax(distance))} is farthest off, by {np.nanmax(distance):.2f} cm"
+            last = far if seen.mean() >= _SEEN else f"{last}, of which {far}"
         if self.straightened[-2:].any():
             early += " It was being straightened for another try: more commands may reach the target."
         return (
             f"{self.target.name}: not reached within {self.goal_cm:.2f} cm. The error went from {start:.2f} to "
-            f"{end:.2f} cm (lowest {self.error_cm[best]:.2f} cm after {self.times[best]:.0f} s); keypoint "
-            f"{int(np.nanargmax(distance))} is farthest off, by {np.nanmax(distance):.2f} cm.{early}"
+            f"{end:.2f} cm (lowest {self.error_cm[best]:.2f} cm after {self.times[best]:.0f} s); {last}.{early}"
         )
 
 

@@ -189,7 +189,7 @@ def make_controller(model: Model, target: Target, *, method: Method, solver: Sol
     learner = STATIC if model.config.prior == "static" else LearnerConfig()
     config = MPCConfig.for_length(
         model.config.length,
-        residual=learner.scaled(model.config.length) if method == "residual" else None,
+        residual=learner.scaled(model.config.length, model.config.interval) if method == "residual" else None,
         adaptation=AdaptationConfig(prior_mean=model.believed) if model.config.conditioned else None,
         solver=SOLVERS[solver],
         history_length=model.config.history,

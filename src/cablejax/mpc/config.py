@@ -100,7 +100,8 @@ class MPCConfig:
         )
         scaled = {name: ratio * getattr(cls, name) for name in own}
         scaled["objective"] = _scaled(cls.objective, ratio, "rotation_weight", "arrival_margin")
-        scaled["residual"] = cls.residual and cls.residual.scaled(ratio)
+        interval = settings.get("objective", cls.objective).interval
+        scaled["residual"] = cls.residual and cls.residual.scaled(ratio, interval)
         return cls(**{**scaled, **settings})
 
     def __post_init__(self):

@@ -73,7 +73,7 @@ class LearnerConfig:
         response_floor: the same of a keypoint's response in all samples together, in units of s(t).
         memory: phi, by which evidence fades in one step, in (0, 1].
         error_std: s, root mean square error of a good prediction at rest [m].
-        error_ratio: r, the same relative to the grippers' motion.
+        error_ratio: r, the same relative to the grippers' speed [s]: a tenth of their motion in a step of a second.
         rotation_weight: w [m/rad], turns a rotation into a length.
         outlier: root mean square error [m] beyond which a step that no candidate predicted counts less and less, as in
             `RidgeConfig`: that a cable has snapped through says little about any of them.
@@ -121,17 +121,18 @@ class LearnerConfig:
         """Whether a candidate asks for the model's derivative by the command."""
         return any(candidate.response for candidate in self.candidates)
 
-    def scaled(self, ratio: float) -> LearnerConfig:
-        """The settings for a cable so many times as long."""
+    def scaled(self, ratio: float, interval: float = 1.0) -> LearnerConfig:
+        """The settings for a cable so many times as long, and a step of so many seconds instead of one."""
 
         def of(candidate: Candidate) -> Candidate:
             ridge = candidate.ridge
-            return candidate if ridge is None else dataclasses.replace(candidate, ridge=ridge.scaled(ratio))
+            return candidate if ridge is None else dataclasses.replace(candidate, ridge=ridge.scaled(ratio, interval))
 
         lengths = {
             name: ratio * getattr(self, name) for name in ("drift_floor", "error_std", "rotation_weight", "outlier")
         }
-        return dataclasses.replace(self, candidates=tuple(map(of, self.candidates)), **lengths)
+        candidates = tuple(map(of, self.candidates))
+        return dataclasses.replace(self, candidates=candidates, error_ratio=interval * self.error_ratio, **lengths)
 
 
 STATIC = LearnerConfig(candidates=tuple(one for one in LearnerConfig().candidates if not one.response))

@@ -33,7 +33,7 @@ class RidgeConfig:
 
     Attributes:
         regularisation: the penalty lambda on the scaled coefficients.
-        motion_scale: gripper travel per step that counts as one unit of regressor [m].
+        motion_scale: gripper speed that counts as one unit of regressor [m/s]: a centimetre in a step of a second.
         rotation_weight: w [m/rad], turns a rotation into a length before scaling.
         bias: whether the error at rest is fitted too. Without it an error that does not vanish with the motion (a wrong
             steady state, friction) ends up in the gain, or nowhere once the grippers are still.
@@ -63,10 +63,10 @@ class RidgeConfig:
         if not self.outlier > 0:
             raise ValueError(f"RidgeConfig.outlier is {self.outlier}, expected a positive number [m], or infinity.")
 
-    def scaled(self, ratio: float) -> RidgeConfig:
-        """The settings for a cable so many times as long."""
-        lengths = ("motion_scale", "rotation_weight", "outlier")
-        return dataclasses.replace(self, **{name: ratio * getattr(self, name) for name in lengths})
+    def scaled(self, ratio: float, interval: float = 1.0) -> RidgeConfig:
+        """The settings for a cable so many times as long, and a step of so many seconds instead of one."""
+        lengths = {name: ratio * getattr(self, name) for name in ("rotation_weight", "outlier")}
+        return dataclasses.replace(self, motion_scale=ratio * self.motion_scale / interval, **lengths)
 
 
 @jax.tree_util.register_dataclass

@@ -65,6 +65,7 @@ class RobotRun:
             except GapLogError as error:
                 fault = str(error)
             if fault:
+                self.log.forget_command()
                 return self.stop(now, f"What was observed so far is not a cable between these grippers: {fault}")
         return reply
 
