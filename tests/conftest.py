@@ -20,6 +20,9 @@ if tuple(map(int, importlib.metadata.version("jaxlib").split(".")[:2])) < (0, 11
     _FLAGS.append("--xla_cpu_use_fusion_emitters=false")
 os.environ["XLA_FLAGS"] = " ".join([os.environ.get("XLA_FLAGS", ""), *_FLAGS])
 
+# One thread for each of two workers, which fight for the processors otherwise.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
 # A program is compiled once for all workers, all that tests start, and later runs: this file is loaded first by the
 # process that starts the workers, and they inherit what it sets.
 os.environ.setdefault(FOLDER, str(pathlib.Path(__file__).parents[1] / ".pytest_cache" / "jax"))

@@ -40,6 +40,7 @@ def filled(path, config: DatasetConfig, shards: int | None = None):
     for shard in range(config.n_shards if shards is None else shards):
         size = len(config.shard_rows(shard))
         content = {n: rng.standard_normal((size, *s)).astype(d) for n, (s, d) in config.array_shapes().items()}
+        content["parameters"] = np.abs(content["parameters"])
         store.write_shard(shard, Block(**content))
     return store
 
@@ -47,6 +48,7 @@ def filled(path, config: DatasetConfig, shards: int | None = None):
 CONFIG = DatasetConfig(
     n_trajectories=4, n_steps=2, shard_size=2, discretisation=Discretisation(Cable(n_keypoints=4), n_links=5)
 )
+ARRAYS = CONFIG.array_shapes()
 
 
 def test_several_stores_are_split_each_and_trained_on_one_after_the_other(tmp_path):
@@ -57,6 +59,22 @@ def test_several_stores_are_split_each_and_trained_on_one_after_the_other(tmp_pa
     assert len(held_out) == 2
     for part, store in zip(held_out, stores, strict=True):
         jax.tree.map(np.testing.assert_array_equal, part, read_trajectories(store, [3]))
+
+
+def test_what_is_held_out_of_one_store_is_not_trained_on_in_another(tmp_path):
+    content = {n: np.random.default_rng(3).uniform(1, 2, (8, *s)).astype(d) for n, (s, d) in ARRAYS.items()}
+
+    def of(name: str, count: int):
+        store = open_or_create(tmp_path / name, dataclasses.replace(CONFIG, n_trajectories=count))
+        for shard in range(count // 2):
+            rows = slice(2 * shard, 2 * shard + 2)
+            store.write_shard(shard, Block(**{n: a[rows] for n, a in content.items()}))
+        return store
+
+    few, many = of("few", 4), of("many", 8)
+    with pytest.raises(ValueError, match=r"1 of the 1 trajectories that are held out of .*few are among .*many"):
+        read_split([few, many], 0.3)
+    read_split([few, few], 0.3)  # twice the weight, and the same are held out
 
 
 def test_stores_that_do_not_belong_together_are_refused(tmp_path):

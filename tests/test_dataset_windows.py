@@ -58,6 +58,8 @@ def test_drawn_windows_reach_both_ends_and_repeat(trajectory):
     windows = draw(jax.random.key(0), trajectory, batch=2000, history=2, steps=4)
     newest = np.asarray(windows.history.keypoints[:, -1, 0, 0])
     assert set(newest // 100) == set(range(M))
+    asis = draw_windows(jax.random.key(0), trajectory, batch=200, history=2, steps=4, flips=False)
+    assert (asis.history.keypoints[..., 0, 1] == 1).all() and (windows.history.keypoints[:, -1, 0, 1] != 1).any()
     assert set(newest % 100) == set(range(T - 4 + 1))
     np.testing.assert_array_equal(windows.future[:, -1, 0, 0], newest + 4)
     again = draw(jax.random.key(0), trajectory, batch=2000, history=2, steps=4)

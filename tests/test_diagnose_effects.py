@@ -14,7 +14,7 @@ from cablejax.diagnose import LIBRARY, CableEffect, Parameter
 from cablejax.diagnose.case import FINE_LINKS
 from cablejax.diagnose.check import check_effect
 from cablejax.effects.camera import in_camera_frame
-from cablejax.effects.given import parse_effect, with_effects
+from cablejax.effects.given import EFFECTS, parse_effect, with_effects
 from cablejax.effects.physics import nominal_physics
 from cablejax.simulate import MjxEngine, compiler_options
 from cablejax.simulate.chain.replay import Chain
@@ -68,6 +68,22 @@ def test_an_effect_given_twice_acts_twice_or_is_refused(effect):
     both = effect.apply(effect.apply(believed, once, effect.variants[0], chain), other, effect.variants[0], chain)
     lost = all(np.array_equal(getattr(alone, f.name), getattr(both, f.name)) for f in dataclasses.fields(alone))
     assert lost == effect.alone
+
+
+@pytest.mark.parametrize("effect", EFFECTS.values(), ids=lambda e: e.name)
+def test_symmetric_effects_have_no_side_no_end_and_no_place(effect):
+    chain, symmetric = Discretisation(Cable()), True
+    believed = nominal_physics(chain, np.float64)
+    for variant in effect.variants[:2]:
+        values = [np.float64(p.value(np.float64(0.8))) for p in effect.parameters]
+        physics = effect.apply(believed, values, variant, chain)
+        by_place = {f.name: np.asarray(getattr(physics, f.name)) for f in dataclasses.fields(physics)}
+        ends = ("stiffness", "extra_mass", "slip", "rotation_compliance", "bias_across", "bias_along")
+        sides = ("rest_curvature", "tilt", "rotation_offset", "bias_across", "patch_friction", "obstacle_radius")
+        camera = (physics.camera_angle, *physics.camera_offset, physics.camera_scale - 1, physics.camera_lag)
+        symmetric &= all(np.allclose(by_place[name], by_place[name][::-1]) for name in ends)
+        symmetric &= not any(by_place[name].any() for name in sides) and not np.any(camera)
+    assert symmetric == effect.symmetric
 
 
 def test_two_patches_at_a_time_are_refused():

@@ -20,8 +20,10 @@ CONDITIONED = dataclasses.replace(SMALL, conditioned=True)
 
 
 def test_descriptor_of_the_reference_cable_is_zero_and_no_table_is_finite():
-    np.testing.assert_allclose(cable_descriptor(REFERENCE_STIFFNESS, REFERENCE_FRICTION), 0.0, atol=1e-6)
-    np.testing.assert_allclose(cable_descriptor(2 * REFERENCE_STIFFNESS, 0.0), [np.log(2), np.log(1e-3)], rtol=1e-5)
+    np.testing.assert_allclose(cable_descriptor(*np.array([REFERENCE_STIFFNESS, REFERENCE_FRICTION])), 0.0, atol=1e-6)
+    np.testing.assert_allclose(
+        cable_descriptor(*np.array([2 * REFERENCE_STIFFNESS, 0.0])), [np.log(2), np.log(1e-3)], rtol=1e-5
+    )
 
 
 @pytest.fixture

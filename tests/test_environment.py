@@ -98,6 +98,15 @@ def test_effects_targets_and_random_parameters_change_the_episode():
     assert np.abs(rollout(varied, actions, target="S") - plain)[-1].max() > 1e-3
 
 
+def test_the_first_observation_has_the_effects_of_the_reset():
+    env = ShapeCableEnv(clean())
+    bare, _ = env.reset(seed=1)
+    given, _ = env.reset(seed=1, options={"effects": ["keypoint_bias:index=3,across=1,offset_m=0.05"]})
+    after = env.step(np.zeros((2, 3), np.float32))[0]
+    np.testing.assert_allclose(after["keypoints"], given["keypoints"], atol=1e-4)
+    assert given["keypoints"][3, 1] - bare["keypoints"][3, 1] == pytest.approx(0.05, abs=1e-3)
+
+
 def test_the_grippers_stay_within_their_limits():
     env = ShapeCableEnv(clean(steps=30))
     env.reset(seed=0)

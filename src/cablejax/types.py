@@ -115,17 +115,20 @@ REFERENCE_FRICTION = Cable.friction_coefficient * Cable.linear_density * GRAVITY
 """Friction force per length of the reference cable on its table, `mu w` [N/m]."""
 
 
-def cable_descriptor(stiffness: Array, friction: Array) -> Float[Array, "*batch 2"]:
+def cable_descriptor(
+    stiffness: Float[Array | np.ndarray, "*batch"], friction: Float[Array | np.ndarray, "*batch"]
+) -> Float[Array | np.ndarray, "*batch 2"]:
     """`[ln(EI / EI_0), ln(mu w / (mu w)_0)]`: what decides a uniform cable's slow motion on a table; 0 = reference.
 
-    Friction below a thousandth of the reference's counts as that.
+    Friction below a thousandth of the reference's counts as that. NumPy in, NumPy out; JAX in, JAX out.
 
     Args:
         stiffness: EI [N m^2].
         friction: friction force per length `mu w` [N/m].
     """
-    friction = jnp.maximum(friction, 1e-3 * REFERENCE_FRICTION)
-    return jnp.stack([jnp.log(stiffness / REFERENCE_STIFFNESS), jnp.log(friction / REFERENCE_FRICTION)], axis=-1)
+    xp = stiffness.__array_namespace__()
+    friction = xp.maximum(friction, 1e-3 * REFERENCE_FRICTION)
+    return xp.stack([xp.log(stiffness / REFERENCE_STIFFNESS), xp.log(friction / REFERENCE_FRICTION)], axis=-1)
 
 
 def advance(

@@ -91,10 +91,15 @@ class Simulate(Command):
             "digest": info.digest,
             "seconds": round(seconds, 3),
         }
-        return result, (
-            f"{info.n_complete} of {config.n_trajectories} trajectories are in {place} ({seconds:.0f} s).\n"
-            f"Train on them: cablejax train --data {place}"
-        )
+        made = f"{info.n_complete} of {config.n_trajectories} trajectories are in {place} ({seconds:.0f} s)."
+        if info.n_complete < config.n_trajectories:
+            return result, made
+        if any(name.startswith("camera") for name in config.effect_names):
+            return (
+                result,
+                f"{made}\nThe camera's effects move the keypoints off the cable: no model is trained on them.",
+            )
+        return result, f"{made}\nTrain on them: cablejax train --data {place}"
 
     def dataset_config(self) -> DatasetConfig:
         """The data set that these options describe.

@@ -82,7 +82,13 @@ class Train(Command):
             require(self.lr, "learning_rate", "--lr")
         stores = [open_store(path) for path in self.data]
         self._check_cables(stores)
-        config = self._config(stores[0])
+        asymmetric = sorted({name for store in stores for name in store.config.asymmetric})
+        config = self._config(stores[0], flips=not asymmetric)
+        if asymmetric and self.symmetric:
+            say(
+                f"With {', '.join(asymmetric)} a cable moves otherwise in a mirror or counted from its other end, and "
+                "a symmetric network learns the mean: leave out --symmetric to learn the difference."
+            )
         training_mesh(config)  # refuses a batch that the devices cannot share, before anything is read
         training, held_out = read_split(stores, self.held_out, buffer=self.buffer, seed=self.seed)
         count = sum(len(part.gripper_twist) for part in held_out)
@@ -133,6 +139,12 @@ class Train(Command):
                 f"{first.path} has keypoints at given arc lengths, but a network is trained on evenly spaced ones. "
                 "Simulate a cable with `keypoints = N` in place of keypoint_arclength_m."
             )
+        for store in stores:
+            if camera := sorted({name for name in store.config.effect_names if name.startswith("camera")}):
+                raise UsageError(
+                    f"{store.path} has {', '.join(camera)}: its keypoints are not where the cable is. A model is of "
+                    "the cable itself: simulate without the camera's effects."
+                )
         for store in stores[1:]:
             if other := differing(store.config.cable, first.config.cable):
                 raise UsageError(
@@ -143,7 +155,7 @@ class Train(Command):
         if self.start_from is not None and (other := differing(cable_of_weights(self.start_from), first.config.cable)):
             say(f"{self.start_from} and {first.path} are of different cables: {fields(other)}.")
 
-    def _config(self, store: Store) -> TrainConfig:
+    def _config(self, store: Store, *, flips: bool) -> TrainConfig:
         """The preset's training with what the data and the options change."""
         from cablejax.dynamics.train_config import PRESETS
 
@@ -171,7 +183,7 @@ class Train(Command):
             phases = tuple(dataclasses.replace(p, lr_start=share * p.lr_start, lr_end=share * p.lr_end) for p in phases)
         if self.batch is not None:
             phases = tuple(dataclasses.replace(p, batch=self.batch) for p in phases)
-        return dataclasses.replace(config, seed=self.seed, model=model, phases=phases)
+        return dataclasses.replace(config, seed=self.seed, model=model, phases=phases, flips=flips)
 
     def _info(self, config: TrainConfig, stores: list[Store], held_out: list[int]) -> dict[str, Any]:
         """Provenance of the weights, without local paths."""

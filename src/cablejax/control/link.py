@@ -271,15 +271,8 @@ class RobotLink:
         if config.limits is not None:
             held = config.interval + config.grace
             allowed = config.limits.shortened(twist, seen.gripper_pose, held, self.target.length)
-        instant = Instant(
-            seen,
-            allowed,
-            float(getattr(info, "residual_share", math.nan)),
-            float(getattr(info, "radius", math.nan)),
-            float(getattr(info, "action", math.nan)),
-            spent,
-            limited=allowed is not twist,
-        )
+        share, radius, action = (float(getattr(info, n, math.nan)) for n in ("residual_share", "radius", "action"))
+        instant = Instant(seen, allowed, share, radius, action, spent, limited=allowed is not twist)
         state = dataclasses.replace(
             state,
             reason="" if allowed.any() or not twist.any() else "The limits leave nothing of the controller's command.",

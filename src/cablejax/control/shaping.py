@@ -157,9 +157,7 @@ def _believed(effects: Sequence[GivenEffect], cable: Cable) -> tuple[float, floa
     """
     config = Discretisation(cable)
     physics = with_effects(nominal_physics(config, np.float64), effects, config)
-    descriptor = cable_descriptor(*map(jnp.asarray, mean_resistance(physics)))
-    # before they are clipped: a bound in single precision may lie beyond itself
-    stiffness, friction = np.asarray(descriptor, float)
+    stiffness, friction = cable_descriptor(*map(np.asarray, mean_resistance(physics)))
     low, high = AdaptationConfig().limits
     within = np.clip(friction, low, high)
     return float(np.clip(stiffness - (friction - within), low, high)), float(within)

@@ -25,6 +25,7 @@ from cablejax.dataset.opening import open_or_create
 from cablejax.dataset.parallel import DeviceParallel
 from cablejax.dataset.schema import Block, DatasetConfig
 from cablejax.dataset.store import DatasetInfo, Store
+from cablejax.effects.given import EFFECTS
 from cablejax.simulate import ENGINES, Engine, ThreadedEngine
 from cablejax.types import Trajectory
 from cablejax.whole_file import sole_writer
@@ -231,7 +232,7 @@ def find_fault(config: DatasetConfig, one: Block) -> str | None:
     keypoints, grippers = one.keypoints, one.gripper_pose[..., :2]
     if not (np.isfinite(keypoints).all() and np.isfinite(one.gripper_pose).all()):
         return "the simulation diverged (not finite)"
-    hooks = {effect.effect.hook for effects in (config.effects, *config.posterior) for effect in effects}
+    hooks = {EFFECTS[name].hook for name in config.effect_names}
     if "observation" in hooks:
         return None
     gap = np.linalg.norm(keypoints[:, [0, -1]] - grippers, axis=-1).max()
@@ -272,8 +273,10 @@ def shards_at_once(config: DatasetConfig, engine: Engine) -> int:
 
 
 def _rollout(config: DatasetConfig, engine: Engine, draws: Sequence[Draw]) -> Trajectory:
-    state = engine.initial_state(jnp.stack([item.gripper_pose for item in draws]))
     cables = [cable_params(config, item.parameters, item.index) for item in draws]
     params = jax.tree.map(lambda *leaves: np.stack(leaves), *cables)
-    twist = jnp.stack([item.gripper_twist for item in draws])
-    return engine.rollout(params, state, twist, config.interval)[1]
+    # a data set has the same bytes whatever JAX's default precision is
+    with jax.enable_x64(False):
+        state = engine.initial_state(jnp.stack([item.gripper_pose for item in draws]))
+        twist = jnp.stack([item.gripper_twist for item in draws])
+        return engine.rollout(params, state, twist, config.interval)[1]

@@ -14,7 +14,7 @@ from typing import Any, Literal
 import numpy as np
 
 from cablejax.cable import Cable, Discretisation
-from cablejax.effects.given import GivenEffect, with_effects
+from cablejax.effects.given import EFFECTS, GivenEffect, with_effects
 from cablejax.effects.physics import nominal_physics
 from cablejax.limits import LIMITS, check, shown
 from cablejax.simulate import ENGINES, ChainEngine, check_effects
@@ -112,6 +112,17 @@ class DatasetConfig:
     def effects_of(self, index: int) -> tuple[GivenEffect, ...]:
         """The effects of trajectory `index`."""
         return self.effects + (self.posterior[index % len(self.posterior)] if self.posterior else ())
+
+    @property
+    def asymmetric(self) -> tuple[str, ...]:
+        """What makes its cables move otherwise in a mirror, or counted from their other end; empty: nothing does."""
+        names = sorted(name for name in self.effect_names if not EFFECTS[name].symmetric)
+        return (*names, *(["rest_curvature_per_m"] if self.cable.rest_curvature else []))
+
+    @property
+    def effect_names(self) -> frozenset[str]:
+        """Names of all effects that any trajectory has."""
+        return frozenset(effect.name for effects in (self.effects, *self.posterior) for effect in effects)
 
     @property
     def effects_shown(self) -> tuple[str, ...]:

@@ -46,7 +46,7 @@ def read_split(
 
     Raises:
         ValueError: a store is not complete or damaged, they differ in keypoints, length of trajectories, interval or
-            length of the cable, or the buffer holds less than two blocks.
+            length of the cable, what is held out of one is in another, or the buffer holds less than two blocks.
     """
     stores = [source if isinstance(source, Store) else open_store(source) for source in sources]
     if not stores:
@@ -67,6 +67,7 @@ def read_split(
                 f"{stores[0].path} has {expected}: only data sets of the same cable and protocol can be used together."
             )
     rows = [split(store.config.n_trajectories, held_out) for store in stores]
+    _check_apart(stores, rows)
     rest = [read_trajectories(store, last) for store, (_, last) in zip(stores, rows, strict=True)]
     training = [first for first, _ in rows]
     if buffer is not None and buffer < sum(map(len, training)):
@@ -79,3 +80,17 @@ def read_split(
             )
         return StreamedData(tuple(stores), blocks_of(training, size), buffer // size, seed), rest
     return concatenate([read_trajectories(store, mine) for store, mine in zip(stores, training, strict=True)]), rest
+
+
+def _check_apart(stores: Sequence[Store], rows: Sequence[tuple[np.ndarray, np.ndarray]]) -> None:
+    """Raises ValueError if a trajectory that is held out of one store is trained on in another."""
+    # eight bytes of a digest tell billions of trajectories apart
+    digests = [np.ascontiguousarray(store.digests()[0][:, :8]).view(np.uint64)[:, 0] for store in stores]
+    trained = [digest[mine] for digest, (mine, _) in zip(digests, rows, strict=True)]
+    for store, digest, (_, last) in zip(stores, digests, rows, strict=True):
+        for other, there in zip(stores, trained, strict=True):
+            if (both := np.isin(digest[last], there)).any():
+                raise ValueError(
+                    f"{both.sum()} of the {len(last)} trajectories that are held out of {store.path} are among those "
+                    f"to train on in {other.path}: simulate one of the two with another --seed."
+                )

@@ -147,8 +147,8 @@ class Store:
                 array[here] = getattr(block, name)[rows[here] - shard * self.config.shard_size]
         return Block(**out)
 
-    def info(self) -> DatasetInfo:
-        """Summary of what is on disk, from the digests alone: fast, and reads no trajectory."""
+    def digests(self) -> tuple[np.ndarray, np.ndarray]:
+        """Digest of each trajectory, zero where it is not there, shape [M, 32]; and its attempts, shape [M]."""
         digest = np.zeros((self.config.n_trajectories, 32), np.uint8)
         attempts = np.zeros(self.config.n_trajectories, np.int32)
         for shard in range(self.config.n_shards):
@@ -159,6 +159,11 @@ class Store:
                 raise
             except Exception:  # a damaged shard counts as not there
                 continue
+        return digest, attempts
+
+    def info(self) -> DatasetInfo:
+        """Summary of what is on disk, from the digests alone: fast, and reads no trajectory."""
+        digest, attempts = self.digests()
         done = digest.any(axis=1)
         return DatasetInfo(
             config=self.config,

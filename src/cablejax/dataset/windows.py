@@ -82,8 +82,10 @@ def window_at(trajectory: Trajectory, start: Array, *, history: int, steps: int)
     )
 
 
-def draw_windows(key: PRNGKeyArray, data: Trajectory, *, batch: int, history: int, steps: int) -> Window:
-    """`batch` windows, uniform over trajectories [M, T, ...] and starts, mirrored and reversed at random."""
+def draw_windows(
+    key: PRNGKeyArray, data: Trajectory, *, batch: int, history: int, steps: int, flips: bool = True
+) -> Window:
+    """`batch` windows, uniform over trajectories [M, T, ...] and starts; with `flips` mirrored, reversed at random."""
     data = jax.tree.map(jnp.asarray, data)
     m, t = data.gripper_twist.shape[:2]
     key_episode, key_start, key_mirror, key_reverse = jax.random.split(key, 4)
@@ -95,6 +97,8 @@ def draw_windows(key: PRNGKeyArray, data: Trajectory, *, batch: int, history: in
     def one(episode, start, flip, swap):
         trajectory = jax.tree.map(lambda x: x[episode], data)
         window = window_at(trajectory, start, history=history, steps=steps)
+        if not flips:
+            return window
         window = jax.tree.map(lambda a, b: jnp.where(flip, a, b), mirrored(window), window)
         return jax.tree.map(lambda a, b: jnp.where(swap, a, b), reversed_ends(window), window)
 

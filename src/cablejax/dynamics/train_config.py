@@ -49,6 +49,8 @@ class TrainConfig:
     Attributes:
         model: sizes of the network; its normalisation is replaced by one measured on the training data.
         phases: one after the other; optimiser state and averaged weights carry over.
+        flips: whether windows are mirrored and reversed at random: as likely as the originals for a uniform straight
+            cable, and not for one with an effect at some place or on some side.
         seed: of initial weights, windows, augmentation and noise.
         warmup: optimiser steps over which the learning rate rises from 0.
         weight_decay: of AdamW.
@@ -65,6 +67,7 @@ class TrainConfig:
         Phase(steps=30_000, batch=32, rollout=1, noise=1e-4, lr_start=1e-3, lr_end=2e-4),
         Phase(steps=12_000, batch=16, rollout=4, noise=3e-5, lr_start=2e-4, lr_end=1e-6),
     )
+    flips: bool = True
     seed: int = 0
     warmup: int = 500
     weight_decay: float = 1e-6

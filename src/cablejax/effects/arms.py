@@ -18,6 +18,7 @@ class ActuationGain(CableEffect):
 
     name = "actuation_gain"
     hook = "input"
+    symmetric = True
     parameters = (Parameter("gain", "", 0.1, 3.0, 1.0, 0.1),)
     null = (1.0,)
     amplitude, reversible = 0, True
@@ -36,6 +37,7 @@ class ActuationLag(CableEffect):
 
     name = "actuation_lag"
     hook = "input"
+    symmetric = True
     parameters = (
         Parameter("time_s", "s", 0.0, 10.0, 0.2, 0.2),
         Parameter("delay_s", "s", 0.0, 5.0, 0.0, 0.2),

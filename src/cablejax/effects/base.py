@@ -54,6 +54,8 @@ class CableEffect(Effect, abc.ABC):
     """The hook through which the effect acts."""
     side: ClassVar[Literal["dynamics", "observation"]] = "dynamics"
     """Whether the cable moves differently, or is only seen differently."""
+    symmetric: ClassVar[bool] = False
+    """Whether a uniform straight cable with it still moves alike in a mirror, and counted from its other end."""
     stage: ClassVar[int] = 0
     """Effects of a later stage change what those of earlier ones have made, in whatever order they are given."""
     alone: ClassVar[bool] = False

@@ -45,6 +45,7 @@ class BendingStiffness(CableEffect):
 
     name = "bending_stiffness"
     hook = "bending"
+    symmetric = True
     parameters = (Parameter("ratio", "", 0.02, 50.0, 1.0, 1.0, log=True),)
     null = (1.0,)
     amplitude, reversible = 0, True
@@ -99,6 +100,7 @@ class Plasticity(CableEffect):
 
     name = "plasticity"
     hook = "memory"
+    symmetric = True
     parameters = (
         Parameter("yield_curvature_per_m", "1/m", 0.2, 100.0, 5.0, 0.8, log=True),
         Parameter("hardening", "", 1e-3, 30.0, 0.3, 1.5, log=True),
@@ -124,6 +126,7 @@ class BendingHysteresis(CableEffect):
 
     name = "bending_hysteresis"
     hook = "memory"
+    symmetric = True
     parameters = (
         Parameter("moment_n_m", "N m", 1e-5, 1.0, 0.01, 1.2, log=True),
         Parameter("transition_curvature_per_m", "1/m", 0.02, 20.0, 0.5, 0.8, log=True),
@@ -147,6 +150,7 @@ class BendingDamping(CableEffect):
 
     name = "bending_damping"
     hook = "bending"
+    symmetric = True
     parameters = (Parameter("ratio", "", 0.01, 1000.0, 1.0, 1.5, log=True),)
     null = (1.0,)
 
@@ -173,6 +177,7 @@ class AxialStretch(CableEffect):
 
     name = "axial_stretch"
     hook = "extension"
+    symmetric = True
     parameters = (Parameter("stiffness_n", "N", 0.05, 1e6, 20.0, 1.5, log=True),)
     null = (np.inf,)
     amplitude = 0
@@ -191,6 +196,7 @@ class LinearDensity(CableEffect):
 
     name = "linear_density"
     hook = "mass"
+    symmetric = True
     parameters = (Parameter("ratio", "", 0.05, 20.0, 1.0, 0.7, log=True),)
     null = (1.0,)
     amplitude, reversible = 0, True

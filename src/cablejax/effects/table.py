@@ -28,6 +28,7 @@ class TableFriction(CableEffect):
 
     name = "table_friction"
     hook = "table"
+    symmetric = True
     parameters = (
         Parameter("ratio", "", 0.01, 50.0, 1.0, 1.0, log=True),
         Parameter("static_excess", "", 0.0, 1.5, 0.0, 0.2),
@@ -121,6 +122,7 @@ class ViscousDrag(CableEffect):
 
     name = "viscous_drag"
     hook = "table"
+    symmetric = True
     parameters = (Parameter("coefficient_n_s_per_m2", "N s/m^2", 1e-3, 1e3, 1.0, 1.2, log=True),)
     null = (0.0,)
     amplitude = 0

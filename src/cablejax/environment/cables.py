@@ -18,9 +18,11 @@ from cablejax.dataset.drawing import cable_params, draw_parameters
 from cablejax.dataset.schema import DatasetConfig, Randomisation
 from cablejax.effects.camera import in_camera_frame, without_camera
 from cablejax.effects.given import GivenEffect, parse_effect
+from cablejax.effects.physics import Physics
 from cablejax.limits import check
 from cablejax.simulate.chain.engine import ChainEngine
 from cablejax.simulate.engine import refuse_lags
+from cablejax.types import CableState
 
 EffectText = GivenEffect | str
 """An effect, or its text as `parse_effect` reads it."""
@@ -156,9 +158,7 @@ class Cables:
         self._targets = [config.target(target) for target in config.targets]
         pose = straight_start(config.cable)
         self._start = self._engine.initial_state(pose[None])
-        physics, start = self._resting()
-        rest = self._engine.rollout(without_camera(physics), start, np.zeros((1, 1, 2, 3)))[1]
-        self._shown = np.asarray(rest.keypoints[0, 0])
+        self._shown = self._at_rest(*self._resting())
         if not np.isfinite(self._shown).all():
             raise ValueError(
                 f"The simulation of this cable by {config.discretisation.n_links} links diverges at rest. Check "
@@ -174,6 +174,11 @@ class Cables:
         self.gripper_pose = rows(np.asarray(pose, np.float32)[None])
         self.error, self.taken = np.zeros(size), np.zeros(size, int)
         self.names = [""] * size
+
+    def _at_rest(self, physics: Physics, start: CableState) -> Float[np.ndarray, "N 2"]:
+        """Keypoints of one cable before its first action [m]."""
+        rest = self._engine.rollout(without_camera(physics), start, np.zeros((1, 1, 2, 3)))[1]
+        return np.asarray(rest.keypoints[0, 0])
 
     def _resting(self):
         one = cable_params(self._recipe, draw_parameters(self._recipe, np.random.default_rng(0)))
@@ -216,7 +221,9 @@ class Cables:
         self.gripper_pose[row] = np.asarray(self._start.gripper_pose[0])
         self.taken[row] = 0
         only = np.arange(len(self.taken)) == row
-        self._observe(only, np.broadcast_to(self._shown, self.keypoints.shape), [random] * len(only))
+        batch = jax.tree.map(lambda leaf: np.asarray(leaf, np.float32)[None], physics)
+        shown = self._shown if effects is None else self._at_rest(batch, self._start)
+        self._observe(only, np.broadcast_to(shown, self.keypoints.shape), [random] * len(only))
 
     def step(
         self,
