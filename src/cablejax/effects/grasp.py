@@ -36,7 +36,7 @@ class GripperSlip(_AtGripper):
         Parameter("distance_m", "m", -0.2, 0.2, 0.0, 0.02),
     )
     null = (10.0, 0.0)
-    amplitude, reversible = 1, True
+    amplitude, reversible, alone = 1, True, True
 
     def apply(self, physics, values, variant, config):
         """Adds to the length that slips through one gripper [m], and sets the time at which it does [s]."""
