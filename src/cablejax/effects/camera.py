@@ -31,7 +31,6 @@ class CameraSimilarity(CableEffect):
         Parameter("y_m", "m", -0.5, 0.5, 0.0, 0.01),
     )
     null = (1.0, 0.0, 0.0, 0.0)
-    alone = True
     side = "observation"
     origin = (0.0, 0.0)
     """Place that the keypoints are scaled and turned about in the fit [m]."""
