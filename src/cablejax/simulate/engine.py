@@ -50,6 +50,9 @@ class Engine(abc.ABC):
     ) -> CableState:
         """The cable at rest in static equilibrium, without friction locked in.
 
+        It is sought by a solver outside of JAX: poses are numbers, not traced within `jit` or `grad`. Differentiate a
+        rollout by the state that this returns.
+
         Args:
             gripper_pose: (x, y, theta) in the plane, shape [Q, 3]; (x, y, z, qw, qx, qy, qz) in space, shape [Q, 7].
             guess: keypoints near the wanted equilibrium, for poses with several.
@@ -66,6 +69,9 @@ class Engine(abc.ABC):
 
         All arguments carry the same leading batch axis, or none of them does. Arms that lag and a camera that lags
         begin at rest, whatever was before `state`.
+
+        Where a caller's `jit` or `grad` traces the physics, a lag may not be zero, and commands are simulated in parts
+        of a tenth of a second: keypoints then differ by some micrometres from those outside of it.
 
         Args:
             physics: physical parameters.
