@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 
 from cablejax.cable import Cable, Discretisation
+from cablejax.commands.train import Train
 from cablejax.dataset import generate as generation
 from cablejax.dataset.drawing import draw
 from cablejax.dataset.generate import (
@@ -30,7 +31,7 @@ from cablejax.dataset.generate import (
 from cablejax.dataset.opening import open_store
 from cablejax.dataset.schema import DatasetConfig, Randomisation, config_from_json, config_to_json
 from cablejax.dataset.windows import read_trajectories
-from cablejax.effects.given import EFFECTS, GivenEffect
+from cablejax.effects.given import EFFECTS, GivenEffect, parse_effect
 from cablejax.simulate import ThreadedEngine
 from cablejax.simulate.motions import MotionConfig, random_motion
 
@@ -60,6 +61,28 @@ def test_what_is_known_of_a_cable_has_its_effects(tmp_path):
     expected = np.array([[np.log(2.0), 0.0], [np.log(2.0), more]] * 2)
     np.testing.assert_allclose(with_them - without, expected, atol=1e-5)
     np.testing.assert_array_equal(read_trajectories(tmp_path / "a.zarr", [3, 1]).cable, with_them[[3, 1]])
+
+
+@pytest.mark.parametrize(
+    ("text", "asymmetric", "camera"),
+    [
+        ("table_friction:coefficient=0.5", (), ()),
+        ("stiffness_profile:centre_m=0.3,width_m=0.3,ratio=0.3", ("stiffness_profile",), ()),
+        ("camera_lag:time_s=0.5", ("camera_lag",), ("camera_lag",)),
+    ],
+)
+def test_a_training_flips_what_is_as_likely_and_takes_no_camera(tmp_path, text, asymmetric, camera):
+    config = dataclasses.replace(STAGED, effects=(parse_effect(text),))
+    assert (config.asymmetric, config.camera_effects) == (asymmetric, camera)
+    generate(config, tmp_path / "data", progress=False)
+    training = Train(data=(tmp_path / "data",), out=tmp_path / "out", preset="smoke", prior="rigid")
+    if camera:
+        with pytest.raises(ValueError, match="camera_lag: its keypoints are not where the cable is"):
+            training.execute()
+    else:
+        training.execute()
+        made = json.loads((tmp_path / "out" / "run.json").read_text())
+        assert made["config"]["flips"] is not bool(asymmetric)
 
 
 STAGED = dataclasses.replace(

@@ -81,6 +81,9 @@ class Simulate(Command):
         if self.overwrite:
             _clear(place, config)
         say(f"{config.n_trajectories} trajectories of {config.n_steps} steps into {place}")
+        if config.camera_effects:
+            moved = ", ".join(config.camera_effects)
+            say(f"With {moved} keypoints are not where the cable is: no model can be trained on them.")
         begin = time.perf_counter()
         info = generate(config, place, process_index=self.process_index, process_count=self.process_count)
         seconds = time.perf_counter() - begin
@@ -92,14 +95,8 @@ class Simulate(Command):
             "seconds": round(seconds, 3),
         }
         made = f"{info.n_complete} of {config.n_trajectories} trajectories are in {place} ({seconds:.0f} s)."
-        if info.n_complete < config.n_trajectories:
-            return result, made
-        if any(name.startswith("camera") for name in config.effect_names):
-            return (
-                result,
-                f"{made}\nThe camera's effects move the keypoints off the cable: no model is trained on them.",
-            )
-        return result, f"{made}\nTrain on them: cablejax train --data {place}"
+        ready = info.n_complete == config.n_trajectories and not config.camera_effects
+        return result, f"{made}\nTrain on them: cablejax train --data {place}" if ready else made
 
     def dataset_config(self) -> DatasetConfig:
         """The data set that these options describe.

@@ -140,7 +140,7 @@ class Train(Command):
                 "Simulate a cable with `keypoints = N` in place of keypoint_arclength_m."
             )
         for store in stores:
-            if camera := sorted({name for name in store.config.effect_names if name.startswith("camera")}):
+            if camera := store.config.camera_effects:
                 raise UsageError(
                     f"{store.path} has {', '.join(camera)}: its keypoints are not where the cable is. A model is of "
                     "the cable itself: simulate without the camera's effects."

@@ -120,6 +120,11 @@ class DatasetConfig:
         return (*names, *(["rest_curvature_per_m"] if self.cable.rest_curvature else []))
 
     @property
+    def camera_effects(self) -> tuple[str, ...]:
+        """The effects with which its keypoints are not where the cable is."""
+        return tuple(sorted(name for name in self.effect_names if name.startswith("camera")))
+
+    @property
     def effect_names(self) -> frozenset[str]:
         """Names of all effects that any trajectory has."""
         return frozenset(effect.name for effects in (self.effects, *self.posterior) for effect in effects)
