@@ -433,7 +433,7 @@ def test_two_and_eight_devices_make_the_bytes_of_one(tmp_path):
     code = "import jax\nprint(jax.local_device_count(), generate(config, path, progress=False).complete)\n"
     for count in (1, 2, 8):
         flags = f"--xla_force_host_platform_device_count={count}"
-        output = finish(child(code, config, tmp_path / str(count), XLA_FLAGS=flags, JAX_PLATFORMS="cpu"))
+        output = finish(child(code, config, tmp_path / str(count), XLA_FLAGS=flags, JAX_PLATFORMS="cpu", NPROC="8"))
         assert f"{count} True" in output
     assert tree(tmp_path / "1") == tree(tmp_path / "2") == tree(tmp_path / "8")
     # and they are the trajectories of the other engine

@@ -40,7 +40,7 @@ LONG = dataclasses.replace(TINY_TRAINING, phases=(Phase(steps=60, batch=4), Phas
 
 CHILD = """
 import sys
-sys.path.insert(0, sys.argv[1])
+sys.path[:0] = [sys.argv[1], sys.argv[1] + "/../experiments"]
 from test_dynamics_train import DATA, LONG
 from cablejax.dynamics.train import train
 train(LONG, DATA, sys.argv[2], progress=False)
