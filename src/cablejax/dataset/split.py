@@ -52,11 +52,12 @@ def read_split(
     if not stores:
         raise ValueError("No data set given: expected at least one.")
     first = stores[0].config
-    for store in stores:
-        info, cable = store.info(), store.config.cable
-        if not info.complete:
+    digests = [store.digests()[0] for store in stores]
+    for store, digest in zip(stores, digests, strict=True):
+        complete, cable = digest.any(axis=1), store.config.cable
+        if not complete.all():
             raise ValueError(
-                f"{store.path} holds {info.n_complete} of {store.config.n_trajectories} trajectories. "
+                f"{store.path} holds {complete.sum()} of {store.config.n_trajectories} trajectories. "
                 "Complete it first: run the command that began it again."
             )
         came = (cable.n_keypoints, cable.length, store.config.n_steps, store.config.interval)
@@ -67,7 +68,7 @@ def read_split(
                 f"{stores[0].path} has {expected}: only data sets of the same cable and protocol can be used together."
             )
     rows = [split(store.config.n_trajectories, held_out) for store in stores]
-    _check_apart(stores, rows)
+    _check_apart(stores, rows, digests)
     rest = [read_trajectories(store, last) for store, (_, last) in zip(stores, rows, strict=True)]
     training = [first for first, _ in rows]
     if buffer is not None and buffer < sum(map(len, training)):
@@ -82,14 +83,16 @@ def read_split(
     return concatenate([read_trajectories(store, mine) for store, mine in zip(stores, training, strict=True)]), rest
 
 
-def _check_apart(stores: Sequence[Store], rows: Sequence[tuple[np.ndarray, np.ndarray]]) -> None:
+def _check_apart(
+    stores: Sequence[Store], rows: Sequence[tuple[np.ndarray, np.ndarray]], digests: Sequence[np.ndarray]
+) -> None:
     """Raises ValueError if a trajectory that is held out of one store is trained on in another."""
     # eight bytes of a digest tell billions of trajectories apart
-    digests = [np.ascontiguousarray(store.digests()[0][:, :8]).view(np.uint64)[:, 0] for store in stores]
-    trained = [digest[mine] for digest, (mine, _) in zip(digests, rows, strict=True)]
-    for store, digest, (_, last) in zip(stores, digests, rows, strict=True):
+    names = [np.ascontiguousarray(digest[:, :8]).view(np.uint64)[:, 0] for digest in digests]
+    trained = [name[mine] for name, (mine, _) in zip(names, rows, strict=True)]
+    for store, name, (_, last) in zip(stores, names, rows, strict=True):
         for other, there in zip(stores, trained, strict=True):
-            if (both := np.isin(digest[last], there)).any():
+            if (both := np.isin(name[last], there)).any():
                 raise ValueError(
                     f"{both.sum()} of the {len(last)} trajectories that are held out of {store.path} are among those "
                     f"to train on in {other.path}: simulate one of the two with another --seed."

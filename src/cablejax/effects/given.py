@@ -140,8 +140,7 @@ def with_effects(physics: Physics, effects: Iterable[GivenEffect], chain: Discre
     for one, other in itertools.combinations(ordered, 2):
         if one.name == other.name and one.effect.alone and one.meets(other):
             raise ValueError(
-                f"{one.name} is given twice ({one}; {other}), and a simulation has one at a time: leave one out, or "
-                "let them act one after the other (from_s, until_s)."
+                f"{one.name} is given twice ({one}; {other}), and a simulation has one at a time: leave one out."
             )
     for effect in ordered:
         physics = effect.applied(physics, chain)
