@@ -35,7 +35,7 @@ def chosen(folder: pathlib.Path, names: Sequence[str]) -> tuple[list[pathlib.Pat
     return [path for path in found if path not in absent], [path.stem for path in absent]
 
 
-async def execute(path: pathlib.Path, free: asyncio.Semaphore, *, keep: bool) -> None:
+async def execute(path: pathlib.Path, free: asyncio.Semaphore, programs: str, *, keep: bool) -> None:
     """Executes a notebook in its own kernel and folder once a processor is free, and prints how long that takes."""
     notebook = nbformat.read(path, as_version=4)
     # notebooks find `experiments/` from their own folder, which this is not
@@ -43,6 +43,8 @@ async def execute(path: pathlib.Path, free: asyncio.Semaphore, *, keep: bool) ->
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(places)}
     # one thread for each of the kernels that run at once; they fight for the processors otherwise
     environment.setdefault("NPROC", "1")
+    # what one of them has compiled no other compiles again, as on the command line
+    environment.setdefault("JAX_COMPILATION_CACHE_DIR", programs)
     async with free:
         began = time.monotonic()
         with tempfile.TemporaryDirectory() as folder:
@@ -60,8 +62,9 @@ async def execute(path: pathlib.Path, free: asyncio.Semaphore, *, keep: bool) ->
 async def execute_all(paths: Sequence[pathlib.Path], *, keep: bool) -> None:
     """Executes as many notebooks at once as there are processors."""
     free = asyncio.Semaphore(os.cpu_count() or 1)
-    # the long ones are the last, and begin first
-    await asyncio.gather(*(execute(path, free, keep=keep) for path in reversed(paths)))
+    with tempfile.TemporaryDirectory() as programs:
+        # the long ones are the last, and begin first
+        await asyncio.gather(*(execute(path, free, programs, keep=keep) for path in reversed(paths)))
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
