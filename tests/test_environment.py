@@ -218,6 +218,22 @@ def test_the_controller_is_a_policy():
     assert min(errors) < 0.2 * errors[0]
 
 
+def test_a_policy_says_why_it_cannot_act():
+    config = clean(targets=("U",))
+    target = make_target("U", config.cable)
+    settings = MPCConfig.for_length(config.cable.length, horizon=1, history_length=3)
+    policy = LinkPolicy(config, lambda goal: MPC(settings, relaxing_cable, 0.8, goal.keypoints))
+    observation, _ = ShapeCableEnv(config).reset(seed=0)
+    with pytest.raises(ValueError, match="call `begin`"):
+        policy(observation)
+    policy.begin(target)
+    with pytest.raises(ValueError, match="keypoints of shape"):
+        policy({**observation, "keypoints": observation["keypoints"][::2]})
+    policy.begin(target)
+    with pytest.raises(ValueError, match="metres"):
+        policy({name: 1000 * value for name, value in observation.items()})
+
+
 @pytest.mark.parametrize(
     ("settings", "message"),
     [

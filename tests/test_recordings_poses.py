@@ -208,3 +208,12 @@ def test_a_pose_that_is_not_known_spoils_its_neighbourhood_alone():
     assert np.isnan(found[0]).all()
     np.testing.assert_allclose(found[1:, 0], [2.5, 3.5, 4.5])
     np.testing.assert_allclose(np.abs(found[1:, 3:]), np.tile([1.0, 0.0, 0.0, 0.0], (3, 1)), atol=1e-12)
+
+
+def test_an_angle_between_two_on_either_side_of_half_a_turn_is_near_both():
+    """Whole turns are those of the pose before: measured poses stay as they are."""
+    time = np.arange(4.0)
+    angle = np.array([3.10, 3.14, -3.12, -3.08])
+    pose = np.stack([np.zeros(4), np.zeros(4), angle], axis=1)
+    found = poses_at(np.array([0.5, 1.5, 2.5]), time, pose)[:, 2]
+    np.testing.assert_allclose(found, [3.12, (3.14 - 3.12 + 2 * np.pi) / 2, -3.10], atol=1e-12)

@@ -242,6 +242,33 @@ def test_on_a_table_one_lost_frame_is_filled_in(interval, missing, parts):
         np.testing.assert_allclose(takes[0].gripper_pose[30, :, :2], points[30, [0, -1]], atol=1e-12)
 
 
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_a_lost_pose_is_filled_in_the_short_way_round(dimension):
+    """Angles of arctan2 jump by a whole turn, and trackers change the sign of a quaternion: neither is a motion."""
+    samples = 60
+    angle = np.pi - 0.0295 + 0.001 * np.arange(samples)
+    places = np.stack([np.linspace(0, 1, 5), *np.zeros((dimension - 1, 5))], axis=1)
+    points = np.tile(places, (samples, 1, 1))
+    if dimension == 2:
+        turned = np.arctan2(np.sin(angle), np.cos(angle))[:, None]
+    else:
+        still = np.zeros(samples)
+        turned = np.stack([np.cos(angle / 2), still, still, np.sin(angle / 2)], axis=1)
+        turned[30:] *= -1.0
+    pose = np.stack([np.append(points[:, end], turned, axis=1) for end in (0, -1)], axis=1)
+    lost = pose.copy()
+    lost[30, 0] = np.nan
+    takes, _ = cut_at_gaps((Take("1", 0.02 * np.arange(samples), points, lost),), None)
+    filled = takes[0].gripper_pose
+    np.testing.assert_array_equal(filled[:, 1], pose[:, 1])
+    difference = filled[30, 0] - pose[30, 0]
+    if dimension == 2:
+        difference[2] = (difference[2] + np.pi) % (2 * np.pi) - np.pi
+    else:
+        difference[3:] = 1.0 - abs(filled[30, 0, 3:] @ pose[30, 0, 3:])
+    np.testing.assert_allclose(difference, 0.0, atol=1e-6)
+
+
 def test_keypoints_between_the_grippers_may_be_missing():
     points = swinging()
     points[20:180, 3:5] = np.nan

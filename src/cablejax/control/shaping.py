@@ -120,6 +120,10 @@ def knowing(model: Model, effects: Sequence[GivenEffect]) -> Model:
         ValueError: nothing of the effects enters the model; names the ways that remain.
     """
     if effects and not enters(model, effects):
+        if all(effect.name.startswith("camera") for effect in effects):
+            raise ValueError(
+                f"{', '.join(map(str, effects))}: no model knows of the camera. Correct the camera, or the recording."
+            )
         raise ValueError(
             f"Nothing of {', '.join(map(str, effects))} enters the model {model.name}: neither the rest of its cable, "
             "nor stiffness and friction of a conditioned model, such as gns-conditioned. Simulate data with it "

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from cablejax.control.link import Controller, RobotLink
-from cablejax.control.link_state import LinkConfig, Status
+from cablejax.control.link_state import LinkConfig
 from cablejax.control.targets import Target
 from cablejax.environment.cables import ShapeCableConfig
 from cablejax.simulate.table_plant import Observation
@@ -27,6 +27,7 @@ class LinkPolicy:
         self._config, self._controller = config, controller
         interval = config.interval
         self._settings = LinkConfig(interval=interval, rest=0.0, watchdog=interval, limits=None)
+        self._link: RobotLink | None = None
 
     def begin(self, target: Target) -> None:
         """Begins an episode with this target, the one whose keypoints the environment shows."""
@@ -37,12 +38,14 @@ class LinkPolicy:
         """The action for an observation of the environment.
 
         Raises:
-            ValueError: the controller has failed.
+            ValueError: no episode has begun, the link has no use for the observation, or the controller has failed.
         """
+        if self._link is None:
+            raise ValueError("No episode has begun: call `begin` with the target before asking for an action.")
         now = self._steps * self._config.interval
         seen = Observation(observation["keypoints"], observation["gripper_pose"], now)
         self._state, reply = self._link.step(self._state, now, [seen])
         self._steps += 1
-        if reply.reason and reply.status != Status.WAITING:
-            raise ValueError(reply.reason)
+        if wrong := (*reply.refused, *filter(None, [reply.reason])):
+            raise ValueError(wrong[0])
         return np.clip(reply.twist / self._config.scale, -1.0, 1.0).astype(np.float32)

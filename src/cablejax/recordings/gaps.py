@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from cablejax.arrays import stretches
+from cablejax.recordings.poses import poses_at, positions_at
 from cablejax.recordings.take import Take, median_step
 
 FILLED = 0.05
@@ -167,13 +168,14 @@ def _filled(take: Take, on_grippers: tuple[int, ...] | None) -> tuple[Take, int]
         return take, 0
     ends = take.keypoints[:, on_grippers] if on_grippers is not None else take.gripper_pose
     assert ends is not None
-    values = ends.reshape(len(known), -1).copy()
-    for column in values.T:
-        column[few] = np.interp(take.time[few], take.time[known], column[known])
-    values = values.reshape(ends.shape)
+    values = ends.copy()
+    between = positions_at if on_grippers is not None else poses_at
+    for part in range(values.shape[1]):
+        # what was observed of the other gripper stays
+        seen = np.isfinite(ends[:, part]).all(axis=-1)
+        lost = few & ~seen
+        values[lost, part] = between(take.time[lost], take.time[seen], ends[seen, part])
     if on_grippers is None:
-        if take.keypoints.shape[2] == 3:
-            values[..., 3:] /= np.linalg.norm(values[..., 3:], axis=-1, keepdims=True)
         return dataclasses.replace(take, gripper_pose=values), int(few.sum())
     points = take.keypoints.copy()
     points[:, on_grippers] = values

@@ -75,24 +75,38 @@ def rotated(quaternion: Float[np.ndarray, "*B 4"], vector: Float[np.ndarray, "*B
 
 
 def poses_at(
-    at: Float[np.ndarray, " G"], time: Float[np.ndarray, " T"], pose: Float[np.ndarray, "T *Q 7"]
-) -> Float[np.ndarray, "G *Q 7"]:
-    """Poses at other times, shape [G, *Q, 7]: a straight line, and the shorter way between quaternions.
+    at: Float[np.ndarray, " G"], time: Float[np.ndarray, " T"], pose: Float[np.ndarray, "T *Q P"]
+) -> Float[np.ndarray, "G *Q P"]:
+    """Poses at other times, shape [G, *Q, P]: a straight line, and the shorter way between angles or quaternions.
 
-    The first and the last pose are held; next to a pose that is NaN the result is NaN.
+    The first and the last pose are held; next to a pose that is NaN the result is NaN. Whole turns of an angle are
+    those of the pose before.
 
     Args:
         at: those times [s].
         time: when the poses were, ascending [s].
-        pose: (x, y, z, qw, qx, qy, qz) [m, 1].
+        pose: (x, y, theta) or (x, y, z, qw, qx, qy, qz) [m, rad, 1].
     """
+    if pose.shape[-1] == 3:
+        turned = np.unwrap(pose[..., 2], axis=0)
+        found = positions_at(at, time, np.concatenate([pose[..., :2], turned[..., None]], axis=-1))
+        before = np.clip(np.searchsorted(time, at, side="right") - 1, 0, None)
+        found[..., 2] += (pose[..., 2] - turned)[before]
+        return found
     pose = pose.astype(float)
     opposite = (pose[1:, ..., 3:] * pose[:-1, ..., 3:]).sum(axis=-1, keepdims=True) < 0
     pose[1:, ..., 3:] *= np.cumprod(np.where(opposite, -1.0, 1.0), axis=0)
-    columns = [np.interp(at, time, column) for column in pose.reshape(len(pose), -1).T]
-    found = np.stack(columns, axis=1).reshape(len(at), *pose.shape[1:])
+    found = positions_at(at, time, pose)
     found[..., 3:] /= np.linalg.norm(found[..., 3:], axis=-1, keepdims=True)
     return found
+
+
+def positions_at(
+    at: Float[np.ndarray, " G"], time: Float[np.ndarray, " T"], position: Float[np.ndarray, "T *B"]
+) -> Float[np.ndarray, "G *B"]:
+    """Positions at other times, on straight lines between those known; the first and the last are held."""
+    columns = [np.interp(at, time, column) for column in position.reshape(len(position), -1).T]
+    return np.stack(columns, axis=1).reshape(len(at), *position.shape[1:])
 
 
 def twists(time: Float[np.ndarray, " T"], pose: Float[np.ndarray, "T Q P"]) -> Float[np.ndarray, "T Q V"]:

@@ -44,6 +44,11 @@ _BADGES: dict[Verdict, tuple[str, str]] = {
     "named+unknown": ("partly", "Part of the cause named"),
     "unknown": ("unknown", "Cause unknown"),
 }
+_INFORMING = (
+    {"stiffness_profile", "intrinsic_curvature", "gripper_rotation_offset", "gripper_compliance"}
+    | {"bending_stiffness", "table_friction", "linear_density"}
+)  # fmt: skip
+"""Effects that a model can be informed of, see `control.shaping.knowing`; the last three are for conditioned models."""
 _DPI = 150
 _SPACE_CAPTION = (
     "Five seconds from two observations on, in the files with the largest, middling and smallest gaps. Drag to turn, "
@@ -106,6 +111,7 @@ def write_diagnosis_page(diagnosis: CableDiagnosis, out: str | os.PathLike[str])
         label = explained_label(diagnosis) if diagnosis.explained is not None and diagnosis.effects else ""
         orbit = {"data": json_script(orbit_data(diagnosis)), "explained": label}
     path = out / PAGE
+    named = {effect.name for effect in diagnosis.effects}
     write_html(
         path,
         "diagnosis.html",
@@ -118,6 +124,8 @@ def write_diagnosis_page(diagnosis: CableDiagnosis, out: str | os.PathLike[str])
         works=_works(diagnosis),
         pictures=inline,
         orbit=orbit,
+        in_data=bool(named) and not any(name.startswith("camera") for name in named),
+        informs=not named.isdisjoint(_INFORMING),
         cable_caption=_SPACE_CAPTION if space else _cable_caption(diagnosis),
         where_caption=_FILES_CAPTION if space else _WHERE_CAPTION,
         effects=sections.named_effects(diagnosis),
