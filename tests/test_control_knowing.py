@@ -105,7 +105,9 @@ def test_the_learner_scales_responses_only_of_a_model_without_static_prior(model
 
 
 def test_what_does_not_enter_a_model_is_refused_with_what_to_do(model, tmp_path, capsys):
-    with pytest.raises(ValueError, match=r"Nothing of camera_lag:time_s=0.3 enters.*simulate --with.*--start-from"):
+    with pytest.raises(ValueError, match=r"Nothing of viscous_drag.* enters.*simulate --with.*--start-from"):
+        knowing(model, (parse_effect("viscous_drag:coefficient_n_s_per_m2=2"),))
+    with pytest.raises(ValueError, match=r"camera_lag:time_s=0.3.*Correct the camera"):
         knowing(model, (parse_effect("camera_lag:time_s=0.3"),))
     words = ["shape", "--out", str(tmp_path / "run"), "--effect", "bending_stiffness:ratio=0.3", "--steps", "1"]
     assert main(words) == 2
