@@ -17,11 +17,13 @@ from cablejax.control.targets import make_target
 from cablejax.dataset.generate import make_engine, simulate
 from cablejax.dataset.schema import DatasetConfig
 from cablejax.dynamics.weights import released_names
-from cablejax.effects.given import parse_effect
+from cablejax.effects.given import GivenEffect, parse_effect
+from cablejax.report.diagnosis_page import INFORMING
 from cablejax.residual import STATIC, LearnerConfig
 from cablejax.simulate.plant.config import PlantConfig
 from cablejax.types import Trajectory
 from open_loop import open_loop_error
+from test_dataset_generate import VALUES
 
 CURVED = "intrinsic_curvature:centre_m=0.6,width_m=0.3,curvature_per_m=2"
 
@@ -114,6 +116,11 @@ def test_what_does_not_enter_a_model_is_refused_with_what_to_do(model, tmp_path,
     assert "such as gns-conditioned" in capsys.readouterr().err
     assert main([*words, "--motion", "next.npz"]) == 2
     assert "--motion uses no model" in capsys.readouterr().err
+
+
+def test_a_page_proposes_to_inform_a_model_of_what_enters_one():
+    conditioned = load_model("gns-conditioned")
+    assert {name for name, values in VALUES.items() if enters(conditioned, (GivenEffect(name, values),))} == INFORMING
 
 
 def test_of_look_alikes_a_model_is_informed_of_the_first_that_enters_it(tmp_path):

@@ -20,6 +20,7 @@ from cablejax.dynamics.bfloat16_slopes import with_bfloat16_slopes
 from cablejax.dynamics.config import ModelConfig
 from cablejax.dynamics.model import apply, structure_of
 from cablejax.dynamics.weights import cable_of_weights, load_info, load_weights
+from cablejax.effects import CAMERA
 from cablejax.effects.given import GivenEffect, with_effects
 from cablejax.effects.physics import mean_resistance, nominal_physics
 from cablejax.limits import shown
@@ -120,7 +121,7 @@ def knowing(model: Model, effects: Sequence[GivenEffect]) -> Model:
         ValueError: nothing of the effects enters the model; names the ways that remain.
     """
     if effects and not enters(model, effects):
-        if all(effect.name.startswith("camera") for effect in effects):
+        if all(effect.name in CAMERA for effect in effects):
             raise ValueError(
                 f"{', '.join(map(str, effects))}: no model knows of the camera. Correct the camera, or the recording."
             )

@@ -14,6 +14,7 @@ from typing import Any, Literal
 import numpy as np
 
 from cablejax.cable import Cable, Discretisation
+from cablejax.effects import CAMERA
 from cablejax.effects.given import EFFECTS, GivenEffect, with_effects
 from cablejax.effects.physics import nominal_physics
 from cablejax.limits import LIMITS, check, shown
@@ -122,7 +123,7 @@ class DatasetConfig:
     @property
     def camera_effects(self) -> tuple[str, ...]:
         """The effects with which its keypoints are not where the cable is."""
-        return tuple(sorted(name for name in self.effect_names if name.startswith("camera")))
+        return tuple(sorted(self.effect_names & CAMERA))
 
     @property
     def effect_names(self) -> frozenset[str]:

@@ -45,4 +45,7 @@ LIBRARY: tuple[CableEffect, ...] = (
 ARMS: tuple[CableEffect, ...] = (ActuationGain(), ActuationLag())
 """Effects of the arms. A diagnosis finds them from commands and encoders, see `cablejax.diagnose.actuation`."""
 
-__all__ = ["ARMS", "LIBRARY", "CableEffect", "Context", "Effect", "Hook", "Parameter"]
+CAMERA = frozenset({CameraSimilarity.name, CameraLag.name})
+"""Names of those with which keypoints are not where the cable is: no model is trained on them, or informed of them."""
+
+__all__ = ["ARMS", "CAMERA", "LIBRARY", "CableEffect", "Context", "Effect", "Hook", "Parameter"]

@@ -12,6 +12,7 @@ from cablejax.diagnose.belief import Calibration
 from cablejax.diagnose.diagnosis import CableDiagnosis, NamedEffect, Verdict
 from cablejax.diagnose.judgement import FAINT, effect_title, listed, look_alikes
 from cablejax.diagnose.verdict_json import write_verdict
+from cablejax.effects import CAMERA
 from cablejax.gaplog import SIMULATED, write_gap_log
 from cablejax.report import diagnosis_sections as sections
 from cablejax.report.diagnosis_charts import ranking_figure, shrinkage_figure
@@ -44,10 +45,17 @@ _BADGES: dict[Verdict, tuple[str, str]] = {
     "named+unknown": ("partly", "Part of the cause named"),
     "unknown": ("unknown", "Cause unknown"),
 }
-_INFORMING = (
-    {"stiffness_profile", "intrinsic_curvature", "gripper_rotation_offset", "gripper_compliance"}
-    | {"bending_stiffness", "table_friction", "linear_density"}
-)  # fmt: skip
+INFORMING = frozenset(
+    (
+        "stiffness_profile",
+        "intrinsic_curvature",
+        "gripper_rotation_offset",
+        "gripper_compliance",
+        "bending_stiffness",
+        "table_friction",
+        "linear_density",
+    )
+)
 """Effects that a model can be informed of, see `control.shaping.knowing`; the last three are for conditioned models."""
 _DPI = 150
 _SPACE_CAPTION = (
@@ -124,8 +132,8 @@ def write_diagnosis_page(diagnosis: CableDiagnosis, out: str | os.PathLike[str])
         works=_works(diagnosis),
         pictures=inline,
         orbit=orbit,
-        in_data=bool(named) and not any(name.startswith("camera") for name in named),
-        informs=not named.isdisjoint(_INFORMING),
+        in_data=bool(named) and named.isdisjoint(CAMERA),
+        informs=not named.isdisjoint(INFORMING),
         cable_caption=_SPACE_CAPTION if space else _cable_caption(diagnosis),
         where_caption=_FILES_CAPTION if space else _WHERE_CAPTION,
         effects=sections.named_effects(diagnosis),
