@@ -9,7 +9,7 @@ import numpy as np
 
 from cablejax.cable import Cable
 from cablejax.gaplog import Episode, gap_log_from_episodes
-from cablejax.recordings.poses import twists
+from cablejax.poses import twists
 from cablejax.simulate.compile import compiler_options
 from cablejax.simulate.rod import Rod, RodPhysics
 from cablejax.simulate.rod.clamps import frames_along

@@ -130,6 +130,16 @@ def test_an_offset_of_the_tool_is_told():
     assert not any("ahead of" in text or "behind" in text for text in prepare(log).caveats)
 
 
+def test_an_angle_that_is_half_a_turn_off_in_one_sample_is_told_and_put_right():
+    log = record()
+    pose = log.gripper_pose.copy()
+    pose[1, 40, 0, 2] += np.pi
+    found, right = prepare(dataclasses.replace(log, gripper_pose=pose)), prepare(log)
+    np.testing.assert_allclose(found.gripper_pose, right.gripper_pose, atol=0.02)
+    (told_,) = set(found.caveats) - set(right.caveats)
+    assert told_.startswith("In episode 1 the pose of gripper 0 jumps away and back in 1 of 100 samples, for example")
+
+
 SCATTER = np.array([3e-4, 3e-4, 4e-3])
 
 

@@ -14,9 +14,9 @@ from cablejax.diagnose.conclude import Conclusion
 from cablejax.diagnose.diagnosis import NamedEffect
 from cablejax.diagnose.fit import Fit
 from cablejax.diagnose.noise import SMALLEST, noise_floor, still
-from cablejax.diagnose.planar_run import _caveats, _worth_naming, calibrated
+from cablejax.diagnose.planar_run import _caveats, _excused, _worth_naming, calibrated
 from cablejax.diagnose.playback import Playback
-from diagnose_cases import holds, log_of, poses, record
+from diagnose_cases import evidence, holds, log_of, poses, record
 
 EPISODES, SAMPLES, POINTS = 4, 300, 13
 
@@ -267,6 +267,24 @@ def test_simulations_that_break_down_do_not_count_in_what_stated_numbers_may_be_
 
     monkeypatch.setattr(Playback, "keypoints", broken)
     assert again.stated_error() == pytest.approx(whole, rel=0.5)
+
+
+def test_a_motion_that_says_nothing_of_a_gap_is_told():
+    """By a verdict of "none" only; the other motions count as ever."""
+    facts = evidence(noise_mm=0.5)
+    own, off = np.full(4, 3.5e-4), np.zeros(4)
+    own[2], off[2] = 0.05, 0.054
+    facts = dataclasses.replace(facts, own_error=own)
+    fit = Fit(explanation(), facts.count * (1.0 + (off / 5e-4) ** 2), np.zeros((4, 0)), np.zeros((4, 0, 0)))
+    none = Conclusion("none", fit, (), (), (), 0.0)
+    (text,) = _excused(facts, none, Calibration())
+    assert text.startswith(
+        "Episode 2 says nothing for or against a gap: the nominal simulator misses the cable by 54 mm"
+    )
+    assert "1 % more or less stiffness or friction makes 50 mm" in text
+    assert not list(_excused(facts, dataclasses.replace(none, verdict="unknown"), Calibration()))
+    calm = dataclasses.replace(fit, sse=facts.count * 1.0)
+    assert not list(_excused(facts, dataclasses.replace(none, best=calm), Calibration()))
 
 
 def test_what_stands_beside_an_unknown_cause_makes_the_gap_smaller():

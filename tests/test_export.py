@@ -21,9 +21,9 @@ from cablejax.gaplog import (
     targets_of,
     write_gap_log,
 )
+from cablejax.poses import poses_from_markers, twists
 from cablejax.recordings.lerobot import read_lerobot, write_lerobot
 from cablejax.recordings.mcap_log import read_mcap, write_mcap
-from cablejax.recordings.poses import poses_from_markers, twists
 from cablejax.types import GapLog
 from file_cases import with_other_bytes
 from recording_cases import DT, swinging

@@ -326,6 +326,24 @@ class TestJoined:
         with pytest.raises(GapLogError, match=rf"b.npz is not of the set-up of a.npz: .*{field}.* Diagnose them apart"):
             joined(logs, names)
 
+    def test_arc_lengths_that_were_measured_apart_are_averaged(self):
+        logs, names = self._halves()
+        for log, stretch in zip(logs, (1.0, 1.002), strict=True):
+            marks = (stretch * np.asarray(log.meta["keypoint_arclength_m"])).tolist()
+            log.meta.update(keypoint_arclength_m=marks, arclength_measured=True)
+            log.meta["cable"] = {**log.meta["cable"], "length_m": marks[-1]}
+        one, two = (log.meta["keypoint_arclength_m"] for log in logs)
+        whole = joined(logs, names).meta
+        np.testing.assert_allclose(whole["keypoint_arclength_m"], np.mean([one, two], axis=0))
+        assert whole["cable"]["length_m"] == whole["keypoint_arclength_m"][-1] and whole["arclength_measured"]
+        farther = (1.02 * np.asarray(two)).tolist()
+        for change in ({"arclength_measured": False}, {"keypoint_arclength_m": farther}):
+            other = dataclasses.replace(logs[1], meta={**logs[1].meta, **change})
+            with pytest.raises(
+                GapLogError, match=r"b.npz is not of the set-up of a.npz: 'meta.*(length_m|arclength_m)'"
+            ):
+                joined([logs[0], other], names)
+
     def test_the_same_recording_counts_once(self, log):
         with pytest.raises(GapLogError, match=r"a\.npz and copy\.npz are the same recording"):
             joined([log, log], ["a.npz", "copy.npz"])

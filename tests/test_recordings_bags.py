@@ -14,8 +14,8 @@ from rosbags.typesys import Stores, get_typestore  # noqa: E402
 
 from cablejax import limits  # noqa: E402
 from cablejax.gaplog import validate  # noqa: E402
+from cablejax.poses import poses_from_markers, rotated  # noqa: E402
 from cablejax.recordings.bags import import_mcap  # noqa: E402
-from cablejax.recordings.poses import poses_from_markers, rotated  # noqa: E402
 from recording_cases import DT, swinging  # noqa: E402
 
 DOCUMENTATION = Path(__file__).parents[1] / "docs" / "how_to" / "own_recording.md"

@@ -7,15 +7,16 @@ import numpy as np
 import pytest
 
 from cablejax.arrays import quaternion_product
-from cablejax.recordings.frames import AXES, Frame, into_frame, require_along_x, require_hanging, require_rigid
-from cablejax.recordings.poses import (
+from cablejax.poses import (
     poses_at,
     poses_from_markers,
     rotated,
     smallest_rotation,
     transported_frames,
     twists,
+    without_misreadings,
 )
+from cablejax.recordings.frames import AXES, Frame, into_frame, require_along_x, require_hanging, require_rigid
 from cablejax.recordings.take import Take
 from cablejax.recordings.units import metres_per, recognised_unit, require_metres
 from cablejax.simulate.pose import integrate_pose
@@ -217,3 +218,51 @@ def test_an_angle_between_two_on_either_side_of_half_a_turn_is_near_both():
     pose = np.stack([np.zeros(4), np.zeros(4), angle], axis=1)
     found = poses_at(np.array([0.5, 1.5, 2.5]), time, pose)[:, 2]
     np.testing.assert_allclose(found, [3.12, (3.14 - 3.12 + 2 * np.pi) / 2, -3.10], atol=1e-12)
+
+
+def swaying(width: int) -> tuple[np.ndarray, np.ndarray]:
+    """Times and poses of two grippers that sway and turn, at 20 Hz."""
+    time = 0.05 * np.arange(200)
+    turn = 2.5 + np.sin(0.5 * time)
+    place = np.stack([0.2 * np.sin(time), 0.1 * np.cos(0.7 * time), 0.05 * np.sin(0.3 * time)], axis=1)
+    if width == 3:
+        one = np.concatenate([place[:, :2], turn[:, None]], axis=1)
+    else:
+        zero = np.zeros_like(time)
+        one = np.concatenate([place, np.stack([np.cos(turn / 2), zero, zero, np.sin(turn / 2)], axis=1)], axis=1)
+    return time, np.stack([one, one], axis=1)
+
+
+@pytest.mark.parametrize("width", [3, 7])
+def test_readings_that_jump_away_and_back_are_on_a_line(width):
+    time, pose = swaying(width)
+    wrong = pose.copy()
+    if width == 3:
+        wrong[50, 0, 2] -= np.pi
+        wrong[80:83, 0, 2] += 1.5
+    else:
+        # half a turn about x, and the same rotation as before by the other sign
+        wrong[50, 0, 3:] = quaternion_product(pose[50, 0, 3:], np.array([0.0, 1.0, 0.0, 0.0]))
+        wrong[80:83, 0, 3:] *= -1.0
+    wrong[120, 1, 0] += 0.4
+    found, clauses = without_misreadings(time, wrong)
+    if width == 7:
+        found[..., 3:] *= np.sign((found * pose)[..., 3:].sum(axis=-1, keepdims=True))
+    np.testing.assert_allclose(found, pose, atol=2e-3)
+    first, second = clauses
+    count = 4 if width == 3 else 1
+    assert first.startswith(f"the pose of gripper 0 jumps away and back in {count} of 200 samples, for example by 3.")
+    assert first.endswith("rad at 2.5 s") and second.endswith("by 0.41 m at 6 s")
+
+
+@pytest.mark.parametrize("width", [3, 7])
+def test_poses_that_arms_can_have_are_not_touched(width):
+    """Noise, jumps that stay, a quick motion there and back, and what is not known."""
+    time, pose = swaying(width)
+    pose[:, :, :2] += np.random.default_rng(0).normal(0.0, 3e-3, (200, 2, 2))
+    pose[60:, 0, 0] += 0.5
+    pose[100:110, 1, 1] += 0.15 * np.sin(np.linspace(0.0, np.pi, 10))
+    pose[150, 1] = np.nan
+    found, clauses = without_misreadings(time, pose)
+    assert clauses == []
+    np.testing.assert_array_equal(found, pose)

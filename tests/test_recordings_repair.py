@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import recording_cases
+from cablejax.poses import poses_from_markers
 from cablejax.recordings.assemble import Nominal, gap_log_from_takes, measured_arclength
 from cablejax.recordings.deform import read_deform, takes_of
 from cablejax.recordings.frames import Frame
@@ -321,6 +322,20 @@ def test_a_jerk_of_a_gripper_is_told_and_kept():
     assert len(one.time) == 200
     (sentence,) = repairs
     assert sentence.startswith("Sudden accelerations: gripper 0 of take a by ") and " at 1 s. " in sentence
+
+
+def test_a_turn_that_no_arm_makes_is_told_and_one_that_is_back_is_filled_in():
+    points = np.concatenate([swinging()[..., [0, 2]]])
+    pose = poses_from_markers(points[:, 0], points[:, 1], points[:, 0])
+    stays, back = np.stack([pose, pose], axis=1), np.stack([pose, pose], axis=1)
+    stays[100:, 0, 2] += 0.5 * np.pi
+    back[100, 1, 2] += np.pi
+    setup = Setup(unit="m", on_grippers="ends")
+    _, (sentence,) = prepare((take(points, pose=stays),), setup)
+    assert sentence.startswith("Sudden accelerations: gripper 0 of take a by ") and "rad/s^2 at 0.99 s. " in sentence
+    (one,), (sentence,) = prepare((take(points, pose=back),), setup)
+    assert sentence.startswith("Take a: the pose of gripper 1 jumps away and back in 1 of 200 samples")
+    np.testing.assert_allclose(one.gripper_pose[:, 1], pose, atol=0.02)
 
 
 def test_a_gripper_never_seen_is_refused():

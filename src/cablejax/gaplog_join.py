@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from typing import Any
 
@@ -12,6 +13,9 @@ from cablejax.gaplog_check import META_FIELDS, GapLogError
 from cablejax.limits import shown
 from cablejax.types import GapLog
 
+MEASURED = 0.005
+"""Part of a cable's length by which arc lengths measured along its keypoints differ from one recording to another: by
+noise, and by how it was bent."""
 EPISODE_LABELS = ("file", "recording", "split", "take")
 """Extra fields of `meta` with one entry per episode that importers write; what a diagnosis keeps apart by them."""
 
@@ -21,7 +25,8 @@ def joined(logs: Sequence[GapLog], names: Sequence[str]) -> GapLog:
 
     Its `meta` has the field `recordings`: the name of each and how many episodes it has, by which a diagnosis says what
     each one added. Of the extra fields of `meta`, `EPISODE_LABELS` are joined too (equal names of different logs stay
-    apart), and others stay where all recordings have the same.
+    apart), and others stay where all recordings have the same. Arc lengths that an importer measured in each may differ
+    by `MEASURED`; the log has their mean over the episodes.
 
     Args:
         logs: at least one.
@@ -32,6 +37,7 @@ def joined(logs: Sequence[GapLog], names: Sequence[str]) -> GapLog:
     """
     if not logs:
         raise GapLogError("Nothing to join: expected at least one gap log.")
+    logs = _of_one_length(logs)
     for i, (log, name) in enumerate(zip(logs, names, strict=True)):
         for other, other_name in zip(logs[:i], names, strict=False):
             if _same_recording(log, other):
@@ -57,6 +63,28 @@ def joined(logs: Sequence[GapLog], names: Sequence[str]) -> GapLog:
     }
     episodes = [episode for log in logs for episode in episodes_of(log)]
     return stack_episodes(episodes, meta, holds=any(log.hold is not None for log in logs))
+
+
+def _of_one_length(logs: Sequence[GapLog]) -> Sequence[GapLog]:
+    """The logs with the mean of the arc lengths that were measured in each, if they differ as measurements do."""
+    marks = [np.asarray(log.meta["keypoint_arclength_m"], float) for log in logs]
+    measured = all(log.meta.get("arclength_measured") is True for log in logs)
+    if not measured or len({len(mark) for mark in marks}) > 1:
+        return logs
+    mean = np.average(marks, axis=0, weights=[len(log.episode_length) for log in logs])
+    if np.abs(marks - mean).max() > MEASURED * mean[-1]:
+        return logs
+    return [
+        dataclasses.replace(
+            log,
+            meta={
+                **log.meta,
+                "keypoint_arclength_m": mean.tolist(),
+                "cable": {**log.meta["cable"], "length_m": float(mean[-1])},
+            },
+        )
+        for log in logs
+    ]
 
 
 def _labels(logs: Sequence[GapLog], names: Sequence[str], field: str) -> list[Any] | None:

@@ -185,6 +185,26 @@ def has_gap(null: Fit, evidence: Evidence, calibration: Calibration) -> bool:
     return float(np.mean(fourth) - 2.0 * chance) > 1.0
 
 
+def excused(null: Fit, evidence: Evidence, calibration: Calibration) -> list[tuple[int, float, float]]:
+    """Motions with a gap beyond the usual error of the simulator, which may be off by as much or more in them.
+
+    Where the cable snaps over, for example. They say nothing for a gap, see `has_gap`, and nothing against one.
+
+    Returns:
+        The first episode of each, what the nominal simulator misses it by, and its own error there, both in metres per
+        coordinate.
+    """
+    if evidence.own_error is None:
+        return []
+    motions = [rows for rows in episodes_by_motion(evidence.motion) if evidence.count[rows].sum() > 0]
+    usual = calibration.smallest_gap(level(evidence))
+    return [
+        (int(rows[0]), float(gap), own)
+        for rows, gap in zip(motions, left_by_motion(null, evidence), strict=True)
+        if usual < gap <= calibration.resolvable * (own := float(evidence.own_error[rows].max()))
+    ]
+
+
 def _squares_by_motion(fit: Fit, evidence: Evidence) -> tuple[Float[np.ndarray, "M"], Float[np.ndarray, "M"]]:
     """Sum of squares above the noise, in its units, and number of coordinates, of each motion that was seen."""
     motions = episodes_by_motion(evidence.motion)

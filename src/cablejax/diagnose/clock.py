@@ -13,6 +13,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
+from cablejax.poses import positions_at
+
 # A clock whose samples are all within this share of the interval from an even one is even.
 _EVEN = 0.01
 # Samples farther apart than this many intervals have a gap between them, which is not bridged.
@@ -71,20 +73,15 @@ def on_even_clock(time: Float[np.ndarray, "T"], samples: Samples, interval: floa
     done = np.diff(samples.gripper_pose, axis=0)
     steps = np.where(held <= _GAP * interval, samples.gripper_command[:-1] * held, done)
     path = np.concatenate([np.zeros((1, 2, 3)), np.cumsum(steps, axis=0)])
-    commanded = np.diff(_linear(grid, time, path), axis=0) / interval
+    commanded = np.diff(positions_at(grid, time, path), axis=0) / interval
     before = np.clip(np.searchsorted(time, grid + 1e-9, side="right") - 1, 0, len(time) - 1)
     after = np.minimum(before + 1, len(time) - 1)
     return Samples(
         keypoints=keypoints_at(grid, time, samples.keypoints, interval),
-        gripper_pose=_linear(grid, time, samples.gripper_pose),
+        gripper_pose=positions_at(grid, time, samples.gripper_pose),
         gripper_command=np.concatenate([commanded, np.zeros((1, 2, 3))]),
         hold=samples.hold[before] & samples.hold[after],
     )
-
-
-def _linear(grid, time, values: Float[np.ndarray, "T Q 3"]) -> Float[np.ndarray, "G Q 3"]:
-    columns = [np.interp(grid, time, column) for column in values.reshape(len(values), -1).T]
-    return np.stack(columns, axis=1).reshape(len(grid), *values.shape[1:])
 
 
 def keypoints_at(

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
 
 from cablejax.diagnose.actuation import with_arms
-from cablejax.diagnose.belief import Calibration, excess
+from cablejax.diagnose.belief import Calibration, excess, excused
 from cablejax.diagnose.case import FINE_LINKS, FIT_LINKS, STATED, Case
 from cablejax.diagnose.conclude import Conclusion
 from cablejax.diagnose.diagnosis import CableDiagnosis, Gap, NextMotion
@@ -103,7 +103,7 @@ def diagnose(
         **fields,
         where=localise(repaired, case.to_log(reference), case.noise.std),
         next_motion=following,
-        caveats=(*_contradictions(rounds), *caveats, *none_kept),
+        caveats=(*_contradictions(rounds), *_excused(evidence, conclusion, calibration), *caveats, *none_kept),
         log=repaired,
         nominal=case.to_log(reference),
         explained=None if conclusion.verdict == "none" else case.to_log(after),
@@ -215,6 +215,19 @@ def _contradictions(rounds: Rounds | None) -> tuple[str, ...]:
         f"the rest, as recordings of one set-up would be in fewer than {UNLIKELY:g} of all cases. Check what was "
         "changed between them, and diagnose each one alone.",
     )
+
+
+def _excused(evidence: Evidence, conclusion: Conclusion, calibration: Calibration) -> Iterator[str]:
+    """What the verdict "none" leaves out, if anything."""
+    if conclusion.verdict != "none":
+        return
+    for episode, gap, own in excused(conclusion.best, evidence, calibration):
+        yield (
+            f"Episode {episode} says nothing for or against a gap: the nominal simulator misses the cable by "
+            f"{1e3 * gap:.2g} mm per coordinate there, and {100 * STATED:g} % more or less stiffness or friction makes "
+            f"{1e3 * own:.2g} mm, as where a cable snaps over or is wrung by a wrong pose. Look at it, or record a "
+            "calmer motion."
+        )
 
 
 def _caveats(

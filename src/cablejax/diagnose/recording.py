@@ -13,6 +13,7 @@ from cablejax.diagnose.log_faults import command_fault, tool_offset, without_fro
 from cablejax.diagnose.noise import still
 from cablejax.gaplog import validate
 from cablejax.log_geometry import cable_fault
+from cablejax.poses import without_misreadings
 from cablejax.types import GapLog
 
 # Samples are padded to a multiple of this, so that logs of nearly equal length share one compiled program.
@@ -99,7 +100,8 @@ def prepare(log: GapLog) -> Recording:
         caveats.append(f"Left out for having fewer than {_SHORTEST} samples: episode {', '.join(map(str, short))}.")
     episodes, intervals = [], []
     for e in range(n_episodes):
-        time, samples = _samples(log, e, observed=e not in short)
+        time, samples, misread = _samples(log, e, observed=e not in short)
+        caveats += [f"In episode {e} {clause}: taken to be on a straight line." for clause in misread]
         interval = usual_interval(time) if len(time) > 1 else _ANY_INTERVAL
         if not is_even(time, interval):
             caveats.append(
@@ -147,19 +149,21 @@ def prepare(log: GapLog) -> Recording:
     return dataclasses.replace(recording, caveats=tuple(caveats))
 
 
-def _samples(log: GapLog, e: int, *, observed: bool) -> tuple[Float[np.ndarray, "T"], Samples]:
-    """Times and samples of one episode as recorded, angles continuous in time and along the cable."""
+def _samples(log: GapLog, e: int, *, observed: bool) -> tuple[Float[np.ndarray, "T"], Samples, list[str]]:
+    """Times and samples of one episode, angles continuous in time and along the cable, and what was taken out."""
     n = int(log.episode_length[e])
-    points, pose = log.keypoints[e, :n].astype(float), log.gripper_pose[e, :n].astype(float)
+    points = log.keypoints[e, :n].astype(float)
+    pose, misread = without_misreadings(log.time[e, :n], log.gripper_pose[e, :n].astype(float))
     pose[..., 2] = np.unwrap(pose[..., 2], axis=0)
     pose[:, 1, 2] += _whole_turns(points, pose)
     derived = log.meta.get("commands_from_poses", False)  # an importer made them of the poses: no commands are known
-    return log.time[e, :n], Samples(
+    samples = Samples(
         keypoints=points if observed else np.full_like(points, np.nan),
         gripper_pose=pose,
         gripper_command=np.zeros_like(pose) if derived else np.nan_to_num(log.gripper_command[e, :n].astype(float)),
         hold=np.zeros(n, bool) if log.hold is None else log.hold[e, :n],
     )
+    return log.time[e, :n], samples, misread
 
 
 def _whole_turns(points: Float[np.ndarray, "T N 2"], pose: Float[np.ndarray, "T 2 3"]) -> float:

@@ -14,7 +14,7 @@ from cablejax.cable import Cable
 from cablejax.cable_length import require_fitting_length
 from cablejax.gaplog import Episode, gap_log_from_episodes
 from cablejax.log_geometry import setup_fault
-from cablejax.recordings.poses import twists
+from cablejax.poses import twists
 from cablejax.recordings.take import Take, typical_spacing
 from cablejax.types import GapLog
 
@@ -54,7 +54,8 @@ def gap_log_from_takes(takes: Sequence[Take], nominal: Nominal, *, source: str, 
     """One gap log with an episode per take, with the labels of the takes as further fields of `meta`.
 
     `gripper_command` is the twist that carries each measured pose to the next, since the recording holds no commands;
-    `meta` says so by `commands_from_poses`. `hold` is left out: nobody said when the grippers rested.
+    `meta` says so by `commands_from_poses`, and by `arclength_measured` whether the arc lengths were measured too.
+    `hold` is left out: nobody said when the grippers rested.
 
     Args:
         takes: as `prepare` yields them.
@@ -110,6 +111,7 @@ def gap_log_from_takes(takes: Sequence[Take], nominal: Nominal, *, source: str, 
         extra={
             "take": [take.name for take in takes],
             "commands_from_poses": True,
+            "arclength_measured": nominal.arclength is None,
             **({"guessed": list(nominal.guessed)} if nominal.guessed else {}),
             **{name: [take.labels[name] for take in takes] for name in names},
         },

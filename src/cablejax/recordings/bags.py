@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 
 from cablejax.limits import require
+from cablejax.poses import poses_at
 from cablejax.recordings.assemble import gap_log_from_takes
 from cablejax.recordings.layout import Fields, Layout, read_layout
-from cablejax.recordings.poses import poses_at
 from cablejax.recordings.prepare import prepare
 from cablejax.recordings.table import unit_quaternions
 from cablejax.recordings.take import Take

@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from cablejax.recordings.poses import rotated
+from cablejax.poses import rotated
 from cablejax.recordings.take import Take
 
 Axis = Literal["x", "y", "z", "-x", "-y", "-z"]

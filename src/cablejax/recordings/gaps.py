@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from cablejax.arrays import stretches
-from cablejax.recordings.poses import poses_at, positions_at
+from cablejax.poses import poses_at, positions_at, without_misreadings
 from cablejax.recordings.take import Take, median_step
 
 FILLED = 0.05
@@ -54,7 +54,8 @@ def cut_at_gaps(takes: tuple[Take, ...], on_grippers: tuple[int, ...] | None) ->
     parts: list[Take] = []
     reports: list[str] = []
     for take in takes:
-        take, filled = _filled(_without_repeats(take, reports), on_grippers)
+        take = _without_misreadings(_without_repeats(take, reports), reports)
+        take, filled = _filled(take, on_grippers)
         if filled:
             reports.append(
                 f"Take {take.name}: {filled} samples without one of the grippers were filled in by straight lines: "
@@ -155,6 +156,14 @@ def _without_repeats(take: Take, reports: list[str]) -> Take:
     if pose is None:
         return dataclasses.replace(take, keypoints=points)
     return dataclasses.replace(take, time=take.time[keep], keypoints=take.keypoints[keep], gripper_pose=pose[keep])
+
+
+def _without_misreadings(take: Take, reports: list[str]) -> Take:
+    if take.gripper_pose is None:
+        return take
+    pose, clauses = without_misreadings(take.time, take.gripper_pose)
+    reports += [f"Take {take.name}: {clause}: taken to be on a straight line." for clause in clauses]
+    return dataclasses.replace(take, gripper_pose=pose)
 
 
 def _filled(take: Take, on_grippers: tuple[int, ...] | None) -> tuple[Take, int]:

@@ -9,10 +9,10 @@ import numpy as np
 from scipy.cluster.hierarchy import fcluster, linkage
 
 from cablejax.cable_length import STRETCH
+from cablejax.poses import poses_from_markers, twists
 from cablejax.recordings.frames import Frame, into_frame, onto_table, require_along_x, require_hanging, require_rigid
 from cablejax.recordings.gaps import cut_at_gaps
 from cablejax.recordings.marker_order import restore_order
-from cablejax.recordings.poses import poses_from_markers
 from cablejax.recordings.take import Take, spacing, typical_spacing
 from cablejax.recordings.units import METRES, metres_per, recognised_unit, require_metres
 
@@ -28,8 +28,9 @@ of the cable's length, are not both on it."""
 _FEW_STRETCHED = 0.2
 """Up to this part of the takes is left out where the cable stretches; more have a cause that needs another mend."""
 
-_JERK = 50.0, 10.0
-"""Acceleration of a gripper [m/s^2] that is reported, and how many times its median in the take: noise has some."""
+_JERK, _UNUSUAL = (("m/s^2", 50.0, 0.0), ("rad/s^2", 300.0, 0.3)), 10.0
+"""Accelerations of a gripper that are reported, what they have to change a step by [m, rad], and how many times their
+median in the take they are: noise has some."""
 _TOLD = 5
 _NAMED = 20
 
@@ -68,7 +69,8 @@ def prepare(takes: tuple[Take, ...], setup: Setup) -> tuple[tuple[Take, ...], li
 
     In this order: the unit of length; the frame; heights above a table, which are left out; branches and the order of
     the markers; whether it is one cable; jumps of single markers; takes in which the cable stretches, which are left
-    out; gaps in time; orientations against markers; jerks of the grippers, which are kept.
+    out; poses that jump away and back, and gaps in time; orientations against markers; jerks of the grippers, which are
+    kept.
 
     Returns:
         The takes in metres, z up, right-handed, without gaps, each with gripper poses; and a sentence on each repair.
@@ -225,14 +227,18 @@ def _jerks(takes: tuple[Take, ...]) -> list[str]:
     found: list[tuple[float, str]] = []
     for take in takes:
         assert take.gripper_pose is not None
-        place = take.gripper_pose[..., : take.keypoints.shape[2]]
-        step = np.diff(take.time)[:, None, None]
-        change = np.linalg.norm(np.diff(np.diff(place, axis=0) / step, axis=0), axis=-1) / step[1:, :, 0]
-        least, ratio = _JERK
-        for gripper, most in enumerate(change.max(axis=0, initial=0.0)):
-            if most > max(least, ratio * np.median(change[:, gripper])):
-                when = take.time[int(np.argmax(change[:, gripper])) + 1]
-                found.append((most, f"gripper {gripper} of take {take.name} by {most:.0f} m/s^2 at {when:.3g} s"))
+        twist = twists(take.time, take.gripper_pose)[:-1]
+        step = np.diff(take.time)[1:, None, None]
+        change = np.diff(twist, axis=0) / step
+        for (unit, least, jump), part in zip(_JERK, np.split(change, [take.keypoints.shape[2]], axis=-1), strict=True):
+            size = np.linalg.norm(part, axis=-1)
+            usual = np.median(size, axis=0) if len(size) else np.zeros(2)
+            size[size * step[..., 0] ** 2 < jump] = 0.0
+            for gripper, most in enumerate(size.max(axis=0, initial=0.0)):
+                if most > max(least, _UNUSUAL * usual[gripper]):
+                    when = take.time[int(np.argmax(size[:, gripper])) + 1]
+                    words = f"gripper {gripper} of take {take.name} by {most:.0f} {unit} at {when:.3g} s"
+                    found.append((most / least, words))
     if not found:
         return []
     strongest = [text for _, text in sorted(found, reverse=True)]

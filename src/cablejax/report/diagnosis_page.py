@@ -192,7 +192,9 @@ def _cards(diagnosis: CableDiagnosis) -> Iterator[tuple[str, str, str]]:
         places = [p for p in (effect_place(e) for e in diagnosis.effects) if p]
         yield ("Place of the cause", listed(places) if places else "no single place", _peak(diagnosis))
     elif diagnosis.verdict == "none":
-        yield ("Cause", "none needed", f"a gap of {millimetres(_least(diagnosis))} would have shown")
+        least = _least(diagnosis)
+        where = " in a calm motion" if gap.before_rmse_mm > least else ""
+        yield ("Cause", "none needed", f"a gap of {millimetres(least)} would have shown{where}")
     else:
         best = max(diagnosis.ranking, key=lambda r: (r.probability or 0.0, r.held_out_shrinkage), default=None)
         note = "" if best is None else f"closest: {effect_title(best.name)}, which is not enough"

@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 
 from cablejax.diagnose.clock import keypoints_at
-from cablejax.recordings.poses import poses_at
+from cablejax.poses import poses_at, without_misreadings
 from cablejax.types import GapLog
 
 # Clocks whose intervals are all within this share of the usual one are taken as they are.
@@ -15,15 +15,23 @@ _EVEN = 0.05
 
 
 def on_one_clock(log: GapLog) -> tuple[GapLog, tuple[str, ...]]:
-    """The log, sampled again where its clocks are uneven or differ between episodes, and a sentence if it was.
+    """The log, sampled again where its clocks are uneven or differ between episodes, and sentences on what was changed.
+
+    Readings of the grippers that jump away and back are taken out before.
 
     Positions and tangents of the grippers are linear between samples, as under the twists that were held; keypoints are
     those of `diagnose.clock.keypoints_at`.
     """
+    pose, repairs = log.gripper_pose.copy(), []
+    for e, n in enumerate(log.episode_length):
+        pose[e, :n], clauses = without_misreadings(log.time[e, :n], pose[e, :n])
+        repairs += [f"In episode {e} {clause}: taken to be on a straight line." for clause in clauses]
+    if repairs:
+        log = dataclasses.replace(log, gripper_pose=pose)
     steps = np.concatenate([np.diff(time[:n]) for time, n in zip(log.time, log.episode_length, strict=True)])
     interval = float(np.median(steps)) if len(steps) else 0.0
     if not len(steps) or np.abs(steps - interval).max() <= _EVEN * interval:
-        return log, ()
+        return log, tuple(repairs)
     length = [
         int(np.floor((time[n - 1] - time[0]) / interval + 1e-6)) + 1
         for time, n in zip(log.time, log.episode_length, strict=True)
@@ -51,4 +59,4 @@ def on_one_clock(log: GapLog) -> tuple[GapLog, tuple[str, ...]]:
         f"Samples are {1e3 * steps.min():.3g} to {1e3 * steps.max():.3g} ms apart: sampled again every "
         f"{1e3 * interval:.3g} ms."
     )
-    return dataclasses.replace(log, episode_length=np.array(length, np.int32), **whole), (report,)
+    return dataclasses.replace(log, episode_length=np.array(length, np.int32), **whole), (*repairs, report)

@@ -13,7 +13,7 @@ from cablejax.cable_length import TOLERANCE, require_fitting_length
 from cablejax.diagnose.log_faults import steadied
 from cablejax.diagnose.noise import noise_floor
 from cablejax.log_geometry import cable_fault
-from cablejax.recordings.poses import rotated
+from cablejax.poses import rotated
 from cablejax.simulate.rod.clamps import frames_along
 from cablejax.types import GapLog
 

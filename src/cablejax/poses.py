@@ -9,12 +9,21 @@ nothing of how the cable was twisted by the gripper: a model has to fit the roll
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 from jaxtyping import Float
 
 from cablejax.arrays import quaternion_product, wrapped
 
 _X = np.array([1.0, 0.0, 0.0])
+
+_JUMPS = ("m", 0.02, 50.0), ("rad", 0.3, 100.0)
+"""Least step [m, rad] and acceleration [m/s^2, rad/s^2] of a reading that jumps: no arm moves like that."""
+_UNUSUAL = 8.0
+"""A jump is so many times the usual step besides: all poses may be noisy."""
+_AWAY, _BACK = 5, 0.25
+"""A misreading is back after so many samples at most, within this part of the jump."""
 
 
 def poses_from_markers(
@@ -107,6 +116,58 @@ def positions_at(
     """Positions at other times, on straight lines between those known; the first and the last are held."""
     columns = [np.interp(at, time, column) for column in position.reshape(len(position), -1).T]
     return np.stack(columns, axis=1).reshape(len(at), *position.shape[1:])
+
+
+def without_misreadings(
+    time: Float[np.ndarray, " T"], pose: Float[np.ndarray, "T Q P"]
+) -> tuple[Float[np.ndarray, "T Q P"], list[str]]:
+    """Poses in which readings that jump away and back are replaced by what lies between their neighbours.
+
+    A tracker that takes one axis for another does that, or an angle that was read half a turn off. A simulated cable
+    would be wrung by it, and what it does then says nothing of the real one.
+
+    Args:
+        time: of the samples, increasing [s].
+        pose: (x, y, theta) or (x, y, z, qw, qx, qy, qz) [m, rad, 1], NaN = not known.
+
+    Returns:
+        The poses, and a clause on each gripper that had such readings.
+    """
+    result, clauses = pose.copy(), []
+    for gripper, own in enumerate(pose.swapaxes(0, 1)):
+        wrong, farthest = np.zeros(len(time), bool), []
+        for (unit, least, acceleration), apart in zip(_JUMPS, (_distance, _turn), strict=True):
+            step = apart(own[1:], own[:-1])
+            usual = float(np.nanmedian(step)) if np.isfinite(step).any() else 0.0
+            # there and back: the velocity changes by twice its size
+            impossible = acceleration * np.diff(time) ** 2 / 2
+            jumps = np.flatnonzero(step > np.maximum(max(least, _UNUSUAL * usual), impossible))
+            after = 0
+            for first, last in itertools.pairwise(jumps):
+                back = apart(own[last + 1], own[first])
+                if first >= after and last - first <= _AWAY and back < _BACK * min(step[first], step[last]):
+                    wrong[first + 1 : last + 1], after = True, last + 1
+                    farthest.append((step[first], f"{step[first]:.2g} {unit} at {time[first + 1]:.4g} s"))
+        if farthest:
+            result[wrong, gripper] = poses_at(time[wrong], time[~wrong], own[~wrong])
+            clauses.append(
+                f"the pose of gripper {gripper} jumps away and back in {int(wrong.sum())} of {len(time)} samples, for "
+                f"example by {max(farthest)[1]}"
+            )
+    return result, clauses
+
+
+def _distance(pose: Float[np.ndarray, "*B P"], other: Float[np.ndarray, "*B P"]) -> Float[np.ndarray, "*B"]:
+    """Between the places of two poses [m]."""
+    axes = 2 if pose.shape[-1] == 3 else 3
+    return np.linalg.norm((pose - other)[..., :axes], axis=-1)
+
+
+def _turn(pose: Float[np.ndarray, "*B P"], other: Float[np.ndarray, "*B P"]) -> Float[np.ndarray, "*B"]:
+    """Smallest angle from one pose to another [rad]."""
+    if pose.shape[-1] == 3:
+        return np.abs(wrapped((pose - other)[..., 2]))
+    return 2 * np.arccos(np.clip(np.abs((pose * other)[..., 3:].sum(axis=-1)), 0.0, 1.0))
 
 
 def twists(time: Float[np.ndarray, " T"], pose: Float[np.ndarray, "T Q P"]) -> Float[np.ndarray, "T Q V"]:
