@@ -1,5 +1,6 @@
 """The letters as targets, and targets from files."""
 
+import dataclasses
 import json
 
 import numpy as np
@@ -68,9 +69,15 @@ def test_target_from_a_file(tmp_path, suffix):
 
 
 @pytest.mark.parametrize("shape", ["U", "S", "Z"])
-def test_length_of_a_polyline_is_not_mistaken_for_another_cable(shape):
-    # 13 points cut the corners of a bent cable; that alone must not refuse it.
-    target_from_keypoints("mine", make_target(shape, CABLE).keypoints, CABLE)
+@pytest.mark.parametrize("points", [2, 3, 4, 5, 13])
+def test_length_of_a_polyline_is_not_mistaken_for_another_cable(shape, points):
+    # few points cut the corners of a bent cable; that alone must not refuse it, and another length is seen all the same
+    cable = dataclasses.replace(CABLE, n_keypoints=points)
+    letter = make_target(shape, cable)
+    letter.require_length(cable.length, "the model")
+    target_from_keypoints("mine", letter.keypoints, cable)
+    with pytest.raises(ValueError, match=r"the model is of a cable of 0.6 m: take one of the other's length"):
+        dataclasses.replace(letter, keypoints=6 * letter.keypoints).require_length(0.6 * cable.length, "the model")
 
 
 def test_unfit_targets_are_refused():

@@ -252,8 +252,16 @@ def test_settings_that_cannot_be_are_refused(settings, message):
 def test_wrong_targets_are_refused():
     with pytest.raises(ValueError, match=r"expected \(7, 2\) as the cable"):
         ShapeCableEnv(dataclasses.replace(CONFIG, targets=(make_target("U"),)))
+    longer = dataclasses.replace(CONFIG.cable, length=2 * CONFIG.cable.length)
+    with pytest.raises(ValueError, match="and the environment is of a cable of 1 m"):
+        ShapeCableEnv(CONFIG).reset(options={"target": make_target("U", longer)})
     with pytest.raises(ValueError, match="no shape 'X'"):
         ShapeCableEnv(CONFIG).reset(options={"target": "X"})
+
+
+def test_a_number_of_environments_is_a_count():
+    with pytest.raises(ValueError, match="num_envs is True, expected a whole number"):
+        ShapeCableVectorEnv(True, CONFIG)
 
 
 @pytest.mark.parametrize("make", [ShapeCableEnv, functools.partial(ShapeCableVectorEnv, 2)])
@@ -283,6 +291,8 @@ def test_there_is_no_step_before_a_reset(make):
         ({"discretisation": Cable()}, r"discretisation is a Cable, expected a Discretisation: Discretisation\(cable\)"),
         ({"randomisation": {"friction": 0.1}}, "randomisation is a dict"),
         ({"targets": "USZ"}, "targets is 'USZ', expected a tuple"),
+        ({"targets": 3}, "targets is 3, expected a tuple"),
+        ({"effects": 3}, "Effects are 3, expected a list"),
     ],
 )
 def test_settings_of_another_type_are_refused(settings, message):

@@ -184,11 +184,7 @@ def make_controller(model: Model, target: Target, *, method: Method, solver: Sol
             f"Target {target.name!r} has {len(target.keypoints)} keypoints, expected {model.config.n_keypoints} as "
             f"the model {model.name}: use a model that was trained on this cable."
         )
-    if not 0.8 <= target.length / model.config.length <= 1.1:
-        raise ValueError(
-            f"Target {target.name!r} is {target.length:.3g} m along its keypoints, and the model {model.name} is "
-            f"of a cable of {model.config.length:.3g} m: take a target, or a model, of the other's length."
-        )
+    target.require_length(model.config.length, f"the model {model.name}")
     learner = STATIC if model.config.prior == "static" else LearnerConfig()
     config = MPCConfig.for_length(
         model.config.length,

@@ -26,13 +26,21 @@ START_LEAN = 0.01
 LENGTH_TOLERANCE = 0.03
 """How far the length of a target's polyline may be from the cable's length, relative to it."""
 
+_OTHER = 0.8, 1.1
+"""A target's length over the cable's, between which a controller can bring the cable near it."""
+_COARSE = 13.0, 1.3
+"""Arcs through few keypoints are shorter than a cable with inflections, and longer than one that bends less towards its
+ends: by these over the fourth power of the number of spaces."""
+
 STRETCH = 0.2
 """How much farther neighbouring keypoints may be apart than the cable between them is long, relative to it."""
 
 
 def length_through(points: Float[np.ndarray, "N 2"]) -> float:
-    """Length [m] of a cable through three or more points, from arcs: an edge that turns by a is the chord of one."""
+    """Length [m] of a cable through two or more points, from arcs: an edge that turns by a is the chord of one."""
     edges = np.diff(points, axis=0)
+    if len(edges) < 2:
+        return float(np.hypot(*edges.T).sum())
     turn = np.abs(np.gradient(np.unwrap(np.arctan2(edges[:, 1], edges[:, 0]))))
     return float((np.hypot(*edges.T) / np.sinc(turn / 2 / np.pi)).sum())
 
@@ -55,6 +63,21 @@ class Target:
     def length(self) -> float:
         """Of the cable through the keypoints [m]."""
         return length_through(self.keypoints)
+
+    def require_length(self, length: float, whose: str) -> None:
+        """Raises ValueError unless a cable of this length [m] comes near the target; `whose` it is, in words."""
+        (low, high), (shorter, longer) = _OTHER, _coarse(len(self.keypoints))
+        if not low - shorter <= self.length / length <= high + longer:
+            raise ValueError(
+                f"Target {self.name!r} is {self.length:.3g} m along its keypoints, and {whose} is of a cable of "
+                f"{length:.3g} m: take one of the other's length."
+            )
+
+
+def _coarse(n_keypoints: int) -> tuple[float, float]:
+    """Parts of a cable's length by which `length_through` may be too short and too long."""
+    shorter, longer = _COARSE
+    return shorter / (n_keypoints - 1) ** 4, longer / (n_keypoints - 1) ** 4
 
 
 @dataclasses.dataclass(frozen=True)
@@ -140,7 +163,8 @@ def target_from_keypoints(
     edges = np.diff(points, axis=0)
     angle = np.unwrap(np.arctan2(edges[:, 1], edges[:, 0]))
     length = length_through(points)
-    if abs(length - config.length) > LENGTH_TOLERANCE * config.length:
+    shorter, longer = _coarse(len(points))
+    if not -LENGTH_TOLERANCE - shorter <= length / config.length - 1 <= LENGTH_TOLERANCE + longer:
         raise ValueError(
             f"Target {name!r} is {length:.4g} m long, but the cable is {config.length:.4g} m long and does not "
             "stretch: scale the target, or use a model of a cable of that length."
@@ -153,8 +177,10 @@ def target_from_keypoints(
             "length."
         )
     if gripper_pose is None:
-        ends = [1.5 * angle[0] - 0.5 * angle[1], 1.5 * angle[-1] - 0.5 * angle[-2]]
-        pose = np.concatenate([points[[0, -1]], np.array(ends)[:, None]], axis=1)
+        # two points show no bend
+        bend = np.diff(angle) if len(angle) > 1 else np.zeros(1)
+        ends = angle[[0, -1]] + 0.5 * bend[[0, -1]] * [-1, 1]
+        pose = np.concatenate([points[[0, -1]], ends[:, None]], axis=1)
     else:
         pose = _real(gripper_pose, f"Target {name!r} has a gripper_pose")
         if pose.shape != (2, 3) or not np.isfinite(pose).all():

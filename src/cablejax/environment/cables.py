@@ -64,7 +64,7 @@ class ShapeCableConfig:
                     f"ShapeCableConfig.{name} is a {type(getattr(self, name)).__name__}, expected a {kind.__name__}"
                     f"{': Discretisation(cable)' if kind is Discretisation else ''}."
                 )
-        if isinstance(self.targets, str):
+        if isinstance(self.targets, str) or not isinstance(self.targets, Sequence):
             raise ValueError(f"ShapeCableConfig.targets is {self.targets!r}, expected a tuple: ({self.targets!r},).")
         if not self.targets:
             raise ValueError("ShapeCableConfig.targets is empty, expected one target or more.")
@@ -107,7 +107,7 @@ class ShapeCableConfig:
         Raises:
             ValueError: an effect is unknown, out of bounds, or a lag.
         """
-        if isinstance(effects, str):
+        if isinstance(effects, str) or not isinstance(effects, Sequence):
             raise ValueError(f"Effects are {effects!r}, expected a list of them: [{effects!r}].")
         given = tuple(parse_effect(effect) if isinstance(effect, str) else effect for effect in effects)
         recipe = DatasetConfig(
@@ -121,7 +121,7 @@ class ShapeCableConfig:
         return recipe
 
     def target(self, target: Shape | Target) -> Target:
-        """A target of this cable; raises ValueError for another letter or number of keypoints, or one out of reach."""
+        """A target of this cable; raises ValueError for another letter, length or number of points, or far away."""
         made = make_target(target, self.cable) if isinstance(target, str) else target
         if not isinstance(made, Target):
             raise ValueError(f"The target is a {type(made).__name__}, expected a letter or a `Target`.")
@@ -135,7 +135,14 @@ class ShapeCableConfig:
                 f"Target {made.name!r} has a coordinate that is not finite or beyond {self.room:g} m, where no gripper "
                 "of this environment comes."
             )
+        made.require_length(self.cable.length, "the environment")
         return made
+
+
+def require_config(config: object) -> None:
+    """Raises ValueError for what is no configuration of the environments."""
+    if not isinstance(config, ShapeCableConfig):
+        raise ValueError(f"config is of type {type(config).__name__}, expected a ShapeCableConfig.")
 
 
 class Cables:

@@ -21,7 +21,7 @@ from cablejax.dataset.drawing import cable_params, draw_parameters
 from cablejax.dataset.schema import Randomisation
 from cablejax.effects.camera import in_camera_frame, without_camera
 from cablejax.effects.physics import Physics, may_touch, without_obstacle
-from cablejax.environment.cables import ShapeCableConfig
+from cablejax.environment.cables import ShapeCableConfig, require_config
 from cablejax.simulate.chain.engine import ChainEngine
 from cablejax.simulate.mjx import mjx
 from cablejax.simulate.mjx_engine import MjxEngine
@@ -59,6 +59,7 @@ class MjxShapeCable:
     """
 
     def __init__(self, config: ShapeCableConfig = ShapeCableConfig()):
+        require_config(config)
         self.config = config
         self._engine, self._recipe = ChainEngine(config.discretisation), config.recipe(config.effects)
         nominal = draw_parameters(

@@ -14,7 +14,8 @@ from gymnasium.utils.seeding import np_random
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
-from cablejax.environment.cables import Cables, ShapeCableConfig
+from cablejax.environment.cables import Cables, ShapeCableConfig, require_config
+from cablejax.limits import require
 
 OBSERVED = ("keypoints", "gripper_pose", "target")
 """Parts of an observation."""
@@ -22,8 +23,7 @@ OBSERVED = ("keypoints", "gripper_pose", "target")
 
 def _spaces(config: ShapeCableConfig, render_mode: str | None) -> tuple[gymnasium.spaces.Dict, gymnasium.spaces.Box]:
     """What is observed, and the actions; raises ValueError for a render mode, or what is no configuration."""
-    if not isinstance(config, ShapeCableConfig):
-        raise ValueError(f"config is of type {type(config).__name__}, expected a ShapeCableConfig.")
+    require_config(config)
     if render_mode is not None:
         raise ValueError(f"render_mode is {render_mode!r}, expected None: look at runs with `cablejax.report`.")
     points, length = config.cable.n_keypoints, config.cable.length
@@ -103,8 +103,7 @@ class ShapeCableVectorEnv(gymnasium.vector.VectorEnv):
     """Gymnasium's description of the environment."""
 
     def __init__(self, num_envs: int, config: ShapeCableConfig = ShapeCableConfig(), render_mode: str | None = None):
-        if not isinstance(num_envs, int | np.integer) or num_envs < 1:
-            raise ValueError(f"num_envs is {num_envs!r}, expected a whole number above 0.")
+        require(num_envs, "count", "num_envs")
         self.num_envs, self.config, self.render_mode = num_envs, config, render_mode
         self.single_observation_space, self.single_action_space = _spaces(config, render_mode)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
