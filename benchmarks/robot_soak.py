@@ -25,7 +25,8 @@ import numpy as np
 
 from cablejax.cable import Cable, Discretisation
 from cablejax.control.command_limits import CommandLimits
-from cablejax.control.link import Controller, RobotLink
+from cablejax.control.controller import Controller
+from cablejax.control.link import RobotLink
 from cablejax.control.link_state import LinkConfig
 from cablejax.control.targets import Shape, make_target, straight_start
 from cablejax.effects.given import parse_effect

@@ -75,6 +75,34 @@ def test_it_rests_then_commands_at_every_interval():
     assert (episode.gripper_command[:10] == 0).all() and (episode.gripper_command[10:, 0, 0] == 0.01).all()
 
 
+@pytest.mark.parametrize("silent", [True, False])
+def test_a_clock_that_is_set_back_does_not_stop_the_watchdog(silent):
+    """A computer's clock may be; a twist ends all the same."""
+    robot = Harness()
+    robot.run(3.0)
+    for k in range(1, 60):
+        now = 3.0 + 0.1 * k
+        reply = robot.step(now - 50.0, *(() if silent else (robot.seen(now),)))
+        robot.pose = robot.pose + 0.1 * reply.twist
+    if silent:
+        assert reply.status == Status.PAUSED and not reply.twist.any()
+        assert robot.pose[0, 0] - START[0, 0] == pytest.approx(0.025, abs=0.01)
+    else:
+        assert reply.status == Status.SHAPING and robot.pose[0, 0] - START[0, 0] == pytest.approx(0.079, abs=0.01)
+
+
+@pytest.mark.parametrize("spoil", ["keypoints", "gripper_pose"])
+def test_ends_that_are_exchanged_on_the_way_pause_the_robot(spoil):
+    robot = Harness()
+    robot.run(2.0)
+    for k in range(1, 30):
+        now = 2.0 + 0.1 * k
+        seen = robot.seen(now)
+        reply = robot.step(now, dataclasses.replace(seen, **{spoil: getattr(seen, spoil)[::-1]}))
+        assert "The first keypoint is at gripper 1 and the last at gripper 0" in reply.refused[0]
+    assert reply.status == Status.PAUSED and not reply.twist.any()
+
+
 def test_the_watchdog_holds_the_grippers_and_begins_from_rest():
     robot = Harness()
     robot.run(2.0)

@@ -23,7 +23,7 @@ from cablejax.types import History, Measurement
 class StraightDrive:
     """Both grippers straight to where the target's ends are held, as fast as the bound allows, and there they stay.
 
-    It has no model and no feedback of the shape: a `control.link.Controller` that reads the keypoints' total turn only.
+    It has no model and no feedback of the shape: a `Controller` that reads the keypoints' total turn only.
 
     Attributes:
         target: wanted keypoints [m], shape [N, 2].

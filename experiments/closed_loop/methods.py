@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 
-from cablejax.control.link import Controller
+from cablejax.control.controller import Controller
 from cablejax.control.shaping import Model, make_controller
 from cablejax.control.targets import Target
 from cablejax.residual import PAPER, STATIC, LearnerConfig

@@ -53,6 +53,19 @@ def out_of_reach(
     return _distance(keypoints, grippers) > REACH * length + 1.0
 
 
+def ends_exchanged(keypoints: Float[np.ndarray, "N D"], grippers: Float[np.ndarray, "Q D"], length: float) -> bool:
+    """Whether each end of the cable is seen at the other end's gripper: the tracker, or the arms, changed their order.
+
+    Args:
+        keypoints: [m], NaN = not observed.
+        grippers: positions [m], NaN = not known.
+        length: of the cable [m].
+    """
+    ends = keypoints[[0, -1]]
+    own, other = (float(np.linalg.norm(ends - at, axis=-1).max()) for at in (grippers, grippers[::-1]))
+    return own > AT_GRIPPER * length and other < AT_GRIPPER * length
+
+
 def _distance(keypoints: np.ndarray, grippers: np.ndarray) -> np.ndarray:
     """Of each keypoint from the nearer gripper [m]; 0 where either was not observed."""
     offset = np.asarray(keypoints, float)[..., :, None, :] - np.asarray(grippers, float)[..., None, :, :]

@@ -9,19 +9,19 @@ import dataclasses
 import math
 import time
 from collections.abc import Sequence
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
-from jaxtyping import Array, Float
 
 from cablejax.arrays import filled
+from cablejax.control.controller import Controller, check_interval, resting
 from cablejax.control.link_state import Instant, LinkConfig, LinkState, Reply, Status
 from cablejax.control.run import shape_error_cm
 from cablejax.control.targets import Target
 from cablejax.limits import LIMITS, require
-from cablejax.log_geometry import MOVED, out_of_reach
+from cablejax.log_geometry import MOVED, ends_exchanged, out_of_reach
 from cablejax.simulate.table_plant import Observation
-from cablejax.types import History, Measurement
+from cablejax.types import Measurement
 
 RESTING_CM = 0.01
 """Range of the error [cm] over `patience` commands in which nothing more is expected to happen."""
@@ -29,48 +29,9 @@ EARLY = 0.02
 """By how much an observation may come before a control instant and count as its own, in intervals."""
 DRIFT = 1e-3
 """Rate at which the two clocks may drift apart; a delay that grows more slowly is not noticed."""
-_HISTORY = 6
-"""Samples of a first history where the controller does not say."""
-
-
-class Controller(Protocol):
-    """A controller: an object with two pure functions. `mpc.MPC` is one.
-
-    For `control.batched` it is a pytree with a leaf `target` as well, the keypoints [N, 2] that it steers towards. One
-    that was made for a certain time between commands has it as `interval` [s], and one that wants another number of
-    samples in its first history than 6 has that as `history_length`.
-    """
-
-    def init(self, history: History) -> Any:
-        """The state before the first step, a pytree, from the last observations of the cable."""
-        ...
-
-    def step(self, state: Any, measurement: Measurement) -> tuple[Any, Float[Array | np.ndarray, "Q 3"], Any]:
-        """The next state, the twist to hold until then [m/s, rad/s], and a report.
-
-        Of the report the fields `residual_share`, `radius` and `action` are recorded, where it has them.
-        """
-        ...
 
 
 _STILL = np.zeros((2, 3))
-
-
-def check_interval(controller: Controller, interval: float) -> None:
-    """Raises ValueError if a controller was made for another time between commands [s]."""
-    own = getattr(controller, "interval", interval)
-    if not math.isclose(own, interval):
-        raise ValueError(
-            f"The controller plans for {own:g} s between commands, and the interval of this run is {interval:g} s. "
-            "Give both the same: `interval` of the run, and of `MPCConfig.objective`."
-        )
-
-
-def resting(controller: Controller, keypoints: Array | np.ndarray, gripper_pose: Array | np.ndarray) -> History:
-    """The history with which a controller begins, of a cable that rests at these keypoints [N, 2]."""
-    samples = getattr(controller, "history_length", _HISTORY)
-    repeated = keypoints.__array_namespace__().repeat(keypoints[None], samples, axis=0)
-    return History(keypoints=repeated, gripper_pose=gripper_pose)  # pyright: ignore[reportArgumentType]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -116,14 +77,17 @@ class RobotLink:
 
         Args:
             state: from the last step.
-            now: the link's clock, which only goes forwards [s].
+            now: the link's clock [s]. Where it is set back, time goes on from where it was: a watchdog has to run out.
             observations: that have come since the last step, in the order in which they came.
 
         Raises:
             ValueError: the controller refuses its first history; a controller that fails later stops the run.
         """
-        settled = state.commands == 0
-        state = dataclasses.replace(state, now=now, offset=state.offset + DRIFT * max(now - state.now, 0.0))
+        settled, behind = state.commands == 0, max(state.behind, state.now - now)
+        now = now + behind
+        state = dataclasses.replace(
+            state, now=now, behind=behind, offset=state.offset + DRIFT * max(now - state.now, 0.0)
+        )
         accepted, refused = [], []
         for observation in observations:
             try:
@@ -157,7 +121,7 @@ class RobotLink:
     def _waiting(self, state: LinkState, reason: str) -> LinkState:
         """Holds until there are usable observations; before the first command as if there had been none."""
         if state.commands == 0:  # the first time stamps may have been wrong
-            return dataclasses.replace(self.init(), now=state.now, reason=reason)
+            return dataclasses.replace(self.init(), now=state.now, behind=state.behind, reason=reason)
         return self._held(state, Status.PAUSED, reason)
 
     def _held(self, state: LinkState, status: Status, reason: str) -> LinkState:
@@ -189,6 +153,11 @@ class RobotLink:
         # an absent pose can only be judged by the last one
         near = pose if np.isfinite(pose).all() or last is None else last.gripper_pose
         keypoints[~(np.abs(keypoints) <= largest)] = np.nan
+        if ends_exchanged(keypoints, near[:, :2], self.target.length):
+            raise ValueError(
+                "The first keypoint is at gripper 1 and the last at gripper 0: exchange the grippers, or reverse the "
+                "order of the keypoints."
+            )
         keypoints[out_of_reach(keypoints, near[:, :2], self.target.length)] = np.nan
         cleaned = dataclasses.replace(observation, keypoints=keypoints, gripper_pose=pose, time=stamp)
         unchanged = state.unchanged

@@ -129,6 +129,7 @@ class LinkState:
         unchanged: keypoints as last seen to change, and the poses at that time.
         offset: smallest difference of the link's clock and a time stamp [s]: that of the quickest message.
         now: the link's clock at the last step [s].
+        behind: how far that clock was set back so far, in all [s].
         due: time stamp of the next control instant, or of the end of a rest [s].
         command: twist in force, since, and until when.
         commands: given so far.
@@ -146,3 +147,4 @@ class LinkState:
     command: tuple[np.ndarray, float, float]
     commands: int
     errors: tuple[float, ...]
+    behind: float = 0.0

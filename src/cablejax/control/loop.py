@@ -7,7 +7,8 @@ from typing import Protocol
 import numpy as np
 from jaxtyping import Float
 
-from cablejax.control.link import Controller, RobotLink
+from cablejax.control.controller import Controller
+from cablejax.control.link import RobotLink
 from cablejax.control.link_state import LinkConfig, Status
 from cablejax.control.run import ClosedLoopRun
 from cablejax.control.run_log import RunLog

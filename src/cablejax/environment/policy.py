@@ -7,7 +7,8 @@ from collections.abc import Callable, Mapping
 import numpy as np
 from jaxtyping import Float
 
-from cablejax.control.link import Controller, RobotLink
+from cablejax.control.controller import Controller
+from cablejax.control.link import RobotLink
 from cablejax.control.link_state import LinkConfig
 from cablejax.control.targets import Target
 from cablejax.environment.cables import ShapeCableConfig

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import collections
 import math
 from typing import Any
 
@@ -13,15 +14,20 @@ from cablejax.simulate.table_plant import Observation
 RATE_HZ = 20.0
 """Rate at which the watchdog looks and the command is published."""
 
+_UNKNOWN = np.full((2, 3), np.nan)
+_KEPT = 100
+"""Messages of the grippers that are looked through, some ticks even at the rate of an arm's controller."""
+
 
 def make_node(run: RobotRun, *, name: str = "cablejax", frame: str = "world") -> Any:
     """A node for `rclpy.spin`, which raises SystemExit when the run has ended; then call `run.finish()`.
 
     Subscribes to `~/keypoints` (geometry_msgs/PoseArray, the positions of all N in their order, NaN where not
     observed) and `~/grippers` (geometry_msgs/PoseArray, both poses; the rotation about z is theta). Each message with
-    keypoints is one observation, with its own time stamp and the newest poses, if they are less than one tick older or
-    newer. Publishes `~/gripper_0/twist` and `~/gripper_1/twist` (geometry_msgs/TwistStamped) at 20 Hz, zero when a
-    command has ended, and `~/status` (std_msgs/String).
+    keypoints is one observation, with its own time stamp and the poses nearest to it, if they are less than one tick
+    older or newer; it waits a tick for them, since topics come in any order. Publishes `~/gripper_0/twist` and
+    `~/gripper_1/twist` (geometry_msgs/TwistStamped) at 20 Hz, zero when a command has ended, and `~/status`
+    (std_msgs/String).
 
     Args:
         run: the run.
@@ -37,8 +43,9 @@ def make_node(run: RobotRun, *, name: str = "cablejax", frame: str = "world") ->
 
         def __init__(self):
             super().__init__(name)
-            self._waiting: list[Observation] = []
-            self._grippers: tuple[float, np.ndarray] = (-math.inf, np.full((2, 3), np.nan))
+            self._new: list[tuple[float, np.ndarray]] = []
+            self._waiting: list[tuple[float, np.ndarray]] = []
+            self._grippers = collections.deque([(-math.inf, _UNKNOWN)], maxlen=_KEPT)
             self._twists = [self.create_publisher(TwistStamped, f"~/gripper_{q}/twist", 1) for q in (0, 1)]
             self._status = self.create_publisher(String, "~/status", 1)
             self.create_subscription(PoseArray, "~/keypoints", self.on_keypoints, 10)
@@ -47,16 +54,25 @@ def make_node(run: RobotRun, *, name: str = "cablejax", frame: str = "world") ->
 
         def on_grippers(self, message: Any) -> None:
             if self._in_frame(message):
-                self._grippers = _stamp(message), np.array([_planar(pose) for pose in message.poses])
+                self._grippers.append((_stamp(message), np.array([_planar(pose) for pose in message.poses])))
 
         def on_keypoints(self, message: Any) -> None:
-            if not self._in_frame(message):
-                return
-            measured, pose = self._grippers
-            if abs(_stamp(message) - measured) > 1.0 / RATE_HZ:
-                pose = np.full((2, 3), np.nan)
-            keypoints = np.array([[pose.position.x, pose.position.y] for pose in message.poses])
-            self._waiting.append(Observation(keypoints, pose, _stamp(message)))
+            if self._in_frame(message):
+                keypoints = np.array([[pose.position.x, pose.position.y] for pose in message.poses])
+                self._new.append((_stamp(message), keypoints))
+
+        def _observations(self) -> list[Observation]:
+            """In their order, up to the first that came in this tick and whose poses may still come."""
+            ready, stamps = self._waiting, [stamp for stamp, _ in self._grippers]
+            while self._new and self._new[0][0] in stamps:
+                ready.append(self._new.pop(0))
+            self._waiting, self._new = self._new, []
+            observations = []
+            for stamp, keypoints in ready:
+                measured, pose = min(self._grippers, key=lambda one: abs(one[0] - stamp))
+                near = abs(measured - stamp) <= 1.0 / RATE_HZ
+                observations.append(Observation(keypoints, pose if near else _UNKNOWN, stamp))
+            return observations
 
         def _in_frame(self, message: Any) -> bool:
             if message.header.frame_id != frame:
@@ -65,8 +81,7 @@ def make_node(run: RobotRun, *, name: str = "cablejax", frame: str = "world") ->
 
         def on_timer(self) -> None:
             now = self.get_clock().now()
-            reply = run.exchange(1e-9 * now.nanoseconds, self._waiting)
-            self._waiting = []
+            reply = run.exchange(1e-9 * now.nanoseconds, self._observations())
             for publisher, (vx, vy, omega) in zip(self._twists, reply.twist.tolist(), strict=True):
                 message = TwistStamped()
                 message.header.stamp, message.header.frame_id = now.to_msg(), frame

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from cablejax.control.link_state import Reply
+from cablejax.control.link_state import Reply, Status
 from cablejax.gaplog_check import GapLogError
 from cablejax.limits import require
 from cablejax.robot.session import RobotRun
@@ -154,7 +154,7 @@ def reply_line(reply: Reply, refused: Sequence[str] = ()) -> bytes:
         "since": reply.since if math.isfinite(reply.since) else None,
         "until": reply.until if math.isfinite(reply.until) else None,
         "status": reply.status,
-        "reason": reply.reason,
+        "reason": reply.reason or (refused[-1] if refused and reply.status == Status.WAITING else ""),
         "refused": [*refused, *reply.refused],
     }
     return json.dumps(message, allow_nan=False).encode() + b"\n"
