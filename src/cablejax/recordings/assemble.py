@@ -50,7 +50,9 @@ class Nominal:
         return self.bending_stiffness / self.linear_density
 
 
-def gap_log_from_takes(takes: Sequence[Take], nominal: Nominal, *, source: str, repairs: Sequence[str] = ()) -> GapLog:
+def gap_log_from_takes(
+    takes: Sequence[Take], nominal: Nominal, *, source: str, repairs: Sequence[str] = (), measured: bool = False
+) -> GapLog:
     """One gap log with an episode per take, with the labels of the takes as further fields of `meta`.
 
     `gripper_command` is the twist that carries each measured pose to the next, since the recording holds no commands;
@@ -62,6 +64,7 @@ def gap_log_from_takes(takes: Sequence[Take], nominal: Nominal, *, source: str, 
         nominal: what is believed of the cable.
         source: where the recording is from, and which values are guesses.
         repairs: sentences on the changes, for the log's source.
+        measured: whether the poses are not those of two markers, and so show how the grippers roll: `roll_observed`.
 
     Raises:
         ValueError: takes or values that make no gap log, a cable shorter than its keypoints are apart, or grippers that
@@ -112,6 +115,7 @@ def gap_log_from_takes(takes: Sequence[Take], nominal: Nominal, *, source: str, 
             "take": [take.name for take in takes],
             "commands_from_poses": True,
             "arclength_measured": nominal.arclength is None,
+            "roll_observed": measured,
             **({"guessed": list(nominal.guessed)} if nominal.guessed else {}),
             **{name: [take.labels[name] for take in takes] for name in names},
         },

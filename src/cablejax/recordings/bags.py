@@ -50,7 +50,8 @@ def import_mcap(path: str | os.PathLike[str], layout: str | os.PathLike[str]) ->
     how = read_layout(layout, "topics")
     take = _take(pathlib.Path(path), how)
     takes, repairs = prepare((take,), how.setup)
-    return gap_log_from_takes(takes, how.nominal, source=how.source, repairs=repairs), repairs
+    measured = take.gripper_pose is not None
+    return gap_log_from_takes(takes, how.nominal, source=how.source, repairs=repairs, measured=measured), repairs
 
 
 def _take(path: pathlib.Path, how: Layout) -> Take:

@@ -59,9 +59,11 @@ def import_csv(path: str | os.PathLike[str], layout: str | os.PathLike[str]) -> 
     """
     how = read_layout(layout, "columns")
     takes, unread = _takes(pathlib.Path(path), how)
+    measured = all(take.gripper_pose is not None for take in takes)
     takes, repairs = prepare(takes, how.setup)
     repairs = [*unread, *repairs]
-    return gap_log_from_takes(takes, how.nominal, source=how.source, repairs=repairs), repairs
+    log = gap_log_from_takes(takes, how.nominal, source=how.source, repairs=repairs, measured=measured)
+    return log, repairs
 
 
 def _takes(path: pathlib.Path, how: Layout) -> tuple[tuple[Take, ...], list[str]]:

@@ -162,8 +162,10 @@ def _caveats(windows, left_out, found) -> tuple[str, ...]:
         "The noise is what markers scatter by from one sample to the next. A marker that sits off the cable's "
         "centreline, or off its stated place along the cable, is off all the time; that error is not part of the "
         "noise, but of the constant offsets, as is what the simulator has wrong at rest.",
-        "Roll of the grippers about the cable is not observed; it is taken as the least turn from their mean "
-        "direction.",
+        "Roll of the grippers about the cable is that of the log's quaternions."
+        if windows.rolls
+        else "Roll of the grippers about the cable is not observed, or the log's `roll_observed` does not say that it "
+        "is; it is taken as the least turn from their mean direction.",
         "All effects that were tried are fitted together. The gap after is what the named ones leave, with their "
         "values from that fit, on recordings that no fit has seen.",
     ]

@@ -14,18 +14,16 @@ from cablejax.diagnose.log_faults import steadied
 from cablejax.diagnose.noise import noise_floor
 from cablejax.log_geometry import cable_fault
 from cablejax.poses import rotated
-from cablejax.simulate.rod.clamps import frames_along
+from cablejax.spatial.grips import clamps, frames_of, held_keypoints, rolls_observed
 from cablejax.types import GapLog
 
 WINDOW = 5.0
 """Length of a window [s]: so far ahead the simulator predicts from two observations."""
 _SHORTEST = 1.0
-# A keypoint whose place in the gripper's frame stays within this is held by it [m].
-_HELD = 0.003
 # Part of a window that must be recorded for it to be a whole one.
 _WHOLE = 0.8
-# Clamps that scatter by less than this from one sample to the next [m], and their tangents, stay as they were measured.
-_STEADY, _STEADY_TANGENT = np.full(3, 1e-4), np.full(3, 5e-3)
+# Clamps that scatter by less than this from one sample to the next [m] stay as they were measured.
+_STEADY = np.full(3, 1e-4)
 # Weight in fits of a window in which the grippers are further apart than the cable is long.
 _TORN = 0.01
 
@@ -50,6 +48,7 @@ class Windows:
         n_keypoints: N.
         first_clamp: arc length of the first clamp, from the first keypoint [m].
         gravity: as the log states it [m/s^2].
+        rolls: whether the grippers' roll about the cable is that of the log; else it is not known, see `frames_along`.
         trust: weight of each window in fits, shape [W]; None = 1.
         smoothed: what was taken from the measured paths of the clamps so that they are smooth, root mean square of a
             coordinate [m].
@@ -71,6 +70,7 @@ class Windows:
     n_keypoints: int
     first_clamp: float = 0.0
     gravity: tuple[float, ...] = (0.0, 0.0, -GRAVITY)
+    rolls: bool = False
     trust: Float[np.ndarray, "W"] | None = None
     smoothed: float = 0.0
     left_out: tuple[str, ...] = ()
@@ -140,21 +140,14 @@ def windows_of(log: GapLog) -> Windows:
     pose = np.asarray(log.gripper_pose, float)
     valid = np.arange(points.shape[1]) < log.episode_length[:, None]
     tangent = rotated(pose[..., 3:], np.array([1.0, 0.0, 0.0]))
-    held = _held(points, pose[..., :3], tangent, valid)
     s = np.asarray(log.meta["keypoint_arclength_m"], float)
-    clamp = _clamps(points, pose[..., :3], tangent, s, held)
+    held = held_keypoints(points, pose[..., :3], tangent, valid, s)
+    clamp = clamps(points, pose[..., :3], tangent, s, held)
     clamp, taken = steadied(clamp, np.zeros_like(clamp), log.episode_length, least=_STEADY)
-    tangent, turned = steadied(tangent, np.zeros_like(tangent), log.episode_length, least=_STEADY_TANGENT)
-    if turned.any():
-        tangent = tangent / np.linalg.norm(tangent, axis=-1, keepdims=True)
+    frames = frames_of(log, tangent, valid)
     first = s[held[0] - 1] if held[0] else s[0]
     last = s[len(s) - held[1]] if held[1] else s[-1]
     free = slice(held[0], len(s) - held[1])
-    flat = tangent[valid]
-    frames = np.zeros((*tangent.shape[:3], 3, 3))
-    for q in range(2):
-        frames[valid, q] = frames_along(flat[:, q])
-
     recording = labels(log, "recording")
     groups = {r: i for i, r in enumerate(dict.fromkeys(recording))}
     files, splits = labels(log, "file", "take"), labels(log, "split", default="")
@@ -192,6 +185,7 @@ def windows_of(log: GapLog) -> Windows:
         n_keypoints=len(s),
         first_clamp=float(first - s[0]),
         gravity=tuple(log.meta["gravity_m_per_s2"]),
+        rolls=rolls_observed(log),
         smoothed=float(np.sqrt((taken**2).mean(axis=-1)).max()),
         left_out=tuple(f"file {files[e]} from {begin * interval:.3g} s" for e, begin in left_out),
     )
@@ -234,22 +228,6 @@ def labels(log: GapLog, *names: str, default: str | None = None) -> list[str]:
     return [str(e) if default is None else default for e in range(len(log.keypoints))]
 
 
-def _held(points, position, tangent, valid):
-    """Numbers of keypoints that move with either gripper."""
-    count = []
-    for q, order in enumerate((range(points.shape[2]), range(points.shape[2] - 1, -1, -1))):
-        n = 0
-        for k in order:
-            offset = (points[:, :, k] - position[:, :, q])[valid]
-            along = np.sum(offset * tangent[:, :, q][valid], axis=-1)
-            across = np.linalg.norm(offset - along[:, None] * tangent[:, :, q][valid], axis=-1)
-            if np.nanpercentile(across, 95) > _HELD:
-                break
-            n += 1
-        count.append(n)
-    return tuple(count)
-
-
 def _sample_interval(log: GapLog) -> float:
     """The one sample interval [s] of a log that has passed all checks, see `windows_of`."""
     if log.keypoints.shape[-1] != 3 or log.gripper_pose.shape[2] != 2:
@@ -273,15 +251,3 @@ def _sample_interval(log: GapLog) -> float:
     if fault := cable_fault(log):
         raise ValueError(fault)
     return interval
-
-
-def _clamps(points, position, tangent, s, held):
-    """Points at which the cable leaves either gripper [m], shape [E, T, 2, 3]."""
-    reach = np.array([s[held[0] - 1] - s[0] if held[0] else 0.0, s[-1] - s[len(s) - held[1]] if held[1] else 0.0])
-    # the second gripper's tangent points along the cable too: towards its end
-    clamp = position + np.array([1.0, -1.0])[:, None] * reach[:, None] * tangent
-    # the innermost held keypoint is where the cable leaves the gripper: it is observed, so it is what moves the clamp
-    for q, k in enumerate((held[0] - 1, len(s) - held[1])):
-        if held[q]:
-            clamp[:, :, q] = np.where(np.isfinite(points[:, :, k]), points[:, :, k], clamp[:, :, q])
-    return clamp

@@ -1,0 +1,60 @@
+"""How the grippers of a log in space hold the cable."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+import spatial_cases as cases
+from cablejax.arrays import quaternion_product
+from cablejax.poses import rotated
+from cablejax.spatial.grips import frames_of, held_keypoints
+from cablejax.spatial.windows import windows_of
+
+SAMPLES = 400
+
+
+def bending(spacing: float, leaves_at: float, count: int = 9):
+    """Keypoints next to two grippers that stand still, of a cable that bends up and down where it leaves them."""
+    random = np.random.default_rng(0)
+    s = spacing * np.arange(count)
+    curvature = 5.0 * random.standard_normal((SAMPLES, 1))
+    half = np.stack(
+        [
+            np.tile(s, (SAMPLES, 1)),
+            np.zeros((SAMPLES, count)),
+            0.5 * curvature * np.clip(s - leaves_at, 0.0, None) ** 2,
+        ],
+        axis=-1,
+    )
+    other = half[:, ::-1] * [-1.0, 1.0, 1.0] + [1.0, 0.0, 0.0]
+    points = np.concatenate([half, other], axis=1) + 3e-4 * random.standard_normal((SAMPLES, 2 * count, 3))
+    position = np.tile(np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]]), (SAMPLES, 1, 1))
+    tangent = np.tile(np.array([1.0, 0.0, 0.0]), (SAMPLES, 2, 1))
+    marks = np.concatenate([s, 1.0 - s[::-1]])
+    return points[None], position[None], tangent[None], np.ones((1, SAMPLES), bool), marks
+
+
+@pytest.mark.parametrize(("spacing", "held"), [(0.1, 1), (0.025, 1), (0.025, 2), (0.03, 2), (0.02, 3)])
+def test_keypoints_that_bend_with_the_cable_are_not_held(spacing, held):
+    """However near to a gripper: a cable is moved across by less than 3 mm there whether or not it is held."""
+    assert held_keypoints(*bending(spacing, (held - 1) * spacing)) == (held, held)
+
+
+def test_roll_is_that_of_the_log_where_it_was_observed():
+    log = cases.recording()
+    valid = np.arange(log.keypoints.shape[1]) < log.episode_length[:, None]
+    roll = 0.8 * np.sin(np.linspace(0.0, 3.0, log.keypoints.shape[1]))[None, :, None, None]
+    about = np.concatenate([np.cos(roll / 2), np.sin(roll / 2), 0.0 * roll, 0.0 * roll], axis=-1)
+    pose = log.gripper_pose.astype(float)
+    pose[..., 3:] = quaternion_product(pose[..., 3:], np.broadcast_to(about, pose[..., 3:].shape))
+    rolled = dataclasses.replace(log, gripper_pose=pose.astype(np.float32))
+    told = dataclasses.replace(rolled, meta={**log.meta, "roll_observed": True})
+    tangent = rotated(pose[..., 3:], np.array([1.0, 0.0, 0.0]))
+    unknown, known = frames_of(rolled, tangent, valid)[valid], frames_of(told, tangent, valid)[valid]
+    np.testing.assert_allclose(unknown, frames_of(log, tangent, valid)[valid], atol=1e-6)
+    for axis in range(3):
+        np.testing.assert_allclose(known[..., axis, :], rotated(pose[..., 3:], np.eye(3)[axis])[valid], atol=1e-5)
+    turned = np.arccos(np.clip((known[..., 1, :] * unknown[..., 1, :]).sum(axis=-1), -1.0, 1.0))
+    assert np.ptp(turned) > 0.5
+    assert windows_of(told).rolls and not windows_of(rolled).rolls
