@@ -11,8 +11,7 @@ from cablejax.simulate.rod.clamps import frames_along
 from cablejax.types import GapLog
 
 # A keypoint whose place in the gripper's frame stays within the first [m] may be held by it. It is, unless it moves
-# across by the second part of what the next one does, if the cable left the gripper at its end: so near to a gripper
-# free ones hardly move.
+# across with the next one, by the second part or more of what bending does: so near to a gripper free ones hardly move.
 _HELD, _BENT = 0.003, 0.5
 # Axes of the grippers that scatter by less than this from one sample to the next stay as they were measured.
 _STEADY = np.full(3, 5e-3)
@@ -62,7 +61,8 @@ def held_keypoints(
             both = np.isfinite(across[:, n : n + 2]).all(axis=(1, 2))
             own, following = across[both, n], across[both, n + 1]
             share = np.sum(own * following) / max(np.sum(following**2), 1e-30)
-            if n and share > _BENT * (distance[n] / distance[n + 1]) ** 2:
+            # as of a cable that leaves the gripper at the keypoint before
+            if n and share > _BENT * ((distance[n] - distance[n - 1]) / (distance[n + 1] - distance[n - 1])) ** 2:
                 break
             n += 1
         count.append(n)
