@@ -5,10 +5,11 @@ import os
 import subprocess
 import sys
 
+import numba
 import pytest
 
 from cablejax import compiled_programs
-from cablejax.compiled_programs import FOLDER, keep_compiled_programs
+from cablejax.compiled_programs import FOLDER, keep_compiled_programs, kept_on_disk
 
 PROGRAM = """
 import json
@@ -78,3 +79,16 @@ def test_a_folder_that_cannot_be_made_is_no_error(undecided, tmp_path):
     (tmp_path / "file").write_text("")
     undecided.setenv(FOLDER, str(tmp_path / "file"))
     assert keep_compiled_programs() is None and "JAX_COMPILATION_CACHE_DIR" not in os.environ
+
+
+def test_numba_compiles_where_nothing_can_be_kept(monkeypatch):
+    """As for a service without a home, and a package that another user installed."""
+
+    def njit(*function, cache=False, **options):
+        if cache is True:
+            raise RuntimeError("cannot cache function 'double': no locator available")
+        return numba_njit(*function, **options)
+
+    numba_njit = numba.njit
+    monkeypatch.setattr(numba, "njit", njit)
+    assert kept_on_disk(lambda x: 2 * x)(21) == 42

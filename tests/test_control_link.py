@@ -91,15 +91,27 @@ def test_a_clock_that_is_set_back_does_not_stop_the_watchdog(silent):
         assert reply.status == Status.SHAPING and robot.pose[0, 0] - START[0, 0] == pytest.approx(0.079, abs=0.01)
 
 
-@pytest.mark.parametrize("spoil", ["keypoints", "gripper_pose"])
+def test_a_clock_that_is_set_forward_is_told():
+    robot = Harness()
+    robot.run(3.0)
+    for k in range(1, 20):
+        reply = robot.step(63.0 + 0.1 * k, robot.seen(3.0 + 0.1 * k))
+    assert reply.status == Status.PAUSED and not reply.twist.any()
+    assert re.match(r"Observations are (59\.9|60)\S* s old: late, or a clock was set\?", reply.reason)
+
+
+@pytest.mark.parametrize("spoil", [["keypoints"], ["gripper_pose"], ["keypoints", "gripper_pose"]])
 def test_ends_that_are_exchanged_on_the_way_pause_the_robot(spoil):
     robot = Harness()
     robot.run(2.0)
     for k in range(1, 30):
         now = 2.0 + 0.1 * k
         seen = robot.seen(now)
-        reply = robot.step(now, dataclasses.replace(seen, **{spoil: getattr(seen, spoil)[::-1]}))
-        assert "The first keypoint is at gripper 1 and the last at gripper 0" in reply.refused[0]
+        reply = robot.step(now, dataclasses.replace(seen, **{name: getattr(seen, name)[::-1] for name in spoil}))
+        told = (
+            "Each gripper is where the other one was" if "gripper_pose" in spoil else "first keypoint is at gripper 1"
+        )
+        assert told in reply.refused[0]
     assert reply.status == Status.PAUSED and not reply.twist.any()
 
 

@@ -259,6 +259,15 @@ def test_wrong_targets_are_refused():
         ShapeCableEnv(CONFIG).reset(options={"target": "X"})
 
 
+@pytest.mark.parametrize("effect", ["gripper_slip:gripper=1,time_s=0,distance_m=-0.1"])
+def test_a_cable_that_an_effect_tears_out_at_rest_is_refused(effect):
+    """No action would be executed, since each is refused that leaves it torn."""
+    with pytest.raises(ValueError, match=r"At rest this cable is torn \d+ mm out of a gripper before its first action"):
+        ShapeCableEnv(CONFIG).reset(seed=0, options={"effects": [effect]})
+    with pytest.raises(ValueError, match="torn"):
+        ShapeCableEnv(dataclasses.replace(CONFIG, effects=(effect,)))
+
+
 def test_a_number_of_environments_is_a_count():
     with pytest.raises(ValueError, match="num_envs is True, expected a whole number"):
         ShapeCableVectorEnv(True, CONFIG)

@@ -139,6 +139,16 @@ NOISE = [
 ]
 
 
+def test_a_log_of_a_robot_that_came_late_is_plain_json(tmp_path):
+    run = run_to(tmp_path / "log.npz")
+    run.exchange(0.0)
+    for k in range(30):
+        run.exchange(0.1 + 0.1 * k, [Harness().seen(0.1 * k)])
+    events = read_gap_log(run.finish()).meta["robot_link"]["events"]
+    assert events[0] == [None, "waiting", ""] and events[1][:2] == [0.0, "resting"]
+    json.dumps(events, allow_nan=False)
+
+
 def test_a_robot_that_waits_for_what_was_refused_says_so(tmp_path):
     robot = Client(run_to(tmp_path / "log.npz"), simulated_clock=True)
     robot.say(NOISE[2], now(0.0))

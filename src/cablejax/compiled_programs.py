@@ -1,4 +1,4 @@
-"""Where JAX keeps compiled programs between runs of the command line."""
+"""Where compiled programs are kept between runs: those of JAX on the command line, and those of numba."""
 
 from __future__ import annotations
 
@@ -7,6 +7,8 @@ import os
 import pathlib
 import platform
 import sys
+from collections.abc import Callable
+from typing import Any
 
 FOLDER = "CABLEJAX_CACHE"
 """Environment variable that names the folder for compiled programs; empty = keep none."""
@@ -44,6 +46,19 @@ def keep_compiled_programs() -> pathlib.Path | None:
     os.environ.setdefault("JAX_COMPILATION_CACHE_MAX_SIZE", str(LARGEST_BYTES))
     os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", str(LEAST_SECONDS))
     return folder
+
+
+def kept_on_disk(function: Callable[..., Any]) -> Any:
+    """The function compiled by numba, which keeps it next to its file or in the user's cache folder.
+
+    Where neither can be written to, as for a service without a home, it is compiled in each process.
+    """
+    import numba
+
+    try:
+        return numba.njit(nogil=True, cache=True)(function)
+    except RuntimeError:  # numba finds no folder
+        return numba.njit(nogil=True)(function)
 
 
 def _user_cache() -> pathlib.Path:

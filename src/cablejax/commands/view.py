@@ -100,4 +100,4 @@ def sheet_of(kind: Kind, path: pathlib.Path) -> Sheet:
         return made_sheets.verdict_sheet(read_verdict(path), str(path))
     from cablejax.commands.export import read_log
 
-    return log_sheet.log_sheet(read_log(kind, path), str(path))
+    return log_sheet.log_sheet(read_log(kind, path), str(path), "" if kind == "log" else kind)

@@ -153,6 +153,8 @@ class RobotLink:
         # an absent pose can only be judged by the last one
         near = pose if np.isfinite(pose).all() or last is None else last.gripper_pose
         keypoints[~(np.abs(keypoints) <= largest)] = np.nan
+        if last is not None and ends_exchanged(pose[:, :2], last.gripper_pose[:, :2], self.target.length):
+            raise ValueError("Each gripper is where the other one was: their order has changed. Start the run again.")
         if ends_exchanged(keypoints, near[:, :2], self.target.length):
             raise ValueError(
                 "The first keypoint is at gripper 1 and the last at gripper 0: exchange the grippers, or reverse the "
@@ -174,6 +176,8 @@ class RobotLink:
                 f"The newest time stamp is {last.time - stamp:.3g} s before an earlier one: was the clock set back?"
             )
             state = dataclasses.replace(state, reason=behind)
+        elif newer and state.status == Status.PAUSED and (old := offset - state.offset) > self.config.watchdog:
+            state = dataclasses.replace(state, reason=f"Observations are {old:.3g} s old: late, or a clock was set?")
         if newer and share >= self.config.min_seen and np.isfinite(pose).all():
             state = dataclasses.replace(state, newest=cleaned)
         elif state.newest is None:

@@ -166,11 +166,6 @@ class Cables:
         pose = straight_start(config.cable)
         self._start = self._engine.initial_state(pose[None])
         self._shown = self._at_rest(*self._resting())
-        if not np.isfinite(self._shown).all():
-            raise ValueError(
-                f"The simulation of this cable by {config.discretisation.n_links} links diverges at rest. Check "
-                "the cable's numbers and their units, or take a discretisation with fewer links (n_links)."
-            )
 
         def rows(leaf):
             return np.repeat(np.asarray(leaf), size, axis=0)
@@ -183,8 +178,20 @@ class Cables:
         self.names = [""] * size
 
     def _at_rest(self, physics: Physics, start: CableState) -> Float[np.ndarray, "N 2"]:
-        """Keypoints of one cable before its first action [m]."""
-        rest = self._engine.rollout(without_camera(physics), start, np.zeros((1, 1, 2, 3)))[1]
+        """Keypoints of one cable before its first action [m]; raises ValueError if that is none to begin with."""
+        after, rest = self._engine.rollout(without_camera(physics), start, np.zeros((1, 1, 2, 3)), self.config.interval)
+        if not np.isfinite(rest.keypoints).all():
+            raise ValueError(
+                f"The simulation of this cable by {self.config.discretisation.n_links} links diverges at rest. Check "
+                "the numbers of the cable and of its effects, and their units, or take a discretisation with fewer "
+                "links (n_links)."
+            )
+        if (opening := float(np.max(self._engine.opening(after)))) > self.config.widest:
+            raise ValueError(
+                f"At rest this cable is torn {1e3 * opening:.0f} mm out of a gripper before its first action, by an "
+                f"effect or by too few links: expected at most {1e3 * self.config.widest:.3g} mm. No action would be "
+                "executed."
+            )
         return np.asarray(rest.keypoints[0, 0])
 
     def _resting(self):
@@ -208,13 +215,16 @@ class Cables:
             effects: by default the configuration's.
 
         Raises:
-            ValueError: the target does not fit the cable, or see `ShapeCableConfig.recipe`.
+            ValueError: the target does not fit the cable, the effects tear it out of a gripper at rest, or see
+                `ShapeCableConfig.recipe`.
         """
         config = self.config
         drawn = self._targets[random.integers(len(self._targets))]
         chosen = drawn if target is None else config.target(target)
         recipe = self._recipe if effects is None else config.recipe(effects)
         physics = cable_params(recipe, draw_parameters(recipe, random))
+        batch = jax.tree.map(lambda leaf: np.asarray(leaf, np.float32)[None], physics)
+        shown = self._shown if effects is None else self._at_rest(batch, self._start)
 
         def put(whole, leaf):
             whole[row] = leaf
@@ -228,8 +238,6 @@ class Cables:
         self.gripper_pose[row] = np.asarray(self._start.gripper_pose[0])
         self.taken[row] = 0
         only = np.arange(len(self.taken)) == row
-        batch = jax.tree.map(lambda leaf: np.asarray(leaf, np.float32)[None], physics)
-        shown = self._shown if effects is None else self._at_rest(batch, self._start)
         self._observe(only, np.broadcast_to(shown, self.keypoints.shape), [random] * len(only))
 
     def step(

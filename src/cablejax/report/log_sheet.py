@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import shlex
 from collections.abc import Sequence
 
 import matplotlib
@@ -25,8 +26,8 @@ _LISTED = 40
 _MOMENTS = 5
 
 
-def log_sheet(log: GapLog, name: str) -> Sheet:
-    """What a gap log holds."""
+def log_sheet(log: GapLog, name: str, exported: str = "") -> Sheet:
+    """What a gap log holds; `exported` is the format of one that has to be imported first, as the command has it."""
     episodes, targets, planar = episodes_of(log), targets_of(log), log.keypoints.shape[-1] == 2
     cable = dataclasses.replace(config_of_log(log).cable, diameter=log.meta["cable"]["diameter_m"])
     seconds = sum(float(episode.time[-1] - episode.time[0]) for episode in episodes)
@@ -34,6 +35,7 @@ def log_sheet(log: GapLog, name: str) -> Sheet:
     steps = np.concatenate([np.diff(episode.time) for episode in episodes])
     points = np.concatenate([episode.keypoints for episode in episodes])
     noise, how = _noise(log)
+    file = shlex.quote(name)
     # a few episodes, evenly over the log
     chosen = np.unique(np.linspace(0, len(episodes) - 1, min(len(episodes), _SHOWN)).round().astype(int)).tolist()
     which = "" if len(chosen) == len(episodes) else f" {len(chosen)} of {len(episodes)} episodes."
@@ -56,8 +58,9 @@ def log_sheet(log: GapLog, name: str) -> Sheet:
         ],
         tables=[_table(episodes, targets)],
         following=(
-            f"Find out what the simulator lacks: cablejax diagnose {name}",
-            f"Look at it in motion: cablejax export rerun {name} --out run.rrd",
+            *([f"Make a gap log of it again: cablejax import {exported} {file} --out log.npz"] if exported else []),
+            f"Find out what the simulator lacks: cablejax diagnose {'log.npz' if exported else file}",
+            f"Look at it in motion: cablejax export rerun {'log.npz' if exported else file} --out run.rrd",
         ),
         facts={
             **cable_facts(cable),

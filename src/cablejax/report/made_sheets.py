@@ -7,6 +7,7 @@ import csv
 import math
 import os
 import pathlib
+import shlex
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -57,10 +58,10 @@ def store_sheet(store: Store, name: str) -> Sheet:
         figures=[] if block is None else [(_store_figure(block), _STORE_CAPTION)],
         tables=[] if block is None else [_store_ranges(block)],
         following=(
-            f"Train a model on it: cablejax train --data {name}"
+            f"Train a model on it: cablejax train --data {shlex.quote(name)}"
             if info.complete
             else "Run the same command again: it goes on where it stopped.",
-            f"Write its cable to a file: cablejax cable --from {name} --out cable.toml",
+            f"Write its cable to a file: cablejax cable --from {shlex.quote(name)} --out cable.toml",
         ),
         facts={
             **cable_facts(config.cable),
@@ -108,7 +109,7 @@ def weights_sheet(source: str | os.PathLike[str], name: str) -> Sheet:
         ],
         figures=[(letters_figure(cable), LETTERS_CAPTION) if curve is None else (curve, _TRAINING_CAPTION)],
         tables=[("Data sets", ("data set", "motions", "held out", "digest"), data)] if data else [],
-        following=(f"Shape a cable with it: cablejax shape --weights {source}",),
+        following=(f"Shape a cable with it: cablejax shape --weights {shlex.quote(str(source))}",),
         facts={
             **cable_facts(cable),
             **{key: str(value) for key, value in info.items() if isinstance(value, (str, int, float))},
@@ -149,7 +150,7 @@ def verdict_sheet(diagnosis: Diagnosis, name: str) -> Sheet:
             for effect, meaning, estimates in named_effects(diagnosis)
         ],
         following=(
-            *([f"Add what is named to the simulator: cablejax simulate --with {name}"] if addable else []),
+            *([f"Add what is named to the simulator: cablejax simulate --with {shlex.quote(name)}"] if addable else []),
             *diagnosis.caveats,
         ),
         facts={

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import os
 import pathlib
+import shlex
 from collections.abc import Mapping, Sequence
 
 import matplotlib
@@ -65,7 +66,7 @@ def cable_sheet(cable: Cable, name: str) -> Sheet:
         cards=cable_cards(cable),
         figures=[(letters_figure(cable), LETTERS_CAPTION)],
         following=(
-            f"Simulate motions of it: cablejax simulate --cable {name}",
+            f"Simulate motions of it: cablejax simulate --cable {shlex.quote(name)}",
             "Train a model on them: cablejax train --data runs/data.zarr --out runs/train",
             "Shape it with that model: cablejax shape --target Z --weights runs/train",
         ),

@@ -73,7 +73,7 @@ def serve(
 
 def _converse(run: RobotRun, connection: socket.socket, simulated_clock: bool) -> None:
     """Answers until the robot leaves or the run ends."""
-    waiting, refused, sent = [], [], None
+    waiting, refused, sent = [], [], (-math.inf, Status.WAITING)
     for lines in _lines(connection):
         clocks = [] if simulated_clock else [time.monotonic()]
         for line in lines:

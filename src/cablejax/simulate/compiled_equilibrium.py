@@ -5,8 +5,9 @@ Both are in one file: numba keeps compiled code on disk until the file itself ch
 
 from __future__ import annotations
 
-import numba
 import numpy as np
+
+from cablejax.compiled_programs import kept_on_disk
 
 _MAX_ITERATIONS = 200
 _MAX_TURN = 0.2  # largest change of a joint angle in one iteration [rad]
@@ -17,7 +18,7 @@ _LEAST_CURVATURE = 1e-6  # smaller eigenvalues count as this [1 / h]
 _MAX_REDRAWS = 50
 
 
-@numba.njit(cache=True, nogil=True)
+@kept_on_disk
 def settle(lengths, pose, guess):
     """Joint angles at which the chain rests, near a guess; half-length links at the ends.
 
@@ -34,7 +35,7 @@ def settle(lengths, pose, guess):
     return angles, np.linalg.eigh(free)[0][0] if settled else np.nan, off
 
 
-@numba.njit(cache=True, nogil=True)
+@kept_on_disk
 def _newton(lengths, pose, guess):
     """Joint angles, whether they have settled, the second derivative along the constraints, error of the far end."""
     h, length, n = lengths[1], lengths.sum(), len(guess)
@@ -80,7 +81,7 @@ def _newton(lengths, pose, guess):
     return angles, False, free, off
 
 
-@numba.njit(cache=True, nogil=True)
+@kept_on_disk
 def walk(rng, lengths, pose, angles, count, interval, unit, persistence, rest_probability, bound, reach, limits):
     """Twists of a random motion that keeps to its limits [m/s, rad/s], shape [count, 2, 3].
 
@@ -123,7 +124,7 @@ def walk(rng, lengths, pose, angles, count, interval, unit, persistence, rest_pr
     return twists
 
 
-@numba.njit(cache=True, nogil=True)
+@kept_on_disk
 def admissible(pose, limits):
     """See `cablejax.simulate.motions.admissible`.
 
@@ -142,7 +143,7 @@ def admissible(pose, limits):
     return distance >= limits[0] and distance <= limits[1] - detour
 
 
-@numba.njit(cache=True, nogil=True)
+@kept_on_disk
 def joints(lengths, pose, angles):
     """Positions of the joints of the chain that leaves gripper 0 [m], shape [n - 1, 2]."""
     theta, (x, y) = pose[0, 2], pose[0, :2]
@@ -154,7 +155,7 @@ def joints(lengths, pose, angles):
     return nodes
 
 
-@numba.njit(cache=True, nogil=True)
+@kept_on_disk
 def _furthest(one, other):
     """Largest distance of two points of the same number [m]."""
     largest = 0.0
@@ -163,7 +164,7 @@ def _furthest(one, other):
     return np.sqrt(largest)
 
 
-@numba.njit(cache=True, nogil=True)
+@kept_on_disk
 def _far_end(lengths, pose, angles, beyond, error):
     """Writes what lies beyond every joint [m] and by how much the far end misses its gripper."""
     theta, n = pose[0, 2], len(angles)
@@ -181,7 +182,7 @@ def _far_end(lengths, pose, angles, beyond, error):
     error[2] = pose[1, 2] - theta
 
 
-@numba.njit(cache=True, nogil=True)
+@kept_on_disk
 def _dot(a, b):
     total = 0.0
     for i in range(len(a)):
@@ -189,7 +190,7 @@ def _dot(a, b):
     return total
 
 
-@numba.njit(cache=True, nogil=True)
+@kept_on_disk
 def _product(matrix, vector):
     out = np.empty_like(vector)
     for i in range(len(vector)):
@@ -197,7 +198,7 @@ def _product(matrix, vector):
     return out
 
 
-@numba.njit(cache=True, nogil=True)
+@kept_on_disk
 def _mirrors(jacobian):
     """Householder's unit vectors: reflected by one after the other, the null space is the last n - 3 axes."""
     rows = jacobian.copy()
@@ -214,7 +215,7 @@ def _mirrors(jacobian):
     return mirrors
 
 
-@numba.njit(cache=True, nogil=True)
+@kept_on_disk
 def _reflect(mirror, matrix):
     """Reflects a symmetric matrix on both sides, in place."""
     along = _product(matrix, mirror)
@@ -224,7 +225,7 @@ def _reflect(mirror, matrix):
             matrix[i, j] -= 2.0 * (mirror[i] * along[j] + along[i] * mirror[j])
 
 
-@numba.njit(cache=True, nogil=True)
+@kept_on_disk
 def _solve(matrix, rhs, safe, floor):
     """Solves `|matrix| x = rhs` in place of `rhs`, where |matrix| has its eigenvalues' sizes, at least `floor`.
 

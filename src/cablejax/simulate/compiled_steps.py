@@ -10,9 +10,10 @@ import pathlib
 
 import llvmlite.binding
 import mujoco
-import numba
 import numpy as np
 from numba.core import types
+
+from cablejax.compiled_programs import kept_on_disk
 
 
 def _c_function(name: str) -> types.ExternalFunction:
@@ -33,7 +34,7 @@ llvmlite.binding.load_library_permanently(
 _step1, _step2, _kinematics = (_c_function(name) for name in ("mj_step1", "mj_step2", "mj_kinematics"))
 
 
-@numba.njit(nogil=True, cache=True)
+@kept_on_disk
 def advance(
     addresses,
     mocap_pos,
@@ -80,7 +81,7 @@ def advance(
         poses[t + 1] = pose
 
 
-@numba.njit(nogil=True, cache=True)
+@kept_on_disk
 def friction_there(table, x, y, squared_speed):
     """Coefficient of friction at one place and speed, see `friction.drag_coefficient`."""
     distance = np.sqrt((x - table[2]) ** 2 + (y - table[3]) ** 2)
@@ -88,7 +89,7 @@ def friction_there(table, x, y, squared_speed):
     return coefficient * (1.0 + table[1] * np.exp(-squared_speed / table[9] ** 2))
 
 
-@numba.njit(nogil=True, cache=True)
+@kept_on_disk
 def _sample(model, data, xipos, xmat, links, nodes, tangents):
     _kinematics(model, data)
     for k in range(links.shape[0]):
@@ -97,7 +98,7 @@ def _sample(model, data, xipos, xmat, links, nodes, tangents):
             tangents[k, axis] = xmat[links[k], 3 * axis]
 
 
-@numba.njit(nogil=True, cache=True)
+@kept_on_disk
 def _integrate(start, twist, duration, pose):
     """`pose.integrate_pose` in place."""
     if start.shape[1] == 3:
@@ -116,7 +117,7 @@ def _integrate(start, twist, duration, pose):
         pose[q, 6] = w * d + x * c - y * b + z * a
 
 
-@numba.njit(nogil=True, cache=True)
+@kept_on_disk
 def _set_mocap(pose, rotation_offset, mocap_pos, mocap_quat):
     for q in range(pose.shape[0]):
         if pose.shape[1] == 3:
