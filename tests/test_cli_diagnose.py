@@ -204,6 +204,13 @@ def test_motion_that_was_not_executed_as_commanded_is_reported(tmp_path):
     assert any("not executed as commanded" in text and "60 mm" in text for text in caveats)
 
 
+def test_an_exported_log_is_to_be_imported_first(tmp_path, capsys):
+    (tmp_path / "a log.mcap").write_bytes(b"\x89MCAP0\r\n")
+    for name, command in (("a log.mcap", "cablejax import mcap '"), (".", "cablejax import lerobot ")):
+        assert main(["diagnose", str(tmp_path / name)]) == 2
+        assert command in capsys.readouterr().err
+
+
 def test_missing_file_is_refused(tmp_path, capsys):
     assert "nowhere.npz" in refused([tmp_path / "nowhere.npz", "--out", tmp_path / "report"], capsys)
     assert not (tmp_path / "report").exists()

@@ -140,6 +140,16 @@ def test_an_angle_that_is_half_a_turn_off_in_one_sample_is_told_and_put_right():
     assert told_.startswith("In episode 1 the pose of gripper 0 jumps away and back in 1 of 100 samples, for example")
 
 
+@pytest.mark.parametrize("late", [0, 1, 4, -4])
+def test_poses_that_come_later_than_the_keypoints_are_told(late):
+    """Of a camera that lags, an effect of the library, nothing is said here."""
+    log = record()
+    rows = np.clip(np.arange(SAMPLES) - late, 0, SAMPLES - 1)
+    caveats = prepare(dataclasses.replace(log, gripper_pose=log.gripper_pose[:, rows])).caveats
+    told_ = [text for text in caveats if "fit their poses" in text]
+    assert len(told_) == (late > 0) and all(f"{0.1 * late:.2g} s later" in text for text in told_)
+
+
 SCATTER = np.array([3e-4, 3e-4, 4e-3])
 
 

@@ -113,6 +113,15 @@ def test_a_single_mcap_file_is_read_like_its_bag(tmp_path):
     np.testing.assert_allclose(log.gripper_pose[0, :, 1, :3], points[:, 8], atol=1e-6)
 
 
+def test_clocks_that_do_not_overlap_are_named(tmp_path):
+    points = swinging(201)
+    grippers = {topic: (times + 500.0, poses) for topic, (times, poses) in grippers_of(points).items()}
+    bag = write_bag(tmp_path / "bag", points, grippers, StoragePlugin.MCAP)
+    told = r"/left/pose has time stamps from 1500\.000 to 1502\.000 s and /cable/keypoints from 1000\.000 .* do not overlap"
+    with pytest.raises(ValueError, match=told):
+        import_mcap(bag, layout(tmp_path))
+
+
 def test_a_gap_in_a_gripper_cuts_the_recording(tmp_path):
     points = swinging(201)
     grippers = grippers_of(points)

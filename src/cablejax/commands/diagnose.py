@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import pathlib
+import shlex
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Annotated
 
@@ -56,6 +57,12 @@ class Diagnose(Command):
 
         if not self.logs:
             raise UsageError("Nothing to diagnose: name a gap log, or several of one set-up.")
+        for path in self.logs:
+            if path.is_dir() or path.suffix.lower() == ".mcap":
+                raise UsageError(
+                    f"{path} is {'a folder' if path.is_dir() else 'an MCAP file'}, expected a gap log (.npz). Import "
+                    f"it first: cablejax import {'lerobot' if path.is_dir() else 'mcap'} {shlex.quote(str(path))}"
+                )
         read = [read_gap_log(path) for path in self.logs]
         log = read[0] if len(read) == 1 else joined(read, [str(path) for path in self.logs])
         if _in_space(log):

@@ -20,6 +20,8 @@ _WINDOWS = (5, 7, 11, 15, 21, 31, 45, 65, 91)
 _PARABOLA = 2
 # Commands that leave the poses by this [m], and by this part of it in another meaning, have that one.
 _UNFIT, _FITS = 0.02, 0.2
+# By how much poses may come later than the keypoints for it to be looked for [s].
+_LATEST = 1.0
 
 
 def without_frozen(points: Float[np.ndarray, "E T N 2"]) -> list[str]:
@@ -69,6 +71,45 @@ def tool_offset(end: Float[np.ndarray, "E T 2"], pose: Float[np.ndarray, "E T 3"
         f"The keypoint at gripper {gripper} is {1e3 * abs(along):.1f} mm {'ahead of' if along > 0 else 'behind'} its "
         f"pose and {1e3 * abs(across):.1f} mm beside it in the gripper's frame, in all samples: an offset of the "
         "tool or of the marker is no effect of the library and can look like one. Correct the pose if it is wrong."
+    ]
+
+
+def early_keypoints(
+    ends: Float[np.ndarray, "E T 2 2"],
+    place: Float[np.ndarray, "E T 2 2"],
+    length: Int[np.ndarray, "E"],
+    interval: Float[np.ndarray, "E"],
+) -> list[str]:
+    """A sentence where the cable's ends are where their grippers are only later: poses that lag, or another clock.
+
+    The other way round it is `camera_lag`, an effect of the library.
+
+    Args:
+        ends: keypoints at the grippers [m], NaN = not observed.
+        place: of the grippers [m].
+        length: valid samples of each episode.
+        interval: between samples [s].
+    """
+
+    def apart(seconds: float) -> float:
+        every = []
+        for end, own, n, step in zip(ends, place, length, interval, strict=True):
+            ahead = round(seconds / step)
+            every.append((end[: max(n - ahead, 0)] - own[ahead:n]).reshape(-1, 2, 2))
+        off = np.concatenate(every)
+        off = off - np.nanmedian(off, axis=0)
+        return float(np.sqrt(np.nanmean(off**2)))
+
+    step = float(np.max(interval))
+    shifts = step * np.arange(int(_LATEST / step) + 1)
+    sizes = [apart(shift) for shift in shifts if np.isfinite(ends[:, : int(length.max() - shift / step)]).any()]
+    best = int(np.argmin(sizes)) if sizes else 0
+    if best == 0 or sizes[0] < _TOOL or sizes[best] > _FITS * sizes[0]:
+        return []
+    return [
+        f"The keypoints at the grippers fit their poses {shifts[best]:.2g} s later: {1e3 * sizes[best]:.2g} mm off "
+        f"instead of {1e3 * sizes[0]:.2g} mm (root mean square). The poses come late, or both have clocks of their "
+        "own, which is no effect of the library and can look like one: shift the poses."
     ]
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from cablejax.diagnose.clock import Samples, furthest_off, is_even, on_even_clock, usual_interval
-from cablejax.diagnose.log_faults import command_fault, tool_offset, without_frozen
+from cablejax.diagnose.log_faults import command_fault, early_keypoints, tool_offset, without_frozen
 from cablejax.diagnose.noise import still
 from cablejax.gaplog import validate
 from cablejax.log_geometry import cable_fault
@@ -198,6 +198,9 @@ def _plausible(log: GapLog, recording: Recording) -> list[str]:
         caveats.append(f"{missing:.0%} of the keypoints are missing: small or local effects may go unseen.")
     for gripper, end in ((0, 0), (1, -1)):
         caveats += tool_offset(points[:, :, end], recording.gripper_pose[:, :, gripper], gripper)
+    caveats += early_keypoints(
+        points[:, :, [0, -1]], recording.gripper_pose[..., :2], recording.length, recording.interval
+    )
     length = log.meta["cable"]["length_m"]
     span = np.linalg.norm(recording.gripper_pose[:, :, 1, :2] - recording.gripper_pose[:, :, 0, :2], axis=-1)
     if span[valid].max() > 1.001 * length:

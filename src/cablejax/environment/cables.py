@@ -179,18 +179,12 @@ class Cables:
 
     def _at_rest(self, physics: Physics, start: CableState) -> Float[np.ndarray, "N 2"]:
         """Keypoints of one cable before its first action [m]; raises ValueError if that is none to begin with."""
-        after, rest = self._engine.rollout(without_camera(physics), start, np.zeros((1, 1, 2, 3)), self.config.interval)
+        rest = self._engine.rollout(without_camera(physics), start, np.zeros((1, 1, 2, 3)))[1]
         if not np.isfinite(rest.keypoints).all():
             raise ValueError(
                 f"The simulation of this cable by {self.config.discretisation.n_links} links diverges at rest. Check "
                 "the numbers of the cable and of its effects, and their units, or take a discretisation with fewer "
                 "links (n_links)."
-            )
-        if (opening := float(np.max(self._engine.opening(after)))) > self.config.widest:
-            raise ValueError(
-                f"At rest this cable is torn {1e3 * opening:.0f} mm out of a gripper before its first action, by an "
-                f"effect or by too few links: expected at most {1e3 * self.config.widest:.3g} mm. No action would be "
-                "executed."
             )
         return np.asarray(rest.keypoints[0, 0])
 
@@ -215,8 +209,7 @@ class Cables:
             effects: by default the configuration's.
 
         Raises:
-            ValueError: the target does not fit the cable, the effects tear it out of a gripper at rest, or see
-                `ShapeCableConfig.recipe`.
+            ValueError: the target does not fit the cable, or see `ShapeCableConfig.recipe`.
         """
         config = self.config
         drawn = self._targets[random.integers(len(self._targets))]
@@ -249,7 +242,7 @@ class Cables:
         """Executes actions: twists of both grippers in units of `speed` and `turn_rate`, cut off at 1.
 
         A twist that would leave `limits` is shortened. One that is not finite counts as zero. One that would tear the
-        cable out of a gripper, as where it is wound up, is not executed.
+        cable out of a gripper, as where it is wound up, or farther out where an effect has, is not executed.
 
         Args:
             actions: in the world's frame.
@@ -270,7 +263,8 @@ class Cables:
         after, shown = self._engine.rollout(truly, self._state, twists[:, None], config.interval)
         keypoints, poses = np.asarray(shown.keypoints[:, -1]), np.asarray(shown.gripper_pose[:, -1])
         diverged = ~(np.abs(keypoints) < config.room).all(axis=(1, 2))
-        torn = ~diverged & (np.asarray(self._engine.opening(after)) > config.widest)
+        before, opening = (np.asarray(self._engine.opening(state)) for state in (self._state, after))
+        torn = ~diverged & (opening > np.maximum(config.widest, before))
         self._state = jax.tree.map(
             lambda new, old: np.where(torn.reshape(-1, *[1] * (new.ndim - 1)), old, new), after, self._state
         )

@@ -71,6 +71,14 @@ def _take(path: pathlib.Path, how: Layout) -> Take:
         )
     poses = None
     if gripper_topics is not None:
+        for topic in gripper_topics:
+            stamps, _ = _sorted(messages[topic])
+            if stamps[0] > time[-1] or stamps[-1] < time[0]:
+                raise ValueError(
+                    f"{path}: {topic} has time stamps from {stamps[0]:.3f} to {stamps[-1]:.3f} s and {keypoints_topic} "
+                    f"from {time[0]:.3f} to {time[-1]:.3f} s, which do not overlap: expected the times of one clock in "
+                    "the headers."
+                )
         tracks = [_at(time, *_sorted(messages[topic])) for topic in gripper_topics]
         poses = unit_quaternions(np.stack(tracks, axis=1), str(path))
     return Take(path.stem, time - time[0], np.array(rows)[..., :3], poses, labels={"motion": motion})
