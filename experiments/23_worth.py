@@ -36,7 +36,8 @@ from cablejax.control.loop import run_closed_loop
 from cablejax.control.shaping import Model, enters, knowing, load_model, make_controller
 from cablejax.control.targets import Shape
 from cablejax.diagnose import diagnose, write_verdict
-from cablejax.effects.given import effects_of_verdict, parse_effect
+from cablejax.effects.given import parse_effect
+from cablejax.effects.verdicts import effects_of_verdict
 from cablejax.gaplog import gap_log_from_episodes, read_gap_log, write_gap_log
 from cablejax.residual import STATIC
 from cablejax.simulate.chain.statics import clamped, resting_shapes, statics_with

@@ -26,8 +26,9 @@ from blind.motions import INTERVAL, Commands, draw_motion
 from blind.rod import arch
 from cablejax.cable import Discretisation
 from cablejax.diagnose import diagnose, write_verdict
-from cablejax.effects.given import GivenEffect, effects_of_verdict, parse_effect, with_effects
+from cablejax.effects.given import GivenEffect, parse_effect, with_effects
 from cablejax.effects.physics import nominal_physics
+from cablejax.effects.verdicts import effects_of_verdict
 from cablejax.gaplog import Episode, gap_log_from_episodes
 from cablejax.simulate import ChainEngine
 from cablejax.simulate.plant import Plant, PlantConfig

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from cablejax.adaptation.belief import AdaptationConfig
 from cablejax.cable import Cable
 from cablejax.cli import main
 from cablejax.commands.runs import Job, about, known_from
@@ -96,6 +97,18 @@ def test_a_model_without_prior_can_be_informed_of_stiffness_alone():
     mpc = make_controller(model, target, method="residual", solver="levenberg-marquardt")
     assert mpc.config.residual == LearnerConfig().scaled(model.config.length) and mpc.config.adaptation is not None
     assert make_controller(model, target, method="direct", solver="levenberg-marquardt").config.residual is None
+
+
+def test_the_error_bar_of_the_adaptation_scales_with_the_cable():
+    """As the learner's does: errors of a network are so many parts of the length."""
+    model = load_model("gns-conditioned")
+    for length in (0.4, 1.0, 1.5):
+        config = dataclasses.replace(model.config, length=length)
+        cable = dataclasses.replace(model.cable, length=length)
+        other = dataclasses.replace(model, config=config)
+        found = make_controller(other, make_target("S", cable), method="residual", solver="levenberg-marquardt").config
+        assert found.adaptation.error_std == pytest.approx(length * AdaptationConfig.error_std)
+        assert found.residual.error_std == pytest.approx(length * LearnerConfig().scaled(1.0, 1.0).error_std)
 
 
 def test_the_learner_scales_responses_only_of_a_model_without_static_prior(model):

@@ -15,7 +15,7 @@ from cablejax.dataset.drawing import draw
 from cablejax.dataset.opening import open_or_create, open_store
 from cablejax.dynamics.run_folder import claim_folder
 from cablejax.dynamics.weights import cable_of_weights, load_weights
-from cablejax.effects.given import effects_of_verdict
+from cablejax.effects.verdicts import effects_of_verdict, posterior_of_verdict
 from cablejax.gaplog import read_gap_log, write_gap_log
 from cablejax.text_file import version_of
 
@@ -124,6 +124,29 @@ def test_what_is_no_version_is_another_kind_of_file(schema):
 
 def test_versions_up_to_the_known_one_are_returned():
     assert [version_of(f"toy/{number}", "toy/3", "x") for number in (1, 2, 3)] == [1, 2, 3]
+
+
+def test_places_of_a_verdict_are_about_where_its_grippers_were(tmp_path):
+    """For motions about the origin; what is added to a simulation of the log itself stays where it is."""
+
+    def read(place):
+        parameters = {"x_m": {"value": 4.7}, "y_m": {"value": 0.2}, "radius_m": {"value": 0.03}}
+        effects = [
+            {"name": "obstacle", "parameters": parameters},
+            {"name": "bending_stiffness", "parameters": {"ratio": {"value": 2.0}}},
+        ]
+        draw = [{"name": "obstacle", "parameters": {"x_m": 4.8, "y_m": 0.2, "radius_m": 0.03}}]
+        verdict = {"schema": "cablejax-verdict/1", "effects": effects, "place_m": place, "posterior": [draw]}
+        (tmp_path / "verdict.json").write_text(json.dumps(verdict))
+        obstacle, stiffness = effects_of_verdict(tmp_path / "verdict.json")
+        assert dict(obstacle.parameters)["x_m"] == 4.7 and dict(stiffness.parameters) == {"ratio": 2.0}
+        ((drawn,),) = posterior_of_verdict(tmp_path / "verdict.json")
+        return [dict(drawn.parameters)[name] for name in ("x_m", "y_m", "radius_m")]
+
+    assert read([4.5, -0.1]) == pytest.approx([0.3, 0.3, 0.03])
+    assert read(None) == [4.8, 0.2, 0.03], "of an older version"
+    with pytest.raises(ValueError, match=r"place_m is \[0.0\], expected x and y in metres"):
+        read([0.0])
 
 
 def test_a_verdict_in_other_units_is_refused(tmp_path):

@@ -158,6 +158,19 @@ def test_grippers_carry_the_ends_as_they_would_a_beam_on_a_table():
     assert hanging == pytest.approx(0.5 * weight * (cable.length + h) - pressed.sum(), rel=0.01)
 
 
+def test_what_hangs_has_a_slope_where_a_joint_has_no_stiffness():
+    """Of both grippers that lie on the table, in every joint; the power that says how far they lift has none at 0."""
+    config = Discretisation(n_links=8)
+    with jax.enable_x64(True):
+        physics = jax.tree.map(jnp.asarray, nominal_physics(config, np.float64))
+        mass = jnp.full(config.n_links, 0.01)
+        for stiffness in (0.0 * physics.stiffness, physics.stiffness.at[0].set(0.0)):
+            slope = jax.grad(
+                lambda k: jnp.sum(on_table(dataclasses.replace(physics, stiffness=k), mass, config.link_length) ** 2)
+            )(stiffness)
+            np.testing.assert_array_equal(slope, 0.0)
+
+
 def test_grippers_that_carry_the_ends_do_so_in_every_engine(nominal):
     config, still = nominal
     physics = dataclasses.replace(nominal_physics(config), grip_height=np.float32(2e-3))

@@ -182,6 +182,8 @@ def test_an_effect_that_is_misspelt_is_not_another_one(text, message):
         ("keypoint_bias:index=99,offset_m=0.01", "index is 99, expected 0 to 12"),
         ("keypoint_bias:index=3,across=2,offset_m=0.01", "across is 2, expected 0 or 1"),
         ("intrinsic_curvature:centre_m=2.5,width_m=0.1,curvature_per_m=3", "centre_m is 2.5, expected 0 to 0.6 m"),
+        ("intrinsic_curvature:centre_m=0.3,width_m=2,curvature_per_m=3", r"width_m is 2, expected 0.018 to 0.6 m"),
+        ("stiffness_profile:centre_m=0.3,width_m=0,ratio=2", r"width_m is 0, expected 0.018 to 0.6 m"),
     ],
 )
 def test_a_place_out_of_bounds_is_told_as_it_was_given(text, message):

@@ -87,7 +87,7 @@ def cable_of_verdict(path: pathlib.Path) -> Cable | None:
         ValueError: it is no verdict, or its cable is none.
     """
     from cablejax.cable_file import cable_from_fields
-    from cablejax.effects.given import read_verdict_json
+    from cablejax.effects.verdicts import read_verdict_json
 
     stated = read_verdict_json(path).get("cable")
     return None if stated is None else cable_from_fields(stated, f"{path}: cable")

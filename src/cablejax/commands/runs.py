@@ -20,8 +20,9 @@ from cablejax.control.shaping import Method, Model, check_fit, enters, shape_onc
 from cablejax.control.targets import Target
 from cablejax.diagnose.judgement import listed
 from cablejax.dynamics.fingerprint import fingerprint
-from cablejax.effects.given import GivenEffect, effects_of_verdict, parse_effect, posterior_of_verdict
+from cablejax.effects.given import GivenEffect, parse_effect
 from cablejax.effects.physics import nominal_physics
+from cablejax.effects.verdicts import effects_of_verdict, posterior_of_verdict
 from cablejax.limits import require
 from cablejax.perceive.camera import CameraConfig
 from cablejax.report.effect_words import EFFECTS

@@ -106,7 +106,8 @@ class Simulate(Command):
         """
         from cablejax.cable import Cable
         from cablejax.commands.cable import cable_of_verdict, check_verdicts, find_cable
-        from cablejax.effects.given import parse_effect, posterior_of_verdict
+        from cablejax.effects.given import parse_effect
+        from cablejax.effects.verdicts import posterior_of_verdict
 
         effects = tuple(parse_effect(text) for text in self.effect)
         verdicts = [posterior_of_verdict(path) for path in self.with_]

@@ -61,7 +61,7 @@ class Study(Command):
         from cablejax.diagnose.motion_bounds import Bounds, read_bounds
         from cablejax.diagnose.study import ENDED, ended, first_recording, left_open
         from cablejax.diagnose.verdict_json import read_verdict
-        from cablejax.effects.given import read_verdict_json
+        from cablejax.effects.verdicts import read_verdict_json
         from cablejax.gaplog import read_gap_log, write_gap_log
         from cablejax.gaplog_join import joined
         from cablejax.limits import require

@@ -186,10 +186,11 @@ def make_controller(model: Model, target: Target, *, method: Method, solver: Sol
         )
     target.require_length(model.config.length, f"the model {model.name}")
     learner = STATIC if model.config.prior == "static" else LearnerConfig()
+    adaptation = AdaptationConfig(prior_mean=model.believed, error_std=AdaptationConfig.error_std * model.config.length)
     config = MPCConfig.for_length(
         model.config.length,
         residual=learner.scaled(model.config.length, model.config.interval) if method == "residual" else None,
-        adaptation=AdaptationConfig(prior_mean=model.believed) if model.config.conditioned else None,
+        adaptation=adaptation if model.config.conditioned else None,
         solver=SOLVERS[solver],
         history_length=model.config.history,
     )

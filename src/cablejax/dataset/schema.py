@@ -72,7 +72,7 @@ class DatasetConfig:
         shard_size: trajectories per shard: the unit that one process writes and that a kill can cost.
         effects: added to every cable after its parameters are drawn, in this order.
         posterior: sets of effects, equally probable; after `effects`, trajectory i gets the one of number i modulo
-            their number. See `cablejax.effects.given.posterior_of_verdict`.
+            their number. See `cablejax.effects.verdicts.posterior_of_verdict`.
     """
 
     n_trajectories: int = 2000

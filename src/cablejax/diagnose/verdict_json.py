@@ -25,7 +25,7 @@ from cablejax.diagnose.diagnosis import (
     Ranked,
     UnderLaw,
 )
-from cablejax.effects.given import VERDICT_SCHEMA, read_verdict_json
+from cablejax.effects.verdicts import VERDICT_SCHEMA, read_verdict_json
 from cablejax.limits import LIMITS, shown
 from cablejax.whole_file import whole_file
 
@@ -40,7 +40,8 @@ def verdict_json(diagnosis: Diagnosis) -> dict[str, Any]:
     explanation all the same. `ci90` is null for a choice, such as a gripper, and a list where the value is one. All
     `_mm` are null where observations are not in metres; `gap` has the sizes in their own unit too.
 
-    In addition to the fields of the format it has `cable` (the keys of a cable file: as the log states it), `sentence`,
+    In addition to the fields of the format it has `cable` (the keys of a cable file: as the log states it), `place_m`
+    (where the grippers are on average, in the world of the effects' places; null in space), `sentence`,
     `baselines`, `leftover_p`, `caveats`, `seconds`, `quantities` (by name, like an effect's parameters), `posterior`
     (fields of `EffectValues`), `under_laws` (fields of `UnderLaw`) and `next_motion_worth`: fields of `NextMotion`,
     those in nats with `_nats`, and whether no motion that was tried separates the explanations; of several recordings
@@ -54,6 +55,7 @@ def verdict_json(diagnosis: Diagnosis) -> dict[str, Any]:
         {
             "schema": VERDICT_SCHEMA,
             "cable": _cable(diagnosis),
+            "place_m": _place(diagnosis),
             "verdict": diagnosis.verdict,
             "sentence": diagnosis.sentence,
             "effects": [_effect(effect) for effect in diagnosis.effects],
@@ -91,6 +93,15 @@ def _cable(diagnosis: Diagnosis) -> dict[str, Any] | None:
         return cable_to_fields(cable_of_log(diagnosis.log))
     except ValueError:  # a rod that no planar simulator can take
         return None
+
+
+def _place(diagnosis: Diagnosis) -> list[float] | None:
+    """Of the grippers on a table [m]; None in space, and of a simulator of one's own."""
+    if not isinstance(diagnosis, CableDiagnosis) or diagnosis.log.keypoints.shape[-1] != 2:
+        return None
+    log = diagnosis.log
+    valid = np.arange(log.gripper_pose.shape[1]) < log.episode_length[:, None]
+    return np.round(log.gripper_pose[valid][..., :2].mean(axis=(0, 1), dtype=float), 2).tolist()
 
 
 def write_verdict(path: str | os.PathLike[str], diagnosis: Diagnosis) -> pathlib.Path:

@@ -1,11 +1,10 @@
-"""Effects with their parameters: staged in a plant, added to a simulator, read from a verdict or a command line."""
+"""Effects with their parameters: staged in a plant, added to a simulator, read from a command line."""
 
 from __future__ import annotations
 
 import dataclasses
 import itertools
 import math
-import os
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
@@ -17,14 +16,9 @@ from cablejax.effects.base import CableEffect, Hook
 from cablejax.effects.effect import Parameter
 from cablejax.effects.physics import Physics
 from cablejax.limits import require, shown
-from cablejax.text_file import read_json, version_of
 
 EFFECTS: Mapping[str, CableEffect] = {effect.name: effect for effect in (*LIBRARY, *ARMS)}
 """Every effect by its name in the gap log's format."""
-
-VERDICT_SCHEMA = "cablejax-verdict/1"
-"""Format and version of `verdict.json`."""
-
 
 # Parameters that say which: a gripper, a keypoint, a direction.
 _CHOICES = frozenset({"index", "across", *(effect.variant_name for effect in EFFECTS.values())})
@@ -57,7 +51,7 @@ class GivenEffect:
                 f"{self.name}: from_s is {self.from_s}, until_s {self.until_s}; expected 0 <= from_s < until_s [s]."
             )
         object.__setattr__(self, "parameters", tuple((str(n), v) for n, v in self.parameters))
-        known = tuple(_parameter_units(self.effect))
+        known = tuple(parameter_units(self.effect))
         required = [name for name in known if name not in OPTIONAL]
         named = dict(self.parameters)
         if len(named) < len(self.parameters):
@@ -108,17 +102,20 @@ class GivenEffect:
 
     def _out_of_bounds(self, parameter: Parameter, value: float, variant: int, chain: Discretisation) -> str:
         """What a parameter is and may be, by the name and in the unit in which it was given."""
-        own = [p.name for p in self.effect.parameters]
-        # one that the fit knows by another name was given by the name of the verdict
-        given = [name for name, _ in self.parameters if name == parameter.name]
-        name, *_ = [*given, *(name for name, _ in self.parameters if name not in own), parameter.name]
-        limits = []
-        for limit in (parameter.low, parameter.high):
-            values = [limit if p is parameter else p.centre for p in self.effect.parameters]
-            shown, unit = self.effect.reported(values, variant, chain).get(name, (limit, parameter.unit))
-            limits.append(shown)
+        low, high = (
+            self.effect.reported(
+                [limit if p is parameter else p.centre for p in self.effect.parameters], variant, chain
+            )
+            for limit in (parameter.low, parameter.high)
+        )
+        # one that the fit knows by another name was given by the name of the verdict that it changes
+        changed = [name for name, _ in self.parameters if low.get(name) != high.get(name)]
+        name = parameter.name if parameter.name in dict(self.parameters) or not changed else changed[0]
+        (first, unit), (last, _) = (
+            one.get(name, (limit, parameter.unit)) for one, limit in ((low, parameter.low), (high, parameter.high))
+        )
         number = dict(self.parameters).get(name, value)
-        return f"{name} is {number:g}, expected {min(limits):g} to {max(limits):g} {unit}".rstrip() + "."
+        return f"{name} is {number:g}, expected {min(first, last):g} to {max(first, last):g} {unit}".rstrip() + "."
 
     def __str__(self) -> str:
         """The effect as `parse_effect` reads it back, without loss."""
@@ -170,61 +167,6 @@ def parse_effect(text: str) -> GivenEffect:
     return GivenEffect(name.strip(), tuple(pair for pair in parameters if pair[0] not in times), **times)
 
 
-def effects_of_verdict(path: str | os.PathLike[str]) -> tuple[GivenEffect, ...]:
-    """The effects that a verdict names, with their estimated parameters. Several pieces become several effects.
-
-    Raises:
-        ValueError: the file is no verdict, or it names no effect ("none" and "unknown").
-    """
-    verdict = read_verdict_json(path)
-    named = verdict.get("effects")
-    if not isinstance(named, list):
-        raise ValueError(f"{path}: effects is {shown(named)}, expected a list.")
-    if not named:
-        raise ValueError(
-            f"{path} names no effect (its verdict is {shown(verdict.get('verdict'))}), so there is nothing to add. "
-            "Leave --with out, or give an effect with --effect."
-        )
-    return tuple(piece for effect in named for piece in _pieces(effect, path))
-
-
-def posterior_of_verdict(path: str | os.PathLike[str]) -> tuple[tuple[GivenEffect, ...], ...]:
-    """Sets of effects, equally probable: which explanation holds, and its parameters, as uncertain as a verdict is.
-
-    Of a verdict of an older version, which holds no such draws, the effects that it names.
-
-    Raises:
-        ValueError: as `effects_of_verdict`.
-    """
-    named = effects_of_verdict(path)
-    posterior = read_verdict_json(path).get("posterior") or []
-    try:
-        drawn = tuple(
-            tuple(GivenEffect(one["name"], tuple(one["parameters"].items())) for one in draw) for draw in posterior
-        )
-    except (KeyError, TypeError, AttributeError) as error:
-        raise ValueError(f"{path}: posterior is not of the verdict's format ({error}).") from error
-    return drawn or (named,)
-
-
-def read_verdict_json(path: str | os.PathLike[str]) -> dict[str, Any]:
-    """A verdict's JSON object, of the schema that this version writes; its fields are not looked at.
-
-    Raises:
-        ValueError: the file is no verdict.
-    """
-    try:
-        verdict = read_json(path)
-    except FileNotFoundError as error:
-        raise ValueError(f"{error} Expected a verdict.json of `diagnose`.") from error
-    except (OSError, ValueError) as error:
-        raise ValueError(f"This is not a verdict: {error} Expected a verdict.json of `diagnose`.") from error
-    if not isinstance(verdict, dict):
-        raise ValueError(f"{path} is {shown(verdict)}, expected {VERDICT_SCHEMA!r}: a verdict.json of `diagnose`.")
-    version_of(verdict.get("schema"), VERDICT_SCHEMA, path)
-    return verdict
-
-
 def check_hooks(
     effects: Sequence[GivenEffect],
     hooks: frozenset[Hook],
@@ -255,38 +197,13 @@ def check_hooks(
             )
 
 
-def _pieces(effect: Any, path: Any) -> list[GivenEffect]:
-    try:
-        values = {name: entry["value"] for name, entry in effect["parameters"].items()}
-        _check_units(effect["name"], {name: entry.get("unit") for name, entry in effect["parameters"].items()}, path)
-        count = max((len(value) for value in values.values() if isinstance(value, list)), default=1)
-        rows = [
-            tuple((name, value[i] if isinstance(value, list) else value) for name, value in values.items())
-            for i in range(count)
-        ]
-        return [GivenEffect(effect["name"], row) for row in rows]
-    except (KeyError, TypeError, AttributeError, IndexError) as error:
-        raise ValueError(f"{path}: an effect is not of the verdict's format ({error}).") from error
-
-
-def _check_units(name: str, units: Mapping[str, str | None], path: Any) -> None:
-    """Raises ValueError if a parameter is stated in another unit than its effect has; a unit may be left out."""
-    expected = _parameter_units(EFFECTS[name]) if name in EFFECTS else {}
-    for parameter, unit in units.items():
-        if unit is not None and unit != expected.get(parameter, unit):
-            raise ValueError(
-                f"{path}: {name} has {parameter} in {shown(unit)}, expected {shown(expected[parameter])}. Convert the "
-                "values and their intervals."
-            )
-
-
 def number_text(value: float) -> str:
     """A number as short as it can be without loss."""
     short = f"{value:g}"
     return short if float(short) == value else repr(float(value))
 
 
-def _parameter_units(effect: CableEffect) -> dict[str, str]:
+def parameter_units(effect: CableEffect) -> dict[str, str]:
     """Names of the verdict that an effect takes, and their units."""
     chain, units = Discretisation(), {}
     values = [p.centre for p in effect.parameters]
