@@ -7,8 +7,14 @@ import pytest
 
 import spatial_cases as cases
 from cablejax.arrays import quaternion_product
+from cablejax.diagnose.protocol import explanation
 from cablejax.poses import rotated
+from cablejax.simulate.rod import Rod
+from cablejax.spatial.cable import SpatialCable
+from cablejax.spatial.diagnose import with_roll
+from cablejax.spatial.gap import in_log
 from cablejax.spatial.grips import frames_of, held_keypoints
+from cablejax.spatial.identify import EDGES, layout_of
 from cablejax.spatial.windows import windows_of
 
 SAMPLES = 400
@@ -41,15 +47,24 @@ def test_keypoints_that_bend_with_the_cable_are_not_held(spacing, held):
     assert held_keypoints(*bending(spacing, (held - 1) * spacing)) == (held, held)
 
 
-def test_roll_is_that_of_the_log_where_it_was_observed():
-    log = cases.recording()
-    valid = np.arange(log.keypoints.shape[1]) < log.episode_length[:, None]
+def rolling(log):
+    """The log with grippers that roll about the cable, and says so."""
     roll = 0.8 * np.sin(np.linspace(0.0, 3.0, log.keypoints.shape[1]))[None, :, None, None]
     about = np.concatenate([np.cos(roll / 2), np.sin(roll / 2), 0.0 * roll, 0.0 * roll], axis=-1)
     pose = log.gripper_pose.astype(float)
     pose[..., 3:] = quaternion_product(pose[..., 3:], np.broadcast_to(about, pose[..., 3:].shape))
-    rolled = dataclasses.replace(log, gripper_pose=pose.astype(np.float32))
-    told = dataclasses.replace(rolled, meta={**log.meta, "roll_observed": True})
+    meta = {**log.meta, "cable": {**log.meta["cable"], "bending_damping_s": 0.05}, "roll_observed": True}
+    return dataclasses.replace(log, gripper_pose=pose.astype(np.float32), meta=meta)
+
+
+def unsaid(log):
+    return dataclasses.replace(log, meta={name: log.meta[name] for name in log.meta if name != "roll_observed"})
+
+
+def test_roll_is_that_of_the_log_where_it_was_observed():
+    log = cases.recording()
+    told, rolled = rolling(log), unsaid(rolling(log))
+    pose, valid = told.gripper_pose.astype(float), np.arange(log.keypoints.shape[1]) < log.episode_length[:, None]
     tangent = rotated(pose[..., 3:], np.array([1.0, 0.0, 0.0]))
     unknown, known = frames_of(rolled, tangent, valid)[valid], frames_of(told, tangent, valid)[valid]
     np.testing.assert_allclose(unknown, frames_of(log, tangent, valid)[valid], atol=1e-6)
@@ -58,3 +73,21 @@ def test_roll_is_that_of_the_log_where_it_was_observed():
     turned = np.arccos(np.clip((known[..., 1, :] * unknown[..., 1, :]).sum(axis=-1), -1.0, 1.0))
     assert np.ptp(turned) > 0.5
     assert windows_of(told).rolls and not windows_of(rolled).rolls
+
+
+def test_roll_that_moves_the_cable_as_recorded_was_observed():
+    """Where the log does not say."""
+    told = rolling(cases.recording())
+    cable, windows = told.meta["cable"], windows_of(told)
+    layout = layout_of(windows, cable["bending_stiffness_n_m2"] / cable["linear_density_kg_per_m"], 0.05)
+    motion = SpatialCable(Rod(EDGES, 1, twisting=False), layout, windows).motion(explanation())
+    moved = in_log(told, windows, motion)
+    as_rolled = dataclasses.replace(
+        told, keypoints=np.where(np.isfinite(moved), moved, told.keypoints).astype(np.float32)
+    )
+    assert with_roll(unsaid(as_rolled)).meta["roll_observed"] is True
+    for log in (cases.recording(), unsaid(told)):
+        assert with_roll(log) is log, "made of markers, or not what the cable did"
+    for meta in ({"roll_observed": False}, {"commands_from_poses": True}):
+        log = dataclasses.replace(unsaid(as_rolled), meta={**unsaid(told).meta, **meta})
+        assert with_roll(log) is log

@@ -15,19 +15,21 @@ from cablejax.diagnose.belief import Calibration
 from cablejax.diagnose.diagnosis import CableDiagnosis, Gap, ParameterEstimate, Ranked, Verdict
 from cablejax.diagnose.judgement import judged, listed, verdict_sentence
 from cablejax.diagnose.protocol import explanation
-from cablejax.simulate.rod import RodResult
+from cablejax.simulate.rod import Rod, RodResult
 from cablejax.spatial.accidents import accident_sentences, kept, moderated, off
-from cablejax.spatial.cable import errors
+from cablejax.spatial.cable import SpatialCable, errors
 from cablejax.spatial.clock import on_one_clock
 from cablejax.spatial.effects import GRIP
-from cablejax.spatial.gap import constant_offset, gap_of, in_log, noise_of, smallest_gap, where_of
+from cablejax.spatial.gap import constant_offset, gap_of, in_log, noise_of, smallest_gap, squares, where_of
 from cablejax.spatial.geometry import local_changes
-from cablejax.spatial.identify import Identified, identify
+from cablejax.spatial.identify import EDGES, Identified, identify, layout_of
 from cablejax.spatial.named import named_effects, quantities_of, with_both_drags
 from cablejax.spatial.windows import WINDOW, windows_of
 from cablejax.types import GapLog
 
 _CALIBRATION = Calibration()
+# Windows by which it is found out whether the roll of a log was observed, and by how much the error has to be smaller.
+_COMPARED, _CLEARLY = 12, 0.9
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -64,6 +66,7 @@ def diagnose_space(
     """
     begun = time.perf_counter()
     log, repairs = on_one_clock(log)
+    log = with_roll(log)
     windows = windows_of(log)
     left_out = sum(split == "eval" for split in windows.split)
     if left_out == len(windows):
@@ -118,6 +121,30 @@ def diagnose_space(
     )
 
 
+def with_roll(log: GapLog) -> GapLog:
+    """The log with `roll_observed`, where it does not say whether its quaternions show how the grippers roll.
+
+    They do if the nominal cable moves more like the recorded one with it. Quaternions that were made of markers have a
+    roll too, which nobody observed.
+    """
+    if "roll_observed" in log.meta or log.meta.get("commands_from_poses"):
+        return log
+    cable, sizes = log.meta["cable"], []
+    stiffness = cable["bending_stiffness_n_m2"] / cable["linear_density_kg_per_m"]
+    told = dataclasses.replace(log, meta={**log.meta, "roll_observed": True})
+    for one in (log, told):
+        windows = windows_of(one)
+        fitted = [i for i, split in enumerate(windows.split) if split != "eval"]
+        if not fitted:
+            return log
+        windows = windows.chosen(fitted)
+        windows = windows.chosen(windows.whole(_COMPARED))
+        layout = layout_of(windows, stiffness, cable["bending_damping_s"])
+        motion = SpatialCable(Rod(EDGES, 1, twisting=False), layout, windows).motion(explanation())
+        sizes.append(float(np.sqrt(np.nanmean(squares(motion, windows)))))
+    return told if sizes[1] < _CLEARLY * sizes[0] else log
+
+
 def _verdict(gap: Gap, smallest_mm: float, named: Sequence[str], equivalent: tuple[tuple[str, ...], ...]) -> Verdict:
     allowed = max(_CALIBRATION.adequate * gap.before_rmse_mm, smallest_mm)
     return judged(
@@ -164,8 +191,8 @@ def _caveats(windows, left_out, found) -> tuple[str, ...]:
         "noise, but of the constant offsets, as is what the simulator has wrong at rest.",
         "Roll of the grippers about the cable is that of the log's quaternions."
         if windows.rolls
-        else "Roll of the grippers about the cable is not observed, or the log's `roll_observed` does not say that it "
-        "is; it is taken as the least turn from their mean direction.",
+        else "Roll of the grippers about the cable is not observed, or the nominal cable does not move more like the "
+        "recorded one with that of the log; it is taken as the least turn from their mean direction.",
         "All effects that were tried are fitted together. The gap after is what the named ones leave, with their "
         "values from that fit, on recordings that no fit has seen.",
     ]
