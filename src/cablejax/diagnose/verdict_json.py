@@ -101,7 +101,7 @@ def _place(diagnosis: Diagnosis) -> list[float] | None:
         return None
     log = diagnosis.log
     valid = np.arange(log.gripper_pose.shape[1]) < log.episode_length[:, None]
-    return np.round(log.gripper_pose[valid][..., :2].mean(axis=(0, 1), dtype=float), 2).tolist()
+    return (np.round(log.gripper_pose[valid][..., :2].mean(axis=(0, 1), dtype=float), 2) + 0.0).tolist()
 
 
 def write_verdict(path: str | os.PathLike[str], diagnosis: Diagnosis) -> pathlib.Path:
