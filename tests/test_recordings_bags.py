@@ -113,6 +113,22 @@ def test_a_single_mcap_file_is_read_like_its_bag(tmp_path):
     np.testing.assert_allclose(log.gripper_pose[0, :, 1, :3], points[:, 8], atol=1e-6)
 
 
+def test_a_pose_that_was_misread_is_put_right_before_it_is_interpolated(tmp_path):
+    """Between slow poses it would be away for many samples of the keypoints."""
+    points = swinging(201)
+    grippers = grippers_of(points, stride=4)
+    right = {topic: (times, poses.copy()) for topic, (times, poses) in grippers.items()}
+    grippers["/right/pose"][1][8, :3] += [0.5, 0.0, 0.0]
+    logs = []
+    for name, poses in (("wrong", grippers), ("right", right)):
+        bag = write_bag(tmp_path / name, points, poses, StoragePlugin.MCAP)
+        logs.append(import_mcap(bag, layout(tmp_path)))
+    (log, repairs), (expected, none) = logs
+    assert none == [] and len(repairs) == 1
+    assert repairs[0].startswith("/right/pose jumps away and back in 1 of 51 samples, for example by 0.5")
+    np.testing.assert_allclose(log.gripper_pose[..., :3], expected.gripper_pose[..., :3], atol=0.02)
+
+
 def test_clocks_that_do_not_overlap_are_named(tmp_path):
     points = swinging(201)
     grippers = {topic: (times + 500.0, poses) for topic, (times, poses) in grippers_of(points).items()}

@@ -120,7 +120,7 @@ def positions_at(
 
 def without_misreadings(
     time: Float[np.ndarray, " T"], pose: Float[np.ndarray, "T Q P"]
-) -> tuple[Float[np.ndarray, "T Q P"], list[str]]:
+) -> tuple[Float[np.ndarray, "T Q P"], dict[int, str]]:
     """Poses in which readings that jump away and back are replaced by what lies between their neighbours.
 
     A tracker that takes one axis for another does that, or an angle that was read half a turn off. A simulated cable
@@ -131,9 +131,9 @@ def without_misreadings(
         pose: (x, y, theta) or (x, y, z, qw, qx, qy, qz) [m, rad, 1], NaN = not known.
 
     Returns:
-        The poses, and a clause on each gripper that had such readings.
+        The poses, and how often and how far the grippers that had such readings jumped, in words.
     """
-    result, clauses = pose.copy(), []
+    result, words = pose.copy(), {}
     for gripper, own in enumerate(pose.swapaxes(0, 1)):
         wrong, farthest = np.zeros(len(time), bool), []
         for (unit, least, acceleration), apart in zip(_JUMPS, (_distance, _turn), strict=True):
@@ -150,11 +150,11 @@ def without_misreadings(
                     farthest.append((step[first], f"{step[first]:.2g} {unit} at {time[first + 1]:.4g} s"))
         if farthest:
             result[wrong, gripper] = poses_at(time[wrong], time[~wrong], own[~wrong])
-            clauses.append(
-                f"the pose of gripper {gripper} jumps away and back in {int(wrong.sum())} of {len(time)} samples, for "
-                f"example by {max(farthest)[1]}"
+            words[gripper] = (
+                f"jumps away and back in {int(wrong.sum())} of {len(time)} samples, for example by {max(farthest)[1]}: "
+                "taken to be on a straight line."
             )
-    return result, clauses
+    return result, words
 
 
 def _distance(pose: Float[np.ndarray, "*B P"], other: Float[np.ndarray, "*B P"]) -> Float[np.ndarray, "*B"]:

@@ -101,7 +101,7 @@ def prepare(log: GapLog) -> Recording:
     episodes, intervals = [], []
     for e in range(n_episodes):
         time, samples, misread = _samples(log, e, observed=e not in short)
-        caveats += [f"In episode {e} {clause}: taken to be on a straight line." for clause in misread]
+        caveats += [f"In episode {e} the pose of gripper {q} {words}" for q, words in misread.items()]
         interval = usual_interval(time) if len(time) > 1 else _ANY_INTERVAL
         if not is_even(time, interval):
             caveats.append(
@@ -149,7 +149,7 @@ def prepare(log: GapLog) -> Recording:
     return dataclasses.replace(recording, caveats=tuple(caveats))
 
 
-def _samples(log: GapLog, e: int, *, observed: bool) -> tuple[Float[np.ndarray, "T"], Samples, list[str]]:
+def _samples(log: GapLog, e: int, *, observed: bool) -> tuple[Float[np.ndarray, "T"], Samples, dict[int, str]]:
     """Times and samples of one episode, angles continuous in time and along the cable, and what was taken out."""
     n = int(log.episode_length[e])
     points = log.keypoints[e, :n].astype(float)

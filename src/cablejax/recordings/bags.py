@@ -10,9 +10,10 @@ import pathlib
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 
 from cablejax.limits import require
-from cablejax.poses import poses_at
+from cablejax.poses import poses_at, without_misreadings
 from cablejax.recordings.assemble import gap_log_from_takes
 from cablejax.recordings.layout import Fields, Layout, read_layout
 from cablejax.recordings.prepare import prepare
@@ -48,13 +49,15 @@ def import_mcap(path: str | os.PathLike[str], layout: str | os.PathLike[str]) ->
             used without guessing.
     """
     how = read_layout(layout, "topics")
-    take = _take(pathlib.Path(path), how)
+    take, misread = _take(pathlib.Path(path), how)
     takes, repairs = prepare((take,), how.setup)
+    repairs = [*misread, *repairs]
     measured = take.gripper_pose is not None
     return gap_log_from_takes(takes, how.nominal, source=how.source, repairs=repairs, measured=measured), repairs
 
 
-def _take(path: pathlib.Path, how: Layout) -> Take:
+def _take(path: pathlib.Path, how: Layout) -> tuple[Take, list[str]]:
+    """The take of a bag, and a sentence on each topic with poses that jump away and back."""
     fields: Fields = how.place
     keypoints_topic = fields.take("keypoints", str, "the topic of the keypoints")
     gripper_topics = fields.names("grippers", (2,), "the topics of gripper 0 and gripper 1", None)
@@ -69,19 +72,22 @@ def _take(path: pathlib.Path, how: Layout) -> Take:
             f"{path}: the messages on {keypoints_topic} have {min(count)} to {max(count)} poses, expected the same "
             "number in each, NaN where a keypoint was not observed."
         )
-    poses = None
+    poses, misread = None, []
     if gripper_topics is not None:
+        tracks = []
         for topic in gripper_topics:
-            stamps, _ = _sorted(messages[topic])
+            stamps, gripper_rows = _sorted(messages[topic])
             if stamps[0] > time[-1] or stamps[-1] < time[0]:
                 raise ValueError(
                     f"{path}: {topic} has time stamps from {stamps[0]:.3f} to {stamps[-1]:.3f} s and {keypoints_topic} "
                     f"from {time[0]:.3f} to {time[-1]:.3f} s, which do not overlap: expected the times of one clock in "
                     "the headers."
                 )
-        tracks = [_at(time, *_sorted(messages[topic])) for topic in gripper_topics]
-        poses = unit_quaternions(np.stack(tracks, axis=1), str(path))
-    return Take(path.stem, time - time[0], np.array(rows)[..., :3], poses, labels={"motion": motion})
+            track, jumps = without_misreadings(stamps, unit_quaternions(np.array(gripper_rows), f"{path}: {topic}"))
+            misread += [f"{topic} {words}" for words in jumps.values()]
+            tracks.append(_at(time, stamps, track[:, 0]))
+        poses = np.stack(tracks, axis=1)
+    return Take(path.stem, time - time[0], np.array(rows)[..., :3], poses, labels={"motion": motion}), misread
 
 
 def _messages(path: pathlib.Path, wanted: dict[str, str]) -> dict[str, list[tuple[float, np.ndarray]]]:
@@ -142,9 +148,9 @@ def _sorted(messages: list[tuple[float, np.ndarray]]) -> tuple[np.ndarray, list[
     return np.array([time for time, _ in ordered]), [poses for _, poses in ordered]
 
 
-def _at(time: np.ndarray, stamps: np.ndarray, rows: list[np.ndarray]) -> np.ndarray:
+def _at(time: np.ndarray, stamps: np.ndarray, poses: Float[np.ndarray, "S 7"]) -> Float[np.ndarray, "T 7"]:
     """Poses at other times, shape [T, 7], see `poses_at`; NaN in gaps, before the first and after the last."""
-    track = poses_at(time, stamps, np.array(rows)[:, 0])
+    track = poses_at(time, stamps, poses)
     after = np.clip(np.searchsorted(stamps, time), 1, len(stamps) - 1)
     far = (stamps[after] - time > LARGEST_LAG) | (time - stamps[after - 1] > LARGEST_LAG)
     outside = (time < stamps[0]) | (time > stamps[-1])

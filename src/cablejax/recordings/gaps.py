@@ -161,8 +161,8 @@ def _without_repeats(take: Take, reports: list[str]) -> Take:
 def _without_misreadings(take: Take, reports: list[str]) -> Take:
     if take.gripper_pose is None:
         return take
-    pose, clauses = without_misreadings(take.time, take.gripper_pose)
-    reports += [f"Take {take.name}: {clause}: taken to be on a straight line." for clause in clauses]
+    pose, jumps = without_misreadings(take.time, take.gripper_pose)
+    reports += [f"Take {take.name}: the pose of gripper {q} {words}" for q, words in jumps.items()]
     return dataclasses.replace(take, gripper_pose=pose)
 
 

@@ -24,8 +24,8 @@ def on_one_clock(log: GapLog) -> tuple[GapLog, tuple[str, ...]]:
     """
     pose, repairs = log.gripper_pose.copy(), []
     for e, n in enumerate(log.episode_length):
-        pose[e, :n], clauses = without_misreadings(log.time[e, :n], pose[e, :n])
-        repairs += [f"In episode {e} {clause}: taken to be on a straight line." for clause in clauses]
+        pose[e, :n], jumps = without_misreadings(log.time[e, :n], pose[e, :n])
+        repairs += [f"In episode {e} the pose of gripper {q} {words}" for q, words in jumps.items()]
     if repairs:
         log = dataclasses.replace(log, gripper_pose=pose)
     steps = np.concatenate([np.diff(time[:n]) for time, n in zip(log.time, log.episode_length, strict=True)])
