@@ -27,7 +27,7 @@ help:
 	@echo "make notebooks  executes the notebooks as they are and prints their times"
 	@echo "make docs       the documentation as a site, site/index.html"
 	@echo "make dist       wheel and source distribution, checked, in dist/"
-	@echo "make wheel-check  that wheel in clean environments, with README's commands and their times; half an hour"
+	@echo "make wheel-check  that wheel in clean environments, with README's commands and their times; a quarter to half an hour"
 	@echo "make clean      remove .venv and caches (runs/ stays)"
 
 $(STAMP): pyproject.toml constraints.txt
