@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from cablejax.diagnose import CableDiagnosis, DiagnosisError, diagnose
-from cablejax.diagnose.log_faults import steadied
+from cablejax.diagnose.log_faults import early_keypoints, steadied
 from cablejax.diagnose.recording import prepare
 from cablejax.gaplog import GapLogError
 from cablejax.types import GapLog
@@ -148,6 +148,20 @@ def test_poses_that_come_later_than_the_keypoints_are_told(late):
     caveats = prepare(dataclasses.replace(log, gripper_pose=log.gripper_pose[:, rows])).caveats
     told_ = [text for text in caveats if "fit their poses" in text]
     assert len(told_) == (late > 0) and all(f"{0.1 * late:.2g} s later" in text for text in told_)
+
+
+@pytest.mark.parametrize("unseen", [[0], [0, 1]])
+def test_ends_that_are_not_seen_say_nothing_of_clocks(unseen):
+    log = record()
+    keypoints = log.keypoints[:, :, [0, -1]].astype(float)
+    ends = keypoints.copy()
+    ends[:, :, unseen] = np.nan
+    place, interval = log.gripper_pose[..., :2].astype(float), np.full(len(ends), 0.1)
+    assert early_keypoints(ends, place, log.episode_length, interval) == []
+    if unseen == [0]:
+        late = np.concatenate([place[:, :1].repeat(4, axis=1), place[:, :-4]], axis=1)
+        assert "0.4 s later" in early_keypoints(ends, late, log.episode_length, interval)[0]
+        assert early_keypoints(ends[:, :3], late[:, :3], np.full(len(ends), 3), interval) == []
 
 
 SCATTER = np.array([3e-4, 3e-4, 4e-3])

@@ -92,19 +92,23 @@ def early_keypoints(
     """
 
     def apart(seconds: float) -> float:
-        every = []
-        for end, own, n, step in zip(ends, place, length, interval, strict=True):
-            ahead = round(seconds / step)
-            every.append((end[: max(n - ahead, 0)] - own[ahead:n]).reshape(-1, 2, 2))
-        off = np.concatenate(every)
-        off = off - np.nanmedian(off, axis=0)
-        return float(np.sqrt(np.nanmean(off**2)))
+        squares = []
+        for q in (0, 1):
+            rows = []
+            for end, own, n, step in zip(ends[:, :, q], place[:, :, q], length, interval, strict=True):
+                ahead = round(seconds / step)
+                rows.append(end[: max(n - ahead, 0)] - own[ahead : max(n, ahead)])
+            off = np.concatenate(rows)
+            off = off[np.isfinite(off).all(axis=1)]
+            if len(off):
+                squares.append((off - np.median(off, axis=0)) ** 2)
+        return float(np.sqrt(np.mean(np.concatenate(squares)))) if squares else np.inf
 
     step = float(np.max(interval))
     shifts = step * np.arange(int(_LATEST / step) + 1)
-    sizes = [apart(shift) for shift in shifts if np.isfinite(ends[:, : int(length.max() - shift / step)]).any()]
-    best = int(np.argmin(sizes)) if sizes else 0
-    if best == 0 or sizes[0] < _TOOL or sizes[best] > _FITS * sizes[0]:
+    sizes = [apart(shift) for shift in shifts]
+    best = int(np.argmin(sizes))
+    if best == 0 or not _TOOL < sizes[0] < np.inf or sizes[best] > _FITS * sizes[0]:
         return []
     return [
         f"The keypoints at the grippers fit their poses {shifts[best]:.2g} s later: {1e3 * sizes[best]:.2g} mm off "
