@@ -1,4 +1,4 @@
-"""Gripper poses from the two markers on each gripper, and twists from poses.
+"""Gripper poses: from the two markers on each gripper, at other times, without misreadings, and their twists.
 
 Two markers show a position and a tangent; the rotation about the tangent, the roll, is not observed. In space the
 quaternion of the first sample is the smallest rotation that takes the x axis to the tangent, and from then on the frame

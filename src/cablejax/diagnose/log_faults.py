@@ -104,15 +104,18 @@ def early_keypoints(
                 squares.append((off - np.median(off, axis=0)) ** 2)
         return float(np.sqrt(np.mean(np.concatenate(squares)))) if squares else np.inf
 
+    now = apart(0.0)
+    if not _TOOL < now < np.inf:
+        return []
     step = float(np.max(interval))
     shifts = step * np.arange(int(_LATEST / step) + 1)
     sizes = [apart(shift) for shift in shifts]
     best = int(np.argmin(sizes))
-    if best == 0 or not _TOOL < sizes[0] < np.inf or sizes[best] > _FITS * sizes[0]:
+    if sizes[best] > _FITS * now:
         return []
     return [
         f"The keypoints at the grippers fit their poses {shifts[best]:.2g} s later: {1e3 * sizes[best]:.2g} mm off "
-        f"instead of {1e3 * sizes[0]:.2g} mm (root mean square). The poses come late, or both have clocks of their "
+        f"instead of {1e3 * now:.2g} mm (root mean square). The poses come late, or both have clocks of their "
         "own, which is no effect of the library and can look like one: shift the poses."
     ]
 
