@@ -10,7 +10,7 @@ from cablejax.dynamics.config import Normalisation
 from cablejax.dynamics.fine_tune import starting_from
 from cablejax.dynamics.model import apply
 from cablejax.dynamics.train import train
-from cablejax.dynamics.weights import save_weights
+from cablejax.dynamics.weights import load_weights, save_weights
 from cablejax.types import REFERENCE_FRICTION, REFERENCE_STIFFNESS, advance, cable_descriptor
 from dynamics_cases import SMALL, TINY_TRAINING, arched_history, network, resized, trajectories
 
@@ -53,10 +53,26 @@ def test_a_conditioned_model_starts_as_the_model_it_came_from_and_learns_to_list
     assert np.abs(moved(result.weights, [1.0, -1.0]) - moved(result.weights, [0.0, 0.0])).max() > 0
 
 
+@pytest.mark.parametrize("conditioned", [False, True])
+def test_what_started_symmetric_predicts_the_same_and_learns_a_side(tmp_path, conditioned):
+    symmetric = dataclasses.replace(TRAINED, symmetric=True)
+    graphdef, weights = network(symmetric)
+    path = tmp_path / "symmetric.safetensors"
+    save_weights(path, symmetric, weights, {})
+    config, weights = starting_from(path, dataclasses.replace(SMALL, conditioned=conditioned))
+    assert not config.symmetric
+    known = jnp.asarray([0.3, -0.4]) if conditioned else None
+    history = dataclasses.replace(arched_history(SMALL), cable=known)
+    before = apply((graphdef, load_weights(path)[2]), arched_history(SMALL), TWIST)
+    np.testing.assert_allclose(apply((network(config)[0], weights), history, TWIST), before, atol=1e-7)
+
+
 def test_what_does_not_fit_is_refused(trained, tmp_path):
     path, _ = trained
-    with pytest.raises(ValueError, match=r"latent is 8 there and 16 here. Only `conditioned` may differ"):
+    with pytest.raises(ValueError, match=r"latent is 8 there and 16 here\. Only `conditioned` may be added"):
         starting_from(path, dataclasses.replace(SMALL, latent=16))
+    with pytest.raises(ValueError, match=r"symmetric is False there and True here\. .* and `symmetric` left out"):
+        starting_from(path, dataclasses.replace(SMALL, symmetric=True))
     with pytest.raises(ValueError, match="conditioned model is trained on what is known"):
         train(resized(TINY_TRAINING, conditioned=True), trajectories(), tmp_path / "run", progress=False)
     with pytest.raises(ValueError, match=r"needs History\.cable"):

@@ -87,10 +87,12 @@ def record(
 def fine_tune(data: Trajectory, config: FineTuneConfig, folder: pathlib.Path) -> Model:
     """The released model after training on recorded transitions; what is in the folder already is not done again."""
     if not (folder / FILE_NAME).is_file():
+        # of a recorded cable it is not known whether it is the same in a mirror and from its other end
         source = load_model(config.weights)
-        initial = starting_from(config.weights, source.config)
+        model = dataclasses.replace(source.config, symmetric=False)
+        initial = starting_from(config.weights, model)
         training = TrainConfig(
-            model=source.config, phases=config.phases, seed=config.seed, warmup=20, ema=0.99, clip=1.0
+            model=model, phases=config.phases, flips=False, seed=config.seed, warmup=20, ema=0.99, clip=1.0
         )
         result = train(training, data, folder / "training", initial=initial)
         if not result.completed:

@@ -13,9 +13,10 @@ from cablejax.dynamics.weights import load_weights
 
 
 def starting_from(source: str | os.PathLike[str], config: ModelConfig) -> tuple[ModelConfig, nnx.State]:
-    """The weights of a trained model for `train(..., initial=...)` of a model that may in addition be conditioned.
+    """The weights of a trained model for `train(..., initial=...)` of one that may learn more of cables than it did.
 
-    A conditioned model starts as if it did not listen: the weights of what is known of the cable are zero.
+    That one predicts at first what the trained model does. It may in addition be conditioned: the weights of what is
+    known of the cable start at zero. And it need not be symmetric, so that it can learn an end or a side of the cable.
 
     Args:
         source: see `load_weights`.
@@ -26,25 +27,27 @@ def starting_from(source: str | os.PathLike[str], config: ModelConfig) -> tuple[
 
     Raises:
         WeightsError: no such model.
-        ValueError: it differs from `config` in more than being conditioned.
+        ValueError: it differs from `config` in more than that.
     """
     trained, _, weights = load_weights(source)
     config = dataclasses.replace(config, normalisation=trained.normalisation)
-    if config == trained:
-        return config, weights
-    if dataclasses.replace(config, conditioned=False) != trained:
+    same = dataclasses.replace(config, conditioned=trained.conditioned, symmetric=trained.symmetric)
+    if same != trained or trained.conditioned > config.conditioned or config.symmetric > trained.symmetric:
         other = [
             f"{field.name} is {getattr(trained, field.name)!r} there and {getattr(config, field.name)!r} here"
             for field in dataclasses.fields(config)
             if getattr(trained, field.name) != getattr(config, field.name)
         ]
         raise ValueError(
-            f"The model to start from differs: {'; '.join(other)}. Only `conditioned` may differ. Train with the "
-            "settings of that model."
+            f"The model to start from differs: {'; '.join(other)}. Only `conditioned` may be added, and `symmetric` "
+            "left out. Train with the settings of that model."
         )
-    encoder = ("node_encoder", "first", 0, "kernel")
     flat = dict(nnx.to_flat_state(weights))
-    kernel = flat[encoder].get_value()
-    deaf = jnp.zeros((config.node_features - trained.node_features, kernel.shape[1]), kernel.dtype)
-    flat[encoder] = flat[encoder].replace(jnp.concatenate([kernel, deaf]))
+    kernel, bias = (flat["node_encoder", "first", 0, name] for name in ("kernel", "bias"))
+    rows = kernel.get_value()
+    # a symmetric model counts the arc length, which follows the positions and displacements, from the middle
+    shift = 0.5 * (trained.symmetric - config.symmetric) * rows[2 * config.history]
+    deaf = jnp.zeros((config.node_features - trained.node_features, rows.shape[1]), rows.dtype)
+    flat["node_encoder", "first", 0, "kernel"] = kernel.replace(jnp.concatenate([rows, deaf]))
+    flat["node_encoder", "first", 0, "bias"] = bias.replace(bias.get_value() - shift)
     return config, nnx.from_flat_state(flat.items())
