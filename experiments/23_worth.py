@@ -11,7 +11,8 @@ it was informed of before (`cablejax shape --with verdict.json`), and by the onl
 - `plain`: nothing;
 - `diagnosed`: what the verdict on the log names, where that enters a model;
 - `oracle`: the true effect;
-- `recorded`: `gns-reference`, trained on the log's own 180 transitions with their noise.
+- `recorded`: `gns-reference`, trained on the log's own 180 transitions with their noise, and let go of its symmetry
+  where the effect has a side or an end.
 """
 
 from __future__ import annotations
@@ -36,6 +37,7 @@ from cablejax.control.loop import run_closed_loop
 from cablejax.control.shaping import Model, enters, knowing, load_model, make_controller
 from cablejax.control.targets import Shape
 from cablejax.diagnose import diagnose, write_verdict
+from cablejax.effects.given import EFFECTS as LIBRARY
 from cablejax.effects.given import parse_effect
 from cablejax.effects.verdicts import effects_of_verdict
 from cablejax.gaplog import gap_log_from_episodes, read_gap_log, write_gap_log
@@ -165,7 +167,8 @@ def model_for(text: str, kind: str, home: pathlib.Path, case: Case) -> Model:
     """The model of an arm."""
     del case
     if kind == "recorded":
-        return fine_tune(transitions_of(log_of(text, home)), FineTuneConfig(), home / kind)
+        tuning = FineTuneConfig(symmetric=LIBRARY[parse_effect(text).name].symmetric)
+        return fine_tune(transitions_of(log_of(text, home)), tuning, home / kind)
     model = load_model(MODEL)
     if kind == "oracle":
         return knowing(model, (parse_effect(text),))

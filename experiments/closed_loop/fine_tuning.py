@@ -31,6 +31,7 @@ class FineTuneConfig:
         trajectories: recorded from straight starts.
         commands: of each, one second long.
         phases: of the training.
+        symmetric: whether the cable is the same in a mirror and from its other end. Knowing it is a gift to this rival.
         seed: of motions and training.
     """
 
@@ -41,6 +42,7 @@ class FineTuneConfig:
         Phase(steps=400, batch=32, rollout=1, noise=1e-4, lr_start=1e-4, lr_end=5e-5),
         Phase(steps=150, batch=16, rollout=4, noise=3e-5, lr_start=5e-5, lr_end=1e-6),
     )
+    symmetric: bool = True
     seed: int = 0
 
 
@@ -87,12 +89,17 @@ def record(
 def fine_tune(data: Trajectory, config: FineTuneConfig, folder: pathlib.Path) -> Model:
     """The released model after training on recorded transitions; what is in the folder already is not done again."""
     if not (folder / FILE_NAME).is_file():
-        # of a recorded cable it is not known whether it is the same in a mirror and from its other end
         source = load_model(config.weights)
-        model = dataclasses.replace(source.config, symmetric=False)
+        model = dataclasses.replace(source.config, symmetric=source.config.symmetric and config.symmetric)
         initial = starting_from(config.weights, model)
         training = TrainConfig(
-            model=model, phases=config.phases, flips=False, seed=config.seed, warmup=20, ema=0.99, clip=1.0
+            model=model,
+            phases=config.phases,
+            flips=config.symmetric,
+            seed=config.seed,
+            warmup=20,
+            ema=0.99,
+            clip=1.0,
         )
         result = train(training, data, folder / "training", initial=initial)
         if not result.completed:
