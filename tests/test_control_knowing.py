@@ -2,6 +2,8 @@
 
 import dataclasses
 import json
+import re
+from typing import get_args
 
 import jax.numpy as jnp
 import numpy as np
@@ -13,12 +15,20 @@ from cablejax.cli import main
 from cablejax.commands.runs import Job, about, known_from
 from cablejax.control.link import RobotLink
 from cablejax.control.link_state import LinkConfig
-from cablejax.control.shaping import enters, initial_history, knowing, load_model, make_controller
-from cablejax.control.targets import make_target
+from cablejax.control.shaping import (
+    enters,
+    initial_history,
+    knowing,
+    load_model,
+    make_controller,
+    not_within_reach,
+)
+from cablejax.control.targets import Shape, make_target, target_from_keypoints
 from cablejax.dataset.generate import make_engine, simulate
 from cablejax.dataset.schema import DatasetConfig
 from cablejax.dynamics.weights import released_names
 from cablejax.effects.given import GivenEffect, parse_effect
+from cablejax.mpc import MPCConfig
 from cablejax.report.diagnosis_page import INFORMING
 from cablejax.residual import STATIC, LearnerConfig
 from cablejax.simulate.plant.config import PlantConfig
@@ -194,6 +204,17 @@ def test_a_controller_plans_for_the_models_interval(model):
     with pytest.raises(ValueError, match=r"plans for 0\.5 s between commands, and the interval of this run is 1 s"):
         RobotLink(controller, target)
     RobotLink(controller, target, LinkConfig(interval=0.5))
+
+
+def test_a_target_whose_ends_meet_is_out_of_the_grippers_reach(model):
+    angle = np.linspace(0, 2 * np.pi, model.config.n_keypoints)
+    ring = np.stack([np.sin(angle), 1 - np.cos(angle)], axis=1) * model.cable.length / (2 * np.pi)
+    bounds = MPCConfig.for_length(model.config.length)
+    assert re.match(
+        r"The ends of ring are \S+ cm apart, and the controller keeps the grippers 15 to 99 cm apart .* only come near",
+        not_within_reach(target_from_keypoints("ring", ring, model.cable), bounds),
+    )
+    assert not any(not_within_reach(make_target(shape, model.cable), bounds) for shape in get_args(Shape))
 
 
 def test_a_plant_whose_cable_is_curved_at_rest_is_not_the_same(model):

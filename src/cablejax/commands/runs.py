@@ -16,7 +16,7 @@ from cablejax.commands.options import UsageError, say
 from cablejax.commands.results import summarise, write_results
 from cablejax.commands.resuming import Parts
 from cablejax.control.run import ClosedLoopRun
-from cablejax.control.shaping import Method, Model, check_fit, enters, shape_once
+from cablejax.control.shaping import Method, Model, check_fit, enters, not_within_reach, shape_once
 from cablejax.control.targets import Target
 from cablejax.diagnose.judgement import listed
 from cablejax.dynamics.fingerprint import fingerprint
@@ -24,6 +24,7 @@ from cablejax.effects.given import GivenEffect, parse_effect
 from cablejax.effects.physics import nominal_physics
 from cablejax.effects.verdicts import effects_of_verdict, posterior_of_verdict
 from cablejax.limits import require
+from cablejax.mpc import MPCConfig
 from cablejax.perceive.camera import CameraConfig
 from cablejax.report.effect_words import EFFECTS
 from cablejax.report.style import METHOD_LABEL
@@ -57,6 +58,12 @@ class Job:
     def __post_init__(self):
         require(self.steps, "commands", "--steps")
         check_fit(self.model, self.plant.cable)
+
+    @property
+    def out_of_reach(self) -> list[str]:
+        """Why targets are, in sentences."""
+        bounds = MPCConfig.for_length(self.model.config.length)
+        return [text for target in self.targets if (text := not_within_reach(target, bounds))]
 
     def settings(self) -> dict[str, Any]:
         """All that a run depends on, as for JSON: of the model its weights, since a name may stand for others later."""
@@ -92,6 +99,8 @@ def shape_and_report(job: Job, out: pathlib.Path, parts: Parts, *, facts: Mappin
     """
     begin = time.perf_counter()
     kept = {(t.name, method): parts.load(f"{t.name}-{method}") for t in job.targets for method in job.methods}
+    for text in job.out_of_reach:
+        say(text)
     if any(run is None for run in kept.values()):
         say("compiling the control step ...")
     runs: dict[tuple[str, Method], ClosedLoopRun] = {}
@@ -177,7 +186,7 @@ def plant_of(
 
 
 def about(job: Job) -> str:
-    """Differences of the plant from the model's training data, in sentences.
+    """Differences of the plant from the model's training data, and what the targets ask too much, in sentences.
 
     Every ratio is computed: the plant's cable with its effects over the model's cable.
     """
@@ -210,6 +219,7 @@ def about(job: Job) -> str:
         )
     elif plant.keypoint_noise > 0:
         sentences.append(f"The keypoints are seen with {1e3 * plant.keypoint_noise:g} mm of noise.")
+    sentences += job.out_of_reach
     return " ".join(sentences)
 
 

@@ -35,6 +35,9 @@ from cablejax.simulate.plant import Plant, PlantConfig
 from cablejax.solver_names import SolverName
 from cablejax.types import History, cable_descriptor
 
+_NEAR = 0.01
+"""By how much a target's ends may be closer or farther apart than the grippers may be, in lengths of the cable."""
+
 Method = Literal["residual", "direct"]
 """The learned model with the online residual, or as it was trained."""
 
@@ -196,6 +199,19 @@ def make_controller(model: Model, target: Target, *, method: Method, solver: Sol
     )
     objective = dataclasses.replace(config.objective, interval=model.config.interval)
     return MPC(dataclasses.replace(config, objective=objective), model.dynamics, model.weights, target.keypoints)
+
+
+def not_within_reach(target: Target, config: MPCConfig) -> str:
+    """Why a controller cannot bring a cable exactly to a target, whatever its model: a sentence, or nothing."""
+    apart, length = float(np.linalg.norm(target.keypoints[-1] - target.keypoints[0])), config.cable_length
+    low, high = config.min_distance * length, config.max_distance * length
+    if low - _NEAR * length <= apart <= high + _NEAR * length:
+        return ""
+    return (
+        f"The ends of {target.name} are {100 * apart:.3g} cm apart, and the controller keeps the grippers "
+        f"{100 * low:.3g} to {100 * high:.3g} cm apart (`MPCConfig.min_distance`, `max_distance`): the cable can only "
+        "come near it."
+    )
 
 
 def initial_history(cable: Cable, config: ModelConfig) -> History:
