@@ -6,7 +6,9 @@ import argparse
 import concurrent.futures
 import contextlib
 import multiprocessing
+import os
 import sys
+import threading
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, cast
 
@@ -48,11 +50,24 @@ def executor_of(text: str) -> Iterator[concurrent.futures.Executor | None]:
         yield None
         return
     # forked processes would inherit JAX's threads, and wait for them for ever
-    pool = concurrent.futures.ProcessPoolExecutor(int(text), multiprocessing.get_context("spawn"))
+    context = multiprocessing.get_context("spawn")
+    pool = concurrent.futures.ProcessPoolExecutor(int(text), context, initializer=_ends_with_its_parent)
     try:
         yield pool
     finally:
         pool.shutdown(wait=True, cancel_futures=True)
+
+
+def _ends_with_its_parent() -> None:
+    """Workers of a process that is killed would wait for the next row for ever, with gigabytes of memory each."""
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+
+    def wait() -> None:
+        parent.join()
+        os._exit(1)
+
+    threading.Thread(target=wait, daemon=True).start()
 
 
 @contextlib.contextmanager

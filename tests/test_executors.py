@@ -35,6 +35,14 @@ def rows_in(folder: pathlib.Path) -> Rows:
     return Rows(folder / "rows.jsonl", ("number",))
 
 
+def lives(process: str) -> bool:
+    try:
+        state = pathlib.Path("/proc", process, "stat").read_text()
+    except (FileNotFoundError, ProcessLookupError):
+        return False
+    return not state.rpartition(")")[2].lstrip().startswith("Z")
+
+
 KEYS = [(number,) for number in range(20)]
 
 
@@ -57,6 +65,28 @@ def test_processes_share_the_rows_and_a_killed_one_costs_nothing_that_was_done(t
         with pytest.raises(ExecutorError, match="run the same command"):
             rows.run(rows.missing(KEYS[:7]), die, executor=executor, progress=False)
     assert rows.read() == made and rows.missing(KEYS[:7]) == [(6,)]
+
+
+@pytest.mark.skipif(not pathlib.Path("/proc/self/stat").exists(), reason="reads /proc")
+def test_workers_end_with_the_process_that_is_killed(tmp_path):
+    """Or they would wait for the next row for ever, each with the memory of a simulation."""
+    script = (
+        "import os, signal\n"
+        "from executors import executor_of\n"
+        "if __name__ == '__main__':\n"
+        "    with executor_of('2') as pool:\n"
+        "        print(pool.submit(os.getpid).result(), flush=True)\n"
+        "        os.kill(os.getpid(), signal.SIGKILL)\n"
+    )
+    (tmp_path / "killed.py").write_text(script)
+    program = [sys.executable, str(tmp_path / "killed.py")]
+    paths = os.pathsep.join(filter(None, [str(EXPERIMENTS), os.environ.get("PYTHONPATH")]))
+    run = subprocess.run(program, capture_output=True, text=True, timeout=120, env={**os.environ, "PYTHONPATH": paths})
+    assert run.returncode == -signal.SIGKILL, run.stderr
+    worker, deadline = run.stdout.strip(), time.monotonic() + 30.0
+    while lives(worker) and time.monotonic() < deadline:
+        time.sleep(0.1)
+    assert not lives(worker)
 
 
 def test_any_executor_will_do_and_no_row_is_begun_when_the_time_is_up(tmp_path):
