@@ -40,7 +40,8 @@ def joined(logs: Sequence[GapLog], names: Sequence[str]) -> GapLog:
     logs = _of_one_length(logs)
     for i, (log, name) in enumerate(zip(logs, names, strict=True)):
         for other, other_name in zip(logs[:i], names, strict=False):
-            if _same_recording(log, other):
+            same = (np.array_equal(getattr(log, n), getattr(other, n), equal_nan=True) for n in ("time", "keypoints"))
+            if all(same):
                 raise GapLogError(
                     f"{other_name} and {name} are the same recording: name it once, or it would count twice."
                 )
@@ -163,9 +164,3 @@ def _set_up(log: GapLog) -> dict[str, Any]:
         **{f"meta.cable.{name}": value for name, value in meta["cable"].items()},
         **{f"meta.{name}": meta[name] for name in ("table", "gravity_m_per_s2", "keypoint_arclength_m", "grasp")},
     }
-
-
-def _same_recording(log: GapLog, other: GapLog) -> bool:
-    return all(
-        np.array_equal(getattr(log, name), getattr(other, name), equal_nan=True) for name in ("time", "keypoints")
-    )

@@ -41,9 +41,10 @@ class Export(Command):
     def execute(self):
         """Reads the log, and writes it in the other format."""
         out = pathlib.Path(_DEFAULTS[self.format]) if self.out is None else self.out
-        if out.is_dir() or (out.exists() and (self.format == "lerobot" or not self.overwrite)):
-            advice = ", or add --overwrite" if out.is_file() and self.format != "lerobot" else ""
-            raise UsageError(f"{out} exists. Give another {_noun(self.format)} with --out{advice}.")
+        noun = "folder" if self.format == "lerobot" else "file"
+        if out.is_dir() or (out.exists() and (noun == "folder" or not self.overwrite)):
+            advice = ", or add --overwrite" if out.is_file() and noun == "file" else ""
+            raise UsageError(f"{out} exists. Give another {noun} with --out{advice}.")
         log, simulated, about = recorded(self.source)
         if self.format == "mcap":
             from cablejax.recordings.mcap_log import write_mcap
@@ -113,7 +114,3 @@ def _log_of_run(folder: pathlib.Path) -> pathlib.Path:
         f"{folder} has neither log.npz nor simulated.npz. Give a gap log: of a study that in one of its folders, "
         "round_1 for instance."
     )
-
-
-def _noun(form: str) -> str:
-    return "folder" if form == "lerobot" else "file"

@@ -23,6 +23,10 @@ SCHEMA = "cablejax-parts/1"
 """Marks the folder as ours; a folder of that name without it belongs to somebody else."""
 
 _NESTED = {"target": Target, "episode": Episode}
+_FIELDS = [
+    *(field.name for field in dataclasses.fields(ClosedLoopRun) if field.name not in _NESTED),
+    *(f"{group}.{field.name}" for group, cls in _NESTED.items() for field in dataclasses.fields(cls)),
+]
 _SETTINGS, _STATE, _RUN = "settings.json", "state.json", ".run.npz"
 
 
@@ -150,14 +154,6 @@ def unfinished(out: pathlib.Path, settings: Mapping[str, Any], *, overwrite: boo
                 parts.remove()
             raise
         parts.remove()
-
-
-def _names() -> list[str]:
-    fields = [field.name for field in dataclasses.fields(ClosedLoopRun) if field.name not in _NESTED]
-    return fields + [f"{group}.{field.name}" for group, cls in _NESTED.items() for field in dataclasses.fields(cls)]
-
-
-_FIELDS = _names()
 
 
 def _flatten(run: ClosedLoopRun) -> dict[str, Any]:

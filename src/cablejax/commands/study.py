@@ -12,7 +12,6 @@ from cablejax.commands.options import Command, say
 
 if TYPE_CHECKING:
     from cablejax.diagnose import Diagnosis
-    from cablejax.simulate.plant import Plant
     from cablejax.types import GapLog
 
 
@@ -68,6 +67,7 @@ class Study(Command):
         from cablejax.report.sheet import write_sheet
         from cablejax.report.study_sheet import study_sheet
         from cablejax.simulate.plant import Plant
+        from cablejax.simulate.play import play
         from cablejax.text_file import read_json, write_json
 
         require(self.rounds, "count", "--rounds")
@@ -93,7 +93,9 @@ class Study(Command):
                 path, folder = self.out / f"recording_{number}.npz", self.out / f"round_{number}"
                 if number > kept:
                     say(f"round {number}: recording {', '.join(commands.meta['motion'])} ...")
-                    write_gap_log(path, self._recorded(plant, commands, number), overwrite=True)
+                    noise, seed = 1e-3 * self.noise_mm, self.seed + number
+                    log = play(plant, commands, source="contact plant", noise=noise, seed=seed)
+                    write_gap_log(path, log, overwrite=True)
                 recordings.append(read_gap_log(path))
                 if number > kept:
                     log = joined(recordings, [f"recording_{k}.npz" for k in range(1, number + 1)])
@@ -120,8 +122,3 @@ class Study(Command):
             }
             write_json(self.out / "summary.json", result)
         return result, f"{found[-1].verdict}: {found[-1].sentence} {ENDED[why]}\n{page}"
-
-    def _recorded(self, plant: Plant, commands: GapLog, number: int) -> GapLog:
-        from cablejax.simulate.play import play
-
-        return play(plant, commands, source="contact plant", noise=1e-3 * self.noise_mm, seed=self.seed + number)

@@ -234,10 +234,6 @@ def _real(values: object, what: str) -> np.ndarray:
     raise ValueError(f"{what} of {came}, expected real numbers.")
 
 
-def _read_npz(path: pathlib.Path) -> dict[str, np.ndarray]:
-    return read_npz(path, ["keypoints"], ["gripper_pose"])
-
-
 def _read_json(path: pathlib.Path) -> dict[str, np.ndarray]:
     content = read_json(path)
     if not isinstance(content, dict) or "keypoints" not in content:
@@ -256,4 +252,8 @@ def _read_csv(path: pathlib.Path) -> dict[str, np.ndarray]:
     return {"keypoints": np.array(rows)}
 
 
-_READERS = {".npz": _read_npz, ".json": _read_json, ".csv": _read_csv}
+_READERS = {
+    ".npz": lambda path: read_npz(path, ["keypoints"], ["gripper_pose"]),
+    ".json": _read_json,
+    ".csv": _read_csv,
+}

@@ -108,7 +108,8 @@ class Case:
         nominal = run(replay(FINE_LINKS, FINE_STEP, recording.gripper_pose))
         if not np.isfinite(nominal).all():
             raise DiagnosisError("The nominal simulation of this log breaks down: are the poses continuous, in metres?")
-        place = _place(recording.gripper_pose)
+        # roughly [m]: the world's origin wherever the grippers are within a metre of it
+        place = _FRAME * np.round(np.nanmean(recording.gripper_pose[..., :2], axis=(0, 1, 2)) / _FRAME)
         simulator = PlanarCable(
             effects=[effect.around(place) for effect in effects],
             playback=playback,
@@ -212,11 +213,6 @@ def first_shapes(recording: Recording) -> list[np.ndarray | None]:
         mean = np.where(count > 0, np.nansum(still, axis=0) / np.maximum(count, 1), np.nan)
         shapes.append(mean if np.isfinite(mean).all(axis=1).sum() >= 3 else None)
     return shapes
-
-
-def _place(gripper_pose: Float[np.ndarray, "E T Q 3"]) -> Float[np.ndarray, "2"]:
-    """Where the recording is, roughly [m]: the world's origin wherever the grippers are within a metre of it."""
-    return _FRAME * np.round(np.nanmean(gripper_pose[..., :2], axis=(0, 1, 2)) / _FRAME)
 
 
 def _at_uniform_marks(

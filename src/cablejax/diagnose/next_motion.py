@@ -12,7 +12,7 @@ from cablejax.diagnose.motion_bounds import Bounds, BoundsError
 from cablejax.diagnose.motion_design import DesignConfig, design_motion, excluded
 from cablejax.diagnose.motion_judge import Judge, Judged
 from cablejax.diagnose.playback import Playback
-from cablejax.diagnose.protocol import Explanation, explanation
+from cablejax.diagnose.protocol import explanation
 from cablejax.diagnose.safe_motions import INTERVAL, Way, safe_ways, starting_pose
 
 DESIGNED = "designed"
@@ -48,7 +48,7 @@ def next_motion(judge: Judge, design: DesignConfig | None = None) -> NextMotion 
     name = DESIGNED if design is not None else max(kept, key=lambda name: kept[name].information)
     best = kept[name]
     assert best.keypoints is not None
-    names = [_name(one) for one in judge.explanations]
+    names = [" + ".join(dict.fromkeys(one.names)) or "nominal" for one in judge.explanations]
     return NextMotion(
         motion=name,
         separates=() if judge.about_parameters else tuple(names),
@@ -87,7 +87,3 @@ def _safe(judge: Judge) -> tuple[dict[str, Way], dict[str, Judged], int]:
     ways = safe_ways(playback.config, starting_pose(playback.gripper_pose), bounds)
     judged = judge.judged([way.played(n_samples, bounds) for way in ways.values()])
     return ways, dict(zip(ways, judged, strict=True)), n_samples
-
-
-def _name(one: Explanation) -> str:
-    return " + ".join(dict.fromkeys(one.names)) or "nominal"

@@ -102,7 +102,9 @@ def _along(where: Where, arclength: np.ndarray) -> list[str]:
 def _when(where: Where) -> list[str]:
     sentences = []
     known = {name: (ratio, p) for name, (ratio, p) in where.contrasts.items() if p < LEVEL}
-    hold, moving = where.regimes.get("speed: hold"), _moving(where)
+    hold, slow, fast = (where.regimes.get(f"speed: {one}") for one in ("hold", "slow", "fast"))
+    sizes = [size for size in (slow, fast) if size is not None]
+    moving = float(np.sqrt(np.mean(np.square(sizes)))) if sizes else None
     if hold is not None and moving is not None:
         if "speed: hold" in known and known["speed: hold"][0] < 1 / _CLEAR_RATIO:
             sentences.append(
@@ -110,7 +112,6 @@ def _when(where: Where) -> list[str]:
             )
         elif hold > 0.7 * moving and hold > 0:
             sentences.append(f"It stays while the grippers rest, {hold:.1f} mm in holds: not a lag.")
-    slow, fast = (where.regimes.get(f"speed: {name}") for name in ("slow", "fast"))
     if where.episode_p is None and slow is not None and fast is not None:
         sentences.append(f"It is {_mm(fast)} while the grippers move fast, {_mm(slow)} while they move slowly.")
     horizons = list(where.horizons_mm.items())
@@ -148,11 +149,6 @@ def _frame(where: Where) -> list[str]:
         }
         return [f"{100 * frames[best]:.0f} % of it does not change with the motion: {words[best]}."]
     return []
-
-
-def _moving(where: Where) -> float | None:
-    sizes = [where.regimes[name] for name in ("speed: slow", "speed: fast") if name in where.regimes]
-    return float(np.sqrt(np.mean(np.square(sizes)))) if sizes else None
 
 
 def _mm(value: float) -> str:

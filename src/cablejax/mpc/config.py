@@ -99,7 +99,8 @@ class MPCConfig:
             "restart_above",
         )
         scaled = {name: ratio * getattr(cls, name) for name in own}
-        scaled["objective"] = _scaled(cls.objective, ratio, "rotation_weight", "arrival_margin")
+        lengths = {name: ratio * getattr(cls.objective, name) for name in ("rotation_weight", "arrival_margin")}
+        scaled["objective"] = dataclasses.replace(cls.objective, **lengths)
         interval = settings.get("objective", cls.objective).interval
         scaled["residual"] = cls.residual and cls.residual.scaled(ratio, interval)
         return cls(**{**scaled, **settings})
@@ -163,7 +164,3 @@ class MPCConfig:
     def n_commands(self) -> int:
         """Commands of a plan, T = h + 1."""
         return self.horizon + 1
-
-
-def _scaled(config: Any, ratio: float, *names: str) -> Any:
-    return dataclasses.replace(config, **{name: ratio * getattr(config, name) for name in names})

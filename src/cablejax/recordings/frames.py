@@ -145,7 +145,8 @@ def require_hanging(takes: tuple[Take, ...], frame: Frame) -> None:
     Raises:
         ValueError: names the axis along which the cable hangs.
     """
-    above = np.concatenate([_above(take.keypoints) for take in takes])
+    # from the middle of the cable to the middle of its ends [m]; NaN where not all keypoints are observed
+    above = np.concatenate([take.keypoints[:, [0, -1]].mean(axis=1) - take.keypoints.mean(axis=1) for take in takes])
     above = above[np.isfinite(above).all(axis=1)]
     mean = above.mean(axis=0) if len(above) else np.zeros(3)
     size = np.linalg.norm(mean)
@@ -161,11 +162,6 @@ def require_hanging(takes: tuple[Take, ...], frame: Frame) -> None:
         f"The frame is stated to have {frame.up} up, but the cable hangs from its ends opposite to {found}: "
         f"say that {found} is up, or check the order of the coordinates."
     )
-
-
-def _above(points: Float[np.ndarray, "T N 3"]) -> Float[np.ndarray, "T 3"]:
-    """From the middle of the cable to the middle of its ends [m]; NaN where not all keypoints are observed."""
-    return points[:, [0, -1]].mean(axis=1) - points.mean(axis=1)
 
 
 def require_rigid(takes: tuple[Take, ...], pairs: tuple[tuple[int, int], ...]) -> None:

@@ -70,7 +70,8 @@ def cut_at_gaps(takes: tuple[Take, ...], on_grippers: tuple[int, ...] | None) ->
         edges[1:-1] |= known[1:] != known[:-1]
         begins = np.flatnonzero(edges).tolist()
         spans = [(a, b) for a, b in itertools.pairwise(begins) if known[a]]
-        kept = [(a, b) for a, b in spans if _long_enough(take.time[a:b])]
+        long_enough = ((a, b) for a, b in spans if b - a >= SHORTEST_SAMPLES)
+        kept = [(a, b) for a, b in long_enough if take.time[b - 1] - take.time[a] >= SHORTEST]
         if not known.all():
             reports.append(
                 f"Take {take.name}: in {int((~known).sum())} samples one of the grippers is not seen, for more than "
@@ -121,10 +122,6 @@ def _fillable(take: Take) -> float:
     usual = float(np.median(steps)) if len(steps) else 0.0
     one_missing = min(2.1 * usual, FILLED_ON_TABLE) if take.keypoints.shape[2] == 2 else 0.0
     return max(FILLED + 1e-9, one_missing)
-
-
-def _long_enough(time: np.ndarray) -> bool:
-    return len(time) >= SHORTEST_SAMPLES and time[-1] - time[0] >= SHORTEST
 
 
 def _known(take: Take, on_grippers: tuple[int, ...] | None) -> np.ndarray:

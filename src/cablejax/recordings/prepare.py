@@ -94,7 +94,8 @@ def prepare(takes: tuple[Take, ...], setup: Setup) -> tuple[tuple[Take, ...], li
             "poses, or two keypoints on each gripper."
         )
     takes, repairs = _in_metres(takes, setup)
-    if all(len(take.time) > 1 and _frozen(take.keypoints) for take in takes):
+    points = [take.keypoints for take in takes]
+    if all(len(own) > 1 and np.array_equal(own[1:], own[:-1], equal_nan=True) for own in points):
         raise ValueError(
             "All samples have the same keypoints to the last digit, which no tracker measures: expected a recording of "
             "a cable that moves. Check the columns, and that the tracker ran."
@@ -118,10 +119,6 @@ def prepare(takes: tuple[Take, ...], setup: Setup) -> tuple[tuple[Take, ...], li
     if not measured:
         takes = tuple(_with_poses(take, pairs) for take in takes)
     return takes, [*repairs, *outliers, *flattened, *exchanged, *jumps, *stretched, *cut, *_jerks(takes)]
-
-
-def _frozen(keypoints: np.ndarray) -> bool:
-    return bool(np.array_equal(keypoints[1:], keypoints[:-1], equal_nan=True))
 
 
 def _without_outliers(takes: tuple[Take, ...]) -> tuple[tuple[Take, ...], list[str]]:

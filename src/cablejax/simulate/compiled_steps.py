@@ -15,12 +15,6 @@ from numba.core import types
 
 from cablejax.compiled_programs import kept_on_disk
 
-
-def _c_function(name: str) -> types.ExternalFunction:
-    """A C function `void f(const mjModel*, mjData*)`, by its name, so that numba can keep what it compiled on disk."""
-    return types.ExternalFunction(name, types.void(types.uint64, types.uint64))
-
-
 # The very library that the Python bindings have loaded: from here on its functions are found by their names.
 llvmlite.binding.load_library_permanently(
     str(
@@ -31,7 +25,11 @@ llvmlite.binding.load_library_permanently(
         )
     )
 )
-_step1, _step2, _kinematics = (_c_function(name) for name in ("mj_step1", "mj_step2", "mj_kinematics"))
+# `void f(const mjModel*, mjData*)`, by their names, so that numba can keep what it compiled on disk
+_step1, _step2, _kinematics = (
+    types.ExternalFunction(name, types.void(types.uint64, types.uint64))
+    for name in ("mj_step1", "mj_step2", "mj_kinematics")
+)
 
 
 @kept_on_disk

@@ -151,7 +151,7 @@ class _Simulation:
         if obstacle[2] == 0:
             self.model, self.data = self.bare
         else:
-            self.model = copy.copy(_model_with(self.config, obstacle))
+            self.model = copy.copy(_kept_model(self.config, obstacle))
             self.data = mujoco.MjData(self.model)
 
     def _table(self, physics: Physics) -> np.ndarray:
@@ -191,6 +191,4 @@ class _Simulation:
             model.opt.gravity[:] = [*physics.tilt, -normal_gravity(physics)]
 
 
-@functools.lru_cache(maxsize=64)
-def _model_with(config: Discretisation, obstacle: tuple[float, float, float]) -> mujoco.MjModel:
-    return build_grasped_chain(config, obstacle)
+_kept_model = functools.lru_cache(maxsize=64)(build_grasped_chain)
