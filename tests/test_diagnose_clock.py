@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from cablejax.diagnose.clock import Samples, furthest_off, is_even, on_even_clock, usual_interval
+from cablejax.diagnose.clock import furthest_off, is_even, on_even_clock, usual_interval
+from cablejax.gaplog import Episode
 
 INTERVAL, N = 0.1, 120
 
@@ -25,12 +26,16 @@ def clocks():
     }
 
 
+def episode_of(time, pose, command, hold=False):
+    return Episode("recorded", time, truth(time), pose, command, np.full(len(time), hold))
+
+
 def samples_at(time):
     """Grippers that move with piecewise constant twists, which are their commands too."""
     rng = np.random.default_rng(1)
     command = np.repeat(rng.normal(size=(len(time) // 10 + 1, 2, 3)), 10, axis=0)[: len(time)] * 0.05
     path = np.cumsum(command[:-1] * np.diff(time)[:, None, None], axis=0)
-    return Samples(truth(time), np.concatenate([np.zeros((1, 2, 3)), path]), command, np.zeros(len(time), bool))
+    return episode_of(time, np.concatenate([np.zeros((1, 2, 3)), path]), command)
 
 
 @pytest.mark.parametrize("name", ["jitter", "drift", "two steps"])
@@ -38,7 +43,7 @@ def test_keypoints_and_arms_are_those_of_the_even_times(name):
     time = clocks()[name]
     interval = usual_interval(time)
     assert interval == pytest.approx(np.diff(time).mean(), abs=1e-6) and not is_even(time, interval)
-    even = on_even_clock(time, samples_at(time), interval)
+    even = on_even_clock(samples_at(time), interval)
     grid = interval * np.arange(len(even.hold))
     assert np.isfinite(even.keypoints).all()
     np.testing.assert_allclose(even.keypoints, truth(grid + time[0]), atol=3e-5)
@@ -50,7 +55,7 @@ def test_a_gap_is_left_open_and_the_rest_bridged():
     time = np.delete(INTERVAL * np.arange(N), np.arange(50, 60))
     assert usual_interval(time) == INTERVAL
     samples = samples_at(time)
-    even = on_even_clock(time, samples, INTERVAL)
+    even = on_even_clock(samples, INTERVAL)
     missing = np.isnan(even.keypoints).any(axis=(1, 2))
     np.testing.assert_array_equal(np.flatnonzero(missing), np.arange(50, 60))
     np.testing.assert_array_equal(even.keypoints[:50], samples.keypoints[:50])
@@ -61,7 +66,7 @@ def test_a_keypoint_that_is_not_seen_is_taken_from_its_neighbours_in_time_or_not
     time = clocks()["jitter"]
     samples = samples_at(time)
     samples.keypoints[40, 0] = np.nan
-    even = on_even_clock(time, samples, INTERVAL)
+    even = on_even_clock(samples, INTERVAL)
     lost = np.flatnonzero(np.isnan(even.keypoints[:, 0, 0]))
     assert 1 <= len(lost) <= 2 and np.abs(lost - 40).max() <= 1
     assert np.isfinite(even.keypoints[:, 1]).all()
@@ -77,5 +82,5 @@ def test_an_even_clock_is_known_by_its_farthest_sample():
 
 def test_two_samples_are_enough():
     time = np.array([0.0, 0.13])
-    even = on_even_clock(time, Samples(truth(time), np.zeros((2, 2, 3)), np.zeros((2, 2, 3)), np.ones(2, bool)), 0.1)
+    even = on_even_clock(episode_of(time, np.zeros((2, 2, 3)), np.zeros((2, 2, 3)), hold=True), 0.1)
     assert even.hold.all() and np.isfinite(even.keypoints).all()

@@ -30,6 +30,12 @@ def quarter_turn(vectors: Float[Any, "*B 2"]) -> Float[Any, "*B 2"]:
     return vectors.__array_namespace__().stack([-vectors[..., 1], vectors[..., 0]], axis=-1)
 
 
+def turns(vectors: Float[Any, "*B N 2"]) -> Float[Any, "*B N1"]:
+    """Angle from each vector of the plane to the next [rad]. NumPy in, NumPy out; JAX in, JAX out."""
+    xp, a, b = vectors.__array_namespace__(), vectors[..., :-1, :], vectors[..., 1:, :]
+    return xp.arctan2(a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0], xp.sum(a * b, axis=-1))
+
+
 def quaternion_product(a: Float[Any, "*B 4"], b: Float[Any, "*B 4"]) -> Float[Any, "*B 4"]:
     """Hamilton product, scalar first. NumPy in, NumPy out; JAX in, JAX out."""
     xp = a.__array_namespace__()

@@ -8,11 +8,12 @@ hundredths of a millimetre where a straight line, or the nearest sample, would b
 
 from __future__ import annotations
 
-from typing import NamedTuple
+import dataclasses
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
+from cablejax.gaplog import Episode
 from cablejax.poses import positions_at
 
 # A clock whose samples are all within this share of the interval from an even one is even.
@@ -21,22 +22,6 @@ _EVEN = 0.01
 _GAP = 1.7
 # A sample within this share of the interval from the clock is taken as it is next to a gap.
 _CLOSE = 0.05
-
-
-class Samples(NamedTuple):
-    """One episode.
-
-    Attributes:
-        keypoints: [m], NaN = not observed, shape [T, N, 2].
-        gripper_pose: theta continuous, shape [T, 2, 3].
-        gripper_command: mean twist from each sample to the next, shape [T, 2, 3].
-        hold: shape [T].
-    """
-
-    keypoints: Float[np.ndarray, "T N 2"]
-    gripper_pose: Float[np.ndarray, "T 2 3"]
-    gripper_command: Float[np.ndarray, "T 2 3"]
-    hold: Bool[np.ndarray, "T"]
 
 
 def usual_interval(time: Float[np.ndarray, "T"]) -> float:
@@ -56,31 +41,32 @@ def is_even(time: Float[np.ndarray, "T"], interval: float) -> bool:
     return furthest_off(time, interval) <= _EVEN * interval
 
 
-def on_even_clock(time: Float[np.ndarray, "T"], samples: Samples, interval: float) -> Samples:
-    """The samples at even times.
+def on_even_clock(episode: Episode, interval: float) -> Episode:
+    """The episode at even times, from 0 on.
 
     What was commanded is integrated over the times at which it was held, so that exact arms stay exact. In a gap
     between samples keypoints are not observed, and what was commanded is taken to be what was done.
 
     Args:
-        time: of the samples, increasing [s].
-        samples: as recorded.
+        episode: as recorded, its angles continuous.
         interval: of the new clock [s].
     """
-    time = time - time[0]
+    time = episode.time - episode.time[0]
     grid = np.arange(int(np.floor(time[-1] / interval + 1e-6)) + 1) * interval
     held = np.diff(time)[:, None, None]
-    done = np.diff(samples.gripper_pose, axis=0)
-    steps = np.where(held <= _GAP * interval, samples.gripper_command[:-1] * held, done)
+    done = np.diff(episode.gripper_pose, axis=0)
+    steps = np.where(held <= _GAP * interval, episode.gripper_command[:-1] * held, done)
     path = np.concatenate([np.zeros((1, 2, 3)), np.cumsum(steps, axis=0)])
     commanded = np.diff(positions_at(grid, time, path), axis=0) / interval
     before = np.clip(np.searchsorted(time, grid + 1e-9, side="right") - 1, 0, len(time) - 1)
     after = np.minimum(before + 1, len(time) - 1)
-    return Samples(
-        keypoints=keypoints_at(grid, time, samples.keypoints, interval),
-        gripper_pose=positions_at(grid, time, samples.gripper_pose),
+    return dataclasses.replace(
+        episode,
+        time=grid,
+        keypoints=keypoints_at(grid, time, episode.keypoints, interval),
+        gripper_pose=positions_at(grid, time, episode.gripper_pose),
         gripper_command=np.concatenate([commanded, np.zeros((1, 2, 3))]),
-        hold=samples.hold[before] & samples.hold[after],
+        hold=episode.hold[before] & episode.hold[after],
     )
 
 

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from cablejax.diagnose.clock import Samples, furthest_off, is_even, on_even_clock, usual_interval
+from cablejax.diagnose.clock import furthest_off, is_even, on_even_clock, usual_interval
 from cablejax.diagnose.log_faults import command_fault, early_keypoints, tool_offset, without_frozen
 from cablejax.diagnose.noise import still
-from cablejax.gaplog import validate
+from cablejax.gaplog import Episode, episodes_of, validate
 from cablejax.log_geometry import cable_fault
 from cablejax.poses import without_misreadings
 from cablejax.types import GapLog
@@ -99,27 +99,29 @@ def prepare(log: GapLog) -> Recording:
     if short:
         caveats.append(f"Left out for having fewer than {_SHORTEST} samples: episode {', '.join(map(str, short))}.")
     episodes, intervals = [], []
-    for e in range(n_episodes):
-        time, samples, misread = _samples(log, e, observed=e not in short)
+    # an importer made commands of the poses: none are known
+    derived = log.meta.get("commands_from_poses", False)
+    for e, recorded in enumerate(episodes_of(log)):
+        episode, misread = _continuous(recorded, observed=e not in short, commanded=not derived)
         caveats += [f"In episode {e} the pose of gripper {q} {words}" for q, words in misread.items()]
-        interval = usual_interval(time) if len(time) > 1 else _ANY_INTERVAL
-        if not is_even(time, interval):
+        interval = usual_interval(episode.time) if len(episode.time) > 1 else _ANY_INTERVAL
+        if not is_even(episode.time, interval):
             caveats.append(
-                f"The clock of episode {e} is up to {1e3 * furthest_off(time, interval):.0f} ms off an even one: "
-                f"sampled again every {interval:g} s."
+                f"The clock of episode {e} is up to {1e3 * furthest_off(episode.time, interval):.0f} ms off an even "
+                f"one: sampled again every {interval:g} s."
             )
-            samples = on_even_clock(time, samples, interval)
-        episodes.append(samples)
+            episode = on_even_clock(episode, interval)
+        episodes.append(episode)
         intervals.append(interval)
-    lengths = [len(samples.hold) for samples in episodes]
+    lengths = [len(episode.time) for episode in episodes]
     total = -(-max(lengths) // _PADDING) * _PADDING
     shape = (n_episodes, total)
     points = np.full((*shape, log.keypoints.shape[2], 2), np.nan)
     pose, command = np.zeros((*shape, 2, 3)), np.zeros((*shape, 2, 3))
     hold = np.zeros(shape, bool)
-    for e, (samples, n) in enumerate(zip(episodes, lengths, strict=True)):
-        points[e, :n], pose[e, :n], hold[e, :n] = samples.keypoints, samples.gripper_pose, samples.hold
-        pose[e, n:], command[e, : n - 1] = samples.gripper_pose[-1], samples.gripper_command[: n - 1]
+    for e, (episode, n) in enumerate(zip(episodes, lengths, strict=True)):
+        points[e, :n], pose[e, :n], hold[e, :n] = episode.keypoints, episode.gripper_pose, episode.hold
+        pose[e, n:], command[e, : n - 1] = episode.gripper_pose[-1], episode.gripper_command[: n - 1]
         # both grippers by the same whole turns, so that an episode which repeats another one is known by its angles
         pose[e, ..., 2] += 2 * np.pi * np.round((pose[0, 0, 0, 2] - pose[e, 0, 0, 2]) / (2 * np.pi))
     marked, hold = hold, still(hold, pose)
@@ -149,21 +151,19 @@ def prepare(log: GapLog) -> Recording:
     return dataclasses.replace(recording, caveats=tuple(caveats))
 
 
-def _samples(log: GapLog, e: int, *, observed: bool) -> tuple[Float[np.ndarray, "T"], Samples, dict[int, str]]:
-    """Times and samples of one episode, angles continuous in time and along the cable, and what was taken out."""
-    n = int(log.episode_length[e])
-    points = log.keypoints[e, :n].astype(float)
-    pose, misread = without_misreadings(log.time[e, :n], log.gripper_pose[e, :n].astype(float))
+def _continuous(episode: Episode, *, observed: bool, commanded: bool) -> tuple[Episode, dict[int, str]]:
+    """An episode in double precision, its angles continuous in time and along the cable, and what was taken out."""
+    points = episode.keypoints.astype(float)
+    pose, misread = without_misreadings(episode.time, episode.gripper_pose.astype(float))
     pose[..., 2] = np.unwrap(pose[..., 2], axis=0)
     pose[:, 1, 2] += _whole_turns(points, pose)
-    derived = log.meta.get("commands_from_poses", False)  # an importer made them of the poses: no commands are known
-    samples = Samples(
+    repaired = dataclasses.replace(
+        episode,
         keypoints=points if observed else np.full_like(points, np.nan),
         gripper_pose=pose,
-        gripper_command=np.zeros_like(pose) if derived else np.nan_to_num(log.gripper_command[e, :n].astype(float)),
-        hold=np.zeros(n, bool) if log.hold is None else log.hold[e, :n],
+        gripper_command=np.nan_to_num(episode.gripper_command.astype(float)) if commanded else np.zeros_like(pose),
     )
-    return log.time[e, :n], samples, misread
+    return repaired, misread
 
 
 def _whole_turns(points: Float[np.ndarray, "T N 2"], pose: Float[np.ndarray, "T 2 3"]) -> float:

@@ -13,6 +13,8 @@ from __future__ import annotations
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from cablejax.arrays import turns
+
 
 def total_turn(keypoints: Float[Array, "N 2"]) -> Float[Array, ""]:
     """Angle [rad] by which the tangent turns from the first to the last keypoint, whole turns included.
@@ -20,14 +22,14 @@ def total_turn(keypoints: Float[Array, "N 2"]) -> Float[Array, ""]:
     The tangent of a chord is that of the cable at its middle, so half a chord's turn is added at each end. Right as
     long as the cable turns by less than pi from chord to chord.
     """
-    turns = _turns(keypoints)
-    return jnp.sum(turns) + 0.5 * (turns[0] + turns[-1])
+    turned = turns(jnp.diff(keypoints, axis=0))
+    return jnp.sum(turned) + 0.5 * (turned[0] + turned[-1])
 
 
 def target_pose(target: Float[Array, "N 2"]) -> Float[Array, "2 3"]:
     """(x, y, theta) of the two grippers in a target shape; theta of the second continues that of the first."""
     chord = target[1] - target[0]
-    first = jnp.arctan2(chord[1], chord[0]) - 0.5 * _turns(target)[0]
+    first = jnp.arctan2(chord[1], chord[0]) - 0.5 * turns(jnp.diff(target, axis=0))[0]
     heading = jnp.stack([first, first + total_turn(target)])
     return jnp.concatenate([target[jnp.array([0, -1])], heading[:, None]], axis=1)
 
@@ -78,10 +80,3 @@ def straight_plan(
     fraction = jnp.minimum(radius / longest, 1.0)
     done = jnp.minimum(fraction * jnp.arange(steps + 1), 1.0)
     return jnp.diff(done)[:, None, None] * way
-
-
-def _turns(keypoints: Float[Array, "N 2"]) -> Float[Array, " N-2"]:
-    """Angle [rad] from each chord to the next."""
-    chords = jnp.diff(keypoints, axis=0)
-    a, b = chords[:-1], chords[1:]
-    return jnp.arctan2(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0], jnp.sum(a * b, axis=-1))

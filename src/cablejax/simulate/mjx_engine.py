@@ -66,11 +66,7 @@ class MjxEngine(Engine):
         """See `Engine`. Compiles on the first call for a shape and interval."""
         twist = jnp.asarray(twist)
         self.check_twist(twist)
-
-        def run(physics, state, twist, interval):
-            return rolled_out(self, physics, state, twist, interval)
-
-        return finely_sampled(run, self, physics, state, twist, interval)
+        return finely_sampled(functools.partial(rolled_out, self), self, physics, state, twist, interval)
 
     @full_precision
     def unroll(

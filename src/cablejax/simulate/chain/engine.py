@@ -56,13 +56,9 @@ class ChainEngine(Engine):
 
     def rollout(self, physics, state, twist, interval=1.0):
         """See `Engine`. Compiles on the first call for a shape and interval."""
-        twist = jnp.asarray(twist)
+        twist, state = jnp.asarray(twist), self._remembering(state)
         self.check_twist(twist)
-
-        def run(physics, state, twist, interval):
-            return rolled_out(self, physics, state, twist, interval)
-
-        return finely_sampled(run, self, physics, self._remembering(state), twist, interval)
+        return finely_sampled(functools.partial(rolled_out, self), self, physics, state, twist, interval)
 
     @full_precision
     def unroll(

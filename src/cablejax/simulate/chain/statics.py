@@ -21,6 +21,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from scipy.interpolate import CubicSpline
 
+from cablejax.arrays import turns
 from cablejax.cable import Cable, Discretisation
 from cablejax.effects.given import GivenEffect, with_effects
 from cablejax.effects.physics import nominal_physics
@@ -221,9 +222,7 @@ def _beyond(bending: _Bending, links: Float[Array, "n 2"]) -> Float[Array, "J 2"
 def _observed_angles(matrices: ChainMatrices, keypoints: Array, pose: Array) -> Float[Array, "J"]:
     """Joint angles [rad] of the chain along the cubic spline through the keypoints, clamped in the grippers."""
     heading = jnp.stack([jnp.cos(pose[:, 2]), jnp.sin(pose[:, 2])], axis=-1)
-    tangent = matrices.tangents_of_keypoints @ keypoints + matrices.tangents_of_ends @ heading
-    a, b = tangent[:-1], tangent[1:]
-    return jnp.arctan2(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0], jnp.sum(a * b, axis=-1))
+    return turns(matrices.tangents_of_keypoints @ keypoints + matrices.tangents_of_ends @ heading)
 
 
 def _heading(angles: Array, pose: Array, turn: Array) -> Float[Array, ""]:
