@@ -191,7 +191,6 @@ class AbstractBoundedLeastSquares(optx.AbstractLeastSquaresSolver):
             "optimality": state.last.optimality,
             "evaluations": state.evaluations,
             "linearisations": state.linearisations,
-            "projections": state.linearisations + state.evaluations,
         }
         return y, aux, stats
 

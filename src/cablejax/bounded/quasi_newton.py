@@ -185,6 +185,5 @@ class BoundedQuasiNewton(optx.AbstractMinimiser):
             "optimality": state.optimality,
             "evaluations": state.evaluations,
             "linearisations": state.evaluations,
-            "projections": 2 * state.evaluations,
         }
         return y, aux, stats

@@ -70,13 +70,11 @@ class Stats:
         iterations: steps of the solver.
         evaluations: of the function alone.
         linearisations: gradients or Jacobians.
-        projections: nearest points and quadratic programs.
     """
 
     iterations: Int[Array, "*batch"]
     evaluations: Int[Array, "*batch"]
     linearisations: Int[Array, "*batch"]
-    projections: Int[Array, "*batch"]
 
 
 @jax.tree_util.register_dataclass

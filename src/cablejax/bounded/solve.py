@@ -154,7 +154,6 @@ def _finish(
             iterations=jnp.asarray(out.stats["num_steps"], jnp.int32),
             evaluations=out.stats["evaluations"],
             linearisations=out.stats["linearisations"],
-            projections=out.stats["projections"],
         ),
         optimality=out.stats["optimality"],
     )

@@ -213,7 +213,6 @@ class SpectralProjectedGradient(optx.AbstractGradientDescent):
             "objective": jnp.where(done, inner.f_info.f, state.best_value),
             "evaluations": state.steps,
             "linearisations": state.linearisations,
-            "projections": state.steps + state.linearisations,
         }
         value = jnp.where(done, inner.descent_state.y, state.best)
         return value, chosen(done, inner.aux, state.best_aux), stats

@@ -14,6 +14,7 @@ from cablejax.control.run import ClosedLoopRun, shape_error_cm
 from cablejax.control.targets import Target
 from cablejax.gaplog import TARGETS, Episode, gap_log_from_episodes
 from cablejax.limits import LIMITS
+from cablejax.poses import positions_at
 from cablejax.simulate.table_plant import Observation
 from cablejax.types import GapLog
 
@@ -98,9 +99,7 @@ class RunLog:
         if not known.any():
             return None
         stamps = np.array(times)
-        for column in np.ndindex(poses.shape[1:]):
-            missing = (~known, *column)
-            poses[missing] = np.interp(stamps[~known], stamps[known], poses[(known, *column)])
+        poses[~known] = positions_at(stamps[~known], stamps[known], poses[known])
         return Episode(
             motion=name,
             time=stamps - stamps[0],

@@ -23,6 +23,7 @@ from cablejax.diagnose.regimes import largest_curvature
 from cablejax.diagnose.run import weighed
 from cablejax.effects import LIBRARY, CableEffect
 from cablejax.effects.physics import nominal_physics
+from cablejax.poses import positions_at
 from cablejax.simulate.chain.replay import FINE_STEP, LARGEST_STEP, SETTLING
 from cablejax.types import GapLog
 
@@ -222,4 +223,4 @@ def _at_uniform_marks(
     if keypoints is None:
         return None
     uniform, seen = np.linspace(0.0, marks[-1], len(marks)), np.isfinite(keypoints).all(axis=1)
-    return np.stack([np.interp(uniform, marks[seen], column[seen]) for column in keypoints.T], axis=1)
+    return positions_at(uniform, marks[seen], keypoints[seen])

@@ -45,11 +45,10 @@ class Colours:
     """The colours on white, as hexadecimal strings; the pages have their own for dark screens.
 
     Attributes:
-        background, ink, muted, faint: of the page, its text, its captions and its lines.
+        ink, muted, faint: of the text, the captions and the lines.
         gripper, target, residual, direct: of the grippers, the target, and the cable by each method.
     """
 
-    background: str = "#ffffff"
     ink: str = "#1c2228"
     muted: str = "#5c6670"
     faint: str = "#d9dee3"

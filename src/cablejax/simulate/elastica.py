@@ -19,6 +19,8 @@ import numpy as np
 from jaxtyping import Float
 from scipy.integrate import cumulative_trapezoid, solve_bvp
 
+from cablejax.poses import positions_at
+
 MESH = 61
 """Points of the initial collocation mesh."""
 SMALL_ANGLE = 0.15
@@ -149,7 +151,7 @@ def elastica(
 ) -> Float[np.ndarray, "N 2"]:
     """Points of the clamped elastica at given arc lengths [m]; see `solve_elastica`."""
     shape = solve_elastica(gripper_pose, length, guess=guess, n_samples=2001)
-    return np.stack([np.interp(arclength, shape.arclength, shape.position[:, i]) for i in range(2)], axis=1)
+    return positions_at(arclength, shape.arclength, shape.position)
 
 
 def _rod(s, state, force):

@@ -7,6 +7,7 @@ import dataclasses
 import numpy as np
 
 from cablejax.diagnose.clock import keypoints_at
+from cablejax.gaplog import episodes_of, stack_episodes
 from cablejax.poses import poses_at, without_misreadings
 from cablejax.types import GapLog
 
@@ -32,31 +33,26 @@ def on_one_clock(log: GapLog) -> tuple[GapLog, tuple[str, ...]]:
     interval = float(np.median(steps)) if len(steps) else 0.0
     if not len(steps) or np.abs(steps - interval).max() <= _EVEN * interval:
         return log, tuple(repairs)
-    length = [
-        int(np.floor((time[n - 1] - time[0]) / interval + 1e-6)) + 1
-        for time, n in zip(log.time, log.episode_length, strict=True)
-    ]
-    clock = interval * np.arange(max(length))
-    whole = {"time": np.tile(clock, (len(length), 1))}
-    for name in ("keypoints", "gripper_pose", "gripper_command", "hold"):
-        array = getattr(log, name)
-        if array is not None:
-            empty = np.nan if name == "keypoints" else 0
-            whole[name] = np.full((len(length), max(length), *array.shape[2:]), empty, array.dtype)
-    for e, (samples, n) in enumerate(zip(length, log.episode_length, strict=True)):
-        time, grid = log.time[e, :n] - log.time[e, 0], clock[:samples]
-        before = np.clip(np.searchsorted(time, grid + 1e-9, side="right") - 1, 0, n - 1)
-        points = log.keypoints[e, :n].astype(float)
-        if n > 1:
+    episodes = []
+    for one in episodes_of(log):
+        time = one.time - one.time[0]
+        grid = interval * np.arange(int(np.floor(time[-1] / interval + 1e-6)) + 1)
+        before = np.clip(np.searchsorted(time, grid + 1e-9, side="right") - 1, 0, len(time) - 1)
+        points = one.keypoints.astype(float)
+        if len(time) > 1:
             # an episode may be slower than the clock: a gap is one in its own clock
             points = keypoints_at(grid, time, points, max(interval, float(np.median(np.diff(time)))))
-        whole["keypoints"][e, :samples] = points
-        whole["gripper_pose"][e] = poses_at(clock, time, log.gripper_pose[e, :n])
-        whole["gripper_command"][e, :samples] = log.gripper_command[e, before]
-        if log.hold is not None:
-            whole["hold"][e, :samples] = log.hold[e, before] & log.hold[e, np.minimum(before + 1, n - 1)]
+        even = dataclasses.replace(
+            one,
+            time=grid,
+            keypoints=points,
+            gripper_pose=poses_at(grid, time, one.gripper_pose),
+            gripper_command=one.gripper_command[before],
+            hold=one.hold[before] & one.hold[np.minimum(before + 1, len(time) - 1)],
+        )
+        episodes.append(even)
     report = (
         f"Samples are {1e3 * steps.min():.3g} to {1e3 * steps.max():.3g} ms apart: sampled again every "
         f"{1e3 * interval:.3g} ms."
     )
-    return dataclasses.replace(log, episode_length=np.array(length, np.int32), **whole), (*repairs, report)
+    return stack_episodes(episodes, log.meta, holds=log.hold is not None), (*repairs, report)
