@@ -247,6 +247,28 @@ def test_derivatives_of_the_projection_from_far_away():
         assert np.linalg.matrix_rank(forward, tol=1e-6) < SIZE, "some bound is active"
 
 
+@pytest.mark.parametrize("scale", [1.0, 10.0, 100.0])
+def test_derivatives_where_the_last_step_was_rounding(scale):
+    """Of projections from far away, and of quadratics that are centred at their minimiser: planes as they are known."""
+    with jax.enable_x64(True):
+        levels = jnp.asarray([0.1, 0.2, -0.3])
+        slopes = jax.jit(jax.jacfwd(lambda y, normals: Halfspaces(normals, levels).project(y)))
+        of_quadratic = jax.jit(
+            jax.jacfwd(lambda g, normals, y: minimise_quadratic(jnp.eye(6), g, Halfspaces(normals, levels), y).point)
+        )
+        for seed in range(30):
+            rng = np.random.default_rng(seed)
+            y, normals = scale * rng.normal(size=6), rng.normal(size=(3, 6))
+            nearest = np.asarray(Halfspaces(normals, levels).project(jnp.asarray(y)))
+            forces = np.linalg.lstsq(normals.T, y - nearest, rcond=None)[0]
+            held = normals[forces > 1e-7]
+            exact = np.eye(6) - held.T @ np.linalg.solve(held @ held.T, held)
+            np.testing.assert_allclose(slopes(y, normals), exact, atol=1e-7, err_msg=str(seed))
+            for start in (nearest, nearest + 1e-10 * rng.normal(size=6)):
+                found = of_quadratic(start - y, normals, start)
+                np.testing.assert_allclose(found, -exact, atol=1e-7, err_msg=str(seed))
+
+
 @pytest.mark.parametrize("name", SETS)
 def test_minimum_of_a_quadratic_meets_its_conditions(name):
     """The conditions are those of any minimum, whoever found it: of a regular Hessian and of a singular one."""

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from cablejax.gaplog import episodes_of, stack_episodes
+from cablejax.gaplog import Episode, episodes_of, stack_episodes
 from cablejax.gaplog_check import META_FIELDS, GapLogError
 from cablejax.limits import shown
 from cablejax.types import GapLog
@@ -33,18 +33,22 @@ def joined(logs: Sequence[GapLog], names: Sequence[str]) -> GapLog:
         names: of each, for example that of its file; one that was joined itself keeps its parts' names.
 
     Raises:
-        GapLogError: recordings of different set-ups, or the same one twice; names both and what differs.
+        GapLogError: recordings of different set-ups, or an episode twice; names both and what differs.
     """
     if not logs:
         raise GapLogError("Nothing to join: expected at least one gap log.")
+    if len(names) != len(logs):
+        raise GapLogError(f"There are {len(names)} names, expected one for each of the {len(logs)} gap logs.")
     logs = _of_one_length(logs)
-    for i, (log, name) in enumerate(zip(logs, names, strict=True)):
-        for other, other_name in zip(logs[:i], names, strict=False):
-            same = (np.array_equal(getattr(log, n), getattr(other, n), equal_nan=True) for n in ("time", "keypoints"))
-            if all(same):
-                raise GapLogError(
-                    f"{other_name} and {name} are the same recording: name it once, or it would count twice."
-                )
+    seen: dict[bytes, str] = {}
+    for log, name in zip(logs, names, strict=True):
+        own = {b"".join(np.ascontiguousarray(a).tobytes() for a in _samples(one)) for one in episodes_of(log)}
+        for other_name in filter(None, map(seen.get, own)):
+            raise GapLogError(
+                f"{other_name} and {name} have an episode of the same samples: name a recording once, or it would "
+                "count twice."
+            )
+        seen |= dict.fromkeys(own, name)
         there_all, here_all = _set_up(logs[0]), _set_up(log)
         for field in there_all | here_all:
             if (here := here_all.get(field)) != (there := there_all.get(field)):
@@ -64,6 +68,11 @@ def joined(logs: Sequence[GapLog], names: Sequence[str]) -> GapLog:
     }
     episodes = [episode for log in logs for episode in episodes_of(log)]
     return stack_episodes(episodes, meta, holds=any(log.hold is not None for log in logs))
+
+
+def _samples(episode: Episode) -> tuple[np.ndarray, ...]:
+    """What was measured in an episode."""
+    return episode.time, episode.keypoints, episode.gripper_pose
 
 
 def _of_one_length(logs: Sequence[GapLog]) -> Sequence[GapLog]:

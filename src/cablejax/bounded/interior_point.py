@@ -176,17 +176,8 @@ def _terms(
     quadrics, tiny = problem.quadrics, jnp.finfo(at.x.dtype).tiny
     steep = jnp.abs(jacobian)
     forces = jnp.abs(problem.hessian) @ jnp.abs(at.x) + jnp.abs(problem.linear) + at.multipliers @ steep + tiny
-    lengths = quadrics.sizes(jnp.abs(quadrics.matrix) @ jnp.abs(at.x) + jnp.abs(quadrics.offset))
-    # at a bound of 0 all terms may vanish: then rounding of the set's size counts, in a cone that of the step
-    whole = jnp.where(problem.present, lengths, 0.0).max(initial=0.0)
-    whole = jnp.where(_has_size(quadrics), whole, jnp.maximum(whole, jnp.linalg.norm(problem.linear)))
-    lengths = lengths + jnp.finfo(at.x.dtype).eps ** 0.4 * whole + tiny
+    lengths = quadrics.lengths(at.x, problem.linear)
     return forces, lengths, steep @ forces / (steep.sum(axis=1) ** 2 + tiny) + tiny
-
-
-def _has_size(quadrics: Quadrics) -> Bool[Array, ""]:
-    """Whether the set is no cone about 0, which looks alike from near and far."""
-    return jnp.abs(quadrics.level).max(initial=0.0) > 0
 
 
 def _step_on_bounds(problem: _Scaled, now: _Iterate) -> _Iterate:
@@ -237,7 +228,7 @@ def _start(problem: _Scaled) -> tuple[_Iterate, _Sizes]:
     # The step is about as long as the force, as far as there is room; a curved bound leaves its radius.
     curved = quadrics.groups @ quadrics.curvature > 0
     size = jnp.where(present, quadrics.sizes(quadrics.offset), 0.0).max(initial=0.0)
-    most = jnp.where(_has_size(quadrics), jnp.minimum(force, _ROOM * size), force)
+    most = jnp.where(quadrics.has_size, jnp.minimum(force, _ROOM * size), force)
     room = jnp.where(curved, jnp.minimum(-2.0 * quadrics.level, force), most)
     slack = jnp.where(present, jnp.maximum(-start, 0.1 * room), 1.0)
     length = jnp.sum(jnp.where(present, jnp.minimum(slack, room), 0.0)) / _count(present, dtype)

@@ -61,7 +61,9 @@ def _minimum(quadrics: Quadrics, hessian, linear, start) -> QuadraticMinimum:
     problem = quadrics, hessian, linear, start
     solution = interior_point(*jax.lax.stop_gradient(problem))
     step, multipliers, converged, iterations = _solved(solution, *problem)
-    return QuadraticMinimum(_inside(quadrics, start, step), multipliers, converged, iterations)
+    # what is pulled back is an error of the method, and no part of how the minimiser moves
+    back = _inside(*jax.lax.stop_gradient((quadrics, start, step))) - jax.lax.stop_gradient(start + step)
+    return QuadraticMinimum(start + step + back, multipliers, converged, iterations)
 
 
 @jax.jit
@@ -132,11 +134,15 @@ def _solved_jvp(primals, tangents):
     """By the implicit function theorem, on the bounds that hold the minimiser."""
     step, multipliers, converged, iterations = _solved(*primals)
     primals, tangents = primals[1:], tangents[1:]
-    quadrics, hessian, _, centre = primals
+    quadrics, hessian, linear, centre = primals
     size = step.size
     z = quadrics.lift(centre + step)
-    length = jnp.abs(quadrics.matrix @ step).max() + jnp.finfo(step.dtype).tiny
-    active = multipliers > -quadrics.of_lift(z) * jnp.abs(multipliers).max() / length
+    # Of a bound either the force or the room is rounding, each relative to what it is the sum of: relative to the step,
+    # which may be rounding itself, all room would count.
+    room = -quadrics.of_lift(z) / quadrics.lengths(centre + step, linear)
+    forces = multipliers * jnp.linalg.norm(quadrics.jacobian(z), axis=1)
+    pulls = jnp.abs(hessian) @ (jnp.abs(centre) + jnp.abs(step)) + jnp.abs(linear)
+    active = forces > room * jnp.maximum(pulls.max(), jnp.abs(forces).max())
     binding = jnp.where(active, multipliers, 0.0)
 
     def conditions(quadrics, hessian, linear, centre):

@@ -8,7 +8,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import jax.scipy.linalg
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 
 class Quadrics(eqx.Module):
@@ -45,6 +45,19 @@ class Quadrics(eqx.Module):
         """Sizes of the terms of which c is the sum where the lifted point is z; 0 for the level of an absent bound."""
         terms = self.groups @ (0.5 * self.curvature * z**2 + jnp.abs(self.slope * z))
         return jnp.where(jnp.isfinite(self.level), jnp.abs(self.level), 0.0) + terms
+
+    @property
+    def has_size(self) -> Bool[Array, ""]:
+        """Whether the set is no cone about 0, which looks alike from near and far."""
+        return jnp.where(jnp.isfinite(self.level), jnp.abs(self.level), 0.0).max(initial=0.0) > 0
+
+    def lengths(self, x: Float[Array, " P"], linear: Float[Array, " P"]) -> Float[Array, " K"]:
+        """What c is small compared with at x; `linear` is the gradient at 0 of a quadratic that is minimised there."""
+        sizes = self.sizes(jnp.abs(self.matrix) @ jnp.abs(x) + jnp.abs(self.offset))
+        # at a bound of 0 all terms may vanish: then rounding of the set's size counts, in a cone that of the step
+        whole = jnp.where(jnp.isfinite(self.level), sizes, 0.0).max(initial=0.0)
+        whole = jnp.where(self.has_size, whole, jnp.maximum(whole, jnp.linalg.norm(linear)))
+        return sizes + jnp.finfo(x.dtype).eps ** 0.4 * whole + jnp.finfo(x.dtype).tiny
 
     def values(self, x: Float[Array, " P"]) -> Float[Array, " K"]:
         """C at a point."""

@@ -162,5 +162,7 @@ def _finish(
         if result is Result.EMPTY_SET:
             raise ValueError(result.message)
         if result is not Result.CONVERGED:
-            raise RuntimeError(f"{result.message} (objective {float(solution.objective):.6g})")
+            # a derivative is being taken of the objective, not of the code
+            reached = "" if isinstance(solution.objective, Tracer) else f" (objective {float(solution.objective):.6g})"
+            raise RuntimeError(f"{result.message}{reached}")
     return solution

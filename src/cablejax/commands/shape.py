@@ -48,7 +48,8 @@ class Shape(Command):
             options only --plant-effect, --noise-mm, --links and --seed are used.
         noise_mm: Noise: standard deviation of the observed keypoints, per coordinate, or of the camera's range [mm]. By
             default 0 for the first and 2 for the second.
-        links: Links of the plant's cable.
+        links: Links of the plant's cable. By default 24, and 48 with --motion, as in `cablejax study`: the plant's own
+            error grows with the square of their length, and a diagnosis of its log takes it for a gap.
     """
 
     resume_hint: ClassVar[str] = "Run the same command again: finished runs are kept and not repeated."
@@ -67,7 +68,7 @@ class Shape(Command):
     perception: Literal["true", "cloud"] = "true"
     motion: pathlib.Path | None = None
     noise_mm: float | None = None
-    links: int = 24
+    links: int | None = None
 
     def execute(self):
         """Brings the cable to the targets, keeps each run as it ends, and reports."""
@@ -98,7 +99,7 @@ class Shape(Command):
         plant = plant_of(
             cable,
             effects,
-            links=self.links,
+            links=24 if self.links is None else self.links,
             seed=self.seed,
             keypoint_noise=0.0 if cloud else 1e-3 * noise_mm,
         )
@@ -122,6 +123,7 @@ class Shape(Command):
             if field.name not in ("json", "out", "overwrite", "device", "cable", "plant_effect", "effect", "with_")
         }
         facts["model knows of"] = ", ".join(model.known) or "nothing"
+        facts["links"] = str(plant.discretisation.n_links)
         facts["plant effect"] = ", ".join(map(str, effects)) or "none"
         with unfinished(self.out, job.settings(), overwrite=self.overwrite) as parts:
             summary = shape_and_report(job, self.out, parts, facts=facts)
@@ -137,9 +139,8 @@ class Shape(Command):
         from cablejax.simulate.play import play
 
         commands, out = read_gap_log(path), output_folder(self.out, overwrite=self.overwrite)
-        plant = plant_of(
-            find_cable(path if self.cable is None else self.cable), effects, links=self.links, seed=self.seed
-        )
+        cable = find_cable(path if self.cable is None else self.cable)
+        plant = plant_of(cable, effects, links=48 if self.links is None else self.links, seed=self.seed)
         log = play(
             Plant(plant),
             commands,

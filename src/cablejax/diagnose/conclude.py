@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Sequence
 from typing import Any
 
@@ -39,6 +40,9 @@ from cablejax.diagnose.laws import Law
 from cablejax.diagnose.posterior import drawn_by, draws, over_laws, posterior
 from cablejax.diagnose.protocol import Simulator
 from cablejax.diagnose.search import Search
+
+_AS_LISTS = {"keypoint_bias"}
+"""Effects of which a verdict has several as one, with lists of values."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -144,13 +148,13 @@ def _concluded(
         )
         if len(alike) > 1:
             equivalent.append(tuple(alike))
-        effects.append(_named(name, best, odds[name] / total, drawn, evidence.simulator))
+        effects += _named(name, best, odds[name] / total, drawn, evidence.simulator)
     complete = calibration.complete(left, gap, level(evidence))
     telling = _telling(best, null, explained, complete, evidence, calibration)
     verdict = judged(resolvable=True, telling=telling, complete=complete, alike=bool(equivalent))
     if verdict == "unknown":
         return Conclusion("unknown", best, (), (), ranking, explained, as_much, (), under), nothing
-    order = np.argsort([-e.probability for e in effects])
+    order = np.argsort([-e.probability for e in effects], kind="stable")
     named = tuple(effects[i] for i in order)
     if verdict == "named+unknown":
         named = tuple(beside_unknown(effect, evidence.simulator.beside_unknown) for effect in named)
@@ -178,23 +182,6 @@ def _telling(best: Fit, null: Fit, explained: float, complete: bool, evidence, c
     before, after = (fit.refits.sse - evidence.count for fit in (null, best) if fit.refits is not None)
     interval = shrinkage(before, after, evidence.motion)[1]
     return interval is not None and interval[0] > 0
-
-
-def baselines(found: Search, evidence: Evidence) -> dict[str, str]:
-    """Effects that simpler rules would have named, see `Diagnosis.baselines`."""
-    singles = [fit for fit in found.fits if len(effect_names(fit.explanation)) == 1]
-    if not singles:
-        return {}
-    samples = float(evidence.count.sum())
-
-    def bic(fit: Fit) -> float:
-        return float(fit.sse.sum()) + len(fit.explanation.z) * float(np.log(samples))
-
-    return {
-        "lowest_cost": min(singles, key=lambda fit: float(fit.sse.sum())).explanation.names[0],
-        "bic": min(singles, key=bic).explanation.names[0],
-        "sparse_regression": max(found.screened, key=lambda name: found.screened[name]),
-    }
 
 
 def _ranking(found: Search, evidence: Evidence) -> tuple[Ranked, ...]:
@@ -227,10 +214,10 @@ def _ranking(found: Search, evidence: Evidence) -> tuple[Ranked, ...]:
 
 def _named(
     name: str, fit: Fit, probability: float, draws: Float[np.ndarray, "D P"], simulator: Simulator
-) -> NamedEffect:
-    """One effect of a fit, with intervals from draws of the fit's coordinates."""
+) -> list[NamedEffect]:
+    """One effect of a fit, with intervals from draws of the fit's coordinates; each, where there are several."""
     parts: list[dict[str, ParameterEstimate]] = []
-    location: dict[str, Any] = dict.fromkeys(PLACES)
+    locations: list[dict[str, Any]] = []
     drawn = [fit.explanation.by_term(draw) for draw in draws]
     for i, (term, z) in enumerate(fit.explanation.by_term()):
         if term.effect.name != name:
@@ -242,8 +229,10 @@ def _named(
             column = [sample[key][0] for sample in sampled]
             parameters[key] = ParameterEstimate(value, _interval(value, column, unit), unit)
         parts.append(parameters)
-        location = _spanning(location, report.location)
-    return NamedEffect(name, probability, _merged(parts), location)
+        locations.append(dict.fromkeys(PLACES) | report.location)
+    if name in _AS_LISTS:
+        parts, locations = [_merged(parts)], [functools.reduce(_spanning, locations)]
+    return [NamedEffect(name, probability, *each) for each in zip(parts, locations, strict=True)]
 
 
 def _spanning(location: dict[str, Any], other: dict[str, Any]) -> dict[str, Any]:
@@ -265,7 +254,7 @@ def _interval(value, column: Sequence[Any], unit: str):
 
 
 def _merged(parts: list[dict[str, ParameterEstimate]]) -> dict[str, ParameterEstimate]:
-    """Several pieces of one effect as lists, which the format allows."""
+    """Several pieces of one effect as lists."""
     if len(parts) == 1:
         return parts[0]
     merged = {}

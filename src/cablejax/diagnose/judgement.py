@@ -55,8 +55,8 @@ def look_alikes(
     Of a set in place of the only named effect, the ranking has the members' probabilities; members of an explanation
     by several effects are not ranked as such, and all count.
     """
-    chances = {ranked.name: ranked.probability for ranked in ranking} if len(effects) == 1 else {}
     named = {effect.name for effect in effects}
+    chances = {ranked.name: ranked.probability for ranked in ranking} if len(named) == 1 else {}
     faint = [n for n in group if n not in named and (chance := chances.get(n)) is not None and chance < FAINT]
     return [name for name in group if name not in faint], faint
 
@@ -81,35 +81,46 @@ def verdict_sentence(
     """
     # what acts in one motion alone cannot be found from the others
     fitted_only = verdict in ("named", "ambiguous") and shrinkage is not None and shrinkage < _CONFIRMED
-    share = f"{100 * max(explained if shrinkage is None or fitted_only else shrinkage, 0.0):.0f} %"
-    names = listed([effect_title(e.name) for e in effects])
+    gone = share(max(explained if shrinkage is None or fitted_only else shrinkage, 0.0))
+    distinct = list(dict.fromkeys(effect_title(e.name) for e in effects))
+    names = listed(distinct)
     split = [look_alikes(group, effects, ranking) for group in equivalent]
     alike = "; ".join(listed([*map(effect_title, likely)], "or") for likely, _ in split if len(likely) > 1)
     faint = listed([effect_title(name) for _, members in split for name in members])
-    explains = "which explains" if len(effects) == 1 else "which together explain"
+    explains = "which explains" if len(distinct) == 1 else "which together explain"
     rivals = f" (this log cannot tell apart: {alike})" if alike else ""
     too = f" {faint[:1].upper()}{faint[1:]} would leave as little, at a probability below 1 %." if faint else ""
     either = f" or a look-alike, which this log cannot tell apart: {alike}" if alike else ""
     better = shrinkage is None or shrinkage > 0
     best = (
-        f"the best explanation takes away {share} of it"
+        f"the best explanation takes away {gone} of it"
         if better
         else "on motions left out of the fit, the best explanation does no better than none"
     )
     said = {
         "none": "The simulator explains this log within what the noise and its own resolution allow.",
-        "named": f"The gap comes from {names}, {explains} {share} of it.",
+        "named": f"The gap comes from {names}, {explains} {gone} of it.",
         "ambiguous": f"The gap comes from {names}{either}.{too}",
         "named+unknown": (
-            f"Part of the gap, {share}, looks like {names}{rivals}; the rest like no effect of the library.{too}"
+            f"Part of the gap, {gone}, looks like {names}{rivals}; the rest like no effect of the library.{too}"
         ),
         "unknown": f"No effect of the library explains the gap: {best}.",
     }[verdict]
     if not fitted_only:
         return said
-    confirmed = f"{100 * max(shrinkage or 0.0, 0.0):.0f} %"
+    confirmed = share(max(shrinkage or 0.0, 0.0))
     again = "Repeat the motions in which it shows."
     return f"{said} That is unconfirmed: on motions left out of the fit {confirmed} goes away. {again}"
+
+
+def share(value: float) -> str:
+    """A share in per cent; never 0 or 100 where it is only close."""
+    percent = 100 * value
+    if percent > 99:
+        return "> 99 %"
+    if 0 < percent < 1:
+        return "< 1 %"
+    return "0 %" if -0.5 <= percent <= 0 else f"{percent:.0f} %"
 
 
 def listed(words: Sequence[str], last: str = "and") -> str:

@@ -70,7 +70,8 @@ def tool_offset(end: Float[np.ndarray, "E T 2"], pose: Float[np.ndarray, "E T 3"
     return [
         f"The keypoint at gripper {gripper} is {1e3 * abs(along):.1f} mm {'ahead of' if along > 0 else 'behind'} its "
         f"pose and {1e3 * abs(across):.1f} mm beside it in the gripper's frame, in all samples: an offset of the "
-        "tool or of the marker is no effect of the library and can look like one. Correct the pose if it is wrong."
+        "tool is no effect of the library and can look like one, and one of the marker is a keypoint bias. Correct the "
+        "pose if it is wrong."
     ]
 
 

@@ -191,7 +191,10 @@ def _plausible(log: GapLog, recording: Recording) -> list[str]:
     valid = np.arange(points.shape[1])[None] < recording.length[:, None]
     missing = 1 - seen[valid].mean()
     if missing > 0.9:
-        raise DiagnosisError(f"{missing:.0%} of the keypoints are missing: nothing to diagnose.")
+        raise DiagnosisError(
+            f"{missing:.0%} of the keypoints are missing (NaN), expected at most 90 %: nothing to diagnose. Was the "
+            "camera on, and are the keypoints' columns or topics the right ones?"
+        )
     if not seen[:, :, 1:-1].any():
         raise DiagnosisError("No keypoint between the grippers was observed: nothing to diagnose.")
     if missing > 0.1:

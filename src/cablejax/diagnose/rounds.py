@@ -3,7 +3,8 @@
 The log likelihood of an explanation is a sum over episodes (see `belief`), so it is one over recordings too: each adds
 so many nats for one explanation against another, with the parameters that fit all of them.
 
-Recordings contradict one another where the best explanation would need other parameters for each. It is fitted to every
+Recordings contradict one another where the best explanation by an effect would need other parameters for each: also
+where none at all is more probable, since what is there in one recording only fits no other. It is fitted to every
 recording alone, from the fit to all of them. Twice the sum of the nats that this gains has, for K recordings of one
 set-up, a chi-squared distribution of P (K - 1) degrees of freedom for P parameters (Wilks); that a fit alone pays its
 prior again makes the test cautious.
@@ -39,7 +40,7 @@ class Round:
         nats: by which it speaks for each explanation that the whole leaves open against the most probable one; that one
             has 0. With what is believed beforehand and as calibrated, they add up to the logarithm of the odds.
         probability: of these explanations after this recording and those before it, with the parameters that fit all.
-        own_gain: nats that parameters of its own would gain for the most probable explanation.
+        own_gain: nats that parameters of its own would gain for the most probable explanation by an effect.
     """
 
     name: str
@@ -55,8 +56,7 @@ class Rounds:
 
     Attributes:
         rounds: one for each recording.
-        contradiction: how likely recordings of one set-up differ as much by chance; None where the most probable
-            explanation has no parameters.
+        contradiction: how likely recordings of one set-up differ as much by chance; None where no effect was fitted.
     """
 
     rounds: tuple[Round, ...]
@@ -98,7 +98,8 @@ def rounds_of(
     believed = np.array([score[id(fit)] for fit in kept]) - each.sum(axis=1)
     ends = np.cumsum([part["episodes"] for part in parts])
     rows = [np.arange(end - part["episodes"], end) for part, end in zip(parts, ends, strict=True)]
-    gains = [_own_gain(kept[0], evidence, own) for own in rows]
+    tested = next((fit for fit in [kept[0], *fits] if fit.explanation.terms), kept[0])
+    gains = [_own_gain(tested, evidence, own) for own in rows]
     rounds = []
     for part, own, end, gain in zip(parts, rows, ends, gains, strict=True):
         nats = each[:, own].sum(axis=1)
@@ -112,7 +113,7 @@ def rounds_of(
                 own_gain=gain,
             )
         )
-    freedom = len(kept[0].explanation.z) * (len(parts) - 1)
+    freedom = len(tested.explanation.z) * (len(parts) - 1)
     chance = float(chi2.sf(2.0 * sum(gains), freedom)) if freedom else None
     return Rounds(tuple(rounds), chance)
 

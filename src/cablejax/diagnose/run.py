@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import ArrayLike, Float, Int
 
 from cablejax.diagnose.belief import Calibration, has_gap, level
-from cablejax.diagnose.conclude import Conclusion, baselines, conclude, sentence
+from cablejax.diagnose.conclude import Conclusion, conclude, sentence
 from cablejax.diagnose.diagnosis import Diagnosis, Gap
 from cablejax.diagnose.evidence import Evidence
 from cablejax.diagnose.fit import Fit, evaluate, improve
@@ -21,7 +21,7 @@ from cablejax.diagnose.given_arrays import checked_nominal, inert_effects, recor
 from cablejax.diagnose.laws import by_other_laws
 from cablejax.diagnose.protocol import Simulator, explanation
 from cablejax.diagnose.refits import refitted
-from cablejax.diagnose.search import Search, search
+from cablejax.diagnose.search import Search, baselines, search
 
 # Of the noise: the error of its own that a simulator is taken to have if nobody says more.
 _BASELINE = 0.1

@@ -103,6 +103,23 @@ def search(
     return Search(tuple(fits), log_scores(fits, evidence, calibration), screened)
 
 
+def baselines(found: Search, evidence: Evidence) -> dict[str, str]:
+    """Effects that simpler rules would have named, see `Diagnosis.baselines`."""
+    singles = [fit for fit in found.fits if len(effect_names(fit.explanation)) == 1]
+    if not singles:
+        return {}
+    samples = float(evidence.count.sum())
+
+    def bic(fit: Fit) -> float:
+        return float(fit.sse.sum()) + len(fit.explanation.z) * float(np.log(samples))
+
+    return {
+        "lowest_cost": min(singles, key=lambda fit: float(fit.sse.sum())).explanation.names[0],
+        "bic": min(singles, key=bic).explanation.names[0],
+        "sparse_regression": max(found.screened, key=lambda name: found.screened[name]),
+    }
+
+
 def _promising(starts: Sequence[Explanation], screened: dict[str, float]) -> list[Explanation]:
     """Starts of effects whose best template explains a part of the gap worth a fit, and of the next best ones."""
     ordered = sorted(screened, key=lambda name: -screened[name])

@@ -130,7 +130,7 @@ class KeypointBias(CableEffect):
         tangent = tangent / np.linalg.norm(tangent, axis=-1, keepdims=True)
         normal = quarter_turn(tangent)
         gains = []
-        for index in range(1, context.config.cable.n_keypoints - 1):
+        for index in range(context.config.cable.n_keypoints):
             for across, direction in ((0, tangent), (1, normal)):
                 projected = np.sum(context.residual[:, :, index] * direction[:, :, index], axis=-1)
                 if not np.isfinite(projected).any():

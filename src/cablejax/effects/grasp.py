@@ -62,6 +62,7 @@ class GripperRotationOffset(_AtGripper):
     parameters = (Parameter("angle_rad", "rad", -1.0, 1.0, 0.0, 0.15),)
     null = (0.0,)
     amplitude, reversible = 0, True
+    repeatable = True
 
     def apply(self, physics, values, variant, config):
         """Adds to one gripper's angle between its pose and the cable's tangent [rad]."""
@@ -80,6 +81,7 @@ class GripperCompliance(_AtGripper):
     parameters = (Parameter("stiffness_n_m_per_rad", "N m/rad", 1e-3, 1e4, 0.3, 1.2, log=True),)
     null = (float("inf"),)
     amplitude = 0
+    repeatable = True
 
     def apply(self, physics, values, variant, config):
         """Adds to one grasp's compliance in rotation [rad/(N m)]."""

@@ -10,7 +10,7 @@ import numpy as np
 
 from cablejax.diagnose.belief import Calibration
 from cablejax.diagnose.diagnosis import CableDiagnosis, NamedEffect, Verdict
-from cablejax.diagnose.judgement import FAINT, effect_title, listed, look_alikes
+from cablejax.diagnose.judgement import FAINT, effect_title, listed, look_alikes, share
 from cablejax.diagnose.verdict_json import write_verdict
 from cablejax.effects import CAMERA
 from cablejax.gaplog import SIMULATED, write_gap_log
@@ -27,7 +27,6 @@ from cablejax.report.effect_words import (
     millimetres,
     parameter_title,
     quantity,
-    share,
 )
 from cablejax.report.html import json_script, svg, write_html
 from cablejax.report.motion_figures import motion_figure, write_motion_gif

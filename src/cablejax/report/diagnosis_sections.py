@@ -8,7 +8,7 @@ from collections.abc import Sequence
 
 from cablejax.diagnose.belief import BESIDE_UNKNOWN
 from cablejax.diagnose.diagnosis import CableDiagnosis, Diagnosis, NamedEffect, UnderLaw
-from cablejax.diagnose.judgement import effect_title, listed, look_alikes
+from cablejax.diagnose.judgement import effect_title, listed, look_alikes, share
 from cablejax.report.effect_words import (
     EFFECTS,
     between,
@@ -17,7 +17,6 @@ from cablejax.report.effect_words import (
     millimetres,
     parameter_title,
     quantity,
-    share,
 )
 
 # More episodes than this are counted, not listed.
@@ -131,7 +130,7 @@ def ranking_note(diagnosis: CableDiagnosis) -> str:
             " For the probability every motion counts alike; the share is of all squares, in which one motion where "
             "the cable swings over can outweigh the others."
         )
-    if len(diagnosis.effects) > 1:
+    if len({effect.name for effect in diagnosis.effects}) > 1:
         note += " The cause named above is a set; alone, none of its members is enough."
     return note
 
@@ -139,7 +138,7 @@ def ranking_note(diagnosis: CableDiagnosis) -> str:
 def how_far(diagnosis: CableDiagnosis) -> str:
     """How far the gap shrinks, by which effects, and on which episodes."""
     gap = diagnosis.gap
-    added = listed([effect_title(e.name) for e in diagnosis.effects]) or "the best explanation"
+    added = listed(list(dict.fromkeys(effect_title(e.name) for e in diagnosis.effects))) or "the best explanation"
     if diagnosis.verdict == "none":
         text = "There is no gap above the noise that could shrink."
     elif diagnosis.explained is None:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from cablejax.diagnose.diagnosis import CableDiagnosis, Gap, NamedEffect
-from cablejax.diagnose.judgement import effect_title, listed
+from cablejax.diagnose.judgement import effect_title, listed, share
 
 EFFECTS: dict[str, str] = {
     "bending_stiffness": "the bending stiffness differs everywhere by one factor",
@@ -158,16 +158,6 @@ def effect_place(effect: NamedEffect) -> str:
     return _place(effect.location, None if gripper is None else gripper.value)
 
 
-def share(value: float) -> str:
-    """A share in per cent; never 0 or 100 where it is only close."""
-    percent = 100 * value
-    if percent > 99:
-        return "> 99 %"
-    if 0 < percent < 1:
-        return "< 1 %"
-    return "0 %" if -0.5 <= percent <= 0 else f"{percent:.0f} %"
-
-
 def between(low: float, high: float) -> str:
     """An interval of shares, "88 % to 93 %"; a single one where both ends read the same."""
     ends = share(low), share(high)
@@ -185,5 +175,5 @@ def explained_label(diagnosis: CableDiagnosis) -> str:
     """Legend of the curve with the explanation."""
     if not diagnosis.effects:
         return "with the best explanation found, not named"
-    names = [effect_title(effect.name) for effect in diagnosis.effects]
+    names = list(dict.fromkeys(effect_title(effect.name) for effect in diagnosis.effects))
     return f"with {names[0]}" if len(names) == 1 else "with the named effects"

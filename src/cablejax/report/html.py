@@ -14,7 +14,8 @@ import jinja2
 from markupsafe import Markup
 from matplotlib.figure import Figure
 
-from cablejax.report.effect_words import explanation_title, share
+from cablejax.diagnose.judgement import share
+from cablejax.report.effect_words import explanation_title
 from cablejax.report.style import LIGHT
 from cablejax.whole_file import whole_file
 

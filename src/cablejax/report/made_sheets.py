@@ -19,13 +19,13 @@ from matplotlib.figure import Figure
 from cablejax.dataset.schema import Block
 from cablejax.dataset.store import MissingShardError, Store
 from cablejax.diagnose.diagnosis import Diagnosis
-from cablejax.diagnose.judgement import effect_title, listed
+from cablejax.diagnose.judgement import effect_title, listed, share
 from cablejax.dynamics.card import network_words
 from cablejax.dynamics.weights import cable_of_weights, load_info, load_weights, weights_path
 from cablejax.effects.given import EFFECTS
 from cablejax.report.diagnosis_charts import ranking_figure
 from cablejax.report.diagnosis_sections import named_effects
-from cablejax.report.effect_words import between, share
+from cablejax.report.effect_words import between
 from cablejax.report.sheet import LETTERS_CAPTION, Sheet, cable_cards, cable_facts, letters_figure, span
 from cablejax.report.style import DIAGNOSIS_STYLE, LIGHT, cable_curve
 from cablejax.text_file import read_text

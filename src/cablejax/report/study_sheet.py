@@ -10,10 +10,10 @@ from markupsafe import Markup
 from matplotlib.figure import Figure
 
 from cablejax.diagnose.diagnosis import Diagnosis
-from cablejax.diagnose.judgement import effect_title, listed
+from cablejax.diagnose.judgement import effect_title, listed, share
 from cablejax.diagnose.study import ENDED, Ended, left_open
 from cablejax.effects.given import GivenEffect
-from cablejax.report.effect_words import error_falls, share
+from cablejax.report.effect_words import error_falls
 from cablejax.report.sheet import Sheet
 from cablejax.report.style import DIAGNOSIS_STYLE, LIGHT
 

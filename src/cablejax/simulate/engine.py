@@ -24,6 +24,8 @@ from cablejax.types import CableState, Trajectory
 
 _FINE_SAMPLE = 0.1
 """Interval of the samples between which arms and camera with a lag move linearly [s]."""
+_TAUT = 1e-4
+"""Grippers are that near to the cable's length, relative to it, where it is taut."""
 _LAGS = ("actuation_time", "actuation_delay", "camera_lag")
 
 
@@ -65,7 +67,7 @@ class Engine(abc.ABC):
     ) -> tuple[CableState, Trajectory]:
         """Moves the grippers by T twists, each held for `interval` seconds.
 
-        A taut cable has no derivative along its chord: pulled, it does not move; pushed, it buckles.
+        A taut cable has none: pulled, it does not move; pushed, it buckles; and small errors of its length jerk it.
 
         All arguments carry the same leading batch axis, or none of them does. Arms that lag and a camera that lags
         begin at rest, whatever was before `state`.
@@ -141,10 +143,11 @@ def _warn_if_taut(engine: Engine, physics: Physics, state: CableState, twist: An
         moved[..., 1, :] - moved[..., 0, :], axis=-2
     )
     reach = np.linalg.norm(chord[..., : engine.config.dimension], axis=-1).max()
-    if reach > engine.config.cable.length * (1 + 1e-4):
+    if reach > engine.config.cable.length * (1 - _TAUT):
         warnings.warn(
             f"The grippers are commanded {reach:.4f} m apart and the cable is {engine.config.cable.length:g} m long: "
-            "its ends will leave the grippers, and derivatives mean nothing there. Bring the grippers closer.",
+            "it is taut, or its ends will leave the grippers, and where it goes and derivatives mean nothing there. "
+            "Bring the grippers closer.",
             stacklevel=4,
         )
 

@@ -78,9 +78,9 @@ def on_table(physics: Physics, mass: Float[Array, "n"] | Float[np.ndarray, "n"],
 def _hanging(physics: Physics, stiffness, nodes, link_length: float):
     """Mass that one gripper carries at each node, counted from it [kg]; negative where the cable comes down."""
     xp = nodes.__array_namespace__()
-    held = (physics.grip_height > 0) & (stiffness > 0)
-    # without weight nothing comes down; the other branch of `where` must have a derivative nevertheless
     weight = physics.density * normal_gravity(physics)
+    # without weight no force is the table's; the other branch of `where` must have a derivative nevertheless
+    held = (physics.grip_height > 0) & (stiffness > 0) & (weight > 0)
     weight, bending = xp.where(held, weight, 1.0), xp.where(held, stiffness, 1.0)
     span = xp.where(held, (72.0 * bending * xp.where(held, physics.grip_height, 1.0) / weight) ** 0.25, 0.0)
     reach = span / link_length
