@@ -330,6 +330,15 @@ def test_statistics_are_counts():
             assert int(getattr(solution.stats, field.name)) > 0
 
 
+def test_what_does_not_converge_says_so_while_it_is_differentiated():
+    def reached(centre):
+        box = Box(jnp.full(2, -2.0), jnp.full(2, 2.0))
+        return least_squares(rosenbrock, SOLVERS["dogleg"], jnp.asarray([-1.2, 1.0]), box, centre, max_steps=1).value
+
+    with jax.enable_x64(True), pytest.raises(RuntimeError, match=Result.STEP_LIMIT.message):
+        jax.jacfwd(reached)(1.0)
+
+
 @pytest.mark.parametrize("trials", [2, 4])
 def test_a_linearisation_lasts_for_as_many_trials_as_asked(trials):
     with jax.enable_x64(True):

@@ -88,6 +88,18 @@ def test_the_cable_of_a_verdict_is_simulated_and_another_one_refused(tmp_path):
         known_from(load_model("gns-reference"), (), (path,))
 
 
+def test_what_is_named_beside_an_unknown_cause_is_added_with_a_warning(tmp_path, capsys):
+    named = {"name": "bending_stiffness", "parameters": {"ratio": {"value": 1.5, "ci90": None, "unit": ""}}}
+    verdict = {"schema": "cablejax-verdict/1", "verdict": "named+unknown", "effects": [named]}
+    path = tmp_path / "verdict.json"
+    path.write_text(json.dumps(verdict))
+    assert list(map(str, Simulate(with_=(path,)).dataset_config().effects)) == ["bending_stiffness:ratio=1.5"]
+    assert "beside a cause that it does not know; of such effects about 27 % are causes" in capsys.readouterr().err
+    path.write_text(json.dumps({**verdict, "verdict": "maybe"}))
+    with pytest.raises(ValueError, match=r"verdict is 'maybe', expected none, named, ambiguous"):
+        Simulate(with_=(path,)).dataset_config()
+
+
 def test_a_verdicts_draws_are_dealt_out_to_the_trajectories(tmp_path):
     def drawn(name, **values):
         return [{"name": name, "parameters": values}]

@@ -72,6 +72,16 @@ def test_a_cable_that_was_changed_between_two_recordings():
     assert rounds.contradictory and (rounds.contradiction or 0.0) < 1e-4
 
 
+def test_an_effect_in_one_recording_only():
+    """Whatever is most probable for both: no effect at all says nothing of how they differ."""
+    still = ("bending_stiffness", 0, (1.0,))
+    rounds, _ = _rounds(_mixed(("bending_stiffness", 0, (0.3,)), still))
+    assert rounds.contradictory
+    rounds, scores = _rounds(_mixed(still, still))
+    assert next(iter(rounds.rounds[0].nats)) == "nominal" and len(scores) == 3
+    assert not rounds.contradictory and rounds.contradiction is not None
+
+
 def test_a_log_that_was_not_joined_has_no_rounds():
     log = log_of(clean(n_links=N_LINKS))
     assert rounds_of(log, [], np.zeros(0), _mixed(SOFT, SOFT), CALIBRATION) is None

@@ -308,6 +308,7 @@ def test_there_is_no_step_before_a_reset(make):
         ({"randomisation": {"friction": 0.1}}, "randomisation is a dict"),
         ({"targets": "USZ"}, "targets is 'USZ', expected a tuple"),
         ({"targets": 3}, "targets is 3, expected a tuple"),
+        ({"targets": ("Q",)}, "targets has 'Q', expected U, S, Z or a `Target`"),
         ({"effects": 3}, "Effects are 3, expected a list"),
     ],
 )

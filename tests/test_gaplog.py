@@ -345,8 +345,13 @@ class TestJoined:
                 joined([logs[0], other], names)
 
     def test_the_same_recording_counts_once(self, log):
-        with pytest.raises(GapLogError, match=r"a\.npz and copy\.npz are the same recording"):
+        with pytest.raises(GapLogError, match=r"a\.npz and copy\.npz have an episode of the same samples"):
             joined([log, log], ["a.npz", "copy.npz"])
+        logs, names = self._halves()
+        with pytest.raises(GapLogError, match=r"both and b\.npz have an episode of the same samples"):
+            joined([joined(logs, names), logs[1]], ["both", "b.npz"])
+        with pytest.raises(GapLogError, match="There are 1 names, expected one for each of the 2 gap logs"):
+            joined(logs, ["a.npz"])
 
     def test_what_was_joined_is_taken_apart(self):
         logs, names = self._halves()

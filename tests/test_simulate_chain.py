@@ -171,6 +171,14 @@ def test_what_hangs_has_a_slope_where_a_joint_has_no_stiffness():
             np.testing.assert_array_equal(slope, 0.0)
 
 
+def test_without_weight_the_table_carries_what_it_may():
+    """Gravity in the table's plane presses nothing on it, and lifts nothing off."""
+    config = Discretisation(n_links=8)
+    physics = dataclasses.replace(nominal_physics(config, gravity=(0, -9.81, 0)), grip_height=np.float32(1e-3))
+    mass = np.full(config.n_links, 0.01, np.float32)
+    np.testing.assert_array_equal(on_table(physics, mass, config.link_length), mass)
+
+
 def test_grippers_that_carry_the_ends_do_so_in_every_engine(nominal):
     config, still = nominal
     physics = dataclasses.replace(nominal_physics(config), grip_height=np.float32(2e-3))

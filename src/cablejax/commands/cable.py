@@ -6,13 +6,14 @@ import dataclasses
 import math
 import pathlib
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, get_args
 
 import tyro
 
 from cablejax.commands.artefacts import kind_of
 from cablejax.commands.export import recorded
-from cablejax.commands.options import Command, UsageError
+from cablejax.commands.options import Command, UsageError, say
+from cablejax.limits import shown
 
 if TYPE_CHECKING:
     from cablejax.cable import Cable
@@ -96,12 +97,25 @@ def cable_of_verdict(path: pathlib.Path) -> Cable | None:
 def check_verdicts(paths: Sequence[pathlib.Path], cable: Cable, remedy: str) -> None:
     """Checks that verdicts are of this cable: an effect is one of the cable to which it is added.
 
+    Says so where an effect is named beside an unknown cause.
+
     Raises:
-        ValueError: one is of another cable; says how the two differ, and `remedy`.
+        ValueError: one is of another cable, or no verdict; says how the two differ, and `remedy`.
     """
     from cablejax.cable_file import NUMBERS
+    from cablejax.diagnose.belief import BESIDE_UNKNOWN
+    from cablejax.diagnose.diagnosis import Verdict
+    from cablejax.effects.verdicts import read_verdict_json
 
     for path in paths:
+        word = read_verdict_json(path).get("verdict")
+        if word not in get_args(Verdict):
+            raise ValueError(f"{path}: verdict is {shown(word)}, expected {', '.join(get_args(Verdict))}.")
+        if word == "named+unknown":
+            say(
+                f"{path} names an effect beside a cause that it does not know; of such effects about "
+                f"{100 * BESIDE_UNKNOWN:.0f} % are causes. It is added all the same."
+            )
         if (theirs := cable_of_verdict(path)) is None:
             continue
         pairs = {key: (getattr(theirs, name), getattr(cable, name)) for key, (name, _) in NUMBERS.items()}

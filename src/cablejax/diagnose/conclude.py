@@ -41,8 +41,8 @@ from cablejax.diagnose.posterior import drawn_by, draws, over_laws, posterior
 from cablejax.diagnose.protocol import Simulator
 from cablejax.diagnose.search import Search
 
-_AS_LISTS = {"keypoint_bias"}
-"""Effects of which a verdict has several as one, with lists of values."""
+_GRIPPER = "gripper"
+"""Several of an effect are one with lists of values, as of keypoints, but each gripper's is one for itself."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -230,7 +230,7 @@ def _named(
             parameters[key] = ParameterEstimate(value, _interval(value, column, unit), unit)
         parts.append(parameters)
         locations.append(dict.fromkeys(PLACES) | report.location)
-    if name in _AS_LISTS:
+    if not all(_GRIPPER in part for part in parts):
         parts, locations = [_merged(parts)], [functools.reduce(_spanning, locations)]
     return [NamedEffect(name, probability, *each) for each in zip(parts, locations, strict=True)]
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 from collections.abc import Sequence
+from typing import get_args
 
 import jax
 import numpy as np
@@ -68,6 +69,11 @@ class ShapeCableConfig:
             raise ValueError(f"ShapeCableConfig.targets is {self.targets!r}, expected a tuple: ({self.targets!r},).")
         if not self.targets:
             raise ValueError("ShapeCableConfig.targets is empty, expected one target or more.")
+        for target in self.targets:
+            if not isinstance(target, Target) and target not in get_args(Shape):
+                raise ValueError(
+                    f"ShapeCableConfig.targets has {target!r}, expected {', '.join(get_args(Shape))} or a `Target`."
+                )
         self.recipe(self.effects)
 
     @property

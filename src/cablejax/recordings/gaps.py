@@ -91,8 +91,9 @@ def cut_at_gaps(takes: tuple[Take, ...], on_grippers: tuple[int, ...] | None) ->
     if not parts:
         raise ValueError(
             f"Between its gaps the recording has no stretch of at least {SHORTEST:g} s and {SHORTEST_SAMPLES} samples "
-            f"in "
-            "which both grippers are known. What was found: " + " ".join(reports)
+            "in which both grippers are known. Its samples are "
+            f"{np.median(np.concatenate([np.diff(take.time) for take in takes])):.3g} s apart: check the unit of time. "
+            "What was found: " + " ".join(reports)
         )
     return tuple(parts), reports
 
