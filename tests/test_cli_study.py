@@ -22,7 +22,11 @@ GOALS = {letter: make_target(letter, LONG).gripper_pose for letter in ("U", "S",
 
 def found(name: str, alike: float | None = None) -> Diagnosis:
     """A diagnosis that names friction, and leaves density with this probability in its place."""
-    effects = () if name in ("none", "unknown") else (NamedEffect("table_friction", 0.9, {}, {}),)
+    effects = (
+        ()
+        if name in ("none", "unknown")
+        else (NamedEffect("table_friction", 0.9, {}, {}, {} if alike is None else {"linear_density": alike}),)
+    )
     return Diagnosis(
         verdict=name,  # pyright: ignore[reportArgumentType]
         sentence="",

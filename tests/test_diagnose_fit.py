@@ -24,7 +24,7 @@ from cablejax.diagnose.conclude import conclude, sentence
 from cablejax.diagnose.evidence import Evidence
 from cablejax.diagnose.fit import Fit, evaluate, improve
 from cablejax.diagnose.gap import held_out_predictions
-from cablejax.diagnose.judgement import beside_unknown
+from cablejax.diagnose.judgement import beside_unknown, share
 from cablejax.diagnose.planar import physics_of
 from cablejax.diagnose.playback import Playback
 from cablejax.diagnose.protocol import Term
@@ -149,7 +149,7 @@ def test_a_motion_that_nothing_explains_does_not_hide_the_cause_of_the_others():
     left, gap = (excess(fit, facts) for fit in (right, null))
     assert conclusion.leftover_p == leftover_p(leftover_score(left, gap, level(facts), calibration)) < 0.05
     assert ", 70 %, looks" in sentence(conclusion, 0.7) and ", 0 %, looks" in sentence(conclusion, -0.2)
-    assert f", {100 * conclusion.explained:.0f} %, looks" in sentence(conclusion, None)
+    assert f", {share(conclusion.explained)}, looks" in sentence(conclusion, None)
 
 
 def test_two_effects_come_back_together():
@@ -316,9 +316,9 @@ def test_the_headline_lists_no_cause_whose_probability_is_below_one_per_cent():
     words = sentence(conclusion, 0.9)
     assert words.startswith("The gap comes from bending stiffness.")
     assert "Table friction would leave as little, at a probability below 1 %." in words
-    even = dataclasses.replace(
-        conclusion, ranking=tuple(dataclasses.replace(ranked, probability=0.5) for ranked in conclusion.ranking)
-    )
+    (named,) = conclusion.effects
+    assert named.alike["table_friction"] < 0.01
+    even = dataclasses.replace(conclusion, effects=(dataclasses.replace(named, alike=dict.fromkeys(named.alike, 0.5)),))
     assert "cannot tell apart: bending stiffness or table friction." in sentence(even, 0.9)
 
 

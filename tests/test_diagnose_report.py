@@ -140,6 +140,7 @@ NO_GAP = Gap(
 )
 ALIKE = (("intrinsic_curvature", "gripper_rotation_offset"),)
 THREE = (("intrinsic_curvature", "gripper_rotation_offset", "obstacle"),)
+CHANCES = {"gripper_rotation_offset": 0.06, "obstacle": 0.004}
 FAINT = ("taut", ("bending_stiffness", "table_friction"), 0.03)
 CASES = {
     "named": (
@@ -169,7 +170,7 @@ CASES = {
         ["the best, the <b>designed motion", "Measure one of them by other means"],
     ),
     "with one that is improbable": (
-        lambda: diagnosis("ambiguous", equivalent=THREE),
+        lambda: diagnosis("ambiguous", equivalent=THREE, effects=(dataclasses.replace(CURVED, alike=CHANCES),)),
         "Cause narrowed down",
         [
             "<p>intrinsic curvature or gripper rotation offset</p>",

@@ -48,8 +48,8 @@ class Shape(Command):
             options only --plant-effect, --noise-mm, --links and --seed are used.
         noise_mm: Noise: standard deviation of the observed keypoints, per coordinate, or of the camera's range [mm]. By
             default 0 for the first and 2 for the second.
-        links: Links of the plant's cable. By default 24, and 48 with --motion, as in `cablejax study`: the plant's own
-            error grows with the square of their length, and a diagnosis of its log takes it for a gap.
+        links: Links of the plant's cable. Fewer are faster; the plant's own error grows with the square of their
+            length, and a diagnosis of the log takes it for a gap.
     """
 
     resume_hint: ClassVar[str] = "Run the same command again: finished runs are kept and not repeated."
@@ -68,7 +68,7 @@ class Shape(Command):
     perception: Literal["true", "cloud"] = "true"
     motion: pathlib.Path | None = None
     noise_mm: float | None = None
-    links: int | None = None
+    links: int = 48
 
     def execute(self):
         """Brings the cable to the targets, keeps each run as it ends, and reports."""
@@ -99,7 +99,7 @@ class Shape(Command):
         plant = plant_of(
             cable,
             effects,
-            links=24 if self.links is None else self.links,
+            links=self.links,
             seed=self.seed,
             keypoint_noise=0.0 if cloud else 1e-3 * noise_mm,
         )
@@ -123,7 +123,6 @@ class Shape(Command):
             if field.name not in ("json", "out", "overwrite", "device", "cable", "plant_effect", "effect", "with_")
         }
         facts["model knows of"] = ", ".join(model.known) or "nothing"
-        facts["links"] = str(plant.discretisation.n_links)
         facts["plant effect"] = ", ".join(map(str, effects)) or "none"
         with unfinished(self.out, job.settings(), overwrite=self.overwrite) as parts:
             summary = shape_and_report(job, self.out, parts, facts=facts)
@@ -140,7 +139,7 @@ class Shape(Command):
 
         commands, out = read_gap_log(path), output_folder(self.out, overwrite=self.overwrite)
         cable = find_cable(path if self.cable is None else self.cable)
-        plant = plant_of(cable, effects, links=48 if self.links is None else self.links, seed=self.seed)
+        plant = plant_of(cable, effects, links=self.links, seed=self.seed)
         log = play(
             Plant(plant),
             commands,

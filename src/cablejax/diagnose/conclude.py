@@ -148,7 +148,8 @@ def _concluded(
         )
         if len(alike) > 1:
             equivalent.append(tuple(alike))
-        effects += _named(name, best, odds[name] / total, drawn, evidence.simulator)
+        chance_of = {other: odds[other] / total for other in alike}
+        effects += _named(name, best, chance_of, drawn, evidence.simulator)
     complete = calibration.complete(left, gap, level(evidence))
     telling = _telling(best, null, explained, complete, evidence, calibration)
     verdict = judged(resolvable=True, telling=telling, complete=complete, alike=bool(equivalent))
@@ -213,9 +214,12 @@ def _ranking(found: Search, evidence: Evidence) -> tuple[Ranked, ...]:
 
 
 def _named(
-    name: str, fit: Fit, probability: float, draws: Float[np.ndarray, "D P"], simulator: Simulator
+    name: str, fit: Fit, chances: dict[str, float], draws: Float[np.ndarray, "D P"], simulator: Simulator
 ) -> list[NamedEffect]:
-    """One effect of a fit, with intervals from draws of the fit's coordinates; each, where there are several."""
+    """One effect of a fit, with intervals from draws of the fit's coordinates; each, where there are several.
+
+    `chances` are its probability and those of its look-alikes.
+    """
     parts: list[dict[str, ParameterEstimate]] = []
     locations: list[dict[str, Any]] = []
     drawn = [fit.explanation.by_term(draw) for draw in draws]
@@ -232,7 +236,8 @@ def _named(
         locations.append(dict.fromkeys(PLACES) | report.location)
     if not all(_GRIPPER in part for part in parts):
         parts, locations = [_merged(parts)], [functools.reduce(_spanning, locations)]
-    return [NamedEffect(name, probability, *each) for each in zip(parts, locations, strict=True)]
+    alike = {other: chance for other, chance in chances.items() if other != name}
+    return [NamedEffect(name, chances[name], *each, alike) for each in zip(parts, locations, strict=True)]
 
 
 def _spanning(location: dict[str, Any], other: dict[str, Any]) -> dict[str, Any]:

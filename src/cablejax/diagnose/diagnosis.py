@@ -50,12 +50,14 @@ class NamedEffect:
             that are causes (`Simulator.beside_unknown`). None where nothing of the kind was computed.
         parameters: by the names of the format.
         location: keys `PLACES`; None where an effect has no such place.
+        alike: probability of each look-alike in its place, as its own, where it was computed.
     """
 
     name: str
     probability: float | None
     parameters: dict[str, ParameterEstimate]
     location: dict[str, Any]
+    alike: dict[str, float] = dataclasses.field(default_factory=dict)
 
 
 @dataclasses.dataclass(frozen=True)

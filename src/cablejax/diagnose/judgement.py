@@ -39,25 +39,19 @@ def beside_unknown(effect: NamedEffect, causes: float | None) -> NamedEffect:
         causes: see `Simulator.beside_unknown`.
     """
     if causes is None or effect.probability is None:
-        return dataclasses.replace(effect, probability=None)
-    return dataclasses.replace(effect, probability=causes * effect.probability)
+        return dataclasses.replace(effect, probability=None, alike={})
+    alike = {name: causes * chance for name, chance in effect.alike.items()}
+    return dataclasses.replace(effect, probability=causes * effect.probability, alike=alike)
 
 
 FAINT = 0.01
 """Probability below which a look-alike is not listed with the named effect."""
 
 
-def look_alikes(
-    group: Sequence[str], effects: Sequence[NamedEffect], ranking: Sequence[Ranked]
-) -> tuple[list[str], list[str]]:
-    """Members of a set of look-alikes: the probable ones, and those that merely leave as little of the gap.
-
-    Of a set in place of the only named effect, the ranking has the members' probabilities; members of an explanation
-    by several effects are not ranked as such, and all count.
-    """
-    named = {effect.name for effect in effects}
-    chances = {ranked.name: ranked.probability for ranked in ranking} if len(named) == 1 else {}
-    faint = [n for n in group if n not in named and (chance := chances.get(n)) is not None and chance < FAINT]
+def look_alikes(group: Sequence[str], effects: Sequence[NamedEffect]) -> tuple[list[str], list[str]]:
+    """Members of a set of look-alikes: the probable ones, and those that merely leave as little of the gap."""
+    chances = next((effect.alike for effect in effects if effect.name in group), {})
+    faint = [name for name in group if chances.get(name, 1.0) < FAINT]
     return [name for name in group if name not in faint], faint
 
 
@@ -84,7 +78,7 @@ def verdict_sentence(
     gone = share(max(explained if shrinkage is None or fitted_only else shrinkage, 0.0))
     distinct = list(dict.fromkeys(effect_title(e.name) for e in effects))
     names = listed(distinct)
-    split = [look_alikes(group, effects, ranking) for group in equivalent]
+    split = [look_alikes(group, effects) for group in equivalent]
     alike = "; ".join(listed([*map(effect_title, likely)], "or") for likely, _ in split if len(likely) > 1)
     faint = listed([effect_title(name) for _, members in split for name in members])
     explains = "which explains" if len(distinct) == 1 else "which together explain"

@@ -85,5 +85,5 @@ def ended(found: Diagnosis, worth: Mapping[str, Any] | None, *, rounds_left: int
 def left_open(found: Diagnosis) -> tuple[str, ...]:
     """The effects that a diagnosis names, and those in their place that are not improbable."""
     named = [effect.name for effect in found.effects]
-    alike = [name for group in found.equivalent for name in look_alikes(group, found.effects, found.ranking)[0]]
+    alike = [name for group in found.equivalent for name in look_alikes(group, found.effects)[0]]
     return tuple(dict.fromkeys([*named, *alike]))

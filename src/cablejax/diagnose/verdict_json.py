@@ -47,8 +47,8 @@ def verdict_json(diagnosis: Diagnosis) -> dict[str, Any]:
     those in nats with `_nats`, and whether no motion that was tried separates the explanations; of several recordings
     `rounds`, the fields of `Round`, and `rounds_contradict`. `next_motion` is recommended only where that is false.
     `gap` has also `unit`, `before_rmse`, `noise_floor`, `after_rmse`, `horizons`, `split`, `ahead_mm` and
-    `best_shrinkage`, `ranking` also `leftover_mm` and `outcome`, and `where` also `sentences`, `per_horizon_mm` and
-    `frames`.
+    `best_shrinkage`, an effect also `alike`, `ranking` also `leftover_mm` and `outcome`, and `where` also `sentences`,
+    `per_horizon_mm` and `frames`.
     """
     gap, rounds = diagnosis.gap, getattr(diagnosis, "rounds", None)
     return _plain(
@@ -183,7 +183,8 @@ def _effect_of(effect: Mapping[str, Any]) -> NamedEffect:
     place = effect["location"]
     location = {name: (_number if name == "time_s" else _pair)(place[name]) for name in PLACES}
     estimates = {str(name): _estimate_of(estimate) for name, estimate in effect["parameters"].items()}
-    return NamedEffect(str(effect["name"]), _number(effect["probability"]), estimates, location)
+    alike = {str(name): float(chance) for name, chance in effect.get("alike", {}).items()}
+    return NamedEffect(str(effect["name"]), _number(effect["probability"]), estimates, location, alike)
 
 
 def _estimate_of(estimate: Mapping[str, Any]) -> ParameterEstimate:

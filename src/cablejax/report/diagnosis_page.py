@@ -243,7 +243,7 @@ def _peak(diagnosis: CableDiagnosis) -> str:
 def _alike(diagnosis: CableDiagnosis, effect: NamedEffect) -> list[str]:
     """The effect and its look-alikes that are not improbable, in words."""
     whole = next((g for g in diagnosis.equivalent if effect.name in g), ())
-    group, _ = look_alikes(whole, diagnosis.effects, diagnosis.ranking)
+    group, _ = look_alikes(whole, diagnosis.effects)
     return [effect_title(effect.name), *(effect_title(name) for name in group if name != effect.name)]
 
 

@@ -61,7 +61,7 @@ def quantities(diagnosis: Diagnosis) -> list[tuple[str, str]]:
 
 def alike(diagnosis: CableDiagnosis) -> list[tuple[list[str], list[str]]]:
     """Names of the effects that are indistinguishable on the log: those with a chance, and those without."""
-    return [look_alikes(group, diagnosis.effects, diagnosis.ranking) for group in diagnosis.equivalent]
+    return [look_alikes(group, diagnosis.effects) for group in diagnosis.equivalent]
 
 
 def under_other_laws(diagnosis: Diagnosis) -> list[str]:
