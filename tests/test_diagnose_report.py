@@ -296,6 +296,7 @@ def test_verdict_has_the_formats_effects():
             "curvature_per_m": {"value": 1.25, "ci90": [1.1, 1.4], "unit": "1/m"},
         },
         "location": {"along_cable_m": [0.2, 0.42], "time_s": None, "table_m": None},
+        "alike": {},
     }
     assert verdict["ranking"][2]["held_out_shrinkage"] is None
     assert verdict["next_motion"] == "mirror" and verdict["seconds"] == 12.3

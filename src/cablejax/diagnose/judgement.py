@@ -75,7 +75,7 @@ def verdict_sentence(
     """
     # what acts in one motion alone cannot be found from the others
     fitted_only = verdict in ("named", "ambiguous") and shrinkage is not None and shrinkage < _CONFIRMED
-    gone = share(max(explained if shrinkage is None or fitted_only else shrinkage, 0.0))
+    gone = _spelled(max(explained if shrinkage is None or fitted_only else shrinkage, 0.0))
     distinct = list(dict.fromkeys(effect_title(e.name) for e in effects))
     names = listed(distinct)
     split = [look_alikes(group, effects) for group in equivalent]
@@ -102,7 +102,7 @@ def verdict_sentence(
     }[verdict]
     if not fitted_only:
         return said
-    confirmed = share(max(shrinkage or 0.0, 0.0))
+    confirmed = _spelled(max(shrinkage or 0.0, 0.0))
     again = "Repeat the motions in which it shows."
     return f"{said} That is unconfirmed: on motions left out of the fit {confirmed} goes away. {again}"
 
@@ -115,6 +115,10 @@ def share(value: float) -> str:
     if 0 < percent < 1:
         return "< 1 %"
     return "0 %" if -0.5 <= percent <= 0 else f"{percent:.0f} %"
+
+
+def _spelled(value: float) -> str:
+    return share(value).replace("> ", "more than ").replace("< ", "less than ")
 
 
 def listed(words: Sequence[str], last: str = "and") -> str:
