@@ -279,6 +279,24 @@ def test_no_view_of_the_log_changes_the_verdict_of_the_whole_library(view):
 
 
 @pytest.mark.slow
+def test_both_grippers_askew_are_named_for_each():
+    log = record(("gripper_rotation_offset", 0, (0.12,)), ("gripper_rotation_offset", 1, (-0.1,)))
+    result = diagnose(log, effects=LIBRARY)
+    found = {e.parameters["gripper"].value: e.parameters["angle_rad"].value for e in result.effects}
+    assert result.verdict == "named" and {e.name for e in result.effects} == {"gripper_rotation_offset"}
+    assert found == {0: pytest.approx(0.12, abs=0.01), 1: pytest.approx(-0.1, abs=0.01)}
+    assert result.sentence.startswith("The gap comes from gripper rotation offset, which explains")
+
+
+@pytest.mark.slow
+def test_a_short_stiff_end_is_no_soft_rest_of_the_cable():
+    result = diagnose(record(("stiffness_profile", (1.0, 0.1, 4.0))), effects=LIBRARY)
+    (effect,) = result.effects
+    assert effect.name == "stiffness_profile" and effect.parameters["ratio"].value > 2.0
+    assert effect.parameters["centre_m"].value > 0.9
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(10, 16))
 def test_the_whole_library_names_nothing_without_an_effect(seed):
     assert diagnose(record(seed=seed)).verdict == "none"

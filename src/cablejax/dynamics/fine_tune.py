@@ -33,10 +33,9 @@ def starting_from(source: str | os.PathLike[str], config: ModelConfig) -> tuple[
     config = dataclasses.replace(config, normalisation=trained.normalisation)
     same = dataclasses.replace(config, conditioned=trained.conditioned, symmetric=trained.symmetric)
     if same != trained or trained.conditioned > config.conditioned or config.symmetric > trained.symmetric:
+        pairs = [(f.name, getattr(trained, f.name), getattr(config, f.name)) for f in dataclasses.fields(config)]
         other = [
-            f"{field.name} is {getattr(trained, field.name)!r} there and {getattr(config, field.name)!r} here"
-            for field in dataclasses.fields(config)
-            if getattr(trained, field.name) != getattr(config, field.name)
+            f"{name} is {_short(there)} there and {_short(here)} here" for name, there, here in pairs if there != here
         ]
         raise ValueError(
             f"The model to start from differs: {'; '.join(other)}. Only `conditioned` may be added, and `symmetric` "
@@ -51,3 +50,7 @@ def starting_from(source: str | os.PathLike[str], config: ModelConfig) -> tuple[
     flat["node_encoder", "first", 0, "kernel"] = kernel.replace(jnp.concatenate([rows, deaf]))
     flat["node_encoder", "first", 0, "bias"] = bias.replace(bias.get_value() - shift)
     return config, nnx.from_flat_state(flat.items())
+
+
+def _short(value: object) -> str:
+    return f"{value:g}" if isinstance(value, float) else repr(value)

@@ -73,8 +73,11 @@ class StiffnessProfile(_Section):
         return replace(physics, stiffness=physics.stiffness * values[2] ** part)
 
     def starts(self, context):
-        """A section of half the stiffness at eight places along the cable."""
-        return [(0, (c, 0.2, 0.5)) for c in _CENTRES]
+        """A section of half the stiffness at eight places along the cable, and short stiff ends.
+
+        Those look like a soft cable but for an end, and fits from there stay there.
+        """
+        return [(0, (c, 0.2, 0.5)) for c in _CENTRES] + [(0, (c, 0.1, 3.0)) for c in (0.0, 1.0)]
 
 
 class IntrinsicCurvature(_Section):
