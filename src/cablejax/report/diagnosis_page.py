@@ -184,7 +184,7 @@ def _cards(diagnosis: CableDiagnosis) -> Iterator[tuple[str, str, str]]:
     """Heading, text and note of each card."""
     gap = diagnosis.gap
     if diagnosis.effects:
-        names = listed([listed(_alike(diagnosis, e), "or") for e in diagnosis.effects])
+        names = listed(list(dict.fromkeys(listed(_alike(diagnosis, e), "or") for e in diagnosis.effects)))
         note = _chance(diagnosis)
         title = "Part of the cause" if diagnosis.verdict == "named+unknown" else "Cause"
         yield (title, names, note)
