@@ -142,7 +142,10 @@ def test_twists_beyond_the_cables_reach_are_warned_of_where_they_are_differentia
     for direction in (apart, jnp.zeros_like(apart)):
         with pytest.warns(UserWarning, match=r"commanded 1\.0010 m apart and the cable is 1 m long"):
             jax.jvp(lambda twist: engine.rollout(params, state, twist)[1].keypoints, (apart,), (direction,))
-    engine.rollout(params, state, 0.05 * apart)  # within the tolerance: no warning, which would be an error here
+    with pytest.warns(UserWarning, match=r"commanded 1\.0000 m apart .* it is taut"):
+        engine.rollout(params, state, jnp.zeros_like(apart))
+    slack = engine.initial_state(np.array([[-0.499, 0.0, 0.0], [0.499, 0.0, 0.0]]))
+    engine.rollout(params, slack, apart)  # within reach: no warning, which would be an error here
 
 
 def test_links_shorter_than_thick_have_an_inertia_that_mujoco_takes():
