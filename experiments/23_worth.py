@@ -37,7 +37,6 @@ from cablejax.control.loop import run_closed_loop
 from cablejax.control.shaping import Model, enters, knowing, load_model, make_controller
 from cablejax.control.targets import Shape
 from cablejax.diagnose import diagnose, write_verdict
-from cablejax.effects.given import EFFECTS as LIBRARY
 from cablejax.effects.given import parse_effect
 from cablejax.effects.verdicts import effects_of_verdict
 from cablejax.gaplog import gap_log_from_episodes, read_gap_log, write_gap_log
@@ -167,7 +166,7 @@ def model_for(text: str, kind: str, home: pathlib.Path, case: Case) -> Model:
     """The model of an arm."""
     del case
     if kind == "recorded":
-        tuning = FineTuneConfig(symmetric=LIBRARY[parse_effect(text).name].symmetric)
+        tuning = FineTuneConfig(symmetric=parse_effect(text).effect.symmetric)
         return fine_tune(transitions_of(log_of(text, home)), tuning, home / kind)
     model = load_model(MODEL)
     if kind == "oracle":

@@ -438,7 +438,7 @@ def test_places_in_words():
 @pytest.mark.parametrize(("shrinkage", "confirmed"), [(None, True), (0.9, True), (0.01, False), (-0.3, False)])
 def test_a_name_that_unseen_motions_do_not_confirm_is_said_to_be_fitted(shrinkage, confirmed):
     effect = NamedEffect("friction_patch", 0.99, {}, {})
-    said = verdict_sentence("named", [effect], (), (), 0.93, shrinkage)
+    said = verdict_sentence("named", [effect], (), 0.93, shrinkage)
     share = 93 if shrinkage is None or not confirmed else 90
     assert said.startswith(f"The gap comes from friction patch, which explains {share} % of it.")
     assert ("unconfirmed: on motions left out of the fit" in said) == (not confirmed)

@@ -347,6 +347,10 @@ class TestJoined:
     def test_the_same_recording_counts_once(self, log):
         with pytest.raises(GapLogError, match=r"a\.npz and copy\.npz have an episode of the same samples"):
             joined([log, log], ["a.npz", "copy.npz"])
+        # imported again: of another precision, and with corrected poses
+        again = dataclasses.replace(log, keypoints=log.keypoints.astype(float), gripper_pose=log.gripper_pose + 0.01)
+        with pytest.raises(GapLogError, match="have an episode of the same samples"):
+            joined([log, again], ["a.npz", "again.npz"])
         logs, names = self._halves()
         with pytest.raises(GapLogError, match=r"both and b\.npz have an episode of the same samples"):
             joined([joined(logs, names), logs[1]], ["both", "b.npz"])

@@ -44,12 +44,16 @@ class Quadrics(eqx.Module):
     def sizes(self, z: Float[Array, " M"]) -> Float[Array, " K"]:
         """Sizes of the terms of which c is the sum where the lifted point is z; 0 for the level of an absent bound."""
         terms = self.groups @ (0.5 * self.curvature * z**2 + jnp.abs(self.slope * z))
-        return jnp.where(jnp.isfinite(self.level), jnp.abs(self.level), 0.0) + terms
+        return jnp.abs(self._levels) + terms
+
+    @property
+    def _levels(self) -> Float[Array, " K"]:
+        return jnp.where(jnp.isfinite(self.level), self.level, 0.0)
 
     @property
     def has_size(self) -> Bool[Array, ""]:
         """Whether the set is no cone about 0, which looks alike from near and far."""
-        return jnp.where(jnp.isfinite(self.level), jnp.abs(self.level), 0.0).max(initial=0.0) > 0
+        return jnp.abs(self._levels).max(initial=0.0) > 0
 
     def lengths(self, x: Float[Array, " P"], linear: Float[Array, " P"]) -> Float[Array, " K"]:
         """What c is small compared with at x; `linear` is the gradient at 0 of a quadratic that is minimised there."""

@@ -284,7 +284,7 @@ def sentence(conclusion: Conclusion, shrinkage: float | None) -> str:
         )
     if conclusion.undecided:
         return "There is a gap, but too little of it in this log to name its cause: record more motions."
-    parts = (conclusion.effects, conclusion.equivalent, conclusion.ranking, conclusion.explained)
+    parts = (conclusion.effects, conclusion.equivalent, conclusion.explained)
     said, nothing = verdict_sentence(conclusion.verdict, *parts, shrinkage), conclusion.posterior.count(())
     if not nothing:
         return said

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 
-from cablejax.diagnose.diagnosis import NamedEffect, Ranked, Verdict
+from cablejax.diagnose.diagnosis import NamedEffect, Verdict
 
 _CONFIRMED = 0.5
 """Share of the squared gap that has to go away on motions left out of the fit."""
@@ -59,7 +59,6 @@ def verdict_sentence(
     verdict: Verdict,
     effects: Sequence[NamedEffect],
     equivalent: Sequence[Sequence[str]],
-    ranking: Sequence[Ranked],
     explained: float,
     shrinkage: float | None = None,
 ) -> str:
@@ -69,7 +68,6 @@ def verdict_sentence(
         verdict: to put into words.
         effects: named.
         equivalent: sets of effects that are indistinguishable on the log.
-        ranking: every effect tried.
         explained: share of the squared gap that the best explanation takes away.
         shrinkage: the same on motions left out of the fit; None where none could be.
     """

@@ -100,7 +100,9 @@ def diagnose(
     if alone.verdict == "none" and case.arms.strays(calibration.smallest_gap(0.0)):
         fields["sentence"] = _ONLY_ARMS
     if rounds is not None and rounds.contradictory:
-        fields["sentence"] += f" But the recordings contradict one another, {rounds.odd_one.name} the others."
+        fields["sentence"] += (
+            f" But the recordings contradict one another: {rounds.odd_one.name} needs other parameters."
+        )
     diagnosis = CableDiagnosis(
         **fields,
         where=localise(repaired, case.to_log(reference), case.noise.std),

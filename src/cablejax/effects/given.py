@@ -161,7 +161,9 @@ def parse_effect(text: str) -> GivenEffect:
         except ValueError:
             value = math.nan
         if not math.isfinite(value):
-            raise ValueError(f"Effect {shown(text)}: {shown(item)} is not of the form parameter=number, finite.")
+            raise ValueError(
+                f"Effect {shown(text)}: {shown(item)} is not of the form parameter=number with a finite number."
+            )
         parameters.append((key.strip(), value))
     times = {key: value for key, value in parameters if key in ("from_s", "until_s")}
     return GivenEffect(name.strip(), tuple(pair for pair in parameters if pair[0] not in times), **times)

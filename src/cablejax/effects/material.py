@@ -75,7 +75,7 @@ class StiffnessProfile(_Section):
     def starts(self, context):
         """A section of half the stiffness at eight places along the cable, and short stiff ends.
 
-        Those look like a soft cable but for an end, and fits from there stay there.
+        A short stiff end looks like the rest of the cable being soft, and a fit that starts there does not leave it.
         """
         return [(0, (c, 0.2, 0.5)) for c in _CENTRES] + [(0, (c, 0.1, 3.0)) for c in (0.0, 1.0)]
 

@@ -89,11 +89,11 @@ def cut_at_gaps(takes: tuple[Take, ...], on_grippers: tuple[int, ...] | None) ->
         else:
             parts.extend(take.part(a, b, f"{take.name}/{index}") for index, (a, b) in enumerate(kept, 1))
     if not parts:
+        steps = np.concatenate([np.diff(take.time) for take in takes])
+        apart = f" Its samples are {np.median(steps):.3g} s apart: check the unit of time." if len(steps) else ""
         raise ValueError(
             f"Between its gaps the recording has no stretch of at least {SHORTEST:g} s and {SHORTEST_SAMPLES} samples "
-            "in which both grippers are known. Its samples are "
-            f"{np.median(np.concatenate([np.diff(take.time) for take in takes])):.3g} s apart: check the unit of time. "
-            "What was found: " + " ".join(reports)
+            f"in which both grippers are known.{apart} What was found: " + " ".join(reports)
         )
     return tuple(parts), reports
 

@@ -98,7 +98,7 @@ def diagnose_space(
     where = where_of(log, windows.chosen(use), nominal, before[use], noise, changes)
     return SpatialDiagnosis(
         verdict=verdict,
-        sentence=" ".join([verdict_sentence(verdict, effects, equivalent, (), gap.shrinkage or 0.0), *changes[:1]]),
+        sentence=" ".join([verdict_sentence(verdict, effects, equivalent, gap.shrinkage or 0.0), *changes[:1]]),
         effects=effects,
         equivalent=equivalent,
         quantities=quantities_of(found, None if guessed else density) | {"constant_offset_m": offset},
