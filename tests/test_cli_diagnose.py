@@ -120,7 +120,7 @@ def test_goes_on_after_ctrl_c_with_half_a_report(log, tmp_path, capsys, monkeypa
         assert "Run the same command again" in capsys.readouterr().err
         assert main(arguments) == 130, "it begins anew"
         assert main([*arguments[:-1]]) == 2, "another diagnosis is not mixed with it"
-    assert "holds an unfinished run with other options" in capsys.readouterr().err
+    assert "holds an unfinished run with other options (" in capsys.readouterr().err
     assert (tmp_path / "parts" / "state.json").exists()
 
 

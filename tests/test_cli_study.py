@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 
 import numpy as np
@@ -9,12 +10,14 @@ import pytest
 
 from cablejax.cable import Cable
 from cablejax.cli import main
+from cablejax.commands.study import finished_rounds, remove_rounds
 from cablejax.control.targets import make_target, straight_start
 from cablejax.diagnose.diagnosis import Diagnosis, Gap, NamedEffect, Ranked
 from cablejax.diagnose.motion_bounds import Bounds
-from cablejax.diagnose.study import ended, first_recording
-from cablejax.diagnose.verdict_json import read_verdict
-from cablejax.gaplog import read_gap_log
+from cablejax.diagnose.study import ended, first_recording, left_open
+from cablejax.diagnose.verdict_json import read_verdict, write_verdict
+from cablejax.gaplog import read_gap_log, write_gap_log
+from cablejax.report.study_sheet import study_sheet
 
 LONG = Cable(length=1.5, linear_density=0.05, bending_stiffness=0.05, n_keypoints=17)
 GOALS = {letter: make_target(letter, LONG).gripper_pose for letter in ("U", "S", "Z")}
@@ -63,6 +66,20 @@ def test_a_study_goes_on_only_where_a_motion_can_tell_more(one, inseparable, rou
     assert ended(one, worth, rounds_left=rounds_left) == why
 
 
+def test_effects_that_act_together_are_no_alternatives():
+    one = found("ambiguous", 0.1)
+    curved = NamedEffect("intrinsic_curvature", 0.99, {}, {})
+    both = dataclasses.replace(one, effects=(*one.effects, curved))
+    page = study_sheet([one, both], [["U"], ["S"]], "inseparable", ())
+    assert page.title == "After 2 recordings: table friction (or linear density) and intrinsic curvature"
+    ((_, _, (first, second)),) = page.tables
+    assert first[2] == "table friction or linear density" and second[2] in page.title
+    assert left_open(both) == ("table_friction", "linear_density", "intrinsic_curvature")
+    # one of each gripper, and a look-alike: not clear, though no more names are left than effects
+    twice = dataclasses.replace(one, effects=one.effects * 2)
+    assert ended(twice, {"inseparable": False}, rounds_left=2) is None
+
+
 def test_first_recording_goes_to_the_goals_and_back_in_the_middle_of_the_workspace():
     bounds = Bounds(workspace=((1.0, 1.0), (3.4, 3.4)), speed=0.03)
     log = first_recording(LONG, straight_start(LONG), GOALS, bounds)
@@ -99,6 +116,28 @@ def test_bad_input_is_refused_before_anything_is_recorded(options, message, tmp_
     assert message in capsys.readouterr().err and not (tmp_path / "study").exists()
 
 
+def test_damaged_rounds_are_made_again_and_those_of_an_earlier_study_deleted(tmp_path, capsys):
+    for number in (1, 2, 3):
+        (tmp_path / f"round_{number}").mkdir()
+        write_verdict(tmp_path / f"round_{number}" / "verdict.json", found("ambiguous", 0.1))
+        commands = first_recording(LONG, straight_start(LONG), GOALS)
+        write_gap_log(tmp_path / f"recording_{number}.npz", commands)
+        write_gap_log(tmp_path / f"round_{number}" / "next_motion.npz", commands)
+    (tmp_path / "report.html").write_text("of three rounds")
+    state = tmp_path / "parts" / "state.json"
+    assert finished_rounds(state) == 0 and capsys.readouterr().err == "", "none was begun"
+    state.parent.mkdir()
+    for text, rounds in (('{"rounds": 3}', 3), ('{"rounds": 4}', 3), ("[]", 0), ('{"rounds": "3"}', 0), ("{", 0)):
+        state.write_text(text)
+        assert finished_rounds(state) == rounds
+        assert ("made again" in capsys.readouterr().err) == (rounds == 0 or "4" in text)
+    state.write_text('{"rounds": 3}')
+    (tmp_path / "recording_2.npz").write_bytes(b"cut off")
+    assert finished_rounds(state) == 1 and "Round 2 was kept, but is damaged" in capsys.readouterr().err
+    remove_rounds(tmp_path, 1)
+    assert {path.name for path in tmp_path.iterdir()} == {"parts", "recording_1.npz", "round_1"}
+
+
 @pytest.mark.slow
 def test_a_study_ends_with_a_verdict_on_all_recordings_and_goes_on_after_a_kill(tmp_path, monkeypatch):
     out = tmp_path / "study"
@@ -119,7 +158,7 @@ def test_a_study_ends_with_a_verdict_on_all_recordings_and_goes_on_after_a_kill(
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr("cablejax.commands.study.Study._recorded", killed)
+        patch.setattr("cablejax.simulate.play.play", killed)
         assert main(arguments) == 130
     assert main(arguments) == 0 and len(diagnosed) >= 1
     summary = json.loads((out / "summary.json").read_text())

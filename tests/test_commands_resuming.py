@@ -51,7 +51,7 @@ def assert_same(run, other):
 def test_a_run_comes_back_as_it_was_kept(tmp_path):
     parts, run = Parts(tmp_path / "parts", SETTINGS), made_up_run(TARGET)
     parts.begin()
-    assert parts.match() and parts.load("U") is None
+    assert parts.differing() == [] and parts.load("U") is None
     parts.save("U", run)
     kept = parts.load("U")
     assert kept is not None
@@ -78,7 +78,7 @@ def test_settings_that_cannot_be_read_are_reported(tmp_path):
     for text in ("", '{"schema": ', "[" * 100_000):
         (parts.folder / "settings.json").write_text(text)
         with pytest.raises(UsageError, match=r"settings\.json is .* Delete .*parts to start again"):
-            parts.match()
+            parts.differing()
 
 
 def test_parts_of_other_settings_are_refused_or_replaced(tmp_path):
@@ -93,7 +93,7 @@ def test_parts_of_other_settings_are_refused_or_replaced(tmp_path):
         parts.save("U", made_up_run(TARGET))
         raise KeyboardInterrupt
     with (
-        pytest.raises(UsageError, match="unfinished run with other options"),
+        pytest.raises(UsageError, match=r"unfinished run with other options \(steps\)"),
         unfinished(tmp_path, {"steps": 3}, overwrite=False),
     ):
         pass
@@ -135,7 +135,7 @@ def test_a_kill_before_the_settings_are_whole_is_no_foreign_folder(tmp_path):
     (tmp_path / "parts").mkdir()
     (tmp_path / "parts" / "settings.json.part").write_text("{")
     with unfinished(tmp_path, SETTINGS, overwrite=True) as parts:
-        assert parts.match()
+        assert parts.differing() == []
     assert list(tmp_path.iterdir()) == []
 
 

@@ -56,7 +56,9 @@ def arms(*, gain: float = 1.0, delay: float = 0.0, slow: float = 0.0, backlash: 
 def told(**faults):
     measured = arms(**faults)
     n = len(MOTIONS)
-    return actuation(measured, commands(), np.full(n, INTERVAL), np.full(n, measured.shape[1]), np.arange(n))
+    return actuation(
+        measured, commands(), np.full(n, INTERVAL), np.full(n, measured.shape[1]), np.arange(n), np.full(n, True)
+    )
 
 
 def test_exact_arms_do_not_deviate():
@@ -110,7 +112,9 @@ def test_noise_of_the_measured_poses_is_no_deviation(faults):
 def test_an_effect_at_the_bound_of_its_fit_has_no_name():
     """Commands that mean something else are fitted best by arms that barely move."""
     measured, n = arms(), len(MOTIONS)
-    result = actuation(measured, 50.0 * commands(), np.full(n, INTERVAL), np.full(n, measured.shape[1]), np.arange(n))
+    result = actuation(
+        measured, 50.0 * commands(), np.full(n, INTERVAL), np.full(n, measured.shape[1]), np.arange(n), np.full(n, True)
+    )
     assert result.deviates and not result.effects and result.strays(1e-3)
 
 
@@ -125,8 +129,8 @@ def test_padding_does_not_count():
     length = np.array([measured.shape[1]] * len(MOTIONS))
     padded = np.concatenate([measured, np.full((*measured.shape[:1], 30, 2, 3), 9.0)], axis=1)
     more = np.concatenate([twist, np.zeros((*twist.shape[:1], 30, 2, 3))], axis=1)
-    plain = actuation(measured, twist, np.full(4, INTERVAL), length, np.arange(4))
-    result = actuation(padded, more, np.full(4, INTERVAL), length, np.arange(4))
+    plain = actuation(measured, twist, np.full(4, INTERVAL), length, np.arange(4), np.full(4, True))
+    result = actuation(padded, more, np.full(4, INTERVAL), length, np.arange(4), np.full(4, True))
     assert result.effects["actuation_gain"][0] == pytest.approx(plain.effects["actuation_gain"][0], abs=1e-6)
     assert result.deviation == pytest.approx(plain.deviation)
 
@@ -156,6 +160,6 @@ def test_a_deviation_that_shows_in_one_motion_only_makes_nothing_certain():
     one = np.arange(len(MOTIONS))[:, None, None, None] == 0
     measured = np.where(one, arms(gain=1.08), arms())
     shape = np.full(len(wanted), INTERVAL), np.full(len(wanted), wanted.shape[1])
-    result = actuation(measured, commands(), *shape, np.arange(len(wanted)))
+    result = actuation(measured, commands(), *shape, np.arange(len(wanted)), np.full(len(wanted), True))
     conclusion = with_arms(NOTHING, result, Calibration())
     assert max((effect.probability for effect in conclusion.effects), default=0.0) < 0.5

@@ -105,7 +105,12 @@ def test_exact_arms_are_exact_on_any_clock():
     jittered = dataclasses.replace(log, time=time, **{n: a.astype(np.float32) for n, a in arrays.items()})
     recording = prepare(jittered)
     arms = actuation(
-        recording.gripper_pose, recording.gripper_command, recording.interval, recording.length, np.arange(len(time))
+        recording.gripper_pose,
+        recording.gripper_command,
+        recording.interval,
+        recording.length,
+        np.arange(len(time)),
+        recording.commanded,
     )
     assert not arms.deviates and arms.deviation < 1e-5
     assert any("off an even one" in caveat for caveat in recording.caveats)

@@ -412,7 +412,7 @@ def kept_files(folder, edit):
     run_folder.claim_folder(folder / "train", {"config": {}, "data": "a"}, overwrite=False)
     file = (parts.folder / "settings.json", parts.folder / "U-direct.run.npz", folder / "train" / "run.json")[which]
     file.write_bytes(edges.edited_bytes(file.read_bytes(), raw))
-    answer(lambda: Parts(folder / "parts", settings_).match())
+    answer(lambda: Parts(folder / "parts", settings_).differing())
     answer(lambda: parts.load("U-direct") and None)
     answer(lambda: run_folder.claim_folder(folder / "train", {"config": {}, "data": "a"}, overwrite=False))
 

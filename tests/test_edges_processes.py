@@ -191,7 +191,7 @@ def test_a_second_writer_is_refused_and_the_first_loses_nothing(tmp_path, store,
             other = unfinished(tmp_path / "out", {"steps": steps}, overwrite=True)
             with pytest.raises(ValueError, match="Another process"), other:
                 pass
-        assert parts.state.read_text() == "kept" and parts.match()
+        assert parts.state.read_text() == "kept" and parts.differing() == []
     claim_folder(tmp_path / "train", {"config": {}, "data": "a"}, overwrite=False)
     with sole_writer(tmp_path / "train"), pytest.raises(ValueError, match="Another process"):
         claim_folder(tmp_path / "train", {"config": {}, "data": "b"}, overwrite=True)

@@ -204,14 +204,23 @@ def test_a_bag_that_is_too_large_is_refused_before_it_is_read(tmp_path, monkeypa
 
 
 def test_what_is_no_bag_is_reported(tmp_path):
+    """Before its layout is asked for, where the file alone shows it."""
     (tmp_path / "run.mcap").write_bytes(b"nothing")
+    (tmp_path / "empty.mcap").write_bytes(b"")
+    (tmp_path / "cut.mcap").write_bytes(b"\x89MCAP0\r\n")
     (tmp_path / "run.txt").write_bytes(b"nothing")
     (tmp_path / "folder").mkdir()
-    for name in ("run.mcap", "run.txt", "folder"):
+    for name, message in (
+        ("run.mcap", "is no MCAP file: it begins with b'nothing', expected a bag"),
+        ("empty.mcap", "is empty, expected a bag"),
+        ("folder", "is empty, expected a bag"),
+        ("absent", "does not exist, expected a bag"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            import_mcap(tmp_path / name, tmp_path / "no layout.toml")
+    for name in ("cut.mcap", "run.txt"):
         with pytest.raises(ValueError, match="could not be read as a bag"):
             import_mcap(tmp_path / name, layout(tmp_path))
-    with pytest.raises(ValueError, match="does not exist, expected a bag"):
-        import_mcap(tmp_path / "absent", layout(tmp_path))
 
 
 def test_without_the_library_its_extra_is_named(tmp_path, monkeypatch):

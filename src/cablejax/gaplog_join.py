@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
-import hashlib
+import math
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+from jaxtyping import Bool
 
 from cablejax.gaplog import Episode, episodes_of, stack_episodes
 from cablejax.gaplog_check import META_FIELDS, GapLogError
@@ -19,6 +20,10 @@ MEASURED = 0.005
 noise, and by how it was bent."""
 EPISODE_LABELS = ("file", "recording", "split", "take")
 """Extra fields of `meta` with one entry per episode that importers write; what a diagnosis keeps apart by them."""
+COMMANDS_DERIVED = "commands_from_poses"
+"""Field of `meta`: whether an importer made commands of the poses and none are known; of all, or of each episode."""
+SAME = 1e-6
+"""Difference of two numbers, relative and absolute, below which recordings state or saw the same [m, s]."""
 
 
 def joined(logs: Sequence[GapLog], names: Sequence[str]) -> GapLog:
@@ -26,7 +31,8 @@ def joined(logs: Sequence[GapLog], names: Sequence[str]) -> GapLog:
 
     Its `meta` has the field `recordings`: the name of each and how many episodes it has, by which a diagnosis says what
     each one added. Of the extra fields of `meta`, `EPISODE_LABELS` are joined too (equal names of different logs stay
-    apart), and others stay where all recordings have the same. Arc lengths that an importer measured in each may differ
+    apart), `COMMANDS_DERIVED` is said of each episode where they differ, and others stay where all recordings have the
+    same. Arc lengths that an importer measured in each may differ
     by `MEASURED`; the log has their mean over the episodes.
 
     Args:
@@ -41,28 +47,32 @@ def joined(logs: Sequence[GapLog], names: Sequence[str]) -> GapLog:
     if len(names) != len(logs):
         raise GapLogError(f"There are {len(names)} names, expected one for each of the {len(logs)} gap logs.")
     logs = _of_one_length(logs)
-    seen: dict[bytes, str] = {}
+    seen: list[tuple[Episode, str]] = []
     for log, name in zip(logs, names, strict=True):
-        own = {_digest(one) for one in episodes_of(log) if np.isfinite(one.keypoints).any()}
-        for other_name in filter(None, map(seen.get, own)):
+        own = [one for one in episodes_of(log) if np.isfinite(one.keypoints).any()]
+        for other_name in (other_name for other, other_name in seen for one in own if _same_samples(one, other)):
             raise GapLogError(
                 f"{other_name} and {name} have an episode of the same samples: name a recording once, or it would "
                 "count twice."
             )
-        seen |= dict.fromkeys(own, name)
+        seen += [(one, name) for one in own]
         there_all, here_all = _set_up(logs[0]), _set_up(log)
         for field in there_all | here_all:
-            if (here := here_all.get(field)) != (there := there_all.get(field)):
+            here, there = here_all.get(field), there_all.get(field)
+            if not _same(here, there):
                 raise GapLogError(
                     f"{name} is not of the set-up of {names[0]}: '{field}' is {shown(here)}, and there {shown(there)}. "
                     "Diagnose them apart, or correct the one that states it wrongly."
                 )
-    extra = set.intersection(*(set(log.meta) for log in logs)) - {*META_FIELDS, *EPISODE_LABELS, "recordings"}
+    derived = np.concatenate([commands_derived(log) for log in logs])
+    own_words = {*META_FIELDS, *EPISODE_LABELS, COMMANDS_DERIVED, "recordings"}
+    extra = set.intersection(*(set(log.meta) for log in logs)) - own_words
     alike = (name for name in sorted(extra) if all(log.meta[name] == logs[0].meta[name] for log in logs))
     shared = [*META_FIELDS, *alike]
     meta = {
         **{name: logs[0].meta[name] for name in shared},
         **{name: values for name in EPISODE_LABELS if (values := _labels(logs, names, name)) is not None},
+        **({COMMANDS_DERIVED: True if derived.all() else derived.tolist()} if derived.any() else {}),
         "motion": [motion for log in logs for motion in log.meta["motion"]],
         "source": "; ".join(dict.fromkeys(log.meta["source"] for log in logs)),
         "recordings": [part for log, name in zip(logs, names, strict=True) for part in recordings(log, name)],
@@ -71,11 +81,39 @@ def joined(logs: Sequence[GapLog], names: Sequence[str]) -> GapLog:
     return stack_episodes(episodes, meta, holds=any(log.hold is not None for log in logs))
 
 
-def _digest(episode: Episode) -> bytes:
-    """Of the values that were observed, and when: whatever the precision, the sign of a zero and the kind of a NaN."""
-    points = np.asarray(episode.keypoints, float) + 0.0
-    points[np.isnan(points)] = np.nan
-    return hashlib.sha256((np.asarray(episode.time, float) + 0.0).tobytes() + points.tobytes()).digest()
+def commands_derived(log: GapLog) -> Bool[np.ndarray, "E"]:
+    """Of which episodes an importer made the commands, see `COMMANDS_DERIVED`.
+
+    Raises:
+        GapLogError: the field is neither one word nor one for each episode.
+    """
+    value, episodes = log.meta.get(COMMANDS_DERIVED, False), len(log.episode_length)
+    every = value if isinstance(value, list) else [value] * episodes
+    if len(every) != episodes or not all(isinstance(one, bool) for one in every):
+        raise GapLogError(
+            f"Field 'meta.{COMMANDS_DERIVED}' is {shown(value)}, expected true or false, or a list of {episodes}."
+        )
+    return np.array(every)
+
+
+def _same_samples(one: Episode, other: Episode) -> bool:
+    """Whether the same was observed, and when after the beginning: in whatever unit and time base it was stored."""
+    if one.keypoints.shape != other.keypoints.shape:
+        return False
+    a, b = (np.append(e.keypoints.astype(float).ravel(), e.time - e.time[0]) for e in (one, other))
+    # the first few numbers decide nearly always
+    return all(np.allclose(a[part], b[part], SAME, SAME, equal_nan=True) for part in (slice(8), slice(None)))
+
+
+def _same(here: Any, there: Any) -> bool:
+    """Whether two set-ups state the same, numbers within rounding."""
+    if isinstance(here, dict) and isinstance(there, dict):
+        return here.keys() == there.keys() and all(_same(here[key], there[key]) for key in here)
+    if isinstance(here, list) and isinstance(there, list):
+        return len(here) == len(there) and all(map(_same, here, there))
+    if isinstance(here, (int, float)) and isinstance(there, (int, float)):
+        return math.isclose(here, there, rel_tol=SAME, abs_tol=SAME**2)
+    return here == there
 
 
 def _of_one_length(logs: Sequence[GapLog]) -> Sequence[GapLog]:

@@ -42,15 +42,15 @@ class Parts:
         """A file for what else there is to go on from."""
         return self.folder / _STATE
 
-    def match(self) -> bool:
-        """Whether a command of these settings began here and did not end.
+    def differing(self) -> list[str] | None:
+        """Names of the settings in which the command that began here and did not end differs; None where none began.
 
         Raises:
             UsageError: the folder is not one that a command made, or its settings cannot be read.
         """
         # a kill may leave settings that were never finished
         if not self.folder.exists() or (self.folder.is_dir() and self._files() <= {f"{_SETTINGS}{DRAFT}"}):
-            return False
+            return None
         try:
             found = read_json(self.folder / _SETTINGS)
         except (FileNotFoundError, NotADirectoryError):
@@ -64,7 +64,7 @@ class Parts:
                 f"{self.folder} was not made by this command, which needs a folder of that name for what is "
                 "unfinished. Move it elsewhere, or give another folder with --out."
             )
-        return found == self._settings
+        return _differing(found, self._settings)
 
     def begin(self) -> None:
         """Makes the folder ready; of a command of other settings, what it kept is deleted."""
@@ -121,8 +121,8 @@ class Parts:
 def unfinished(out: pathlib.Path, settings: Mapping[str, Any], *, overwrite: bool) -> Iterator[Parts]:
     """A folder for results that is marked as unfinished until the block has ended.
 
-    However the block was left, the same command goes on in the folder; another one is refused, as it is by any folder
-    that is not empty.
+    However the block was left, the same command goes on in the folder, with or without `overwrite`; another one is
+    refused, as it is by any folder that is not empty.
 
     Args:
         out: the folder.
@@ -134,12 +134,13 @@ def unfinished(out: pathlib.Path, settings: Mapping[str, Any], *, overwrite: boo
         ValueError: another process is at work in the folder.
     """
     parts = Parts(out / "parts", settings)
-    begun = parts.match()
+    differing = parts.differing()
+    begun = differing == []
     if not begun:
-        if parts.folder.exists() and not overwrite:
+        if differing and not overwrite:
             raise UsageError(
-                f"{out} holds an unfinished run with other options: run it with these to finish it, give "
-                "another folder with --out, or add --overwrite."
+                f"{out} holds an unfinished run with other options ({', '.join(differing)}): run it with these to finish "
+                "it, give another folder with --out, or add --overwrite."
             )
         output_folder(out, overwrite=overwrite)
         parts.folder.mkdir(exist_ok=True)
@@ -154,6 +155,16 @@ def unfinished(out: pathlib.Path, settings: Mapping[str, Any], *, overwrite: boo
                 parts.remove()
             raise
         parts.remove()
+
+
+def _differing(found: Any, wanted: Any, name: str = "") -> list[str]:
+    """Names of the entries in which two settings differ, those of settings in settings after a dot."""
+    if not (isinstance(found, dict) and isinstance(wanted, dict)):
+        return [] if found == wanted else [name]
+    keys = [*wanted, *(key for key in found if key not in wanted)]
+    return [
+        one for key in keys for one in _differing(found.get(key), wanted.get(key), f"{name}.{key}" if name else key)
+    ]
 
 
 def _flatten(run: ClosedLoopRun) -> dict[str, Any]:

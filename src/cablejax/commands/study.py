@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import pathlib
+import shutil
 from typing import TYPE_CHECKING, ClassVar
 
 import tyro
@@ -68,7 +69,7 @@ class Study(Command):
         from cablejax.report.study_sheet import study_sheet
         from cablejax.simulate.plant import Plant
         from cablejax.simulate.play import play
-        from cablejax.text_file import read_json, write_json
+        from cablejax.text_file import write_json
 
         require(self.rounds, "count", "--rounds")
         require(self.noise_mm, "noise_mm", "--noise-mm")
@@ -81,13 +82,13 @@ class Study(Command):
             "study": dataclasses.asdict(config),
             "bounds": dataclasses.asdict(bounds),
             "noise_mm": self.noise_mm,
-            "rounds": self.rounds,
         }
         found: list[Diagnosis] = []
         recordings: list[GapLog] = []
         why = None
         with unfinished(self.out, settings, overwrite=self.overwrite) as parts:
-            kept = read_json(parts.state)["rounds"] if parts.state.exists() else 0
+            kept = finished_rounds(parts.state)
+            remove_rounds(self.out, kept)
             while why is None:
                 number = len(found) + 1
                 path, folder = self.out / f"recording_{number}.npz", self.out / f"round_{number}"
@@ -122,3 +123,40 @@ class Study(Command):
             }
             write_json(self.out / "summary.json", result)
         return result, f"{found[-1].verdict}: {found[-1].sentence} {ENDED[why]}\n{page}"
+
+
+def finished_rounds(state: pathlib.Path) -> int:
+    """How many rounds of an interrupted study are whole: what cannot be read is made again, and what followed it."""
+    from cablejax.diagnose.verdict_json import read_verdict
+    from cablejax.effects.verdicts import read_verdict_json
+    from cablejax.gaplog import read_gap_log
+    from cablejax.text_file import read_json
+
+    out, number = state.parents[1], 0
+    try:
+        rounds = read_json(state)["rounds"]
+        for number in range(rounds):
+            folder = out / f"round_{number + 1}"
+            read_gap_log(out / f"recording_{number + 1}.npz")
+            read_verdict(folder / "verdict.json")
+            if number + 1 < rounds or read_verdict_json(folder / "verdict.json")["next_motion"] is not None:
+                read_gap_log(folder / "next_motion.npz")
+        return rounds
+    except FileNotFoundError as error:
+        if not state.exists():
+            return 0
+        why = error
+    except (ValueError, TypeError, KeyError) as error:
+        why = error
+    say(f"Round {number + 1} was kept, but is damaged and made again: {why}")
+    return number
+
+
+def remove_rounds(out: pathlib.Path, kept: int) -> None:
+    """Deletes what comes after the rounds that are kept: of an earlier study that is overwritten, or damaged."""
+    for old in ("report.html", "summary.json"):
+        (out / old).unlink(missing_ok=True)
+    for path in (*out.glob("recording_*.npz"), *out.glob("round_*")):
+        number = path.stem.rpartition("_")[2]
+        if number.isdecimal() and int(number) > kept:
+            shutil.rmtree(path) if path.is_dir() else path.unlink()

@@ -164,6 +164,7 @@ def actuation(
     interval: Float[np.ndarray, "E"],
     length: Int[np.ndarray, "E"],
     motion: Int[np.ndarray, "E"],
+    known: Bool[np.ndarray, "E"],
 ) -> Actuation:
     """Compares measured gripper poses with their commands and fits gain and lag.
 
@@ -175,11 +176,14 @@ def actuation(
         interval: between samples [s].
         length: valid samples of each episode.
         motion: episodes with the same number repeat one another.
+        known: whether an episode's commands are; the others say nothing of the arms, and move as was measured.
     """
-    if command is None:
+    if command is None or not known.any():
         return Actuation(np.zeros(len(pose), int), motion, pose, pose)
-    valid = np.arange(pose.shape[1])[None] < np.asarray(length)[:, None]
-    arms = _Arms(pose, integrated(pose[:, 0], command, interval), np.asarray(interval), valid)
+    valid = (np.arange(pose.shape[1])[None] < np.asarray(length)[:, None]) & known[:, None]
+    whole = known[:, None, None, None]
+    commanded = np.where(whole, integrated(pose[:, 0], command, interval), pose)
+    arms = _Arms(pose, commanded, np.asarray(interval), valid)
     deviation = arms.rms(arms.commanded)
     count, noise = 6 * valid.sum(axis=1), max(arms.noise, _ENCODER_NOISE)
     nothing = Actuation(count, motion, arms.commanded, arms.commanded, deviation, deviation, noise)
@@ -206,7 +210,7 @@ def actuation(
     if max(left[best], arms.rms(unseen[best])) >= _TELLING * deviation or arms.extreme(best, found[best].x):
         return tried
     named = _named(best, found[best], max(float(np.hypot(left[best], arms.noise)) / _ENCODER_NOISE, 1.0))
-    return dataclasses.replace(tried, effects=named, leftover=left[best], predicted=unseen[best])
+    return dataclasses.replace(tried, effects=named, leftover=left[best], predicted=np.where(whole, unseen[best], pose))
 
 
 def with_arms(conclusion: Conclusion, arms: Actuation, calibration: Calibration) -> Conclusion:

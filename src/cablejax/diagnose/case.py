@@ -84,6 +84,7 @@ class Case:
             recording.interval,
             recording.length,
             repeated_motions(recording.gripper_pose, log.meta["cable"]["length_m"]),
+            recording.commanded,
         )
         pose, scatter = _steadied(recording.gripper_pose, recording, arms)
         recording = dataclasses.replace(recording, gripper_pose=pose)
@@ -201,7 +202,8 @@ class Case:
 
 def _steadied(pose: Float[np.ndarray, "E T 2 3"], recording: Recording, arms: Actuation):
     """As `steadied`, about what the arms make of their commands, where there are any."""
-    return steadied(pose, arms.predicted if recording.has_commands else np.zeros_like(pose), recording.length)
+    known = recording.has_commands & recording.commanded
+    return steadied(pose, np.where(known[:, None, None, None], arms.predicted, 0.0), recording.length)
 
 
 def first_shapes(recording: Recording) -> list[np.ndarray | None]:

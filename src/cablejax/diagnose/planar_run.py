@@ -12,7 +12,7 @@ import numpy as np
 from cablejax.diagnose.actuation import with_arms
 from cablejax.diagnose.belief import Calibration, excess, excused
 from cablejax.diagnose.case import FINE_LINKS, FIT_LINKS, STATED, Case
-from cablejax.diagnose.conclude import Conclusion
+from cablejax.diagnose.conclude import Conclusion, sentence
 from cablejax.diagnose.diagnosis import CableDiagnosis, Gap, NextMotion
 from cablejax.diagnose.evidence import Evidence
 from cablejax.diagnose.fit import evaluate
@@ -33,10 +33,12 @@ from cablejax.diagnose.where import localise
 from cablejax.effects import LIBRARY, CableEffect
 from cablejax.types import GapLog
 
-_ONLY_ARMS = (
-    "With the measured poses the simulator explains this log. The arms do not follow their commands, and no effect of "
-    "the library explains why."
-)
+_ARMS = "The arms do not follow their commands, and no effect of the library explains why."
+_ARMS_TOO = {
+    "none": f"With the measured poses the simulator explains this log. {_ARMS}",
+    **dict.fromkeys(("named", "ambiguous"), f"With the measured poses: {{}} {_ARMS}"),
+}
+"""Sentences of a log in which arms stray, by the verdict on the cable alone."""
 # Reported: holds in which keypoints scatter by this many times what they do between samples.
 _SCATTERED = 1.5
 
@@ -97,8 +99,9 @@ def diagnose(
     rounds = rounds_of(log, found.fits, found.scores, evidence, calibration)
     caveats = _caveats(case, calibration, length, stated, commissioned=bool(commissioning))
     fields = Examined(evidence, found, conclusion, reference, after, gap).fields()
-    if alone.verdict == "none" and case.arms.strays(calibration.smallest_gap(0.0)):
-        fields["sentence"] = _ONLY_ARMS
+    if case.arms.strays(calibration.smallest_gap(0.0)) and alone.verdict in _ARMS_TOO:
+        # what is left of the gap is theirs: not a share that right explanations leave, nor for an unknown cause to take
+        fields |= {"sentence": _ARMS_TOO[alone.verdict].format(sentence(alone, None)), "leftover_p": None}
     if rounds is not None and rounds.contradictory:
         fields["sentence"] += (
             f" But the recordings contradict one another: {rounds.odd_one.name} needs other parameters."
@@ -257,8 +260,8 @@ def _caveats(
     if case.arms.strays(calibration.smallest_gap(0.0)):
         caveats.append(
             f"The measured poses are {1e3 * case.arms.deviation:.3g} mm (root mean square) from where the commands "
-            "lead, and neither a gain nor a lag explains that. Check the frame and the units of gripper_command, and "
-            "whether the commands of both arms were logged."
+            "lead, and neither a gain nor a lag explains that. Check the frame and the units of gripper_command, "
+            "whether the commands of both arms were logged, and whether every motion was executed whole."
         )
     if case.recording.has_commands:
         off = np.linalg.norm((case.recording.gripper_pose - case.arms.commanded)[..., :2], axis=-1).max(axis=(1, 2))
@@ -266,7 +269,8 @@ def _caveats(
             caveats.append(
                 f"Motions were not executed as commanded: the grippers of episode {int(off.argmax())} are up to "
                 f"{1e3 * off.max():.0f} mm from their commands, more than the {1e3 * MARGIN:g} mm by which a designed "
-                "motion keeps its bounds. The diagnosis uses the measured poses."
+                "motion keeps its bounds. The diagnosis uses the measured poses. If that was not meant, record them "
+                "again, or leave out their commands."
             )
     scatter, rapid = float(np.median(case.noise.std)), case.noise.rapid
     if case.noise.from_holds and rapid > 0 and scatter > _SCATTERED * rapid:

@@ -6,12 +6,13 @@ import dataclasses
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from cablejax.diagnose.clock import furthest_off, is_even, on_even_clock, usual_interval
 from cablejax.diagnose.log_faults import command_fault, early_keypoints, tool_offset, without_frozen
 from cablejax.diagnose.noise import still
 from cablejax.gaplog import Episode, episodes_of, validate
+from cablejax.gaplog_join import commands_derived
 from cablejax.log_geometry import cable_fault
 from cablejax.poses import without_misreadings
 from cablejax.types import GapLog
@@ -40,6 +41,7 @@ class Recording:
         hold: where the grippers rest too, shape [E, T], or None.
         interval: between samples [s], shape [E].
         length: valid samples, shape [E].
+        commanded: episodes whose commands are known, shape [E].
         caveats: what had to be repaired or is missing, in words.
     """
 
@@ -49,12 +51,17 @@ class Recording:
     hold: np.ndarray | None
     interval: Float[np.ndarray, "E"]
     length: np.ndarray
+    commanded: Bool[np.ndarray, "E"]
     caveats: tuple[str, ...]
 
     @property
     def has_commands(self) -> bool:
         """Whether commands were logged; all zero while the grippers move means that they were not."""
-        return bool(np.abs(self.gripper_command).any()) or float(np.ptp(self.gripper_pose, axis=1).max()) <= 1e-3
+        if not self.commanded.any():
+            return False
+        return bool(
+            np.abs(self.gripper_command).any() or np.ptp(self.gripper_pose[self.commanded], axis=1).max() <= 1e-3
+        )
 
     def as_log(self, meta: dict[str, Any]) -> GapLog:
         """The log after repairs, without the padding."""
@@ -99,10 +106,9 @@ def prepare(log: GapLog) -> Recording:
     if short:
         caveats.append(f"Left out for having fewer than {_SHORTEST} samples: episode {', '.join(map(str, short))}.")
     episodes, intervals = [], []
-    # an importer made commands of the poses: none are known
-    derived = log.meta.get("commands_from_poses", False)
+    derived = commands_derived(log)
     for e, recorded in enumerate(episodes_of(log)):
-        episode, misread = _continuous(recorded, observed=e not in short, commanded=not derived)
+        episode, misread = _continuous(recorded, observed=e not in short, commanded=not derived[e])
         caveats += [f"In episode {e} the pose of gripper {q} {words}" for q, words in misread.items()]
         interval = usual_interval(episode.time) if len(episode.time) > 1 else _ANY_INTERVAL
         if not is_even(episode.time, interval):
@@ -138,17 +144,28 @@ def prepare(log: GapLog) -> Recording:
         hold=None if log.hold is None else hold,
         interval=np.array(intervals),
         length=np.array(lengths),
+        commanded=~derived,
         caveats=(),
     )
     caveats += _plausible(log, recording)
-    valid = np.arange(total)[None] < recording.length[:, None]
+    valid = (np.arange(total)[None] < recording.length[:, None]) & recording.commanded[:, None]
     if recording.has_commands and (fault := command_fault(pose, command, recording.interval, valid)):
         raise DiagnosisError(fault)
     if log.hold is None or not hold.any():
         caveats.append("No holds are marked: the noise is taken to be white, and a slow drift would count as a gap.")
-    if not recording.has_commands:
-        caveats.append("No commands were logged although the grippers move: effects of the arms cannot be estimated.")
+    caveats += _without_commands(recording)
     return dataclasses.replace(recording, caveats=tuple(caveats))
+
+
+def _without_commands(recording: Recording) -> list[str]:
+    if not recording.has_commands:
+        return ["No commands were logged although the grippers move: effects of the arms cannot be estimated."]
+    if recording.commanded.all():
+        return []
+    return [
+        f"{(~recording.commanded).sum()} of {len(recording.commanded)} episodes were imported without commands: "
+        "effects of the arms are estimated from the others."
+    ]
 
 
 def _continuous(episode: Episode, *, observed: bool, commanded: bool) -> tuple[Episode, dict[int, str]]:

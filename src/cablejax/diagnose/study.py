@@ -75,7 +75,7 @@ def ended(found: Diagnosis, worth: Mapping[str, Any] | None, *, rounds_left: int
     """
     if found.verdict in ("unknown", "named+unknown"):
         return "unknown"
-    if found.verdict != "ambiguous" or len(left_open(found)) <= len(found.effects):
+    if found.verdict != "ambiguous" or all(len(names) == 1 for names in alternatives(found)):
         return "clear"
     if worth is None or worth["inseparable"]:
         return "inseparable"
@@ -83,7 +83,14 @@ def ended(found: Diagnosis, worth: Mapping[str, Any] | None, *, rounds_left: int
 
 
 def left_open(found: Diagnosis) -> tuple[str, ...]:
-    """The effects that a diagnosis names, and those in their place that are not improbable."""
-    named = [effect.name for effect in found.effects]
-    alike = [name for group in found.equivalent for name in look_alikes(group, found.effects)[0]]
-    return tuple(dict.fromkeys([*named, *alike]))
+    """All of `alternatives`."""
+    return tuple(dict.fromkeys(name for names in alternatives(found) for name in names))
+
+
+def alternatives(found: Diagnosis) -> tuple[tuple[str, ...], ...]:
+    """For each effect that a diagnosis names, its name and then those in its place that are not improbable."""
+    likely = [look_alikes(group, found.effects)[0] for group in found.equivalent]
+    return tuple(
+        tuple(dict.fromkeys([name, *(one for group in likely if name in group for one in group)]))
+        for name in dict.fromkeys(effect.name for effect in found.effects)
+    )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -114,16 +114,26 @@ class Effect:
         """Pairs (variant, values) from which fits begin; enough of them that one is within reach of the truth.
 
         Unless a subclass knows better: each parameter one prior standard deviation from its median, the others there.
+        One whose median is its null value may switch the whole effect off there: the others move only where it does.
+        A place, a time or a threshold has more minima than these starts reach: list enough values of it.
 
         Args:
             context: what the simulator knows of the recording, see `Simulator.starts`.
         """
         del context
-        starts = []
-        for variant in self.variants:
-            for i, parameter in enumerate(self.parameters):
-                for z in (-1.0, 1.0):
-                    values = [p.centre for p in self.parameters]
-                    values[i] = float(np.clip(parameter.value(np.float64(z)), parameter.low, parameter.high))
-                    starts.append((variant, tuple(values)))
-        return starts
+        every, medians = range(len(self.parameters)), tuple(p.centre for p in self.parameters)
+        switches = [i for i in every if medians[i] == self.null[i]]
+        starts = [values for values in self._moved([medians], switches or every) if values != medians]
+        if switches:
+            starts += self._moved(starts, [i for i in every if i not in switches])
+        return [(variant, values) for variant in self.variants for values in dict.fromkeys(starts)]
+
+    def _moved(self, points: Sequence[tuple[float, ...]], which: Iterable[int]) -> list[tuple[float, ...]]:
+        """Each point with one of its values a standard deviation below and above the median, within bounds."""
+        return [
+            (*point[:i], float(np.clip(one.value(np.float64(z)), one.low, one.high)), *point[i + 1 :])
+            for point in points
+            for i in which
+            for one in (self.parameters[i],)
+            for z in (-1.0, 1.0)
+        ]

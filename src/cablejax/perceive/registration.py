@@ -27,6 +27,8 @@ from cablejax.simulate.grasp import constrained_acceleration
 COOLING = 0.9
 """Factor by which the standard deviation falls at least in an iteration, until it is settled. Left to the estimate it
 would stay large in a cloud of many outliers, which then all seem to belong to the cable."""
+TOGETHER = 1e-9
+"""Distance of the grippers, in lengths of the cable, below which there is no direction from one to the other."""
 MAX_TURN = 0.3
 """Largest change of a joint angle in one iteration [rad]."""
 
@@ -222,9 +224,12 @@ def _maximisation(
     hessian = hessian + (config.bending / spacing) * jnp.eye(len(angles), dtype=dtype)
     force = force - config.bending / spacing * angles
     arm = shape.end - shape.joint
-    # along and across the chord: a taut cable cannot move along it, whatever its heading
-    chord = pose[1, :2] - pose[0, :2]
-    chord = chord / jnp.sqrt(jnp.sum(chord**2) + jnp.finfo(dtype).tiny)
+    # along and across the chord: a taut cable cannot move along it, whatever its heading. The step is the same in every
+    # frame, so no derivative passes through this one, and grippers at one point have that of the table.
+    chord = jax.lax.stop_gradient(pose[1, :2] - pose[0, :2])
+    apart = jnp.sqrt(jnp.sum(chord**2))
+    far = apart > TOGETHER * config.length
+    chord = jnp.where(far, chord / jnp.where(far, apart, 1.0), jnp.eye(2, dtype=dtype)[0])
     frame = jnp.stack([chord, quarter_turn(chord)])
     constraint = jnp.concatenate([frame @ quarter_turn(arm).T, jnp.full((1, len(angles)), config.length, dtype)])
     gap = _closure(config, shape, angles, pose)

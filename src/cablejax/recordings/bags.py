@@ -16,6 +16,7 @@ from cablejax.limits import require
 from cablejax.poses import poses_at, without_misreadings
 from cablejax.recordings.assemble import gap_log_from_takes
 from cablejax.recordings.layout import Fields, Layout, read_layout
+from cablejax.recordings.mcap_log import MAGIC
 from cablejax.recordings.prepare import prepare
 from cablejax.recordings.table import unit_quaternions
 from cablejax.recordings.take import Take
@@ -48,8 +49,10 @@ def import_mcap(path: str | os.PathLike[str], layout: str | os.PathLike[str]) ->
         ValueError: rosbags is not installed, a file or topic is missing or of another type, or the recording cannot be
             used without guessing.
     """
+    path = pathlib.Path(path)
+    _require_bag(path)
     how = read_layout(layout, "topics")
-    take, misread = _take(pathlib.Path(path), how)
+    take, misread = _take(path, how)
     takes, repairs = prepare((take,), how.setup)
     repairs = [*misread, *repairs]
     measured = take.gripper_pose is not None
@@ -97,12 +100,6 @@ def _messages(path: pathlib.Path, wanted: dict[str, str]) -> dict[str, list[tupl
         from rosbags.typesys import Stores, get_typestore
     except ModuleNotFoundError:
         raise ValueError("Reading bags needs the library rosbags: pip install 'cablejax[recordings]'.") from None
-    if not path.exists():
-        raise ValueError(
-            f"{path} does not exist, expected a bag: a folder with metadata.yaml, an .mcap or a .db3 file."
-        )
-    files = [file for file in path.rglob("*") if file.is_file()] if path.is_dir() else [path]
-    require(sum(file.stat().st_size for file in files), "bag_bytes", f"The size of {path}", "Cut the recording.")
     found: dict[str, list[tuple[float, np.ndarray]]] = {topic: [] for topic in wanted}
     size = 0
     try:
@@ -127,6 +124,23 @@ def _messages(path: pathlib.Path, wanted: dict[str, str]) -> dict[str, list[tupl
         if len(messages) < 2:
             raise ValueError(f"{path} has {len(messages)} messages on {topic}, expected at least two.")
     return found
+
+
+def _require_bag(path: pathlib.Path) -> None:
+    """Looks at the bag before its layout is asked for: a layout does not help a file that is no bag."""
+    expected = "expected a bag: a folder with metadata.yaml, an .mcap or a .db3 file."
+    if not path.exists():
+        raise ValueError(f"{path} does not exist, {expected}")
+    files = [file for file in path.rglob("*") if file.is_file()] if path.is_dir() else [path]
+    size = sum(file.stat().st_size for file in files)
+    if not size:
+        raise BagError(f"{path} is empty, {expected}")
+    if path.suffix == ".mcap" and path.is_file():
+        with path.open("rb") as stream:
+            head = stream.read(len(MAGIC))
+        if head != MAGIC:
+            raise BagError(f"{path} is no MCAP file: it begins with {head!r}, {expected}")
+    require(size, "bag_bytes", f"The size of {path}", "Cut the recording.")
 
 
 def _require_topics(path: pathlib.Path, types: dict[str, str], wanted: dict[str, str]) -> None:

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 
 from cablejax.diagnose.diagnosis import Diagnosis
 from cablejax.diagnose.judgement import effect_title, listed, share
-from cablejax.diagnose.study import ENDED, Ended, left_open
+from cablejax.diagnose.study import ENDED, Ended, alternatives
 from cablejax.effects.given import GivenEffect
 from cablejax.report.effect_words import error_falls
 from cablejax.report.sheet import Sheet
@@ -39,8 +39,8 @@ def study_sheet(
         staged: effects of the plant.
     """
     last, rounds = found[-1], len(found)
-    names = listed([effect_title(name) for name in left_open(last)], "or") or _VERDICTS[last.verdict]
-    ranked = any(entry.probability is not None for one in found for entry in one.ranking)
+    names = _causes(last)
+    ranked = any(chance is not None for one in found for chance in _chances(one).values())
     pictures = [(_beliefs(found), "How probable each cause was after each round, by all recordings so far.")]
     return Sheet(
         kind="study",
@@ -80,15 +80,35 @@ def _row(number: int, found: Diagnosis, motions: Sequence[str]) -> tuple[str, ..
     return (
         str(number),
         listed([name.replace("_", " ") for name in motions]),
-        listed([effect_title(name) for name in left_open(found)], "or") or _VERDICTS[found.verdict],
+        _causes(found),
         error_falls(found.gap),
         Markup('<a href="round_{}/report.html">diagnosis</a>').format(number),
     )
 
 
+def _causes(found: Diagnosis) -> str:
+    """What is named, and what could be in the place of each: "a or b" of one effect, "a (or b) and c" of two."""
+    named = [[effect_title(name) for name in names] for names in alternatives(found)]
+    if len(named) < 2:
+        return listed(named[0], "or") if named else _VERDICTS[found.verdict]
+    return listed([f"{name} (or {listed(others, 'or')})" if others else name for name, *others in named])
+
+
+def _chances(found: Diagnosis) -> dict[str, float | None]:
+    """The probability of each cause: in its place where an effect is named, else if it were the only one.
+
+    How good single effects are says nothing of two that act together.
+    """
+    named = {
+        name: chance for one in found.effects for name, chance in ({one.name: one.probability} | one.alike).items()
+    }
+    single = {entry.name: entry.probability for entry in found.ranking}
+    return named if len(alternatives(found)) > 1 else single | named
+
+
 def _beliefs(found: Sequence[Diagnosis]) -> Figure:
     """Bars of the probabilities of the causes by round."""
-    chances = [{entry.name: entry.probability or 0.0 for entry in one.ranking} for one in found]
+    chances = [{name: chance or 0.0 for name, chance in _chances(one).items()} for one in found]
     best = {name: max(c.get(name, 0.0) for c in chances) for name in set().union(*chances)}
     names = sorted(best, key=lambda name: (-best[name], name))[:_SHOWN]
     with matplotlib.rc_context(DIAGNOSIS_STYLE):

@@ -16,7 +16,8 @@ def marked_keypoints(
 ) -> Any:
     """Points of a planar cable where its keypoints are marked, with the bias of each mark. One function of all engines.
 
-    NumPy in, NumPy out; JAX in, JAX out, differentiable in all arrays. Without bias and slip the arc lengths are those
+    NumPy in, NumPy out; JAX in, JAX out, differentiable in all arrays; in the bias of an end, which stays on the cable,
+    from within. Without bias and slip the arc lengths are those
     of `hermite_weights`, to the last bit.
 
     Args:
@@ -43,7 +44,9 @@ def marked_keypoints(
         moved = physics.bias_along + slipped[0] - marks * total / config.cable.length
         ends = np.isin(np.arange(len(marks)), (0, len(marks) - 1))
         shift = xp.where(ends, shift, last * moved / (config.cable.length + total))
-    t = within + xp.clip(shift, -place, last - place)
+    # not xp.clip: at both ends of the cable the derivative is that of moving inwards, not the mean of both sides
+    inside = xp.where(shift > last - place, last - place, shift)
+    t = within + xp.where(inside < -place, -place, inside)
     further = xp.clip(xp.floor(t + 1e-4), -segment, last - 1 - segment)
     t = (t - further)[:, None]
     index = (segment + further).astype(int)
