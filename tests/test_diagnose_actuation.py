@@ -109,6 +109,21 @@ def test_noise_of_the_measured_poses_is_no_deviation(faults):
     assert with_arms(NOTHING, result, Calibration()).verdict == ("named" if faults else "none")
 
 
+def test_episodes_without_commands_say_nothing_of_the_arms():
+    """An importer made theirs of the poses: counted as commands, they would be of exact arms."""
+    measured, n = arms(gain=1.08), len(MOTIONS)
+    derived, known = commands().copy(), np.arange(n) > 0
+    derived[0, :-1] = np.diff(measured[0], axis=0) / INTERVAL
+    shape = np.full(n, INTERVAL), np.full(n, measured.shape[1])
+    result = actuation(measured, derived, *shape, np.arange(n), known)
+    value, (low, high), _ = result.effects["actuation_gain"]
+    assert value == pytest.approx(1.08, abs=1e-3) and low <= 1.08 <= high and not result.count[0]
+    np.testing.assert_array_equal(result.predicted[0], measured[0])
+    np.testing.assert_array_equal(result.commanded[0], measured[0])
+    nothing = actuation(measured, derived, *shape, np.arange(n), np.full(n, False))
+    assert not nothing.deviates and nothing.effects == {}
+
+
 def test_an_effect_at_the_bound_of_its_fit_has_no_name():
     """Commands that mean something else are fitted best by arms that barely move."""
     measured, n = arms(), len(MOTIONS)

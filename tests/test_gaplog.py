@@ -20,7 +20,7 @@ from cablejax.gaplog import (
     validate,
     write_gap_log,
 )
-from cablejax.gaplog_join import chosen, joined, recordings
+from cablejax.gaplog_join import chosen, commands_derived, joined, recordings
 from cablejax.text_file import parse_json
 from cablejax.types import GapLog
 from file_cases import with_other_bytes
@@ -344,13 +344,41 @@ class TestJoined:
             ):
                 joined([logs[0], other], names)
 
+    def test_commands_that_an_importer_made_are_known_episode_by_episode(self):
+        logs, names = self._halves()
+        logs[0].meta.update(commands_from_poses=True)
+        whole = joined(logs, names)
+        assert whole.meta["commands_from_poses"] == [True, False] and commands_derived(whole).tolist() == [True, False]
+        assert chosen(whole, [1]).meta["commands_from_poses"] == [False]
+        logs[1].meta.update(commands_from_poses=True)
+        assert joined(logs, names).meta["commands_from_poses"] is True
+        for wrong in ("yes", [True, False]):
+            logs[0].meta.update(commands_from_poses=wrong)
+            with pytest.raises(
+                GapLogError, match=r"commands_from_poses' is .*, expected true or false, or a list of 1"
+            ):
+                joined(logs, names)
+
+    def test_numbers_within_rounding_are_of_one_set_up(self):
+        logs, names = self._halves()
+        marks = [0.1 * k * 2.5 for k in range(5)]
+        logs[1].meta.update(keypoint_arclength_m=[float(np.float32(mark)) for mark in marks])
+        logs[1].meta["cable"] = {**logs[1].meta["cable"], "length_m": 1.0 + 1e-10}
+        assert joined(logs, names).meta["cable"]["length_m"] == 1.0
+        logs[1].meta.update(keypoint_arclength_m=[0.0, 0.25, 0.50001, 0.75, 1.0])
+        with pytest.raises(GapLogError, match="keypoint_arclength_m"):
+            joined(logs, names)
+
     def test_the_same_recording_counts_once(self, log):
         with pytest.raises(GapLogError, match=r"a\.npz and copy\.npz have an episode of the same samples"):
             joined([log, log], ["a.npz", "copy.npz"])
         # imported again: of another precision, and with corrected poses
         again = dataclasses.replace(log, keypoints=log.keypoints.astype(float), gripper_pose=log.gripper_pose + 0.01)
-        with pytest.raises(GapLogError, match="have an episode of the same samples"):
-            joined([log, again], ["a.npz", "again.npz"])
+        # in another unit, and on a clock that began earlier
+        later = dataclasses.replace(log, keypoints=log.keypoints.astype(float) * (1 + 1e-7), time=log.time + 1000.0)
+        for copy in (again, later):
+            with pytest.raises(GapLogError, match="have an episode of the same samples"):
+                joined([log, copy], ["a.npz", "again.npz"])
         logs, names = self._halves()
         with pytest.raises(GapLogError, match=r"both and b\.npz have an episode of the same samples"):
             joined([joined(logs, names), logs[1]], ["both", "b.npz"])

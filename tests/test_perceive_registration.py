@@ -169,6 +169,29 @@ def test_derivatives():
             assert np.abs(forward).max() > 0
 
 
+def test_grippers_at_one_point_hold_the_ends_as_any_others():
+    """A closed loop: nothing jumps as the grippers come together, nor do the derivatives."""
+    with jax.enable_x64(True):
+        angle, n = np.linspace(0, 2 * np.pi, 120), REGISTRATION.n_links - 1
+        loop = jnp.asarray(np.stack([np.sin(angle), 1 - np.cos(angle)], axis=1) * REGISTRATION.length / (2 * np.pi))
+        angles = jnp.full(n, 2 * np.pi / n)
+        begun = jnp.array([[0.0, 0.0, 0.0], [0.02, 0.0, 2 * np.pi]])
+
+        def fit(apart):
+            pose = begun.at[1, 0].set(apart)
+            mask = jnp.ones(len(loop), bool)
+            return register(REGISTRATION, loop, mask, pose, angles, begun, jnp.asarray(0.02), iterations=6)
+
+        value, slope = jax.jit(lambda at: jax.jvp(lambda x: (fit(x).keypoints, fit(x).gap), (at,), (1.0,)))(
+            jnp.linspace(-1e-5, 1e-5, 3)[1]
+        )
+        near = {at: jax.jit(fit)(at) for at in (-1e-5, 1e-9, 1e-5)}
+        wanted = (near[1e-5].keypoints - near[-1e-5].keypoints) / 2e-5
+    assert float(value[1]) < 1e-5 and float(near[1e-9].gap) < 1e-5
+    np.testing.assert_allclose(value[0], near[1e-9].keypoints, atol=1e-7)
+    np.testing.assert_allclose(slope[0], wanted, atol=1e-5)
+
+
 @pytest.mark.parametrize(
     "change", [{"length": -1.0}, {"outlier_weight": 1.0}, {"n_links": 3}, {"coherence": np.nan}, {"bending": 0.0}]
 )

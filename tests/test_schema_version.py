@@ -149,6 +149,17 @@ def test_places_of_a_verdict_are_about_where_its_grippers_were(tmp_path):
         read([0.0])
 
 
+@pytest.mark.parametrize(("dimension", "what"), [(3, "a cable in space"), (None, "something other than a cable on")])
+def test_a_verdict_on_something_else_is_refused(dimension, what, tmp_path):
+    """Also where the parameters have the same names: the damping of a cable in space is one in time, too."""
+    effect = {"name": "bending_damping", "parameters": {"time_s": {"value": 0.3, "unit": "s"}}}
+    verdict = {"schema": "cablejax-verdict/1", "verdict": "named", "effects": [effect], "dimension": dimension}
+    (tmp_path / "verdict.json").write_text(json.dumps(verdict))
+    for read in (effects_of_verdict, posterior_of_verdict):
+        with pytest.raises(ValueError, match=f"is the verdict on {what}"):
+            read(tmp_path / "verdict.json")
+
+
 def test_a_verdict_in_other_units_is_refused(tmp_path):
     def read(unit):
         parameters = {"mass_kg": {"value": 20.0, "unit": unit}, "centre_m": {"value": 0.3, "unit": "m"}}

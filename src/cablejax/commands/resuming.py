@@ -138,9 +138,10 @@ def unfinished(out: pathlib.Path, settings: Mapping[str, Any], *, overwrite: boo
     begun = differing == []
     if not begun:
         if differing and not overwrite:
+            names = ", ".join(differing)
             raise UsageError(
-                f"{out} holds an unfinished run with other options ({', '.join(differing)}): run it with these to finish "
-                "it, give another folder with --out, or add --overwrite."
+                f"{out} holds an unfinished run with other options ({names}): run it with these to finish it, give "
+                "another folder with --out, or add --overwrite."
             )
         output_folder(out, overwrite=overwrite)
         parts.folder.mkdir(exist_ok=True)

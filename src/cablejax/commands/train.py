@@ -47,7 +47,7 @@ class Train(Command):
         message_passing: Message-passing steps; by default those of the preset.
     """
 
-    resume_hint: ClassVar[str] = "The last checkpoint is kept; run the same command again to go on."
+    resume_hint: ClassVar[str] = "The last checkpoint is kept, if one was made; run the same command again to go on."
 
     data: tuple[pathlib.Path, ...] = (pathlib.Path("runs/data.zarr"),)
     out: pathlib.Path = pathlib.Path("runs/train")

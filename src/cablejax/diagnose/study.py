@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping
 from typing import Any, Literal
 
@@ -11,9 +12,10 @@ from jaxtyping import Float
 from cablejax.cable import Cable, Discretisation
 from cablejax.diagnose.diagnosis import Diagnosis
 from cablejax.diagnose.judgement import look_alikes
-from cablejax.diagnose.motion_bounds import SNAP_THROUGH, Bounds, grippers_beyond
+from cablejax.diagnose.motion_bounds import SNAP_THROUGH, Bounds, cable_beyond, grippers_beyond
 from cablejax.diagnose.motion_design import excluded_by
 from cablejax.diagnose.motion_file import commands_log
+from cablejax.diagnose.playback import Playback
 from cablejax.diagnose.safe_motions import INTERVAL, there_and_back
 from cablejax.types import GapLog
 
@@ -41,8 +43,9 @@ def first_recording(
         cable: that is believed to be moved.
         start: gripper poses (x, y, theta) of every motion [m, rad]; in a workspace start and goals are moved to the
             middle of it. A start farther apart than the bounds allow is brought together.
-        goals: gripper poses by name. A motion that breaks the bounds on the grippers is left out; one that comes close
-            to a snap-through is not, since a robot that shapes a cable does that too.
+        goals: gripper poses by name. A motion that breaks the bounds, on the grippers or on the cable as it is believed
+            to be, is left out; one that comes close to a snap-through is not, since a robot that shapes a cable does
+            that too.
         bounds: to keep.
 
     Raises:
@@ -54,15 +57,35 @@ def first_recording(
     start[:, :2] = centre + min(1.0, farthest / max(apart, 1e-9)) * (start[:, :2] - centre)
     middle = np.zeros(3) if bounds.workspace is None else np.append(np.mean(bounds.workspace, axis=0), 0.0)
     motions = {name: there_and_back(start + middle, goal + middle, bounds=bounds) for name, goal in goals.items()}
-    broken = {name: grippers_beyond(bounds, config, poses, INTERVAL).keys() for name, poses in motions.items()}
-    kept = {name: poses for name, poses in motions.items() if broken[name] <= {SNAP_THROUGH}}
+    broken = {
+        name: {*grippers_beyond(bounds, config, poses, INTERVAL)} - {SNAP_THROUGH} for name, poses in motions.items()
+    }
+    seen = _simulated(config, {name: poses for name, poses in motions.items() if not broken[name]})
+    broken |= {
+        name: {*cable_beyond(bounds, config, motions[name], points[None])} - {SNAP_THROUGH}
+        for name, points in seen.items()
+    }
+    kept = {name: poses for name, poses in motions.items() if not broken[name]}
     if not kept:
-        words = excluded_by(names - {SNAP_THROUGH} for names in broken.values())
+        words = excluded_by(broken.values())
         raise ValueError(
             f"No way keeps the bounds, of those by which a study begins ({', '.join(goals)}): {words}. Make a first "
             "recording of your own, and give it to `cablejax diagnose` with these bounds."
         )
     return commands_log(kept, INTERVAL, cable)
+
+
+def _simulated(
+    config: Discretisation, motions: Mapping[str, Float[np.ndarray, "T 2 3"]]
+) -> dict[str, Float[np.ndarray, "T N 2"]]:
+    """Keypoints of the cable as it is believed to be on each motion [m]."""
+    if not motions:
+        return {}
+    longest = max(map(len, motions.values()))
+    padded = np.stack([np.pad(p, ((0, longest - len(p)), (0, 0), (0, 0)), "edge") for p in motions.values()])
+    playback = Playback.of_motion(config, padded, None, np.full(len(padded), INTERVAL))
+    points = dataclasses.replace(playback, rows=len(padded)).keypoints([playback.believed])[0]
+    return {name: seen[: len(poses)] for (name, poses), seen in zip(motions.items(), points, strict=True)}
 
 
 def ended(found: Diagnosis, worth: Mapping[str, Any] | None, *, rounds_left: int) -> Ended | None:

@@ -40,21 +40,22 @@ def verdict_json(diagnosis: Diagnosis) -> dict[str, Any]:
     explanation all the same. `ci90` is null for a choice, such as a gripper, and a list where the value is one. All
     `_mm` are null where observations are not in metres; `gap` has the sizes in their own unit too.
 
-    In addition to the fields of the format it has `cable` (the keys of a cable file: as the log states it), `place_m`
-    (where the grippers are on average, in the world of the effects' places; null in space), `sentence`,
-    `baselines`, `leftover_p`, `caveats`, `seconds`, `quantities` (by name, like an effect's parameters), `posterior`
-    (fields of `EffectValues`), `under_laws` (fields of `UnderLaw`) and `next_motion_worth`: fields of `NextMotion`,
-    those in nats with `_nats`, and whether no motion that was tried separates the explanations; of several recordings
-    `rounds`, the fields of `Round`, and `rounds_contradict`. `next_motion` is recommended only where that is false.
-    `gap` has also `unit`, `before_rmse`, `noise_floor`, `after_rmse`, `horizons`, `split`, `ahead_mm` and
-    `best_shrinkage`, an effect also `alike`, `ranking` also `leftover_mm` and `outcome`, and `where` also `sentences`,
-    `per_horizon_mm` and `frames`.
+    In addition to the fields of the format it has `cable` (the keys of a cable file: as the log states it), `dimension`
+    (2 on a table, 3 in space, null for a simulator of one's own and a hanging wire), `place_m` (where the grippers are
+    on average, in the world of the effects' places; null in space), `sentence`, `baselines`, `leftover_p`, `caveats`,
+    `seconds`, `quantities` (by name, like an effect's parameters), `posterior` (fields of `EffectValues`), `under_laws`
+    (fields of `UnderLaw`) and `next_motion_worth`: fields of `NextMotion`, those in nats with `_nats`, and whether no
+    motion that was tried separates the explanations; of several recordings `rounds`, the fields of `Round`, and
+    `rounds_contradict`. `next_motion` is recommended only where that is false. `gap` has also `unit`, `before_rmse`,
+    `noise_floor`, `after_rmse`, `horizons`, `split`, `ahead_mm` and `best_shrinkage`, an effect also `alike`, `ranking`
+    also `leftover_mm` and `outcome`, and `where` also `sentences`, `per_horizon_mm` and `frames`.
     """
     gap, rounds = diagnosis.gap, getattr(diagnosis, "rounds", None)
     return _plain(
         {
             "schema": VERDICT_SCHEMA,
             "cable": _cable(diagnosis),
+            "dimension": diagnosis.log.keypoints.shape[-1] if isinstance(diagnosis, CableDiagnosis) else None,
             "place_m": _place(diagnosis),
             "verdict": diagnosis.verdict,
             "sentence": diagnosis.sentence,

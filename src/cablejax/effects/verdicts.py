@@ -20,9 +20,15 @@ def effects_of_verdict(path: str | os.PathLike[str]) -> tuple[GivenEffect, ...]:
     """The effects that a verdict names, with their estimated parameters. Several pieces become several effects.
 
     Raises:
-        ValueError: the file is no verdict, or it names no effect ("none" and "unknown").
+        ValueError: the file is no verdict, or not on a cable on a table, or it names no effect ("none" and "unknown").
     """
     verdict = read_verdict_json(path)
+    if (dimension := verdict.get("dimension", 2)) != 2:
+        what = "a cable in space" if dimension == 3 else "something other than a cable on a table"
+        raise ValueError(
+            f"{path} is the verdict on {what}: its effects and their parameters are not those of a cable on a table, "
+            "which is what is simulated here."
+        )
     named = verdict.get("effects")
     if not isinstance(named, list):
         raise ValueError(f"{path}: effects is {shown(named)}, expected a list.")

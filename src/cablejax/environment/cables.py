@@ -20,7 +20,7 @@ from cablejax.dataset.schema import DatasetConfig, Randomisation
 from cablejax.effects.camera import in_camera_frame, without_camera
 from cablejax.effects.given import GivenEffect, parse_effect
 from cablejax.effects.physics import Physics
-from cablejax.limits import check
+from cablejax.limits import check, shown
 from cablejax.simulate.chain.engine import ChainEngine
 from cablejax.simulate.engine import refuse_lags
 from cablejax.types import CableState
@@ -116,6 +116,9 @@ class ShapeCableConfig:
         if isinstance(effects, str) or not isinstance(effects, Sequence):
             raise ValueError(f"Effects are {effects!r}, expected a list of them: [{effects!r}].")
         given = tuple(parse_effect(effect) if isinstance(effect, str) else effect for effect in effects)
+        for effect in given:
+            if not isinstance(effect, GivenEffect):
+                raise ValueError(f"An effect is {shown(effect)}, expected NAME:PARAMETER=VALUE,... or a `GivenEffect`.")
         recipe = DatasetConfig(
             interval=self.interval,
             discretisation=self.discretisation,

@@ -28,14 +28,20 @@ def play(plant: TablePlant, log: GapLog, *, source: str, noise: float = 0.0, see
         seed: of the noise.
 
     Raises:
-        ValueError: the log is not of two grippers in the plane, an episode has too few samples or an uneven clock, or
-            the plant rejects a start or a command.
+        ValueError: the log is not of two grippers on a level table, an episode has too few samples or an uneven clock,
+            or the plant rejects a start or a command.
         PlantError: the simulation became unstable.
     """
     if log.gripper_pose.shape[2:] != (2, 3):
         raise ValueError(
             f"The motion has gripper poses of shape {log.gripper_pose.shape[2:]}, expected (2, 3): (x, y, theta) of "
             "two grippers on a table."
+        )
+    gravity = np.asarray(log.meta["gravity_m_per_s2"], float)
+    if np.abs(gravity[:2]).max() > 1e-6:
+        raise ValueError(
+            f"The motion states gravity as {gravity.tolist()} m/s^2, and the plant's table is level: state "
+            "[0, 0, -9.81] in meta.gravity_m_per_s2 of both logs, and give the tilt as an effect, gravity_tilt."
         )
     episodes, random = [], np.random.default_rng(seed)
     for e, length in enumerate(log.episode_length):

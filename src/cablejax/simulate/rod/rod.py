@@ -88,7 +88,8 @@ class Rod:
     """Simulates `RodPhysics`. Pure, to be vmapped and jitted by the caller, in double precision.
 
     Attributes:
-        n_edges: from clamp to clamp, the two held halves counted as one.
+        n_edges: from clamp to clamp, the two held halves counted as one. With fewer than 20, or more than 40, the first
+            shape may be drawn in a wrong fold, which no result code tells.
         substeps: time steps between two samples.
         twisting: whether the material frame is followed. Without it rest curvature, twist and offsets across the cable
             have no effect, and a step costs half.
