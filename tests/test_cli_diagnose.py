@@ -201,8 +201,13 @@ def test_motion_that_was_not_executed_as_commanded_is_reported(tmp_path):
     moved.gripper_command[:, 30:60, 0, 1] += 0.02
     path = write_gap_log(tmp_path / "moved.npz", moved)
     assert main(["diagnose", str(path), "--out", str(tmp_path / "report"), *ONLY]) == 0
-    caveats = json.loads((tmp_path / "report" / "verdict.json").read_text())["caveats"]
-    assert any("not executed as commanded" in text and "60 mm" in text for text in caveats)
+    verdict = json.loads((tmp_path / "report" / "verdict.json").read_text())
+    assert any("not executed as commanded" in text and "60 mm" in text for text in verdict["caveats"])
+    # the cable itself is explained, and what is left is no unknown cause of the cable's
+    assert verdict["verdict"] == "named+unknown" and verdict["effects"][0]["name"] == "gripper_rotation_offset"
+    assert verdict["sentence"].startswith("With the measured poses: The gap comes from gripper rotation offset")
+    assert "arms do not follow their commands" in verdict["sentence"] and verdict["leftover_p"] is None
+    assert "are causes" not in (tmp_path / "report" / "report.html").read_text()
 
 
 def test_an_exported_log_is_to_be_imported_first(tmp_path, capsys):

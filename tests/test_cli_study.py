@@ -95,6 +95,12 @@ def test_first_recording_goes_to_the_goals_and_back_in_the_middle_of_the_workspa
 def test_bounds_without_room_are_refused():
     with pytest.raises(ValueError, match=r"\(U, S, Z\): workspace excludes 3.*Make a first recording of your own"):
         first_recording(LONG, straight_start(LONG), GOALS, Bounds(workspace=((0.0, 0.0), (0.5, 0.5))))
+    # the cable counts too, which sweeps farther than the grippers
+    disc = Bounds(keep_out=((0.0, -0.45, 0.12),))
+    with pytest.raises(ValueError, match="keep_out excludes 3"):
+        first_recording(LONG, straight_start(LONG), GOALS, disc)
+    low = Bounds(workspace=((-1.05, -0.45), (1.05, 0.45)))
+    assert first_recording(LONG, straight_start(LONG), GOALS, low).meta["motion"] == ["Z"]
     narrow = Bounds(max_distance=0.9 * LONG.length)
     log = first_recording(LONG, straight_start(LONG), GOALS, narrow)
     apart = np.linalg.norm(log.gripper_pose[:, :, 1, :2] - log.gripper_pose[:, :, 0, :2], axis=-1)

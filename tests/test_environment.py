@@ -310,6 +310,7 @@ def test_there_is_no_step_before_a_reset(make):
         ({"targets": 3}, "targets is 3, expected a tuple"),
         ({"targets": ("Q",)}, "targets has 'Q', expected U, S, Z or a `Target`"),
         ({"effects": 3}, "Effects are 3, expected a list"),
+        ({"effects": [3]}, "An effect is 3, expected NAME:PARAMETER=VALUE"),
     ],
 )
 def test_settings_of_another_type_are_refused(settings, message):
