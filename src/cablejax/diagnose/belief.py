@@ -106,11 +106,15 @@ class Calibration:
                 raise ValueError(f"Calibration.{name} is {value}, expected a finite number that is not negative.")
 
     def temper(
-        self, gap: Float[np.ndarray, "E"], noise: float, count: Float[np.ndarray, "E"] | int
+        self,
+        gap: Float[np.ndarray, "E"],
+        noise: float,
+        count: Float[np.ndarray, "E"] | int,
+        own: Float[np.ndarray, "E"] | None = None,
     ) -> Float[np.ndarray, "E"]:
-        """See the module's docstring; `gap` and samples of each episode, and `noise`, in metres per coordinate."""
+        """See the module's docstring; `own` is b if it is not `baseline`, all in metres per coordinate."""
         together = np.minimum(self.correlated_samples, np.maximum(count, 1))
-        return 1.0 + together * (self.baseline**2 + (self.law_error * gap) ** 2) / noise**2
+        return 1.0 + together * ((self.baseline if own is None else own) ** 2 + (self.law_error * gap) ** 2) / noise**2
 
     def smallest_gap(self, noise: float, own: float | None = None) -> float:
         """The gap from which on there is one; `own` is the simulator's error if it is not `baseline`."""

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -36,6 +37,8 @@ _FRAME = 2.0
 """What the origin of a recording is rounded to [m]: no finer than the priors of places on the table are."""
 STATED = 0.01
 """Relative error that a cable's stated stiffness and friction may have without being a gap."""
+ASKEW = 0.003
+"""Error of a clamp's angle [rad] that moves a usual cable by about what a simulator without any effect is off by."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -136,19 +139,20 @@ class Case:
     def evidence(self, calibration: Calibration) -> Evidence:
         """The log as evidence, weighed by the noise and the simulator's baseline error.
 
-        In an episode in which stated numbers matter more than usual, as where the cable snaps over, the simulator may
-        be off by that much more.
+        In an episode in which small errors grow, as where the cable comes close to snapping over, the simulator may be
+        off by as many times more as an error of the clamps' angles moves the cable more than usual; and by what stated
+        numbers matter more than usual.
         """
-        bare = weighed(
+        more = np.maximum(self._stated - np.median(self._stated), 0.0)
+        return weighed(
             self.simulator,
             self.recording.keypoints,
             self.nominal,
             self.noise.std[:, None],
             self.motion,
             calibration,
+            own_error=np.sqrt((calibration.baseline * self._growth) ** 2 + more),
         )
-        more = np.maximum(self._stated - np.median(self._stated), 0.0)
-        return dataclasses.replace(bare, own_error=np.sqrt(calibration.baseline**2 + more))
 
     def stated_error(self) -> float:
         """Error of the nominal simulator, per coordinate [m], if stiffness and friction are stated wrong by `STATED`.
@@ -161,14 +165,36 @@ class Case:
     @functools.cached_property
     def _stated(self) -> Float[np.ndarray, "E"]:
         """Squares of `stated_error`, of each episode."""
-        playback = self.simulator.playback
-        changed = [
-            dataclasses.replace(playback.believed, **{name: getattr(playback.believed, name) * (1 + sign * STATED)})
+        believed = self.simulator.playback.believed
+        return self._moved_by(
+            {name: getattr(believed, name) * (1 + sign * STATED)}
             for name in ("stiffness", "friction")
             for sign in (-1, 1)
-        ]
-        stiffer, softer, rougher, smoother = playback.keypoints(changed).astype(np.float64)
-        return self._squares(((stiffer - softer) ** 2 + (rougher - smoother) ** 2) / 4)
+        )
+
+    @functools.cached_property
+    def _growth(self) -> Float[np.ndarray, "E"]:
+        """How many times more than usual an error of the clamps' angles moves the cable in each episode, at least 1."""
+        believed = self.simulator.playback.believed
+        moved = np.sqrt(
+            self._moved_by(
+                {"rotation_offset": believed.rotation_offset + np.float32(sign * ASKEW) * clamp}
+                for clamp in np.eye(2, dtype=np.float32)
+                for sign in (-1, 1)
+            )
+        )
+        return np.maximum(moved / max(float(np.median(moved)), 1e-9), 1.0)
+
+    def _moved_by(self, changes: Iterable[dict[str, Any]]) -> Float[np.ndarray, "E"]:
+        """Mean squares of each episode [m^2] by which changes of the believed cable move it, together.
+
+        Args:
+            changes: pairs of one down and one up.
+        """
+        playback = self.simulator.playback
+        points = playback.keypoints([dataclasses.replace(playback.believed, **change) for change in changes])
+        pairs = points.astype(np.float64).reshape(-1, 2, *points.shape[1:])
+        return self._squares(((pairs[:, 1] - pairs[:, 0]) ** 2).sum(axis=0) / 4)
 
     def pose_error(self) -> float:
         """Error of the nominal simulator, per coordinate [m], by what is left of the scatter of the gripper poses.

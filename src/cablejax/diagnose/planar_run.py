@@ -231,8 +231,8 @@ def _excused(evidence: Evidence, conclusion: Conclusion, calibration: Calibratio
     for episode, gap, own in excused(conclusion.best, evidence, calibration):
         yield (
             f"Episode {episode} says nothing for or against a gap: the nominal simulator misses the cable by "
-            f"{1e3 * gap:.2g} mm per coordinate there, and {100 * STATED:g} % more or less stiffness or friction makes "
-            f"{1e3 * own:.2g} mm, as where a cable snaps over or is wrung by a wrong pose. Look at it, or record a "
+            f"{1e3 * gap:.2g} mm per coordinate there, and may be off by {1e3 * own:.2g} mm without any effect, for "
+            "small errors grow in it, as where a cable snaps over or is wrung by a wrong pose. Look at it, or record a "
             "calmer motion."
         )
 

@@ -171,8 +171,11 @@ def weighed(
     noise: Float[np.ndarray, "*O"],
     motion: Int[np.ndarray, "E"],
     calibration: Calibration,
+    own_error: Float[np.ndarray, "E"] | None = None,
 ) -> Evidence:
-    """Evidence of a recording, weighed by the noise and the simulator's baseline error.
+    """Evidence of a recording, weighed by the noise and by what the simulator is off by without any effect.
+
+    That is `own_error` in each episode, or the calibration's baseline error in all.
 
     Where recordings have numbers of their own, the nominal simulator has them fitted: they are no part of the gap.
     """
@@ -186,6 +189,7 @@ def weighed(
         freedom=calibration.freedom,
         motion=motion,
         fit_freedom=calibration.fit_freedom,
+        own_error=own_error,
     )
     if simulator.own(explanation()):
         temper = calibration.temper(np.zeros(len(observed)), level(bare), bare.count)
@@ -194,7 +198,7 @@ def weighed(
         bare = dataclasses.replace(bare, nominal=nominal)
     squares = (bare.whitened(nominal) ** 2).sum(axis=1)
     gap = level(bare) * np.sqrt(np.maximum(squares / np.maximum(bare.count, 1) - 1, 0.0))
-    return dataclasses.replace(bare, temper=calibration.temper(gap, level(bare), bare.count))
+    return dataclasses.replace(bare, temper=calibration.temper(gap, level(bare), bare.count, own_error))
 
 
 def explain(
