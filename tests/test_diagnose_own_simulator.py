@@ -361,12 +361,14 @@ def test_names_of_parameters_are_there_once():
 def test_fits_do_not_begin_where_an_effect_is_switched_off():
     """There nothing depends on the place or the time at which it acts."""
     size, when = Parameter("size", "m", -1.0, 1.0, 0.0, 0.1), Parameter("when_s", "s", 0.0, 3.0, 1.5, 0.6)
-    step = Effect(name="step", parameters=(size, when), null=(0.0, 1.5))
     starts = [values for _, values in Effect(name="step", parameters=(size, when), null=(0.0, 0.0)).starts(None)]
     wanted = {(s, w) for s in (-0.1, 0.1) for w in (0.9, 1.5, 2.1)}
     assert {(round(s, 9), round(w, 9)) for s, w in starts} == wanted and len(starts) == len(wanted)
-    # both are what they are at the null: either may be moved alone
-    assert len(step.starts(None)) == 4
+    # both are what they are at the null: either may switch it off, unless the effect says which
+    both = [values for _, values in Effect(name="step", parameters=(size, when), null=(0.0, 1.5)).starts(None)]
+    assert set(starts) < set(both) and len(both) == 8
+    told = Effect(name="step", parameters=(size, when), null=(0.0, 1.5), amplitude=0)
+    assert {values for _, values in told.starts(None)} == set(starts)
     positive = Effect(name="pull", parameters=(Parameter("size", "m", 0.0, 1.0, 0.0, 0.1), when), null=(0.0, 0.0))
     assert [values[0] for _, values in positive.starts(None)] == [0.1] * 3
     ratio = Effect(name="ratio", parameters=(Parameter("ratio", "", 0.1, 10.0, 2.0, 0.5, log=True),), null=(1.0,))

@@ -114,19 +114,20 @@ class Effect:
         """Pairs (variant, values) from which fits begin; enough of them that one is within reach of the truth.
 
         Unless a subclass knows better: each parameter one prior standard deviation from its median, the others there.
-        One whose median is its null value may switch the whole effect off there: the others move only where it does.
-        A place, a time or a threshold has more minima than these starts reach: list enough values of it.
+        One whose median is its null value may switch the whole effect off there, as `amplitude` does: each of the
+        others is moved together with it, too. A place, a time or a threshold has more minima than these starts reach:
+        list enough values of it.
 
         Args:
             context: what the simulator knows of the recording, see `Simulator.starts`.
         """
         del context
         every, medians = range(len(self.parameters)), tuple(p.centre for p in self.parameters)
-        switches = [i for i in every if medians[i] == self.null[i]]
-        starts = [values for values in self._moved([medians], switches or every) if values != medians]
+        switches = [i for i in every if medians[i] == self.null[i] and self.amplitude in (None, i)]
+        starts = self._moved([medians], switches or every)
         if switches:
-            starts += self._moved(starts, [i for i in every if i not in switches])
-        return [(variant, values) for variant in self.variants for values in dict.fromkeys(starts)]
+            starts += self._moved([values for values in starts if values != medians], every)
+        return [(v, values) for v in self.variants for values in dict.fromkeys(starts) if values != medians]
 
     def _moved(self, points: Sequence[tuple[float, ...]], which: Iterable[int]) -> list[tuple[float, ...]]:
         """Each point with one of its values a standard deviation below and above the median, within bounds."""
