@@ -190,7 +190,7 @@ def has_gap(null: Fit, evidence: Evidence, calibration: Calibration) -> bool:
 
 
 def excused(null: Fit, evidence: Evidence, calibration: Calibration) -> list[tuple[int, float, float]]:
-    """Motions with a gap beyond the usual error of the simulator, which may be off by as much or more in them.
+    """Motions with a gap beyond the usual error of the simulator, in which it may be off by more than usual.
 
     Where the cable snaps over, for example. They say nothing for a gap, see `has_gap`, and nothing against one.
 
@@ -205,7 +205,7 @@ def excused(null: Fit, evidence: Evidence, calibration: Calibration) -> list[tup
     return [
         (int(rows[0]), float(gap), own)
         for rows, gap in zip(motions, left_by_motion(null, evidence), strict=True)
-        if usual < gap <= calibration.resolvable * (own := float(evidence.own_error[rows].max()))
+        if usual < gap and usual < (own := float(evidence.own_error[rows].max()))
     ]
 
 

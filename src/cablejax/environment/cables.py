@@ -116,9 +116,8 @@ class ShapeCableConfig:
         if isinstance(effects, str) or not isinstance(effects, Sequence):
             raise ValueError(f"Effects are {effects!r}, expected a list of them: [{effects!r}].")
         given = tuple(parse_effect(effect) if isinstance(effect, str) else effect for effect in effects)
-        for effect in given:
-            if not isinstance(effect, GivenEffect):
-                raise ValueError(f"An effect is {shown(effect)}, expected NAME:PARAMETER=VALUE,... or a `GivenEffect`.")
+        if wrong := [effect for effect in given if not isinstance(effect, GivenEffect)]:
+            raise ValueError(f"An effect is {shown(wrong[0])}, expected NAME:PARAMETER=VALUE,... or a `GivenEffect`.")
         recipe = DatasetConfig(
             interval=self.interval,
             discretisation=self.discretisation,
