@@ -31,14 +31,9 @@ def quarter_turn(vectors: Float[Any, "*B 2"]) -> Float[Any, "*B 2"]:
 
 
 def turns(vectors: Float[Any, "*B N 2"]) -> Float[Any, "*B N1"]:
-    """Angle from each vector of the plane to the next [rad]. NumPy in, NumPy out; JAX in, JAX out.
-
-    Differentiable; from or to a vector of no length the angle is 0, and so is its derivative.
-    """
+    """Angle from each vector of the plane to the next [rad]. NumPy in, NumPy out; JAX in, JAX out."""
     xp, a, b = vectors.__array_namespace__(), vectors[..., :-1, :], vectors[..., 1:, :]
-    cross, dot = a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0], xp.sum(a * b, axis=-1)
-    none = (cross == 0) & (dot == 0)
-    return xp.where(none, 0.0, xp.arctan2(cross, xp.where(none, 1.0, dot)))
+    return xp.arctan2(a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0], xp.sum(a * b, axis=-1))
 
 
 def quaternion_product(a: Float[Any, "*B 4"], b: Float[Any, "*B 4"]) -> Float[Any, "*B 4"]:

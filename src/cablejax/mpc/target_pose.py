@@ -29,14 +29,9 @@ def total_turn(keypoints: Float[Array, "N 2"]) -> Float[Array, ""]:
 def target_pose(target: Float[Array, "N 2"]) -> Float[Array, "2 3"]:
     """(x, y, theta) of the two grippers in a target shape; theta of the second continues that of the first."""
     chord = target[1] - target[0]
-    first = _heading(chord) - 0.5 * turns(jnp.diff(target, axis=0))[0]
+    first = jnp.arctan2(chord[1], chord[0]) - 0.5 * turns(jnp.diff(target, axis=0))[0]
     heading = jnp.stack([first, first + total_turn(target)])
     return jnp.concatenate([target[jnp.array([0, -1])], heading[:, None]], axis=1)
-
-
-def _heading(vector: Float[Array, "2"]) -> Float[Array, ""]:
-    """Angle from the x axis [rad]; differentiable as `turns` is."""
-    return turns(jnp.stack([jnp.array([1.0, 0.0], vector.dtype), vector]))[0]
 
 
 def straightened(target: Float[Array, "N 2"], distance: float | Float[Array, ""]) -> Float[Array, "2 3"]:
@@ -46,7 +41,7 @@ def straightened(target: Float[Array, "N 2"], distance: float | Float[Array, ""]
     """
     first, last = target[0], target[-1]
     chord = last - first
-    heading = _heading(chord)
+    heading = jnp.arctan2(chord[1], chord[0])
     half = 0.5 * distance * jnp.stack([jnp.cos(heading), jnp.sin(heading)])
     middle = 0.5 * (first + last)
     return jnp.concatenate([jnp.stack([middle - half, middle + half]), jnp.full((2, 1), heading)], axis=1)
