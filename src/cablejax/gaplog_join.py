@@ -32,8 +32,8 @@ def joined(logs: Sequence[GapLog], names: Sequence[str]) -> GapLog:
     Its `meta` has the field `recordings`: the name of each and how many episodes it has, by which a diagnosis says what
     each one added. Of the extra fields of `meta`, `EPISODE_LABELS` are joined too (equal names of different logs stay
     apart), `COMMANDS_DERIVED` is said of each episode where they differ, and others stay where all recordings have the
-    same. Arc lengths that an importer measured in each may differ
-    by `MEASURED`; the log has their mean over the episodes.
+    same. Arc lengths that an importer measured in each may differ by `MEASURED`; the log has their mean over the
+    episodes.
 
     Args:
         logs: at least one.
