@@ -136,9 +136,11 @@ def place(tmp_path_factory):
         patch.setattr(diagnose, "diagnose_and_report", diagnosed)
         patch.setattr(play, "played", begun)
         # what is imported and compiled once is no part of an answer
-        load_model(str(original("model")))
-        diagnose_arrays(original("log"), [])
-        motion_arrays(original("motion"), [])
+        with pytest.MonkeyPatch.context() as first:
+            first.setattr("edge_cases.ANSWER", 600.0)
+            load_model(str(original("model")))
+            diagnose_arrays(original("log"), [])
+            motion_arrays(original("motion"), [])
         with tempfile.TemporaryDirectory() as out, contextlib.suppress(Accepted):
             cli.main(["study", "--out", f"{out}/study"])
         yield

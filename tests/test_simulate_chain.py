@@ -395,6 +395,9 @@ def test_derivatives_in_every_hook(programs, start):
             for name in SMOOTH[hook]:
                 leaf = getattr(physics, name)
                 direction = jnp.ones_like(leaf) * jnp.where(leaf == 0, 0.01, leaf)
+                if name == "bias_along":
+                    # an end's keypoint moves inwards only: `test_simulate_keypoints.py`
+                    direction = direction.at[jnp.array([0, -1])].set(0.0)
                 change = (dataclasses.replace(nothing[0], **{name: direction}), nothing[1])
                 exact = push(physics, state, twist, change)
                 # the grasps of a taut cable are nearly one condition too many, which rounds coarsely: the more so, the

@@ -9,10 +9,11 @@ from __future__ import annotations
 import contextlib
 import os
 import signal
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from typing import TypeVar
+from typing import Any, TypeVar
 
 INTERRUPTED = 130
 """Exit code after Ctrl-C, as shells have it."""
@@ -48,12 +49,19 @@ def answered(message: str) -> Iterator[None]:
                     os.write(2, f"\ncablejax: {message}\n".encode())
                     os._exit(INTERRUPTED)
 
-    before = signal.set_wakeup_fd(signalled, warn_on_full_buffer=False)
+    def unraisable(found: Any) -> None:
+        # Ctrl-C within a callback of the garbage collector is lost there, with a traceback: the watcher answers it
+        if not issubclass(found.exc_type, KeyboardInterrupt):
+            hook(found)
+
+    before, hook = signal.set_wakeup_fd(signalled, warn_on_full_buffer=False), sys.unraisablehook
     watcher = threading.Thread(target=watch, daemon=True)
     watcher.start()
+    sys.unraisablehook = unraisable
     try:
         yield
     finally:
+        sys.unraisablehook = hook
         left.set()
         signal.set_wakeup_fd(before)
         os.close(signalled)
