@@ -139,7 +139,7 @@ def finished_rounds(state: pathlib.Path) -> int:
             folder = out / f"round_{number + 1}"
             read_gap_log(out / f"recording_{number + 1}.npz")
             read_verdict(folder / "verdict.json")
-            if number + 1 < rounds or read_verdict_json(folder / "verdict.json")["next_motion"] is not None:
+            if read_verdict_json(folder / "verdict.json")["next_motion"] is not None:
                 read_gap_log(folder / "next_motion.npz")
         return rounds
     except FileNotFoundError as error:

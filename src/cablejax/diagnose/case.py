@@ -37,8 +37,8 @@ _FRAME = 2.0
 """What the origin of a recording is rounded to [m]: no finer than the priors of places on the table are."""
 STATED = 0.01
 """Relative error that a cable's stated stiffness and friction may have without being a gap."""
-CLAMP_ERROR = 0.003
-"""Error of a clamp's angle [rad] that moves a usual cable by about what a simulator without any effect is off by."""
+CLAMP_PROBE = 0.003
+"""Small error of a clamp's angle [rad]: it moves a usual cable by about what a simulator without effect is off by."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -178,7 +178,7 @@ class Case:
         believed = self.simulator.playback.believed
         moved = np.sqrt(
             self._moved_by(
-                {"rotation_offset": believed.rotation_offset + np.float32(sign * CLAMP_ERROR) * clamp}
+                {"rotation_offset": believed.rotation_offset + np.float32(sign * CLAMP_PROBE) * clamp}
                 for clamp in np.eye(2, dtype=np.float32)
                 for sign in (-1, 1)
             )

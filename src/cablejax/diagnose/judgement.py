@@ -55,6 +55,12 @@ def look_alikes(group: Sequence[str], effects: Sequence[NamedEffect]) -> tuple[l
     return [name for name in group if name not in faint], faint
 
 
+def in_its_place(name: str, equivalent: Sequence[Sequence[str]], effects: Sequence[NamedEffect]) -> list[str]:
+    """A named effect, and then those that could be in its place and are not improbable."""
+    group = next((names for names in equivalent if name in names), ())
+    return [name, *(other for other in look_alikes(group, effects)[0] if other != name)]
+
+
 def verdict_sentence(
     verdict: Verdict,
     effects: Sequence[NamedEffect],

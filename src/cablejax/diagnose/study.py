@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 from cablejax.cable import Cable, Discretisation
 from cablejax.diagnose.diagnosis import Diagnosis
-from cablejax.diagnose.judgement import look_alikes
+from cablejax.diagnose.judgement import in_its_place
 from cablejax.diagnose.motion_bounds import SNAP_THROUGH, Bounds, cable_beyond, grippers_beyond
 from cablejax.diagnose.motion_design import excluded_by
 from cablejax.diagnose.motion_file import commands_log
@@ -111,9 +111,6 @@ def left_open(found: Diagnosis) -> tuple[str, ...]:
 
 
 def alternatives(found: Diagnosis) -> tuple[tuple[str, ...], ...]:
-    """For each effect that a diagnosis names, its name and then those in its place that are not improbable."""
-    likely = [look_alikes(group, found.effects)[0] for group in found.equivalent]
-    return tuple(
-        tuple(dict.fromkeys([name, *(one for group in likely if name in group for one in group)]))
-        for name in dict.fromkeys(effect.name for effect in found.effects)
-    )
+    """For each effect that a diagnosis names, what `in_its_place` says; once where both grippers have it."""
+    names = dict.fromkeys(effect.name for effect in found.effects)
+    return tuple(tuple(in_its_place(name, found.equivalent, found.effects)) for name in names)

@@ -13,6 +13,7 @@ from scipy.interpolate import CubicSpline
 from cablejax.cable import Cable
 from cablejax.cable_length import require_fitting_length
 from cablejax.gaplog import Episode, gap_log_from_episodes
+from cablejax.gaplog_join import COMMANDS_DERIVED
 from cablejax.log_geometry import setup_fault
 from cablejax.poses import twists
 from cablejax.recordings.take import Take, typical_spacing
@@ -113,7 +114,7 @@ def gap_log_from_takes(
         keypoint_arclength=arclength.tolist(),
         extra={
             "take": [take.name for take in takes],
-            "commands_from_poses": True,
+            COMMANDS_DERIVED: True,
             "arclength_measured": nominal.arclength is None,
             "roll_observed": measured,
             **({"guessed": list(nominal.guessed)} if nominal.guessed else {}),

@@ -10,7 +10,7 @@ import numpy as np
 
 from cablejax.diagnose.belief import Calibration
 from cablejax.diagnose.diagnosis import CableDiagnosis, NamedEffect, Verdict
-from cablejax.diagnose.judgement import FAINT, effect_title, listed, look_alikes, share
+from cablejax.diagnose.judgement import FAINT, effect_title, in_its_place, listed, share
 from cablejax.diagnose.verdict_json import write_verdict
 from cablejax.effects import CAMERA
 from cablejax.gaplog import SIMULATED, write_gap_log
@@ -242,9 +242,7 @@ def _peak(diagnosis: CableDiagnosis) -> str:
 
 def _alike(diagnosis: CableDiagnosis, effect: NamedEffect) -> list[str]:
     """The effect and its look-alikes that are not improbable, in words."""
-    whole = next((g for g in diagnosis.equivalent if effect.name in g), ())
-    group, _ = look_alikes(whole, diagnosis.effects)
-    return [effect_title(effect.name), *(effect_title(name) for name in group if name != effect.name)]
+    return [effect_title(name) for name in in_its_place(effect.name, diagnosis.equivalent, diagnosis.effects)]
 
 
 def _most_telling(effect: NamedEffect) -> str:

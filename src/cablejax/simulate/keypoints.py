@@ -17,8 +17,7 @@ def marked_keypoints(
     """Points of a planar cable where its keypoints are marked, with the bias of each mark. One function of all engines.
 
     NumPy in, NumPy out; JAX in, JAX out, differentiable in all arrays; in the bias of an end, which stays on the cable,
-    from within. Without bias and slip the arc lengths are those
-    of `hermite_weights`, to the last bit.
+    from within. Without bias and slip the arc lengths are those of `hermite_weights`, to the last bit.
 
     Args:
         config: of the cable.

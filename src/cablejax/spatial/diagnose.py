@@ -15,6 +15,7 @@ from cablejax.diagnose.belief import Calibration
 from cablejax.diagnose.diagnosis import CableDiagnosis, Gap, ParameterEstimate, Ranked, Verdict
 from cablejax.diagnose.judgement import judged, listed, verdict_sentence
 from cablejax.diagnose.protocol import explanation
+from cablejax.gaplog_join import COMMANDS_DERIVED
 from cablejax.simulate.rod import Rod, RodResult
 from cablejax.spatial.accidents import accident_sentences, kept, moderated, off
 from cablejax.spatial.cable import SpatialCable, errors
@@ -127,7 +128,7 @@ def with_roll(log: GapLog) -> GapLog:
     They do if the nominal cable moves more like the recorded one with it. Quaternions that were made of markers have a
     roll too, which nobody observed.
     """
-    if "roll_observed" in log.meta or log.meta.get("commands_from_poses"):
+    if "roll_observed" in log.meta or log.meta.get(COMMANDS_DERIVED):
         return log
     cable, sizes = log.meta["cable"], []
     stiffness = cable["bending_stiffness_n_m2"] / cable["linear_density_kg_per_m"]
