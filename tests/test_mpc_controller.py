@@ -528,3 +528,7 @@ def test_millimetres_and_whole_targets_are_refused():
     whole = Target("own", np.asarray(hermite_shape(START, N)), np.asarray(START))
     with pytest.raises(ValueError, match=r"The target is a Target, expected an array of keypoints .*: its `keypoints`"):
         MPC(CONFIG, relaxing_cable, jnp.ones(()), whole)  # pyright: ignore[reportArgumentType]
+    twice = np.array(whole.keypoints)
+    twice[4] = twice[3]
+    with pytest.raises(ValueError, match=r"The target's keypoints 3 and 4 are at one point, expected keypoints along"):
+        MPC(CONFIG, relaxing_cable, jnp.ones(()), twice)

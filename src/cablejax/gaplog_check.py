@@ -106,6 +106,8 @@ def _check_clock(time: Float[np.ndarray, " T"], which: str) -> None:
     if not len(step):
         return
     usual, advice = float(np.median(step)), "Is the unit of time right, which is a second?"
+    begin = "Times are seconds from the episode's start: subtract the first of each episode."
+    _require(abs(float(time[0])), "duration", f"The first time {which}", begin)
     _require(usual, "sample_interval", f"The usual time between samples {which}", advice)
     _require(float(time[-1] - time[0]), "duration", f"The time from the first to the last sample {which}", advice)
     if time[-1] - time[0] > _LOST * usual * len(time):

@@ -94,7 +94,8 @@ class GivenEffect:
         """
         values, variant = self.effect.given(dict(self.parameters), chain)
         if variant not in self.effect.variants:
-            raise ValueError(f"{self.name}: {self.effect.variant_name} {variant} does not exist.")
+            known = shown(list(self.effect.variants))
+            raise ValueError(f"{self.name}: {self.effect.variant_name} is {variant}, expected one of {known}.")
         for parameter, value in zip(self.effect.parameters, values, strict=True):
             if not parameter.low * (1 - 1e-9) <= value <= parameter.high:
                 raise ValueError(f"{self.name}: {self._out_of_bounds(parameter, value, variant, chain)}")

@@ -18,7 +18,10 @@ _FAR = 2.0
 
 
 def check_target(target: Float[Array | np.ndarray, "*batch N 2"]) -> None:
-    """Raises ValueError unless the target is an array of finite keypoints [N, 2], N at least 3: fewer have no shape."""
+    """Raises ValueError unless the target is an array of finite keypoints [N, 2], N at least 3: fewer have no shape.
+
+    Neighbours at one point are refused too: no direction leads from one to the other, and its derivative is NaN.
+    """
     if not isinstance(target, (np.ndarray, jax.Array)):
         raise ValueError(
             f"The target is a {type(target).__name__}, expected an array of keypoints [N, 2]"
@@ -30,6 +33,12 @@ def check_target(target: Float[Array | np.ndarray, "*batch N 2"]) -> None:
         raise ValueError(
             f"The target has shape {shape}{'' if finite else ' with non-finite values'}, "
             "expected finite keypoints [N, 2] in metres, three or more."
+        )
+    if not isinstance(target, Tracer) and (same := np.argwhere((np.diff(target, axis=-2) == 0).all(axis=-1))).size:
+        first = int(same[0, -1])
+        raise ValueError(
+            f"The target's keypoints {first} and {first + 1} are at one point, expected keypoints along a cable, each "
+            "away from the one before: sample the shape again."
         )
 
 
