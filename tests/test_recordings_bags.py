@@ -138,6 +138,22 @@ def test_clocks_that_do_not_overlap_are_named(tmp_path):
         import_mcap(bag, layout(tmp_path))
 
 
+def test_poses_too_rare_to_say_how_a_gripper_moves_are_named(tmp_path):
+    points = swinging(201)
+    bag = write_bag(tmp_path / "bag", points, grippers_of(points, stride=10), StoragePlugin.MCAP)
+    with pytest.raises(ValueError, match=r"poses on /left/pose are 0\.1 s apart, expected 0\.075 s at most"):
+        import_mcap(bag, layout(tmp_path))
+
+
+def test_headers_without_a_time_are_named(tmp_path):
+    points = swinging(201)
+    grippers = grippers_of(points)
+    grippers["/right/pose"] = np.zeros(101), grippers["/right/pose"][1]
+    bag = write_bag(tmp_path / "bag", points, grippers, StoragePlugin.MCAP)
+    with pytest.raises(ValueError, match=r"all messages on /right/pose are stamped 1000 s, .* set header\.stamp"):
+        import_mcap(bag, layout(tmp_path))
+
+
 def test_a_gap_in_a_gripper_cuts_the_recording(tmp_path):
     points = swinging(201)
     grippers = grippers_of(points)

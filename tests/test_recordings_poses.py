@@ -16,7 +16,15 @@ from cablejax.poses import (
     twists,
     without_misreadings,
 )
-from cablejax.recordings.frames import AXES, Frame, into_frame, require_along_x, require_hanging, require_rigid
+from cablejax.recordings.frames import (
+    AXES,
+    Frame,
+    into_frame,
+    require_along_x,
+    require_hanging,
+    require_readable,
+    require_rigid,
+)
 from cablejax.recordings.take import Take
 from cablejax.recordings.units import metres_per, recognised_unit, require_metres
 from cablejax.simulate.pose import integrate_pose
@@ -168,6 +176,25 @@ def test_a_gripper_whose_x_axis_is_not_along_its_markers_is_refused(axis, name):
     require_along_x((take(points, pose=pose),), ((0, 1),))
 
 
+@pytest.mark.parametrize("words", ["have their scalar last", "are inverted"])
+def test_quaternions_read_in_another_way_are_named_where_only_the_cable_shows_it(words):
+    """With one keypoint on each gripper, and the cable bent by 17 degrees until the next one."""
+    angle = 0.3 * np.sin(0.05 * np.arange(200))
+    tilt = np.stack([np.cos(angle), 0 * angle, np.sin(angle), 0 * angle], axis=1)
+    along, points, pose = np.tile([np.cos(0.3), np.sin(0.3), 0.0], (200, 1)), swinging(), []
+    for end, inner, turn in ((0, 1, 0.7), (-1, -2, 0.6)):
+        quaternion = quaternion_product(np.array([np.cos(turn), 0.0, 0.0, np.sin(turn)]), tilt)
+        points[:, inner] = points[:, end] + (1 if inner == 1 else -1) * 0.1 * rotated(quaternion, along)
+        pose.append(np.concatenate([points[:, end], quaternion], axis=1))
+    right = np.stack(pose, axis=1)
+    require_readable((take(points, pose=right),))
+    wrong = right * [1, 1, 1, 1, -1, -1, -1]
+    if "last" in words:
+        wrong[..., 3:] = np.roll(right[..., 3:], -1, axis=-1)
+    with pytest.raises(ValueError, match=rf"x axes of grippers 0 and 1 are .* if the quaternions {words}: expected qw"):
+        require_readable((take(points, pose=wrong),))
+
+
 def test_units_are_recognised_by_the_length_of_the_cable():
     assert [metres_per(unit) for unit in ("m", "cm", "mm", "in")] == [1, 0.01, 0.001, 0.0254]
     assert recognised_unit(1037.0, (0.3, 3.0)) == ("mm",)
@@ -231,6 +258,16 @@ def swaying(width: int) -> tuple[np.ndarray, np.ndarray]:
         zero = np.zeros_like(time)
         one = np.concatenate([place, np.stack([np.cos(turn / 2), zero, zero, np.sin(turn / 2)], axis=1)], axis=1)
     return time, np.stack([one, one], axis=1)
+
+
+def test_a_pose_that_is_not_known_changes_no_other():
+    time, pose = swaying(3)
+    wrong = pose.copy()
+    wrong[10, 0] = np.nan
+    wrong[150, 0, 2] -= np.pi
+    found, words = without_misreadings(time, wrong)
+    assert np.isnan(found[10, 0]).all() and "in 1 of 200 samples" in words[0]
+    np.testing.assert_allclose(np.delete(found, 10, axis=0), np.delete(pose, 10, axis=0), atol=2e-3)
 
 
 @pytest.mark.parametrize("width", [3, 7])

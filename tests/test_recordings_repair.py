@@ -304,6 +304,50 @@ def test_a_marker_that_jumps_is_not_observed_there():
     assert sentence.startswith("Take a: keypoint 4 is farther") and "20 of 200 samples, from sample 70" in sentence
 
 
+def test_neighbours_that_a_tracker_puts_at_the_origin_are_not_observed_there():
+    right = swinging()
+    points = right.copy()
+    points[70:76, 4:6], points[70:90, 6] = 0.0, np.nan
+    (one, *_), repairs = prepare((take(points), *others()), PAIRS)
+    assert np.isnan(one.keypoints[70:76, 4:6]).all()
+    points[70:76, 4:6] = np.nan
+    np.testing.assert_array_equal(one.keypoints, points)
+    assert [text.split(" is farther")[0] for text in repairs] == ["Take a: keypoint 4", "Take a: keypoint 5"]
+
+
+def test_a_marker_whose_tracker_holds_it_is_not_observed_meanwhile():
+    right = swinging()
+    points = right.copy()
+    points[70:130, 4] = points[70, 4]
+    (one, *_), (sentence,) = prepare((take(points), *others()), PAIRS)
+    assert np.isnan(one.keypoints[71:130, 4]).all()
+    points[71:130, 4] = np.nan
+    np.testing.assert_array_equal(one.keypoints, points)
+    assert sentence.startswith("Take a: keypoint 4 repeats its last value to the last digit in 59 of 200 samples")
+
+
+def test_exchanged_markers_are_put_back_while_another_is_not_observed():
+    right = swinging()
+    right[40:150, 6] = np.nan
+    points = exchanged(right, slice(60, 130), [0, 1, 2, 4, 3, 5, 6, 7, 8])
+    restored, repairs = restore_order((take(points), *others()))
+    np.testing.assert_array_equal(restored[0].keypoints, right)
+    assert len(repairs) == 1 and "keypoints 3, 4 had exchanged their names in 70 of 200 samples" in repairs[0]
+
+
+def test_a_bend_between_arms_nearer_than_the_keypoints_is_no_wrong_order():
+    """Five keypoints on a U whose arms are half a spacing apart: its way is the shortest there is."""
+    hanging = np.array([[0, 0, 0], [0, 0, -0.2], [0.05, 0, -0.39], [0.1, 0, -0.2], [0.1, 0, 0]])
+    time = 0.01 * np.arange(100)
+    points = hanging + 0.02 * np.sin(time)[:, None, None] + 1e-4 * np.random.default_rng(0).normal(size=(100, 5, 3))
+    restored, repairs = restore_order((take(points),))
+    np.testing.assert_array_equal(restored[0].keypoints, points)
+    assert not repairs
+    for order in ([0, 2, 1, 3, 4], [1, 0, 2, 3, 4], [0, 3, 1, 2, 4]):
+        with pytest.raises(ValueError, match=r"folds back .* in their order"):
+            restore_order((take(points[:, order]),))
+
+
 @pytest.mark.parametrize("end", [0, 8])
 def test_an_end_that_jumps_does_not_move_its_gripper(end):
     right = swinging()

@@ -83,6 +83,15 @@ def rotated(quaternion: Float[np.ndarray, "*B 4"], vector: Float[np.ndarray, "*B
     return vector + quaternion[..., :1] * twice + np.cross(axis, twice)
 
 
+def unwrapped(angle: Float[np.ndarray, "T *Q"]) -> Float[np.ndarray, "T *Q"]:
+    """Angles [rad] without whole turns from each that is known to the next one; NaN stays NaN."""
+    columns = angle.astype(float).reshape(len(angle), -1)
+    for column in columns.T:
+        known = np.isfinite(column)
+        column[known] = np.unwrap(column[known])
+    return columns.reshape(angle.shape)
+
+
 def poses_at(
     at: Float[np.ndarray, " G"], time: Float[np.ndarray, " T"], pose: Float[np.ndarray, "T *Q P"]
 ) -> Float[np.ndarray, "G *Q P"]:
@@ -97,7 +106,7 @@ def poses_at(
         pose: (x, y, theta) or (x, y, z, qw, qx, qy, qz) [m, rad, 1].
     """
     if pose.shape[-1] == 3:
-        turned = np.unwrap(pose[..., 2], axis=0)
+        turned = unwrapped(pose[..., 2])
         found = positions_at(at, time, np.concatenate([pose[..., :2], turned[..., None]], axis=-1))
         before = np.clip(np.searchsorted(time, at, side="right") - 1, 0, None)
         found[..., 2] += (pose[..., 2] - turned)[before]

@@ -15,6 +15,7 @@ from jaxtyping import Float
 from cablejax.limits import require
 from cablejax.poses import poses_at, without_misreadings
 from cablejax.recordings.assemble import gap_log_from_takes
+from cablejax.recordings.gaps import FILLED
 from cablejax.recordings.layout import Fields, Layout, read_layout
 from cablejax.recordings.mcap_log import MAGIC
 from cablejax.recordings.prepare import prepare
@@ -27,6 +28,9 @@ POSE_ARRAY, POSE_STAMPED = "geometry_msgs/msg/PoseArray", "geometry_msgs/msg/Pos
 
 LARGEST_LAG = 0.05
 """Farthest from a sample of the keypoints [s] that the poses of a gripper on both sides of it may be."""
+
+SLOWEST = LARGEST_LAG + FILLED / 2
+"""Usual time between a gripper's poses [s] from which on too little is known of its motion in between."""
 
 
 class BagError(ValueError):
@@ -86,6 +90,11 @@ def _take(path: pathlib.Path, how: Layout) -> tuple[Take, list[str]]:
                     f"from {time[0]:.3f} to {time[-1]:.3f} s, which do not overlap: expected the times of one clock in "
                     "the headers."
                 )
+            if (apart := float(np.median(np.diff(stamps)))) > SLOWEST:
+                raise ValueError(
+                    f"{path}: the poses on {topic} are {apart:.3g} s apart, expected {SLOWEST:g} s at most: the "
+                    "gripper's motion in between is not known. Record them at a higher rate."
+                )
             track, jumps = without_misreadings(stamps, unit_quaternions(np.array(gripper_rows), f"{path}: {topic}"))
             misread += [f"{topic} {words}" for words in jumps.values()]
             tracks.append(_at(time, stamps, track[:, 0]))
@@ -123,6 +132,11 @@ def _messages(path: pathlib.Path, wanted: dict[str, str]) -> dict[str, list[tupl
     for topic, messages in found.items():
         if len(messages) < 2:
             raise ValueError(f"{path} has {len(messages)} messages on {topic}, expected at least two.")
+        if len({stamp for stamp, _ in messages}) == 1:
+            raise ValueError(
+                f"{path}: all messages on {topic} are stamped {messages[0][0]:g} s, expected the time of each in its "
+                "header: let the node that publishes them set header.stamp."
+            )
     return found
 
 
@@ -168,5 +182,5 @@ def _at(time: np.ndarray, stamps: np.ndarray, poses: Float[np.ndarray, "S 7"]) -
     after = np.clip(np.searchsorted(stamps, time), 1, len(stamps) - 1)
     far = (stamps[after] - time > LARGEST_LAG) | (time - stamps[after - 1] > LARGEST_LAG)
     outside = (time < stamps[0]) | (time > stamps[-1])
-    track[outside | (far & (stamps[after] != time))] = np.nan
+    track[outside | (far & ~np.isin(time, stamps))] = np.nan
     return track

@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from cablejax.poses import rotated
+from cablejax.poses import rotated, unwrapped
 from cablejax.recordings.take import Take
 
 Axis = Literal["x", "y", "z", "-x", "-y", "-z"]
@@ -33,6 +33,8 @@ ALONG = np.radians(45)
 FLAT = 0.02
 """Height above or below the others that 99 % of the keypoints of a cable on a table keep within [m]."""
 
+ASKEW, _BETTER = np.radians(60), 3.0
+"""Both x axes farther off the cable were misread, if so many times nearer to it when read in another convention."""
 RIGID = np.radians(8)
 """Largest root-mean-square angle by which a pair of markers may turn against the gripper that it is on."""
 
@@ -122,10 +124,7 @@ def onto_table(takes: tuple[Take, ...]) -> tuple[tuple[Take, ...], list[str]]:
         pose = take.gripper_pose
         if pose is not None:
             along = rotated(pose[..., 3:], np.array([1.0, 0.0, 0.0]))
-            angle = np.arctan2(along[..., 1], along[..., 0])
-            known = np.isfinite(angle)
-            for q in range(angle.shape[1]):
-                angle[known[:, q], q] = np.unwrap(angle[known[:, q], q])
+            angle = unwrapped(np.arctan2(along[..., 1], along[..., 0]))
             pose = np.concatenate([pose[..., :2], angle[..., None]], axis=-1)
         return dataclasses.replace(take, keypoints=take.keypoints[..., :2], gripper_pose=pose)
 
@@ -217,6 +216,32 @@ def require_along_x(takes: tuple[Take, ...], pairs: tuple[tuple[int, int], ...])
         )
 
 
+def require_readable(takes: tuple[Take, ...]) -> None:
+    """Refuses orientations whose x axes fit the cable far better if their quaternions are read in another way.
+
+    For grippers with one keypoint on each: the next is on the cable, whose bend hides all but a gross mistake.
+
+    Raises:
+        ValueError: says how far both are off, and in what other convention they would fit.
+    """
+    last = takes[0].keypoints.shape[1] - 1
+    seen = [_seen(takes, 0, 0, 1), _seen(takes, 1, last - 1, last)]
+
+    def off(change) -> np.ndarray:
+        along = (rotated(_inverse(q), d)[:, 0] for q, d in (change(*one) for one in seen if one is not None))
+        return np.array([np.median(np.arccos(np.clip(one, -1, 1))) for one in along if len(one)])
+
+    stated = off(lambda quaternion, direction: (quaternion, direction))
+    for name, change in _QUATERNIONS.items():
+        if len(stated) == 2 and (stated > ASKEW).all() and (off(change) < stated / _BETTER).all():
+            (one, other), (better, well) = np.degrees(stated), np.degrees(off(change))
+            raise ValueError(
+                f"The x axes of grippers 0 and 1 are {one:.0f} and {other:.0f} degrees off the cable next to them "
+                f"(median), and {better:.0f} and {well:.0f} if {name}: expected qw, qx, qy, qz of a gripper whose x "
+                "axis is along the cable. Correct the order of the columns."
+            )
+
+
 def _seen(takes: tuple[Take, ...], gripper: int, first: int, second: int) -> tuple[np.ndarray, np.ndarray] | None:
     """Orientations of a gripper, and the directions of its markers, where both were observed; None without poses."""
     posed = [take for take in takes if take.gripper_pose is not None]
@@ -233,10 +258,14 @@ def _in_gripper(
     quaternion: Float[np.ndarray, "S 4"], direction: Float[np.ndarray, "S 3"]
 ) -> tuple[Float[np.ndarray, "3"], float]:
     """Mean of a direction in the gripper's own frame, and the root-mean-square angle about it [rad]."""
-    own = rotated(quaternion * np.array([1.0, -1.0, -1.0, -1.0]), direction)
+    own = rotated(_inverse(quaternion), direction)
     mean = own.mean(axis=0)
     mean = mean / max(float(np.linalg.norm(mean)), 1e-12)
     return mean, float(np.sqrt((np.arccos(np.clip(own @ mean, -1, 1)) ** 2).mean()))
+
+
+def _inverse(quaternion: Float[np.ndarray, "S 4"]) -> Float[np.ndarray, "S 4"]:
+    return quaternion * np.array([1.0, -1.0, -1.0, -1.0])
 
 
 def _mirrored(axis: int):
@@ -251,9 +280,12 @@ def _exchanged(a: int, b: int):
     return lambda quaternion, direction: (quaternion, direction[:, order])
 
 
-_CONVENTIONS = {
+_QUATERNIONS = {
     "the quaternions have their scalar last": lambda quaternion, direction: (np.roll(quaternion, 1, axis=1), direction),
-    "the quaternions are inverted": lambda quaternion, direction: (quaternion * [1.0, -1.0, -1.0, -1.0], direction),
+    "the quaternions are inverted": lambda quaternion, direction: (_inverse(quaternion), direction),
+}
+_CONVENTIONS = {
+    **_QUATERNIONS,
     **{
         f"the positions are mirrored along {name}, as from a left-handed frame": _mirrored(k)
         for k, name in enumerate("xyz")

@@ -133,8 +133,8 @@ def _known(take: Take, on_grippers: tuple[int, ...] | None) -> np.ndarray:
 
 def _without_repeats(take: Take, reports: list[str]) -> Take:
     """The take without the samples in which a tracker holds its last values."""
-    with np.errstate(invalid="ignore"):
-        same = (np.diff(take.keypoints, axis=0) == 0).all(axis=(1, 2))
+    one, other, hidden = take.keypoints[1:], take.keypoints[:-1], np.isnan(take.keypoints)
+    same = ((one == other) | (hidden[1:] & hidden[:-1])).all(axis=(1, 2)) & ~hidden[1:].all(axis=(1, 2))
     if not same.any() or same.mean() > _HELD_PART:
         return take
     repeated = np.zeros(len(take.time), bool)

@@ -8,26 +8,24 @@ from typing import Literal
 import numpy as np
 from scipy.cluster.hierarchy import fcluster, linkage
 
-from cablejax.cable_length import STRETCH
 from cablejax.poses import poses_from_markers, twists
-from cablejax.recordings.frames import Frame, into_frame, onto_table, require_along_x, require_hanging, require_rigid
+from cablejax.recordings.frames import (
+    Frame,
+    into_frame,
+    onto_table,
+    require_along_x,
+    require_hanging,
+    require_readable,
+    require_rigid,
+)
 from cablejax.recordings.gaps import cut_at_gaps
 from cablejax.recordings.marker_order import restore_order
+from cablejax.recordings.strays import without_held, without_jumps, without_outliers, without_stretched
 from cablejax.recordings.take import Take, spacing, typical_spacing
 from cablejax.recordings.units import METRES, metres_per, recognised_unit, require_metres
 
 _USUAL_LENGTH = 0.3, 3.0
 """Lengths of a cable [m] by which an unstated unit is recognised."""
-_OUTLIER = 1.5
-"""Distance of a keypoint from the median of its sample, in lengths of the cable, from which on it cannot be on it."""
-
-_TAUT = 1.3, 0.01
-"""A cable does not stretch: neighbouring keypoints farther apart than usual by this factor, and by more than this part
-of the cable's length, are not both on it."""
-
-_FEW_STRETCHED = 0.2
-"""Up to this part of the takes is left out where the cable stretches; more have a cause that needs another mend."""
-
 _JERK, _UNUSUAL = (("m/s^2", 50.0, 0.0), ("rad/s^2", 300.0, 0.3)), 10.0
 """Accelerations of a gripper that are reported, what they have to change a step by [m, rad], and how many times their
 median in the take they are: noise has some."""
@@ -68,9 +66,9 @@ def prepare(takes: tuple[Take, ...], setup: Setup) -> tuple[tuple[Take, ...], li
     """Checks and repairs takes of one cable, and gives each the poses of both grippers.
 
     In this order: the unit of length; the frame; heights above a table, which are left out; branches and the order of
-    the markers; whether it is one cable; jumps of single markers; takes in which the cable stretches, which are left
-    out; poses that jump away and back, and gaps in time; orientations against markers; jerks of the grippers, which are
-    kept.
+    the markers; whether it is one cable; single markers that are held or jump; takes in which the cable stretches,
+    which are left out; poses that jump away and back, and gaps in time; orientations against markers; jerks of the
+    grippers, which are kept.
 
     Returns:
         The takes in metres, z up, right-handed, without gaps, each with gripper poses; and a sentence on each repair.
@@ -100,44 +98,29 @@ def prepare(takes: tuple[Take, ...], setup: Setup) -> tuple[tuple[Take, ...], li
             "All samples have the same keypoints to the last digit, which no tracker measures: expected a recording of "
             "a cable that moves. Check the columns, and that the tracker ran."
         )
-    takes, outliers = _without_outliers(takes)
+    takes, outliers = without_outliers(takes)
     takes, flattened = tuple(into_frame(take, setup.frame) for take in takes), []
     if not setup.hangs and takes[0].keypoints.shape[2] == 3:
         takes, flattened = onto_table(takes)
     takes, exchanged = restore_order(takes)
     _require_one_cable(takes, setup)
-    takes, jumps = _without_jumps(takes)
-    takes, stretched = _without_stretched(takes)
+    takes, held = without_held(takes)
+    takes, jumps = without_jumps(takes)
+    takes, stretched = without_stretched(takes)
     if takes[0].keypoints.shape[2] == 3:
         require_hanging(takes, setup.frame)
     last = takes[0].keypoints.shape[1] - 1
     pairs = ((0, 1), (last - 1, last))
     takes, cut = cut_at_gaps(takes, None if measured else (*pairs[0], *pairs[1]))
-    if measured and setup.on_grippers == "pairs" and takes[0].keypoints.shape[2] == 3:
-        require_rigid(takes, pairs)
-        require_along_x(takes, pairs)
+    if measured and takes[0].keypoints.shape[2] == 3:
+        if setup.on_grippers == "pairs":
+            require_rigid(takes, pairs)
+            require_along_x(takes, pairs)
+        else:
+            require_readable(takes)
     if not measured:
         takes = tuple(_with_poses(take, pairs) for take in takes)
-    return takes, [*repairs, *outliers, *flattened, *exchanged, *jumps, *stretched, *cut, *_jerks(takes)]
-
-
-def _without_outliers(takes: tuple[Take, ...]) -> tuple[tuple[Take, ...], list[str]]:
-    """Marks keypoints as not observed that lie farther from the rest of their sample than the cable is long."""
-    length, kept, count, farthest = float(typical_spacing(takes).sum()), [], 0, 0.0
-    for take in takes:
-        middle = np.full((len(take.time), 1, take.keypoints.shape[2]), np.nan)
-        shown = np.asarray(np.isfinite(take.keypoints).all(axis=2)).any(axis=1)
-        middle[shown, 0] = np.nanmedian(take.keypoints[shown], axis=1)
-        distance = np.nan_to_num(np.linalg.norm(take.keypoints - middle, axis=2), nan=0.0)
-        far = distance > _OUTLIER * length
-        count, farthest = count + int(far.sum()), max(farthest, float(distance.max(initial=0.0)))
-        kept.append(dataclasses.replace(take, keypoints=np.where(far[..., None], np.nan, take.keypoints)))
-    if not count:
-        return takes, []
-    return tuple(kept), [
-        f"{count} keypoint{'s' if count > 1 else ''} lay up to {farthest:.3g} m from the rest of the cable, which is "
-        f"{length:.3g} m long: taken as not observed."
-    ]
+    return takes, [*repairs, *outliers, *flattened, *exchanged, *held, *jumps, *stretched, *cut, *_jerks(takes)]
 
 
 def _require_one_cable(takes: tuple[Take, ...], setup: Setup) -> None:
@@ -172,51 +155,6 @@ def _require_one_cable(takes: tuple[Take, ...], setup: Setup) -> None:
         f"distances than in the other {usual.sum()} (keypoints {k + ends} and {k + ends + 1}: {1e3 * here[k]:.1f} mm "
         f"instead of {1e3 * there[k]:.1f} mm). Import each cable by itself."
     )
-
-
-def _without_jumps(takes: tuple[Take, ...]) -> tuple[tuple[Take, ...], list[str]]:
-    """Marks keypoints as not observed that are too far from both neighbours, where these are not from each other."""
-    usual = typical_spacing(takes)
-    factor, part = _TAUT
-    kept, reports = [], []
-
-    def apart(distance: np.ndarray, usual: np.ndarray, length: float) -> np.ndarray:
-        return np.nan_to_num(distance) > np.maximum(factor * usual, usual + part * length)
-
-    for take in takes:
-        far = apart(spacing(take.keypoints), usual, usual.sum())
-        across = np.linalg.norm(take.keypoints[:, 2:] - take.keypoints[:, :-2], axis=-1)
-        off = np.zeros(take.keypoints.shape[:2], bool)
-        off[:, 1:-1] = far[:, :-1] & far[:, 1:] & ~apart(across, usual[:-1] + usual[1:], usual.sum())
-        # an end has one neighbour, which is where it should be by its other one
-        near = np.nan_to_num(spacing(take.keypoints), nan=np.inf) <= usual + part * usual.sum()
-        off[:, 0] = far[:, 0] & near[:, 1]
-        off[:, -1] = far[:, -1] & near[:, -2]
-        kept.append(dataclasses.replace(take, keypoints=np.where(off[..., None], np.nan, take.keypoints)))
-        for index in np.flatnonzero(off.any(axis=0)):
-            samples = np.flatnonzero(off[:, index])
-            reports.append(
-                f"Take {take.name}: keypoint {index} is farther from its neighbours than the cable reaches in "
-                f"{len(samples)} of {len(off)} samples, from sample {samples[0]}: taken as not observed."
-            )
-    return tuple(kept), reports
-
-
-def _without_stretched(takes: tuple[Take, ...]) -> tuple[tuple[Take, ...], list[str]]:
-    """Leaves out a few takes in which the keypoints are farther apart than the cable is long."""
-    usual = float(typical_spacing(takes).sum())
-    kept, reports = [], []
-    for take in takes:
-        whole = spacing(take.keypoints).sum(axis=1)
-        longest = float(np.nanquantile(whole, 0.95)) if np.isfinite(whole).any() else 0.0
-        if longest <= (1 + STRETCH) * usual:
-            kept.append(take)
-            continue
-        reports.append(
-            f"Take {take.name}: along the keypoints the cable measures up to {longest:.3g} m, usually {usual:.3g} m, "
-            "and a cable does not stretch so far: left out. Was it torn, or had a marker come off?"
-        )
-    return (tuple(kept), reports) if len(reports) <= _FEW_STRETCHED * len(takes) else (takes, [])
 
 
 def _jerks(takes: tuple[Take, ...]) -> list[str]:

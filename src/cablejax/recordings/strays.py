@@ -1,0 +1,150 @@
+"""Takes out keypoints that cannot be on the cable, and takes in which it would have to stretch."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+
+import numpy as np
+from jaxtyping import Float
+
+from cablejax.arrays import stretches
+from cablejax.cable_length import STRETCH
+from cablejax.recordings.take import Take, spacing, typical_spacing
+
+_OUTLIER = 1.5
+"""Distance of a keypoint from the median of its sample, in lengths of the cable, from which on it cannot be on it."""
+
+_TAUT = 1.3, 0.01
+"""A cable does not stretch: neighbouring keypoints farther apart than usual by this factor, and by more than this part
+of the cable's length, are not both on it."""
+
+_HELD_SAMPLES, _MOVED = 3, 0.02
+"""A keypoint that repeats in so many samples in a row is held by its tracker, if both neighbours move by more than this
+part of the cable's length meanwhile."""
+
+_FEW_STRETCHED = 0.2
+"""Up to this part of the takes is left out where the cable stretches; more have a cause that needs another mend."""
+
+
+def without_outliers(takes: tuple[Take, ...]) -> tuple[tuple[Take, ...], list[str]]:
+    """Marks keypoints as not observed that lie farther from the rest of their sample than the cable is long."""
+    length, kept, count, farthest = float(typical_spacing(takes).sum()), [], 0, 0.0
+    for take in takes:
+        middle = np.full((len(take.time), 1, take.keypoints.shape[2]), np.nan)
+        shown = np.asarray(np.isfinite(take.keypoints).all(axis=2)).any(axis=1)
+        middle[shown, 0] = np.nanmedian(take.keypoints[shown], axis=1)
+        distance = np.nan_to_num(np.linalg.norm(take.keypoints - middle, axis=2), nan=0.0)
+        far = distance > _OUTLIER * length
+        count, farthest = count + int(far.sum()), max(farthest, float(distance.max(initial=0.0)))
+        kept.append(dataclasses.replace(take, keypoints=np.where(far[..., None], np.nan, take.keypoints)))
+    if not count:
+        return takes, []
+    return tuple(kept), [
+        f"{count} keypoint{'s' if count > 1 else ''} lay up to {farthest:.3g} m from the rest of the cable, which is "
+        f"{length:.3g} m long: taken as not observed."
+    ]
+
+
+def without_jumps(takes: tuple[Take, ...]) -> tuple[tuple[Take, ...], list[str]]:
+    """Marks keypoints as not observed that are too far from those on both sides, where these are not from each other.
+
+    Several next to each other too: a tracker may write the origin for each that it has lost.
+    """
+    along = np.concatenate([[0.0], np.cumsum(typical_spacing(takes))])
+    kept, reports = [], []
+    for take in takes:
+        off = np.zeros(take.keypoints.shape[:2], bool)
+        for t in np.flatnonzero(_too_far_apart(take.keypoints, along)):
+            off[t] = _off_the_cable(take.keypoints[t], along)
+        kept.append(dataclasses.replace(take, keypoints=np.where(off[..., None], np.nan, take.keypoints)))
+        for index in np.flatnonzero(off.any(axis=0)):
+            samples = np.flatnonzero(off[:, index])
+            reports.append(
+                f"Take {take.name}: keypoint {index} is farther from its neighbours than the cable reaches in "
+                f"{len(samples)} of {len(off)} samples, from sample {samples[0]}: taken as not observed."
+            )
+    return tuple(kept), reports
+
+
+def without_held(takes: tuple[Take, ...]) -> tuple[tuple[Take, ...], list[str]]:
+    """Marks keypoints as not observed whose tracker holds its last value while the cable on both sides moves away."""
+    length, kept, reports = float(typical_spacing(takes).sum()), [], []
+    for take in takes:
+        off = np.zeros(take.keypoints.shape[:2], bool)
+        same = np.asarray((np.diff(take.keypoints, axis=0) == 0).all(axis=2))
+        for k in range(1, take.keypoints.shape[1] - 1):
+            for a, b in stretches(same[:, k]):
+                beside = take.keypoints[a : b + 1, [k - 1, k + 1]]
+                moved = np.nan_to_num(np.linalg.norm(beside - beside[0], axis=-1)).max(axis=0)
+                off[a + 1 : b + 1, k] = b - a >= _HELD_SAMPLES and moved.min() > _MOVED * length
+        kept.append(dataclasses.replace(take, keypoints=np.where(off[..., None], np.nan, take.keypoints)))
+        for index in np.flatnonzero(off.any(axis=0)):
+            samples = np.flatnonzero(off[:, index])
+            reports.append(
+                f"Take {take.name}: keypoint {index} repeats its last value to the last digit in {len(samples)} of "
+                f"{len(off)} samples, from sample {samples[0]}, while its neighbours move: taken as not observed."
+            )
+    return tuple(kept), reports
+
+
+def without_stretched(takes: tuple[Take, ...]) -> tuple[tuple[Take, ...], list[str]]:
+    """Leaves out a few takes in which the keypoints are farther apart than the cable is long."""
+    usual = float(typical_spacing(takes).sum())
+    kept, reports = [], []
+    for take in takes:
+        whole = spacing(take.keypoints).sum(axis=1)
+        longest = float(np.nanquantile(whole, 0.95)) if np.isfinite(whole).any() else 0.0
+        if longest <= (1 + STRETCH) * usual:
+            kept.append(take)
+            continue
+        reports.append(
+            f"Take {take.name}: along the keypoints the cable measures up to {longest:.3g} m, usually {usual:.3g} m, "
+            "and a cable does not stretch so far: left out. Was it torn, or had a marker come off?"
+        )
+    return (tuple(kept), reports) if len(reports) <= _FEW_STRETCHED * len(takes) else (takes, [])
+
+
+def _reach(along: np.ndarray, length: float) -> np.ndarray:
+    """How far apart two points on the cable may be seen [m], by the length of cable between them [m]."""
+    factor, part = _TAUT
+    return np.maximum(factor * along, along + part * length)
+
+
+def _too_far_apart(points: Float[np.ndarray, "T N D"], along: Float[np.ndarray, " N"]) -> np.ndarray:
+    """The samples in which a keypoint is out of reach of the one observed before it along the cable, shape [T]."""
+    seen = np.asarray(np.isfinite(points).all(axis=-1))
+    last = np.maximum.accumulate(np.where(seen, np.arange(len(along)), -1), axis=1)[:, :-1]
+    before = np.take_along_axis(points, np.maximum(last, 0)[..., None], axis=1)
+    distance = np.linalg.norm(points[:, 1:] - before, axis=-1)
+    far = seen[:, 1:] & (last >= 0) & (distance > _reach(along[1:] - along[last], along[-1]))
+    return np.asarray(far.any(axis=1))
+
+
+def _off_the_cable(points: Float[np.ndarray, "N D"], along: Float[np.ndarray, " N"]) -> np.ndarray:
+    """Keypoints out of reach of the longest chain of keypoints that are within reach of the next, shape [N].
+
+    At an end of the cable only the last one: more may be the part of a cable that is torn.
+    """
+    off, seen = np.zeros(len(points), bool), np.flatnonzero(np.isfinite(points).all(axis=-1))
+    between: np.ndarray = along[seen][None] - along[seen][:, None]
+    distance = np.linalg.norm(points[seen][:, None] - points[seen][None], axis=-1)
+    within = distance <= _reach(between, along[-1])
+    longest, before = np.ones(len(seen), int), np.full(len(seen), -1)
+    for j in range(1, len(seen)):
+        if (nearer := np.flatnonzero(within[:j, j])).size:
+            before[j] = nearer[::-1][np.argmax(longest[nearer[::-1]])]
+            longest[j] = longest[before[j]] + 1
+    chain = [int(np.argmax(longest))]
+    while before[chain[0]] >= 0:
+        chain.insert(0, int(before[chain[0]]))
+    if 2 * len(chain) <= len(seen):
+        return off
+    for a, b in itertools.pairwise(chain):
+        if b > a + 1 and not within[a, a + 1] and not within[b - 1, b]:
+            off[seen[a + 1 : b]] = True
+    # an end has one neighbour, which is where it should be by its other one
+    for end, (one, other) in ((0, chain[:2]), (len(seen) - 1, chain[:-3:-1])):
+        if abs(one - end) == 1 and distance[one, other] <= abs(between[one, other]) + _TAUT[1] * along[-1]:
+            off[seen[end]] = True
+    return off
