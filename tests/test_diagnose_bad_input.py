@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from cablejax.diagnose import CableDiagnosis, DiagnosisError, diagnose
-from cablejax.diagnose.log_faults import early_keypoints, steadied
+from cablejax.diagnose.log_faults import clock_offset, early_keypoints, steadied
 from cablejax.diagnose.recording import prepare
 from cablejax.gaplog import GapLogError
 from cablejax.types import GapLog
@@ -157,11 +157,14 @@ def test_ends_that_are_not_seen_say_nothing_of_clocks(unseen):
     ends = keypoints.copy()
     ends[:, :, unseen] = np.nan
     place, interval = log.gripper_pose[..., :2].astype(float), np.full(len(ends), 0.1)
-    assert early_keypoints(ends, place, log.episode_length, interval) == []
+    assert clock_offset(ends, place, log.episode_length, interval) is None
     if unseen == [0]:
         late = np.concatenate([place[:, :1].repeat(4, axis=1), place[:, :-4]], axis=1)
-        assert "0.4 s later" in early_keypoints(ends, late, log.episode_length, interval)[0]
-        assert early_keypoints(ends[:, :3], late[:, :3], np.full(len(ends), 3), interval) == []
+        found = clock_offset(ends, late, log.episode_length, interval)
+        assert found is not None and "0.4 s later" in early_keypoints(found)[0]
+        ahead = clock_offset(late, ends, log.episode_length, interval)
+        assert ahead is not None and ahead[0] == pytest.approx(-0.4) and early_keypoints(ahead) == []
+        assert clock_offset(ends[:, :3], late[:, :3], np.full(len(ends), 3), interval) is None
 
 
 SCATTER = np.array([3e-4, 3e-4, 4e-3])

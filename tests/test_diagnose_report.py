@@ -25,7 +25,7 @@ from cablejax.report.effect_words import effect_place, quantity, share
 from cablejax.report.spatial_figures import recording_ends
 from cablejax.simulate.rod import Rod
 from cablejax.spatial.cable import SpatialCable
-from cablejax.spatial.gap import constant_offset, gap_of, in_log, noise_of, where_of
+from cablejax.spatial.gap import constant_offset, gap_of, in_log, noise_of, smallest_gap, where_of
 from cablejax.spatial.identify import layout_of
 from cablejax.spatial.windows import windows_of
 from diagnose_cases import log_of, poses
@@ -341,8 +341,8 @@ def space(tmp_path_factory):
             "constant_offset_m": ParameterEstimate(constant_offset(after, windows), None, "m"),
         },
         leftover_p=None,
-        gap=gap_of(before, after, cable, noise),
-        where=where_of(log, windows, nominal, before, noise, ()),
+        gap=gap_of(before, after, cable, noise, smallest_gap(noise, cable.windows)),
+        where=where_of(log, windows, nominal, before, noise, smallest_gap(noise, windows), ()),
         next_motion=None,
         baselines={},
         caveats=(),

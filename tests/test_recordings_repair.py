@@ -323,7 +323,7 @@ def test_a_marker_whose_tracker_holds_it_is_not_observed_meanwhile():
     assert np.isnan(one.keypoints[71:130, 4]).all()
     points[71:130, 4] = np.nan
     np.testing.assert_array_equal(one.keypoints, points)
-    assert sentence.startswith("Take a: keypoint 4 repeats its last value to the last digit in 59 of 200 samples")
+    assert sentence.startswith("Take a: keypoint 4 repeats its last value to the digit in 59 of 200 samples")
 
 
 def test_exchanged_markers_are_put_back_while_another_is_not_observed():

@@ -18,9 +18,9 @@ from cablejax.log_geometry import setup_fault
 from cablejax.report.diagnosis_page import write_diagnosis_page
 from cablejax.simulate.rod import Rod
 from cablejax.spatial.cable import SpatialCable, errors
-from cablejax.spatial.clock import on_one_clock
-from cablejax.spatial.diagnose import diagnose_space
-from cablejax.spatial.gap import OWN, noise_of, smallest_gap
+from cablejax.spatial.clock import on_one_clock, thinned
+from cablejax.spatial.diagnose import _other_clock, diagnose_space
+from cablejax.spatial.gap import OWN, error_from_beginning, noise_of, smallest_gap
 from cablejax.spatial.geometry import local_changes
 from cablejax.spatial.identify import layout_of
 from cablejax.spatial.named import _shown
@@ -213,6 +213,44 @@ def test_clocks_that_differ_are_made_one():
         assert np.nanmedian(off) < (1e-9 if e == 0 else 3e-4)
         np.testing.assert_allclose(np.linalg.norm(even.gripper_pose[e, :n, :, 3:], axis=-1), 1.0, atol=1e-6)
     assert len(windows_of(even)) == len(windows_of(log))
+
+
+def test_many_samples_a_second_are_averaged_and_keep_their_episodes():
+    """Four times as many, with noise that is less by half in their means; an episode of two has one."""
+    log, rng = cases.recording(), np.random.default_rng(0)
+    fast = copy.deepcopy(log)
+    fast.time[:] = fast.time / 4
+    fast.episode_length[1] = 3
+    fast.keypoints[:] = log.keypoints[:, :1] + rng.normal(0, 1e-3, log.keypoints.shape)
+    assert thinned(log) == (log, ())
+    found, (told,) = thinned(fast)
+    assert "5 ms apart: the mean of every 2 is taken" in told
+    assert len(found.episode_length) == len(log.episode_length) and found.episode_length[1] == 1
+    assert found.episode_length[0] == log.episode_length[0] // 2
+    n = int(found.episode_length[0])
+    np.testing.assert_allclose(np.diff(found.time[0, :n]), cases.INTERVAL / 2, rtol=1e-9)
+    off = found.keypoints[0, :n] - log.keypoints[0, 0]
+    assert np.std(off) == pytest.approx(1e-3 / np.sqrt(2), rel=0.05)
+    np.testing.assert_allclose(np.linalg.norm(found.gripper_pose[0, :n, :, 3:], axis=-1), 1.0, atol=1e-6)
+
+
+def test_noise_in_the_beginning_of_a_window_makes_no_gap():
+    """Half a millimetre at 50 Hz is a velocity of 2 to 4 cm/s that the cable does not have."""
+    windows = windows_of(cases.recording())
+    cable = SpatialCable(Rod(16, twisting=False), layout_of(windows, cases.NOMINAL), windows)
+    nominal = cable.motion(explanation())
+    small, large = (error_from_beginning(cable, nominal, noise) for noise in (1e-4, 5e-4))
+    assert large == pytest.approx(5 * small, rel=0.2) and large > 5e-4
+    assert smallest_gap(5e-4, windows, large) > 1.4 * large > smallest_gap(5e-4, windows) / 3
+
+
+def test_poses_on_another_clock_than_the_keypoints_are_told():
+    log = cases.recording()
+    assert _other_clock(log) == []
+    late = copy.deepcopy(log)
+    late.gripper_pose[:, 10:] = log.gripper_pose[:, :-10]
+    (told,) = _other_clock(late)
+    assert told.startswith("The keypoints at the grippers fit their poses 0.2 s later: ") and "shift the poses" in told
 
 
 @pytest.mark.slow

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
+from cablejax.arrays import stretches
 from cablejax.cable_length import BENT, bent_chord
 from cablejax.types import GapLog
 
@@ -24,9 +25,28 @@ ASKEW = np.radians(60.0)
 _FEWEST = 5
 _FEWEST_NEAR = 9
 """Keypoints from which on the first two show the cable's direction at a gripper."""
+# So many samples without any change, while both neighbours move in most of them, are a tracker's last value.
+_FROZEN, _MOVING = 10, 0.8
 _DEGREES_OFF = 0.5
 _DEGREES_BETTER = 3.0
 _DEGREES_TURN = 10.0
+
+
+def frozen(points: Float[np.ndarray, "T N D"]) -> Bool[np.ndarray, "T N"]:
+    """Which keypoints a tracker repeats to the last digit while both their neighbours move on.
+
+    Args:
+        points: [m], NaN = not observed.
+    """
+    found = np.zeros(points.shape[:2], bool)
+    same = np.asarray((points[1:] == points[:-1]).all(axis=-1))
+    for index in 1 + np.flatnonzero(same[:, 1:-1].sum(axis=0) >= _FROZEN):
+        for first, after in stretches(same[:, index]):
+            beside = points[first : after + 1][:, [index - 1, index + 1]]
+            moving = (np.abs(np.diff(beside, axis=0)) > 0).any(axis=-1)
+            if after - first >= _FROZEN and moving.mean(axis=0).min() > _MOVING:
+                found[first + 1 : after + 1, index] = True
+    return found
 
 
 def far_keypoint(

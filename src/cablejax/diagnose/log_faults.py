@@ -6,11 +6,10 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.signal import savgol_coeffs, savgol_filter
 
-from cablejax.arrays import quarter_turn, stretches
+from cablejax.arrays import quarter_turn
+from cablejax.log_geometry import frozen
 from cablejax.types import ROTATION_WEIGHT
 
-# So many samples without any change, while both neighbours move in most of them, are a tracker's last value.
-_FROZEN, _MOVING = 10, 0.8
 # An end keypoint that is off its gripper by this [m], at the same place of the gripper's frame, is reported.
 _TOOL, _FIXED = 2e-3, 0.5
 # Poses that scatter by less than this from one sample to the next [m, rad] are replayed as they were measured.
@@ -33,20 +32,13 @@ def without_frozen(points: Float[np.ndarray, "E T N 2"]) -> list[str]:
     Returns:
         A sentence on it, or nothing.
     """
-    same = (points[:, 1:] == points[:, :-1]).all(axis=-1)
-    found = set()
-    for episode, keypoint in zip(*np.nonzero(same[..., 1:-1].sum(axis=1) >= _FROZEN), strict=True):
-        index = keypoint + 1
-        for first, after in stretches(same[episode, :, index]):
-            beside = points[episode, first : after + 1][:, [index - 1, index + 1]]
-            moving = (np.abs(np.diff(beside, axis=0)) > 0).any(axis=-1)
-            if after - first >= _FROZEN and moving.mean(axis=0).min() > _MOVING:
-                points[episode, first + 1 : after + 1, index] = np.nan
-                found.add(int(index))
-    if not found:
+    held = np.stack([frozen(episode) for episode in points])
+    points[held] = np.nan
+    found = np.flatnonzero(held.any(axis=(0, 1)))
+    if not len(found):
         return []
     return [
-        f"Keypoint {', '.join(map(str, sorted(found)))} repeats its last value to the digit while its neighbours move: "
+        f"Keypoint {', '.join(map(str, found))} repeats its last value to the digit while its neighbours move: "
         "taken as not observed there."
     ]
 
@@ -75,15 +67,15 @@ def tool_offset(end: Float[np.ndarray, "E T 2"], pose: Float[np.ndarray, "E T 3"
     ]
 
 
-def early_keypoints(
-    ends: Float[np.ndarray, "E T 2 2"],
-    place: Float[np.ndarray, "E T 2 2"],
+def clock_offset(
+    ends: Float[np.ndarray, "E T 2 D"],
+    place: Float[np.ndarray, "E T 2 D"],
     length: Int[np.ndarray, "E"],
     interval: Float[np.ndarray, "E"],
-) -> list[str]:
-    """A sentence where the cable's ends are where their grippers are only later: poses that lag, or another clock.
+) -> tuple[float, str] | None:
+    """By how much the grippers' poses come later than the keypoints on them [s], and how well they fit then.
 
-    The other way round it is `camera_lag`, an effect of the library.
+    None where they fit as they are, or at no other time.
 
     Args:
         ends: keypoints at the grippers [m], NaN = not observed.
@@ -98,7 +90,9 @@ def early_keypoints(
             rows = []
             for end, own, n, step in zip(ends[:, :, q], place[:, :, q], length, interval, strict=True):
                 ahead = round(seconds / step)
-                rows.append(end[: max(n - ahead, 0)] - own[ahead : max(n, ahead)])
+                before, after = max(-ahead, 0), max(ahead, 0)
+                count = max(n - abs(ahead), 0)
+                rows.append(end[before : before + count] - own[after : after + count])
             off = np.concatenate(rows)
             off = off[np.isfinite(off).all(axis=1)]
             if len(off):
@@ -107,17 +101,31 @@ def early_keypoints(
 
     now = apart(0.0)
     if not _TOOL < now < np.inf:
-        return []
+        return None
     step = float(np.max(interval))
-    shifts = step * np.arange(int(_LATEST / step) + 1)
+    most = int(_LATEST / step)
+    shifts = step * np.arange(-most, most + 1)
     sizes = [apart(shift) for shift in shifts]
     best = int(np.argmin(sizes))
     if sizes[best] > _FITS * now:
+        return None
+    return float(shifts[best]), f"{1e3 * sizes[best]:.2g} mm off instead of {1e3 * now:.2g} mm (root mean square)"
+
+
+def early_keypoints(offset: tuple[float, str] | None) -> list[str]:
+    """A sentence where the cable's ends are where their grippers are only later: poses that lag, or another clock.
+
+    The other way round it is `camera_lag`, an effect of the library on a table.
+
+    Args:
+        offset: see `clock_offset`.
+    """
+    if offset is None or offset[0] <= 0:
         return []
+    seconds, fit = offset
     return [
-        f"The keypoints at the grippers fit their poses {shifts[best]:.2g} s later: {1e3 * sizes[best]:.2g} mm off "
-        f"instead of {1e3 * now:.2g} mm (root mean square). The poses come late, or both have clocks of their "
-        "own, which is no effect of the library and can look like one: shift the poses."
+        f"The keypoints at the grippers fit their poses {seconds:.2g} s later: {fit}. The poses come late, or both "
+        "have clocks of their own, which is no effect of the library and can look like one: shift the poses."
     ]
 
 

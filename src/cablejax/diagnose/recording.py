@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from cablejax.diagnose.clock import furthest_off, is_even, on_even_clock, usual_interval
-from cablejax.diagnose.log_faults import command_fault, early_keypoints, tool_offset, without_frozen
+from cablejax.diagnose.log_faults import clock_offset, command_fault, early_keypoints, tool_offset, without_frozen
 from cablejax.diagnose.noise import still
 from cablejax.gaplog import Episode, episodes_of, validate
 from cablejax.gaplog_join import commands_derived
@@ -218,9 +218,8 @@ def _plausible(log: GapLog, recording: Recording) -> list[str]:
         caveats.append(f"{missing:.0%} of the keypoints are missing: small or local effects may go unseen.")
     for gripper, end in ((0, 0), (1, -1)):
         caveats += tool_offset(points[:, :, end], recording.gripper_pose[:, :, gripper], gripper)
-    caveats += early_keypoints(
-        points[:, :, [0, -1]], recording.gripper_pose[..., :2], recording.length, recording.interval
-    )
+    place = recording.gripper_pose[..., :2]
+    caveats += early_keypoints(clock_offset(points[:, :, [0, -1]], place, recording.length, recording.interval))
     length = log.meta["cable"]["length_m"]
     span = np.linalg.norm(recording.gripper_pose[:, :, 1, :2] - recording.gripper_pose[:, :, 0, :2], axis=-1)
     if span[valid].max() > 1.001 * length:

@@ -8,8 +8,8 @@ import itertools
 import numpy as np
 from jaxtyping import Float
 
-from cablejax.arrays import stretches
 from cablejax.cable_length import STRETCH
+from cablejax.log_geometry import frozen
 from cablejax.recordings.take import Take, spacing, typical_spacing
 
 _OUTLIER = 1.5
@@ -18,10 +18,6 @@ _OUTLIER = 1.5
 _TAUT = 1.3, 0.01
 """A cable does not stretch: neighbouring keypoints farther apart than usual by this factor, and by more than this part
 of the cable's length, are not both on it."""
-
-_HELD_SAMPLES, _MOVED = 3, 0.02
-"""A keypoint that repeats in so many samples in a row is held by its tracker, if both neighbours move by more than this
-part of the cable's length meanwhile."""
 
 _FEW_STRETCHED = 0.2
 """Up to this part of the takes is left out where the cable stretches; more have a cause that needs another mend."""
@@ -68,21 +64,15 @@ def without_jumps(takes: tuple[Take, ...]) -> tuple[tuple[Take, ...], list[str]]
 
 
 def without_held(takes: tuple[Take, ...]) -> tuple[tuple[Take, ...], list[str]]:
-    """Marks keypoints as not observed whose tracker holds its last value while the cable on both sides moves away."""
-    length, kept, reports = float(typical_spacing(takes).sum()), [], []
+    """Marks keypoints as not observed that a tracker holds while the cable on both sides moves on, see `frozen`."""
+    kept, reports = [], []
     for take in takes:
-        off = np.zeros(take.keypoints.shape[:2], bool)
-        same = np.asarray((np.diff(take.keypoints, axis=0) == 0).all(axis=2))
-        for k in range(1, take.keypoints.shape[1] - 1):
-            for a, b in stretches(same[:, k]):
-                beside = take.keypoints[a : b + 1, [k - 1, k + 1]]
-                moved = np.nan_to_num(np.linalg.norm(beside - beside[0], axis=-1)).max(axis=0)
-                off[a + 1 : b + 1, k] = b - a >= _HELD_SAMPLES and moved.min() > _MOVED * length
+        off = frozen(take.keypoints)
         kept.append(dataclasses.replace(take, keypoints=np.where(off[..., None], np.nan, take.keypoints)))
         for index in np.flatnonzero(off.any(axis=0)):
             samples = np.flatnonzero(off[:, index])
             reports.append(
-                f"Take {take.name}: keypoint {index} repeats its last value to the last digit in {len(samples)} of "
+                f"Take {take.name}: keypoint {index} repeats its last value to the digit in {len(samples)} of "
                 f"{len(off)} samples, from sample {samples[0]}, while its neighbours move: taken as not observed."
             )
     return tuple(kept), reports

@@ -43,7 +43,7 @@ _PARAMETERS: dict[str, str] = {
     "ratio": "ratio to the believed value",
     "stiffness_over_density_m4_per_s2": "EI over the mass per length",
     "bending_stiffness_n_m2": "bending stiffness EI",
-    "drag_at_speed_per_s": "linear and quadratic drag together, per mass, at the speed below",
+    "drag_at_speed_per_s": "linear and quadratic drag together, per mass, at the keypoints' usual speed",
     "speed_m_per_s": "speed of the keypoints, root mean square",
     "constant_offset_m": "constant offset of the keypoints within a recording, root mean square",
     "curvature_per_m": "rest curvature",

@@ -14,14 +14,25 @@ import numpy as np
 from cablejax.diagnose.belief import Calibration
 from cablejax.diagnose.diagnosis import CableDiagnosis, Gap, ParameterEstimate, Ranked, Verdict
 from cablejax.diagnose.judgement import judged, listed, verdict_sentence
+from cablejax.diagnose.log_faults import clock_offset
 from cablejax.diagnose.protocol import explanation
 from cablejax.gaplog_join import COMMANDS_DERIVED
 from cablejax.simulate.rod import Rod, RodResult
 from cablejax.spatial.accidents import accident_sentences, kept, moderated, off
 from cablejax.spatial.cable import SpatialCable, errors
-from cablejax.spatial.clock import on_one_clock
+from cablejax.spatial.clock import on_one_clock, thinned
 from cablejax.spatial.effects import GRIP
-from cablejax.spatial.gap import constant_offset, gap_of, in_log, noise_of, smallest_gap, squares, where_of
+from cablejax.spatial.gap import (
+    OWN,
+    constant_offset,
+    error_from_beginning,
+    gap_of,
+    in_log,
+    noise_of,
+    smallest_gap,
+    squares,
+    where_of,
+)
 from cablejax.spatial.geometry import local_changes
 from cablejax.spatial.identify import EDGES, Identified, identify, layout_of
 from cablejax.spatial.named import named_effects, quantities_of, with_both_drags
@@ -67,6 +78,8 @@ def diagnose_space(
     """
     begun = time.perf_counter()
     log, repairs = on_one_clock(log)
+    log, fewer = thinned(log)
+    other_clock = _other_clock(log)
     log = with_roll(log)
     windows = windows_of(log)
     left_out = sum(split == "eval" for split in windows.split)
@@ -89,17 +102,22 @@ def diagnose_space(
     lost = ~np.array([np.isfinite(part[valid]).all() for part, valid in zip(after, windows.valid, strict=True)])
     error = errors(after, windows)
     use = np.flatnonzero(kept(lost | off(error) | windows.torn))
-    gap = gap_of(before[use], after[use], found.cable.on(windows.chosen(use)), noise)
+    kept_windows = found.cable.on(windows.chosen(use))
+    begin = error_from_beginning(kept_windows, before[use], noise)
+    smallest = smallest_gap(noise, windows, begin)
+    gap = gap_of(before[use], after[use], kept_windows, noise, smallest)
     equivalent = _equivalent(found, named)
-    verdict = _verdict(gap, 1e3 * smallest_gap(noise, windows), named, equivalent)
+    verdict = _verdict(gap, 1e3 * smallest, named, equivalent)
     if verdict in ("none", "unknown"):
         effects = ()
-    offset = ParameterEstimate(constant_offset(after[use], windows.chosen(use)), None, "m")
+    offset = ParameterEstimate(constant_offset(after[use], kept_windows.windows), None, "m")
     nominal, explained = (in_log(log, windows, part) for part in (before, after))
-    where = where_of(log, windows.chosen(use), nominal, before[use], noise, changes)
+    where = where_of(log, kept_windows.windows, nominal, before[use], noise, smallest, changes)
     return SpatialDiagnosis(
         verdict=verdict,
-        sentence=" ".join([verdict_sentence(verdict, effects, equivalent, gap.shrinkage or 0.0), *changes[:1]]),
+        sentence=" ".join(
+            [verdict_sentence(verdict, effects, equivalent, gap.shrinkage or 0.0), *changes[:1], *other_clock]
+        ),
         effects=effects,
         equivalent=equivalent,
         quantities=quantities_of(found, None if guessed else density) | {"constant_offset_m": offset},
@@ -108,8 +126,10 @@ def diagnose_space(
         where=where,
         caveats=(
             *repairs,
+            *fewer,
+            *other_clock,
             *accident_sentences(lost, error, windows, results == RodResult.COARSE),
-            *_caveats(windows, left_out, found),
+            *_caveats(windows, left_out, found, begin),
         ),
         log=log,
         nominal=nominal,
@@ -180,13 +200,32 @@ def _ranking(found: Identified) -> tuple[Ranked, ...]:
     return tuple(ranked)
 
 
-def _caveats(windows, left_out, found) -> tuple[str, ...]:
+def _other_clock(log: GapLog) -> list[str]:
+    """A sentence where the keypoints at the grippers fit their poses at another time: every fit suffers from it."""
+    steps = np.concatenate([np.diff(time[:n]) for time, n in zip(log.time, log.episode_length, strict=True)])
+    interval = np.full(len(log.time), np.median(steps) if len(steps) else 1.0)
+    ends, place = log.keypoints[:, :, [0, -1]].astype(float), log.gripper_pose[..., :3].astype(float)
+    offset = clock_offset(ends, place, log.episode_length, interval)
+    if offset is None:
+        return []
+    seconds, fit = offset
+    return [
+        f"The keypoints at the grippers fit their poses {abs(seconds):.2g} s {'later' if seconds > 0 else 'earlier'}: "
+        f"{fit}. Keypoints and poses have clocks of their own, which is no effect in space and can look like one: "
+        "shift the poses, and diagnose again."
+    ]
+
+
+def _caveats(windows, left_out, found, begin) -> tuple[str, ...]:
     result = [
         "The motion of a hanging cable does not depend on its weight: stiffness, drag and added masses are known "
         "relative to the linear density only, that of the cable with its markers, and a wrong density "
         "(linear_density) is not identifiable.",
-        "A camera that lags would shift keypoints and grippers alike, for both come from the same markers: camera_lag "
-        "is not identifiable.",
+        "A lag between the keypoints and grippers whose poses were measured apart is no effect in space; it is looked "
+        "for in the keypoints at the grippers."
+        if windows.rolls
+        else "A camera that lags would shift keypoints and grippers alike, where both come from the same markers: "
+        "camera_lag is not identifiable.",
         "The noise is what markers scatter by from one sample to the next. A marker that sits off the cable's "
         "centreline, or off its stated place along the cable, is off all the time; that error is not part of the "
         "noise, but of the constant offsets, as is what the simulator has wrong at rest.",
@@ -203,6 +242,11 @@ def _caveats(windows, left_out, found) -> tuple[str, ...]:
             "How the cable sits in the grippers is fitted for each recording: it differs by "
             f"{np.sqrt((own**2).mean()):.2f} rad (root mean square) from the mean. Recordings that no fit has seen are "
             "predicted with the mean."
+        )
+    if begin > OWN:
+        result.append(
+            f"Noise in the two samples that each window begins with alone causes errors of {1e3 * begin:.1f} mm. They "
+            "are part of the gap after, and an error up to one and a half times as large is none."
         )
     if windows.smoothed:
         result.append(

@@ -13,6 +13,7 @@ from cablejax.diagnose.diagnosis import Gap
 from cablejax.diagnose.evidence import Evidence
 from cablejax.diagnose.gap import measure_gap
 from cablejax.diagnose.noise import noise_floor
+from cablejax.diagnose.protocol import explanation
 from cablejax.diagnose.where import HORIZONS, Where
 from cablejax.diagnose.where_sizes import above, mean_of_finite, sizes_of
 from cablejax.spatial.cable import SpatialCable, bounded
@@ -21,6 +22,9 @@ from cablejax.types import GapLog
 
 RESOLVABLE = 3.0
 """An error up to so many times the noise is none."""
+
+FROM_BEGINNING = 1.5
+"""Nor up to so many times what noise in the beginning of windows causes."""
 
 OWN = Calibration().smallest_gap(0.0)
 """Nor is one that the simulator may have by itself [m], of a cable of up to a metre: as on a table."""
@@ -31,9 +35,32 @@ def noise_of(windows: Windows) -> float:
     return float(np.sqrt((noise_floor(windows.observed, None, order=4).std ** 2).mean()))
 
 
-def smallest_gap(noise: float, windows: Windows) -> float:
-    """The error of a coordinate [m], root mean square, from which on there is a gap; longer cables err by more."""
-    return float(np.hypot(RESOLVABLE * noise, OWN * max(1.0, windows.arclength[-1])))
+def smallest_gap(noise: float, windows: Windows, begin: float = 0.0) -> float:
+    """The error of a coordinate [m], root mean square, from which on there is a gap; longer cables err by more.
+
+    Args:
+        noise: standard deviation of a coordinate [m].
+        windows: of the cable.
+        begin: what noise in the beginning of each window causes, see `error_from_beginning` [m].
+    """
+    parts = (RESOLVABLE * noise, OWN * max(1.0, windows.arclength[-1]), FROM_BEGINNING * begin)
+    return float(np.linalg.norm(parts))
+
+
+def error_from_beginning(cable: SpatialCable, nominal: Float[np.ndarray, "W T F 3"], noise: float) -> float:
+    """The error of a coordinate that noise in the first two samples of each window causes, root mean square [m].
+
+    A window begins with the shape and the velocity that these two show: noise makes both wrong. Of as much noise again.
+
+    Args:
+        cable: nominal.
+        nominal: its motion in the windows.
+        noise: standard deviation of a coordinate [m].
+    """
+    points = cable.windows.keypoints.copy()
+    points[:, :2] += np.random.default_rng(0).normal(0.0, noise, points[:, :2].shape)
+    again = cable.on(dataclasses.replace(cable.windows, keypoints=points)).motion(explanation())
+    return float(np.sqrt(np.nanmean(np.where(cable.windows.valid[..., None, None], again - nominal, np.nan) ** 2)))
 
 
 def constant_offset(predicted: Float[np.ndarray, "W T F 3"], windows: Windows) -> float:
@@ -58,7 +85,11 @@ def squares(predicted: Float[np.ndarray, "W T F 3"], windows: Windows) -> Float[
 
 
 def gap_of(
-    before: Float[np.ndarray, "W T F 3"], after: Float[np.ndarray, "W T F 3"], cable: SpatialCable, noise: float
+    before: Float[np.ndarray, "W T F 3"],
+    after: Float[np.ndarray, "W T F 3"],
+    cable: SpatialCable,
+    noise: float,
+    smallest: float,
 ) -> Gap:
     """Errors of two predictions of the windows, and the shrinkage from one to the other.
 
@@ -67,6 +98,7 @@ def gap_of(
         after: with the effects that were found, each window from a fit that has not seen it [m].
         cable: in the windows as recorded.
         noise: standard deviation of a coordinate [m].
+        smallest: error from which on there is a gap [m], see `smallest_gap`.
     """
     windows = cable.windows
     observed = windows.observed
@@ -87,7 +119,7 @@ def gap_of(
         interval=np.full(len(windows), windows.interval),
         length=windows.valid.sum(axis=1),
         held_out=tuple(range(len(windows))),
-        resolvable=bool(np.nanmean(squares(before, windows)) > smallest_gap(noise, windows) ** 2),
+        resolvable=bool(np.nanmean(squares(before, windows)) > smallest**2),
     )
     return dataclasses.replace(gap, held_out_episodes=tuple(sorted({int(e) for e in windows.episode})))
 
@@ -109,6 +141,7 @@ def where_of(
     nominal: Float[np.ndarray, "E T N 3"],
     before: Float[np.ndarray, "W T F 3"],
     noise: float,
+    smallest: float,
     changes: Sequence[str],
 ) -> Where:
     """Keypoints, episodes and speeds at which the nominal simulator is off.
@@ -119,6 +152,7 @@ def where_of(
         nominal: predictions of the nominal simulator at the log's samples [m].
         before: the same of the windows [m].
         noise: standard deviation of a coordinate [m].
+        smallest: error from which on there is a gap [m], see `smallest_gap`.
         changes: of the set-up between recordings, in words.
     """
     off = bounded(np.asarray(log.keypoints, float) - nominal) ** 2
@@ -130,7 +164,7 @@ def where_of(
         off,
         noise,
         np.asarray(log.meta["keypoint_arclength_m"]),
-        smallest_mm=1e3 * smallest_gap(noise, windows),
+        smallest_mm=1e3 * smallest,
         names=[f"file {name}" for name in labels(log, "file", "take")],
         gap_mm=float(above(squared, noise)),
         horizons_mm=_by_time(squared, windows.interval, noise),
