@@ -292,6 +292,26 @@ def test_a_recording_without_noise_at_rest_is_no_gap():
     assert samples_of(parts) == [("a", 200)] and repairs == []
 
 
+@pytest.mark.parametrize("poses", [False, True])
+def test_a_tracker_slower_than_its_recording_has_only_new_samples(poses):
+    right = swinging(300)
+    held = right[np.arange(300) // 3 * 3]
+    pose = np.concatenate([right[:, [0, -1]], np.tile([1.0, 0.0, 0.0, 0.0], (300, 2, 1))], axis=2) if poses else None
+    parts, (told,) = cut_at_gaps((take(held, pose=pose),), None if poses else HELD)
+    assert "200 samples repeat" in told and "about 3 times slower than the recording" in told
+    assert samples_of(parts) == [("a", 100)]
+    np.testing.assert_array_equal(parts[0].keypoints, right[::3])
+    np.testing.assert_allclose(np.diff(parts[0].time), 3 * DT)
+
+
+def test_a_tracker_that_stops_is_noticed_beside_a_hidden_marker():
+    points = swinging()
+    points[:, 4] = np.nan
+    points[100:130] = points[99]
+    (one, *_), told = prepare((take(points), *others()), PAIRS)
+    assert len(one.time) < 200 and any("30 samples repeat the one before to the last digit" in text for text in told)
+
+
 def test_a_marker_that_jumps_is_not_observed_there():
     right = swinging()
     points = right.copy()

@@ -20,7 +20,7 @@ from cablejax.simulate.rod import Rod
 from cablejax.spatial.cable import SpatialCable, errors
 from cablejax.spatial.clock import on_one_clock, thinned
 from cablejax.spatial.diagnose import _other_clock, diagnose_space
-from cablejax.spatial.gap import OWN, error_from_beginning, noise_of, smallest_gap
+from cablejax.spatial.gap import OWN, noise_of, own_error, smallest_gap
 from cablejax.spatial.geometry import local_changes
 from cablejax.spatial.identify import layout_of
 from cablejax.spatial.named import _shown
@@ -234,14 +234,19 @@ def test_many_samples_a_second_are_averaged_and_keep_their_episodes():
     np.testing.assert_allclose(np.linalg.norm(found.gripper_pose[0, :n, :, 3:], axis=-1), 1.0, atol=1e-6)
 
 
-def test_noise_in_the_beginning_of_a_window_makes_no_gap():
+def test_noise_in_the_beginning_of_a_window_and_few_edges_make_no_gap():
     """Half a millimetre at 50 Hz is a velocity of 2 to 4 cm/s that the cable does not have."""
     windows = windows_of(cases.recording())
-    cable = SpatialCable(Rod(16, twisting=False), layout_of(windows, cases.NOMINAL), windows)
-    nominal = cable.motion(explanation())
-    small, large = (error_from_beginning(cable, nominal, noise) for noise in (1e-4, 5e-4))
-    assert large == pytest.approx(5 * small, rel=0.2) and large > 5e-4
-    assert smallest_gap(5e-4, windows, large) > 1.4 * large > smallest_gap(5e-4, windows) / 3
+    few, many = (
+        SpatialCable(Rod(edges, twisting=False), layout_of(windows, cases.NOMINAL), windows) for edges in (20, 32)
+    )
+    coarse, fine = few.motion(explanation()), many.motion(explanation())
+    edges, some, more = (own_error(few, coarse, noise) for noise in (0.0, 1e-4, 5e-4))
+    off = np.sqrt(np.mean((coarse - fine) ** 2))
+    # a part 1.6 squared of it is left with the finer one
+    assert edges == pytest.approx(off / (1 - 1 / 1.6**2), rel=0.4) and own_error(many, fine, 0.0) < 0.6 * edges
+    assert np.sqrt(more**2 - edges**2) == pytest.approx(5 * np.sqrt(some**2 - edges**2), rel=0.2)
+    assert smallest_gap(5e-4, windows, more) == pytest.approx(np.hypot(1.5 * more, smallest_gap(5e-4, windows)))
 
 
 def test_poses_on_another_clock_than_the_keypoints_are_told():

@@ -229,7 +229,7 @@ def test_names_only_what_the_estimate_shows(found, everything):
     values[where] += [0.0, 0.0, 1.5, 0.0, 0.0]
     assert "stiffness_profile" in _named(found, values)
     # damping that the integrator's own could be
-    hidden, step = everything.shared.copy(), found.cable.windows.interval / found.cable.rod.substeps
+    hidden, step = everything.shared.copy(), found.cable.windows.interval / found.time_steps.substeps
     hidden[everything.layout.slices["damping_time"]] = 0.25 * step
     assert "bending_damping" not in _named(found, hidden)
 

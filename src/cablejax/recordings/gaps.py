@@ -11,7 +11,7 @@ import dataclasses
 import itertools
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from cablejax.arrays import stretches
 from cablejax.poses import poses_at, positions_at, without_misreadings
@@ -34,6 +34,8 @@ JUMP_RATIO = 2.5
 
 # Repeated samples: so many in a row are a hold of the last value, if no more than this part of all steps are repeats.
 _HELD_SAMPLES, _HELD_PART = 3, 0.2
+# In so many of its steps a slower tracker repeats as often as usual, give or take one.
+_REGULAR = 0.9
 
 
 def cut_at_gaps(takes: tuple[Take, ...], on_grippers: tuple[int, ...] | None) -> tuple[tuple[Take, ...], list[str]]:
@@ -135,7 +137,18 @@ def _without_repeats(take: Take, reports: list[str]) -> Take:
     """The take without the samples in which a tracker holds its last values."""
     one, other, hidden = take.keypoints[1:], take.keypoints[:-1], np.isnan(take.keypoints)
     same = ((one == other) | (hidden[1:] & hidden[:-1])).all(axis=(1, 2)) & ~hidden[1:].all(axis=(1, 2))
-    if not same.any() or same.mean() > _HELD_PART:
+    if not same.any():
+        return take
+    if slower := _slower(same):
+        reports.append(
+            f"Take {take.name}: {int(same.sum())} samples repeat the one before to the last digit, one or more after "
+            f"each that is new: the tracker is about {slower} times slower than the recording. Only new samples are "
+            "kept."
+        )
+        new = np.append(True, ~same)
+        pose = None if take.gripper_pose is None else take.gripper_pose[new]
+        return dataclasses.replace(take, time=take.time[new], keypoints=take.keypoints[new], gripper_pose=pose)
+    if same.mean() > _HELD_PART:
         return take
     repeated = np.zeros(len(take.time), bool)
     for a, b in stretches(same):
@@ -154,6 +167,18 @@ def _without_repeats(take: Take, reports: list[str]) -> Take:
     if pose is None:
         return dataclasses.replace(take, keypoints=points)
     return dataclasses.replace(take, time=take.time[keep], keypoints=take.keypoints[keep], gripper_pose=pose[keep])
+
+
+def _slower(same: Bool[np.ndarray, " S"]) -> int:
+    """Of how many samples one is new, if that is so throughout; 0 otherwise.
+
+    Args:
+        same: whether each sample but the first repeats the one before.
+    """
+    apart = np.diff(np.flatnonzero(np.append(True, ~same)))
+    usual = int(np.median(apart)) if len(apart) else 1
+    regular = len(apart) > _HELD_SAMPLES and (np.abs(apart - usual) <= 1).mean() > _REGULAR
+    return usual if usual > 1 and regular else 0
 
 
 def _without_misreadings(take: Take, reports: list[str]) -> Take:

@@ -119,7 +119,7 @@ def orbit_data(diagnosis: CableDiagnosis) -> dict[str, Any]:
             "observed": whole(observed),
             "nominal": whole(diagnosis.nominal[e, samples]),
             "middle": np.nanmean(observed, axis=(0, 1)).round(4).tolist(),
-            "reach": float(np.nanmax(np.ptp(observed.reshape(-1, 3), axis=0))),
+            "reach": float((np.nanmax(observed, axis=(0, 1)) - np.nanmin(observed, axis=(0, 1))).max()),
             "floor": round(1e3 * float(np.nanmin(observed[..., 2])) - 50),
         }
         # begins where the simulator is furthest off, but not lost: at the first sample there is nothing to see

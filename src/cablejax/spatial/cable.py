@@ -95,11 +95,18 @@ class SpatialCable(Simulator):
         finer = dataclasses.replace(rod, substeps=factor * rod.substeps, local_error=rod.local_error / factor**3)
         return dataclasses.replace(self, rod=finer)
 
-    def with_more_edges(self) -> SpatialCable:
-        """With the number of edges that estimates are corrected for, without correction."""
+    def exact(self) -> SpatialCable:
+        """With the edges and time steps that estimates are corrected for, without correction.
+
+        Values that were fitted with them predict with them: with the longer steps of a fit they are off by what the
+        correction took out.
+        """
         # the longest local error stays the same length
         rod = dataclasses.replace(
-            self.rod, n_edges=round(_MORE_EDGES * self.rod.n_edges), local_error=_MORE_EDGES * self.rod.local_error
+            self.rod,
+            n_edges=round(_MORE_EDGES * self.rod.n_edges),
+            local_error=_MORE_EDGES * self.rod.local_error,
+            substeps=_FINER * self.rod.substeps,
         )
         return dataclasses.replace(self, rod=rod, correction=None)
 
@@ -110,10 +117,8 @@ class SpatialCable(Simulator):
         difference taken anew at its result until that stays where it is, the residuals are those of the finer rod,
         at the price of this one's derivatives.
         """
-        finer = self.with_more_edges()
-        finer = dataclasses.replace(finer, rod=dataclasses.replace(finer.rod, substeps=_FINER * self.rod.substeps))
         plain, every = dataclasses.replace(self, correction=None), np.arange(len(self.windows))
-        exact, coarse = (cable.predict([one], every)[0] for cable in (finer, plain))
+        exact, coarse = (cable.predict([one], every)[0] for cable in (self.exact(), plain))
         return dataclasses.replace(self, correction=exact - coarse)
 
     def own(self, one: Explanation) -> int:

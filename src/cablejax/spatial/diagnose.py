@@ -25,10 +25,10 @@ from cablejax.spatial.effects import GRIP
 from cablejax.spatial.gap import (
     OWN,
     constant_offset,
-    error_from_beginning,
     gap_of,
     in_log,
     noise_of,
+    own_error,
     smallest_gap,
     squares,
     where_of,
@@ -103,8 +103,8 @@ def diagnose_space(
     error = errors(after, windows)
     use = np.flatnonzero(kept(lost | off(error) | windows.torn))
     kept_windows = found.cable.on(windows.chosen(use))
-    begin = error_from_beginning(kept_windows, before[use], noise)
-    smallest = smallest_gap(noise, windows, begin)
+    own = own_error(kept_windows, before[use], noise)
+    smallest = smallest_gap(noise, windows, own)
     gap = gap_of(before[use], after[use], kept_windows, noise, smallest)
     equivalent = _equivalent(found, named)
     verdict = _verdict(gap, 1e3 * smallest, named, equivalent)
@@ -129,7 +129,7 @@ def diagnose_space(
             *fewer,
             *other_clock,
             *accident_sentences(lost, error, windows, results == RodResult.COARSE),
-            *_caveats(windows, left_out, found, begin),
+            *_caveats(windows, left_out, found, own),
         ),
         log=log,
         nominal=nominal,
@@ -216,7 +216,7 @@ def _other_clock(log: GapLog) -> list[str]:
     ]
 
 
-def _caveats(windows, left_out, found, begin) -> tuple[str, ...]:
+def _caveats(windows, left_out, found, own) -> tuple[str, ...]:
     result = [
         "The motion of a hanging cable does not depend on its weight: stiffness, drag and added masses are known "
         "relative to the linear density only, that of the cable with its markers, and a wrong density "
@@ -243,10 +243,10 @@ def _caveats(windows, left_out, found, begin) -> tuple[str, ...]:
             f"{np.sqrt((own**2).mean()):.2f} rad (root mean square) from the mean. Recordings that no fit has seen are "
             "predicted with the mean."
         )
-    if begin > OWN:
+    if own > OWN:
         result.append(
-            f"Noise in the two samples that each window begins with alone causes errors of {1e3 * begin:.1f} mm. They "
-            "are part of the gap after, and an error up to one and a half times as large is none."
+            f"Noise in the two samples that each window begins with, and the simulated cable's edges, alone cause "
+            f"errors of {1e3 * own:.1f} mm. They are part of the gap after; up to one and a half times as much is none."
         )
     if windows.smoothed:
         result.append(

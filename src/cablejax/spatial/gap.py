@@ -23,8 +23,9 @@ from cablejax.types import GapLog
 RESOLVABLE = 3.0
 """An error up to so many times the noise is none."""
 
-FROM_BEGINNING = 1.5
-"""Nor up to so many times what noise in the beginning of windows causes."""
+SURE_OF_OWN, _FEWER = 1.5, 1.6
+"""Nor up to so many times what noise in the beginning of windows and the rod's edges cause; and by what factor fewer
+edges show the latter."""
 
 OWN = Calibration().smallest_gap(0.0)
 """Nor is one that the simulator may have by itself [m], of a cable of up to a metre: as on a table."""
@@ -35,32 +36,38 @@ def noise_of(windows: Windows) -> float:
     return float(np.sqrt((noise_floor(windows.observed, None, order=4).std ** 2).mean()))
 
 
-def smallest_gap(noise: float, windows: Windows, begin: float = 0.0) -> float:
+def smallest_gap(noise: float, windows: Windows, own: float = 0.0) -> float:
     """The error of a coordinate [m], root mean square, from which on there is a gap; longer cables err by more.
 
     Args:
         noise: standard deviation of a coordinate [m].
         windows: of the cable.
-        begin: what noise in the beginning of each window causes, see `error_from_beginning` [m].
+        own: error that nothing in the cable causes, see `own_error` [m].
     """
-    parts = (RESOLVABLE * noise, OWN * max(1.0, windows.arclength[-1]), FROM_BEGINNING * begin)
-    return float(np.linalg.norm(parts))
+    return float(np.linalg.norm([RESOLVABLE * noise, OWN * max(1.0, windows.arclength[-1]), SURE_OF_OWN * own]))
 
 
-def error_from_beginning(cable: SpatialCable, nominal: Float[np.ndarray, "W T F 3"], noise: float) -> float:
-    """The error of a coordinate that noise in the first two samples of each window causes, root mean square [m].
+def own_error(cable: SpatialCable, nominal: Float[np.ndarray, "W T F 3"], noise: float) -> float:
+    """The error of a coordinate that the cable's physics do not cause, root mean square [m].
 
-    A window begins with the shape and the velocity that these two show: noise makes both wrong. Of as much noise again.
+    A window begins with the shape and the velocity that its first two samples show, and noise makes both wrong: by as
+    much noise again. And the rod has edges, whose error falls with the square of their number: by fewer.
 
     Args:
-        cable: nominal.
+        cable: nominal, with the edges of predictions.
         nominal: its motion in the windows.
         noise: standard deviation of a coordinate [m].
     """
+
+    def off(other: SpatialCable) -> float:
+        apart = bounded(other.motion(explanation()) - nominal) ** 2
+        return float(np.sqrt(np.mean(apart[cable.windows.valid])))
+
     points = cable.windows.keypoints.copy()
     points[:, :2] += np.random.default_rng(0).normal(0.0, noise, points[:, :2].shape)
-    again = cable.on(dataclasses.replace(cable.windows, keypoints=points)).motion(explanation())
-    return float(np.sqrt(np.nanmean(np.where(cable.windows.valid[..., None, None], again - nominal, np.nan) ** 2)))
+    begun = cable.on(dataclasses.replace(cable.windows, keypoints=points))
+    coarse = dataclasses.replace(cable, rod=dataclasses.replace(cable.rod, n_edges=round(cable.rod.n_edges / _FEWER)))
+    return float(np.hypot(off(begun), off(coarse) / (_FEWER**2 - 1)))
 
 
 def constant_offset(predicted: Float[np.ndarray, "W T F 3"], windows: Windows) -> float:

@@ -173,7 +173,7 @@ def identify(
     first = halves(windows.group)
     one, other, everything = _estimates(cable, first, last.halves, names, memory, progress)
     return Identified(
-        cable=cable.with_more_edges(),
+        cable=cable.exact(),
         time_steps=time_steps,
         effects=tuple(name for name in accepted_effects(steps) if name in last.halves[0].names),
         tried=tuple(names),

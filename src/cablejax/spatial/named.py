@@ -56,7 +56,7 @@ def named_effects(found: Identified, density: float) -> tuple[NamedEffect, ...]:
     """
     windows, estimate = found.cable.windows, found.everything
     layout = estimate.layout
-    hidden = _HIDDEN * windows.interval / found.cable.rod.substeps
+    hidden = _HIDDEN * windows.interval / found.time_steps.substeps
     damping = max(float(layout.null[layout.slices["damping_time"]].item()), hidden)
     # motion shows the drags' sum: it goes by the names that stayed in the search, or by that of the larger one
     drags = [name for name in found.effects if name in _DRAGS] or [_main_drag(estimate)]
