@@ -23,6 +23,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 _MOST_STEPS = 40
@@ -30,6 +31,14 @@ _CONVERGED = 1e-9
 """Largest change of a link's angle [rad] after which Newton's method ends."""
 _LARGEST_TURN = 0.3
 """Largest change of a link's angle [rad] in one step of Newton's method."""
+_SHARES = 0.5 ** np.arange(6)
+"""Of a step that are tried."""
+_WAY, _ON_THE_WAY = (0.0, 0.2, 0.4, 0.6, 0.8), 8
+"""Shares of the way from one stiffness to another at which the wire is brought to rest, in at most so many steps."""
+_MOST_FACTOR = 100.0
+"""By which that stiffness may differ."""
+_SOLVED = 1e-8
+"""What may be left of the conditions, over those of the wire's weight and length; more is no solution."""
 
 
 @jax.tree_util.register_dataclass
@@ -60,7 +69,7 @@ def hanging_angles(
 ) -> Float[Array, " M"]:
     """Angles of the links of a wire at rest [rad], counter-clockwise from the horizontal, shape [M].
 
-    Which of several equilibria is found, or whether one is, depends on the guess. Differentiable in the wire and the
+    Which of several equilibria is found depends on the guess; NaN where none is. Differentiable in the wire and the
     clamps, in both modes.
 
     Args:
@@ -68,26 +77,68 @@ def hanging_angles(
         clamps: x, z and angle of the first and second clamp; the angle is not taken modulo a turn [m, rad].
         guess: angles near the wanted equilibrium [rad]; no derivatives are taken in it.
     """
-    start = jnp.append(jax.lax.stop_gradient(guess), jnp.zeros(2, guess.dtype))
+    guess, given = jax.lax.stop_gradient((guess, (wire, clamps)))
+    stiffness, force = _explained_by(guess, *given)
+    start = jnp.append(guess, force)
 
     def solve(residual, unknowns):
-        def going_on(state):
-            _, change, step = state
-            return (jnp.abs(change[:-2]).max() > _CONVERGED) & (step < _MOST_STEPS)
-
-        def newton(state):
-            unknowns, _, step = state
-            change = jnp.linalg.solve(_jacobian(unknowns, wire), -residual(unknowns))
-            largest = jnp.abs(change[:-2]).max()
-            return unknowns + change * jnp.minimum(1.0, _LARGEST_TURN / (largest + 1e-300)), change, step + 1
-
-        return jax.lax.while_loop(going_on, newton, (unknowns, jnp.full_like(unknowns, jnp.inf), 0))[0]
+        direct = _newton(unknowns, *given, _MOST_STEPS)
+        lost = _left(direct, *given) > _SOLVED
+        # by way of the stiffness under which the guess is nearest to rest, as it is for a traced wire
+        first = jnp.log(stiffness / given[0].stiffness)
+        for share in _WAY:
+            between = dataclasses.replace(given[0], stiffness=given[0].stiffness * jnp.exp((1 - share) * first))
+            unknowns = _newton(unknowns, between, given[1], jnp.where(lost, _ON_THE_WAY, 0))
+        return jnp.where(lost, _newton(unknowns, *given, jnp.where(lost, _MOST_STEPS, 0)), direct)
 
     def tangent_solve(linear, value):
         # The zeros do not depend on the value: many tangents share one factorisation.
         return jnp.linalg.solve(jax.jacfwd(linear)(jnp.zeros(value.shape, value.dtype)), value)
 
-    return jax.lax.custom_root(lambda u: _residual(u, wire, clamps), start, solve, tangent_solve)[:-2]
+    found = jax.lax.custom_root(lambda u: _residual(u, wire, clamps), start, solve, tangent_solve)
+    return jnp.where(jax.lax.stop_gradient(_left(found, wire, clamps)) <= _SOLVED, found[:-2], jnp.nan)
+
+
+def _newton(unknowns: Float[Array, " U"], wire: Wire, clamps: Float[Array, "2 3"], most: Any) -> Float[Array, " U"]:
+    """Newton's method, with steps that are halved until less is left; in at most so many of them."""
+
+    def going_on(state):
+        _, change, step = state
+        return (change > _CONVERGED) & (step < most)
+
+    def newton(state):
+        unknowns, _, step = state
+        change = jnp.linalg.solve(_jacobian(unknowns, wire), -_residual(unknowns, wire, clamps))
+        change = change * jnp.minimum(1.0, _LARGEST_TURN / (jnp.abs(change[:-2]).max() + 1e-300))
+        sizes = jax.vmap(lambda share: _left(unknowns + share * change, wire, clamps))(_SHARES)
+        # the largest share that lowers it, else the smallest: a step that is worse now may lead on
+        lower = sizes < _left(unknowns, wire, clamps)
+        share = jnp.asarray(_SHARES)[jnp.where(lower.any(), jnp.argmax(lower), len(_SHARES) - 1)]
+        return unknowns + share * change, share * jnp.abs(change[:-2]).max(), step + 1
+
+    return jax.lax.while_loop(going_on, newton, (unknowns, jnp.full((), jnp.inf, unknowns.dtype), 0))[0]
+
+
+def _explained_by(
+    angles: Float[Array, " M"], wire: Wire, clamps: Float[Array, "2 3"]
+) -> tuple[Float[Array, " J"], Float[Array, "2"]]:
+    """The wire's stiffness times a factor [m^3], and the force at the second clamp over the weight per length [m].
+
+    With these the angles are nearest to rest: moments are linear in both.
+    """
+    links = angles.shape[0]
+    zero = dataclasses.replace(wire, stiffness=jnp.zeros_like(wire.stiffness))
+    weight = _residual(jnp.append(angles, jnp.zeros(2)), zero, clamps)[:-2]
+    bending = _residual(jnp.append(angles, jnp.zeros(2)), wire, clamps)[:-2] - weight
+    lever = wire.length / links * jnp.stack([-jnp.sin(angles), jnp.cos(angles)], axis=-1)
+    factor, *force = jnp.linalg.lstsq(jnp.concatenate([bending[:, None], lever], axis=1), -weight)[0]
+    return wire.stiffness * jnp.clip(factor, 1 / _MOST_FACTOR, _MOST_FACTOR), jnp.stack(force)
+
+
+def _left(unknowns: Float[Array, " U"], wire: Wire, clamps: Float[Array, "2 3"]) -> Float[Array, ""]:
+    """Norm of the moments over that of the wire's weight at its length, and of what the end misses over the length."""
+    residual = _residual(unknowns, wire, clamps)
+    return jnp.hypot(jnp.linalg.norm(residual[:-2]) / wire.length**2, jnp.linalg.norm(residual[-2:]) / wire.length)
 
 
 def hanging_points(

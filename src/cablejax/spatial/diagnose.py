@@ -237,10 +237,10 @@ def _caveats(windows, left_out, found, own) -> tuple[str, ...]:
         "values from that fit, on recordings that no fit has seen.",
     ]
     if "gripper_rotation_offset" in found.tried:
-        own = GRIP * found.everything.explanation.own[np.unique(windows.group)]
+        grips = GRIP * found.everything.explanation.own[np.unique(windows.group)]
         result.append(
             "How the cable sits in the grippers is fitted for each recording: it differs by "
-            f"{np.sqrt((own**2).mean()):.2f} rad (root mean square) from the mean. Recordings that no fit has seen are "
+            f"{np.sqrt((grips**2).mean()):.2f} rad (root mean square) from the mean. Recordings that no fit has seen are "
             "predicted with the mean."
         )
     if own > OWN:
