@@ -289,6 +289,42 @@ def test_photographs_that_are_none_are_refused(change, message):
         Photographs(**(right | change))
 
 
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda points: {"points": points * [-1, 1]}, "from right to left at both clamps, .* reverse the order"),
+        (lambda points: {"points": points * [1, -1]}, "hangs upwards from its clamps, .* negate it"),
+        (lambda points: {"error": 0.112}, "error is 0.112 m, expected less than 5% of the wire's length"),
+    ],
+    ids=["from right to left", "upside down", "clamps that move"],
+)
+def test_photographs_in_other_coordinates_are_refused(change, message):
+    s = np.linspace(0, 1, 21)
+    points = np.tile(np.stack([0.9 * s, -2.2 * s * (1 - s)], axis=1), (3, 1, 1))
+    length = float(np.linalg.norm(np.diff(points[0], axis=0), axis=1).sum())
+    right = {"points": points, "length": length, "stiffness": 1e-3, "error": 1e-3}
+    Photographs(**right)
+    with pytest.raises(ValueError, match=message):
+        Photographs(**(right | change(points)))
+
+
+def test_a_wire_far_softer_than_a_traced_one_comes_to_rest_or_has_none():
+    """Newton's method alone ended 0.2 m away from the clamp, without a word."""
+    s = np.linspace(0, 1, 2 * (COUNT - 1) + 1)
+    clamps = jnp.asarray([[0.0, 0.0, 0.05], [0.7, 0.0, -0.05]])
+    guess = jnp.asarray(1.25 * np.cos(np.pi * (s[:-1] + s[1:]) / 2) * -1)
+    for span in (0.7, 0.9, 1.1):
+        clamps = clamps.at[1, 0].set(span)
+        for factor in (1.0, 1 / 3, 1 / 10, 10.0):
+            found = wire(2.5e-3 * factor, 2 * (COUNT - 1))
+            found = Wire(found.stiffness, found.rest_curvature, jnp.asarray(1.5))
+            points = hanging_points(hanging_angles(found, clamps, guess), clamps, 1.5, COUNT)
+            np.testing.assert_allclose(points[-1], [span, 0.0], atol=1e-7)
+            assert points[COUNT // 2, 1] < -0.4
+    too_far = clamps.at[1, 0].set(1.6)
+    assert np.isnan(hanging_angles(found, too_far, guess)).all()
+
+
 def test_single_precision_is_refused():
     with jax.enable_x64(False), pytest.raises(ValueError, match="double precision"):
         HangingWire(photographs(0.0, 1.0))

@@ -240,8 +240,8 @@ def _caveats(windows, left_out, found, own) -> tuple[str, ...]:
         grips = GRIP * found.everything.explanation.own[np.unique(windows.group)]
         result.append(
             "How the cable sits in the grippers is fitted for each recording: it differs by "
-            f"{np.sqrt((grips**2).mean()):.2f} rad (root mean square) from the mean. Recordings that no fit has seen are "
-            "predicted with the mean."
+            f"{np.sqrt((grips**2).mean()):.2f} rad (root mean square) from the mean. Recordings that no fit has seen "
+            "are predicted with the mean."
         )
     if own > OWN:
         result.append(

@@ -38,6 +38,9 @@ LINKS_PER_SPACING = 2
 
 _TAIL = 0.95
 
+_RIG = 0.05
+"""Part of the wire's length that is no error of a rig any more."""
+
 
 @dataclasses.dataclass(frozen=True)
 class Photographs:
@@ -48,6 +51,9 @@ class Photographs:
         length: of the wire [m].
         stiffness: EI over the weight per length that is believed true [m^3].
         error: root mean square error of a coordinate that the rig shows [m].
+
+    Raises:
+        ValueError: too few points, another scale or length, or a wire that does not hang down, from left to right.
     """
 
     points: Float[np.ndarray, "R N 2"]
@@ -70,6 +76,24 @@ class Photographs:
             raise ValueError(
                 f"Along its traced points the wire measures {longest:.4g} m, expected its length, {self.length:g} m: "
                 "check the scale of the photographs."
+            )
+
+        if not self.error < _RIG * self.length:
+            raise ValueError(
+                f"Photographs.error is {self.error:.3g} m, expected less than {_RIG:.0%} of the wire's length, "
+                f"{self.length:g} m: nothing would count as a gap. `rig_error` holds for clamps that stay in one place."
+            )
+        first, last = (np.median(self.points[:, b, 0] - self.points[:, a, 0]) for a, b in ((0, 1), (-2, -1)))
+        if first < 0 and last < 0:
+            raise ValueError(
+                "The wire runs from right to left at both clamps, expected the first coordinate to grow: reverse the "
+                "order of the points, or negate their first coordinate."
+            )
+        ends = self.points[:, [0, -1], 1].mean(axis=1)
+        if np.median(self.points[:, 1:-1, 1].mean(axis=1) - ends) > 0:
+            raise ValueError(
+                "The wire hangs upwards from its clamps, expected the second coordinate to grow upwards: negate it, as "
+                "that of an image's pixels."
             )
 
     @property
