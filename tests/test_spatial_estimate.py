@@ -204,12 +204,7 @@ def _named(found, values):
 
 
 def _at(found, values):
-    return dataclasses.replace(found, everything=_valued(found.everything, values), halves=_halves(found, values))
-
-
-def _halves(found, values):
-    one, other = (_valued(half, values) for half in found.halves)
-    return one, other
+    return dataclasses.replace(found, everything=_valued(found.everything, values))
 
 
 def _valued(everything, values):
@@ -232,18 +227,6 @@ def test_names_only_what_the_estimate_shows(found, everything):
     hidden, step = everything.shared.copy(), found.cable.windows.interval / found.time_steps.substeps
     hidden[everything.layout.slices["damping_time"]] = 0.25 * step
     assert "bending_damping" not in _named(found, hidden)
-
-
-def test_names_what_the_others_need(found, everything):
-    """A soft middle whose interval reaches none, but without which unseen recordings are predicted worse."""
-    values, profile = everything.shared.copy(), "stiffness_profile"
-    values[everything.layout.slices["log_profile"]] += [0.0, 0.0, 1.5, 0.0, 0.0]
-    soft = dataclasses.replace(found, halves=_halves(found, values))
-    windows = dataclasses.replace(found.cable.windows, keypoints=soft.unseen()[0])
-    soft = dataclasses.replace(soft, cable=found.cable.on(windows))
-    assert [e.name for e in named_effects(soft, 0.05)] == list(_FOUND), "it did not stay in the search"
-    stayed = dataclasses.replace(soft, effects=(*_FOUND, profile))
-    assert [e.name for e in named_effects(stayed, 0.05)] == [*_FOUND, profile]
 
 
 def test_what_is_predicted_with_the_named_effects_alone_has_no_other(found, everything):

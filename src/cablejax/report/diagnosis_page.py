@@ -58,8 +58,8 @@ INFORMING = frozenset(
 """Effects that a model can be informed of, see `control.shaping.knowing`; the last three are for conditioned models."""
 _DPI = 150
 _SPACE_CAPTION = (
-    "Five seconds from two observations on, in the files with the largest, middling and smallest gaps. Drag to turn, "
-    "scroll to zoom. The solid line is a fit to recordings that this file is not part of."
+    "Up to five seconds from two observations on, in the files with the largest, middling and smallest gaps. Drag to "
+    "turn, scroll to zoom. The solid line is a fit to recordings that this file is not part of."
 )
 _WHERE_CAPTION = (
     "Top: the gap of each keypoint over the whole log. Below: each episode over time; the darker, the further beyond "

@@ -63,7 +63,7 @@ def thinned(log: GapLog) -> tuple[GapLog, tuple[str, ...]]:
 def on_one_clock(log: GapLog) -> tuple[GapLog, tuple[str, ...]]:
     """The log, sampled again where its clocks are uneven or differ between episodes, and sentences on what was changed.
 
-    Readings of the grippers that jump away and back are taken out before.
+    Readings of the grippers that jump away and back are taken out before, and many samples a second are `thinned`.
 
     Positions and tangents of the grippers are linear between samples, as under the twists that were held; keypoints are
     those of `diagnose.clock.keypoints_at`.
@@ -76,8 +76,11 @@ def on_one_clock(log: GapLog) -> tuple[GapLog, tuple[str, ...]]:
         log = dataclasses.replace(log, gripper_pose=pose)
     steps = np.concatenate([np.diff(time[:n]) for time, n in zip(log.time, log.episode_length, strict=True)])
     interval = float(np.median(steps)) if len(steps) else 0.0
-    if not len(steps) or np.abs(steps - interval).max() <= _EVEN * interval:
+    if not len(steps):
         return log, tuple(repairs)
+    if np.abs(steps - interval).max() <= _EVEN * interval:
+        log, fewer = thinned(log)
+        return log, (*repairs, *fewer)
     episodes = []
     for one in episodes_of(log):
         time = one.time - one.time[0]
@@ -100,4 +103,5 @@ def on_one_clock(log: GapLog) -> tuple[GapLog, tuple[str, ...]]:
         f"Samples are {1e3 * steps.min():.3g} to {1e3 * steps.max():.3g} ms apart: sampled again every "
         f"{1e3 * interval:.3g} ms."
     )
-    return stack_episodes(episodes, log.meta, holds=log.hold is not None), (*repairs, report)
+    log, fewer = thinned(stack_episodes(episodes, log.meta, holds=log.hold is not None))
+    return log, (*repairs, report, *fewer)

@@ -10,6 +10,7 @@ from collections.abc import Callable, Sequence
 
 import jax
 import numpy as np
+from jaxtyping import Float
 
 from cablejax.diagnose.belief import Calibration
 from cablejax.diagnose.diagnosis import CableDiagnosis, Gap, ParameterEstimate, Ranked, Verdict
@@ -20,7 +21,7 @@ from cablejax.gaplog_join import COMMANDS_DERIVED
 from cablejax.simulate.rod import Rod, RodResult
 from cablejax.spatial.accidents import accident_sentences, kept, moderated, off
 from cablejax.spatial.cable import SpatialCable, errors
-from cablejax.spatial.clock import on_one_clock, thinned
+from cablejax.spatial.clock import on_one_clock
 from cablejax.spatial.effects import GRIP
 from cablejax.spatial.gap import (
     OWN,
@@ -36,7 +37,7 @@ from cablejax.spatial.gap import (
 from cablejax.spatial.geometry import local_changes
 from cablejax.spatial.identify import EDGES, Identified, identify, layout_of
 from cablejax.spatial.named import named_effects, quantities_of, with_both_drags
-from cablejax.spatial.windows import WINDOW, windows_of
+from cablejax.spatial.windows import Windows, windows_of
 from cablejax.types import GapLog
 
 _CALIBRATION = Calibration()
@@ -78,36 +79,32 @@ def diagnose_space(
     """
     begun = time.perf_counter()
     log, repairs = on_one_clock(log)
-    log, fewer = thinned(log)
     other_clock = _other_clock(log)
     log = with_roll(log)
-    windows = windows_of(log)
-    left_out = sum(split == "eval" for split in windows.split)
-    if left_out == len(windows):
-        raise ValueError("All windows are of the eval split, which is not to be fitted: record or label others.")
-    windows = windows.chosen([i for i, split in enumerate(windows.split) if split != "eval"])
+    windows, left_out = _to_fit(log)
+    longest = round(float(windows.valid.sum(axis=1).max() * windows.interval), 1)
     cable = log.meta["cable"]
     stiffness = cable["bending_stiffness_n_m2"] / cable["linear_density_kg_per_m"]
-    progress(f"{len(windows)} windows of {WINDOW:g} s, {len(np.unique(windows.group))} recordings")
+    progress(f"{len(windows)} windows of {longest:g} s, {len(np.unique(windows.group))} recordings")
     changes = local_changes(log, windows.held)
     for change in changes:
         progress(change)
     found = identify(windows, stiffness, cable["bending_damping_s"], only=only, state=state, progress=progress)
 
     density, guessed = cable["linear_density_kg_per_m"], "linear_density_kg_per_m" in log.meta.get("guessed", ())
-    effects = named_effects(found, density)
-    named, edges = [effect.name for effect in effects], found.cable.rod.n_edges
+    effects, edges = named_effects(found, density), found.cable.rod.n_edges
+    named = [effect.name for effect in effects]
     before, (after, results) = found.cable.motion(explanation()), found.unseen(with_both_drags(named))
     noise = noise_of(windows)
-    lost = ~np.array([np.isfinite(part[valid]).all() for part, valid in zip(after, windows.valid, strict=True)])
-    error = errors(after, windows)
-    use = np.flatnonzero(kept(lost | off(error) | windows.torn))
+    lost, error, use = _simulated(after, windows)
     kept_windows = found.cable.on(windows.chosen(use))
-    own = own_error(kept_windows, before[use], noise)
-    smallest = smallest_gap(noise, windows, own)
+    smallest = smallest_gap(noise, windows, own := own_error(kept_windows, before[use], noise))
     gap = gap_of(before[use], after[use], kept_windows, noise, smallest)
     equivalent = _equivalent(found, named)
     verdict = _verdict(gap, 1e3 * smallest, named, equivalent)
+    # each may be absent, and all of them together still explain some of it
+    most = found.unseen()[0] if verdict == "unknown" else after
+    share = gap_of(before[use], most[use], kept_windows, noise, smallest).shrinkage or 0.0
     if verdict in ("none", "unknown"):
         effects = ()
     offset = ParameterEstimate(constant_offset(after[use], kept_windows.windows), None, "m")
@@ -116,7 +113,7 @@ def diagnose_space(
     return SpatialDiagnosis(
         verdict=verdict,
         sentence=" ".join(
-            [verdict_sentence(verdict, effects, equivalent, gap.shrinkage or 0.0), *changes[:1], *other_clock]
+            [verdict_sentence(verdict, effects, equivalent, max(share, 0.0)), *changes[:1], *other_clock]
         ),
         effects=effects,
         equivalent=equivalent,
@@ -126,7 +123,6 @@ def diagnose_space(
         where=where,
         caveats=(
             *repairs,
-            *fewer,
             *other_clock,
             *accident_sentences(lost, error, windows, results == RodResult.COARSE),
             *_caveats(windows, left_out, found, own),
@@ -137,9 +133,25 @@ def diagnose_space(
         noise_mm=np.full(windows.n_keypoints, 1e3 * noise),
         noise_correlation=np.zeros(0),
         seconds=time.perf_counter() - begun,
-        settings={"edges": edges, "window_s": WINDOW, "jax": jax.__version__, "devices": jax.default_backend()},
+        settings={"edges": edges, "window_s": longest, "jax": jax.__version__, "devices": jax.default_backend()},
         identified=found,
     )
+
+
+def _to_fit(log: GapLog) -> tuple[Windows, int]:
+    """The windows that may be fitted, and how many may not."""
+    windows = windows_of(log)
+    fitted = [i for i, split in enumerate(windows.split) if split != "eval"]
+    if not fitted:
+        raise ValueError("All windows are of the eval split, which is not to be fitted: record or label others.")
+    return windows.chosen(fitted), len(windows) - len(fitted)
+
+
+def _simulated(after: Float[np.ndarray, "W T F 3"], windows: Windows) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Which windows the simulation lost, the error of each [m], and the indices of those that count."""
+    lost = ~np.array([np.isfinite(part[valid]).all() for part, valid in zip(after, windows.valid, strict=True)])
+    error = errors(after, windows)
+    return lost, error, np.flatnonzero(kept(lost | off(error) | windows.torn))
 
 
 def with_roll(log: GapLog) -> GapLog:

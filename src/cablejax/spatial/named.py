@@ -10,8 +10,6 @@ import numpy as np
 from scipy.stats import norm
 
 from cablejax.diagnose.diagnosis import NamedEffect, ParameterEstimate
-from cablejax.spatial.accidents import moderated
-from cablejax.spatial.cable import errors
 from cablejax.spatial.effects import CURVATURE_KNOTS, PROFILE_KNOTS
 from cablejax.spatial.estimate import UNMODELLED, Estimate, Interval
 from cablejax.spatial.identify import Identified
@@ -25,15 +23,12 @@ SURE = 0.95
 """An effect is named where an interval that holds its value in this share of cases leaves its absence out. By the 90 %
 that are reported too many were named that the cables to choose on of `34_fresh_cables.py` do not have."""
 _WIDER = float(norm.ppf(0.5 + 0.5 * SURE) / norm.ppf(0.95))
-_DAMPING = "bending_damping"
 _DRAGS = ("viscous_drag", "quadratic_drag")
 _WHOLE, _STIFFNESS, _DRAG = "bending_stiffness", "stiffness_over_density_m4_per_s2", "drag_at_speed_per_s"
-_WORSE = 1.2
-"""So many times the error of all effects together is clearly worse."""
 _TELLING = {
     "bending_stiffness": "ratio",
     "stiffness_profile": "ratio",
-    _DAMPING: "time_s",
+    "bending_damping": "time_s",
     **dict.fromkeys(_DRAGS, _DRAG),
     "lumped_mass": "mass_kg",
     "gripper_rotation_offset": "angle_rad",
@@ -47,56 +42,26 @@ def named_effects(found: Identified, density: float) -> tuple[NamedEffect, ...]:
     """The effects that the estimate shows, with parameters and 90 % intervals: those that stayed in the search first.
 
     That an effect does not help to simulate other recordings, which the search asks, does not mean that it is absent.
-    All values are of one fit, and some hold only together: of the effects that stayed, those without which the others
-    predict unseen recordings clearly worse are named too, though their own intervals may reach their absence.
 
     Args:
         found: by `identify`.
         density: mass per length, with the markers, that is believed true [kg/m], for what is known per mass only.
     """
-    windows, estimate = found.cable.windows, found.everything
+    named, windows, estimate = [], found.cable.windows, found.everything
     layout = estimate.layout
     hidden = _HIDDEN * windows.interval / found.time_steps.substeps
     damping = max(float(layout.null[layout.slices["damping_time"]].item()), hidden)
     # motion shows the drags' sum: it goes by the names that stayed in the search, or by that of the larger one
     drags = [name for name in found.effects if name in _DRAGS] or [_main_drag(estimate)]
-    every = [name for name in dict.fromkeys((*found.effects, *found.tried)) if name not in _DRAGS or name in drags]
-    effects = {
-        name: parameters_of(name, estimate, density, first_marker=windows.held[0], first_clamp=windows.first_clamp)
-        for name in every
-    }
-    shown = [
-        name for name in every if _shown(name, effects[name][0][_TELLING[name]], damping, longer_only=damping == hidden)
-    ]
-    # a damping no longer than the integrator's own is none
-    kept = [
-        name for name in found.effects if name != _DAMPING or effects[name][0]["time_s"].value > (1 + 1e-6) * hidden
-    ]
-    named = _with_needed(found, shown, kept)
-    return tuple(
-        NamedEffect(name, None, parameters, {"along_cable_m": along, "time_s": None, "table_m": None})
-        for name, (parameters, along) in effects.items()
-        if name in named
-    )
-
-
-def _with_needed(found: Identified, named: Sequence[str], kept: Sequence[str]) -> list[str]:
-    """Named effects, and those kept without which they predict unseen recordings clearly worse than all together."""
-
-    def error(names: Sequence[str]) -> float:
-        return float(moderated(errors(found.unseen(with_both_drags(names))[0], found.cable.windows)).mean())
-
-    whole, result = error(found.tried), list(named)
-    now, left = error(result), [name for name in kept if name not in result]
-    while left and now > _WORSE * whole:
-        without = {name: error([*result, name]) for name in left}
-        best = min(left, key=lambda name: without[name])
-        if without[best] >= now:
-            break
-        now = without[best]
-        result.append(best)
-        left.remove(best)
-    return result
+    for name in dict.fromkeys((*found.effects, *found.tried)):
+        if name in _DRAGS and name not in drags:
+            continue
+        parameters, along = parameters_of(
+            name, estimate, density, first_marker=windows.held[0], first_clamp=windows.first_clamp
+        )
+        if _shown(name, parameters[_TELLING[name]], damping, longer_only=damping == hidden):
+            named.append(NamedEffect(name, None, parameters, {"along_cable_m": along, "time_s": None, "table_m": None}))
+    return tuple(named)
 
 
 def with_both_drags(named: Sequence[str]) -> set[str]:
@@ -140,7 +105,7 @@ def _shown(effect: str, parameter: ParameterEstimate, damping: float, *, longer_
         longer_only: whether a shorter one cannot be told from it.
     """
     ends = np.reshape(np.array(parameter.ci90, float), (-1, 2)).T
-    ends, damped = np.stack([np.ravel(parameter.value), *ends]), effect == _DAMPING
+    ends, damped = np.stack([np.ravel(parameter.value), *ends]), effect == "bending_damping"
     if damped:
         ends = np.log(ends / damping)
     elif _TELLING[effect] == "ratio":
