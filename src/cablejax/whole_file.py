@@ -22,13 +22,14 @@ def whole_file(path: pathlib.Path) -> Iterator[BinaryIO]:
     mode is the umask's.
 
     Raises:
-        ValueError: another process is writing the file.
+        ValueError: another process is writing the file, or has just done so.
     """
     draft = path.with_name(f"{path.name}{DRAFT}")
     try:
         # truncated only once it is known that nobody else writes it
         with open(draft, "wb", opener=lambda name, _: os.open(name, os.O_WRONLY | os.O_CREAT, 0o666)) as stream:
             _lock(stream.fileno(), path)
+            _require_draft(stream.fileno(), draft, path)
             try:
                 stream.truncate()
                 yield stream
@@ -56,6 +57,16 @@ def sole_writer(folder: pathlib.Path) -> Iterator[None]:
         yield
     finally:
         os.close(place)
+
+
+def _require_draft(place: int, draft: pathlib.Path, path: pathlib.Path) -> None:
+    """Refuses a draft that another process has completed between its opening here and its lock."""
+    try:
+        same = os.path.samestat(os.fstat(place), os.stat(draft))
+    except FileNotFoundError:
+        same = False
+    if not same:
+        raise ValueError(f"Another process has just written {path}. Look at it, and begin again if it is not wanted.")
 
 
 def _lock(place: int, path: pathlib.Path) -> None:

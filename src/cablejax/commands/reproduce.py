@@ -14,6 +14,7 @@ from cablejax.dataset.schema import DatasetConfig
 from cablejax.effects.given import number_text
 from cablejax.simulate import ENGINES
 
+_NAMES_OR_FOLDERS = ("start_from", "weights")
 REPEATED = ("effect", "with_", "plant_effect")
 """Options that are given once for each of their values."""
 
@@ -33,6 +34,8 @@ def command_line(command: Command, name: str) -> str:
                 option,
                 *(word for item in (value if isinstance(value, tuple) else (value,)) for word in _words(item)),
             ]
+        if field.name in _NAMES_OR_FOLDERS:
+            words[-1] = pathlib.Path(words[-1]).name
     return shlex.join(words)
 
 

@@ -11,7 +11,8 @@ from jaxtyping import Bool, Float
 from cablejax.limits import check, check_workspace
 
 _SHARES = np.linspace(0.0, 1.0, 201)
-_ROUNDING = 1e-12
+_ROUNDING, _DIGITS = 1e-12, 8.0
+"""Beyond a limit by this, or by so many times the rounding of a number of one, is within."""
 _CLAMPED = 0.05
 """Length of the cable, in lengths of it, along which it leaves a gripper in the gripper's direction."""
 
@@ -72,6 +73,7 @@ class CommandLimits:
     def _broken(self, twist: Any, pose: Any, duration: float, length: float) -> Bool[Any, "*B"]:
         """Which twists end outside of a limit, and farther out than they begin."""
         xp, start = twist.__array_namespace__(), pose[..., :2]
+        rounding = max(_ROUNDING, _DIGITS * float(np.finfo(start.dtype).eps))
         ends = start + duration * twist[..., :2]
         apart, before = (xp.linalg.norm(places[..., 1, :] - places[..., 0, :], axis=-1) for places in (ends, start))
         clamped = _CLAMPED * length * xp.asarray([1.0, -1.0], dtype=start.dtype)[:, None]
@@ -79,13 +81,13 @@ class CommandLimits:
         for places, theta in ((ends, pose[..., 2] + duration * twist[..., 2]), (start, pose[..., 2])):
             beyond = places + clamped * xp.stack([xp.cos(theta), xp.sin(theta)], axis=-1)
             free.append(xp.linalg.norm(beyond[..., 1, :] - beyond[..., 0, :], axis=-1))
-        broken = (xp.linalg.norm(twist[..., :2], axis=-1) > self.speed + _ROUNDING).any(axis=-1)
-        broken |= (xp.abs(twist[..., 2]) > self.turn_rate + _ROUNDING).any(axis=-1)
-        broken |= apart > xp.maximum(self.max_distance * length, before) + _ROUNDING
-        broken |= free[0] > xp.maximum(self.max_distance * (1 - 2 * _CLAMPED) * length, free[1]) + _ROUNDING
-        broken |= apart < xp.minimum(self.min_distance * length, before) - _ROUNDING
+        broken = (xp.linalg.norm(twist[..., :2], axis=-1) > self.speed + rounding).any(axis=-1)
+        broken |= (xp.abs(twist[..., 2]) > self.turn_rate + rounding).any(axis=-1)
+        broken |= apart > xp.maximum(self.max_distance * length, before) + rounding
+        broken |= free[0] > xp.maximum(self.max_distance * (1 - 2 * _CLAMPED) * length, free[1]) + rounding
+        broken |= apart < xp.minimum(self.min_distance * length, before) - rounding
         if self.workspace is not None:
             low, high = (xp.asarray(corner, dtype=start.dtype) for corner in self.workspace)
-            outside = (ends < xp.minimum(low, start) - _ROUNDING) | (ends > xp.maximum(high, start) + _ROUNDING)
+            outside = (ends < xp.minimum(low, start) - rounding) | (ends > xp.maximum(high, start) + rounding)
             broken |= outside.any(axis=(-2, -1))
         return broken

@@ -31,6 +31,8 @@ DRIFT = 1e-3
 """Rate at which the two clocks may drift apart; a delay that grows more slowly is not noticed."""
 
 
+_KIND = 16
+"""Letters by which reasons of one kind agree."""
 _STILL = np.zeros((2, 3))
 
 
@@ -80,8 +82,8 @@ class RobotLink:
             now: the link's clock [s]. Where it is set back, time goes on from where it was: a watchdog has to run out.
             observations: that have come since the last step, in the order in which they came.
 
-        Raises:
-            ValueError: the controller refuses its first history; a controller that fails later stops the run.
+        What a controller refuses is told as the reason: of its first history the link waits for another, later the run
+        stops.
         """
         settled, behind = state.commands == 0, max(state.behind, state.now - now)
         now = now + behind
@@ -165,6 +167,8 @@ class RobotLink:
         unchanged = state.unchanged
         if unchanged is None or not np.array_equal(keypoints, unchanged.keypoints, equal_nan=True):
             unchanged = cleaned
+        elif not np.isfinite(unchanged.gripper_pose).all():  # where the grippers were when it stopped is not known
+            unchanged = dataclasses.replace(unchanged, gripper_pose=pose)
         elif np.linalg.norm((pose - unchanged.gripper_pose)[:, :2], axis=1).max() > MOVED * self.target.length:
             # a tracker that has stopped repeats its last frame
             cleaned = dataclasses.replace(cleaned, keypoints=np.full_like(keypoints, np.nan))
@@ -175,9 +179,9 @@ class RobotLink:
             behind = (
                 f"The newest time stamp is {last.time - stamp:.3g} s before an earlier one: was the clock set back?"
             )
-            state = dataclasses.replace(state, reason=behind)
+            state = _told(state, behind)
         elif newer and state.status == Status.PAUSED and (old := offset - state.offset) > self.config.watchdog:
-            state = dataclasses.replace(state, reason=f"Observations are {old:.3g} s old: late, or a clock was set?")
+            state = _told(state, f"Observations are {old:.3g} s old: late, or a clock was set?")
         if newer and share >= self.config.min_seen and np.isfinite(pose).all():
             state = dataclasses.replace(state, newest=cleaned)
         elif state.newest is None:
@@ -251,7 +255,8 @@ class RobotLink:
             reason="" if allowed.any() or not twist.any() else "The limits leave nothing of the controller's command.",
             controller=controller,
             due=seen.time + config.interval,
-            command=(allowed, seen.time, seen.time + config.interval + config.grace),
+            # what comes late is commanded late
+            command=(allowed, max(seen.time, state.now - state.offset), seen.time + config.interval + config.grace),
             commands=state.commands + 1,
         )
         return state, instant
@@ -259,6 +264,11 @@ class RobotLink:
     def _initial(self, seen: Observation) -> Any:
         """The controller's state for a cable at rest, as it is seen now."""
         return self.controller.init(resting(self.controller, _complete(seen.keypoints), seen.gripper_pose))
+
+
+def _told(state: LinkState, reason: str) -> LinkState:
+    """The state with this reason; one of the same kind, whose number alone changes, stays as it was first."""
+    return state if state.reason[:_KIND] == reason[:_KIND] else dataclasses.replace(state, reason=reason)
 
 
 def _complete(keypoints: np.ndarray) -> np.ndarray:

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from cablejax.cable import Cable
-from cablejax.control.link_state import Instant, Reply
+from cablejax.control.link_state import Instant, Reply, Status
 from cablejax.control.run import ClosedLoopRun, shape_error_cm
 from cablejax.control.targets import Target
 from cablejax.gaplog import TARGETS, Episode, gap_log_from_episodes
@@ -48,6 +48,9 @@ class RunLog:
         """Takes in what one step of the link has reported."""
         self.counts["received"] += len(reply.accepted)
         self.refuse(reply.refused)
+        if reply.status == Status.WAITING:  # the link has forgotten what came before its first command
+            self._samples.clear()
+            self._commands.clear()
         for observation in reply.accepted:
             self.counts["doubled"] += observation.time in self._samples
             self._samples.setdefault(observation.time, (observation, reply.settled))

@@ -28,8 +28,22 @@ def place_of(path: str | os.PathLike[str] | Bucket) -> Path | Bucket:
     """A folder, or a bucket's prefix where the path begins with `s3://`; `pathlib` makes one slash of the two."""
     if isinstance(path, Bucket):
         return path
-    found = re.fullmatch(r"s3:/{1,2}([^/].*?)/*", os.fspath(path))
+    text = os.fspath(path)
+    found = re.fullmatch(r"s3:/{1,2}([^/].*?)/*", text, re.IGNORECASE)
+    if not found and text.lower().startswith("s3:"):
+        raise ValueError(f"{text} is no place in object storage, expected s3://BUCKET/PREFIX.")
     return Bucket(f"s3://{found[1]}") if found else Path(path)
+
+
+def _obstore(url: str) -> Any:
+    """The library of object storage."""
+    try:
+        import obstore
+        import obstore.exceptions
+        import obstore.store
+    except ImportError as error:
+        raise UnreachableError(f"{url} needs obstore: pip install 'cablejax[cluster]'.") from error
+    return obstore
 
 
 @dataclasses.dataclass(frozen=True)
@@ -54,13 +68,9 @@ class Bucket:
 
     @functools.cached_property
     def _objects(self) -> S3Store:
-        try:
-            from obstore.store import S3Store
-        except ImportError as error:
-            raise UnreachableError(f"{self.url} needs obstore: pip install 'cablejax[cluster]'.") from error
         endpoint = os.environ.get("AWS_ENDPOINT_URL", "")
         with self.reached():
-            return S3Store.from_url(
+            return _obstore(self.url).store.S3Store.from_url(
                 self.url,
                 client_options={
                     "timeout": "30s",
@@ -78,46 +88,37 @@ class Bucket:
 
     def read(self, name: str) -> bytes | None:
         """One object, or None if there is none of this name."""
-        import obstore
-
         with self.reached():
             try:
-                return bytes(obstore.get(self._objects, name).bytes())
+                return bytes(_obstore(self.url).get(self._objects, name).bytes())
             except FileNotFoundError:
                 return None
 
     def write(self, name: str, content: bytes) -> None:
         """Writes one object, over what was there."""
-        import obstore
-
         with self.reached():
-            obstore.put(self._objects, name, content)
+            _obstore(self.url).put(self._objects, name, content)
 
     def names(self, prefix: str | None = None) -> list[str]:
         """All objects, or those in a folder of this name."""
-        import obstore
-
         with self.reached():
-            return [item["path"] for batch in obstore.list(self._objects, prefix) for item in batch]
+            return [item["path"] for batch in _obstore(self.url).list(self._objects, prefix) for item in batch]
 
     def remove(self, names: list[str]) -> None:
         """Removes objects."""
-        import obstore
-
         with self.reached():
             if names:
-                obstore.delete(self._objects, names)
+                _obstore(self.url).delete(self._objects, names)
 
     @contextlib.contextmanager
     def reached(self) -> Iterator[None]:
         """Around requests: raises `UnreachableError` where the storage does not answer or refuses."""
-        from obstore.exceptions import BaseError
-
+        refused = _obstore(self.url).exceptions.BaseError
         try:
             yield
         except FileNotFoundError:
             raise
-        except (BaseError, OSError) as error:
+        except (refused, OSError) as error:
             reason = next((line.strip() for line in str(error).splitlines() if line.strip()), type(error).__name__)
             raise UnreachableError(
                 f"{self.url} cannot be reached: {reason[:300]}. Check AWS_ENDPOINT_URL, the keys and the connection. "

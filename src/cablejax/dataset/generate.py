@@ -269,7 +269,7 @@ def make_engine(config: DatasetConfig) -> Engine:
 
 def shards_at_once(config: DatasetConfig, engine: Engine) -> int:
     """Shards that `simulate` is best given together."""
-    return engine.width // config.shard_size if isinstance(engine, DeviceParallel) else 1
+    return max(engine.width // config.shard_size, 1) if isinstance(engine, DeviceParallel) else 1
 
 
 def _rollout(config: DatasetConfig, engine: Engine, draws: Sequence[Draw]) -> Trajectory:

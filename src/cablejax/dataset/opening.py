@@ -218,8 +218,8 @@ def _descriptions(config: DatasetConfig, versions: dict[str, str]) -> dict[str, 
 def _draft(path: Path, config: DatasetConfig, versions: dict[str, str]) -> Path:
     """An empty store next to the place where one is wanted."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    draft = path.parent / f".{path.name}.{os.getpid()}.draft"
-    shutil.rmtree(draft, ignore_errors=True)
+    # a name of its own: on a file system that several machines share, their processes may have one number
+    draft = Path(tempfile.mkdtemp(prefix=f".{path.name}.", suffix=".draft", dir=path.parent))
     try:
         _fill(draft, config, versions)
     except BaseException:  # a full disk

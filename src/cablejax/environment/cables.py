@@ -17,7 +17,7 @@ from cablejax.control.run import shape_error_cm
 from cablejax.control.targets import Shape, Target, make_target, straight_start
 from cablejax.dataset.drawing import cable_params, draw_parameters
 from cablejax.dataset.schema import DatasetConfig, Randomisation
-from cablejax.effects.camera import in_camera_frame, without_camera
+from cablejax.effects.camera import in_camera_frame, without_observation
 from cablejax.effects.given import GivenEffect, parse_effect
 from cablejax.effects.physics import Physics
 from cablejax.limits import check, shown
@@ -187,7 +187,7 @@ class Cables:
 
     def _at_rest(self, physics: Physics, start: CableState) -> Float[np.ndarray, "N 2"]:
         """Keypoints of one cable before its first action [m]; raises ValueError if that is none to begin with."""
-        rest = self._engine.rollout(without_camera(physics), start, np.zeros((1, 1, 2, 3)))[1]
+        rest = self._engine.rollout(without_observation(physics), start, np.zeros((1, 1, 2, 3)))[1]
         if not np.isfinite(rest.keypoints).all():
             raise ValueError(
                 f"The simulation of this cable by {self.config.discretisation.n_links} links diverges at rest. Check "
@@ -267,7 +267,7 @@ class Cables:
         twists = config.scale * np.clip(np.nan_to_num(np.asarray(actions, float), posinf=0.0, neginf=0.0), -1.0, 1.0)
         length = config.cable.length
         twists = config.limits.shortened(twists, self.gripper_pose, config.interval, length) * active[:, None, None]
-        truly = without_camera(self._physics)
+        truly = without_observation(self._physics)
         after, shown = self._engine.rollout(truly, self._state, twists[:, None], config.interval)
         keypoints, poses = np.asarray(shown.keypoints[:, -1]), np.asarray(shown.gripper_pose[:, -1])
         diverged = ~(np.abs(keypoints) < config.room).all(axis=(1, 2))
@@ -294,7 +294,7 @@ class Cables:
             camera_angle=physics.camera_angle[:, None],
             camera_offset=physics.camera_offset[:, None],
         )
-        self.keypoints[rows] = in_camera_frame(camera, keypoints)[rows]
+        self.keypoints[rows] = in_camera_frame(camera, np.asarray(self._engine.keypoints(physics, self._state)))[rows]
         if config.keypoint_noise:
             for row in np.flatnonzero(rows).tolist():
                 self.keypoints[row] += config.keypoint_noise * randoms[row].standard_normal(keypoints.shape[1:])

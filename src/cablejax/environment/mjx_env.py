@@ -19,7 +19,7 @@ from jaxtyping import Array, Float
 from cablejax.control.targets import straight_start
 from cablejax.dataset.drawing import cable_params, draw_parameters
 from cablejax.dataset.schema import Randomisation
-from cablejax.effects.camera import in_camera_frame, without_camera
+from cablejax.effects.camera import in_camera_frame, without_observation
 from cablejax.effects.physics import Physics, may_touch, without_obstacle
 from cablejax.environment.cables import ShapeCableConfig, require_config
 from cablejax.simulate.chain.engine import ChainEngine
@@ -160,13 +160,13 @@ class MjxShapeCable:
     def _moved(self, physics: Physics, data: CableState, twist: Float[Array, "2 3"]):
         """The cable after a twist, and its true keypoints before and after, shape [2, N, 2]."""
         known = physics if self._obstacle else without_obstacle(physics)
-        data, shown = self._engine.unroll(without_camera(known), data, twist[None], self.config.interval)
+        data, shown = self._engine.unroll(without_observation(known), data, twist[None], self.config.interval)
         return data, shown.keypoints
 
     def _observed(self, rng: Array, physics: Physics, keypoints: Array, data: CableState, target: Array):
         """The next key, an observation of the true keypoints [N, 2], and their error to the target [N, 2]."""
         error = jnp.sqrt(jnp.mean(jnp.sum((keypoints - target) ** 2, axis=-1))) / self.config.cable.length
-        keypoints = in_camera_frame(physics, keypoints)
+        keypoints = in_camera_frame(physics, self._engine.keypoints(physics, data))
         if noise := self.config.keypoint_noise:
             rng, own = jax.random.split(rng)
             keypoints = keypoints + noise * jax.random.normal(own, keypoints.shape)

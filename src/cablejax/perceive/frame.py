@@ -66,6 +66,11 @@ class TrackerConfig:
         counts, sizes = ("capacity", "iterations", "min_points", "retry"), ("reach", "max_sigma", "max_curvature")
         check(self, **dict.fromkeys(counts, "count"), **dict.fromkeys((*sizes, "max_search"), "positive"))
         check(self, min_support="probability", min_seen="probability")
+        if self.capacity < self.min_points:
+            raise ValueError(
+                f"TrackerConfig.capacity is {self.capacity}, expected at least min_points, {self.min_points}: every "
+                "thinned cloud would have too few."
+            )
 
 
 class TrackState(NamedTuple):

@@ -75,19 +75,17 @@ def _converse(run: RobotRun, connection: socket.socket, simulated_clock: bool) -
     """Answers until the robot leaves or the run ends."""
     waiting, refused, sent = [], [], (-math.inf, Status.WAITING)
     for lines in _lines(connection):
-        clocks = [] if simulated_clock else [time.monotonic()]
-        for line in lines:
+        # the robot's simulated clock stands among its lines, ours at their end
+        for line in lines if simulated_clock else [*lines, None]:
             try:
-                message = _message(line, simulated_clock)
+                message = time.monotonic() if line is None else _message(line, simulated_clock)
             except ValueError as error:
                 refused.append(str(error))
                 continue
             if isinstance(message, Observation):
                 waiting.append(message)
-            else:
-                clocks.append(message)
-        for now in clocks:
-            reply = run.exchange(now, waiting)
+                continue
+            reply = run.exchange(message, waiting)
             if lines or (reply.since, reply.status) != sent:
                 connection.sendall(reply_line(reply, refused))
             run.log.refuse(refused)

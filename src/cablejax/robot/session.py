@@ -20,6 +20,8 @@ from cablejax.simulate.table_plant import Observation
 from cablejax.types import GapLog
 from cablejax.whole_file import whole_file
 
+_RAW = ".raw.npz"
+
 
 class RobotRun:
     """Drives a link and records it; `finish` writes the gap log. The controller is compiled when it is made.
@@ -83,12 +85,12 @@ class RobotRun:
         if not self.log.recorded:
             raise GapLogError(f"There is no log: nothing usable was observed. {self._state.reason}".strip())
         path, count = self.path, itertools.count(2)
-        while path.exists():
+        while path.exists() or path.with_suffix(_RAW).exists():
             path = self.path.with_stem(f"{self.path.stem}_{next(count)}")
         try:
             return write_gap_log(path, self._recorded())
         except GapLogError as error:
-            kept = path.with_suffix(".raw.npz")
+            kept = path.with_suffix(_RAW)
             pieces = enumerate(self.log.episodes(motion(self.link.target)))
             arrays = {f"{name}_{k}": array for k, (_, episode) in pieces for name, array in vars(episode).items()}
             with whole_file(kept) as stream:

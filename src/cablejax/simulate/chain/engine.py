@@ -94,6 +94,18 @@ class ChainEngine(Engine):
         return _cable_state(*final), trajectory
 
     @functools.partial(jax.jit, static_argnames="self")
+    @full_precision
+    def keypoints(self, physics: Physics, state: CableState) -> Float[Array, "*B N 2"]:
+        """Keypoints of cables in these states [m], each with its bias. Differentiable in both."""
+
+        def one(physics, state):
+            time = state.memory.time
+            return centreline_keypoints(self.config, physics, _chain_state(state), state.gripper_pose[0, :2], time)
+
+        state = self._remembering(state)
+        return (jax.vmap(one) if state.qpos.ndim > 1 else one)(physics, state)
+
+    @functools.partial(jax.jit, static_argnames="self")
     def opening(self, state: CableState) -> Float[Array, "*B"]:
         """Distance of the cable's end from gripper 1 [m]: more than rounding only where it does not reach that far."""
         memory = self._remembering(state).memory
