@@ -131,3 +131,5 @@ def test_only_what_was_changed_is_said_and_no_local_folder():
     train = Train(data=folders, out=pathlib.Path("/tmp/mine"), held_out=0.1, json=True, device="cpu")
     assert command_line(train, "train") == "cablejax train --data a.zarr b.zarr --out mine --held-out 0.1"
     assert command_line(dataclasses.replace(Train(), latent=5), "train") == "cablejax train --latent 5"
+    from_mine = dataclasses.replace(Train(), start_from="/home/somebody/train")
+    assert command_line(from_mine, "train") == "cablejax train --start-from train"

@@ -204,6 +204,51 @@ def test_a_tracker_that_stopped_is_blind():
     assert reply.status == Status.PAUSED and np.abs(robot.pose - START).max() < 0.1
 
 
+def test_a_tracker_that_stopped_where_a_pose_was_not_known_is_blind():
+    robot = Harness(Inwards(speed=0.05))
+    robot.run(1.0)
+    frozen = KEYPOINTS.copy()
+    for k in range(11, 50):
+        pose = np.full((2, 3), np.nan) if k == 11 else robot.pose.copy()
+        reply = robot.step(0.1 * k, robot.seen(0.1 * k, keypoints=frozen, gripper_pose=pose))
+        robot.pose = robot.pose + 0.1 * reply.twist
+    assert reply.status == Status.PAUSED and np.abs(robot.pose - START).max() < 0.15
+
+
+def test_a_clock_that_begins_again_before_the_first_command_is_another_recording():
+    robot = Harness()
+    robot.run(0.5)
+    robot.pose[:, 0] += 0.03
+    assert robot.step(3.7).status == Status.WAITING
+    for k in range(20):  # a simulation that was reset: its clock, not ours
+        robot.step(3.8 + 0.1 * k, robot.seen(0.1 * k))
+    [(_, episode)] = robot.log.episodes("test")
+    assert (episode.gripper_pose[:, 0, 0] == episode.gripper_pose[0, 0, 0]).all()
+
+
+def test_what_comes_late_is_commanded_late_in_the_log_too():
+    robot = Harness()
+    for k in range(41):
+        late = 0.3 if k else 0.0
+        reply = robot.step(0.1 * k + late, robot.seen(0.1 * k))
+        if reply.status == Status.SHAPING and reply.instant is not None:
+            assert reply.since == pytest.approx(0.1 * k + 0.3, abs=5e-3)
+    [(_, episode)] = robot.log.episodes("test")
+    since = [command[0] for command in robot.log._commands]
+    assert since == sorted(since)
+    # each ends 1.2 s after what it was made for, and the next one comes 1.3 s after that
+    moving, index = episode.gripper_command[:, 0, 0] != 0, np.arange(len(episode.time))
+    np.testing.assert_array_equal(moving, (index >= 13) & (index % 10 != 2))
+
+
+def test_a_pause_is_one_event_however_old_its_observations():
+    robot = Harness()
+    robot.run(2.0)
+    for k in range(21, 200):
+        robot.step(0.1 * k + 1.0 + 0.01 * k, robot.seen(0.1 * k))
+    assert robot.state.status == Status.PAUSED and len(robot.log.events) < 8
+
+
 def test_a_first_time_stamp_that_is_wrong_costs_half_a_second():
     robot = Harness()
     assert robot.step(0.0, robot.seen(9e8)).status == Status.RESTING
@@ -309,6 +354,18 @@ def test_from_outside_only_the_way_back_is_open():
     back, out = np.array([[0.05, 0, 0], [0, 0, 0]]), np.array([[-0.05, 0, 0], [0, 0, 0]])
     assert LIMITS.shortened(back, pose, 1.0, 1.0) is back
     assert not LIMITS.shortened(out, pose, 1.0, 1.0).any()
+
+
+@pytest.mark.parametrize("given", [np.asarray, jnp.asarray])
+def test_grippers_outside_that_move_alike_may_move_in_either_precision(given):
+    rng = np.random.default_rng(0)
+    for _ in range(100):
+        turn, place = rng.uniform(-3, 3), rng.uniform(-0.05, 0.05, 2)
+        along = np.array([np.cos(turn), np.sin(turn)])
+        pose = np.array([[*(place - 0.503 * along), turn], [*(place + 0.503 * along), turn]])
+        twist = given(np.tile([*rng.uniform(-0.05, 0.05, 2), 0.0], (2, 1)))
+        shortened = CommandLimits().shortened(twist, given(pose), 1.0, 1.0)
+        np.testing.assert_array_equal(shortened, twist)
 
 
 @pytest.mark.parametrize("seed", range(3))

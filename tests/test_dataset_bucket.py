@@ -6,6 +6,7 @@ import json
 import shutil
 import socket
 import subprocess
+import sys
 import threading
 import time
 import urllib.request
@@ -210,3 +211,14 @@ def test_a_training_reads_a_bucket(wire, tmp_path):
 def test_places():
     assert place_of("s3://a/b/c.zarr/") == place_of("s3:/a/b/c.zarr") == Bucket("s3://a/b/c.zarr")
     assert Bucket("s3://a/b/c.zarr").name == "c.zarr" and str(place_of("runs/s3:/x")) == "runs/s3:/x"
+    assert place_of("S3://a/b") == Bucket("s3://a/b")
+    for wrong in ("s3://", "s3:///a/b", "s3:a"):
+        with pytest.raises(ValueError, match="no place in object storage, expected s3://BUCKET/PREFIX"):
+            place_of(wrong)
+
+
+def test_without_its_library_object_storage_says_what_to_install(monkeypatch):
+    for name in ("obstore", "obstore.store", "obstore.exceptions"):
+        monkeypatch.setitem(sys.modules, name, None)
+    with pytest.raises(UnreachableError, match=r"s3://a/b needs obstore: pip install 'cablejax\[cluster\]'"):
+        Bucket("s3://a/b").names()

@@ -157,6 +157,27 @@ def test_a_cable_that_diverges_ends_its_episode_alone(value):
 
 
 @pytest.mark.parametrize("form", ["gymnasium", "jax"])
+def test_reward_is_of_the_true_keypoints_where_a_marker_is_off_its_place(form):
+    biased = clean(targets=("U",), effects=("keypoint_bias:index=6,across=1,offset_m=0.08",))
+    seen, errors = [], []
+    for one in (biased, dataclasses.replace(biased, effects=())):
+        if form == "gymnasium":
+            env = ShapeCableEnv(one)
+            env.reset(seed=0)
+            after, _, _, _, info = env.step(np.full((2, 3), 0.1, np.float32))
+            seen.append(after["keypoints"])
+            errors.append(info["error"])
+        else:
+            env = MjxShapeCable(one)
+            state = env.step(env.reset(jax.random.key(0)), jnp.full(6, 0.1))
+            seen.append(np.asarray(state.obs)[: 2 * one.cable.n_keypoints].reshape(-1, 2))
+            errors.append(float(state.metrics["error"]))
+    assert errors[0] == pytest.approx(errors[1], rel=1e-5)
+    apart = np.linalg.norm(seen[0] - seen[1], axis=1)
+    assert apart[6] == pytest.approx(0.08, abs=1e-5) and np.delete(apart, 6).max() < 1e-5
+
+
+@pytest.mark.parametrize("form", ["gymnasium", "jax"])
 def test_reward_is_of_the_true_keypoints_where_the_camera_is_off(form):
     """From the first observation on; without noise the error is not that of what is observed."""
     config = clean(targets=("U",), effects=("camera_similarity:scale=1.05,angle_rad=0.05,x_m=0.05,y_m=0.05",))

@@ -166,6 +166,11 @@ def test_what_cannot_be_a_cloud_is_refused(tracker, started):
         dataclasses.replace(TRACKER, capacity=0)
 
 
+def test_a_capacity_below_the_fewest_points_is_refused():
+    with pytest.raises(ValueError, match="capacity is 20, expected at least min_points, 30"):
+        TrackerConfig(capacity=20)
+
+
 def test_a_cloud_is_thinned_and_padded():
     points = np.random.default_rng(0).standard_normal((50, 3))
     points[3] = np.nan

@@ -191,6 +191,15 @@ def test_half_lines_wait_for_their_end(tmp_path):
     assert robot.leave() == tmp_path / "log.npz"
 
 
+def test_lines_of_a_simulated_clock_count_in_their_order(tmp_path):
+    """A client that does not wait for replies says everything at once."""
+    robot, harness = Client(run_to(tmp_path / "log.npz"), simulated_clock=True), Harness()
+    times = [0.1 * k for k in range(15)]
+    robot.say(b"".join(robot_soak.observation_line(harness.seen(t)) + now(t) for t in times))
+    assert [robot.answer()["status"] for _ in times][-3:] == ["shaping"] * 3
+    assert robot.leave() == tmp_path / "log.npz"
+
+
 def test_a_line_without_end_ends_the_run_and_keeps_the_log(tmp_path, monkeypatch):
     monkeypatch.setattr(server, "LONGEST_LINE", 10_000)
     robot, harness = Client(run_to(tmp_path / "log.npz"), simulated_clock=True), Harness()
@@ -302,6 +311,8 @@ def test_a_recording_is_kept_where_its_name_was_taken_or_it_is_no_log(tmp_path):
         run.finish()
     with np.load(tmp_path / "burst.raw.npz") as kept:
         assert kept["keypoints_0"].shape == (21, CABLE.n_keypoints, 2)
+    with pytest.raises(GapLogError, match=r"samples are kept in .*burst_2.raw.npz: .*pause"):
+        run.finish()
 
 
 def test_a_log_is_not_overwritten(tmp_path):

@@ -5,6 +5,7 @@ import os
 import pytest
 from flax import nnx
 
+from cablejax import whole_file as whole_file_module
 from cablejax.dynamics.networks import GNS
 from cablejax.dynamics.weights import save_weights
 from cablejax.whole_file import whole_file
@@ -19,6 +20,21 @@ def test_a_block_that_is_left_early_changes_nothing(tmp_path):
         stream.write(b"two")
         raise KeyboardInterrupt
     assert path.read_bytes() == b"one" and list(tmp_path.iterdir()) == [path]
+
+
+def test_a_writer_that_comes_as_another_ends_does_not_touch_its_file(tmp_path, monkeypatch):
+    path, opened = tmp_path / "a.txt", []
+
+    def lock(place, _):
+        if not opened:  # another process writes the file between the opening and the lock
+            opened.append(place)
+            with whole_file(path) as stream:
+                stream.write(b"first")
+
+    monkeypatch.setattr(whole_file_module, "_lock", lock)
+    with pytest.raises(ValueError, match="Another process has just written"), whole_file(path) as stream:
+        stream.write(b"second")
+    assert path.read_bytes() == b"first" and list(tmp_path.iterdir()) == [path]
 
 
 @pytest.mark.parametrize("umask", [0o022, 0o077])

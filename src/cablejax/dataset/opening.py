@@ -7,6 +7,7 @@ import json
 import os
 import shutil
 import tempfile
+import uuid
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
@@ -219,7 +220,7 @@ def _draft(path: Path, config: DatasetConfig, versions: dict[str, str]) -> Path:
     """An empty store next to the place where one is wanted."""
     path.parent.mkdir(parents=True, exist_ok=True)
     # a name of its own: on a file system that several machines share, their processes may have one number
-    draft = Path(tempfile.mkdtemp(prefix=f".{path.name}.", suffix=".draft", dir=path.parent))
+    draft = path.parent / f".{path.name}.{uuid.uuid4().hex}.draft"
     try:
         _fill(draft, config, versions)
     except BaseException:  # a full disk
