@@ -7,7 +7,7 @@ import pytest
 
 from cablejax.adaptation.belief import AdaptationConfig, prior_belief, update
 
-CONFIG = AdaptationConfig(memory=1.0, outlier=1e6, max_step=10.0, limits=(-10.0, 10.0))
+CONFIG = AdaptationConfig(memory=1.0, outlier=1e6, max_step=10.0, limits=((-10.0, 10.0), (-10.0, 10.0)))
 SEEN = np.ones(13, bool)
 
 
@@ -75,7 +75,7 @@ def test_it_never_leaves_its_limits_and_follows_a_change():
     config = AdaptationConfig(memory=0.9, outlier=1e6)
     sensitivity, noise, _ = linear_world(3, [0, 0], steps=60)
     belief = run(config, sensitivity, noise, np.array([9.0, -9.0]))
-    np.testing.assert_allclose(belief.mean, [config.limits[1], config.limits[0]], atol=1e-6)
+    np.testing.assert_allclose(belief.mean, [config.limits[0][1], config.limits[1][0]], atol=1e-6)
     for h in sensitivity:
         error = jnp.asarray(h @ (np.array([-0.4, 0.2]) - np.asarray(belief.mean)))
         belief = update(config, belief, jnp.asarray(h), error, SEEN)
@@ -98,7 +98,7 @@ def test_derivatives_match_finite_differences():
         np.testing.assert_allclose(jnp.sum(back * way), forward.sum(), rtol=1e-9)
 
 
-@pytest.mark.parametrize("wrong", [{"memory": 0.0}, {"prior_std": -1.0}, {"limits": (0.1, 1.0)}])
+@pytest.mark.parametrize("wrong", [{"memory": 0.0}, {"prior_std": -1.0}, {"limits": ((1.0, 0.1), (-1.0, 1.0))}])
 def test_settings_that_make_no_sense_are_refused(wrong):
     with pytest.raises(ValueError, match="AdaptationConfig"):
         AdaptationConfig(**wrong)

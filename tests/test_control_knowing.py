@@ -8,9 +8,11 @@ from typing import get_args
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from flax import nnx
 
 from cablejax.adaptation.belief import AdaptationConfig
-from cablejax.cable import Cable
+from cablejax.cable import Cable, Discretisation
+from cablejax.cable_file import cable_to_fields
 from cablejax.cli import main
 from cablejax.commands.runs import Job, about, known_from
 from cablejax.control.link import RobotLink
@@ -26,13 +28,16 @@ from cablejax.control.shaping import (
 from cablejax.control.targets import Shape, make_target, target_from_keypoints
 from cablejax.dataset.generate import make_engine, simulate
 from cablejax.dataset.schema import DatasetConfig
-from cablejax.dynamics.weights import released_names
+from cablejax.dynamics.networks import GNS
+from cablejax.dynamics.weights import released_names, save_weights
 from cablejax.effects.given import GivenEffect, parse_effect
+from cablejax.effects.physics import mean_resistance, nominal_physics
 from cablejax.mpc import MPCConfig
 from cablejax.report.diagnosis_page import INFORMING
 from cablejax.residual import STATIC, LearnerConfig
 from cablejax.simulate.plant.config import PlantConfig
-from cablejax.types import Trajectory
+from cablejax.types import Trajectory, cable_descriptor
+from dynamics_cases import SMALL
 from open_loop import open_loop_error
 from test_dataset_generate import VALUES
 
@@ -72,6 +77,23 @@ def test_informed_of_nothing_a_model_is_as_it_was(model):
     assert same.config == model.config and same.dynamics == model.dynamics and same.known == ()
 
 
+def test_a_conditioned_model_begins_with_its_own_cable_and_may_believe_what_it_was_trained_on(tmp_path):
+    """The inputs are log ratios to the reference cable, which this one is not."""
+    cable = Cable(length=0.6, linear_density=0.3, bending_stiffness=0.2, n_keypoints=SMALL.n_keypoints)
+    config = dataclasses.replace(SMALL, conditioned=True, length=0.6)
+    info = {"cable": cable_to_fields(cable)}
+    save_weights(tmp_path / "weights.safetensors", config, nnx.split(GNS(config, nnx.Rngs(0)))[1], info)
+    model = load_model(str(tmp_path))
+    physics = nominal_physics(Discretisation(cable), np.float64)
+    own = np.array([float(x) for x in cable_descriptor(*map(np.asarray, mean_resistance(physics)))])
+    assert own.min() > 1.0
+    np.testing.assert_allclose(model.believed, own)
+    softer = knowing(model, (parse_effect("bending_stiffness:ratio=0.5"),))
+    np.testing.assert_allclose(softer.believed, own + np.log([0.5, 1.0]), atol=1e-6)
+    adaptation = make_controller(model, make_target("U", cable), method="direct", solver="two-trials").config.adaptation
+    np.testing.assert_allclose(np.array(adaptation.limits), own[:, None] + [-2.4, 1.2])
+
+
 def test_a_conditioned_model_begins_with_what_it_is_informed_of():
     conditioned = load_model("gns-conditioned")
     informed = knowing(conditioned, tuple(map(parse_effect, ("bending_stiffness:ratio=0.5", "linear_density:ratio=2"))))
@@ -81,7 +103,7 @@ def test_a_conditioned_model_begins_with_what_it_is_informed_of():
     # only the ratio of both matters in slow motion: what is beyond the bound of one is taken up by the other
     far = knowing(conditioned, (parse_effect("linear_density:ratio=8"),))
     np.testing.assert_allclose(far.believed[1] - far.believed[0], np.log(8.0), rtol=1e-5)
-    assert far.believed[1] == mpc.config.adaptation.limits[1]
+    assert far.believed[1] == mpc.config.adaptation.limits[1][1]
     make_controller(far, make_target("U", far.cable), method="direct", solver="levenberg-marquardt")
 
 

@@ -14,9 +14,9 @@ import spatial_cases as cases
 from cablejax.diagnose.fit import evaluate, improve
 from cablejax.diagnose.protocol import explanation
 from cablejax.simulate.rod import Rod
-from cablejax.spatial.cable import TWISTED, SpatialCable
+from cablejax.spatial.cable import FINER, TWISTED, SpatialCable
 from cablejax.spatial.estimate import UNMODELLED, Interval, estimate, restarts
-from cablejax.spatial.identify import Identified, TimeSteps, layout_of
+from cablejax.spatial.identify import Identified, TimeSteps, _for_predictions, layout_of
 from cablejax.spatial.named import named_effects, parameters_of, quantities_of, with_both_drags
 from cablejax.spatial.search import with_effect
 from cablejax.spatial.windows import windows_of
@@ -227,6 +227,19 @@ def test_names_only_what_the_estimate_shows(found, everything):
     hidden, step = everything.shared.copy(), found.cable.windows.interval / found.time_steps.substeps
     hidden[everything.layout.slices["damping_time"]] = 0.25 * step
     assert "bending_damping" not in _named(found, hidden)
+
+
+def test_predictions_have_as_many_time_steps_as_matter(fitted):
+    """Of what fits a motion at 50 Hz few are enough; of one of which nothing is left, all that it was corrected for."""
+    cable, best = fitted
+    noisy = dataclasses.replace(
+        cable.windows,
+        keypoints=cable.windows.keypoints + np.random.default_rng(0).normal(0, 0.02, cable.windows.keypoints.shape),
+    )
+    exact = dataclasses.replace(cable.windows, keypoints=cable.exact().motion(best))
+    few, all_ = (_for_predictions(cable.on(windows), best).rod for windows in (noisy, exact))
+    assert (few.substeps, all_.substeps) == (cable.rod.substeps, FINER * cable.rod.substeps)
+    assert few.n_edges == all_.n_edges > cable.rod.n_edges
 
 
 def test_what_is_predicted_with_the_named_effects_alone_has_no_other(found, everything):

@@ -17,6 +17,7 @@ import dataclasses
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from cablejax.limits import check
@@ -27,8 +28,8 @@ class AdaptationConfig:
     """Settings of the filter; logarithms are natural.
 
     Attributes:
-        prior_mean: c_0, the log ratios of stiffness and friction before anything was seen: the nominal cable, or what
-            a diagnosis named.
+        prior_mean: c_0, the log ratios of stiffness and friction to those of the reference cable before anything was
+            seen: the model's nominal cable, or what a diagnosis named.
         prior_std: their standard deviation: a factor of e either way.
         error_std: standard deviation of a keypoint's coordinate that no cable explains [m]. Errors of neighbouring
             keypoints are alike, so this is above the error of one.
@@ -36,7 +37,7 @@ class AdaptationConfig:
         outlier: root mean square error of one step, in units of `error_std`, beyond which it counts less and less: a
             cable that snaps through says nothing about its stiffness.
         max_step: largest change of a log ratio in one step: the model is linearised.
-        limits: smallest and largest log ratio believed: what conditioned models are trained on.
+        limits: smallest and largest log ratio believed, of stiffness and of friction: what the model is trained on.
     """
 
     prior_mean: tuple[float, float] = (0.0, 0.0)
@@ -45,16 +46,20 @@ class AdaptationConfig:
     memory: float = 0.95
     outlier: float = 3.0
     max_step: float = 0.5
-    limits: tuple[float, float] = (-2.4, 1.2)
+    limits: tuple[tuple[float, float], tuple[float, float]] = ((-2.4, 1.2), (-2.4, 1.2))
 
     def __post_init__(self):
         check(self, prior_std="positive", error_std="positive", memory="share", outlier="positive", max_step="positive")
-        if not self.limits[0] < 0 < self.limits[1]:
-            raise ValueError(f"AdaptationConfig.limits are {self.limits}, expected one below and one above 0.")
-        if len(self.prior_mean) != 2 or not all(self.limits[0] <= mean <= self.limits[1] for mean in self.prior_mean):
+        if np.shape(self.limits) != (2, 2) or not all(low < high for low, high in self.limits):
             raise ValueError(
-                f"AdaptationConfig.prior_mean is {self.prior_mean}, expected two log ratios from {self.limits[0]} to "
-                f"{self.limits[1]}: of stiffness and friction."
+                f"AdaptationConfig.limits are {self.limits}, expected the smallest and the largest log ratio of "
+                "stiffness, and those of friction."
+            )
+        within = (low <= mean <= high for mean, (low, high) in zip(self.prior_mean, self.limits, strict=False))
+        if len(self.prior_mean) != 2 or not all(within):
+            raise ValueError(
+                f"AdaptationConfig.prior_mean is {self.prior_mean}, expected the log ratios of stiffness and friction "
+                f"within {self.limits}."
             )
 
 
@@ -109,4 +114,4 @@ def update(
     returning = jnp.linalg.solve(faded, forgotten @ (prior.mean - belief.mean))
     step = returning + jnp.linalg.solve(information, weight * rows.T @ (innovation - rows @ returning))
     step = jnp.clip(step, -config.max_step, config.max_step)
-    return CableBelief(mean=jnp.clip(belief.mean + step, *config.limits), information=information)
+    return CableBelief(mean=jnp.clip(belief.mean + step, *jnp.asarray(config.limits).T), information=information)

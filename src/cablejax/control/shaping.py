@@ -58,7 +58,7 @@ class Model:
         dynamics: `(weights, history, twist) -> displacement`.
         weights: its arrays.
         cable: nominal cable of the data that it was trained on.
-        effects: effects in those data, as `parse_effect` reads them.
+        effects: effects in those data, for a reader: `DatasetConfig.effects_shown`.
         known: effects that the model was informed of after its training, see `knowing`.
         believed: descriptor of the cable before anything was seen, for a conditioned model: see `cable_descriptor`.
     """
@@ -109,7 +109,9 @@ def load_model(name: str) -> Model:
     effects = load_info(name).get("effects", [])
     if not isinstance(effects, list) or not all(isinstance(effect, str) for effect in effects):
         raise ValueError(f"{name} records the effects {shown(effects)}, expected a list of texts.")
-    return Model(name, config, NetworkDynamics(graphdef), weights, cable_of_weights(name), tuple(effects))
+    cable = cable_of_weights(name)
+    believed = _believed((), cable) if config.conditioned else (0.0, 0.0)
+    return Model(name, config, NetworkDynamics(graphdef), weights, cable, tuple(effects), believed=believed)
 
 
 def knowing(model: Model, effects: Sequence[GivenEffect]) -> Model:
@@ -154,7 +156,7 @@ def enters(model: Model, effects: Sequence[GivenEffect]) -> bool:
 def _informed(model: Model, effects: Sequence[GivenEffect]) -> tuple[Statics, tuple[float, float]]:
     """Statics and belief of a model that is informed of effects."""
     statics = statics_with(effects, model.cable) if model.config.prior == "static" else Statics()
-    return statics, _believed(effects, model.cable) if model.config.conditioned and effects else model.believed
+    return statics, _believed(effects, model.cable) if model.config.conditioned else model.believed
 
 
 def _believed(effects: Sequence[GivenEffect], cable: Cable) -> tuple[float, float]:
@@ -163,12 +165,26 @@ def _believed(effects: Sequence[GivenEffect], cable: Cable) -> tuple[float, floa
     In slow motion only the ratio of stiffness and friction matters: what is beyond a bound of one is taken up by the
     other.
     """
+    stiffness, friction = _descriptor(effects, cable)
+    softest_to_stiffest, smoothest_to_roughest = _believable(cable)
+    within = np.clip(friction, *smoothest_to_roughest)
+    return float(np.clip(stiffness - (friction - within), *softest_to_stiffest)), float(within)
+
+
+def _believable(cable: Cable) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Limits of both inputs of a conditioned model, about those of its nominal cable."""
+    about = _descriptor((), cable)
+    stiffness, friction = (
+        (own + low, own + high) for own, (low, high) in zip(about, AdaptationConfig().limits, strict=True)
+    )
+    return stiffness, friction
+
+
+def _descriptor(effects: Sequence[GivenEffect], cable: Cable) -> tuple[float, float]:
     config = Discretisation(cable)
     physics = with_effects(nominal_physics(config, np.float64), effects, config)
     stiffness, friction = cable_descriptor(*map(np.asarray, mean_resistance(physics)))
-    low, high = AdaptationConfig().limits
-    within = np.clip(friction, low, high)
-    return float(np.clip(stiffness - (friction - within), low, high)), float(within)
+    return float(stiffness), float(friction)
 
 
 def make_controller(model: Model, target: Target, *, method: Method, solver: SolverName) -> MPC:
@@ -189,7 +205,11 @@ def make_controller(model: Model, target: Target, *, method: Method, solver: Sol
         )
     target.require_length(model.config.length, f"the model {model.name}")
     learner = STATIC if model.config.prior == "static" else LearnerConfig()
-    adaptation = AdaptationConfig(prior_mean=model.believed, error_std=AdaptationConfig.error_std * model.config.length)
+    adaptation = AdaptationConfig(
+        prior_mean=model.believed,
+        error_std=AdaptationConfig.error_std * model.config.length,
+        limits=_believable(model.cable),
+    )
     config = MPCConfig.for_length(
         model.config.length,
         residual=learner.scaled(model.config.length, model.config.interval) if method == "residual" else None,

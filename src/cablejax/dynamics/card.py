@@ -68,6 +68,10 @@ def write_card(
             for d in info["data"]
         ),
         "",
+        f"Effects in the data: {', '.join(f'`{effect}`' for effect in info.get('effects', ())) or 'none'}. The weights "
+        "file has the whole configuration of each data set: its cable, its effects with their draws, and the ranges of "
+        "its parameters.",
+        "",
         "Held out are the last trajectories of each. Differences between the data sets' configurations: "
         + (", ".join(f"{name} ({', '.join(map(str, values))})" for name, values in changes.items()) or "none")
         + ".",

@@ -42,7 +42,9 @@ _CORRELATION = 0.3  # [s]
 _FITTED = slice(2, None, 4)
 # The rod that predictions are corrected by has so many edges for each of this one, and so many time steps. With more
 # than 32 edges XLA shares its small products among threads, which costs more time than the edges.
-_MORE_EDGES, _FINER = 1.6, 4
+FINER = 4
+"""Time steps that estimates are corrected for, in place of each of a fit."""
+_MORE_EDGES = 1.6
 # Nats per window: a step that promises less is not worth the simulations that it takes.
 _TOLERANCE = 0.1
 # Steps end by the tolerance. This is for fits that creep.
@@ -95,18 +97,18 @@ class SpatialCable(Simulator):
         finer = dataclasses.replace(rod, substeps=factor * rod.substeps, local_error=rod.local_error / factor**3)
         return dataclasses.replace(self, rod=finer)
 
-    def exact(self) -> SpatialCable:
+    def exact(self, finer: int = FINER) -> SpatialCable:
         """With the edges and time steps that estimates are corrected for, without correction.
 
-        Values that were fitted with them predict with them: with the longer steps of a fit they are off by what the
-        correction took out.
+        Args:
+            finer: so many time steps in place of each.
         """
         # the longest local error stays the same length
         rod = dataclasses.replace(
             self.rod,
             n_edges=round(_MORE_EDGES * self.rod.n_edges),
             local_error=_MORE_EDGES * self.rod.local_error,
-            substeps=_FINER * self.rod.substeps,
+            substeps=finer * self.rod.substeps,
         )
         return dataclasses.replace(self, rod=rod, correction=None)
 
