@@ -1,8 +1,10 @@
 """The store keeps what was written, whatever happens in between, and says so when it cannot."""
 
 import dataclasses
+import errno
 import hashlib
 import json
+import os
 import shutil
 import tempfile
 from pathlib import Path
@@ -144,6 +146,24 @@ def test_a_failed_write_leaves_no_shard_that_looks_whole(tmp_path):
     (path / "attempts" / "c").unlink()
     assert complete(store) == [0, 1, 2]  # attempts of 0 and 2 were lost too
     assert store.info().complete
+
+
+def test_a_store_that_is_removed_meanwhile_says_so(tmp_path):
+    store = open_or_create(tmp_path / "data", SMALL)
+    shutil.rmtree(tmp_path / "data")
+    with pytest.raises(ValueError, match=r"data has no keypoints any more: was it removed\?"):
+        store.write_shard(0, block(SMALL, 0))
+
+
+def test_a_full_disk_is_told_with_the_store(tmp_path, monkeypatch):
+    store = open_or_create(tmp_path / "data", SMALL)
+
+    def full(*_):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(Store, "_array", full)
+    with pytest.raises(OSError, match=r"No space left on device: '.*data'"):
+        store.write_shard(0, block(SMALL, 0))
 
 
 def test_lost_data_file_is_noticed(tmp_path):

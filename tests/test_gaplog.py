@@ -307,6 +307,12 @@ class TestJoined:
         assert meta["recording"] == ["a.npz: 1", "b.npz: 1"] and meta["take"] == ["a.npz: 1/1", "b.npz: 0"]
         assert meta["split"] == ["", "eval"] and "file" not in meta
 
+    def test_what_one_recording_guessed_is_a_guess(self):
+        logs, names = self._halves()
+        logs[1].meta["guessed"] = ["linear_density_kg_per_m"]
+        assert joined(logs, names).meta["guessed"] == ["linear_density_kg_per_m"]
+        assert "guessed" not in joined(*self._halves()).meta
+
     def test_a_recording_without_holds(self):
         logs, names = self._halves()
         logs[1] = dataclasses.replace(logs[1], hold=None)

@@ -31,9 +31,9 @@ def joined(logs: Sequence[GapLog], names: Sequence[str]) -> GapLog:
 
     Its `meta` has the field `recordings`: the name of each and how many episodes it has, by which a diagnosis says what
     each one added. Of the extra fields of `meta`, `EPISODE_LABELS` are joined too (equal names of different logs stay
-    apart), `COMMANDS_DERIVED` is said of each episode where they differ, and others stay where all recordings have the
-    same. Arc lengths that an importer measured in each may differ by `MEASURED`; the log has their mean over the
-    episodes.
+    apart), `COMMANDS_DERIVED` is said of each episode where they differ, what any has guessed is guessed, and others
+    stay where all recordings have the same. Arc lengths that an importer measured in each may differ by `MEASURED`; the
+    log has their mean over the episodes.
 
     Args:
         logs: at least one.
@@ -65,7 +65,9 @@ def joined(logs: Sequence[GapLog], names: Sequence[str]) -> GapLog:
                     "Diagnose them apart, or correct the one that states it wrongly."
                 )
     derived = np.concatenate([commands_derived(log) for log in logs])
-    own_words = {*META_FIELDS, *EPISODE_LABELS, COMMANDS_DERIVED, "recordings"}
+    # what one of them guessed of the cable that they share is a guess
+    guessed = list(dict.fromkeys(name for log in logs for name in log.meta.get("guessed", ())))
+    own_words = {*META_FIELDS, *EPISODE_LABELS, COMMANDS_DERIVED, "guessed", "recordings"}
     extra = set.intersection(*(set(log.meta) for log in logs)) - own_words
     alike = (name for name in sorted(extra) if all(log.meta[name] == logs[0].meta[name] for log in logs))
     shared = [*META_FIELDS, *alike]
@@ -73,6 +75,7 @@ def joined(logs: Sequence[GapLog], names: Sequence[str]) -> GapLog:
         **{name: logs[0].meta[name] for name in shared},
         **{name: values for name in EPISODE_LABELS if (values := _labels(logs, names, name)) is not None},
         **({COMMANDS_DERIVED: True if derived.all() else derived.tolist()} if derived.any() else {}),
+        **({"guessed": guessed} if guessed else {}),
         "motion": [motion for log in logs for motion in log.meta["motion"]],
         "source": "; ".join(dict.fromkeys(log.meta["source"] for log in logs)),
         "recordings": [part for log, name in zip(logs, names, strict=True) for part in recordings(log, name)],

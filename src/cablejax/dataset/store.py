@@ -15,7 +15,7 @@ import contextlib
 import dataclasses
 import hashlib
 import shutil
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, Literal, cast
 
@@ -174,14 +174,29 @@ class Store:
         )
 
     def _array(self, name: str) -> zarr.Array:
-        return cast(zarr.Array, self.group[name])
+        try:
+            return cast(zarr.Array, self.group[name])
+        except KeyError:
+            raise ValueError(
+                f"{self.path} has no {name} any more: was it removed? Begin again in another folder."
+            ) from None
 
     def _load(self, name: str, rows: slice) -> np.ndarray:
         with self._reached():
             return np.asarray(self._array(name)[rows])
 
     def _reached(self) -> contextlib.AbstractContextManager[None]:
-        return self.path.reached() if isinstance(self.path, Bucket) else contextlib.nullcontext()
+        return self.path.reached() if isinstance(self.path, Bucket) else self._told()
+
+    @contextlib.contextmanager
+    def _told(self) -> Iterator[None]:
+        """Names the store where the disk is full, which does not say whose file it was."""
+        try:
+            yield
+        except OSError as error:
+            if error.errno and error.filename is None:
+                error.filename = str(self.path)
+            raise
 
     def _slice(self, shard: int) -> slice:
         if not 0 <= shard < self.config.n_shards:
