@@ -79,6 +79,8 @@ def _take(path: pathlib.Path, how: Layout) -> tuple[Take, list[str]]:
             f"{path}: the messages on {keypoints_topic} have {min(count)} to {max(count)} poses, expected the same "
             "number in each, NaN where a keypoint was not observed."
         )
+    if count == {0}:
+        raise ValueError(f"{path}: the messages on {keypoints_topic} have no poses, expected one for each keypoint.")
     poses, misread = None, []
     if gripper_topics is not None:
         tracks = []
