@@ -12,7 +12,7 @@ import tyro
 
 from cablejax.commands.artefacts import kind_of
 from cablejax.commands.export import recorded
-from cablejax.commands.options import Command, UsageError, say
+from cablejax.commands.options import Command, output_file, say
 from cablejax.limits import shown
 
 if TYPE_CHECKING:
@@ -45,11 +45,7 @@ class CableFile(Command):
         cable = Cable() if self.from_ is None else find_cable(self.from_)
         if self.out is None:
             return cable_to_fields(cable), cable_text(cable).rstrip()
-        if self.out.is_dir():
-            raise UsageError(f"--out is {self.out}, which is a folder; expected a file such as cable.toml.")
-        if self.out.exists() and not self.overwrite:
-            raise UsageError(f"{self.out} exists. Give another file with --out, or add --overwrite.")
-        self.out.parent.mkdir(parents=True, exist_ok=True)
+        output_file(self.out, overwrite=self.overwrite).parent.mkdir(parents=True, exist_ok=True)
         write_cable(self.out, cable)
         text = f"The cable is in {self.out}. Edit it, then: cablejax simulate --cable {self.out}"
         return {"out": str(self.out), **cable_to_fields(cable)}, text

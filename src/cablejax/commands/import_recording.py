@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 from tyro.conf import subcommand
 
-from cablejax.commands.options import Command, UsageError
+from cablejax.commands.options import Command, UsageError, output_file
 
 if TYPE_CHECKING:
     from cablejax.types import GapLog
@@ -40,9 +40,8 @@ class _Import(Command, abc.ABC):
 
         if self.out.suffix.lower() != ".npz":
             raise UsageError(f"--out is {self.out}, expected a file name that ends in .npz.")
+        output_file(self.out, overwrite=self.overwrite)
         log, repairs = self.imported()
-        if self.out.exists() and not self.overwrite:
-            raise UsageError(f"{self.out} exists. Give another file with --out, or add --overwrite.")
         result = _summary(write_gap_log(self.out, log, overwrite=self.overwrite), log, repairs)
         return {"logs": [result]}, _as_text(result)
 

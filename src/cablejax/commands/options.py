@@ -84,6 +84,19 @@ def output_folder(path: pathlib.Path, *, overwrite: bool) -> pathlib.Path:
     return path
 
 
+def output_file(path: pathlib.Path, *, overwrite: bool) -> pathlib.Path:
+    """The path of a file that may be written.
+
+    Raises:
+        UsageError: if it exists, unless `overwrite`; or if it is a folder.
+    """
+    if path.is_dir():
+        raise UsageError(f"--out is {path}, which is a folder; expected a file.")
+    if path.exists() and not overwrite:
+        raise UsageError(f"{path} exists. Give another file with --out, or add --overwrite.")
+    return path
+
+
 def say(message: str) -> None:
     """Prints progress on stderr."""
     print(message, file=sys.stderr, flush=True)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from cablejax.commands.artefacts import PAGE, Kind, kind_of
-from cablejax.commands.options import Command, UsageError
+from cablejax.commands.options import Command, UsageError, output_file
 
 if TYPE_CHECKING:
     from cablejax.report.sheet import Sheet
@@ -45,9 +45,7 @@ class View(Command):
         else:
             if page.suffix.lower() not in (".html", ".htm"):
                 raise UsageError(f"--out is {page}, expected a file name that ends in .html.")
-            if page.exists() and not self.overwrite:
-                raise UsageError(f"{page} exists. Give another file with --out, or add --overwrite.")
-            title = self._write(kind, path, page)
+            title = self._write(kind, path, output_file(page, overwrite=self.overwrite))
         if self.browser:
             import webbrowser
 
