@@ -168,15 +168,12 @@ def seen_by_camera(physics: Physics, keypoints: Any, interval: Any) -> Any:
     return in_camera_frame(physics, delayed(keypoints, physics.camera_lag / interval))
 
 
-def without_observation(physics: Physics) -> Physics:
-    """The physics with keypoints where they are: in the world's frame, each at its place along the cable."""
+def without_bias(physics: Physics) -> Physics:
+    """The physics with keypoints each at its place along the cable, for keypoints that no camera has seen."""
     return replace(
         physics,
         bias_along=physics.bias_along * 0.0,
         bias_across=physics.bias_across * 0.0,
-        camera_scale=physics.camera_scale * 0.0 + 1.0,
-        camera_angle=physics.camera_angle * 0.0,
-        camera_offset=physics.camera_offset * 0.0,
     )
 
 

@@ -17,7 +17,7 @@ from cablejax.control.run import shape_error_cm
 from cablejax.control.targets import Shape, Target, make_target, straight_start
 from cablejax.dataset.drawing import cable_params, draw_parameters
 from cablejax.dataset.schema import DatasetConfig, Randomisation
-from cablejax.effects.camera import in_camera_frame, without_observation
+from cablejax.effects.camera import without_bias
 from cablejax.effects.given import GivenEffect, parse_effect
 from cablejax.effects.physics import Physics
 from cablejax.limits import check, shown
@@ -185,16 +185,17 @@ class Cables:
         self.error, self.taken = np.zeros(size), np.zeros(size, int)
         self.names = [""] * size
 
-    def _at_rest(self, physics: Physics, start: CableState) -> Float[np.ndarray, "N 2"]:
-        """Keypoints of one cable before its first action [m]; raises ValueError if that is none to begin with."""
-        rest = self._engine.rollout(without_observation(physics), start, np.zeros((1, 1, 2, 3)))[1]
+    def _at_rest(self, physics: Physics, start: CableState) -> Float[np.ndarray, "2 N 2"]:
+        """True and seen keypoints of one cable before its first action [m]; raises ValueError if it diverges there."""
+        rest = self._engine.rollout(physics, start, np.zeros((1, 1, 2, 3)))[1]
         if not np.isfinite(rest.keypoints).all():
             raise ValueError(
                 f"The simulation of this cable by {self.config.discretisation.n_links} links diverges at rest. Check "
                 "the numbers of the cable and of its effects, and their units, or take a discretisation with fewer "
                 "links (n_links)."
             )
-        return np.asarray(rest.keypoints[0, 0])
+        true = self._engine.keypoints(without_bias(physics), start)
+        return np.stack([np.asarray(true[0]), np.asarray(rest.keypoints[0, 0])])
 
     def _resting(self):
         one = cable_params(self._recipe, draw_parameters(self._recipe, np.random.default_rng(0)))
@@ -239,7 +240,8 @@ class Cables:
         self.gripper_pose[row] = np.asarray(self._start.gripper_pose[0])
         self.taken[row] = 0
         only = np.arange(len(self.taken)) == row
-        self._observe(only, np.broadcast_to(shown, self.keypoints.shape), [random] * len(only))
+        true, seen = np.repeat(shown[:, None], len(only), axis=1)
+        self._observe(only, true, seen, [random] * len(only))
 
     def step(
         self,
@@ -267,9 +269,9 @@ class Cables:
         twists = config.scale * np.clip(np.nan_to_num(np.asarray(actions, float), posinf=0.0, neginf=0.0), -1.0, 1.0)
         length = config.cable.length
         twists = config.limits.shortened(twists, self.gripper_pose, config.interval, length) * active[:, None, None]
-        truly = without_observation(self._physics)
-        after, shown = self._engine.rollout(truly, self._state, twists[:, None], config.interval)
-        keypoints, poses = np.asarray(shown.keypoints[:, -1]), np.asarray(shown.gripper_pose[:, -1])
+        after, shown = self._engine.rollout(self._physics, self._state, twists[:, None], config.interval)
+        keypoints = np.asarray(self._engine.keypoints(without_bias(self._physics), after))
+        poses = np.asarray(shown.gripper_pose[:, -1])
         diverged = ~(np.abs(keypoints) < config.room).all(axis=(1, 2))
         before, opening = (np.asarray(self._engine.opening(state)) for state in (self._state, after))
         torn = ~diverged & (opening > np.maximum(config.widest, before))
@@ -279,22 +281,17 @@ class Cables:
         self.taken += active
         seen = active & ~diverged & ~torn
         self.gripper_pose[seen] = poses[seen]
-        self._observe(seen, keypoints, randoms)
+        self._observe(seen, keypoints, np.asarray(shown.keypoints[:, -1]), randoms)
         done = (self.error <= config.tolerance) | diverged
         return -self.error, done, ~done & (self.taken >= config.steps)
 
-    def _observe(self, rows: np.ndarray, keypoints: np.ndarray, randoms: Sequence[np.random.Generator]) -> None:
-        """Takes in the true keypoints [B, N, 2] of some rows."""
+    def _observe(
+        self, rows: np.ndarray, true: np.ndarray, seen: np.ndarray, randoms: Sequence[np.random.Generator]
+    ) -> None:
+        """Takes in the true and the seen keypoints [B, N, 2] of some rows."""
         config = self.config
-        self.error[rows] = shape_error_cm(keypoints[rows], self.target[rows]) / (100.0 * config.cable.length)
-        physics = self._physics
-        camera = dataclasses.replace(
-            physics,
-            camera_scale=physics.camera_scale[:, None, None],
-            camera_angle=physics.camera_angle[:, None],
-            camera_offset=physics.camera_offset[:, None],
-        )
-        self.keypoints[rows] = in_camera_frame(camera, np.asarray(self._engine.keypoints(physics, self._state)))[rows]
+        self.error[rows] = shape_error_cm(true[rows], self.target[rows]) / (100.0 * config.cable.length)
+        self.keypoints[rows] = seen[rows]
         if config.keypoint_noise:
             for row in np.flatnonzero(rows).tolist():
-                self.keypoints[row] += config.keypoint_noise * randoms[row].standard_normal(keypoints.shape[1:])
+                self.keypoints[row] += config.keypoint_noise * randoms[row].standard_normal(seen.shape[1:])

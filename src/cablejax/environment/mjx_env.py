@@ -19,7 +19,7 @@ from jaxtyping import Array, Float
 from cablejax.control.targets import straight_start
 from cablejax.dataset.drawing import cable_params, draw_parameters
 from cablejax.dataset.schema import Randomisation
-from cablejax.effects.camera import in_camera_frame, without_observation
+from cablejax.effects.camera import without_bias
 from cablejax.effects.physics import Physics, may_touch, without_obstacle
 from cablejax.environment.cables import ShapeCableConfig, require_config
 from cablejax.simulate.chain.engine import ChainEngine
@@ -80,8 +80,9 @@ class MjxShapeCable:
         physics = jax.tree.map(jnp.asarray, cable_params(self._recipe, self._nominal * factors))
         target = jnp.asarray(self._targets)[jax.random.randint(choice, (), 0, len(self._targets))]
         start, zero = self._start, jnp.zeros(())
-        seen = self._moved(physics, start, jnp.zeros((2, 3)))[1][0]
-        rng, obs, error = self._observed(rng, physics, seen, start, target)
+        rng, obs, error = self._observed(
+            rng, self._true(physics, start), self._moved(physics, start, jnp.zeros((2, 3)))[1][0], start, target
+        )
         return State(start, obs, zero, zero, {"error": error}, {"rng": rng, "physics": physics, "target": target})
 
     def step(self, state: State, action: Float[Array, " 6"]) -> State:
@@ -95,11 +96,12 @@ class MjxShapeCable:
         twist = jnp.asarray(config.scale, share.dtype) * share
         twist = config.limits.shortened(twist, before.gripper_pose, config.interval, config.cable.length)
         after, (_, seen) = self._moved(info["physics"], before, twist)
-        diverged = ~(jnp.abs(seen) < config.room).all()
+        true = self._true(info["physics"], after)
+        diverged = ~(jnp.abs(true) < config.room).all()
         open_before, opening = self._engine.opening(before), self._engine.opening(after)
         sound = ~diverged & ~(opening > jnp.maximum(config.widest, open_before))
         data = jax.tree.map(lambda new, old: jnp.where(sound, new, old), after, before)
-        rng, obs, error = self._observed(info["rng"], info["physics"], seen, data, info["target"])
+        rng, obs, error = self._observed(info["rng"], true, seen, data, info["target"])
         obs, error = jnp.where(sound, obs, state.obs), jnp.where(sound, error, state.metrics["error"])
         done = ((error <= config.tolerance) | diverged).astype(jnp.float32)
         return dataclasses.replace(
@@ -158,15 +160,17 @@ class MjxShapeCable:
         return self
 
     def _moved(self, physics: Physics, data: CableState, twist: Float[Array, "2 3"]):
-        """The cable after a twist, and its true keypoints before and after, shape [2, N, 2]."""
+        """The cable after a twist, and its keypoints as they are seen before and after, shape [2, N, 2]."""
         known = physics if self._obstacle else without_obstacle(physics)
-        data, shown = self._engine.unroll(without_observation(known), data, twist[None], self.config.interval)
+        data, shown = self._engine.unroll(known, data, twist[None], self.config.interval)
         return data, shown.keypoints
 
-    def _observed(self, rng: Array, physics: Physics, keypoints: Array, data: CableState, target: Array):
-        """The next key, an observation of the true keypoints [N, 2], and their error to the target [N, 2]."""
-        error = jnp.sqrt(jnp.mean(jnp.sum((keypoints - target) ** 2, axis=-1))) / self.config.cable.length
-        keypoints = in_camera_frame(physics, self._engine.keypoints(physics, data))
+    def _true(self, physics: Physics, data: CableState) -> Array:
+        return self._engine.keypoints(without_bias(physics), data)
+
+    def _observed(self, rng: Array, true: Array, keypoints: Array, data: CableState, target: Array):
+        """The next key, an observation of the seen keypoints [N, 2], and the error of the true ones to the target."""
+        error = jnp.sqrt(jnp.mean(jnp.sum((true - target) ** 2, axis=-1))) / self.config.cable.length
         if noise := self.config.keypoint_noise:
             rng, own = jax.random.split(rng)
             keypoints = keypoints + noise * jax.random.normal(own, keypoints.shape)

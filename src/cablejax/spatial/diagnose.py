@@ -102,9 +102,9 @@ def diagnose_space(
     gap = gap_of(before[use], after[use], kept_windows, noise, smallest)
     equivalent = _equivalent(found, named)
     verdict = _verdict(gap, 1e3 * smallest, named, equivalent)
-    # each may be absent, and all of them together still explain some of it
-    most = found.unseen()[0] if verdict == "unknown" else after
-    share = gap_of(before[use], most[use], kept_windows, noise, smallest).shrinkage or 0.0
+    told = gap
+    if verdict == "unknown":  # each may be absent, and all of them together still explain some of it
+        told = gap_of(before[use], found.unseen()[0][use], kept_windows, noise, smallest)
     if verdict in ("none", "unknown"):
         effects = ()
     offset = ParameterEstimate(constant_offset(after[use], kept_windows.windows), None, "m")
@@ -113,7 +113,11 @@ def diagnose_space(
     return SpatialDiagnosis(
         verdict=verdict,
         sentence=" ".join(
-            [verdict_sentence(verdict, effects, equivalent, max(share, 0.0)), *changes[:1], *other_clock]
+            [
+                verdict_sentence(verdict, effects, equivalent, max(told.shrinkage or 0.0, 0.0)),
+                *changes[:1],
+                *other_clock,
+            ]
         ),
         effects=effects,
         equivalent=equivalent,
