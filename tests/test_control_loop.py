@@ -144,6 +144,8 @@ def test_wrong_requests_are_refused():
     plant, controller = Plant(CONFIG), GoToPose(target.gripper_pose)
     with pytest.raises(ValueError, match="at least one step"):
         run_closed_loop(plant, controller, target, 0, start=start)
+    with pytest.raises(ValueError, match=r"The time of a run is 20001.*, expected .* to 10000 s.* make several runs"):
+        run_closed_loop(plant, controller, target, 20_000, start=start)
     with pytest.raises(ValueError, match="whole number of samples"):
         run_closed_loop(plant, controller, target, 1, start=start, record_hz=2.5)
     short = dataclasses.replace(target, keypoints=target.keypoints[:-1])

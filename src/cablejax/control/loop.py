@@ -13,6 +13,7 @@ from cablejax.control.link_state import LinkConfig, Status
 from cablejax.control.run import ClosedLoopRun
 from cablejax.control.run_log import RunLog
 from cablejax.control.targets import Target
+from cablejax.limits import require
 from cablejax.simulate.table_plant import Observation, PlantError
 
 
@@ -56,8 +57,8 @@ def run_closed_loop(
         patience: end the run once the error has stayed within `RESTING_CM` for so many commands; None = never.
 
     Raises:
-        ValueError: `steps` is not positive, `record_hz` does not divide the interval, the target has another number of
-            keypoints than the plant shows, or the plant refuses `start`.
+        ValueError: `steps` is not positive or more than an episode of a log holds, `record_hz` does not divide the
+            interval, the target has another number of keypoints than the plant shows, or the plant refuses `start`.
     """
     samples = round(interval * record_hz)
     if steps < 1 or samples < 1 or abs(samples - interval * record_hz) > 1e-9:
@@ -65,6 +66,7 @@ def run_closed_loop(
             f"A run of {steps} steps with {record_hz} samples per second, in intervals of {interval} s, is not "
             f"possible: give at least one step and a whole number of samples in an interval."
         )
+    require((steps + 1) * interval, "duration", "The time of a run", "A log's episode is no longer: make several runs.")
     first = plant.reset(np.asarray(start, float))
     if first.keypoints.shape != target.keypoints.shape:
         raise ValueError(
