@@ -84,14 +84,13 @@ def diagnose_space(
     windows, left_out = _to_fit(log)
     longest = round(float(windows.valid.sum(axis=1).max() * windows.interval), 1)
     cable = log.meta["cable"]
-    stiffness = cable["bending_stiffness_n_m2"] / cable["linear_density_kg_per_m"]
+    density, guessed = cable["linear_density_kg_per_m"], "linear_density_kg_per_m" in log.meta.get("guessed", ())
+    stiffness = cable["bending_stiffness_n_m2"] / density
     progress(f"{len(windows)} windows of {longest:g} s, {len(np.unique(windows.group))} recordings")
     changes = local_changes(log, windows.held)
     for change in changes:
         progress(change)
     found = identify(windows, stiffness, cable["bending_damping_s"], only=only, state=state, progress=progress)
-
-    density, guessed = cable["linear_density_kg_per_m"], "linear_density_kg_per_m" in log.meta.get("guessed", ())
     effects, edges = named_effects(found, density), found.cable.rod.n_edges
     named = [effect.name for effect in effects]
     before, (after, results) = found.cable.motion(explanation()), found.unseen(with_both_drags(named))
@@ -102,9 +101,7 @@ def diagnose_space(
     gap = gap_of(before[use], after[use], kept_windows, noise, smallest)
     equivalent = _equivalent(found, named)
     verdict = _verdict(gap, 1e3 * smallest, named, equivalent)
-    told = gap
-    if verdict == "unknown":  # each may be absent, and all of them together still explain some of it
-        told = gap_of(before[use], found.unseen()[0][use], kept_windows, noise, smallest)
+    share = _share(verdict, gap, lambda: gap_of(before[use], found.unseen()[0][use], kept_windows, noise, smallest))
     if verdict in ("none", "unknown"):
         effects = ()
     offset = ParameterEstimate(constant_offset(after[use], kept_windows.windows), None, "m")
@@ -112,13 +109,7 @@ def diagnose_space(
     where = where_of(log, kept_windows.windows, nominal, before[use], noise, smallest, changes)
     return SpatialDiagnosis(
         verdict=verdict,
-        sentence=" ".join(
-            [
-                verdict_sentence(verdict, effects, equivalent, max(told.shrinkage or 0.0, 0.0)),
-                *changes[:1],
-                *other_clock,
-            ]
-        ),
+        sentence=" ".join([verdict_sentence(verdict, effects, equivalent, share), *changes[:1], *other_clock]),
         effects=effects,
         equivalent=equivalent,
         quantities=quantities_of(found, None if guessed else density) | {"constant_offset_m": offset},
@@ -140,6 +131,11 @@ def diagnose_space(
         settings={"edges": edges, "window_s": longest, "jax": jax.__version__, "devices": jax.default_backend()},
         identified=found,
     )
+
+
+def _share(verdict: Verdict, gap: Gap, of_all_effects: Callable[[], Gap]) -> float:
+    """Share of the gap that goes away; where each effect may be absent, by all of them together."""
+    return max((of_all_effects() if verdict == "unknown" else gap).shrinkage or 0.0, 0.0)
 
 
 def _to_fit(log: GapLog) -> tuple[Windows, int]:
