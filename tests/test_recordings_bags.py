@@ -1,5 +1,6 @@
 """ROS 2 bags and MCAP files, written here by the library that reads them."""
 
+import itertools
 import re
 import sys
 from pathlib import Path
@@ -41,8 +42,8 @@ grippers = ["/left/pose", "/right/pose"]
 """
 
 
-def header(time: float):
-    return HEADER(TIME(int(time), round(1e9 * (time % 1))), "world")
+def header(time: float, frame: str = "world"):
+    return HEADER(TIME(int(time), round(1e9 * (time % 1))), frame)
 
 
 def pose_of(values: np.ndarray):
@@ -143,6 +144,14 @@ def test_poses_too_rare_to_say_how_a_gripper_moves_are_named(tmp_path):
     bag = write_bag(tmp_path / "bag", points, grippers_of(points, stride=10), StoragePlugin.MCAP)
     with pytest.raises(ValueError, match=r"poses on /left/pose are 0\.1 s apart, expected 0\.075 s at most"):
         import_mcap(bag, layout(tmp_path))
+
+
+def test_headers_that_name_other_frames_are_told(tmp_path, monkeypatch):
+    points, frames = swinging(201), itertools.cycle(["world", "", "camera"])
+    monkeypatch.setattr(sys.modules[__name__], "header", lambda time, original=header: original(time, next(frames)))
+    bag = write_bag(tmp_path / "bag", points, grippers_of(points), StoragePlugin.MCAP)
+    _, (told,) = import_mcap(bag, layout(tmp_path))
+    assert told == "The headers name the frames camera, world: positions are taken as of one frame."
 
 
 def test_headers_without_a_time_are_named(tmp_path):

@@ -64,14 +64,14 @@ def import_mcap(path: str | os.PathLike[str], layout: str | os.PathLike[str]) ->
 
 
 def _take(path: pathlib.Path, how: Layout) -> tuple[Take, list[str]]:
-    """The take of a bag, and a sentence on each topic with poses that jump away and back."""
+    """The take of a bag, and sentences on frames that differ and on topics with poses that jump away and back."""
     fields: Fields = how.place
     keypoints_topic = fields.take("keypoints", str, "the topic of the keypoints")
     gripper_topics = fields.names("grippers", (2,), "the topics of gripper 0 and gripper 1", None)
     motion = fields.take("motion", str, "what the grippers did", "recorded")
     fields.nothing_left()
     wanted = {keypoints_topic: POSE_ARRAY, **{topic: POSE_STAMPED for topic in gripper_topics or []}}
-    messages = _messages(path, wanted)
+    messages, frames = _messages(path, wanted)
     time, rows = _sorted(messages[keypoints_topic])
     count = {len(row) for row in rows}
     if len(count) > 1:
@@ -82,6 +82,8 @@ def _take(path: pathlib.Path, how: Layout) -> tuple[Take, list[str]]:
     if count == {0}:
         raise ValueError(f"{path}: the messages on {keypoints_topic} have no poses, expected one for each keypoint.")
     poses, misread = None, []
+    if len(frames) > 1:
+        misread.append(f"The headers name the frames {', '.join(sorted(frames))}: positions are taken as of one frame.")
     if gripper_topics is not None:
         tracks = []
         for topic in gripper_topics:
@@ -104,15 +106,15 @@ def _take(path: pathlib.Path, how: Layout) -> tuple[Take, list[str]]:
     return Take(path.stem, time - time[0], np.array(rows)[..., :3], poses, labels={"motion": motion}), misread
 
 
-def _messages(path: pathlib.Path, wanted: dict[str, str]) -> dict[str, list[tuple[float, np.ndarray]]]:
-    """Time [s] and poses (x, y, z, qw, qx, qy, qz) of every message on the wanted topics."""
+def _messages(path: pathlib.Path, wanted: dict[str, str]) -> tuple[dict[str, list[tuple[float, np.ndarray]]], set[str]]:
+    """Time [s] and poses (x, y, z, qw, qx, qy, qz) of every message on the wanted topics, and the frames they name."""
     try:
         from rosbags.highlevel import AnyReader
         from rosbags.typesys import Stores, get_typestore
     except ModuleNotFoundError:
         raise ValueError("Reading bags needs the library rosbags: pip install 'cablejax[recordings]'.") from None
     found: dict[str, list[tuple[float, np.ndarray]]] = {topic: [] for topic in wanted}
-    size = 0
+    frames, size = set(), 0
     try:
         # Bags of older releases hold no message definitions; these messages have been the same in all of them.
         with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as bag:
@@ -123,6 +125,7 @@ def _messages(path: pathlib.Path, wanted: dict[str, str]) -> dict[str, list[tupl
                 require(size, "array_bytes", f"The size of the messages on {', '.join(wanted)}", "Cut the recording.")
                 message: Any = bag.deserialize(data, connection.msgtype)
                 stamp = message.header.stamp
+                frames.add(message.header.frame_id)
                 poses = message.poses if wanted[connection.topic] == POSE_ARRAY else [message.pose]
                 found[connection.topic].append(
                     (stamp.sec + 1e-9 * stamp.nanosec, np.array([_numbers(p) for p in poses]))
@@ -139,7 +142,7 @@ def _messages(path: pathlib.Path, wanted: dict[str, str]) -> dict[str, list[tupl
                 f"{path}: all messages on {topic} are stamped {messages[0][0]:g} s, expected the time of each in its "
                 "header: let the node that publishes them set header.stamp."
             )
-    return found
+    return found, frames - {""}
 
 
 def _require_bag(path: pathlib.Path) -> None:
