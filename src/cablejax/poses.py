@@ -92,6 +92,14 @@ def unwrapped(angle: Float[np.ndarray, "T *Q"]) -> Float[np.ndarray, "T *Q"]:
     return columns.reshape(angle.shape)
 
 
+def with_one_sign(pose: Float[np.ndarray, "T *Q 7"]) -> Float[np.ndarray, "T *Q 7"]:
+    """Poses in space, each quaternion with the sign that is nearer to the one before: both are one rotation."""
+    pose = pose.astype(float)
+    opposite = (pose[1:, ..., 3:] * pose[:-1, ..., 3:]).sum(axis=-1, keepdims=True) < 0
+    pose[1:, ..., 3:] *= np.cumprod(np.where(opposite, -1.0, 1.0), axis=0)
+    return pose
+
+
 def poses_at(
     at: Float[np.ndarray, " G"], time: Float[np.ndarray, " T"], pose: Float[np.ndarray, "T *Q P"]
 ) -> Float[np.ndarray, "G *Q P"]:
@@ -111,10 +119,7 @@ def poses_at(
         before = np.clip(np.searchsorted(time, at, side="right") - 1, 0, None)
         found[..., 2] += (pose[..., 2] - turned)[before]
         return found
-    pose = pose.astype(float)
-    opposite = (pose[1:, ..., 3:] * pose[:-1, ..., 3:]).sum(axis=-1, keepdims=True) < 0
-    pose[1:, ..., 3:] *= np.cumprod(np.where(opposite, -1.0, 1.0), axis=0)
-    found = positions_at(at, time, pose)
+    found = positions_at(at, time, with_one_sign(pose))
     found[..., 3:] /= np.linalg.norm(found[..., 3:], axis=-1, keepdims=True)
     return found
 

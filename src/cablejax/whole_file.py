@@ -15,6 +15,17 @@ DRAFT = ".part"
 
 
 @contextlib.contextmanager
+def naming(path: str | os.PathLike[str]) -> Iterator[None]:
+    """Gives an error of the system the file or folder that it is about: a full disk does not say whose it was."""
+    try:
+        yield
+    except OSError as error:
+        if error.errno and error.filename is None:
+            error.filename = os.fspath(path)
+        raise
+
+
+@contextlib.contextmanager
 def whole_file(path: pathlib.Path) -> Iterator[BinaryIO]:
     """A stream into a file that takes its place, over what was there, when the block has ended.
 
@@ -25,23 +36,22 @@ def whole_file(path: pathlib.Path) -> Iterator[BinaryIO]:
         ValueError: another process is writing the file, or has just done so.
     """
     draft = path.with_name(f"{path.name}{DRAFT}")
-    try:
-        # truncated only once it is known that nobody else writes it
-        with open(draft, "wb", opener=lambda name, _: os.open(name, os.O_WRONLY | os.O_CREAT, 0o666)) as stream:
-            _lock(stream.fileno(), path)
-            _require_draft(stream.fileno(), draft, path)
-            try:
-                stream.truncate()
-                yield stream
-                stream.flush()
-                os.replace(draft, path)
-            except BaseException:
-                draft.unlink(missing_ok=True)
-                raise
-    except OSError as error:
-        if error.errno and error.filename is None:  # a full disk does not say whose file it was
-            error.filename = os.fspath(path)
-        raise
+    # truncated only once it is known that nobody else writes it
+    with naming(path), open(draft, "wb", opener=_not_truncated) as stream:
+        _lock(stream.fileno(), path)
+        _require_draft(stream.fileno(), draft, path)
+        try:
+            stream.truncate()
+            yield stream
+            stream.flush()
+            os.replace(draft, path)
+        except BaseException:
+            draft.unlink(missing_ok=True)
+            raise
+
+
+def _not_truncated(name: str, _: int) -> int:
+    return os.open(name, os.O_WRONLY | os.O_CREAT, 0o666)
 
 
 @contextlib.contextmanager

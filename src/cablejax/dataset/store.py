@@ -15,7 +15,7 @@ import contextlib
 import dataclasses
 import hashlib
 import shutil
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal, cast
 
@@ -24,6 +24,7 @@ import zarr
 
 from cablejax.dataset.bucket import Bucket, UnreachableError
 from cablejax.dataset.schema import Block, DatasetConfig
+from cablejax.whole_file import naming
 
 
 class MissingShardError(ValueError):
@@ -186,17 +187,7 @@ class Store:
             return np.asarray(self._array(name)[rows])
 
     def _reached(self) -> contextlib.AbstractContextManager[None]:
-        return self.path.reached() if isinstance(self.path, Bucket) else self._told()
-
-    @contextlib.contextmanager
-    def _told(self) -> Iterator[None]:
-        """Names the store where the disk is full, which does not say whose file it was."""
-        try:
-            yield
-        except OSError as error:
-            if error.errno and error.filename is None:
-                error.filename = str(self.path)
-            raise
+        return self.path.reached() if isinstance(self.path, Bucket) else naming(self.path)
 
     def _slice(self, shard: int) -> slice:
         if not 0 <= shard < self.config.n_shards:

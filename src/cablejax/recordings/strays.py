@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+from collections.abc import Callable
 
 import numpy as np
 from jaxtyping import Float
@@ -48,33 +49,35 @@ def without_jumps(takes: tuple[Take, ...]) -> tuple[tuple[Take, ...], list[str]]
     Several next to each other too: a tracker may write the origin for each that it has lost.
     """
     along = np.concatenate([[0.0], np.cumsum(typical_spacing(takes))])
-    kept, reports = [], []
-    for take in takes:
-        off = np.zeros(take.keypoints.shape[:2], bool)
-        for t in np.flatnonzero(_too_far_apart(take.keypoints, along)):
-            off[t] = _off_the_cable(take.keypoints[t], along)
-        kept.append(dataclasses.replace(take, keypoints=np.where(off[..., None], np.nan, take.keypoints)))
-        for index in np.flatnonzero(off.any(axis=0)):
-            samples = np.flatnonzero(off[:, index])
-            reports.append(
-                f"Take {take.name}: keypoint {index} is farther from its neighbours than the cable reaches in "
-                f"{len(samples)} of {len(off)} samples, from sample {samples[0]}: taken as not observed."
-            )
-    return tuple(kept), reports
+
+    def off(points: Float[np.ndarray, "T N D"]) -> np.ndarray:
+        found = np.zeros(points.shape[:2], bool)
+        for t in np.flatnonzero(_too_far_apart(points, along)):
+            found[t] = _off_the_cable(points[t], along)
+        return found
+
+    words = "is farther from its neighbours than the cable reaches in {where}: taken as not observed."
+    return _without(takes, off, words)
 
 
 def without_held(takes: tuple[Take, ...]) -> tuple[tuple[Take, ...], list[str]]:
     """Marks keypoints as not observed that a tracker holds while the cable on both sides moves on, see `frozen`."""
+    words = "repeats its last value to the digit in {where}, while its neighbours move: taken as not observed."
+    return _without(takes, frozen, words)
+
+
+def _without(
+    takes: tuple[Take, ...], off: Callable[[np.ndarray], np.ndarray], words: str
+) -> tuple[tuple[Take, ...], list[str]]:
+    """The takes without keypoints [T, N] that are off, and a sentence on each keypoint, `where` in its words."""
     kept, reports = [], []
     for take in takes:
-        off = frozen(take.keypoints)
-        kept.append(dataclasses.replace(take, keypoints=np.where(off[..., None], np.nan, take.keypoints)))
-        for index in np.flatnonzero(off.any(axis=0)):
-            samples = np.flatnonzero(off[:, index])
-            reports.append(
-                f"Take {take.name}: keypoint {index} repeats its last value to the digit in {len(samples)} of "
-                f"{len(off)} samples, from sample {samples[0]}, while its neighbours move: taken as not observed."
-            )
+        found = off(take.keypoints)
+        kept.append(dataclasses.replace(take, keypoints=np.where(found[..., None], np.nan, take.keypoints)))
+        for index in np.flatnonzero(found.any(axis=0)):
+            samples = np.flatnonzero(found[:, index])
+            where = f"{len(samples)} of {len(found)} samples, from sample {samples[0]}"
+            reports.append(f"Take {take.name}: keypoint {index} {words.format(where=where)}")
     return tuple(kept), reports
 
 

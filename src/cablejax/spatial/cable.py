@@ -44,7 +44,8 @@ _FITTED = slice(2, None, 4)
 # than 32 edges XLA shares its small products among threads, which costs more time than the edges.
 FINER = 4
 """Time steps that estimates are corrected for, in place of each of a fit."""
-_MORE_EDGES = 1.6
+MORE_EDGES = 1.6
+"""And edges."""
 # Nats per window: a step that promises less is not worth the simulations that it takes.
 _TOLERANCE = 0.1
 # Steps end by the tolerance. This is for fits that creep.
@@ -106,8 +107,8 @@ class SpatialCable(Simulator):
         # the longest local error stays the same length
         rod = dataclasses.replace(
             self.rod,
-            n_edges=round(_MORE_EDGES * self.rod.n_edges),
-            local_error=_MORE_EDGES * self.rod.local_error,
+            n_edges=round(MORE_EDGES * self.rod.n_edges),
+            local_error=MORE_EDGES * self.rod.local_error,
             substeps=finer * self.rod.substeps,
         )
         return dataclasses.replace(self, rod=rod, correction=None)

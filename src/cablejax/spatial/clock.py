@@ -5,16 +5,22 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
+from jaxtyping import Float
 
 from cablejax.diagnose.clock import keypoints_at
 from cablejax.gaplog import episodes_of, stack_episodes
-from cablejax.poses import poses_at, without_misreadings
+from cablejax.poses import poses_at, with_one_sign, without_misreadings
 from cablejax.types import GapLog
 
 # Clocks whose intervals are all within this share of the usual one are taken as they are.
 _EVEN = 0.05
 # Samples a second that are enough [Hz]; twice as many are averaged.
 _RATE = 75.0
+
+
+def steps_of(log: GapLog) -> Float[np.ndarray, " S"]:
+    """Times between samples, of all episodes [s]."""
+    return np.concatenate([np.diff(time[:n]) for time, n in zip(log.time, log.episode_length, strict=True)])
 
 
 def thinned(log: GapLog) -> tuple[GapLog, tuple[str, ...]]:
@@ -26,7 +32,7 @@ def thinned(log: GapLog) -> tuple[GapLog, tuple[str, ...]]:
     Args:
         log: its samples one interval apart.
     """
-    steps = np.concatenate([np.diff(time[:n]) for time, n in zip(log.time, log.episode_length, strict=True)])
+    steps = steps_of(log)
     count = int(1.0 / (_RATE * np.median(steps)) + 1e-6) if len(steps) else 1
     if count < 2:
         return log, ()
@@ -38,10 +44,7 @@ def thinned(log: GapLog) -> tuple[GapLog, tuple[str, ...]]:
 
     episodes = []
     for one in episodes_of(log):
-        pose = one.gripper_pose.astype(float)
-        opposite = (pose[1:, :, 3:] * pose[:-1, :, 3:]).sum(axis=-1, keepdims=True) < 0
-        pose[1:, :, 3:] *= np.cumprod(np.where(opposite, -1.0, 1.0), axis=0)
-        pose = means(pose)
+        pose = means(with_one_sign(one.gripper_pose))
         pose[..., 3:] /= np.linalg.norm(pose[..., 3:], axis=-1, keepdims=True)
         episodes.append(
             dataclasses.replace(
@@ -74,7 +77,7 @@ def on_one_clock(log: GapLog) -> tuple[GapLog, tuple[str, ...]]:
         repairs += [f"In episode {e} the pose of gripper {q} {words}" for q, words in jumps.items()]
     if repairs:
         log = dataclasses.replace(log, gripper_pose=pose)
-    steps = np.concatenate([np.diff(time[:n]) for time, n in zip(log.time, log.episode_length, strict=True)])
+    steps = steps_of(log)
     interval = float(np.median(steps)) if len(steps) else 0.0
     if not len(steps):
         return log, tuple(repairs)

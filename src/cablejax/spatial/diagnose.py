@@ -21,7 +21,7 @@ from cablejax.gaplog_join import COMMANDS_DERIVED
 from cablejax.simulate.rod import Rod, RodResult
 from cablejax.spatial.accidents import accident_sentences, kept, moderated, off
 from cablejax.spatial.cable import SpatialCable, errors
-from cablejax.spatial.clock import on_one_clock
+from cablejax.spatial.clock import on_one_clock, steps_of
 from cablejax.spatial.effects import GRIP
 from cablejax.spatial.gap import (
     OWN,
@@ -214,7 +214,7 @@ def _ranking(found: Identified) -> tuple[Ranked, ...]:
 
 def _other_clock(log: GapLog) -> list[str]:
     """A sentence where the keypoints at the grippers fit their poses at another time: every fit suffers from it."""
-    steps = np.concatenate([np.diff(time[:n]) for time, n in zip(log.time, log.episode_length, strict=True)])
+    steps = steps_of(log)
     interval = np.full(len(log.time), np.median(steps) if len(steps) else 1.0)
     ends, place = log.keypoints[:, :, [0, -1]].astype(float), log.gripper_pose[..., :3].astype(float)
     offset = clock_offset(ends, place, log.episode_length, interval)

@@ -16,16 +16,15 @@ from cablejax.diagnose.noise import noise_floor
 from cablejax.diagnose.protocol import explanation
 from cablejax.diagnose.where import HORIZONS, Where
 from cablejax.diagnose.where_sizes import above, mean_of_finite, sizes_of
-from cablejax.spatial.cable import SpatialCable, bounded
+from cablejax.spatial.cable import MORE_EDGES, SpatialCable, bounded
 from cablejax.spatial.windows import Windows, labels
 from cablejax.types import GapLog
 
 RESOLVABLE = 3.0
 """An error up to so many times the noise is none."""
 
-SURE_OF_OWN, _FEWER = 1.5, 1.6
-"""Nor up to so many times what noise in the beginning of windows and the rod's edges cause; and by what factor fewer
-edges show the latter."""
+SURE_OF_OWN = 1.5
+"""Nor up to so many times what noise in the beginning of windows and the rod's edges cause."""
 
 OWN = Calibration().smallest_gap(0.0)
 """Nor is one that the simulator may have by itself [m], of a cable of up to a metre: as on a table."""
@@ -66,8 +65,10 @@ def own_error(cable: SpatialCable, nominal: Float[np.ndarray, "W T F 3"], noise:
     points = cable.windows.keypoints.copy()
     points[:, :2] += np.random.default_rng(0).normal(0.0, noise, points[:, :2].shape)
     begun = cable.on(dataclasses.replace(cable.windows, keypoints=points))
-    coarse = dataclasses.replace(cable, rod=dataclasses.replace(cable.rod, n_edges=round(cable.rod.n_edges / _FEWER)))
-    return float(np.hypot(off(begun), off(coarse) / (_FEWER**2 - 1)))
+    coarse = dataclasses.replace(
+        cable, rod=dataclasses.replace(cable.rod, n_edges=round(cable.rod.n_edges / MORE_EDGES))
+    )
+    return float(np.hypot(off(begun), off(coarse) / (MORE_EDGES**2 - 1)))
 
 
 def constant_offset(predicted: Float[np.ndarray, "W T F 3"], windows: Windows) -> float:

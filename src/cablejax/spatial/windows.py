@@ -14,6 +14,7 @@ from cablejax.diagnose.log_faults import steadied
 from cablejax.diagnose.noise import noise_floor
 from cablejax.log_geometry import cable_fault
 from cablejax.poses import rotated
+from cablejax.spatial.clock import steps_of
 from cablejax.spatial.grips import clamps, frames_of, held_keypoints, rolls_observed
 from cablejax.types import GapLog
 
@@ -237,7 +238,7 @@ def _sample_interval(log: GapLog) -> float:
         )
     if log.meta["table"] is not None:
         raise ValueError("The log has a table; a cable in space is expected to hang free (`table` null).")
-    intervals = np.concatenate([np.diff(t[:n]) for t, n in zip(log.time, log.episode_length, strict=True)])
+    intervals = steps_of(log)
     interval = float(np.median(intervals))
     if np.abs(intervals - interval).max() > 0.05 * interval:
         raise ValueError(
