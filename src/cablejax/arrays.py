@@ -1,4 +1,4 @@
-"""Operations that belong to no stage: flags, points not seen, angles within a turn, quarter turns, quaternions."""
+"""Operations that belong to no stage: flags, points not seen, angles in a turn, lengths, quarter turns, quaternions."""
 
 from __future__ import annotations
 
@@ -23,6 +23,12 @@ def filled(points: Float[np.ndarray, "N D"]) -> Float[np.ndarray, "N D"]:
 def wrapped(angle):
     """The same angle within [-pi, pi) [rad]. NumPy in, NumPy out; JAX in, JAX out."""
     return (angle + math.pi) % (2 * math.pi) - math.pi
+
+
+def rms_length(vectors: Float[Any, "*B N D"]) -> Float[Any, "*B"]:
+    """Root mean square length of N vectors. NumPy in, NumPy out; JAX in, JAX out."""
+    xp = vectors.__array_namespace__()
+    return xp.sqrt(xp.mean(xp.sum(vectors**2, axis=-1), axis=-1))
 
 
 def quarter_turn(vectors: Float[Any, "*B 2"]) -> Float[Any, "*B 2"]:

@@ -15,12 +15,11 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Float
 
 from cablejax.cable import Discretisation
 from cablejax.commands.options import say
-from cablejax.control.batched import AXIS, BatchRun, LoopConfig, for_each_cable, shape_batch
+from cablejax.control.batched import BatchRun, LoopConfig, for_each_cable, shape_batch
 from cablejax.control.shaping import Model, make_controller
 from cablejax.control.targets import make_target, straight_start
 from cablejax.dataset.drawing import draw_all
@@ -32,6 +31,7 @@ from cablejax.mpc import MPC, MPCConfig
 from cablejax.perceive.synthetic import Clutter, scatter
 from cablejax.report.provenance import machine
 from cablejax.simulate import MjxEngine
+from cablejax.simulate.compile import on_devices
 from cablejax.simulate.elastica import solve_elastica
 from cablejax.simulate.equilibrium import equilibrium_state
 from cablejax.solver_names import SolverName
@@ -180,8 +180,7 @@ def batched_control(controller: MPC, history: History, size: int) -> tuple[Calla
     """
     measurement = Measurement(history.keypoints[-1], history.gripper_pose)
     devices = next(jax.devices()[:n] for n in range(len(jax.devices()), 0, -1) if size % n == 0)
-    spread = NamedSharding(Mesh(np.array(devices), (AXIS,)), PartitionSpec(AXIS))
-    arguments = jax.device_put(repeated((controller.init(history), measurement), size), spread)
+    arguments = on_devices(repeated((controller.init(history), measurement), size), devices, size // len(devices))
     steps = for_each_cable(lambda state, measurement: controller.step(state, measurement), devices)
     step = jax.jit(steps).lower(*arguments).compile()
 

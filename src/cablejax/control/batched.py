@@ -21,17 +21,16 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Float, Int
 
 from cablejax.control.controller import Controller, check_interval, resting
+from cablejax.control.run import shape_error_cm
 from cablejax.effects.physics import Physics, may_touch, without_obstacle
 from cablejax.limits import check
 from cablejax.simulate.chain.engine import ChainEngine
-from cablejax.simulate.compile import compiler_options
+from cablejax.simulate.compile import AXIS, compiler_options, on_devices
 from cablejax.simulate.engine import refuse_lags
 from cablejax.simulate.mjx_engine import MjxEngine
 from cablejax.simulate.plant_config import check_camera
 from cablejax.types import CableState, Measurement
 
-AXIS = "cable"
-"""Of devices, by which a batch is spread."""
 REPORTED = ("residual_share", "radius")
 """Fields of a controller's report that a run keeps."""
 
@@ -170,7 +169,8 @@ def shape_batch(
     if lengths != {(size,)}:
         raise ValueError(f"The leading axes are {sorted(lengths)}, expected {size}, the number of targets, everywhere.")
     if devices is not None:
-        batch, shared = _spread(batch, shared, size, devices)
+        batch = on_devices(batch, devices, -(-size // len(devices)))
+        shared = jax.device_put(shared, NamedSharding(Mesh(np.array(devices), (AXIS,)), PartitionSpec()))
     spread_over = None if devices is None else tuple(devices)
     run = _compiled_batch(engine, config, may_touch(params), spread_over)(shared, *batch)
     return run if devices is None else jax.tree.map(lambda leaf: leaf[:size], run)
@@ -179,16 +179,6 @@ def shape_batch(
 def _with_target(controller: Any, target: Any) -> Any:
     """The same pytree with another leaf for its target."""
     return eqx.tree_at(lambda controller: controller.target, controller, target)
-
-
-def _spread(batch, shared, size: int, devices: Sequence[jax.Device]):  # pyright: ignore[reportInvalidTypeForm]
-    """The batch in equal shares on all devices, padded by copies of its last trial, and what is shared on each."""
-    width = -(-size // len(devices)) * len(devices)
-    rows = np.minimum(np.arange(width), size - 1)
-    mesh = Mesh(np.array(devices), (AXIS,))
-    split, whole = NamedSharding(mesh, PartitionSpec(AXIS)), NamedSharding(mesh, PartitionSpec())
-    batch = jax.tree.map(lambda leaf: jax.device_put(np.asarray(leaf)[rows], split), batch)
-    return batch, jax.tree.map(lambda leaf: jax.device_put(leaf, whole), shared)
 
 
 @functools.lru_cache(maxsize=16)
@@ -249,7 +239,7 @@ def _trials(
         keypoints=keypoints,
         gripper_pose=jnp.concatenate([cables.gripper_pose[:, None], pose], axis=1),
         twist=twist,
-        error_cm=jax.vmap(_shape_error_cm)(keypoints, targets),
+        error_cm=shape_error_cm(keypoints, targets[:, None]),
         residual_share=share,
         radius=radius,
     )
@@ -270,9 +260,3 @@ def _observed(config: LoopConfig, key: Array, keypoints: Float[Array, "N 2"]) ->
     missing = jax.random.bernoulli(gaps, config.keypoint_dropout, keypoints.shape[:1])
     missing = missing.at[jnp.array([0, -1])].set(False)
     return jnp.where(missing[:, None], jnp.nan, keypoints)
-
-
-def _shape_error_cm(keypoints: Float[Array, "T N 2"], target: Float[Array, "N 2"]) -> Float[Array, " T"]:
-    """`control.run.shape_error_cm`; the held ends are always seen unless the simulation diverged."""
-    squared = ((keypoints - target) ** 2).sum(axis=-1)
-    return 100.0 * jnp.sqrt(jnp.nanmean(squared, axis=-1))

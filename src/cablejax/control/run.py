@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -114,15 +115,17 @@ class ClosedLoopRun:
         )
 
 
-def shape_error_cm(
-    keypoints: Float[np.ndarray, "*T N 2"], target: Float[np.ndarray, "*#T N 2"]
-) -> Float[np.ndarray, "*T"]:
-    """Root mean square distance [cm] of the observed keypoints to the target's; NaN where none was observed."""
-    squared = ((np.asarray(keypoints) - target) ** 2).sum(axis=-1)
-    seen = np.isfinite(squared)
+def shape_error_cm(keypoints: Float[Any, "*T N 2"], target: Float[Any, "*#T N 2"]) -> Float[Any, "*T"]:
+    """Root mean square distance [cm] of the observed keypoints to the target's; NaN where none was observed.
+
+    NumPy in, NumPy out; JAX in, JAX out, also within `jit`.
+    """
+    xp = keypoints.__array_namespace__()
+    squared = ((keypoints - target) ** 2).sum(axis=-1)
+    seen = xp.isfinite(squared)
     count = seen.sum(axis=-1)
-    total = np.where(seen, squared, 0.0).sum(axis=-1)
-    return np.where(count > 0, 100 * np.sqrt(total / np.maximum(count, 1)), np.nan)
+    total = xp.where(seen, squared, 0.0).sum(axis=-1)
+    return xp.where(count > 0, 100 * xp.sqrt(total / xp.maximum(count, 1)), xp.nan)
 
 
 def settling_time(times: Float[np.ndarray, " T"], error_cm: Float[np.ndarray, " T"]) -> float:

@@ -6,9 +6,9 @@ import dataclasses
 
 import jax
 import numpy as np
-from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from cablejax.cable import Discretisation
+from cablejax.simulate.compile import on_devices
 from cablejax.simulate.engine import Engine
 from cablejax.types import CableState
 
@@ -53,9 +53,5 @@ class DeviceParallel(Engine):
         size, width = np.shape(twist)[0], self.width
         if not 0 < size <= width:
             raise ValueError(f"The batch has {size} cables, expected 1 to {width}: {self.per_device} on each device.")
-        rows = np.minimum(np.arange(width), size - 1)
-        sharding = NamedSharding(Mesh(np.array(self.devices), ("device",)), PartitionSpec("device"))
-        inputs = (params, state, twist)
-        params, state, twist = jax.tree.map(lambda leaf: jax.device_put(np.asarray(leaf)[rows], sharding), inputs)
-        result = self.engine.rollout(params, state, twist, interval)
+        result = self.engine.rollout(*on_devices((params, state, twist), self.devices, self.per_device), interval)
         return jax.tree.map(lambda leaf: np.asarray(leaf)[:size], result)

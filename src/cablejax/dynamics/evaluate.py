@@ -13,6 +13,7 @@ import numpy as np
 from flax import nnx
 from jaxtyping import Array, Bool, Float
 
+from cablejax.arrays import rms_length
 from cablejax.dataset.windows import Window, window_at
 from cablejax.dynamics.config import ModelConfig
 from cablejax.dynamics.graph import prior_of
@@ -105,7 +106,7 @@ def make_errors(rollout: Callable[..., OneStepModel], interval: float) -> Callab
 
         def one(window):
             shape = predict(dynamics, window.history, window.twist, interval)
-            return jnp.sqrt(jnp.mean(jnp.sum((shape - window.future) ** 2, axis=-1), axis=-1))
+            return rms_length(shape - window.future)
 
         return jax.vmap(one)(windows)
 
@@ -144,7 +145,7 @@ def summarise(
 ) -> OpenLoopError:
     """Statistics of errors [m] over windows, those that `count` marks as true or all."""
     truth = np.asarray(windows.future, np.float64) - np.asarray(windows.history.keypoints[:, -1:], np.float64)
-    moved = np.sqrt(np.mean(np.sum(truth**2, axis=-1), axis=-1))
+    moved = rms_length(truth)
     count = np.ones(error.shape, bool) if count is None else count
 
     def column(h: int) -> tuple[float, ...]:

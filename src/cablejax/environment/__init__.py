@@ -8,7 +8,7 @@ try:
 except ModuleNotFoundError as error:
     raise ModuleNotFoundError("cablejax.environment needs Gymnasium: pip install 'cablejax[rl]'.") from error
 
-from cablejax.environment.cables import ShapeCableConfig
+from cablejax.environment.config import ShapeCableConfig
 from cablejax.environment.mjx_env import MjxShapeCable
 from cablejax.environment.policy import LinkPolicy
 from cablejax.environment.shape_cable import ShapeCableEnv, ShapeCableVectorEnv

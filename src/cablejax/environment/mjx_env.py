@@ -16,12 +16,13 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Float
 
+from cablejax.control.run import shape_error_cm
 from cablejax.control.targets import straight_start
 from cablejax.dataset.drawing import cable_params, draw_parameters
 from cablejax.dataset.schema import Randomisation
 from cablejax.effects.camera import without_bias
 from cablejax.effects.physics import Physics, may_touch, without_obstacle
-from cablejax.environment.cables import ShapeCableConfig, require_config
+from cablejax.environment.config import ShapeCableConfig, require_config
 from cablejax.simulate.chain.engine import ChainEngine
 from cablejax.simulate.mjx import mjx
 from cablejax.simulate.mjx_engine import MjxEngine
@@ -80,9 +81,9 @@ class MjxShapeCable:
         physics = jax.tree.map(jnp.asarray, cable_params(self._recipe, self._nominal * factors))
         target = jnp.asarray(self._targets)[jax.random.randint(choice, (), 0, len(self._targets))]
         start, zero = self._start, jnp.zeros(())
-        rng, obs, error = self._observed(
-            rng, self._true(physics, start), self._moved(physics, start, jnp.zeros((2, 3)))[1][0], start, target
-        )
+        true = self._engine.keypoints(without_bias(physics), start)
+        seen, _ = self._moved(physics, start, jnp.zeros((2, 3)))[1]
+        rng, obs, error = self._observed(rng, true, seen, start, target)
         return State(start, obs, zero, zero, {"error": error}, {"rng": rng, "physics": physics, "target": target})
 
     def step(self, state: State, action: Float[Array, " 6"]) -> State:
@@ -91,15 +92,10 @@ class MjxShapeCable:
         See `Cables.step`. A cable that diverges stays where it was, and its episode is done.
         """
         config, info, before = self.config, state.info, state.data
-        action = jnp.asarray(action, jnp.float32).reshape(2, 3)
-        share = jnp.clip(jnp.nan_to_num(action, posinf=0.0, neginf=0.0), -1.0, 1.0)
-        twist = jnp.asarray(config.scale, share.dtype) * share
-        twist = config.limits.shortened(twist, before.gripper_pose, config.interval, config.cable.length)
+        twist = config.twist(jnp.asarray(action, jnp.float32).reshape(2, 3), before.gripper_pose)
         after, (_, seen) = self._moved(info["physics"], before, twist)
-        true = self._true(info["physics"], after)
-        diverged = ~(jnp.abs(true) < config.room).all()
-        open_before, opening = self._engine.opening(before), self._engine.opening(after)
-        sound = ~diverged & ~(opening > jnp.maximum(config.widest, open_before))
+        true, diverged, torn = config.outcome(self._engine, info["physics"], before, after)
+        sound = ~diverged & ~torn
         data = jax.tree.map(lambda new, old: jnp.where(sound, new, old), after, before)
         rng, obs, error = self._observed(info["rng"], true, seen, data, info["target"])
         obs, error = jnp.where(sound, obs, state.obs), jnp.where(sound, error, state.metrics["error"])
@@ -165,12 +161,9 @@ class MjxShapeCable:
         data, shown = self._engine.unroll(known, data, twist[None], self.config.interval)
         return data, shown.keypoints
 
-    def _true(self, physics: Physics, data: CableState) -> Array:
-        return self._engine.keypoints(without_bias(physics), data)
-
     def _observed(self, rng: Array, true: Array, keypoints: Array, data: CableState, target: Array):
         """The next key, an observation of the seen keypoints [N, 2], and the error of the true ones to the target."""
-        error = jnp.sqrt(jnp.mean(jnp.sum((true - target) ** 2, axis=-1))) / self.config.cable.length
+        error = shape_error_cm(true, target) / (100.0 * self.config.cable.length)
         if noise := self.config.keypoint_noise:
             rng, own = jax.random.split(rng)
             keypoints = keypoints + noise * jax.random.normal(own, keypoints.shape)

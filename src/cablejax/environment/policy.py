@@ -11,7 +11,7 @@ from cablejax.control.controller import Controller
 from cablejax.control.link import RobotLink
 from cablejax.control.link_state import LinkConfig
 from cablejax.control.targets import Target
-from cablejax.environment.cables import ShapeCableConfig
+from cablejax.environment.config import ShapeCableConfig
 from cablejax.simulate.table_plant import Observation
 
 

@@ -14,7 +14,8 @@ from gymnasium.utils.seeding import np_random
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
-from cablejax.environment.cables import Cables, ShapeCableConfig, require_config
+from cablejax.environment.cables import Cables
+from cablejax.environment.config import ShapeCableConfig, require_config
 from cablejax.limits import require
 
 OBSERVED = ("keypoints", "gripper_pose", "target")

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from cablejax.arrays import rms_length
 from cablejax.limits import check
 from cablejax.mpc.feasible import FeasibleSet
 from cablejax.mpc.target_pose import continued, target_pose, total_turn, way_to
@@ -183,7 +184,7 @@ class ShapingProblem:
 
     def shape_error(self, keypoints: Float[Array, "*batch N 2"]) -> Float[Array, "*batch"]:
         """Root mean square distance of keypoints to the target [m]."""
-        return jnp.sqrt(jnp.mean(jnp.sum((keypoints - self.target) ** 2, axis=-1), axis=-1))
+        return rms_length(keypoints - self.target)
 
     def _weigh(self, shape_error: Float[Array, "T N 2"], motion: Float[Array, "T Q 3"]) -> Float[Array, " M"]:
         n_steps, n_keypoints = shape_error.shape[:2]

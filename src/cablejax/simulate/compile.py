@@ -1,12 +1,17 @@
-"""Compiler options and precision of simulator functions."""
+"""Compiler options and precision of simulator functions, and batches that are spread over devices."""
 
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import ParamSpec, TypeVar
 
 import jax
+import numpy as np
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+
+AXIS = "cable"
+"""Of devices, over which a batch is spread."""
 
 _Arguments = ParamSpec("_Arguments")
 _Result = TypeVar("_Result")
@@ -21,6 +26,20 @@ def compiler_options() -> dict[str, bool]:
     if jax.default_backend() == "cpu" and jax.__version_info__ < (0, 11):
         return {"xla_cpu_use_fusion_emitters": False}
     return {}
+
+
+def on_devices(
+    batch: _Result,
+    devices: Sequence[jax.Device],  # pyright: ignore[reportInvalidTypeForm]
+    each: int,
+) -> _Result:
+    """The same arrays with `each` rows on every device, filled up with copies of the last row."""
+    split = NamedSharding(Mesh(np.array(devices), (AXIS,)), PartitionSpec(AXIS))
+
+    def spread(leaf):
+        return jax.device_put(np.asarray(leaf)[np.minimum(np.arange(each * len(devices)), len(leaf) - 1)], split)
+
+    return jax.tree.map(spread, batch)
 
 
 def full_precision(function: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result]:
