@@ -7,6 +7,8 @@ import errno
 import fcntl
 import os
 import pathlib
+import shutil
+import uuid
 from collections.abc import Iterator
 from typing import BinaryIO
 
@@ -48,6 +50,19 @@ def whole_file(path: pathlib.Path) -> Iterator[BinaryIO]:
         except BaseException:
             draft.unlink(missing_ok=True)
             raise
+
+
+@contextlib.contextmanager
+def draft_folder(path: pathlib.Path) -> Iterator[pathlib.Path]:
+    """A new name next to a path, for a folder to be filled and then renamed; what is left of it in the end is removed.
+
+    It is no other's: on a file system that several machines share, their processes may have one number.
+    """
+    draft = path.parent / f".{path.name}.{uuid.uuid4().hex}.draft"
+    try:
+        yield draft
+    finally:
+        shutil.rmtree(draft, ignore_errors=True)
 
 
 def _not_truncated(name: str, _: int) -> int:

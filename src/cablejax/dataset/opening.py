@@ -5,9 +5,7 @@ from __future__ import annotations
 import importlib.metadata
 import json
 import os
-import shutil
 import tempfile
-import uuid
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
@@ -31,6 +29,7 @@ from cablejax.dataset.schema import (
 from cablejax.dataset.store import Store
 from cablejax.limits import shown
 from cablejax.text_file import differences, read_json, version_of
+from cablejax.whole_file import draft_folder
 
 PACKAGES = ("jax", "jaxlib", "mujoco", "mujoco-mjx", "numpy")
 """Packages whose versions decide the content, besides cablejax itself: those that begin a store must complete it."""
@@ -158,11 +157,11 @@ def open_or_create(path: str | os.PathLike[str] | Bucket, config: DatasetConfig)
                 place.write(f"{name}/zarr.json", descriptions[f"{name}/zarr.json"])
             store = _recorded(place, "r+")
     elif faulty:
-        draft = _draft(place, config, versions)
-        for name in faulty:  # the trajectories stay: each is checked against its digest
-            (place / name).mkdir(exist_ok=True)
-            os.replace(draft / name / "zarr.json", place / name / "zarr.json")
-        shutil.rmtree(draft)
+        with draft_folder(place) as draft:
+            _fill(draft, config, versions)
+            for name in faulty:  # the trajectories stay: each is checked against its digest
+                (place / name).mkdir(exist_ok=True)
+                os.replace(draft / name / "zarr.json", place / name / "zarr.json")
         store = _recorded(place, "r+")
     return store
 
@@ -185,13 +184,14 @@ def package_versions(packages: Sequence[str] = PACKAGES) -> dict[str, str]:
 
 def _create(path: Path, config: DatasetConfig, versions: dict[str, str]) -> None:
     """Makes the empty store under a temporary name and renames it: it appears whole, and only once."""
-    draft = _draft(path, config, versions)
-    try:
-        draft.rename(path)
-    except OSError:  # another process was first
-        shutil.rmtree(draft)
-        if not (path / "zarr.json").is_file():
-            raise
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with draft_folder(path) as draft:
+        _fill(draft, config, versions)
+        try:
+            draft.rename(path)
+        except OSError:  # another process was first
+            if not (path / "zarr.json").is_file():
+                raise
 
 
 def _create_in_bucket(bucket: Bucket, config: DatasetConfig, versions: dict[str, str]) -> None:
@@ -214,19 +214,6 @@ def _descriptions(config: DatasetConfig, versions: dict[str, str]) -> dict[str, 
         draft = Path(folder) / "draft"
         _fill(draft, config, versions)
         return {str(file.relative_to(draft)): file.read_bytes() for file in draft.rglob("zarr.json")}
-
-
-def _draft(path: Path, config: DatasetConfig, versions: dict[str, str]) -> Path:
-    """An empty store next to the place where one is wanted."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    # a name of its own: on a file system that several machines share, their processes may have one number
-    draft = path.parent / f".{path.name}.{uuid.uuid4().hex}.draft"
-    try:
-        _fill(draft, config, versions)
-    except BaseException:  # a full disk
-        shutil.rmtree(draft, ignore_errors=True)
-        raise
-    return draft
 
 
 def _fill(folder: Path, config: DatasetConfig, versions: dict[str, str]) -> None:

@@ -15,7 +15,6 @@ import importlib
 import json
 import os
 import pathlib
-import shutil
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -26,7 +25,7 @@ from cablejax.gaplog_check import SCHEMA, GapLogError
 from cablejax.limits import require
 from cablejax.text_file import read_json, write_json
 from cablejax.types import GapLog
-from cablejax.whole_file import DRAFT, whole_file
+from cablejax.whole_file import draft_folder, whole_file
 
 VERSION = "v3.0"
 """Version of the data sets' layout."""
@@ -61,11 +60,9 @@ def write_lerobot(folder: str | os.PathLike[str], log: GapLog) -> pathlib.Path:
     episodes = episodes_of(log)
     tasks = list(dict.fromkeys(log.meta["motion"]))
     columns = _columns(episodes, tasks, holds=log.hold is not None)
-    draft = folder.with_name(f"{folder.name}{DRAFT}")
-    shutil.rmtree(draft, ignore_errors=True)
-    for place in ("meta/episodes/chunk-000", "data/chunk-000"):
-        (draft / place).mkdir(parents=True)
-    try:
+    with draft_folder(folder) as draft:
+        for place in ("meta/episodes/chunk-000", "data/chunk-000"):
+            (draft / place).mkdir(parents=True)
         _write_table(arrow, draft / "data" / _FIRST, columns)
         rows = _episode_rows(columns, [len(episode.time) for episode in episodes], log.meta["motion"])
         _write_table(arrow, draft / "meta/episodes" / _FIRST, rows)
@@ -74,9 +71,6 @@ def write_lerobot(folder: str | os.PathLike[str], log: GapLog) -> pathlib.Path:
         write_json(draft / "meta/stats.json", {name: _statistics(column) for name, column in columns.items()})
         write_json(draft / _LOG, log.meta)
         draft.rename(folder)
-    except BaseException:
-        shutil.rmtree(draft, ignore_errors=True)
-        raise
     return folder
 
 
