@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from cablejax.diagnose import Calibration, explanation
-from cablejax.diagnose.actuation import actuation, with_arms
+from cablejax.diagnose.actuation import actuation
+from cablejax.diagnose.actuation_verdict import with_arms
 from cablejax.diagnose.conclude import Conclusion
 from cablejax.diagnose.fit import Fit
 from diagnose_cases import INTERVAL, MOTIONS, poses
@@ -71,8 +72,9 @@ def test_exact_arms_do_not_deviate():
 def test_a_gain_is_told(gain):
     result = told(gain=gain)
     assert set(result.effects) == {"actuation_gain"} and result.explained(2e-4)
-    value, (low, high), unit = result.effects["actuation_gain"]
-    assert value == pytest.approx(gain, abs=0.002) and low <= gain <= high and unit == ""
+    estimate = result.effects["actuation_gain"]["gain"]
+    low, high = estimate.ci90
+    assert estimate.value == pytest.approx(gain, abs=0.002) and low <= gain <= high and estimate.unit == ""
 
 
 @pytest.mark.parametrize(
@@ -81,8 +83,10 @@ def test_a_gain_is_told(gain):
 def test_a_lag_is_told_by_its_total(delay, slow):
     result = told(delay=delay, slow=slow)
     assert set(result.effects) == {"actuation_lag"} and result.explained(2e-4)
-    value, (low, high), unit = result.effects["actuation_lag"]
-    assert value == pytest.approx(delay + slow, abs=0.02) and unit == "s"
+    total, pure = (result.effects["actuation_lag"][name] for name in ("time_s", "delay_s"))
+    low, high = total.ci90
+    assert pure.value == pytest.approx(delay, abs=0.02)
+    assert total.value == pytest.approx(delay + slow, abs=0.02) and total.unit == pure.unit == "s"
     assert low - 0.01 <= delay + slow <= high + 0.01
     assert result.leftover < 0.1 * result.deviation
 
@@ -90,8 +94,8 @@ def test_a_lag_is_told_by_its_total(delay, slow):
 def test_gain_and_lag_are_told_together():
     result = told(gain=1.08, delay=0.1, slow=0.15)
     assert set(result.effects) == {"actuation_gain", "actuation_lag"} and result.explained(2e-4)
-    assert result.effects["actuation_gain"][0] == pytest.approx(1.08, abs=0.004)
-    assert result.effects["actuation_lag"][0] == pytest.approx(0.25, abs=0.02)
+    assert result.effects["actuation_gain"]["gain"].value == pytest.approx(1.08, abs=0.004)
+    assert result.effects["actuation_lag"]["time_s"].value == pytest.approx(0.25, abs=0.02)
 
 
 @pytest.mark.parametrize(("backlash", "verdict"), [(0.012, "unknown"), (0.001, "none")])

@@ -173,7 +173,8 @@ def chosen(log: GapLog, episodes: Sequence[int]) -> GapLog:
         raise GapLogError(f"The episodes {shown(numbers)} were asked for, expected increasing numbers below {total}.")
     meta = dict(log.meta)
     for name, value in log.meta.items():
-        if name == "motion" or (name not in META_FIELDS and isinstance(value, list) and len(value) == total):
+        of_cable = name in META_FIELDS or name == "guessed"
+        if name == "motion" or (not of_cable and isinstance(value, list) and len(value) == total):
             meta[name] = [value[number] for number in numbers]
     if "recordings" in log.meta:
         parts = recordings(log)

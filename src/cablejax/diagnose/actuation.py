@@ -8,29 +8,28 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from typing import Any, get_args
+from typing import Any
 
 import numpy as np
 import scipy.optimize
 from jaxtyping import Bool, Float, Int
-from scipy.special import softmax
 
-from cablejax.diagnose.belief import Calibration
-from cablejax.diagnose.conclude import Conclusion
-from cablejax.diagnose.diagnosis import PLACES, NamedEffect, ParameterEstimate, Ranked, Verdict
-from cablejax.diagnose.evidence import episodes_by_motion, student_log_likelihoods
+from cablejax.diagnose.diagnosis import ParameterEstimate
+from cablejax.diagnose.evidence import held_out_together
 from cablejax.diagnose.log_faults import integrated, scatter_of
 from cablejax.effects.arms import lagged
 from cablejax.types import ROTATION_WEIGHT
 
 # Poses are believed to this [m].
 _ENCODER_NOISE = 5e-5
-# A deviation of less than this is none [m].
-_NEGLIGIBLE = 2e-4
+NEGLIGIBLE = 2e-4
+"""A deviation of less than this is none [m]."""
 # An effect explains the arms' deviation if it leaves no more than this share of it, root mean square.
 _EXPLAINED = 0.25
 # An effect that leaves more of it than this is not named: a backlash looks like a lag, and leaves more.
 _TELLING = 0.5
+HALF_90 = 1.645
+"""Half of a normal distribution's 90 % interval, in standard deviations."""
 ARMS = ("actuation_gain", "actuation_lag")
 """Names of the effects of the arms."""
 _GAIN, _LAG = ARMS
@@ -50,7 +49,7 @@ class Actuation:
         leftover: the same after the effects.
         noise: of the measured poses [m].
         deviates: whether measured and commanded poses differ at all.
-        effects: names and parameters (value, 90 % interval, unit) of what explains the deviation, at most both.
+        effects: what explains the deviation, at most both, with the parameters of each.
         alone: what every effect that was tried leaves by itself, of poses that it was fitted to and of others [m].
         unseen: root mean square error of each episode [m] by set of effects: of poses as commanded for no effect, else
             from fits to the other motions, shape [E] each.
@@ -64,7 +63,7 @@ class Actuation:
     leftover: float = 0.0
     noise: float = 0.0
     deviates: bool = False
-    effects: dict[str, tuple[float, tuple[float, float], str]] = dataclasses.field(default_factory=dict)
+    effects: dict[str, dict[str, ParameterEstimate]] = dataclasses.field(default_factory=dict)
     alone: dict[str, tuple[float, float]] = dataclasses.field(default_factory=dict)
     unseen: dict[tuple[str, ...], Float[np.ndarray, "E"]] = dataclasses.field(default_factory=dict)
 
@@ -145,8 +144,11 @@ class _Arms:
         )
 
     def unseen(self, effects: tuple[str, ...], theta, motion: Int[np.ndarray, "E"]) -> Float[np.ndarray, "E T 2 3"]:
-        """Poses of each motion from a fit without it, begun at the fit of all; from that where there is one motion."""
-        result, groups = self.predicted(effects, theta), episodes_by_motion(motion)
+        """Poses of each motion from a fit without it, begun at the fit of all; from that where there is one motion.
+
+        Of many motions, several are left out together.
+        """
+        result, groups = self.predicted(effects, theta), held_out_together(motion)
         for group in groups if len(groups) > 1 else ():
             rest = self.chosen(np.setdiff1d(np.arange(len(motion)), group))
             inside = np.clip(theta, [1e-3] * len(theta), [2.9] * len(theta))
@@ -187,7 +189,7 @@ def actuation(
     deviation = arms.rms(arms.commanded)
     count, noise = 6 * valid.sum(axis=1), max(arms.noise, _ENCODER_NOISE)
     nothing = Actuation(count, motion, arms.commanded, arms.commanded, deviation, deviation, noise)
-    if deviation < _NEGLIGIBLE:
+    if deviation < NEGLIGIBLE:
         return nothing
 
     lags = [[0.1, 0.05], [0.02, 0.2], [0.4, 0.2]]
@@ -213,76 +215,20 @@ def actuation(
     return dataclasses.replace(tried, effects=named, leftover=left[best], predicted=np.where(whole, unseen[best], pose))
 
 
-def with_arms(conclusion: Conclusion, arms: Actuation, calibration: Calibration) -> Conclusion:
-    """Adds what the encoders show to what the keypoints show."""
-    if not arms.deviates:
-        return conclusion
-    of_set = _chances(arms, calibration)
-    named = tuple(
-        NamedEffect(
-            name=name,
-            probability=sum(chance for effects, chance in of_set.items() if name in effects),
-            parameters={key: ParameterEstimate(value, (float(ci[0]), float(ci[1])), unit)},
-            location=dict.fromkeys(PLACES),
-        )
-        for name, (value, ci, unit) in arms.effects.items()
-        for key in ("gain" if name == _GAIN else "time_s",)
-    )
-    among_singles = sum(of_set[name,] for name in arms.alone)
-    ranked = [
-        Ranked(
-            name,
-            of_set[name,] / among_singles,
-            float(np.clip(1 - (unseen / arms.deviation) ** 2, -1.0, 1.0)),
-            1e3 * left,
-        )
-        for name, (left, unseen) in arms.alone.items()
-    ]
-    changed: dict[Verdict, Verdict] = {}
-    if named and arms.explained(calibration.smallest_gap(0.0)):
-        changed = {"none": "named", "unknown": "named+unknown"}
-    elif named:
-        changed = dict.fromkeys(get_args(Verdict), "named+unknown")
-    elif arms.strays(calibration.smallest_gap(0.0)):
-        changed = {"none": "unknown", "named": "named+unknown", "ambiguous": "named+unknown"}
-    share = 1 - (arms.leftover / arms.deviation) ** 2
-    return dataclasses.replace(
-        conclusion,
-        verdict=changed.get(conclusion.verdict, conclusion.verdict),
-        effects=(*named, *conclusion.effects),
-        ranking=tuple(sorted([*ranked, *conclusion.ranking], key=lambda r: -(r.probability or 0.0))),
-        explained=share if conclusion.verdict == "none" else conclusion.explained,
-    )
-
-
-def _chances(arms: Actuation, calibration: Calibration) -> dict[tuple[str, ...], float]:
-    """Probability of every set of effects of the arms.
-
-    By the rule of `belief`: likelihoods of held-out motions, tempered for errors of the arms' laws, and a cost for
-    every effect.
-    """
-    calibration = dataclasses.replace(calibration, baseline=_NEGLIGIBLE)
-    temper = calibration.temper(arms.unseen[()], arms.noise, arms.count)
-    scores = [
-        student_log_likelihoods(
-            arms.count * ((error / arms.noise) ** 2 - 1.0) / temper, calibration.freedom, arms.motion
-        ).sum()
-        - calibration.term_cost * len(effects)
-        for effects, error in arms.unseen.items()
-    ]
-    return dict(zip(arms.unseen, softmax(scores).tolist(), strict=True))
-
-
-def _named(effects: tuple[str, ...], result: Any, scale: float) -> dict[str, tuple[float, tuple[float, float], str]]:
-    """Value, 90 % interval and unit of every effect of a fit."""
+def _named(effects: tuple[str, ...], result: Any, scale: float) -> dict[str, dict[str, ParameterEstimate]]:
+    """The parameters of every effect of a fit, with 90 % intervals."""
     # residuals of one motion are far from independent: a hundred samples count as one
     covariance = 100.0 * scale**2 * np.linalg.pinv(result.jac.T @ result.jac)
-    named = {}
+
+    def estimate(weights: np.ndarray, unit: str, share: float = 0.0) -> ParameterEstimate:
+        """Of a sum of the fit's values, which is good to a share of it at best."""
+        value = float(weights @ result.x)
+        half = HALF_90 * float(np.sqrt(weights @ covariance @ weights)) + share * value
+        return ParameterEstimate(value, (max(value - half, 0.0), value + half), unit)
+
+    each, named = np.eye(len(result.x)), {}
     if _GAIN in effects:
-        half = 1.645 * float(np.sqrt(covariance[0, 0]))
-        named[_GAIN] = (float(result.x[0]), (result.x[0] - half, result.x[0] + half), "")
+        named[_GAIN] = {"gain": estimate(each[0], "")}
     if _LAG in effects:
-        total = float(result.x[-2:].sum())
-        half = 1.645 * float(np.sqrt(covariance[-2:, -2:].sum())) + 0.01 * total
-        named[_LAG] = (total, (max(total - half, 0.0), total + half), "s")
+        named[_LAG] = {"time_s": estimate(each[-2] + each[-1], "s", 0.01), "delay_s": estimate(each[-2], "s")}
     return named

@@ -48,6 +48,7 @@ class Case:
     Attributes:
         recording: the log after checks and repairs.
         config: the nominal cable at the resolution of the fits.
+        effects: that may be at work, as they were given: the simulator's are where the recording is.
         arms: how the grippers followed their commands.
         noise: floor of the recording.
         scatter: what was taken from the gripper poses so that they are smooth [m, m, rad], shape [2, 3].
@@ -59,6 +60,7 @@ class Case:
 
     recording: Recording
     config: Discretisation
+    effects: Sequence[CableEffect]
     arms: Actuation
     noise: NoiseFloor
     scatter: Float[np.ndarray, "2 3"]
@@ -86,7 +88,7 @@ class Case:
             recording.gripper_command if recording.has_commands else None,
             recording.interval,
             recording.length,
-            repeated_motions(recording.gripper_pose, log.meta["cable"]["length_m"]),
+            repeated_motions(recording.motion, log.meta["cable"]["length_m"]),
             recording.commanded,
         )
         pose, scatter = _steadied(recording.gripper_pose, recording, arms)
@@ -127,6 +129,7 @@ class Case:
         return cls(
             recording=recording,
             config=config,
+            effects=effects,
             arms=arms,
             noise=noise,
             scatter=scatter,
@@ -218,7 +221,7 @@ class Case:
     @property
     def motion(self) -> Int[np.ndarray, "E"]:
         """Episodes with the same number repeat one another."""
-        return repeated_motions(self.recording.gripper_pose, self.config.cable.length)
+        return repeated_motions(self.recording.motion, self.config.cable.length)
 
     def to_log(self, keypoints: Float[np.ndarray, "E T N 2"]) -> Float[np.ndarray, "E T1 N 2"]:
         """NaN beyond an episode's end, and as long as the log."""

@@ -28,7 +28,7 @@ def usual_interval(time: Float[np.ndarray, "T"]) -> float:
     """Of an episode of at least two samples [s]: the mean, or the median where some are lost."""
     step = np.diff(time)
     mean, median = float(step.mean()), float(np.median(step))
-    return float(np.round(mean if step.max() <= _GAP * median else median, 6))
+    return float(np.round(mean if step.max() <= _GAP * median else median, 9))
 
 
 def furthest_off(time: Float[np.ndarray, "T"], interval: float) -> float:

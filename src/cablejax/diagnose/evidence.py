@@ -16,6 +16,8 @@ from cablejax.diagnose.protocol import Explanation, Simulator
 
 _ALIKE = 0.05
 """Motions whose gripper poses differ by less than this share of the cable's length, root mean square, are one."""
+_FOLDS = 6
+"""Parts of the episodes that are held out one after the other, at most."""
 _ARM = 0.15
 """Share of the cable's length that a radian of a gripper counts for there."""
 
@@ -141,12 +143,13 @@ def repeated_motions(gripper_pose: Float[np.ndarray, "E T 2 3"], length: float) 
         length: of the cable [m].
     """
     place = gripper_pose * np.array([1.0, 1.0, _ARM * length])
-    first = np.arange(len(place))
+    first, samples = np.arange(len(place)), np.isfinite(place).all(axis=(2, 3)).sum(axis=1)
     for e in range(1, len(place)):
         square = ((place[:e] - place[e]) ** 2).sum(axis=(2, 3))
         common = np.isfinite(square)
         mean = np.where(common, square, 0.0).sum(axis=1) / np.maximum(common.sum(axis=1), 1)
-        alike = np.flatnonzero((mean < (_ALIKE * length) ** 2) & (2 * common.sum(axis=1) > common.shape[1]))
+        half = np.maximum(samples[:e], samples[e]) / 2
+        alike = np.flatnonzero((mean < (_ALIKE * length) ** 2) & (common.sum(axis=1) > half))
         if len(alike):
             first[e] = first[alike[0]]
     return first
@@ -155,6 +158,13 @@ def repeated_motions(gripper_pose: Float[np.ndarray, "E T 2 3"], length: float) 
 def episodes_by_motion(motion: Int[np.ndarray, "E"]) -> list[Int[np.ndarray, "_"]]:
     """The episodes of each motion, in the order of their numbers."""
     return [np.flatnonzero(motion == first) for first in np.unique(motion)]
+
+
+def held_out_together(motion: Int[np.ndarray, "E"]) -> list[Int[np.ndarray, "_"]]:
+    """Parts of the episodes, as large as each other, each to be held out by a fit to the others; by whole motions."""
+    motions = episodes_by_motion(motion)
+    folds = np.array_split(np.arange(len(motions)), min(len(motions), _FOLDS))
+    return [np.sort(np.concatenate([motions[i] for i in fold])) for fold in folds]
 
 
 def share_of_motion(motion: Int[np.ndarray, "E"]) -> Float[np.ndarray, "E"]:

@@ -7,14 +7,13 @@ from jaxtyping import Float, Int
 
 from cablejax.diagnose.belief import level
 from cablejax.diagnose.diagnosis import Gap
-from cablejax.diagnose.evidence import Evidence, episodes_by_motion
+from cablejax.diagnose.evidence import Evidence, episodes_by_motion, held_out_together
 from cablejax.diagnose.fit import Fit, evaluate, improve
 from cablejax.diagnose.protocol import Plan
 from cablejax.diagnose.search import without_one
 
 _HORIZONS = (1.0, 2.0, 5.0, 10.0)
 _FOLD_STEPS = 2
-_FOLDS = 6
 # Nats that an effect must be worth on the other episodes to be used on one that no fit has seen.
 _WORTH = 2.0
 _DRAWS = 1000
@@ -34,12 +33,11 @@ def held_out_predictions(evidence: Evidence, best: Fit) -> tuple[Float[np.ndarra
         return result, tuple(range(n_episodes))
     if not best.explanation.terms or len(motions) == 1:
         return evidence.predict([best.explanation])[0], tuple(range(n_episodes)) if len(motions) > 1 else ()
-    folds = np.array_split(np.arange(len(motions)), min(len(motions), _FOLDS))
-    groups = [sorted(int(e) for i in fold for e in motions[i]) for fold in folds]
+    groups = held_out_together(evidence.motion)
     # the sums of a fit are those of its episodes: what is left out needs no simulation of its own
     simpler, chosen = evaluate(evidence, without_one(best.explanation)), []
     for group in groups:
-        rows = np.array([e for e in range(n_episodes) if e not in group])
+        rows = np.setdiff1d(np.arange(n_episodes), group)
         rest, whole = evidence.restricted(rows), best.restricted(rows)
         (fit,) = improve(rest, [whole], _FOLD_STEPS, tolerance=Plan.tolerance)
         least = min((other.restricted(rows) for other in simpler), key=lambda other: other.cost(rest))
@@ -78,9 +76,12 @@ def measure_gap(
     """
     observed, floor = evidence.observed, level(evidence)
     inner = tuple(range(1, observed.ndim))
+    # a simulation that breaks down explains nothing from there on
+    before = np.where(np.isfinite(before), before, np.nan)
+    after = np.where(np.isfinite(before) & np.isfinite(after), after, before)
 
     def squares(simulated, until=np.inf):
-        early = (np.arange(observed.shape[1])[None] * interval[:, None]) <= until
+        early = np.arange(observed.shape[1])[None] <= until / interval[:, None] + 0.5
         difference = np.where(early.reshape(*early.shape, *[1] * (observed.ndim - 2)), simulated - observed, np.nan)
         return np.nansum(difference**2, axis=inner), np.isfinite(difference).sum(axis=inner)
 
@@ -91,7 +92,7 @@ def measure_gap(
     (b, count), (a, _) = squares(before), squares(after)
     noise = floor**2 * count
     ratio, interval90 = shrinkage(b - noise, a - noise, evidence.motion) if resolvable else (None, None)
-    whole = float(np.round((interval * (length - 1)).max(), 3))
+    whole = float(f"{(interval * (length - 1)).max():.6g}")
     return Gap(
         horizon_s=whole,
         before_rmse_mm=1e3 * rmse(before),

@@ -91,11 +91,11 @@ def inert_effects(simulator: Simulator, observed: Float[np.ndarray, "E T *O"], n
         for start in simulator.starts(effect, nominal, observed - nominal)
     ]
     predicted = np.asarray(simulator.predict(begun, np.arange(len(observed))), float) if begun else np.zeros(0)
-    caveats = []
+    seen, caveats = np.isfinite(observed), []
     for effect in simulator.effects:
         own = [k for k, one in enumerate(begun) if one.names == (effect.name,)]
-        finite = [k for k in own if np.isfinite(predicted[k]).all()]
-        if not own or any((predicted[k] != nominal).any() for k in finite):
+        finite = [k for k in own if np.isfinite(predicted[k][seen]).all()]
+        if not own or any((predicted[k] != nominal)[seen].any() for k in finite):
             continue
         values = ", ".join(
             f"{p.name} = {v:g}" for p, v in zip(effect.parameters, begun[own[-1]].values()[0], strict=True)

@@ -47,7 +47,7 @@ class Length(Reading):
     def apart(self) -> str:
         """In words: how far apart keypoints are."""
         word = "closer together" if self.ratio < 1 else "further apart"
-        return f"{100 * abs(self.ratio - 1):.1f} % {word} than the stated arc lengths, in every episode"
+        return f"{100 * abs(self.ratio - 1):.1f} % {word} than the stated arc lengths, in every episode that shows it"
 
     @property
     def assumes(self) -> str:
@@ -70,14 +70,14 @@ class Length(Reading):
 
 
 def other_length(case: Case, log: GapLog) -> Length | None:
-    """The length that the keypoints suggest, if it differs from the stated one in every episode in the same direction.
+    """The length that the keypoints suggest, if it differs from the stated one in the same direction wherever they do.
 
     Args:
         case: of the log.
         log: with the stated length.
     """
     ratio = _closeness(case)
-    if np.abs(ratio - 1).min() <= _OFF or np.ptp(np.sign(ratio - 1)) > 0:
+    if not len(ratio) or np.abs(ratio - 1).min() <= _OFF or np.ptp(np.sign(ratio - 1)) > 0:
         return None
     stated = float(log.meta["cable"]["length_m"])
     measured = stated * float(ratio.mean())
@@ -86,13 +86,13 @@ def other_length(case: Case, log: GapLog) -> Length | None:
     other = dataclasses.replace(log, meta=log.meta | {"cable": cable, "keypoint_arclength_m": marks})
     try:
         settling = case.simulator.playback.settling
-        return Length(other, Case.of(other, case.simulator.effects, settling=settling), stated, measured)
+        return Length(other, Case.of(other, case.effects, settling=settling), stated, measured)
     except DiagnosisError:
         return Length(other, None, stated, measured)
 
 
 def _closeness(case: Case) -> np.ndarray:
-    """Distance of neighbouring keypoints over that of the nominal cable's, median of each episode; 1 if not seen.
+    """Distance of neighbouring keypoints over that of the nominal cable's, median of each episode that shows it.
 
     Where the nominal cable is bent so much between two keypoints that these are far closer than along it, they say
     nothing of the length.
@@ -103,4 +103,4 @@ def _closeness(case: Case) -> np.ndarray:
     marks = case.config.cable.keypoint_arclength + case.simulator.playback.believed.bias_along
     stretched = nominal > _STRETCHED * np.diff(marks)
     ratio = np.where(stretched, seen / np.where(stretched, nominal, 1.0), np.nan)
-    return np.array([np.median(one[np.isfinite(one)]) if np.isfinite(one).any() else 1.0 for one in ratio])
+    return np.array([np.median(one[np.isfinite(one)]) for one in ratio if np.isfinite(one).any()])

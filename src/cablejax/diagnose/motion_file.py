@@ -13,7 +13,7 @@ from jaxtyping import Float
 from cablejax.cable import Cable
 from cablejax.cable_file import cable_of_log
 from cablejax.diagnose.diagnosis import NextMotion
-from cablejax.gaplog import Episode, gap_log_from_episodes, write_gap_log
+from cablejax.gaplog import TARGETS, Episode, gap_log_from_episodes, write_gap_log
 from cablejax.gaplog_join import COMMANDS_DERIVED, EPISODE_LABELS
 from cablejax.types import GapLog
 from cablejax.whole_file import whole_file
@@ -50,7 +50,7 @@ def commands_log(motions: Mapping[str, Float[np.ndarray, "T 2 3"]], interval: fl
 def motion_log(following: NextMotion, log: GapLog) -> GapLog:
     """The next motion as a gap log without keypoints, of the cable in the log that was diagnosed."""
     commands = commands_log({following.motion: following.poses}, following.interval, cable_of_log(log))
-    not_its_own = ("motion", "source", "recordings", COMMANDS_DERIVED, *EPISODE_LABELS)
+    not_its_own = ("motion", "source", "recordings", TARGETS, COMMANDS_DERIVED, *EPISODE_LABELS)
     kept = {name: value for name, value in log.meta.items() if name not in not_its_own}
     return dataclasses.replace(commands, meta={**commands.meta, **kept})
 

@@ -22,6 +22,8 @@ _LONG = 300
 _RESTLESS = 4.0
 # First-order noise has the measured correlations to this; a cable that creeps in its holds does not.
 _LIKE_FIRST_ORDER = 0.05
+# Single precision has about as many digits.
+_DIGITS = 7
 # A keypoint counts as noisier than the others beyond this many standard errors.
 _DISTINCT = 4.0
 
@@ -87,6 +89,7 @@ def noise_floor(
             f"or 20 times more than {order} in an episode."
         )
     common = float(np.average(variance, weights=np.maximum(count, 1e-9)))
+    smallest = max(smallest, _rounding(keypoints))
     common, variance = max(common, smallest**2), np.maximum(variance, smallest**2)
     if not common > 0:
         raise ValueError("The observations have no noise that could be estimated: say how large it is.")
@@ -96,6 +99,13 @@ def noise_floor(
     return NoiseFloor(
         std=std, correlation=correlation, from_holds=from_holds, rapid=math.sqrt(level), restless=restless
     )
+
+
+def _rounding(keypoints) -> float:
+    """Root mean square of what is lost where a tracker reports whole pixels or millimetres; hardly anything else."""
+    seen = keypoints[np.isfinite(keypoints)]
+    steps = np.diff(np.unique(np.round(seen / np.abs(seen).max(initial=1e-9), _DIGITS)))
+    return float(np.abs(seen).max() * steps.min()) / math.sqrt(12.0) if len(steps) else 0.0
 
 
 def still(hold: Bool[np.ndarray, "E T"], gripper_pose: Float[np.ndarray, "E T 2 3"]) -> Bool[np.ndarray, "E T"]:

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from cablejax.diagnose.actuation import with_arms
+from cablejax.diagnose.actuation_verdict import with_arms
 from cablejax.diagnose.belief import Calibration, excess, excused
 from cablejax.diagnose.case import FINE_LINKS, FIT_LINKS, STATED, Case
 from cablejax.diagnose.conclude import Conclusion, sentence

@@ -71,8 +71,9 @@ def over_laws(
     if not others:
         return own
     parts = [drawn[: round(len(own) * probability)] for probability, drawn in others]
-    rest = len(own) - sum(map(len, parts))
-    return np.random.default_rng(0).permutation(np.concatenate([own[:rest], *parts]))
+    rest = max(len(own) - sum(map(len, parts)), 0)
+    # shares that were rounded up may be one more together
+    return np.random.default_rng(0).permutation(np.concatenate([own[:rest], *parts]))[: len(own)]
 
 
 def posterior(

@@ -96,7 +96,7 @@ def held(case: Case, log: GapLog, calibration: Calibration) -> Held | None:
     if max(float(np.sqrt(np.mean(one**2) / 2)) for one in off) <= smallest:
         return None
     try:
-        unsettled = Case.of(log, case.simulator.effects, settling=0.0)
+        unsettled = Case.of(log, case.effects, settling=0.0)
     except DiagnosisError:
         return None
     return Held(log, unsettled, max(float(one.max()) for one in off))

@@ -63,6 +63,12 @@ class Recording:
             np.abs(self.gripper_command).any() or np.ptp(self.gripper_pose[self.commanded], axis=1).max() <= 1e-3
         )
 
+    @property
+    def motion(self) -> Float[np.ndarray, "E T 2 3"]:
+        """The gripper poses, NaN beyond an episode's end."""
+        recorded = np.arange(self.gripper_pose.shape[1])[None] < np.asarray(self.length)[:, None]
+        return np.where(recorded[:, :, None, None], self.gripper_pose, np.nan)
+
     def as_log(self, meta: dict[str, Any]) -> GapLog:
         """The log after repairs, without the padding."""
         longest = int(self.length.max())

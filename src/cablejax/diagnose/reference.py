@@ -9,13 +9,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from cablejax.diagnose.clock import keypoints_at
 from cablejax.diagnose.recording import Recording
+from cablejax.poses import positions_at
 from cablejax.residual.learner import PAPER
 from cablejax.residual.ridge import RidgeConfig, apply, fit
 
 HORIZON = 5
 """Steps that the residual is carried on."""
-_STEP = 1.0
+_STEP = 1.0  # [s]
 _RIDGE = RidgeConfig()
 
 
@@ -37,16 +39,15 @@ def predicted_ahead(
     """
     alone, corrected = [], []
     for e in range(len(observed)):
-        stride = max(1, round(_STEP / float(interval[e])))
-        samples = slice(0, int(length[e]), stride)
-        error = observed[e, samples] - simulated[e, samples]
-        pose = gripper_pose[e, samples]
-        twist = np.diff(pose, axis=0) / (stride * float(interval[e]))
-        delta = np.diff(error, axis=0)
-        window = PAPER.window
-        n_starts = len(delta) - window - HORIZON + 1
+        recorded, window = slice(0, int(length[e])), PAPER.window
+        time = float(interval[e]) * np.arange(int(length[e]))
+        grid = _STEP * np.arange(int(time[-1] / _STEP + 1e-6) + 1)
+        n_starts = len(grid) - window - HORIZON
         if n_starts < 1:
             continue
+        error = keypoints_at(grid, time, observed[e, recorded] - simulated[e, recorded], float(interval[e]))
+        twist = np.diff(positions_at(grid, time, gripper_pose[e, recorded]), axis=0) / _STEP
+        delta = np.diff(error, axis=0)
         past = np.arange(n_starts)[:, None] + np.arange(window)
         ahead = window + np.arange(n_starts)[:, None] + np.arange(HORIZON)
         guess = np.asarray(_carried()(delta[past], twist[past], np.isfinite(delta[past]).all(axis=-1), twist[ahead]))

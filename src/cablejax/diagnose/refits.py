@@ -35,6 +35,8 @@ def refitted(evidence: Evidence, fits: Sequence[Fit]) -> list[Fit]:
         return list(fits)
     several = len(np.unique(evidence.motion)) > 1
     part_of = dealt(evidence.motion if several else evidence.episodes, plan.parts)
+    if not part_of.any():  # one episode: nothing can be left out
+        return list(fits)
     result = list(fits)
     sse, ended, left_out = [np.zeros(len(part_of)) for _ in todo], [[] for _ in todo], []
     for part in range(part_of.max() + 1):

@@ -223,8 +223,15 @@ def _effect(effect: NamedEffect) -> dict[str, Any]:
 
 def _gap(gap: Gap, *, blamed: bool) -> dict[str, Any]:
     metres = gap.unit == "m"
-    after = gap.after_rmse_mm if blamed else gap.before_rmse_mm
-    sizes = {"before_rmse": gap.before_rmse_mm, "noise_floor": gap.noise_floor_mm, "after_rmse": after}
+    if not blamed:  # what explains best is not added to the simulator
+        unexplained = (gap.split["unexplained"] or 0.0) + (gap.split["named"] or 0.0)
+        gap = dataclasses.replace(
+            gap,
+            after_rmse_mm=gap.before_rmse_mm,
+            horizons_mm={seconds: (before, before) for seconds, (before, _) in gap.horizons_mm.items()},
+            split=gap.split | {"named": 0.0, "unexplained": unexplained},
+        )
+    sizes = {"before_rmse": gap.before_rmse_mm, "noise_floor": gap.noise_floor_mm, "after_rmse": gap.after_rmse_mm}
     return {
         "horizon_s": gap.horizon_s,
         **{f"{name}_mm": size if metres else None for name, size in sizes.items()},

@@ -7,7 +7,7 @@ Two kinds of test, since each sees what the other cannot. Against the noise floo
 of the whitened residuals, corrected for their correlation in time and by Holm (1979) for the number of episodes.
 Between parts of the cable and between regimes: signs of per-episode contrasts are flipped together (episodes are the
 independent unit), and a contrast is held against the largest of all that are looked at (Westfall and Young 1993).
-Flipping the signs of E episodes cannot give less than 2^-E: fewer than 6 episodes never make a contrast significant.
+Flipping the signs of E episodes cannot give less than 2 / 2^E: fewer than 6 episodes never make a contrast significant.
 """
 
 from __future__ import annotations
@@ -125,7 +125,8 @@ def localise(log: GapLog, nominal: Float[np.ndarray, "E T N 2"], noise: Float[np
         contrasts=_contrasts(residual, noise, squared, regimes, motion),
         regime_masks=regimes.masks,
     )
-    sentences = describe(where, np.asarray(log.meta["keypoint_arclength_m"]), noise)
+    arclength, motions = np.asarray(log.meta["keypoint_arclength_m"]), len(np.unique(motion))
+    sentences = describe(where, arclength, noise, motions=motions)
     return dataclasses.replace(where, sentences=sentences)
 
 

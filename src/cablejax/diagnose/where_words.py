@@ -20,7 +20,11 @@ _FRAME_SHARE = 0.7
 
 
 def describe(
-    where: Where, arclength: np.ndarray, noise: np.ndarray, names: Sequence[str] | None = None
+    where: Where,
+    arclength: np.ndarray,
+    noise: np.ndarray,
+    names: Sequence[str] | None = None,
+    motions: int | None = None,
 ) -> tuple[str, ...]:
     """Two to five sentences for a lab engineer.
 
@@ -28,11 +32,12 @@ def describe(
         where: the numbers; its own sentences are not read. Where nothing was tested, the sentences give sizes only.
         arclength: of the keypoints [m].
         noise: standard deviation of each keypoint's coordinates [m].
-        names: what to call each episode; by default "episode 1" and so on.
+        names: what to call each episode; by default "episode 0" and so on.
+        motions: how many of the episodes repeat no other; by default all.
     """
     floor = 1e3 * float(np.sqrt((noise**2).mean()))
     total = len(where.per_episode_mm)
-    names = names or [f"episode {e + 1}" for e in range(total)]
+    names = names or [f"episode {e}" for e in range(total)]
     if where.episode_p is None or where.keypoint_p is None:
         return (_size(where, None, floor, names), *_along(where, arclength), *_when(where), *_frame(where))[:5]
     shown = [e for e in range(total) if where.episode_p[e] < LEVEL]
@@ -42,10 +47,11 @@ def describe(
             f"A gap of {_mm(max(where.smallest_mm, 0.01))} or more over the whole log would have shown.",
         )
     sentences = [_size(where, shown, floor, names), *_along(where, arclength), *_when(where), *_frame(where)]
-    if total >= 6:
+    motions = total if motions is None else motions
+    if motions >= 6:
         return tuple(sentences[:5])
-    episodes = f"{total} episode{'' if total == 1 else 's'}"
-    few = f"With {episodes} no comparison between regimes can be tested at the 5 % level: six are needed."
+    recorded = f"{motions} {'episode' if motions == total else 'different motion'}{'' if motions == 1 else 's'}"
+    few = f"With {recorded} no comparison between regimes can be tested at the 5 % level: six are needed."
     return (*sentences[:4], few)
 
 
@@ -56,7 +62,7 @@ def _size(where: Where, shown: list[int] | None, floor: float, names: Sequence[s
     if shown is not None and not shown:
         return f"{size}, too small to show in any single episode."
     if shown is not None and len(shown) < total:
-        numbers = listed([str(e + 1) for e in shown])
+        numbers = listed([str(e) for e in shown])
         return f"{size}; it shows in {'episode' if len(shown) == 1 else 'episodes'} {numbers} of {total} only."
     if total == 1:
         return f"{size}, in the one episode."

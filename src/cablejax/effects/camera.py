@@ -13,6 +13,7 @@ from cablejax.effects.arms import delayed
 from cablejax.effects.base import CableEffect
 from cablejax.effects.effect import Parameter
 from cablejax.effects.physics import Physics
+from cablejax.limits import LIMITS
 
 
 class CameraSimilarity(CableEffect):
@@ -112,7 +113,7 @@ class KeypointBias(CableEffect):
     null = (0.0,)
     amplitude, reversible = 0, True
     side = "observation"
-    variants = tuple(range(128))
+    variants = tuple(range(2 * int(LIMITS["keypoints"].high)))
     variant_name = "index"
     repeatable = True
 

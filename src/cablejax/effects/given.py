@@ -21,6 +21,8 @@ EFFECTS: Mapping[str, CableEffect] = {effect.name: effect for effect in (*LIBRAR
 """Every effect by its name in the gap log's format."""
 
 # Parameters that say which: a gripper, a keypoint, a direction.
+_ROUNDED = 1e-5
+"""Beyond a bound by this share of the distance between both is at it."""
 _CHOICES = frozenset({"index", "across", *(effect.variant_name for effect in EFFECTS.values())})
 
 
@@ -96,10 +98,14 @@ class GivenEffect:
         if variant not in self.effect.variants:
             known = shown(list(self.effect.variants))
             raise ValueError(f"{self.name}: {self.effect.variant_name} is {variant}, expected one of {known}.")
+        bounded = []
         for parameter, value in zip(self.effect.parameters, values, strict=True):
-            if not parameter.low * (1 - 1e-9) <= value <= parameter.high:
+            # verdicts round what they found at a bound
+            slack = _ROUNDED * (parameter.high - parameter.low)
+            if not parameter.low - slack <= value <= parameter.high + slack:
                 raise ValueError(f"{self.name}: {self._out_of_bounds(parameter, value, variant, chain)}")
-        return self.effect.apply(physics, [np.float32(v) for v in values], variant, chain)
+            bounded.append(np.float32(min(max(value, parameter.low), parameter.high)))
+        return self.effect.apply(physics, bounded, variant, chain)
 
     def _out_of_bounds(self, parameter: Parameter, value: float, variant: int, chain: Discretisation) -> str:
         """What a parameter is and may be, by the name and in the unit in which it was given."""

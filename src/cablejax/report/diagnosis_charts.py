@@ -95,7 +95,7 @@ def shrinkage_figure(diagnosis: CableDiagnosis) -> Figure:
         if gap.ahead_mm:
             label = "cause\nadded" if diagnosis.effects else "best found\nadded"
             _ahead(figure.add_subplot(grid[0, 1]), gap.ahead_mm, believed, label if explained else None)
-        _split_bar(figure.add_subplot(grid[1, :]), gap.split)
+        _split_bar(figure.add_subplot(grid[1, :]), gap.split, named=bool(diagnosis.effects))
         figure.legend(*ax.get_legend_handles_labels(), loc="outside upper left", ncols=3)
     return figure
 
@@ -121,11 +121,12 @@ def _ahead(ax: Axes, errors: dict[str, float], believed: str, label: str | None)
     ax.set_title("5 s ahead, from an observation")
 
 
-def _split_bar(ax: Axes, split: dict[str, float | None]) -> None:
-    """Parts of the squared error before."""
+def _split_bar(ax: Axes, split: dict[str, float | None], *, named: bool) -> None:
+    """Parts of the squared error before; without effects that are named, what the best explanation would take away."""
     begin = 0.0
     for key, label, colour in _SPLIT:
         share = split.get(key) or 0.0
+        label = "best found, not named" if key == "named" and not named else label
         if share >= 5e-3:
             ax.barh(0, share, left=begin, color=colour, height=0.6, label=f"{label} {100 * share:.0f} %")
             begin += share

@@ -59,7 +59,7 @@ def cable_figure(diagnosis: CableDiagnosis) -> Figure:
         figure = Figure(
             figsize=(10.0, 0.9 + (7.2 if enlarged else 9.6) * min(max(height / width, 0.3), 0.6)), layout="constrained"
         )
-        figure.suptitle(f"Episode {episode + 1}, {log.time[episode, sample]:.1f} s", x=0.0, ha="left", fontsize=11)
+        figure.suptitle(f"Episode {episode}, {log.time[episode, sample]:.1f} s", x=0.0, ha="left", fontsize=11)
         if enlarged:
             ax, zoom = figure.subplots(1, 2, width_ratios=[7.4, 2.6])
             views = [(ax, 1.0), (zoom, 1.6)]
@@ -119,7 +119,7 @@ def where_figure(diagnosis: CableDiagnosis) -> Figure:
                 interpolation="nearest",
             )  # fmt: skip
             _mark_holds(ax, diagnosis, int(e), arclength[-1] + half)
-            ax.set_title(f"Episode {e + 1}: {where.per_episode_mm[e]:.1f} mm", fontsize=10)
+            ax.set_title(f"Episode {e}: {where.per_episode_mm[e]:.1f} mm", fontsize=10)
             ax.tick_params(labelleft=index % columns == 0)
             if index % columns == 0:
                 ax.set_ylabel("along\ncable [m]", fontsize=9)

@@ -67,8 +67,8 @@ def alike(diagnosis: CableDiagnosis) -> list[tuple[list[str], list[str]]]:
 def under_other_laws(diagnosis: Diagnosis) -> list[str]:
     """What the verdict would be by each other law of the simulator, in words."""
     return [
-        f"If {law.assumes}, {_verdict_under(law)}. Compared with the simulator as believed, that law has a probability "
-        f"of {share(law.probability)} on this log; the intervals cover both."
+        f"If {law.assumes}, {_verdict_under(law)}. Among all laws that were tried, that one has a probability of "
+        f"{share(law.probability)} on this log; the intervals cover those by which the same effects are found."
         for law in diagnosis.under_laws
     ]
 
@@ -150,7 +150,7 @@ def how_far(diagnosis: CableDiagnosis) -> str:
             f"{millimetres(gap.after_rmse_mm)} with {added}."
         )
     else:
-        held = [str(e + 1) for e in gap.held_out_episodes]
+        held = [str(e) for e in gap.held_out_episodes]
         word = "episode" if len(held) == 1 else "episodes"
         named = f"{word} {listed(held)}" if len(held) <= _LISTED else f"{len(held)} {word}"
         interval = ""

@@ -1,0 +1,93 @@
+"""What the encoders show of the arms, added to what the keypoints show of the cable."""
+
+from __future__ import annotations
+
+import dataclasses
+import operator
+from typing import get_args
+
+import numpy as np
+from scipy.special import softmax
+
+from cablejax.diagnose.actuation import HALF_90, NEGLIGIBLE, Actuation
+from cablejax.diagnose.belief import Calibration
+from cablejax.diagnose.conclude import Conclusion
+from cablejax.diagnose.diagnosis import PLACES, EffectValues, NamedEffect, Ranked, Verdict
+from cablejax.diagnose.evidence import student_log_likelihoods
+from cablejax.effects.given import EFFECTS
+
+
+def with_arms(conclusion: Conclusion, arms: Actuation, calibration: Calibration) -> Conclusion:
+    """Adds what the encoders show to what the keypoints show."""
+    if not arms.deviates:
+        return conclusion
+    scores = _scores(arms, calibration)
+    of_set = dict(zip(scores, softmax(list(scores.values())).tolist(), strict=True))
+    named = tuple(
+        NamedEffect(
+            name=name,
+            probability=sum(chance for effects, chance in of_set.items() if name in effects),
+            parameters=parameters,
+            location=dict.fromkeys(PLACES),
+        )
+        for name, parameters in arms.effects.items()
+    )
+    among_singles = softmax([scores[name,] for name in arms.alone])
+    ranked = [
+        Ranked(name, float(chance), float(np.clip(1 - (unseen / arms.deviation) ** 2, -1.0, 1.0)), 1e3 * left)
+        for chance, (name, (left, unseen)) in zip(among_singles, arms.alone.items(), strict=True)
+    ]
+    changed: dict[Verdict, Verdict] = {}
+    if named and arms.explained(calibration.smallest_gap(0.0)):
+        changed = {"none": "named", "unknown": "named+unknown"}
+    elif named:
+        changed = dict.fromkeys(get_args(Verdict), "named+unknown")
+    elif arms.strays(calibration.smallest_gap(0.0)):
+        changed = {"none": "unknown", "named": "named+unknown", "ambiguous": "named+unknown"}
+    share = 1 - (arms.leftover / arms.deviation) ** 2
+    return dataclasses.replace(
+        conclusion,
+        verdict=changed.get(conclusion.verdict, conclusion.verdict),
+        effects=(*named, *conclusion.effects),
+        posterior=tuple(map(operator.add, _drawn(arms, len(conclusion.posterior)), conclusion.posterior)),
+        ranking=tuple(sorted([*ranked, *conclusion.ranking], key=lambda r: -(r.probability or 0.0))),
+        explained=share if conclusion.verdict == "none" else conclusion.explained,
+    )
+
+
+def _drawn(arms: Actuation, count: int) -> list[tuple[EffectValues, ...]]:
+    """The arms' effects, with values as uncertain as they are; those of one effect are off together."""
+
+    def value(name: str, key: str, share: float) -> float:
+        """So many halves of its interval away from the estimate."""
+        one = arms.effects[name][key]
+        low, high = one.ci90  # pyright: ignore[reportGeneralTypeIssues]
+        (bounds,) = (p for p in EFFECTS[name].parameters if p.name == key)
+        side = high - one.value if share > 0 else one.value - low
+        return float(np.clip(one.value + share * side, bounds.low, bounds.high))
+
+    shares = np.random.default_rng(0).standard_normal((count, len(arms.effects))) / HALF_90
+    return [
+        tuple(
+            EffectValues(name, {key: value(name, key, share) for key in arms.effects[name]})
+            for name, share in zip(arms.effects, row.tolist(), strict=True)
+        )
+        for row in shares
+    ]
+
+
+def _scores(arms: Actuation, calibration: Calibration) -> dict[tuple[str, ...], float]:
+    """Logarithm of the probability of every set of effects of the arms, up to a constant.
+
+    By the rule of `belief`: likelihoods of held-out motions, tempered for errors of the arms' laws, and a cost for
+    every effect.
+    """
+    calibration = dataclasses.replace(calibration, baseline=NEGLIGIBLE)
+    temper = calibration.temper(arms.unseen[()], arms.noise, arms.count)
+    return {
+        effects: student_log_likelihoods(
+            arms.count * ((error / arms.noise) ** 2 - 1.0) / temper, calibration.freedom, arms.motion
+        ).sum()
+        - calibration.term_cost * len(effects)
+        for effects, error in arms.unseen.items()
+    }
