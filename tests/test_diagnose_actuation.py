@@ -120,8 +120,9 @@ def test_episodes_without_commands_say_nothing_of_the_arms():
     derived[0, :-1] = np.diff(measured[0], axis=0) / INTERVAL
     shape = np.full(n, INTERVAL), np.full(n, measured.shape[1])
     result = actuation(measured, derived, *shape, np.arange(n), known)
-    value, (low, high), _ = result.effects["actuation_gain"]
-    assert value == pytest.approx(1.08, abs=1e-3) and low <= 1.08 <= high and not result.count[0]
+    gain = result.effects["actuation_gain"]["gain"]
+    low, high = gain.ci90
+    assert gain.value == pytest.approx(1.08, abs=1e-3) and low <= 1.08 <= high and not result.count[0]
     np.testing.assert_array_equal(result.predicted[0], measured[0])
     np.testing.assert_array_equal(result.commanded[0], measured[0])
     nothing = actuation(measured, derived, *shape, np.arange(n), np.full(n, False))
@@ -150,7 +151,8 @@ def test_padding_does_not_count():
     more = np.concatenate([twist, np.zeros((*twist.shape[:1], 30, 2, 3))], axis=1)
     plain = actuation(measured, twist, np.full(4, INTERVAL), length, np.arange(4), np.full(4, True))
     result = actuation(padded, more, np.full(4, INTERVAL), length, np.arange(4), np.full(4, True))
-    assert result.effects["actuation_gain"][0] == pytest.approx(plain.effects["actuation_gain"][0], abs=1e-6)
+    gain, expected = (one.effects["actuation_gain"]["gain"].value for one in (result, plain))
+    assert gain == pytest.approx(expected, abs=1e-6)
     assert result.deviation == pytest.approx(plain.deviation)
 
 

@@ -54,7 +54,7 @@ def test_place_and_episodes_of_a_gap():
     where = localise(*case(gap), np.full(POINTS, NOISE))
     assert np.flatnonzero(where.episode_p < LEVEL).tolist() == [1, 3]
     assert set(np.argsort(-where.along_cable_mm)[:3]) == {5, 6, 7}
-    assert "it shows in episodes 2 and 4 of 4 only" in where.sentences[0]
+    assert "it shows in episodes 1 and 3 of 4 only" in where.sentences[0]
     assert "between 0.42 and 0.58 m" in where.sentences[1]
     assert where.horizons_mm[2.0] < 0.3 < 1.0 < where.horizons_mm[10.0]
 

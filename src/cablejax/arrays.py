@@ -20,6 +20,13 @@ def filled(points: Float[np.ndarray, "N D"]) -> Float[np.ndarray, "N D"]:
     return np.stack([np.interp(index, index[seen], column[seen]) for column in points.T], axis=1)
 
 
+def mean_of_finite(values: np.ndarray, axis: tuple[int, ...] | int | None) -> np.ndarray:
+    """Mean of what is finite; NaN where nothing is."""
+    seen = np.isfinite(values)
+    count = seen.sum(axis=axis)
+    return np.where(count > 0, np.where(seen, values, 0.0).sum(axis=axis) / np.maximum(count, 1), np.nan)
+
+
 def wrapped(angle):
     """The same angle within [-pi, pi) [rad]. NumPy in, NumPy out; JAX in, JAX out."""
     return (angle + math.pi) % (2 * math.pi) - math.pi

@@ -156,10 +156,10 @@ def episodes_of(log: GapLog) -> list[Episode]:
 
 
 def until(log: GapLog, seconds: float) -> GapLog:
-    """The samples of every episode before a time [s]; episodes begin at 0, so a positive one leaves some of each."""
+    """The samples of every episode in so many seconds from its first one on; a positive number leaves some of each."""
     fields = ("time", "keypoints", "gripper_pose", "gripper_command", "hold")
     episodes = [
-        dataclasses.replace(one, **{name: getattr(one, name)[one.time < seconds] for name in fields})
+        dataclasses.replace(one, **{name: getattr(one, name)[one.time - one.time[0] < seconds] for name in fields})
         for one in episodes_of(log)
     ]
     return stack_episodes(episodes, log.meta, holds=log.hold is not None)

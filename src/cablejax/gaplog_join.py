@@ -8,9 +8,9 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 
-from cablejax.gaplog import Episode, episodes_of, stack_episodes
+from cablejax.gaplog import TARGETS, Episode, episodes_of, stack_episodes, targets_of
 from cablejax.gaplog_check import META_FIELDS, GapLogError
 from cablejax.limits import shown
 from cablejax.types import GapLog
@@ -22,6 +22,7 @@ EPISODE_LABELS = ("file", "recording", "split", "take")
 """Extra fields of `meta` with one entry per episode that importers write; what a diagnosis keeps apart by them."""
 COMMANDS_DERIVED = "commands_from_poses"
 """Field of `meta`: whether an importer made commands of the poses and none are known; of all, or of each episode."""
+_FIRST = 8
 SAME = 1e-6
 """Difference of two numbers, relative and absolute, below which recordings state or saw the same [m, s]."""
 
@@ -30,10 +31,10 @@ def joined(logs: Sequence[GapLog], names: Sequence[str]) -> GapLog:
     """One log of several recordings of one set-up, episodes in the order given.
 
     Its `meta` has the field `recordings`: the name of each and how many episodes it has, by which a diagnosis says what
-    each one added. Of the extra fields of `meta`, `EPISODE_LABELS` are joined too (equal names of different logs stay
-    apart), `COMMANDS_DERIVED` is said of each episode where they differ, what any has guessed is guessed, and others
-    stay where all recordings have the same. Arc lengths that an importer measured in each may differ by `MEASURED`; the
-    log has their mean over the episodes.
+    each one added. Of the extra fields of `meta`, targets and `EPISODE_LABELS` are joined (equal names of different logs
+    stay apart), `COMMANDS_DERIVED` is said of each episode where they differ, what any has guessed is guessed, and
+    others stay where all recordings have the same. Arc lengths that an importer measured in each may differ by
+    `MEASURED`; the log has their mean over the episodes.
 
     Args:
         logs: at least one.
@@ -48,14 +49,20 @@ def joined(logs: Sequence[GapLog], names: Sequence[str]) -> GapLog:
         raise GapLogError(f"There are {len(names)} names, expected one for each of the {len(logs)} gap logs.")
     logs = _of_one_length(logs)
     seen: list[tuple[Episode, str]] = []
+    begun = np.zeros((0, _FIRST))
     for log, name in zip(logs, names, strict=True):
         own = [one for one in episodes_of(log) if np.isfinite(one.keypoints).any()]
-        for other_name in (other_name for other, other_name in seen for one in own if _same_samples(one, other)):
-            raise GapLogError(
-                f"{other_name} and {name} have an episode of the same samples: name a recording once, or it would "
-                "count twice."
-            )
+        for one in own:
+            # the first few numbers decide nearly always
+            alike = np.isclose(begun, _numbers(one)[:_FIRST], SAME, SAME, equal_nan=True).all(axis=1)
+            for other, other_name in (seen[i] for i in np.flatnonzero(alike)):
+                if _same_samples(one, other):
+                    raise GapLogError(
+                        f"{other_name} and {name} have an episode of the same samples: name a recording once, or it "
+                        "would count twice."
+                    )
         seen += [(one, name) for one in own]
+        begun = np.concatenate([begun, *(_numbers(one)[None, :_FIRST] for one in own)])
         there_all, here_all = _set_up(logs[0]), _set_up(log)
         for field in there_all | here_all:
             here, there = here_all.get(field), there_all.get(field)
@@ -67,7 +74,8 @@ def joined(logs: Sequence[GapLog], names: Sequence[str]) -> GapLog:
     derived = np.concatenate([commands_derived(log) for log in logs])
     # what one of them guessed of the cable that they share is a guess
     guessed = list(dict.fromkeys(name for log in logs for name in log.meta.get("guessed", ())))
-    own_words = {*META_FIELDS, *EPISODE_LABELS, COMMANDS_DERIVED, "guessed", "recordings"}
+    own_words = {*META_FIELDS, *EPISODE_LABELS, COMMANDS_DERIVED, TARGETS, "guessed", "recordings"}
+    targets = [None if target is None else target.tolist() for log in logs for target in targets_of(log)]
     extra = set.intersection(*(set(log.meta) for log in logs)) - own_words
     alike = (name for name in sorted(extra) if all(log.meta[name] == logs[0].meta[name] for log in logs))
     shared = [*META_FIELDS, *alike]
@@ -76,6 +84,7 @@ def joined(logs: Sequence[GapLog], names: Sequence[str]) -> GapLog:
         **{name: values for name in EPISODE_LABELS if (values := _labels(logs, names, name)) is not None},
         **({COMMANDS_DERIVED: True if derived.all() else derived.tolist()} if derived.any() else {}),
         **({"guessed": guessed} if guessed else {}),
+        **({TARGETS: targets} if any(target is not None for target in targets) else {}),
         "motion": [motion for log in logs for motion in log.meta["motion"]],
         "source": "; ".join(dict.fromkeys(log.meta["source"] for log in logs)),
         "recordings": [part for log, name in zip(logs, names, strict=True) for part in recordings(log, name)],
@@ -103,9 +112,13 @@ def _same_samples(one: Episode, other: Episode) -> bool:
     """Whether the same was observed, and when after the beginning: in whatever unit and time base it was stored."""
     if one.keypoints.shape != other.keypoints.shape:
         return False
-    a, b = (np.append(e.keypoints.astype(float).ravel(), e.time - e.time[0]) for e in (one, other))
-    # the first few numbers decide nearly always
-    return all(np.allclose(a[part], b[part], SAME, SAME, equal_nan=True) for part in (slice(8), slice(None)))
+    return np.allclose(_numbers(one), _numbers(other), SAME, SAME, equal_nan=True)
+
+
+def _numbers(episode: Episode) -> Float[np.ndarray, " M"]:
+    """What was observed, and when after the beginning; at least `_FIRST` numbers."""
+    numbers = np.append(episode.keypoints.astype(float).ravel(), episode.time - episode.time[0])
+    return np.append(numbers, np.zeros(max(_FIRST - len(numbers), 0)))
 
 
 def _same(here: Any, there: Any) -> bool:

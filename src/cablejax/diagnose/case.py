@@ -95,7 +95,10 @@ class Case:
         recording = dataclasses.replace(recording, gripper_pose=pose)
         config = config_of_log(log, n_links=FIT_LINKS)
         marks = np.asarray(log.meta["keypoint_arclength_m"], float)
-        first = [_at_uniform_marks(shape, marks) for shape in first_shapes(recording)]
+        ends = recording.gripper_pose[:, 0, :, :2]
+        first = [
+            _at_uniform_marks(shape, marks, held) for shape, held in zip(first_shapes(recording), ends, strict=True)
+        ]
 
         def replay(n_links, step, pose):
             of_links = dataclasses.replace(config, n_links=n_links)
@@ -248,10 +251,15 @@ def first_shapes(recording: Recording) -> list[np.ndarray | None]:
 
 
 def _at_uniform_marks(
-    keypoints: Float[np.ndarray, "N 2"] | None, marks: Float[np.ndarray, "N"]
+    keypoints: Float[np.ndarray, "N 2"] | None, marks: Float[np.ndarray, "N"], held: Float[np.ndarray, "2 2"]
 ) -> Float[np.ndarray, "N 2"] | None:
-    """Approximate positions of keypoints uniform in arc length, by linear interpolation between the observed ones."""
+    """Approximate positions of keypoints uniform in arc length, by linear interpolation between the observed ones.
+
+    Ends that are not seen are where they are held.
+    """
     if keypoints is None:
         return None
+    keypoints = keypoints.copy()
+    keypoints[[0, -1]] = np.where(np.isfinite(keypoints[[0, -1]]), keypoints[[0, -1]], held)
     uniform, seen = np.linspace(0.0, marks[-1], len(marks)), np.isfinite(keypoints).all(axis=1)
     return positions_at(uniform, marks[seen], keypoints[seen])

@@ -26,13 +26,14 @@ def held_out_predictions(evidence: Evidence, best: Fit) -> tuple[Float[np.ndarra
     nothing would be known of it before this episode.
     """
     n_episodes, motions = len(evidence.motion), episodes_by_motion(evidence.motion)
+    seen = tuple(np.flatnonzero(evidence.count).tolist())
     if best.refits is not None:
         result = np.empty_like(evidence.nominal)
         for one, rows in zip(best.refits.explanations, best.refits.left_out, strict=True):
             result[rows] = evidence.restricted(rows).predict([one])[0]
-        return result, tuple(range(n_episodes))
+        return result, seen
     if not best.explanation.terms or len(motions) == 1:
-        return evidence.predict([best.explanation])[0], tuple(range(n_episodes)) if len(motions) > 1 else ()
+        return evidence.predict([best.explanation])[0], seen if len(motions) > 1 else ()
     groups = held_out_together(evidence.motion)
     # the sums of a fit are those of its episodes: what is left out needs no simulation of its own
     simpler, chosen = evaluate(evidence, without_one(best.explanation)), []
@@ -46,7 +47,7 @@ def held_out_predictions(evidence: Evidence, best: Fit) -> tuple[Float[np.ndarra
     result = np.empty_like(evidence.nominal)
     for group, predicted in zip(groups, every, strict=True):
         result[group] = predicted[group]
-    return result, tuple(range(n_episodes))
+    return result, seen
 
 
 def measure_gap(
@@ -87,11 +88,13 @@ def measure_gap(
 
     def rmse(simulated, until=np.inf):
         total, count = squares(simulated, until)
-        return float(np.sqrt(total.sum() / count.sum()))
+        return float(np.sqrt(total.sum() / count.sum())) if count.any() else np.nan
 
     (b, count), (a, _) = squares(before), squares(after)
     noise = floor**2 * count
     ratio, interval90 = shrinkage(b - noise, a - noise, evidence.motion) if resolvable else (None, None)
+    if ratio is not None and not np.isfinite(ratio):  # what only the encoders show
+        ratio, interval90 = None, None
     whole = float(f"{(interval * (length - 1)).max():.6g}")
     return Gap(
         horizon_s=whole,
@@ -102,7 +105,9 @@ def measure_gap(
         shrinkage_ci90=interval90,
         ahead_mm=ahead_mm,
         horizons_mm={
-            h: (1e3 * rmse(before, h), 1e3 * rmse(after, h)) for h in (*(h for h in _HORIZONS if h < whole), whole)
+            h: (1e3 * rmse(before, h), 1e3 * rmse(after, h))
+            for h in (*(h for h in _HORIZONS if h < whole), whole)
+            if np.isfinite(rmse(before, h))  # a camera may begin later
         },
         held_out_episodes=held_out,
         split=_split(b, a, noise, resolvable, learnable),

@@ -51,7 +51,8 @@ class Bounds:
         keep_out: discs (x, y, radius) that neither grippers nor cable may enter [m].
         speed: of each gripper at most [m/s].
         turn_rate: of each gripper at most [rad/s].
-        min_distance: of the grippers from each other at least [m]; None = 0.15 lengths of the cable.
+        min_distance: of the grippers from each other at least [m]; None = 0.15 lengths of the cable, or half
+            the largest.
         max_distance: of the grippers from each other at most [m]; None = 0.995 lengths of the cable.
         bend_radius: of the cable at least [m]; None = 0.03 lengths of the cable.
         duration: of a motion at most [s].
@@ -91,9 +92,9 @@ class Bounds:
 
     def distances(self, length: float) -> tuple[float, float]:
         """Smallest and largest distance of the grippers for a cable of this length [m]."""
-        low = NEAREST * length if self.min_distance is None else self.min_distance
         # no cable can be pulled farther
-        return low, min(FARTHEST * length if self.max_distance is None else self.max_distance, FARTHEST * length)
+        high = min(FARTHEST * length if self.max_distance is None else self.max_distance, FARTHEST * length)
+        return min(NEAREST * length, high / 2) if self.min_distance is None else self.min_distance, high
 
     def radius(self, length: float) -> float:
         """Smallest bend radius of a cable of this length [m]."""
@@ -227,8 +228,8 @@ def cable_beyond(
 
 def refined(points: Float[np.ndarray, "*B N 2"]) -> Float[np.ndarray, "*B M 2"]:
     """A line through points of a cable with a point between each two, by cubic interpolation; straight for two."""
-    if points.shape[-2] < 4:
-        return points
+    if points.shape[-2] < 3:
+        return np.stack([points[..., 0, :], points.mean(axis=-2), points[..., -1, :]], axis=-2)
     inner = (9 * (points[..., 1:-2, :] + points[..., 2:-1, :]) - points[..., :-3, :] - points[..., 3:, :]) / 16
     first = (3 * points[..., :1, :] + 6 * points[..., 1:2, :] - points[..., 2:3, :]) / 8
     last = (3 * points[..., -1:, :] + 6 * points[..., -2:-1, :] - points[..., -3:-2, :]) / 8
@@ -241,14 +242,17 @@ def refined(points: Float[np.ndarray, "*B N 2"]) -> Float[np.ndarray, "*B M 2"]:
 def curvature(points: Float[np.ndarray, "*B N 2"]) -> Float[np.ndarray, "*B N"]:
     """Size of a cable's curvature at its keypoints [1/m]: of the circle through each three, linear to the ends.
 
+    Two keypoints show none; three show that of their circle.
+
     An elastic cable's curvature is linear in the distance from the line of the force that it carries.
     """
-    if points.shape[-2] < 4:
+    if points.shape[-2] < 3:
         return np.zeros(points.shape[:-1])
     a, b = points[..., 1:-1, :] - points[..., :-2, :], points[..., 2:, :] - points[..., 1:-1, :]
     sides = np.linalg.norm(a, axis=-1) * np.linalg.norm(b, axis=-1) * np.linalg.norm(a + b, axis=-1)
     inner = 2 * (a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]) / np.maximum(sides, 1e-12)
-    first, last = 2 * inner[..., :1] - inner[..., 1:2], 2 * inner[..., -1:] - inner[..., -2:-1]
+    beside = inner[..., [1, -2]] if inner.shape[-1] > 1 else inner[..., [0, 0]]
+    first, last = 2 * inner[..., :1] - beside[..., :1], 2 * inner[..., -1:] - beside[..., 1:]
     return np.abs(np.concatenate([first, inner, last], axis=-1))
 
 

@@ -93,6 +93,8 @@ class PlanarCable(Simulator):
     def report(self, term, values) -> Report:
         """By the names and in the units of the gap log's format."""
         effect, config = cast(CableEffect, term.effect), self.playback.config
+        marks = tuple(config.cable.keypoint_arclength + self.playback.believed.bias_along)
+        marked = dataclasses.replace(config, cable=dataclasses.replace(config.cable, marks=marks))
         return Report(
-            effect.reported(values, term.variant, config), dict(effect.location(values, term.variant, config))
+            effect.reported(values, term.variant, config), dict(effect.location(values, term.variant, marked))
         )

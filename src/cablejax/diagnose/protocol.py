@@ -29,7 +29,6 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from cablejax.effects.effect import Effect
-from cablejax.limits import shown
 
 # Forward differences in what a recording has for its own, in prior standard deviations.
 _OWN_DIFFERENCE = 0.03
@@ -126,10 +125,9 @@ def explanation(*parts: tuple[Effect, int, Sequence[float]]) -> Explanation:
         if len(values) != len(effect.parameters) or np.isnan(np.asarray(values, float)).any():
             raise ValueError(f"Effect {effect.name!r} has the values {list(values)}, expected one number each.")
         if variant not in effect.variants:
-            known = shown(list(effect.variants))
-            raise ValueError(f"Effect {effect.name!r} has the variant {variant}, expected one of {known}.")
+            raise ValueError(f"Effect {effect.name!r} has the variant {variant}, expected one of its own.")
     z = [
-        np.clip(p.coordinate(float(value)), *p.z_bounds)
+        np.clip(p.coordinate(float(np.clip(value, p.low, p.high))), *p.z_bounds)
         for effect, _, values in parts
         for p, value in zip(effect.parameters, values, strict=True)
     ]

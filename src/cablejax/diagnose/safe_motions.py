@@ -7,6 +7,7 @@ distance keeps to its limits on the whole way.
 from __future__ import annotations
 
 import dataclasses
+import math
 
 import numpy as np
 from jaxtyping import Float
@@ -52,6 +53,12 @@ class Way:
             bounds: with the largest speed and turn rate, which together count as one: half of both may be used at once.
             rest: at least so long the grippers stay where they are at the end [s].
         """
+        times, vectors = self.timed(bounds)
+        grid = np.minimum(INTERVAL * np.arange(n_samples), INTERVAL * (n_samples - 1) - rest)
+        return _poses(np.stack([np.interp(grid, times, column) for column in np.array(vectors).T], axis=1))
+
+    def timed(self, bounds: Bounds) -> tuple[list[float], list[np.ndarray]]:
+        """When the grippers leave and reach each place [s], and where that is."""
         times, vectors = [0.0, self.holds[0]], [self.places[0]] * 2
         for target, share, hold in zip(self.places[1:], self.shares, self.holds[1:], strict=True):
             way = vectors[-1] + np.linspace(0.0, 1.0, _SEGMENT_SAMPLES)[:, None] * (target - vectors[-1])
@@ -60,8 +67,7 @@ class Way:
             arrival = times[-1] + size * (_SEGMENT_SAMPLES - 1) / (_FULL * share)
             times += [arrival, arrival + hold]
             vectors += [target, target]
-        grid = np.minimum(INTERVAL * np.arange(n_samples), INTERVAL * (n_samples - 1) - rest)
-        return _poses(np.stack([np.interp(grid, times, column) for column in np.array(vectors).T], axis=1))
+        return times, vectors
 
 
 def _vector(pose: Float[np.ndarray, "2 3"]) -> Float[np.ndarray, "6"]:
@@ -80,16 +86,19 @@ def starting_pose(gripper_pose: Float[np.ndarray, "E T 2 3"]) -> Float[np.ndarra
 def there_and_back(
     first: Float[np.ndarray, "2 3"], goal: Float[np.ndarray, "2 3"], bounds: Bounds
 ) -> Float[np.ndarray, "T 2 3"]:
-    """Gripper poses every 0.1 s, 300 of them: from one pose to another, with a rest there, and back.
+    """Gripper poses every 0.1 s: from one pose to another, with a rest there, and back.
+
+    For half a minute, or as long as motions may be; longer where the bounds on speed make the way last longer.
 
     Args:
         first: (x, y, theta) of both grippers [m, rad].
         goal: likewise.
-        bounds: on the grippers' speed; the others are not looked at.
+        bounds: on the grippers' speed and the duration; the others are not looked at.
     """
     start, there = _vector(first), _vector(goal)
     way = Way(np.stack([start, there, start]), np.ones(2), np.array([1.0, _HOLD, 2 * _HOLD]))
-    return way.played(_SAMPLES, bounds)
+    allowed = min(_SAMPLES, int(bounds.duration / INTERVAL + 1e-6) + 1)
+    return way.played(max(allowed, math.ceil(way.timed(bounds)[0][-1] / INTERVAL) + 1), bounds)
 
 
 def safe_motions(

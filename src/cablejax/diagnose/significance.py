@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.stats import chi2
 
-from cablejax.arrays import stretches
+from cablejax.arrays import mean_of_finite, stretches
 from cablejax.diagnose.evidence import episodes_by_motion
 from cablejax.types import GapLog
 
@@ -33,11 +33,12 @@ def variance_inflation(whitened: Float[np.ndarray, "E T N 2"], log: GapLog, hold
             if end - begin < 2 * _LAGS:
                 continue
             piece = whitened[e, begin:end].reshape(end - begin, -1)
-            piece = piece[:, np.isfinite(piece).all(axis=0)]
-            piece = piece - piece.mean(axis=0)
-            products += [(piece[: len(piece) - k] * piece[k:]).sum() / (len(piece) - k) for k in range(_LAGS + 1)]
+            piece = piece[:, np.isfinite(piece).mean(axis=0) > 0.5]
+            piece = piece - np.nanmean(piece, axis=0)
+            pairs = [piece[: len(piece) - k] * piece[k:] for k in range(_LAGS + 1)]
+            products += [mean_of_finite(both, 0).sum() for both in pairs]
             count += piece.shape[1]
-            samples += piece.size
+            samples += np.isfinite(piece).sum()
     if count == 0 or products[0] <= 0:
         steps = np.diff(log.time[0, : log.episode_length[0]])
         return 1.0 + (_DEFAULT_CORRELATION / float(np.median(steps)) if len(steps) else 0.0)

@@ -104,6 +104,7 @@ def localise(log: GapLog, nominal: Float[np.ndarray, "E T N 2"], noise: Float[np
     regimes = regimes_of(log, nominal, valid)
     pose = np.where(valid[..., None, None], log.gripper_pose, np.nan)
     motion = repeated_motions(pose, float(log.meta["cable"]["length_m"]))
+    arclength = np.asarray(log.meta["keypoint_arclength_m"], float)
 
     whitened = residual / noise[:, None]
     squared = (whitened**2).mean(axis=-1)
@@ -122,10 +123,10 @@ def localise(log: GapLog, nominal: Float[np.ndarray, "E T N 2"], noise: Float[np
         horizons_mm=_horizons(log, valid, everywhere, above),
         regimes={name: above(mask[..., None] & everywhere) for name, mask in regimes.masks.items() if mask.any()},
         frames=_frames(residual, noise, nominal),
-        contrasts=_contrasts(residual, noise, squared, regimes, motion),
+        contrasts=_contrasts(residual, noise, squared, regimes, motion, arclength),
         regime_masks=regimes.masks,
     )
-    arclength, motions = np.asarray(log.meta["keypoint_arclength_m"]), len(np.unique(motion))
+    motions = len(np.unique(motion[everywhere.any(axis=(1, 2))]))
     sentences = describe(where, arclength, noise, motions=motions)
     return dataclasses.replace(where, sentences=sentences)
 
@@ -203,11 +204,11 @@ def _frames(residual, noise, nominal) -> dict[str, float]:
     }
 
 
-def _contrasts(residual, noise, squared, regimes: Regimes, motion) -> dict[str, tuple[float, float]]:
+def _contrasts(residual, noise, squared, regimes: Regimes, motion, arclength) -> dict[str, tuple[float, float]]:
     """Ratios of the gap in one part to that in its opposite, with p-values against the largest of all contrasts."""
     everywhere = np.isfinite(squared)
     pairs = {name: (a[..., None] & everywhere, b[..., None] & everywhere) for name, (a, b) in regimes.pairs.items()}
-    third = np.linspace(0, 1, squared.shape[2])
+    third = arclength / arclength[-1]
     for name, part in (
         ("cable: first third", third < 1 / 3),
         ("cable: middle third", (third >= 1 / 3) & (third <= 2 / 3)),

@@ -9,15 +9,9 @@ from types import MappingProxyType
 import numpy as np
 from jaxtyping import Float
 
+from cablejax.arrays import mean_of_finite
 from cablejax.diagnose.where import Where
 from cablejax.diagnose.where_words import describe
-
-
-def mean_of_finite(values: np.ndarray, axis: tuple[int, ...] | int | None) -> np.ndarray:
-    """Mean of what is finite; NaN where nothing is."""
-    seen = np.isfinite(values)
-    count = seen.sum(axis=axis)
-    return np.where(count > 0, np.where(seen, values, 0.0).sum(axis=axis) / np.maximum(count, 1), np.nan)
 
 
 def above(squares: np.ndarray, noise: float, axis: tuple[int, ...] | int | None = None) -> np.ndarray:

@@ -33,14 +33,14 @@ def describe(
         arclength: of the keypoints [m].
         noise: standard deviation of each keypoint's coordinates [m].
         names: what to call each episode; by default "episode 0" and so on.
-        motions: how many of the episodes repeat no other; by default all.
+        motions: how many of the episodes that were seen repeat no other; by default all.
     """
-    floor = 1e3 * float(np.sqrt((noise**2).mean()))
-    total = len(where.per_episode_mm)
-    names = names or [f"episode {e}" for e in range(total)]
+    floor, seen = 1e3 * float(np.sqrt((noise**2).mean())), _seen(where)
+    total = len(seen)
+    names = names or [f"episode {e}" for e in range(len(where.per_episode_mm))]
     if where.episode_p is None or where.keypoint_p is None:
         return (_size(where, None, floor, names), *_along(where, arclength), *_when(where), *_frame(where))[:5]
-    shown = [e for e in range(total) if where.episode_p[e] < LEVEL]
+    shown = [e for e in seen if where.episode_p[e] < LEVEL]
     if not shown and not (where.keypoint_p < LEVEL).any():
         return (
             f"No episode deviates from the simulator by more than its noise of {_mm(floor)}.",
@@ -57,7 +57,8 @@ def describe(
 
 def _size(where: Where, shown: list[int] | None, floor: float, names: Sequence[str]) -> str:
     """Size of the gap, and its episodes; `shown` are those in which tests found it, None without tests."""
-    sizes, total = where.per_episode_mm, len(where.per_episode_mm)
+    sizes, seen = where.per_episode_mm, _seen(where)
+    total = len(seen)
     size = f"The gap is {_mm(where.gap_mm)} above the noise of {_mm(floor)}"
     if shown is not None and not shown:
         return f"{size}, too small to show in any single episode."
@@ -66,8 +67,8 @@ def _size(where: Where, shown: list[int] | None, floor: float, names: Sequence[s
         return f"{size}; it shows in {'episode' if len(shown) == 1 else 'episodes'} {numbers} of {total} only."
     if total == 1:
         return f"{size}, in the one episode."
-    worst = int(np.nanargmax(sizes))
-    others = float(np.nanmedian(np.delete(sizes, worst)))
+    worst = max(seen, key=lambda e: sizes[e])
+    others = float(np.median([sizes[e] for e in seen if e != worst]))
     if shown is None:
         return (
             f"{size}. It is largest in {names[worst]}, {_mm(sizes[worst])}; the median of the others is {_mm(others)}."
@@ -75,6 +76,11 @@ def _size(where: Where, shown: list[int] | None, floor: float, names: Sequence[s
     if sizes[worst] > 2.5 * others:
         return f"{size}, in every episode but mostly in {names[worst]}: {sizes[worst]:.1f} mm."
     return f"{size}, in every episode."
+
+
+def _seen(where: Where) -> list[int]:
+    """Episodes of which something was observed."""
+    return np.flatnonzero(np.isfinite(where.heat).any(axis=(1, 2))).tolist()
 
 
 def _along(where: Where, arclength: np.ndarray) -> list[str]:

@@ -69,6 +69,11 @@ class CableEffect(Effect, abc.ABC):
         del place
         return self
 
+    def seen_from(self, parameters: Mapping[str, float], place: Sequence[float]) -> dict[str, float]:
+        """Parameters by the names of the verdict in a world whose origin is this place [m]."""
+        del place
+        return dict(parameters)
+
     @abc.abstractmethod
     def apply(self, physics: Physics, values: Sequence[Any], variant: int, config: Discretisation) -> Physics:
         """The physics with this effect. NumPy in, NumPy out; JAX in, JAX out, differentiable in `values`.
@@ -108,6 +113,12 @@ class CableEffect(Effect, abc.ABC):
         """The effect's place: keys "along_cable_m", "time_s", "table_m" of the verdict, where they apply."""
         del values, variant, config
         return {}
+
+
+def shifted(parameters: Mapping[str, float], place: Sequence[float]) -> dict[str, float]:
+    """Parameters of which x_m and y_m [m] are a place on the table, in a world whose origin is another place."""
+    by = {"x_m": place[0], "y_m": place[1]}
+    return {name: value - by.get(name, 0.0) for name, value in parameters.items()}
 
 
 def moved(effect: CableEffect, place: Float[np.ndarray, "2"]) -> CableEffect:

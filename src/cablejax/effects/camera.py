@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -45,7 +46,7 @@ class CameraSimilarity(CableEffect):
     def apply(self, physics, values, variant, config):
         """Scales, turns [rad] and shifts [m] the keypoints' frame."""
         xp = values[0].__array_namespace__()
-        x, y = self._shifted(values, 1.0)
+        x, y = _shifted(values, self.origin, 1.0)
         return replace(
             physics,
             camera_scale=physics.camera_scale * values[0],
@@ -55,22 +56,17 @@ class CameraSimilarity(CableEffect):
 
     def reported(self, values, variant, config):
         """The offset [m] is that about the world's origin."""
-        x, y = self._shifted([np.float64(value) for value in values], 1.0)
+        x, y = _shifted([np.float64(value) for value in values], self.origin, 1.0)
         return super().reported((values[0], values[1], x, y), variant, config)
 
-    def _from_reported(self, parameters, config):
-        named = {p.name: p.centre for p in self.parameters} | parameters
-        x, y = self._shifted([np.float64(named[p.name]) for p in self.parameters], -1.0)
-        return {**named, "x_m": x, "y_m": y}
+    def seen_from(self, parameters, place):
+        """A scale or a rotation about another origin comes with another offset."""
+        named = {p.name: p.centre for p in self.parameters} | dict(parameters)
+        x, y = _shifted([np.float64(named[p.name]) for p in self.parameters], place, -1.0)
+        return {**named, "x_m": float(x), "y_m": float(y)}
 
-    def _shifted(self, values: Any, sign: float) -> tuple[Any, Any]:
-        """The offset about the world's origin from that about `origin`, or with the other sign the reverse."""
-        scale, angle, x, y = values
-        if not any(self.origin):
-            return x, y
-        xp, (ox, oy) = scale.__array_namespace__(), self.origin
-        cosine, sine = scale * xp.cos(angle), scale * xp.sin(angle)
-        return x + sign * (ox - cosine * ox + sine * oy), y + sign * (oy - sine * ox - cosine * oy)
+    def _from_reported(self, parameters, config):
+        return self.seen_from(parameters, self.origin)
 
     def starts(self, context):
         """The similarity nearest to the observed keypoints, by linear least squares."""
@@ -81,6 +77,16 @@ class CameraSimilarity(CableEffect):
         columns = np.concatenate([np.stack([x, -y, one, zero], axis=1), np.stack([y, x, zero, one], axis=1)])
         a, b, dx, dy = np.linalg.lstsq(columns, context.residual[seen].T.ravel(), rcond=None)[0]
         return [(0, (np.hypot(1 + a, b), np.arctan2(b, 1 + a), dx, dy))]
+
+
+def _shifted(values: Any, origin: Sequence[float], sign: float) -> tuple[Any, Any]:
+    """The offset about the world's origin from that about another one, or with the other sign the reverse."""
+    scale, angle, x, y = values
+    if not any(origin):
+        return x, y
+    xp, (ox, oy) = scale.__array_namespace__(), origin
+    cosine, sine = scale * xp.cos(angle), scale * xp.sin(angle)
+    return x + sign * (ox - cosine * ox + sine * oy), y + sign * (oy - sine * ox - cosine * oy)
 
 
 class CameraLag(CableEffect):

@@ -107,6 +107,13 @@ class Effect:
                 f"Effect {self.name!r}: amplitude is {self.amplitude}, expected the index of one of its "
                 f"{len(self.parameters)} parameters, or None."
             )
+        if self.amplitude is not None and self.reversible:
+            parameter, null = self.parameters[self.amplitude], self.null[self.amplitude]
+            if parameter.log and null in (0.0, math.inf):
+                raise ValueError(
+                    f"Effect {self.name!r} is reversible, but its parameter {parameter.name!r} is positive and has the "
+                    f"null value {null}: it has no opposite. Leave reversible out."
+                )
         if not self.variants:
             raise ValueError(f"Effect {self.name!r} has no variant, expected one at least: variants=(0,).")
 

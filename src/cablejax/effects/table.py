@@ -9,13 +9,14 @@ from jaxtyping import Float
 
 from cablejax.arrays import filled
 from cablejax.cable import Discretisation
-from cablejax.effects.base import CableEffect, Context, moved
+from cablejax.effects.base import CableEffect, Context, moved, shifted
 from cablejax.effects.effect import Parameter
 
 # Discs tried as obstacles: of which size at most, how many, and how far apart [m].
 _LARGEST, _MOST_DISCS, _APART = 0.06, 3, 0.05
 # Of the search for them: the grid's step over the cable's length, every which sample, and how near touches [m].
 _GRID, _EVERY, _CONTACT = 0.015, 4, 6e-3
+_MOST_PLACES = 10_000
 
 
 def _believed(config: Discretisation) -> float:
@@ -83,16 +84,19 @@ class FrictionPatch(CableEffect):
         """Its centre is sought about the place."""
         return moved(self, place)
 
+    def seen_from(self, parameters, place):
+        """Its centre moves."""
+        return shifted(parameters, place)
+
     def apply(self, physics, values, variant, config):
         """Sets the patch's centre and radius [m] and the coefficient inside, whatever it is outside."""
         x, y, radius, ratio = values
         xp = ratio.__array_namespace__()
-        elsewhere = physics.friction - config.cable.friction_coefficient
         return replace(
             physics,
             patch_centre=xp.stack([x, y]),
             patch_radius=physics.patch_radius * 0.0 + radius,
-            patch_friction=(ratio - 1.0) * _believed(config) - elsewhere,
+            patch_friction=ratio * _believed(config) - physics.friction,
         )
 
     def starts(self, context):
@@ -190,6 +194,10 @@ class Obstacle(CableEffect):
         """Its centre is sought about the place."""
         return moved(self, place)
 
+    def seen_from(self, parameters, place):
+        """Its centre moves."""
+        return shifted(parameters, place)
+
     def apply(self, physics, values, variant, config):
         """Sets the disc's centre and radius [m]."""
         x, y, radius = values
@@ -224,7 +232,8 @@ def _in_the_way(context: Context) -> list[tuple[float, float, float]]:
         return []
     simulated, observed = simulated[seen], (simulated + residual)[seen]
     low, high = simulated.min(axis=(0, 1)), simulated.max(axis=(0, 1))
-    step = _GRID * context.config.cable.length
+    # a fit moves the disc from there: a short cable that is carried far needs no finer grid
+    step = max(_GRID * context.config.cable.length, float(np.sqrt(np.prod(high - low) / _MOST_PLACES)))
     axes = [np.arange(begin, end + step, step) for begin, end in zip(low, high, strict=True)]
     grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
     away = _distances(grid, observed)

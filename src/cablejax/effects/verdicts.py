@@ -6,8 +6,6 @@ import os
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import numpy as np
-
 from cablejax.effects.given import EFFECTS, GivenEffect, parameter_units
 from cablejax.limits import LIMITS, shown
 from cablejax.text_file import read_json, version_of
@@ -84,12 +82,9 @@ def read_verdict_json(path: str | os.PathLike[str]) -> dict[str, Any]:
 
 
 def _about(effect: GivenEffect, place: Sequence[float]) -> GivenEffect:
-    """The effect in a world whose origin is this place [m]; only what has a place on the table moves."""
-    if effect.effect.around(np.ones(2)).parameters == effect.effect.parameters:
-        return effect
-    by = {"x_m": place[0], "y_m": place[1]}
-    moved = tuple((name, value - by.get(name, 0.0)) for name, value in effect.parameters)
-    return GivenEffect(effect.name, moved, effect.from_s, effect.until_s)
+    """The effect in a world whose origin is this place [m]."""
+    moved = effect.effect.seen_from(dict(effect.parameters), place)
+    return GivenEffect(effect.name, tuple(moved.items()), effect.from_s, effect.until_s)
 
 
 def _pieces(effect: Any, path: Any) -> list[GivenEffect]:

@@ -32,8 +32,10 @@ def worst_moment(diagnosis: CableDiagnosis) -> tuple[int, int]:
     """Episode and sample at which the observed cable is furthest from the nominal one, over half a second."""
     seen = np.isfinite(diagnosis.where.heat)
     squared = np.where(seen, diagnosis.where.heat**2, 0.0).sum(axis=-1) / np.maximum(seen.sum(axis=-1), 1)
-    width = max(1, round(0.5 / _interval(diagnosis)))
-    smooth = np.stack([np.convolve(row, np.ones(width) / width, mode="same") for row in squared])
+    widths = [max(1, round(0.5 / _interval(diagnosis, episode))) for episode in range(len(squared))]
+    smooth = np.stack(
+        [np.convolve(row, np.ones(width) / width, mode="same") for row, width in zip(squared, widths, strict=True)]
+    )
     # one that shows the whole cable, if there is any
     whole = seen.sum(axis=-1) >= seen.sum(axis=-1).max()
     episode, sample = np.unravel_index(np.argmax(np.where(whole, smooth, -1.0)), smooth.shape)
@@ -131,8 +133,8 @@ def where_figure(diagnosis: CableDiagnosis) -> Figure:
     return figure
 
 
-def _interval(diagnosis: CableDiagnosis) -> float:
-    steps = np.diff(diagnosis.log.time[0, : diagnosis.log.episode_length[0]])
+def _interval(diagnosis: CableDiagnosis, episode: int) -> float:
+    steps = np.diff(diagnosis.log.time[episode, : diagnosis.log.episode_length[episode]])
     return float(np.median(steps)) if len(steps) else 1.0
 
 
@@ -140,7 +142,7 @@ def _smoothed(diagnosis: CableDiagnosis, episode: int) -> np.ndarray:
     """Gap in noise units over about one second, noise taken out, shape [T, N]; NaN where nothing was observed."""
     length = int(diagnosis.log.episode_length[episode])
     squared = diagnosis.where.heat[episode, :length] ** 2
-    width = max(1, round(_SMOOTHING_S / _interval(diagnosis)))
+    width = max(1, round(_SMOOTHING_S / _interval(diagnosis, episode)))
     seen = np.isfinite(squared)
     kernel = np.ones(min(width, length))
     sums = np.stack(

@@ -131,7 +131,7 @@ def write_diagnosis_page(diagnosis: CableDiagnosis, out: str | os.PathLike[str])
         works=_works(diagnosis),
         pictures=inline,
         orbit=orbit,
-        in_data=bool(named) and named.isdisjoint(CAMERA),
+        in_data=sections.addable(diagnosis) and named.isdisjoint(CAMERA),
         informs=not named.isdisjoint(INFORMING),
         cable_caption=_SPACE_CAPTION if space else _cable_caption(diagnosis),
         where_caption=_FILES_CAPTION if space else _WHERE_CAPTION,

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from cablejax.diagnose.belief import BESIDE_UNKNOWN
 from cablejax.diagnose.diagnosis import CableDiagnosis, Diagnosis, NamedEffect, UnderLaw
 from cablejax.diagnose.judgement import effect_title, listed, look_alikes, share
+from cablejax.effects import given
 from cablejax.report.effect_words import (
     EFFECTS,
     between,
@@ -57,6 +58,11 @@ def quantities(diagnosis: Diagnosis) -> list[tuple[str, str]]:
     return [
         (parameter_title(name), quantity(one.value, one.unit, one.ci90)) for name, one in diagnosis.quantities.items()
     ]
+
+
+def addable(diagnosis: Diagnosis) -> bool:
+    """Whether the named effects can be added to the package's simulators: one of one's own cannot."""
+    return bool(diagnosis.effects) and all(effect.name in given.EFFECTS for effect in diagnosis.effects)
 
 
 def alike(diagnosis: CableDiagnosis) -> list[tuple[list[str], list[str]]]:

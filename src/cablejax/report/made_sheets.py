@@ -22,9 +22,8 @@ from cablejax.diagnose.diagnosis import Diagnosis
 from cablejax.diagnose.judgement import effect_title, listed, share
 from cablejax.dynamics.card import network_words
 from cablejax.dynamics.weights import cable_of_weights, load_info, load_weights, weights_path
-from cablejax.effects.given import EFFECTS
 from cablejax.report.diagnosis_charts import ranking_figure
-from cablejax.report.diagnosis_sections import named_effects
+from cablejax.report.diagnosis_sections import addable, named_effects
 from cablejax.report.effect_words import between
 from cablejax.report.sheet import LETTERS_CAPTION, Sheet, cable_cards, cable_facts, letters_figure, span
 from cablejax.report.style import DIAGNOSIS_STYLE, LIGHT, cable_curve
@@ -129,7 +128,6 @@ def verdict_sheet(diagnosis: Diagnosis, name: str) -> Sheet:
     shrinks = "not known" if gap.shrinkage is None else share(gap.shrinkage)
     interval = "" if gap.shrinkage_ci90 is None else f"90 % interval {between(*gap.shrinkage_ci90)}"
     ranking = ranking_figure(diagnosis)
-    addable = diagnosis.effects and all(effect.name in EFFECTS for effect in diagnosis.effects)
     return Sheet(
         kind="verdict",
         title=diagnosis.sentence,
@@ -150,7 +148,11 @@ def verdict_sheet(diagnosis: Diagnosis, name: str) -> Sheet:
             for effect, meaning, estimates in named_effects(diagnosis)
         ],
         following=(
-            *([f"Add what is named to the simulator: cablejax simulate --with {shlex.quote(name)}"] if addable else []),
+            *(
+                [f"Add what is named to the simulator: cablejax simulate --with {shlex.quote(name)}"]
+                if addable(diagnosis)
+                else []
+            ),
             *diagnosis.caveats,
         ),
         facts={

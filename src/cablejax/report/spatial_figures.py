@@ -9,8 +9,8 @@ import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
 
+from cablejax.arrays import mean_of_finite
 from cablejax.diagnose.diagnosis import CableDiagnosis
-from cablejax.diagnose.where_sizes import mean_of_finite
 from cablejax.report.effect_words import explained_label
 from cablejax.report.style import DIAGNOSIS_STYLE, LIGHT
 

@@ -96,11 +96,13 @@ def cable_curve(
     """
     points = np.asarray(keypoints, dtype=float)
     points = points[np.isfinite(points).all(axis=1)]
+    if not len(points):
+        return np.full((n_points, 2), np.nan)
     distance = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(points, axis=0).T))])
     keep = np.concatenate([[True], np.diff(distance) > 1e-9])
     points, distance = points[keep], distance[keep]
     if len(points) < 2:
-        return np.repeat(points[:1], n_points, axis=0)
+        return np.repeat(points, n_points, axis=0)
     ends: Any = "not-a-knot"
     if gripper_pose is not None:
         theta = np.asarray(gripper_pose)[:, 2]

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 
+from cablejax.arrays import mean_of_finite
 from cablejax.diagnose.belief import Calibration
 from cablejax.diagnose.diagnosis import Gap
 from cablejax.diagnose.evidence import Evidence
@@ -15,7 +16,7 @@ from cablejax.diagnose.gap import measure_gap
 from cablejax.diagnose.noise import noise_floor
 from cablejax.diagnose.protocol import explanation
 from cablejax.diagnose.where import HORIZONS, Where
-from cablejax.diagnose.where_sizes import above, mean_of_finite, sizes_of
+from cablejax.diagnose.where_sizes import above, sizes_of
 from cablejax.spatial.cable import MORE_EDGES, SpatialCable, bounded
 from cablejax.spatial.windows import Windows, labels
 from cablejax.types import GapLog

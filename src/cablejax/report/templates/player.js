@@ -48,7 +48,9 @@
 
     const line = (flat) => {
       pen.beginPath();
-      for (let i = 0; i < flat.length; i += 2) pen.lineTo(...at(flat[i] * METRES, flat[i + 1] * METRES));
+      for (let i = 0; i < flat.length; i += 2) {
+        if (flat[i] !== null) pen.lineTo(...at(flat[i] * METRES, flat[i + 1] * METRES));
+      }
       pen.stroke();
     };
     pen.strokeStyle = colour("target");
