@@ -219,7 +219,7 @@ def main() -> None:
     cables = [["cable", *(name for name in MODELS), *FLOORS]]
     for length, n in CABLES if options.full else CABLES[:3]:
         moved = other_cable(length, n, 24 if options.full else 4)
-        calm_moved = ~snapping(moved, steps=20, stride=10)[:, -1]
+        calm_moved = ~snapping(moved, steps=20, stride=10, length=length)[:, -1]
         row = [f"{length:g} m, {n} keypoints"]
         for name in MODELS.values():
             try:

@@ -62,11 +62,10 @@ def held(*effects: str) -> PlantConfig:
         (composite.build_grasped_chain, EXACT[2]),
         (composite.build_grasped_chain, EXACT[3]),
         (composite.build_grasped_chain, Discretisation()),
-        (lambda config: composite.build_grasped_chain(config, (0.1, 0.2, 0.05)), EXACT[2]),
         (plant_model, held()),
         (plant_model, held("gripper_compliance:gripper=0,stiffness_n_m_per_rad=0.3", "axial_stretch:stiffness_n=20")),
     ],
-    ids=["planar", "spatial", "planar-held", "spatial-held", "default", "obstacle", "plant", "compliant-plant"],
+    ids=["planar", "spatial", "planar-held", "spatial-held", "default", "plant", "compliant-plant"],
 )
 def test_every_array_of_the_model_is_the_composites(build, config, monkeypatch):
     own = build(config)

@@ -70,6 +70,10 @@ class Cable:
             grasp = shown(self.grasp)
             raise ValueError(f'Cable.grasp is {grasp}, expected ("clamped", "clamped"), the only grasp simulated.')
         self._check_marks()
+        # lists and arrays are taken too, but a cable is hashable
+        object.__setattr__(self, "grasp", tuple(self.grasp))
+        if self.marks is not None:
+            object.__setattr__(self, "marks", tuple(map(float, self.marks)))
 
     def _check_marks(self) -> None:
         if self.marks is None:

@@ -31,8 +31,8 @@ def joined(logs: Sequence[GapLog], names: Sequence[str]) -> GapLog:
     """One log of several recordings of one set-up, episodes in the order given.
 
     Its `meta` has the field `recordings`: the name of each and how many episodes it has, by which a diagnosis says what
-    each one added. Of the extra fields of `meta`, targets and `EPISODE_LABELS` are joined (equal names of different logs
-    stay apart), `COMMANDS_DERIVED` is said of each episode where they differ, what any has guessed is guessed, and
+    each one added. Of the extra fields of `meta`, targets and `EPISODE_LABELS` are joined (equal names of different
+    logs stay apart), `COMMANDS_DERIVED` is said of each episode where they differ, what any has guessed is guessed, and
     others stay where all recordings have the same. Arc lengths that an importer measured in each may differ by
     `MEASURED`; the log has their mean over the episodes.
 

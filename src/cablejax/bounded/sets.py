@@ -190,7 +190,7 @@ class Halfspaces(ConvexSet):
     """`a_k y <= b_k` for every k, with `y` flattened.
 
     Attributes:
-        normals: a, none of them 0, shape [K, P].
+        normals: a, shape [K, P]; one of 0 holds for all y, or for none where its bound is negative.
         bounds: b, inf where there is none, shape [K].
     """
 
@@ -200,7 +200,8 @@ class Halfspaces(ConvexSet):
     def quadrics(self, y: Float[Array, "..."]) -> Quadrics:
         """One linear function per plane, scaled to give the distance."""
         normals = self.normals.astype(y.dtype)
-        length = jnp.linalg.norm(normals, axis=-1)
+        squares = jnp.sum(normals**2, axis=-1)
+        length = jnp.sqrt(jnp.where(squares > 0, squares, 1.0))
         return linear_quadrics(normals / length[:, None], -self.bounds.astype(y.dtype) / length)
 
     def empty(self) -> Bool[Array, ""]:

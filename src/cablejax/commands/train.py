@@ -178,6 +178,7 @@ class Train(Command):
         if self.steps is not None:
             share = self.steps / config.total_steps
             phases = tuple(dataclasses.replace(p, steps=max(1, round(share * p.steps))) for p in phases)
+            config = dataclasses.replace(config, warmup=min(config.warmup, round(share * config.warmup)))
         if self.lr is not None:
             share = self.lr / phases[0].lr_start
             phases = tuple(dataclasses.replace(p, lr_start=share * p.lr_start, lr_end=share * p.lr_end) for p in phases)

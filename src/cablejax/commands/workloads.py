@@ -124,7 +124,8 @@ def distance_from_fine(config: DatasetConfig) -> Float[np.ndarray, "samples"]:
     truth, one = (simulate(made, make_engine(made), [0])[0] for made in (fine, config))
     away = np.linalg.norm(one.keypoints - truth.keypoints, axis=-1).max(axis=-1)[:, 1:]
     known = Trajectory(truth.keypoints, truth.gripper_pose, truth.gripper_twist)  # pyright: ignore[reportArgumentType]
-    snapped = snapping(known, steps=config.n_steps, stride=config.n_steps, interval=config.interval)
+    steps, length = config.n_steps, config.cable.length
+    snapped = snapping(known, steps=steps, stride=steps, interval=config.interval, length=length)
     return away[~snapped & (one.attempts == truth.attempts)[:, None]]
 
 

@@ -98,7 +98,8 @@ def there_and_back(
     start, there = _vector(first), _vector(goal)
     way = Way(np.stack([start, there, start]), np.ones(2), np.array([1.0, _HOLD, 2 * _HOLD]))
     allowed = min(_SAMPLES, int(bounds.duration / INTERVAL + 1e-6) + 1)
-    return way.played(max(allowed, math.ceil(way.timed(bounds)[0][-1] / INTERVAL) + 1), bounds)
+    back = way.timed(bounds)[0][-2]
+    return way.played(max(allowed, math.ceil(back / INTERVAL) + 1), bounds)
 
 
 def safe_motions(

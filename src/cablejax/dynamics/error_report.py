@@ -97,7 +97,7 @@ def error_report(
     horizons = tuple(h for h in horizons if h <= data.gripper_twist.shape[1])
     steps = max(horizons)
     windows = evaluation_windows(data, config, steps=steps, stride=stride)
-    snapped = snapping(data, steps=steps, stride=stride, interval=config.interval)
+    snapped = snapping(data, steps=steps, stride=stride, interval=config.interval, length=config.length)
     predictors = {
         MODEL: model,
         "static prior": prior_motion(config, "static"),

@@ -29,7 +29,7 @@ SNAP_FACTOR = 2.5
 """A keypoint that moves more than so many times the sum of what both grippers move was not led by them."""
 
 SNAP_MARGIN = 0.01
-"""And at least so much further [m]."""
+"""And at least so much further [lengths of the cable]."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -162,15 +162,18 @@ def summarise(
     )
 
 
-def snapping(data: Trajectory, *, steps: int, stride: int, interval: float = 1.0) -> Bool[np.ndarray, "W K"]:
+def snapping(
+    data: Trajectory, *, steps: int, stride: int, interval: float = 1.0, length: float = 1.0
+) -> Bool[np.ndarray, "W K"]:
     """Whether the true cable snaps through within the first k steps of a window or in the two steps before it.
 
     It does in a step in which some keypoint moves further than `SNAP_FACTOR` times the sum of what both grippers move,
-    plus `SNAP_MARGIN`. Windows are those of `evaluation_windows`.
+    plus `SNAP_MARGIN`. Windows are those of `evaluation_windows`, `length` is the cable's [m].
     """
     moved = np.linalg.norm(np.diff(np.asarray(data.keypoints, np.float64), axis=1), axis=-1).max(axis=-1)
-    reach = interval * twist_size(np.asarray(data.gripper_twist, np.float64), MotionConfig().rotation_weight).sum(-1)
-    snaps = moved > SNAP_FACTOR * reach + SNAP_MARGIN
+    weight = MotionConfig.for_length(length).rotation_weight
+    reach = interval * twist_size(np.asarray(data.gripper_twist, np.float64), weight).sum(-1)
+    snaps = moved > SNAP_FACTOR * reach + SNAP_MARGIN * length
     m, t = snaps.shape
     padded = np.concatenate([np.zeros((m, 2), bool), snaps], axis=1)
     starts = np.arange(0, t - steps + 1, stride)

@@ -13,7 +13,7 @@ from cablejax.dynamics.run_folder import BOARD, METRICS
 class MetricsLog:
     """Appends rows of numbers, keyed by optimiser step.
 
-    Rows at or after `resume_step` stem from work that was lost with the process and is about to be repeated: they are
+    Rows after `resume_step` stem from work that was lost with the process and is about to be repeated: they are
     dropped.
     """
 

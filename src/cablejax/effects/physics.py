@@ -116,10 +116,12 @@ def nominal_physics(
         arclength: where the keypoints are marked on the cable [m], shape [N]; None = uniform over its length.
     """
     joints, links = config.n_joints, config.n_links
+    # in space about the joints' z axes, those of a cable on a table
+    hinges = np.ones(joints) if config.dimension == 2 else np.tile([0.0, 0.0, 1.0], (joints, 1))
     marks = config.cable.keypoint_arclength if arclength is None else np.asarray(arclength, float)
     values = {
         "stiffness": np.full(joints, config.cable.bending_stiffness),
-        "rest_curvature": np.full(joints if config.dimension == 2 else (joints, 3), config.cable.rest_curvature),
+        "rest_curvature": config.cable.rest_curvature * hinges,
         "damping_time": config.cable.damping_time,
         "yield_curvature": NEVER,
         "hardening": 0.0,

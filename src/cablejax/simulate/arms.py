@@ -42,6 +42,9 @@ class Arms:
         Exact arms take a command in one piece, unless short `pieces` are asked for.
         """
         begin = self._times[-1]
+        # nothing is asked of what is longer ago than the delay
+        old = max(int(np.searchsorted(self._times, begin - self._delay)) - 1, 0)
+        del self._times[:old], self._poses[:old]
         self.commanded = self.target(twist, steps * timestep)
         if not self.exact:
             self._times.append(begin + steps * timestep)

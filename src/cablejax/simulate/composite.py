@@ -26,8 +26,6 @@ _HELD_MASS = 10.0  # [kg]
 _HELD_INERTIA = 0.04  # [kg m^2], a sphere of 10 cm
 # Constraint impedance, as close to a rigid weld as MuJoCo allows.
 _RIGID = (0.9999, 0.9999, 0.001, 0.5, 2.0)
-# Of an obstacle: a link of 2 g that is pressed by 0.1 N goes 0.2 mm deep.
-_CONTACT = (0.99, 0.99, 0.001, 0.5, 2.0)
 
 
 def build_chain(config: Discretisation) -> mujoco.MjModel:
@@ -35,7 +33,7 @@ def build_chain(config: Discretisation) -> mujoco.MjModel:
     return _chain_spec(config)[0].compile()
 
 
-def build_grasped_chain(config: Discretisation, obstacle: tuple[float, float, float] | None = None) -> mujoco.MjModel:
+def build_grasped_chain(config: Discretisation) -> mujoco.MjModel:
     """The chain welded at both ends to mocap bodies `gripper_0`, `gripper_1`, with friction actuators in the plane.
 
     The welds are deadbeat: with `k = 1/dt^2` and `b = 1/dt` the held end reaches the mocap pose within the very step,
@@ -47,11 +45,8 @@ def build_grasped_chain(config: Discretisation, obstacle: tuple[float, float, fl
 
     Args:
         config: the cable.
-        obstacle: centre and radius of a fixed disc, to the cable's centreline [m]; None = nothing can be touched.
     """
     spec, links = _chain_spec(config)
-    if obstacle is not None:
-        _add_obstacle(spec, links, obstacle, config.timestep)
     # a simulation that diverges shall say so, not start again in silence
     spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
     for link in (links[0], links[-1]):
@@ -87,33 +82,6 @@ def build_grasped_chain(config: Discretisation, obstacle: tuple[float, float, fl
                 actuator.biastype = mujoco.mjtBias.mjBIAS_AFFINE
                 actuator.gainprm[0] = 0.0
     return spec.compile()
-
-
-def _add_obstacle(
-    spec: mujoco.MjSpec, links: list[mujoco.MjsBody], obstacle: tuple[float, float, float], dt: float
-) -> None:
-    """Adds a sphere in the cable's plane, without friction.
-
-    Sphere and links have half the radius each, so that it counts to the centreline. A contact is all but resolved
-    within one step, like a grasp.
-    """
-    x, y, radius = obstacle
-    for link in links:
-        geom = link.geoms[0]
-        geom.contype, geom.conaffinity, geom.condim = 1, 0, 1
-        geom.size[0] = radius / 2
-        geom.solref, geom.solimp = [-1.0 / dt**2, -1.0 / dt], _CONTACT
-    spec.worldbody.add_geom(
-        name="obstacle",
-        type=mujoco.mjtGeom.mjGEOM_SPHERE,
-        pos=[x, y, 0.0],
-        size=[radius / 2, 0.0, 0.0],
-        contype=0,
-        conaffinity=1,
-        condim=1,
-        solref=[-1.0 / dt**2, -1.0 / dt],
-        solimp=_CONTACT,
-    )
 
 
 def stable_damping_time(damping_time: Any, timestep: float) -> Any:

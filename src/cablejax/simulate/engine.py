@@ -38,7 +38,8 @@ class Engine(abc.ABC):
     Attributes:
         config: the cable, its resolution and time step.
         name: of the engine in configurations and messages.
-        hooks: through which effects act on this engine; other fields of `Physics` must be at their null values.
+        hooks: through which effects act on this engine, on a table; other fields of `Physics` must be at their null
+            values, and in space all but stiffness, rest curvature, damping and density.
         data_timestep: time step [s] at which it makes data; all are about as accurate at theirs.
     """
 
@@ -50,7 +51,7 @@ class Engine(abc.ABC):
     def initial_state(
         self, gripper_pose: Float[ArrayLike, "*B Q P"], *, guess: Float[ArrayLike, "*B N D"] | None = None
     ) -> CableState:
-        """The cable at rest in static equilibrium, without friction locked in.
+        """The cable at rest in static equilibrium, without friction locked in; in space, before gravity acts.
 
         It is sought by a solver outside of JAX: poses are numbers, not traced within `jit` or `grad`. Differentiate a
         rollout by the state that this returns.

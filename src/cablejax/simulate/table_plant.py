@@ -209,7 +209,7 @@ class TablePlant(abc.ABC):
 
     def _steps(self, interval: float) -> int:
         steps = round(interval / self._timestep)
-        if steps < 1 or abs(steps * self._timestep - interval) > 1e-9:
+        if steps < 1 or abs(steps * self._timestep - interval) > 1e-6 * interval:
             raise ValueError(f"{interval} s is not a whole number of time steps of {self._timestep} s.")
         return steps
 

@@ -43,9 +43,7 @@ class ThreadedEngine(Engine):
     n_threads: int | None = None
 
     name: ClassVar[str] = "threaded"
-    hooks: ClassVar[frozenset[Hook]] = frozenset(
-        ("bending", "table", "mass", "grasp", "input", "observation", "obstacle")
-    )
+    hooks: ClassVar[frozenset[Hook]] = frozenset(("bending", "table", "mass", "grasp", "input", "observation"))
 
     @functools.cached_property
     def mj_model(self) -> mujoco.MjModel:
@@ -100,7 +98,6 @@ class _Simulation:
         self.config = config
         self.model = copy.copy(model)
         self.data = mujoco.MjData(self.model)
-        self.bare = self.model, self.data
         self.nominal_mass = self.model.body_mass.copy()
         self.nominal_inertia = self.model.body_inertia.copy()
         self.links = np.array([i for i in range(self.model.nbody) if self.model.body(i).name.startswith("cable")])
@@ -108,10 +105,8 @@ class _Simulation:
     def run(self, physics: Physics, state: CableState, twist, count: int, interval: float, keypoints, poses) -> None:
         """Simulates in place; writes samples into `keypoints` [T + 1, N, D] and `poses` [T + 1, Q, P]."""
         config, planar = self.config, self.config.dimension == 2
-        if planar:
-            self._place_obstacle(physics)
-            if not follows_exactly(physics):
-                twist = executed_twist(physics, state.gripper_pose, twist, interval)
+        if planar and not follows_exactly(physics):
+            twist = executed_twist(physics, state.gripper_pose, twist, interval)
         model, data = self.model, self.data
         self._write(physics)
         mujoco.mj_resetData(model, data)
@@ -144,15 +139,6 @@ class _Simulation:
         else:
             positions_w, tangents_w = hermite_weights(config)
             keypoints[:] = positions_w @ nodes + tangents_w @ tangents
-
-    def _place_obstacle(self, physics: Physics) -> None:
-        """Takes the model with this obstacle: C MuJoCo builds its collision trees with the model."""
-        obstacle = (*map(float, physics.obstacle_centre), float(physics.obstacle_radius))
-        if obstacle[2] == 0:
-            self.model, self.data = self.bare
-        else:
-            self.model = copy.copy(_kept_model(self.config, obstacle))
-            self.data = mujoco.MjData(self.model)
 
     def _table(self, physics: Physics) -> np.ndarray:
         """The table of `compiled_steps.advance`: ten values, then the weight of each free node [N]."""
@@ -189,6 +175,3 @@ class _Simulation:
         if self.config.dimension == 2:
             model.body_mass[free] += physics.extra_mass[1:-1]
             model.opt.gravity[:] = [*physics.tilt, -normal_gravity(physics)]
-
-
-_kept_model = functools.lru_cache(maxsize=64)(build_grasped_chain)

@@ -12,8 +12,10 @@ from cablejax.gaplog import episodes_of, stack_episodes
 from cablejax.poses import poses_at, with_one_sign, without_misreadings
 from cablejax.types import GapLog
 
-# Clocks whose intervals are all within this share of the usual one are taken as they are.
+# Clocks whose intervals are all within this share of the usual one are taken as they are,
 _EVEN = 0.05
+# if the mean interval of each episode is within this: a jitter is none in the mean, another rate is.
+_SAME_RATE = 0.003
 # Samples a second that are enough [Hz]; twice as many are averaged.
 _RATE = 75.0
 
@@ -81,7 +83,9 @@ def on_one_clock(log: GapLog) -> tuple[GapLog, tuple[str, ...]]:
     interval = float(np.median(steps)) if len(steps) else 0.0
     if not len(steps):
         return log, tuple(repairs)
-    if np.abs(steps - interval).max() <= _EVEN * interval:
+    rates = [(time[n - 1] - time[0]) / (n - 1) for time, n in zip(log.time, log.episode_length, strict=True) if n > 1]
+    same = np.abs(np.array(rates) - interval).max() <= _SAME_RATE * interval
+    if same and np.abs(steps - interval).max() <= _EVEN * interval:
         log, fewer = thinned(log)
         return log, (*repairs, *fewer)
     episodes = []

@@ -144,6 +144,11 @@ def _to_fit(log: GapLog) -> tuple[Windows, int]:
     fitted = [i for i, split in enumerate(windows.split) if split != "eval"]
     if not fitted:
         raise ValueError("All windows are of the eval split, which is not to be fitted: record or label others.")
+    if len(fitted) < 2:
+        raise ValueError(
+            f"The log has one window to fit, of {windows.valid.sum(axis=1).max() * windows.interval:.3g} s, expected "
+            "two at least: nothing could be left out of a fit. Record more."
+        )
     return windows.chosen(fitted), len(windows) - len(fitted)
 
 

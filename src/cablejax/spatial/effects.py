@@ -25,6 +25,7 @@ from jaxtyping import Array, Float
 from cablejax.cable import GRAVITY
 from cablejax.effects.effect import Effect, Parameter
 from cablejax.simulate.rod import RodPhysics
+from cablejax.simulate.rod.discrete import along_joints
 
 PROFILE_KNOTS = CURVATURE_KNOTS = 5
 """Places along the cable between which a profile and a rest curvature are interpolated."""
@@ -36,6 +37,8 @@ GRIP = 0.3
 It turns about the cable with the roll, which is not observed, and differs each time that the cable is gripped."""
 # Almost inextensible: 1 m of cable that hangs by its end stretches by 0.2 mm.
 _STRETCH = 5e4
+# Places along the cable at which the mean of its stiffness is taken.
+_ALONG = 64
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -164,7 +167,9 @@ class Layout:
         arclength = jnp.asarray(self.arclength) + part["along"]
         laden = self.laden(values)
         stiffness = self.nominal_stiffness * laden * part["ratio"]
-        profile = jnp.exp(part["log_profile"] - part["log_profile"].mean())
+        # the rod interpolates the stiffness itself, the ratio is of its geometric mean
+        knots = jnp.exp(part["log_profile"])
+        profile = knots * jnp.exp(-jnp.log(along_joints(knots, _ALONG)).mean())
         points = len(self.arclength) - 1
         return RodPhysics(
             length=arclength[-1],

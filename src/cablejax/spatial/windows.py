@@ -196,7 +196,7 @@ def windows_of(log: GapLog) -> Windows:
 def _pieces(
     points: Float[np.ndarray, "E T F 3"], length: Int[np.ndarray, "E"], samples: int, least: int
 ) -> tuple[list[tuple[int, int, int]], list[tuple[int, int]]]:
-    """Windows (episode, first sample, samples), and those left out, which nowhere begin with two whole samples."""
+    """Windows (episode, first sample, samples), and those left out: no two whole samples, or nothing later."""
     pieces, left_out = [], []
     for e, count in enumerate(length):
         for begin in range(0, int(count), samples):
@@ -207,7 +207,7 @@ def _pieces(
             seen = np.asarray(np.isfinite(points[e, begin:end]).all(axis=(1, 2)))
             whole = np.flatnonzero(seen[:-1] & seen[1:])
             start = begin + int(whole[0]) if len(whole) else end
-            if end - start >= least:
+            if end - start >= least and np.isfinite(points[e, start + 2 : end]).any():
                 pieces.append((e, start, end - start))
             else:
                 left_out.append((e, begin))

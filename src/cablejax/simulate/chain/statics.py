@@ -177,13 +177,27 @@ def resting_shapes(
     bending = _bending(statics, length, keypoints.dtype)
     angles = _observed_angles(matrices, keypoints, before)
     turn = jnp.sum(angles)
+    reached = _within_reach(before, length)
     for _ in range(SETTLING_STEPS):
-        angles = _newton_step(matrices, bending, angles, before, turn, length)
+        angles = _newton_step(matrices, bending, angles, reached, turn, length)
     resting = _chain_keypoints(matrices, bending, angles, before, turn)
     turn = turn + (after[1, 2] - after[0, 2]) - (before[1, 2] - before[0, 2])
+    reached = _within_reach(after, length)
     for _ in range(FOLLOWING_STEPS):
-        angles = _newton_step(matrices, bending, angles, after, turn, length)
+        angles = _newton_step(matrices, bending, angles, reached, turn, length)
     return resting, _chain_keypoints(matrices, bending, angles, after, turn)
+
+
+def _within_reach(pose: Float[Array, "2 3"], length: float) -> Float[Array, "2 3"]:
+    """The clamps' poses, the second on its way to the first no farther than the cable is long: what no chain can meet.
+
+    Without that the steps would wander where grippers are farther apart by an error of the length, or of a tool.
+    """
+    way = pose[1, :2] - pose[0, :2]
+    squared = jnp.sum(way**2)
+    beyond = squared > length**2
+    nearer = pose[0, :2] + way * (length / jnp.sqrt(jnp.where(beyond, squared, 1.0)))
+    return pose.at[1, :2].set(jnp.where(beyond, nearer, pose[1, :2]))
 
 
 class _Bending(NamedTuple):

@@ -174,8 +174,9 @@ def _impulses(
     """Right-hand side: momentum at the start of the step and impulses during it."""
     contact = load.contact
     fading = 1.0 + jnp.mean((0.5 * dt * halfway.rate) ** 2) / _FAST_TURN**2
+    # at its end, the step's velocities act where the links are halfway: only half of the bias is left to come
     impulse = (
-        load.mass[:, None] * (start.velocity - root_velocity - dt * halfway.bias / fading)
+        load.mass[:, None] * (start.velocity - root_velocity - 0.5 * dt * halfway.bias / fading)
         + dt * load.force
         - dt * load.drag[:, None] * root_velocity
     )

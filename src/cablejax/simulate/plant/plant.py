@@ -53,9 +53,9 @@ class Plant(TablePlant):
         self._friction = TableFriction(self.model, self._data, self._links, config) if uneven else None
         self._extension = Extension(self.model, self._data, config) if extensible(physics) else None
 
-    def _change(self) -> None:
-        """Begins and ends effects that are due, at the cable's present state."""
-        due = self.config.acting(self.time)
+    def _change(self, time: float) -> None:
+        """Begins and ends effects that are due at this time [s], at the cable's present state."""
+        due = self.config.acting(time)
         if due == self._effects:
             return
         before = self._data
@@ -145,16 +145,17 @@ class Plant(TablePlant):
 
     def _advance(self, twist: np.ndarray, steps: int) -> None:
         """`steps` time steps under one twist; the mocap bodies lead to the pose at the end of each."""
-        if self._acting:
-            self._change()
-        model, data, dt = self.model, self._data, self.config.discretisation.timestep
-        start, time = self._pose, self.time
+        start, time, dt = self._pose, self.time, self.config.discretisation.timestep
+        lasting = all(effect.lasting for effect in self.config.effects)
         for step in range(1, steps + 1):
+            if self._acting and (step == 1 or not lasting):
+                self._change(time + (step - 1) * dt)
             self._place_grippers(start + (step * dt) * twist)
             if self._acting:
                 self._act(time + step * dt)
-            mujoco.mj_step(model, data)
-        mujoco.mj_kinematics(model, data)
+            mujoco.mj_step(self.model, self._data)
+        data = self._data
+        mujoco.mj_kinematics(self.model, data)
         unstable = data.warning[mujoco.mjtWarning.mjWARN_BADQACC].number or not np.isfinite(data.qpos).all()
         self._moved(twist, steps, stable=not unstable)
 

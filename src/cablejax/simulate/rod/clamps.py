@@ -9,6 +9,9 @@ from jaxtyping import Array, Float
 from cablejax.simulate.rod.material import unit
 from cablejax.simulate.rod.physics import RodPhysics
 
+_NO_DIRECTION = 0.05
+"""Length of the mean of unit vectors below which they have none in common."""
+
 
 def frames_along(tangent: Float[np.ndarray, "*B 3"]) -> Float[np.ndarray, "*B 3 3"]:
     """Gripper frames whose roll is not observed: the smallest rotation from the mean direction of all tangents.
@@ -16,7 +19,10 @@ def frames_along(tangent: Float[np.ndarray, "*B 3"]) -> Float[np.ndarray, "*B 3 
     Rows are the axes in the world. The grippers of a recording keep their roll about as they were mounted; what they do
     turn about their own axis is not seen.
     """
-    mean = tangent.reshape(-1, 3).mean(axis=0)
+    every = tangent.reshape(-1, 3)
+    mean = every.mean(axis=0)
+    if np.linalg.norm(mean) < _NO_DIRECTION:  # set-ups that were turned by half a turn
+        mean = every[0]
     mean = mean / np.linalg.norm(mean)
     side = np.cross(mean, np.eye(3)[np.argmin(np.abs(mean))])
     side = np.broadcast_to(side / np.linalg.norm(side), tangent.shape)
@@ -26,6 +32,9 @@ def frames_along(tangent: Float[np.ndarray, "*B 3"]) -> Float[np.ndarray, "*B 3 
         + np.cross(axis, side)
         + axis * (axis * side).sum(-1, keepdims=True) / np.maximum(1 + cosine, 1e-3)
     )
+    # exact but for tangents against the mean
+    second = second - (second * tangent).sum(-1, keepdims=True) * tangent
+    second = second / np.linalg.norm(second, axis=-1, keepdims=True)
     return np.stack([tangent, second, np.cross(tangent, second)], axis=-2)
 
 
@@ -43,8 +52,8 @@ def held_nodes(
         frames: of the grippers, rows are axes in the world.
         h: length of an edge [m].
     """
-    angle = physics.clamp_rotation
-    along = unit(frames[:, :, 0] + angle[:, 1:] * frames[:, :, 1] - angle[:, :1] * frames[:, :, 2])
+    slope = jnp.tan(physics.clamp_rotation)
+    along = unit(frames[:, :, 0] + slope[:, 1:] * frames[:, :, 1] - slope[:, :1] * frames[:, :, 2])
     half = 0.5 * h * along
     held = jnp.stack(
         [

@@ -151,8 +151,11 @@ class Rod:
         """The free markers at the first two samples, the motion from there on, and whether that was found."""
         n, h = discrete.n, discrete.h
         nodes_s = (jnp.arange(n) - 0.5) * h
-        arclength = discrete.physics.arclength
-        guess = jnp.stack([jnp.interp(nodes_s, arclength, seen[0, :, k]) for k in range(3)], axis=1)[2:-2]
+        # beyond the markers on the way to the nodes that are held
+        ends = nodes_s[jnp.array([1, -2])]
+        known_s = jnp.clip(jnp.insert(discrete.physics.arclength, jnp.array([0, len(seen[0])]), ends), *ends)
+        known = jnp.concatenate([held[0][1:2], seen[0], held[0][2:3]])
+        guess = jnp.stack([jnp.interp(nodes_s, known_s, known[:, k]) for k in range(3)], axis=1)[2:-2]
         start, found = discrete.through(seen[0], held[0], guess)
         offsets = jnp.zeros_like(seen[0])
         if self.twisting:
