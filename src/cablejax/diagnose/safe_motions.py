@@ -88,7 +88,7 @@ def there_and_back(
 ) -> Float[np.ndarray, "T 2 3"]:
     """Gripper poses every 0.1 s: from one pose to another, with a rest there, and back.
 
-    For half a minute, or as long as motions may be; longer where the bounds on speed make the way last longer.
+    For half a minute, or as long as it takes at the speed that is allowed; cut off where motions may not last so long.
 
     Args:
         first: (x, y, theta) of both grippers [m, rad].
@@ -97,9 +97,8 @@ def there_and_back(
     """
     start, there = _vector(first), _vector(goal)
     way = Way(np.stack([start, there, start]), np.ones(2), np.array([1.0, _HOLD, 2 * _HOLD]))
-    allowed = min(_SAMPLES, int(bounds.duration / INTERVAL + 1e-6) + 1)
-    back = way.timed(bounds)[0][-2]
-    return way.played(max(allowed, math.ceil(back / INTERVAL) + 1), bounds)
+    back = math.ceil(way.timed(bounds)[0][-2] / INTERVAL) + 1
+    return way.played(min(max(_SAMPLES, back), int(bounds.duration / INTERVAL + 1e-6) + 1), bounds)
 
 
 def safe_motions(
