@@ -112,6 +112,7 @@ def score(evaluated: bool) -> dict:
     return {
         "stages": [("nominal", 20.0, 18.0 if evaluated else None)],
         "learned": [("rod", errors | {"mean": 5.0}, on_eval, (1.0, 2.0)), ("rod + ridge", errors, on_eval, (2.5, 3.5))],
+        "unsimulated": [("no simulator", errors | {"mean": 50.0}, on_eval)],
         "without_own": on_eval, "estimated": ((0.02, 0.018, 0.022),) * 2,
         "seconds": (0.03, 1.0), "length": 5.0, "left_out": () if evaluated else ("file 7",), "effects": (),
         "networks": ((16, 3),) * 2,
@@ -127,6 +128,7 @@ def test_a_page_of_any_cables(tmp_path):
     assert (tmp_path / "errors.png").stat().st_size > 5000
     assert text.index("## By recording") < text.index("## Upstream's eval split")
     assert "| **rod + ridge** | **4.0** | **4.0** | **4.0** | **4.0** |" in text
+    assert "| no simulator | 50.0 |" in text and "| no simulator | 3.0 (9.0) |" in text
     assert "| theirs, as published | 9.5 |" in text and "neither" not in text and "DLO" not in text
     assert "| **rod + ridge** | **3.0 (9.0)** |" in text and "1 / 0 of 7 |" in text and "7 of 57 for one" in text
     assert "2.5 to 3.5" in text and "Of two, 1 blocks are left out" in text

@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from cablejax.diagnose.protocol import Explanation
 from cablejax.npz import NpzError, read_npz
@@ -27,6 +27,7 @@ from real_cables.residual import fit_residual
 
 _DRAWS = 5000
 _LEARNED = ("rod", "rod + ridge", "rod + graph network", "rod + graph network + ridge")
+_CARRIED, _RIDGE = "no simulator: its first shape, carried by the grippers", "no simulator: the same ridge on that"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -57,6 +58,7 @@ class CableScore:
             over the fits to either half of the recordings.
         learned: (name, split by recording, on the eval split, 5 and 95 % quantile over draws with replacement of as
             many of all windows as eval has [mm]) of the rod with all effects and of what is learned on top of it.
+        unsimulated: likewise without a simulator, and without the spread: nothing clever, and what is learned on it.
         without_own: the rod on the eval split, its recordings' own values left at what all recordings share.
         estimated: EI / rho from either half of the recordings, with its 90 % interval [m^4/s^2].
         seconds: of one rollout alone (median), and of a batch of all windows.
@@ -69,6 +71,7 @@ class CableScore:
 
     stages: tuple[tuple[str, float, float | None], ...]
     learned: tuple[tuple[str, Errors, Errors | None, tuple[float, float] | None], ...]
+    unsimulated: tuple[tuple[str, Errors, Errors | None], ...]
     without_own: Errors | None
     estimated: tuple[tuple[float, float, float], ...]
     seconds: tuple[float, float]
@@ -125,6 +128,7 @@ def score_cable(recordings: DeformRecordings, *, state: pathlib.Path, progress: 
     return CableScore(
         stages=tuple(stages),
         learned=tuple(learned),
+        unsimulated=_unsimulated(train, found.first, kept),
         without_own=without_own,
         estimated=tuple(dataclasses.astuple(half.stiffness) for half in found.halves),
         seconds=_seconds(found, windows),
@@ -133,6 +137,30 @@ def score_cable(recordings: DeformRecordings, *, state: pathlib.Path, progress: 
         effects=found.effects,
         networks=tuple(networks),
     )
+
+
+def _unsimulated(
+    train: Windows, first: Bool[np.ndarray, "W"], kept: Windows | None
+) -> tuple[tuple[str, Errors, Errors | None], ...]:
+    """Errors of cables that only move as their grippers do, and with a ridge regression on the grippers' history."""
+    still, corrected = carried(train), np.zeros_like(train.keypoints)
+    for seen in (first, ~first):
+        part, other = (train.chosen(np.flatnonzero(use)) for use in (seen, ~seen))
+        corrected[~seen] = fit_residual(still[seen], part).correct(still[~seen], other)
+    on_eval: list[Errors | None] = [None, None]
+    if kept is not None:
+        shapes = carried(kept)
+        learned = fit_residual(still, train).correct(shapes, kept)
+        on_eval = [errors_of(shapes, kept), errors_of(learned, kept)]
+    by_recording = [errors_of(still, train), errors_of(corrected, train)]
+    return tuple(zip((_CARRIED, _RIDGE), by_recording, on_eval, strict=True))
+
+
+def carried(windows: Windows) -> Float[np.ndarray, "W T F 3"]:
+    """The free markers as they were at the second sample, in the frame that moves with the clamps [m]."""
+    frame, middle = features.moving_frame(windows), windows.position.mean(axis=2, keepdims=True)
+    first = features.in_frame(windows.keypoints[:, 1:2] - middle[:, 1:2], frame[:, 1:2])
+    return np.einsum("wmk,wtkc->wtmc", first[:, 0], frame) + middle
 
 
 def _by_recording(found: Identified, train: Windows, path: pathlib.Path, progress):

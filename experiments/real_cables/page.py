@@ -166,6 +166,14 @@ def _learned_rows(scores: Mapping[str, Any], learned: Sequence[str], best: int, 
     return rows
 
 
+def _unsimulated_rows(scores: Mapping[str, Any], column: int) -> list[str]:
+    names = [name for name, *_ in next(iter(scores.values()))["unsimulated"]]
+    return [
+        _row(name, [_error(score["unsimulated"][i][column]) for score in scores.values()])
+        for i, name in enumerate(names)
+    ]
+
+
 def _by_recording(scores: Mapping[str, Any], learned: Sequence[str], best: int) -> list[str]:
     def pick(key: Callable[[Any], Any], form: str) -> list[str]:
         return [form.format(key(score)) for score in scores.values()]
@@ -177,6 +185,7 @@ def _by_recording(scores: Mapping[str, Any], learned: Sequence[str], best: int) 
             "nominal simulator: length from the markers, textbook EI/rho, no damping, no drag (windows of the search)",
             pick(lambda s: s["stages"][0][1], "{:.1f}"),
         ),
+        *_unsimulated_rows(scores, 1),
         *_learned_rows(scores, learned, best, 1),
         *(
             _row(
@@ -223,6 +232,7 @@ def _on_eval(scores: Mapping[str, Any], published: Published, learned: Sequence[
             if any(value is not None for value in values)
         ),
         _row("nominal simulator", [f"{score['stages'][0][2]:.1f}" for score in scores.values()]),
+        *_unsimulated_rows(scores, 2),
         *_learned_rows(scores, learned, best, 2),
         _row(
             "rod, every recording with the mean of how the grippers hold the cable",

@@ -115,7 +115,9 @@ class BatchedGaussNewton:
                     continue
                 trial = self._trial(at, damping[i])
                 if trial is None:
-                    results[i] = Result.CONVERGED
+                    # rejected steps raise the damping, and a step that is damped enough promises next to nothing
+                    promising = self._trial(at, _LEAST_DAMPING) is not None
+                    results[i] = Result.STALLED if promising else Result.CONVERGED
                 else:
                     trials[i] = trial
             if not trials:
