@@ -167,15 +167,19 @@ def page(trials: list[Trial], table: dict, picture: str | None) -> str:
             ]
         ),
     ]
-    slow = table.get((CONVERGED, MPCConfig().horizon))
+    slow = {t.key[2:]: t for t in trials if t.key[:2] == (CONVERGED, MPCConfig().horizon)}
     fast = [(h, table["two-trials", h]) for h in HORIZONS if ("two-trials", h) in table]
     if slow and fast:
-        lines += ["", "## Two trials against converged", ""]
-        lines += [
-            f"- horizon {h}: {cell['error']:.3f} cm in {cell['p50']:.0f} ms, p95 {cell['p95']:.0f} ms, against "
-            f"{slow['error']:.3f} cm in {slow['p50']:.0f} ms ({100 * (cell['error'] / slow['error'] - 1):+.0f} %)"
-            for h, cell in fast
-        ]
+        lines += ["", "## Two trials against converged, in the same targets and seeds", ""]
+        for h, cell in fast:
+            same = [slow[t.key[2:]] for t in trials if t.key[:2] == ("two-trials", h) and t.key[2:] in slow]
+            if len(same) == cell["runs"]:
+                (other,) = cells(same).values()
+                lines.append(
+                    f"- horizon {h}, {cell['runs']} runs: {cell['error']:.3f} cm in {cell['p50']:.0f} ms, p95 "
+                    f"{cell['p95']:.0f} ms, against {other['error']:.3f} cm in {other['p50']:.0f} ms "
+                    f"({100 * (cell['error'] / other['error'] - 1):+.0f} %)"
+                )
     stopped = [t for t in trials if t.stopped]
     lines += ["", "## Runs that ended early", ""]
     lines += [f"- {' '.join(map(str, t.key))}: {t.stopped}" for t in stopped] or ["None."]

@@ -160,7 +160,8 @@ def page(experiment: Experiment, trials: Sequence[Trial], command: str, picture:
                 "",
                 "### What learning online changes",
                 "",
-                f"Wins / losses in pairs, by means of the last {LATE} s.",
+                f"Wins / losses in pairs, by means of the last {LATE} s; p counts them as independent, and those of "
+                "one seed share their start.",
             ]
             lines += ["", interval_tables.learning_table(mine, table, WITHOUT_LEARNING, labels=LABEL)]
         if NO_PRIOR_LEARNER in methods and len(methods) > 1:

@@ -21,7 +21,7 @@ from closed_loop.cells import (
     value_of,
 )
 from closed_loop.paper import LIANG, METHOD_LABEL, Measure
-from closed_loop.statistics import Interval, bootstrap_interval, paired_difference, summarise
+from closed_loop.statistics import Interval, mean_interval, paired_difference, summarise
 from closed_loop.trials import LATE, LIANG_TABLE, Trial
 
 RESTING_MM = 0.3
@@ -115,7 +115,8 @@ def learning_table(
 ) -> str:
     """What learning online changes: each method against the same model without it, by stiffness, in the same trials.
 
-    Errors are means of the last `LATE` seconds. A cell is one letter and stiffness; p is of the one-sided sign test.
+    Errors are means of the last `LATE` seconds. A cell is one letter and stiffness; p is of the one-sided sign test, by
+    which all pairs are independent: those of one seed share their start. A lost cable ranks behind every other run.
 
     Args:
         trials: of any tables.
@@ -127,7 +128,7 @@ def learning_table(
         ValueError: there is no trial of this table.
     """
     mine = trials_of_table(trials, table)
-    late = {(t.method, t.scenario, t.stiffness, t.seed): float(t.late_errors_cm.mean()) for t in mine}
+    late = {(t.method, t.scenario, t.stiffness, t.seed): late_error(t) for t in mine}
     ratios, letters = sorted({t.stiffness for t in mine}), scenarios_of(mine)
     rows = []
     for method, base in bases.items():
@@ -148,8 +149,9 @@ def learning_table(
         for letter in letters:
             for ratio in ratios:
                 cell = np.array([pair for key, pair in pairs if key[1:3] == (letter, ratio)])
-                if len(cell):
-                    change[f"{letter} at {ratio:g}"] = cell[:, 0].mean() / cell[:, 1].mean() - 1
+                ours, other = cell.mean(axis=0) if len(cell) else (np.nan, np.nan)
+                if np.isfinite(other):
+                    change[f"{letter} at {ratio:g}"] = ours / other - 1
         worse = [f"{name} {100 * part:+.0f} %" for name, part in change.items() if part > 0]
         text = f"{len(worse)} of {len(change)}" + (f": {', '.join(worse)}" if worse else "")
         rows.append([label_of(method, labels), label_of(base, labels), *counts, text])
@@ -173,12 +175,13 @@ def reached_table(
         scenarios = sorted({trial.scenario for trial in of_method})
         for scenario in [*scenarios, "all"] if len(scenarios) > 1 else scenarios:
             cell = of_method if scenario == "all" else of_scenario(of_method, scenario)
-            over = np.array([trial.late_errors_cm.mean() - trial.reachable_cm for trial in cell])
+            over = np.array([late_error(trial) - trial.reachable_cm for trial in cell])
             reached = int((over <= margin_cm).sum())
+            between = "linear" if np.isfinite(over).all() else "higher"
             rows.append(
                 [
                     label_of(method, labels), scenario, f"{reached}/{len(cell)}", _rate_text(reached, len(cell)),
-                    number_text(float(np.median(over))), number_text(float(np.nanquantile(over, 0.9))),
+                    number_text(float(np.median(over))), number_text(float(np.quantile(over, 0.9, method=between))),
                     str(sum(trial.stopped is not None for trial in cell)),
                 ]
             )  # fmt: skip
@@ -263,8 +266,8 @@ def end_table(
             rows.append(
                 [
                     label_of(method, labels), scenario, str(len(cell)),
-                    number_text(float(np.mean([errors.mean() for errors in late]))),
-                    number_text(float(np.max([errors.max() for errors in late]))),
+                    number_text(float(np.mean([late_error(trial) for trial in cell]))),
+                    number_text(float(np.max(np.nan_to_num(late, nan=np.inf)))),
                     number_text(float(np.median(swing))), f"{np.sum(swing <= RESTING_MM)}/{len(cell)}",
                     f"{sum(trial.worse_than_best for trial in cell)}/{len(cell)}",
                     number_text(100 * float(np.mean(travel))) if np.isfinite(travel).all() else "",
@@ -285,20 +288,26 @@ def nearby_table(trials: Iterable[Trial], table: str, *, labels: Mapping[str, st
     """
     mine, rows = trials_of_table(trials, table), []
     for method in methods_of(mine, None):
-        late = [float(trial.late_errors_cm.mean()) for trial in mine if trial.method == method]
+        late = [late_error(trial) for trial in mine if trial.method == method]
         numbers = min(late), float(np.median(late)), max(late), max(late) / min(late)
         rows.append([label_of(method, labels), str(len(late)), *map(number_text, numbers)])
     return markdown(["method", "plants", "best [cm]", "median [cm]", "worst [cm]", "worst over best"], rows)
 
 
+def late_error(trial: Trial) -> float:
+    """Mean error of the last `LATE` seconds [cm]; infinite where the cable was lost."""
+    error = float(trial.late_errors_cm.mean())
+    return error if np.isfinite(error) else np.inf
+
+
 def _seed_interval(cell: Sequence[Trial], measure: Measure) -> Interval:
-    """Bootstrap interval of the mean of the trials that did not fail, seeds resampled."""
+    """Interval of the mean of the trials that did not fail, by the seeds' means."""
     by_seed: dict[int, list[float]] = {}
     for trial in cell:
         if np.isfinite(value := value_of(trial, measure)):
             by_seed.setdefault(trial.seed, []).append(value)
     means = [float(np.mean(values)) for values in by_seed.values()]
-    return bootstrap_interval(means) if means else Interval(np.nan, np.nan)
+    return mean_interval(means) if means else Interval(np.nan, np.nan)
 
 
 def _rate_text(successes: int, trials: int) -> str:

@@ -17,6 +17,8 @@ from scipy import stats
 
 RESAMPLES = 10_000
 """Bootstrap samples of an interval."""
+FEW = 15
+"""Of fewer values than this the bootstrap's intervals are too narrow: of five they hold the mean in 85 % of cases."""
 
 Values = Sequence[float] | Float[np.ndarray, " n"]
 """One number per trial."""
@@ -61,8 +63,8 @@ class PairedDifference:
         pairs: trials that both methods have.
         unpaired: trials that only one of them has; they count for nothing.
         failures: pairs in which one or both failed. They are in no mean, but see `better` and `worse`.
-        mean: of the differences of the other pairs.
-        interval: bootstrap interval of that mean.
+        mean: of the differences of the other pairs, every cluster with its mean.
+        interval: of that mean.
         better: pairs in which the method is lower, or finite where the other failed.
         worse: pairs in which it is the other way round.
     """
@@ -96,8 +98,11 @@ def summarise(values: Values) -> Summary:
     )
 
 
-def bootstrap_interval(values: Values, *, confidence: float = 0.95, seed: int = 0) -> Interval:
-    """Confidence interval of the mean of independent values, by the BCa bootstrap (Efron, J. Am. Stat. Assoc. 1987).
+def mean_interval(values: Values, *, confidence: float = 0.95, seed: int = 0) -> Interval:
+    """Confidence interval of the mean of independent values.
+
+    Of few values Student's, right for a normal distribution; else by the BCa bootstrap (Efron, J. Am. Stat. Assoc.
+    1987).
 
     Args:
         values: finite, shape [n].
@@ -120,7 +125,10 @@ def bootstrap_interval(values: Values, *, confidence: float = 0.95, seed: int = 
         return Interval(np.nan, np.nan)
     if np.ptp(x) <= 1e-12 * np.abs(x).max():
         return Interval(float(x[0]), float(x[0]))
-    # With few values some resamples have the estimate as their mean. Such ties count half: no rounding may break them.
+    if len(x) < FEW:
+        half = float(stats.t.ppf(0.5 + confidence / 2, len(x) - 1) * x.std(ddof=1) / np.sqrt(len(x)))
+        return Interval(float(x.mean()) - half, float(x.mean()) + half)
+    # Some resamples have the estimate as their mean. Such ties count half: no rounding may break them.
     digits = 12 - int(np.ceil(np.log10(np.abs(x).max())))
 
     def mean(sample: np.ndarray, axis: int) -> np.ndarray:
@@ -143,8 +151,8 @@ def paired_difference(
     Args:
         method: its values by trial.
         reference: the other's.
-        cluster: what trials share that are not independent, the seed for instance. The interval resamples clusters, by
-            the mean difference in each; by default every trial is its own.
+        cluster: what trials share that are not independent, the seed for instance. The interval is of the clusters'
+            mean differences; by default every trial is its own.
         confidence: coverage of the interval.
         seed: of the resampling.
     """
@@ -162,7 +170,7 @@ def paired_difference(
         unpaired=len(method) + len(reference) - 2 * len(shared),
         failures=int(np.sum(~both)),
         mean=float(np.mean(means)) if means else np.nan,
-        interval=bootstrap_interval(means, confidence=confidence, seed=seed) if means else Interval(np.nan, np.nan),
+        interval=mean_interval(means, confidence=confidence, seed=seed) if means else Interval(np.nan, np.nan),
         better=int(np.sum(rank_ours < rank_theirs)),
         worse=int(np.sum(rank_ours > rank_theirs)),
     )

@@ -35,7 +35,7 @@ class BenchStart(Command):
     """Time start-up, the first control call and a verdict, each in a process of its own.
 
     Each runs with an empty folder for compiled programs, then with the folder as the first run has left it. Processor
-    time, of all cores together, is stated beside wall time: on a busy machine only that can be compared.
+    time, of all cores together, is reported next to wall time: on a busy machine only that can be compared.
 
     Attributes:
         logs: Gap logs to diagnose; by default one of a cable that is too soft, staged with the contact plant.

@@ -50,7 +50,7 @@ class _Import(Command, abc.ABC):
 class Deform(_Import):
     """Import recordings of the DEFORM data set: three-dimensional motion capture of one cable.
 
-    SOURCE is upstream's folder of one cable, with pickles in train/ and eval/, one such pickle, or an .npz. Pickles are
+    PATH is upstream's folder of one cable, with pickles in train/ and eval/, one such pickle, or an .npz. Pickles are
     read without running anything that they say.
 
     Attributes:

@@ -54,7 +54,7 @@ docs/results/blind/20270404/cases.jsonl --leftovers`."""
 
 BESIDE_UNKNOWN = 0.27
 """Share of the effects named beside an unknown cause that are causes, or have a cause among their look-alikes: 14 of 51
-in the blind checks from seed 20270404 on, as `experiments/22_blind_score.py` prints for each."""
+in the blind checks from seed 20270404 to 20301125, as `experiments/22_blind_score.py` prints for each."""
 
 
 @dataclasses.dataclass(frozen=True)

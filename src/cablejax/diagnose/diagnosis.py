@@ -126,12 +126,12 @@ class Gap:
             resolvable, or nothing could be held out.
         shrinkage_ci90: by resampling episodes.
         ahead_mm: errors of predictions five seconds ahead of the last observation, by "nominal", "ridge" (the nominal
-            simulator with the controller's online residual, which knows no cause) and "named" (the simulator with the
+            simulator with a ridge residual, which knows no cause) and "named" (the simulator with the
             named effects, without a residual); None if no episode is long enough.
         horizons_mm: {seconds since the episode's start: (before, after)}.
         held_out_episodes: those scored; all of them where every episode was held out once.
         split: shares of the squared error before: "noise", "named", "learnable", "unexplained"; they sum to 1.
-            "learnable" is what the online residual would take away of what is left; None where that was not computed,
+            "learnable" is what a ridge residual would take away of what is left; None where that was not computed,
             and then it is part of "unexplained".
         unit: of the observations.
     """

@@ -1,4 +1,4 @@
-"""The controller's online ridge residual on a recorded run: a correction without a cause, to compare with."""
+"""A ridge residual on a recorded run: a correction without a cause, to compare with."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def predicted_ahead(
     interval: Float[np.ndarray, "E"],
     length: np.ndarray,
 ) -> tuple[float, float] | None:
-    """Corrects a simulator's displacements as the controller does: `delta = R J + b` over the last five steps.
+    """Corrects a simulator's displacements by ridge regression, `delta = R J + b`, over the last five steps.
 
     The residual is fitted to what the last five steps of one second got wrong, and carried on for `HORIZON` steps with
     the grippers' true motion. Errors contain the noise of two observations.

@@ -47,7 +47,7 @@ def import_mcap(path: str | os.PathLike[str], layout: str | os.PathLike[str]) ->
         layout: TOML file that names the topics, see `docs/how_to/own_recording.md`.
 
     Returns:
-        A gap log in space, and a sentence on each repair.
+        A gap log, in space or on the table of the layout, and a sentence on each repair.
 
     Raises:
         ValueError: rosbags is not installed, a file or topic is missing or of another type, or the recording cannot be

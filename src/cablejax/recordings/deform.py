@@ -209,7 +209,7 @@ def import_deform(
 
     Args:
         path: as for `read_deform`.
-        unit: of length; None = metres, or millimetres where the length of the cable leaves no doubt.
+        unit: of length; None = metres, or another one where the length of the cable leaves no doubt.
         frame: the frame of the positions; upstream's has z up.
 
     Returns:

@@ -68,7 +68,7 @@ def ranking_figure(diagnosis: Diagnosis) -> Figure | None:
 def shrinkage_figure(diagnosis: CableDiagnosis) -> Figure:
     """Error before and after, by horizon, over the noise floor.
 
-    Also five seconds ahead compared with the online residual, and the parts of the error before.
+    Also five seconds ahead compared with a ridge residual, and the parts of the error before.
     """
     gap = diagnosis.gap
     explained = diagnosis.explained is not None
@@ -108,7 +108,7 @@ def _bars(ax: Axes, x: np.ndarray, heights: np.ndarray, width: float, colour: An
 
 
 def _ahead(ax: Axes, errors: dict[str, float], believed: str, label: str | None) -> None:
-    """Errors five seconds ahead of an observation; the online residual is a correction that knows no cause."""
+    """Errors five seconds ahead of an observation; a ridge residual is a correction that knows no cause."""
     kinds = {"nominal": ("as\nbelieved", believed), "ridge": ("online\nresidual", LIGHT.target)}
     if label is not None:
         kinds["named"] = (label, LIGHT.residual)

@@ -173,7 +173,7 @@ def how_far(diagnosis: CableDiagnosis) -> str:
         ahead = {name: millimetres(value) for name, value in gap.ahead_mm.items()}
         text += (
             f" Five seconds ahead of an observation, the simulator as believed is off by {ahead['nominal']}; "
-            f"with an online ridge residual, which knows no cause, by {ahead['ridge']}"
+            f"with a ridge residual, which knows no cause, by {ahead['ridge']}"
         )
         text += f"; with {added} and no residual by {ahead['named']}." if diagnosis.explained is not None else "."
     return text
