@@ -3,8 +3,8 @@
     python benchmarks/wheel.py dist/cablejax-*.whl --python python3.11 python3.13
 
 Each Python gets an environment in a temporary folder, with empty caches and nothing of this repository on the path, and
-the newest packages that the wheel allows. The commands are those of README, shortened as docs/how_to/own_cable.md proposes for a quick
-try. The first that fails ends the check. `make wheel-check` builds the wheel first.
+the newest packages that the wheel allows. The commands are those of README, shortened as docs/how_to/own_cable.md
+proposes for a quick try. The first that fails ends the check. `make wheel-check` builds the wheel first.
 """
 
 from __future__ import annotations

@@ -4,7 +4,8 @@ A few samples may say more about noise than about the cable, and a correction th
 So a candidate has to earn its influence. At every step each one predicts the model's error before it is seen, and is
 weighed by the likelihood of what it has predicted so far,
 
-    w_k  ~  (1 + d S_k / 2) ^ -(1 + d n / 2),      S_k = sum_t phi^(n - t) |error(t) - predicted_k(t)|^2 / (N s(t)^2)
+    w_k  ~  (1 + d S_k / 2) ^ -(1 + d m / 2),      m = sum_t phi^(n - t),
+    S_k  =  sum_t phi^(n - t) |error(t) - predicted_k(t)|^2 / (N s(t)^2)
 
 with fading memory phi: the marginal likelihood of d independent Gaussian errors a step, of variance s(t)^2 up to an
 unknown factor with an inverse gamma prior around 1. Models err in proportion to the motion, s(t)^2 = s^2 + (r |R|)^2: a
