@@ -56,7 +56,7 @@ _TURNED = (0.0, 0.3, -0.3)
 FRICTION = Cable().friction_coefficient
 
 DISTURBANCES: dict[str, tuple[str, ...]] = {
-    "push": ("gravity_tilt:angle_rad=0.6,direction_rad={angle},from_s=30,until_s=32",),
+    "push": ("gravity_tilt:angle_rad=0.6,direction_rad={angle},from_s=30,until_s=31.5",),
     "slip": ("gripper_slip:gripper={gripper},time_s=30,distance_m=0.005",),
     "friction rises": (f"table_friction:coefficient={3 * FRICTION:g},from_s=30",),
     "stiffness falls": ("bending_stiffness:ratio=0.3,from_s=30",),

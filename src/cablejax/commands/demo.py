@@ -10,7 +10,7 @@ from cablejax.commands.options import Command, say, text_table
 
 PUSHED_AT = 25.0
 """When the cable is pushed [s]."""
-PUSH = f"gravity_tilt:angle_rad=0.6,direction_rad=1.6,from_s={PUSHED_AT:g},until_s={PUSHED_AT + 2:g}"
+PUSH = f"gravity_tilt:angle_rad=0.6,direction_rad=1.6,from_s={PUSHED_AT:g},until_s={PUSHED_AT + 1.5:g}"
 """Gravity seems tilted for a moment, so that the cable slides aside by a decimetre."""
 
 
