@@ -99,7 +99,10 @@ def run_corner(corner: tuple[str, str, str], tests: list[str], workers: int) -> 
     report = results / "tests.xml"
     parallel = ["-n", str(workers), "--dist", "loadfile"] if workers else ["-n", "0"]
     words = [inside, "-m", "pytest", "-q", "-m", "not slow", *parallel, f"--junitxml={report}", *tests]
-    subprocess.run(words, cwd=ROOT, env=own)
+    report.unlink(missing_ok=True)  # of an earlier run
+    tested = subprocess.run(words, cwd=ROOT, env=own).returncode
+    if not report.is_file():
+        raise SystemExit(f"{python}: pytest ended with code {tested} before it tested anything.")
     subprocess.run([inside, __file__, "--record", str(results / "motions.json")], cwd=ROOT, env=own, check=True)
     suite = next(xml.etree.ElementTree.parse(report).getroot().iter("testsuite"))
     counts: dict = {name: int(suite.get(name, 0)) for name in ("tests", "skipped", "failures", "errors")}

@@ -17,14 +17,13 @@ from pathlib import Path
 
 os.environ.setdefault("NPROC", "4")
 
-import jax.numpy as jnp
 import numpy as np
 
 from cablejax.dataset.generate import make_engine, simulate
 from cablejax.dataset.opening import open_store
 from cablejax.dataset.parallel import DeviceParallel
 from cablejax.dataset.schema import DatasetConfig, config_from_json
-from cablejax.dataset.windows import concatenate, read_trajectories
+from cablejax.dataset.windows import concatenate, read_trajectories, trajectory_of
 from cablejax.dynamics.error_report import MODEL, error_report
 from cablejax.dynamics.evaluate import SNAP_FACTOR, SNAP_MARGIN
 from cablejax.dynamics.weights import load_info, load_weights
@@ -41,11 +40,9 @@ def simulated(config: DatasetConfig, rows: range) -> Trajectory:
     engine, parts = make_engine(config), []
     together = engine.width if isinstance(engine, DeviceParallel) else TOGETHER
     for first in range(rows.start, rows.stop, together):
-        blocks = simulate(config, engine, range(first, min(first + together, rows.stop)))
-        parts += [
-            Trajectory(*(jnp.asarray(each) for each in (block.keypoints, block.gripper_pose, block.gripper_twist)))
-            for block in blocks
-        ]
+        wanted = range(first, min(first + together, rows.stop))
+        blocks = simulate(config, engine, wanted)
+        parts += [trajectory_of(config, block, [row]) for row, block in zip(wanted, blocks, strict=True)]
         print(f"{len(parts)} of {len(rows)} simulated", file=sys.stderr, flush=True)
     return concatenate(parts)
 

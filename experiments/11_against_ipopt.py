@@ -174,7 +174,7 @@ def page(options: argparse.Namespace, folder: Path, n_all: int) -> str:
     lines = [
         f"{len(rows)} of {n_all} problems, in a random order, seed 0; {n_exact} of them with the exact Hessian too. "
         f"Network {options.weights}, the corners of its ReLUs rounded, with the residual fitted online, horizon 5, "
-        f"36 unknowns, float64. Ours: `mpc.{ACCURATE}`. "
+        f"36 unknowns, float64. Ours: `against_ipopt.accurate.{ACCURATE}`. "
         "IPOPT: tol 1e-9 on the objective divided by its value at the start, constr_viol_tol 1e-9, "
         f"bound_relax_factor 0, adaptive mu, limited memory of 20, at most {ITERATIONS} iterations, or exact Hessian, "
         f"at most {EXACT_ITERATIONS}. Both begin at the same feasible plan.",

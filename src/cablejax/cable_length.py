@@ -60,7 +60,7 @@ def require_fitting_length(
         )
     whole = chords.sum(axis=1)[np.isfinite(chords).all(axis=1)]
     short, long = np.quantile(whole, [0.05, 0.95]) if len(whole) else (1.0, 1.0)
-    if long > (1 + STRETCH) / ring * short + 2 * len(stated) * noise:
+    if ring and long > (1 + STRETCH) / ring * short + 2 * len(stated) * noise:
         raise ValueError(
             f"Along the keypoints the cable measures {short:.4g} m in some samples and {long:.4g} m in others, and a "
             "cable does not stretch so far: check the camera's scale, and that the markers stay on the cable."
@@ -69,7 +69,7 @@ def require_fitting_length(
 
 def bent_chord(n_keypoints: int) -> float:
     """Chord between neighbouring keypoints over the arc between them, where the cable is bent into a ring."""
-    return 1 - (2 * np.pi / (n_keypoints - 1)) ** 2 / 24
+    return max(1 - (2 * np.pi / (n_keypoints - 1)) ** 2 / 24, 0.0)
 
 
 def _noise(episodes: Sequence[Float[np.ndarray, "T N D"]]) -> float:

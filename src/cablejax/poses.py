@@ -49,7 +49,7 @@ def poses_from_markers(
         )
     tangent = along / length
     if tangent.shape[1] == 2:
-        angle = np.unwrap(np.arctan2(tangent[:, 1], tangent[:, 0]))
+        angle = unwrapped(np.arctan2(tangent[:, 1], tangent[:, 0]))
         return np.concatenate([at, angle[:, None]], axis=1)
     return np.concatenate([at, transported_frames(tangent)], axis=1)
 

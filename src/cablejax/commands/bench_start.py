@@ -91,7 +91,7 @@ class BenchStart(Command):
         for k, log in enumerate(logs):
             say(f"the verdict of {log.name} ...")
             words = ["-m", "cablejax", "diagnose", str(log), "--out", str(folder / f"report_{k}"), "--overwrite"]
-            each[log.stem] = twice(words, folder / f"programs_{k}")
+            each[log.stem if log.stem not in each else str(log)] = twice(words, folder / f"programs_{k}")
         return {"logs": each, **{state: median(one[state] for one in each.values()) for state in ("empty", "filled")}}
 
     def _rows(self, result: dict[str, Any]) -> list[tuple[str, dict[str, float]]]:

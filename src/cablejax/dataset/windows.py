@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import os
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import jax
 import jax.numpy as jnp
@@ -17,6 +17,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from cablejax.dataset.drawing import cable_params
 from cablejax.dataset.opening import open_store
+from cablejax.dataset.schema import Block, DatasetConfig
 from cablejax.dataset.store import Store
 from cablejax.effects.physics import mean_resistance
 from cablejax.types import History, Trajectory, cable_descriptor
@@ -31,9 +32,14 @@ def read_trajectories(
         ValueError: a shard is missing or damaged, or a row does not exist.
     """
     store = source if isinstance(source, Store) else open_store(source)
-    block, indices = store.read(rows), range(store.config.n_trajectories) if rows is None else np.asarray(rows)
+    indices = range(store.config.n_trajectories) if rows is None else np.asarray(rows)
+    return trajectory_of(store.config, store.read(rows), indices)
+
+
+def trajectory_of(config: DatasetConfig, block: Block, indices: Iterable[int]) -> Trajectory:
+    """Some trajectories of a data set, by their numbers, with what a network is told of each cable."""
     # with the effects that were simulated: a stiffer cable is known to be one
-    cables = [cable_params(store.config, row, int(i)) for i, row in zip(indices, block.parameters, strict=True)]
+    cables = [cable_params(config, row, int(i)) for i, row in zip(indices, block.parameters, strict=True)]
     stiffness, friction = np.array([mean_resistance(cable) for cable in cables]).T
     known = cable_descriptor(stiffness, friction)
     return Trajectory(

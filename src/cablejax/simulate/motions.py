@@ -19,6 +19,8 @@ from cablejax.types import ROTATION_WEIGHT
 _COARSE_LINKS = 13
 # Poses that are drawn before the bounds are said to exclude all of them.
 _DRAWS = 10_000
+# Angle of both grippers at a straight start, by which the cable leans to a side [rad].
+_LEAN = 0.01
 
 
 @dataclasses.dataclass(frozen=True)
@@ -111,6 +113,12 @@ def random_motion(
     """
     start = _straight_start if motion.start == "straight" else _random_start
     pose = start(rng, config, motion)
+    if not admissible(config, motion, pose):
+        raise ValueError(
+            f"A straight start is out of the bounds of MotionConfig: grippers {1 - 1.5 * motion.straight_slack:g} "
+            f"lengths apart, {_LEAN:g} rad from their line. Widen min_distance or max_angle, or make straight_slack "
+            "smaller."
+        )
     coarse = dataclasses.replace(config, n_links=min(config.n_links, _COARSE_LINKS))
     scale = np.exp(rng.uniform(np.log(motion.min_scale), 0.0))
     persistence = rng.uniform(0.0, motion.max_persistence)
@@ -156,7 +164,7 @@ def _limits(config: Discretisation, motion: MotionConfig) -> tuple[float, float,
 def _straight_start(rng, config, motion):
     """Aligned grippers along a random direction; the slack lets the cable lean to a random side."""
     half = 0.5 * config.cable.length * (1.0 - 1.5 * motion.straight_slack)
-    lean = rng.choice([-1.0, 1.0]) * 0.01
+    lean = rng.choice([-1.0, 1.0]) * _LEAN
     heading = rng.uniform(-np.pi, np.pi)
     offset = half * np.array([np.cos(heading), np.sin(heading)])
     return np.array([[*-offset, heading + lean], [*offset, heading - lean]])

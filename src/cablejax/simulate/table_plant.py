@@ -207,10 +207,10 @@ class TablePlant(abc.ABC):
                 f"timestep than {dt} s, or gentler commands it may stay stable."
             )
 
-    def _steps(self, interval: float) -> int:
+    def _steps(self, interval: float, name: str = "The interval") -> int:
         steps = round(interval / self._timestep)
         if steps < 1 or abs(steps * self._timestep - interval) > 1e-6 * interval:
-            raise ValueError(f"{interval} s is not a whole number of time steps of {self._timestep} s.")
+            raise ValueError(f"{name} is {interval} s, expected a whole number of time steps of {self._timestep} s.")
         return steps
 
     def _check_distance(self, pose: np.ndarray, length: float) -> None:
