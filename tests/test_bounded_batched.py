@@ -168,3 +168,23 @@ def test_blocks_change_no_step_though_some_of_their_coordinates_are_at_a_bound()
     assert dense.result == eliminated.result == Result.CONVERGED
     assert 0 < (~dense.best.free).sum() < len(middle)
     np.testing.assert_allclose(eliminated.best.point, dense.best.point, atol=1e-7)
+
+
+def test_a_problem_whose_steps_are_rejected_is_stalled_and_not_converged():
+    """The derivative has the wrong sign: no step lowers the value, however much the damping shortens it."""
+
+    def wrong(y):
+        return np.array([y[0] - 3.0]), np.array([[-1.0]])
+
+    def linearise(points):
+        return [
+            Linearised(
+                y, np.full(1, -9.0), np.full(1, 9.0), 0.5 * float(r @ r), jacobian.T @ r, jacobian.T @ jacobian, None
+            )
+            for y in points.values()
+            for r, jacobian in [wrong(y)]
+        ]
+
+    solver = BatchedGaussNewton(tolerance=1e-6, max_steps=300)
+    (end,) = solver.minimise(linearise({0: np.zeros(1)}), linearise)
+    assert end.result is Result.STALLED and end.best.point[0] == 0.0

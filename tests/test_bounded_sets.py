@@ -354,3 +354,10 @@ def test_empty_sets_say_so():
 
 def test_a_ball_of_no_radius_leaves_its_centre():
     np.testing.assert_array_equal(Balls(jnp.asarray(0.0)).project(jnp.ones((2, 3))), np.zeros((2, 3)))
+
+
+def test_a_normal_of_zero_bounds_nothing():
+    vacuous = Halfspaces(jnp.asarray([[0.0, 0.0], [1.0, 0.0]]), jnp.asarray([1.0, 0.5]))
+    np.testing.assert_allclose(vacuous.project(jnp.asarray([2.0, 3.0])), [0.5, 3.0], atol=1e-5)
+    never = Halfspaces(jnp.zeros((1, 2)), jnp.asarray([-1.0]))
+    assert float(never.violation(jnp.zeros(2))) > 0

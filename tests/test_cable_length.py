@@ -5,6 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
+from cablejax.cable import Cable, differing
 from cablejax.cable_length import require_fitting_length
 from cablejax.recordings.assemble import Nominal, gap_log_from_takes
 from cablejax.recordings.take import Take
@@ -67,3 +68,17 @@ def test_stated_arc_lengths_are_checked_at_the_import():
         gap_log_from_takes([take()], dataclasses.replace(NOMINAL, arclength=stated), source="test")
     with pytest.raises(ValueError, match="correct keypoint_arclength_m"):
         gap_log_from_takes([take()], dataclasses.replace(NOMINAL, arclength=tuple(0.9 * MARKS)), source="test")
+
+
+def test_two_keypoints_of_a_cable_may_come_as_near_as_they_like():
+    ends = np.zeros((50, 2, 2))
+    ends[:, 1, 0] = np.linspace(0.2, 0.95, 50)
+    require_fitting_length([ends], np.array([0.0, 1.0]), NAME)
+
+
+def test_cables_given_by_lists_are_hashable_and_differ_by_more_than_rounding_only():
+    listed = Cable(n_keypoints=3, marks=[0.0, 0.3, 1.0], grasp=["clamped", "clamped"])
+    assert hash(listed) == hash(Cable(n_keypoints=3, marks=(0.0, 0.3, 1.0)))
+    assert not differing(listed, Cable(n_keypoints=3, marks=(0.0, 0.1 + 0.2, 1.0)))
+    assert not differing(Cable(n_keypoints=3), Cable(n_keypoints=3, marks=(0.0, 0.5, 1.0)))
+    assert "marks" in differing(listed, Cable(n_keypoints=3))

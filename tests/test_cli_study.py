@@ -14,6 +14,7 @@ from cablejax.commands.study import finished_rounds, remove_rounds
 from cablejax.control.targets import make_target, straight_start
 from cablejax.diagnose.diagnosis import Diagnosis, Gap, NamedEffect, Ranked
 from cablejax.diagnose.motion_bounds import Bounds
+from cablejax.diagnose.safe_motions import there_and_back
 from cablejax.diagnose.study import ended, first_recording, left_open
 from cablejax.diagnose.verdict_json import read_verdict, write_verdict
 from cablejax.gaplog import read_gap_log, write_gap_log
@@ -178,3 +179,12 @@ def test_a_study_ends_with_a_verdict_on_all_recordings_and_goes_on_after_a_kill(
     page = (out / "report.html").read_text()
     assert f"round_{len(rounds)}/report.html" in page and "bending_damping" in page
     assert main(arguments) == 2, "what is there stays"
+
+
+def test_a_first_recording_fits_into_short_motions_and_takes_as_long_as_slow_ones_need():
+    start, goal = straight_start(LONG), GOALS["U"]
+    short = there_and_back(start, goal, Bounds(duration=20.0))
+    assert len(short) == 201
+    slow = there_and_back(start, goal, Bounds(speed=0.01, turn_rate=0.1, duration=300.0))
+    assert np.abs(slow - goal).max(axis=(1, 2)).min() < 1e-3
+    np.testing.assert_allclose(slow[-1], start, atol=1e-6)

@@ -477,3 +477,8 @@ def test_bounds_that_no_random_start_keeps_are_an_error_not_a_hang():
     motion = MotionConfig(start="random", min_distance=0.9995)
     with pytest.raises(ValueError, match=r"None of 10000 random starts keeps the bounds .* Widen them"):
         random_motion(np.random.default_rng(0), TINY.discretisation, 1, motion)
+
+
+def test_a_straight_start_out_of_its_own_bounds_is_refused():
+    with pytest.raises(ValueError, match="A straight start is out of the bounds"):
+        random_motion(np.random.default_rng(0), Discretisation(), 5, MotionConfig(straight_slack=0.6))

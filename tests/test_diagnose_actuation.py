@@ -1,5 +1,7 @@
 """What the arms do wrong is told from commands and encoders alone."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -7,6 +9,7 @@ from cablejax.diagnose import Calibration, explanation
 from cablejax.diagnose.actuation import actuation
 from cablejax.diagnose.actuation_verdict import with_arms
 from cablejax.diagnose.conclude import Conclusion
+from cablejax.diagnose.diagnosis import EffectValues
 from cablejax.diagnose.fit import Fit
 from diagnose_cases import INTERVAL, MOTIONS, poses
 
@@ -184,3 +187,26 @@ def test_a_deviation_that_shows_in_one_motion_only_makes_nothing_certain():
     result = actuation(measured, commands(), *shape, np.arange(len(wanted)), np.full(len(wanted), True))
     conclusion = with_arms(NOTHING, result, Calibration())
     assert max((effect.probability for effect in conclusion.effects), default=0.0) < 0.5
+
+
+def test_draws_of_an_explanation_have_the_arms_in_them():
+    cable = (EffectValues("bending_stiffness", {"ratio": 2.0}),)
+    found = dataclasses.replace(NOTHING, verdict="named", posterior=(cable,) * 64)
+    conclusion = with_arms(found, told(gain=1.08, delay=0.1, slow=0.15), Calibration())
+    assert all(draw[-1] == cable[0] for draw in conclusion.posterior)
+    lags = [draw[1].parameters for draw in conclusion.posterior]
+    assert {draw[0].name for draw in conclusion.posterior} == {"actuation_gain"}
+    assert np.mean([lag["time_s"] for lag in lags]) == pytest.approx(0.25, abs=0.02)
+    assert np.std([lag["time_s"] for lag in lags]) > 0 and np.mean([lag["delay_s"] for lag in lags]) > 0.05
+
+
+def test_many_motions_leave_both_single_effects_without_a_chance_and_the_ranking_whole():
+    one = told(gain=1.08, delay=0.1, slow=0.15)
+    many = dataclasses.replace(
+        one,
+        count=np.tile(one.count, 60),
+        motion=np.arange(60 * len(one.motion)),
+        unseen={effects: np.tile(error, 60) for effects, error in one.unseen.items()},
+    )
+    conclusion = with_arms(NOTHING, many, Calibration())
+    assert sum(ranked.probability for ranked in conclusion.ranking) == pytest.approx(1.0)

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from cablejax.diagnose.clock import furthest_off, is_even, on_even_clock, usual_interval
+from cablejax.diagnose.reference import predicted_ahead
 from cablejax.gaplog import Episode
 
 INTERVAL, N = 0.1, 120
@@ -84,3 +85,19 @@ def test_two_samples_are_enough():
     time = np.array([0.0, 0.13])
     even = on_even_clock(episode_of(time, np.zeros((2, 2, 3)), np.zeros((2, 2, 3)), hold=True), 0.1)
     assert even.hold.all() and np.isfinite(even.keypoints).all()
+
+
+def test_an_even_clock_of_any_rate_is_even():
+    for rate in (30.0, 60.0, 120.0):
+        time = np.arange(3000) / rate
+        assert is_even(time, usual_interval(time))
+
+
+@pytest.mark.parametrize("interval", [0.1, 0.4, 0.7])
+def test_five_seconds_ahead_are_five_seconds_whatever_the_clock(interval):
+    """Errors that grow by a millimetre a second."""
+    count = int(40 / interval)
+    observed = np.broadcast_to(1e-3 * interval * np.arange(count)[None, :, None, None], (1, count, 3, 2))
+    pose = np.zeros((1, count, 2, 3))
+    plain, _ = predicted_ahead(observed, np.zeros_like(observed), pose, np.array([interval]), np.array([count]))
+    assert 1e3 * plain == pytest.approx(5.0, rel=1e-6)

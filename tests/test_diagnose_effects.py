@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import tracemalloc
 
 import jax
 import jax.numpy as jnp
@@ -13,8 +14,10 @@ from cablejax.cable import Cable, Discretisation
 from cablejax.diagnose import LIBRARY, CableEffect, Parameter
 from cablejax.diagnose.case import FINE_LINKS
 from cablejax.diagnose.check import check_effect
+from cablejax.effects.base import Context
 from cablejax.effects.camera import in_camera_frame
-from cablejax.effects.given import EFFECTS, parse_effect, with_effects
+from cablejax.effects.effect import Effect
+from cablejax.effects.given import EFFECTS, GivenEffect, parse_effect, with_effects
 from cablejax.effects.physics import nominal_physics
 from cablejax.simulate import MjxEngine, compiler_options
 from cablejax.simulate.chain.replay import Chain
@@ -229,3 +232,64 @@ def test_no_obstacle_is_sought_where_nothing_was_seen():
     facts = evidence()
     effect = {one.name: one for one in LIBRARY}["obstacle"]
     assert not facts.simulator.starts(effect, facts.nominal, np.full_like(facts.nominal, np.nan))
+
+
+def test_values_that_a_verdict_rounded_at_a_bound_are_at_it():
+    config = Discretisation(Cable(length=0.7312874513))
+    given = GivenEffect("gripper_slip", (("gripper", 0), ("time_s", 3.0), ("distance_m", -0.2)))
+    assert np.min(given.applied(nominal_physics(config), config).slip) == np.float32(-0.2)
+    width = float(f"{config.cable.length:.6g}")
+    wide = GivenEffect("stiffness_profile", (("centre_m", 0.3), ("width_m", width), ("ratio", 2.0)))
+    assert wide.applied(nominal_physics(config), config).stiffness.max() > 0
+    with pytest.raises(ValueError, match=r"distance_m is -0\.21"):
+        GivenEffect("gripper_slip", (("gripper", 0), ("time_s", 3.0), ("distance_m", -0.21))).applied(
+            nominal_physics(config), config
+        )
+
+
+def test_any_of_many_keypoints_may_be_off():
+    config = Discretisation(Cable(n_keypoints=90))
+    physics = parse_effect("keypoint_bias:index=80,offset_m=0.01").applied(nominal_physics(config), config)
+    assert np.flatnonzero(np.asarray(physics.bias_along)).tolist() == [80]
+
+
+def test_a_patch_on_a_smooth_table_has_its_stated_coefficient():
+    config = Discretisation(Cable(friction_coefficient=0.0))
+    for coefficient in (0.05, 0.008):
+        patch = parse_effect(f"friction_patch:x_m=0,y_m=0,radius_m=0.1,coefficient={coefficient}")
+        physics = patch.applied(nominal_physics(config), config)
+        assert float(physics.friction + physics.patch_friction) == pytest.approx(coefficient)
+
+
+def test_a_scale_seen_about_another_origin_comes_with_another_offset():
+    camera, points = EFFECTS["camera_similarity"], np.array([[4.0, 1.0], [4.5, 0.8]])
+    values = {"scale": 1.05, "angle_rad": 0.1, "x_m": -0.1, "y_m": 0.02}
+    place = (4.0, 1.0)
+    config = Discretisation()
+
+    def seen(parameters, at):
+        physics = GivenEffect("camera_similarity", tuple(parameters.items())).applied(nominal_physics(config), config)
+        return in_camera_frame(physics, at.astype(np.float32))
+
+    moved = camera.seen_from(values, place)
+    np.testing.assert_allclose(seen(moved, points - place) + place, seen(values, points), atol=1e-5)
+
+
+def test_a_short_cable_that_is_carried_far_is_searched_for_obstacles_in_time():
+    time = np.linspace(0.0, 1.0, 300)
+    centre = np.stack([np.sin(2 * np.pi * time), np.sin(4 * np.pi * time)], axis=-1)
+    cable = np.stack([np.linspace(0.0, 0.08, 13), 0.01 * np.sin(np.linspace(0.0, 3.0, 13))], axis=-1)
+    keypoints = (centre[:, None] + cable)[None]
+    config = Discretisation(Cable(length=0.1, diameter=1e-3))
+    about = Context(config, keypoints, np.full_like(keypoints, 2e-3), 30.0, np.ones(1))
+    tracemalloc.start()
+    EFFECTS["obstacle"].starts(about)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 300e6
+
+
+def test_an_effect_without_an_opposite_is_not_reversible():
+    positive = Parameter("size", "", 1e-3, 1e3, 1.0, 1.0, log=True)
+    with pytest.raises(ValueError, match="has no opposite"):
+        Effect(name="mine", parameters=(positive,), null=(0.0,), amplitude=0, reversible=True)

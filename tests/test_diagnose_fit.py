@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import types
 from collections import Counter
 
 import numpy as np
@@ -23,10 +24,11 @@ from cablejax.diagnose.belief import (
 from cablejax.diagnose.conclude import conclude, sentence
 from cablejax.diagnose.evidence import Evidence
 from cablejax.diagnose.fit import Fit, evaluate, improve
-from cablejax.diagnose.gap import held_out_predictions
+from cablejax.diagnose.gap import held_out_predictions, measure_gap
 from cablejax.diagnose.judgement import beside_unknown
 from cablejax.diagnose.planar import physics_of
 from cablejax.diagnose.playback import Playback
+from cablejax.diagnose.posterior import over_laws
 from cablejax.diagnose.protocol import Term
 from cablejax.diagnose.screen import screen, shortlist
 from cablejax.diagnose.search import Search, without_one
@@ -357,3 +359,31 @@ def test_held_out_predictions_are_those_of_fits_without_each_motion():
         assert (simpler.cost(rest) < starts[0].cost(rest) + 2.0) == (e == 2)
         expected = (simpler if e == 2 else fit).explanation
         np.testing.assert_allclose(predicted[e], facts.predict([expected])[0, e], rtol=0, atol=1e-5)
+
+
+def test_a_simulation_that_breaks_down_explains_nothing():
+    random, shape = np.random.default_rng(0), (4, 200, 2)
+    observed = 1e-3 * random.standard_normal(shape)
+    before, after = observed + 0.02, observed + 0.02
+    after[2:] = np.nan
+    bare = types.SimpleNamespace(unit="m")
+    facts = Evidence(
+        simulator=bare, episodes=np.arange(4), observed=observed, nominal=before, noise=np.array(1e-3),
+        temper=np.ones(4), freedom=6.0, motion=np.arange(4),
+    )  # fmt: skip
+    time = {"interval": np.full(4, 0.1), "length": np.full(4, 200)}
+    gap = measure_gap(facts, before, after, **time, held_out=(0, 1, 2, 3), resolvable=True)
+    assert gap.shrinkage == 0.0 and gap.split["named"] == 0.0
+    late = observed.copy()
+    late[:, :15] = np.nan
+    facts = dataclasses.replace(facts, observed=late)
+    gap = measure_gap(facts, before, before, **time, held_out=(), resolvable=True)
+    assert list(gap.horizons_mm) == [2.0, 5.0, 10.0, 19.9] and np.isfinite(list(gap.horizons_mm.values())).all()
+    quiet = dataclasses.replace(facts, observed=observed, noise=np.array(0.1))
+    assert measure_gap(quiet, before, before, **time, held_out=(0,), resolvable=True).shrinkage is None
+
+
+def test_draws_by_laws_whose_shares_were_rounded_up_are_no_more_than_asked():
+    own = np.zeros((400, 1))
+    drawn = over_laws(own, [(chance, np.ones((400, 1))) for chance in (0.401, 0.351, 0.247)])
+    assert drawn.shape == (400, 1) and drawn.mean() > 0.99

@@ -144,3 +144,15 @@ def test_bounds_in_lengths_follow_the_cable():
     assert Bounds().distances(short.length) == pytest.approx((0.09, 0.597))
     assert Bounds().radius(short.length) == pytest.approx(0.018)
     assert Bounds(max_distance=5.0).distances(short.length)[1] == pytest.approx(0.597)
+
+
+def test_three_keypoints_show_the_curvature_of_their_circle():
+    angle = np.linspace(0.0, 1.0, 3)
+    points = 0.25 * np.stack([np.sin(angle), 1 - np.cos(angle)], axis=-1)
+    np.testing.assert_allclose(curvature(points), 4.0)
+    assert refined(points).shape == (5, 2) and refined(points[:2]).shape == (3, 2)
+
+
+def test_the_smallest_distance_is_below_a_largest_one_that_is_small():
+    low, high = Bounds(max_distance=0.1).distances(1.0)
+    assert low < high == 0.1

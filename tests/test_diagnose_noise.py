@@ -319,3 +319,12 @@ def test_what_stands_beside_an_unknown_cause_makes_the_gap_smaller():
         assert left.verdict == "unknown" and not left.effects and not left.equivalent
     named = dataclasses.replace(found, verdict="named")
     assert _worth_naming(named, -0.5) is named
+
+
+@pytest.mark.parametrize("holds", [False, True])
+def test_a_tracker_that_reports_whole_millimetres_errs_by_their_rounding(holds):
+    """At rest it repeats the same number, which is no sign of a tracker without noise."""
+    points, flags = held(60, 290)
+    coarse = 1e-3 * np.round(points / 1e-3)
+    floor = noise_floor(coarse, flags if holds else None)
+    assert np.all(floor.std >= 0.999e-3 / np.sqrt(12)) and np.all(floor.std < 5e-4)

@@ -27,6 +27,7 @@ from cablejax.diagnose import (
     verdict_json,
     write_verdict,
 )
+from cablejax.diagnose.protocol import Plan
 
 NOTEBOOK = pathlib.Path(__file__).parents[1] / "notebooks" / "05_your_own_simulator.ipynb"
 
@@ -450,3 +451,39 @@ def test_one_episode_shows_a_gap_and_too_little_of_it_to_name_its_cause():
     found = [diagnose_simulator(swing, true[:n], interval=0.05, noise=1e-3, calibration=dear) for n in (1, 2)]
     assert [one.verdict for one in found] == ["unknown", "named"]
     assert found[0].sentence.startswith("There is a gap, but too little of it") and "library" not in found[0].sentence
+
+
+GAIN = Effect(
+    name="gain", parameters=(Parameter("gain", "", 0.1, 3.0, 1.0, 0.3),), null=(1.0,), amplitude=0, reversible=True
+)
+
+
+class Gained(Simulator):
+    """A signal of which a gain is unknown; NaN where its episode has ended."""
+
+    unit = "m"
+    effects = (GAIN,)
+
+    def __init__(self, count: int, plan: Plan | None = None):
+        self.plan, time = plan or Plan(), 0.05 * np.arange(300)
+        self.signal = np.stack([np.sin((0.5 + 0.2 * e) * time) for e in range(count)])[..., None]
+        self.signal[1:, 200:] = np.nan
+
+    def predict(self, explanations, episodes):
+        gains = np.array([one.values()[0][0] if one.terms else 1.0 for one in explanations])
+        return gains[:, None, None, None] * self.signal[np.asarray(episodes, int)]
+
+    def seen(self) -> np.ndarray:
+        return 1.2 * self.signal + 0.01 * np.random.default_rng(0).standard_normal(self.signal.shape)
+
+
+def test_a_simulator_may_end_where_its_episode_does():
+    simulator = Gained(4)
+    found = diagnose_simulator(simulator, simulator.seen(), interval=0.05)
+    assert found.verdict == "named" and found.effects[0].parameters["gain"].value == pytest.approx(1.2, abs=0.05)
+
+
+def test_of_one_episode_nothing_is_left_out_whatever_the_plan():
+    simulator = Gained(1, Plan(parts=4))
+    found = diagnose_simulator(simulator, simulator.seen(), interval=0.05)
+    assert found.verdict == "named" and found.gap.held_out_episodes == ()

@@ -67,3 +67,13 @@ def test_a_profile_ends_where_the_refitted_cost_has_risen_by_its_share():
         )
         assert lowest - 0.5 * (weight @ fit.sse + z @ z) == pytest.approx(0.5 * QUANTILE**2, rel=0.35)
     assert seen == 2
+
+
+def test_episodes_are_compared_over_their_own_lengths():
+    """Two short motions in a log with a long one: neither their padding nor its length says anything of them."""
+    pose = np.full((4, 300, 2, 3), np.nan)
+    sway = 0.3 * np.sin(np.linspace(0.0, np.pi, 60))
+    pose[0] = 0.0
+    pose[1:, :60] = 0.0
+    pose[1, :60, 0, 1], pose[2, :60, 0, 1], pose[3, :60, 0, 1] = sway, sway, -sway
+    assert repeated_motions(pose, 1.0).tolist() == [0, 1, 1, 3]

@@ -11,6 +11,7 @@ import pytest
 from cablejax.diagnose.regimes import largest_curvature
 from cablejax.diagnose.significance import LEVEL, contrast_p, variance_inflation
 from cablejax.diagnose.where import localise
+from cablejax.diagnose.where_words import describe
 from diagnose_cases import MOTIONS, SAMPLES, log_of, poses
 
 NOISE = 1e-3
@@ -196,3 +197,31 @@ def test_largest_curvature_of_keypoints_that_are_not_evenly_spaced():
     arclength = np.array([0.0, 0.05, 0.1, 0.3, 0.5, 0.8, 0.85, 1.0])
     circle = 0.5 * np.stack([np.cos(arclength / 0.5), np.sin(arclength / 0.5)], axis=-1)
     np.testing.assert_allclose(largest_curvature(circle[None, None], arclength), 2.0, rtol=1e-12)
+
+
+def test_what_was_not_seen_and_what_repeats_is_no_episode_of_its_own():
+    gap = np.zeros((4, SAMPLES, POINTS, 2))
+    gap[1, 40:, 5:8] = 4e-3
+    log, nominal = case(gap)
+    keypoints = log.keypoints.copy()
+    keypoints[3] = np.nan
+    where = localise(dataclasses.replace(log, keypoints=keypoints), nominal, np.full(POINTS, NOISE))
+    assert "it shows in episode 1 of 3 only" in where.sentences[0]
+    again = dataclasses.replace(
+        where,
+        heat=np.concatenate([where.heat] * 2),
+        per_episode_mm=np.tile(where.per_episode_mm, 2),
+        episode_p=np.tile(where.episode_p, 2),
+    )
+    marks, noise = np.linspace(0, 1, POINTS), np.full(POINTS, NOISE)
+    assert "3 different motions" in describe(again, marks, noise, motions=3)[-1]
+    assert "six are needed" not in describe(again, marks, noise)[-1]
+
+
+def test_dropouts_in_holds_leave_the_noise_white():
+    random, hold = np.random.default_rng(0), np.zeros((6, 300), bool)
+    hold[:, 150:] = True
+    whitened = random.standard_normal((6, 300, POINTS, 2))
+    whitened[random.random((6, 300, POINTS)) < 0.1] = np.nan
+    log = dataclasses.replace(case()[0], time=np.tile(np.arange(300) / 60, (6, 1)), episode_length=np.full(6, 300))
+    assert variance_inflation(whitened, log, hold) < 1.2

@@ -137,3 +137,13 @@ def test_bad_data_is_refused():
             open_loop_error(no_motion, dataclasses.replace(DATA, **change), SMALL, horizons=(1,))
     with pytest.raises(ValueError, match="use longer trajectories"):
         open_loop_error(no_motion, DATA, SMALL)
+
+
+@pytest.mark.parametrize("length", [0.1, 10.0])
+def test_snap_throughs_of_a_cable_of_another_length_are_the_same(length):
+    data = snapping_data()
+    scaled = dataclasses.replace(
+        data, keypoints=length * data.keypoints, gripper_twist=data.gripper_twist * np.array([length, length, 1.0])
+    )
+    usual, found = snapping(data, steps=3, stride=1), snapping(scaled, steps=3, stride=1, length=length)
+    np.testing.assert_array_equal(found, usual)

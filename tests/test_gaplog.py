@@ -11,11 +11,13 @@ import pytest
 
 from cablejax.cable import Cable
 from cablejax.gaplog import (
+    TARGETS,
     Episode,
     GapLogError,
     episodes_of,
     gap_log_from_episodes,
     read_gap_log,
+    targets_of,
     until,
     validate,
     write_gap_log,
@@ -419,3 +421,29 @@ class TestJoined:
     def test_recordings_that_do_not_add_up(self, log, parts):
         with pytest.raises(GapLogError, match=r"meta\.recordings"):
             recordings(dataclasses.replace(log, meta={**log.meta, "recordings": parts}))
+
+
+def test_names_of_guesses_are_not_taken_for_labels_of_episodes():
+    one = dataclasses.replace(episode(8), gripper_pose=np.zeros((8, 2, 3)), keypoints=straight(8))
+    whole = gap_log_from_episodes([one] * 3, CABLE, source="test")
+    guessed = ["diameter_m", "linear_density_kg_per_m", "bending_stiffness_n_m2"]
+    some = chosen(dataclasses.replace(whole, meta={**whole.meta, "guessed": guessed}), [0, 2])
+    assert some.meta["guessed"] == guessed and len(some.meta["motion"]) == 2
+
+
+def straight(samples: int) -> np.ndarray:
+    return np.broadcast_to(np.stack([np.linspace(0, 1, 5), np.zeros(5)], axis=1), (samples, 5, 2)).copy()
+
+
+def test_targets_of_joined_recordings_stay_with_their_episodes():
+    logs = [gap_log_from_episodes([episode(8, seed=seed)], CABLE, source="test") for seed in range(2)]
+    target = np.arange(10.0).reshape(5, 2)
+    logs[1].meta[TARGETS] = [target.tolist()]
+    first, second = targets_of(joined(logs, ["a.npz", "b.npz"]))
+    assert first is None
+    np.testing.assert_array_equal(second, target)
+
+
+def test_the_beginning_of_a_log_whose_clock_ran_before(log):
+    later = dataclasses.replace(log, time=log.time + 100.0)
+    np.testing.assert_array_equal(until(later, 0.35).episode_length, until(log, 0.35).episode_length)

@@ -247,3 +247,10 @@ def test_a_shape_name_cannot_break_the_page(tmp_path):
 def test_a_report_of_no_runs_is_refused():
     with pytest.raises(ValueError, match="at least one run"):
         by_shape({})
+
+
+def test_curve_of_a_cable_that_was_not_seen_is_empty():
+    assert np.isnan(cable_curve(np.full((13, 2), np.nan), np.zeros((2, 3)), 49)).all()
+    one = np.full((13, 2), np.nan)
+    one[4] = 0.5
+    np.testing.assert_array_equal(cable_curve(one, n_points=5), np.full((5, 2), 0.5))

@@ -16,6 +16,8 @@ from cablejax.effects.arms import delayed
 from cablejax.effects.given import EFFECTS, GivenEffect, parse_effect, with_effects
 from cablejax.effects.physics import Physics, nominal_physics, normal_gravity
 from cablejax.simulate import ENGINES, ChainEngine, MjxEngine, check_effects
+from cablejax.simulate.chain.geometry import levers
+from cablejax.simulate.composite import link_lengths
 from cablejax.simulate.engine import compiled_rollout
 from cablejax.simulate.friction import on_table
 from cablejax.simulate.motions import MotionConfig, random_motion
@@ -466,3 +468,34 @@ def test_a_soft_rope_that_buckles_stays_finite():
     physics = jax.tree.map(lambda leaf: jnp.repeat(jnp.asarray(leaf)[None], 8, axis=0), nominal_physics(config))
     points = engine.rollout(physics, engine.initial_state(jnp.array(poses)), jnp.array(twists))[1].keypoints
     assert np.isfinite(points).all() and np.abs(points).max() < 2 * ROPE.length
+
+
+def test_a_loose_chain_between_steady_grippers_keeps_its_energy():
+    """Without friction, damping or stiffness, as seen from the grippers: centrifugal forces do no work."""
+    with jax.enable_x64(True):
+        loose = Cable(n_keypoints=9, friction_coefficient=0.0, bending_stiffness=1e-9, damping_time=0.0)
+        config = Discretisation(loose, n_links=9, timestep=1e-3)
+        engine, physics, twist = ChainEngine(config), nominal_physics(config, np.float64), np.zeros((1, 2, 3))
+        twist[..., :2] = 0.3
+        state = engine.initial_state(np.array([[-0.3, 0.0, 1.0], [0.3, 0.05, -0.7]]))
+        energies = []
+        for time in (1e-3, 0.1, 0.1):  # first the grippers' jump
+            state, _ = engine.rollout(physics, state, twist, time)
+            energies.append(kinetic_energy(config, state, twist[0, 0, :2]))
+    np.testing.assert_allclose(energies, energies[0], rtol=0.01)
+
+
+def kinetic_energy(config: Discretisation, state, velocity) -> float:
+    """Of all links relative to grippers that move with a velocity [J]."""
+    qpos, qvel, length = np.asarray(state.qpos), np.asarray(state.qvel), link_lengths(config)
+    theta, rate, mass = np.cumsum(qpos[2:]), np.cumsum(qvel[2:]), config.cable.linear_density * length
+    across = rate[:, None] * np.stack([-np.sin(theta), np.cos(theta)], axis=1)
+    of_nodes = qvel[:2] - velocity + levers(config) @ across
+    return float(0.5 * (mass @ (of_nodes**2).sum(axis=1) + mass @ (length * rate) ** 2 / 12))
+
+
+def test_a_short_cable_held_above_the_table_is_lifted_once():
+    config = Discretisation(Cable(length=0.3), n_links=17)
+    physics = dataclasses.replace(nominal_physics(config), grip_height=np.float32(1e-3))
+    mass = on_table(physics, np.full(17, 0.08 * config.link_length, np.float32), config.link_length)
+    assert np.min(mass) >= 0 and np.argmax(mass) == 8 and np.sum(mass) < 0.5 * 0.08 * 0.3

@@ -190,3 +190,28 @@ def test_a_place_out_of_bounds_is_told_as_it_was_given(text, message):
     config = Discretisation(Cable(length=0.6))
     with pytest.raises(ValueError, match=message):
         with_effects(nominal_physics(config), [parse_effect(text)], config)
+
+
+def test_an_effect_begins_and_ends_within_a_command():
+    """Half of a second of tilt moves the cable, whether the second is one command or ten."""
+    staged = parse_effect("gravity_tilt:angle_rad=0.5,direction_rad=1.5,from_s=0.5,until_s=0.8")
+    shapes = []
+    for count in (1, 10):
+        plant = Plant(dataclasses.replace(CONFIG, effects=(staged,)))
+        plant.reset(ARCH)
+        for _ in range(count):
+            seen = plant.step(np.zeros((2, 3)), 1.0 / count)
+        shapes.append(seen.true_keypoints)
+    still = Plant(CONFIG)
+    still.reset(ARCH)
+    assert np.abs(shapes[0] - still.step(np.zeros((2, 3)), 1.0).true_keypoints).max() > 1e-3
+    np.testing.assert_allclose(*shapes, atol=1e-6)
+
+
+def test_arms_forget_what_is_longer_ago_than_their_delay():
+    physics = dataclasses.replace(nominal_physics(CABLE, np.float64), actuation_delay=np.float64(0.3))
+    arms = Arms(physics, ARCH)
+    for _ in range(200):
+        executed_part = list(arms.follow(TWIST, 20, 0.005))
+    np.testing.assert_allclose(executed_part[-1][0], TWIST, atol=1e-12)
+    assert len(arms._times) < 10

@@ -141,3 +141,17 @@ def test_derivatives_against_central_differences(where):
             (history.keypoints[-1], pose, twist),
             step=1e-7 if where == "straight" else 1e-6,
         )
+
+
+@pytest.mark.parametrize("apart", [1.0, 1.005, 1.02])
+def test_grippers_a_little_too_far_apart_leave_the_cable_straight(apart):
+    """A length that was measured short, or a tool that is off: no chain meets them, and none may wander for that."""
+    with jax.enable_x64(True):
+        random, pose = np.random.default_rng(0), np.array([[0.0, 0.0, 0.005], [apart, 0.0, -0.005]])
+        straight = np.stack([np.linspace(0.0, apart, 13), np.zeros(13)], axis=1)
+        seen = straight + 1e-3 * random.standard_normal(straight.shape)
+        before, after = resting_shapes(jnp.asarray(seen), jnp.asarray(pose), jnp.asarray(pose), length=1.0)
+        slope = jax.jacfwd(lambda points: resting_shapes(points, jnp.asarray(pose), jnp.asarray(pose), length=1.0)[1])
+        np.testing.assert_allclose(before, straight, atol=0.012)
+        np.testing.assert_allclose(after, before, atol=0.004)
+        assert np.abs(slope(jnp.asarray(seen))).max() < 2.0

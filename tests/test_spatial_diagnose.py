@@ -17,9 +17,12 @@ from cablejax.diagnose.fit import evaluate, improve
 from cablejax.log_geometry import setup_fault
 from cablejax.report.diagnosis_page import write_diagnosis_page
 from cablejax.simulate.rod import Rod
+from cablejax.simulate.rod.clamps import frames_along
+from cablejax.simulate.rod.discrete import along_joints
 from cablejax.spatial.cable import SpatialCable, errors
 from cablejax.spatial.clock import on_one_clock, thinned
 from cablejax.spatial.diagnose import _other_clock, diagnose_space
+from cablejax.spatial.effects import Layout, effects_of
 from cablejax.spatial.gap import OWN, noise_of, own_error, smallest_gap
 from cablejax.spatial.geometry import local_changes
 from cablejax.spatial.identify import layout_of
@@ -280,3 +283,41 @@ def test_names_the_cause_and_goes_on_where_it_was(tmp_path):
     verdict = json.loads((tmp_path / "report" / "verdict.json").read_text())
     assert verdict == json.loads(json.dumps(verdict_json(result)))
     assert len(verdict["where"]["per_episode_mm"]) == 6
+
+
+def test_one_window_is_too_little_and_one_that_ends_at_once_is_left_out():
+    log = cases.recording(1)
+    with pytest.raises(ValueError, match="one window to fit"):
+        diagnose_space(log)
+    whole = cases.recording()
+    keypoints = whole.keypoints.copy()
+    keypoints[1, 2:, 1:-1] = np.nan
+    windows = windows_of(dataclasses.replace(whole, keypoints=keypoints))
+    assert len(windows) == 3 and len(windows.left_out) == 1
+
+
+def test_a_recording_at_another_rate_is_sampled_again():
+    """By 4 %: no jitter, or one clock would play it too fast."""
+    log = cases.recording()
+    time = log.time.copy()
+    time[1] *= 1.04
+    even, repairs = on_one_clock(dataclasses.replace(log, time=time))
+    assert repairs and "sampled again" in repairs[0]
+    assert even.episode_length[1] == pytest.approx(1.04 * log.episode_length[1], abs=1)
+
+
+def test_stiffness_is_the_geometric_mean_along_the_cable():
+    layout = Layout(effects_of(3), 0.02, (0.25, 0.5, 0.75, 1.0))
+    for profile in ([1.0, 0, 0, 0, 0], [0.7, 0, 0, 0, 0.7], [0, 0, 1.0, 0, 0]):
+        values = layout.null.copy()
+        values[layout.slices["log_profile"]] = profile
+        stiffness = np.asarray(along_joints(layout.physics(values).stiffness, 200))
+        assert np.log(stiffness).mean() == pytest.approx(np.log(0.02), abs=2e-3)
+
+
+def test_frames_of_set_ups_that_were_turned_by_half_a_turn():
+    angle = np.concatenate([np.linspace(-0.2, 0.2, 10), np.pi + np.linspace(-0.2, 0.2, 10)])
+    tangent = np.stack([np.cos(angle), np.sin(angle), np.zeros(20)], axis=1)
+    frames = frames_along(tangent)
+    np.testing.assert_allclose(frames @ np.swapaxes(frames, -1, -2), np.broadcast_to(np.eye(3), (20, 3, 3)), atol=1e-9)
+    np.testing.assert_allclose(frames[:, 0], tangent, atol=1e-9)

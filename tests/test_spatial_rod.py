@@ -278,3 +278,32 @@ def test_forces_of_torques_have_the_power_of_the_torques():
     force = forces_of_torques(edges, torque)
     np.testing.assert_allclose(force, transposed(torque)[0], rtol=1e-12, atol=1e-12)
     np.testing.assert_allclose(jnp.vdot(force, rate), jnp.vdot(torque, spin), rtol=1e-12)
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_a_rod_begins_at_its_markers_however_few(count):
+    """An arch with one or two markers: beyond them the clamps say where the first shape goes on."""
+    opening = 1.9
+    radius, s = 1.0 / opening, np.linspace(0.0, 1.0, count + 2)
+
+    def place(at):
+        angle = opening * (at - 0.5)
+        height = radius * (np.cos(opening / 2) - np.cos(angle))
+        return np.stack([radius * np.sin(angle), 0 * at, height], axis=-1)
+
+    angle = opening * (s[[0, -1]] - 0.5)
+    along = np.stack([np.cos(angle), 0 * angle, np.sin(angle)], axis=-1)
+    across = np.broadcast_to([0.0, 1.0, 0.0], (2, 3))
+    frames = np.broadcast_to(np.stack([along, across, np.cross(along, across)], axis=1), (3, 2, 3, 3))
+    physics = RodPhysics(
+        length=jnp.ones(()), stiffness=jnp.full(1, 0.25), rest_curvature=jnp.zeros((1, 2)),
+        damping_time=jnp.asarray(0.03), drag=jnp.asarray(0.3), quadratic_drag=jnp.zeros(()),
+        twist_stiffness=jnp.asarray(0.1), stretch=jnp.asarray(5e4), marker_mass=jnp.zeros(()),
+        clamp_rotation=jnp.zeros((2, 2)), arclength=jnp.asarray(s[1:-1]), offset=jnp.zeros((count, 2)),
+        gravity=jnp.array([0.0, 0.0, -9.81]),
+    )  # fmt: skip
+    seen = np.broadcast_to(place(s[1:-1]), (2, count, 3))
+    found = Rod(32, 1, twisting=False).rollout(
+        physics, np.broadcast_to(place(s[[0, -1]]), (3, 2, 3)), frames, seen, _INTERVAL
+    )
+    np.testing.assert_allclose(found.points[0], seen[0], atol=3e-3)

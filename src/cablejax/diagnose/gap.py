@@ -118,7 +118,10 @@ def measure_gap(
 def shrinkage(
     before: Float[np.ndarray, "E"], after: Float[np.ndarray, "E"], motion: Int[np.ndarray, "E"]
 ) -> tuple[float, tuple[float, float] | None]:
-    """Of the squared errors above the noise of each episode, with a 90 % interval by resampling motions."""
+    """Of the squared errors above the noise of each episode, with a 90 % interval by resampling motions.
+
+    NaN where they are no larger than the noise before.
+    """
 
     def of(chosen) -> float:
         denominator = before[chosen].sum()
@@ -126,7 +129,7 @@ def shrinkage(
 
     motions = episodes_by_motion(motion)
     whole = float(of(np.arange(len(before))))
-    if len(motions) == 1:
+    if len(motions) == 1 or not np.isfinite(whole):
         return whole, None
     rng = np.random.default_rng(0)
     draws = [

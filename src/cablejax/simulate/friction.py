@@ -85,7 +85,8 @@ def _hanging(physics: Physics, stiffness, nodes, link_length: float):
     held = (physics.grip_height > 0) & (stiffness > 0) & (weight > 0)
     weight, bending = xp.where(held, weight, 1.0), xp.where(held, stiffness, 1.0)
     span = xp.where(held, (72.0 * bending * xp.where(held, physics.grip_height, 1.0) / weight) ** 0.25, 0.0)
-    reach = span / link_length
+    # a short cable comes down in its middle
+    reach = xp.minimum(span / link_length, 0.5 * (len(nodes) - 1))
     lifted = xp.clip(reach - nodes + 0.5, 0.0, xp.minimum(reach, 1.0))
     landing = xp.clip(1.0 - xp.abs(reach - nodes), 0.0, 1.0) * reach / 3.0
     return physics.density * link_length * (lifted - landing)

@@ -106,6 +106,11 @@ def effect_names() -> tuple[str, ...]:
     return tuple(effect.name for effect in effects_of(1))
 
 
+def mean_along(log_profile: Float[Array | np.ndarray, "K"]) -> Float[Array, ""]:
+    """Mean along the cable of the logarithm of a stiffness that is linear between evenly spaced knots."""
+    return jnp.log(along_joints(jnp.exp(jnp.asarray(log_profile)), _ALONG)).mean()
+
+
 @dataclasses.dataclass(frozen=True)
 class Layout:
     """The effects of one cable, and what their values mean.
@@ -167,9 +172,7 @@ class Layout:
         arclength = jnp.asarray(self.arclength) + part["along"]
         laden = self.laden(values)
         stiffness = self.nominal_stiffness * laden * part["ratio"]
-        # the rod interpolates the stiffness itself, the ratio is of its geometric mean
-        knots = jnp.exp(part["log_profile"])
-        profile = knots * jnp.exp(-jnp.log(along_joints(knots, _ALONG)).mean())
+        profile = jnp.exp(part["log_profile"] - mean_along(part["log_profile"]))
         points = len(self.arclength) - 1
         return RodPhysics(
             length=arclength[-1],
