@@ -202,8 +202,8 @@ def page(rows: list[dict[str, Any]]) -> str:
         "not tried; even seeds by links on ball joints in MuJoCo, which share no code with the fit. Each effect is "
         "there with a chance of one half: EI/rho off the believed one by a factor of 1.3 or more, damping of 0.01 to "
         "0.1 s, drag of 0.2 to 0.8 1/s at the grippers' speed, shared at random by both laws, EI somewhere off its "
-        "mean by about 30 % or more, grips turned with a standard deviation of 0.2 rad in all recordings and 0.2 rad more in "
-        "each. Naming nothing would be right on none of the first column and all of "
+        "mean by about 30 % or more, grips turned with a standard deviation of 0.2 rad in all recordings and 0.2 rad "
+        "more in each. Naming nothing would be right on none of the first column and all of "
         "the second. Either law of drag counts for both. The markers' mass and places are not judged: every cable has "
         "markers, whose mass motion hardly shows apart from the cable's own, and whose places are read off the "
         "recording, some millimetres wrong.",
