@@ -120,3 +120,9 @@ def test_gradient_of_a_rollout_against_central_differences(config, where):
             return predict(bind(graphdef, weights), history, commands)
 
         check_derivatives(shapes, (as_float64(weights), history, commands), step=1e-7, seeds=(0, 1))
+
+
+@pytest.mark.parametrize(("setting", "value"), [("symmetric", "no"), ("conditioned", 1), ("message_passing", 1000)])
+def test_settings_that_are_no_settings_are_refused(setting, value):
+    with pytest.raises(ValueError, match=f"ModelConfig.{setting} is {value!r}"):
+        ModelConfig(**{setting: value})

@@ -78,7 +78,7 @@ LIMITS: Mapping[str, Limit] = MappingProxyType(
         "at_least_three": Limit(3, 1000, whole=True),
         "history": Limit(1, 1000, whole=True),
         "width": Limit(1, 65_536, whole=True),
-        "layers": Limit(1, 1000, whole=True),
+        "layers": Limit(1, 50, whole=True),
         "optimiser_steps": Limit(1, 1_000_000_000, whole=True),
         "batch": Limit(1, 1_000_000, whole=True),
         "learning_rate": Limit(1e-12, 1.0),

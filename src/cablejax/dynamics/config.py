@@ -92,6 +92,9 @@ class ModelConfig:
         )
         if self.prior not in (known := ("static", "rigid", "none")):
             raise ValueError(f"ModelConfig.prior is {self.prior!r}, expected one of {known}.")
+        for name in ("conditioned", "symmetric"):
+            if not isinstance(getattr(self, name), bool):
+                raise ValueError(f"ModelConfig.{name} is {getattr(self, name)!r}, expected True or False.")
         if self.symmetric and (self.latent % 4 or self.hidden % 4):
             raise ValueError(
                 f"ModelConfig.latent is {self.latent} and hidden {self.hidden}, expected multiples of 4: a symmetric "
