@@ -46,6 +46,9 @@ MAX_TURN = 0.2
 """Largest change of a joint angle in one Newton step [rad]."""
 
 _SMALL = 1e-6
+# Clamps farther apart than so many lengths are brought nearer. A taut cable is shaped as it is, with its derivatives;
+# where clamps are a hundred-thousandth farther apart the steps begin to wander.
+_REACH = 1.000003
 
 
 @dataclasses.dataclass(frozen=True)
@@ -189,14 +192,15 @@ def resting_shapes(
 
 
 def _within_reach(pose: Float[Array, "2 3"], length: float) -> Float[Array, "2 3"]:
-    """The clamps' poses, the second on its way to the first no farther than the cable is long: what no chain can meet.
+    """The clamps' poses, the second on its way to the first hardly farther than the cable is long: no chain meets more.
 
     Without that the steps would wander where grippers are farther apart by an error of the length, or of a tool.
     """
     way = pose[1, :2] - pose[0, :2]
     squared = jnp.sum(way**2)
-    beyond = squared > length**2
-    nearer = pose[0, :2] + way * (length / jnp.sqrt(jnp.where(beyond, squared, 1.0)))
+    reach = _REACH * length
+    beyond = squared > reach**2
+    nearer = pose[0, :2] + way * (reach / jnp.sqrt(jnp.where(beyond, squared, 1.0)))
     return pose.at[1, :2].set(jnp.where(beyond, nearer, pose[1, :2]))
 
 
