@@ -18,11 +18,9 @@ from cablejax.log_geometry import setup_fault
 from cablejax.report.diagnosis_page import write_diagnosis_page
 from cablejax.simulate.rod import Rod
 from cablejax.simulate.rod.clamps import frames_along
-from cablejax.simulate.rod.discrete import along_joints
 from cablejax.spatial.cable import SpatialCable, errors
 from cablejax.spatial.clock import on_one_clock, thinned
 from cablejax.spatial.diagnose import _other_clock, diagnose_space
-from cablejax.spatial.effects import Layout, effects_of
 from cablejax.spatial.gap import OWN, noise_of, own_error, smallest_gap
 from cablejax.spatial.geometry import local_changes
 from cablejax.spatial.identify import layout_of
@@ -304,15 +302,6 @@ def test_a_recording_at_another_rate_is_sampled_again():
     even, repairs = on_one_clock(dataclasses.replace(log, time=time))
     assert repairs and "sampled again" in repairs[0]
     assert even.episode_length[1] == pytest.approx(1.04 * log.episode_length[1], abs=1)
-
-
-def test_stiffness_is_the_geometric_mean_along_the_cable():
-    layout = Layout(effects_of(3), 0.02, (0.25, 0.5, 0.75, 1.0))
-    for profile in ([1.0, 0, 0, 0, 0], [0.7, 0, 0, 0, 0.7], [0, 0, 1.0, 0, 0]):
-        values = layout.null.copy()
-        values[layout.slices["log_profile"]] = profile
-        stiffness = np.asarray(along_joints(layout.physics(values).stiffness, 200))
-        assert np.log(stiffness).mean() == pytest.approx(np.log(0.02), abs=2e-3)
 
 
 def test_frames_of_set_ups_that_were_turned_by_half_a_turn():

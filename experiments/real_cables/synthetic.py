@@ -22,7 +22,7 @@ from cablejax.recordings.deform import NOMINAL, SAMPLE_INTERVAL, DeformRecording
 from cablejax.simulate.compile import compiler_options
 from cablejax.simulate.rod import Rod, RodPhysics
 from cablejax.simulate.rod.clamps import frames_along
-from cablejax.spatial.effects import CURVATURE_KNOTS, PROFILE_KNOTS, TWIST_RATIO, mean_along
+from cablejax.spatial.effects import CURVATURE_KNOTS, PROFILE_KNOTS, TWIST_RATIO
 from cablejax.spatial.identify import EDGES
 from real_cables import composite
 
@@ -50,7 +50,7 @@ class SyntheticCable:
     """What is true of a cable and of how it is held and seen.
 
     Attributes:
-        stiffness: EI / rho, geometric mean along the cable [m^4/s^2].
+        stiffness: EI / rho, geometric mean over the knots of the profile [m^4/s^2].
         profile: logarithm of EI / rho over that mean, at evenly spaced knots along the cable, shape [K].
         length: between the clamps [m].
         damping_time: Kelvin-Voigt time constant of bending [s].
@@ -137,7 +137,7 @@ def drawn_cable(generator: np.random.Generator, recordings: int) -> SyntheticCab
     profile = 0.25 * generator.normal(size=PROFILE_KNOTS)
     return SyntheticCable(
         stiffness=between(0.01, 0.2),
-        profile=_about_its_mean(profile),
+        profile=profile - profile.mean(),
         length=float(generator.uniform(0.85, 1.0)),
         damping_time=between(0.01, 0.1),
         drag=float(generator.uniform(0.0, 0.8)),
@@ -149,10 +149,6 @@ def drawn_cable(generator: np.random.Generator, recordings: int) -> SyntheticCab
         offset=np.zeros((MARKERS, 2)),
         roll=0.0,
     )
-
-
-def _about_its_mean(log_profile: Float[np.ndarray, "K"]) -> Float[np.ndarray, "K"]:
-    return log_profile - float(mean_along(log_profile))
 
 
 def with_effects(cable: SyntheticCable, present: Sequence[str], generator: np.random.Generator) -> SyntheticCable:
@@ -172,7 +168,7 @@ def with_effects(cable: SyntheticCable, present: Sequence[str], generator: np.ra
         damping_time=cable.damping_time if has["bending_damping"] else _UNDAMPED,
         drag=linear * has["drag"],
         quadratic_drag=quadratic / SPEED * has["drag"],
-        profile=_about_its_mean(cable.profile * max(1.0, _UNEVEN / uneven) * has["stiffness_profile"]),
+        profile=cable.profile * max(1.0, _UNEVEN / uneven) * has["stiffness_profile"],
         grips=cable.grips * has["gripper_rotation_offset"],
     )
 

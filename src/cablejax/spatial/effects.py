@@ -25,7 +25,6 @@ from jaxtyping import Array, Float
 from cablejax.cable import GRAVITY
 from cablejax.effects.effect import Effect, Parameter
 from cablejax.simulate.rod import RodPhysics
-from cablejax.simulate.rod.discrete import along_joints
 
 PROFILE_KNOTS = CURVATURE_KNOTS = 5
 """Places along the cable between which a profile and a rest curvature are interpolated."""
@@ -37,8 +36,6 @@ GRIP = 0.3
 It turns about the cable with the roll, which is not observed, and differs each time that the cable is gripped."""
 # Almost inextensible: 1 m of cable that hangs by its end stretches by 0.2 mm.
 _STRETCH = 5e4
-# Places along the cable at which the mean of its stiffness is taken.
-_ALONG = 64
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -106,11 +103,6 @@ def effect_names() -> tuple[str, ...]:
     return tuple(effect.name for effect in effects_of(1))
 
 
-def mean_along(log_profile: Float[Array | np.ndarray, "K"]) -> Float[Array, ""]:
-    """Mean along the cable of the logarithm of a stiffness that is linear between evenly spaced knots."""
-    return jnp.log(along_joints(jnp.exp(jnp.asarray(log_profile)), _ALONG)).mean()
-
-
 @dataclasses.dataclass(frozen=True)
 class Layout:
     """The effects of one cable, and what their values mean.
@@ -163,7 +155,7 @@ class Layout:
         return 1.0 + jnp.asarray(values)[self.slices["marker_mass"].start] / spacing
 
     def log_stiffness(self, values: Float[Array, "P"] | np.ndarray) -> Float[Array, ""]:
-        """Logarithm of EI / rho over the nominal one, mean along the cable; differentiable in `values`."""
+        """Logarithm of EI / rho over the nominal one, mean over the profile's knots; differentiable in `values`."""
         return jnp.log(jnp.asarray(values)[self.slices["ratio"].start])
 
     def physics(self, values: Float[Array, "P"] | np.ndarray) -> RodPhysics:
@@ -172,7 +164,7 @@ class Layout:
         arclength = jnp.asarray(self.arclength) + part["along"]
         laden = self.laden(values)
         stiffness = self.nominal_stiffness * laden * part["ratio"]
-        profile = jnp.exp(part["log_profile"] - mean_along(part["log_profile"]))
+        profile = jnp.exp(part["log_profile"] - part["log_profile"].mean())
         points = len(self.arclength) - 1
         return RodPhysics(
             length=arclength[-1],

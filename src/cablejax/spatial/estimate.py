@@ -148,7 +148,7 @@ class Estimate:
 
     @property
     def stiffness(self) -> Interval:
-        """EI / rho, geometric mean along the cable [m^4/s^2]."""
+        """EI / rho, geometric mean over the knots of the profile, ends included [m^4/s^2]."""
         ratio, nominal = self.ratio(self.layout.log_stiffness), self.layout.nominal_stiffness
         return Interval(nominal * ratio.value, nominal * ratio.low, nominal * ratio.high)
 
