@@ -269,7 +269,10 @@ def main() -> None:
     options = parser.parse_args()
     rows = Rows(options.trials, ("seed",))
     if options.report:
-        publish(page([row for row in rows.read() if row["seed"] in HELD_OUT]), options.report)
+        done = [row for row in rows.read() if row["seed"] in HELD_OUT]
+        if all("broken" in row for row in done):
+            raise SystemExit(f"{options.trials} has no finished cable of the seeds {HELD_OUT.start}:{HELD_OUT.stop}.")
+        publish(page(done), options.report)
         return
     if options.calibrate:
         chosen_on = [row for row in rows.read() if row["seed"] < HELD_OUT.start and "broken" not in row]

@@ -10,7 +10,7 @@ from cablejax.control.loop import run_closed_loop
 from cablejax.control.run import shape_error_cm
 from cablejax.control.targets import make_target, straight_start
 from cablejax.perceive.camera import CameraConfig, DepthCamera
-from cablejax.perceive.plant import CloudPlant
+from cablejax.perceive.plant import CloudPlant, tracker_for
 from cablejax.simulate.elastica import solve_elastica
 from cablejax.simulate.plant import PlantConfig
 from perceive_cases import TRACKER
@@ -140,3 +140,9 @@ def test_tracker_and_plant_must_be_about_the_same_cable():
     )
     with pytest.raises(ValueError, match="13 keypoints"):
         CloudPlant(other, camera=CAMERA, tracker=TRACKER)
+
+
+def test_a_tracker_finds_evenly_spaced_keypoints_only():
+    with pytest.raises(ValueError, match="a tracker finds evenly spaced ones"):
+        tracker_for(Cable(n_keypoints=3, marks=(0.0, 0.3, 1.0)))
+    assert tracker_for(Cable(n_keypoints=3, marks=(0.0, 0.5, 1.0))) == tracker_for(Cable(n_keypoints=3))

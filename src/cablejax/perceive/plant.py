@@ -85,7 +85,16 @@ class CloudPlant(Plant):
 
 
 def tracker_for(cable: Cable) -> TrackerConfig:
-    """A tracker's settings for a cable: the defaults, with lengths that depend on the cable's in proportion to it."""
+    """A tracker's settings for a cable: the defaults, with lengths that depend on the cable's in proportion to it.
+
+    Raises:
+        ValueError: the cable's keypoints are not evenly spaced.
+    """
+    if not np.allclose(cable.keypoint_arclength, np.linspace(0.0, cable.length, cable.n_keypoints)):
+        raise ValueError(
+            "The cable has keypoints at given arc lengths (marks), and a tracker finds evenly spaced ones. Give it a "
+            "cable with marks=None and interpolate between them."
+        )
     ratio = cable.length / Cable.length
     return TrackerConfig(
         registration=RegistrationConfig(length=cable.length, n_keypoints=cable.n_keypoints),

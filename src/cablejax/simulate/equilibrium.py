@@ -2,7 +2,8 @@
 
 Minimises the bending energy `sum_i EI/(2h) (phi_i - h kappa_0i)^2` over the joint angles phi, subject to the far end's
 position and tangent, by Newton's method in the null space of the constraints. Negative curvature is reflected, so that
-the iteration ends in a minimum, a shape in which a real cable would rest, never in a saddle.
+the iteration ends in a minimum, a shape in which a real cable would rest. Only from a guess with a symmetry that no
+minimum has may it end in a saddle: `Equilibrium.stability` is below 0 there.
 """
 
 from __future__ import annotations
