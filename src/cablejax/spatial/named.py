@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -177,7 +178,8 @@ def parameters_of(
                 "mass_kg": _reported(from_zero(estimate.marker_mass), "kg", times=density),
             }
         case "gripper_rotation_offset":
-            angles = [from_zero(size("clamp_rotation", 2 * gripper)) for gripper in range(2)]
+            slopes = [from_zero(size("clamp_rotation", 2 * gripper)) for gripper in range(2)]
+            angles = [Interval(*map(math.atan, (one.value, one.low, one.high))) for one in slopes]
             parameters = {"gripper": _choice([0, 1], ""), "angle_rad": _reported_all(angles, "rad")}
         case "keypoint_bias":
             slots = range(where["along"].start, where["along"].stop)

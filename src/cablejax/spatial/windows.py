@@ -207,7 +207,8 @@ def _pieces(
             seen = np.asarray(np.isfinite(points[e, begin:end]).all(axis=(1, 2)))
             whole = np.flatnonzero(seen[:-1] & seen[1:])
             start = begin + int(whole[0]) if len(whole) else end
-            if end - start >= least and np.isfinite(points[e, start + 2 : end]).any():
+            later = points[e, start + 2 : end]
+            if end - start >= least and (np.isfinite(later).any() or not later.size):
                 pieces.append((e, start, end - start))
             else:
                 left_out.append((e, begin))

@@ -52,7 +52,7 @@ def held_nodes(
         frames: of the grippers, rows are axes in the world.
         h: length of an edge [m].
     """
-    slope = jnp.tan(physics.clamp_rotation)
+    slope = physics.clamp_rotation
     along = unit(frames[:, :, 0] + slope[:, 1:] * frames[:, :, 1] - slope[:, :1] * frames[:, :, 2])
     half = 0.5 * h * along
     held = jnp.stack(

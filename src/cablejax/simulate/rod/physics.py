@@ -23,7 +23,8 @@ class RodPhysics:
         twist_stiffness: GJ / rho [m^4/s^2].
         stretch: EA / rho [m^2/s^2].
         marker_mass: of each marker, as length of cable of the same mass [m].
-        clamp_rotation: of the cable against either gripper, about its second and third axis [rad], shape [2, 2].
+        clamp_rotation: slope of the cable against either gripper, the tangent of its angle about its second and third
+            axis, shape [2, 2].
         arclength: of every free marker from the first clamp [m], shape [N].
         offset: of every free marker from the centreline along the second and third axis [m], shape [N, 2].
         gravity: [m/s^2], shape [3].
