@@ -54,5 +54,5 @@ def _true_value(cable: SyntheticCable, effect: str, parameters: Mapping[str, Par
             knot = round(parameters["centre_m"].value / length * (len(cable.profile) - 1))
             return np.exp(cable.profile[knot] - np.delete(cable.profile, knot).mean())
         case "gripper_rotation_offset":
-            return np.linalg.norm(cable.grips.mean(axis=0), axis=-1)
+            return np.arctan(np.linalg.norm(cable.grips.mean(axis=0), axis=-1))
     raise ValueError(f"The effect is {effect!r}, expected one of {', '.join(REPORTED)}.")

@@ -57,7 +57,7 @@ class SyntheticCable:
         drag: force per mass and speed [1/s].
         quadratic_drag: force per mass and squared speed [1/m].
         marker_mass: of each marker, as length of cable of the same mass [m].
-        grips: rotation of the cable against both grippers in every recording [rad], shape [R, 2, 2].
+        grips: slope of the cable against both grippers in every recording, the tangent of its angle, shape [R, 2, 2].
         noise: standard deviation of a coordinate, independent at every sample [m].
         rest_curvature: at evenly spaced knots, about the material's second and third axis [1/m], shape [C, 2].
         offset: of the free markers from the centreline [m], shape [N, 2].
