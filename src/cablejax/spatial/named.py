@@ -178,8 +178,7 @@ def parameters_of(
                 "mass_kg": _reported(from_zero(estimate.marker_mass), "kg", times=density),
             }
         case "gripper_rotation_offset":
-            slopes = [from_zero(size("clamp_rotation", 2 * gripper)) for gripper in range(2)]
-            angles = [Interval(*map(math.atan, (one.value, one.low, one.high))) for one in slopes]
+            angles = [_angle(from_zero(size("clamp_rotation", 2 * gripper))) for gripper in range(2)]
             parameters = {"gripper": _choice([0, 1], ""), "angle_rad": _reported_all(angles, "rad")}
         case "keypoint_bias":
             slots = range(where["along"].start, where["along"].stop)
@@ -197,6 +196,10 @@ def parameters_of(
         case _:
             raise ValueError(f"The effect is {effect!r}, expected one of {estimate.layout.effects}.")
     return parameters, along
+
+
+def _angle(slope: Interval) -> Interval:
+    return Interval(*map(math.atan, (slope.value, slope.low, slope.high)))
 
 
 def _section(estimate: Estimate) -> tuple[int, Interval]:
