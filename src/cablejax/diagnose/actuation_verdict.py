@@ -66,13 +66,15 @@ def _drawn(arms: Actuation, count: int) -> list[tuple[EffectValues, ...]]:
         side = high - one.value if share > 0 else one.value - low
         return float(np.clip(one.value + share * side, bounds.low, bounds.high))
 
+    def values(name: str, share: float) -> EffectValues:
+        drawn = {key: value(name, key, share) for key in arms.effects[name]}
+        if "delay_s" in drawn:  # a part of the whole lag, which is known better
+            drawn["delay_s"] = min(drawn["delay_s"], drawn["time_s"])
+        return EffectValues(name, drawn)
+
     shares = np.random.default_rng(0).standard_normal((count, len(arms.effects))) / HALF_90
     return [
-        tuple(
-            EffectValues(name, {key: value(name, key, share) for key in arms.effects[name]})
-            for name, share in zip(arms.effects, row.tolist(), strict=True)
-        )
-        for row in shares
+        tuple(values(name, share) for name, share in zip(arms.effects, row.tolist(), strict=True)) for row in shares
     ]
 
 
