@@ -197,6 +197,7 @@ def test_draws_of_an_explanation_have_the_arms_in_them():
     lags = [draw[1].parameters for draw in conclusion.posterior]
     assert {draw[0].name for draw in conclusion.posterior} == {"actuation_gain"}
     assert np.mean([lag["time_s"] for lag in lags]) == pytest.approx(0.25, abs=0.02)
+    assert all(0 <= lag["delay_s"] <= lag["time_s"] for lag in lags)
     assert np.std([lag["time_s"] for lag in lags]) > 0 and np.mean([lag["delay_s"] for lag in lags]) > 0.05
 
 
