@@ -313,7 +313,7 @@ BAD = {
         lambda: broken(starts=lambda self, effect, *_: [(7, (1.0,))]),
         {},
         line(("slope", 0, 2.0)),
-        "has the variant 7, expected one of its own",
+        "has the variant 7, expected one of",
     ),
     "one name twice": (lambda: broken(effects=Line.effects[:1] * 2), {}, None, "every name once"),
     "no effects": (lambda: broken(effects=()), {}, None, "at least one"),

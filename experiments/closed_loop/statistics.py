@@ -18,7 +18,7 @@ from scipy import stats
 RESAMPLES = 10_000
 """Bootstrap samples of an interval."""
 FEW = 15
-"""Of fewer values than this the bootstrap's intervals are too narrow: of five they hold the mean in 85 % of cases."""
+"""Of fewer values than this the bootstrap's intervals are too narrow."""
 
 Values = Sequence[float] | Float[np.ndarray, " n"]
 """One number per trial."""

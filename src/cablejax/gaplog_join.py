@@ -52,9 +52,10 @@ def joined(logs: Sequence[GapLog], names: Sequence[str]) -> GapLog:
     begun = np.zeros((0, _FIRST))
     for log, name in zip(logs, names, strict=True):
         own = [one for one in episodes_of(log) if np.isfinite(one.keypoints).any()]
-        for one in own:
+        first = np.array([_numbers(one)[:_FIRST] for one in own]).reshape(-1, _FIRST)
+        for one, numbers in zip(own, first, strict=True):
             # the first few numbers decide nearly always
-            alike = np.isclose(begun, _numbers(one)[:_FIRST], SAME, SAME, equal_nan=True).all(axis=1)
+            alike = np.isclose(begun, numbers, SAME, SAME, equal_nan=True).all(axis=1)
             for other, other_name in (seen[i] for i in np.flatnonzero(alike)):
                 if _same_samples(one, other):
                     raise GapLogError(
@@ -62,7 +63,7 @@ def joined(logs: Sequence[GapLog], names: Sequence[str]) -> GapLog:
                         "would count twice."
                     )
         seen += [(one, name) for one in own]
-        begun = np.concatenate([begun, *(_numbers(one)[None, :_FIRST] for one in own)])
+        begun = np.concatenate([begun, first])
         there_all, here_all = _set_up(logs[0]), _set_up(log)
         for field in there_all | here_all:
             here, there = here_all.get(field), there_all.get(field)

@@ -17,6 +17,7 @@ from jaxtyping import Bool, Float, Int
 from cablejax.diagnose.diagnosis import ParameterEstimate
 from cablejax.diagnose.evidence import held_out_together
 from cablejax.diagnose.log_faults import integrated, scatter_of
+from cablejax.diagnose.posterior import QUANTILE
 from cablejax.effects.arms import lagged
 from cablejax.types import ROTATION_WEIGHT
 
@@ -28,8 +29,6 @@ NEGLIGIBLE = 2e-4
 _EXPLAINED = 0.25
 # An effect that leaves more of it than this is not named: a backlash looks like a lag, and leaves more.
 _TELLING = 0.5
-HALF_90 = 1.645
-"""Half of a normal distribution's 90 % interval, in standard deviations."""
 ARMS = ("actuation_gain", "actuation_lag")
 """Names of the effects of the arms."""
 _GAIN, _LAG = ARMS
@@ -223,7 +222,7 @@ def _named(effects: tuple[str, ...], result: Any, scale: float) -> dict[str, dic
     def estimate(weights: np.ndarray, unit: str, share: float = 0.0) -> ParameterEstimate:
         """Of a sum of the fit's values, which is good to a share of it at best."""
         value = float(weights @ result.x)
-        half = HALF_90 * float(np.sqrt(weights @ covariance @ weights)) + share * value
+        half = QUANTILE * float(np.sqrt(weights @ covariance @ weights)) + share * value
         return ParameterEstimate(value, (max(value - half, 0.0), value + half), unit)
 
     each, named = np.eye(len(result.x)), {}

@@ -9,11 +9,12 @@ from typing import get_args
 import numpy as np
 from scipy.special import softmax
 
-from cablejax.diagnose.actuation import HALF_90, NEGLIGIBLE, Actuation
+from cablejax.diagnose.actuation import NEGLIGIBLE, Actuation
 from cablejax.diagnose.belief import Calibration
 from cablejax.diagnose.conclude import Conclusion
 from cablejax.diagnose.diagnosis import PLACES, EffectValues, NamedEffect, Ranked, Verdict
 from cablejax.diagnose.evidence import student_log_likelihoods
+from cablejax.diagnose.posterior import QUANTILE
 from cablejax.effects.given import EFFECTS
 
 
@@ -72,7 +73,7 @@ def _drawn(arms: Actuation, count: int) -> list[tuple[EffectValues, ...]]:
             drawn["delay_s"] = min(drawn["delay_s"], drawn["time_s"])
         return EffectValues(name, drawn)
 
-    shares = np.random.default_rng(0).standard_normal((count, len(arms.effects))) / HALF_90
+    shares = np.random.default_rng(0).standard_normal((count, len(arms.effects))) / QUANTILE
     return [
         tuple(values(name, share) for name, share in zip(arms.effects, row.tolist(), strict=True)) for row in shares
     ]

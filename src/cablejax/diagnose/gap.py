@@ -96,6 +96,8 @@ def measure_gap(
     if ratio is not None and not np.isfinite(ratio):  # what only the encoders show
         ratio, interval90 = None, None
     whole = float(f"{(interval * (length - 1)).max():.6g}")
+    until = (*(h for h in _HORIZONS if h < whole), whole)
+    sizes = {h: (1e3 * rmse(before, h), 1e3 * rmse(after, h)) for h in until}
     return Gap(
         horizon_s=whole,
         before_rmse_mm=1e3 * rmse(before),
@@ -104,11 +106,8 @@ def measure_gap(
         shrinkage=ratio if held_out else None,
         shrinkage_ci90=interval90,
         ahead_mm=ahead_mm,
-        horizons_mm={
-            h: (1e3 * rmse(before, h), 1e3 * rmse(after, h))
-            for h in (*(h for h in _HORIZONS if h < whole), whole)
-            if np.isfinite(rmse(before, h))  # a camera may begin later
-        },
+        # a camera may begin later
+        horizons_mm={h: both for h, both in sizes.items() if np.isfinite(both).all()},
         held_out_episodes=held_out,
         split=_split(b, a, noise, resolvable, learnable),
         unit=evidence.simulator.unit,

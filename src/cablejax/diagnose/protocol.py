@@ -125,7 +125,7 @@ def explanation(*parts: tuple[Effect, int, Sequence[float]]) -> Explanation:
         if len(values) != len(effect.parameters) or np.isnan(np.asarray(values, float)).any():
             raise ValueError(f"Effect {effect.name!r} has the values {list(values)}, expected one number each.")
         if variant not in effect.variants:
-            raise ValueError(f"Effect {effect.name!r} has the variant {variant}, expected one of its own.")
+            raise ValueError(f"Effect {effect.name!r} has the variant {variant}, expected one of {effect.variants}.")
     z = [
         np.clip(p.coordinate(float(np.clip(value, p.low, p.high))), *p.z_bounds)
         for effect, _, values in parts

@@ -64,7 +64,7 @@ class Recording:
         )
 
     @property
-    def motion(self) -> Float[np.ndarray, "E T 2 3"]:
+    def recorded_pose(self) -> Float[np.ndarray, "E T 2 3"]:
         """The gripper poses, NaN beyond an episode's end."""
         recorded = np.arange(self.gripper_pose.shape[1])[None] < np.asarray(self.length)[:, None]
         return np.where(recorded[:, :, None, None], self.gripper_pose, np.nan)

@@ -119,7 +119,7 @@ class KeypointBias(CableEffect):
     null = (0.0,)
     amplitude, reversible = 0, True
     side = "observation"
-    variants = tuple(range(2 * int(LIMITS["keypoints"].high)))
+    variants = range(2 * int(LIMITS["keypoints"].high))
     variant_name = "index"
     repeatable = True
 

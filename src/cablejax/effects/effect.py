@@ -87,7 +87,7 @@ class Effect:
     null: tuple[float, ...]
     amplitude: int | None = None
     reversible: bool = False
-    variants: tuple[int, ...] = (0,)
+    variants: Sequence[int] = (0,)
     variant_name: str | None = None
     repeatable: bool = False
 

@@ -20,9 +20,9 @@ from cablejax.limits import require, shown
 EFFECTS: Mapping[str, CableEffect] = {effect.name: effect for effect in (*LIBRARY, *ARMS)}
 """Every effect by its name in the gap log's format."""
 
-# Parameters that say which: a gripper, a keypoint, a direction.
+# Beyond a bound by this share of the distance between both is at it.
 _ROUNDED = 1e-5
-"""Beyond a bound by this share of the distance between both is at it."""
+# Parameters that say which: a gripper, a keypoint, a direction.
 _CHOICES = frozenset({"index", "across", *(effect.variant_name for effect in EFFECTS.values())})
 
 

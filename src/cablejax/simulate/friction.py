@@ -68,13 +68,11 @@ def on_table(physics: Physics, mass: Float[Array, "n"] | Float[np.ndarray, "n"],
         link_length: between two nodes [m].
     """
     nodes = mass.__array_namespace__().arange(len(mass))
-    left = (
+    return (
         mass
         - _hanging(physics, physics.stiffness[0], nodes, link_length)
         - _hanging(physics, physics.stiffness[-1], nodes[::-1], link_length)
     )
-    # what both grippers lift of a short cable is lifted once
-    return mass.__array_namespace__().maximum(left, 0.0)
 
 
 def _hanging(physics: Physics, stiffness, nodes, link_length: float):

@@ -113,12 +113,6 @@ def random_motion(
     """
     start = _straight_start if motion.start == "straight" else _random_start
     pose = start(rng, config, motion)
-    if not admissible(config, motion, pose):
-        raise ValueError(
-            f"A straight start is out of the bounds of MotionConfig: grippers {1 - 1.5 * motion.straight_slack:g} "
-            f"lengths apart, {_LEAN:g} rad from their line. Widen min_distance or max_angle, or make straight_slack "
-            "smaller."
-        )
     coarse = dataclasses.replace(config, n_links=min(config.n_links, _COARSE_LINKS))
     scale = np.exp(rng.uniform(np.log(motion.min_scale), 0.0))
     persistence = rng.uniform(0.0, motion.max_persistence)
@@ -167,7 +161,14 @@ def _straight_start(rng, config, motion):
     lean = rng.choice([-1.0, 1.0]) * _LEAN
     heading = rng.uniform(-np.pi, np.pi)
     offset = half * np.array([np.cos(heading), np.sin(heading)])
-    return np.array([[*-offset, heading + lean], [*offset, heading - lean]])
+    pose = np.array([[*-offset, heading + lean], [*offset, heading - lean]])
+    if not admissible(config, motion, pose):
+        raise ValueError(
+            f"A straight start is out of the bounds of MotionConfig: grippers {1 - 1.5 * motion.straight_slack:g} "
+            f"lengths apart, {_LEAN:g} rad from their line. Widen min_distance or max_angle, or make straight_slack "
+            "smaller."
+        )
+    return pose
 
 
 def _random_start(rng, config, motion):
