@@ -5,8 +5,8 @@ python benchmarks/accelerator.py --small --out runs/accelerator.md          # so
 python benchmarks/accelerator.py --only rollout precision --out runs/accelerator.md
 
 Finished measurements are kept as JSON lines next to the page (`--records`); the same command measures what is missing.
-A record counts for the device, processor and package versions it was made with. Compiling takes most of the time: set
-JAX_COMPILATION_CACHE_DIR to a folder, and a second run does not compile again.
+A record counts for the device, processor, package versions and sizes it was made with. Compiling takes most of the
+time: set JAX_COMPILATION_CACHE_DIR to a folder, and a second run does not compile again.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ class Records:
 
     Attributes:
         path: the file.
-        setting: device, processor and versions; records of another setting are left alone.
+        setting: device, processor, versions and sizes; records of another setting are left alone.
     """
 
     path: pathlib.Path
@@ -124,7 +124,8 @@ def main(arguments: list[str] | None = None) -> None:
     options = parser.parse_args(arguments)
     deadline = time.monotonic() + 60 * options.minutes
     sizes = Sizes.small() if options.small else Sizes()
-    records = Records(options.records or options.out.with_suffix(".jsonl"), {**setting(), "versions": versions()})
+    made_with = {**setting(), "versions": versions(), "sizes": "small" if options.small else "full"}
+    records = Records(options.records or options.out.with_suffix(".jsonl"), made_with)
     for wave in WAVES:
         cases = [case for name in wave if name in options.only for case in SECTIONS[name](sizes)]
         todo = [case for case in cases if case.name not in records.read()]

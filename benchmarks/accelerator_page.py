@@ -23,7 +23,8 @@ def page(records: Sequence[Record], setting: dict[str, str]) -> str:
     lines = [
         "# One accelerator",
         "",
-        "Made by `python benchmarks/accelerator.py --out docs/results/accelerator.md`"
+        f"Made by `python benchmarks/accelerator.py {'--small ' if setting['sizes'] == 'small' else ''}"
+        "--out docs/results/accelerator.md`"
         + (f", {dates[0]}" if dates[:1] == dates[-1:] else f", {dates[0]} to {dates[-1]}" if dates else "")
         + ".",
         f"Device: {setting['device']}. Host: {setting['machine']}. {setting['versions']}.",

@@ -14,7 +14,7 @@ class MetricsLog:
     """Appends rows of numbers, keyed by optimiser step.
 
     Rows after `resume_step` stem from work that was lost with the process and is about to be repeated: they are
-    dropped.
+    dropped, as are rows that a full disk cut short.
     """
 
     def __init__(self, folder: Path, columns: tuple[str, ...], resume_step: int):
@@ -24,7 +24,8 @@ class MetricsLog:
         if path.exists():
             with path.open(newline="") as file:
                 rows = list(csv.reader(file))
-            kept = [row for row in rows[1:] if len(row) == len(columns) + 1 and int(row[0]) <= resume_step]
+            whole = [row for row in rows[1:] if len(row) == len(columns) + 1 and row[0].isdecimal()]
+            kept = [row for row in whole if int(row[0]) <= resume_step]
         self._file = path.open("w", newline="")
         self._csv = csv.writer(self._file)
         self._csv.writerow(["step", *columns])

@@ -146,12 +146,10 @@ class GravityTilt(CableEffect):
     name = "gravity_tilt"
     hook = "table"
     parameters = (
-        Parameter("sine_x", "", -0.9, 0.9, 0.0, 0.15),
-        Parameter("sine_y", "", -0.9, 0.9, 0.0, 0.15),
+        Parameter("sine_x", "", -1.0, 1.0, 0.0, 0.15),
+        Parameter("sine_y", "", -1.0, 1.0, 0.0, 0.15),
     )
     null = (0.0, 0.0)
-    steepest = 1.1
-    """Slope of which gravity's part in either direction is within the bounds [rad]."""
 
     def apply(self, physics, values, variant, config):
         """Adds gravity's component in the plane of the table [m/s^2]."""
@@ -171,8 +169,9 @@ class GravityTilt(CableEffect):
 
     def _from_reported(self, parameters, config):
         angle, direction = parameters["angle_rad"], parameters["direction_rad"]
-        if not 0 <= angle <= self.steepest:
-            raise ValueError(f"{self.name}: angle_rad is {angle:g}, expected 0 to {self.steepest:g} rad.")
+        # verdicts round
+        if not 0 <= angle <= 1.5708:
+            raise ValueError(f"{self.name}: angle_rad is {angle:g}, expected 0 to 1.5708 rad.")
         sine = np.sin(angle)
         return {"sine_x": sine * np.cos(direction), "sine_y": sine * np.sin(direction)}
 

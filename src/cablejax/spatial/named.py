@@ -58,7 +58,7 @@ def named_effects(found: Identified, density: float) -> tuple[NamedEffect, ...]:
         if name in _DRAGS and name not in drags:
             continue
         parameters, along = parameters_of(
-            name, estimate, density, first_marker=windows.held[0], first_clamp=windows.first_clamp
+            name, estimate, density, placed=windows.placed, first_clamp=windows.first_clamp
         )
         if _shown(name, parameters[_TELLING[name]], damping, longer_only=damping == hidden):
             named.append(NamedEffect(name, None, parameters, {"along_cable_m": along, "time_s": None, "table_m": None}))
@@ -121,7 +121,7 @@ def parameters_of(
     estimate: Estimate,
     density: float,
     *,
-    first_marker: int = 0,
+    placed: Sequence[int] = (),
     first_clamp: float = 0.0,
     unmodelled: Mapping[str, float] = UNMODELLED,
 ) -> tuple[dict[str, ParameterEstimate], list[float] | None]:
@@ -131,7 +131,7 @@ def parameters_of(
         effect: name.
         estimate: in which it is free.
         density: see `named_effects`.
-        first_marker: index of the first free marker among all keypoints.
+        placed: see `Windows.placed`.
         first_clamp: arc length of the first clamp, from the first keypoint [m].
         unmodelled: error of an effect's parameter besides, see `UNMODELLED`.
     """
@@ -183,11 +183,9 @@ def parameters_of(
         case "keypoint_bias":
             slots = range(where["along"].start, where["along"].stop)
             each = [estimate.of(lambda values, i=i: values[i]).among(len(slots)) for i in slots]
-            off = [i for i, e in enumerate(each) if abs(e.value) > _PLACED and not e.low <= 0 <= e.high]
-            parameters = {
-                "index": _choice([i + first_marker for i in off], ""),
-                "offset_m": _reported_all([each[i] for i in off], "m"),
-            }
+            pairs = zip(placed, each, strict=False)  # a second clamp without a keypoint of its own is none
+            off = {i: e for i, e in pairs if abs(e.value) > _PLACED and not e.low <= 0 <= e.high}
+            parameters = {"index": _choice(list(off), ""), "offset_m": _reported_all(list(off.values()), "m")}
         case "intrinsic_curvature":
             curvature = estimate.shared[where["rest_curvature"]].reshape(-1, 2)
             knot = int(np.linalg.norm(curvature, axis=1).argmax())

@@ -95,6 +95,11 @@ class Windows:
         return np.where(self.valid[:, :, None, None], self.keypoints, np.nan)
 
     @property
+    def placed(self) -> range:
+        """Indices among all keypoints of the free ones, and of that at the second clamp if it holds one."""
+        return range(self.held[0], min(self.held[0] + len(self.arclength), self.n_keypoints))
+
+    @property
     def torn(self) -> Bool[np.ndarray, "W"]:
         """Windows in which the grippers are further apart than the cable between them is long, beyond tolerance."""
         return (self.apart > (1 + TOLERANCE) * self.arclength[-1]).any(axis=1)
