@@ -63,7 +63,8 @@ def test_what_is_short_of_a_goal_is_said():
     slow = common | {"engine": "MJX", "batch": 64, "work": 1e5, "seconds": [0.5, 1.0, 1.0]}
     fast = common | {"engine": "chain", "batch": 512, "work": 1e7, "seconds": [1.0]}
     full = {"date": "2026-11-22", "section": "rollout", "links": 33, "engine": "MJX", "batch": 9, "failure": "no room"}
-    text = page([slow, fast, full], {"device": "d", "machine": "m", "versions": "v"})
+    text = page([slow, fast, full], {"device": "d", "machine": "m", "versions": "v", "sizes": "small"})
+    assert "accelerator.py --small --out" in text
     assert "| 100,000, batch 64 | no, 10 times short |" in text
     assert "| 10 million, batch 512 | yes |" in text
     assert "100,000 (100,000 to 200,000; 3) | 1 MiB | 20 J |" in text

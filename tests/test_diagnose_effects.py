@@ -247,6 +247,15 @@ def test_values_that_a_verdict_rounded_at_a_bound_are_at_it():
         )
 
 
+@pytest.mark.parametrize("values", [(1.0, 0.3), (0.0, 0.97), (-0.6, 0.8)])
+def test_a_tilt_is_given_as_it_was_reported(values):
+    tilt, config = EFFECTS["gravity_tilt"], Discretisation()
+    told = {name: float(f"{value:.4f}") for name, (value, _) in tilt.reported(values, 0, config).items()}
+    given = GivenEffect(tilt.name, tuple(told.items())).applied(nominal_physics(config), config)
+    sine = np.array(values) / max(1.0, np.hypot(*values))
+    np.testing.assert_allclose(given.tilt, 9.81 * sine, atol=2e-3)
+
+
 def test_any_of_many_keypoints_may_be_off():
     config = Discretisation(Cable(n_keypoints=90))
     physics = parse_effect("keypoint_bias:index=80,offset_m=0.01").applied(nominal_physics(config), config)

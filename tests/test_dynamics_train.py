@@ -332,6 +332,10 @@ def test_metrics_forget_what_was_lost_with_the_process(tmp_path):
     with MetricsLog(tmp_path, ("loss",), 20) as log:
         log.write(30, {})
     assert (tmp_path / "metrics.csv").read_text().split() == ["step,loss", "10,0.1", "20,0.2", "30,"]
+    with (tmp_path / "metrics.csv").open("a") as file:
+        file.write("\0\0\0,0.4\n")
+    MetricsLog(tmp_path, ("loss",), 20).__exit__()
+    assert (tmp_path / "metrics.csv").read_text().split() == ["step,loss", "10,0.1", "20,0.2"]
 
 
 def test_sizes_of_the_network_follow_the_configuration():

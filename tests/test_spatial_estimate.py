@@ -214,6 +214,20 @@ def _valued(everything, values):
     return dataclasses.replace(everything, explanation=one.moved(other.z))
 
 
+def test_a_clamp_beyond_the_last_keypoint_is_no_keypoint(found, everything):
+    values, along = everything.shared.copy(), everything.layout.slices["along"]
+    values[along.start], values[along.stop - 1] = 0.02, 0.03
+    off, windows = _at(found, values), found.cable.windows
+    first, last = windows.held[0], windows.held[0] + len(windows.arclength) - 1
+
+    def displaced(count):
+        cable = found.cable.on(dataclasses.replace(windows, n_keypoints=count))
+        named = {e.name: e for e in named_effects(dataclasses.replace(off, cable=cable), 0.05)}
+        return named["keypoint_bias"].parameters["index"].value
+
+    assert displaced(last + 1) == [first, last] and displaced(last) == [first]
+
+
 def test_names_only_what_the_estimate_shows(found, everything):
     # of a cable that is stiffer than believed, everywhere alike, and has some damping, whatever stayed in the search
     for stayed in ((), _FOUND, found.tried[:-1]):
