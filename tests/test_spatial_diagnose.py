@@ -15,12 +15,13 @@ from cablejax.diagnose import explanation, verdict_json
 from cablejax.diagnose.diagnosis import ParameterEstimate
 from cablejax.diagnose.fit import evaluate, improve
 from cablejax.log_geometry import setup_fault
+from cablejax.poses import poses_at
 from cablejax.report.diagnosis_page import write_diagnosis_page
 from cablejax.simulate.rod import Rod
 from cablejax.simulate.rod.clamps import frames_along
 from cablejax.spatial.cable import SpatialCable, errors
-from cablejax.spatial.clock import on_one_clock, thinned
-from cablejax.spatial.diagnose import _other_clock, diagnose_space
+from cablejax.spatial.clock import on_one_clock, thinned, with_poses_in_time
+from cablejax.spatial.diagnose import diagnose_space
 from cablejax.spatial.gap import OWN, noise_of, own_error, smallest_gap
 from cablejax.spatial.geometry import local_changes
 from cablejax.spatial.identify import layout_of
@@ -250,13 +251,23 @@ def test_noise_in_the_beginning_of_a_window_and_few_edges_make_no_gap():
     assert smallest_gap(5e-4, windows, more) == pytest.approx(np.hypot(1.5 * more, smallest_gap(5e-4, windows)))
 
 
-def test_poses_on_another_clock_than_the_keypoints_are_told():
+@pytest.mark.parametrize("late", [10, -7, 3.4])
+def test_poses_on_another_clock_than_the_keypoints_are_shifted(late):
     log = cases.recording()
-    assert _other_clock(log) == []
-    late = copy.deepcopy(log)
-    late.gripper_pose[:, 10:] = log.gripper_pose[:, :-10]
-    (told,) = _other_clock(late)
-    assert told.startswith("The keypoints at the grippers fit their poses 0.2 s later: ") and "shift the poses" in told
+    assert with_poses_in_time(log) == (log, ())
+    step = log.time[0, 1]
+    wrong = copy.deepcopy(log)
+    for e, time in enumerate(log.time):
+        wrong.gripper_pose[e] = poses_at(time - late * step, time, log.gripper_pose[e])
+    right, (told,) = with_poses_in_time(wrong)
+    assert told.startswith(f"The keypoints at the grippers fit their poses {abs(late) * step:.2g} s ")
+    assert ("later" if late > 0 else "earlier") in told and "poses were shifted" in told
+    seen = np.isfinite(right.keypoints).all(axis=(2, 3))
+    assert (~seen).sum(axis=1).max() <= abs(late) + 1
+    seen[:, 0] = False  # before the first pose that was written there is none
+    np.testing.assert_allclose(right.gripper_pose[seen], log.gripper_pose[seen], atol=2e-3)
+    if abs(late) == 10:
+        np.testing.assert_allclose(right.keypoints[seen], log.keypoints[seen])
 
 
 @pytest.mark.slow

@@ -73,7 +73,7 @@ def clock_offset(
     length: Int[np.ndarray, "E"],
     interval: Float[np.ndarray, "E"],
 ) -> tuple[float, str] | None:
-    """By how much the grippers' poses come later than the keypoints on them [s], and how well they fit then.
+    """By how much the grippers' poses come later than the keypoints on them [s], and how well they fit about then.
 
     None where they fit as they are, or at no other time.
 
@@ -109,7 +109,13 @@ def clock_offset(
     best = int(np.argmin(sizes))
     if sizes[best] > _FITS * now:
         return None
-    return float(shifts[best]), f"{1e3 * sizes[best]:.2g} mm off instead of {1e3 * now:.2g} mm (root mean square)"
+    seconds = float(shifts[best])
+    if 0 < best < len(shifts) - 1:
+        # between samples: at the lowest point of the parabola through three squares
+        below, least, above = np.square(sizes[best - 1 : best + 2])
+        if np.isfinite(below + above) and below + above > 2 * least:
+            seconds += 0.5 * step * (below - above) / (below - 2 * least + above)
+    return seconds, f"{1e3 * sizes[best]:.2g} mm off instead of {1e3 * now:.2g} mm (root mean square)"
 
 
 def early_keypoints(offset: tuple[float, str] | None) -> list[str]:

@@ -1,4 +1,4 @@
-"""Resamples a log in space to one interval."""
+"""Puts a log in space on one clock: one interval, and the keypoints' times for the grippers' poses."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from cablejax.diagnose.clock import keypoints_at
+from cablejax.diagnose.log_faults import clock_offset
 from cablejax.gaplog import episodes_of, stack_episodes
 from cablejax.poses import poses_at, with_one_sign, without_misreadings
 from cablejax.types import GapLog
@@ -112,3 +113,34 @@ def on_one_clock(log: GapLog) -> tuple[GapLog, tuple[str, ...]]:
     )
     log, fewer = thinned(stack_episodes(episodes, log.meta, holds=log.hold is not None))
     return log, (*repairs, report, *fewer)
+
+
+def with_poses_in_time(log: GapLog) -> tuple[GapLog, tuple[str, ...]]:
+    """The log with the grippers' poses when the keypoints on them fit them, and a sentence where that was another time.
+
+    Keypoints of which the pose is not recorded then count as not observed.
+
+    Args:
+        log: its samples one interval apart.
+    """
+    steps = steps_of(log)
+    interval = np.full(len(log.time), np.median(steps) if len(steps) else 1.0)
+    ends, place = log.keypoints[:, :, [0, -1]].astype(float), log.gripper_pose[..., :3].astype(float)
+    offset = clock_offset(ends, place, log.episode_length, interval)
+    if offset is None:
+        return log, ()
+    seconds, fit = offset
+    episodes = []
+    for one in episodes_of(log):
+        then = one.time + seconds
+        known = (then >= one.time[0]) & (then <= one.time[-1])
+        points = np.where(known[:, None, None], one.keypoints, np.nan)
+        episodes.append(
+            dataclasses.replace(one, keypoints=points, gripper_pose=poses_at(then, one.time, one.gripper_pose))
+        )
+    report = (
+        f"The keypoints at the grippers fit their poses {abs(seconds):.2g} s {'later' if seconds > 0 else 'earlier'}: "
+        f"{fit}. Keypoints and poses have clocks of their own, which is no effect in space and can look like one: the "
+        "poses were shifted by that."
+    )
+    return stack_episodes(episodes, log.meta, holds=log.hold is not None), (report,)

@@ -15,13 +15,12 @@ from jaxtyping import Float
 from cablejax.diagnose.belief import Calibration
 from cablejax.diagnose.diagnosis import CableDiagnosis, Gap, ParameterEstimate, Ranked, Verdict
 from cablejax.diagnose.judgement import judged, listed, verdict_sentence
-from cablejax.diagnose.log_faults import clock_offset
 from cablejax.diagnose.protocol import explanation
 from cablejax.gaplog_join import COMMANDS_DERIVED
 from cablejax.simulate.rod import Rod, RodResult
 from cablejax.spatial.accidents import accident_sentences, kept, moderated, off
 from cablejax.spatial.cable import SpatialCable, errors
-from cablejax.spatial.clock import on_one_clock, steps_of
+from cablejax.spatial.clock import on_one_clock, with_poses_in_time
 from cablejax.spatial.effects import GRIP
 from cablejax.spatial.gap import (
     OWN,
@@ -79,7 +78,7 @@ def diagnose_space(
     """
     begun = time.perf_counter()
     log, repairs = on_one_clock(log)
-    other_clock = _other_clock(log)
+    log, shifted = with_poses_in_time(log)
     log = with_roll(log)
     windows, left_out = _to_fit(log)
     longest = round(float(windows.valid.sum(axis=1).max() * windows.interval), 1)
@@ -109,7 +108,7 @@ def diagnose_space(
     where = where_of(log, kept_windows.windows, nominal, before[use], noise, smallest, changes)
     return SpatialDiagnosis(
         verdict=verdict,
-        sentence=" ".join([verdict_sentence(verdict, effects, equivalent, share), *changes[:1], *other_clock]),
+        sentence=" ".join([verdict_sentence(verdict, effects, equivalent, share), *changes[:1], *shifted]),
         effects=effects,
         equivalent=equivalent,
         quantities=quantities_of(found, None if guessed else density) | {"constant_offset_m": offset},
@@ -118,7 +117,7 @@ def diagnose_space(
         where=where,
         caveats=(
             *repairs,
-            *other_clock,
+            *shifted,
             *accident_sentences(lost, error, windows, results == RodResult.COARSE),
             *_caveats(windows, left_out, found, own),
         ),
@@ -215,22 +214,6 @@ def _ranking(found: Identified) -> tuple[Ranked, ...]:
         ranked.append(Ranked(step.effect.split(" ")[0], None, gain, 1e3 * float(error.mean()), outcome))
         before = error if step.accepted else before
     return tuple(ranked)
-
-
-def _other_clock(log: GapLog) -> list[str]:
-    """A sentence where the keypoints at the grippers fit their poses at another time: every fit suffers from it."""
-    steps = steps_of(log)
-    interval = np.full(len(log.time), np.median(steps) if len(steps) else 1.0)
-    ends, place = log.keypoints[:, :, [0, -1]].astype(float), log.gripper_pose[..., :3].astype(float)
-    offset = clock_offset(ends, place, log.episode_length, interval)
-    if offset is None:
-        return []
-    seconds, fit = offset
-    return [
-        f"The keypoints at the grippers fit their poses {abs(seconds):.2g} s {'later' if seconds > 0 else 'earlier'}: "
-        f"{fit}. Keypoints and poses have clocks of their own, which is no effect in space and can look like one: "
-        "shift the poses, and diagnose again."
-    ]
 
 
 def _caveats(windows, left_out, found, own) -> tuple[str, ...]:
