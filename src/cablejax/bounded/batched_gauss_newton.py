@@ -107,13 +107,16 @@ class BatchedGaussNewton:
                 in the mapping's order.
         """
         now, damping, trials_made = list(starts), np.full(len(starts), _DAMPING), np.zeros(len(starts), int)
-        results = [self._at_start(start) for start in starts]
+        results, rejected = [self._at_start(start) for start in starts], np.zeros(len(starts), bool)
         for _ in range(self.max_steps):
             trials = {}
             for i, at in enumerate(now):
                 if results[i] is not Result.STEP_LIMIT:
                     continue
                 trial = self._trial(at, damping[i])
+                if trial is None and not rejected[i]:
+                    # damping hides what a step along a valley promises
+                    trial, damping[i] = self._trial(at, _LEAST_DAMPING), _LEAST_DAMPING
                 if trial is None:
                     # rejected steps raise the damping, and a step that is damped enough promises next to nothing
                     promising = self._trial(at, _LEAST_DAMPING) is not None
@@ -124,7 +127,8 @@ class BatchedGaussNewton:
                 break
             for i, there in zip(trials, linearise(trials), strict=True):
                 trials_made[i] += 1
-                if there.value < now[i].value:
+                rejected[i] = not there.value < now[i].value
+                if not rejected[i]:
                     now[i], damping[i] = there, max(damping[i] * _EASED, _LEAST_DAMPING)
                 else:
                     damping[i] = max(damping[i] * _RAISED, _LEAST_RAISED)

@@ -204,16 +204,17 @@ def make_controller(model: Model, target: Target, *, method: Method, solver: Sol
             f"the model {model.name}: use a model that was trained on this cable."
         )
     target.require_length(model.config.length, f"the model {model.name}")
-    learner = STATIC if model.config.prior == "static" else LearnerConfig()
-    adaptation = AdaptationConfig(
-        prior_mean=model.believed,
-        error_std=AdaptationConfig.error_std * model.config.length,
-        limits=_believable(model.cable),
-    )
+    learner, adaptation = STATIC if model.config.prior == "static" else LearnerConfig(), None
+    if model.config.conditioned:
+        adaptation = AdaptationConfig(
+            prior_mean=model.believed,
+            error_std=AdaptationConfig.error_std * model.config.length,
+            limits=_believable(model.cable),
+        )
     config = MPCConfig.for_length(
         model.config.length,
         residual=learner.scaled(model.config.length, model.config.interval) if method == "residual" else None,
-        adaptation=adaptation if model.config.conditioned else None,
+        adaptation=adaptation,
         solver=SOLVERS[solver],
         history_length=model.config.history,
     )

@@ -14,7 +14,7 @@ from cablejax.diagnose.belief import Calibration
 from cablejax.diagnose.conclude import Conclusion
 from cablejax.diagnose.diagnosis import PLACES, EffectValues, NamedEffect, Ranked, Verdict
 from cablejax.diagnose.evidence import student_log_likelihoods
-from cablejax.diagnose.posterior import QUANTILE
+from cablejax.diagnose.posterior import POSTERIOR, QUANTILE
 from cablejax.effects.given import EFFECTS
 
 
@@ -46,11 +46,12 @@ def with_arms(conclusion: Conclusion, arms: Actuation, calibration: Calibration)
     elif arms.strays(calibration.smallest_gap(0.0)):
         changed = {"none": "unknown", "named": "named+unknown", "ambiguous": "named+unknown"}
     share = 1 - (arms.leftover / arms.deviation) ** 2
+    of_cable = conclusion.posterior or ((),) * POSTERIOR
     return dataclasses.replace(
         conclusion,
         verdict=changed.get(conclusion.verdict, conclusion.verdict),
         effects=(*named, *conclusion.effects),
-        posterior=tuple(map(operator.add, _drawn(arms, len(conclusion.posterior)), conclusion.posterior)),
+        posterior=tuple(map(operator.add, _drawn(arms, len(of_cable)), of_cable)) if named else conclusion.posterior,
         ranking=tuple(sorted([*ranked, *conclusion.ranking], key=lambda r: -(r.probability or 0.0))),
         explained=share if conclusion.verdict == "none" else conclusion.explained,
     )

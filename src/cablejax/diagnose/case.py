@@ -88,7 +88,7 @@ class Case:
             recording.gripper_command if recording.has_commands else None,
             recording.interval,
             recording.length,
-            repeated_motions(recording.recorded_pose, log.meta["cable"]["length_m"]),
+            repeated_motions(recording.recorded_pose, recording.interval, log.meta["cable"]["length_m"]),
             recording.commanded,
         )
         pose, scatter = _steadied(recording.gripper_pose, recording, arms)
@@ -224,7 +224,7 @@ class Case:
     @property
     def motion(self) -> Int[np.ndarray, "E"]:
         """Episodes with the same number repeat one another."""
-        return repeated_motions(self.recording.recorded_pose, self.config.cable.length)
+        return repeated_motions(self.recording.recorded_pose, self.recording.interval, self.config.cable.length)
 
     def to_log(self, keypoints: Float[np.ndarray, "E T N 2"]) -> Float[np.ndarray, "E T1 N 2"]:
         """NaN beyond an episode's end, and as long as the log."""

@@ -60,6 +60,7 @@ class Conclusion:
         posterior: see `Diagnosis`.
         under_laws: see `Diagnosis`.
         undecided: whether an effect that pays too little for itself would leave nothing, where none is named.
+        nothing: share of the posterior's draws in which the observations show no effect.
     """
 
     verdict: Verdict
@@ -72,6 +73,7 @@ class Conclusion:
     posterior: tuple[tuple[EffectValues, ...], ...] = ()
     under_laws: tuple[UnderLaw, ...] = ()
     undecided: bool = False
+    nothing: float = 0.0
 
 
 def conclude(found: Search, evidence: Evidence, calibration: Calibration, laws: Sequence[Law] = ()) -> Conclusion:
@@ -87,7 +89,8 @@ def conclude(found: Search, evidence: Evidence, calibration: Calibration, laws: 
     conclusion, drawn = _concluded(found, evidence, calibration, laws)
     if not conclusion.effects:
         return conclusion
-    return dataclasses.replace(conclusion, posterior=posterior(found, evidence, calibration, drawn))
+    every = posterior(found, evidence, calibration, drawn)
+    return dataclasses.replace(conclusion, posterior=every, nothing=every.count(()) / max(len(every), 1))
 
 
 def _concluded(
@@ -285,8 +288,8 @@ def sentence(conclusion: Conclusion, shrinkage: float | None) -> str:
     if conclusion.undecided:
         return "There is a gap, but too little of it in this log to name its cause: record more motions."
     parts = (conclusion.effects, conclusion.equivalent, conclusion.explained)
-    said, nothing = verdict_sentence(conclusion.verdict, *parts, shrinkage), conclusion.posterior.count(())
-    if not nothing:
+    said = verdict_sentence(conclusion.verdict, *parts, shrinkage)
+    if not conclusion.nothing:
         return said
-    chance = f"{100 * nothing / len(conclusion.posterior):.0f} %"
+    chance = f"{100 * conclusion.nothing:.0f} %"
     return f"{said} With a probability of {chance} it is no effect, but what the simulator itself is off by."

@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from cablejax.diagnose.protocol import Explanation, Simulator
+from cablejax.poses import positions_at
 
 _ALIKE = 0.05
 """Motions whose gripper poses differ by less than this share of the cable's length, root mean square, are one."""
@@ -135,14 +136,22 @@ def student_log_likelihoods(
     return -0.5 * (freedom + 1) * share_of_motion(motion) * each
 
 
-def repeated_motions(gripper_pose: Float[np.ndarray, "E T 2 3"], length: float) -> Int[np.ndarray, "E"]:
+def repeated_motions(
+    gripper_pose: Float[np.ndarray, "E T 2 3"], interval: Float[np.ndarray, "E"], length: float
+) -> Int[np.ndarray, "E"]:
     """For every episode, the first one with the same motion; its own number where there is none before it.
 
     Args:
         gripper_pose: of the grippers, theta continuous, NaN beyond an episode's end [m, m, rad].
+        interval: between samples [s].
         length: of the cable [m].
     """
-    place = gripper_pose * np.array([1.0, 1.0, _ARM * length])
+    last = gripper_pose.shape[1] - 1
+    clock = interval.min() * np.arange(1 + int(last * interval.max() / interval.min() + 1e-6))
+    place = np.full((len(interval), len(clock), 2, 3), np.nan)
+    for row, own, pose in zip(place, interval, gripper_pose, strict=True):
+        within = clock <= last * own + 1e-9
+        row[within] = positions_at(clock[within], own * np.arange(last + 1), pose) * [1.0, 1.0, _ARM * length]
     first, samples = np.arange(len(place)), np.isfinite(place).all(axis=(2, 3)).sum(axis=1)
     for e in range(1, len(place)):
         square = ((place[:e] - place[e]) ** 2).sum(axis=(2, 3))

@@ -129,10 +129,14 @@ class Fit:
         if self.refits is not None:
             return self.refits.sse
         precision, weight = self.precision(evidence), evidence.weight(self.sse)
+        model = self.model(weight, 0.0)
+        # a fit ends where a step promises little: where one motion says almost all, what is left of the gradient of all
+        # of them is not small beside that of the others
+        left = np.where(model.free, model.gradient, 0.0)
         result = np.empty_like(self.sse)
         for left_out in episodes_by_motion(evidence.motion):
             informed = np.einsum("e,epq->pq", weight[left_out], self.curvature[left_out])
-            step = np.linalg.solve(precision - informed, weight[left_out] @ self.gradient[left_out])
+            step = np.linalg.solve(precision - informed, weight[left_out] @ self.gradient[left_out] - left)
             for e in left_out:
                 if np.abs(step).max(initial=0.0) <= _LARGEST_HELD_OUT_STEP:
                     result[e] = self.sse[e] + 2 * self.gradient[e] @ step + step @ self.curvature[e] @ step

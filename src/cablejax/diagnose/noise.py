@@ -22,8 +22,10 @@ _LONG = 300
 _RESTLESS = 4.0
 # First-order noise has the measured correlations to this; a cable that creeps in its holds does not.
 _LIKE_FIRST_ORDER = 0.05
-# Single precision has about as many digits.
-_DIGITS = 7
+# Changes below this share of the largest number are those of single precision.
+_REPEATED = 1e-7
+# Where more of the samples than this share differ from the one before, they were rounded to less than the noise.
+_WHOLE = 0.98
 # A keypoint counts as noisier than the others beyond this many standard errors.
 _DISTINCT = 4.0
 
@@ -102,10 +104,18 @@ def noise_floor(
 
 
 def _rounding(keypoints) -> float:
-    """Root mean square of what is lost where a tracker reports whole pixels or millimetres; hardly anything else."""
-    seen = keypoints[np.isfinite(keypoints)]
-    steps = np.diff(np.unique(np.round(seen / np.abs(seen).max(initial=1e-9), _DIGITS)))
-    return float(np.abs(seen).max() * steps.min()) / math.sqrt(12.0) if len(steps) else 0.0
+    """Root mean square of what is lost where a tracker reports whole pixels or millimetres; 0 where it does not.
+
+    Then some samples repeat the one before to the last digit, and others are whole steps away from it.
+    """
+    apart, largest = np.abs(np.diff(keypoints, axis=1)), np.abs(keypoints[np.isfinite(keypoints)]).max(initial=1e-9)
+    apart = apart[np.isfinite(apart)]
+    moved = apart[apart > _REPEATED * largest]
+    if not len(moved) or len(moved) > _WHOLE * len(apart):
+        return 0.0
+    step = float(moved.min())
+    off = np.abs(moved / step - np.round(moved / step)).max()
+    return step / math.sqrt(12.0) if off < 0.02 + 10.0 * _REPEATED * largest / step else 0.0
 
 
 def still(hold: Bool[np.ndarray, "E T"], gripper_pose: Float[np.ndarray, "E T 2 3"]) -> Bool[np.ndarray, "E T"]:

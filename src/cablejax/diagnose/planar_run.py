@@ -211,7 +211,7 @@ def _worth_naming(conclusion: Conclusion, shrinkage: float | None) -> Conclusion
     under = tuple(
         dataclasses.replace(law, **nothing) if law.verdict == "named+unknown" else law for law in conclusion.under_laws
     )
-    return dataclasses.replace(conclusion, **nothing, posterior=(), under_laws=under)
+    return dataclasses.replace(conclusion, **nothing, posterior=(), nothing=0.0, under_laws=under)
 
 
 def _contradictions(rounds: Rounds | None) -> tuple[str, ...]:

@@ -28,8 +28,8 @@ _MOST, _LEAST = 2.0, 0.5
 _DRAWS = 400
 # These are not simulated, and Student's tails need more of them.
 _JACKKNIFE_DRAWS = 4000
-# Of the posterior that a verdict holds.
-_POSTERIOR = 16
+POSTERIOR = 16
+"""Draws of the posterior that a verdict holds."""
 
 
 def draws(evidence: Evidence, fit: Fit, calibration: Calibration) -> Float[np.ndarray, "D P"]:
@@ -88,7 +88,7 @@ def posterior(
         best: draws of the best fit's coordinates, in no order.
     """
     fits, chances = in_doubt(found.fits, found.scores, evidence, calibration)
-    taken = np.searchsorted(np.cumsum(chances), (np.arange(_POSTERIOR) + 0.5) / _POSTERIOR)
+    taken = np.searchsorted(np.cumsum(chances), (np.arange(POSTERIOR) + 0.5) / POSTERIOR)
     result = []
     for k in np.unique(np.minimum(taken, len(fits) - 1)):
         drawn = best if fits[k] is found.fits[0] else draws(evidence, fits[k], calibration)

@@ -96,6 +96,7 @@ def there_and_back(
         bounds: on the grippers' speed and the duration; the others are not looked at.
     """
     start, there = _vector(first), _vector(goal)
+    there[2] = start[2] + wrapped(there[2] - start[2])
     way = Way(np.stack([start, there, start]), np.ones(2), np.array([1.0, _HOLD, 2 * _HOLD]))
     back = math.ceil(way.timed(bounds)[0][-2] / INTERVAL) + 1
     return way.played(min(max(_SAMPLES, back), int(bounds.duration / INTERVAL + 1e-6) + 1), bounds)

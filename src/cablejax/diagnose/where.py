@@ -103,7 +103,10 @@ def localise(log: GapLog, nominal: Float[np.ndarray, "E T N 2"], noise: Float[np
         raise ValueError("Not one keypoint is both observed and simulated: there is no gap to look at.")
     regimes = regimes_of(log, nominal, valid)
     pose = np.where(valid[..., None, None], log.gripper_pose, np.nan)
-    motion = repeated_motions(pose, float(log.meta["cable"]["length_m"]))
+    clocks = [time[:n] for time, n in zip(log.time, log.episode_length, strict=True)]
+    steps = np.array([np.median(np.diff(clock)) if len(clock) > 1 else np.nan for clock in clocks])
+    interval = np.where(np.isnan(steps), np.nanmin(np.append(steps, 1.0)), steps)
+    motion = repeated_motions(pose, interval, float(log.meta["cable"]["length_m"]))
     arclength = np.asarray(log.meta["keypoint_arclength_m"], float)
 
     whitened = residual / noise[:, None]
@@ -148,15 +151,18 @@ def _only(mask, axis: int, index: int):
 
 
 def _bending(log: GapLog, residual, noise) -> np.ndarray:
-    """Root mean square difference of curvature above the noise [1/m], by second differences across the cable."""
-    spacing = np.gradient(np.asarray(log.meta["keypoint_arclength_m"], np.float64))[1:-1]
-    second = residual[:, :, 2:] - 2 * residual[:, :, 1:-1] + residual[:, :, :-2]
-    floor = noise[2:] ** 2 + 4 * noise[1:-1] ** 2 + noise[:-2] ** 2
+    """Root mean square difference of curvature above the noise [1/m], by divided differences across the cable."""
+    spacing = np.diff(np.asarray(log.meta["keypoint_arclength_m"], np.float64))
+    before, after = spacing[:-1], spacing[1:]
+    weights = np.stack([after, -before - after, before]) * 2.0 / (before * after * (before + after))
+    three = np.arange(len(before)) + np.arange(3)[:, None]
+    second = np.einsum("kn,etknd->etnd", weights, residual[:, :, three])
+    floor = ((weights * noise[three]) ** 2).sum(axis=0)
     seen = np.isfinite(second[..., 0])
     count = np.maximum(2 * seen.sum(axis=(0, 1)), 1)
     square = np.where(seen[..., None], second**2, 0.0).sum(axis=(0, 1, 3)) / count
     # across the cable only: twice the mean of both coordinates
-    return np.sqrt(np.maximum(2 * (square - floor), 0.0) * (seen.any(axis=(0, 1)))) / spacing**2
+    return np.sqrt(np.maximum(2 * (square - floor), 0.0) * (seen.any(axis=(0, 1))))
 
 
 def _horizons(log: GapLog, valid, everywhere, above) -> dict[float, float]:

@@ -20,7 +20,7 @@ from cablejax.limits import require, shown
 EFFECTS: Mapping[str, CableEffect] = {effect.name: effect for effect in (*LIBRARY, *ARMS)}
 """Every effect by its name in the gap log's format."""
 
-# Beyond a bound by this share of the distance between both is at it.
+# A value beyond a bound by this share of it is at it.
 _ROUNDED = 1e-5
 # Parameters that say which: a gripper, a keypoint, a direction.
 _CHOICES = frozenset({"index", "across", *(effect.variant_name for effect in EFFECTS.values())})
@@ -101,8 +101,8 @@ class GivenEffect:
         bounded = []
         for parameter, value in zip(self.effect.parameters, values, strict=True):
             # verdicts round what they found at a bound
-            slack = _ROUNDED * (parameter.high - parameter.low)
-            if not parameter.low - slack <= value <= parameter.high + slack:
+            beyond = max(parameter.low - value, value - parameter.high)
+            if not beyond <= _ROUNDED * abs(value):
                 raise ValueError(f"{self.name}: {self._out_of_bounds(parameter, value, variant, chain)}")
             bounded.append(np.float32(min(max(value, parameter.low), parameter.high)))
         return self.effect.apply(physics, bounded, variant, chain)
