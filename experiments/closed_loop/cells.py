@@ -10,6 +10,7 @@ import numpy as np
 from closed_loop.paper import METHOD_LABEL, Measure
 from closed_loop.statistics import Interval, summarise
 from closed_loop.trials import Trial
+from pages import markdown_table
 
 SHAPES = ("U", "S", "Z")
 MEASURES: tuple[Measure, ...] = get_args(Measure)
@@ -81,5 +82,4 @@ def label_of(method: str, labels: Mapping[str, str]) -> str:
 
 
 def markdown(title: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    lines = [title, ["---", *("---:" for _ in title[1:])], *rows]
-    return "\n".join(f"| {' | '.join(line)} |" for line in lines) + "\n"
+    return "\n".join(markdown_table([title, *rows])) + "\n"
