@@ -148,7 +148,7 @@ class RodPlant(TablePlant):
         nodes = np.concatenate([shape.position[:1], shape.position[1:-1:2], shape.position[-1:]])
         _rod_loop().lay(rod, nodes, np.concatenate([pose[:1, 2], shape.angle[2:-1:2], pose[1:, 2]]))
         self._restart(pose)
-        self._advance(np.zeros((2, 3)), self._steps(self.config.settle_time), settling=True)
+        self._advance(np.zeros((2, 3)), self.config.discretisation.steps_in(self.config.settle_time), settling=True)
         rod.velocity_collection[:], rod.omega_collection[:] = 0.0, 0.0
         self._steps_done = 0
         return self.observe()
