@@ -36,6 +36,7 @@ from cablejax.cable_file import config_of_log
 from cablejax.commands.workloads import distance_from_fine, moving_arches
 from cablejax.dataset.generate import make_engine, simulate
 from cablejax.dataset.schema import DatasetConfig
+from cablejax.dataset.windows import trajectory_of
 from cablejax.dynamics.evaluate import prior_motion
 from cablejax.dynamics.train import train
 from cablejax.dynamics.train_config import PRESETS
@@ -47,7 +48,7 @@ from cablejax.simulate.equilibrium import equilibrium_state
 from cablejax.simulate.motions import MotionConfig
 from cablejax.types import Trajectory
 from open_loop import open_loop_error
-from pages import page_of_results, publish
+from pages import markdown_table, page_of_results, publish
 from recorded_replay import replay_episode
 
 ROWS = (
@@ -128,7 +129,7 @@ def trajectories(engine: str, count: int, seed: int) -> Trajectory:
         shard_size=count,
     )
     (block,) = simulate(config, make_engine(config), [0])
-    return Trajectory(block.keypoints, block.gripper_pose, block.gripper_twist)  # pyright: ignore[reportArgumentType]
+    return trajectory_of(config, block, range(count))
 
 
 def trained_networks() -> list[str]:
@@ -137,7 +138,7 @@ def trained_networks() -> list[str]:
     phases = tuple(dataclasses.replace(p, steps=round(share * p.steps)) for p in PRESETS["small"].phases)
     made = {name: trajectories(name, TRAIN, 1) for name in ("mjx", "chain")}
     held_out = {name: trajectories(name, HELD_OUT, 2) for name in ("mjx", "threaded", "chain")}
-    lines = []
+    rows = [["trained on", "on MJX", "on C MuJoCo", "on the chain"]]
     for seed in range(2):
         for name, data in made.items():
             config = dataclasses.replace(PRESETS["small"], phases=phases, seed=seed)
@@ -147,16 +148,11 @@ def trained_networks() -> list[str]:
                 open_loop_error((result.graphdef, result.weights), data, result.model) for data in held_out.values()
             ]
             cells = [f"{e.median_cm[-1]:.4f} ({e.p95_cm[-1]:.4f})" for e in errors]
-            lines.append(f"| {name}, seed {seed} | {' | '.join(cells)} |")
-            print(lines[-1], flush=True)
+            rows.append([f"{name}, seed {seed}", *cells])
+            print(*rows[-1], sep=" | ", flush=True)
     priors = [open_loop_error(prior_motion(result.model, "static"), data, result.model) for data in held_out.values()]
     cells = [f"{e.median_cm[-1]:.4f} ({e.p95_cm[-1]:.4f})" for e in priors]
-    return [
-        "| trained on | on MJX | on C MuJoCo | on the chain |",
-        "| --- | ---: | ---: | ---: |",
-        *lines,
-        f"| static prior, not trained | {' | '.join(cells)} |",
-    ]
+    return markdown_table([*rows, ["static prior, not trained", *cells]])
 
 
 def main() -> None:
@@ -167,25 +163,21 @@ def main() -> None:
     recorded = (folder / "labels.json").exists()
     if not recorded:
         print("No recordings: set CABLEJAX_DATA to compare with them. Their columns stay empty.")
-    lines = [
-        "| engine | links | time step [ms] | elastica [mm] | recorded, gentle | recorded, S and Z "
-        "| random, median [mm] | random, 99 % [mm] | cost [us] |",
-        "| --- | ---: | ---: | ---: | ---: | ---: | ---: | ---: | ---: |",
-    ]
+    measures = ("elastica [mm]", "recorded, gentle", "recorded, S and Z", "random, median [mm]", "random, 99 % [mm]")
+    rows = [["engine", "links", "time step [ms]", *measures, "cost [us]"]]
     for name, n_links, timestep in ROWS:
         gentle, demanding = replay_ratios(name, n_links, timestep, folder) if recorded else (np.nan, np.nan)
         median, rare = random_motions(name, n_links, timestep)
-        lines.append(
-            f"| {name} | {n_links} | {1e3 * timestep:g} | {elastica_error(n_links):.3f} | {gentle:.3f} "
-            f"| {demanding:.3f} | {median:.4f} | {rare:.3f} | {cost(name, n_links, timestep):.0f} |"
-        )
-        print(lines[-1], flush=True)
+        replayed = [f"{elastica_error(n_links):.3f}", f"{gentle:.3f}", f"{demanding:.3f}"]
+        rest = [f"{median:.4f}", f"{rare:.3f}", f"{cost(name, n_links, timestep):.0f}"]
+        rows.append([name, f"{n_links}", f"{1e3 * timestep:g}", *replayed, *rest])
+        print(*rows[-1], sep=" | ", flush=True)
     default, samples = Discretisation(), RANDOM.n_trajectories * RANDOM.n_steps
     page = page_of_results(
         "Resolution and time step of the simulators",
         "`python experiments/02_resolution.py --out docs/results/resolution.md`",
         [
-            *lines,
+            *markdown_table(rows),
             "",
             f"Default: **{default.n_links} links**; data are made at **20 ms** by MJX and C MuJoCo (threaded) and at",
             "**50 ms** by the chain. The error falls with the square of the link length; at 33 links it is within",

@@ -26,15 +26,14 @@ from cablejax.dynamics.train import train
 from cablejax.dynamics.train_config import PRESETS
 from cablejax.simulate.motions import MotionConfig
 from open_loop import open_loop_error
-from pages import page_of_results, publish
+from pages import markdown_table, page_of_results, publish
 
 TRAIN, HELD_OUT = 100, 10
 
 
-def row(name: str, error: OpenLoopError) -> str:
+def row(name: str, error: OpenLoopError) -> list[str]:
     """Median and 95th percentile after every horizon."""
-    cells = [f"{m:.4f} ({p:.4f})" for m, p in zip(error.median_cm, error.p95_cm, strict=True)]
-    return f"| {name} | {' | '.join(cells)} |"
+    return [name, *(f"{m:.4f} ({p:.4f})" for m, p in zip(error.median_cm, error.p95_cm, strict=True))]
 
 
 def main() -> None:
@@ -64,7 +63,7 @@ def main() -> None:
                 result = train(config, data, Path(scratch) / f"{name} {seed}", initial=initial)
                 error = open_loop_error((result.graphdef, result.weights), held_out, result.model)
                 lines.append(row(f"{name}, seed {seed}", error))
-                print(lines[-1], flush=True)
+                print(*lines[-1], sep=" | ", flush=True)
             missed = f"{pretrained.node_error:.2%} of node and {pretrained.edge_error:.2%} of edge features"
         lines.append(row("static prior", open_loop_error(prior_motion(result.model, "static"), held_out, result.model)))
     model = preset.model
@@ -77,9 +76,7 @@ def main() -> None:
             f"{HELD_OUT} others [cm]. Pretraining: as many steps before that ({seconds:.0f} s), after which the "
             f"auto-encoders miss {missed} (root mean square).",
             "",
-            "| | " + " | ".join(f"after {h}" for h in error.horizons) + " |",
-            "| --- |" + " ---: |" * len(error.horizons),
-            *lines,
+            *markdown_table([["", *(f"after {h}" for h in error.horizons)], *lines]),
         ],
     )
     publish(page, options.out)

@@ -22,6 +22,7 @@ import numpy as np
 from cablejax.control.shaping import Model, knowing, load_model
 from cablejax.dataset.generate import make_engine, simulate
 from cablejax.dataset.schema import DatasetConfig
+from cablejax.dataset.windows import trajectory_of
 from cablejax.dynamics.evaluate import evaluation_windows, no_motion, predict
 from cablejax.effects.given import GivenEffect, parse_effect
 from cablejax.simulate.motions import MotionConfig
@@ -51,7 +52,7 @@ def recorded(effects: tuple[GivenEffect, ...]) -> Trajectory:
         effects=effects,
     )
     (block,) = simulate(config, make_engine(config), [0])
-    return Trajectory(*(jnp.asarray(a) for a in (block.keypoints, block.gripper_pose, block.gripper_twist)))
+    return trajectory_of(config, block, range(MOTIONS))
 
 
 def median_error(model: Model | None, data: Trajectory) -> float:

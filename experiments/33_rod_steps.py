@@ -18,7 +18,7 @@ import numpy as np
 from cablejax.report.provenance import machine, versions
 from cablejax.simulate.rod import Rod, RodResult
 from cablejax.simulate.rod.constrained import TOLERANCE
-from pages import publish
+from pages import markdown_table, publish
 from real_cables.rod_grid import MOTIONS, STIFFNESS, every_case, rollouts
 
 _FINER = 32
@@ -50,23 +50,25 @@ def main() -> None:
         "cable's length, over the first second and over all five; where a cable is chaotic the latter grows "
         "whatever the step.",
         "",
-        "| clamps | EI/rho [m^4/s^2] | solved, coarse, unsolved | steps a sample, median, largest | "
-        "error in 1 s, median, largest [%] | in 5 s [%] | processor time, median [ms] |",
-        "| --- | ---: | ---: | ---: | ---: | ---: | ---: |",
     ]
+    measures = ("steps a sample, median, largest", "error in 1 s, median, largest [%]", "in 5 s [%]")
+    rows = [["clamps", "EI/rho [m^4/s^2]", "solved, coarse, unsolved", *measures, "processor time, median [ms]"]]
     for motion in MOTIONS:
         for stiffness in STIFFNESS:
             row = np.array([c.motion == motion and c.stiffness == stiffness for c in cases])
             counts = [int((found.result[row] == code).sum()) for code in RodResult]
             steps = found.steps[row] / found.points.shape[1]
             one, five = ([np.median(error[s][row]), error[s][row].max()] for s in (1, 5))
-            lines.append(
-                f"| {motion} | {stiffness:g} | {counts[0]}, {counts[1]}, {counts[2]} | {np.median(steps):.2f}, "
-                f"{steps.max():.1f} | {one[0]:.2f}, {one[1]:.2f} | {five[0]:.2f}, {five[1]:.1f} | "
-                f"{1e3 * np.median(np.array(seconds)[row]):.0f} |"
+            measured = (
+                f"{np.median(steps):.2f}, {steps.max():.1f}",
+                f"{one[0]:.2f}, {one[1]:.2f}",
+                f"{five[0]:.2f}, {five[1]:.1f}",
+                f"{1e3 * np.median(np.array(seconds)[row]):.0f}",
             )
+            rows.append([motion, f"{stiffness:g}", ", ".join(map(str, counts)), *measured])
     lost = [int((result == RodResult.UNSOLVED).sum()) for result in (found.result, reference.result)]
     lines += [
+        *markdown_table(rows),
         "",
         f"Unsolved in all: {lost[0]} of {len(cases)}, and {lost[1]} of the references. A batch holds the four "
         "motions of one cable; times are its own, over four.",

@@ -9,12 +9,7 @@ import numpy as np
 from scipy.stats import binomtest
 
 from cablejax.report.provenance import machine, versions
-
-
-def markdown_table(rows: Sequence[Sequence[str]]) -> list[str]:
-    """Lines of a table; the first row is its title."""
-    title, *rest = ["| " + " | ".join(row) + " |" for row in rows]
-    return [title, "|" + " --- |" * len(rows[0]), *rest]
+from cablejax.text_file import markdown_table as markdown_table
 
 
 def share(of: Sequence[bool]) -> list[str]:

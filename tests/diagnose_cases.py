@@ -54,6 +54,14 @@ def poses(motion: str, samples: int = SAMPLES) -> Float[np.ndarray, "T 2 3"]:
     )
 
 
+def arches(points: int, motions: Sequence[str] = MOTIONS) -> np.ndarray:
+    """Keypoints of a made-up cable between the grippers. Where the gap lies needs no physics."""
+    s = np.linspace(0.0, 1.0, points)
+    pose = np.stack([poses(m) for m in motions])[..., :2]
+    line = pose[:, :, None, 0] * (1 - s)[:, None] + pose[:, :, None, 1] * s[:, None]
+    return line + 0.2 * np.sin(np.pi * s)[:, None] * np.array([0.0, 1.0])
+
+
 def holds(samples: int = SAMPLES) -> np.ndarray:
     """At rest before the motion, and after it once the cable has settled."""
     index = np.arange(samples)

@@ -1,7 +1,7 @@
 """The Cosserat rod's plant: rest, grasps, friction law, agreement with the elastica, and what it refuses."""
 
-import builtins
 import dataclasses
+import sys
 
 import numpy as np
 import pytest
@@ -14,7 +14,6 @@ from cablejax.control.targets import make_target, straight_start
 from cablejax.effects.given import parse_effect
 from cablejax.simulate.elastica import elastica
 from cablejax.simulate.plant import Plant, PlantConfig
-from closed_loop import rod_plant
 from closed_loop.rod_plant import ETHERNET, USB, RodPlant, RodPlantConfig
 
 CABLE = Discretisation(n_links=15, timestep=4e-4)
@@ -144,16 +143,9 @@ def test_an_effect_changes_the_rod_as_it_changes_the_contact_plant(effect):
 
 
 def test_a_missing_library_says_how_to_get_it(monkeypatch):
-    real = builtins.__import__
-
-    def without(name, *args, **kwargs):
-        if name.startswith("elastica"):
-            raise ImportError(name)
-        return real(name, *args, **kwargs)
-
-    monkeypatch.setattr(builtins, "__import__", without)
+    monkeypatch.setitem(sys.modules, "closed_loop.rod_loop", None)
     with pytest.raises(ImportError, match="pip install pyelastica"):
-        rod_plant._import_rod_class()
+        RodPlant()
 
 
 def test_the_closed_loop_takes_it_for_a_plant():

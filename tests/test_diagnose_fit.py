@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import types
 from collections import Counter
 
@@ -87,20 +88,26 @@ def test_the_time_step_does_not_damp():
     assert relaxation_time(LARGEST_STEP) == pytest.approx(relaxation_time(0.002), rel=0.06)
 
 
-def test_a_rival_that_leaves_as_little_is_a_look_alike():
-    """However sure the likelihood is: in a wide gap it tells small differences between two laws from each other."""
+@functools.cache
+def soft_and_dragged():
+    """A cable that is soft and dragged, and fits of what look alike on it, none at all last."""
     facts = evidence(("bending_stiffness", (0.25,)), ("viscous_drag", (0.3,)), noise_mm=0.02)
     fits = improve(facts, evaluate(facts, [explanation(*parts((n, v))) for n, v in LOOK_ALIKES]), max_iterations=15)
-    null = evaluate(facts, [explanation()])[0]
-    scores = log_scores([*fits, null], facts, Calibration())
+    fits += evaluate(facts, [explanation()])
+    scores = log_scores(fits, facts, Calibration())
     order = np.argsort(-scores)
-    found = Search(tuple([*fits, null][i] for i in order), scores[order], {})
+    return facts, fits, Search(tuple(fits[i] for i in order), scores[order], {})
+
+
+def test_a_rival_that_leaves_as_little_is_a_look_alike():
+    """However sure the likelihood is: in a wide gap it tells small differences between two laws from each other."""
+    facts, fits, found = soft_and_dragged()
     ((_, rival),) = conclude(found, facts, Calibration(as_good=1e3)).equivalent
     assert rival == "table_friction"
     strict = conclude(found, facts, Calibration(as_good=1.0))
     assert strict.equivalent == () and strict.effects[0].probability > 0.99
     # draws of the posterior: each explanation as often as it is probable, none at all among them
-    posterior = conclude(Search((*fits, null), np.array([0.0, -0.4, -0.8]), {}), facts, Calibration()).posterior
+    posterior = conclude(Search(tuple(fits), np.array([0.0, -0.4, -0.8]), {}), facts, Calibration()).posterior
     counts = Counter(tuple(effect.name for effect in draw) for draw in posterior)
     assert [counts[names] for names in (("bending_stiffness",), ("table_friction",), ())] == [8, 5, 3]
     assert len({draw[0].parameters["ratio"] for draw in posterior[:8]}) == 8
@@ -307,12 +314,7 @@ def test_every_start_of_the_library_lies_within_its_bounds():
 
 def test_the_headline_lists_no_cause_whose_probability_is_below_one_per_cent():
     """A likelihood may be sure against a look-alike that leaves as little: it is mentioned, not listed as a cause."""
-    facts = evidence(("bending_stiffness", (0.25,)), ("viscous_drag", (0.3,)), noise_mm=0.02)
-    fits = improve(facts, evaluate(facts, [explanation(*parts((n, v))) for n, v in LOOK_ALIKES]), max_iterations=15)
-    null = evaluate(facts, [explanation()])[0]
-    scores = log_scores([*fits, null], facts, Calibration())
-    order = np.argsort(-scores)
-    found = Search(tuple([*fits, null][i] for i in order), scores[order], {})
+    facts, _, found = soft_and_dragged()
     conclusion = conclude(found, facts, Calibration(as_good=1e3, adequate=1.0))
     assert conclusion.verdict == "ambiguous" and conclusion.ranking[1].probability < 0.01
     words = sentence(conclusion, 0.9)

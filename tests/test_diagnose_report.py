@@ -28,7 +28,7 @@ from cablejax.spatial.cable import SpatialCable
 from cablejax.spatial.gap import constant_offset, gap_of, in_log, noise_of, smallest_gap, where_of
 from cablejax.spatial.identify import layout_of
 from cablejax.spatial.windows import windows_of
-from diagnose_cases import log_of, poses
+from diagnose_cases import arches, log_of, poses
 
 MOTIONS = ("approach", "translation")
 POINTS = 13
@@ -85,10 +85,7 @@ def following(motion: str, separates: tuple[str, ...], information: float, ended
 
 def diagnosis(verdict="named", **changes) -> CableDiagnosis:
     """A made-up diagnosis of two episodes whose gap is 3 mm in the middle of the cable."""
-    s = np.linspace(0.0, 1.0, POINTS)
-    pose = np.stack([poses(m) for m in MOTIONS])[..., :2]
-    nominal = pose[:, :, None, 0] * (1 - s)[:, None] + pose[:, :, None, 1] * s[:, None]
-    nominal = nominal + 0.2 * np.sin(np.pi * s)[:, None] * np.array([0.0, 1.0])
+    s, nominal = np.linspace(0.0, 1.0, POINTS), arches(POINTS, MOTIONS)
     gap = 0.0 if verdict == "none" else 4e-3 * np.sin(np.pi * s)[:, None]
     noise = 1e-3 * np.random.default_rng(0).normal(size=nominal.shape)
     log = log_of((nominal + gap + noise).astype(np.float32), MOTIONS)

@@ -12,23 +12,15 @@ from cablejax.diagnose.regimes import largest_curvature
 from cablejax.diagnose.significance import LEVEL, contrast_p, variance_inflation
 from cablejax.diagnose.where import localise
 from cablejax.diagnose.where_words import describe
-from diagnose_cases import MOTIONS, SAMPLES, log_of, poses
+from diagnose_cases import MOTIONS, SAMPLES, arches, log_of, poses
 
 NOISE = 1e-3
 POINTS = 13
 
 
-def shapes(motions=MOTIONS):
-    """Keypoints of a made-up cable: an arch between the grippers. Where the gap lies needs no physics."""
-    s = np.linspace(0.0, 1.0, POINTS)
-    pose = np.stack([poses(m) for m in motions])[..., :2]
-    line = pose[:, :, None, 0] * (1 - s)[:, None] + pose[:, :, None, 1] * s[:, None]
-    return line + 0.2 * np.sin(np.pi * s)[:, None] * np.array([0.0, 1.0])
-
-
 def case(gap=0.0, motions=MOTIONS, seed=0):
     """A log that deviates by `gap` [m], broadcast to [E, T, N, 2], and its nominal keypoints."""
-    nominal = shapes(motions)
+    nominal = arches(POINTS, motions)
     noise = NOISE * np.random.default_rng(seed).normal(size=nominal.shape)
     return log_of((nominal + gap + noise).astype(np.float32), motions), nominal
 
@@ -99,7 +91,7 @@ def test_rest_before_any_motion_does_not_make_a_gap_one_of_motion():
 
 
 def test_frames_tell_a_camera_from_marks_on_the_cable():
-    nominal = shapes()
+    nominal = arches(POINTS)
     turned = nominal * 1.01 + np.array([-0.02, 0.01]) * nominal[..., ::-1] + 0.004
     camera = localise(*case(turned - nominal), np.full(POINTS, NOISE))
     assert camera.frames["image"] > 0.95

@@ -5,7 +5,7 @@ from pages import markdown_table, page_of_results, publish
 
 
 def test_table_has_a_title_and_as_many_dashes_as_columns():
-    assert markdown_table([["a", "b"], ["1", "2"]]) == ["| a | b |", "| --- | --- |", "| 1 | 2 |"]
+    assert markdown_table([["a", "b"], ["1", "2"]]) == ["| a | b |", "| --- | ---: |", "| 1 | 2 |"]
 
 
 def test_page_is_printed_and_written_to_a_folder_that_is_made(tmp_path, capsys):

@@ -18,13 +18,10 @@ from typing import Any
 
 import numba
 import numpy as np
-from elastica.rod.cosserat_rod import (
-    CosseratRod,
-    _compute_internal_forces,
-    _compute_internal_torques,
-    _update_accelerations,
-)
+from elastica.rod.cosserat_rod import CosseratRod, _update_accelerations
 from elastica.rod.data_structures import overload_operator_kinematic_numba
+
+from closed_loop.rod_loop import arrays, hold, internal_loads, lay, straight_rod
 
 from .rod import Motion, arch
 from .world import GRAVITY, World, bump
@@ -102,9 +99,9 @@ def simulate(world: World, pose: np.ndarray, frame: float, *, height: float = 0.
     settling = np.empty((2, ELEMENTS, 2))
     settle_steps = int(SETTLE_TIME / dt)
     march: Any = _march  # its first arguments come as one tuple
-    march(*_arrays(rod), still, settle_steps, dt, damper, p, SETTLE_RATE, settling)
+    march(*arrays(rod), still, settle_steps, dt, damper, p, SETTLE_RATE, settling)
     rod.velocity_collection[:], rod.omega_collection[:] = 0.0, 0.0
-    march(*_arrays(rod), held, substeps, dt, damper, p, 0.0, out)
+    march(*arrays(rod), held, substeps, dt, damper, p, 0.0, out)
     if not np.isfinite(out).all() or np.abs(rod.dilatation - 1).max() > 0.1:
         raise FloatingPointError("The Cosserat rod became unstable.")
     arc = np.repeat(np.linspace(0.0, world.length, ELEMENTS)[None], len(out), axis=0)
@@ -113,24 +110,11 @@ def simulate(world: World, pose: np.ndarray, frame: float, *, height: float = 0.
 
 def _rod(world: World) -> CosseratRod:
     """A straight rod at rest along x."""
-    h = world.length / (ELEMENTS - 1)
-    lengths = np.full(ELEMENTS, h)
+    lengths = np.full(ELEMENTS, world.length / (ELEMENTS - 1))
     lengths[[0, -1]] /= 2
-    position = np.zeros((3, ELEMENTS + 1))
-    position[0, 1:] = np.cumsum(lengths)
-    area = np.pi * world.diameter**2 / 4
-    rod = CosseratRod.straight_rod(
-        ELEMENTS, np.zeros(3), np.array([1.0, 0.0, 0.0]), np.array([0.0, 0.0, 1.0]), world.length, world.diameter / 2,
-        world.linear_density / area, youngs_modulus=1.0, shear_modulus=1.0, position=position,
-    )  # fmt: skip
-    axial = AXIAL_RATIO * world.stiffness
-    rod.shear_matrix[:] = np.diag([0.5 * axial, 0.5 * axial, axial])[:, :, None]
-    # Large enough an inertia of rotation that shear waves are no faster than axial ones; nothing visible depends on it.
-    inertia = world.linear_density * lengths * (h / 2) ** 2
-    rod.mass_second_moment_of_inertia[:] = np.eye(3)[:, :, None] * inertia
-    rod.inv_mass_second_moment_of_inertia[:] = np.eye(3)[:, :, None] / inertia
+    rod = straight_rod(world.length, world.diameter, world.linear_density, lengths, AXIAL_RATIO * world.stiffness)
     if world.lump is not None:
-        s = position[0]
+        s = np.append(0.0, np.cumsum(lengths))
         share = np.exp(-0.5 * ((s - world.lump[0]) / 0.02) ** 2)
         rod.mass[:] = rod.mass + world.lump[1] * share / share.sum()
     return rod
@@ -143,37 +127,16 @@ def _lay(rod: CosseratRod, pose: np.ndarray, length: float) -> None:
     nodes = np.concatenate([middle[:1], joints, middle[-1:]])
     angle = np.arctan2(*np.diff(nodes, axis=0).T[::-1])
     angle[0], angle[-1] = pose[0, 2], pose[1, 2]
-    rod.position_collection[:2] = nodes.T
-    cos, sin, zero = np.cos(angle), np.sin(angle), np.zeros(ELEMENTS)
-    rod.director_collection[0] = np.stack([zero, zero, zero + 1.0])
-    rod.director_collection[1] = np.stack([sin, -cos, zero])
-    rod.director_collection[2] = np.stack([cos, sin, zero])
-
-
-def _arrays(rod: CosseratRod) -> tuple:
-    """What the loop needs of a rod."""
-    return (
-        rod.position_collection, rod.velocity_collection, rod.acceleration_collection, rod.director_collection,
-        rod.omega_collection, rod.alpha_collection, rod.mass, rod.mass_second_moment_of_inertia,
-        rod.inv_mass_second_moment_of_inertia,
-        (rod.shear_matrix, rod.bend_matrix, rod.rest_sigma, rod.rest_kappa),
-        (rod.volume, rod.lengths, rod.rest_lengths, rod.rest_voronoi_lengths, rod.tangents, rod.radius),
-        (rod.dilatation, rod.voronoi_dilatation, rod.dilatation_rate, rod.sigma, rod.kappa),
-        (rod.internal_stress, rod.internal_couple, rod.internal_forces, rod.internal_torques),
-        rod.external_forces, rod.external_torques, rod.ghost_elems_idx,
-    )  # fmt: skip
+    lay(rod, nodes, angle)
 
 
 @numba.njit(cache=True)
 def _march(
-    x, v, a, q, omega, alpha, mass, inertia, inverse_inertia, stiffness, geometry, strain, stress, outer, couple,
+    x, v, a, q, omega, alpha, mass, inertia, inverse_inertia, stiffness, geometry, strain, stress, external,
     ghosts, pose, substeps, dt, damper, p, settling, out,
 ):  # fmt: skip
     """Steps the rod along gripper poses [F + 1, 2, 3]; the elements' middles at every frame go to `out`."""
-    shear_matrix, bend_matrix, rest_sigma, rest_kappa = stiffness
-    volume, lengths, rest_lengths, rest_voronoi, tangents, radius = geometry
-    dilatation, voronoi_dilatation, dilatation_rate, sigma, kappa = strain
-    internal_stress, internal_couple, force, torque = stress
+    rest_lengths, tangents, dilatation, outer, couple = geometry[2], geometry[4], strain[0], external[0], external[1]
     n = x.shape[1]
     elements = n - 1
     lower = np.zeros(elements)
@@ -183,17 +146,9 @@ def _march(
             _middles(x, out[0])
         rate = (pose[f + 1] - pose[f]) / (substeps * dt)
         for sub in range(substeps):
-            _grasp(x, v, q, omega, rest_lengths, pose[f] + sub * dt * rate, rate)
+            hold(x, v, q, omega, rest_lengths, pose[f] + sub * dt * rate, rate)
             overload_operator_kinematic_numba(0.5 * dt, x, q, v, omega)
-            _compute_internal_forces(
-                x, volume, lengths, tangents, radius, rest_lengths, rest_voronoi, dilatation, voronoi_dilatation, q,
-                sigma, rest_sigma, shear_matrix, internal_stress, force, ghosts,
-            )  # fmt: skip
-            _compute_internal_torques(
-                x, v, tangents, lengths, rest_lengths, q, rest_voronoi, bend_matrix, rest_kappa, kappa,
-                voronoi_dilatation, inertia, omega, internal_stress, internal_couple, dilatation, dilatation_rate,
-                torque, ghosts,
-            )  # fmt: skip
+            force, torque = internal_loads(x, v, q, omega, inertia, stiffness, geometry, strain, stress, ghosts)
             # Outer forces: downhill pull, a dashpot along the elements against axial waves, an obstacle.
             for i in range(n):
                 outer[0, i], outer[1, i] = mass[i] * p[PULL_X], mass[i] * p[PULL_Y]
@@ -260,24 +215,8 @@ def _march(
                 for k in range(3):
                     omega[k, e] += lower[e] * omega[k, e + 1]
             overload_operator_kinematic_numba(0.5 * dt, x, q, v, omega)
-        _grasp(x, v, q, omega, rest_lengths, pose[f + 1], rate)
+        hold(x, v, q, omega, rest_lengths, pose[f + 1], rate)
         _middles(x, out[f + 1])
-
-
-@numba.njit(cache=True)
-def _grasp(x, v, q, omega, rest_lengths, pose, rate):
-    """Puts the two end elements where the grippers are."""
-    last = x.shape[1] - 1
-    for g in range(2):
-        cos, sin, turn = np.cos(pose[g, 2]), np.sin(pose[g, 2]), rate[g, 2]
-        end, inner, e = (0, 1, 0) if g == 0 else (last, last - 1, last - 1)
-        long = rest_lengths[0] if g == 0 else -rest_lengths[last - 1]
-        x[0, end], x[1, end] = pose[g, 0], pose[g, 1]
-        v[0, end], v[1, end] = rate[g, 0], rate[g, 1]
-        x[0, inner], x[1, inner] = pose[g, 0] + long * cos, pose[g, 1] + long * sin
-        v[0, inner], v[1, inner] = rate[g, 0] - long * turn * sin, rate[g, 1] + long * turn * cos
-        q[1, 0, e], q[1, 1, e], q[2, 0, e], q[2, 1, e] = sin, -cos, cos, sin
-        omega[0, e], omega[1, e], omega[2, e] = turn, 0.0, 0.0
 
 
 @numba.njit(cache=True)

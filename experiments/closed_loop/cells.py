@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from typing import get_args
 
 import numpy as np
 
+from closed_loop.methods import LABEL
 from closed_loop.paper import METHOD_LABEL, Measure
 from closed_loop.statistics import Interval, summarise
 from closed_loop.trials import Trial
+from pages import markdown_table
 
 SHAPES = ("U", "S", "Z")
 MEASURES: tuple[Measure, ...] = get_args(Measure)
@@ -31,10 +33,10 @@ def scenarios_of(trials: Sequence[Trial]) -> list[str]:
     return [s for s in SHAPES if s in present] + [s for s in present if s not in SHAPES]
 
 
-def methods_of(trials: Sequence[Trial], chosen: Sequence[str] | None) -> list[str]:
+def methods_of(trials: Sequence[Trial]) -> list[str]:
+    """The paper's in its order, then the others as they appear."""
     present = dict.fromkeys(trial.method for trial in trials)
-    order = [*METHOD_LABEL, *(m for m in present if m not in METHOD_LABEL)] if chosen is None else chosen
-    return [method for method in order if method in present]
+    return [method for method in {**METHOD_LABEL, **present} if method in present]
 
 
 def of_scenario(trials: Iterable[Trial], scenario: str) -> list[Trial]:
@@ -76,10 +78,9 @@ def trial_count(trials: Sequence[Trial]) -> str:
     return str(counts.pop()) if len(counts) == 1 else f"{min(counts)} to {max(counts)}"
 
 
-def label_of(method: str, labels: Mapping[str, str]) -> str:
-    return labels.get(method, method)
+def label_of(method: str) -> str:
+    return LABEL.get(method, method)
 
 
 def markdown(title: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    lines = [title, ["---", *("---:" for _ in title[1:])], *rows]
-    return "\n".join(f"| {' | '.join(line)} |" for line in lines) + "\n"
+    return "\n".join(markdown_table([title, *rows])) + "\n"

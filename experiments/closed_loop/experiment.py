@@ -20,7 +20,7 @@ from closed_loop.cases import NEARBY, NEARBY_RATIOS
 from closed_loop.failures import failure_figure, worst
 from closed_loop.fine_tuning import FineTuneConfig, fine_tune, record
 from closed_loop.harder import MARGIN_CM
-from closed_loop.methods import LABEL, METHODS, NO_PRIOR_LEARNER, WITHOUT_LEARNING, model_named
+from closed_loop.methods import METHODS, NO_PRIOR_LEARNER, WITHOUT_LEARNING, model_named
 from closed_loop.protocols import least_time
 from closed_loop.suite import Case, read_suite, run_suite
 from closed_loop.trials import LATE, LIANG_TABLE, Trial
@@ -138,22 +138,22 @@ def page(experiment: Experiment, trials: Sequence[Trial], command: str, picture:
             ratios = f"{NEARBY_RATIOS[0]:g} to {NEARBY_RATIOS[-1]:g} times as stiff as the trained cable"
             about = f"Z from one start, {ratios}; mean error of the last {LATE} s."
             lines += ["", "## Ten plants next to one another", "", about, ""]
-            lines += [interval_tables.nearby_table(mine, table, labels=LABEL)]
+            lines += [interval_tables.nearby_table(mine, table)]
             continue
         lines += ["", f"## Table {table}", "", f"Seeds: {seeds_text({trial.seed for trial in mine})}.", ""]
         if table == LIANG_TABLE:
-            lines += [interval_tables.success_table(mine, labels=LABEL)]
+            lines += [interval_tables.success_table(mine)]
             continue
         if table in MARGIN_CM:
-            lines += [interval_tables.reached_table(mine, table, MARGIN_CM[table], labels=LABEL)]
+            lines += [interval_tables.reached_table(mine, table, MARGIN_CM[table])]
             continue
-        lines += [tables.comparison_table(mine, table, labels=LABEL)]
+        lines += [tables.comparison_table(mine, table)]
         least = least_times(experiment, {trial.key[:1] + trial.key[2:] for trial in mine})
         lines += ["", "### Settling time by other definitions", "", f"{SETTLING_NOTE} {least}"]
-        lines += ["", tables.settling_table(mine, table, labels=LABEL)]
-        lines += ["", "### By stiffness", "", tables.stiffness_table(mine, table, labels=LABEL)]
-        lines += ["", "### How runs end", "", interval_tables.end_table(mine, table, labels=LABEL)]
-        lines += ["", "### Intervals and failures", "", interval_tables.interval_table(mine, table, labels=LABEL)]
+        lines += ["", tables.settling_table(mine, table)]
+        lines += ["", "### By stiffness", "", tables.stiffness_table(mine, table)]
+        lines += ["", "### How runs end", "", interval_tables.end_table(mine, table)]
+        lines += ["", "### Intervals and failures", "", interval_tables.interval_table(mine, table)]
         methods = {trial.method for trial in mine}
         if any({learning, base} <= methods for learning, base in WITHOUT_LEARNING.items()):
             lines += [
@@ -163,9 +163,9 @@ def page(experiment: Experiment, trials: Sequence[Trial], command: str, picture:
                 f"Wins / losses in pairs, by means of the last {LATE} s; p counts them as independent, and those of "
                 "one seed share their start.",
             ]
-            lines += ["", interval_tables.learning_table(mine, table, WITHOUT_LEARNING, labels=LABEL)]
+            lines += ["", interval_tables.learning_table(mine, table, WITHOUT_LEARNING)]
         if NO_PRIOR_LEARNER in methods and len(methods) > 1:
-            lines += ["", "### In pairs", "", interval_tables.paired_table(mine, table, NO_PRIOR_LEARNER, labels=LABEL)]
+            lines += ["", "### In pairs", "", interval_tables.paired_table(mine, table, NO_PRIOR_LEARNER)]
     if picture is not None:
         lines += ["", "## The runs that ended farthest off", "", f"![start, end and target of each]({picture})"]
     return page_of_results(experiment.title, f"`{command}`", lines)

@@ -18,9 +18,8 @@ from closed_loop.cells import (
     of_scenario,
     scenarios_of,
     trials_of_table,
-    value_of,
 )
-from closed_loop.paper import LIANG, METHOD_LABEL, Measure
+from closed_loop.paper import LIANG
 from closed_loop.statistics import Interval, mean_interval, paired_difference, summarise
 from closed_loop.trials import LATE, LIANG_TABLE, Trial
 
@@ -30,14 +29,7 @@ SUCCESS_CM = 1.0
 """Liang et al.: a shape is reached below this root mean square error [cm]."""
 
 
-def interval_table(
-    trials: Iterable[Trial],
-    table: str,
-    measure: Measure = "terminal",
-    *,
-    methods: Sequence[str] | None = None,
-    labels: Mapping[str, str] = METHOD_LABEL,
-) -> str:
+def interval_table(trials: Iterable[Trial], table: str) -> str:
     """What a mean hides: its 95 % bootstrap interval, the median, the worst trial, and failures.
 
     The interval resamples seeds, since trials of one seed share their start.
@@ -47,36 +39,28 @@ def interval_table(
     """
     mine = trials_of_table(trials, table)
     rows = []
-    for method in methods_of(mine, methods):
+    for method in methods_of(mine):
         for scenario in scenarios_of(mine):
             cell = of_scenario([trial for trial in mine if trial.method == method], scenario)
             if not cell:
                 continue
-            summary = summarise([value_of(trial, measure) for trial in cell])
+            summary = summarise([trial.terminal_error_cm for trial in cell])
             rows.append(
                 [
-                    label_of(method, labels), scenario, str(summary.count), str(summary.failures),
+                    label_of(method), scenario, str(summary.count), str(summary.failures),
                     str(sum(trial.stopped is not None for trial in cell)), number_text(summary.mean),
-                    interval_text(_seed_interval(cell, measure)), number_text(summary.median),
+                    interval_text(_seed_interval(cell)), number_text(summary.median),
                     number_text(summary.worst),
                 ]
             )  # fmt: skip
     title = [
-        "method", "scenario", "trials", FAILED[measure], "stopped early", f"mean {UNIT[measure]}", "95 % interval",
-        "median", "worst",
+        "method", "scenario", "trials", FAILED["terminal"], "stopped early", f"mean {UNIT['terminal']}",
+        "95 % interval", "median", "worst",
     ]  # fmt: skip
     return markdown(title, rows)
 
 
-def paired_table(
-    trials: Iterable[Trial],
-    table: str,
-    reference: str,
-    measure: Measure = "terminal",
-    *,
-    methods: Sequence[str] | None = None,
-    labels: Mapping[str, str] = METHOD_LABEL,
-) -> str:
+def paired_table(trials: Iterable[Trial], table: str, reference: str) -> str:
     """Every method against `reference` in the same trials (stiffness and seed): negative = lower than the reference.
 
     Raises:
@@ -88,31 +72,29 @@ def paired_table(
 
     def values(method: str, scenario: str) -> dict[tuple[float, int], float]:
         cell = of_scenario([trial for trial in mine if trial.method == method], scenario)
-        return {(trial.stiffness, trial.seed): value_of(trial, measure) for trial in cell}
+        return {(trial.stiffness, trial.seed): trial.terminal_error_cm for trial in cell}
 
     rows = []
-    for method in methods_of(mine, methods):
+    for method in methods_of(mine):
         for scenario in scenarios_of(mine):
             if method == reference or not (ours := values(method, scenario)):
                 continue
             result = paired_difference(ours, values(reference, scenario), cluster=lambda key: key[1])
             rows.append(
                 [
-                    label_of(method, labels), scenario, str(result.pairs), str(result.unpaired), str(result.failures),
+                    label_of(method), scenario, str(result.pairs), str(result.unpaired), str(result.failures),
                     f"{result.mean:+.3f}" if np.isfinite(result.mean) else "none",
                     interval_text(result.interval, "+.3f"), f"{result.better} / {result.worse}",
                 ]
             )  # fmt: skip
     title = [
-        f"against {label_of(reference, labels)}", "scenario", "pairs", "unpaired", "pairs with a failure",
-        f"difference of {UNIT[measure]}", "95 % interval", "better / worse",
+        f"against {label_of(reference)}", "scenario", "pairs", "unpaired", "pairs with a failure",
+        f"difference of {UNIT['terminal']}", "95 % interval", "better / worse",
     ]  # fmt: skip
     return markdown(title, rows)
 
 
-def learning_table(
-    trials: Iterable[Trial], table: str, bases: Mapping[str, str], *, labels: Mapping[str, str] = METHOD_LABEL
-) -> str:
+def learning_table(trials: Iterable[Trial], table: str, bases: Mapping[str, str]) -> str:
     """What learning online changes: each method against the same model without it, by stiffness, in the same trials.
 
     Errors are means of the last `LATE` seconds. A cell is one letter and stiffness; p is of the one-sided sign test, by
@@ -122,7 +104,6 @@ def learning_table(
         trials: of any tables.
         table: whose rows count.
         bases: the model without it, by method. Those that were not tried are left out.
-        labels: of methods.
 
     Raises:
         ValueError: there is no trial of this table.
@@ -154,14 +135,12 @@ def learning_table(
                     change[f"{letter} at {ratio:g}"] = ours / other - 1
         worse = [f"{name} {100 * part:+.0f} %" for name, part in change.items() if part > 0]
         text = f"{len(worse)} of {len(change)}" + (f": {', '.join(worse)}" if worse else "")
-        rows.append([label_of(method, labels), label_of(base, labels), *counts, text])
+        rows.append([label_of(method), label_of(base), *counts, text])
     title = ["method", "against", *(f"at {ratio:g}" for ratio in ratios), *letters, "cells where its mean is worse"]
     return markdown(title, rows)
 
 
-def reached_table(
-    trials: Iterable[Trial], table: str, margin_cm: float, *, labels: Mapping[str, str] = METHOD_LABEL
-) -> str:
+def reached_table(trials: Iterable[Trial], table: str, margin_cm: float) -> str:
     """How many runs end within a margin of the best that a cable at rest can do, by scenario.
 
     A run ends where the mean of its last ten seconds is; `Trial.reachable_cm` is the best.
@@ -170,7 +149,7 @@ def reached_table(
         ValueError: there is no trial of this table.
     """
     mine, rows = trials_of_table(trials, table), []
-    for method in methods_of(mine, None):
+    for method in methods_of(mine):
         of_method = [trial for trial in mine if trial.method == method]
         scenarios = sorted({trial.scenario for trial in of_method})
         for scenario in [*scenarios, "all"] if len(scenarios) > 1 else scenarios:
@@ -180,7 +159,7 @@ def reached_table(
             between = "linear" if np.isfinite(over).all() else "higher"
             rows.append(
                 [
-                    label_of(method, labels), scenario, f"{reached}/{len(cell)}", _rate_text(reached, len(cell)),
+                    label_of(method), scenario, f"{reached}/{len(cell)}", _rate_text(reached, len(cell)),
                     number_text(float(np.median(over))), number_text(float(np.quantile(over, 0.9, method=between))),
                     str(sum(trial.stopped is not None for trial in cell)),
                 ]
@@ -192,13 +171,7 @@ def reached_table(
     return markdown(head, rows)
 
 
-def success_table(
-    trials: Iterable[Trial],
-    *,
-    table: str = LIANG_TABLE,
-    methods: Sequence[str] | None = None,
-    labels: Mapping[str, str] = METHOD_LABEL,
-) -> str:
+def success_table(trials: Iterable[Trial]) -> str:
     """How often a random target was reached from a random start, compared with Liang et al.
 
     A success is an error below 10 mm at the end of the run. That is stricter than below 10 mm at some time within the
@@ -207,9 +180,9 @@ def success_table(
     Raises:
         ValueError: there is no trial of this table.
     """
-    mine = trials_of_table(trials, table)
+    mine = trials_of_table(trials, LIANG_TABLE)
     rows = []
-    for method in methods_of(mine, methods):
+    for method in methods_of(mine):
         of_method = [trial for trial in mine if trial.method == method]
         for scenario in sorted({trial.scenario for trial in of_method}, reverse=True):
             cell = of_scenario(of_method, scenario)
@@ -219,7 +192,7 @@ def success_table(
             lost = f" ({every.failures} lost)" if every.failures else ""
             rows.append(
                 [
-                    label_of(method, labels), scenario, f"{len(reached)}/{len(cell)}",
+                    label_of(method), scenario, f"{len(reached)}/{len(cell)}",
                     _rate_text(len(reached), len(cell)), f"{once}/{len(cell)}",
                     number_text(summarise([10 * t.terminal_error_cm for t in reached]).mean if reached else np.nan),
                     f"{number_text(every.mean)}{lost}", number_text(every.median),
@@ -241,13 +214,7 @@ def success_table(
     return markdown(title, rows)
 
 
-def end_table(
-    trials: Iterable[Trial],
-    table: str,
-    *,
-    methods: Sequence[str] | None = None,
-    labels: Mapping[str, str] = METHOD_LABEL,
-) -> str:
+def end_table(trials: Iterable[Trial], table: str) -> str:
     """How runs end: the error over the last `LATE` seconds, whether it still moves, and what the grippers still do.
 
     Raises:
@@ -255,7 +222,7 @@ def end_table(
     """
     mine = trials_of_table(trials, table)
     rows = []
-    for method in methods_of(mine, methods):
+    for method in methods_of(mine):
         for scenario in scenarios_of(mine):
             cell = of_scenario([trial for trial in mine if trial.method == method], scenario)
             if not cell:
@@ -265,7 +232,7 @@ def end_table(
             travel = [trial.late_travel_m for trial in cell]
             rows.append(
                 [
-                    label_of(method, labels), scenario, str(len(cell)),
+                    label_of(method), scenario, str(len(cell)),
                     number_text(float(np.mean([late_error(trial) for trial in cell]))),
                     number_text(float(np.max(np.nan_to_num(late, nan=np.inf)))),
                     number_text(float(np.median(swing))), f"{np.sum(swing <= RESTING_MM)}/{len(cell)}",
@@ -280,17 +247,17 @@ def end_table(
     return markdown(title, rows)
 
 
-def nearby_table(trials: Iterable[Trial], table: str, *, labels: Mapping[str, str] = METHOD_LABEL) -> str:
+def nearby_table(trials: Iterable[Trial], table: str) -> str:
     """Best, median and worst of runs that differ by next to nothing, in the mean of the last `LATE` seconds.
 
     Raises:
         ValueError: there is no trial of this table.
     """
     mine, rows = trials_of_table(trials, table), []
-    for method in methods_of(mine, None):
+    for method in methods_of(mine):
         late = [late_error(trial) for trial in mine if trial.method == method]
         numbers = min(late), float(np.median(late)), max(late), max(late) / min(late)
-        rows.append([label_of(method, labels), str(len(late)), *map(number_text, numbers)])
+        rows.append([label_of(method), str(len(late)), *map(number_text, numbers)])
     return markdown(["method", "plants", "best [cm]", "median [cm]", "worst [cm]", "worst over best"], rows)
 
 
@@ -300,11 +267,11 @@ def late_error(trial: Trial) -> float:
     return error if np.isfinite(error) else np.inf
 
 
-def _seed_interval(cell: Sequence[Trial], measure: Measure) -> Interval:
+def _seed_interval(cell: Sequence[Trial]) -> Interval:
     """Interval of the mean of the trials that did not fail, by the seeds' means."""
     by_seed: dict[int, list[float]] = {}
     for trial in cell:
-        if np.isfinite(value := value_of(trial, measure)):
+        if np.isfinite(value := trial.terminal_error_cm):
             by_seed.setdefault(trial.seed, []).append(value)
     means = [float(np.mean(values)) for values in by_seed.values()]
     return mean_interval(means) if means else Interval(np.nan, np.nan)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Collection
 from typing import Literal
 
 PaperTable = Literal["III", "IV", "V"]
@@ -41,9 +40,6 @@ METHOD_LABEL: dict[str, str] = {
     RESIDUAL: "GNS + online residual",
 }
 """The paper's methods in its order, under the names that trials have for them."""
-
-OFFLINE_METHODS = (DIRECT, RANDOMISED, FINE_TUNED)
-"""Those that learn nothing while they shape."""
 
 _Cells = dict[str, dict[str, PaperCell]]
 
@@ -123,21 +119,17 @@ PAPER: dict[PaperTable, _Cells] = {
 """The paper prints in bold what it calls best, twice not the lowest number: use `best_in_paper`."""
 
 
-def best_in_paper(table: PaperTable, scenario: str, measure: Measure, methods: Collection[str] | None = None) -> float:
-    """The lowest mean that the paper reports in one column, of all its methods or of some.
+def best_in_paper(table: PaperTable, scenario: str, measure: Measure) -> float:
+    """The lowest mean that the paper reports in one column.
 
     Raises:
-        ValueError: the paper has no such table, or no such scenario in it for any of these methods.
+        ValueError: the paper has no such table, or no such scenario in it.
     """
-    cells = [
-        row[scenario]
-        for method, row in PAPER.get(table, {}).items()
-        if scenario in row and (methods is None or method in methods)
-    ]
+    cells = [row[scenario] for row in PAPER.get(table, {}).values() if scenario in row]
     if not cells:
         raise ValueError(
-            f"The paper reports nothing for scenario {scenario!r} in table {table!r} by "
-            f"{'any method' if methods is None else sorted(methods)}: its tables are III (U, S, Z), IV and V (U, S)."
+            f"The paper reports nothing for scenario {scenario!r} in table {table!r} by any method: its tables are III "
+            "(U, S, Z), IV and V (U, S)."
         )
     return min(getattr(cell, measure)[0] for cell in cells)
 

@@ -1,4 +1,4 @@
-"""The loop over the time steps of a Cosserat rod, compiled around PyElastica's kernels.
+"""A Cosserat rod of PyElastica, and the loop over its time steps, compiled around PyElastica's kernels.
 
 A file of its own because it cannot be imported without PyElastica, and because compiled code is kept on disk only for
 functions at the top level of a file.
@@ -13,12 +13,68 @@ from __future__ import annotations
 import numba
 import numpy as np
 from elastica.dissipation import nb_filter_rate
-from elastica.rod.cosserat_rod import _compute_internal_forces, _compute_internal_torques, _update_accelerations
+from elastica.rod.cosserat_rod import (
+    CosseratRod,
+    _compute_internal_forces,
+    _compute_internal_torques,
+    _update_accelerations,
+)
 from elastica.rod.data_structures import overload_operator_kinematic_numba
 
 FILTER_ORDER = 3
 """Of PyElastica's filter of velocities that alternate from node to node; it hardly touches long wavelengths. Axial
 waves have no other damping, and friction that falls with the speed feeds them."""
+
+
+def straight_rod(length: float, diameter: float, density: float, lengths: np.ndarray, axial: float) -> CosseratRod:
+    """A rod along x, at rest and without a bending stiffness.
+
+    Directors are the table's normal, the in-plane normal and the tangent; bending in the plane is about the first.
+
+    Args:
+        length: of the cable [m].
+        diameter: [m].
+        density: mass per length [kg/m].
+        lengths: of the elements [m]; the held ones are half as long as the others.
+        axial: EA [N].
+    """
+    position = np.zeros((3, len(lengths) + 1))
+    position[0, 1:] = np.cumsum(lengths)
+    rod = CosseratRod.straight_rod(
+        len(lengths), np.zeros(3), np.array([1.0, 0.0, 0.0]), np.array([0.0, 0.0, 1.0]), length, diameter / 2,
+        density / (np.pi * diameter**2 / 4), youngs_modulus=1.0, shear_modulus=1.0, position=position,
+    )  # fmt: skip
+    # Shear at half the axial stiffness, and inertia of rotation with the gyration radius h / 2: then the fastest shear
+    # mode is as fast as the fastest axial one, and nothing visible depends on either.
+    rod.shear_matrix[:] = np.diag([0.5 * axial, 0.5 * axial, axial])[:, :, None]
+    inertia = density * lengths * (length / (len(lengths) - 1) / 2) ** 2
+    rod.mass_second_moment_of_inertia[:] = np.eye(3)[:, :, None] * inertia
+    rod.inv_mass_second_moment_of_inertia[:] = np.eye(3)[:, :, None] / inertia
+    return rod
+
+
+def lay(rod: CosseratRod, nodes: np.ndarray, angle: np.ndarray) -> None:
+    """Puts the rod's nodes to these places in the plane [m], and turns its elements to these angles [rad]."""
+    rod.position_collection[:2] = nodes.T
+    cos, sin, zero = np.cos(angle), np.sin(angle), np.zeros_like(angle)
+    rod.director_collection[0] = np.stack([zero, zero, zero + 1.0])
+    rod.director_collection[1] = np.stack([sin, -cos, zero])
+    rod.director_collection[2] = np.stack([cos, sin, zero])
+
+
+def arrays(rod: CosseratRod) -> tuple:
+    """The first arguments of `advance`."""
+    return (
+        rod.position_collection, rod.velocity_collection, rod.acceleration_collection, rod.director_collection,
+        rod.omega_collection, rod.alpha_collection, rod.mass, rod.mass_second_moment_of_inertia,
+        rod.inv_mass_second_moment_of_inertia,
+        (rod.shear_matrix, rod.bend_matrix, rod.rest_sigma, rod.rest_kappa),
+        (rod.volume, rod.lengths, rod.rest_lengths, rod.rest_voronoi_lengths, rod.tangents, rod.radius),
+        (rod.dilatation, rod.voronoi_dilatation, rod.dilatation_rate, rod.sigma, rod.kappa),
+        (rod.internal_stress, rod.internal_couple, rod.internal_forces, rod.internal_torques),
+        (rod.external_forces, rod.external_torques),
+        rod.ghost_elems_idx,
+    )  # fmt: skip
 
 
 @numba.njit(cache=True)
@@ -54,27 +110,15 @@ def advance(
         stribeck_speed: v_s [m/s].
         damping: rate at which all motion dies [1/s].
     """
-    shear_matrix, bend_matrix, rest_sigma, rest_kappa = stiffness
-    volume, lengths, rest_lengths, rest_voronoi, tangents, radius = geometry
-    dilatation, voronoi_dilatation, dilatation_rate, sigma, kappa = strain
-    internal_stress, internal_couple, force, torque = stress
-    rubbing, external_torque = external
+    rest_lengths, dilatation, rubbing, external_torque = geometry[2], strain[0], external[0], external[1]
     n_nodes = x.shape[1]
     n_elements = n_nodes - 1
     upper, rough = np.zeros(n_elements), np.zeros_like(v)
     keep, resistance = np.exp(-damping * dt), dt * damper
     for step in range(steps):
-        _hold(x, v, q, omega, rest_lengths, pose, twist, step * dt)
+        hold(x, v, q, omega, rest_lengths, pose + step * dt * twist, twist)
         overload_operator_kinematic_numba(0.5 * dt, x, q, v, omega)
-        _compute_internal_forces(
-            x, volume, lengths, tangents, radius, rest_lengths, rest_voronoi, dilatation, voronoi_dilatation, q,
-            sigma, rest_sigma, shear_matrix, internal_stress, force, ghosts,
-        )  # fmt: skip
-        _compute_internal_torques(
-            x, v, tangents, lengths, rest_lengths, q, rest_voronoi, bend_matrix, rest_kappa, kappa,
-            voronoi_dilatation, inertia, omega, internal_stress, internal_couple, dilatation, dilatation_rate,
-            torque, ghosts,
-        )  # fmt: skip
+        force, torque = internal_loads(x, v, q, omega, inertia, stiffness, geometry, strain, stress, ghosts)
         _update_accelerations(a, force, rubbing, mass, alpha, inverse_inertia, torque, external_torque, dilatation)
         for node in range(2, n_nodes - 2):
             v[0, node] = keep * (v[0, node] + dt * a[0, node])
@@ -95,27 +139,41 @@ def advance(
             omega[1, element], omega[2, element] = 0.0, 0.0
         _damp_bending(omega[0], inertia[0, 0], resistance, upper)
         overload_operator_kinematic_numba(0.5 * dt, x, q, v, omega)
-    _hold(x, v, q, omega, rest_lengths, pose, twist, steps * dt)
+    hold(x, v, q, omega, rest_lengths, pose + steps * dt * twist, twist)
 
 
 @numba.njit(cache=True)
-def _hold(x, v, q, omega, rest_lengths, pose, twist, time):
-    """Puts the two end elements where the grippers are at `time`, with their velocities."""
-    n_nodes = x.shape[1]
-    for gripper in range(2):
-        angle, rate = pose[gripper, 2] + time * twist[gripper, 2], twist[gripper, 2]
-        cos, sin = np.cos(angle), np.sin(angle)
-        outer, inner, element, inward = 0, 1, 0, rest_lengths[0]
-        if gripper == 1:
-            outer, inner, element, inward = n_nodes - 1, n_nodes - 2, n_nodes - 2, -rest_lengths[-1]
-        for axis in range(2):
-            x[axis, outer] = pose[gripper, axis] + time * twist[gripper, axis]
-            v[axis, outer] = twist[gripper, axis]
-        x[0, inner], x[1, inner] = x[0, outer] + inward * cos, x[1, outer] + inward * sin
-        v[0, inner], v[1, inner] = v[0, outer] - inward * rate * sin, v[1, outer] + inward * rate * cos
-        q[1, 0, element], q[1, 1, element] = sin, -cos
-        q[2, 0, element], q[2, 1, element] = cos, sin
-        omega[0, element], omega[1, element], omega[2, element] = rate, 0.0, 0.0
+def internal_loads(x, v, q, omega, inertia, stiffness, geometry, strain, stress, ghosts):
+    """Elastic forces on the nodes and couples on the elements; arguments as those of `advance`."""
+    shear_matrix, bend_matrix, rest_sigma, rest_kappa = stiffness
+    volume, lengths, rest_lengths, rest_voronoi, tangents, radius = geometry
+    dilatation, voronoi_dilatation, dilatation_rate, sigma, kappa = strain
+    internal_stress, internal_couple, force, torque = stress
+    _compute_internal_forces(
+        x, volume, lengths, tangents, radius, rest_lengths, rest_voronoi, dilatation, voronoi_dilatation, q, sigma,
+        rest_sigma, shear_matrix, internal_stress, force, ghosts,
+    )  # fmt: skip
+    _compute_internal_torques(
+        x, v, tangents, lengths, rest_lengths, q, rest_voronoi, bend_matrix, rest_kappa, kappa, voronoi_dilatation,
+        inertia, omega, internal_stress, internal_couple, dilatation, dilatation_rate, torque, ghosts,
+    )  # fmt: skip
+    return force, torque
+
+
+@numba.njit(cache=True)
+def hold(x, v, q, omega, rest_lengths, pose, rate):
+    """Puts the two end elements where the grippers are, with their velocities."""
+    last = x.shape[1] - 1
+    for g in range(2):
+        cos, sin, turn = np.cos(pose[g, 2]), np.sin(pose[g, 2]), rate[g, 2]
+        end, inner, e = (0, 1, 0) if g == 0 else (last, last - 1, last - 1)
+        long = rest_lengths[0] if g == 0 else -rest_lengths[last - 1]
+        x[0, end], x[1, end] = pose[g, 0], pose[g, 1]
+        v[0, end], v[1, end] = rate[g, 0], rate[g, 1]
+        x[0, inner], x[1, inner] = pose[g, 0] + long * cos, pose[g, 1] + long * sin
+        v[0, inner], v[1, inner] = rate[g, 0] - long * turn * sin, rate[g, 1] + long * turn * cos
+        q[1, 0, e], q[1, 1, e], q[2, 0, e], q[2, 1, e] = sin, -cos, cos, sin
+        omega[0, e], omega[1, e], omega[2, e] = turn, 0.0, 0.0
 
 
 @numba.njit(cache=True)

@@ -26,6 +26,7 @@ The rod lies in the table's plane. Its end elements are held rigidly and are hal
 from __future__ import annotations
 
 import dataclasses
+import importlib
 
 import numpy as np
 from jaxtyping import Float
@@ -133,11 +134,7 @@ class RodPlant(TablePlant):
 
     def __init__(self, config: RodPlantConfig | None = None):
         super().__init__(RodPlantConfig() if config is None else config)
-        _import_rod_class()
-        from closed_loop import rod_loop
-
-        self._loop = rod_loop.advance
-        self._rod = _straight_rod(self.config)
+        self._rod = self._straight_rod()
 
     def reset(
         self, gripper_pose: Float[np.ndarray, "Q 3"], *, guess: Float[np.ndarray, "S 2"] | None = None
@@ -147,14 +144,11 @@ class RodPlant(TablePlant):
         shape = solve_elastica(
             pose, self.config.cable.length, guess=guess, n_samples=2 * self.config.discretisation.n_joints + 1
         )
-        rod = _straight_rod(self.config)
-        rod.position_collection[:2] = np.concatenate(
-            [shape.position[:1], shape.position[1:-1:2], shape.position[-1:]]
-        ).T
-        _set_directors(rod, np.concatenate([pose[:1, 2], shape.angle[2:-1:2], pose[1:, 2]]))
-        self._rod = rod
+        self._rod = rod = self._straight_rod()
+        nodes = np.concatenate([shape.position[:1], shape.position[1:-1:2], shape.position[-1:]])
+        _rod_loop().lay(rod, nodes, np.concatenate([pose[:1, 2], shape.angle[2:-1:2], pose[1:, 2]]))
         self._restart(pose)
-        self._advance(np.zeros((2, 3)), self._steps(self.config.settle_time), settling=True)
+        self._advance(np.zeros((2, 3)), self.config.discretisation.steps_in(self.config.settle_time), settling=True)
         rod.velocity_collection[:], rod.omega_collection[:] = 0.0, 0.0
         self._steps_done = 0
         return self.observe()
@@ -175,22 +169,9 @@ class RodPlant(TablePlant):
         config, rod = self.config, self._rod
         cable, physics, h = config.cable, config.physics, config.discretisation.link_length
         friction = 0.0 if settling else cable.friction_coefficient
-        self._loop(
-            rod.position_collection,
-            rod.velocity_collection,
-            rod.acceleration_collection,
-            rod.director_collection,
-            rod.omega_collection,
-            rod.alpha_collection,
-            rod.mass,
-            rod.mass_second_moment_of_inertia,
-            rod.inv_mass_second_moment_of_inertia,
-            (rod.shear_matrix, rod.bend_matrix, rod.rest_sigma, rod.rest_kappa),
-            (rod.volume, rod.lengths, rod.rest_lengths, rod.rest_voronoi_lengths, rod.tangents, rod.radius),
-            (rod.dilatation, rod.voronoi_dilatation, rod.dilatation_rate, rod.sigma, rod.kappa),
-            (rod.internal_stress, rod.internal_couple, rod.internal_forces, rod.internal_torques),
-            (rod.external_forces, rod.external_torques),
-            rod.ghost_elems_idx,
+        loop = _rod_loop()
+        loop.advance(
+            *loop.arrays(rod),
             self._pose,
             twist,
             steps,
@@ -204,59 +185,28 @@ class RodPlant(TablePlant):
         stable = np.isfinite(rod.position_collection).all() and self.stretch() < LARGEST_STRETCH
         self._moved(twist, steps, stable=bool(stable))
 
-
-def _straight_rod(config: RodPlantConfig):
-    """A PyElastica rod along x, at rest, with the stiffness, inertia and unstressed shape of the configuration.
-
-    Directors are the table's normal, the in-plane normal and the tangent; bending in the plane is about the first.
-    """
-    rod_class = _import_rod_class()
-    cable, physics, h = config.cable, config.physics, config.discretisation.link_length
-    lengths = link_lengths(config.discretisation)
-    position = np.zeros((3, config.discretisation.n_links + 1))
-    position[0, 1:] = np.cumsum(lengths)
-    area = np.pi * cable.diameter**2 / 4
-    rod = rod_class.straight_rod(
-        config.discretisation.n_links,
-        np.zeros(3),
-        np.array([1.0, 0.0, 0.0]),
-        np.array([0.0, 0.0, 1.0]),
-        cable.length,
-        cable.diameter / 2,
-        float(physics.density) / area,
-        youngs_modulus=1.0,
-        shear_modulus=1.0,
-        position=position,
-    )
-    axial = config.axial_stiffness
-    # Shear at half the axial stiffness, and inertia of rotation with the gyration radius h / 2: then the fastest shear
-    # mode is as fast as the fastest axial one.
-    rod.shear_matrix[:] = np.diag([0.5 * axial, 0.5 * axial, axial])[:, :, None]
-    inertia = physics.density * lengths * (h / 2) ** 2
-    rod.mass_second_moment_of_inertia[:] = np.eye(3)[:, :, None] * inertia
-    rod.inv_mass_second_moment_of_inertia[:] = np.eye(3)[:, :, None] / inertia
-    # All joints bend alike, EI / h, those next to the half-length elements too: h is the cable's length per joint.
-    rod.bend_matrix[:] = np.eye(3)[:, :, None] * (physics.stiffness * rod.rest_voronoi_lengths / h)
-    rod.rest_kappa[0] = physics.rest_curvature * h / rod.rest_voronoi_lengths
-    # the chain's nodes are the middles of the elements, and the ends
-    rod.mass[:-1] += 0.5 * physics.extra_mass
-    rod.mass[1:] += 0.5 * physics.extra_mass
-    return rod
+    def _straight_rod(self):
+        """A rod along x, at rest, with the stiffness, inertia and unstressed shape of the configuration."""
+        config, physics = self.config, self.config.physics
+        cable, h = config.cable, config.discretisation.link_length
+        lengths = link_lengths(config.discretisation)
+        rod = _rod_loop().straight_rod(
+            cable.length, cable.diameter, float(physics.density), lengths, config.axial_stiffness
+        )
+        # All joints bend alike, EI / h, those next to the half-length elements too: h is the cable's length per joint.
+        rod.bend_matrix[:] = np.eye(3)[:, :, None] * (physics.stiffness * rod.rest_voronoi_lengths / h)
+        rod.rest_kappa[0] = physics.rest_curvature * h / rod.rest_voronoi_lengths
+        # the chain's nodes are the middles of the elements, and the ends
+        rod.mass[:-1] += 0.5 * physics.extra_mass
+        rod.mass[1:] += 0.5 * physics.extra_mass
+        return rod
 
 
-def _set_directors(rod, angle: Float[np.ndarray, " n"]) -> None:
-    """Elements turned to these angles in the plane."""
-    cos, sin, zero = np.cos(angle), np.sin(angle), np.zeros_like(angle)
-    rod.director_collection[0] = np.stack([zero, zero, zero + 1.0])
-    rod.director_collection[1] = np.stack([sin, -cos, zero])
-    rod.director_collection[2] = np.stack([cos, sin, zero])
-
-
-def _import_rod_class():
+def _rod_loop():
+    """The module that needs PyElastica."""
     try:
-        from elastica.rod.cosserat_rod import CosseratRod
+        return importlib.import_module("closed_loop.rod_loop")
     except ImportError as error:
         raise ImportError(
             "The plant made of a Cosserat rod needs PyElastica, which is not installed: pip install pyelastica==1.0.0"
         ) from error
-    return CosseratRod

@@ -143,8 +143,6 @@ def paired_difference(
     reference: Mapping[Key, float],
     *,
     cluster: Callable[[Key], Hashable] = lambda key: key,
-    confidence: float = 0.95,
-    seed: int = 0,
 ) -> PairedDifference:
     """How much lower or higher a method is than a reference in the same trials.
 
@@ -153,8 +151,6 @@ def paired_difference(
         reference: the other's.
         cluster: what trials share that are not independent, the seed for instance. The interval is of the clusters'
             mean differences; by default every trial is its own.
-        confidence: coverage of the interval.
-        seed: of the resampling.
     """
     shared = [key for key in method if key in reference]
     ours = np.array([method[key] for key in shared], float)
@@ -170,7 +166,7 @@ def paired_difference(
         unpaired=len(method) + len(reference) - 2 * len(shared),
         failures=int(np.sum(~both)),
         mean=float(np.mean(means)) if means else np.nan,
-        interval=mean_interval(means, confidence=confidence, seed=seed) if means else Interval(np.nan, np.nan),
+        interval=mean_interval(means) if means else Interval(np.nan, np.nan),
         better=int(np.sum(rank_ours < rank_theirs)),
         worse=int(np.sum(rank_ours > rank_theirs)),
     )

@@ -6,7 +6,7 @@ many trials each method was run.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable
 from typing import cast
 
 from closed_loop.cells import (
@@ -23,20 +23,14 @@ from closed_loop.cells import (
     trial_count,
     trials_of_table,
 )
-from closed_loop.paper import METHOD_LABEL, PAPER, PaperTable, best_in_paper
+from closed_loop.paper import PAPER, PaperTable, best_in_paper
 from closed_loop.trials import Trial
 
 STEP_BANDS = (0.05, 0.02)
 """Bands of the settling time of a step response, as fractions of the way that the error went."""
 
 
-def comparison_table(
-    trials: Iterable[Trial],
-    table: str,
-    *,
-    methods: Sequence[str] | None = None,
-    labels: Mapping[str, str] = METHOD_LABEL,
-) -> str:
+def comparison_table(trials: Iterable[Trial], table: str) -> str:
     """Terminal error and settling time as mean ± standard deviation over all stiffnesses and seeds.
 
     One row per method, under it the paper's row where it has one, and at the end the paper's best of each column.
@@ -44,8 +38,6 @@ def comparison_table(
     Args:
         trials: of any table; only those of `table` count.
         table: "III", "IV", "V", or another name, which then has no published rows.
-        methods: rows and their order; by default the paper's order, then others as they appear.
-        labels: names of methods for readers.
 
     Raises:
         ValueError: there is no trial of this table.
@@ -54,9 +46,9 @@ def comparison_table(
     scenarios = scenarios_of(mine)
     published = PAPER.get(cast(PaperTable, table), {})
     rows = []
-    for method in methods_of(mine, methods):
+    for method in methods_of(mine):
         of_method = [trial for trial in mine if trial.method == method]
-        rows.append([label_of(method, labels), trial_count(of_method)])
+        rows.append([label_of(method), trial_count(of_method)])
         rows[-1] += [cell_text(of_scenario(of_method, s), measure) for s in scenarios for measure in MEASURES]
         if method in published:
             rows.append(["*in the paper*", "*5*"])
@@ -74,13 +66,7 @@ def comparison_table(
     return markdown(["method", "trials", *(f"{s}: {UNIT[m]}" for s in scenarios for m in MEASURES)], rows)
 
 
-def stiffness_table(
-    trials: Iterable[Trial],
-    table: str,
-    *,
-    methods: Sequence[str] | None = None,
-    labels: Mapping[str, str] = METHOD_LABEL,
-) -> str:
+def stiffness_table(trials: Iterable[Trial], table: str) -> str:
     """As `comparison_table`, one row for each method and stiffness.
 
     Raises:
@@ -89,21 +75,15 @@ def stiffness_table(
     mine = trials_of_table(trials, table)
     scenarios = scenarios_of(mine)
     rows = []
-    for method in methods_of(mine, methods):
+    for method in methods_of(mine):
         for stiffness in sorted({trial.stiffness for trial in mine if trial.method == method}):
             cell = [trial for trial in mine if trial.method == method and trial.stiffness == stiffness]
-            rows.append([label_of(method, labels), f"{stiffness:g}", trial_count(cell)])
+            rows.append([label_of(method), f"{stiffness:g}", trial_count(cell)])
             rows[-1] += [cell_text(of_scenario(cell, s), measure) for s in scenarios for measure in MEASURES]
     return markdown(["method", "stiffness", "trials", *(f"{s}: {UNIT[m]}" for s in scenarios for m in MEASURES)], rows)
 
 
-def settling_table(
-    trials: Iterable[Trial],
-    table: str,
-    *,
-    methods: Sequence[str] | None = None,
-    labels: Mapping[str, str] = METHOD_LABEL,
-) -> str:
+def settling_table(trials: Iterable[Trial], table: str) -> str:
     """Settling times by the textbook's two bands, next to the stricter one of the other tables and the paper's own.
 
     Raises:
@@ -112,7 +92,7 @@ def settling_table(
     mine = trials_of_table(trials, table)
     published = PAPER.get(cast(PaperTable, table), {})
     rows = []
-    for method in methods_of(mine, methods):
+    for method in methods_of(mine):
         for scenario in scenarios_of(mine):
             cell = of_scenario([trial for trial in mine if trial.method == method], scenario)
             if not cell:
@@ -120,7 +100,7 @@ def settling_table(
             paper = published.get(method, {}).get(scenario)
             rows.append(
                 [
-                    label_of(method, labels), scenario, str(len(cell)), cell_text(cell, "settling"),
+                    label_of(method), scenario, str(len(cell)), cell_text(cell, "settling"),
                     *(failing_text([t.step_settling_time_s(band) for t in cell], "settling") for band in STEP_BANDS),
                     "" if paper is None else spread_text(*paper.settling),
                 ]

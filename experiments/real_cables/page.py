@@ -12,6 +12,7 @@ import matplotlib
 from matplotlib.figure import Figure
 
 from cablejax.report.provenance import machine, versions
+from pages import markdown_table
 
 _NINETY = 1.645
 _PANELS = 3
@@ -135,12 +136,8 @@ def page(scores: Mapping[str, Any], published: Published, picture: str) -> str:
     return "\n".join(lines)
 
 
-def _row(name: str, values: Sequence[str]) -> str:
-    return f"| {name} | " + " | ".join(values) + " |"
-
-
-def _head(cables: Sequence[str]) -> list[str]:
-    return ["| | " + " | ".join(cables) + " |", "| --- |" + " ---: |" * len(cables)]
+def _row(name: str, values: Sequence[str]) -> list[str]:
+    return [name, *values]
 
 
 def _error(errors: Mapping[str, Any]) -> str:
@@ -148,7 +145,7 @@ def _error(errors: Mapping[str, Any]) -> str:
     return f"{errors['mean']:.1f}{plain}"
 
 
-def _learned_rows(scores: Mapping[str, Any], learned: Sequence[str], best: int, column: int) -> list[str]:
+def _learned_rows(scores: Mapping[str, Any], learned: Sequence[str], best: int, column: int) -> list[list[str]]:
     """Errors of the rod and of what is learned on it, and how many windows are off."""
     rows = []
     for i, name in enumerate(learned):
@@ -166,7 +163,7 @@ def _learned_rows(scores: Mapping[str, Any], learned: Sequence[str], best: int, 
     return rows
 
 
-def _unsimulated_rows(scores: Mapping[str, Any], column: int) -> list[str]:
+def _unsimulated_rows(scores: Mapping[str, Any], column: int) -> list[list[str]]:
     names = [name for name, *_ in next(iter(scores.values()))["unsimulated"]]
     return [
         _row(name, [_error(score["unsimulated"][i][column]) for score in scores.values()])
@@ -179,8 +176,8 @@ def _by_recording(scores: Mapping[str, Any], learned: Sequence[str], best: int) 
         return [form.format(key(score)) for score in scores.values()]
 
     halves = ("one half", "the other half")
-    return [
-        *_head(list(scores)),
+    rows = [
+        ["", *scores],
         _row(
             "nominal simulator: length from the markers, textbook EI/rho, no damping, no drag (windows of the search)",
             pick(lambda s: s["stages"][0][1], "{:.1f}"),
@@ -203,6 +200,7 @@ def _by_recording(scores: Mapping[str, Any], learned: Sequence[str], best: int) 
         _row("one rollout, median [s]", pick(lambda s: s["seconds"][0], "{:.3f}")),
         _row("all windows in batches [s]", pick(lambda s: s["seconds"][1], "{:.2f}")),
     ]
+    return markdown_table(rows)
 
 
 def _about_stiffness() -> list[str]:
@@ -221,11 +219,8 @@ def _on_eval(scores: Mapping[str, Any], published: Published, learned: Sequence[
         for c, s in scores.items()
     )
     compared = [(method, [errors.get(cable) for cable in scores]) for method, errors in published.items()]
-    return [
-        "Every sample of each window is scored, with the fit to all other recordings' windows. Upstream's choice of "
-        "files is theirs; nothing was chosen by looking at it.",
-        "",
-        *_head(list(scores)),
+    rows = [
+        ["", *scores],
         *(
             _row(method, [_NONE if value is None else f"{value:.1f}" for value in values])
             for method, values in compared
@@ -242,6 +237,12 @@ def _on_eval(scores: Mapping[str, Any], published: Published, learned: Sequence[
             f"spread of {learned[best]} over the drawing of windows, 5 % to 95 %",
             ["{0[0]:.1f} to {0[1]:.1f}".format(score["learned"][best][3]) for score in scores.values()],
         ),
+    ]
+    return [
+        "Every sample of each window is scored, with the fit to all other recordings' windows. Upstream's choice of "
+        "files is theirs; nothing was chosen by looking at it.",
+        "",
+        *markdown_table(rows),
         "",
         "The grip is fitted for each recording: an eval window takes it from the other windows of its own recording, "
         "where there are any; the row with the mean does not use it. Upstream's split is easier than the split by "
@@ -261,11 +262,10 @@ def _step_by_step(scores: Mapping[str, Any]) -> list[str]:
     ]
     for cable, score in scores.items():
         evaluated = score["stages"][0][2] is not None
-        lines += [f"### {cable}", "", f"| step | unseen [mm] |{' eval [mm] |' if evaluated else ''}"]
-        lines.append("| --- | ---: |" + " ---: |" * evaluated)
+        rows = [["step", "unseen [mm]", *(["eval [mm]"] if evaluated else [])]]
         for name, unseen, scored in score["stages"]:
-            lines.append(_row(name.replace("_", " "), [f"{unseen:.1f}", *([f"{scored:.1f}"] if evaluated else [])]))
-        lines.append("")
+            rows.append([name.replace("_", " "), f"{unseen:.1f}", *([f"{scored:.1f}"] if evaluated else [])])
+        lines += [f"### {cable}", "", *markdown_table(rows), ""]
     return lines
 
 

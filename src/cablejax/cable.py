@@ -157,6 +157,15 @@ class Discretisation:
         """Number of bending joints J."""
         return self.n_links - 1
 
+    def steps_in(self, interval: float, name: str = "The interval") -> int:
+        """Number of time steps in an interval [s]. Raises `ValueError`, which names it, if that is not whole."""
+        count = round(interval / self.timestep)
+        if count < 1 or abs(count * self.timestep - interval) > 1e-6 * interval:
+            raise ValueError(
+                f"{name} is {interval} s, expected a multiple of the time step, {self.timestep} s: change one of them."
+            )
+        return count
+
 
 def differing(one: Cable, other: Cable) -> dict[str, tuple[Any, Any]]:
     """The fields in which two cables differ by more than rounding, with both values; even marks are none."""

@@ -5,11 +5,12 @@ Files are read without unpickling, checked field by field, and written whole or 
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import json
 import os
 import pathlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -95,6 +96,19 @@ def gap_log_from_episodes(
             **(extra or {}),
         },
     )
+
+
+@contextlib.contextmanager
+def reading_export(path: os.PathLike[str]) -> Iterator[None]:
+    """Says of what file or folder a log cannot be read: on a damaged one libraries raise what their parts raise."""
+    try:
+        yield
+    except GapLogError as error:
+        raise GapLogError(f"{path}: {error}") from error
+    except Exception as error:
+        raise GapLogError(
+            f"{path} could not be read ({type(error).__name__}: {error}). Export the log again."
+        ) from error
 
 
 def stack_episodes(episodes: Sequence[Episode], meta: Mapping[str, Any], *, holds: bool = True) -> GapLog:

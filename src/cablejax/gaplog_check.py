@@ -44,8 +44,11 @@ class GapLogError(ValueError):
 
 def validate(log: GapLog) -> None:
     """Checks a gap log; raises `GapLogError` with the field, what it is and what was expected."""
-    _validate_arrays(log)
-    _validate_meta(log)
+    try:
+        _validate_arrays(log)
+        _validate_meta(log)
+    except ValueError as error:
+        raise GapLogError(str(error)) from None
     if fault := geometry_fault(log):
         raise GapLogError(fault)
 
@@ -57,12 +60,12 @@ def _validate_arrays(log: GapLog) -> None:
             continue
         if not isinstance(array, np.ndarray) or array.dtype != dtype:
             found = array.dtype if isinstance(array, np.ndarray) else type(array).__name__
-            raise GapLogError(f"Field '{name}' is {found}, expected an array of {np.dtype(dtype)}.")
+            raise ValueError(f"Field '{name}' is {found}, expected an array of {np.dtype(dtype)}.")
     if log.keypoints.ndim != 4 or log.keypoints.shape[3] not in _POSE_WIDTH:
-        raise GapLogError(f"Field 'keypoints' has shape {log.keypoints.shape}, expected (E, T, N, 2) or (E, T, N, 3).")
+        raise ValueError(f"Field 'keypoints' has shape {log.keypoints.shape}, expected (E, T, N, 2) or (E, T, N, 3).")
     episodes, samples, points, dimension = log.keypoints.shape
     if episodes < 1 or points < 2:
-        raise GapLogError(
+        raise ValueError(
             f"Field 'keypoints' has shape {log.keypoints.shape}, expected at least one episode and two keypoints: the "
             "first and the last are at the grippers."
         )
@@ -77,27 +80,27 @@ def _validate_arrays(log: GapLog) -> None:
     for name, shape in shapes.items():
         array = getattr(log, name)
         if array is not None and array.shape != shape:
-            raise GapLogError(f"Field '{name}' has shape {array.shape}, expected {shape} for these keypoints.")
+            raise ValueError(f"Field '{name}' has shape {array.shape}, expected {shape} for these keypoints.")
     for index, length in enumerate(log.episode_length):
         if not 1 <= length <= samples:
-            raise GapLogError(f"Field 'episode_length' is {length} in episode {index}, expected 1 to {samples}.")
+            raise ValueError(f"Field 'episode_length' is {length} in episode {index}, expected 1 to {samples}.")
         time = log.time[index, :length]
         if not np.isfinite(time).all() or (np.diff(time) <= 0).any():
-            raise GapLogError(f"Field 'time' does not increase, or is not finite, in episode {index}.")
+            raise ValueError(f"Field 'time' does not increase, or is not finite, in episode {index}.")
         _check_clock(time, f"of episode {index}")
         # the last command is held for no sample
         for name, end in (("gripper_pose", length), ("gripper_command", length - 1)):
             if not np.isfinite(getattr(log, name)[index, :end]).all():
-                raise GapLogError(f"Field '{name}' is not finite in episode {index}; only keypoints may be NaN.")
+                raise ValueError(f"Field '{name}' is not finite in episode {index}; only keypoints may be NaN.")
         if np.isinf(log.keypoints[index, :length]).any():
-            raise GapLogError(f"Field 'keypoints' is infinite in episode {index}; a keypoint not observed is NaN.")
+            raise ValueError(f"Field 'keypoints' is infinite in episode {index}; a keypoint not observed is NaN.")
         for name, limit, end in (("gripper_pose", "coordinate", length), ("gripper_command", "speed", length - 1)):
             largest = float(np.abs(getattr(log, name)[index, :end]).max(initial=0.0))
-            _require(largest, limit, f"The largest entry of field '{name}' in episode {index}")
+            require(largest, limit, f"The largest entry of field '{name}' in episode {index}")
         if dimension == 3:
             norm = np.linalg.norm(log.gripper_pose[index, :length, :, 3:], axis=-1)
             if np.abs(norm - 1).max() > 1e-3:
-                raise GapLogError(f"Field 'gripper_pose' has quaternions not of unit length in episode {index}.")
+                raise ValueError(f"Field 'gripper_pose' has quaternions not of unit length in episode {index}.")
 
 
 def _check_clock(time: Float[np.ndarray, " T"], which: str) -> None:
@@ -107,59 +110,49 @@ def _check_clock(time: Float[np.ndarray, " T"], which: str) -> None:
         return
     usual, advice = float(np.median(step)), "Is the unit of time right, which is a second?"
     begin = "Times are seconds from the episode's start: subtract the first of each episode."
-    _require(abs(float(time[0])), "duration", f"The first time {which}", begin)
-    _require(usual, "sample_interval", f"The usual time between samples {which}", advice)
-    _require(float(time[-1] - time[0]), "duration", f"The time from the first to the last sample {which}", advice)
+    require(abs(float(time[0])), "duration", f"The first time {which}", begin)
+    require(usual, "sample_interval", f"The usual time between samples {which}", advice)
+    require(float(time[-1] - time[0]), "duration", f"The time from the first to the last sample {which}", advice)
     if time[-1] - time[0] > _LOST * usual * len(time):
-        raise GapLogError(
+        raise ValueError(
             f"Field 'time' has a pause of {step.max():.4g} s after sample {int(step.argmax())} {which}, where "
             f"{usual:.4g} s is usual: make two episodes of it."
         )
 
 
-def _require(value: object, limit: str, name: str, advice: str = "") -> None:
-    try:
-        require(value, limit, name, advice)
-    except ValueError as error:
-        raise GapLogError(str(error)) from None
-
-
 def _validate_meta(log: GapLog) -> None:
     meta = log.meta
     if not isinstance(meta, dict):
-        raise GapLogError(f"Field 'meta' is a {type(meta).__name__}, expected a JSON object.")
+        raise ValueError(f"Field 'meta' is a {type(meta).__name__}, expected a JSON object.")
     if "schema" in meta:
-        try:
-            version_of(meta["schema"], SCHEMA, "Field 'meta'")
-        except ValueError as error:
-            raise GapLogError(str(error)) from None
+        version_of(meta["schema"], SCHEMA, "Field 'meta'")
     for name in META_FIELDS:
         if name not in meta:
-            raise GapLogError(f"Field 'meta.{name}' is missing.")
+            raise ValueError(f"Field 'meta.{name}' is missing.")
     points, grippers = log.keypoints.shape[2], log.gripper_pose.shape[2]
     _check_cable(meta, points)
     for name, length in (("gravity_m_per_s2", 3), ("keypoint_arclength_m", points)):
         value = meta[name]
         if not isinstance(value, list) or len(value) != length or not all(v in LIMITS["finite"] for v in value):
-            raise GapLogError(f"Field 'meta.{name}' is {shown(value)}, expected {length} finite numbers.")
+            raise ValueError(f"Field 'meta.{name}' is {shown(value)}, expected {length} finite numbers.")
     gravity = meta["gravity_m_per_s2"]
-    _require(math.hypot(*gravity), "gravity", "The magnitude of field 'meta.gravity_m_per_s2'")
+    require(math.hypot(*gravity), "gravity", "The magnitude of field 'meta.gravity_m_per_s2'")
     if log.keypoints.shape[3] == 2 and gravity[2] > 0:
-        raise GapLogError(f"Field 'meta.gravity_m_per_s2' is {gravity}: off the table, expected the third negative.")
+        raise ValueError(f"Field 'meta.gravity_m_per_s2' is {gravity}: off the table, expected the third negative.")
     marks, cable_length = np.asarray(meta["keypoint_arclength_m"], float), float(meta["cable"]["length_m"])
     if (np.diff(marks) <= 0).any():
-        raise GapLogError("Field 'meta.keypoint_arclength_m' does not increase.")
+        raise ValueError("Field 'meta.keypoint_arclength_m' does not increase.")
     if np.abs(marks[[0, -1]] - [0.0, cable_length]).max() > _ENDS * cable_length:
-        raise GapLogError(
+        raise ValueError(
             f"Field 'meta.keypoint_arclength_m' goes from {marks[0]:g} to {marks[-1]:g} m, expected 0 to the cable's "
             f"length of {cable_length:g} m: the first and the last keypoint are at the grippers."
         )
     for name, length in (("grasp", grippers), ("motion", len(log.episode_length))):
         value = meta[name]
         if not isinstance(value, list) or len(value) != length or not all(isinstance(entry, str) for entry in value):
-            raise GapLogError(f"Field 'meta.{name}' is {shown(value)}, expected {length} strings.")
+            raise ValueError(f"Field 'meta.{name}' is {shown(value)}, expected {length} strings.")
     if not isinstance(meta["source"], str):
-        raise GapLogError(f"Field 'meta.source' is {shown(meta['source'])}, expected text.")
+        raise ValueError(f"Field 'meta.source' is {shown(meta['source'])}, expected text.")
 
 
 def _check_cable(meta: dict[str, Any], points: int) -> None:
@@ -167,9 +160,6 @@ def _check_cable(meta: dict[str, Any], points: int) -> None:
     cable, table = meta["cable"], {"friction_coefficient": 0.0} if meta["table"] is None else meta["table"]
     for name, value in (("cable", cable), ("table", table)):
         if not isinstance(value, dict):
-            raise GapLogError(f"Field 'meta.{name}' is {shown(value)}, expected an object.")
+            raise ValueError(f"Field 'meta.{name}' is {shown(value)}, expected an object.")
     known = {key: value for key, value in {**cable, **table}.items() if key in NUMBERS}
-    try:
-        cable_from_fields({**known, "keypoints": points}, "Field 'meta.cable' or 'meta.table'")
-    except ValueError as error:
-        raise GapLogError(str(error)) from None
+    cable_from_fields({**known, "keypoints": points}, "Field 'meta.cable' or 'meta.table'")

@@ -1,4 +1,4 @@
-"""Reads and writes text, JSON and TOML files; writes are atomic, and errors name the file; versions of schemas."""
+"""Reads and writes text, JSON and TOML files, and errors name the file; Markdown tables; versions of schemas."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import json
 import os
 import pathlib
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from cablejax.limits import require, shown
@@ -22,6 +22,12 @@ def write_json(path: pathlib.Path, value: Mapping[str, Any]) -> None:
     """
     with whole_file(path) as stream:
         stream.write((json.dumps(value, indent=2, allow_nan=False) + "\n").encode())
+
+
+def markdown_table(rows: Sequence[Sequence[str]]) -> list[str]:
+    """Lines of a table whose first row is its title: the first column to the left, the others to the right."""
+    title, *rest = ["| " + " | ".join(row) + " |" for row in rows]
+    return [title, "| --- |" + " ---: |" * (len(rows[0]) - 1), *rest]
 
 
 def read_bytes(path: str | os.PathLike[str]) -> bytes:

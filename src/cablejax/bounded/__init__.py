@@ -7,59 +7,45 @@ travels in their options:
     solution.value, solution.certificate(residuals, Box(lower, upper))
 """
 
-from cablejax.bounded.batched_gauss_newton import BatchedGaussNewton, Linearised, Minimised, solve_arrow
+from cablejax.bounded.batched_gauss_newton import BatchedGaussNewton, Linearised, solve_arrow
 from cablejax.bounded.certificate import Certificate, certify
-from cablejax.bounded.dogleg import BoundedDogleg, BoundedDoglegDescent
-from cablejax.bounded.gain_ratio import GainRatio
-from cablejax.bounded.gauss_newton import BoundedGaussNewton, ConstrainedNewton
+from cablejax.bounded.dogleg import BoundedDogleg
+from cablejax.bounded.gauss_newton import BoundedGaussNewton
 from cablejax.bounded.implicit import FixedPointAdjoint
-from cablejax.bounded.least_squares import AbstractBoundedLeastSquares
-from cablejax.bounded.levenberg_marquardt import BoundedLevenbergMarquardt, DampedQuadratic
-from cablejax.bounded.quadratic import QuadraticMinimum, minimise_quadratic
+from cablejax.bounded.levenberg_marquardt import BoundedLevenbergMarquardt
+from cablejax.bounded.quadratic import minimise_quadratic
 from cablejax.bounded.quasi_newton import BoundedQuasiNewton
-from cablejax.bounded.results import Result, Solution, Stats
+from cablejax.bounded.results import Result, Solution
 from cablejax.bounded.sets import (
     AbstractSet,
     AffineBalls,
     Balls,
     Box,
-    ConvexSet,
     Halfspaces,
     Intersection,
     project_ball,
 )
 from cablejax.bounded.solve import least_squares, minimise
-from cablejax.bounded.spectral import NonmonotoneArmijo, ProjectionArc, SpectralProjectedGradient
+from cablejax.bounded.spectral import SpectralProjectedGradient
 
 __all__ = [
-    "AbstractBoundedLeastSquares",
     "AbstractSet",
     "AffineBalls",
     "Balls",
     "BatchedGaussNewton",
     "BoundedDogleg",
-    "BoundedDoglegDescent",
     "BoundedGaussNewton",
     "BoundedLevenbergMarquardt",
     "BoundedQuasiNewton",
     "Box",
     "Certificate",
-    "ConstrainedNewton",
-    "ConvexSet",
-    "DampedQuadratic",
     "FixedPointAdjoint",
-    "GainRatio",
     "Halfspaces",
     "Intersection",
     "Linearised",
-    "Minimised",
-    "NonmonotoneArmijo",
-    "ProjectionArc",
-    "QuadraticMinimum",
     "Result",
     "Solution",
     "SpectralProjectedGradient",
-    "Stats",
     "certify",
     "least_squares",
     "minimise",

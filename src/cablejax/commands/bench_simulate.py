@@ -48,14 +48,13 @@ class BenchSimulate(Command):
 
     def execute(self):
         """Times the engines in turns and returns microseconds, distances and transitions per second."""
-        from cablejax.cable import Cable
         from cablejax.commands.cable import find_cable
         from cablejax.commands.workloads import setting
         from cablejax.simulate import ENGINES
 
         for name in ("batch", "seconds", "rounds", "threads", "steps"):
             require(getattr(self, name), "count", f"--{name}")
-        cable = Cable() if self.cable is None else find_cable(self.cable)
+        cable = find_cable(self.cable)
         engines: dict[str, Engine] = {name: kind(self.chain(cable, name)) for name, kind in ENGINES.items()}  # pyright: ignore[reportCallIssue]
         result = {
             "links": engines["chain"].config.n_links,
@@ -138,10 +137,10 @@ class BenchSimulate(Command):
         )
 
     def data(self, cable: Cable) -> dict[str, Any]:
-        """Accuracy over random motions, and seconds of each part of making a store of them."""
+        """Accuracy over random motions, and medians of what each part of making a store takes, once compiled."""
         import numpy as np
 
-        from cablejax.commands.workloads import data_seconds, distance_from_fine
+        from cablejax.commands.workloads import data_stages, distance_from_fine, seconds_in_turns
         from cablejax.dataset.schema import DatasetConfig
         from cablejax.simulate import ENGINES
         from cablejax.simulate.motions import MotionConfig
@@ -160,9 +159,10 @@ class BenchSimulate(Command):
             away = 1e3 * distance_from_fine(config)
             values = (np.median(away), np.percentile(away, 99), away.max())
             accuracy[name] = dict(zip(("median_mm", "p99_mm", "largest_mm"), map(float, values), strict=True))
-            seconds = data_seconds(config, self.rounds)
-            per_transition = {part: value / (self.trajectories * self.steps) for part, value in seconds.items()}
-            parts[name] = {part: 1e6 * value for part, value in per_transition.items()}
+            turns = seconds_in_turns(data_stages(config), self.rounds)
+            # the checks and the store are what the whole takes beyond the others
+            drawn, both, whole = (1e6 / (self.trajectories * self.steps) * np.median(s) for s in turns.values())
+            parts[name] = {"drawing": drawn, "simulation": both - drawn, "store": max(whole - both, 0.0)}
         total = {name: sum(of.values()) for name, of in parts.items()}
         return {
             "accuracy": accuracy,

@@ -23,8 +23,6 @@ from cablejax.limits import require
 Part = Literal["import", "help", "control", "verdict"]
 """What is timed."""
 
-EFFECT = "bending_stiffness:ratio=0.2"
-"""Staged where no log is given."""
 # A first control call in a process of its own.
 _CONTROL = "import sys; from cablejax.commands.bench_start import first_call; first_call(sys.argv[1], int(sys.argv[2]))"
 _CACHE = ("JAX_COMPILATION_CACHE", "JAX_PERSISTENT_CACHE")
@@ -189,17 +187,17 @@ def staged_log(path: pathlib.Path, seed: int) -> pathlib.Path:
         The path.
     """
     from cablejax.cable import Cable
-    from cablejax.commands.runs import plant_of, staged_effects
+    from cablejax.commands.runs import PLANT_EFFECT, plant_of, staged_effects
     from cablejax.control.targets import make_target, straight_start
     from cablejax.diagnose.study import first_recording
     from cablejax.gaplog import write_gap_log
     from cablejax.simulate.plant import Plant
     from cablejax.simulate.play import play
 
-    say(f"staging {EFFECT} in the contact plant ...")
+    say(f"staging {PLANT_EFFECT} in the contact plant ...")
     cable = Cable()
     goals = {f"to {letter}": make_target(letter, cable).gripper_pose for letter in ("U", "S", "Z")}
-    plant = Plant(plant_of(cable, staged_effects((EFFECT,)), links=24, seed=seed))
+    plant = Plant(plant_of(cable, staged_effects(()), links=24, seed=seed))
     log = play(
         plant, first_recording(cable, straight_start(cable), goals), source="contact plant", noise=1e-3, seed=seed
     )

@@ -39,10 +39,9 @@ class CableFile(Command):
 
     def execute(self):
         """Writes a cable file, or prints it where no --out is given."""
-        from cablejax.cable import Cable
         from cablejax.cable_file import cable_text, cable_to_fields, write_cable
 
-        cable = Cable() if self.from_ is None else find_cable(self.from_)
+        cable = find_cable(self.from_)
         if self.out is None:
             return cable_to_fields(cable), cable_text(cable).rstrip()
         output_file(self.out, overwrite=self.overwrite).parent.mkdir(parents=True, exist_ok=True)
@@ -51,12 +50,18 @@ class CableFile(Command):
         return {"out": str(self.out), **cable_to_fields(cable)}, text
 
 
-def find_cable(source: str | pathlib.Path) -> Cable:
+def find_cable(source: str | pathlib.Path | None) -> Cable:
     """The cable in a cable file, a gap log, a data set's folder, trained weights, or a run's folder with its log.
+
+    That of None is the reference cable.
 
     Raises:
         ValueError: there is no such thing, or it cannot be read.
     """
+    from cablejax.cable import Cable
+
+    if source is None:
+        return Cable()
     kind, path = kind_of(source)
     if kind == "cable":
         from cablejax.cable_file import read_cable

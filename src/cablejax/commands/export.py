@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from cablejax.commands.artefacts import Kind, kind_of
-from cablejax.commands.options import Command, UsageError
+from cablejax.commands.options import Command, UsageError, output_file
 
 if TYPE_CHECKING:
     import numpy as np
@@ -41,10 +41,9 @@ class Export(Command):
     def execute(self):
         """Reads the log, and writes it in the other format."""
         out = pathlib.Path(_DEFAULTS[self.format]) if self.out is None else self.out
-        noun = "folder" if self.format == "lerobot" else "file"
-        if out.is_dir() or (out.exists() and (noun == "folder" or not self.overwrite)):
-            advice = ", or add --overwrite" if out.is_file() and noun == "file" else ""
-            raise UsageError(f"{out} exists. Give another {noun} with --out{advice}.")
+        if self.format == "lerobot" and out.exists():
+            raise UsageError(f"{out} exists. Give another folder with --out.")
+        output_file(out, overwrite=self.overwrite)
         log, simulated, about = recorded(self.source)
         if self.format == "mcap":
             from cablejax.recordings.mcap_log import write_mcap

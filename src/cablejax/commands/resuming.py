@@ -16,7 +16,7 @@ from cablejax.control.run import ClosedLoopRun
 from cablejax.control.targets import Target
 from cablejax.gaplog import Episode
 from cablejax.npz import read_npz
-from cablejax.text_file import parse_json, read_json, version_of, write_json
+from cablejax.text_file import differences, parse_json, read_json, version_of, write_json
 from cablejax.whole_file import DRAFT, sole_writer, whole_file
 
 SCHEMA = "cablejax-parts/1"
@@ -64,7 +64,7 @@ class Parts:
                 f"{self.folder} was not made by this command, which needs a folder of that name for what is "
                 "unfinished. Move it elsewhere, or give another folder with --out."
             )
-        return _differing(found, self._settings)
+        return list(differences(self._settings, found))
 
     def begin(self) -> None:
         """Makes the folder ready; of a command of other settings, what it kept is deleted."""
@@ -156,16 +156,6 @@ def unfinished(out: pathlib.Path, settings: Mapping[str, Any], *, overwrite: boo
                 parts.remove()
             raise
         parts.remove()
-
-
-def _differing(found: Any, wanted: Any, name: str = "") -> list[str]:
-    """Names of the entries in which two settings differ, those of settings in settings after a dot."""
-    if not (isinstance(found, dict) and isinstance(wanted, dict)):
-        return [] if found == wanted else [name]
-    keys = [*wanted, *(key for key in found if key not in wanted)]
-    return [
-        one for key in keys for one in _differing(found.get(key), wanted.get(key), f"{name}.{key}" if name else key)
-    ]
 
 
 def _flatten(run: ClosedLoopRun) -> dict[str, Any]:

@@ -52,7 +52,6 @@ class Study(Command):
 
     def execute(self):
         """Records and diagnoses round by round, keeps each as it ends, and reports."""
-        from cablejax.cable import Cable
         from cablejax.commands.cable import find_cable
         from cablejax.commands.diagnose import diagnose_and_report
         from cablejax.commands.resuming import unfinished
@@ -73,7 +72,7 @@ class Study(Command):
 
         require(self.rounds, "count", "--rounds")
         require(self.noise_mm, "noise_mm", "--noise-mm")
-        cable = Cable() if self.cable is None else find_cable(self.cable)
+        cable = find_cable(self.cable)
         bounds = Bounds() if self.bounds is None else read_bounds(self.bounds)
         config = plant_of(cable, staged_effects(self.plant_effect), links=self.links, seed=self.seed)
         goals = {f"to {letter}": make_target(letter, cable).gripper_pose for letter in ("U", "S", "Z")}

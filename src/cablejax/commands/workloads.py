@@ -147,16 +147,6 @@ def data_stages(config: DatasetConfig) -> dict[str, Callable[[], Any]]:
     }
 
 
-def data_seconds(config: DatasetConfig, rounds: int) -> dict[str, float]:
-    """Seconds that a data set takes, once compiled: drawing its motions, simulating them, and the checks and the store.
-
-    The last is what the whole takes beyond the others. Medians of the rounds.
-    """
-    turns = seconds_in_turns(data_stages(config), rounds)
-    drawn, both, whole = (float(np.median(seconds)) for seconds in turns.values())
-    return {"drawing": drawn, "simulation": both - drawn, "store": max(whole - both, 0.0)}
-
-
 def repeated(tree: Any, size: int) -> Any:
     """Every leaf `size` times along a new first axis."""
     return jax.tree.map(lambda leaf: jnp.broadcast_to(jnp.asarray(leaf), (size, *jnp.shape(leaf))), tree)

@@ -10,14 +10,13 @@ from cablejax.diagnose.protocol import Explanation, Simulator, explanation, in_b
 from cablejax.diagnose.recording import DiagnosisError
 from cablejax.diagnose.run import diagnose_simulator
 from cablejax.diagnose.verdict_json import verdict_json, write_verdict
-from cablejax.effects import LIBRARY, CableEffect, Context, Effect, Parameter
+from cablejax.effects import LIBRARY, CableEffect, Effect, Parameter
 
 __all__ = [
     "LIBRARY",
     "CableDiagnosis",
     "CableEffect",
     "Calibration",
-    "Context",
     "Diagnosis",
     "DiagnosisError",
     "Effect",

@@ -102,11 +102,6 @@ class Evidence:
         """Of each episode's squared residuals, see `student_log_likelihoods`."""
         return student_log_likelihoods(self.surprise(sse), self.freedom, self.motion)
 
-    def fit_log_likelihood(self, sse: Float[np.ndarray, "E"]) -> float:
-        """Of all episodes' squared residuals, as fits have it."""
-        each = student_log_likelihoods(self.surprise(sse), self.fit_freedom or self.freedom, self.motion)
-        return float(each.sum())
-
     def weight(self, sse: Float[np.ndarray, "E"]) -> Float[np.ndarray, "E"]:
         """Weight of each episode's squared residuals in the least squares problem that a fit solves in one step."""
         share, freedom = share_of_motion(self.motion), self.fit_freedom or self.freedom

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from cablejax.bounded import BatchedGaussNewton, Linearised, Result, solve_arrow
-from cablejax.diagnose.evidence import Evidence, episodes_by_motion
+from cablejax.diagnose.evidence import Evidence, episodes_by_motion, student_log_likelihoods
 from cablejax.diagnose.protocol import Explanation
 
 # Largest change of one coordinate in one step, in prior standard deviations.
@@ -68,7 +68,8 @@ class Fit:
         """Negative log posterior density up to a constant."""
         own = self.explanation.own[np.unique(self.recording)]
         prior = 0.5 * float(self.explanation.z @ self.explanation.z) + 0.5 * float((own**2).sum())
-        return -evidence.fit_log_likelihood(self.sse) + prior
+        freedom = evidence.fit_freedom or evidence.freedom
+        return prior - float(student_log_likelihoods(evidence.surprise(self.sse), freedom, evidence.motion).sum())
 
     def precision(self, evidence: Evidence) -> Float[np.ndarray, "P P"]:
         """Inverse posterior covariance of the shared coordinates, by Laplace's approximation with fixed weights."""

@@ -47,14 +47,6 @@ def commands_log(motions: Mapping[str, Float[np.ndarray, "T 2 3"]], interval: fl
     return gap_log_from_episodes(episodes, cable, source=source, grasp=cable.grasp)
 
 
-def motion_log(following: NextMotion, log: GapLog) -> GapLog:
-    """The next motion as a gap log without keypoints, of the cable in the log that was diagnosed."""
-    commands = commands_log({following.motion: following.poses}, following.interval, cable_of_log(log))
-    not_its_own = ("motion", "source", "recordings", TARGETS, COMMANDS_DERIVED, *EPISODE_LABELS)
-    kept = {name: value for name, value in log.meta.items() if name not in not_its_own}
-    return dataclasses.replace(commands, meta={**commands.meta, **kept})
-
-
 def write_motion(folder: str | os.PathLike[str], following: NextMotion | None, log: GapLog) -> pathlib.Path | None:
     """Writes `next_motion.npz`, a gap log without keypoints, and `next_motion.csv`, one row of poses for each sample.
 
@@ -78,4 +70,7 @@ def write_motion(folder: str | os.PathLike[str], following: NextMotion | None, l
     text = "\n".join([",".join(COLUMNS), *(",".join(f"{v:.6f}" for v in row) for row in rows), ""])
     with whole_file(table) as stream:
         stream.write(text.encode())
-    return write_gap_log(path, motion_log(following, log), overwrite=True)
+    commands = commands_log({following.motion: following.poses}, following.interval, cable_of_log(log))
+    not_its_own = ("motion", "source", "recordings", TARGETS, COMMANDS_DERIVED, *EPISODE_LABELS)
+    kept = {name: value for name, value in log.meta.items() if name not in not_its_own}
+    return write_gap_log(path, dataclasses.replace(commands, meta={**commands.meta, **kept}), overwrite=True)

@@ -154,7 +154,9 @@ def safe_ways(config: Discretisation, first: Float[np.ndarray, "2 3"], bounds: B
 
     def at(ratio: float, mirrored: bool = False, shift: float = 0.0) -> Float[np.ndarray, "6"]:
         """An arch on the side to which the cable leans, its grippers turned half as far as they would turn freely."""
-        lean = 0.5 * _free_angle(ratio) * (-side if mirrored else side)
+        # pinned ends with the tangent `a cos(pi s / L)` between them are `J0(a) L` apart
+        angles = np.linspace(2.4, 0.0, 481)
+        lean = 0.5 * float(np.interp(ratio, j0(angles), angles)) * (-side if mirrored else side)
         across = np.array([-np.sin(start[2]), np.cos(start[2])])
         return np.array([*(start[:2] + shift * length * across), start[2], ratio * length, lean, -lean])
 
@@ -193,15 +195,6 @@ def safe_ways(config: Discretisation, first: Float[np.ndarray, "2 3"], bounds: B
         )
         for name, plan in plans.items()
     }
-
-
-def _free_angle(ratio: float) -> float:
-    """Angle [rad] at which a cable pinned at this distance, relative to its length, leaves its ends.
-
-    With the tangent `a cos(pi s / L)` the ends are `J0(a) L` apart.
-    """
-    angles = np.linspace(2.4, 0.0, 481)
-    return float(np.interp(ratio, j0(angles), angles))
 
 
 def _poses(vectors: Float[np.ndarray, "T 6"]) -> Float[np.ndarray, "T 2 3"]:

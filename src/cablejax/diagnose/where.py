@@ -13,12 +13,11 @@ Flipping the signs of E episodes cannot give less than 2 / 2^E: fewer than 6 epi
 from __future__ import annotations
 
 import dataclasses
-import functools
 
 import numpy as np
 from jaxtyping import Bool, Float
 
-from cablejax.arrays import quarter_turn
+from cablejax.arrays import mean_of_finite, quarter_turn
 from cablejax.diagnose.evidence import repeated_motions
 from cablejax.diagnose.regimes import Regimes, regimes_of
 from cablejax.diagnose.significance import (
@@ -110,23 +109,26 @@ def localise(log: GapLog, nominal: Float[np.ndarray, "E T N 2"], noise: Float[np
     arclength = np.asarray(log.meta["keypoint_arclength_m"], float)
 
     whitened = residual / noise[:, None]
-    squared = (whitened**2).mean(axis=-1)
-    above = functools.partial(_above, residual, noise)
+    squared, squares = (whitened**2).mean(axis=-1), (residual**2).mean(axis=-1)
     everywhere = np.isfinite(squared)
+
+    def size(mask) -> float:
+        return float(np.nan_to_num(above(np.where(mask, squares, np.nan), noise)))
+
     inflation = variance_inflation(whitened, log, regimes.hold)
     where = Where(
-        gap_mm=above(everywhere),
+        gap_mm=size(True),
         smallest_mm=smallest_gap(noise, 2 * everywhere.sum() / inflation, LEVEL),
-        along_cable_mm=np.array([above(_only(everywhere, 2, i)) for i in range(nominal.shape[2])]),
+        along_cable_mm=np.nan_to_num(above(squares, noise, (0, 1))),
         bend_per_m=_bending(log, residual, noise),
-        per_episode_mm=np.array([above(_only(everywhere, 0, e)) for e in range(len(nominal))]),
+        per_episode_mm=np.nan_to_num(above(squares, noise, (1, 2))),
         episode_p=exceedance_p(squared.reshape(len(squared), -1), inflation),
         keypoint_p=exceedance_p(squared.reshape(-1, squared.shape[-1]).T, inflation),
         heat=np.sqrt(squared),
-        horizons_mm=_horizons(log, valid, everywhere, above),
-        regimes={name: above(mask[..., None] & everywhere) for name, mask in regimes.masks.items() if mask.any()},
+        horizons_mm=_horizons(log, valid, size),
+        regimes={name: size(mask[..., None]) for name, mask in regimes.masks.items() if mask.any()},
         frames=_frames(residual, noise, nominal),
-        contrasts=_contrasts(residual, noise, squared, regimes, motion, arclength),
+        contrasts=_contrasts(squares, noise, size, regimes, motion, arclength),
         regime_masks=regimes.masks,
     )
     motions = len(np.unique(motion[everywhere.any(axis=(1, 2))]))
@@ -134,20 +136,9 @@ def localise(log: GapLog, nominal: Float[np.ndarray, "E T N 2"], noise: Float[np
     return dataclasses.replace(where, sentences=sentences)
 
 
-def _above(residual, noise, mask) -> float:
-    """Root mean square [mm] above the noise over the keypoints of a mask [E, T, N]; 0 where it holds none."""
-    seen = mask & np.isfinite(residual[..., 0])
-    if not seen.any():
-        return 0.0
-    square = (residual**2).mean(axis=-1)[seen].mean()
-    floor = np.broadcast_to(noise**2, seen.shape)[seen].mean()
-    return 1e3 * float(np.sqrt(max(square - floor, 0.0)))
-
-
-def _only(mask, axis: int, index: int):
-    chosen = np.zeros(mask.shape[axis], bool)
-    chosen[index] = True
-    return mask & np.expand_dims(chosen, tuple(a for a in range(mask.ndim) if a != axis))
+def above(squares: np.ndarray, noise: float | np.ndarray, axis: tuple[int, ...] | int | None = None) -> np.ndarray:
+    """Root mean square above the noise [mm] of squared errors [m^2], NaN where none is finite."""
+    return 1e3 * np.sqrt(np.maximum(mean_of_finite(squares - noise**2, axis), 0.0))
 
 
 def _bending(log: GapLog, residual, noise) -> np.ndarray:
@@ -165,7 +156,7 @@ def _bending(log: GapLog, residual, noise) -> np.ndarray:
     return np.sqrt(np.maximum(2 * (square - floor), 0.0) * (seen.any(axis=(0, 1))))
 
 
-def _horizons(log: GapLog, valid, everywhere, above) -> dict[float, float]:
+def _horizons(log: GapLog, valid, size) -> dict[float, float]:
     end = float(log.time[valid].max())
     result, before = {}, 0.0
     for horizon in HORIZONS:
@@ -173,7 +164,7 @@ def _horizons(log: GapLog, valid, everywhere, above) -> dict[float, float]:
             break
         mask = valid & (log.time > before) & (log.time <= horizon)
         if mask.any():
-            result[horizon] = above(mask[..., None] & everywhere)
+            result[horizon] = size(mask[..., None])
         before = horizon
     return result
 
@@ -210,9 +201,9 @@ def _frames(residual, noise, nominal) -> dict[str, float]:
     }
 
 
-def _contrasts(residual, noise, squared, regimes: Regimes, motion, arclength) -> dict[str, tuple[float, float]]:
+def _contrasts(squares, noise, size, regimes: Regimes, motion, arclength) -> dict[str, tuple[float, float]]:
     """Ratios of the gap in one part to that in its opposite, with p-values against the largest of all contrasts."""
-    everywhere = np.isfinite(squared)
+    everywhere = np.isfinite(squares)
     pairs = {name: (a[..., None] & everywhere, b[..., None] & everywhere) for name, (a, b) in regimes.pairs.items()}
     third = arclength / arclength[-1]
     for name, part in (
@@ -223,9 +214,9 @@ def _contrasts(residual, noise, squared, regimes: Regimes, motion, arclength) ->
         pairs[name] = everywhere & part, everywhere & ~part
     floor = float((noise**2).mean())
 
-    def size(mask) -> np.ndarray:
+    def logs(mask) -> np.ndarray:
         """Log of the square above the noise of each episode; bounded where it is all noise."""
-        square = np.where(mask, (squared - 1.0) * noise**2, 0.0).sum(axis=(1, 2)) / np.maximum(mask.sum(axis=(1, 2)), 1)
+        square = mean_of_finite(np.where(mask, squares - noise**2, np.nan), (1, 2))
         return np.log(np.maximum(square, 0.0) + 0.1 * floor)
 
     names, columns, ratios = [], [], []
@@ -234,9 +225,9 @@ def _contrasts(residual, noise, squared, regimes: Regimes, motion, arclength) ->
         if both.sum() < 2:
             continue
         names.append(name)
-        columns.append(np.where(both, 0.5 * (size(a) - size(b)), np.nan))
-        low = max(_above(residual, noise, b), 0.1 * np.sqrt(floor) * 1e3)
-        ratios.append(max(_above(residual, noise, a), 0.1 * np.sqrt(floor) * 1e3) / low)
+        columns.append(np.where(both, 0.5 * (logs(a) - logs(b)), np.nan))
+        least = 0.1 * np.sqrt(floor) * 1e3
+        ratios.append(max(size(a), least) / max(size(b), least))
     if not names:
         return {}
     p = contrast_p(np.stack(columns, axis=1), motion)

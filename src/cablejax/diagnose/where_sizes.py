@@ -10,13 +10,8 @@ import numpy as np
 from jaxtyping import Float
 
 from cablejax.arrays import mean_of_finite
-from cablejax.diagnose.where import Where
+from cablejax.diagnose.where import Where, above
 from cablejax.diagnose.where_words import describe
-
-
-def above(squares: np.ndarray, noise: float, axis: tuple[int, ...] | int | None = None) -> np.ndarray:
-    """Root mean square above the noise [mm] of squared errors [m^2], NaN where none is finite."""
-    return 1e3 * np.sqrt(np.maximum(mean_of_finite(squares, axis) - noise**2, 0.0))
 
 
 def sizes_of(

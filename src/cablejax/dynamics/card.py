@@ -12,7 +12,7 @@ import numpy as np
 
 from cablejax.dynamics.config import ModelConfig
 from cablejax.dynamics.error_report import ErrorReport
-from cablejax.text_file import differences
+from cablejax.text_file import differences, markdown_table
 
 _POINTS = 12
 _CURVE = ("step", "phase", "learning_rate", "loss")
@@ -49,6 +49,10 @@ def write_card(
         for h, share in zip(report.errors["all windows"]["network"].horizons, report.snapping_fraction(), strict=True)
     )
     changes = differences(*(d["config"] for d in info["data"]))
+    data = [["data set", "trajectories", "held out", "commands each", "seed", "SHA-256"]]
+    for d in info["data"]:
+        one = {**d["config"], **d, "digest": f"`{d['digest']}`"}
+        data.append([str(one[key]) for key in ("name", "n_trajectories", "held_out", "n_steps", "seed", "digest")])
     lines = [
         f"# {name}",
         "",
@@ -60,13 +64,7 @@ def write_card(
         "",
         "## Data",
         "",
-        "| data set | trajectories | held out | commands each | seed | SHA-256 |",
-        "| --- | ---: | ---: | ---: | ---: | --- |",
-        *(
-            f"| {d['name']} | {d['config']['n_trajectories']} | {d['held_out']} | {d['config']['n_steps']} "
-            f"| {d['config']['seed']} | `{d['digest']}` |"
-            for d in info["data"]
-        ),
+        *markdown_table(data),
         "",
         f"Effects in the data: {', '.join(f'`{effect}`' for effect in info.get('effects', ())) or 'none'}. The weights "
         "file has the whole configuration of each data set: its cable, its effects with their draws, and the ranges of "
@@ -116,5 +114,4 @@ def _curve(metrics: Path) -> list[str]:
     pick = np.unique(np.linspace(0, len(scored) - 1, min(_POINTS, len(scored))).round().astype(int))
     columns = [*_CURVE, *scores]
     header = [column.replace("open_loop_", "after ").replace("_cm", "").replace("_", " ") for column in columns]
-    lines = [header, ["---:"] * len(columns), *([scored[i][column] for column in columns] for i in pick)]
-    return ["| " + " | ".join(line) + " |" for line in lines]
+    return markdown_table([header, *([scored[i][column] for column in columns] for i in pick)])

@@ -26,6 +26,7 @@ from cablejax.dynamics.evaluate import (
     summarise,
     window_errors,
 )
+from cablejax.text_file import markdown_table
 from cablejax.types import Trajectory
 
 MODEL = "network"
@@ -70,10 +71,10 @@ class ErrorReport:
                 for k in range(len(predictors[MODEL].horizons))
                 for name, error in predictors.items()
             ]
-            lines += ["", f"### {group.capitalize()}", "", *_table(["predictor", *_COLUMNS], rows)]
+            lines += ["", f"### {group.capitalize()}", "", *markdown_table([["predictor", *_COLUMNS], *rows])]
         rows = [[name, *_row(error, k)] for name, error in self.by_data.items() for k in range(len(error.horizons))]
         title = "### The network by data set, no snap-through"
-        return [*lines[1:], "", title, "", *_table(["data set", *_COLUMNS], rows)]
+        return [*lines[1:], "", title, "", *markdown_table([["data set", *_COLUMNS], *rows])]
 
 
 def error_report(
@@ -132,7 +133,3 @@ def _row(error: OpenLoopError, k: int) -> list[str]:
 def _fields(error: OpenLoopError) -> dict[str, Any]:
     fields = dataclasses.asdict(error) | {"relative": error.relative}
     return {name: [v if math.isfinite(v) else None for v in values] for name, values in fields.items()}
-
-
-def _table(header: list[str], rows: list[list[str]]) -> list[str]:
-    return ["| " + " | ".join(cells) + " |" for cells in (header, ["---", *["---:"] * (len(header) - 1)], *rows)]

@@ -1,15 +1,13 @@
 """From point clouds to keypoints: registration, first frame, tracking, a depth camera and recorded sequences."""
 
-from cablejax.perceive.frame import Status, Track, TrackerConfig, TrackState, track
-from cablejax.perceive.registration import CurveFit, RegistrationConfig, register
+from cablejax.perceive.frame import Status, Track, TrackerConfig, track
+from cablejax.perceive.registration import RegistrationConfig, register
 from cablejax.perceive.tracker import Tracker
 
 __all__ = [
-    "CurveFit",
     "RegistrationConfig",
     "Status",
     "Track",
-    "TrackState",
     "Tracker",
     "TrackerConfig",
     "register",

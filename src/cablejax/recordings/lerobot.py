@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from cablejax.gaplog import Episode, episodes_of, stack_episodes
+from cablejax.gaplog import Episode, episodes_of, reading_export, stack_episodes
 from cablejax.gaplog_check import SCHEMA, GapLogError
 from cablejax.limits import require
 from cablejax.text_file import read_json, write_json
@@ -96,17 +96,9 @@ def read_lerobot(folder: str | os.PathLike[str]) -> GapLog:
     meta = read_json(folder / _LOG)
     if not isinstance(meta, dict) or not isinstance(meta.get("motion"), list):
         raise GapLogError(f"{folder / _LOG} is damaged: it is no `meta` of a gap log ({SCHEMA}). Export the log again.")
-    try:
+    with reading_export(folder):
         table = _read_table(arrow, sorted((folder / "data").glob("chunk-*/file-*.parquet")))
-        episodes = _episodes(table, info["features"], meta["motion"])
-    except GapLogError:
-        raise
-    except Exception as error:  # on a damaged file pyarrow raises what its parts raise
-        raise GapLogError(f"{folder} could not be read ({type(error).__name__}: {error}). Export it again.") from error
-    try:
-        return stack_episodes(episodes, meta, holds="hold" in table)
-    except GapLogError as error:
-        raise GapLogError(f"{folder}: {error}") from error
+        return stack_episodes(_episodes(table, info["features"], meta["motion"]), meta, holds="hold" in table)
 
 
 def _features(columns: Mapping[str, np.ndarray], log: GapLog) -> dict[str, dict[str, Any]]:

@@ -22,7 +22,7 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from cablejax import __version__
-from cablejax.gaplog import Episode, episodes_of, stack_episodes
+from cablejax.gaplog import Episode, episodes_of, reading_export, stack_episodes
 from cablejax.gaplog_check import SCHEMA, GapLogError
 from cablejax.limits import require
 from cablejax.simulate.pose import points_in_space, pose_in_space
@@ -94,20 +94,10 @@ def read_mcap(path: str | os.PathLike[str]) -> GapLog:
             "cablejax import mcap BAG --layout layout.toml."
         )
     require(path.stat().st_size, "array_bytes", f"The size of {path}")
-    try:
+    with reading_export(path):
         with path.open("rb") as stream:
             meta, clouds, samples = _content(library, stream)
-        episodes = _episodes(meta, clouds, samples)
-    except GapLogError:
-        raise
-    except Exception as error:  # on a damaged file the library raises what its parts raise
-        raise GapLogError(
-            f"{path} could not be read ({type(error).__name__}: {error}). Export the log again."
-        ) from error
-    try:
-        return stack_episodes(episodes, meta, holds="hold" in samples[0])
-    except GapLogError as error:
-        raise GapLogError(f"{path}: {error}") from error
+        return stack_episodes(_episodes(meta, clouds, samples), meta, holds="hold" in samples[0])
 
 
 def _content(library: Any, stream: BinaryIO) -> tuple[dict[str, Any], list[Any], list[Any]]:

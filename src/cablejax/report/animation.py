@@ -21,7 +21,8 @@ from cablejax.report.style import (
     by_shape,
     cable_curve,
     common_window,
-    gripper_outline,
+    draw_grippers,
+    draw_scale_bar,
 )
 from cablejax.whole_file import whole_file
 
@@ -40,8 +41,8 @@ _HEADER, _FOOTER = 78, 48
 _COLOURS = 64
 
 
-def write_gif(path: str | os.PathLike[str], runs: Runs, *, width: int = 960, frames_per_second: float = 12.0) -> int:
-    """Writes the animation and returns its size in bytes.
+def write_gif(path: str | os.PathLike[str], runs: Runs, *, width: int = 960, frames_per_second: float = 12.0) -> None:
+    """Writes the animation.
 
     Args:
         path: the file to write.
@@ -69,14 +70,14 @@ def write_gif(path: str | os.PathLike[str], runs: Runs, *, width: int = 960, fra
             _still(ax, shape, panel, views[shape])
         drawn = axes[-1].lines[:1]
         figure.legend(drawn, ["target"], loc="center left", bbox_to_anchor=(300 / width, top), labelcolor=LIGHT.muted)
-        _scale_bar(axes[-1], views[list(pairs)[-1]])
+        draw_scale_bar(axes[-1], views[list(pairs)[-1]])
 
         def draw(time: float) -> list[Any]:
             clock.set_text(f"{time:.0f} s")
             panels = zip(axes, pairs.values(), strict=True)
             return [artist for ax, panel in panels for artist in _moving(ax, panel, time)]
 
-        return animate(path, figure, draw, instants, frames_per_second=frames_per_second, hold_s=_HOLD_S)
+        animate(path, figure, draw, instants, frames_per_second=frames_per_second, hold_s=_HOLD_S)
 
 
 def animate(
@@ -87,8 +88,8 @@ def animate(
     *,
     frames_per_second: float,
     hold_s: float,
-) -> int:
-    """Writes a GIF of a figure and returns its size in bytes. All frames share one palette, which keeps it small.
+) -> None:
+    """Writes a GIF of a figure. All frames share one palette, which keeps it small.
 
     Args:
         path: the file to write.
@@ -109,18 +110,10 @@ def animate(
     palette = frames[len(frames) // 2].quantize(_COLOURS, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
     indexed = [frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]
     durations = [round(1000.0 / frames_per_second)] * (len(frames) - 1) + [round(1000.0 * hold_s)]
-    path = pathlib.Path(path)
-    with whole_file(path) as stream:
+    with whole_file(pathlib.Path(path)) as stream:
         indexed[0].save(
             stream, format="GIF", save_all=True, append_images=indexed[1:], duration=durations, loop=0, optimize=False
         )
-    return path.stat().st_size
-
-
-def gripper_patches(ax: Any, pose: np.ndarray, colour: str) -> list[Any]:
-    """Draws both grippers at their poses [m, rad], shape [2, 3]."""
-    outlines = [polygon for end in range(2) for polygon in gripper_outline(pose[end], end)]
-    return [patch for polygon in outlines for patch in ax.fill(*polygon.T, color=colour, lw=0)]
 
 
 def _still(ax: Any, shape: str, runs: dict[Method, ClosedLoopRun], view: tuple[float, float, float, float]) -> None:
@@ -132,12 +125,6 @@ def _still(ax: Any, shape: str, runs: dict[Method, ClosedLoopRun], view: tuple[f
     ax.plot(*target.T, color=LIGHT.target, lw=2.2, ls=(0, (2.4, 1.7)))
 
 
-def _scale_bar(ax: Any, view: tuple[float, float, float, float]) -> None:
-    right, low, room = view[1], view[2], 0.02 * (view[1] - view[0])
-    ax.plot([right - room - 0.2, right - room], [low + room] * 2, color=LIGHT.muted, lw=1.5)
-    ax.text(right - room - 0.1, low + 1.5 * room, "20 cm", color=LIGHT.muted, size=9, ha="center")
-
-
 def _moving(ax: Any, runs: dict[Method, ClosedLoopRun], time: float) -> list[Any]:
     """Draws the runs of a panel at one instant [s]; between samples the cable is interpolated."""
     artists: list[Any] = []
@@ -146,7 +133,7 @@ def _moving(ax: Any, runs: dict[Method, ClosedLoopRun], time: float) -> list[Any
         run, colour = runs[method], LIGHT.method(method)
         strong = method == "residual" or len(runs) == 1
         pose, keypoints = _at(run.times, run.gripper_pose, time), _at(run.times, run.keypoints, time)
-        artists += gripper_patches(ax, pose, LIGHT.gripper if strong else _GHOST)
+        artists += draw_grippers(ax, pose, color=LIGHT.gripper if strong else _GHOST)
         artists += ax.plot(*cable_curve(keypoints, pose).T, color=colour, lw=2.2, solid_capstyle="round")
         artists += ax.plot(*keypoints.T, color=colour, ls="", marker="o", ms=3.4)
     for row, method in enumerate(methods[::-1]):

@@ -16,7 +16,7 @@ from cablejax.arrays import stretches
 from cablejax.diagnose.diagnosis import CableDiagnosis, NamedEffect
 from cablejax.diagnose.judgement import effect_title
 from cablejax.report.effect_words import explained_label
-from cablejax.report.style import DIAGNOSIS_STYLE, LIGHT, cable_curve, gripper_outline
+from cablejax.report.style import DIAGNOSIS_STYLE, LIGHT, cable_curve, draw_grippers
 
 # Transparent where there is no gap, so that it reads on a light and on a dark page.
 _HEAT = LinearSegmentedColormap.from_list(
@@ -74,9 +74,7 @@ def cable_figure(diagnosis: CableDiagnosis) -> Figure:
             axes.set(aspect="equal", xticks=[], yticks=[])
             axes.spines[:].set_visible(axes is zoom)
             _draw_places(axes, diagnosis, nominal if explained is None else explained)
-            for end in range(2):
-                for polygon in gripper_outline(pose[end], end):
-                    axes.fill(*polygon.T, color=LIGHT.gripper, alpha=0.8, lw=0)
+            draw_grippers(axes, pose, alpha=0.8)
             if explained is not None:
                 label = explained_label(diagnosis)
                 axes.plot(*cable_curve(explained).T, color=LIGHT.residual, lw=3.2 * thick, label=label)

@@ -184,7 +184,8 @@ def _cards(diagnosis: CableDiagnosis) -> Iterator[tuple[str, str, str]]:
     """Heading, text and note of each card."""
     gap = diagnosis.gap
     if diagnosis.effects:
-        names = listed(list(dict.fromkeys(listed(_alike(diagnosis, e), "or") for e in diagnosis.effects)))
+        alike = (in_its_place(e.name, diagnosis.equivalent, diagnosis.effects) for e in diagnosis.effects)
+        names = listed(list(dict.fromkeys(listed([*map(effect_title, names)], "or") for names in alike)))
         note = _chance(diagnosis)
         title = "Part of the cause" if diagnosis.verdict == "named+unknown" else "Cause"
         yield (title, names, note)
@@ -238,11 +239,6 @@ def _peak(diagnosis: CableDiagnosis) -> str:
     profile = diagnosis.where.along_cable_mm
     peak = int(profile.argmax())
     return f"the gap peaks at {diagnosis.log.meta['keypoint_arclength_m'][peak]:.2f} m, {millimetres(profile[peak])}"
-
-
-def _alike(diagnosis: CableDiagnosis, effect: NamedEffect) -> list[str]:
-    """The effect and its look-alikes that are not improbable, in words."""
-    return [effect_title(name) for name in in_its_place(effect.name, diagnosis.equivalent, diagnosis.effects)]
 
 
 def _most_telling(effect: NamedEffect) -> str:

@@ -23,7 +23,8 @@ from cablejax.report.style import (
     by_shape,
     cable_curve,
     common_window,
-    gripper_outline,
+    draw_grippers,
+    draw_scale_bar,
 )
 
 if TYPE_CHECKING:
@@ -68,7 +69,7 @@ def final_shapes(runs: Runs) -> Figure:
                     words, (0.0, 0.0), xycoords="axes fraction", xytext=(0.0, -4.0 - 15.0 * row),
                     textcoords="offset points", color=LIGHT.method(method), va="top", fontsize=10.5,
                 )  # fmt: skip
-        _scale_bar(axes[-1], views[next(reversed(views))])
+        draw_scale_bar(axes[-1], views[next(reversed(views))])
         _method_legend(figure, runs, Line2D([], [], color=LIGHT.target, lw=7, alpha=0.45, label="target"))
     return figure
 
@@ -165,7 +166,7 @@ def snapshots(runs: Runs) -> Figure:
             ax.plot(*cable_curve(run.target.keypoints).T, color=LIGHT.target, lw=1.6, ls=(0, (4, 3)))
             _draw_cable(ax, run, int(index), "residual")
             ax.set_title(f"{run.times[index]:.0f} s   {run.error_cm[index]:.2f} cm", fontsize=10)
-        _scale_bar(axes[-1], view)
+        draw_scale_bar(axes[-1], view)
     return figure
 
 
@@ -180,17 +181,9 @@ def _table_axes(ax: Axes, view: tuple[float, float, float, float]) -> None:
 
 def _draw_cable(ax: Axes, run: ClosedLoopRun, index: int, method: Method) -> None:
     colour = LIGHT.method(method)
-    for end in range(2):
-        for polygon in gripper_outline(run.gripper_pose[index, end], end):
-            ax.fill(*polygon.T, color=LIGHT.gripper, alpha=0.85 if method == "residual" else 0.3, lw=0)
+    draw_grippers(ax, run.gripper_pose[index], alpha=0.85 if method == "residual" else 0.3)
     ax.plot(*cable_curve(run.keypoints[index], run.gripper_pose[index]).T, color=colour, lw=2.2)
     ax.plot(*run.keypoints[index].T, "o", color=colour, ms=3.0)
-
-
-def _scale_bar(ax: Axes, view: tuple[float, float, float, float]) -> None:
-    x, y = view[1] - 0.02, view[2] + 0.02
-    ax.plot([x - 0.2, x], [y, y], color=LIGHT.muted, lw=1.5, solid_capstyle="butt")
-    ax.text(x - 0.1, y + 0.012, "20 cm", ha="center", va="bottom", color=LIGHT.muted, fontsize=9)
 
 
 def _panel_width(n_panels: int) -> float:

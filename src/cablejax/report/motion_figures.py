@@ -12,9 +12,9 @@ from matplotlib.figure import Figure
 
 from cablejax.diagnose.diagnosis import NextMotion
 from cablejax.diagnose.judgement import effect_title
-from cablejax.report.animation import DPI, animate, gripper_patches
+from cablejax.report.animation import DPI, animate
 from cablejax.report.effect_words import explanation_title
-from cablejax.report.style import DIAGNOSIS_STYLE, LIGHT, cable_curve, gripper_outline
+from cablejax.report.style import DIAGNOSIS_STYLE, LIGHT, cable_curve, draw_grippers
 
 _COLOURS = (LIGHT.residual, LIGHT.direct, "#009e73", "#cc79a7", "#e69f00")
 _MOMENTS = 5
@@ -38,8 +38,8 @@ def motion_figure(following: NextMotion | None) -> Figure | None:
     return figure
 
 
-def write_motion_gif(path: str | os.PathLike[str], following: NextMotion) -> int:
-    """Writes a preview of the motion, five times as fast, and returns its size in bytes."""
+def write_motion_gif(path: str | os.PathLike[str], following: NextMotion) -> None:
+    """Writes a preview of the motion, five times as fast."""
     low, high = _window(following)
     names, width = list(following.shapes), _WIDTH / DPI
     header = (_HEADER + _LINE * len(names)) / DPI
@@ -57,13 +57,13 @@ def write_motion_gif(path: str | os.PathLike[str], following: NextMotion) -> int
 
         def draw(sample: int) -> list[Any]:
             clock.set_text(f"{following.interval * sample:.0f} s")
-            artists = gripper_patches(ax, following.poses[sample], LIGHT.gripper)
+            artists = draw_grippers(ax, following.poses[sample])
             for name, colour in zip(names, _COLOURS, strict=False):
                 artists += ax.plot(*cable_curve(following.shapes[name][sample]).T, color=colour, lw=1.8)
             return artists
 
         samples = [*np.arange(0.0, last, step).round().astype(int), last]
-        return animate(path, figure, draw, samples, frames_per_second=_FRAMES_PER_SECOND, hold_s=_HOLD_S)
+        animate(path, figure, draw, samples, frames_per_second=_FRAMES_PER_SECOND, hold_s=_HOLD_S)
 
 
 def _film(figure: Any, following: NextMotion) -> None:
@@ -71,8 +71,7 @@ def _film(figure: Any, following: NextMotion) -> None:
     for ax, sample in zip(figure.subplots(1, len(moments), squeeze=False)[0], moments, strict=True):
         for gripper in range(2):
             ax.plot(*following.poses[:, gripper, :2].T, color=LIGHT.faint, lw=1.5)
-            for polygon in gripper_outline(following.poses[sample, gripper], gripper):
-                ax.fill(*polygon.T, color=LIGHT.gripper, alpha=0.85, lw=0)
+        draw_grippers(ax, following.poses[sample], alpha=0.85)
         for (name, points), colour in zip(following.shapes.items(), _COLOURS, strict=False):
             ax.plot(*cable_curve(points[sample]).T, color=colour, lw=1.8, label=explanation_title(name))
         ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal", xticks=[], yticks=[])

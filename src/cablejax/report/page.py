@@ -140,10 +140,13 @@ def animation_data(runs: Runs) -> dict[str, Any]:
         return [None if not np.isfinite(v) else round(v) for v in flat.tolist()]
 
     def course(method: Method, run: ClosedLoopRun) -> dict[str, Any]:
+        seen = np.isfinite(run.error_cm)
+        # instants at which nothing was observed, filled in from their neighbours
+        error = np.interp(run.times, run.times[seen], run.error_cm[seen]) if seen.any() else np.zeros(len(seen))
         return {
             "method": method,
             "times": [round(float(t), 3) for t in run.times],
-            "error": np.round(_bridged(run.error_cm), 6).tolist(),
+            "error": np.round(error, 6).tolist(),
             "pose": np.round(run.gripper_pose.reshape(len(run.times), 6), 5).tolist(),
             "points": [integers(x) for x in run.keypoints],
             "curve": [integers(cable_curve(x, g, 49)) for x, g in zip(run.keypoints, run.gripper_pose, strict=True)],
@@ -163,12 +166,6 @@ def animation_data(runs: Runs) -> dict[str, Any]:
             for shape, pair in pairs.items()
         ],
     }
-
-
-def _bridged(values: np.ndarray) -> np.ndarray:
-    """Instants at which nothing was observed, filled in from their neighbours."""
-    index, seen = np.arange(len(values)), np.isfinite(values)
-    return np.interp(index, index[seen], values[seen]) if seen.any() else np.zeros(len(values))
 
 
 def _figures(runs: Runs):

@@ -58,7 +58,8 @@ def write_rerun(
     rr, path = _rerun(), pathlib.Path(path)
     recording = rr.RecordingStream("cablejax", make_default=False)
     content = recording.binary_stream()
-    episodes = dict(zip(entities(log), episodes_of(log), strict=True))
+    names = [f"{e}_{re.sub(r'[^A-Za-z0-9_]+', '_', motion)[:40]}" for e, motion in enumerate(log.meta["motion"])]
+    episodes = dict(zip(names, episodes_of(log), strict=True))
     for (name, episode), target in zip(episodes.items(), targets_of(log), strict=True):
         _write_observed(rr, recording, name, episode)
         if target is not None:
@@ -77,11 +78,6 @@ def write_rerun(
         stream.write(content.read() or b"")
     recording.disconnect()
     return path
-
-
-def entities(log: GapLog) -> list[str]:
-    """The name of each episode's entity: its number and what the grippers did, "0_approach_u"."""
-    return [f"{e}_{re.sub(r'[^A-Za-z0-9_]+', '_', motion)[:40]}" for e, motion in enumerate(log.meta["motion"])]
 
 
 def _write_observed(rr: Any, recording: Any, name: str, episode: Episode) -> None:

@@ -19,12 +19,6 @@ _SHOWN = 4
 _LOST = 0.5  # [m]
 
 
-def error_per_file(diagnosis: CableDiagnosis, predicted: np.ndarray) -> np.ndarray:
-    """Root mean square error of each keypoint in each episode [mm], shape [E, N]; NaN where nothing was predicted."""
-    squared = np.minimum(np.abs(np.asarray(diagnosis.log.keypoints, float) - predicted), 1.0) ** 2
-    return 1e3 * np.sqrt(mean_of_finite(squared, (1, 3)))
-
-
 def _names(diagnosis: CableDiagnosis) -> list[str]:
     meta = diagnosis.log.meta
     return [str(n) for n in meta.get("file", meta.get("take", range(len(diagnosis.log.episode_length))))]
@@ -47,7 +41,9 @@ def files_figure(diagnosis: CableDiagnosis) -> Figure:
     with matplotlib.rc_context(DIAGNOSIS_STYLE):
         figure = Figure(figsize=(11.0, 2.4 * len(parts) + 0.8), layout="constrained")
         panels = np.atleast_1d(figure.subplots(len(parts), 1, sharex=True))
-        maps = [error_per_file(diagnosis, predicted) for _, predicted in parts]
+        # NaN where nothing was predicted
+        off = [np.abs(np.asarray(diagnosis.log.keypoints, float) - predicted) for _, predicted in parts]
+        maps = [1e3 * np.sqrt(mean_of_finite(np.minimum(one, 1.0) ** 2, (1, 3))) for one in off]
         used = np.flatnonzero(np.isfinite(maps[0]).any(axis=1))
         top = float(np.nanpercentile(maps[0], 95))
         names = _names(diagnosis)

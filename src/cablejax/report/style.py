@@ -161,3 +161,16 @@ def gripper_outline(pose: Float[np.ndarray, "3"], end: int) -> list[Float[np.nda
         box((0.030, 0.048), (-0.032, 0.032)),
         box((0.048, 0.078), (-0.014, 0.014)),
     ]
+
+
+def draw_grippers(ax: Any, pose: Float[np.ndarray, "2 3"], **look: Any) -> list[Any]:
+    """Draws both grippers at their poses [m, rad] and returns the patches."""
+    outlines = [polygon for end in range(2) for polygon in gripper_outline(pose[end], end)]
+    return [patch for polygon in outlines for patch in ax.fill(*polygon.T, lw=0, **{"color": LIGHT.gripper, **look})]
+
+
+def draw_scale_bar(ax: Any, view: tuple[float, float, float, float]) -> None:
+    """A bar of 20 cm in the lower right corner of a view [m]."""
+    x, y = view[1] - 0.02, view[2] + 0.02
+    ax.plot([x - 0.2, x], [y, y], color=LIGHT.muted, lw=1.5, solid_capstyle="butt")
+    ax.text(x - 0.1, y + 0.012, "20 cm", ha="center", va="bottom", color=LIGHT.muted, fontsize=9)

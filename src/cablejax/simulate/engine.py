@@ -88,14 +88,8 @@ class Engine(abc.ABC):
         """
 
     def substeps(self, interval: float) -> int:
-        """Number of time steps in one interval. Raises `ValueError` if that is not a whole number."""
-        count = round(interval / self.config.timestep)
-        if count < 1 or abs(count * self.config.timestep - interval) > 1e-6 * interval:
-            raise ValueError(
-                f"The interval is {interval} s, expected a multiple of the time step, {self.config.timestep} s: "
-                "change one of them."
-            )
-        return count
+        """See `Discretisation.steps_in`."""
+        return self.config.steps_in(interval)
 
     def check_twist(self, twist) -> None:
         """Raises `ValueError` unless twist has shape [..., T, 2, 3] in the plane or [..., T, 2, 6] in space."""

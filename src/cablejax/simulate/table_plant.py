@@ -109,7 +109,7 @@ class TablePlant(abc.ABC):
         if self._steps_done is None:
             raise ValueError("The plant has no cable yet: call reset(gripper_pose) first.")
         twist = checked("twist", twist)
-        steps = self._steps(interval)
+        steps = self.config.discretisation.steps_in(interval)
         if samples < 1 or steps % samples:
             raise ValueError(
                 f"{samples} samples in {interval} s do not fall on time steps of {self._timestep} s: "
@@ -206,12 +206,6 @@ class TablePlant(abc.ABC):
                 f"The plant's simulation became unstable at {time:.3f} s: with fewer links, a shorter "
                 f"timestep than {dt} s, or gentler commands it may stay stable."
             )
-
-    def _steps(self, interval: float, name: str = "The interval") -> int:
-        steps = round(interval / self._timestep)
-        if steps < 1 or abs(steps * self._timestep - interval) > 1e-6 * interval:
-            raise ValueError(f"{name} is {interval} s, expected a whole number of time steps of {self._timestep} s.")
-        return steps
 
     def _check_distance(self, pose: np.ndarray, length: float) -> None:
         # A twist moves one gripper along a straight line relative to the other, so its end has the largest distance.

@@ -25,7 +25,7 @@ that buckles swing ever more from step to step.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -238,18 +238,27 @@ def _remembered(
     h = config.link_length
     angles = state.angles + dt * speeds[:-1]
     change = angles[1:] / h - state.angles[1:] / h
-    sign = jnp.where(change < 0, -1.0, 1.0)
-    rubbed = sign + (state.friction_state - sign) * jnp.exp(-jnp.abs(change) / physics.hysteresis_curvature)
-    # Return mapping of plasticity with linear kinematic hardening (Simo and Hughes 1998, 1.5).
-    driven = angles[1:] / h - physics.rest_curvature - (1.0 + physics.hardening) * state.set_curvature
-    excess = driven - jnp.clip(driven, -physics.yield_curvature, physics.yield_curvature)
+    bends, rubbed = kept_bends(physics, angles[1:] / h, change, state.set_curvature, state.friction_state)
     return ChainState(
         angles=angles,
         stretch=state.stretch + dt * speeds[-1],
         velocity=speeds,
         expected=2.0 * speeds - state.velocity,
-        set_curvature=state.set_curvature + excess / (1.0 + physics.hardening),
+        set_curvature=bends,
         friction_state=rubbed,
         root_velocity=root_velocity,
         expected_root=2.0 * root_velocity - state.root_velocity,
     )
+
+
+def kept_bends(physics: Physics, curvature: Any, change: Any, bends: Any, rubbed: Any) -> tuple[Any, Any]:
+    """Plastic bend [1/m] and internal friction of joints at this curvature, after this change. NumPy or JAX arrays.
+
+    Dahl's law (Dahl 1968) is exact for a constant direction; plasticity is the return mapping with linear kinematic
+    hardening (Simo and Hughes 1998, 1.5).
+    """
+    xp = curvature.__array_namespace__()
+    driven = curvature - physics.rest_curvature - (1.0 + physics.hardening) * bends
+    excess = driven - xp.clip(driven, -physics.yield_curvature, physics.yield_curvature)
+    sign, worn = xp.where(change < 0, -1.0, 1.0), xp.exp(-xp.abs(change) / physics.hysteresis_curvature)
+    return bends + excess / (1.0 + physics.hardening), sign + (rubbed - sign) * worn

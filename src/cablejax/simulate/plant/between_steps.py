@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from cablejax.arrays import wrapped
-from cablejax.simulate.chain.step import SLIP_DURATION
+from cablejax.simulate.chain.step import SLIP_DURATION, kept_bends
 from cablejax.simulate.friction import PATCH_EDGE, STRIBECK_SPEED
 from cablejax.simulate.plant.config import PlantConfig
 from cablejax.simulate.plant.model import FRICTIONLESS, bending_joints, quaternions
@@ -92,25 +92,15 @@ class Memory:
         self._model.jnt_stiffness[self._joints] = np.asarray(self._physics.stiffness) / self._h
 
     def update(self) -> None:
-        """Takes note of the last step's bending, and sets the springs for the next one.
-
-        Dahl's law (Dahl 1968) is exact for a constant direction; plasticity is the return mapping with linear
-        kinematic hardening (Simo and Hughes 1998, 1.5).
-        """
+        """Takes note of the last step's bending, see `kept_bends`, and sets the springs for the next one."""
         physics = self._physics
         rotation = self._data.qpos[self._position]
         curvature = 2.0 * np.arctan2(rotation[:, 3], rotation[:, 0])
         curvature = wrapped(curvature) / self._h
-        if self._curvature is not None:
-            change = curvature - self._curvature
-            sign = np.where(change < 0, -1.0, 1.0)
-            worn = np.exp(-np.abs(change) / physics.hysteresis_curvature)
-            self._friction_state = sign + (self._friction_state - sign) * worn
+        change = np.zeros_like(curvature) if self._curvature is None else curvature - self._curvature
+        kept = kept_bends(physics, curvature, change, self._set_curvature, self._friction_state)
+        self._set_curvature, self._friction_state = kept
         self._curvature = curvature
-        hardened = 1.0 + float(physics.hardening)
-        driven = curvature - physics.rest_curvature - hardened * self._set_curvature
-        beyond = driven - np.clip(driven, -physics.yield_curvature, physics.yield_curvature)
-        self._set_curvature += beyond / hardened
         elastic = curvature - physics.rest_curvature - self._set_curvature
         moment = physics.stiffness * elastic + physics.hysteresis_moment * self._friction_state
         rest = self._h * (curvature - moment / self._stiffness)

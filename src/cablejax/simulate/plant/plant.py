@@ -88,7 +88,7 @@ class Plant(TablePlant):
         self._height = cable.diameter / 2
         self._restart(pose)
         self._forget()
-        still, settle = np.zeros((2, 3)), self._steps(self.config.settle_time, "settle_time")
+        still, settle = np.zeros((2, 3)), self.config.discretisation.steps_in(self.config.settle_time, "settle_time")
         self._set_friction(0.0)
         self._settle(still, settle)
         self._set_friction(float(physics.friction))

@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from cablejax.poses import rotated, smallest_rotation
 from cablejax.simulate.rod.material import unit
 from cablejax.simulate.rod.physics import RodPhysics
 
@@ -25,16 +26,7 @@ def frames_along(tangent: Float[np.ndarray, "*B 3"]) -> Float[np.ndarray, "*B 3 
         mean = every[0]
     mean = mean / np.linalg.norm(mean)
     side = np.cross(mean, np.eye(3)[np.argmin(np.abs(mean))])
-    side = np.broadcast_to(side / np.linalg.norm(side), tangent.shape)
-    axis, cosine = np.cross(mean, tangent), (tangent @ mean)[..., None]
-    second = (
-        cosine * side
-        + np.cross(axis, side)
-        + axis * (axis * side).sum(-1, keepdims=True) / np.maximum(1 + cosine, 1e-3)
-    )
-    # exact but for tangents against the mean
-    second = second - (second * tangent).sum(-1, keepdims=True) * tangent
-    second = second / np.linalg.norm(second, axis=-1, keepdims=True)
+    second = rotated(smallest_rotation(np.broadcast_to(mean, tangent.shape), tangent), side / np.linalg.norm(side))
     return np.stack([tangent, second, np.cross(tangent, second)], axis=-2)
 
 
