@@ -55,8 +55,8 @@ class BendingStiffness(CableEffect):
         return replace(physics, stiffness=physics.stiffness * values[0])
 
     def starts(self, context):
-        """A cable 2.5 times softer and one 2.5 times stiffer."""
-        return [(0, (0.4,)), (0, (2.5,))]
+        """Cables of a tenth to five times the stiffness: of a long one a fit from 0.4 may not arrive at 0.2."""
+        return [(0, (ratio,)) for ratio in (0.1, 0.2, 0.4, 2.5, 5.0)]
 
 
 class StiffnessProfile(_Section):
@@ -209,8 +209,8 @@ class LinearDensity(CableEffect):
         return replace(physics, density=physics.density * values[0])
 
     def starts(self, context):
-        """Half and twice the mass per length."""
-        return [(0, (0.5,)), (0, (2.0,))]
+        """A fifth to ten times the mass per length, for the same reason."""
+        return [(0, (ratio,)) for ratio in (0.2, 0.5, 2.0, 5.0, 10.0)]
 
 
 class LumpedMass(CableEffect):
