@@ -15,7 +15,8 @@ from typing import Any, cast
 from cablejax.dataset.opening import package_versions
 
 SECONDS = 20.0
-"""How long a scheduler may take to answer."""
+"""How long a scheduler may take to answer, and how often a cluster is asked for its workers."""
+_GO_ON = "What was done is kept: run the same command to go on."
 
 
 class ExecutorError(SystemExit):
@@ -78,10 +79,11 @@ def _dask(address: str) -> Iterator[concurrent.futures.Executor]:
         raise ExecutorError("--executor names a Dask cluster: pip install 'cablejax[cluster]'.") from error
     try:
         client = Client(address, timeout=SECONDS, set_as_default=False)
-    except (OSError, TimeoutError, ValueError) as error:
+    except (OSError, TimeoutError, ValueError, TypeError, AssertionError) as error:
+        # an address without a port fails an assertion, one of another kind has no security settings
         raise ExecutorError(
-            f"No Dask scheduler answers at {address} ({error or type(error).__name__}). Start one with "
-            "`dask scheduler`, or give a number of processes."
+            f"No Dask scheduler answers at {address} ({str(error) or type(error).__name__}). Start one with "
+            "`dask scheduler`, give its address as tcp://HOST:PORT, or give a number of processes."
         ) from error
     with client:
         # a function inside another one travels whole, to workers that may not know this file yet
@@ -95,14 +97,21 @@ def _dask(address: str) -> Iterator[concurrent.futures.Executor]:
 
         client.register_worker_callbacks(know_the_experiments)
         _check(cast("dict[str, Any]", client.run(versions, on_error="return")), address)
-        yield _Opaque(client.get_executor(pure=False))
+        yield _Opaque(client)
 
 
 class _Opaque(concurrent.futures.Executor):
     """Sends calls as bytes: a scheduler reads the tasks that it hands on, and need not know this checkout."""
 
-    def __init__(self, inner: concurrent.futures.Executor):
-        self._inner = inner
+    def __init__(self, client: Any):
+        self._client, self._inner = client, client.get_executor(pure=False)
+
+    def abandoned(self) -> bool:
+        """Whether the cluster has no workers: it would wait for some for ever."""
+        try:
+            return not self._client.scheduler_info()["workers"]
+        except (OSError, TimeoutError):
+            return True
 
     def submit(self, fn, /, *args, **kwargs):
         import cloudpickle
@@ -155,17 +164,22 @@ def results(
             yield key, make(*key)
         return
     pending = {executor.submit(make, *key): key for key in keys if going()}
+    waiting: set[concurrent.futures.Future] = set(pending)
     try:
-        for future in concurrent.futures.as_completed(list(pending)):
-            try:
-                result = future.result()
-            except Exception as error:
-                if lost := _lost(error):
-                    raise ExecutorError(f"{lost} What was done is kept: run the same command to go on.") from error
-                raise
-            yield pending[future], result
-            if not going():
-                return
+        while waiting:
+            done, waiting = concurrent.futures.wait(waiting, SECONDS, concurrent.futures.FIRST_COMPLETED)
+            if not done and isinstance(executor, _Opaque) and executor.abandoned():
+                raise ExecutorError(f"The cluster has no workers any more. {_GO_ON}")
+            for future in done:
+                try:
+                    result = future.result()
+                except Exception as error:
+                    if lost := _lost(error):
+                        raise ExecutorError(f"{lost} {_GO_ON}") from error
+                    raise
+                yield pending[future], result
+                if not going():
+                    return
     finally:
         for future in pending:
             future.cancel()
@@ -175,5 +189,5 @@ def _lost(error: Exception) -> str | None:
     if isinstance(error, concurrent.futures.BrokenExecutor):
         return "A process ended abruptly, perhaps for want of memory."
     if type(error).__name__ in ("KilledWorker", "FutureCancelledError", "CancelledError", "CommClosedError"):
-        return f"The cluster lost the work ({error})."
+        return f"The cluster lost the work ({str(error) or type(error).__name__})."
     return None

@@ -188,3 +188,18 @@ def test_a_problem_whose_steps_are_rejected_is_stalled_and_not_converged():
     solver = BatchedGaussNewton(tolerance=1e-6, max_steps=300)
     (end,) = solver.minimise(linearise({0: np.zeros(1)}), linearise)
     assert end.result is Result.STALLED and end.best.point[0] == 0.0
+
+
+def test_a_start_in_a_valley_goes_along_it():
+    """Damping by the curvature across hides what a step along the valley promises."""
+    turn = np.array([[np.cos(0.7), -np.sin(0.7)], [np.sin(0.7), np.cos(0.7)]])
+    matrix = turn @ np.diag([1e5, 1.0]) @ turn.T
+
+    def linearise(points):
+        wide = np.full(2, 99.0)
+        return [
+            Linearised(y, -wide, wide, 0.5 * float(y @ matrix @ y), matrix @ y, matrix, None) for y in points.values()
+        ]
+
+    (end,) = BatchedGaussNewton(tolerance=0.02, max_steps=8).minimise(linearise({0: turn @ [0.0, 3.0]}), linearise)
+    assert end.result is Result.CONVERGED and end.best.value < 0.02

@@ -188,3 +188,19 @@ def test_a_first_recording_fits_into_short_motions_and_takes_as_long_as_slow_one
     slow = there_and_back(start, goal, Bounds(speed=0.01, turn_rate=0.1, duration=300.0))
     assert np.abs(slow - goal).max(axis=(1, 2)).min() < 1e-3
     np.testing.assert_allclose(slow[-1], start, atol=1e-6)
+
+
+def test_a_first_recording_turns_the_short_way_round():
+    """Grippers whose line passes the turn of the circle on the way."""
+    start, goal = straight_start(LONG), GOALS["U"]
+
+    def turned(pose: np.ndarray, angle: float) -> np.ndarray:
+        turn = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
+        return np.concatenate([pose[:, :2] @ turn, pose[:, 2:] + angle], axis=1)
+
+    ahead, behind = (
+        there_and_back(turned(start, heading - 0.05), turned(goal, heading + 0.05), Bounds())
+        for heading in (0.0, np.pi)
+    )
+    assert len(ahead) == len(behind)
+    np.testing.assert_allclose(np.ptp(ahead[..., 2], axis=0), np.ptp(behind[..., 2], axis=0), atol=1e-6)

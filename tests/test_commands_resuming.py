@@ -131,10 +131,13 @@ def test_files_that_a_user_put_between_the_parts_stay(tmp_path):
     assert {file.name for file in parts.folder.iterdir()} == mine
 
 
-def test_a_kill_before_the_settings_are_whole_is_no_foreign_folder(tmp_path):
+@pytest.mark.parametrize("overwrite", [False, True])
+@pytest.mark.parametrize("begun", [False, True])
+def test_a_kill_before_the_settings_are_whole_is_no_foreign_folder(begun, overwrite, tmp_path):
     (tmp_path / "parts").mkdir()
-    (tmp_path / "parts" / "settings.json.part").write_text("{")
-    with unfinished(tmp_path, SETTINGS, overwrite=True) as parts:
+    if begun:
+        (tmp_path / "parts" / "settings.json.part").write_text("{")
+    with unfinished(tmp_path, SETTINGS, overwrite=overwrite) as parts:
         assert parts.differing() == []
     assert list(tmp_path.iterdir()) == []
 

@@ -255,3 +255,12 @@ def test_a_plant_whose_cable_is_curved_at_rest_is_not_the_same(model):
     assert "The plant has the same cable." in said(model.cable)
     curved = said(dataclasses.replace(model.cable, rest_curvature=3.0))
     assert "The plant has curvature at rest 3 1/m (the model's is 0)." in curved and "same cable" not in curved
+
+
+@pytest.mark.parametrize("ratio", [0.2, 15.0])
+def test_a_model_that_estimates_nothing_may_be_of_any_cable(model, ratio):
+    cable = dataclasses.replace(model.cable, bending_stiffness=ratio * model.cable.bending_stiffness)
+    other = dataclasses.replace(model, cable=cable)
+    assert not other.config.conditioned
+    controller = make_controller(other, make_target("U"), method="direct", solver="levenberg-marquardt")
+    assert controller.config.adaptation is None

@@ -8,7 +8,7 @@ import pytest
 from cablejax.diagnose import Calibration, explanation
 from cablejax.diagnose.actuation import actuation
 from cablejax.diagnose.actuation_verdict import with_arms
-from cablejax.diagnose.conclude import Conclusion
+from cablejax.diagnose.conclude import Conclusion, sentence
 from cablejax.diagnose.diagnosis import EffectValues
 from cablejax.diagnose.fit import Fit
 from diagnose_cases import INTERVAL, MOTIONS, poses
@@ -211,3 +211,17 @@ def test_many_motions_leave_both_single_effects_without_a_chance_and_the_ranking
     )
     conclusion = with_arms(NOTHING, many, Calibration())
     assert sum(ranked.probability for ranked in conclusion.ranking) == pytest.approx(1.0)
+
+
+def test_what_the_arms_alone_explain_has_draws_too():
+    conclusion = with_arms(NOTHING, told(gain=1.08), Calibration())
+    assert conclusion.verdict == "named" and len(conclusion.posterior) == 16
+    assert {draw[0].name for draw in conclusion.posterior} == {"actuation_gain"}
+
+
+def test_that_the_cable_may_have_no_effect_is_said_beside_the_arms():
+    cable = (EffectValues("bending_stiffness", {"ratio": 2.0}),)
+    found = dataclasses.replace(NOTHING, verdict="named", posterior=(cable,) * 12 + ((),) * 4, nothing=0.25)
+    assert "With a probability of 25 % it is no effect" in sentence(
+        with_arms(found, told(gain=1.08), Calibration()), 0.8
+    )

@@ -365,3 +365,13 @@ def test_turns_beyond_half_a_circle_stay_continuous():
     keypoints = (log.keypoints @ turn).astype(np.float32)
     pose = prepare(dataclasses.replace(log, gripper_pose=wrapped, keypoints=keypoints)).gripper_pose
     assert np.abs(np.diff(pose[..., 2], axis=1)).max() < 0.2
+
+
+def test_commissioning_logs_of_another_cable_and_the_log_itself_are_refused():
+    log = record()
+    cable = {**log.meta["cable"], "bending_stiffness_n_m2": 0.05}
+    other = dataclasses.replace(log, meta={**log.meta, "cable": cable}, keypoints=log.keypoints + np.float32(1e-3))
+    with pytest.raises(ValueError, match="commissioning log 1 is not of the set-up of the log"):
+        diagnose(log, commissioning=[other])
+    with pytest.raises(ValueError, match="have an episode of the same samples"):
+        diagnose(log, commissioning=[log])

@@ -302,3 +302,18 @@ def test_an_effect_without_an_opposite_is_not_reversible():
     positive = Parameter("size", "", 1e-3, 1e3, 1.0, 1.0, log=True)
     with pytest.raises(ValueError, match="has no opposite"):
         Effect(name="mine", parameters=(positive,), null=(0.0,), amplitude=0, reversible=True)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "axial_stretch:stiffness_n=-5",
+        "gripper_compliance:gripper=1,stiffness_n_m_per_rad=-0.05",
+        "viscous_drag:coefficient_n_s_per_m2=-0.005",
+        "viscous_drag:coefficient_n_s_per_m2=0",
+    ],
+)
+def test_a_value_below_a_small_bound_is_refused(text):
+    config = Discretisation()
+    with pytest.raises(ValueError, match="expected 0"):
+        parse_effect(text).applied(nominal_physics(config), config)

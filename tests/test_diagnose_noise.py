@@ -13,7 +13,7 @@ from cablejax.diagnose.case import Case
 from cablejax.diagnose.conclude import Conclusion
 from cablejax.diagnose.diagnosis import NamedEffect
 from cablejax.diagnose.fit import Fit
-from cablejax.diagnose.noise import SMALLEST, noise_floor, still
+from cablejax.diagnose.noise import SMALLEST, _rounding, noise_floor, still
 from cablejax.diagnose.planar_run import _caveats, _excused, _worth_naming, calibrated
 from cablejax.diagnose.playback import Playback
 from diagnose_cases import evidence, holds, log_of, poses, record
@@ -328,3 +328,13 @@ def test_a_tracker_that_reports_whole_millimetres_errs_by_their_rounding(holds):
     coarse = 1e-3 * np.round(points / 1e-3)
     floor = noise_floor(coarse, flags if holds else None)
     assert np.all(floor.std >= 0.999e-3 / np.sqrt(12)) and np.all(floor.std < 5e-4)
+
+
+def test_numbers_with_all_their_digits_were_not_rounded():
+    smooth = np.sin(np.linspace(0, 6, 60))[None, :, None, None]
+    seen = smooth + 1e-5 * np.random.default_rng(0).standard_normal(smooth.shape)
+    for points in (smooth, seen, np.linspace(0, 1, 60)[None, :, None, None], np.tile(seen[:, :1], (1, 50, 1, 1))):
+        assert _rounding(points) == 0.0
+    for dtype in (np.float64, np.float32):
+        whole = (np.round(1e3 * np.sin(np.linspace(0, 6, 3000))) / 1e3)[None, :, None, None].astype(dtype)
+        assert _rounding(whole.astype(float)) == pytest.approx(1e-3 / np.sqrt(12), rel=1e-3)

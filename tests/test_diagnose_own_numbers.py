@@ -174,3 +174,11 @@ def test_a_simulator_that_ignores_its_explanations_is_refused():
 
     with pytest.raises(ValueError, match="Does predict use the explanations"):
         diagnose_simulator(Ignoring(), observed_swings(1.3), interval=0.02, noise=1e-4)
+
+
+def test_one_episode_with_numbers_of_its_own_is_too_little():
+    class One(Ramps):
+        recording = np.zeros(1, int)
+
+    with pytest.raises(ValueError, match="There is one episode"):
+        diagnose_simulator(One(), recorded(0.7)[:1], interval=0.025, noise=_NOISE)

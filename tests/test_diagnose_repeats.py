@@ -20,9 +20,9 @@ def test_motions_a_twentieth_of_the_length_apart_are_one():
     pose[2, :, 0, 0] = 0.2
     # the end of a shorter episode is not compared
     pose[3, 7:] = np.nan
-    assert repeated_motions(pose, 1.0).tolist() == [0, 0, 2, 0]
+    assert repeated_motions(pose, np.full(4, 0.1), 1.0).tolist() == [0, 0, 2, 0]
     # seen on a shorter cable they differ
-    assert repeated_motions(pose, 0.5).tolist() == [0, 1, 2, 0]
+    assert repeated_motions(pose, np.full(4, 0.1), 0.5).tolist() == [0, 1, 2, 0]
     np.testing.assert_allclose(share_of_motion(np.array([0, 0, 2, 0])), [1 / 3, 1 / 3, 1, 1 / 3])
 
 
@@ -76,4 +76,29 @@ def test_episodes_are_compared_over_their_own_lengths():
     pose[0] = 0.0
     pose[1:, :60] = 0.0
     pose[1, :60, 0, 1], pose[2, :60, 0, 1], pose[3, :60, 0, 1] = sway, sway, -sway
-    assert repeated_motions(pose, 1.0).tolist() == [0, 1, 1, 3]
+    assert repeated_motions(pose, np.full(4, 0.1), 1.0).tolist() == [0, 1, 1, 3]
+
+
+def test_one_motion_at_two_rates_is_one():
+    def closing(interval: float) -> np.ndarray:
+        pose = np.full((400, 2, 3), np.nan)
+        time = interval * np.arange(400)
+        pose[time < 20] = 0.0
+        pose[time < 20, 1, 0] = 0.9 - 0.02 * time[time < 20]
+        return pose
+
+    intervals = np.array([0.1, 0.05, 0.08, 0.1])
+    motions = np.stack([closing(interval) for interval in intervals])
+    motions[3, :, 1, 1] += 0.2
+    assert repeated_motions(motions, intervals, 1.0).tolist() == [0, 0, 0, 3]
+
+
+def test_a_held_out_score_is_that_of_the_minimum_wherever_the_fit_ended():
+    """Within its tolerance: where one motion says nearly all, what is left of the gradient is much beside the rest."""
+    facts = evidence(("bending_stiffness", (0.3,)))
+    best = improve(facts, evaluate(facts, [explanation(*parts(("bending_stiffness", (0.3,))))]), 8)[0].explanation
+    near = [best.moved(best.z + off) for off in (-4e-4, -1e-4, 0.0, 1e-4, 4e-4)]
+    fits = evaluate(facts, near)
+    assert np.ptp([fit.cost(facts) for fit in fits]) < 0.05
+    scores = [facts.log_likelihoods(fit.held_out_sse(facts)).sum() for fit in fits]
+    assert np.ptp(scores) < 0.05

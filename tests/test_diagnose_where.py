@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 import time
+import types
 
 import numpy as np
 import pytest
 
 from cablejax.diagnose.regimes import largest_curvature
 from cablejax.diagnose.significance import LEVEL, contrast_p, variance_inflation
-from cablejax.diagnose.where import localise
+from cablejax.diagnose.where import _bending, localise
 from cablejax.diagnose.where_words import describe
 from diagnose_cases import MOTIONS, SAMPLES, arches, log_of, poses
 
@@ -217,3 +218,21 @@ def test_dropouts_in_holds_leave_the_noise_white():
     whitened[random.random((6, 300, POINTS)) < 0.1] = np.nan
     log = dataclasses.replace(case()[0], time=np.tile(np.arange(300) / 60, (6, 1)), episode_length=np.full(6, 300))
     assert variance_inflation(whitened, log, hold) < 1.2
+
+
+def test_bending_of_keypoints_that_are_not_evenly_spaced():
+    marks = np.array([0.0, 0.1, 0.2, 0.3, 0.5, 0.7, 0.9, 1.0])
+    log = types.SimpleNamespace(meta={"keypoint_arclength_m": marks.tolist()})
+    residual = np.zeros((1, 20, 8, 2))
+    residual[..., 1] = 0.5 * marks**2 + 0.02 * marks
+    np.testing.assert_allclose(_bending(log, residual, np.full(8, 1e-9)), 1.0, rtol=1e-6)
+    noisy = 1e-3 * np.random.default_rng(0).standard_normal((1, 20_000, 8, 2))
+    assert _bending(log, noisy, np.full(8, 1e-3)).max() < 0.05
+
+
+def test_the_first_episode_alone_does_not_say_how_far_apart_samples_are():
+    whitened = np.random.default_rng(0).normal(size=(2, 100, 9, 2))
+    whitened[0, 1:] = np.nan
+    log = types.SimpleNamespace(time=np.tile(0.1 * np.arange(100), (2, 1)), episode_length=np.array([1, 100]))
+    hold = np.zeros((2, 100), bool)
+    assert variance_inflation(whitened, log, hold) == pytest.approx(6.0)  # pyright: ignore[reportArgumentType]

@@ -168,6 +168,17 @@ def test_a_cluster_that_loses_a_worker_loses_no_row(cluster, tmp_path):
     assert killed in begun and sum(row["process"] == killed for row in made) < begun.count(killed)
 
 
+@pytest.mark.filterwarnings("ignore")
+def test_a_cluster_that_loses_all_its_workers_is_not_waited_for(cluster, tmp_path, monkeypatch):
+    address, programs, worker = cluster
+    programs.append(worker())
+    wait_for_workers(address, 1)
+    monkeypatch.setattr("executors.SECONDS", 1.0)
+    with executor_of(address) as executor, pytest.raises(ExecutorError, match="no workers any more"):
+        programs[1].kill()
+        rows_in(tmp_path).run(KEYS, functools.partial(slow_square, tmp_path), executor=executor, progress=False)
+
+
 def connect(address: str) -> None:
     # a scheduler that has only just started may not answer yet
     with executor_of(address):
@@ -184,5 +195,6 @@ def wait_for_workers(address: str, count: int) -> None:
 def test_a_cluster_that_cannot_be_reached_is_a_message_at_the_start(monkeypatch):
     pytest.importorskip("distributed")
     monkeypatch.setattr("executors.SECONDS", 1)
-    with pytest.raises(ExecutorError, match="No Dask scheduler answers at tcp://127"):
-        connect(f"tcp://127.0.0.1:{free_port()}")
+    for address in (f"tcp://127.0.0.1:{free_port()}", "tcp://127.0.0.1", f"tls://127.0.0.1:{free_port()}"):
+        with pytest.raises(ExecutorError, match=f"No Dask scheduler answers at {address}"):
+            connect(address)

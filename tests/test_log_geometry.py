@@ -8,6 +8,7 @@ import pytest
 
 from cablejax.cable import Cable
 from cablejax.gaplog import Episode, GapLogError, gap_log_from_episodes, validate
+from cablejax.log_geometry import cable_fault, setup_fault
 from cablejax.recordings.prepare import Setup, prepare
 from cablejax.recordings.take import Take
 from cablejax.simulate.elastica import elastica
@@ -93,3 +94,26 @@ def test_an_import_marks_outliers_as_not_observed_and_says_so():
     assert [text for text in said if "2 keypoints lay up to 1e+03 m from the rest" in text]
     kept = ~np.isnan(prepared.keypoints)
     np.testing.assert_array_equal(prepared.keypoints[kept], points[kept])
+
+
+def test_angles_that_were_converted_from_degrees_and_were_none_are_told():
+    points, pose = motion(0.3)
+    assert setup_fault(log_of(points, pose)) is None
+    small = pose * [1.0, 1.0, np.pi / 180]
+    assert "turns 51 times as far" in str(setup_fault(log_of(points, small)))
+    # one that hardly turns, and not with the cable, has an angle of its own
+    steady = pose.copy()
+    steady[..., 2] = 0.3 + 0.01 * np.random.default_rng(0).standard_normal(pose.shape[:2])
+    assert "times as far" not in str(setup_fault(log_of(points, steady)))
+
+
+def test_the_end_of_a_short_cable_is_nearer_to_its_gripper():
+    """A tenth of the length: a keypoint too few is no cable's end."""
+    cable = Cable(length=0.4, n_keypoints=9)
+    pose = np.tile([[0.0, 0.0, 0.4], [0.35, 0.0, -0.4]], (5, 1, 1))
+    points = np.tile(elastica(pose[0], cable.length, cable.keypoint_arclength), (5, 1, 1))
+    still = Episode("rest", 0.1 * np.arange(5), points, pose, np.zeros((5, 2, 3)), np.zeros(5, bool))
+    assert cable_fault(gap_log_from_episodes([still], cable, source="test")) is None
+    short = dataclasses.replace(still, keypoints=np.concatenate([points[:, :1], points[:, :-1]], axis=1))
+    moved = gap_log_from_episodes([still], cable, source="test")
+    assert "Keypoint N - 1 is 0.05" in str(cable_fault(dataclasses.replace(moved, keypoints=short.keypoints[None])))

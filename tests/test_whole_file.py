@@ -6,9 +6,11 @@ import pytest
 from flax import nnx
 
 from cablejax import whole_file as whole_file_module
+from cablejax.commands.options import output_folder
 from cablejax.dynamics.networks import GNS
+from cablejax.dynamics.run_folder import claim_folder
 from cablejax.dynamics.weights import save_weights
-from cablejax.whole_file import whole_file
+from cablejax.whole_file import draft_folder, holds_anything, whole_file
 from dynamics_cases import SMALL
 
 
@@ -46,3 +48,20 @@ def test_weights_have_the_mode_of_other_files(umask, tmp_path):
     finally:
         os.umask(before)
     assert path.stat().st_mode & 0o777 == 0o666 & ~umask
+
+
+def test_what_kills_left_of_drafts_is_removed_once_it_is_old(tmp_path):
+    for name in (".a.old.draft", ".a.new.draft", ".b.old.draft"):
+        (tmp_path / name / "data").mkdir(parents=True)
+        if "old" in name:
+            os.utime(tmp_path / name, (0, 0))
+    with draft_folder(tmp_path / "a") as draft:
+        draft.mkdir()
+    assert {path.name for path in tmp_path.iterdir()} == {".a.new.draft", ".b.old.draft"}
+
+
+def test_a_draft_of_a_file_is_nothing(tmp_path):
+    (tmp_path / "log.npz.part").touch()
+    assert not holds_anything(tmp_path) and output_folder(tmp_path, overwrite=False) == tmp_path
+    claim_folder(tmp_path, {"config": {}, "data": ""}, overwrite=False)
+    assert holds_anything(tmp_path)

@@ -17,7 +17,7 @@ INWARDS = np.radians(120.0)
 MOVED = 0.02
 """Motion of a gripper, in lengths of the cable, in which keypoints that are held by it move too."""
 AT_GRIPPER = 0.1
-"""Largest median distance of an end's keypoint from its gripper [m]."""
+"""Largest median distance of an end's keypoint from its gripper [m], and in lengths of the cable."""
 BESIDE = 0.02
 """Largest median distance of an end's keypoint from the x axis of its gripper in space [m]."""
 ASKEW = np.radians(60.0)
@@ -30,6 +30,8 @@ _FROZEN, _MOVING = 10, 0.8
 _DEGREES_OFF = 0.5
 _DEGREES_BETTER = 3.0
 _DEGREES_TURN = 10.0
+# A cable that turns so far [rad], so much with its gripper, shows its angle's unit.
+_TURNED, _WITH_IT = 0.35, 0.95
 
 
 def frozen(points: Float[np.ndarray, "T N D"]) -> Bool[np.ndarray, "T N"]:
@@ -134,19 +136,20 @@ def cable_fault(log: GapLog) -> str | None:
         return None
     valid = np.arange(log.keypoints.shape[1])[None] < log.episode_length[:, None]
     points, grippers = log.keypoints[valid].astype(float), log.gripper_pose[valid][..., :dimension].astype(float)
+    near = AT_GRIPPER * min(1.0, float(log.meta["cable"]["length_m"]))
     for gripper, (end, name) in enumerate(((0, "0"), (-1, "N - 1"))):
         seen = np.isfinite(points[:, end]).all(axis=-1)
         if not seen.any():
             continue
         distances = np.median(np.linalg.norm(points[seen, None, end] - grippers[seen], axis=-1), axis=0)
         away, crossed = float(distances[gripper]), float(distances[1 - gripper])
-        if away > AT_GRIPPER:
+        if away > near:
             advice = (
                 f"it is at gripper {1 - gripper}. Exchange the grippers, or reverse the order of the keypoints."
-                if crossed < AT_GRIPPER
+                if crossed < near
                 else "are the keypoints and the poses in one frame, in metres, and of one cable?"
             )
-            return f"Keypoint {name} is {away:.2f} m from gripper {gripper}, expected it at the gripper: {advice}"
+            return f"Keypoint {name} is {away:.2g} m from gripper {gripper}, expected it at the gripper: {advice}"
     # chords are shorter than the cable between them, the more so the fewer there are
     chord = np.linalg.norm(np.diff(points, axis=1), axis=-1) / np.diff(log.meta["keypoint_arclength_m"])
     ratio = float(np.nanmedian(chord)) if np.isfinite(chord).any() else 1.0
@@ -175,6 +178,11 @@ def setup_fault(log: GapLog) -> str | None:
         angle, direction = _tangents(log, gripper)
         if not len(angle):
             continue
+        if (times := _turns_less(angle, direction)) > _DEGREES_TURN:
+            return (
+                f"The cable next to gripper {gripper} turns {times:.0f} times as far as the gripper's angle, and with "
+                "it: the angle is in units of 180 / pi rad, for it was converted from degrees, and was none."
+            )
         off = _median_angle(angle - direction)
         others = {
             "in degrees: expected radians. Multiply it by pi / 180.": np.radians(angle) - direction,
@@ -190,6 +198,14 @@ def setup_fault(log: GapLog) -> str | None:
         if off > ASKEW:
             return f"{begin} to it (median): expected the cable's tangent, from gripper 0 towards gripper 1, at both."
     return None
+
+
+def _turns_less(angle: Float[np.ndarray, " S"], direction: Float[np.ndarray, " S"]) -> float:
+    """How many times as far as the gripper the cable next to it turns; 0 where one does not follow the other."""
+    turns = np.unwrap(direction)
+    if np.ptp(turns) < _TURNED or not np.ptp(angle) > 0 or np.corrcoef(angle, turns)[0, 1] < _WITH_IT:
+        return 0.0
+    return float(np.std(turns) / np.std(angle))
 
 
 def _axis_fault(log: GapLog) -> str | None:

@@ -8,12 +8,20 @@ import fcntl
 import os
 import pathlib
 import shutil
+import time
 import uuid
 from collections.abc import Iterator
 from typing import BinaryIO
 
 DRAFT = ".part"
 """Ending of a file's name until it is complete."""
+# Nobody fills a draft for so long [s].
+_ABANDONED = 24 * 3600
+
+
+def holds_anything(folder: pathlib.Path) -> bool:
+    """Whether there is something in a folder, beside what a kill left of a file that was being written."""
+    return any(not file.name.endswith(DRAFT) for file in folder.iterdir())
 
 
 @contextlib.contextmanager
@@ -56,8 +64,15 @@ def whole_file(path: pathlib.Path) -> Iterator[BinaryIO]:
 def draft_folder(path: pathlib.Path) -> Iterator[pathlib.Path]:
     """A new name next to a path, for a folder to be filled and then renamed; what is left of it in the end is removed.
 
-    It is no other's: on a file system that several machines share, their processes may have one number.
+    It is no other's: on a file system that several machines share, their processes may have one number. What a kill
+    left of earlier ones is removed once it is a day old.
     """
+    if path.parent.is_dir():
+        for old in path.parent.iterdir():
+            if old.name.startswith(f".{path.name}.") and old.name.endswith(".draft"):
+                with contextlib.suppress(FileNotFoundError):
+                    if time.time() - old.stat().st_mtime > _ABANDONED:
+                        shutil.rmtree(old, ignore_errors=True)
     draft = path.parent / f".{path.name}.{uuid.uuid4().hex}.draft"
     try:
         yield draft

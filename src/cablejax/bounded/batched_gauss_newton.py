@@ -26,7 +26,7 @@ _AT_BOUND = 1e-9
 # Damping begins at the first; an accepted step multiplies it by `_EASED`, a rejected one by `_RAISED`.
 _DAMPING, _EASED, _RAISED = 1e-2, 0.2, 8.0
 # It is never below the first, after a rejected step never below the second; at the third a problem has stalled.
-_LEAST_DAMPING, _LEAST_RAISED, _MOST_DAMPING = 1e-4, 0.1, 1e3
+_LEAST_DAMPING, _LEAST_RAISED, _MOST_DAMPING = 1e-8, 0.1, 1e3
 
 
 @dataclasses.dataclass(frozen=True)

@@ -11,6 +11,7 @@ from collections.abc import Mapping
 from typing import Any, ClassVar, Literal
 
 from cablejax.limits import require
+from cablejax.whole_file import holds_anything
 
 
 class UsageError(ValueError):
@@ -78,7 +79,7 @@ def output_folder(path: pathlib.Path, *, overwrite: bool) -> pathlib.Path:
     """
     if path.exists() and not path.is_dir():
         raise UsageError(f"--out is {path}, which is a file; expected a folder. Name another one.")
-    if path.is_dir() and any(path.iterdir()) and not overwrite:
+    if path.is_dir() and holds_anything(path) and not overwrite:
         raise UsageError(f"{path} exists and is not empty. Give another folder with --out, or add --overwrite.")
     path.mkdir(parents=True, exist_ok=True)
     return path

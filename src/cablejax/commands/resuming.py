@@ -143,6 +143,8 @@ def unfinished(out: pathlib.Path, settings: Mapping[str, Any], *, overwrite: boo
                 f"{out} holds an unfinished run with other options ({names}): run it with these to finish it, give "
                 "another folder with --out, or add --overwrite."
             )
+        if differing is None and parts.folder.is_dir():
+            parts.remove()  # nothing but what a kill left of the settings
         output_folder(out, overwrite=overwrite)
         parts.folder.mkdir(exist_ok=True)
     with sole_writer(parts.folder):

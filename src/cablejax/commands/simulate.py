@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 import tyro
 
 from cablejax.commands.options import Command, say
-from cablejax.whole_file import sole_writer
+from cablejax.whole_file import draft_folder, sole_writer
 
 if TYPE_CHECKING:
     from cablejax.cable import Cable
@@ -155,8 +155,6 @@ class Simulate(Command):
 
 def _clear(place: pathlib.Path | Bucket, config: DatasetConfig) -> None:
     """Deletes a data set of another configuration; refuses whatever is no data set, or is being written."""
-    import shutil
-
     from cablejax.dataset.bucket import Bucket
     from cablejax.dataset.generate import WRITER
     from cablejax.dataset.opening import open_store
@@ -168,4 +166,6 @@ def _clear(place: pathlib.Path | Bucket, config: DatasetConfig) -> None:
         for writer in place.glob(f"{WRITER}*"):
             with sole_writer(writer):
                 pass
-        shutil.rmtree(place)
+        # whole or not at all: what is left without its head is no data set
+        with draft_folder(place) as old:
+            place.rename(old)

@@ -77,7 +77,7 @@ def read_split(
         if buffer < 2 * size:
             raise ValueError(
                 f"A buffer of {buffer} trajectories is too small: data come in blocks of {size}, the size of a shard, "
-                f"and at least two are in memory. Give at least {2 * size}."
+                f"and at least two are in memory. Give at least {2 * size}, or none: all are read then."
             )
         return StreamedData(tuple(stores), blocks_of(training, size), buffer // size, seed), rest
     return concatenate([read_trajectories(store, mine) for store, mine in zip(stores, training, strict=True)]), rest

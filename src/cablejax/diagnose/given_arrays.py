@@ -36,6 +36,11 @@ def checked_nominal(
             f"{len(observed)} episodes (it has {len(simulator.recording)}), and a plan that leaves out parts of them: "
             f"Plan(parts=...) of 2 or more (it is {simulator.plan.parts})."
         )
+    if own and len(observed) < 2:
+        raise ValueError(
+            "There is one episode, and recordings have numbers of their own (`own`): nothing could be left out of a "
+            "fit. Record more."
+        )
     nulls: list[Explanation] = []
     for effect in effects:
         with np.errstate(divide="ignore"):

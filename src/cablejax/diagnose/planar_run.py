@@ -31,6 +31,7 @@ from cablejax.diagnose.run import Examined, explain, settings_of
 from cablejax.diagnose.search import Search
 from cablejax.diagnose.where import localise
 from cablejax.effects import LIBRARY, CableEffect
+from cablejax.gaplog_join import joined
 from cablejax.types import GapLog
 
 _ARMS = "The arms do not follow their commands, and no effect of the library explains why."
@@ -74,6 +75,8 @@ def diagnose(
     given, stated, case = calibration, 0.0, Case.of(log, effects)
     calibration = given or calibrated(log.meta["cable"]["length_m"])
     if commissioning:
+        # refuses what is of another set-up, or in the log itself
+        joined([log, *commissioning], ["the log", *(f"commissioning log {i + 1}" for i in range(len(commissioning)))])
         calibration = dataclasses.replace(calibration, baseline=baseline_error(commissioning))
     if given is None:
         stated = case.stated_error()

@@ -10,7 +10,7 @@ from typing import Any
 
 from cablejax.dataset.opening import package_versions
 from cablejax.text_file import differences, read_json, version_of, write_json
-from cablejax.whole_file import sole_writer
+from cablejax.whole_file import holds_anything, sole_writer
 
 SCHEMA = "cablejax-training/1"
 """Name and version of the folder's layout; `run.json` without it is of version 1."""
@@ -66,7 +66,7 @@ def claim_folder(
                 "folder, repeat it with the same configuration and data, or overwrite it (--overwrite)."
             )
         _discard(out_dir)
-    elif out_dir.is_dir() and any(out_dir.iterdir()):
+    elif out_dir.is_dir() and holds_anything(out_dir):
         if not overwrite:
             raise ValueError(
                 f"{out_dir} exists and is not empty, and holds no training. Choose another folder, or write among what "

@@ -144,7 +144,8 @@ def _detours(points: Float[np.ndarray, "T N D"]) -> float:
 
 
 def _broken(points: Float[np.ndarray, "*B N D"], usual: Float[np.ndarray, " M"]) -> np.ndarray:
-    ratio = spacing(points) / usual
+    with np.errstate(invalid="ignore", divide="ignore"):
+        ratio = spacing(points) / usual
     return (_worst_turn(points) < FOLDED) | (np.where(np.isfinite(ratio), ratio, 1.0).max(axis=-1) > STRETCHED)
 
 
@@ -152,8 +153,9 @@ def _reversed(take: Take, usual: Float[np.ndarray, " M"]) -> bool:
     seen = spacing(take.keypoints)
     if not np.isfinite(seen).any(axis=0).all():
         return False
-    own = np.log(np.nanmedian(seen, axis=0))
-    return bool(abs(own - np.log(usual)).max() > _OTHER and abs(own[::-1] - np.log(usual)).max() < _SAME)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        own, usually = np.log(np.nanmedian(seen, axis=0)), np.log(usual)
+        return bool(abs(own - usually).max() > _OTHER and abs(own[::-1] - usually).max() < _SAME)
 
 
 def _tracked(points: Float[np.ndarray, "T N D"], usual: Float[np.ndarray, " M"]) -> np.ndarray:
