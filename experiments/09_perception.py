@@ -42,7 +42,7 @@ from closed_loop.cases import mujoco_plant, stiffness_cases
 from closed_loop.methods import METHODS, NO_PRIOR_LEARNER, model_named
 from closed_loop.suite import run_case
 from pages import markdown_table, page_of_results, publish
-from rows import Rows
+from rows import Rows, made_on
 
 HZ = 10
 FINE = 20
@@ -369,7 +369,8 @@ def main() -> None:
         ]
     command = "python experiments/09_perception.py --out docs/results/perception.md --figure docs/images/perception.png"
     made_by = f"`{command}{' --full' if options.full else ''}`"
-    publish(page_of_results("Perception: keypoints from point clouds", made_by, lines), options.out)
+    made = made_on(kept.rows.path)
+    publish(page_of_results("Perception: keypoints from point clouds", made_by, lines, made_on=made), options.out)
     if options.figure is not None:
         draw(options.figure, ours, drifts)
 

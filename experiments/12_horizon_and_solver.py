@@ -30,7 +30,7 @@ from cablejax.mpc import MPC, SOLVERS, LevenbergMarquardt, MPCConfig
 from closed_loop.cases import PLANT_CHAIN, mujoco_plant
 from closed_loop.protocols import LaidOut, letter_task
 from pages import markdown_table, page_of_results, publish
-from rows import Rows
+from rows import Rows, made_on
 
 CONVERGED = "levenberg-marquardt, converged"
 PLANNERS = {**SOLVERS, CONVERGED: LevenbergMarquardt(max_iterations=12, trials_per_linearisation=1)}
@@ -134,7 +134,7 @@ def draw(table: dict, path: Path) -> None:
     figure.savefig(path, dpi=140)
 
 
-def page(trials: list[Trial], table: dict, picture: str | None) -> str:
+def page(trials: list[Trial], table: dict, picture: str | None, made: str) -> str:
     """The Markdown page."""
     lines = [
         f"{len(trials)} closed loops: a straight cable, {STIFFNESS:g} times as stiff as the trained one, brought to "
@@ -190,7 +190,7 @@ def page(trials: list[Trial], table: dict, picture: str | None) -> str:
     ]
     lines += ["", "## Every run", "", *markdown_table(rows)]
     command = "python experiments/12_horizon_and_solver.py --report docs/results/horizon_and_solver.md"
-    return page_of_results("Horizon and solver", f"`{command}`", lines)
+    return page_of_results("Horizon and solver", f"`{command}`", lines, made_on=made)
 
 
 def main() -> None:
@@ -218,7 +218,7 @@ def main() -> None:
         image = options.report.parent.parent / "images" / "horizon_and_solver.png"
         draw(table, image)
         picture = f"../images/{image.name}"
-    text = page(trials, table, picture)
+    text = page(trials, table, picture, made_on(options.cache))
     publish(text, options.report)
 
 

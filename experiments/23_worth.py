@@ -49,10 +49,11 @@ from closed_loop.fine_tuning import FineTuneConfig, fine_tune
 from closed_loop.methods import MethodSpec
 from closed_loop.protocols import Task, letter_task
 from closed_loop.statistics import PairedDifference, paired_difference
-from closed_loop.suite import Case, read_suite, run_suite
+from closed_loop.suite import TRIALS, Case, read_suite, run_suite
 from closed_loop.trials import Trial
 from executors import add_option, executor_of
 from pages import markdown_table, page_of_results, publish
+from rows import made_on
 
 EFFECTS = (
     "stiffness_profile:centre_m=0.3,width_m=0.25,ratio=0.2",
@@ -250,7 +251,8 @@ def page(out: pathlib.Path) -> str:
             "",
         ]
     command = "python experiments/23_worth.py --out docs/results/trials/worth --report docs/results/worth.md"
-    return page_of_results("What a diagnosis is worth", f"`{command}`", lines)
+    made = made_on(out / "trials" / TRIALS)
+    return page_of_results("What a diagnosis is worth", f"`{command}`", lines, made_on=made)
 
 
 PAIRED_HEAD = (

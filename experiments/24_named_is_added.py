@@ -36,7 +36,7 @@ from cablejax.simulate.play import played
 from cablejax.types import GapLog
 from executors import add_option, executor_of
 from pages import markdown_table, page_of_results, publish
-from rows import Rows
+from rows import Rows, made_on
 from staged import EFFECTS
 
 LOGGED = ("approach_s", "mirror_approach_s", "overload_return", "translation", "ramp_hold", "taut")
@@ -114,7 +114,7 @@ def examine(text: str) -> dict[str, Any]:
     }
 
 
-def page(rows: list[dict[str, Any]]) -> str:
+def page(rows: list[dict[str, Any]], made: str) -> str:
     """The table, with how many of the staged effects are in the set, and the median of the shrinkage."""
     by_name = {row["effect"]: row for row in rows}
     floor = by_name["none"]["before_mm"] if "none" in by_name else 0.0
@@ -167,7 +167,10 @@ def page(rows: list[dict[str, Any]]) -> str:
     if "none" in by_name:
         lines += ["", f"Without a staged effect the verdict is **{by_name['none']['verdict']}**."]
     return page_of_results(
-        "What is named is added", "`python experiments/24_named_is_added.py --rows ROWS --report FILE`", lines
+        "What is named is added",
+        "`python experiments/24_named_is_added.py --rows ROWS --report FILE`",
+        lines,
+        made_on=made,
     )
 
 
@@ -180,7 +183,7 @@ def main() -> None:
     options = parser.parse_args()
     rows = Rows(options.rows, ("effect",))
     if options.report is not None:
-        publish(page(rows.read()), options.report)
+        publish(page(rows.read(), made_on(options.rows)), options.report)
         return
     wanted = [(text,) for text in ("none", *EFFECTS)]
     with executor_of(options.executor) as executor:

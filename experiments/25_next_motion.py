@@ -49,7 +49,7 @@ from cablejax.simulate.plant import Plant, PlantConfig
 from cablejax.simulate.play import played, settled
 from executors import add_option, executor_of
 from pages import markdown_table, page_of_results, publish
-from rows import Rows
+from rows import Rows, made_on
 
 ARMS: dict[str, Objective | None] = {"designed": "explanations", "fisher": "parameters", "random": None}
 """What the search maximises; None = no search."""
@@ -198,7 +198,7 @@ def made_in(row: dict[str, Any]) -> int:
     return len(row["logs"]) - 1
 
 
-def page(rows: Sequence[dict[str, Any]]) -> str:
+def page(rows: Sequence[dict[str, Any]], machines: str) -> str:
     """Set sizes and truth in the set by arm and number of added motions, over seeds that all arms have."""
     arms = [arm for arm in ARMS if any(row["arm"] == arm for row in rows)]
     common = set.intersection(*({row["seed"] for row in rows if row["arm"] == arm} for arm in arms)) if arms else set()
@@ -258,7 +258,7 @@ def page(rows: Sequence[dict[str, Any]]) -> str:
         f"`python experiments/25_next_motion.py --seeds {max(common, default=0)}` and "
         "`--report docs/results/next_motion.md`"
     )
-    return page_of_results("The next motion", made_by, lines)
+    return page_of_results("The next motion", made_by, lines, made_on=machines)
 
 
 def main() -> None:
@@ -272,7 +272,7 @@ def main() -> None:
     options = parser.parse_args()
     rows = Rows(options.rows, ("seed", "arm"))
     if options.report is not None:
-        publish(page(rows.read()), options.report)
+        publish(page(rows.read(), made_on(options.rows)), options.report)
         return
     wanted = [(seed, arm) for seed in range(1, options.seeds + 1) for arm in options.arms]
     with executor_of(options.executor) as executor:

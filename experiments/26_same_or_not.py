@@ -31,7 +31,7 @@ from cablejax.gaplog_join import chosen, joined
 from cablejax.types import GapLog
 from executors import add_option, executor_of
 from pages import markdown_table, page_of_results, publish
-from rows import Rows
+from rows import Rows, made_on
 
 
 def half(log: GapLog, first: int) -> GapLog:
@@ -79,7 +79,7 @@ def main() -> None:
     options = parser.parse_args()
     rows = Rows(options.rows, ("first", "second"))
     if options.report is not None:
-        publish(page(rows.read()), options.report)
+        publish(page(rows.read(), made_on(options.rows)), options.report)
         return
     if options.logs is None:
         parser.error("--logs is missing: the folder of gap logs.")
@@ -96,7 +96,7 @@ def main() -> None:
         rows.run(rows.missing(pairs), make, executor=executor)
 
 
-def page(rows: Sequence[dict[str, Any]]) -> str:
+def page(rows: Sequence[dict[str, Any]], made: str) -> str:
     """The page of all rows."""
     table = [("recordings", "pairs", "contradict one another", "no effect to compare", "median seconds")]
     for title, same in (("of one set-up", True), ("of two set-ups", False)):
@@ -118,7 +118,7 @@ def page(rows: Sequence[dict[str, Any]]) -> str:
         + ".",
     ]
     made_by = "`python experiments/26_same_or_not.py --rows ROWS.jsonl --report docs/results/same_or_not.md`"
-    return page_of_results("Do recordings agree?", made_by, lines)
+    return page_of_results("Do recordings agree?", made_by, lines, made_on=made)
 
 
 if __name__ == "__main__":

@@ -31,10 +31,11 @@ from cablejax.simulate.play import played
 from closed_loop.cases import PLANT_CHAIN
 from closed_loop.methods import MethodSpec
 from closed_loop.protocols import Task, letter_task
-from closed_loop.suite import Case, read_suite, run_suite
+from closed_loop.suite import TRIALS, Case, read_suite, run_suite
 from closed_loop.trials import Trial
 from executors import add_option, executor_of
 from pages import markdown_table, page_of_results, publish
+from rows import made_on
 from staged import EFFECTS
 
 NONE = "none"
@@ -57,7 +58,7 @@ def main() -> None:
     add_option(parser)
     options = parser.parse_args()
     if options.report is not None:
-        publish(page(read_suite(options.out)[0]), options.report)
+        publish(page(read_suite(options.out)[0], made_on(options.out / TRIALS)), options.report)
         return
     with executor_of(options.executor) as executor:
         run_suite(cases(), METHODS, options.out, fine_tuned=_never, executor=executor)
@@ -109,7 +110,7 @@ def shown(text: str, shape: Shape) -> np.ndarray:
     return played(plant_with(text), poses[0], twist, INTERVAL, motion=shape).keypoints[-1]
 
 
-def page(trials: Sequence[Trial]) -> str:
+def page(trials: Sequence[Trial], made: str) -> str:
     """The table, dearest effect first."""
     seeds = len({trial.seed for trial in trials})
     kept = {text: [trial for trial in trials if trial.table == text] for text in (NONE, *EFFECTS)}
@@ -137,7 +138,7 @@ def page(trials: Sequence[Trial]) -> str:
         *markdown_table([head, *rows]),
     ]
     command = "python experiments/28_cost_of_effects.py --report docs/results/cost_of_effects.md"
-    return page_of_results("What an unknown effect costs", f"`{command}`", lines)
+    return page_of_results("What an unknown effect costs", f"`{command}`", lines, made_on=made)
 
 
 def late(trials: Sequence[Trial], method: str, shape: str | None = None) -> float:

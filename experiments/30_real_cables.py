@@ -23,7 +23,7 @@ from pages import publish
 from real_cables.benchmark import score_cable
 from real_cables.page import errors_figure, page, read_published
 from real_cables.protocol import cables_in
-from rows import Rows
+from rows import Rows, made_on
 
 _PUBLISHED = pathlib.Path(__file__).parent / "real_cables" / "published.csv"
 
@@ -57,7 +57,7 @@ def main() -> None:
     picture = arguments.figure or out.parent.parent / "images" / f"{out.stem}.png"
     picture.parent.mkdir(parents=True, exist_ok=True)
     errors_figure(scores, published, picture)
-    publish(page(scores, published, os.path.relpath(picture, out.parent)), out)
+    publish(page(scores, published, os.path.relpath(picture, out.parent), made_on(rows.path)), out)
 
 
 def _key(recordings: DeformRecordings) -> tuple[str, str]:

@@ -36,7 +36,7 @@ from real_cables.benchmark import errors_of
 from real_cables.known import REPORTED, with_true_values
 from real_cables.protocol import protocol_windows
 from real_cables.synthetic import EFFECTS, RECORDINGS, SAMPLES, Law, synthetic_recordings
-from rows import Rows
+from rows import Rows, made_on
 
 HELD_OUT = range(1480, 1520)
 """Seeds of the page: nothing is chosen on these cables."""
@@ -187,7 +187,7 @@ def bias(rows: list[dict[str, Any]]) -> str:
     return f"{100 * off.mean():+.1f} ± {100 * error:.1f} %"
 
 
-def page(rows: list[dict[str, Any]]) -> str:
+def page(rows: list[dict[str, Any]], made: str) -> str:
     """The page of these cables."""
     broken = sum("broken" in row for row in rows)
     rows = sorted((row for row in rows if "broken" not in row), key=lambda row: row["seed"])
@@ -255,7 +255,7 @@ def page(rows: list[dict[str, Any]]) -> str:
     ]
     command = f"`python experiments/34_fresh_cables.py --cables {HELD_OUT.start}:{HELD_OUT.stop}`"
     made_by = f"{command} and `--report docs/results/fresh_cables.md`"
-    return page_of_results("Fresh synthetic cables: is what they have named?", made_by, lines)
+    return page_of_results("Fresh synthetic cables: is what they have named?", made_by, lines, made_on=made)
 
 
 def main() -> None:
@@ -272,7 +272,7 @@ def main() -> None:
         done = [row for row in rows.read() if row["seed"] in HELD_OUT]
         if all("broken" in row for row in done):
             raise SystemExit(f"{options.trials} has no finished cable of the seeds {HELD_OUT.start}:{HELD_OUT.stop}.")
-        publish(page(done), options.report)
+        publish(page(done, made_on(options.trials)), options.report)
         return
     if options.calibrate:
         chosen_on = [row for row in rows.read() if row["seed"] < HELD_OUT.start and "broken" not in row]

@@ -44,7 +44,7 @@ from pages import markdown_table, page_of_results, publish
 from real_cables.benchmark import errors_of, shared_only
 from real_cables.protocol import cables_in, protocol_windows
 from real_cables.synthetic import synthetic_recordings
-from rows import Rows
+from rows import Rows, made_on
 
 FIRST, CANDIDATES = 3, 12
 """Windows that are known at first, and windows that the next one is chosen from."""
@@ -132,7 +132,7 @@ def main() -> None:
     options = parser.parse_args()
     rows = Rows(options.rows, ("cable", "seed"))
     if options.report is not None:
-        publish(page(rows.read()), options.report)
+        publish(page(rows.read(), made_on(options.rows)), options.report)
         return
     names = [SYNTHETIC] if options.data is None else cables_in(pathlib.Path(options.data))
     wanted = [(name, seed) for seed in range(options.seeds) for name in names]
@@ -140,7 +140,7 @@ def main() -> None:
         rows.run(rows.missing(wanted), functools.partial(trial, options.data), executor=executor)
 
 
-def page(rows: Sequence[dict[str, Any]]) -> str:
+def page(rows: Sequence[dict[str, Any]], made: str) -> str:
     """The tables, and what they are of."""
     real = [row for row in rows if row["cable"] != SYNTHETIC]
     known = [row | _off(row) for row in rows if row["cable"] == SYNTHETIC]
@@ -166,7 +166,7 @@ def page(rows: Sequence[dict[str, Any]]) -> str:
         "`python experiments/35_next_recording.py --data $CABLEJAX_DATA/deform`, the same with `--seeds 12` and no "
         "`--data`, and `--report docs/results/next_recording.md`"
     )
-    return page_of_results("The next recording of a cable in space", made_by, lines)
+    return page_of_results("The next recording of a cable in space", made_by, lines, made_on=made)
 
 
 def _off(row: dict[str, Any]) -> dict[str, Any]:

@@ -27,7 +27,7 @@ def page_of_results(title: str, made_by: str, lines: Sequence[str], *, made_on: 
         title: its first line.
         made_by: the command that makes it, in backticks, and whatever else had to run.
         lines: of Markdown, all that follows the head.
-        made_on: versions and machine; by default those of this process.
+        made_on: versions and machine, see `rows.made_on`; by default those of this process.
     """
     made_on = f"{versions()}; {machine()}." if made_on is None else made_on
     return "\n".join([f"# {title}", "", f"Made by {made_by}.", made_on, "", *lines]).rstrip("\n") + "\n"

@@ -3,26 +3,32 @@
 A line is written by one call and flushed to the disk before the next row is computed, so that a run that was killed
 loses at most the rows that were not finished: readers ignore a torn last line, and the next writer cuts it off. Other
 processes or hosts may compute rows (`executors`), and several processes may append to one file. Infinity and NaN, which
-JSON has no numbers for, are the strings "inf", "-inf" and "nan".
+JSON has no numbers for, are the strings "inf", "-inf" and "nan". A row keeps the versions and the machine that made it:
+whoever prints a page of it later may have others.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import fcntl
+import functools
 import json
 import math
 import os
 import pathlib
 import time
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import Executor
 from typing import Any
 
 from tqdm import tqdm
 
+from cablejax.report.provenance import machine, versions
 from executors import results
 
+MADE_ON = "made_on"
+"""Field of a row: versions and machine that made it, in words."""
 _NO_NUMBERS = ("inf", "-inf", "nan")
 
 
@@ -39,7 +45,7 @@ class Rows:
     key: tuple[str, ...]
 
     def read(self) -> list[dict[str, Any]]:
-        """The rows in the order of their first appearance; of two with the same key the later one counts.
+        """The rows in the order of their first appearance, without `MADE_ON`; of two with one key the later one counts.
 
         Raises:
             ValueError: a line is not a JSON object, or lacks a field of the key.
@@ -48,6 +54,7 @@ class Rows:
         for number, row in enumerate(read_rows(self.path), start=1):
             if absent := [name for name in self.key if name not in row]:
                 raise ValueError(f"{self.path}, line {number} has no field {absent}: remove that line to go on.")
+            row.pop(MADE_ON, None)
             rows[tuple(row[name] for name in self.key)] = row
         return list(rows.values())
 
@@ -81,10 +88,28 @@ class Rows:
         """
         began, keys = time.perf_counter(), list(keys)
         with tqdm(total=len(keys), unit="row", disable=not progress, dynamic_ncols=True) as bar:
-            for key, made in results(executor, make, keys, going=lambda: time.perf_counter() - began <= seconds):
+            going = functools.partial(_within, began, seconds)
+            for key, (made, where) in results(executor, functools.partial(_made, make), keys, going=going):
                 bar.set_postfix_str(" ".join(map(str, key)))
-                append_row(self.path, {**dict(zip(self.key, key, strict=True)), **keep(made)})
+                append_row(self.path, {**dict(zip(self.key, key, strict=True)), **keep(made), MADE_ON: where})
                 bar.update()
+
+
+def _within(began: float, seconds: float) -> bool:
+    return time.perf_counter() - began <= seconds
+
+
+def _made(make: Callable[..., Any], *key: Any) -> tuple[Any, str]:
+    """What `make` returns, and where it was called."""
+    return make(*key), f"{versions()}; {machine()}"
+
+
+def made_on(path: str | os.PathLike[str]) -> str:
+    """Versions and machine that made the rows of a file, in a sentence; each with its count where there are several."""
+    counts = Counter(row.get(MADE_ON, "versions and machine were not kept") for row in read_rows(path))
+    if len(counts) == 1:
+        return f"{next(iter(counts))}."
+    return " ".join(f"{count} rows: {where}." for where, count in counts.most_common())
 
 
 def append_row(path: str | os.PathLike[str], row: Mapping[str, Any]) -> None:

@@ -68,7 +68,7 @@ def test_a_suite_is_shared_resumed_and_read_whole(tmp_path):
     assert before == {path: path.read_bytes() for path in tmp_path.iterdir()}
     extent = Extent(lambda seeds: [one for one in cases if one.seed in seeds], range(2), ())
     experiment = Experiment("x", "x.py", "Title", "About.", extent, extent, ("III", "IV"))
-    text = page(experiment, trials, "python x.py", picture=None)
+    text = page(experiment, trials, "python x.py", "where", picture=None)
     assert "| online visual servo | 2 |" in text and "Table IV" not in text and "Seeds: 0, 1." in text
     assert "### How runs end" in text and "| online visual servo | U | 2 |" in text
     assert re.search(r"takes, on average: U [789]\.\d s\.", text)

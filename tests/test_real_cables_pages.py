@@ -124,7 +124,7 @@ def test_a_page_of_any_cables(tmp_path):
     published = read_published(tmp_path / "published.csv")
     scores = {"one": score(True), "two": score(False), "three": score(False), "four": score(False)}
     errors_figure(scores, published, tmp_path / "errors.png")
-    text = page(scores, published, "errors.png")
+    text = page(scores, published, "errors.png", "where")
     assert (tmp_path / "errors.png").stat().st_size > 5000
     assert text.index("## By recording") < text.index("## Upstream's eval split")
     assert "| **rod + ridge** | **4.0** | **4.0** | **4.0** | **4.0** |" in text
@@ -132,7 +132,7 @@ def test_a_page_of_any_cables(tmp_path):
     assert "| theirs, as published | 9.5 |" in text and "neither" not in text and "DLO" not in text
     assert "| **rod + ridge** | **3.0 (9.0)** |" in text and "1 / 0 of 7 |" in text and "7 of 57 for one" in text
     assert "2.5 to 3.5" in text and "Of two, 1 blocks are left out" in text
-    without = page({"two": score(False)}, published, "errors.png")
+    without = page({"two": score(False)}, published, "errors.png", "where")
     assert "eval [mm]" not in without and "Upstream's eval" not in without
     (tmp_path / "published.csv").write_text("method,one\ntheirs,ten\n")
     with pytest.raises(ValueError, match="no number of millimetres"):

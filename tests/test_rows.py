@@ -5,7 +5,8 @@ import multiprocessing
 
 import pytest
 
-from rows import Rows, append_row, read_rows
+from cablejax.report.provenance import machine, versions
+from rows import Rows, append_row, made_on, read_rows
 
 WANTED = [("a", 1), ("a", 2), ("b", 1), ("b", 2)]
 
@@ -60,3 +61,13 @@ def test_a_row_without_its_key_is_refused(tmp_path):
     append_row(rows.path, {"letter": "a"})
     with pytest.raises(ValueError, match=r"line 1 has no field \['number'\]"):
         rows.read()
+
+
+def test_rows_say_where_they_were_made(tmp_path):
+    rows = rows_of(tmp_path)
+    rows.run(WANTED, times, progress=False)
+    assert "made_on" not in rows.read()[0]
+    here = made_on(rows.path)
+    assert here == f"{versions()}; {machine()}."
+    append_row(rows.path, {"letter": "c", "number": 1})
+    assert made_on(rows.path) == f"4 rows: {here} 1 rows: versions and machine were not kept."

@@ -22,9 +22,10 @@ from closed_loop.fine_tuning import FineTuneConfig, fine_tune, record
 from closed_loop.harder import MARGIN_CM
 from closed_loop.methods import METHODS, NO_PRIOR_LEARNER, WITHOUT_LEARNING, model_named
 from closed_loop.protocols import least_time
-from closed_loop.suite import Case, read_suite, run_suite
+from closed_loop.suite import TRIALS, Case, read_suite, run_suite
 from closed_loop.trials import LATE, LIANG_TABLE, Trial
 from pages import page_of_results, publish
+from rows import made_on
 
 WORST = 10
 """Runs shown as pictures: the ones that ended farthest off."""
@@ -106,7 +107,8 @@ def main(experiment: Experiment, arguments: Sequence[str] | None = None) -> None
         if snapshots := [snapshot for snapshot in pictures if snapshot.key in shown]:
             failure_figure(worst(snapshots, WORST)).savefig(picture, dpi=110, bbox_inches="tight")
     name = picture.name if picture is not None and picture.exists() else None
-    publish(page(experiment, trials, command(experiment, options), picture=name), options.report)
+    made = made_on(folder / TRIALS)
+    publish(page(experiment, trials, command(experiment, options), made, picture=name), options.report)
 
 
 def seed_range(text: str) -> range:
@@ -127,7 +129,7 @@ def fine_tuned_model(folder: pathlib.Path, case: Case) -> Model:
     return model_named(str(home))
 
 
-def page(experiment: Experiment, trials: Sequence[Trial], command: str, picture: str | None) -> str:
+def page(experiment: Experiment, trials: Sequence[Trial], command: str, made: str, picture: str | None) -> str:
     """The Markdown page of an experiment's trials."""
     lines = [experiment.about]
     for table in experiment.tables:
@@ -168,7 +170,7 @@ def page(experiment: Experiment, trials: Sequence[Trial], command: str, picture:
             lines += ["", "### In pairs", "", interval_tables.paired_table(mine, table, NO_PRIOR_LEARNER)]
     if picture is not None:
         lines += ["", "## The runs that ended farthest off", "", f"![start, end and target of each]({picture})"]
-    return page_of_results(experiment.title, f"`{command}`", lines)
+    return page_of_results(experiment.title, f"`{command}`", lines, made_on=made)
 
 
 def seeds_text(seeds: set[int]) -> str:

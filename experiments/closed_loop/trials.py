@@ -11,7 +11,7 @@ import numpy as np
 
 from cablejax.control.run import settling_time, time_in_band
 from cablejax.mpc import ObjectiveConfig
-from rows import read_rows
+from rows import MADE_ON, read_rows
 
 if TYPE_CHECKING:
     from cablejax.control.run import ClosedLoopRun
@@ -155,6 +155,7 @@ def read_trials(path: str | os.PathLike[str]) -> list[Trial]:
     """
     trials: dict[TrialKey, Trial] = {}
     for number, fields in enumerate(read_rows(path), start=1):
+        fields.pop(MADE_ON, None)
         trial = _parsed(fields, f"{os.fspath(path)}, line {number}")
         trials[trial.key] = trial
     return list(trials.values())

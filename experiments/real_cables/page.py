@@ -11,7 +11,6 @@ from typing import Any
 import matplotlib
 from matplotlib.figure import Figure
 
-from cablejax.report.provenance import machine, versions
 from pages import markdown_table
 
 _NINETY = 1.645
@@ -77,13 +76,14 @@ def errors_figure(scores: Mapping[str, Any], published: Published, path: pathlib
     figure.savefig(path, dpi=130)
 
 
-def page(scores: Mapping[str, Any], published: Published, picture: str) -> str:
+def page(scores: Mapping[str, Any], published: Published, picture: str, made: str) -> str:
     """The page in Markdown.
 
     Args:
         scores: fields of a `CableScore` by cable.
         published: by `read_published`.
         picture: path of the figure, from the page.
+        made: versions and machine, see `rows.made_on`.
     """
     every, scored = list(scores), [cable for cable in scores if scores[cable]["learned"][0][2] is not None]
     learned = [name for name, *_ in scores[every[0]]["learned"]]
@@ -130,7 +130,7 @@ def page(scores: Mapping[str, Any], published: Published, picture: str) -> str:
         "",
         "---",
         "",
-        f"Made by `python experiments/30_real_cables.py --data DEFORM`. {versions()}; {machine()}.",
+        f"Made by `python experiments/30_real_cables.py --data DEFORM`. {made}",
         "",
     ]
     return "\n".join(lines)
