@@ -15,8 +15,8 @@ from cablejax.diagnose.evidence import Evidence
 from cablejax.diagnose.gap import measure_gap
 from cablejax.diagnose.noise import noise_floor
 from cablejax.diagnose.protocol import explanation
-from cablejax.diagnose.where import HORIZONS, Where
-from cablejax.diagnose.where_sizes import above, sizes_of
+from cablejax.diagnose.where import HORIZONS, Where, above
+from cablejax.diagnose.where_sizes import sizes_of
 from cablejax.spatial.cable import MORE_EDGES, SpatialCable, bounded
 from cablejax.spatial.windows import Windows, labels
 from cablejax.types import GapLog
