@@ -55,3 +55,11 @@ def quaternion_product(a: Float[Any, "*B 4"], b: Float[Any, "*B 4"]) -> Float[An
     scalar = a[..., :1] * b[..., :1] - xp.sum(a[..., 1:] * b[..., 1:], axis=-1, keepdims=True)
     vector = a[..., :1] * b[..., 1:] + b[..., :1] * a[..., 1:] + xp.cross(a[..., 1:], b[..., 1:])
     return xp.concatenate([scalar, vector], axis=-1)
+
+
+def positions_at(
+    at: Float[np.ndarray, " G"], time: Float[np.ndarray, " T"], position: Float[np.ndarray, "T *B"]
+) -> Float[np.ndarray, "G *B"]:
+    """Positions at other times, on straight lines between those known; the first and the last are held."""
+    columns = [np.interp(at, time, column) for column in position.reshape(len(position), -1).T]
+    return np.stack(columns, axis=1).reshape(len(at), *position.shape[1:])

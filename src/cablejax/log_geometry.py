@@ -149,7 +149,7 @@ def cable_fault(log: GapLog) -> str | None:
                 if crossed < near
                 else "are the keypoints and the poses in one frame, in metres, and of one cable?"
             )
-            return f"Keypoint {name} is {away:.2g} m from gripper {gripper}, expected it at the gripper: {advice}"
+            return f"Keypoint {name} is {away:.2f} m from gripper {gripper}, expected it at the gripper: {advice}"
     # chords are shorter than the cable between them, the more so the fewer there are
     chord = np.linalg.norm(np.diff(points, axis=1), axis=-1) / np.diff(log.meta["keypoint_arclength_m"])
     ratio = float(np.nanmedian(chord)) if np.isfinite(chord).any() else 1.0

@@ -14,7 +14,7 @@ import itertools
 import numpy as np
 from jaxtyping import Float
 
-from cablejax.arrays import quaternion_product, wrapped
+from cablejax.arrays import positions_at, quaternion_product, wrapped
 
 _X = np.array([1.0, 0.0, 0.0])
 
@@ -122,14 +122,6 @@ def poses_at(
     found = positions_at(at, time, with_one_sign(pose))
     found[..., 3:] /= np.linalg.norm(found[..., 3:], axis=-1, keepdims=True)
     return found
-
-
-def positions_at(
-    at: Float[np.ndarray, " G"], time: Float[np.ndarray, " T"], position: Float[np.ndarray, "T *B"]
-) -> Float[np.ndarray, "G *B"]:
-    """Positions at other times, on straight lines between those known; the first and the last are held."""
-    columns = [np.interp(at, time, column) for column in position.reshape(len(position), -1).T]
-    return np.stack(columns, axis=1).reshape(len(at), *position.shape[1:])
 
 
 def without_misreadings(

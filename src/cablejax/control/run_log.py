@@ -8,13 +8,13 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from cablejax.arrays import positions_at
 from cablejax.cable import Cable
 from cablejax.control.link_state import Instant, Reply, Status
 from cablejax.control.run import ClosedLoopRun, shape_error_cm
 from cablejax.control.targets import Target
 from cablejax.gaplog import TARGETS, Episode, gap_log_from_episodes
 from cablejax.limits import LIMITS
-from cablejax.poses import positions_at
 from cablejax.simulate.table_plant import Observation
 from cablejax.types import GapLog
 

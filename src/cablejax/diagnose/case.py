@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
+from cablejax.arrays import positions_at
 from cablejax.cable import Discretisation
 from cablejax.cable_file import config_of_log
 from cablejax.diagnose.actuation import Actuation, actuation
@@ -24,7 +25,6 @@ from cablejax.diagnose.regimes import largest_curvature
 from cablejax.diagnose.run import weighed
 from cablejax.effects import LIBRARY, CableEffect
 from cablejax.effects.physics import nominal_physics
-from cablejax.poses import positions_at
 from cablejax.simulate.chain.replay import FINE_STEP, LARGEST_STEP, SETTLING
 from cablejax.types import GapLog
 

@@ -13,8 +13,8 @@ import dataclasses
 import numpy as np
 from jaxtyping import Float
 
+from cablejax.arrays import positions_at
 from cablejax.gaplog import Episode
-from cablejax.poses import positions_at
 
 # A clock whose samples are all within this share of the interval from an even one is even.
 _EVEN = 0.01

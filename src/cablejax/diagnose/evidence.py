@@ -12,8 +12,8 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float, Int
 
+from cablejax.arrays import positions_at
 from cablejax.diagnose.protocol import Explanation, Simulator
-from cablejax.poses import positions_at
 
 _ALIKE = 0.05
 """Motions whose gripper poses differ by less than this share of the cable's length, root mean square, are one."""

@@ -9,9 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from cablejax.arrays import positions_at
 from cablejax.diagnose.clock import keypoints_at
 from cablejax.diagnose.recording import Recording
-from cablejax.poses import positions_at
 from cablejax.residual.learner import PAPER
 from cablejax.residual.ridge import RidgeConfig, apply, fit
 

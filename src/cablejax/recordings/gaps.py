@@ -13,8 +13,8 @@ import itertools
 import numpy as np
 from jaxtyping import Bool, Float
 
-from cablejax.arrays import stretches
-from cablejax.poses import poses_at, positions_at, without_misreadings
+from cablejax.arrays import positions_at, stretches
+from cablejax.poses import poses_at, without_misreadings
 from cablejax.recordings.take import Take, median_step
 
 FILLED = 0.05

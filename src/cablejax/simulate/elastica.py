@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.integrate import cumulative_trapezoid, solve_bvp
 
-from cablejax.poses import positions_at
+from cablejax.arrays import positions_at
 
 MESH = 61
 """Points of the initial collocation mesh."""
