@@ -175,10 +175,8 @@ def _commissioned(log: GapLog, commissioning: Sequence[GapLog]) -> float:
 
 def baseline_error(logs: Sequence[GapLog]) -> float:
     """Root mean square error per coordinate above the noise [m] on logs without any effect."""
-    squares = []
-    for log in logs:
-        evidence = Case.of(log).evidence(Calibration())
-        squares.append(excess(evaluate(evidence, [explanation()])[0], evidence) ** 2)
+    every = [Case.of(log).evidence(Calibration()) for log in logs]
+    squares = [excess(evaluate(one, [explanation()])[0], one) ** 2 for one in every]
     return max(float(np.sqrt(np.mean(squares))), 5e-5)
 
 
