@@ -88,15 +88,13 @@ class Rows:
         """
         began, keys = time.perf_counter(), list(keys)
         with tqdm(total=len(keys), unit="row", disable=not progress, dynamic_ncols=True) as bar:
-            going = functools.partial(_within, began, seconds)
-            for key, (made, where) in results(executor, functools.partial(_made, make), keys, going=going):
+            stamped = functools.partial(_made, make)
+            for key, (made, where) in results(
+                executor, stamped, keys, going=lambda: time.perf_counter() - began <= seconds
+            ):
                 bar.set_postfix_str(" ".join(map(str, key)))
                 append_row(self.path, {**dict(zip(self.key, key, strict=True)), **keep(made), MADE_ON: where})
                 bar.update()
-
-
-def _within(began: float, seconds: float) -> bool:
-    return time.perf_counter() - began <= seconds
 
 
 def _made(make: Callable[..., Any], *key: Any) -> tuple[Any, str]:

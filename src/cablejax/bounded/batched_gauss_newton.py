@@ -114,15 +114,13 @@ class BatchedGaussNewton:
                 if results[i] is not Result.STEP_LIMIT:
                     continue
                 trial = self._trial(at, damping[i])
-                if trial is None and not rejected[i]:
-                    # damping hides what a step along a valley promises
-                    trial, damping[i] = self._trial(at, _LEAST_DAMPING), _LEAST_DAMPING
                 if trial is None:
-                    # rejected steps raise the damping, and a step that is damped enough promises next to nothing
-                    promising = self._trial(at, _LEAST_DAMPING) is not None
-                    results[i] = Result.STALLED if promising else Result.CONVERGED
-                else:
-                    trials[i] = trial
+                    # a step that is damped enough promises next to nothing, along a valley soon
+                    trial, damping[i] = self._trial(at, _LEAST_DAMPING), _LEAST_DAMPING
+                    if trial is None or rejected[i]:
+                        results[i] = Result.CONVERGED if trial is None else Result.STALLED
+                        continue
+                trials[i] = trial
             if not trials:
                 break
             for i, there in zip(trials, linearise(trials), strict=True):

@@ -16,6 +16,8 @@ from jaxtyping import Float
 from cablejax.arrays import positions_at
 from cablejax.gaplog import Episode
 
+# Of an episode of one sample [s].
+_ANY_INTERVAL = 0.1
 # A clock whose samples are all within this share of the interval from an even one is even.
 _EVEN = 0.01
 # Samples farther apart than this many intervals have a gap between them, which is not bridged.
@@ -25,7 +27,9 @@ _CLOSE = 0.05
 
 
 def usual_interval(time: Float[np.ndarray, "T"]) -> float:
-    """Of an episode of at least two samples [s]: the mean, or the median where some are lost."""
+    """Of an episode [s]: the mean, or the median where some samples are lost; of a single sample any."""
+    if len(time) < 2:
+        return _ANY_INTERVAL
     step = np.diff(time)
     mean, median = float(step.mean()), float(np.median(step))
     return float(np.round(mean if step.max() <= _GAP * median else median, 9))

@@ -20,8 +20,6 @@ from cablejax.types import GapLog
 # Samples are padded to a multiple of this, so that logs of nearly equal length share one compiled program.
 _PADDING = 50
 _SHORTEST = 20
-# Of an episode of one sample.
-_ANY_INTERVAL = 0.1
 # Share of gravity in the plane of the table beyond which it is none.
 _STEEP = 0.9
 
@@ -116,7 +114,7 @@ def prepare(log: GapLog) -> Recording:
     for e, recorded in enumerate(episodes_of(log)):
         episode, misread = _continuous(recorded, observed=e not in short, commanded=not derived[e])
         caveats += [f"In episode {e} the pose of gripper {q} {words}" for q, words in misread.items()]
-        interval = usual_interval(episode.time) if len(episode.time) > 1 else _ANY_INTERVAL
+        interval = usual_interval(episode.time)
         if not is_even(episode.time, interval):
             caveats.append(
                 f"The clock of episode {e} is up to {1e3 * furthest_off(episode.time, interval):.0f} ms off an even "

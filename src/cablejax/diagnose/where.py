@@ -18,6 +18,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from cablejax.arrays import mean_of_finite, quarter_turn
+from cablejax.diagnose.clock import usual_interval
 from cablejax.diagnose.evidence import repeated_motions
 from cablejax.diagnose.regimes import Regimes, regimes_of
 from cablejax.diagnose.significance import (
@@ -102,9 +103,7 @@ def localise(log: GapLog, nominal: Float[np.ndarray, "E T N 2"], noise: Float[np
         raise ValueError("Not one keypoint is both observed and simulated: there is no gap to look at.")
     regimes = regimes_of(log, nominal, valid)
     pose = np.where(valid[..., None, None], log.gripper_pose, np.nan)
-    clocks = [time[:n] for time, n in zip(log.time, log.episode_length, strict=True)]
-    steps = np.array([np.median(np.diff(clock)) if len(clock) > 1 else np.nan for clock in clocks])
-    interval = np.where(np.isnan(steps), np.nanmin(np.append(steps, 1.0)), steps)
+    interval = np.array([usual_interval(time[:n]) for time, n in zip(log.time, log.episode_length, strict=True)])
     motion = repeated_motions(pose, interval, float(log.meta["cable"]["length_m"]))
     arclength = np.asarray(log.meta["keypoint_arclength_m"], float)
 
