@@ -1,4 +1,4 @@
-"""The command line: `cablejax COMMAND`."""
+"""Entry point of the command line: `cablejax COMMAND`."""
 
 from __future__ import annotations
 
@@ -53,10 +53,10 @@ _COMMANDS: Any = (
 _DESCRIPTION = """Two robot grippers bring a cable to a shape.
 
 Start with `cablejax demo`: it needs nothing else and writes a page to look at. To make your own model: describe your
-`cable` in a file, `simulate` a data set, `train` on it, `shape` a cable with the result, and `diagnose` what the
-simulator lacks; `study` does that in rounds on a simulated plant. A recording of a real cable is `import`ed first;
-`view` shows what any of them has written, `export` takes it to other programs. `cablejax COMMAND --help` explains each
-one, `cablejax --version` prints the version."""
+`cable` in a file, `simulate` a data set, `train` on it, `shape` a cable with the model, and `diagnose` what the
+simulator lacks. `study` diagnoses a simulated plant in rounds. `import` reads a recording of a real cable, `view` shows
+any file of these commands, and `export` writes it for other programs. `cablejax COMMAND --help` explains each command,
+`cablejax --version` prints the version."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

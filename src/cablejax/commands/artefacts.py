@@ -1,4 +1,4 @@
-"""Recognises what this package writes, by content: gap logs, data sets, weights, verdicts, runs and cables."""
+"""Recognises files of this package by their content: gap logs, data sets, weights, verdicts, runs and cables."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ _SUFFIXES: dict[str, Kind] = {
 
 
 def kind_of(source: str | pathlib.Path) -> tuple[Kind, pathlib.Path]:
-    """What a file or folder of this package is, and the file or folder to read it from.
+    """The kind of a file or folder of this package, and the file or folder to read it from.
 
     The content decides. A file whose content says nothing, such as a damaged one, is what its name says, so that the
     reader of that kind can say what is wrong with it. A plain name of no file is that of released weights.

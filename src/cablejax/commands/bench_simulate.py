@@ -1,4 +1,4 @@
-"""`cablejax bench simulate`: times the simulators, says how accurate they are, and how fast they fill a store."""
+"""`cablejax bench simulate`: measures speed and accuracy of the simulators, and how fast they fill a store."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ class BenchSimulate(Command):
     """Time the simulators, each at the time step at which it makes data: chain and MJX in a batch, C MuJoCo in threads.
 
     The engines take turns, and the median of the rounds counts. Accuracy is the distance of the keypoints from a
-    simulation at 2 ms, over random motions as data sets have them.
+    simulation at 2 ms, over random motions like those of data sets.
 
     Attributes:
-        batch: Cables that chain and MJX simulate at once; C simulates as many, one after the other.
+        batch: Cables that chain and MJX simulate at once; C MuJoCo simulates the same number one by one.
         seconds: Simulated seconds per round.
         rounds: How often each engine takes its turn.
         threads: Threads of C MuJoCo to compare with one.
@@ -137,7 +137,7 @@ class BenchSimulate(Command):
         )
 
     def data(self, cable: Cable) -> dict[str, Any]:
-        """Accuracy over random motions, and medians of what each part of making a store takes, once compiled."""
+        """Accuracy over random motions, and median times of each part of making a store, once compiled."""
         import numpy as np
 
         from cablejax.commands.workloads import data_stages, distance_from_fine, seconds_in_turns

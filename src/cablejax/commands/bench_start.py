@@ -1,4 +1,4 @@
-"""`cablejax bench start`: times what one waits for: start-up, the first control call, and a verdict by command."""
+"""`cablejax bench start`: times start-up, the first control call and a verdict."""
 
 from __future__ import annotations
 
@@ -30,10 +30,10 @@ _CACHE = ("JAX_COMPILATION_CACHE", "JAX_PERSISTENT_CACHE")
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class BenchStart(Command):
-    """Time start-up, the first control call and a verdict, each in a process of its own.
+    """Time start-up, the first control call and a verdict, each in a separate process.
 
-    Each runs with an empty folder for compiled programs, then with the folder as the first run has left it. Processor
-    time, of all cores together, is reported next to wall time: on a busy machine only that can be compared.
+    Each runs first with an empty cache of compiled programs, then with the cache that the first run filled. Processor
+    time, of all cores together, is reported next to wall time: on a busy machine only processor time is comparable.
 
     Attributes:
         logs: Gap logs to diagnose; by default one of a cable that is too soft, staged with the contact plant.
@@ -129,7 +129,7 @@ def _children_cpu() -> float:
 
 
 def twice(words: Sequence[str], programs: pathlib.Path, *, own: bool = False) -> dict[str, dict[str, float]]:
-    """Times of a Python process with an empty folder for compiled programs, and with what that run left there.
+    """Times of a Python process with an empty cache of compiled programs, and with the cache that this run filled.
 
     Args:
         words: after the interpreter on its command line.

@@ -1,4 +1,4 @@
-"""`cablejax cable`: a cable file to edit, or the cable inside of a data set, trained weights or a log."""
+"""`cablejax cable`: writes a cable file to edit, or the cable inside a data set, trained weights or a log."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class CableFile(Command):
-    """Write a cable file to edit: the reference cable, or the cable inside of a data set, trained weights or a log.
+    """Write a cable file to edit: the reference cable, or the cable inside a data set, trained weights or a log.
 
     `simulate` and `shape` take the file as `--cable`. Data sets, weights and logs keep the cable that they were made
     with.
@@ -83,7 +83,7 @@ def find_cable(source: str | pathlib.Path | None) -> Cable:
 
 
 def cable_of_verdict(path: pathlib.Path) -> Cable | None:
-    """The cable that a verdict's log stated; None where the verdict does not say.
+    """The cable of a verdict's log; None if the verdict does not state it.
 
     Raises:
         ValueError: it is no verdict, or its cable is none.
@@ -96,7 +96,7 @@ def cable_of_verdict(path: pathlib.Path) -> Cable | None:
 
 
 def check_verdicts(paths: Sequence[pathlib.Path], cable: Cable, remedy: str) -> None:
-    """Checks that verdicts are of this cable: an effect is one of the cable to which it is added.
+    """Checks that verdicts are on this cable, to which their effects are added.
 
     Says so where an effect is named beside an unknown cause.
 

@@ -1,4 +1,4 @@
-"""`cablejax demo`: the whole method on three shapes, with and without its online correction."""
+"""`cablejax demo`: runs the whole method on three shapes, with and without its online correction."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ PUSH = f"gravity_tilt:angle_rad=0.6,direction_rad=1.6,from_s={PUSHED_AT:g},until
 class Demo(Command):
     """Shape a cable into a U, an S and a Z with the released model, and make a page about it.
 
-    The cable is a fifth as stiff as the one the model was trained on and rubs on the table by another law. Each shape
-    is made with and without the online residual, and after 25 s the cable is pushed aside. Writes summary.json,
-    log.npz, report.html and demo.gif, and ends by diagnosing its own run until the push: diagnosis/report.html names
-    what the simulator lacks.
+    The cable is a fifth as stiff as the one that the model was trained on, and the table's friction follows another
+    law. Each shape is made with and without the online residual; after 25 s the cable is pushed aside. Writes
+    summary.json, log.npz, report.html and demo.gif. Then diagnoses its own run until the push: diagnosis/report.html
+    names what the simulator lacks.
 
     Attributes:
         out: Folder for the results.

@@ -1,4 +1,4 @@
-"""`cablejax diagnose`: where a simulator is wrong on a recorded run, and which effect causes it."""
+"""`cablejax diagnose`: finds where a simulator is wrong on a recorded run, and which effect causes it."""
 
 from __future__ import annotations
 
@@ -24,20 +24,20 @@ class Diagnose(Command):
     """Diagnose the gap between the simulator and a recorded run: where it lies, what causes it, how far it shrinks.
 
     Reads a gap log (`cablejax-gap-log/1`, as `cablejax shape` writes it) and writes report.html, verdict.json and the
-    figures. A log of six episodes on a table takes about half a minute; a log in space takes some minutes and
-    goes on where it was if interrupted.
+    figures. A log of six episodes on a table takes about half a minute. A log in space takes some minutes and resumes
+    if interrupted.
 
     Attributes:
         logs: The recorded run, an .npz file. Several of one set-up are diagnosed together, in the order in which they
             were recorded, and the verdict says what each one added.
         out: Folder of the report.
-        commissioning: Logs of the same set-up known to have no effect: they separate the simulator's own error from the
-            gap. For planar logs only.
-        only: Names of the effects to look for; by default all; in space all but intrinsic_curvature, which takes four
+        commissioning: Logs of the same set-up without any effect: they separate the simulator's own error from the gap.
+            For planar logs only.
+        only: Names of the effects to look for. By default all, in space all but intrinsic_curvature, which takes four
             times as long as the others together.
-        bounds: Bounds of a motion, a TOML file: the motion to record next is designed within them, instead of taken
-            from a few safe ones. For planar logs only.
-        overwrite: Replace a report that is there.
+        bounds: Bounds of a motion, a TOML file: designs the motion to record next within these bounds, instead of
+            choosing one of a few safe motions. For planar logs only.
+        overwrite: Replace an existing report.
     """
 
     logs: Annotated[tuple[pathlib.Path, ...], tyro.conf.Positional]

@@ -1,4 +1,4 @@
-"""`cablejax export`: gap logs and runs in the formats of other programs."""
+"""`cablejax export`: writes gap logs and runs in the formats of other programs."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ class Export(Command):
 
 
 def recorded(source: pathlib.Path) -> tuple[GapLog, dict[str, np.ndarray], str]:
-    """The log of a file or folder, the simulated keypoints where there are any, and where it is from, in Markdown.
+    """The log in a file or folder, its simulated keypoints if there are any, and its origin in Markdown.
 
     Raises:
         ValueError: it holds no log, or one that cannot be read.

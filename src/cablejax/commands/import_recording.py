@@ -1,4 +1,4 @@
-"""`cablejax import`: real recordings to gap logs."""
+"""`cablejax import`: turns real recordings into gap logs."""
 
 from __future__ import annotations
 
@@ -51,12 +51,12 @@ class Deform(_Import):
     """Import recordings of the DEFORM data set: three-dimensional motion capture of one cable.
 
     PATH is upstream's folder of one cable, with pickles in train/ and eval/, one such pickle, or an .npz. Pickles are
-    read without running anything that they say.
+    read without running any of their code.
 
     Attributes:
-        unit: Unit of length. By default metres, or another one where the length of the cable leaves no doubt.
+        unit: Unit of length. By default metres, or another unit if the cable's length fits only that.
         up: The axis that points up.
-        handedness: left: the coordinates are of a left-handed frame.
+        handedness: left: the coordinates are in a left-handed frame.
     """
 
     unit: Literal["m", "cm", "mm", "in"] | None = None
@@ -92,7 +92,7 @@ class Csv(_Import):
 class Mcap(_Import):
     """Import a ROS 2 bag or MCAP file with pose arrays; a small TOML file names its topics and units.
 
-    A log that `cablejax export mcap` wrote needs no such file.
+    A log that `cablejax export mcap` wrote needs no TOML file.
 
     Attributes:
         layout: The TOML file; docs/how_to/own_recording.md has an example.
@@ -101,7 +101,7 @@ class Mcap(_Import):
     layout: pathlib.Path = pathlib.Path("layout.toml")
 
     def imported(self):
-        """The log of the bag, and its repairs; an exported log as it was."""
+        """The log of the bag, and its repairs; an exported log unchanged."""
         from cablejax.recordings.bags import import_mcap
         from cablejax.recordings.mcap_log import read_mcap, written_here
 

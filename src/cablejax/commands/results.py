@@ -18,7 +18,7 @@ from cablejax.report.provenance import machine, versions
 
 
 def summarise(runs: Runs, total_s: float) -> dict[str, Any]:
-    """The summary of the runs; a number that there is none of is null.
+    """The summary of the runs; undefined numbers are null.
 
     Settling and planning times are those of the run with the residual, where there is one.
     """

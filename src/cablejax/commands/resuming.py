@@ -39,11 +39,11 @@ class Parts:
 
     @property
     def state(self) -> pathlib.Path:
-        """A file for what else there is to go on from."""
+        """A file for further progress to resume from."""
         return self.folder / _STATE
 
     def differing(self) -> list[str] | None:
-        """Names of the settings in which the command that began here and did not end differs; None where none began.
+        """Names of the settings in which the unfinished command of this folder differs; None if there is none.
 
         Raises:
             UsageError: the folder is not one that a command made, or its settings cannot be read.
@@ -67,13 +67,13 @@ class Parts:
         return list(differences(self._settings, found))
 
     def begin(self) -> None:
-        """Makes the folder ready; of a command of other settings, what it kept is deleted."""
+        """Prepares the folder; deletes the progress of a command with other settings."""
         self._discard()
         self.folder.mkdir(parents=True, exist_ok=True)
         write_json(self.folder / _SETTINGS, self._settings)
 
     def save(self, name: str, run: ClosedLoopRun) -> None:
-        """Keeps a run, whole or not at all."""
+        """Stores a run, whole or not at all."""
         fields = _flatten(run)
         text = {key: value for key, value in fields.items() if isinstance(value, (str, int)) or value is None}
         arrays = {key: value for key, value in fields.items() if key not in text}
@@ -81,7 +81,7 @@ class Parts:
             np.savez_compressed(stream, text=np.array(json.dumps(text)), **arrays)
 
     def load(self, name: str) -> ClosedLoopRun | None:
-        """A run that was kept; None where there is none, or a damaged one, which has to be made again."""
+        """A stored run; None if it is missing or damaged and has to be made again."""
         try:
             arrays = read_npz(self.folder / f"{name}{_RUN}", ["text"], _FIELDS, text=["text"])
             fields: dict[str, Any] = {**parse_json(str(arrays.pop("text"))), **arrays}
@@ -105,7 +105,7 @@ class Parts:
         return {file.name for file in self.folder.iterdir()}
 
     def remove(self) -> None:
-        """Deletes what the command kept, and the folder unless it holds something else."""
+        """Deletes the command's progress, and the folder unless it holds something else."""
         self._discard()
         with contextlib.suppress(OSError):
             self.folder.rmdir()

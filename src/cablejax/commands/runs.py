@@ -61,12 +61,12 @@ class Job:
 
     @property
     def out_of_reach(self) -> list[str]:
-        """Why targets are, in sentences."""
+        """Sentences on why targets are out of reach."""
         bounds = MPCConfig.for_length(self.model.config.length)
         return [text for target in self.targets if (text := not_within_reach(target, bounds))]
 
     def settings(self) -> dict[str, Any]:
-        """All that a run depends on, as for JSON: of the model its weights, since a name may stand for others later."""
+        """All that a run depends on, for JSON: of the model its weights, since a name may mean others later."""
         return {
             "model": {
                 "config": dataclasses.asdict(self.model.config),
@@ -186,7 +186,7 @@ def plant_of(
 
 
 def about(job: Job) -> str:
-    """Differences of the plant from the model's training data, and what the targets ask too much, in sentences.
+    """Sentences on how the plant differs from the model's training data, and on targets that are out of reach.
 
     Every ratio is computed: the plant's cable with its effects over the model's cable.
     """

@@ -1,4 +1,4 @@
-"""`cablejax shape`: one cable, one target, your own settings."""
+"""`cablejax shape`: shapes one cable into one target, with your own settings."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Shape(Command):
-    """Shape one cable into a target of your own, on a simulated plant: the model's cable and effects of your choice.
+    """Shape one cable into a target, on a simulated plant with the model's cable and effects of your choice.
 
     The target is a letter or a file: .npz or .json with "keypoints" [N, 2] in metres, or .csv with rows x,y. Writes
     summary.json, log.npz, report.html and demo.gif.
@@ -26,7 +26,7 @@ class Shape(Command):
         target: U, S, Z, or a file with the keypoints to reach.
         out: Folder for the results.
         overwrite: Replace the results that are in the folder.
-        method: residual: correct the model online. direct: trust it as it was trained. both: one run of each.
+        method: residual: correct the model online. direct: use the trained model alone. both: one run of each.
         weights: Released model by name, or the folder of a training by `cablejax train`.
         solver: How the controller finds its plan.
         steps: Commands, one second each.
@@ -34,22 +34,22 @@ class Shape(Command):
             that the model was trained on.
         plant_effect: An effect of the plant that the model may not know, as NAME:PARAMETER=VALUE,... in SI units; may
             be given several times. By default bending_stiffness:ratio=0.2; `none` for no effect. With from_s=... and
-            until_s=... it begins and ends in the middle of the run.
-        effect: An effect that the model is informed of, as for --plant-effect; may be given several times. What of it
-            enters the model: stiffness_profile, intrinsic_curvature, gripper_rotation_offset and gripper_compliance
-            change the shape in which its cable rests; bending_stiffness, table_friction and linear_density change the
-            first estimate of the cable, for a conditioned model.
-        with_: A verdict.json of `cablejax diagnose`: the model is informed, as by --effect, of the effects that it
-            names; where nothing of them enters it, of the first of their look-alikes that does.
+            until_s=... it begins and ends during the run.
+        effect: An effect that the model is informed of, written as for --plant-effect; may be given several times.
+            stiffness_profile, intrinsic_curvature, gripper_rotation_offset and gripper_compliance change the resting
+            shape of the model's cable; bending_stiffness, table_friction and linear_density change the initial estimate
+            of a conditioned model. Others do not enter the model.
+        with_: A verdict.json of `cablejax diagnose`: the model is informed of the named effects, as by --effect. If
+            none of them enters the model, it is informed of the first of their look-alikes that does.
         perception: true: the controller observes the simulated keypoints. cloud: it observes keypoints estimated from
             clouds of a depth camera; the printed errors are still those of the true keypoints.
         motion: Play this motion on the plant instead of shaping: a gap log with commands, such as the next_motion.npz
-            of `cablejax diagnose`. Writes log.npz only, of the cable in that log unless --cable is given; of the other
-            options only --plant-effect, --noise-mm, --links and --seed are used.
+            of `cablejax diagnose`. Writes only log.npz. The plant has the cable of that log unless --cable is given. Of
+            the other options only --plant-effect, --noise-mm, --links and --seed are used.
         noise_mm: Noise: standard deviation of the observed keypoints, per coordinate, or of the camera's range [mm]. By
-            default 0 for the first and 2 for the second.
-        links: Links of the plant's cable. Fewer are faster; the plant's own error grows with the square of their
-            length, and a diagnosis of the log takes it for a gap.
+            default 0 for keypoints and 2 for the range.
+        links: Links of the plant's cable. Fewer are faster, but the plant's own error grows with the square of their
+            length, and a diagnosis of the log mistakes this error for a gap.
     """
 
     resume_hint: ClassVar[str] = "Run the same command again: finished runs are kept and not repeated."

@@ -1,4 +1,4 @@
-"""`cablejax simulate`: a data set of cables moved at random."""
+"""`cablejax simulate`: generates a data set of cables moved at random."""
 
 from __future__ import annotations
 
@@ -23,33 +23,33 @@ if TYPE_CHECKING:
 class Simulate(Command):
     """Simulate random two-gripper motions of a cable and store them as training data.
 
-    The store can be interrupted at any time: the same command goes on where it stopped. Several processes may share
-    the work, each with its own --process-index; the result does not depend on how many there are.
+    The command can be interrupted at any time, and resumes when it is run again. Several processes may share the work,
+    each with its own --process-index; the result does not depend on their number.
 
     Attributes:
         out: Folder of the data set (a Zarr v3 store), or its place in object storage, s3://BUCKET/PREFIX.
         trajectories: How many trajectories to simulate.
         steps: Commands per trajectory, one second each.
         start: How each cable lies at first: straight, or at rest between gripper poses drawn at random.
-        max_amplification: Largest movement of any point of the frictionless cable, relative to what the grippers move
-            together. It keeps the cable from snapping through; 1000 lets it snap.
-        engine: chain: batched in JAX, with its time step written out; the fastest, and it can simulate every effect.
-            mjx: the same cable by MJX. threaded: C MuJoCo on all CPU cores.
-        timestep: Time step of the simulation [s]; by default 0.05 for the chain and 0.02 for the others, which is about
-            as accurate.
+        max_amplification: Largest movement of any point of the frictionless cable, relative to the sum of the grippers'
+            movements. This limit keeps the cable from snapping through; 1000 lets it snap.
+        engine: chain: closed-form time step, batched in JAX; the fastest, supports every effect. mjx: the same cable in
+            MJX. threaded: C MuJoCo on all CPU cores.
+        timestep: Time step of the simulation [s]; by default 0.05 for the chain and 0.02 for the others, which are
+            about equally accurate.
         cable: The cable to simulate: a cable file (see `cablejax cable`), or a data set, trained weights or a log that
-            holds a cable. By default that of the verdicts of --with, else the reference cable.
+            holds a cable. By default that of the verdicts in --with, else the reference cable.
         effect: An effect to add to every cable, as NAME:PARAMETER=VALUE,... in SI units; may be given several times.
-        with_: A verdict.json of `cablejax diagnose`: the effects that it names are added, each trajectory with another
-            draw of what the verdict leaves open; may be given several times.
-        links: Links of the simulated cable; by default the resolution that the released model was trained on.
+        with_: A verdict.json of `cablejax diagnose`: adds the named effects, each trajectory with another draw of the
+            verdict's posterior; may be given several times.
+        links: Links of the simulated cable; by default as many as in the released model's training data.
         stiffness_range: Draw each cable's stiffness between these two factors of the nominal one, log-uniformly; by
-            default all are alike.
+            default all are equal.
         damping_range: Draw each cable's damping time likewise.
         friction_range: Draw each cable's friction coefficient likewise.
         process_index: Number of this process, from 0.
         process_count: How many processes share the work.
-        overwrite: Delete a data set that is there and was made by other options. Nothing else is ever deleted.
+        overwrite: Delete an existing data set that was made with other options. Nothing else is ever deleted.
     """
 
     resume_hint: ClassVar[str] = "What was complete is kept; run the same command again to go on."

@@ -1,4 +1,4 @@
-"""`cablejax study`: rounds of recording and diagnosis on a simulated plant, until the answer is clear."""
+"""`cablejax study`: records and diagnoses in rounds on a simulated plant, until the answer is clear."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ if TYPE_CHECKING:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Study(Command):
-    """Find out in rounds what a plant has that the simulator lacks.
+    """Record and diagnose a simulated plant in rounds, until it is clear which effect the simulator lacks.
 
-    Records the ways to a U, an S and a Z on the plant and diagnoses them. As long as several causes are left, designs
-    the motion that is most informative about which of them holds, records it, and diagnoses all recordings together.
-    Ends when one answer is left, when no motion separates what is left, or after --rounds. Writes report.html,
-    recording_1.npz, ... and the diagnosis of each round in round_1, ... A round takes two minutes.
+    Records motions to a U, an S and a Z on the plant and diagnoses them. While several causes are left, designs the
+    motion that is expected to separate them best, records it, and diagnoses all recordings together. Ends when one
+    cause is left, when no motion separates the causes, or after --rounds. Writes report.html, recording_1.npz, ... and
+    the diagnosis of each round in round_1, ... A round takes two minutes.
 
     Attributes:
         out: Folder for the results.
         overwrite: Replace the results that are in the folder.
-        cable: The cable that the plant is believed to have: a cable file, or a data set, weights or a log that holds
-            one. By default the reference cable.
+        cable: The plant's nominal cable: a cable file, or a data set, weights or a log that holds one. By default the
+            reference cable.
         plant_effect: An effect of the plant that the diagnosis does not know, as NAME:PARAMETER=VALUE,... in SI units;
             may be given several times. By default bending_stiffness:ratio=0.2; `none` for no effect.
         rounds: Recordings to make at most.
@@ -125,7 +125,7 @@ class Study(Command):
 
 
 def finished_rounds(state: pathlib.Path) -> int:
-    """How many rounds of an interrupted study are whole: what cannot be read is made again, and what followed it."""
+    """Number of complete rounds of an interrupted study; an unreadable round and all after it are made again."""
     from cablejax.diagnose.verdict_json import read_verdict
     from cablejax.effects.verdicts import read_verdict_json
     from cablejax.gaplog import read_gap_log
@@ -152,7 +152,7 @@ def finished_rounds(state: pathlib.Path) -> int:
 
 
 def remove_rounds(out: pathlib.Path, kept: int) -> None:
-    """Deletes what comes after the rounds that are kept: of an earlier study that is overwritten, or damaged."""
+    """Deletes all rounds after those that are kept, of an overwritten or damaged study."""
     for old in ("report.html", "summary.json"):
         (out / old).unlink(missing_ok=True)
     for path in (*out.glob("recording_*.npz"), *out.glob("round_*")):

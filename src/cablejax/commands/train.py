@@ -1,4 +1,4 @@
-"""`cablejax train`: a model on data sets."""
+"""`cablejax train`: trains a model on data sets."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ class Train(Command):
     """Train a model of the cable's dynamics on data sets made by `cablejax simulate`.
 
     Writes checkpoints, metrics (CSV and TensorBoard), weights.safetensors, a model card, and the error on held-out
-    trajectories. A training that was interrupted goes on with the same command and ends in the very same weights. All
-    devices that JAX sees share each batch; a training may go on with another number of them.
+    trajectories. The same command resumes an interrupted training, which ends in the same weights. All devices that JAX
+    sees share each batch; a training may resume on another number of devices.
 
     Attributes:
         data: Folders of the data sets, or their places in object storage (s3://BUCKET/PREFIX), in this order.
-        out: Folder for what the training writes; one that holds the same training is resumed.
-        overwrite: Delete another training that is in the folder, or write among what else is there.
-        preset: released: as the released model was trained. small: to compare variants, some minutes. smoke: a few
+        out: Folder for the results; a folder that holds the same training is resumed.
+        overwrite: Delete another training in the folder, or write next to other files there.
+        preset: released: as the released model was trained. small: for comparing variants, some minutes. smoke: a few
             steps.
         prior: The prior that the network corrects. static: the frictionless resting shape. rigid: the grippers' motion,
             interpolated. none: nothing.
@@ -38,10 +38,10 @@ class Train(Command):
         conditioned: Give the network each cable's stiffness and friction as inputs; the data should vary in them.
         start_from: Weights to start from instead of random ones: a released model by name, or a training's folder.
         lr: Learning rate at the beginning; the whole schedule is scaled with it. By default that of the preset.
-        held_out: Fraction of each data set kept away from training to measure the error on.
-        buffer: Trajectories to train on that are in memory at a time, for data sets larger than that; by default all.
-            One shard gives way to another every 50 steps.
-        steps: Optimiser steps in all; by default those of the preset. Its phases keep their proportions.
+        held_out: Fraction of each data set that is held out to measure the error.
+        buffer: Training trajectories in memory at a time, for data sets larger than memory; by default all. Every 50
+            steps one shard replaces another.
+        steps: Optimiser steps in all; by default those of the preset. The preset's phases keep their proportions.
         batch: Windows per optimiser step, in every phase; by default those of the preset.
         latent: Width of every hidden layer and latent vector; by default that of the preset.
         message_passing: Message-passing steps; by default those of the preset.

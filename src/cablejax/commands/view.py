@@ -1,4 +1,4 @@
-"""`cablejax view`: the page of anything that this package writes."""
+"""`cablejax view`: writes the page of a file or folder of this package."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ if TYPE_CHECKING:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class View(Command):
-    """Write the page of anything that cablejax has written, and print its path.
+    """Write an HTML page of anything that cablejax has written, and print the page's path.
 
-    Takes a gap log, a data set, weights, a verdict, the folder of a run, or a cable file, and finds out by its content
-    which it is. Runs and diagnoses have their page already; for the others a page is written.
+    Takes a gap log, a data set, weights, a verdict, the folder of a run, or a cable file, and recognises it by its
+    content. Runs and diagnoses already have a page; the others get one.
 
     Attributes:
         artefact: The file or folder, or a released model by name.
@@ -37,7 +37,7 @@ class View(Command):
     browser: bool = False
 
     def execute(self):
-        """Finds out what it is, writes its page and prints the path."""
+        """Recognises the file or folder, writes its page and prints the path."""
         kind, path = kind_of(self.artefact)
         page = self._page(kind, path)
         if kind == "run" and self.out is None:

@@ -76,7 +76,7 @@ def setting() -> dict[str, str]:
 
 
 def program_bytes(compiled: Any) -> int:
-    """Memory [bytes] of a compiled program: its arguments, its results and what it needs in between."""
+    """Memory [bytes] of a compiled program: arguments, results and temporaries."""
     memory = compiled.memory_analysis()
     return memory.temp_size_in_bytes + memory.argument_size_in_bytes + memory.output_size_in_bytes
 
@@ -130,7 +130,7 @@ def distance_from_fine(config: DatasetConfig) -> Float[np.ndarray, "samples"]:
 
 
 def data_stages(config: DatasetConfig) -> dict[str, Callable[[], Any]]:
-    """What a data set takes: drawing its motions, drawing and simulating them, and all of it, into a store."""
+    """Stages of making a data set, to be timed: drawing motions, drawing and simulating, all including the store."""
     engine = make_engine(config)
     at_once, shards = shards_at_once(config, engine), range(config.n_shards)
     groups = [shards[first : first + at_once] for first in shards[::at_once]]
