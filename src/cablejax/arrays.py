@@ -1,4 +1,4 @@
-"""Operations that belong to no stage: flags, points not seen, angles in a turn, lengths, quarter turns, quaternions."""
+"""Array helpers for all stages: flags, unobserved points, wrapped angles, lengths, quarter turns, quaternions."""
 
 from __future__ import annotations
 
@@ -10,18 +10,18 @@ from jaxtyping import Bool, Float, Int
 
 
 def stretches(flags: Bool[np.ndarray, " T"]) -> Int[np.ndarray, "S 2"]:
-    """First sample of each stretch in which a flag is set, and the first after it."""
+    """Begin and end (exclusive) of each stretch of samples in which a flag is set."""
     return np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(int))).reshape(-1, 2)
 
 
 def filled(points: Float[np.ndarray, "N D"]) -> Float[np.ndarray, "N D"]:
-    """Points of which some are NaN, these between their neighbours in the order of the points; at least one is not."""
+    """Points with NaN interpolated between their neighbours in the order of the points; at least one must be finite."""
     seen, index = np.isfinite(points).all(axis=1), np.arange(len(points))
     return np.stack([np.interp(index, index[seen], column[seen]) for column in points.T], axis=1)
 
 
 def mean_of_finite(values: np.ndarray, axis: tuple[int, ...] | int | None) -> np.ndarray:
-    """Mean of what is finite; NaN where nothing is."""
+    """Mean of the finite values; NaN where there are none."""
     seen = np.isfinite(values)
     count = seen.sum(axis=axis)
     return np.where(count > 0, np.where(seen, values, 0.0).sum(axis=axis) / np.maximum(count, 1), np.nan)
@@ -60,6 +60,6 @@ def quaternion_product(a: Float[Any, "*B 4"], b: Float[Any, "*B 4"]) -> Float[An
 def positions_at(
     at: Float[np.ndarray, " G"], time: Float[np.ndarray, " T"], position: Float[np.ndarray, "T *B"]
 ) -> Float[np.ndarray, "G *B"]:
-    """Positions at other times, on straight lines between those known; the first and the last are held."""
+    """Positions at other times, by linear interpolation; constant before the first and after the last."""
     columns = [np.interp(at, time, column) for column in position.reshape(len(position), -1).T]
     return np.stack(columns, axis=1).reshape(len(at), *position.shape[1:])

@@ -91,7 +91,7 @@ class Cable:
             )
 
     def check_material(self) -> None:
-        """Rejects numbers that are possible one by one, but that no material has together.
+        """Rejects combinations of values that no material has.
 
         Raises:
             ValueError: names the field, and the density or Young's modulus of a solid rod of this diameter.
@@ -158,7 +158,7 @@ class Discretisation:
         return self.n_links - 1
 
     def steps_in(self, interval: float, name: str = "The interval") -> int:
-        """Number of time steps in an interval [s]. Raises `ValueError`, which names it, if that is not whole."""
+        """Number of time steps in an interval [s]. Raises `ValueError` if it is not a whole number."""
         count = round(interval / self.timestep)
         if count < 1 or abs(count * self.timestep - interval) > 1e-6 * interval:
             raise ValueError(
@@ -168,7 +168,7 @@ class Discretisation:
 
 
 def differing(one: Cable, other: Cable) -> dict[str, tuple[Any, Any]]:
-    """The fields in which two cables differ by more than rounding, with both values; even marks are none."""
+    """The fields in which two cables differ by more than rounding, with both values; evenly spaced marks equal None."""
     found = {}
     for field in dataclasses.fields(Cable):
         a, b = getattr(one, field.name), getattr(other, field.name)

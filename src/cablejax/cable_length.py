@@ -23,7 +23,7 @@ STRETCH = 0.2
 def require_fitting_length(
     episodes: Sequence[Float[np.ndarray, "T N D"]], arclength: Float[np.ndarray, " N"], name: str
 ) -> None:
-    """Refuses arc lengths that are shorter than the polyline of the keypoints, over any stretch, or far longer.
+    """Rejects arc lengths that are shorter than the polyline through the keypoints, over any stretch, or far longer.
 
     Args:
         episodes: keypoints [m], NaN = not observed.
@@ -68,7 +68,7 @@ def require_fitting_length(
 
 
 def bent_chord(n_keypoints: int) -> float:
-    """Chord between neighbouring keypoints over the arc between them, where the cable is bent into a ring."""
+    """Ratio of chord to arc between neighbouring keypoints on a cable bent into a ring."""
     return max(1 - (2 * np.pi / (n_keypoints - 1)) ** 2 / 24, 0.0)
 
 

@@ -1,4 +1,4 @@
-"""Where compiled programs are kept between runs: those of JAX on the command line, and those of numba."""
+"""Keeps compiled programs between runs: those of JAX on the command line, and those of numba."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ LEAST_SECONDS = 0.5
 
 
 def keep_compiled_programs() -> pathlib.Path | None:
-    """Has JAX keep its compiled programs on disk, and take them from there in later runs.
+    """Makes JAX keep its compiled programs on disk and load them in later runs.
 
     The folder is `$CABLEJAX_CACHE`, or `cablejax` in the user's cache folder, with a folder inside for each kind of
     processor: code compiled for one may hold instructions that another lacks. JAX itself distinguishes programs,

@@ -100,7 +100,7 @@ def gap_log_from_episodes(
 
 @contextlib.contextmanager
 def reading_export(path: os.PathLike[str]) -> Iterator[None]:
-    """Says of what file or folder a log cannot be read: on a damaged one libraries raise what their parts raise."""
+    """Turns the various errors that libraries raise on a damaged export into one that names the file or folder."""
     try:
         yield
     except GapLogError as error:
@@ -170,7 +170,7 @@ def episodes_of(log: GapLog) -> list[Episode]:
 
 
 def until(log: GapLog, seconds: float) -> GapLog:
-    """The samples of every episode in so many seconds from its first one on; a positive number leaves some of each."""
+    """The first seconds of every episode; a positive number keeps at least one sample of each."""
     fields = ("time", "keypoints", "gripper_pose", "gripper_command", "hold")
     episodes = [
         dataclasses.replace(one, **{name: getattr(one, name)[one.time - one.time[0] < seconds] for name in fields})

@@ -1,4 +1,4 @@
-"""Joins recordings of one set-up to one gap log that knows what it was joined of, and takes episodes out of one."""
+"""Joins recordings of one set-up into one gap log that records its parts, and selects episodes of a log."""
 
 from __future__ import annotations
 
@@ -95,7 +95,7 @@ def joined(logs: Sequence[GapLog], names: Sequence[str]) -> GapLog:
 
 
 def commands_derived(log: GapLog) -> Bool[np.ndarray, "E"]:
-    """Of which episodes an importer made the commands, see `COMMANDS_DERIVED`.
+    """Episodes whose commands an importer derived from poses, see `COMMANDS_DERIVED`.
 
     Raises:
         GapLogError: the field is neither one word nor one for each episode.
@@ -200,7 +200,7 @@ def chosen(log: GapLog, episodes: Sequence[int]) -> GapLog:
 
 
 def recordings(log: GapLog, name: str = "the log") -> list[dict[str, Any]]:
-    """What a log was joined of, as `{"name", "episodes"}`; of one that was not joined, itself under this name.
+    """The recordings that a log was joined from, as `{"name", "episodes"}`; a log that was not joined has one, `name`.
 
     Raises:
         GapLogError: the field `recordings` of its `meta` does not add up to its episodes.

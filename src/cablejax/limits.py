@@ -1,4 +1,4 @@
-"""The limits of what is sensible, in one table, for every edge at which a user gives a number or a file."""
+"""One table of sensible limits, for all numbers and files that users give."""
 
 from __future__ import annotations
 

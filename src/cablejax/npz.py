@@ -24,13 +24,13 @@ _UNREADABLE = (
 
 
 class NpzError(ValueError):
-    """An `.npz` file that is damaged, none at all, or lacks an array."""
+    """An `.npz` file that is damaged, in another format, or lacks an array."""
 
 
 def read_npz(
     path: str | os.PathLike[str], required: Sequence[str], optional: Sequence[str] = (), *, text: Sequence[str] = ()
 ) -> dict[str, np.ndarray]:
-    """The named arrays of an `.npz` file. What else it holds is not looked at.
+    """The named arrays of an `.npz` file; other arrays are ignored.
 
     Args:
         path: the file.

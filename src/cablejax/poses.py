@@ -55,7 +55,7 @@ def poses_from_markers(
 
 
 def transported_frames(tangent: Float[np.ndarray, "T 3"]) -> Float[np.ndarray, "T 4"]:
-    """Unit quaternions (scalar first) of frames whose x axis is the tangent, without a roll of their own, [T, 4]."""
+    """Unit quaternions (scalar first) of frames with the tangent as x axis, by parallel transport, [T, 4]."""
     quaternion = np.empty((len(tangent), 4))
     quaternion[0] = smallest_rotation(_X, tangent[0])
     turns = smallest_rotation(tangent[:-1], tangent[1:])
@@ -127,7 +127,7 @@ def poses_at(
 def without_misreadings(
     time: Float[np.ndarray, " T"], pose: Float[np.ndarray, "T Q P"]
 ) -> tuple[Float[np.ndarray, "T Q P"], dict[int, str]]:
-    """Poses in which readings that jump away and back are replaced by what lies between their neighbours.
+    """Poses in which readings that jump away and back are interpolated from their neighbours.
 
     A tracker that takes one axis for another does that, or an angle that was read half a turn off. A simulated cable
     would be wrung by it, and what it does then says nothing of the real one.

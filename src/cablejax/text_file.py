@@ -1,4 +1,4 @@
-"""Reads and writes text, JSON and TOML files, and errors name the file; Markdown tables; versions of schemas."""
+"""Reads and writes text, JSON and TOML files, with errors that name the file; Markdown tables; schema versions."""
 
 from __future__ import annotations
 

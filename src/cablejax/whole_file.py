@@ -1,4 +1,4 @@
-"""Files that are written whole or not at all, and folders that one process writes to at a time."""
+"""Writes files whole or not at all, and reserves a folder for one process at a time."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ _ABANDONED = 24 * 3600
 
 
 def holds_anything(folder: pathlib.Path) -> bool:
-    """Whether there is something in a folder, beside what a kill left of a file that was being written."""
+    """Whether a folder holds anything except drafts that a killed process left."""
     return any(not file.name.endswith(DRAFT) for file in folder.iterdir())
 
 
 @contextlib.contextmanager
 def naming(path: str | os.PathLike[str]) -> Iterator[None]:
-    """Gives an error of the system the file or folder that it is about: a full disk does not say whose it was."""
+    """Adds the file or folder to an operating system's error: "disk full" does not name it."""
     try:
         yield
     except OSError as error:

@@ -78,7 +78,7 @@ class CableBelief:
 
 
 def prior_belief(config: AdaptationConfig) -> CableBelief:
-    """What is believed before anything was seen."""
+    """The belief before any observation."""
     return CableBelief(mean=jnp.array(config.prior_mean), information=jnp.eye(2) / config.prior_std**2)
 
 

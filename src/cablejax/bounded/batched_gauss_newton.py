@@ -79,7 +79,7 @@ class Minimised(Generic[Kept]):
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class BatchedGaussNewton:
-    """Levenberg's and Marquardt's damping of Gauss-Newton steps, bounds by holding what is at them.
+    """Levenberg-Marquardt with bounds on coordinates, by an active set.
 
     The step solves `(H + damping diag H) s = -g` over the free coordinates and is cut off at the bounds (Levenberg
     1944, Marquardt 1963; the choice of free coordinates as in Bertsekas, SIAM J. Control Optim. 20, 1982).

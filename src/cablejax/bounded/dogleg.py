@@ -19,7 +19,7 @@ class BoundedDoglegDescent(ModelDescent):
     """
 
     def init(self, y, f_info_struct):
-        """Two legs of length zero."""
+        """The initial state: two legs of length zero."""
         del f_info_struct
         return jnp.zeros_like(y), jnp.zeros_like(y)
 

@@ -17,7 +17,7 @@ class ConstrainedNewton(ModelDescent):
     """
 
     def init(self, y, f_info_struct):
-        """A direction of zeros."""
+        """The initial state: a direction of zeros."""
         del f_info_struct
         return jnp.zeros_like(y)
 

@@ -1,4 +1,4 @@
-"""Derivatives of bounded minima, right where bounds are active."""
+"""Derivatives of bounded minima, correct where bounds are active."""
 
 from __future__ import annotations
 

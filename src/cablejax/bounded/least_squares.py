@@ -126,12 +126,12 @@ class AbstractBoundedLeastSquares(optx.AbstractLeastSquaresSolver):
     @property
     @abc.abstractmethod
     def descent(self) -> ModelDescent:
-        """The step that is proposed."""
+        """The descent that proposes a step."""
 
     @property
     @abc.abstractmethod
     def search(self) -> optx.AbstractSearch:
-        """What accepts a step and sets its size."""
+        """The search that accepts a step and sets its size."""
 
     def init(self, fn, y, args, options, f_struct, aux_struct, tags):
         """The state before the first step. Raises `ValueError` unless `fn` gives one flat array."""

@@ -1,4 +1,4 @@
-"""The objective of a solve: its value, residuals' Jacobian, quadratic model, and what it returns besides its value."""
+"""The objective of a solve: value, Jacobian of the residuals, quadratic model, and auxiliary output."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float, Scalar
 
 
 def value_of(out: Array) -> Scalar:
-    """The function's value from what was returned: a scalar is the value, residuals stand for half their squares."""
+    """The objective from a function's output: a scalar is the value, residuals give half the sum of their squares."""
     return out if out.ndim == 0 else 0.5 * jnp.sum(out**2)
 
 
@@ -47,17 +47,17 @@ def squared_jacobian(
 
 
 def quadratic_info(value: Scalar, gradient: Float[Array, " P"], hessian: Float[Array, "P P"]):
-    """The model as optimistix's descents and searches take it."""
+    """The model in the form that optimistix's descents and searches expect."""
     return optx.FunctionInfo.EvalGradHessian(value, gradient, lx.MatrixLinearOperator(hessian))
 
 
 def promised_decrease(info: Any, move: Float[Array, " P"]) -> Scalar:
-    """By how much the model, from `quadratic_info`, falls over a move."""
+    """Decrease of the model, from `quadratic_info`, over a move."""
     return -(jnp.sum(info.grad * move) + 0.5 * move @ info.hessian.as_matrix() @ move)
 
 
 def derivative_along(fn: Callable[..., Any], primals: tuple, tangents: tuple) -> Any:
-    """The derivative of `fn(*primals)` along tangents, of which None stands for what does not change."""
+    """The derivative of `fn(*primals)` along tangents; None is a zero tangent."""
     # The tangents are those of arrays; what has none stays as it is.
     moving = jax.tree.map(lambda t: t is not None, tangents, is_leaf=lambda t: t is None)
     varying, fixed = eqx.partition(primals, moving)

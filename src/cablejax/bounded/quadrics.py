@@ -52,11 +52,11 @@ class Quadrics(eqx.Module):
 
     @property
     def has_size(self) -> Bool[Array, ""]:
-        """Whether the set is no cone about 0, which looks alike from near and far."""
+        """Whether the set has a scale: false for a cone about 0, which looks alike from near and far."""
         return jnp.abs(self._levels).max(initial=0.0) > 0
 
     def lengths(self, x: Float[Array, " P"], linear: Float[Array, " P"]) -> Float[Array, " K"]:
-        """What c is small compared with at x; `linear` is the gradient at 0 of a quadratic that is minimised there."""
+        """Scales to judge at x whether c is small; `linear` is the gradient at 0 of a quadratic minimised there."""
         sizes = self.sizes(jnp.abs(self.matrix) @ jnp.abs(x) + jnp.abs(self.offset))
         # at a bound of 0 all terms may vanish: then rounding of the set's size counts, in a cone that of the step
         whole = jnp.where(jnp.isfinite(self.level), sizes, 0.0).max(initial=0.0)
@@ -99,7 +99,7 @@ def ball_quadrics(matrix: Float[Array, "K D P"], offset: Float[Array, "K D"], ra
 
 
 def joined(parts: Sequence[Quadrics]) -> Quadrics:
-    """The functions of several, one after the other."""
+    """The functions of several `Quadrics`, one after the other."""
     return Quadrics(
         matrix=jnp.concatenate([part.matrix for part in parts]),
         offset=jnp.concatenate([part.offset for part in parts]),

@@ -1,4 +1,4 @@
-"""Secant updates of the Hessian: of all of it, or of the part that a Gauss-Newton model leaves out."""
+"""Secant updates of the whole Hessian, or of the part that a Gauss-Newton model leaves out."""
 
 from __future__ import annotations
 

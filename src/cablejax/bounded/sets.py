@@ -37,7 +37,7 @@ class AbstractSet(eqx.Module):
 
     @abc.abstractmethod
     def empty(self) -> Bool[Array, ""]:
-        """Whether some bound contradicts itself or another bound of its kind, or is not a number.
+        """Whether a bound contradicts itself or another bound of its kind, or is NaN.
 
         Bounds of several kinds that contradict each other show as `violation(project(y)) > 0`.
         """
@@ -77,7 +77,7 @@ class ConvexSet(AbstractSet):
         return nearest_point(self.quadrics(y), y.ravel()).reshape(y.shape)
 
     def restore(self, y: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
-        """A `y` that breaks bounds by rounding, without that; only where there is a closed form for it."""
+        """Moves a `y` that breaks bounds by rounding back inside; only where there is a closed form."""
         return y
 
 
@@ -242,7 +242,7 @@ class Intersection(ConvexSet):
         return y
 
     def violation(self, y: Float[Array, "..."]) -> Float[Array, ""]:
-        """The worst of the members'."""
+        """The largest violation of any member."""
         return jnp.stack([member.violation(y) for member in self.members]).max()
 
     def empty(self) -> Bool[Array, ""]:

@@ -90,7 +90,7 @@ def for_each_cable(
     step: Callable[..., Any],
     devices: Sequence[jax.Device] | None = None,  # pyright: ignore[reportInvalidTypeForm]
 ) -> Callable[..., Any]:
-    """The function of many cables that a function of one, such as `MPC.step`, makes; to be compiled by `jax.jit`.
+    """Maps a function of one cable, such as `MPC.step`, over many cables; to be compiled by `jax.jit`.
 
     On an accelerator it is `jax.vmap`. A planner's loops then take as many iterations as the slowest cable needs, which
     costs a processor more than the width gives it: there, each device takes one cable after the other.

@@ -19,7 +19,7 @@ _CLAMPED = 0.05
 
 @dataclasses.dataclass(frozen=True)
 class CommandLimits:
-    """What both grippers may do while a command holds: the last resort, whatever the controller's own bounds are.
+    """Bounds on both grippers while a command holds, enforced in addition to the controller's own bounds.
 
     Attributes:
         speed: of each gripper at most [m/s].

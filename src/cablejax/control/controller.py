@@ -1,4 +1,4 @@
-"""What a controller of a cable is."""
+"""The interface of a controller of a cable."""
 
 from __future__ import annotations
 

@@ -75,7 +75,7 @@ class RobotLink:
         return LinkState(Status.WAITING, "", None, None, None, math.inf, -math.inf, -math.inf, still, 0, ())
 
     def step(self, state: LinkState, now: float, observations: Sequence[Observation] = ()) -> tuple[LinkState, Reply]:
-        """Takes in observations and says what the grippers are to do.
+        """Processes observations and returns what the grippers must do.
 
         Args:
             state: from the last step.
@@ -117,7 +117,7 @@ class RobotLink:
         return state, reply
 
     def stop(self, state: LinkState, reason: str) -> LinkState:
-        """The state in which the grippers hold for good; an end that has come before stays."""
+        """The state in which the grippers hold for good; a run that has already ended stays as it ended."""
         return state if state.status.ended else self._held(state, Status.STOPPED, reason)
 
     def _waiting(self, state: LinkState, reason: str) -> LinkState:

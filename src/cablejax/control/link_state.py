@@ -16,7 +16,7 @@ from cablejax.simulate.table_plant import Observation
 
 
 class Status(enum.StrEnum):
-    """What a link does. The grippers move in `SHAPING` only."""
+    """Activity of a link. The grippers move only in `SHAPING`."""
 
     WAITING = "waiting"
     """No usable observation has come yet."""

@@ -1,4 +1,4 @@
-"""A controller shaping the plant's cable: observe, command, wait one interval, and record all of it."""
+"""The closed loop on a plant: observe, command, wait one interval, and record everything."""
 
 from __future__ import annotations
 

@@ -77,7 +77,7 @@ class ClosedLoopRun:
 
     @property
     def straightened(self) -> Bool[np.ndarray, " T"]:
-        """Where the cable was being straightened, to be shaped once more."""
+        """Control instants at which the cable was being straightened, to be shaped again."""
         return self.action == Action.STRAIGHTEN
 
     @property
@@ -87,7 +87,7 @@ class ClosedLoopRun:
 
     @property
     def reached(self) -> bool:
-        """Whether the target was: by the true keypoints, or by half or more of them as they were last observed."""
+        """Whether the target was reached: by the true keypoints, or by at least half of them as last observed."""
         seen = np.isfinite(self.keypoints[-1]).all(axis=-1)
         guessed = self.terminal_error_cm == shape_error_cm(self.keypoints[-1], self.target.keypoints)
         return self.terminal_error_cm <= self.goal_cm and (seen.mean() >= _SEEN or not guessed)

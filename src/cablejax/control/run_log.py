@@ -25,7 +25,7 @@ def motion(target: Target) -> str:
 
 
 class RunLog:
-    """Everything that a link's replies report, in the order of the observations' time stamps.
+    """All reports of a link's replies, in the order of the observations' time stamps.
 
     An observation that comes late takes its place; one that comes twice is counted and kept once.
 
@@ -45,7 +45,7 @@ class RunLog:
         self._commands: list[tuple[float, float, np.ndarray]] = []
 
     def add(self, reply: Reply) -> None:
-        """Takes in what one step of the link has reported."""
+        """Adds the report of one step of the link."""
         self.counts["received"] += len(reply.accepted)
         self.refuse(reply.refused)
         if reply.status == Status.WAITING:  # the link has forgotten what came before its first command
@@ -68,7 +68,7 @@ class RunLog:
         return bool(self._samples)
 
     def refuse(self, reasons: Sequence[str]) -> None:
-        """Takes note of messages that are no observations."""
+        """Records messages that are not observations."""
         self.counts["received"] += len(reasons)
         self.counts["refused"] += len(reasons)
         self.refused += reasons

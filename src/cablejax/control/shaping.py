@@ -50,7 +50,7 @@ Runs = Mapping[tuple[str, Method], ClosedLoopRun]
 
 @dataclasses.dataclass(frozen=True)
 class Model:
-    """A trained model as the controller takes it.
+    """A trained model in the form that the controller takes.
 
     Attributes:
         name: where it came from.
@@ -115,7 +115,7 @@ def load_model(name: str) -> Model:
 
 
 def knowing(model: Model, effects: Sequence[GivenEffect]) -> Model:
-    """The model of a cable with these effects, without another training.
+    """The model informed that its cable has these effects, without retraining.
 
     Its static prior rests as a cable with them does (`stiffness_profile`, `intrinsic_curvature`,
     `gripper_rotation_offset`, `gripper_compliance`); a conditioned model begins with the ratios of stiffness and
@@ -223,7 +223,7 @@ def make_controller(model: Model, target: Target, *, method: Method, solver: Sol
 
 
 def not_within_reach(target: Target, config: MPCConfig) -> str:
-    """Why a controller cannot bring a cable exactly to a target, whatever its model: a sentence, or nothing."""
+    """A sentence on why no controller can bring a cable exactly to a target; empty if one can."""
     apart, length = float(np.linalg.norm(target.keypoints[-1] - target.keypoints[0])), config.cable_length
     low, high = config.min_distance * length, config.max_distance * length
     if low - _NEAR * length <= apart <= high + _NEAR * length:
@@ -236,7 +236,7 @@ def not_within_reach(target: Target, config: MPCConfig) -> str:
 
 
 def initial_history(cable: Cable, config: ModelConfig) -> History:
-    """A straight cable at rest, as the controller meets it before its first command."""
+    """The history of a straight cable at rest, before the controller's first command."""
     pose = straight_start(cable)
     keypoints = elastica(pose, cable.length, cable.keypoint_arclength)
     return History(

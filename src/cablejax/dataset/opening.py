@@ -1,4 +1,4 @@
-"""Opening a data set to read it, or to begin or continue it, with the checks that it is the one that is meant."""
+"""Opens a data set to read, begin or continue it, and checks that it is the intended one."""
 
 from __future__ import annotations
 

@@ -45,7 +45,7 @@ class DeviceParallel(Engine):
         return self.engine.initial_state(gripper_pose, guess=guess)
 
     def rollout(self, params, state, twist, interval=1.0):
-        """As the engine's, for a batch of up to `per_device` times the number of devices; returns NumPy arrays.
+        """The engine's rollout, for a batch of up to `per_device` times the number of devices; returns NumPy arrays.
 
         Raises:
             ValueError: the batch is larger than that.

@@ -116,13 +116,13 @@ class DatasetConfig:
 
     @property
     def asymmetric(self) -> tuple[str, ...]:
-        """What makes its cables move otherwise in a mirror, or counted from their other end; empty: nothing does."""
+        """Names of what makes its cables asymmetric under mirroring or exchange of ends; empty if nothing does."""
         names = sorted(name for name in self.effect_names if not EFFECTS[name].symmetric)
         return (*names, *(["rest_curvature_per_m"] if self.cable.rest_curvature else []))
 
     @property
     def camera_effects(self) -> tuple[str, ...]:
-        """The effects with which its keypoints are not where the cable is."""
+        """The effects that move the keypoints off the cable."""
         return tuple(sorted(self.effect_names & CAMERA))
 
     @property
@@ -132,7 +132,7 @@ class DatasetConfig:
 
     @property
     def effects_shown(self) -> tuple[str, ...]:
-        """The effects for readers: those of all trajectories, and how often each stands in the posterior."""
+        """The effects in words: those of all trajectories, and how often each occurs in the posterior."""
         drawn = Counter(name for one in self.posterior for name in {effect.name for effect in one})
         often = (f"{name} (in {count} of {len(self.posterior)} draws)" for name, count in drawn.most_common())
         return (*map(str, self.effects), *often)

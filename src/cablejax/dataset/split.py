@@ -1,4 +1,4 @@
-"""Which trajectories of data sets are trained on and which are held out, and both read, or the first streamed."""
+"""Splits trajectories of data sets into training and held-out ones, and reads or streams them."""
 
 from __future__ import annotations
 

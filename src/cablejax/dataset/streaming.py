@@ -38,7 +38,7 @@ class StreamedData:
 
     @property
     def identity(self) -> list[np.ndarray]:
-        """Arrays that decide all that the buffer ever holds: for a fingerprint."""
+        """Arrays that determine all contents of the buffer, for a fingerprint."""
         digests = [np.frombuffer(bytes.fromhex(store.info().digest or ""), np.uint8) for store in self.stores]
         rows = np.array([(store, rows.start, rows.stop) for store, rows in self.blocks])
         return [*digests, rows, np.array([self.buffer, self.seed])]
@@ -49,7 +49,7 @@ class StreamedData:
         return concatenate([self.block(number) for number in order])
 
     def block(self, number: int) -> Trajectory:
-        """The block that comes as number so many, counted from 0 over all passes.
+        """The block with this number in the order of streaming, counted from 0 over all passes.
 
         Raises:
             ValueError: its shard is damaged, or the object storage cannot be reached.

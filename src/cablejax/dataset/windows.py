@@ -37,7 +37,7 @@ def read_trajectories(
 
 
 def trajectory_of(config: DatasetConfig, block: Block, indices: Iterable[int]) -> Trajectory:
-    """Some trajectories of a data set, by their numbers, with what a network is told of each cable."""
+    """Some trajectories of a data set, by number, with the network's inputs that describe each cable."""
     # with the effects that were simulated: a stiffer cable is known to be one
     cables = [cable_params(config, row, int(i)) for i, row in zip(indices, block.parameters, strict=True)]
     stiffness, friction = np.array([mean_resistance(cable) for cable in cables]).T

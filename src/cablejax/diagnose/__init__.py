@@ -1,4 +1,4 @@
-"""Where a simulator is wrong, which unmodelled effect causes it, and how far the gap shrinks with it.
+"""Diagnoses where a simulator is wrong, which unmodelled effect causes it, and how far the gap shrinks with it.
 
 `diagnose` takes a gap log of a cable on a table; `diagnose_simulator` a simulator of your own, see `protocol`.
 """

@@ -67,11 +67,11 @@ class Actuation:
     unseen: dict[tuple[str, ...], Float[np.ndarray, "E"]] = dataclasses.field(default_factory=dict)
 
     def strays(self, negligible: float) -> bool:
-        """Whether the arms are off their commands by more than is `negligible` [m], and no effect explains a part."""
+        """Whether the arms are off their commands by more than `negligible` [m] and no effect explains a part of it."""
         return self.deviates and not self.effects and self.deviation > negligible
 
     def explained(self, negligible: float) -> bool:
-        """Whether the effects leave no more than is `negligible` [m]: grippers move the cable as far as themselves."""
+        """Whether the effects leave at most a small share of the deviation, or at most `negligible` [m]."""
         return not self.deviates or self.leftover <= max(_EXPLAINED * self.deviation, negligible)
 
 

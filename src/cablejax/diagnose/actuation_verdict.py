@@ -1,4 +1,4 @@
-"""What the encoders show of the arms, added to what the keypoints show of the cable."""
+"""Adds the arms' effects, estimated from the encoders, to the verdict on the cable."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from cablejax.effects.given import EFFECTS
 
 
 def with_arms(conclusion: Conclusion, arms: Actuation, calibration: Calibration) -> Conclusion:
-    """Adds what the encoders show to what the keypoints show."""
+    """Adds the arms' effects to the verdict on the cable."""
     if not arms.deviates:
         return conclusion
     scores = _scores(arms, calibration)

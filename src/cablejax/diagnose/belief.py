@@ -112,12 +112,12 @@ class Calibration:
         count: Float[np.ndarray, "E"] | int,
         own: Float[np.ndarray, "E"] | None = None,
     ) -> Float[np.ndarray, "E"]:
-        """See the module's docstring; `own` is b if it is not `baseline`, all in metres per coordinate."""
+        """Temper of each episode, see the module; `own` replaces `baseline` as b, all in metres per coordinate."""
         together = np.minimum(self.correlated_samples, np.maximum(count, 1))
         return 1.0 + together * ((self.baseline if own is None else own) ** 2 + (self.law_error * gap) ** 2) / noise**2
 
     def smallest_gap(self, noise: float, own: float | None = None) -> float:
-        """The gap from which on there is one; `own` is the simulator's error if it is not `baseline`."""
+        """The smallest error that counts as a gap; `own` replaces `baseline` as the simulator's error."""
         return self.resolvable * float(np.hypot(self.baseline if own is None else own, self.noise_share * noise))
 
     def complete(self, left: float, gap: float, noise: float) -> bool:
@@ -125,14 +125,14 @@ class Calibration:
         return left <= self.may_leave(gap, noise)
 
     def needs_no_other(self, gap: float, noise: float) -> float:
-        """A single effect that leaves no more than this is not tried with another one: its law may be off by that.
+        """The error below which a single effect is not combined with another one: its law may be off by as much.
 
         A complete one that leaves more is: it may take most of the gap by values that are in part another's.
         """
         return max(self.law_error * gap, self.smallest_gap(noise))
 
     def may_leave(self, gap: float, noise: float) -> float:
-        """So much of the gap a complete explanation may leave."""
+        """The largest error that a complete explanation may leave."""
         return max(self.adequate * gap, self.smallest_gap(noise))
 
 
@@ -218,7 +218,7 @@ def _squares_by_motion(fit: Fit, evidence: Evidence) -> tuple[Float[np.ndarray, 
 
 
 def excess(fit: Fit, evidence: Evidence) -> float:
-    """Error that a fit leaves, root mean square per coordinate above the noise."""
+    """Remaining error of a fit, root mean square per coordinate above the noise."""
     count = float(evidence.count.sum())
     return float(np.sqrt(max(float(fit.sse.sum()) - count, 0.0) / count)) * level(evidence)
 
@@ -229,7 +229,7 @@ def level(evidence: Evidence) -> float:
 
 
 def log_scores(fits: Sequence[Fit], evidence: Evidence, calibration: Calibration) -> Float[np.ndarray, "F"]:
-    """Log posterior of every explanation, all sets of effects with as many members being equally likely beforehand."""
+    """Log posterior of every explanation; sets with equally many effects have equal prior probability."""
 
     def score(fit: Fit) -> float:
         one = fit.explanation

@@ -227,7 +227,7 @@ class Case:
         return repeated_motions(self.recording.recorded_pose, self.recording.interval, self.config.cable.length)
 
     def to_log(self, keypoints: Float[np.ndarray, "E T N 2"]) -> Float[np.ndarray, "E T1 N 2"]:
-        """NaN beyond an episode's end, and as long as the log."""
+        """Pads an array to the log's length, with NaN beyond each episode's end."""
         valid = np.arange(keypoints.shape[1])[None] < self.recording.length[:, None]
         return np.where(valid[..., None, None], keypoints, np.nan)[:, : self.recording.length.max()]
 

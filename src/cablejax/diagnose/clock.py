@@ -27,7 +27,7 @@ _CLOSE = 0.05
 
 
 def usual_interval(time: Float[np.ndarray, "T"]) -> float:
-    """Of an episode [s]: the mean, or the median where some samples are lost; of a single sample any."""
+    """Usual sample interval of an episode [s]: the mean, or the median where some samples are lost."""
     if len(time) < 2:
         return _ANY_INTERVAL
     step = np.diff(time)
@@ -77,7 +77,7 @@ def on_even_clock(episode: Episode, interval: float) -> Episode:
 def keypoints_at(
     grid: Float[np.ndarray, "G"], time: Float[np.ndarray, "T"], points: Float[np.ndarray, "T N D"], interval: float
 ) -> Float[np.ndarray, "G N D"]:
-    """Cubic where the two samples before and after are observed, else linear between two, else none."""
+    """Keypoints interpolated cubically where two samples before and after are observed, else linearly, else NaN."""
     n = len(time)
     left = np.clip(np.searchsorted(time, grid, side="right") - 1, 0, n - 2)
     share = (grid - time[left]) / (time[left + 1] - time[left])

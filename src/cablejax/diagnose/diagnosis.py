@@ -75,7 +75,7 @@ class EffectValues:
 
 @dataclasses.dataclass(frozen=True)
 class UnderLaw:
-    """What the verdict would be if the simulator assumed something else, of the explanations that it left open.
+    """The verdict on the remaining explanations under another law of the simulator.
 
     Attributes:
         assumes: in words, as in "the grippers carry the cable's ends".
@@ -151,7 +151,7 @@ class Gap:
 
 @dataclasses.dataclass(frozen=True)
 class NextMotion:
-    """The motion that is expected to tell most about which explanation holds, or to sharpen the only one.
+    """The motion with the most expected information about which explanation holds, or about the only one's parameters.
 
     Attributes:
         motion: "designed", or its name among `cablejax.diagnose.safe_motions`.
@@ -197,12 +197,12 @@ class NextMotion:
 
     @property
     def faint(self) -> bool:
-        """Whether it would leave nearly all of the doubt."""
+        """Whether the motion would leave nearly all of the doubt."""
         return bool(self.separates) and self.information < SEPARABLE * self.doubt
 
     @property
     def inseparable(self) -> bool:
-        """Whether a search for a motion found none that would not: the library alone does not show that."""
+        """Whether even a searched motion is `faint`; never true for the safe motions alone."""
         return self.faint and self.ended is not None
 
 

@@ -99,7 +99,7 @@ class Evidence:
         return (sse - self.count) / self.temper
 
     def log_likelihoods(self, sse: Float[np.ndarray, "E"]) -> Float[np.ndarray, "E"]:
-        """Of each episode's squared residuals, see `student_log_likelihoods`."""
+        """Log likelihood of each episode, see `student_log_likelihoods`."""
         return student_log_likelihoods(self.surprise(sse), self.freedom, self.motion)
 
     def weight(self, sse: Float[np.ndarray, "E"]) -> Float[np.ndarray, "E"]:
@@ -172,5 +172,5 @@ def held_out_together(motion: Int[np.ndarray, "E"]) -> list[Int[np.ndarray, "_"]
 
 
 def share_of_motion(motion: Int[np.ndarray, "E"]) -> Float[np.ndarray, "E"]:
-    """1 / how many episodes have the motion of each."""
+    """Weight of each episode: 1 over the number of episodes with the same motion."""
     return 1.0 / (motion[:, None] == motion[None]).sum(axis=1)

@@ -148,7 +148,7 @@ class Fit:
 
 
 def evaluate(evidence: Evidence, explanations: Sequence[Explanation]) -> list[Fit]:
-    """Predictions of explanations together with their derivatives, summed up."""
+    """Evaluates explanations: sums over their residuals and derivatives."""
     return [fit for portion in _portions(explanations) for fit in _evaluated(evidence, portion)]
 
 

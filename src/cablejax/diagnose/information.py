@@ -1,4 +1,4 @@
-"""Expected information of a recording that has yet to be made: about which explanation holds, or about its parameters.
+"""Expected information of a future recording about which explanation holds, or about its parameters.
 
 Under each explanation c, of posterior probability p_c, the recording is Gaussian: its mean is the prediction, and its
 covariance is the noise and what the posterior of the explanation's own parameters leaves open,

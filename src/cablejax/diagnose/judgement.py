@@ -32,7 +32,7 @@ def judged(*, resolvable: bool, telling: bool, complete: bool, alike: bool) -> V
 
 
 def beside_unknown(effect: NamedEffect, causes: float | None) -> NamedEffect:
-    """The effect as a part of an explanation that is not complete: what is missing may be what it stands for.
+    """A named effect of an incomplete explanation, less probable: the missing part may be the cause that it resembles.
 
     Args:
         effect: with its probability among those of the library.
@@ -56,7 +56,7 @@ def look_alikes(group: Sequence[str], effects: Sequence[NamedEffect]) -> tuple[l
 
 
 def in_its_place(name: str, equivalent: Sequence[Sequence[str]], effects: Sequence[NamedEffect]) -> list[str]:
-    """A named effect, and then those that could be in its place and are not improbable."""
+    """A named effect, followed by the effects that could replace it and are not improbable."""
     group = next((names for names in equivalent if name in names), ())
     return [name, *(other for other in look_alikes(group, effects)[0] if other != name)]
 

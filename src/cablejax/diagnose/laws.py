@@ -1,4 +1,4 @@
-"""What the leading explanations come to under other laws of the simulator, which the recording may not exclude.
+"""Refits the leading explanations under other laws of the simulator that the recording may not exclude.
 
 A simulator assumes more than it can know: the planar chain, for example, that the table carries the whole cable. Where
 it offers another law (`Simulator.other_laws`), the explanations that the search left open, and the simulator without

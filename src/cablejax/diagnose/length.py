@@ -1,4 +1,4 @@
-"""The cable's length, as its keypoints show it.
+"""Estimates the cable's length from its keypoints.
 
 A stated length that is 1 % wrong looks like a cable that stretches. Where keypoints are closer together or further
 apart than stated in every episode, a cable of the length that they suggest is one more reading of the log.
@@ -45,7 +45,7 @@ class Length(Reading):
 
     @property
     def apart(self) -> str:
-        """In words: how far apart keypoints are."""
+        """Words for how far apart keypoints are, compared with the stated length."""
         word = "closer together" if self.ratio < 1 else "further apart"
         return f"{100 * abs(self.ratio - 1):.1f} % {word} than the stated arc lengths, in every episode that shows it"
 
@@ -70,7 +70,7 @@ class Length(Reading):
 
 
 def other_length(case: Case, log: GapLog) -> Length | None:
-    """The length that the keypoints suggest, if it differs from the stated one in the same direction wherever they do.
+    """The length that the keypoints suggest, if all their deviations from the stated one have the same sign.
 
     Args:
         case: of the log.

@@ -24,7 +24,7 @@ _LATEST = 1.0
 
 
 def without_frozen(points: Float[np.ndarray, "E T N 2"]) -> list[str]:
-    """Takes out, in place, what a tracker repeats to the last digit while both neighbours of a keypoint move on.
+    """Removes, in place, keypoints that a tracker repeats to the last digit while both their neighbours move on.
 
     Args:
         points: keypoints [m], NaN = not observed.
@@ -44,7 +44,7 @@ def without_frozen(points: Float[np.ndarray, "E T N 2"]) -> list[str]:
 
 
 def tool_offset(end: Float[np.ndarray, "E T 2"], pose: Float[np.ndarray, "E T 3"], gripper: int) -> list[str]:
-    """A sentence where an end of the cable is off its gripper, always by the same vector of the gripper's frame.
+    """A sentence if an end of the cable is off its gripper by a constant vector in the gripper's frame.
 
     Args:
         end: keypoint at the gripper [m], NaN = not observed.
@@ -73,7 +73,7 @@ def clock_offset(
     length: Int[np.ndarray, "E"],
     interval: Float[np.ndarray, "E"],
 ) -> tuple[float, str] | None:
-    """By how much the grippers' poses come later than the keypoints on them [s], and how well they fit about then.
+    """Delay of the grippers' poses relative to the keypoints on them [s], and how well they fit near that delay.
 
     None where they fit as they are, or at no other time.
 
@@ -119,7 +119,7 @@ def clock_offset(
 
 
 def early_keypoints(offset: tuple[float, str] | None) -> list[str]:
-    """A sentence where the cable's ends are where their grippers are only later: poses that lag, or another clock.
+    """A sentence if the cable's ends are ahead of their grippers: the poses lag, or have another clock.
 
     The other way round it is `camera_lag`, an effect of the library on a table.
 
@@ -144,7 +144,7 @@ def integrated(
 
 
 def scatter_of(off: Float[np.ndarray, "E T 2 3"], valid: Bool[np.ndarray, "E T"]) -> Float[np.ndarray, "2 3"]:
-    """Noise of poses, from third differences of what they are off: that is smooth but for jumps.
+    """Noise of poses, from third differences of their deviations, which are smooth except for jumps.
 
     Args:
         off: in any unit of each coordinate.
@@ -162,7 +162,7 @@ def steadied(
     *,
     least: Float[np.ndarray, "3"] = _STEADY,
 ) -> tuple[Float[np.ndarray, "E T 2 3"], Float[np.ndarray, "2 3"]]:
-    """Measured poses without what scatters from one sample to the next, which would shake the simulated cable.
+    """Smooths measured poses that scatter from one sample to the next, which would shake the simulated cable.
 
     What they are off the expected ones by is smoothed by local parabolas (Savitzky and Golay), over so many samples as
     generalised cross-validation chooses for each coordinate. Poses of encoders stay as they are.
@@ -216,7 +216,7 @@ def command_fault(
     interval: Float[np.ndarray, "E"],
     valid: Bool[np.ndarray, "E T"],
 ) -> str | None:
-    """Says which unit or meaning commands have that fit the poses only so; None for twists in the world's frame."""
+    """The unit or meaning under which commands fit the poses, in words; None for twists in the world's frame."""
     degrees, millimetres = np.array([1, 1, np.pi / 180]), np.array([1e-3, 1e-3, 1])
     weight = np.array([1.0, 1.0, ROTATION_WEIGHT])
 

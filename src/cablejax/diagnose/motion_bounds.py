@@ -44,7 +44,7 @@ class BoundsError(ValueError):
 
 @dataclasses.dataclass(frozen=True)
 class Bounds:
-    """What a motion of the grippers, and the cable between them, must keep to.
+    """Bounds on a motion of the grippers and on the cable between them.
 
     Attributes:
         workspace: lowest and highest corner (x, y) of where grippers and cable may be [m]; None = anywhere.
@@ -115,7 +115,7 @@ KEYS: Mapping[str, tuple[str, str]] = {
 
 
 def read_bounds(path: str | os.PathLike[str]) -> Bounds:
-    """The bounds in a TOML file with some of the keys `KEYS`; what is not given has its default.
+    """The bounds in a TOML file with some of the keys `KEYS`; the others have their defaults.
 
     Raises:
         ValueError: the file cannot be read, is no TOML, or has a key that is unknown or a value that is not possible;

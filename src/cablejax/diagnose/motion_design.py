@@ -1,4 +1,4 @@
-"""Designs a motion of the grippers: an evolution strategy over ways in coordinates of the line between them.
+"""Designs a gripper motion by an evolution strategy over paths, in coordinates of the line between the grippers.
 
 A way has four legs. The strategy is CMA-ES with a diagonal covariance (Ros and Hansen 2008, A simple modification in
 CMA-ES achieving linear time and space complexity): each generation is judged in one batch of simulations, motions that
@@ -115,7 +115,7 @@ def design_motion(
 
 
 def excluded(tried: list[Judged]) -> str:
-    """Says how many motions each bound excludes."""
+    """A sentence on how many motions each bound excludes."""
     words = excluded_by(one.beyond for one in tried)
     return (
         f"No motion keeps all bounds: of {len(tried)} that were tried, {words}. Relax the first of these, or record a "

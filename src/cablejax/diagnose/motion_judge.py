@@ -52,7 +52,7 @@ class Judged:
 
 @dataclasses.dataclass(frozen=True)
 class Judge:
-    """What is believed after the recordings so far, and what a motion has to keep to.
+    """The remaining explanations after the recordings so far, and the bounds on a motion.
 
     Attributes:
         playback: of the recordings; of it the cable and the physics that it is believed to have.

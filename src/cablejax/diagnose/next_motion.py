@@ -1,4 +1,4 @@
-"""Chooses or designs the motion to record next: the one that is expected to tell most about which explanation holds."""
+"""Chooses or designs the motion to record next, by expected information about which explanation holds."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def next_motion(judge: Judge, design: DesignConfig | None = None) -> NextMotion 
 
 
 def require_some_motion(playback: Playback, noise: Float[np.ndarray, "N"], bounds: Bounds) -> None:
-    """Checks that some motion of the cable as it is believed to be keeps all bounds.
+    """Checks that some motion of the nominal cable keeps all bounds.
 
     Args:
         playback: of the log's motions.

@@ -119,7 +119,7 @@ def _rounding(keypoints) -> float:
 
 
 def still(hold: Bool[np.ndarray, "E T"], gripper_pose: Float[np.ndarray, "E T 2 3"]) -> Bool[np.ndarray, "E T"]:
-    """The samples of holds in which the measured grippers stay where they are: a moving cable is no noise."""
+    """The samples of holds in which the measured grippers rest: the motion of a moved cable is not noise."""
     kept = np.zeros_like(hold)
     for row, flags, poses in zip(kept, hold, gripper_pose[..., :2], strict=True):
         for begin, end in stretches(flags):

@@ -65,7 +65,7 @@ class PlanarCable(Simulator):
 
     @property
     def other_laws(self) -> dict[str, Simulator]:
-        """The same cable by each of `OTHER_LAWS`, and as the log may be read otherwise."""
+        """The same cable under each of `OTHER_LAWS`, and under other readings of the log."""
         believed, laws = self.playback.believed, dict[str, Simulator](self.readings)
         for assumes, changed in OTHER_LAWS.items():
             values = {name: np.asarray(value, believed.friction.dtype) for name, value in changed.items()}
@@ -91,7 +91,7 @@ class PlanarCable(Simulator):
         return effect.starts(context)
 
     def report(self, term, values) -> Report:
-        """By the names and in the units of the gap log's format."""
+        """A fitted effect with the names and units of the gap log's format."""
         effect, config = cast(CableEffect, term.effect), self.playback.config
         marks = tuple(config.cable.keypoint_arclength + self.playback.believed.bias_along)
         marked = dataclasses.replace(config, cable=dataclasses.replace(config.cable, marks=marks))

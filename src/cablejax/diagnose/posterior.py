@@ -1,4 +1,4 @@
-"""Draws from what a log leaves open: coordinates of one explanation, and explanations with their values.
+"""Draws from the posterior: coordinates of one explanation, and explanations with their values.
 
 The interval of one coordinate ends where the cost, minimised over all others, has risen by `z^2 / 2` (Venzon and
 Moolgavkar 1988), with z the quantile of the normal distribution. A threshold, a stretch limit or a place makes profiles
@@ -33,7 +33,7 @@ POSTERIOR = 16
 
 
 def draws(evidence: Evidence, fit: Fit, calibration: Calibration) -> Float[np.ndarray, "D P"]:
-    """Coordinates as likely as the log says, in no order.
+    """Posterior draws of coordinates, in random order.
 
     Where parts of the recordings were left out, how far that moves them (jackknife) adds to the posterior's width, and
     the distribution is Student's with a degree of freedom fewer than parts; else they follow profiles of the posterior.
@@ -133,7 +133,7 @@ def profile_widths(evidence: Evidence, fit: Fit) -> Float[np.ndarray, "P 2"]:
 def scaled_draws(
     evidence: Evidence, fit: Fit, widening: float, count: int, rng: np.random.Generator
 ) -> Float[np.ndarray, "D P"]:
-    """Coordinates as likely as the log says: normal, stretched on each side to the width of the profile.
+    """Posterior draws of coordinates: normal, stretched on each side to the width of the profile.
 
     Args:
         evidence: that was fitted.

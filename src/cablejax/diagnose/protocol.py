@@ -36,7 +36,7 @@ _OWN_DIFFERENCE = 0.03
 
 @dataclasses.dataclass(frozen=True)
 class Term:
-    """One effect as it takes part in an explanation.
+    """One effect of an explanation.
 
     Attributes:
         effect: of the simulator.
@@ -104,7 +104,7 @@ class Explanation:
         return tuple(term.effect.name for term in self.terms)
 
     def without(self, name: str) -> Explanation:
-        """The same without one of its effects."""
+        """The explanation without one of its effects."""
         kept = [(term, z) for term, z in self.by_term() if term.effect.name != name]
         return Explanation(
             tuple(term for term, _ in kept), np.concatenate([np.zeros(0), *(z for _, z in kept)]), self.own
@@ -149,7 +149,7 @@ class Report:
 
 @dataclasses.dataclass(frozen=True)
 class Plan:
-    """Effort of fits and checks; a simulator states what suits it.
+    """Effort of fits and checks, stated by the simulator.
 
     Attributes:
         first_steps, last_steps, grown_steps: Gauss-Newton steps of every single effect, of the best ones, and of sets

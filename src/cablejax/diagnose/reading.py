@@ -1,4 +1,4 @@
-"""What a log may mean instead of what it states: another length, or cables that begin where the table holds them.
+"""Alternative readings of a log: another cable length, or cables that begin where the table holds them.
 
 Each such reading is one more law of the simulator, see `laws`: it is as likely beforehand as any other, and where the
 log makes it the most probable one, the log is diagnosed again as it has it.
@@ -34,7 +34,7 @@ class Reading(abc.ABC):
 
     @abc.abstractmethod
     def told(self, diagnosis: CableDiagnosis, probability: float) -> CableDiagnosis:
-        """A diagnosis that was made with this reading, which says so."""
+        """A diagnosis made with this reading, with a sentence that says so."""
 
     def probability(self, laws: Sequence[UnderLaw]) -> float:
         """Of this reading, among all laws that were tried; 0 where it was not tried."""
@@ -42,7 +42,7 @@ class Reading(abc.ABC):
 
 
 def with_readings(case: Case, readings: Sequence[Reading]) -> Case:
-    """The case, its simulator with these readings as further laws where that is possible."""
+    """The case with these readings as further laws of its simulator, where possible."""
     laws = {one.assumes: one.case.simulator for one in readings if one.case is not None}
     return dataclasses.replace(case, simulator=dataclasses.replace(case.simulator, readings=laws))
 
@@ -78,7 +78,7 @@ class Held(Reading):
 
 
 def held(case: Case, log: GapLog, calibration: Calibration) -> Held | None:
-    """The reading that the table holds the cable at the start, if it lies elsewhere than settled by more than counts.
+    """The reading that the table holds the cable at the start, if it lies noticeably away from the settled shape.
 
     Args:
         case: of the log, its cables settled.

@@ -1,4 +1,4 @@
-"""A ridge residual on a recorded run: a correction without a cause, to compare with."""
+"""Fits a ridge residual to a recorded run: a correction without a cause, for comparison."""
 
 from __future__ import annotations
 

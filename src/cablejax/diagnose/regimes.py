@@ -1,4 +1,4 @@
-"""Regimes of the samples of a log, by the grippers' motion and the shape of the cable."""
+"""Classifies a log's samples into regimes, by the grippers' motion and the cable's shape."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What each of several recordings of one set-up adds to a diagnosis, and whether they contradict one another.
+"""Measures what each of several recordings adds to a diagnosis, and whether they contradict one another.
 
 The log likelihood of an explanation is a sum over episodes (see `belief`), so it is one over recordings too: each adds
 so many nats for one explanation against another, with the parameters that fit all of them.
@@ -32,7 +32,7 @@ UNLIKELY = 1e-3
 
 @dataclasses.dataclass(frozen=True)
 class Round:
-    """What one recording added.
+    """Contribution of one recording to a diagnosis.
 
     Attributes:
         name: of the recording.
@@ -52,7 +52,7 @@ class Round:
 
 @dataclasses.dataclass(frozen=True)
 class Rounds:
-    """What every recording added, in the order given.
+    """Contribution of every recording, in the order given.
 
     Attributes:
         rounds: one for each recording.
@@ -76,7 +76,7 @@ class Rounds:
 def rounds_of(
     log: GapLog, fits: Sequence[Fit], scores: Float[np.ndarray, "F"], evidence: Evidence, calibration: Calibration
 ) -> Rounds | None:
-    """What each recording of a joined log added; None of a log that is one recording.
+    """Contribution of each recording of a joined log; None for a log of one recording.
 
     Args:
         log: as `cablejax.gaplog_join.joined` makes it.

@@ -138,7 +138,7 @@ def examine(
     *,
     progress: Callable[[str], None],
 ) -> Examined:
-    """Searches, judges, and measures the gap on what no fit has seen.
+    """Searches, judges, and measures the gap on held-out episodes.
 
     Args:
         evidence: to explain.
@@ -173,7 +173,7 @@ def weighed(
     calibration: Calibration,
     own_error: Float[np.ndarray, "E"] | None = None,
 ) -> Evidence:
-    """Evidence of a recording, weighed by the noise and by what the simulator is off by without any effect.
+    """Evidence of a recording, weighted by the noise and the simulator's own error.
 
     That is `own_error` in each episode, or the calibration's baseline error in all.
 

@@ -1,4 +1,4 @@
-"""A few gripper motions that separate causes and that every cable of the format bears.
+"""Gripper motions that separate causes and do not overload a cable.
 
 Each starts from where a log started. A pair of grippers is moved in coordinates of the line between them, so that their
 distance keeps to its limits on the whole way.

@@ -1,4 +1,4 @@
-"""The first look at every effect: finite templates, and how much of the gap each could explain."""
+"""Screens effects: how much of the gap a finite template of each could explain."""
 
 from __future__ import annotations
 
@@ -99,7 +99,7 @@ def _stretch(start: Explanation, n_base: int, amplitude: float) -> Explanation |
 def shortlist(
     templates: Sequence[Template], per_variant: int = 3, per_effect: int = 3, *, weighed: bool = False
 ) -> list[Explanation]:
-    """The best starts of the one kind of template: so many of each effect, of these so many of each variant."""
+    """The best starts of one kind of template, at most so many per effect and per variant."""
     chosen: list[Explanation] = []
     taken: dict[str, int] = {}
     variants: dict[tuple[str, int], int] = {}

@@ -1,4 +1,4 @@
-"""The search for explanations: every effect alone, then sets of effects as far as they pay."""
+"""Searches for explanations: every effect alone, then sets of effects while their score improves."""
 
 from __future__ import annotations
 

@@ -22,7 +22,7 @@ _RANDOM_FLIPS = 4096
 
 
 def variance_inflation(whitened: Float[np.ndarray, "E T N 2"], log: GapLog, hold: Bool[np.ndarray, "E T"]) -> float:
-    """By how much correlation in time widens a sum of squares: `1 + 2 sum rho_k^2`, measured in holds if there are any.
+    """Factor by which correlation in time widens a sum of squares, `1 + 2 sum rho_k^2`, measured in holds if any.
 
     In a hold the residual less its mean is noise. Where no hold is long enough, correlation over half a second is
     assumed.

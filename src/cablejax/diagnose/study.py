@@ -1,4 +1,4 @@
-"""Rounds of diagnosis on one set-up: what is recorded first, and whether another recording is worth its time."""
+"""Rules of a study in rounds: the first recording, and whether another recording is worth its time."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ def _simulated(
 
 
 def ended(found: Diagnosis, worth: Mapping[str, Any] | None, *, rounds_left: int) -> Ended | None:
-    """Why no further recording follows a diagnosis; None where one does.
+    """The reason why no further recording follows a diagnosis; None if one does.
 
     Args:
         found: of all recordings so far.
@@ -111,6 +111,6 @@ def left_open(found: Diagnosis) -> tuple[str, ...]:
 
 
 def alternatives(found: Diagnosis) -> tuple[tuple[str, ...], ...]:
-    """For each effect that a diagnosis names, what `in_its_place` says; once where both grippers have it."""
+    """For each named effect, the alternatives of `in_its_place`; once if both grippers have it."""
     names = dict.fromkeys(effect.name for effect in found.effects)
     return tuple(tuple(in_its_place(name, found.equivalent, found.effects)) for name in names)

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
 
 def verdict_json(diagnosis: Diagnosis) -> dict[str, Any]:
-    """The verdict as a JSON object; what is not a finite number, was never observed or not computed, is null.
+    """The verdict as a JSON object; null where a number is not finite, was never observed or not computed.
 
     Where the verdict is "unknown" nothing was added, and nothing shrinks; `gap.best_shrinkage` is that of the best
     explanation all the same. `ci90` is null for a choice, such as a gripper, and a list where the value is one. All

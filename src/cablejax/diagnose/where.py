@@ -1,4 +1,4 @@
-"""Where the gap lies: along the cable, in which episodes, when, in which regime and in which frame.
+"""Localises the gap: along the cable, by episode, in time, by regime and by frame.
 
 Looks at the open-loop residual only, observed less nominal keypoints over whole episodes, and at no explanation of it.
 Every size is a root mean square per coordinate with the noise taken out, `sqrt(max(ms - sigma^2, 0))`.

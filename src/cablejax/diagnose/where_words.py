@@ -1,4 +1,4 @@
-"""The place of the gap in a few plain sentences."""
+"""Describes the place of the gap in a few plain sentences."""
 
 from __future__ import annotations
 

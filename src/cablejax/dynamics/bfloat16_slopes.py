@@ -1,4 +1,4 @@
-"""A network whose slopes are multiplied in bfloat16: the same values, and a Jacobian good to about a thousandth.
+"""Multiplies a network's slopes in bfloat16: the same values, and a Jacobian accurate to about a thousandth.
 
 Most of a control call is the Jacobian of the network, and most of that are products of cotangents with weights.
 Processors that multiply bfloat16 in hardware do these several times faster. A planner that accepts a step by the exact

@@ -19,7 +19,7 @@ _CURVE = ("step", "phase", "learning_rate", "loss")
 
 
 def network_words(config: ModelConfig) -> str:
-    """Size of the network, to begin a sentence with."""
+    """Words for the size of the network, to begin a sentence."""
     return f"A graph network of {config.message_passing} message-passing steps, latent size {config.latent},"
 
 

@@ -37,7 +37,7 @@ GROUPS = ("all windows", "no snap-through", "snap-through")
 
 @dataclasses.dataclass(frozen=True)
 class ErrorReport:
-    """Open-loop errors of a network and of the floors on held-out trajectories.
+    """Open-loop errors of a network and of the baselines on held-out trajectories.
 
     Attributes:
         errors: by group of windows (`GROUPS`), then by predictor, over all data sets.
@@ -53,7 +53,7 @@ class ErrorReport:
         return tuple(a / b for a, b in zip(snapped, everything, strict=True))
 
     def to_json(self) -> dict[str, Any]:
-        """As a JSON object; a number that there is none of is null."""
+        """The report as a JSON object; undefined numbers are null."""
         return {
             "errors": {
                 group: {name: _fields(error) for name, error in predictors.items()}

@@ -77,12 +77,12 @@ def predict(
 
 
 def no_motion(history: History, twist: Float[Array, "2 3"]) -> Float[Array, "N 2"]:
-    """The floor that expects nothing to move."""
+    """The baseline that predicts no motion."""
     return jnp.zeros_like(history.keypoints[-1])
 
 
 def prior_motion(config: ModelConfig, prior: Literal["static", "rigid", "none"]) -> OneStepModel:
-    """The floor that a model's prior is without learning."""
+    """The baseline of a model's prior without learning."""
     config = dataclasses.replace(config, prior=prior)
     return lambda history, twist: prior_of(history, twist, config).displacement
 

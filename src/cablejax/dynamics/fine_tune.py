@@ -13,10 +13,10 @@ from cablejax.dynamics.weights import load_weights
 
 
 def starting_from(source: str | os.PathLike[str], config: ModelConfig) -> tuple[ModelConfig, nnx.State]:
-    """The weights of a trained model for `train(..., initial=...)` of one that may learn more of cables than it did.
+    """The weights of a trained model, for `train(..., initial=...)` of a model that is at least as general.
 
-    That one predicts at first what the trained model does. It may in addition be conditioned: the weights of what is
-    known of the cable start at zero. And it need not be symmetric, so that it can learn an end or a side of the cable.
+    At first the new model predicts what the trained one does. It may in addition be conditioned: the weights of the
+    cable's inputs start at zero. It need not be symmetric, so that it can learn an end or a side of the cable.
 
     Args:
         source: see `load_weights`.

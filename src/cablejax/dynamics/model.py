@@ -1,4 +1,4 @@
-"""A learned one-step model: a network between the features of a cable and what it moves beyond its prior."""
+"""A learned one-step model: a network from features of the cable to its motion beyond the prior."""
 
 from __future__ import annotations
 

@@ -55,7 +55,7 @@ def on_all_devices(tree: _Tree, mesh: Mesh | None) -> _Tree:
 
 
 def on_one_device(tree: _Tree, mesh: Mesh | None) -> _Tree:
-    """What `on_all_devices` spread, on the first device alone, bit for bit; unchanged without a mesh."""
+    """Undoes `on_all_devices`: arrays on the first device alone, bit for bit; unchanged without a mesh."""
     return tree if mesh is None else jax.device_put(tree, mesh.devices.flat[0])
 
 

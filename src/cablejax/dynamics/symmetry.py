@@ -53,7 +53,7 @@ def regular(width: int) -> Representation:
 
 
 def node_representation(config: ModelConfig) -> Representation:
-    """Of the node features, in the order of `cablejax.dynamics.graph`."""
+    """Representation of the node features, in the order of `cablejax.dynamics.graph`."""
     vectors, known = config.history, 2 * config.conditioned
     # positions and displacements, arc length, control and heading, which gripper, prior, what is known of the cable
     mirror = [1, -1] * vectors + [1, 1] + [1, -1, -1, 1, -1] + [1, 1] + [1, -1] * 2 + [1] * known

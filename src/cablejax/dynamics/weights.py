@@ -1,4 +1,4 @@
-"""Trained weights on disk: one safetensors file with all that is needed to use them, and nothing that runs code.
+"""Trained weights on disk: one safetensors file with all that is needed to use them, and no executable code.
 
 The file's metadata has one key, "cablejax", whose JSON object holds
 

@@ -1,4 +1,4 @@
-"""Effects of the arms: how they follow their commands. The cable is driven by where the grippers really are."""
+"""Effects of the arms: how they follow their commands. The actual gripper poses drive the cable."""
 
 from __future__ import annotations
 

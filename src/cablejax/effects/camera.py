@@ -1,4 +1,4 @@
-"""Effects of how the cable is seen. The cable itself moves as believed."""
+"""Effects of how the cable is observed; they do not change its motion."""
 
 from __future__ import annotations
 

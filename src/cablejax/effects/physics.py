@@ -107,7 +107,7 @@ def nominal_physics(
     gravity: Sequence[float] | np.ndarray = (0.0, 0.0, -GRAVITY),
     arclength: Sequence[float] | np.ndarray | None = None,
 ) -> Physics:
-    """The cable as it is believed to be: no effect.
+    """The physics of the nominal cable, without any effect.
 
     Args:
         config: the cable.

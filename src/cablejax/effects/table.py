@@ -141,7 +141,7 @@ class ViscousDrag(CableEffect):
 
 
 class GravityTilt(CableEffect):
-    """The table is tilted against what is believed. Fitted as what gravity's part in its plane is more, over g."""
+    """The table's tilt differs from the stated one. Fitted as the additional in-plane gravity over g."""
 
     name = "gravity_tilt"
     hook = "table"

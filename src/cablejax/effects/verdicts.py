@@ -1,4 +1,4 @@
-"""Effects that a verdict names, as they are added to a simulator."""
+"""Reads the effects that a verdict names, to be added to a simulator."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def effects_of_verdict(path: str | os.PathLike[str]) -> tuple[GivenEffect, ...]:
 
 
 def posterior_of_verdict(path: str | os.PathLike[str]) -> tuple[tuple[GivenEffect, ...], ...]:
-    """Sets of effects, equally probable: which explanation holds, and its parameters, as uncertain as a verdict is.
+    """Equally probable sets of effects, drawn from a verdict's posterior over explanations and their parameters.
 
     For motions about the origin, as those of a data set are: places on the table are relative to where the grippers
     of the log were. Of a verdict of an older version, which holds no such draws or place, the effects that it names.
@@ -64,7 +64,7 @@ def posterior_of_verdict(path: str | os.PathLike[str]) -> tuple[tuple[GivenEffec
 
 
 def read_verdict_json(path: str | os.PathLike[str]) -> dict[str, Any]:
-    """A verdict's JSON object, of the schema that this version writes; its fields are not looked at.
+    """A verdict's JSON object, of the schema that this version writes; its fields are not checked.
 
     Raises:
         ValueError: the file is no verdict.

@@ -98,7 +98,7 @@ class ShapeCableConfig:
 
     @functools.cached_property
     def limits(self) -> CommandLimits:
-        """Of every action: the grippers stay within a square of three lengths, and never pull the cable taut."""
+        """Limits of every action: the grippers stay within a square of three lengths, and never pull the cable taut."""
         length = self.cable.length
         return CommandLimits(
             speed=2.0 * self.speed * length,
@@ -107,7 +107,7 @@ class ShapeCableConfig:
         )
 
     def twist(self, action: Float[Any, "*B 2 3"], pose: Float[Any, "*B 2 3"]) -> Float[Any, "*B 2 3"]:
-        """What an action commands [m/s, rad/s]: one that is not finite counts as zero, beyond `limits` it is shortened.
+        """The twist of an action [m/s, rad/s]; zero if it is not finite, shortened if it is beyond `limits`.
 
         NumPy in, NumPy out in double precision; JAX in, JAX out, also within `jit`.
 
@@ -123,7 +123,7 @@ class ShapeCableConfig:
     def outcome(
         self, engine: ChainEngine, physics: Physics, before: CableState, after: CableState
     ) -> tuple[Float[Array, "*B N 2"], Bool[Array, "*B"], Bool[Array, "*B"]]:
-        """What a motion did to cables: their true keypoints [m], and which have diverged and which are torn out.
+        """Outcome of a motion: true keypoints [m], which cables have diverged and which are torn out.
 
         Args:
             engine: simulates the cables.
@@ -137,7 +137,7 @@ class ShapeCableConfig:
         return true, diverged, ~diverged & (engine.opening(after) > widest)
 
     def recipe(self, effects: Sequence[EffectText]) -> DatasetConfig:
-        """How cables with these effects are drawn.
+        """The data set's configuration from which cables with these effects are drawn.
 
         Raises:
             ValueError: an effect is unknown, out of bounds, or a lag.
@@ -177,6 +177,6 @@ class ShapeCableConfig:
 
 
 def require_config(config: object) -> None:
-    """Raises ValueError for what is no configuration of the environments."""
+    """Raises ValueError if a value is not a configuration of the environments."""
     if not isinstance(config, ShapeCableConfig):
         raise ValueError(f"config is of type {type(config).__name__}, expected a ShapeCableConfig.")

@@ -31,7 +31,7 @@ class LinkPolicy:
         self._link: RobotLink | None = None
 
     def begin(self, target: Target) -> None:
-        """Begins an episode with this target, the one whose keypoints the environment shows."""
+        """Begins an episode with this target, whose keypoints the environment must show."""
         self._link = RobotLink(self._controller(target), target, self._settings)
         self._state, self._steps = self._link.init(), 0
 

@@ -1,4 +1,4 @@
-"""Fallbacks where no plan is better than holding still, or nothing gets better: hold, straighten, go back, rest."""
+"""Fallbacks if no plan is better than holding still, or the error does not fall: hold, straighten, go back, rest."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def plan_or_recover(
     decision: Decision,
     start: Starts,
 ) -> tuple[Decision, Progress]:
-    """The decision, or the next step of a way to poses that are known to be good, or rest; and the progress.
+    """The decision, a step back to known good poses, or rest; and the progress.
 
     Where no command has lowered the error for a while, none that the model can find will. There are two cases:
 
@@ -159,7 +159,7 @@ def _followed(
 
 
 def radius_after(config: MPCConfig, before: Progress, after: Progress, radius: Float[Array, ""]) -> Float[Array, ""]:
-    """The bound on the next motion [m]: half of it where commands are taken back, the first one after a disturbance."""
+    """The bound on the next motion [m]: halved when commands are taken back, reset after a disturbance."""
     began = after.returns > before.returns
     woken = (before.mode == Action.HOLD) & (after.mode != Action.HOLD)
     radius = jnp.where(began, jnp.maximum(radius / 2.0, config.radius_min), radius)

@@ -26,7 +26,7 @@ _CHANGE_ROOM = 0.02
 
 
 class FeasibleSet(AbstractSet):
-    """Motions of two grippers within all their bounds. Those that are None are not there, and cost nothing.
+    """Motions of two grippers within all bounds. A bound that is None is absent and costs nothing.
 
     The set is convex but for the least distance, whose bound leaves out a disc: `at` has a half-plane of relative
     positions instead, which touches the disc on the side where the grippers are. Grippers that start outside have a
@@ -109,7 +109,7 @@ class FeasibleSet(AbstractSet):
         )
 
     def constraints(self, y: Float[Array, "T 2 3"]) -> Float[Array, " K"]:
-        """By how much each bound is broken [m], smooth: norms, greatest and least distance, workspace, changes."""
+        """Smooth violation of each bound [m]: norms, greatest and least distance, workspace, changes."""
         lower, upper = self._distance_bounds(len(y))
         relative = self._separations(y)
         parts = [
@@ -145,7 +145,7 @@ class FeasibleSet(AbstractSet):
         return jnp.stack(excess).max()
 
     def empty(self) -> Bool[Array, ""]:
-        """Whether bounds contradict themselves or are not numbers; a zero radius leaves rest, which is something."""
+        """Whether bounds contradict themselves or are NaN; a radius of zero is not empty, it allows rest."""
         pairs = [(self.min_distance, self.max_distance), (0.0, self.radius)]
         if self.workspace is not None:
             pairs.append((self.workspace[0], self.workspace[1]))

@@ -1,4 +1,4 @@
-"""Plans: what a planner takes and returns, the best of several starts, derivatives with respect to the problem."""
+"""Plans: the interface of planners, the best of several starts, derivatives with respect to the problem."""
 
 from __future__ import annotations
 

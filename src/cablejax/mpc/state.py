@@ -32,7 +32,7 @@ class Action(enum.IntEnum):
 
 
 class LastCommand(NamedTuple):
-    """The last command and what was expected of it; replaced at the end of every step.
+    """The last command and its predicted effect; replaced at the end of every step.
 
     Attributes:
         plan: the plan whose first command it is [m], shape [T, Q, 3].
@@ -52,7 +52,7 @@ class LastCommand(NamedTuple):
 
 
 class Progress(NamedTuple):
-    """What decides when the cable is straightened to begin again, or rests; every field but `best_pose` has shape [].
+    """Progress of a run, to decide when to straighten, go back or rest; every field but `best_pose` has shape [].
 
     Attributes:
         best_error: lowest shape error since the last restart or rest [m].

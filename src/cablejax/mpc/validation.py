@@ -1,4 +1,4 @@
-"""Validation of what users give: targets, histories, measurements."""
+"""Validates users' input: targets, histories, measurements."""
 
 from __future__ import annotations
 

@@ -108,7 +108,7 @@ class DepthCamera:
         directions: Float[np.ndarray, "n 3"],
         gripper_pose: Float[np.ndarray, "Q 3"],
     ) -> Float[np.ndarray, "S 3"]:
-        """The cloud of what is taken for cable, corrected to lie on its axis [m], shape [S, 3]; S varies.
+        """The cloud of all points classified as cable, shifted to the cable's axis [m], shape [S, 3]; S varies.
 
         Each point is moved on along its ray by the mean depth of a cylinder's axis behind its visible side. Across the
         cable this is exact on average, whatever the direction of view; the rest is a shift along the cable, which no

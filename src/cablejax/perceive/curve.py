@@ -106,7 +106,7 @@ def keypoints_of(matrices: CurveMatrices, shape: Curve) -> Float[Array, "N 2"]:
 
 
 def centre_jacobian(matrices: CurveMatrices, shape: Curve) -> Float[Array, "n J 2"]:
-    """Derivative of every link's middle by every joint angle [m/rad]: what lies beyond a joint turns about it."""
+    """Derivative of every link's middle by every joint angle [m/rad]: links beyond a joint turn about it."""
     arm = shape.centre[:, None] - shape.joint
     return jnp.asarray(matrices.beyond, arm.dtype)[..., None] * quarter_turn(arm)
 
@@ -114,7 +114,7 @@ def centre_jacobian(matrices: CurveMatrices, shape: Curve) -> Float[Array, "n J 
 def carried(
     matrices: CurveMatrices, centre: Float[Array, "n 2"], before: Float[Array, "Q 3"], after: Float[Array, "Q 3"]
 ) -> Float[Array, "n 2"]:
-    """The curve after the grippers have moved, if nothing but their motion were known.
+    """The curve after the grippers have moved, predicted from their motion alone.
 
     Cubic Hermite interpolation along the arc of the ends' displacements and of their tangents' change. Exact if both
     grippers translate alike. Differentiable in all three arrays.

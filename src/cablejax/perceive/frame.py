@@ -121,7 +121,7 @@ class Track(NamedTuple):
 
 
 def quality(fit: CurveFit) -> tuple[Array, ...]:
-    """The last fields of a `Track`, of a fit."""
+    """Quality of a fit: the last fields of a `Track`."""
     return fit.sigma, fit.support, fit.seen, fit.curvature, fit.gap
 
 

@@ -71,7 +71,7 @@ def expectation(
     outlier_weight: float,
     area: float,
 ) -> Moments:
-    """E-step: how far each link answers for each point. Differentiable in `points`, `shape` and `sigma`.
+    """E-step: responsibility of each link for each point. Differentiable in `points`, `shape` and `sigma`.
 
     A point's distance across a link is taken to the osculating parabola, `n d - curvature a^2 / 2`, so that a bent
     cable is not drawn to the inside of its bend.

@@ -19,7 +19,7 @@ from cablejax.simulate.table_plant import Observation
 
 
 class CloudPlant(Plant):
-    """A plant whose keypoints are what a tracker makes of a depth camera's clouds.
+    """A plant whose keypoints a tracker estimates from a depth camera's clouds.
 
     `reset` and `record` are those of `Plant`; every observation is one frame of the camera. Where a frame is lost, its
     inner keypoints are NaN: a controller then uses its own prediction. The true keypoints are returned as well.
@@ -68,7 +68,7 @@ class CloudPlant(Plant):
         return super().reset(gripper_pose, guess=guess)
 
     def observe(self) -> Observation:
-        """One frame: cloud, tracker, and the keypoints that it makes of them."""
+        """Observes one frame: the tracker's keypoints from the camera's cloud."""
         truth = super().observe()
         nodes, directions = self.nodes()
         self.cloud = self.camera.look(nodes, directions, truth.gripper_pose)

@@ -35,7 +35,7 @@ MAX_TURN = 0.3
 
 @dataclasses.dataclass(frozen=True)
 class RegistrationConfig:
-    """The cable that is looked for, and how much each assumption about it counts.
+    """The cable to find, and the weight of each assumption about it.
 
     The three weights are in nats: an assumption that is broken by the amount stated costs as much as one point of
     likelihood `1/e`.

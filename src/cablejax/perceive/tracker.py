@@ -61,7 +61,7 @@ def padded(points: Float[np.ndarray, "n D"], capacity: int) -> PaddedCloud:
 
 @dataclasses.dataclass(frozen=True)
 class Tracker:
-    """The tracker for clouds as they come: any number of points, NaN among them, or none.
+    """The tracker for raw clouds: any number of points, NaN among them, or none.
 
     `init` and `step` are pure functions of their arguments. They raise only on input that can never be a cloud. A
     frame without a cable is counted as lost and reported in `Track.status`, and in words by `explain`.
@@ -102,7 +102,7 @@ class Tracker:
     def step(
         self, state: TrackState, points: Float[np.ndarray, "n D"], gripper_pose: Float[np.ndarray, "Q 3"]
     ) -> tuple[TrackState, Track]:
-        """Takes in the next cloud; arguments and errors as of `init`."""
+        """Processes the next cloud; arguments and errors as in `init`."""
         pose = _checked_pose(gripper_pose)
         cloud = padded(points, self.config.capacity)
         after, seen = track(self.config, state, jnp.asarray(cloud.points, float), cloud.mask, jnp.asarray(pose, float))

@@ -25,7 +25,7 @@ _PER_SEGMENT = 12
 
 @dataclasses.dataclass(frozen=True)
 class Nominal:
-    """The values of a cable that are believed true, or guessed: what the nominal simulator starts from.
+    """The stated or guessed values of a cable, for the nominal simulator.
 
     Attributes:
         diameter: [m].

@@ -34,7 +34,7 @@ SLOWEST = LARGEST_LAG + FILLED / 2
 
 
 class BagError(ValueError):
-    """A bag that cannot be read, or without the topics that are wanted."""
+    """A bag that cannot be read, or that lacks the topics of the layout."""
 
 
 def import_mcap(path: str | os.PathLike[str], layout: str | os.PathLike[str]) -> tuple[GapLog, list[str]]:

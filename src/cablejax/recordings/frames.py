@@ -59,7 +59,7 @@ class Frame:
 
     @property
     def matrix(self) -> Float[np.ndarray, "3 3"]:
-        """Takes coordinates of this frame to those of a right-handed frame with z up.
+        """Matrix from this frame's coordinates to those of a right-handed frame with z up.
 
         The coordinates are permuted in cycles until the vertical is last; half a turn about x if it points down; and y
         is mirrored if the frame is left-handed.
@@ -135,7 +135,7 @@ def onto_table(takes: tuple[Take, ...]) -> tuple[tuple[Take, ...], list[str]]:
 
 
 def require_hanging(takes: tuple[Take, ...], frame: Frame) -> None:
-    """Refuses a frame in which the cable does not hang down.
+    """Rejects a frame in which the cable does not hang down.
 
     Args:
         takes: already in a right-handed frame with z up, of a cable that hangs free.
@@ -164,7 +164,7 @@ def require_hanging(takes: tuple[Take, ...], frame: Frame) -> None:
 
 
 def require_rigid(takes: tuple[Take, ...], pairs: tuple[tuple[int, int], ...]) -> None:
-    """Refuses orientations that do not fit the markers on the same gripper.
+    """Rejects orientations that do not fit the markers on the same gripper.
 
     Args:
         takes: with measured poses in space.
@@ -193,7 +193,7 @@ def require_rigid(takes: tuple[Take, ...], pairs: tuple[tuple[int, int], ...]) -
 
 
 def require_along_x(takes: tuple[Take, ...], pairs: tuple[tuple[int, int], ...]) -> None:
-    """Refuses grippers whose x axis is not along the two markers on them: the cable's tangent is taken from it.
+    """Rejects grippers whose x axis, which gives the cable's tangent, is not along the two markers on them.
 
     Args:
         takes: with measured poses in space that fit the markers, see `require_rigid`.
@@ -217,7 +217,7 @@ def require_along_x(takes: tuple[Take, ...], pairs: tuple[tuple[int, int], ...])
 
 
 def require_readable(takes: tuple[Take, ...]) -> None:
-    """Refuses orientations whose x axes fit the cable far better if their quaternions are read in another way.
+    """Rejects orientations whose x axes fit the cable far better if their quaternions are read in another way.
 
     For grippers with one keypoint on each: the next is on the cable, whose bend hides all but a gross mistake.
 

@@ -38,7 +38,7 @@ class Layout:
 
 
 class Fields:
-    """A table of a TOML file that is read field by field, and complains about what was not read.
+    """A table of a TOML file that is read field by field; unread fields are an error.
 
     Args:
         path: of the file, for messages.
@@ -84,7 +84,7 @@ class Fields:
         return value
 
     def nothing_left(self) -> None:
-        """Complains about fields that nobody asked for.
+        """Raises an error if fields are left that were not read.
 
         Raises:
             ValueError: names them.

@@ -39,7 +39,7 @@ least the third number of them by the second: bending moves them by 0.01 to 0.03
 
 @dataclasses.dataclass(frozen=True)
 class Setup:
-    """Facts about a recording that its numbers do not show.
+    """Facts about a recording that cannot be inferred from its numbers.
 
     Attributes:
         unit: of all lengths: "m", "cm", "mm" or "in"; None = metres, or another unit if the length of the cable leaves

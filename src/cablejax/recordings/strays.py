@@ -1,4 +1,4 @@
-"""Takes out keypoints that cannot be on the cable, and takes in which it would have to stretch."""
+"""Removes keypoints that cannot be on the cable, and takes in which the cable would have to stretch."""
 
 from __future__ import annotations
 

@@ -15,7 +15,7 @@ PLAUSIBLE = (LIMITS["recorded_length"].low, LIMITS["recorded_length"].high)
 
 
 def metres_per(unit: str) -> float:
-    """Metres in one of a unit.
+    """Metres per unit of length.
 
     Raises:
         ValueError: an unknown unit; names the known ones.
@@ -26,12 +26,12 @@ def metres_per(unit: str) -> float:
 
 
 def recognised_unit(length: float, plausible: tuple[float, float] = PLAUSIBLE) -> tuple[str, ...]:
-    """The units in which a cable of this length is a plausible one; several where the length is ambiguous."""
+    """The units in which this cable length is plausible; several if it is ambiguous."""
     return tuple(name for name, metres in METRES.items() if plausible[0] <= length * metres <= plausible[1])
 
 
 def require_metres(length: float, unit: str) -> None:
-    """Refuses a cable of implausible length.
+    """Rejects a cable of implausible length.
 
     Args:
         length: of the cable [m], after conversion from `unit`.

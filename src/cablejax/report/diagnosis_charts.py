@@ -29,7 +29,7 @@ _SPLIT = (
 
 
 def ranking_figure(diagnosis: Diagnosis) -> Figure | None:
-    """Effects that were tried: how probable each is, where that was computed, and how much of the gap it takes away.
+    """Chart of the effects that were tried: probability, if computed, and share of the gap that each removes.
 
     None where none was tried.
     """

@@ -41,7 +41,7 @@ def in_space(diagnosis: CableDiagnosis) -> bool:
 
 
 def named_effects(diagnosis: Diagnosis) -> list[tuple[NamedEffect, str, list[tuple[str, str]]]]:
-    """Each named effect, what and where it is, and its parameters with their estimates."""
+    """Each named effect with its place, parameters and estimates."""
     found = []
     for effect in diagnosis.effects:
         meaning, place = EFFECTS.get(effect.name, "an effect of your own"), effect_place(effect)
@@ -54,14 +54,14 @@ def named_effects(diagnosis: Diagnosis) -> list[tuple[NamedEffect, str, list[tup
 
 
 def quantities(diagnosis: Diagnosis) -> list[tuple[str, str]]:
-    """What the log shows of the cable, whether an effect is named for it or not."""
+    """Quantities of the cable that the log identifies, whether or not an effect is named."""
     return [
         (parameter_title(name), quantity(one.value, one.unit, one.ci90)) for name, one in diagnosis.quantities.items()
     ]
 
 
 def addable(diagnosis: Diagnosis) -> bool:
-    """Whether the named effects can be added to the package's simulators: one of one's own cannot."""
+    """Whether the named effects can be added to the package's simulators; a user's own effects cannot."""
     return bool(diagnosis.effects) and all(effect.name in given.EFFECTS for effect in diagnosis.effects)
 
 
@@ -71,7 +71,7 @@ def alike(diagnosis: CableDiagnosis) -> list[tuple[list[str], list[str]]]:
 
 
 def under_other_laws(diagnosis: Diagnosis) -> list[str]:
-    """What the verdict would be by each other law of the simulator, in words."""
+    """The verdict under each other law of the simulator, in words."""
     return [
         f"If {law.assumes}, {_verdict_under(law)}. Among all laws that were tried, that one has a probability of "
         f"{share(law.probability)} on this log; the intervals cover those by which the same effects are found."
@@ -100,7 +100,7 @@ def _verdict_under(law: UnderLaw) -> str:
 
 
 def what_is_left(diagnosis: CableDiagnosis) -> str:
-    """What no effect explains; "" where everything is explained."""
+    """A sentence on the part of the gap that no effect explains; "" if there is none."""
     if diagnosis.verdict not in ("unknown", "named+unknown"):
         return ""
     gap = diagnosis.gap
@@ -122,7 +122,7 @@ def what_is_left(diagnosis: CableDiagnosis) -> str:
 
 
 def ranking_note(diagnosis: CableDiagnosis) -> str:
-    """What the figure of the effects that were tried shows."""
+    """Caption of the chart of the effects that were tried."""
     if any(ranked.probability is None for ranked in diagnosis.ranking):
         return (
             "Every effect tried in the forward search, in that order: what it takes away on unseen recordings when it "
@@ -188,7 +188,7 @@ def nothing_next(diagnosis: CableDiagnosis) -> str:
 
 
 def rounds_table(diagnosis: CableDiagnosis) -> Table | None:
-    """What each recording added, and what was believed after it; None of a single recording."""
+    """Table of what each recording added and the probabilities after it; None for a single recording."""
     if diagnosis.rounds is None:
         return None
     rounds = diagnosis.rounds.rounds

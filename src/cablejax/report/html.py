@@ -1,4 +1,4 @@
-"""HTML from the templates of this room: pages that need nothing else, no network and no second file."""
+"""Fills this folder's HTML templates: self-contained pages without network or further files."""
 
 from __future__ import annotations
 

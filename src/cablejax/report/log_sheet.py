@@ -1,4 +1,4 @@
-"""The sheet of a gap log: which cable, how many episodes, how noisy, and what the cable did."""
+"""The page of a gap log: its cable, episodes and noise, and how the cable moved."""
 
 from __future__ import annotations
 

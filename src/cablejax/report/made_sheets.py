@@ -1,4 +1,4 @@
-"""The sheets of what the commands make: data sets, trained weights and verdicts."""
+"""The pages of data sets, trained weights and verdicts."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ _SHOWN = 24
 
 
 def store_sheet(store: Store, name: str) -> Sheet:
-    """What a data set holds, from its configuration and its first complete shard.
+    """The page of a data set, from its configuration and its first complete shard.
 
     Raises:
         ValueError: its first complete shard is damaged.
@@ -78,7 +78,7 @@ _STORE_CAPTION = (
 
 
 def weights_sheet(source: str | os.PathLike[str], name: str) -> Sheet:
-    """What trained weights are, what they were trained on, and how the training went where its folder says so.
+    """The page of trained weights: network, training data, and training curves if the folder has them.
 
     Args:
         source: as in `cablejax.dynamics.weights.load_weights`.
@@ -122,7 +122,7 @@ _TRAINING_CAPTION = "Loss over the training, and the open-loop error on held-out
 
 
 def verdict_sheet(diagnosis: Diagnosis, name: str) -> Sheet:
-    """What a verdict says; the diagnosis' own page, next to it, says more."""
+    """The page of a verdict; the diagnosis' own page, next to it, has more."""
     gap = diagnosis.gap
     unit = "mm" if gap.unit == "m" else f"thousandths of {gap.unit}"
     shrinks = "not known" if gap.shrinkage is None else share(gap.shrinkage)

@@ -1,4 +1,4 @@
-"""Pictures of the motion to record next: where the explanations differ on it, and what each motion is worth."""
+"""Pictures of the motion to record next: where the explanations differ, and the information of each motion."""
 
 from __future__ import annotations
 

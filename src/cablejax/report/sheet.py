@@ -1,4 +1,4 @@
-"""A sheet: one page that says what a file is, with what a stranger asks first."""
+"""A sheet: one page that describes a file."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def write_sheet(path: str | os.PathLike[str], sheet: Sheet) -> pathlib.Path:
 
 
 def cable_sheet(cable: Cable, name: str) -> Sheet:
-    """What a cable file describes."""
+    """The page of a cable file."""
     return Sheet(
         kind="cable",
         title=f"A cable of {cable.length:g} m, {1e3 * cable.diameter:g} mm thick",

@@ -1,4 +1,4 @@
-"""The page of a study: what each round recorded, and what was believed after it."""
+"""The page of a study: what each round recorded, and the verdict after it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Colours, names and the drawn curve: what every picture of the report shares.
+"""Colours, names and curves that all pictures of the report share.
 
 The colours are those of Okabe and Ito, which stay apart for colour-blind readers and in grey.
 """

@@ -1,4 +1,4 @@
-"""Online correction of a learned model by what its last errors say, and the composition of both."""
+"""Corrects a learned model online from its last errors."""
 
 from cablejax.residual.jacobian import Corrected, Dynamics
 from cablejax.residual.learner import PAPER, STATIC, Candidate, LearnerConfig

@@ -18,7 +18,7 @@ Dynamics = Callable[[Any, History, Float[Array, "Q 3"]], Float[Array, "N 2"]]
 
 
 class Linearised(NamedTuple):
-    """A one-step model about no command, `f(X, R) ~ drift + gain R`; with a leading axis W for several steps.
+    """A one-step model linearised at zero command, `f(X, R) ~ drift + gain R`; several steps have a leading axis W.
 
     Attributes:
         drift: its displacement without a command, f(X, 0) [m], shape [N, 2].
@@ -30,7 +30,7 @@ class Linearised(NamedTuple):
 
 
 def linearised(dynamics: Dynamics, weights: Any, history: History, *, with_gain: bool) -> Linearised:
-    """The model about no command: one evaluation, and for the gain 3Q tangents in one batch, in forward mode.
+    """Linearises a model at zero command: one evaluation, and 3Q forward-mode tangents in one batch for the gain.
 
     Args:
         dynamics: the model.
@@ -111,7 +111,7 @@ class Corrected:
     def jacobian(
         self, weights: tuple[Any, ResidualModel], history: History, twist: Float[Array, "Q 3"]
     ) -> StepJacobian:
-        """F's own, and J."""
+        """Derivatives of f, and J."""
         offline, residual = weights
         of_f = step_jacobian(self.dynamics, offline, history, twist)
         return of_f._replace(twist=of_f.twist + residual.gain.T.reshape(of_f.twist.shape))

@@ -1,4 +1,4 @@
-"""Learns online what the dynamics model gets wrong, by several candidates that are believed as they have predicted.
+"""Learns the dynamics model's errors online, by several candidates weighted by their past predictions.
 
 A few samples may say more about noise than about the cable, and a correction that is wrong does harm in a closed loop.
 So a candidate has to earn its influence. At every step each one predicts the model's error before it is seen, and is
@@ -160,7 +160,7 @@ class Sample(NamedTuple):
 
 
 class LearnerState(NamedTuple):
-    """What has been learned from.
+    """State of the learner: its samples, and the candidates' evidence.
 
     Attributes:
         window: the last W samples.
@@ -188,7 +188,7 @@ def initial_learner(config: LearnerConfig, n_keypoints: int, n_grippers: int, dt
 
 
 def observe(config: LearnerConfig, state: LearnerState, sample: Sample) -> LearnerState:
-    """The state with one more sample: the candidates are judged by it first, and fitted to it then.
+    """The state with one more sample: candidates are first scored on it, then fitted to it.
 
     Values of `sample.error` where it is not valid are ignored, NaN included, as is what is not finite of the model and
     of the command.
@@ -218,7 +218,7 @@ def observe(config: LearnerConfig, state: LearnerState, sample: Sample) -> Learn
 
 
 def weights(config: LearnerConfig, state: LearnerState) -> Float[Array, " K"]:
-    """How far each candidate is believed, shape [K]; they sum to 1."""
+    """Weight of each candidate, shape [K]; they sum to 1."""
     half = config.dimensions / 2.0
     return jax.nn.softmax(-(1.0 + half * state.count) * jnp.log1p(half * state.evidence))
 

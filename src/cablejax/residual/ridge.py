@@ -64,7 +64,7 @@ class RidgeConfig:
             raise ValueError(f"RidgeConfig.outlier is {self.outlier}, expected a positive number [m], or infinity.")
 
     def scaled(self, ratio: float, interval: float = 1.0) -> RidgeConfig:
-        """The settings for a cable so many times as long, and a step of so many seconds instead of one."""
+        """The settings scaled to another cable length and another duration of a step."""
         lengths = {name: ratio * getattr(self, name) for name in ("rotation_weight", "outlier")}
         return dataclasses.replace(self, motion_scale=ratio * self.motion_scale / interval, **lengths)
 

@@ -31,7 +31,7 @@ class Arms:
         self._executed = pose.copy()
 
     def target(self, twist: Float[np.ndarray, "2 3"], duration: float) -> Float[np.ndarray, "2 3"]:
-        """Poses that this command would bring the arms to, given time."""
+        """Poses to which this command would bring the arms eventually."""
         return self.commanded + duration * self._gain * twist
 
     def follow(

@@ -1,4 +1,4 @@
-"""Compiler options and precision of simulator functions, and batches that are spread over devices."""
+"""Compiler options and precision of simulator functions, and batches spread over devices."""
 
 from __future__ import annotations
 

@@ -58,7 +58,7 @@ def drag_coefficient(
 
 
 def on_table(physics: Physics, mass: Float[Array, "n"] | Float[np.ndarray, "n"], link_length: float):
-    """Mass that the table carries at each node [kg]: all of it, but for what hangs on the grippers.
+    """Mass that the table carries at each node [kg]: the node's mass, less the part that hangs on the grippers.
 
     Differentiable; at a height of 0 the mass stays as it is, and its derivative by the height is 0 instead of infinite.
 

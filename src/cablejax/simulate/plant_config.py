@@ -1,4 +1,4 @@
-"""What the configurations of all plants have in common, and its checks."""
+"""Common configuration of all plants, and its checks."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""Cables in space: recorded motion of real cables, a simulator for it, and the diagnosis of what is left."""
+"""Cables in space: recorded motion of real cables, its simulation, and the diagnosis of the remaining gap."""

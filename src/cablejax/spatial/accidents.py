@@ -1,4 +1,4 @@
-"""Windows that say nothing about an effect: those whose simulation is lost, and those that nothing explains.
+"""Excludes windows that say nothing about an effect: those whose simulation is lost, or that nothing explains.
 
 One of them among seventy moves a mean error more than most effects do. A window is off where its error is more than ten
 times the median. Windows that are off are counted and shown, comparisons leave them out, and fits give them little
@@ -19,12 +19,12 @@ _SHOWN = 5
 
 
 def off(error: Float[np.ndarray, "W"]) -> Bool[np.ndarray, "W"]:
-    """Windows that are off, by their errors [m]."""
+    """Windows whose error is more than ten times the median, from errors [m]."""
     return error > _TIMES * np.median(error)
 
 
 def kept(which: Bool[np.ndarray, "W"]) -> Bool[np.ndarray, "W"]:
-    """The other windows, or all where those are not few."""
+    """The windows that are not off, or all if those that are off are not few."""
     return ~which if which.mean() <= _MOST else np.ones(len(which), bool)
 
 
@@ -40,7 +40,7 @@ def trust(error: Float[np.ndarray, "W"]) -> Float[np.ndarray, "W"]:
 
 
 def compared(before: Float[np.ndarray, "W"], after: Float[np.ndarray, "W"]) -> tuple[Bool[np.ndarray, "W"], bool]:
-    """Windows in which errors before and after an effect came in are compared, and whether the comparison counts.
+    """Windows in which errors with and without a new effect are compared, and whether the comparison counts.
 
     It does not count where the effect throws off more windows than may be left out that were not off before: nothing is
     known of an effect whose simulations are lost.
@@ -52,7 +52,7 @@ def compared(before: Float[np.ndarray, "W"], after: Float[np.ndarray, "W"]) -> t
 def accident_sentences(
     lost: Bool[np.ndarray, "W"], error: Float[np.ndarray, "W"], windows: Windows, coarse: Bool[np.ndarray, "W"]
 ) -> list[str]:
-    """Windows that are off, or not simulated as they should be, for a reader.
+    """Sentences on windows that are off, or not simulated properly.
 
     Args:
         lost: those with samples that the simulation did not reach.

@@ -70,12 +70,12 @@ class SpatialCable(Simulator):
 
     @property
     def effects(self):  # type: ignore[override]
-        """Those of the layout."""
+        """The effects of the layout."""
         return self.layout.effects
 
     @property
     def recording(self) -> Int[np.ndarray, "E"]:  # type: ignore[override]
-        """That of each window."""
+        """The recording of each window."""
         return self.windows.group
 
     @property
@@ -88,18 +88,18 @@ class SpatialCable(Simulator):
         return dataclasses.replace(self, windows=windows, correction=None)
 
     def trusting(self, error: Float[np.ndarray, "W"]) -> SpatialCable:
-        """The same cable in the same windows, those that are off by their errors [m] with less weight in fits."""
+        """The same cable and windows, with less weight in fits for windows that are off by their errors [m]."""
         before = 1.0 if self.windows.trust is None else self.windows.trust
         return self.on(dataclasses.replace(self.windows, trust=before * trust(error)))
 
     def finer(self, factor: int) -> SpatialCable:
-        """With time steps that are so many times shorter, those that are made where the motion is fast too."""
+        """The same cable with time steps that are so many times shorter, including those in fast motion."""
         rod = self.rod
         finer = dataclasses.replace(rod, substeps=factor * rod.substeps, local_error=rod.local_error / factor**3)
         return dataclasses.replace(self, rod=finer)
 
     def exact(self, finer: int = FINER) -> SpatialCable:
-        """With the edges and time steps that estimates are corrected for, without correction.
+        """The same cable with the fine edges and time steps to which estimates are corrected, without correction.
 
         Args:
             finer: so many time steps in place of each.
@@ -114,7 +114,7 @@ class SpatialCable(Simulator):
         return dataclasses.replace(self, rod=rod, correction=None)
 
     def corrected(self, one: Explanation) -> SpatialCable:
-        """A cable that is predicted as by a finer rod at these values, and moves with them as this rod does.
+        """The cable with the predictions of a finer rod at these values, and the derivatives of this rod.
 
         The difference of the two rods at `one` is added to every prediction. Where a fit is made with that, and the
         difference taken anew at its result until that stays where it is, the residuals are those of the finer rod,
@@ -125,7 +125,7 @@ class SpatialCable(Simulator):
         return dataclasses.replace(self, correction=exact - coarse)
 
     def own(self, one: Explanation) -> int:
-        """Number of parameters of each recording alone: those of the grip."""
+        """Number of parameters of each recording alone, those of its grip."""
         return sum(len(e.null) for e in self.layout.effects if e.own and e.name in one.names)
 
     def motion(self, one: Explanation) -> Float[np.ndarray, "W T F 3"]:
@@ -133,7 +133,7 @@ class SpatialCable(Simulator):
         return self.rollouts(one)[0]
 
     def rollouts(self, one: Explanation) -> tuple[Float[np.ndarray, "W T F 3"], Int[np.ndarray, "W"]]:
-        """The same, and how the simulation of each window ended: a `RodResult`."""
+        """The free markers of `motion`, and the `RodResult` of each window."""
         parts = self._in_parallel(0, one, np.arange(len(self.windows)), ())
         points, results = zip(*parts, strict=True)
         return np.concatenate(points), np.concatenate(results)
@@ -244,12 +244,12 @@ def mean_error(predicted: Float[np.ndarray, "W T F 3"], observed: Float[np.ndarr
 
 
 def typical_error(evidence: Evidence, one: Explanation) -> float:
-    """Mean over windows of what `mean_error` says, none of which counts for more than ten times the median [m]."""
+    """Mean of `mean_error` over windows, each limited to ten times the median [m]."""
     return float(moderated(mean_error(evidence.predict([one])[0], evidence.observed)).mean())
 
 
 def bounded(off: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape"]:
-    """Sizes of errors [m]; what a simulation has lost, NaN included, is off by a metre."""
+    """Sizes of errors [m]; lost simulations, NaN included, count as a metre."""
     return np.minimum(np.nan_to_num(np.abs(off), nan=_LOST, posinf=_LOST), _LOST)
 
 

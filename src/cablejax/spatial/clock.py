@@ -27,7 +27,7 @@ def steps_of(log: GapLog) -> Float[np.ndarray, " S"]:
 
 
 def thinned(log: GapLog) -> tuple[GapLog, tuple[str, ...]]:
-    """A log of many samples a second with the mean of several in place of each, and a sentence on it.
+    """Averages groups of samples of a log with a high sample rate, and returns a sentence on it.
 
     A window begins with the velocity between two samples, of which noise says the more the closer they are: that of
     0.3 mm is 0.1 m/s at 240 Hz. A cable moves little within a hundredth of a second.
@@ -67,7 +67,7 @@ def thinned(log: GapLog) -> tuple[GapLog, tuple[str, ...]]:
 
 
 def on_one_clock(log: GapLog) -> tuple[GapLog, tuple[str, ...]]:
-    """The log, sampled again where its clocks are uneven or differ between episodes, and sentences on what was changed.
+    """Resamples a log whose clocks are uneven or differ between episodes, and returns sentences on the changes.
 
     Readings of the grippers that jump away and back are taken out before, and many samples a second are `thinned`.
 
@@ -116,7 +116,7 @@ def on_one_clock(log: GapLog) -> tuple[GapLog, tuple[str, ...]]:
 
 
 def with_poses_in_time(log: GapLog) -> tuple[GapLog, tuple[str, ...]]:
-    """The log with the grippers' poses when the keypoints on them fit them, and a sentence where that was another time.
+    """Shifts the grippers' poses in time to fit the keypoints on them, and returns a sentence if it did.
 
     Keypoints of which the pose is not recorded then count as not observed.
 

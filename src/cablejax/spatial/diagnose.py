@@ -159,7 +159,7 @@ def _simulated(after: Float[np.ndarray, "W T F 3"], windows: Windows) -> tuple[n
 
 
 def with_roll(log: GapLog) -> GapLog:
-    """The log with `roll_observed`, where it does not say whether its quaternions show how the grippers roll.
+    """Adds `roll_observed` to a log that does not state whether its quaternions show how the grippers roll.
 
     They do if the nominal cable moves more like the recorded one with it. Quaternions that were made of markers have a
     roll too, which nobody observed.

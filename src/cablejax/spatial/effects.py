@@ -84,7 +84,7 @@ def _from_zero(name: str, field: str, scale: float, templates: tuple[float, ...]
 
 
 def effects_of(n_markers: int, damping: float = 0.0) -> tuple[SpatialEffect, ...]:
-    """All effects of a cable with so many free markers, of which this damping time is believed true [s]."""
+    """All effects of a cable with so many free markers and this nominal damping time [s]."""
     return (
         _positive("bending_stiffness", "ratio", 1.0, (math.exp(-1), 1.0, math.exp(1), math.exp(2)), null=1.0),
         _positive("bending_damping", "damping_time", 0.03, (0.01, 0.03, 0.1), null=damping),
@@ -105,7 +105,7 @@ def effect_names() -> tuple[str, ...]:
 
 @dataclasses.dataclass(frozen=True)
 class Layout:
-    """The effects of one cable, and what their values mean.
+    """The effects of one cable, and the layout of their values in one vector.
 
     Attributes:
         effects: in the order of the vector.
@@ -121,7 +121,7 @@ class Layout:
 
     @property
     def size(self) -> int:
-        """Of the vector."""
+        """Size of the vector."""
         return len(self.null)
 
     @property

@@ -70,7 +70,7 @@ class Interval:
     high: float
 
     def wider(self, deviation: float) -> Interval:
-        """With an independent error of so great a standard deviation besides."""
+        """The interval widened by an independent error with this standard deviation."""
         more = norm.ppf(_TAIL) * deviation
         return Interval(
             self.value,
@@ -85,7 +85,7 @@ class Interval:
         return Interval(self.value, low, high)
 
     def wider_by_factor(self, deviation: float) -> Interval:
-        """The same of a positive value and its logarithm."""
+        """The interval of a positive value, widened by an error of its logarithm."""
         log = Interval(*np.log(dataclasses.astuple(self))).wider(deviation)
         return Interval(self.value, *np.exp([log.low, log.high]).tolist())
 
@@ -160,7 +160,7 @@ def estimate(
     *,
     progress: Callable[[str], None] = lambda text: None,
 ) -> Estimate:
-    """Fits everything that was tried, in rounds, with predictions corrected at the result of the round before.
+    """Fits all tried effects in rounds, with predictions corrected at the result of the round before.
 
     Args:
         cable: in the windows to fit.
@@ -195,7 +195,7 @@ def estimate(
 
 
 def restarts(one: Explanation) -> list[Explanation]:
-    """Where a fit to half of the recordings may begin: an explanation, and the same with recordings' own values at 0.
+    """Starts of a fit to half of the recordings: an explanation, and the same with recordings' own values at 0.
 
     The search may have left those values in a bad minimum, in which a fit from 0 need not end.
     """
@@ -203,13 +203,13 @@ def restarts(one: Explanation) -> list[Explanation]:
 
 
 def best_start(cable: SpatialCable, one: Explanation, other: Explanation) -> Explanation:
-    """That of `starts_from` which simulates the cable's windows best."""
+    """The start of `starts_from` that simulates the cable's windows best."""
     evidence = cable.evidence()
     return min(starts_from(one, other), key=lambda start: typical_error(evidence, start))
 
 
 def starts_from(one: Explanation, other: Explanation) -> list[Explanation]:
-    """Where a fit to all recordings may begin: the mean of the fits to both halves, and either of them.
+    """Starts of a fit to all recordings: the mean of the fits to both halves, and either of them.
 
     The mean of two fits that went to different places may be worse than both. Each recording keeps what the fit to its
     own half found for it.
@@ -229,7 +229,7 @@ def _with_all(start: Explanation, cable: SpatialCable, tried: Sequence[str]) -> 
 
 
 def estimate_at(evidence: Evidence, fit: Fit) -> Estimate:
-    """The estimate that a fit of a cable's windows amounts to."""
+    """The estimate from a fit to a cable's windows."""
     cable, one = evidence.simulator, fit.explanation
     assert isinstance(cable, SpatialCable)
     # of the vector by the coordinates

@@ -37,7 +37,7 @@ def noise_of(windows: Windows) -> float:
 
 
 def smallest_gap(noise: float, windows: Windows, own: float = 0.0) -> float:
-    """The error of a coordinate [m], root mean square, from which on there is a gap; longer cables err by more.
+    """The smallest root mean square error of a coordinate that counts as a gap [m]; larger for longer cables.
 
     Args:
         noise: standard deviation of a coordinate [m].
@@ -73,7 +73,7 @@ def own_error(cable: SpatialCable, nominal: Float[np.ndarray, "W T F 3"], noise:
 
 
 def constant_offset(predicted: Float[np.ndarray, "W T F 3"], windows: Windows) -> float:
-    """What markers are off by all the time [m]: root mean square over coordinates of their mean error in a recording.
+    """Constant offset of the markers [m]: root mean square over coordinates of their mean error in a recording.
 
     Markers that sit off the centreline, or off their stated places, are part of it, and so is what the simulator has
     wrong at rest; the noise has none of it.

@@ -1,4 +1,4 @@
-"""How the grippers of a log in space hold the cable: which keypoints, where it leaves them, and how they turn."""
+"""How grippers in space hold the cable: the grasped keypoints, the clamps' positions and their frames."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def rolls_observed(log: GapLog) -> bool:
 def frames_of(
     log: GapLog, tangent: Float[np.ndarray, "E T 2 3"], valid: Bool[np.ndarray, "E T"]
 ) -> Float[np.ndarray, "E T 2 3 3"]:
-    """Frames of both grippers, rows are axes, without what scatters from one sample to the next."""
+    """Frames of both grippers, rows are axes, smoothed against scatter between samples."""
     tangent = _steady(tangent, log)
     if rolls_observed(log):
         side = _steady(rotated(log.gripper_pose[..., 3:].astype(float), np.array([0.0, 1.0, 0.0])), log)

@@ -111,7 +111,7 @@ class Identified:
 
 
 def layout_of(windows: Windows, nominal_stiffness: float, nominal_damping: float = 0.0) -> Layout:
-    """The parameters of a cable with these windows' markers; believed are EI / rho [m^4/s^2] and a damping time [s]."""
+    """The parameters of a cable with these windows' markers, nominal EI / rho [m^4/s^2] and damping time [s]."""
     return Layout(
         effects_of(windows.keypoints.shape[2], nominal_damping),
         float(nominal_stiffness),

@@ -66,12 +66,12 @@ def named_effects(found: Identified, density: float) -> tuple[NamedEffect, ...]:
 
 
 def with_both_drags(named: Sequence[str]) -> set[str]:
-    """Named effects, and with either drag the other one: only the sum of the two is identifiable."""
+    """Named effects; if one drag is among them, both are, since only their sum is identifiable."""
     return {*named, *(_DRAGS if set(_DRAGS) & set(named) else ())}
 
 
 def quantities_of(found: Identified, density: float | None) -> dict[str, ParameterEstimate]:
-    """What motion shows of the cable, whether an effect is named for it or not, with 90 % intervals.
+    """Quantities of the cable that motion identifies, whether or not an effect is named, with 90 % intervals.
 
     EI / rho, where the stiffness was free; both drags together at the recording's speed, where one was; and EI, where
     the mass per length is known.

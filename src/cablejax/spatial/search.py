@@ -81,7 +81,7 @@ def falls(before: Float[np.ndarray, "W"], after: Float[np.ndarray, "W"], group) 
 
 
 def accepted_effects(steps: Sequence[Step]) -> list[str]:
-    """Names of the effects that stayed."""
+    """Names of the effects that the search kept."""
     return [step.effect for step in steps if step.accepted and step.effect]
 
 
@@ -136,7 +136,7 @@ def tried_with(
     before: Step,
     progress: Callable[[str], None],
 ) -> Step:
-    """Fits both halves from starts, and says whether that simulates what they have not seen better than before.
+    """Fits both halves from starts, and checks whether that improves the held-out predictions.
 
     Args:
         cable: in all windows.

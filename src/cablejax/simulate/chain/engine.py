@@ -51,7 +51,7 @@ class ChainEngine(Engine):
             )
 
     def initial_state(self, gripper_pose, *, guess=None) -> CableState:
-        """See `Engine`; the cable remembers nothing yet."""
+        """See `Engine`; without plastic bends or internal friction."""
         return self._remembering(super().initial_state(gripper_pose, guess=guess))
 
     def rollout(self, physics, state, twist, interval=1.0):

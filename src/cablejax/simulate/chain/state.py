@@ -1,4 +1,4 @@
-"""The state of the planar chain between two steps, and where that puts its links."""
+"""The state of the planar chain between two steps, and the positions of its links."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ def chain_nodes(
 
 
 def expecting_no_change(state: ChainState) -> ChainState:
-    """The state where only its velocities are known: not how they change."""
+    """The state with known velocities and no expected change of these."""
     return dataclasses.replace(state, expected=state.velocity, expected_root=state.root_velocity)
 
 
@@ -94,7 +94,7 @@ def halfway_state(state: ChainState, dt) -> ChainState:
 
 
 def frame_of(config: Discretisation, state: ChainState) -> Frame:
-    """Where the links of a state are."""
+    """Positions and velocities of a state's links."""
     arms = jnp.asarray(levers(config), state.angles.dtype)
     theta, rate = summed(state.angles), summed(state.velocity[:-1])
     scale = 1.0 + state.stretch

@@ -53,7 +53,7 @@ _REACH = 1.000003
 
 @dataclasses.dataclass(frozen=True)
 class Statics:
-    """What is known of a cable's rest beyond its length; the defaults are a uniform cable, straight when free.
+    """A cable's parameters that determine its resting shape, besides length; by default uniform and straight when free.
 
     Attributes:
         stiffness: of each joint over their mean, J = LINKS - 1 of them; () = uniform. Only its course matters.
@@ -86,7 +86,7 @@ class Statics:
 
 
 def statics_with(effects: Iterable[GivenEffect], cable: Cable) -> Statics:
-    """What effects change of a cable's rest. Those that act in other ways, such as friction, change nothing of it."""
+    """The statics with effects; effects that do not change the resting shape, such as friction, are ignored."""
     config = Discretisation(cable, n_links=LINKS)
     nominal = nominal_physics(config, np.float64)
     physics = with_effects(nominal, effects, config)
@@ -151,7 +151,7 @@ def chain(n_keypoints: int, length: float) -> ChainMatrices:
 
 
 def clamped(gripper_pose: Float[Array, "2 3"], statics: Statics) -> Float[Array, "2 3"]:
-    """Poses of the cable's clamps [m, rad] where the grippers have these."""
+    """Poses of the cable's clamps at given gripper poses [m, rad]."""
     return gripper_pose + jnp.zeros((2, 3), gripper_pose.dtype).at[:, 2].set(jnp.array(statics.rotation_offset))
 
 

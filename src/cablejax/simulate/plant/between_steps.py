@@ -84,7 +84,7 @@ class Memory:
         self.reset()
 
     def reset(self) -> None:
-        """A new cable: no set, no internal friction, and none to come until `update` is called."""
+        """Resets to a new cable without plastic bends or internal friction."""
         self._set_curvature = np.zeros(len(self._joints))
         self._friction_state = np.zeros(len(self._joints))
         self._curvature: np.ndarray | None = None
@@ -92,7 +92,7 @@ class Memory:
         self._model.jnt_stiffness[self._joints] = np.asarray(self._physics.stiffness) / self._h
 
     def update(self) -> None:
-        """Takes note of the last step's bending, see `kept_bends`, and sets the springs for the next one."""
+        """Updates plastic bends from the last step, see `kept_bends`, and sets the springs for the next one."""
         physics = self._physics
         rotation = self._data.qpos[self._position]
         curvature = 2.0 * np.arctan2(rotation[:, 3], rotation[:, 0])

@@ -94,7 +94,7 @@ def with_held(free: Float[Array, "f 3"], held: Float[Array, "4 3"]) -> Float[Arr
 
 
 class Solution(NamedTuple):
-    """Of the system, or the last iterate where there is none.
+    """Solution of the system, or the last iterate if it was not solved.
 
     Attributes:
         free: nodes [m].

@@ -99,7 +99,7 @@ class DiscreteRod:
     def forces(
         self, nodes: Float[Array, "n 3"], directors: Float[Array, "m 3"], tangents: Float[Array, "m 3"]
     ) -> Float[Array, "f 3"]:
-        """Of rest curvature and twist at the free nodes, per mass [m/s^2]."""
+        """Forces of rest curvature and twist at the free nodes, per mass [m/s^2]."""
         h = self.h
         a, b = joint_frames(tangents, directors)
         # a curvature about the second axis bends towards minus the third
@@ -142,7 +142,7 @@ class DiscreteRod:
     def first_frames(
         self, nodes: Float[Array, "n 3"], side: Float[Array, "2 3"]
     ) -> tuple[Float[Array, "m 3"], Float[Array, "m 3"]]:
-        """Directors in equilibrium of twist, and tangents, of a cable that nothing is known of but its nodes."""
+        """Directors in equilibrium of twist, and tangents, from the nodes alone."""
         tangents = unit(jnp.diff(nodes, axis=0))
 
         def along(director, pair):
@@ -158,7 +158,7 @@ class DiscreteRod:
         return jax.lax.fori_loop(0, 20, lambda _, d: self.relaxed(nodes, d, tangents), directors), tangents
 
     def marker_offsets(self, directors: Float[Array, "m 3"], tangents: Float[Array, "m 3"]) -> Float[Array, "N 3"]:
-        """From the centreline to each marker [m]."""
+        """Vectors from the centreline to each marker [m]."""
         a, b = joint_frames(tangents, directors)
         mark, offset = self.weights[:, 1:-1], jnp.asarray(self.physics.offset)
         return offset[:, :1] * (mark @ a) + offset[:, 1:] * (mark @ b)
@@ -166,7 +166,7 @@ class DiscreteRod:
     def through(
         self, markers: Float[Array, "N 3"], held: Float[Array, "4 3"], guess: Float[Array, "f 3"]
     ) -> tuple[Float[Array, "n 3"], Bool[Array, ""]]:
-        """Nodes of the cable at rest that is drawn to observed markers, and whether they were found.
+        """Nodes of the cable at rest that observed markers pull towards themselves, and whether they were found.
 
         Args:
             markers: where the centreline is to pass [m].

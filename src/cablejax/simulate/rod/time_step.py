@@ -26,7 +26,7 @@ _IMPLICIT = 1.5
 
 
 class Motion(NamedTuple):
-    """A cable in motion: the last two time steps, of which no more is needed.
+    """State of a moving cable: its last two time steps.
 
     Attributes:
         nodes, nodes_before: [m].
