@@ -98,7 +98,7 @@ def cable_of_verdict(path: pathlib.Path) -> Cable | None:
 def check_verdicts(paths: Sequence[pathlib.Path], cable: Cable, remedy: str) -> None:
     """Checks that verdicts are on this cable, to which their effects are added.
 
-    Says so where an effect is named beside an unknown cause.
+    Prints a warning if an effect is named alongside an unknown cause.
 
     Raises:
         ValueError: one is of another cable, or no verdict; says how the two differ, and `remedy`.

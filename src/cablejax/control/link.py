@@ -82,8 +82,8 @@ class RobotLink:
             now: the link's clock [s]. Where it is set back, time goes on from where it was: a watchdog has to run out.
             observations: that have come since the last step, in the order in which they came.
 
-        What a controller refuses is told as the reason: of its first history the link waits for another, later the run
-        stops.
+        If a controller rejects its input, the reply states the reason. The link waits for another first history; later,
+        the run stops.
         """
         settled, behind = state.commands == 0, max(state.behind, state.now - now)
         now = now + behind

@@ -1,7 +1,7 @@
 """Data sets larger than memory: a buffer of trajectories, in which blocks from the stores take turns.
 
-The order of the blocks is a function of the seed, and the buffer at a turn one of the order alone, so that a training
-that was killed sees what it would have seen without. The next block is read while the devices compute.
+The order of the blocks depends only on the seed, and the buffer at a turn only on that order, so a training that is
+killed and resumed sees the same data. The next block is read while the devices compute.
 """
 
 from __future__ import annotations

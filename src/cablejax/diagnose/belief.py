@@ -65,23 +65,23 @@ class Calibration:
         baseline: root mean square error per coordinate of the simulator without any effect, in the unit of the
             observations; commissioning logs replace it.
         law_error: rho, of an effect's law relative to the gap it makes.
-        correlated_samples: n, over which errors of simulators stay the same; in a shorter episode all its samples.
+        correlated_samples: n, over which errors of simulators persist; at most all samples of an episode.
         freedom: nu of Student's distribution.
-        fit_freedom: the same in fits; `LEAST_SQUARES` where episodes are so few that a fit may set none aside.
-        term_cost: nats that each effect must pay for itself.
-        prior_cost: share of the nats that its parameters' prior takes away which it must pay too. The constants for
-            logs on a table were set without.
-        resolvable: a gap up to this many baseline errors is none, see `has_gap`.
-        noise_share: so much of the noise is added to the baseline error in that comparison, for the noise floor itself
-            is an estimate.
+        fit_freedom: the same in fits; `LEAST_SQUARES` where episodes are so few that a fit must not discount any.
+        term_cost: cost of each effect [nats].
+        prior_cost: share of the nats of its parameters' prior that an effect costs in addition. The constants for logs
+            on a table were set with 0.
+        resolvable: errors up to this many baseline errors are not a gap, see `has_gap`.
+        noise_share: share of the noise that is added to the baseline error in that comparison, since the noise floor
+            itself is an estimate.
         adequate: an explanation that leaves less than this share of the gap, root mean square, is complete.
-        telling: below this share of explained squared gap nothing is named, unless most motions are explained
+        telling: smallest share of explained squared gap for which an effect is named, unless most motions are explained
             completely.
-        set_odds: an effect belongs to the reported set if its odds against the best are at least these,
-        as_good: or if it leaves at most this many times what the best leaves, in six motions or more, see the function
-            `as_good`.
-        widening: of the intervals of parameters, for a law that is not quite the real one shifts them too.
-        max_effects: in one explanation at most, one that repeats counted once.
+        set_odds: an effect belongs to the reported set if its odds against the best are at least these;
+        as_good: or if its remaining error is at most this many times the best one's, in six motions or more, see the
+            function `as_good`.
+        widening: factor on the intervals of parameters, for errors of the fitted law.
+        max_effects: most effects in one explanation; a repeated effect counts once.
     """
 
     baseline: float = 3.5e-4
@@ -172,10 +172,9 @@ def left_by_motion(fit: Fit, evidence: Evidence) -> Float[np.ndarray, "M"]:
 def has_gap(null: Fit, evidence: Evidence, calibration: Calibration) -> bool:
     """Whether the nominal simulator is off by more than its own error, in the fourth-power mean over motions.
 
-    By a root mean square, calm motions that are recorded besides would make a gap disappear that some motions show.
-    What chance alone adds to the fourth power, by the noise of so few samples, is taken off, and twice its standard
-    deviation. Each motion counts in units of what the simulator may be off by in it: where the cable snaps over, that
-    is more.
+    With a root mean square, additional calm motions would hide a gap that some motions show. The expected contribution
+    of noise to the fourth power, and twice its standard deviation, are subtracted. Each motion counts in units of the
+    simulator's possible error in it, which is larger where the cable snaps through.
     """
     squares, count = _squares_by_motion(null, evidence)
     noise = level(evidence)

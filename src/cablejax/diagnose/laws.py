@@ -1,10 +1,10 @@
 """Refits the leading explanations under other laws of the simulator that the recording may not exclude.
 
-A simulator assumes more than it can know: the planar chain, for example, that the table carries the whole cable. Where
-it offers another law (`Simulator.other_laws`), the explanations that the search left open, and the simulator without
-any effect, are fitted again by that law. All laws are equally likely beforehand; afterwards each is as probable as what
-was fitted by it, together. The verdict is that of the simulator's own law, by which a named effect is added; its
-intervals are over all laws, and it says what the verdict would be under each.
+A simulator makes assumptions that a recording may not test: the planar chain assumes, for example, that the table
+carries the whole cable. Where the simulator offers another law (`Simulator.other_laws`), the remaining explanations and
+the simulator without any effect are refitted under that law. All laws have equal prior probability; the posterior of a
+law is that of all its fits together. The verdict is that of the simulator's own law, under which a named effect is
+added. Its intervals cover all laws, and it states the verdict under each.
 """
 
 from __future__ import annotations

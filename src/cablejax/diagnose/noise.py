@@ -199,7 +199,7 @@ def _scattered(count: Float[np.ndarray, "N"]) -> float:
 def _first_order(correlation: Float[np.ndarray, "K"], lengths: collections.Counter[int], smallest: float):
     """What a first-order process with these correlations about a line has before the line is taken out.
 
-    Its correlation time is at most half of a hold: a longer one cannot be told from a trend.
+    Its correlation time is at most half of a hold: a longer one is indistinguishable from a trend.
 
     Args:
         correlation: of what is left of holds without their lines, at lags 1, 2, ...

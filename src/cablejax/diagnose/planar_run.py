@@ -207,8 +207,8 @@ def _measured(case: Case, evidence: Evidence, conclusion: Conclusion) -> tuple[G
 def _worth_naming(conclusion: Conclusion, shrinkage: float | None) -> Conclusion:
     """The conclusion, once its effects were tried on episodes left out of the fit.
 
-    What stands beside an unknown cause and makes the gap there no smaller is no part of it: nothing is named then, nor
-    by the other laws. `shrinkage` is that of the gap on episodes left out; None where nothing could be.
+    An effect that is named alongside an unknown cause and does not shrink the gap on held-out episodes is dropped, also
+    under the other laws. `shrinkage` is that on held-out episodes; None where nothing could be held out.
     """
     if conclusion.verdict != "named+unknown" or shrinkage is None or shrinkage > 0:
         return conclusion

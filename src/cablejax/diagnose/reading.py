@@ -1,7 +1,7 @@
 """Alternative readings of a log: another cable length, or cables that begin where the table holds them.
 
-Each such reading is one more law of the simulator, see `laws`: it is as likely beforehand as any other, and where the
-log makes it the most probable one, the log is diagnosed again as it has it.
+Each reading is a further law of the simulator (see `laws`), with the same prior probability as any other. If it is the
+most probable law, the log is diagnosed again under this reading.
 """
 
 from __future__ import annotations

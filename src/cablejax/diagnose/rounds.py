@@ -1,13 +1,13 @@
 """Measures what each of several recordings adds to a diagnosis, and whether they contradict one another.
 
-The log likelihood of an explanation is a sum over episodes (see `belief`), so it is one over recordings too: each adds
-so many nats for one explanation against another, with the parameters that fit all of them.
+The log likelihood of an explanation is a sum over episodes (see `belief`), and therefore over recordings: each adds
+some nats for one explanation against another, at the parameters that fit all recordings.
 
-Recordings contradict one another where the best explanation by an effect would need other parameters for each: also
-where none at all is more probable, since what is there in one recording only fits no other. It is fitted to every
-recording alone, from the fit to all of them. Twice the sum of the nats that this gains has, for K recordings of one
-set-up, a chi-squared distribution of P (K - 1) degrees of freedom for P parameters (Wilks); that a fit alone pays its
-prior again makes the test cautious.
+Recordings contradict one another if the best explanation by an effect needs different parameters for each. This is
+tested even if "no effect" is more probable, since an effect in one recording only fits no other. The explanation is
+fitted to every recording alone, starting from the fit to all. For K recordings of one set-up and P parameters, twice
+the nats gained in sum have a chi-squared distribution with P (K - 1) degrees of freedom (Wilks). Every separate fit
+includes its prior, which makes the test cautious.
 """
 
 from __future__ import annotations

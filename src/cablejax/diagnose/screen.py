@@ -24,8 +24,8 @@ class Template:
         start: the explanation, moved along its amplitude to meet the gap where that is possible.
         explained: share of the squared gap that it takes away, the noise taken out of the gap: of the template at its
             best length where a parameter decides on that, else of the template as it is. At most about 1.
-        weighed: whether episodes count in both as in a fit from the base, and not by their squares alone: where the
-            cable snaps over, the gap of one episode is most of the squares, and no template meets it.
+        weighed: whether episodes are weighted as in a fit from the base, instead of by their squares alone: where the
+            cable snaps through, one episode dominates the squares, and no template matches it.
     """
 
     start: Explanation
@@ -38,8 +38,8 @@ def screen(
 ) -> list[Template]:
     """Templates of every start of every effect on top of a base explanation, by all squares and weighed.
 
-    An effect of finite size, not a derivative, is held against the gap: a cable that does not yield, slip or touch at
-    the null value has no derivative there.
+    The gap is compared with an effect of finite size, not with a derivative: a cable that does not yield, slip or touch
+    at the null value has no derivative there.
 
     Args:
         evidence: to explain.

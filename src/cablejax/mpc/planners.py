@@ -35,7 +35,7 @@ def bounded_plan(
 
     def linearise(motion, given):
         problem, guess = given
-        # the first linearisation is at the guess; where there are more, a rollout is little beside each
+        # the first linearisation is at the guess; if there are more, one extra rollout costs little
         return problem.linearise(motion, known=guess if max_steps == 1 else None)
 
     solution = least_squares(

@@ -64,7 +64,7 @@ def serve(
             connection.settimeout(None if simulated_clock else TICK)
             _converse(run, connection, simulated_clock)
     except BaseException:
-        # what ended it is what is told, also where there is nothing to keep
+        # report the error that ended the run, even if there is no log to keep
         with contextlib.suppress(GapLogError):
             run.finish()
         raise

@@ -1,9 +1,8 @@
 """Excludes windows that say nothing about an effect: those whose simulation is lost, or that nothing explains.
 
-One of them among seventy moves a mean error more than most effects do. A window is off where its error is more than ten
-times the median. Windows that are off are counted and shown, comparisons leave them out, and fits give them little
-weight, as long as they are few: where more than a tenth of the windows are off, that is a property of the simulation,
-and counts.
+One such window among seventy changes a mean error more than most effects do. A window is off if its error is more than
+ten times the median. Windows that are off are counted and reported, comparisons leave them out, and fits give them
+little weight. If more than a tenth of the windows are off, this is a property of the simulation, and they count.
 """
 
 from __future__ import annotations

@@ -116,9 +116,9 @@ class SpatialCable(Simulator):
     def corrected(self, one: Explanation) -> SpatialCable:
         """The cable with the predictions of a finer rod at these values, and the derivatives of this rod.
 
-        The difference of the two rods at `one` is added to every prediction. Where a fit is made with that, and the
-        difference taken anew at its result until that stays where it is, the residuals are those of the finer rod,
-        at the price of this one's derivatives.
+        The difference of the two rods at `one` is added to every prediction. If fits are repeated, each with the
+        difference at the last result, until the values settle, the residuals are those of the finer rod, at the cost of
+        this rod's derivatives.
         """
         plain, every = dataclasses.replace(self, correction=None), np.arange(len(self.windows))
         exact, coarse = (cable.predict([one], every)[0] for cable in (self.exact(), plain))

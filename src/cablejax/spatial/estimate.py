@@ -1,12 +1,12 @@
 """Estimates of a cable: EI / rho and the parameters of all effects that were tried, with 90 % intervals.
 
-An effect stays in the search when recordings that no fit has seen are simulated better with it. That is strict: drag, a
-stiffness profile or a recording's own grip may be there and yet not help elsewhere, and what is left out pulls the
-others' values the same way in all recordings, where no resampling of the recordings shows it. So what is good to
-simulate with is not what the cable is. Here all effects that were tried are free, chosen or not, and an interval has
-two parts: how a value changes when recordings are left out (jackknife), and how it changes when the priors move by
-their standard deviation, which is how far the fit may be drawn towards them. What a cable has beyond the law that is
-fitted shows in neither; what is reported of an effect (`named`) is wider by what that does to synthetic cables.
+The search keeps an effect only if it improves predictions on held-out recordings. This is strict: drag, a stiffness
+profile or a recording's own grip may be present and yet not help elsewhere. Leaving out such an effect biases the
+others by the same amount in all recordings, which resampling of the recordings cannot show. Here all effects that were
+tried are therefore free, whether the search kept them or not. An interval has two parts: how a value changes when
+recordings are left out (jackknife), and how it changes when the priors move by their standard deviation. Neither covers
+deviations of the cable from the fitted law; reported intervals (`named`) are widened by the effect of such deviations
+on synthetic cables.
 """
 
 from __future__ import annotations

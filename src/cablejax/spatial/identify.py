@@ -1,14 +1,14 @@
 """Identifies a cable in space from windows of recordings: effects, values, and held-out predictions.
 
 A search adds effects one by one, which brings fits close to the right minimum and shows how much each effect
-contributes (`search`). From where it ends, all effects that were tried are fitted together (`estimate`). Reported
-values and predictions both come from that fit. The search's own selection would serve neither: whether an effect near
-the threshold stays depends on chance, and leaving an effect out biases the others.
+contributes (`search`). From there, all effects that were tried are fitted together (`estimate`). Reported values and
+predictions both come from this fit, not from the search's selection: whether an effect near the threshold stays depends
+on chance, and leaving an effect out biases the others.
 
-Before that, the time steps are chosen from the recorded motion alone. A cable is simulated with steps of a sample's
-length where that is fine enough: on recordings at 100 Hz of clamps that move like a hand it is. Clamps that swing by
-decimetres twice a second, or samples that are far apart, need more. Steps are halved until a cable with the believed
-stiffness and ordinary damping moves as it does with half of them.
+Before the search, the time steps are chosen from the recorded motion alone. One step per sample is enough at 100 Hz for
+clamps that move like a hand. Clamps that swing by decimetres twice a second, or samples that are far apart, need more
+steps. Steps are halved until halving them hardly changes the motion of a cable with the nominal stiffness and ordinary
+damping.
 """
 
 from __future__ import annotations

@@ -103,7 +103,7 @@ def _shown(effect: str, parameter: ParameterEstimate, damping: float, *, longer_
         effect: name.
         parameter: that says how far it is from its absence.
         damping: time that a damping is compared with [s]: the one believed, or the shortest that time steps show.
-        longer_only: whether a shorter one cannot be told from it.
+        longer_only: whether a shorter one is indistinguishable from it.
     """
     ends = np.reshape(np.array(parameter.ci90, float), (-1, 2)).T
     ends, damped = np.stack([np.ravel(parameter.value), *ends]), effect == "bending_damping"

@@ -1,17 +1,16 @@
 """Forward selection of effects, scored on the held-out half of the recordings.
 
-Recordings are split into two halves. Both halves are fitted separately all along, and every window is scored with the
-fit of the other half. At each step the effect is tried with which unseen windows are simulated best
-from the start; it stays if the error on unseen recordings falls by more than a fiftieth, and in more than 84 % of
-resamples of the recordings, one standard error. After four effects in a row that did not, the search ends. Windows that
-are lost or far off in every way are left out of that, and effects that lose many are no failures (`accidents`). The
-search brings fits close to the right minimum and shows how much each effect contributes; from there all effects are
-fitted together (`estimate`).
+Recordings are split into two halves that are fitted separately throughout, and every window is scored with the fit of
+the other half. Each step tries the effect that is expected to reduce this error most. The effect stays if the error
+falls by more than a fiftieth, and in more than 84 % of resamples of the recordings, one standard error. The search ends
+after four effects in a row that do not stay. Windows that are lost or far off in every way are left out of the
+comparison, and effects that lose many do not count as failures (`accidents`). The search brings fits close to the right
+minimum and shows how much each effect contributes; from there all effects are fitted together (`estimate`).
 
-Fits, priors, losses and what is a recording's own are those of every diagnosis. This search is not: that of
-`cablejax.diagnose.search` fits all candidates of a step and believes the likelihood of whole episodes with a
-calibration from labelled logs. Here one fit takes as long as that search, and there are no labelled logs, so candidates
-are ordered by what one Gauss-Newton step promises and judged by resampling; probabilities do not follow from that, and
+Fits, priors, losses and parameters of single recordings are those of every diagnosis, but the search differs.
+`cablejax.diagnose.search` fits all candidates of a step and uses the likelihood of whole episodes, calibrated on
+labelled logs. Here one fit takes as long as that whole search, and there are no labelled logs. Candidates are therefore
+ordered by the decrease that one Gauss-Newton step predicts and judged by resampling. This gives no probabilities, so
 none are reported.
 """
 

@@ -5,8 +5,8 @@ gripper poses and the branch it is on (up or down, S or mirrored S): not on its 
 finds that shape by a few Newton steps on a chain of rigid links, from the observed keypoints before a command to the
 poses after it. An error in the keypoints fades instead of adding up over a rollout, since they only choose the branch.
 
-What is known of a cable that is not uniform, not straight, or held askew enters as `Statics`. What is left for the
-network is what this leaves out: friction, damping, snap-through.
+`Statics` describes a cable that is not uniform, not straight at rest, or clamped askew. The rest is left to the
+network: friction, damping, snap-through.
 """
 
 from __future__ import annotations

@@ -89,7 +89,7 @@ class Rod:
 
     Attributes:
         n_edges: from clamp to clamp, the two held halves counted as one. With fewer than 20, or more than 40, the first
-            shape may be drawn in a wrong fold, which no result code tells.
+            shape may have a wrong fold, which no result code reports.
         substeps: time steps between two samples.
         twisting: whether the material frame is followed. Without it rest curvature, twist and offsets across the cable
             have no effect, and a step costs half.
